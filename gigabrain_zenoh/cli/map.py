@@ -59,7 +59,7 @@ def info(name: str, /) -> None:
 
     path = map_file.path_of(name)
     saved = map_file.load(path)
-    if problem := map_file.what_is_wrong(saved):
+    if problem := map_file.map_problem(saved):
         raise ConfigError(f"{path}: {problem}")
     print_line(f"{path}: {map_file.in_words(saved)}, {saved.resolution:g} m per cell")
     if not path.with_suffix(map_file.GRAPH).exists():

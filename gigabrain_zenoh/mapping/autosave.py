@@ -25,7 +25,7 @@ from gigabrain_zenoh.mapping import map_file
 from gigabrain_zenoh.mapping.map_file import Arrays
 
 if TYPE_CHECKING:
-    from gigabrain_zenoh.mapping.slam_map import Still  # and gtsam: only who makes maps pays
+    from gigabrain_zenoh.mapping.slam_map import MapSnapshot  # and gtsam: only who makes maps pays
 
 log = logging.getLogger(__name__)
 
@@ -39,14 +39,14 @@ HEAD = "head"
 Triple = tuple[Finite, Finite, Finite]
 
 
-class Head(Struct, frozen=True, kw_only=True):
+class SaveHead(Struct, frozen=True, kw_only=True):
     """When and where a map was saved."""
 
     boot: Count  # which start of the driver
     tick: Count
     odometry: Triple  # x, y [m] and yaw [rad] of the robot
     place: Triple | None  # the same in the map, if it was known
-    changes: tuple[int, int, int]  # see Still
+    changes: tuple[int, int, int]  # see MapSnapshot
 
 
 class Autosave:
@@ -56,14 +56,14 @@ class Autosave:
         self._slots = [folder / f"map_{number}.npz" for number in (0, 1)]  # the next one first
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="autosave")
         self._job: Future[int] | None = None
-        self._doing: Head | None = None
-        self._done: Head | None = None  # of what was saved last
+        self._doing: SaveHead | None = None
+        self._done: SaveHead | None = None  # of what was saved last
         self._began_tick = self._next_tick = 0
         self.problem: Cause | None = None
         self.saves = 0
         self.bytes = 0  # of the last one
 
-    def found(self, boot: int) -> Iterator[tuple[Head, Arrays]]:
+    def found(self, boot: int) -> Iterator[tuple[SaveHead, Arrays]]:
         """The maps that were saved in a start of the driver, the newest first."""
         heads = {path: head for path in self._slots if (head := _head(path))}
         good = [path for path, head in heads.items() if head.boot == boot]
@@ -84,10 +84,10 @@ class Autosave:
         new = self._done is None or self._done.boot != boot
         return self._job is None and (new or tick >= self._next_tick)
 
-    def save(self, boot: int, tick: int, odometry: Floats, still: "Still") -> None:
+    def save(self, boot: int, tick: int, odometry: Floats, still: "MapSnapshot") -> None:
         """Begin to save a map as it was at a tick, unless it is as it was saved last."""
         place = None if still.pose is None else _triple(still.pose)
-        head = Head(
+        head = SaveHead(
             boot=boot, tick=tick, odometry=_triple(odometry), place=place, changes=still.changes
         )
         if self._job:
@@ -139,19 +139,19 @@ def _triple(pose: Floats) -> Triple:
     return x, y, yaw
 
 
-def _head(path: Path) -> Head | None:
+def _head(path: Path) -> SaveHead | None:
     """What a file says of itself; nothing where there is none, or none that can be read."""
     if not path.exists():
         return None
     try:
         content = map_file.read_arrays(path, "the map", only=HEAD)[HEAD].tobytes()
-        return msgspec.json.decode(content, type=Head)
+        return msgspec.json.decode(content, type=SaveHead)
     except (ConfigError, *DECODE_ERRORS) as error:
         refuse(str(error))
         return None
 
 
-def _write(path: Path, head: Head, still: "Still") -> int:
+def _write(path: Path, head: SaveHead, still: "MapSnapshot") -> int:
     """The size of the file [bytes]. Raises OSError and ValueError."""
     make_folder(path.parent)
     arrays = still.freeze()
@@ -172,7 +172,7 @@ def _unsaved(why: str) -> Cause:
     )
 
 
-def _alike(one: Head, other: Head) -> bool:
+def _alike(one: SaveHead, other: SaveHead) -> bool:
     """Whether neither the map nor the robot's place has changed much."""
     x, y, yaw = (b - a for a, b in zip(one.odometry, other.odometry, strict=True))
     moved = math.hypot(x, y) > MOVED_M or abs(math.remainder(yaw, math.tau)) > MOVED_RAD

@@ -19,8 +19,8 @@ from gigabrain_zenoh.geometry.se2 import (
     wrapped,
 )
 from gigabrain_zenoh.mapping.keyframes import KeyframePolicy, Scan, seen_through, thinned
-from gigabrain_zenoh.mapping.local_map import LocalMap, build, room_for
-from gigabrain_zenoh.mapping.scan_matching import Fit, Found, Window, icp, search
+from gigabrain_zenoh.mapping.local_map import LocalMap, build, image_buffer
+from gigabrain_zenoh.mapping.scan_matching import IcpResult, SearchResult, Window, icp, search
 
 CELL, SIGMA = 0.05, 0.08  # [m], of the likelihood image
 GATE = 0.3  # [m]
@@ -55,7 +55,7 @@ UNKNOWN = np.diag((10.0, 10.0, np.pi)) ** 2  # covariance of a link that nothing
 
 
 @dataclass(frozen=True, slots=True)
-class Match:
+class ScanMatch:
     """Where the front end puts a scan, and how it came to that.
 
     matched: by ICP. searched: by search alone. recovered: far from where odometry had it.
@@ -71,7 +71,7 @@ class Match:
 
 
 @dataclass(frozen=True, slots=True)
-class Adrift:
+class DriftSinceMatch:
     """What odometry did since a scan was matched."""
 
     misses: int = 0  # scans in a row that fit one another, but not the map
@@ -79,13 +79,13 @@ class Adrift:
     turn: float = 0.0  # [rad]
     blind: bool = False  # there was nothing to match for a while, so odometry may be right
 
-    def moved(self, delta: Floats, blind: bool) -> "Adrift":
+    def moved(self, delta: Floats, blind: bool) -> "DriftSinceMatch":
         """After odometry has moved by `delta` (3,) once more."""
         travel = self.travel + float(np.hypot(delta[0], delta[1]))
         turn = self.turn + abs(float(delta[2]))
-        return Adrift(self.misses, travel, turn, self.blind or blind)
+        return DriftSinceMatch(self.misses, travel, turn, self.blind or blind)
 
-    def missed(self, fits: bool) -> "Adrift":
+    def missed(self, fits: bool) -> "DriftSinceMatch":
         """Return the state after a scan that was not matched; `fits` the one missed before it."""
         return replace(self, misses=self.misses + 1 if fits else 1)
 
@@ -127,13 +127,13 @@ class FrontEnd:
         self._scans: list[Scan] = []
         self._poses: list[Floats] = []
         self._local: LocalMap | None = None
-        self._room, self._spare = room_for(CELL), room_for(CELL)
-        self._adrift = Adrift()
+        self._room, self._spare = image_buffer(CELL), image_buffer(CELL)
+        self._adrift = DriftSinceMatch()
         self._missed: tuple[Scan, Floats] | None = None  # the last scan not matched, and where
         self._noise: Floats | None = UNMOVED  # of odometry since a scan was matched
         self.pose = pose
 
-    def add(self, scan: Scan, delta: Floats, noise: Floats | None = None) -> tuple[Match, bool]:
+    def add(self, scan: Scan, delta: Floats, noise: Floats | None = None) -> tuple[ScanMatch, bool]:
         """Where the scan lies, after odometry has moved by `delta`; and whether to keep it.
 
         `noise` is the covariance of `delta` in its own frame, if it is known.
@@ -142,14 +142,14 @@ class FrontEnd:
         self._adrift = self._adrift.moved(delta, len(scan.points) < FEW)
         self._noise = self._summed(noise, delta)
         if self._local is None:
-            match = Match(guess, self._adrift.covariance, "matched", 1.0, 1.0)
+            match = ScanMatch(guess, self._adrift.covariance, "matched", 1.0, 1.0)
         else:
             match = self._match(self._local, scan, guess)
         self.pose = match.pose
         far = match.kind == "broken" or self._far_enough()
         if match.kind == "odometry":
             return match, self._adrift.far and far
-        self._adrift, self._noise, self._missed = Adrift(), UNMOVED, None
+        self._adrift, self._noise, self._missed = DriftSinceMatch(), UNMOVED, None
         return match, far
 
     def place(self, pose: Floats) -> None:
@@ -169,8 +169,8 @@ class FrontEnd:
         self._local = build(self._scans, placed, self.pose, CELL, SIGMA, self._room)
 
     def settle(
-        self, scan: Scan, scans: Sequence[Scan], poses: Sequence[Floats], about: Match
-    ) -> Match | None:
+        self, scan: Scan, scans: Sequence[Scan], poses: Sequence[Floats], about: ScanMatch
+    ) -> ScanMatch | None:
         """Match to these scans from now on, if the scan that was added last fits them.
 
         `about` is where the scan lies among them, and how uncertain that is.
@@ -193,9 +193,9 @@ class FrontEnd:
         """The scans of the local map, and where they are in the front end's frame."""
         return self._scans, self._poses
 
-    def _match(self, local: LocalMap, scan: Scan, guess: Floats) -> Match:
+    def _match(self, local: LocalMap, scan: Scan, guess: Floats) -> ScanMatch:
         if len(scan.points) < FEW:
-            return Match(guess, self._adrift.covariance, "odometry", 0.0, 0.0)
+            return ScanMatch(guess, self._adrift.covariance, "odometry", 0.0, 0.0)
         covariance = self._adrift.covariance
         found = search(local.image, scan.points, guess, self._adrift.window)
         if self._noise is not None:
@@ -210,8 +210,13 @@ class FrontEnd:
         return self._doubted(local, scan, guess, found, match)
 
     def _doubted(
-        self, local: LocalMap, scan: Scan, guess: Floats, found: Found, match: Match | None
-    ) -> Match:
+        self,
+        local: LocalMap,
+        scan: Scan,
+        guess: Floats,
+        found: SearchResult,
+        match: ScanMatch | None,
+    ) -> ScanMatch:
         """Where a scan lies of which little fits: where it looks through nothing that is there.
 
         What fits best is no proof then, for a scan that shows much that is new fits the better the
@@ -238,8 +243,8 @@ class FrontEnd:
         return match or self._lost(scan, guess, found)
 
     def _turned(
-        self, local: LocalMap, scan: Scan, guess: Floats, found: Found, wrong: float
-    ) -> tuple[Match | None, float]:
+        self, local: LocalMap, scan: Scan, guess: Floats, found: SearchResult, wrong: float
+    ) -> tuple[ScanMatch | None, float]:
         """Where odometry leads if it is off by a turn, and the least that is looked through there.
 
         A small turn takes what is far out of reach of ICP, and lets beams pass through walls.
@@ -258,7 +263,9 @@ class FrontEnd:
                 best = fit
         return (_matched(best, found, covariance, "matched") if best else None), least
 
-    def _led(self, local: LocalMap, scan: Scan, guess: Floats, found: Found) -> Match | None:
+    def _led(
+        self, local: LocalMap, scan: Scan, guess: Floats, found: SearchResult
+    ) -> ScanMatch | None:
         """Where odometry leads, unless the scan contradicts that or shows next to nothing known."""
         covariance = self._adrift.covariance
         fit = _fit(local, scan, guess, guess, covariance)
@@ -270,7 +277,7 @@ class FrontEnd:
 
     def _recover(
         self, local: LocalMap, scan: Scan, guess: Floats, least: float, wrong: float
-    ) -> Match | None:
+    ) -> ScanMatch | None:
         """Where the scan fits beyond doubt, wide round the guess and where the robot was before.
 
         It has to fit better than `least`, and contradict less than `wrong`, if that is known.
@@ -288,13 +295,13 @@ class FrontEnd:
             return None
         return _matched(fit, found, UNKNOWN, "recovered")
 
-    def _lost(self, scan: Scan, guess: Floats, found: Found) -> Match:
+    def _lost(self, scan: Scan, guess: Floats, found: SearchResult) -> ScanMatch:
         """By odometry alone, as long as that goes."""
         self._adrift = self._adrift.missed(self._fits_missed(scan, guess))
         self._missed = scan, guess
         if self._adrift.broken:
-            return Match(guess, self._adrift.after_break(), "broken", found.score, 0.0)
-        return Match(guess, self._adrift.covariance, "odometry", found.score, 0.0)
+            return ScanMatch(guess, self._adrift.after_break(), "broken", found.score, 0.0)
+        return ScanMatch(guess, self._adrift.covariance, "odometry", found.score, 0.0)
 
     def _fits_missed(self, scan: Scan, guess: Floats) -> bool:
         """Return whether the scan fits the one that was not matched before it."""
@@ -328,24 +335,26 @@ def _likely(off: Floats, covariance: Floats) -> bool:
     return bool(off @ inverse_of(covariance) @ off < CONTRADICTED)
 
 
-def _fit(local: LocalMap, scan: Scan, start: Floats, guess: Floats, covariance: Floats) -> Fit:
+def _fit(
+    local: LocalMap, scan: Scan, start: Floats, guess: Floats, covariance: Floats
+) -> IcpResult:
     points = thinned(scan.points, POINTS)
     return icp(local.buckets, points, start, GATE, inverse_of(covariance), guess)
 
 
-def _plain(fit: Fit, found: Found, covariance: Floats) -> Match | None:
+def _plain(fit: IcpResult, found: SearchResult, covariance: Floats) -> ScanMatch | None:
     """Where a search and ICP from there have put the scan, unless both have failed."""
     near = found.score > LEAST_SCORE and _apart(fit.pose, found.pose) <= MOVED
     if near and fit.inliers >= INLIERS:
         return _matched(fit, found, covariance, "matched")
     if found.score > SCORE:
-        return Match(wrapped(found.pose), covariance, "searched", found.score, fit.inliers)
+        return ScanMatch(wrapped(found.pose), covariance, "searched", found.score, fit.inliers)
     return None
 
 
-def _matched(fit: Fit, found: Found, prior: Floats, kind: Kind) -> Match:
+def _matched(fit: IcpResult, found: SearchResult, prior: Floats, kind: Kind) -> ScanMatch:
     covariance = inverse_of(fit.information + inverse_of(prior))
-    return Match(wrapped(fit.pose), covariance, kind, found.score, fit.inliers)
+    return ScanMatch(wrapped(fit.pose), covariance, kind, found.score, fit.inliers)
 
 
 def _apart(one: Floats, other: Floats) -> float:

@@ -21,7 +21,7 @@ from gigabrain_zenoh.mapping.likelihood_field import (
     FieldFit,
     LikelihoodField,
     fit,
-    matches_itself,
+    is_self_similar,
 )
 
 POINTS = 90  # of a scan, evenly chosen
@@ -159,7 +159,7 @@ def _outdone(field: LikelihoodField, one: FieldFit, found: list[FieldFit]) -> bo
         return False
     best = found[0]
     clear = best.shown >= CLEAR_SHOWN and best.score >= CLEAR_SCORE and best.wrong <= CLEAR_WRONG
-    return clear and not matches_itself(field, compose(one.pose, inverse(best.pose)))
+    return clear and not is_self_similar(field, compose(one.pose, inverse(best.pose)))
 
 
 def _least(shown: float) -> float:

@@ -238,10 +238,10 @@ class KeyframePolicy:
         return int(np.argmax(held))
 
 
-def freeze_keyframes(keyframes: Sequence[Keyframe]) -> dict[str, NDArray[np.generic]]:
+def keyframes_to_arrays(keyframes: Sequence[Keyframe]) -> dict[str, NDArray[np.generic]]:
     """All of the keyframes."""
     return {
-        **freeze_edges("link", [keyframe.link for keyframe in keyframes]),
+        **edges_to_arrays("link", [keyframe.link for keyframe in keyframes]),
         "travel": np.array([keyframe.travel for keyframe in keyframes]),
         "segment": np.array([keyframe.segment for keyframe in keyframes], np.int32),
         "points": _joined(keyframe.points for keyframe in keyframes),
@@ -251,9 +251,9 @@ def freeze_keyframes(keyframes: Sequence[Keyframe]) -> dict[str, NDArray[np.gene
     }
 
 
-def thaw_keyframes(arrays: Arrays) -> list[Keyframe]:
+def keyframes_from_arrays(arrays: Arrays) -> list[Keyframe]:
     """The keyframes again; KeyError or ValueError if the arrays do not belong together."""
-    links = thaw_edges("link", arrays)
+    links = edges_from_arrays("link", arrays)
     points = split(arrays["points"], arrays["points_each"])
     free = split(arrays["free"], arrays["free_each"])
     rows = zip(links, points, free, arrays["travel"], arrays["segment"], strict=True)
@@ -263,7 +263,7 @@ def thaw_keyframes(arrays: Arrays) -> list[Keyframe]:
     ]
 
 
-def freeze_edges(name: str, edges: Sequence[Edge]) -> dict[str, NDArray[np.generic]]:
+def edges_to_arrays(name: str, edges: Sequence[Edge]) -> dict[str, NDArray[np.generic]]:
     """The edges as three arrays whose names begin with `name`."""
     return {
         f"{name}_ends": np.array([(e.first, e.second) for e in edges], np.int32).reshape(-1, 2),
@@ -273,7 +273,7 @@ def freeze_edges(name: str, edges: Sequence[Edge]) -> dict[str, NDArray[np.gener
     }
 
 
-def thaw_edges(name: str, arrays: Arrays) -> list[Edge]:
+def edges_from_arrays(name: str, arrays: Arrays) -> list[Edge]:
     """The edges again."""
     ends = arrays[f"{name}_ends"].astype(int)
     relative = arrays[f"{name}_relative"].astype(np.float64)

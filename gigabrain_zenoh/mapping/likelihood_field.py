@@ -27,7 +27,7 @@ JUDGED = 0.5  # of the hits, at least: of a place that the map shows less of, no
 BLUR_M = 0.25  # [m], a beam that ends so much behind a wall has passed through it
 Distances = NDArray[np.float32]
 
-ON_WALL_M = 0.15  # a wall that comes to lie so near another is matches_itself
+ON_WALL_M = 0.15  # a wall that comes to lie this near another matches it
 MIN_WALL_CELLS = 40  # cells of wall, or next to nothing of the map comes to lie on what is known
 MIN_SPREAD_M = 0.4  # how far they deviate from one line: a wall alone is like every other
 MAX_AMID_SHARE = 0.15  # of them, at most, may come to lie amid free ground
@@ -210,7 +210,7 @@ def _pierced(field: LikelihoodField, beams: Beams, pose: Floats) -> float:
     return through / max(len(hits) + len(free), 1)
 
 
-def matches_itself(field: LikelihoodField, move: Floats) -> bool:
+def is_self_similar(field: LikelihoodField, move: Floats) -> bool:
     """Whether the map may well go on as itself moved by `move` (3,), in its own frame."""
     rows, columns = np.nonzero(field.distance < field.cell / 2)
     chosen = np.linspace(0, len(rows) - 1, min(MAX_WALL_CELLS, len(rows))).astype(np.intp)

@@ -59,7 +59,7 @@ EMPTY = Buckets(
 )
 
 
-def room_for(cell: float) -> Bytes:
+def image_buffer(cell: float) -> Bytes:
     """Memory for the images of one map after the other: new memory takes longer than drawing."""
     side = int(2 * REACH / cell) + MARGIN
     return np.empty(2 * side * side, np.uint8)
@@ -79,7 +79,7 @@ def build(
     the means of what shares a cell. To choose one of it by the order of the beams would be wrong:
     of those along a wall the later are the nearer on one side and the farther on the other, and a
     robot between two walls would be turned a little by each scan. Its images are in `room`, see
-    room_for.
+    image_buffer.
     """
     points, normals, low, high = _placed(
         np.concatenate([scan.points for scan in scans]),

@@ -20,9 +20,9 @@ from gigabrain_zenoh.mapping.likelihood_field import (
     contradiction,
     field_of,
     fit,
-    matches_itself,
+    is_self_similar,
 )
-from gigabrain_zenoh.mapping.occupancy_grid import CELL, Grid
+from gigabrain_zenoh.mapping.occupancy_grid import CELL, LogOddsGrid
 
 LOST_SCORE, LOST_SCANS = 0.45, 5  # so bad a fit for so long: the robot is somewhere else
 SURE_SCORE, SURE_SCANS = 0.65, 3  # so good a fit for so long, and the only one: it is here
@@ -67,8 +67,8 @@ class Hypothesis:
     pose: Floats
     covariance: Floats
     score: float = 0.0
-    shown: float = 1.0  # of the hits, see Fit
-    wrong: float = 0.0  # beams that the map rules out, see Fit
+    shown: float = 1.0  # of the hits, see FieldFit
+    wrong: float = 0.0  # beams that the map rules out, see FieldFit
     against: float = 0.0
     continues: bool = False  # odometry has the robot here, from where it was before it was lost
     good: int = 0  # scans in a row that fit
@@ -194,7 +194,7 @@ class Localizer:
         """Whether `one` has led off what is shown, to where the map gives no reason to be."""
         if one.shown >= SHOWN or one.bad % GONE_SCANS != GONE_SCANS - 1 or not best.good:
             return False
-        return not matches_itself(self.map, compose(one.pose, inverse(best.pose)))
+        return not is_self_similar(self.map, compose(one.pose, inverse(best.pose)))
 
 
 def _possible(one: Hypothesis) -> bool:
@@ -319,7 +319,7 @@ class KidnapDetector:
         """Whether the robot is somewhere else."""
         return self.scans >= KIDNAPPED_SCANS
 
-    def look(self, grid: Grid, view: View, pose: Floats) -> bool:
+    def look(self, grid: LogOddsGrid, view: View, pose: Floats) -> bool:
         """Whether the scan does not belong at `pose`, where odometry has the robot."""
         cells, corner = grid.around(float(pose[0]), float(pose[1]), JUDGED_RADIUS_M)
         if not cells.size:

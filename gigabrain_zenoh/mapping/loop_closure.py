@@ -25,7 +25,7 @@ from gigabrain_zenoh.geometry.se2 import (
 )
 from gigabrain_zenoh.mapping.keyframes import Edge, Keyframe, Points, seen_through, thinned
 from gigabrain_zenoh.mapping.local_map import build
-from gigabrain_zenoh.mapping.pose_graph import Drift, Rates, explained
+from gigabrain_zenoh.mapping.pose_graph import Drift, DriftRates, explained
 from gigabrain_zenoh.mapping.scan_matching import Window, icp, search
 
 LOOP_RADIUS_M = 4.0  # [m] round the robot
@@ -87,7 +87,7 @@ MAX_RIVAL_SHARE = 0.5  # stretches that agree on another place, per stretch that
 class LoopSearch:
     """Looks for loops from each keyframe in turn. One thread at a time."""
 
-    def __init__(self, rates: Rates) -> None:
+    def __init__(self, rates: DriftRates) -> None:
         self.drift = Drift(rates)
         self._places = PlaceSearch(self.drift)
         self.waiting: list[Edge] = []  # loops without a second witness

@@ -92,10 +92,10 @@ def path_of(name: str) -> Path:
     """The YAML file of a map by its name, or by its path if it looks like one."""
     if "/" in name or name.endswith((".yaml", ".yml")):
         return Path(name)
-    return saved_as(name)
+    return saved_map_path(name)
 
 
-def saved_as(name: str) -> Path:
+def saved_map_path(name: str) -> Path:
     """The YAML file of a map that was saved, or is to be, under a name."""
     return state_dir() / "maps" / f"{name}.yaml"
 
@@ -143,7 +143,7 @@ def save(path: Path, found: SavedMap, graph: Arrays, *, replace: bool = False) -
 
     Raises Refused for what is no map, or where another one is and `replace` is not said.
     """
-    problem = what_is_wrong(found)
+    problem = map_problem(found)
     if problem:
         raise Refused(f"not saved: {problem}")
     try:
@@ -159,7 +159,7 @@ def save(path: Path, found: SavedMap, graph: Arrays, *, replace: bool = False) -
     _finish(path)
 
 
-def what_is_wrong(found: SavedMap) -> str:
+def map_problem(found: SavedMap) -> str:
     """Why this is no map worth keeping, or an empty text."""
     area = np.count_nonzero(_free(found)) * found.resolution**2
     if area < LEAST_FREE_M2:

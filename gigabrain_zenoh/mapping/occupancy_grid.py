@@ -35,7 +35,7 @@ NEWEST = 3  # sweeps that stay of each of them
 Place = tuple[int, int, int]
 
 
-class Grid:
+class LogOddsGrid:
     """Cells of `CELL` metres that grow with what is drawn."""
 
     def __init__(self) -> None:
@@ -46,7 +46,9 @@ class Grid:
         self.full = False  # whether something was left out because the grid may grow no more
 
     @classmethod
-    def of(cls, log_odds: Cells, known: NDArray[np.bool_], origin: tuple[float, float]) -> "Grid":
+    def of(
+        cls, log_odds: Cells, known: NDArray[np.bool_], origin: tuple[float, float]
+    ) -> "LogOddsGrid":
         """A grid as it was saved."""
         grid = cls()
         grid.origin_x, grid.origin_y = origin
@@ -54,9 +56,9 @@ class Grid:
         grid._stamps, grid._scans = known.astype(np.int32), 1
         return grid
 
-    def still(self) -> "Grid":
+    def still(self) -> "LogOddsGrid":
         """A copy that stays as it is."""
-        held = Grid()
+        held = LogOddsGrid()
         held.origin_x, held.origin_y, held.full = self.origin_x, self.origin_y, self.full
         held.log_odds, held._stamps = self.log_odds.copy(), self._stamps.copy()
         held._scans = self._scans
@@ -195,14 +197,14 @@ def _show(log_odds: Cells, stamps: Stamps, percent: Cells, shown: Cells) -> None
 
 def warm_up() -> None:
     """Compile what a driving robot calls."""
-    points, grid = np.array([[1.0, 0.0]], np.float32), Grid()
+    points, grid = np.array([[1.0, 0.0]], np.float32), LogOddsGrid()
     grid.draw(np.zeros(3), points, points)
     grid.percent()
     grid.around(0.0, 0.0, CELL)
 
 
 @dataclass(frozen=True, slots=True)
-class Sweep:
+class GridScan:
     """One scan that was drawn."""
 
     keyframe: int  # on which it hangs
@@ -211,7 +213,7 @@ class Sweep:
     free: Points  # (m, 2)
     sensor: Floats  # (2,), where the beams start
 
-    def draw(self, into: Grid, keyframe: Floats) -> None:
+    def draw(self, into: LogOddsGrid, keyframe: Floats) -> None:
         """Draw it, `keyframe` (3,) being in the map now."""
         pose = compose(keyframe, self.relative)
         beam = compose(pose, np.array((self.sensor[0], self.sensor[1], 0.0)))
@@ -219,11 +221,11 @@ class Sweep:
         into.draw(beam, self.hits - offset, self.free - offset)
 
 
-class Sweeps:
+class GridScans:
     """All sweeps of a map, in the order in which they were seen."""
 
     def __init__(self) -> None:
-        self._kept: dict[int, Sweep] = {}  # by their number
+        self._kept: dict[int, GridScan] = {}  # by their number
         self._at: dict[Place, list[int]] = defaultdict(list)  # numbers, the oldest first
         self._place: Floats | None = None  # in the map, of the newest that stays
         self._standing = False  # whether the last one gives way to the next
@@ -232,13 +234,13 @@ class Sweeps:
     def __len__(self) -> int:
         return len(self._kept)
 
-    def all(self) -> list[Sweep]:
+    def all(self) -> list[GridScan]:
         """As they are now."""
         return list(self._kept.values())
 
-    def add(self, view: View, keyframe: int, relative: Floats, pose: Floats) -> Sweep:
+    def add(self, view: View, keyframe: int, relative: Floats, pose: Floats) -> GridScan:
         """One more, seen from `pose` in the map; while the robot stands, the newest is enough."""
-        sweep = Sweep(keyframe, relative, view.scan.points, view.scan.free, view.sensor)
+        sweep = GridScan(keyframe, relative, view.scan.points, view.scan.free, view.sensor)
         if self._standing:
             self._kept.popitem()
             self._kept[self.seen] = sweep
@@ -251,7 +253,7 @@ class Sweeps:
             self._place = pose
         return sweep
 
-    def _keep(self, sweep: Sweep, pose: Floats) -> list[int]:
+    def _keep(self, sweep: GridScan, pose: Floats) -> list[int]:
         """Keep the sweep, and return the numbers of all that were seen from the same place."""
         self.seen += 1
         self._kept[self.seen] = sweep
@@ -260,9 +262,9 @@ class Sweeps:
         numbers.append(self.seen)
         return numbers
 
-    def still(self) -> "Sweeps":
+    def still(self) -> "GridScans":
         """A copy to be frozen, which stays as it is."""
-        held = Sweeps()
+        held = GridScans()
         held._kept, held.seen = dict(self._kept), self.seen
         return held
 
@@ -280,7 +282,7 @@ class Sweeps:
         }
 
     @classmethod
-    def thaw(cls, arrays: Mapping[str, NDArray[Any]], poses: Floats) -> "Sweeps":
+    def thaw(cls, arrays: Mapping[str, NDArray[Any]], poses: Floats) -> "GridScans":
         """What was frozen, keyframes being at `poses` (n, 3) in the map.
 
         Raises KeyError or ValueError if the arrays do not belong together.
@@ -300,7 +302,7 @@ class Sweeps:
         rows = zip(on, relative, hits, free, sensor, strict=True)
         thawed = cls()
         for keyframe, *rest in rows:
-            sweep = Sweep(int(keyframe), *rest)
+            sweep = GridScan(int(keyframe), *rest)
             thawed._keep(sweep, compose(poses[sweep.keyframe], sweep.relative))
         return thawed
 

@@ -34,7 +34,7 @@ SLIPPING = 5.0  # so much more uncertain is what the wheels say then
 JUMP_FACTOR, JUMP_M, JUMP_RAD = 2.0, 0.2, 0.5  # more than the body can do is no motion
 
 
-class Moment(NamedTuple):
+class OdometrySample(NamedTuple):
     """Where dead reckoning has got to at one tick."""
 
     tick: int
@@ -45,11 +45,11 @@ class Moment(NamedTuple):
     unaided: int = 0  # how many of the steps since then turned by what the wheels say alone
 
 
-class Fusion:
+class OdometryFusion:
     """Dead reckoning over the states of one start of the driver."""
 
     def __init__(self) -> None:
-        self._moments: deque[Moment] = deque(maxlen=KEPT)
+        self._moments: deque[OdometrySample] = deque(maxlen=KEPT)
         self.bias = 0.0  # [rad/s], of the gyro
         self._calibrated = False
         self._rate: float | None = None  # [rad/s], the gyro's last reading without its bias
@@ -57,7 +57,7 @@ class Fusion:
         self._slip = 0.0  # [rad/s], smoothed
 
     @property
-    def newest(self) -> Moment | None:
+    def newest(self) -> OdometrySample | None:
         """The last moment."""
         return self._moments[-1] if self._moments else None
 
@@ -67,7 +67,7 @@ class Fusion:
         last = self.newest
         if last is None:
             self._rate = self._turn_rate(state)
-            self._moments.append(Moment(state.tick, pose, pose, slipping=False, jumps=0))
+            self._moments.append(OdometrySample(state.tick, pose, pose, slipping=False, jumps=0))
             return
         if state.tick <= last.tick:
             return
@@ -81,14 +81,14 @@ class Fusion:
             turn = self._turn(state, step, ticks)
             unaided += turn is None
             fused = advanced(fused, step, float(step[2]) if turn is None else turn)
-        self._moments.append(Moment(state.tick, pose, fused, self.slipping, jumps, unaided))
+        self._moments.append(OdometrySample(state.tick, pose, fused, self.slipping, jumps, unaided))
 
     @property
     def slipping(self) -> bool:
         """Whether wheels and gyro disagree."""
         return abs(self._slip) > SLIP_RATE
 
-    def at(self, tick: int) -> Moment | None:
+    def at(self, tick: int) -> OdometrySample | None:
         """The moment of `tick`; between two states it is on the way from one to the other.
 
         None where it is not known (yet), or where too many states are missing.
@@ -104,7 +104,7 @@ class Fusion:
         if not 0 < after.tick - before.tick <= GAP_TICKS:
             return None
         share = (tick - before.tick) / (after.tick - before.tick)
-        return Moment(
+        return OdometrySample(
             tick,
             _along(before.odometry, after.odometry, share),
             _along(before.fused, after.fused, share),
@@ -139,7 +139,7 @@ class Fusion:
         return True
 
 
-def way(last: Moment, moment: Moment) -> tuple[Floats, Floats]:
+def way(last: OdometrySample, moment: OdometrySample) -> tuple[Floats, Floats]:
     """The way (3,) from one moment to another, and its covariance (3, 3) in its own frame."""
     step = between(last.fused, moment.fused)
     aided = moment.unaided == last.unaided

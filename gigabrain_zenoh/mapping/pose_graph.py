@@ -184,7 +184,7 @@ def _noise(edge: Edge) -> gtsam.noiseModel.Base:
 
 
 @dataclass(frozen=True, slots=True)
-class Rates:
+class DriftRates:
     """How fast matched scans may drift at most."""
 
     away: float = 0.05  # [m] per square root of a metre driven
@@ -194,7 +194,7 @@ class Rates:
 class Drift:
     """The ways between keyframes, with the variance of yaw [rad²] and of place [m²] on each."""
 
-    def __init__(self, rates: Rates) -> None:
+    def __init__(self, rates: DriftRates) -> None:
         self._rates = rates
         self._ways: dict[int, list[tuple[int, float, float]]] = defaultdict(list)
 

@@ -27,7 +27,7 @@ SIGMA = 0.06  # [m], residuals beyond it lose their weight
 SOFT = 1e-9  # keeps the normal equations regular where the points say nothing
 
 
-class Hits(NamedTuple):
+class LatticeHits(NamedTuple):
     """Points of a scan at each heading of a window, at the window's first row and column."""
 
     inside: NDArray[np.uint32]  # (headings, n): cells, counted row by row, of points that
@@ -54,7 +54,7 @@ class Lattice(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class SearchResult:
     """The likeliest pose of a search."""
 
     pose: Floats
@@ -68,14 +68,14 @@ def search(
     window: Window,
     least: float = -np.inf,
     most: int = SEARCHED,
-) -> Found:
+) -> SearchResult:
     """The pose within the window whose points fall on the likeliest cells.
 
     The guess, with a score of 0, where none scores `least`, which saves most of the search. At
     most `most` of the points are searched with.
     """
     if not len(points):
-        return Found(guess, 0.0)
+        return SearchResult(guess, 0.0)
     steps = int(np.ceil(window.away / image.cell))
     turns = int(np.ceil(window.turn / window.step))
     lattice, few = Lattice(steps, turns, window.step), thinned(points, most)
@@ -83,11 +83,11 @@ def search(
     bounds = _bounds(image.coarse, hits, len(few), lattice)
     score, t, i, j = _best(image.cells, hits, bounds, len(few), lattice, least)
     off = np.array(((j - steps) * image.cell, (i - steps) * image.cell, (t - turns) * window.step))
-    return Found(guess + off, score)
+    return SearchResult(guess + off, score)
 
 
 @kernel
-def _placed(points: Points, guess: Floats, image: LikelihoodImage, lattice: Lattice) -> Hits:
+def _placed(points: Points, guess: Floats, image: LikelihoodImage, lattice: Lattice) -> LatticeHits:
     """Place the points at each heading, with the body in the first corner of the window."""
     (steps, turns, turn), (height, width) = lattice, image.cells.shape
     origin, cell, sides = image.origin, image.cell, BLOCK * (2 * steps // BLOCK + 1)
@@ -108,7 +108,7 @@ def _placed(points: Points, guess: Floats, image: LikelihoodImage, lattice: Latt
             elif -sides < row < height and -sides < column < width:
                 rim[t, rim_count[t], 0], rim[t, rim_count[t], 1] = row, column
                 rim_count[t] += 1
-    return Hits(inside, inside_count, rim, rim_count)
+    return LatticeHits(inside, inside_count, rim, rim_count)
 
 
 @lean_kernel
@@ -123,7 +123,9 @@ def _score(likelihood: float, down: int, right: int, t: int, lattice: Lattice) -
 
 
 @lean_kernel
-def _total(cells: Bytes, flat: NDArray[np.uint8], hits: Hits, t: int, row: int, column: int) -> int:
+def _total(
+    cells: Bytes, flat: NDArray[np.uint8], hits: LatticeHits, t: int, row: int, column: int
+) -> int:
     """How likely all points of heading `t` are together, so many rows and columns on."""
     total = 0
     on = np.uint32(row * cells.shape[1] + column)
@@ -137,7 +139,7 @@ def _total(cells: Bytes, flat: NDArray[np.uint8], hits: Hits, t: int, row: int, 
 
 
 @kernel
-def _bounds(coarse: Bytes, hits: Hits, count: int, lattice: Lattice) -> Floats:
+def _bounds(coarse: Bytes, hits: LatticeHits, count: int, lattice: Lattice) -> Floats:
     """Return upper bounds of the scores in each block (headings, blocks, blocks)."""
     headings, flat, (steps, turns, _) = len(hits.inside), coarse.ravel(), lattice
     blocks = 2 * steps // BLOCK + 1
@@ -154,7 +156,7 @@ def _bounds(coarse: Bytes, hits: Hits, count: int, lattice: Lattice) -> Floats:
 
 @kernel
 def _best(
-    cells: Bytes, hits: Hits, bounds: Floats, count: int, lattice: Lattice, least: float
+    cells: Bytes, hits: LatticeHits, bounds: Floats, count: int, lattice: Lattice, least: float
 ) -> tuple[float, int, int, int]:
     """Return likelihood, heading, row and column of the pose with the best score, the first of
     equals.
@@ -176,7 +178,7 @@ def _best(
     return likeliest, at_t, at_i, at_j
 
 
-class Fit(NamedTuple):
+class IcpResult(NamedTuple):
     """Result of ICP."""
 
     pose: Floats
@@ -282,7 +284,7 @@ def _linearize(
 @kernel
 def icp(
     local: Buckets, points: Points, start: Floats, gate: float, prior: Floats, guess: Floats
-) -> Fit:
+) -> IcpResult:
     """Slide `points` onto the lines of `local`, beginning at `start`.
 
     `prior` is the (3, 3) information about `guess`, the pose that odometry expects. It decides
@@ -305,4 +307,4 @@ def icp(
             break
         gate = max(gate * SHRINK, GATE_LEAST)
     rms = np.sqrt(squares / max(inliers, 1))
-    return Fit(pose, hessian, inliers / max(len(points), 1), rms)
+    return IcpResult(pose, hessian, inliers / max(len(points), 1), rms)

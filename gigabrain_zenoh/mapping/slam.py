@@ -14,21 +14,21 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.geometry.se2 import IDENTITY, between, compose, inverse, turned, wrap
-from gigabrain_zenoh.mapping.front_end import FrontEnd, Kind, Match
+from gigabrain_zenoh.mapping.front_end import FrontEnd, Kind, ScanMatch
 from gigabrain_zenoh.mapping.keyframes import (
     Arrays,
     Edge,
     Keyframe,
     KeyframePolicy,
     Scan,
-    freeze_edges,
-    freeze_keyframes,
+    edges_from_arrays,
+    edges_to_arrays,
+    keyframes_from_arrays,
+    keyframes_to_arrays,
     shaped,
-    thaw_edges,
-    thaw_keyframes,
 )
 from gigabrain_zenoh.mapping.loop_closure import LoopSearch, around
-from gigabrain_zenoh.mapping.pose_graph import Graph, Rates
+from gigabrain_zenoh.mapping.pose_graph import DriftRates, Graph
 
 LINK = np.diag((0.05, 0.05, 0.01)) ** 2  # covariance of a link beside that of its match,
 GUIDED = np.diag((0.02, 0.02, 0.005)) ** 2  # and where odometry was known to be good
@@ -53,7 +53,7 @@ class Estimate:
     covariance: Floats  # (3, 3), of x, y and yaw in the map, against what is mapped round the robot
     keyframe: int  # the keyframe that this hangs on: a correction moves both
     relative: Floats  # the pose in that keyframe's frame
-    kind: Kind  # how it was found, see Match
+    kind: Kind  # how it was found, see ScanMatch
     score: float  # 0 to 1, how well the scan fits
     kept: bool  # the scan has become a keyframe
     lost: bool  # the sequence broke, and nothing has joined the parts since
@@ -74,7 +74,7 @@ class Slam:
         self,
         pose: Floats = IDENTITY,
         spacing: KeyframePolicy | None = None,
-        rates: Rates | None = None,
+        rates: DriftRates | None = None,
     ) -> None:
         self._front = FrontEnd(spacing or KeyframePolicy(), pose)
         self._anchor = (0, pose)  # a keyframe, and where the front end has it
@@ -85,10 +85,10 @@ class Slam:
         self._tied = -np.inf  # [m] of travel, where the way lay right on earlier ones last
         self._known = False  # whether scans are laid onto earlier keyframes alone
         self._smooth: Floats = IDENTITY  # the front end's frame, in the one that never jumps
-        self._ground = Ground()
+        self._ground = KnownGround()
         self._shown: dict[int, Scan] = {}  # keyframes of known ground; their normals take long
         self._graph = Graph()
-        self._rates = rates or Rates()
+        self._rates = rates or DriftRates()
         self._search = LoopSearch(self._rates)
         self._closing: tuple[Edge, ...] = ()  # loops that the graph has not settled with
         self.keyframes: list[Keyframe] = []  # only appended to
@@ -164,7 +164,7 @@ class Slam:
         self._tied = self._travel
         self._smooth = compose(smooth, inverse(self._front.pose))
 
-    def _familiar(self, scan: Scan, match: Match) -> Match | None:
+    def _familiar(self, scan: Scan, match: ScanMatch) -> ScanMatch | None:
         """Lay the scan onto the keyframes of known ground, and match to those from now on.
 
         Return None where the ground is not known, or shows something else.
@@ -255,9 +255,9 @@ class Slam:
         held = {id(keyframe.points): k for k, keyframe in enumerate(self.keyframes)}
         scans, placed = self._front.held
         return {
-            **freeze_keyframes(self.keyframes),
-            **freeze_edges("loop", self._graph.loops),
-            **freeze_edges("waiting", self._search.waiting),
+            **keyframes_to_arrays(self.keyframes),
+            **edges_to_arrays("loop", self._graph.loops),
+            **edges_to_arrays("waiting", self._search.waiting),
             "poses": self.poses,
             "behind": np.array(len(self.keyframes) - len(self._graph.poses)),
             "searched": np.array(self._search.searched),
@@ -271,11 +271,11 @@ class Slam:
 
     @classmethod
     def thaw(
-        cls, arrays: Arrays, spacing: KeyframePolicy | None = None, rates: Rates | None = None
+        cls, arrays: Arrays, spacing: KeyframePolicy | None = None, rates: DriftRates | None = None
     ) -> "Slam":
         """Go on from what was frozen; KeyError or ValueError if it does not belong together."""
         slam = cls(shaped(arrays, "front", 3), spacing, rates)
-        slam.keyframes = thaw_keyframes(arrays)
+        slam.keyframes = keyframes_from_arrays(arrays)
         for keyframe in slam.keyframes:
             slam._ground.add(keyframe)
         poses = arrays["poses"].astype(np.float64)
@@ -292,13 +292,13 @@ class Slam:
         return slam
 
     def _thaw_graph(self, poses: Floats, arrays: Arrays) -> None:
-        loops = thaw_edges("loop", arrays)
+        loops = edges_from_arrays("loop", arrays)
         self._graph = _graph_of(self.keyframes[: len(poses)], poses, loops)
         for keyframe in self.keyframes[: len(poses)]:
             self._search.drift.linked(keyframe.link)
         for loop in loops:
             self._search.drift.closed(loop)
-        self._search.waiting = thaw_edges("waiting", arrays)
+        self._search.waiting = edges_from_arrays("waiting", arrays)
         self._search.searched = float(arrays["searched"])
         self._join(loops)
 
@@ -311,7 +311,7 @@ class Slam:
             if ends & self._joined:
                 self._joined |= ends
 
-    def _keep(self, scan: Scan, match: Match, relative: Floats) -> None:
+    def _keep(self, scan: Scan, match: ScanMatch, relative: Floats) -> None:
         here = len(self.keyframes)
         broken = match.kind == "broken"
         self._segment += broken
@@ -336,7 +336,7 @@ def _graph_of(keyframes: Sequence[Keyframe], poses: Floats, loops: Sequence[Edge
     return graph
 
 
-class Ground:
+class KnownGround:
     """The keyframes of a map by place. Corrections move them, so it is told the poses each time."""
 
     def __init__(self) -> None:

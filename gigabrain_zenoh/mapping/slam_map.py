@@ -16,8 +16,14 @@ from gigabrain_zenoh.mapping.keyframes import Scan, View, shaped
 from gigabrain_zenoh.mapping.likelihood_field import field_of
 from gigabrain_zenoh.mapping.localizer import NOWHERE, BackgroundLocalizer, KidnapDetector, Place
 from gigabrain_zenoh.mapping.map_file import Arrays, SavedMap
-from gigabrain_zenoh.mapping.occupancy_grid import CELL, MOST_CELLS, Grid, Sweep, Sweeps
-from gigabrain_zenoh.mapping.pose_graph import Rates
+from gigabrain_zenoh.mapping.occupancy_grid import (
+    CELL,
+    MOST_CELLS,
+    GridScan,
+    GridScans,
+    LogOddsGrid,
+)
+from gigabrain_zenoh.mapping.pose_graph import DriftRates
 from gigabrain_zenoh.mapping.slam import Correction, Estimate, Slam
 from gigabrain_zenoh.mapping.static_map import warm_up as warm_up_localizing
 
@@ -25,7 +31,7 @@ DRAWN_SCANS = 5  # every so many scans one is drawn, and every keyframe
 DRAWN_AT_ONCE = 8  # sweeps, of those that wait after the map was drawn anew
 LOOP_SCANS, KEYFRAME_SCANS, SWEEPS_A_SCAN = 5, 2, 200  # how long the work beside may take
 SHIFT_M, SHIFT_RAD = 0.02, 0.004  # keyframes that moved less need not be drawn anew
-RATES = Rates(away=0.008, turn=0.002)  # of scans every few centimetres, guided by odometry
+RATES = DriftRates(away=0.008, turn=0.002)  # of scans every few centimetres, guided by odometry
 FITS = ("matched", "recovered")  # scans that were found otherwise are not drawn
 
 LOOKING = "looking for the robot in the map"
@@ -38,15 +44,15 @@ FULL = Cause(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Still:
+class MapSnapshot:
     """A map as it was at one scan; it can be put into arrays in another thread."""
 
     pose: Floats | None  # (3,), of the robot at that scan, if it was known
     slam: Slam
-    sweeps: Sweeps
-    grid: Grid
+    sweeps: GridScans
+    grid: LogOddsGrid
     drawn: list[Floats]  # poses of the keyframes, as they are in the grid
-    waiting: list[Sweep]  # to be drawn
+    waiting: list[GridScan]  # to be drawn
 
     def freeze(self) -> dict[str, NDArray[np.generic]]:
         """All that it takes to go on as if nothing had happened."""
@@ -76,14 +82,14 @@ class Still:
         return len(self.slam.keyframes), self.slam.revision, self.sweeps.seen
 
 
-class GrowingMap:
-    """See Chart in known.py."""
+class SlamMap:
+    """A map that SLAM makes; see RobotMap."""
 
     def __init__(self, patience_s: float = PATIENCE_S, in_time: InTime = done) -> None:
         self._background = ScheduledWorker(patience_s, in_time)
-        self._slam, self._sweeps, self._grid = Slam(rates=RATES), Sweeps(), Grid()
+        self._slam, self._sweeps, self._grid = Slam(rates=RATES), GridScans(), LogOddsGrid()
         self._drawn: list[Floats] = []  # poses of keyframes, as they are in the grid
-        self._waiting: list[Sweep] = []  # to be drawn
+        self._waiting: list[GridScan] = []  # to be drawn
         self._undrawn = 0  # scans
         self._settling = False
         self._finder: BackgroundLocalizer | None = None
@@ -94,7 +100,7 @@ class GrowingMap:
         self._last = Place(IDENTITY, NOWHERE, False, "no scan yet")
         self._loops = self._renewals = 0
         self._wanted = False  # a copy, as soon as nothing is under way beside
-        self._still: Still | None = None
+        self._still: MapSnapshot | None = None
 
     @classmethod
     def thaw(
@@ -103,7 +109,7 @@ class GrowingMap:
         patience_s: float = PATIENCE_S,
         in_time: InTime = done,
         last: Floats | None = None,
-    ) -> "GrowingMap":
+    ) -> "SlamMap":
         """A map to go on with, saved or kept.
 
         The robot is at `last` (3,) if its odometry has gone on since; if the next scan does not
@@ -113,7 +119,7 @@ class GrowingMap:
         grown = cls(patience_s, in_time)
         try:
             grown._slam = Slam.thaw(arrays, rates=RATES)
-            grown._sweeps = Sweeps.thaw(arrays, grown._slam.poses)
+            grown._sweeps = GridScans.thaw(arrays, grown._slam.poses)
             if "grid_odds" in arrays:
                 grown._thaw_grid(arrays)
             else:
@@ -136,13 +142,13 @@ class GrowingMap:
         if odds.ndim != 2 or odds.shape != known.shape or max(odds.shape) > MOST_CELLS:
             raise ValueError(f"a grid of shape {odds.shape}")
         x, y = shaped(arrays, "grid_origin", 2).tolist()
-        self._grid = Grid.of(odds, known.astype(np.bool_), (x, y))
+        self._grid = LogOddsGrid.of(odds, known.astype(np.bool_), (x, y))
         self._drawn = list(shaped(arrays, "drawn", len(self._slam.keyframes), 3))
         sweeps = self._sweeps.all()
         self._waiting = [sweeps[k] for k in arrays["undrawn"].astype(int)]
 
     def step(self, view: View, motion: Floats, noise: Floats) -> Place:
-        """See Chart."""
+        """See RobotMap."""
         self._background.at_scan()
         if self._wanted and self._background.idle:
             self._wanted, self._still = False, self._copied()
@@ -169,7 +175,7 @@ class GrowingMap:
         return self._last
 
     def lose(self, why: str) -> None:
-        """See Chart. The robot may still be where odometry has it."""
+        """See RobotMap. The robot may still be where odometry has it."""
         if not self._slam.keyframes:
             return
         origin = (self._grid.origin_x, self._grid.origin_y)
@@ -187,17 +193,17 @@ class GrowingMap:
         """Copy the map at the next scan at which nothing is under way beside; see `kept`."""
         self._wanted = True
 
-    def kept(self) -> Still | None:
+    def kept(self) -> MapSnapshot | None:
         """The copy of the map before the last scan, if one was made; only once."""
         still, self._still = self._still, None
         return still
 
     def grid(self) -> OccupancyGrid:
-        """See Chart."""
+        """See RobotMap."""
         return self._grid.message()
 
     def settle(self) -> bool:
-        """See Chart."""
+        """See RobotMap."""
         self._settling = True
         return self._background.idle
 
@@ -205,16 +211,16 @@ class GrowingMap:
         """The map now, as `Still` has it. Raises Refused."""
         return self.still().to_save()
 
-    def still(self) -> Still:
-        """See Chart. Waits for the work beside."""
+    def still(self) -> MapSnapshot:
+        """See RobotMap. Waits for the work beside."""
         self._settling = False
         if self._finder or not self._slam.keyframes:
             raise Refused(f"not saved: where the robot is, is not known ({self._last.why})")
         self._background.finish()
         return self._copied()
 
-    def _copied(self) -> Still:
-        return Still(
+    def _copied(self) -> MapSnapshot:
+        return MapSnapshot(
             pose=self._here(),
             slam=self._slam.still(),
             sweeps=self._sweeps.still(),
@@ -224,7 +230,7 @@ class GrowingMap:
         )
 
     def report(self) -> dict[str, int]:
-        """See Chart."""
+        """See RobotMap."""
         return {
             "keyframes": len(self._slam.keyframes),
             "sweeps": len(self._sweeps),
@@ -235,7 +241,7 @@ class GrowingMap:
         }
 
     def problems(self) -> tuple[Cause, ...]:
-        """See Chart."""
+        """See RobotMap."""
         found = [FULL] if self._grid.full else []
         if self._slam.failure:
             text = f"loops are closed no more, the optimiser fails: {self._slam.failure}"
@@ -243,7 +249,7 @@ class GrowingMap:
         return tuple(found)
 
     def close(self) -> None:
-        """See Chart."""
+        """See RobotMap."""
         self._background.close()
 
     def _find(
@@ -306,7 +312,7 @@ class GrowingMap:
         self._background.start(work, scans)
 
     def _correct(
-        self, corrections: list[Correction], grid: Grid | None, drawn: list[Sweep]
+        self, corrections: list[Correction], grid: LogOddsGrid | None, drawn: list[GridScan]
     ) -> None:
         for correction in corrections:
             self._slam.apply(correction)
@@ -320,8 +326,8 @@ class GrowingMap:
                 self.lose(self._last.why)
 
 
-def _rendered(sweeps: Sequence[Sweep], poses: Sequence[Floats] | Floats) -> Grid:
-    grid = Grid()
+def _rendered(sweeps: Sequence[GridScan], poses: Sequence[Floats] | Floats) -> LogOddsGrid:
+    grid = LogOddsGrid()
     for sweep in sweeps:
         sweep.draw(grid, poses[sweep.keyframe])
     return grid

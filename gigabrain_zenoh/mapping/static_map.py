@@ -15,51 +15,55 @@ from gigabrain_zenoh.mapping.keyframes import Scan, View
 from gigabrain_zenoh.mapping.likelihood_field import contradiction, field_of
 from gigabrain_zenoh.mapping.localizer import BackgroundLocalizer, Place
 from gigabrain_zenoh.mapping.map_file import SavedMap
-from gigabrain_zenoh.mapping.occupancy_grid import CELL, Grid
+from gigabrain_zenoh.mapping.occupancy_grid import CELL, LogOddsGrid
 from gigabrain_zenoh.mapping.occupancy_grid import warm_up as warm_up_grid
 
 if TYPE_CHECKING:
-    from gigabrain_zenoh.mapping.slam_map import Still  # and gtsam: only who makes maps pays
+    from gigabrain_zenoh.mapping.slam_map import MapSnapshot  # and gtsam: only who makes maps pays
 
 BEAMS, ROOM_M = 60, 1.0
 
 
-class Chart(Protocol):
-    """A map, and where the robot is in it."""
+class RobotMap(Protocol):
+    """A map, and the robot's pose in it."""
 
     def step(self, view: View, motion: Floats, noise: Floats) -> Place:
-        """One scan, after a `motion` (3,) of that covariance (3, 3), in its own frame."""
+        """Process one scan after a `motion` (3,) of covariance `noise` (3, 3), in its own frame."""
 
     def lose(self, why: str) -> None:
-        """The robot may be anywhere in the map."""
+        """Search the whole map for the robot."""
 
     def grid(self) -> OccupancyGrid:
-        """The map as others see it."""
+        """Return the map as a message."""
 
     def settle(self) -> bool:
-        """Begin nothing new beside, until `still`; whether nothing is under way there."""
+        """Start no background work until `still`; return whether none is running."""
+        return True
 
-    def still(self) -> "Still":
-        """A copy to be saved, which stays as it is. Raises Refused."""
+    def still(self) -> "MapSnapshot":
+        """Return a copy to be saved, which does not change. Raises Refused."""
 
     def keep(self) -> None:
-        """Copy the map at the next scan at which nothing is under way beside; see `kept`."""
+        """Copy the map at the next scan without background work; see `kept`."""
+        return
 
-    def kept(self) -> "Still | None":
-        """The copy of the map before the last scan, if one was made; only once."""
+    def kept(self) -> "MapSnapshot | None":
+        """Return the copy of the map before the last scan, once; None if none was made."""
+        return None
 
     def report(self) -> dict[str, int]:
-        """Figures for people."""
+        """Return counters for health reports."""
 
     def problems(self) -> tuple[Cause, ...]:
-        """What it cannot do now."""
+        """Return the present limitations."""
+        return ()
 
     def close(self) -> None:
-        """End what runs beside."""
+        """End the background work."""
 
 
-class KnownMap:
-    """A saved map, which stays as it is."""
+class StaticMap(RobotMap):
+    """A saved map, which does not change."""
 
     def __init__(
         self, saved: SavedMap, patience_s: float = PATIENCE_S, in_time: InTime = done
@@ -71,16 +75,16 @@ class KnownMap:
         )
 
     def step(self, view: View, motion: Floats, noise: Floats) -> Place:
-        """See Chart."""
+        """See RobotMap."""
         self._background.at_scan()
         return self._finder.step(view, motion, noise)
 
     def lose(self, why: str) -> None:
-        """See Chart."""
+        """See RobotMap."""
         self._finder.lose(why)
 
     def grid(self) -> OccupancyGrid:
-        """See Chart."""
+        """See RobotMap."""
         height, width = self._saved.cells.shape
         return OccupancyGrid(
             resolution=self._saved.resolution,
@@ -91,31 +95,16 @@ class KnownMap:
             cells=self._saved.cells.tobytes(),
         )
 
-    def settle(self) -> bool:
-        """See Chart."""
-        return True
-
-    def still(self) -> "Still":
-        """Never: it is saved already."""
+    def still(self) -> "MapSnapshot":
+        """Refuse: the map is saved already."""
         raise Refused("not saved: perception finds its way in a saved map, it makes none")
 
-    def keep(self) -> None:
-        """Never, likewise."""
-
-    def kept(self) -> "Still | None":
-        """Never, likewise."""
-        return None
-
     def report(self) -> dict[str, int]:
-        """See Chart."""
+        """See RobotMap."""
         return {"late": self._background.late}
 
-    def problems(self) -> tuple[Cause, ...]:
-        """See Chart."""
-        return ()
-
     def close(self) -> None:
-        """See Chart."""
+        """See RobotMap."""
         self._background.close()
 
 
@@ -125,7 +114,7 @@ def warm_up() -> None:
     ways = np.column_stack((np.cos(angles), np.sin(angles)))
     scan = Scan.of(ROOM_M * ways / np.abs(ways).max(axis=1, keepdims=True), ways[:1])
     warm_up_grid()
-    drawn = Grid()
+    drawn = LogOddsGrid()
     drawn.draw(IDENTITY, scan.points, scan.free)
     field = field_of(drawn.percent(), CELL, (drawn.origin_x, drawn.origin_y))
     beams = View(scan, np.zeros(2)).beams

@@ -118,7 +118,7 @@ def motion_of(state: Floats, lane: int) -> MotionState:
 
 
 @lean_kernel
-def of_place(
+def place_cost(
     weights: Weights, scene: Scene, room: float, away: float, motion: MotionState
 ) -> float:
     """Return the cost of a second here, `room` [m] from obstacles and `away` [m] from discs."""
@@ -127,7 +127,7 @@ def of_place(
         cost += weights.near * exponential((weights.margin - room) / weights.near_over)
     if away < NO_DISC and weights.trust == 0.0:
         cost += weights.disc * math.exp(-away / weights.disc_over)
-    return cost + of_time(scene, motion.at.x, motion.at.y, motion.yaw)
+    return cost + time_cost(scene, motion.at.x, motion.at.y, motion.yaw)
 
 
 @lean_kernel
@@ -147,7 +147,7 @@ def exponential(x: float) -> float:
 
 
 @lean_kernel
-def of_time(scene: Scene, x: float, y: float, yaw: float) -> float:
+def time_cost(scene: Scene, x: float, y: float, yaw: float) -> float:
     """What a second costs wherever it is; or it would put off the last turn for ever."""
     return 0.0 if _arrived(scene, x, y, yaw) else 0.5 * SECOND
 
@@ -162,7 +162,7 @@ def _arrived(scene: Scene, x: float, y: float, yaw: float) -> bool:
 
 
 @lean_kernel
-def of_motion(weights: Weights, room: float, vx: float, vy: float, w: float) -> float:
+def motion_cost(weights: Weights, room: float, vx: float, vy: float, w: float) -> float:
     """What it costs to move so for a second."""
     cost = weights.turning * w * w
     over = math.sqrt(vx * vx + vy * vy) - (
@@ -176,7 +176,7 @@ def of_motion(weights: Weights, room: float, vx: float, vy: float, w: float) -> 
 
 
 @lean_kernel
-def of_braking(problem: Problem, room: float, motion: MotionState) -> float:
+def braking_cost(problem: Problem, room: float, motion: MotionState) -> float:
     """Return the cost of a second faster than the free way ahead allows; safety would intervene."""
     model, vx, vy = problem.model, motion.vx, motion.vy
     speed = math.sqrt(vx * vx + vy * vy)
@@ -196,12 +196,12 @@ def of_braking(problem: Problem, room: float, motion: MotionState) -> float:
 def rest(model: MotionModel, scene: Scene, x: float, y: float) -> float:
     """The cost of the way from (x, y) to the goal."""
     away = math.hypot(x - scene.goal_x, y - scene.goal_y)
-    way = away if away < NEAR_GOAL else distance_in(scene.field, x, y)
+    way = away if away < NEAR_GOAL else cost_to_go_at(scene.field, x, y)
     return SECOND * way / model.forward
 
 
 @lean_kernel
-def distance_in(field: DistanceGrid, x: float, y: float) -> float:
+def cost_to_go_at(field: DistanceGrid, x: float, y: float) -> float:
     """The cost to go from (x, y) [m]; beyond the rim that of the rim."""
     rows, columns = field.distance.shape
     cell = field.cell
@@ -211,7 +211,7 @@ def distance_in(field: DistanceGrid, x: float, y: float) -> float:
 
 
 @lean_kernel
-def of_end(problem: Problem, motion: MotionState) -> float:
+def terminal_cost(problem: Problem, motion: MotionState) -> float:
     """Return the cost to go after the last step: turn to the way, drive it, turn at its end.
 
     A body that has nearly arrived only has to stop, with the right yaw.
@@ -226,8 +226,8 @@ def of_end(problem: Problem, motion: MotionState) -> float:
         cost += SECOND * _turn_between(arrives, scene.goal_yaw) / model.turning
     if near:
         return cost + 0.5 * SECOND * math.hypot(vx, vy) / model.forward
-    here = distance_in(scene.field, x, y)
-    ahead = distance_in(scene.field, x + LOOK_AHEAD * cosine, y + LOOK_AHEAD * sine)
+    here = cost_to_go_at(scene.field, x, y)
+    ahead = cost_to_go_at(scene.field, x + LOOK_AHEAD * cosine, y + LOOK_AHEAD * sine)
     rise = max(-1.0, min(1.0, (ahead - here) / LOOK_AHEAD))
     turn = 0.5 * math.pi * (1.0 + rise)
     return cost + SECOND * weights.heading * turn / model.turning
@@ -241,7 +241,7 @@ def _turn_between(one: float, other: float) -> float:
 
 
 @lean_kernel
-def of_contact(weights: Weights, seconds: float, share: float) -> float:
+def disc_contact_cost(weights: Weights, seconds: float, share: float) -> float:
     """What a contact with a moving thing costs, so late and after such a share of the plan."""
     if weights.trust > 0.0:
         return TOUCHED_DISC * math.exp(-seconds / weights.trust)
@@ -249,7 +249,7 @@ def of_contact(weights: Weights, seconds: float, share: float) -> float:
 
 
 @lean_kernel
-def near_discs(
+def fill_disc_distances(
     weights: Weights, discs: Floats, outline: Outline, seconds: float, state: Floats
 ) -> None:
     """How near the bodies of a `state` are to `discs` (m, 6), so many `seconds` from now.
@@ -303,11 +303,11 @@ def _add_disc(
 
 
 @lean_kernel
-def look_round(problem: Problem, states: Floats) -> None:
+def evaluate_surroundings(problem: Problem, states: Floats) -> None:
     """Fill in the surroundings of the bodies in `states` (T + 1, STATE), and their least cost.
 
     MIDDLE becomes the distance of the body's middle to an obstacle [m], SURE the cost of a second
-    there without discs, AWAY and CLOSE the results of `near_discs`.
+    there without discs, AWAY and CLOSE the results of `fill_disc_distances`.
     """
     _, outline, weights, scene, dt = problem
     grid, per_cell = scene.grid, 1.0 / scene.grid.cell
@@ -326,14 +326,14 @@ def look_round(problem: Problem, states: Floats) -> None:
             room = state[MIDDLE + lane] - outline.inner  # it is no more than that
             room = room if room < AT_EASE else ROOM
             near = weights.near * exponential((weights.margin - room) / weights.near_over)
-            motion = of_motion(weights, room, state[VX + lane], state[VY + lane], state[W + lane])
-            time = of_time(scene, state[X + lane], state[Y + lane], state[YAW + lane])
+            motion = motion_cost(weights, room, state[VX + lane], state[VY + lane], state[W + lane])
+            time = time_cost(scene, state[X + lane], state[Y + lane], state[YAW + lane])
             state[SURE + lane] = time + motion + (near if room < AT_EASE else 0.0)
-        near_discs(weights, scene.discs, outline, t * dt, state)
+        fill_disc_distances(weights, scene.discs, outline, t * dt, state)
 
 
 @lean_kernel
-def rooms_of(scene: Scene, outline: Outline, states: Floats, rooms: Floats) -> None:
+def fill_clearances(scene: Scene, outline: Outline, states: Floats, rooms: Floats) -> None:
     """Fill `rooms` (n,) with the clearances [m] in the first `states`, which all lanes share."""
     for t in range(len(rooms)):
         one = states[t]
@@ -347,15 +347,15 @@ def rooms_of(scene: Scene, outline: Outline, states: Floats, rooms: Floats) -> N
 def price(problem: Problem, rooms: Floats, states: Floats, lane: int, limit: float) -> float:
     """Return the cost of a lane's `states`, or inf as soon as it must reach `limit`.
 
-    `rooms` are the result of `rooms_of`.
+    `rooms` are the result of `fill_clearances`.
     """
     model, outline, weights, scene, dt = problem
     least = min(weights.margin, rooms[0] - SPARE)
     least_disc = min(weights.disc_margin, states[0, AWAY + lane] - SPARE)
-    end = of_end(problem, motion_of(states[-1], lane))
+    end = terminal_cost(problem, motion_of(states[-1], lane))
     to_come = -math.inf
     if limit < math.inf:
-        touching, passing = _at_least(problem, states, lane, (least, least_disc))
+        touching, passing = _lower_bounds(problem, states, lane, (least, least_disc))
         to_come = passing + end if touching >= limit else -math.inf
         if min(touching, passing + end) >= limit:
             return math.inf
@@ -380,27 +380,27 @@ def price(problem: Problem, rooms: Floats, states: Floats, lane: int, limit: flo
             slack = room - AT_EASE
         away = one[AWAY + lane]
         if room < least:
-            cost += _of_touch(t / steps) + rest(model, scene, x, y)
+            cost += _contact_cost(t / steps) + rest(model, scene, x, y)
             return cost + IMPACT * math.hypot(vx, vy)
         if away < least_disc:
-            return cost + of_contact(weights, t * dt, t / steps) + rest(model, scene, x, y)
+            return cost + disc_contact_cost(weights, t * dt, t / steps) + rest(model, scene, x, y)
         cost += dt * one[CLOSE + lane]
-        cost += dt * of_place(weights, scene, room, away, motion)
-        cost += dt * of_motion(weights, room, vx, vy, motion.w)
+        cost += dt * place_cost(weights, scene, room, away, motion)
+        cost += dt * motion_cost(weights, room, vx, vy, motion.w)
         to_come -= dt * (one[SURE + lane] + one[CLOSE + lane])
         if t % BRAKE_EVERY == 1:
-            cost += dt * BRAKE_EVERY * of_braking(problem, room, motion)
+            cost += dt * BRAKE_EVERY * braking_cost(problem, room, motion)
     return cost + end
 
 
 @lean_kernel
-def _of_touch(share: float) -> float:
+def _contact_cost(share: float) -> float:
     """What a contact costs after such a share of the plan."""
     return TOUCHED * (1.0 - 0.7 * share)
 
 
 @lean_kernel
-def _at_least(
+def _lower_bounds(
     problem: Problem, states: Floats, lane: int, least: tuple[float, float]
 ) -> tuple[float, float]:
     """Return lower bounds of a lane's cost with a contact, and without one nor its end.
@@ -419,9 +419,9 @@ def _at_least(
         if middle < may or struck:
             left = spent + rest(model, scene, one[X + lane], one[Y + lane])
             if middle < may:
-                touching = min(touching, left + _of_touch(t / steps))
+                touching = min(touching, left + _contact_cost(t / steps))
             if struck:
-                touching = min(touching, left + of_contact(weights, t * dt, t / steps))
+                touching = min(touching, left + disc_contact_cost(weights, t * dt, t / steps))
         if middle < must or struck:
             return touching, math.inf
         spent += dt * (one[SURE + lane] + one[CLOSE + lane])

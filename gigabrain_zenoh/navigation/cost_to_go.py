@@ -59,7 +59,7 @@ class CostToGo:
         inner = self._padded[:, 1:-1]
         found = seed(inner, cell, (grid.x, grid.y), goal, path)
         if ways is not None:
-            _make_dearer(self._halves, cell, grid.x - ways.price.x, grid.y - ways.price.y, ways)
+            _scale_costs(self._halves, cell, grid.x - ways.price.x, grid.y - ways.price.y, ways)
             if not found:
                 _seed_rim(inner, cell, grid.x - ways.price.x, grid.y - ways.price.y, ways)
         sweep(self._halves, self._padded, self._spans)
@@ -129,7 +129,7 @@ def _price(distance: Singles, half_width: np.float32, half: np.float32, halves: 
 
 
 @kernel
-def _make_dearer(halves: Units, cell: float, x: float, y: float, ways: Ways) -> None:
+def _scale_costs(halves: Units, cell: float, x: float, y: float, ways: Ways) -> None:
     """Multiply `halves` by what a metre costs there, (x, y) [m] from the corner of the `ways`."""
     price, per_cell = ways.price.distance, 1.0 / ways.price.cell
     for i in range(halves.shape[1]):

@@ -103,7 +103,7 @@ class TrafficMap:
         keeps, seen = math.exp(-dt / FADES_S), dt if dt < LONGEST_GAP_S else 0.0
         self._follow(x, y)
         left, low = self._column * CELL_M, self._row * CELL_M
-        _watch(self._memory, keeps, seen, x - left, y - low, self._sight)
+        _add_watched(self._memory, keeps, seen, x - left, y - low, self._sight)
         amounts = seen * over**2 * (2.0 * discs[:, 4] + self._width)
         for disc, amount in zip(discs[counts], amounts[counts], strict=True):
             _pass(self._memory.passed, disc[0] - left, disc[1] - low, amount)
@@ -155,7 +155,7 @@ def _shifted(by: int) -> tuple[slice, slice]:
 
 
 @kernel
-def _watch(
+def _add_watched(
     memory: TrafficMemory, keeps: float, dt: float, x: float, y: float, sight: float
 ) -> None:
     """Let `dt` [s] pass, in which what is nearer to (x, y) than `sight` [m] was watched."""

@@ -151,7 +151,7 @@ def _nearest(
     placed = (u, v, np.float32(cosine * per_cell), np.float32(sine * per_cell))
     half, unsure = np.float32(0.5), np.float32(UNSURE * grid.cell)
     best = first
-    nearest = _of_group(cells, groups[first], placed, nearest)
+    nearest = _least_of_group(cells, groups[first], placed, nearest)
     for n in range(len(groups)):
         if n == first:
             continue
@@ -159,14 +159,14 @@ def _nearest(
         column, row = _inside(cells, group[1], group[4], placed)
         there = cells[np.uint32(row + half), np.uint32(column + half)]
         if there - np.float32(STRETCH) * group[6] - unsure < nearest:
-            found = _of_group(cells, group, placed, nearest)
+            found = _least_of_group(cells, group, placed, nearest)
             best = n if found < nearest else best
             nearest = found
     return float(nearest), best
 
 
 @lean_kernel
-def _of_group(
+def _least_of_group(
     cells: Singles, group: Singles, placed: CellPlacement, nearest: np.float32
 ) -> np.float32:
     """Return the least of `nearest` and the distances [m] of the points of a group.

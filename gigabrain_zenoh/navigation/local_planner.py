@@ -13,18 +13,18 @@ from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import ActuationModel, Obstacle, TrajectoryPoint
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.navigation import dynamic_obstacles
-from gigabrain_zenoh.navigation.cost import Scene, Weights, distance_in
+from gigabrain_zenoh.navigation.cost import Scene, Weights, cost_to_go_at
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
 from gigabrain_zenoh.navigation.footprint import Placement, clearance, outline_of
 from gigabrain_zenoh.navigation.local_costmap import LocalCostmap, Pose2D
 from gigabrain_zenoh.navigation.motion_model import (
     InitialState,
     MotionModel,
-    lag_of,
+    delayed_model,
+    first_order_lag,
     model_of,
-    slowed_model,
 )
-from gigabrain_zenoh.navigation.mppi import SampledPlan, Sampler, past_of, step_of
+from gigabrain_zenoh.navigation.mppi import SampledPlan, Sampler, mean_past_commands, step_duration
 
 PlanKind = Literal["going", "going round", "waiting", "backing out", "turning in place", "arrived"]
 
@@ -103,7 +103,7 @@ class LocalPlan:
     remaining: float = 0.0  # [m of free way], cost to go from here
 
 
-def kind_of(model: MotionModel, track: Floats, dt: float, goal: Goal) -> PlanKind:
+def classify_plan(model: MotionModel, track: Floats, dt: float, goal: Goal) -> PlanKind:
     """What `track` (T + 1, 6) amounts to within the next second."""
     soon = min(len(track) - 1, max(1, round(SOON_S / dt)))
     begin, end = track[0].tolist(), track[soon].tolist()  # plain numbers are quicker
@@ -117,7 +117,7 @@ def kind_of(model: MotionModel, track: Floats, dt: float, goal: Goal) -> PlanKin
     return "going round" if _aside(track, goal) > DETOUR_M else "going"
 
 
-def reason_of(kind: PlanKind, track: Floats, discs: Floats, room: float, left: float) -> str:
+def explain_plan(kind: PlanKind, track: Floats, discs: Floats, room: float, left: float) -> str:
     """Why, with what is in the way: `room` [m] round the body, `left` [m] to go."""
     moving = _nearest_moving(track, discs)
     if left < AT_GOAL_M and not moving and kind in ("waiting", "turning in place"):
@@ -192,7 +192,7 @@ class LocalPlanner:
 
     def _sampler_of(self) -> Sampler:
         model, settings = self._model, self._settings
-        return Sampler(model, settings.samples, settings.steps, step_of(model), settings.seed)
+        return Sampler(model, settings.samples, settings.steps, step_duration(model), settings.seed)
 
     def _traffic_of(self) -> dynamic_obstacles.TrafficMap | None:
         """What a quick body looks out for."""
@@ -233,7 +233,7 @@ class LocalPlanner:
                 return _standing("waiting: it looks round for what moves")
             moment = replace(moment, goal=Goal(x=place.x, y=place.y), path=None)
         scene = self._scene(moment, discs)
-        model = slowed_model(self._model, moment.delayed)
+        model = delayed_model(self._model, moment.delayed)
         planned = self._sampler.plan(
             model if moment.may_back else model._replace(backward=0.0),
             self._outline,
@@ -250,7 +250,7 @@ class LocalPlanner:
         if self._traffic:
             self._traffic.see(tick, place.x, place.y, quick)
         if not len(quick):
-            self._sampler.step_by(step_of(self._model))
+            self._sampler.step_by(step_duration(self._model))
             return self._weights
         self._window.take_back(tick, quick)
         self._sampler.step_by(dynamic_obstacles.HORIZON_S / self._settings.steps)
@@ -283,23 +283,23 @@ class LocalPlanner:
         gain = moment.response.turn_gain
         rows[:, 3] *= gain  # what the floor makes of it; control undoes that in what is to come
         before = tuple(rows[-1, 1:].tolist()) if len(rows) else _axes(v)
-        past, share = past_of(rows, _axes(v), moment.response.delay, dt)
-        lag = lag_of(moment.response.lag, dt)
+        past, share = mean_past_commands(rows, _axes(v), moment.response.delay, dt)
+        lag = first_order_lag(moment.response.lag, dt)
         return InitialState(*place, *_axes(v), before, past, share, lag, gain)
 
     def _answer(self, moment: PlanRequest, scene: Scene, planned: SampledPlan) -> LocalPlan:
         place = moment.pose
         at = Placement(place.x, place.y, math.cos(place.yaw), math.sin(place.yaw))
         room = clearance(scene.grid, self._outline, at)
-        left = distance_in(scene.field, place.x, place.y)
+        left = cost_to_go_at(scene.field, place.x, place.y)
         blocked = self._stuck(moment)
-        kind = kind_of(self._model, planned.track, self._sampler.dt, moment.goal)
+        kind = classify_plan(self._model, planned.track, self._sampler.dt, moment.goal)
         vx, vy, w = planned.commands[0].tolist()
         return LocalPlan(
             twist=Velocity(linear_x=vx, linear_y=vy, angular_z=w),
             trajectory=_trajectory(planned.track, self._sampler.dt),
             kind=kind,
-            reason=reason_of(kind, planned.track, scene.discs, room, left),
+            reason=explain_plan(kind, planned.track, scene.discs, room, left),
             blocked=blocked,
             remaining=left,
         )

@@ -68,7 +68,7 @@ def model_of(body: BodyDescription, speed: float | None = None) -> MotionModel:
     )
 
 
-def slowed_model(model: MotionModel, seconds: float) -> MotionModel:
+def delayed_model(model: MotionModel, seconds: float) -> MotionModel:
     """The model of a body that reacts so much later: its way to a stop stays as long as it was."""
     if seconds <= 0.0:
         return model
@@ -128,7 +128,7 @@ class FirstOrderLag(NamedTuple):
     glide: float  # [s], what a difference of 1 m/s adds to the way [m]
 
 
-def lag_of(seconds: float, dt: float) -> FirstOrderLag:
+def first_order_lag(seconds: float, dt: float) -> FirstOrderLag:
     """The lag of a time constant of so many seconds, for steps of `dt` [s]."""
     if seconds < 1e-3:
         return FirstOrderLag(0.0, 0.0)

@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import NONE, kernel, lean_kernel
-from gigabrain_zenoh.navigation.cost import Problem, Scene, Weights, look_round, price, rooms_of
+from gigabrain_zenoh.navigation.cost import (
+    Problem,
+    Scene,
+    Weights,
+    evaluate_surroundings,
+    fill_clearances,
+    price,
+)
 from gigabrain_zenoh.navigation.footprint import Outline
 from gigabrain_zenoh.navigation.motion_model import (
     LANES,
@@ -35,7 +42,7 @@ MEAN_MARGIN = 0.3  # a mean this much worse than the best has run into what its 
 NOISE_SETS = 8  # of noise, drawn once and taken in turn
 
 
-def noise_of(
+def correlated_noise(
     random: np.random.Generator, shape: tuple[int, ...], model: MotionModel
 ) -> NDArray[np.float32]:
     """Autoregressive noise: neighbouring commands go together."""
@@ -51,7 +58,7 @@ def noise_of(
     return scaled
 
 
-def simple_of(
+def two_twist_plans(
     random: np.random.Generator, sets: int, samples: int, steps: int, model: MotionModel
 ) -> Floats:
     """Plans of two twists, (sets, samples, 7): both, and the step in which the second begins.
@@ -83,7 +90,7 @@ def _twists(random: np.random.Generator, shape: tuple[int, ...], model: MotionMo
 
 
 @lean_kernel
-def propose(plans: Floats, last: Floats, noise: NDArray[np.float32], simple: Floats) -> None:
+def fill_plans(plans: Floats, last: Floats, noise: NDArray[np.float32], simple: Floats) -> None:
     """Fill `plans` (blocks, T, 3, LANES)."""
     blocks, steps, axes, _ = plans.shape
     for block in range(blocks):
@@ -114,7 +121,7 @@ class Samples(NamedTuple):
 
     last: Floats  # (T, 3), the last plan
     noise: NDArray[np.float32]  # (blocks, T, 3, LANES), added to it
-    simple: Floats  # (samples, 7), see `simple_of`
+    simple: Floats  # (samples, 7), see `two_twist_plans`
 
 
 class SamplerBuffers(NamedTuple):
@@ -135,10 +142,10 @@ class Sampler:
         self.dt, self._turn = dt, 0
         random = np.random.default_rng(seed)
         blocks = math.ceil(samples / LANES)
-        noise = noise_of(random, (NOISE_SETS, blocks * LANES, steps, 3), model)
+        noise = correlated_noise(random, (NOISE_SETS, blocks * LANES, steps, 3), model)
         lanes = noise.reshape(NOISE_SETS, blocks, LANES, steps, 3).transpose(0, 1, 3, 4, 2)
         self._noise = np.ascontiguousarray(lanes)
-        self._simple = simple_of(random, NOISE_SETS, blocks * LANES, steps, model)
+        self._simple = two_twist_plans(random, NOISE_SETS, blocks * LANES, steps, model)
         self._work = SamplerBuffers(
             np.zeros((blocks + 1, steps, 3, LANES)),
             np.empty((steps + 1, STATE)),
@@ -201,16 +208,16 @@ def _search(
     blocks, mean, best = len(costs), 0, 1
     rooms = np.empty(min(len(states), len(start.past)))
     found = np.full(LANES, math.inf)
-    propose(plans[:blocks], last, noise, simple)
+    fill_plans(plans[:blocks], last, noise, simple)
     least = math.inf
     for block in range(blocks + 1):
         if block == blocks:
             _gather(plans, costs, found, mean, best)
         make_feasible(model, start, dt, plans[block])
         simulate(model, outline.far, start, dt, plans[block], states)
-        look_round(problem, states)
+        evaluate_surroundings(problem, states)
         if block == 0:
-            rooms_of(problem.scene, outline, states, rooms)
+            fill_clearances(problem.scene, outline, states, rooms)
         of = found if block == blocks else costs[block]
         for lane in range(LANES if block < blocks else 2):
             free = block == blocks or (block == 0 and lane == BRAKING_LANE)
@@ -218,12 +225,12 @@ def _search(
             of[lane] = price(problem, rooms, states, lane, limit)
             least = min(least, of[lane])
     taken = best if found[mean] > found[best] + MEAN_MARGIN else mean
-    commands, track = _of_lane(plans[blocks], states, taken)
+    commands, track = _lane_result(plans[blocks], states, taken)
     return commands, track, found[taken], costs[0, BRAKING_LANE]
 
 
 @kernel
-def _of_lane(plans: Floats, states: Floats, lane: int) -> tuple[Floats, Floats]:
+def _lane_result(plans: Floats, states: Floats, lane: int) -> tuple[Floats, Floats]:
     """The commands (T, 3) and the track (T + 1, 6) of one lane."""
     steps, axes, _ = plans.shape
     commands, track = np.empty((steps, axes)), np.empty((steps + 1, 2 * axes))
@@ -268,12 +275,12 @@ def _gather(plans: Floats, costs: Floats, shares: Floats, mean: int, best: int) 
         sums[best] = plans[top // LANES, n // axes, n % axes, top % LANES]
 
 
-def step_of(model: MotionModel) -> float:
+def step_duration(model: MotionModel) -> float:
     """How long one step of a plan is [s]: slow bodies look farther ahead."""
     return max(0.05, min(0.1, 0.1 / model.forward))
 
 
-def past_of(
+def mean_past_commands(
     sent: Floats, before: tuple[float, float, float], delay: float, dt: float
 ) -> tuple[Floats, float]:
     """What was sent in each of the last steps, and how much of the next the oldest still rules.

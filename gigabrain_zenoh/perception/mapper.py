@@ -28,8 +28,8 @@ from gigabrain_zenoh.mapping import map_file
 from gigabrain_zenoh.mapping.autosave import Autosave, refuse
 from gigabrain_zenoh.mapping.keyframes import Scan, View
 from gigabrain_zenoh.mapping.localizer import Place
-from gigabrain_zenoh.mapping.odometry import Fusion, Moment, way
-from gigabrain_zenoh.mapping.static_map import Chart, KnownMap
+from gigabrain_zenoh.mapping.odometry import OdometryFusion, OdometrySample, way
+from gigabrain_zenoh.mapping.static_map import RobotMap, StaticMap
 
 log = logging.getLogger(__name__)
 
@@ -41,25 +41,25 @@ SETTLE_NS, SETTLES = 20_000_000, 100  # poll interval and count: a save waits fo
 TIMED = 1000  # scans whose processing time is kept for the percentiles
 
 
-def chart_of(config: PerceptionConfig, in_time: InTime = done) -> Chart:
+def chart_of(config: PerceptionConfig, in_time: InTime = done) -> RobotMap:
     """Load or create the map that the settings request. Raises ConfigError."""
     path = map_file.path_of(config.map) if config.map else None
     if config.mapping == "localize":
         if path is None:
             raise ConfigError("perception: map: expected a saved map, as mapping is 'localize'")
         saved = map_file.load(path)
-        if problem := map_file.what_is_wrong(saved):
+        if problem := map_file.map_problem(saved):
             raise ConfigError(f"{path}: {problem}; expected one to find the way in")
-        return KnownMap(saved, in_time=in_time)
-    from gigabrain_zenoh.mapping.slam_map import GrowingMap  # imports gtsam: for slam only
+        return StaticMap(saved, in_time=in_time)
+    from gigabrain_zenoh.mapping.slam_map import SlamMap  # imports gtsam: for slam only
 
     if path:
         graph = map_file.load_graph(path)
         try:
-            return GrowingMap.thaw(graph, in_time=in_time)
+            return SlamMap.thaw(graph, in_time=in_time)
         except ConfigError as error:
             raise ConfigError(f"{path.with_suffix(map_file.GRAPH)}: {error}") from None
-    return GrowingMap(in_time=in_time)
+    return SlamMap(in_time=in_time)
 
 
 def view_of(lidar: Lidar, scan: LaserScan, ignore_below: float) -> View:
@@ -80,15 +80,15 @@ class Mapper:
     def __init__(self, config: PerceptionConfig, bus: Bus, bodies: Latest[Body]) -> None:
         self._config, self._bus, self._bodies = config, bus, bodies
         self._chart = chart_of(config, bus.input_log.in_time)
-        self._fusion, self._boot = Fusion(), 0
-        self._last: Moment | None = None  # at the last scan that was processed
+        self._fusion, self._boot = OdometryFusion(), 0
+        self._last: OdometrySample | None = None  # at the last scan that was processed
         self._blank = not config.map  # the map is still empty
         self._mapped = False  # this process has processed a scan, or restored a map
         self._published: OccupancyGrid | None = None
         self._checked_tick = self._sent_tick = 0
         saves = config.mapping == "slam" and config.state_dir and bus.input_log.live
         self._autosave = Autosave(Path(config.state_dir)) if saves else None
-        self._before: Moment | None = None  # at the last scan in a restored map
+        self._before: OdometrySample | None = None  # at the last scan in a restored map
         self._logged, self._left_out = "", ""
         self._early = False  # the first scan arrived without its odometry
         self._took_ms = NewestValues(TIMED)
@@ -136,31 +136,31 @@ class Mapper:
             return
         if self._boot:
             self._chart.lose("the driver has restarted")
-        self._boot, self._fusion, self._last, self._published = boot, Fusion(), None, None
+        self._boot, self._fusion, self._last, self._published = boot, OdometryFusion(), None, None
         self._before, self._early = None, False
         if self._autosave and not self._mapped:
             self._resume_map(self._autosave, boot)
 
     def _resume_map(self, autosave: Autosave, boot: int) -> None:
         """Resume the newest intact map that was saved during this run of the driver, if any."""
-        from gigabrain_zenoh.mapping.slam_map import GrowingMap  # imports gtsam, as above
+        from gigabrain_zenoh.mapping.slam_map import SlamMap  # imports gtsam, as above
 
         for head, arrays in autosave.found(boot):
             last = None if head.place is None else np.array(head.place)
             try:
-                chart = GrowingMap.thaw(arrays, in_time=self._bus.input_log.in_time, last=last)
+                chart = SlamMap.thaw(arrays, in_time=self._bus.input_log.in_time, last=last)
             except ConfigError as error:
                 refuse(str(error))
                 continue
             self._chart.close()
             self._chart, self._blank, self._mapped = chart, False, True
             odometry = np.array(head.odometry)
-            self._before = Moment(head.tick, odometry, odometry, slipping=False, jumps=0)
+            self._before = OdometrySample(head.tick, odometry, odometry, slipping=False, jumps=0)
             data = {"event": "map_restored", "map_tick": head.tick}
             log.info("resumed the map of tick %d", head.tick, extra={"data": data})
             return
 
-    def _process(self, scan: LaserScan, moment: Moment) -> None:
+    def _process(self, scan: LaserScan, moment: OdometrySample) -> None:
         body = self._bodies.current
         if body is None or body.description.lidar is None:
             return
@@ -177,7 +177,7 @@ class Mapper:
         self._left_out = ""
         self._took_ms.add((time.perf_counter() - began) * 1e3)
 
-    def _motion(self, moment: Moment) -> tuple[Floats, Floats]:
+    def _motion(self, moment: OdometrySample) -> tuple[Floats, Floats]:
         """Return the motion from the last scan to this one (3,), and its covariance (3, 3).
 
         The first scan of a new map is placed at its odometry pose. After a crash of this process,
@@ -191,7 +191,7 @@ class Mapper:
             self._chart.lose("the odometry has jumped")
         return moment.fused if blank else step, noise
 
-    def _autosave_map(self, autosave: Autosave, before: Moment) -> None:
+    def _autosave_map(self, autosave: Autosave, before: OdometrySample) -> None:
         """Save the map as it was at the scan `before`, when a save is due.
 
         The copy is cheap and does not alter the map. A run with saves and a run without behave the
@@ -250,7 +250,7 @@ class Mapper:
 
     async def _save(self, request: MapRequest) -> MapReply:
         log_accepted(self._bus, MAP_SAVE.key, request, self._last.tick if self._last else 0)
-        path = map_file.saved_as(request.name)
+        path = map_file.saved_map_path(request.name)
         same = bool(self._config.map) and path == map_file.path_of(self._config.map)
         try:
             async with self._saving:

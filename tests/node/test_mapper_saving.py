@@ -12,7 +12,7 @@ import pytest
 from gigabrain_schemas.topics import MAP, MAP_SAVE, POSE, WORLD
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.mapping import map_file
-from gigabrain_zenoh.mapping.slam_map import Still
+from gigabrain_zenoh.mapping.slam_map import MapSnapshot
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.recording.process_replay import with_requests
 from gigabrain_zenoh.runtime.replay import record, replay
@@ -72,13 +72,13 @@ async def test_two_who_save_at_once_do_not_write_into_each_others_files(
 
 
 async def test_a_map_is_drawn_beside_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
-    real, threads = Still.to_save, []
+    real, threads = MapSnapshot.to_save, []
 
-    def noted(still: Still) -> Any:
+    def noted(still: MapSnapshot) -> Any:
         threads.append(threading.current_thread())
         return real(still)
 
-    monkeypatch.setattr(Still, "to_save", noted)
+    monkeypatch.setattr(MapSnapshot, "to_save", noted)
     async with Robot() as robot:
         robot.say()
         robot.drive(60)

@@ -235,7 +235,7 @@ class GoalSender:
         self._states = bus.latest(STATE)  # also sets the boot that all other messages must have
         self._random, self._search = np.random.default_rng(seed), GridSearch()
         self._world_from_map: Pose | None = None
-        self._watch = GrowthSampler()
+        self._add_watched = GrowthSampler()
         self.sent = self.reached = 0
         self.accepted_s = 0.0  # of the first task, by the host's clock
         self.failures: list[GoalFailure] = []
@@ -288,13 +288,13 @@ class GoalSender:
     def growth(self) -> MapGrowth:
         """Return the growth of perception's memory and map."""
         assert self._maps.current
-        return self._watch.growth(self._maps.current)
+        return self._add_watched.growth(self._maps.current)
 
     def _sample(self) -> None:
         """Sample perception once per minute of the robot's time."""
         pid, grid = self._group.supervisor.statuses["perception"].pid, self._maps.current
-        if pid and grid and self.seconds >= (self._watch.minutes + 1) * 60:
-            self._watch.minute(rss_mb(pid), grid)
+        if pid and grid and self.seconds >= (self._add_watched.minutes + 1) * 60:
+            self._add_watched.minute(rss_mb(pid), grid)
 
     async def report(self) -> dict[str, float]:
         """Return the simulation's truth. Raises GigabrainError if it never arrives."""

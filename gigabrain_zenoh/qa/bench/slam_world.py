@@ -19,8 +19,8 @@ from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.se2 import between, compose, inverse
 from gigabrain_zenoh.mapping.likelihood_field import OCCUPIED
-from gigabrain_zenoh.mapping.odometry import Fusion, Moment, way
-from gigabrain_zenoh.mapping.slam_map import GrowingMap
+from gigabrain_zenoh.mapping.odometry import OdometryFusion, OdometrySample, way
+from gigabrain_zenoh.mapping.slam_map import SlamMap
 from gigabrain_zenoh.perception.mapper import view_of
 from gigabrain_zenoh.qa.bench.slam_logs import DRIVEN, REFERENCE, draw_side_by_side
 from gigabrain_zenoh.qa.judging import Latencies, latencies
@@ -144,7 +144,7 @@ def map_world(body: str, world: str, seed: int, minutes: float, progress: Progre
     roaming = ExploreRun(body, world, seed)
     if (lidar := roaming.body.lidar) is None:
         raise ConfigError(f"{body} has no lidar, and so makes no map")
-    run = _MappingRun(GrowingMap(CLOSE_LOOPS_S))
+    run = _MappingRun(SlamMap(CLOSE_LOOPS_S))
     watch = GrowthSampler()
     for count, one in enumerate(roaming.ticks(round(minutes * TICKS_A_MINUTE)), 1):
         run.fusion.add(one.state, roaming.body)
@@ -185,12 +185,12 @@ def map_world(body: str, world: str, seed: int, minutes: float, progress: Progre
 class _MappingRun:
     """Maps scans and states as perception does, and keeps the poses."""
 
-    def __init__(self, chart: GrowingMap) -> None:
-        self.chart, self.fusion, self.not_localized = chart, Fusion(), 0
+    def __init__(self, chart: SlamMap) -> None:
+        self.chart, self.fusion, self.not_localized = chart, OdometryFusion(), 0
         # flat arrays, so that an hour of them hardly counts in the measured memory
         self.took_ms, self._poses, self._fused = array("d"), array("d"), array("d")
         self._truth = array("d")  # in the world
-        self._last: Moment | None = None
+        self._last: OdometrySample | None = None
 
     def scan(self, lidar: Lidar, scan: LaserScan, truth: Floats) -> None:
         """Add a scan, taken at the pose `truth` (3,)."""

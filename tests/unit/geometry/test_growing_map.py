@@ -6,7 +6,7 @@ import pytest
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.geometry.se2 import between, compose
 from gigabrain_zenoh.host.threads import ScheduledWorker
-from gigabrain_zenoh.mapping.slam_map import GrowingMap
+from gigabrain_zenoh.mapping.slam_map import SlamMap
 from tests.unit.mapping.houses import HALL, HOUSE, PATIENCE_S, Rooms, Walker, at, error, grown
 
 START = (1.0, 2.5)
@@ -23,12 +23,12 @@ def in_map(walker: Walker) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
 
 
 @pytest.fixture(scope="module")
-def toured() -> tuple[GrowingMap, Walker]:
+def toured() -> tuple[SlamMap, Walker]:
     return grown(Rooms(HOUSE), START, *ROUND, *ROUND[:3])
 
 
 def test_after_a_tour_it_knows_where_it_is_and_has_drawn_the_house(
-    toured: tuple[GrowingMap, Walker],
+    toured: tuple[SlamMap, Walker],
 ) -> None:
     chart, walker = toured
     place = walker.look()
@@ -42,7 +42,7 @@ def test_after_a_tour_it_knows_where_it_is_and_has_drawn_the_house(
 
 def test_where_people_walked_the_map_is_free() -> None:
     rooms = Rooms(HOUSE)
-    chart = GrowingMap(PATIENCE_S)
+    chart = SlamMap(PATIENCE_S)
     for k in range(120):
         x = 1.0 + 0.02 * k
         chart.step(rooms.view(at(*START, 0), [(x, 3.4, x, 3.7), (x, 3.4, x + 0.3, 3.4)]),
@@ -88,10 +88,10 @@ def test_lifted_without_a_sign_in_the_odometry_it_notices_after_3_scans() -> Non
     assert error(place, in_map(walker)) < 0.05
 
 
-def test_what_was_saved_goes_on(toured: tuple[GrowingMap, Walker]) -> None:
+def test_what_was_saved_goes_on(toured: tuple[SlamMap, Walker]) -> None:
     chart, walker = toured
     _, arrays = chart.to_save()
-    again = Walker(Rooms(HOUSE, seed=3), GrowingMap.thaw(arrays, PATIENCE_S), walker.pose)
+    again = Walker(Rooms(HOUSE, seed=3), SlamMap.thaw(arrays, PATIENCE_S), walker.pose)
     assert not again.look().localized
     place = again.look(30)
     assert place.localized
@@ -100,21 +100,21 @@ def test_what_was_saved_goes_on(toured: tuple[GrowingMap, Walker]) -> None:
     assert error(place, in_map(again)) < 0.05
 
 
-def test_what_was_kept_goes_on_at_the_next_scan(toured: tuple[GrowingMap, Walker]) -> None:
+def test_what_was_kept_goes_on_at_the_next_scan(toured: tuple[SlamMap, Walker]) -> None:
     chart, walker = toured
     still = chart.still()
     assert still.pose is not None
-    chart = GrowingMap.thaw(still.freeze(), PATIENCE_S, last=still.pose)
+    chart = SlamMap.thaw(still.freeze(), PATIENCE_S, last=still.pose)
     again = Walker(Rooms(HOUSE, seed=3), chart, walker.pose)
     place = again.look()
     assert place.localized
     assert error(place, in_map(again)) < 0.05
 
 
-def test_carried_off_before_it_goes_on_it_is_looked_for(toured: tuple[GrowingMap, Walker]) -> None:
+def test_carried_off_before_it_goes_on_it_is_looked_for(toured: tuple[SlamMap, Walker]) -> None:
     chart, _ = toured
     still = chart.still()
-    chart = GrowingMap.thaw(still.freeze(), PATIENCE_S, last=still.pose)
+    chart = SlamMap.thaw(still.freeze(), PATIENCE_S, last=still.pose)
     again = Walker(Rooms(HOUSE, seed=3), chart, at(6.0, 4.5, 100))
     assert not again.look().localized
     place = again.look(30)
@@ -124,25 +124,25 @@ def test_carried_off_before_it_goes_on_it_is_looked_for(toured: tuple[GrowingMap
 
 @pytest.mark.parametrize("missing", ["poses", "sweep_hits", "link_ends"])
 def test_arrays_that_do_not_belong_together_are_refused(
-    missing: str, toured: tuple[GrowingMap, Walker]
+    missing: str, toured: tuple[SlamMap, Walker]
 ) -> None:
     arrays = dict(toured[0].to_save()[1])
     short = {**arrays, missing: arrays[missing][:-1]}
     for bad in (short, {name: values for name, values in arrays.items() if name != missing}):
         with pytest.raises(ConfigError, match="no pose graph: "):
-            GrowingMap.thaw(bad)
+            SlamMap.thaw(bad)
 
 
 @pytest.mark.parametrize("name", ["points", "sweep_hits", "sweep_free", "sweep_sensor"])
 def test_points_that_no_lidar_has_seen_are_refused(
-    name: str, toured: tuple[GrowingMap, Walker]
+    name: str, toured: tuple[SlamMap, Walker]
 ) -> None:
     """A beam of 1e9 m would be drawn for minutes."""
     arrays = dict(toured[0].to_save()[1])
     far = arrays[name].copy()
     far[0] = 1e9
     with pytest.raises(ConfigError, match="no pose graph: "):
-        GrowingMap.thaw({**arrays, name: far})
+        SlamMap.thaw({**arrays, name: far})
 
 
 def test_the_same_drive_gives_the_same_map_bit_for_bit() -> None:

@@ -10,9 +10,9 @@ from gigabrain_zenoh.geometry.se2 import IDENTITY, compose
 from gigabrain_zenoh.mapping.keyframes import Scan, View
 from gigabrain_zenoh.mapping.localizer import Place
 from gigabrain_zenoh.mapping.map_file import SavedMap
-from gigabrain_zenoh.mapping.occupancy_grid import CELL, Grid
-from gigabrain_zenoh.mapping.slam_map import GrowingMap
-from gigabrain_zenoh.mapping.static_map import KnownMap
+from gigabrain_zenoh.mapping.occupancy_grid import CELL, LogOddsGrid
+from gigabrain_zenoh.mapping.slam_map import SlamMap
+from gigabrain_zenoh.mapping.static_map import StaticMap
 
 Wall = tuple[float, float, float, float]  # from x, y to x, y [m]
 
@@ -85,7 +85,7 @@ def at(x: float, y: float, degrees: float = 0.0) -> Floats:
 class Walker:
     """A robot that goes from place to place in steps of 0.1 m or 10 degrees."""
 
-    def __init__(self, rooms: Rooms, chart: KnownMap | GrowingMap, start: Floats) -> None:
+    def __init__(self, rooms: Rooms, chart: StaticMap | SlamMap, start: Floats) -> None:
         self.rooms, self.chart, self.pose = rooms, chart, start
         self._random = np.random.default_rng(2)
 
@@ -116,9 +116,9 @@ def error(place: Place, pose: Floats) -> float:
     return math.hypot(*(place.pose - pose)[:2].tolist())
 
 
-def grown(rooms: Rooms, *places: tuple[float, float]) -> tuple[GrowingMap, Walker]:
+def grown(rooms: Rooms, *places: tuple[float, float]) -> tuple[SlamMap, Walker]:
     """A map that was made on this way; its origin is the first of the places."""
-    chart = GrowingMap(PATIENCE_S)
+    chart = SlamMap(PATIENCE_S)
     walker = Walker(rooms, chart, at(*places[0]))
     walker.look()
     walker.go(*places[1:])
@@ -127,7 +127,7 @@ def grown(rooms: Rooms, *places: tuple[float, float]) -> tuple[GrowingMap, Walke
 
 def drawn(rooms: Rooms, *places: Floats) -> SavedMap:
     """The map that is seen from these places, in the frame of the rooms."""
-    grid = Grid()
+    grid = LogOddsGrid()
     for place in places:
         scan = rooms.view(place).scan
         for _ in range(3):

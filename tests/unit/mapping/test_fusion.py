@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import ImuData
-from gigabrain_zenoh.mapping.odometry import Fusion, uncertainty, way
+from gigabrain_zenoh.mapping.odometry import OdometryFusion, uncertainty, way
 from gigabrain_zenoh.testing.samples import WAFFLE, state
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)
@@ -25,8 +25,8 @@ def seen(tick: int, pose: tuple[float, float, float], gyro: float | None = None)
     return replace(state(tick, pose=pose), imu=imu)
 
 
-def fused(*states: RobotState) -> Fusion:
-    fusion = Fusion()
+def fused(*states: RobotState) -> OdometryFusion:
+    fusion = OdometryFusion()
     for one in states:
         fusion.add(one, WAFFLE)
     return fusion

@@ -13,7 +13,7 @@ from gigabrain_zenoh.geometry.se2 import between, compose
 from gigabrain_zenoh.mapping import pose_graph
 from gigabrain_zenoh.mapping.keyframes import Edge
 from gigabrain_zenoh.mapping.pose_graph import Graph
-from gigabrain_zenoh.mapping.slam_map import GrowingMap
+from gigabrain_zenoh.mapping.slam_map import SlamMap
 from tests.unit.mapping.houses import HOUSE, PATIENCE_S, Rooms, at, error, grown
 
 SURE = np.diag((0.05, 0.05, 0.01)) ** 2
@@ -190,6 +190,6 @@ def test_a_map_whose_optimiser_always_raises_grows_without_loops_says_so_and_is_
             "Indeterminate linear system detected near variable 7.",
         )
     ]
-    again = GrowingMap.thaw(chart.to_save()[1], PATIENCE_S)
+    again = SlamMap.thaw(chart.to_save()[1], PATIENCE_S)
     assert len(again.grid().cells) == len(chart.grid().cells)
     assert again.problems() != ()

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.mapping import occupancy_grid as grids
-from gigabrain_zenoh.mapping.occupancy_grid import Grid
+from gigabrain_zenoh.mapping.occupancy_grid import LogOddsGrid
 from tests.unit.mapping.houses import HOUSE, Rooms, at
 
 NONE = np.empty((0, 2), np.float32)
@@ -15,13 +15,13 @@ def points(*pairs: tuple[float, float]) -> NDArray[np.float32]:
     return np.array(pairs, np.float32).reshape(-1, 2)
 
 
-def percent(grid: Grid, x: float, y: float) -> int:
+def percent(grid: LogOddsGrid, x: float, y: float) -> int:
     column, row = int((x - grid.origin_x) / 0.05), int((y - grid.origin_y) / 0.05)
     return int(grid.percent()[row, column])
 
 
 def test_a_beam_frees_its_way_and_fills_its_end() -> None:
-    grid = Grid()
+    grid = LogOddsGrid()
     grid.draw(at(0.025, 0.025), points((1.0, 0.0)), NONE)
     assert percent(grid, 1.025, 0.025) == 71
     assert [percent(grid, x, 0.025) for x in (0.025, 0.5, 0.976)] == [38, 38, 38]
@@ -29,27 +29,27 @@ def test_a_beam_frees_its_way_and_fills_its_end() -> None:
 
 
 def test_a_beam_that_hit_nothing_frees_its_way_and_fills_nothing() -> None:
-    grid = Grid()
+    grid = LogOddsGrid()
     grid.draw(at(0.025, 0.025), NONE, points((0.0, 2.0)))
     assert percent(grid, 0.025, 1.976) == 38
     assert grid.percent().max() == 38
 
 
 def test_in_one_scan_a_hit_goes_before_beams_that_pass_and_counts_once() -> None:
-    grid = Grid()
+    grid = LogOddsGrid()
     grid.draw(at(0.025, 0.025), points((1.0, 0.0), (1.0, 0.001), (2.0, 0.0)), NONE)
     assert percent(grid, 1.025, 0.025) == 71
     assert percent(grid, 1.5, 0.025) == 38
 
 
 def test_a_turned_sensor_draws_where_it_looks() -> None:
-    grid = Grid()
+    grid = LogOddsGrid()
     grid.draw(at(1.025, 2.025, 90), points((1.0, 0.0)), NONE)
     assert percent(grid, 1.025, 3.025) == 71
 
 
 def test_it_grows_to_all_sides_and_keeps_what_was_drawn() -> None:
-    grid = Grid()
+    grid = LogOddsGrid()
     grid.draw(at(0.025, 0.025), points((1.0, 0.0)), NONE)
     before = grid.log_odds.shape
     for end in ((-9.0, 0.0), (9.0, 0.0), (0.0, -9.0), (0.0, 9.0)):
@@ -61,7 +61,7 @@ def test_it_grows_to_all_sides_and_keeps_what_was_drawn() -> None:
 
 
 def test_what_would_not_fit_into_a_message_is_left_out_and_told() -> None:
-    grid = Grid()
+    grid = LogOddsGrid()
     grid.draw(at(0, 0), points((1.0, 0.0)), NONE)
     grid.draw(at(0, 0), points((200.0, 0.0)), NONE)
     assert grid.full
@@ -69,7 +69,7 @@ def test_what_would_not_fit_into_a_message_is_left_out_and_told() -> None:
 
 
 def test_what_walked_by_leaves_no_trace_and_walls_stay() -> None:
-    rooms, grid = Rooms(HOUSE), Grid()
+    rooms, grid = Rooms(HOUSE), LogOddsGrid()
     for step in range(60):  # somebody crosses the room, 0.4 m wide
         x = 1.0 + 0.04 * step
         person = [(x, 3.2, x, 3.6), (x - 0.2, 3.4, x + 0.2, 3.4)]
@@ -80,7 +80,7 @@ def test_what_walked_by_leaves_no_trace_and_walls_stay() -> None:
 
 
 def test_what_stood_there_for_long_is_gone_after_eight_scans_without_it() -> None:
-    grid = Grid()
+    grid = LogOddsGrid()
     for _ in range(100):
         grid.draw(at(0.025, 0.025), points((1.0, 0.0)), NONE)
     assert percent(grid, 1.025, 0.025) == 97
@@ -93,7 +93,7 @@ def test_what_stood_there_for_long_is_gone_after_eight_scans_without_it() -> Non
 
 
 def test_its_message_says_where_it_is() -> None:
-    grid = Grid()
+    grid = LogOddsGrid()
     grid.draw(at(-2.025, 1.025), points((1.0, 0.0)), NONE)
     message = grid.message()
     assert (message.resolution, message.width, message.height) == (0.05, 64, 64)
@@ -103,9 +103,9 @@ def test_its_message_says_where_it_is() -> None:
 
 
 def test_a_grid_as_it_was_saved_goes_on() -> None:
-    first = Grid()
+    first = LogOddsGrid()
     first.draw(at(0.025, 0.025), points((1.0, 0.0)), NONE)
-    again = Grid.of(first.log_odds, first.known(), (first.origin_x, first.origin_y))
+    again = LogOddsGrid.of(first.log_odds, first.known(), (first.origin_x, first.origin_y))
     for grid in (first, again):
         grid.draw(at(0.025, 0.025), points((1.5, 0.0)), NONE)
     assert np.array_equal(first.percent(), again.percent())
@@ -113,7 +113,7 @@ def test_a_grid_as_it_was_saved_goes_on() -> None:
 
 
 def test_a_part_of_it_is_what_the_whole_shows_there() -> None:
-    grid = Grid()
+    grid = LogOddsGrid()
     grid.draw(at(0.025, 0.025), points((3.0, 0.0), (-3.0, 2.0)), NONE)
     part, (x, y) = grid.around(2.0, 0.5, 1.0)
     column, row = round((x - grid.origin_x) / 0.05), round((y - grid.origin_y) / 0.05)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from gigabrain_zenoh.mapping.global_localization import Candidate, search
-from gigabrain_zenoh.mapping.likelihood_field import field_of, fit, matches_itself
+from gigabrain_zenoh.mapping.likelihood_field import field_of, fit, is_self_similar
 from gigabrain_zenoh.mapping.localizer import Localizer
 from gigabrain_zenoh.mapping.map_file import SavedMap
-from gigabrain_zenoh.mapping.static_map import KnownMap
+from gigabrain_zenoh.mapping.static_map import StaticMap
 from tests.unit.mapping.houses import (
     BEAMS,
     CORRIDOR,
@@ -39,7 +39,7 @@ def corridor() -> SavedMap:
 
 def walker(saved: SavedMap, walls: list[tuple[float, float, float, float]], x: float, y: float,
            degrees: float = 0.0) -> Walker:  # fmt: skip
-    return Walker(Rooms(walls), KnownMap(saved, PATIENCE_S), at(x, y, degrees))
+    return Walker(Rooms(walls), StaticMap(saved, PATIENCE_S), at(x, y, degrees))
 
 
 def test_a_scan_is_drawn_to_where_it_belongs(house: SavedMap) -> None:
@@ -136,7 +136,7 @@ def test_a_place_that_is_mapped_whole_is_not_taken_for_one_that_is_mapped_half(x
 def test_in_a_hall_that_is_the_same_from_both_ends_neither_is_believed(reach: int) -> None:
     saved, rooms = hall(reach), Rooms(HALL)
     for k, x in enumerate((4.8, 6.5, 8.0, 9.2, 10.5, 11.0, 11.4, 11.8)):
-        robot = Walker(rooms, KnownMap(saved, PATIENCE_S), at(x, 2.8, 50 * k))
+        robot = Walker(rooms, StaticMap(saved, PATIENCE_S), at(x, 2.8, 50 * k))
         places = [robot.look(16), robot.go((8.5, 2.8)), robot.go((8.0, 2.0))]
         wrong = [place for place in places if place.localized and error(place, robot.pose) > 0.3]
         assert not wrong, x
@@ -146,10 +146,10 @@ def test_in_a_hall_that_is_the_same_from_both_ends_neither_is_believed(reach: in
 def test_a_hall_goes_on_as_itself_turned_about() -> None:
     half = hall(9)
     field = field_of(half.cells, half.resolution, (half.origin_x, half.origin_y))
-    assert matches_itself(field, at(16.0, 6.0, 180))
-    assert not matches_itself(field, at(15.0, 6.0, 180))
-    assert not matches_itself(field, at(-3.5, 0.0))  # but for its long walls
-    assert not matches_itself(field, at(-20.0, 0.0))  # nothing comes to lie on anything
+    assert is_self_similar(field, at(16.0, 6.0, 180))
+    assert not is_self_similar(field, at(15.0, 6.0, 180))
+    assert not is_self_similar(field, at(-3.5, 0.0))  # but for its long walls
+    assert not is_self_similar(field, at(-20.0, 0.0))  # nothing comes to lie on anything
 
 
 def test_where_it_was_known_to_be_last_stays_a_place_if_it_explains_what_is_seen() -> None:

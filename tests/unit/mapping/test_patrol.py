@@ -7,9 +7,9 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.geometry.se2 import IDENTITY, between
 from gigabrain_zenoh.mapping.keyframes import Edge, Keyframe, Scan, View
 from gigabrain_zenoh.mapping.map_file import SavedMap
-from gigabrain_zenoh.mapping.occupancy_grid import Sweeps
-from gigabrain_zenoh.mapping.slam import Ground
-from gigabrain_zenoh.mapping.slam_map import GrowingMap
+from gigabrain_zenoh.mapping.occupancy_grid import GridScans
+from gigabrain_zenoh.mapping.slam import KnownGround
+from gigabrain_zenoh.mapping.slam_map import SlamMap
 from tests.unit.mapping.houses import HOUSE, PATIENCE_S, Rooms, Walker, at, box, error
 
 START = (1.0, 2.5)
@@ -22,7 +22,7 @@ class Patrol:
     """A robot that goes its rounds in the house."""
 
     def __init__(self) -> None:
-        self.chart = GrowingMap(PATIENCE_S)
+        self.chart = SlamMap(PATIENCE_S)
         self.walker = Walker(Rooms(HOUSE), self.chart, at(*START))
         self.walker.look()
         self.errors: list[float] = []
@@ -61,11 +61,11 @@ def test_on_known_ground_the_robot_is_where_it_is(patrol: Patrol) -> None:
 
 def test_a_map_of_known_ground_is_saved_and_gone_on_with(patrol: Patrol) -> None:
     _, arrays = patrol.chart.to_save()
-    again = GrowingMap.thaw(arrays, PATIENCE_S)
+    again = SlamMap.thaw(arrays, PATIENCE_S)
     assert again.report()["keyframes"] == patrol.keyframes[-1]
     assert again.report()["sweeps"] == patrol.sweeps[-1]
     frozen = patrol.chart.still().freeze()
-    assert GrowingMap.thaw(frozen, PATIENCE_S).grid() == patrol.chart.grid()
+    assert SlamMap.thaw(frozen, PATIENCE_S).grid() == patrol.chart.grid()
     walker = Walker(Rooms(HOUSE, seed=3), again, patrol.walker.pose)
     place = walker.look(30)
     assert place.localized
@@ -104,7 +104,7 @@ def keyframe(travel: float) -> Keyframe:
 
 
 def around(travels: list[float], poses: Floats, now: float) -> list[int]:
-    ground = Ground()
+    ground = KnownGround()
     for travel in travels:
         ground.add(keyframe(travel))
     return ground.round(IDENTITY, now, poses, {0})
@@ -120,7 +120,7 @@ def test_ground_is_known_after_two_passes_that_are_over() -> None:
 
 
 def test_of_sweeps_from_one_place_the_newest_three_stay() -> None:
-    sweeps = Sweeps()
+    sweeps = GridScans()
     for k in range(6):
         view = View(Scan.of(np.full((30, 2), float(k))), np.zeros(2))
         sweeps.add(view, 0, IDENTITY, np.array((0.05 + 0.15 * (k % 3), 0.1, 0.1)))

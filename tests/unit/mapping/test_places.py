@@ -7,15 +7,15 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.geometry.se2 import between, compose
 from gigabrain_zenoh.mapping.keyframes import Edge, Keyframe
 from gigabrain_zenoh.mapping.loop_closure import PlaceSearch
-from gigabrain_zenoh.mapping.pose_graph import Drift, Rates
+from gigabrain_zenoh.mapping.pose_graph import Drift, DriftRates
 from tests.unit.geometry.test_slam import BLOCK, lap
 from tests.unit.mapping.rooms import Lidar, Walls, box, line
 
-BAD = Rates(away=0.2, turn=0.02)
+BAD = DriftRates(away=0.2, turn=0.02)
 
 
 def searched(
-    walls: Walls, poses: Floats, thought: Floats, lidar: Lidar, first: int, rates: Rates = BAD
+    walls: Walls, poses: Floats, thought: Floats, lidar: Lidar, first: int, rates: DriftRates = BAD
 ) -> list[Edge]:
     """Search from each keyframe from `first` on; the robot is at `poses`, thought at `thought`."""
     drift = Drift(rates)
@@ -60,5 +60,5 @@ def test_a_place_that_drift_cannot_have_led_away_from_is_another_one_like_it() -
     poses = np.concatenate((once, lap()[17:125]))
     second = (np.arange(len(poses)) >= len(once))[:, None]
     thought = np.where(second, compose(np.array((3.5, -2.0, 0.1)), poses), poses)
-    good = Rates(away=0.06, turn=0.01)  # 0.4 m over the lap
+    good = DriftRates(away=0.06, turn=0.01)  # 0.4 m over the lap
     assert searched(BLOCK, poses, thought, Lidar(180, reach=6.0), len(once), good) == []

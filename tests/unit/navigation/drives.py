@@ -19,7 +19,7 @@ from gigabrain_zenoh.navigation.local_planner import (
     PlanRequest,
     SentCommand,
 )
-from gigabrain_zenoh.navigation.motion_model import lag_of, lagged_step
+from gigabrain_zenoh.navigation.motion_model import first_order_lag, lagged_step
 
 WAFFLE = BodyDescription(
     robot_type="waffle",
@@ -117,7 +117,7 @@ class Drive:
     def _tick(self, command: Velocity) -> None:
         self._sent.append(SentCommand(self.tick, command))
         self._queue.append(command)
-        told, lag = self._queue.popleft(), lag_of(self.response.lag, TICK_S)
+        told, lag = self._queue.popleft(), first_order_lag(self.response.lag, TICK_S)
         vx, ahead = lagged_step(self.velocity.linear_x, told.linear_x, lag, TICK_S)
         vy, aside = lagged_step(self.velocity.linear_y, told.linear_y, lag, TICK_S)
         w, turned = lagged_step(self.velocity.angular_z, told.angular_z, lag, TICK_S)

@@ -101,7 +101,7 @@ def near(discs: list[tuple[float, ...]], seconds: float) -> tuple[float, float]:
     state = np.zeros(STATE)
     state[COSINE : COSINE + LANES] = 1.0
     state[X : X + LANES - 1] = 50.0  # the others are elsewhere
-    cost.near_discs(weights, np.array(discs), outline_of(JACKAL.footprint), seconds, state)
+    cost.fill_disc_distances(weights, np.array(discs), outline_of(JACKAL.footprint), seconds, state)
     assert (state[AWAY], state[CLOSE]) == (NO_DISC, 0.0)
     return float(state[AWAY + LANES - 1]), float(state[CLOSE + LANES - 1])
 

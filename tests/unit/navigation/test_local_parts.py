@@ -21,13 +21,13 @@ from gigabrain_zenoh.navigation.footprint import (
 )
 from gigabrain_zenoh.navigation.local_costmap import Chamfer, LocalCostmap, Pose2D
 from gigabrain_zenoh.navigation.motion_model import (
+    delayed_model,
     feasible,
-    lag_of,
+    first_order_lag,
     lagged_step,
     model_of,
-    slowed_model,
 )
-from gigabrain_zenoh.navigation.mppi import past_of
+from gigabrain_zenoh.navigation.mppi import mean_past_commands
 from tests.unit.navigation.drives import CAR, WAFFLE, wall
 
 NOBODY = np.empty((0, 6))
@@ -66,7 +66,7 @@ def test_a_slower_speed_can_be_asked_for() -> None:
 @pytest.mark.parametrize("late", [0.02, 0.1, 0.5])
 def test_a_body_that_reacts_later_is_driven_so_that_it_needs_no_longer_to_stop(late: float) -> None:
     model = model_of(WAFFLE)
-    slow = slowed_model(model, late)
+    slow = delayed_model(model, late)
 
     def way(speed: float, reaction: float) -> float:
         return speed * reaction + speed**2 / (2 * 0.9)
@@ -74,19 +74,19 @@ def test_a_body_that_reacts_later_is_driven_so_that_it_needs_no_longer_to_stop(l
     assert way(slow.forward, 0.22 + late) == pytest.approx(way(0.26, 0.22))
     assert slow.forward / model.forward == pytest.approx(slow.turning / model.turning)
     assert slow.forward < model.forward
-    assert slowed_model(model, 0.0) is model
+    assert delayed_model(model, 0.0) is model
 
 
 def test_a_lag_closes_the_gap_by_the_same_share_in_each_step() -> None:
-    velocity, way = lagged_step(0.0, 1.0, lag_of(0.15, 0.05), 0.05)
+    velocity, way = lagged_step(0.0, 1.0, first_order_lag(0.15, 0.05), 0.05)
     assert velocity == pytest.approx(0.2834687)
     assert way == pytest.approx(0.0074797, abs=1e-6)
-    assert lagged_step(0.0, 1.0, lag_of(0.0, 0.05), 0.05) == (1.0, 0.05)
+    assert lagged_step(0.0, 1.0, first_order_lag(0.0, 0.05), 0.05) == (1.0, 0.05)
 
 
 def test_commands_on_their_way_are_averaged_over_each_step() -> None:
     sent = np.array([(-0.10, 1.0, 0.0, 0.0), (-0.06, 2.0, 0.0, 0.5)])
-    past, share = past_of(sent, (0.0, 0.0, 0.0), 0.12, 0.05)
+    past, share = mean_past_commands(sent, (0.0, 0.0, 0.0), 0.12, 0.05)
     assert share == pytest.approx(0.4)
     # -0.15 to -0.10, -0.10 to -0.05, -0.05 to 0
     assert past[:, 0] == pytest.approx([0.0, 1.2, 2.0])

@@ -12,9 +12,9 @@ from gigabrain_zenoh.navigation.cost import (
     Problem,
     Scene,
     Weights,
-    look_round,
+    evaluate_surroundings,
+    fill_clearances,
     price,
-    rooms_of,
 )
 from gigabrain_zenoh.navigation.dynamic_obstacles import WEIGHTS
 from gigabrain_zenoh.navigation.footprint import DistanceGrid, Outline, outline_of
@@ -23,7 +23,7 @@ from gigabrain_zenoh.navigation.motion_model import (
     STATE,
     InitialState,
     MotionModel,
-    lag_of,
+    first_order_lag,
     make_feasible,
     model_of,
     simulate,
@@ -46,8 +46,8 @@ def prices(
         make_feasible(model, start, dt, plans[block])
         simulate(model, outline.far, start, dt, plans[block], states)
         problem = Problem(model, outline, weights, scene, dt)
-        look_round(problem, states)
-        rooms_of(scene, outline, states, rooms)
+        evaluate_surroundings(problem, states)
+        fill_clearances(scene, outline, states, rooms)
         for n in range(len(limits)):
             for lane in range(LANES):
                 costs[n, block, lane] = price(problem, rooms, states, lane, limits[n])
@@ -80,7 +80,7 @@ def test_a_plan_is_given_up_only_where_it_costs_as_much_as_the_limit(
     plans[:, :, 0] += random.uniform(-0.5, 2.0, (BLOCKS, 1, LANES))
     start = InitialState(
         0.0, 0.0, 0.2, 0.8, 0.0, 0.3, (0.8, 0.0, 0.3), np.tile((0.8, 0.0, 0.3), (3, 1)), 0.4,
-        lag_of(0.15, DT), 1.0,
+        first_order_lag(0.15, DT), 1.0,
     )  # fmt: skip
     limits = np.array([math.inf, 40.0, 60.0, 100.0, 150.0])
     costs = np.empty((len(limits), BLOCKS, LANES))
