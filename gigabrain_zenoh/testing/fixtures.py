@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_zenoh.testing.processes import Home
+from gigabrain_zenoh.testing.processes import Home, ServiceManager
 
 
 @pytest.fixture
@@ -35,3 +35,11 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     for name, module in list(sys.modules.items()):
         if folder in Path(getattr(module, "__file__", None) or "").parents:
             del sys.modules[name]
+
+
+@pytest.fixture
+def service_manager(tmp_path: Path) -> Iterator[ServiceManager]:
+    """A service manager that listens at `notify` in the test's folder."""
+    made = ServiceManager(f"{tmp_path}/notify")
+    yield made
+    made.close()

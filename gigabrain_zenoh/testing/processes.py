@@ -204,6 +204,30 @@ def free_endpoint() -> str:
     return f"tcp/127.0.0.1:{free_port()}"
 
 
+class ServiceManager:
+    """The other end of `$NOTIFY_SOCKET`: receives what sd_notify sends."""
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(address)
+        self._socket.setblocking(False)
+        self._heard: list[str] = []
+
+    @property
+    def heard(self) -> list[str]:
+        """All messages so far."""
+        while True:
+            try:
+                self._heard.append(self._socket.recv(4096).decode())
+            except BlockingIOError:
+                return list(self._heard)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
 class RouterProcess:
     """A router in a process of its own."""
 

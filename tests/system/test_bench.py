@@ -3,29 +3,11 @@
 import json
 from pathlib import Path
 
-import msgspec
 import pytest
 
-from gigabrain_zenoh.qa.bench.stack import ProcessCost, StackResult
 from gigabrain_zenoh.testing.processes import Home
 
 pytestmark = pytest.mark.alone
-
-
-def stack(**changes: object) -> StackResult:
-    values = {
-        "body": "turtlebot3_waffle",
-        "world": "arena",
-        "seconds": 20.0,
-        "ready_s": 1.2,
-        "physics_cpu": 0.04,
-        "processes": (
-            ProcessCost(name="driver", cpu=0.125, rss_bytes=95_000_000),
-            ProcessCost(name="perception", cpu=0.025, rss_bytes=56_000_000),
-            ProcessCost(name="safety", cpu=0.0625, rss_bytes=58_500_000),
-        ),
-    }
-    return msgspec.convert(values | changes, StackResult)
 
 
 async def test_the_chain_is_timed_beside_a_bare_relay(home: Home, tmp_path: Path) -> None:

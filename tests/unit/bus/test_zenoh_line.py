@@ -10,6 +10,7 @@ import zenoh
 from gigabrain_zenoh.bus.bridge import Bridge
 from gigabrain_zenoh.bus.zenoh import session as zenoh_line
 from gigabrain_zenoh.bus.zenoh.session import ReconnectingSession
+from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.testing.waiting import until
 
@@ -117,3 +118,10 @@ async def test_a_link_that_was_lost_before_anybody_listened_is_noticed(
     assert first.closed
     await world.lines.close()
     await asyncio.sleep(0)
+
+
+async def test_who_asks_on_a_session_that_was_just_closed_is_answered_by_nobody() -> None:
+    closed: Any = Session(refuses=zenoh.ZError("session closed"))
+    transport = ZenohTransport(closed, Endpoint(connect=("tcp/127.0.0.1:1",)))
+    assert await transport.query("robot/map", b"", "", 1.0, "data") == []
+    await transport.close()

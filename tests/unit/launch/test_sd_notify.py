@@ -1,89 +1,59 @@
 """What a service manager hears of `gigabrain up`, on a real datagram socket."""
 
 import os
-import socket
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.launch.up import Notifier
 from gigabrain_zenoh.runtime import heartbeat
+from gigabrain_zenoh.testing.processes import ServiceManager
 
 
-class Manager:
-    """The other end of $NOTIFY_SOCKET."""
-
-    def __init__(self, address: str) -> None:
-        self.address = address
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self._socket.bind(address)
-        self._socket.setblocking(False)
-        self._heard: list[str] = []
-
-    @property
-    def heard(self) -> list[str]:
-        """All that it was told so far."""
-        while True:
-            try:
-                self._heard.append(self._socket.recv(4096).decode())
-            except BlockingIOError:
-                return list(self._heard)
-
-    def close(self) -> None:
-        self._socket.close()
-
-
-@pytest.fixture
-def manager(tmp_path: Path) -> Iterator[Manager]:
-    made = Manager(f"{tmp_path}/notify")
-    yield made
-    made.close()
-
-
-def test_the_watchdog_is_fed_in_good_time_and_not_at_every_turn(manager: Manager) -> None:
+def test_the_watchdog_is_fed_in_good_time_and_not_at_every_turn(
+    service_manager: ServiceManager,
+) -> None:
     now = [100.0]
-    notifier = Notifier(manager.address, 10.0, lambda: now[0])
+    notifier = Notifier(service_manager.address, 10.0, lambda: now[0])
     for _ in range(100):
         notifier.alive()
         now[0] += 0.1
-    assert manager.heard == ["WATCHDOG=1"] * 3  # at 0, 4 and 8 s
+    assert service_manager.heard == ["WATCHDOG=1"] * 3  # at 0, 4 and 8 s
 
 
-def test_ready_is_said_once_and_a_status_when_it_changes(manager: Manager) -> None:
-    notifier = Notifier(manager.address)
+def test_ready_is_said_once_and_a_status_when_it_changes(service_manager: ServiceManager) -> None:
+    notifier = Notifier(service_manager.address)
     for text in ("a", "a", "b"):
         notifier.status(text)
         notifier.ready()
         notifier.alive()
-    assert manager.heard == ["STATUS=a", "READY=1", "STATUS=b"]
+    assert service_manager.heard == ["STATUS=a", "READY=1", "STATUS=b"]
 
 
 def test_an_abstract_address_and_a_missing_manager_are_fine(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     name = f"gigabrain-{os.getpid()}"
-    manager = Manager(f"\0{name}")
+    service_manager = ServiceManager(f"\0{name}")
     monkeypatch.setenv("NOTIFY_SOCKET", f"@{name}")
     notifier = Notifier.from_environment()
     assert "NOTIFY_SOCKET" not in os.environ
     notifier.stopping()
-    assert manager.heard == ["STOPPING=1"]
-    manager.close()
+    assert service_manager.heard == ["STOPPING=1"]
+    service_manager.close()
     notifier.stopping()
     Notifier.from_environment().stopping()
 
 
 def test_a_watchdog_that_is_meant_for_another_process_is_not_fed(
-    manager: Manager, monkeypatch: pytest.MonkeyPatch
+    service_manager: ServiceManager, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for pid, heard in (("1", []), (str(os.getpid()), ["WATCHDOG=1"])):
-        monkeypatch.setenv("NOTIFY_SOCKET", manager.address)
+        monkeypatch.setenv("NOTIFY_SOCKET", service_manager.address)
         monkeypatch.setenv("WATCHDOG_USEC", "5000000")
         monkeypatch.setenv("WATCHDOG_PID", pid)
         Notifier.from_environment().alive()
-        assert manager.heard == heard
+        assert service_manager.heard == heard
 
 
 class TurningClock(Clock):

@@ -2,6 +2,7 @@
 
 import contextlib
 import fcntl
+import json
 import logging
 import os
 import sys
@@ -33,6 +34,35 @@ def unread() -> Iterator[IO[bytes]]:
             root.removeHandler(handler)
             handler.close()
         root.setLevel(level)
+
+
+def test_a_console_that_nobody_reads_holds_up_neither_the_program_nor_its_log_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(logs, "LAST_WORDS_S", 60.0)
+    with unread() as pipe:
+        logs.setup("driver", tmp_path, json_console=True)
+        file, console = (
+            h for h in logging.getLogger().handlers if isinstance(h, logs.QueuedHandler)
+        )
+        for i in range(1500):
+            log.info("line %d", i)
+            if i % 100 == 99:
+                file.flush()
+        lost = console.lost
+        assert 400 < lost < 500  # a thousand wait, and a pipe full is with the kernel
+        written = [
+            json.loads(line)["text"]
+            for line in (tmp_path / "driver.jsonl").read_text().splitlines()
+        ]
+        assert written == [f"line {i}" for i in range(1500)]
+        texts = [json.loads(pipe.readline())["text"] for _ in range(1500 - lost)]
+        assert texts == [f"line {i}" for i in range(1500 - lost)]
+        log.info("read again")
+        assert json.loads(pipe.readline())["text"] == "read again"
+        said = json.loads(pipe.readline())
+        assert said["text"] == f"{lost} records did not reach the console"
+        assert said["level"] == "warning"
 
 
 def test_a_log_file_is_rotated_and_all_that_is_kept_is_read(
