@@ -63,14 +63,9 @@ unit: setup
 node: setup
 	$(PYTEST) $(SIDE_BY_SIDE) -q $(or $(ARGS),tests/node)
 
-# robots and sessions side by side; then those that need the machine to themselves
+# robots and sessions, two at a time
 system: setup
-ifdef ARGS
-	$(PYTEST) -q $(ARGS)
-else
-	$(PYTEST) $(SIDE_BY_SIDE) -q -m 'not qa and not alone' tests/system
-	$(PYTEST) -q -m 'not qa and alone' tests/system
-endif
+	$(PYTEST) $(SIDE_BY_SIDE) -q $(or $(ARGS),tests/system)
 
 check: setup
 	@$(MAKE) lint
@@ -126,9 +121,10 @@ fuzz: setup
 	  $(BIN)/python $$target -max_total_time=$(FUZZ_S) -verbosity=0 -print_final_stats=1 || exit 1; \
 	done
 
-# what CI runs behind `make test`: the wheel in an empty environment
-ci-extra: $(INSTALLED)
+# what CI runs behind `make test`: the wheel in an empty environment, and what the pages say to run
+ci-extra: setup
 	$(BIN)/python -m tests.qa.wheel
+	$(BIN)/python -m tests.qa.documentation
 
 bench: setup
 	$(BIN)/gigabrain bench chain

@@ -7,8 +7,6 @@ import pytest
 
 from gigabrain_zenoh.testing.processes import Home
 
-pytestmark = pytest.mark.alone
-
 
 async def test_the_chain_is_timed_beside_a_bare_relay(home: Home, tmp_path: Path) -> None:
     report = tmp_path / "chain.json"

@@ -8,8 +8,6 @@ import pytest
 from gigabrain_drivers.driver.catalog import load_robot, robot_files, robot_links
 from gigabrain_zenoh.qa.conformance import kit
 
-pytestmark = pytest.mark.alone
-
 QUICK = ("mock", "mycustombot")  # the others in `make qa`
 BODIES = [
     pytest.param(name, marks=() if name in QUICK else pytest.mark.qa) for name in robot_files()

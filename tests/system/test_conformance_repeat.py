@@ -8,8 +8,6 @@ from gigabrain_zenoh.qa.conformance import kit
 from gigabrain_zenoh.qa.conformance.driver_checks import CheckedRobot
 from gigabrain_zenoh.qa.judging import Finding, summary
 
-pytestmark = pytest.mark.alone
-
 
 def test_the_worst_and_the_median_of_each_time_are_told() -> None:
     found = [

@@ -8,8 +8,6 @@ from gigabrain_zenoh.qa.faults.rig import Options
 from gigabrain_zenoh.qa.faults.suite import FAULTS, run_suite
 from gigabrain_zenoh.qa.judging import FaultResult, FaultRow
 
-pytestmark = pytest.mark.alone
-
 # a process, the gate, a link, the router, and the e-stop
 QUICK = ("decision-killed", "gate-killed", "serial-unplugged", "router-killed", "e-stop-pressed")
 ROWS = [

@@ -26,8 +26,6 @@ from gigabrain_zenoh.testing.waiting import until
 from tests.places import ROOT
 from tests.system.netns import Network, network
 
-pytestmark = pytest.mark.alone
-
 STOP_TICKS = 6  # 120 ms
 REST_TICKS = 40  # by then the ramp has ended
 RETURN_TICKS = 150  # 3 s

@@ -3,8 +3,6 @@
 import re
 from pathlib import Path
 
-import pytest
-
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.qa.probe import probing
@@ -13,8 +11,6 @@ from gigabrain_zenoh.testing.processes import Home
 from gigabrain_zenoh.testing.waiting import until
 from tests.places import ROOT
 from tests.system.netns import network
-
-pytestmark = pytest.mark.alone
 
 HOSTS = ("robot", "brain", "operator")
 

@@ -19,8 +19,6 @@ from gigabrain_zenoh.testing.processes import Home, free_port
 from gigabrain_zenoh.testing.waiting import until
 from tests.system.test_netns import REST_TICKS, STOP_TICKS, Ears
 
-pytestmark = pytest.mark.alone
-
 ROBOT: tuple[ProcessName, ...] = ("router", "driver", "control", "safety")
 BRAIN: tuple[ProcessName, ...] = ("perception", "decision")
 

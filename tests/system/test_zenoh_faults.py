@@ -23,8 +23,6 @@ from gigabrain_zenoh.testing.processes import (
 )
 from gigabrain_zenoh.testing.waiting import until
 
-pytestmark = pytest.mark.alone
-
 
 def client_of(endpoint: str) -> Awaitable[ZenohTransport]:
     return ZenohTransport.open(Endpoint(connect=(endpoint,)))
