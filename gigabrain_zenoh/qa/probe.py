@@ -162,12 +162,12 @@ class Probe:
                 await until(lambda: self.state.gate.mode == "idle", "idle", math.inf)
                 await self.enable_brain()
 
-        person = asyncio.ensure_future(enable()) if by_hand else None
+        enabling = asyncio.ensure_future(enable()) if by_hand else None
         try:
             await until(driving, f"driving straight at {speed} m/s")
         finally:
-            if person:
-                person.cancel()
+            if enabling:
+                enabling.cancel()
 
     async def enable_brain(self) -> None:
         """Enable the brain as a person would, as soon as the gate agrees."""
@@ -177,7 +177,7 @@ class Probe:
                 return
             await self.ticks(5)
 
-    async def tries_to_enable(self, count: int = 5) -> int:
+    async def count_enables(self, count: int = 5) -> int:
         """Ask `count` times to enable the brain; return how often the gate agreed."""
         enabled = 0
         for _ in range(count):

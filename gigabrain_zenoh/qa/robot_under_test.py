@@ -190,7 +190,7 @@ class RobotUnderTest(ProcessGroup):
     """A whole robot with a probe on its bus. Used as `async with`, or closed by hand."""
 
     probe: Probe
-    person: Robot  # acts as an operator
+    operator: Robot
 
     def __init__(
         self, deployment: Deployment, folder: Path, change: Change | None = None,
@@ -213,7 +213,7 @@ class RobotUnderTest(ProcessGroup):
             await self.until_ready()
             operator = client_endpoint(self.deployment, "operator")
             self.probe = await self._stack.enter_async_context(probing(operator, "suite"))
-            self.person = Robot(self.probe.bus)
+            self.operator = Robot(self.probe.bus)
         except BaseException:
             await self.close()
             raise
@@ -319,7 +319,7 @@ class RobotUnderTest(ProcessGroup):
         await self.probe.ticks(ticks)
         return await self.travelled() - before_m
 
-    async def after_simulated(self, seconds: float) -> dict[str, Any]:
+    async def wait_simulated(self, seconds: float) -> dict[str, Any]:
         """Wait for an emulated body's own time, whatever else runs; return the truth then."""
         truth = await self.truth()
         end_s = float(truth["sim_seconds"]) + seconds
@@ -328,7 +328,7 @@ class RobotUnderTest(ProcessGroup):
             truth = await self.truth()
         return truth
 
-    async def drive(self, room: float = 1.3, share: float = 1.0) -> None:
+    async def until_driving(self, room: float = 1.3, share: float = 1.0) -> None:
         """Wait until the brain drives straight at its full speed; enables it as a person would.
 
         `share` of the speed is enough where the gate is expected to slow the robot down.
@@ -349,7 +349,7 @@ class RobotUnderTest(ProcessGroup):
         probe = self.probe
         while probe.state.gate.mode == "latched":
             try:
-                await self.person.release()
+                await self.operator.release()
             except Refused:
                 await probe.ticks(5)
             else:

@@ -79,7 +79,7 @@ async def _killed(
 ) -> tuple[float, int, float]:
     """Return recording lost at the end [s], earlier messages missing, control's delay [ms]."""
     probe = robot.probe
-    await robot.drive(0.8)
+    await robot.until_driving(0.8)
     await asyncio.sleep(chance.uniform(*LIFE_S))
     newest, start = _newest(folder), probe.state
     pid, killed_ns = robot.kill("recorder"), time.time_ns()

@@ -116,7 +116,7 @@ class Rig:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        await self.give_up()
+        await self.end_robot()
 
     async def robot(self, stage: Stage) -> RobotUnderTest:
         """Return the robot of a stage: the running one if it is reusable, else a new one.
@@ -125,7 +125,7 @@ class Rig:
         """
         kept, wanted = self._kept, deployment_of(self.options, stage)
         if kept and (kept[0] != wanted or not kept[1].reusable):
-            await self.give_up()
+            await self.end_robot()
         if self._kept is None:
             self._kept = wanted, await self.new(wanted).__aenter__()
         _, robot = self._kept
@@ -136,7 +136,7 @@ class Rig:
         self, deployment: Deployment, change: Change | None = None,
         backoff: Backoff = NEVER_GIVE_UP, *, keep_stuck: bool = True,
     ) -> RobotUnderTest:  # fmt: skip
-        """Return a robot that is not started yet. To be used as `async with`, after `give_up`."""
+        """Return a robot that is not started yet. To be used as `async with`, after `end_robot`."""
         folder = self.fresh_folder()
         robot = RobotUnderTest(deployment, folder, change, backoff, keep_stuck=keep_stuck)
         self._robots.append(robot)
@@ -148,7 +148,7 @@ class Rig:
         backoff: Backoff = NEVER_GIVE_UP, *, keep_stuck: bool = True, checked: bool = True,
     ) -> AsyncIterator[RobotUnderTest]:  # fmt: skip
         """Run a robot for one test alone; contacts and deaths fail the test if `checked`."""
-        await self.give_up()
+        await self.end_robot()
         async with self.new(deployment, change, backoff, keep_stuck=keep_stuck) as robot:
             await robot.settle()
             yield robot
@@ -161,7 +161,7 @@ class Rig:
         folder.mkdir(parents=True)
         return folder
 
-    async def give_up(self) -> None:
+    async def end_robot(self) -> None:
         """End the running robot. The next test gets a new one."""
         kept, self._kept = self._kept, None
         if kept:
@@ -240,7 +240,7 @@ async def stop_by(robot: RobotUnderTest, fault: Callable[[], object], victim: st
     Times count from the last tick that the `victim` has answered.
     """
     probe = robot.probe
-    await robot.drive()
+    await robot.until_driving()
     before_m = await robot.travelled()
     start = probe.state
     fault()

@@ -153,7 +153,7 @@ async def _judged(row: FaultRow, rig: Rig) -> FaultRun:
     except Skipped as error:
         return FaultRun(verdict="skipped", reason=str(error))
     except (GigabrainError, TimeoutError) as error:
-        await rig.give_up()
+        await rig.end_robot()
         return FaultRun(verdict="FAILED", reason=str(error) or f"not over after {LIMIT_S:g} s")
     verdict, reason = judge(row, measured, wall=rig.options.wall, long=rig.long)
     by_name = {figure.name: value for figure, value in measured.items()}

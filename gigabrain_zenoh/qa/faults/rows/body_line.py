@@ -63,11 +63,11 @@ async def serial_unplugged(rig: Rig) -> Measured:
     """Unplug the adapter while it drives, and plug it in again."""
     robot = await rig.robot("serial")
     deaths = robot.supervisor.deaths
-    await robot.drive()
+    await robot.until_driving()
     reported_ms = await _until_reported(robot, unplugged=True)
-    gone = await robot.after_simulated(0.5)
+    gone = await robot.wait_simulated(0.5)
     zero_s = float(gone["motors_moved_s"]) - float(gone["faulted_s"])
-    rest_m = (await robot.after_simulated(0.5))["distance_m"]
+    rest_m = (await robot.wait_simulated(0.5))["distance_m"]
     back_s, again = await _mended(robot)
     return {
         REPORTED: reported_ms,
@@ -83,7 +83,7 @@ async def serial_noise(rig: Rig) -> Measured:
     """Flip bits on the line: the driver survives, and the checksum keeps commands right."""
     robot = await rig.robot("serial")
     deaths = robot.supervisor.deaths
-    await robot.drive(room=0.8)
+    await robot.until_driving(room=0.8)
     for byte_errors in BYTE_ERRORS:
         await robot.break_body(base={"bit_errors": byte_errors})
         await robot.probe.ticks(NOISY_TICKS)
@@ -144,9 +144,9 @@ def lost_after_garbage(checksum: str, times: int, seed: int = 0) -> int:
 async def tcp_frozen(rig: Rig) -> Measured:
     """Freeze the body's server with its connection open, and thaw it."""
     robot = await rig.robot("tcp")
-    await robot.drive()
+    await robot.until_driving()
     reported_ms = await _until_reported(robot, frozen=True)
-    rest = await robot.after_simulated(1.0)
+    rest = await robot.wait_simulated(1.0)
     _, again = await _mended(robot)
     return {
         REPORTED: reported_ms,
@@ -161,7 +161,7 @@ async def tcp_frozen(rig: Rig) -> Measured:
 )  # fmt: skip
 async def tcp_cut(rig: Rig) -> Measured:
     """End the connection with RST, with FIN, or leave it open while nothing comes through."""
-    await rig.give_up()
+    await rig.end_robot()
     folder = rig.fresh_folder()
     change = functools.partial(_with_ports_in, str(folder))
     async with (
@@ -205,7 +205,7 @@ async def _cut(
 ) -> Cut:
     """Cut the line while the body drives; heal it after a second."""
     probe = robot.probe
-    await robot.drive(room=0.8)
+    await robot.until_driving(room=0.8)
     start = probe.state
     cut()
     await until(lambda: probe.state.gate.mode != "enabled", "the gate shuts", within_s=10.0)
@@ -213,7 +213,7 @@ async def _cut(
     shut = next(s.tick for s in states if s.gate.mode != "enabled")
     fresh = [s.tick for s in states if s.tick < shut and s.link.age_ms <= FRESH_MS]
     healed = start.tick
-    rest = await robot.after_simulated(REST_S)
+    rest = await robot.wait_simulated(REST_S)
     if heal:
         heal()
         healed = probe.state.tick
@@ -268,7 +268,7 @@ async def _until_noticed(robot: RobotUnderTest, *codes: str, **fault: Any) -> li
     """
     probe = robot.probe
     for _ in range(PLACES):
-        await robot.drive(ROOM_M)
+        await robot.until_driving(ROOM_M)
         start = probe.state
         await robot.break_body(base=fault)
         await probe.ticks(2 * STRAIGHT_TICKS)

@@ -53,7 +53,7 @@ async def wall_clock_jumps(rig: Rig) -> Measured:
 async def _stops_with(rig: Rig, kind: str, names: tuple[str, ...], ticks: int) -> int:
     """Count unexplained stops of a robot whose processes have such clocks."""
     async with rig.own_robot(deployment_of(rig.options, "sim"), broken(names, kind)) as robot:
-        await robot.drive()
+        await robot.until_driving()
         stopped = await _stops_within(robot, ticks)
         stamps = [s.stamp_ns for s in robot.probe.states]
         if "driver" in names and max(stamps) - min(stamps) < HOUR_NS:
@@ -77,16 +77,16 @@ async def stamps_of_other_times(rig: Rig) -> Measured:
     async with tampered(rig, *WRONG_TICKS, *WRONG_STAMPS) as robot:
         probe = robot.probe
         for _ in WRONG_TICKS:
-            await robot.drive(0.8)
+            await robot.until_driving(0.8)
             next_step(robot)
             await until(lambda: probe.state.gate.mode != "enabled", "it stops", 10.0)
             await probe.at_rest()
             fresh += await robot.travel_within(STAMPED_TICKS) > MOVES_M
             next_step(robot)
         for _ in WRONG_STAMPS:
-            await robot.drive(0.8)
+            await robot.until_driving(0.8)
             next_step(robot)
-            await robot.drive()
+            await robot.until_driving()
             fresh += await _stops_within(robot, STAMPED_TICKS)
             next_step(robot)
         fresh += await _commands_of_other_times(robot)
@@ -101,8 +101,8 @@ async def _commands_of_other_times(robot: RobotUnderTest) -> int:
     probe, fresh = robot.probe, 0
     async with forging(robot.endpoint) as forger:
         for offset in TICK_OFFSETS:
-            await robot.drive(0.8)  # so that nothing speaks against moving
-            await robot.person.enable(probe.bus.process, take=True)
+            await robot.until_driving(0.8)  # so that nothing speaks against moving
+            await robot.operator.enable(probe.bus.process, take=True)
             for _ in range(RESTING):
                 forger.send(CMD_VEL, _command(robot, 0.0, 0))
                 await probe.ticks(1)

@@ -165,7 +165,7 @@ async def _flooded(rig: Rig, ticks: int) -> int:
     )
     async with rig.own_robot(deployment) as robot:
         probe = robot.probe
-        await robot.drive()
+        await robot.until_driving()
         body = probe.bodies.current
         assert body
         start, fastest = probe.state, 1.2 * body.description.max_linear_speed
@@ -190,7 +190,7 @@ async def _flood(robot: RobotUnderTest, ticks: int) -> None:
 async def _nan_of_commander(robot: RobotUnderTest, speed: float) -> float:
     """Return the time until the gate is at zero after a non-finite command of the brain [ms]."""
     probe = robot.probe
-    await robot.drive()
+    await robot.until_driving()
     async with forging(robot.endpoint) as forger:
         await probe.ticks(1)
         begin, records, time = probe.state.tick, len(robot.records), probe.bus.time
@@ -271,10 +271,10 @@ def _limit(body: BodyDescription) -> float:
 async def _on_robot(robot: RobotUnderTest) -> tuple[float, float]:
     """Return by how much a robot's commanded and measured accelerations exceed the limits [%]."""
     probe = robot.probe
-    await robot.drive()
+    await robot.until_driving()
     body = probe.bodies.current
     assert body
-    await robot.person.enable(probe.bus.process, take=True)
+    await robot.operator.enable(probe.bus.process, take=True)
     start = probe.state
     async with forging(robot.endpoint) as forger:
         for hold in HOLDS:

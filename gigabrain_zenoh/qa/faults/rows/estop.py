@@ -102,7 +102,7 @@ async def e_stop_pressed(rig: Rig) -> Measured:
     transport = await ZenohTransport.open(endpoint)
 
     async def ours() -> None:
-        await robot.person.estop("fault suite")
+        await robot.operator.estop("fault suite")
 
     async def foreign() -> None:
         await transport.query(ESTOP.key, b"", "", 1.0, "real_time")
@@ -150,7 +150,7 @@ async def _command_ms(endpoint: str) -> float:
 
 async def _while_driving(robot: RobotUnderTest, presses: PressLog, press: Press) -> float:
     """Press while it drives; return the travel until rest [m]."""
-    await robot.drive(room=0.8)
+    await robot.until_driving(room=0.8)
     before_m = await robot.travelled()
     await presses.press(press)
     await robot.probe.at_rest()
@@ -160,7 +160,7 @@ async def _while_driving(robot: RobotUnderTest, presses: PressLog, press: Press)
 async def _while_stopping(robot: RobotUnderTest, presses: PressLog, press: Press) -> None:
     """Press while the body ramps down because control has died."""
     probe = robot.probe
-    await robot.drive(room=0.8)
+    await robot.until_driving(room=0.8)
     pid = robot.kill("control")
     await until(lambda: probe.state.gate.mode != "enabled", "it stops", within_s=5.0)
     await presses.press(press)
@@ -204,11 +204,11 @@ async def release_and_re_enable(rig: Rig) -> Measured:
     """Release too early, with an old generation, twice at once; enable with a joystick held."""
     robot = await rig.robot("sim")
     probe, wrong = robot.probe, 0
-    await robot.drive(room=0.8)
-    await robot.person.estop("fault suite")
+    await robot.until_driving(room=0.8)
+    await robot.operator.estop("fault suite")
     generation = probe.state.gate.estop_generation
     wrong += await _released(robot, generation)  # while it still moves
-    await robot.person.estop("fault suite")
+    await robot.operator.estop("fault suite")
     await until(lambda: probe.state.gate.estop_generation > generation, "the press is counted")
     async with _publishing(robot, TELEOP, Twist(linear_x=0.2), JOYSTICK_S):
         await probe.at_rest(30)

@@ -119,7 +119,7 @@ async def _missed(robot: RobotUnderTest, count: int) -> int:
     for _ in range(count):
         generation = probe.state.gate.estop_generation
         try:
-            await robot.person.estop("fault suite")
+            await robot.operator.estop("fault suite")
         except Refused:
             missed += 1
             continue
@@ -141,7 +141,7 @@ async def flood(rig: Rig) -> Measured:
     rate_hz = LONG_RATE_HZ if rig.long else RATE_HZ
     presses = PressLog(robot)
     large = LONG_LARGE_BYTES if rig.long else LARGE_BYTES
-    await robot.drive()
+    await robot.until_driving()
     before_mb, most_mb, cpu = rss_mb(pid), 0.0, list[float]()
     robot.probe.ignore_commands(True)
     async with cpu_load.running("flood", str(rate_hz), str(large), endpoint) as flooder:
@@ -152,7 +152,7 @@ async def flood(rig: Rig) -> Measured:
             most_mb = max(most_mb, rss_mb(pid))
         named = await _in_audit_log(robot, cpu_load.FLOODER)
         for _ in range(LONG_PRESSES if rig.long else PRESSES):
-            await presses.press(lambda: robot.person.estop("fault suite"))
+            await presses.press(lambda: robot.operator.estop("fault suite"))
     robot.probe.ignore_commands(False)
     sent = await counting
     if sent < MIN_SHARE * rate_hz * seconds:
@@ -191,7 +191,7 @@ async def soak(rig: Rig) -> Measured:
     """Drive for twenty seconds; in the long form for 70 min with deaths, e-stops and viewers."""
     robot = await rig.robot("sim")
     probe, gaps = robot.probe, SequenceGaps()
-    await robot.drive()
+    await robot.until_driving()
     await until(lambda: probe.state.tick >= WARM_TICKS, "20 s since the start")
     pids = {name: robot.pid(name) for name in robot.supervisor.statuses}
     files = {pid: open_files(pid) for pid in pids.values()}
@@ -205,7 +205,7 @@ async def soak(rig: Rig) -> Measured:
     memory = MemorySlopes(now_s() + WARM_UP_S)
     end_s = now_s() + (WARM_UP_S + HOUR_S if rig.long else 0.0)
     while True:
-        await robot.drive(0.3)
+        await robot.until_driving(0.3)
         start = probe.state
         await asyncio.sleep(QUIET_S)
         stopped += len(probe.stops(start))
@@ -272,7 +272,7 @@ class SoakEvents:
         self._pids[victim] = self._robot.pid(victim)
 
     async def _estop(self) -> None:
-        await self._robot.person.estop("soak")
+        await self._robot.operator.estop("soak")
         await self._robot.probe.at_rest()
 
     async def _viewer(self) -> None:

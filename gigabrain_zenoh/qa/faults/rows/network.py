@@ -97,7 +97,7 @@ async def router_killed(rig: Rig) -> Measured:
     """Kill the router: no message arrives until it is back."""
     robot = await rig.robot("sim")
     probe, loop = robot.probe, asyncio.get_running_loop()
-    await robot.drive()
+    await robot.until_driving()
     start, records = probe.state, len(robot.records)
     pid = robot.kill("router")
     await robot.until_restarted("router", pid)
@@ -132,7 +132,7 @@ async def router_frozen(rig: Rig) -> Measured:
     """Freeze the router for seconds: what the kernels hold comes all at once afterwards."""
     robot = await rig.robot("sim")
     probe = robot.probe
-    await robot.drive()
+    await robot.until_driving()
     before, start = await _stale(robot), probe.state
     robot.freeze("router")
     await asyncio.sleep(FREEZE_S)
@@ -176,7 +176,7 @@ def _cut_off(proxy: TcpProxy, seconds: float) -> None:
 async def _short_hole(robot: RobotUnderTest, proxy: TcpProxy) -> tuple[int, bool]:
     """Return the longest gap between two commands [ticks], and whether the robot stopped."""
     probe = robot.probe
-    await robot.drive()
+    await robot.until_driving()
     start = probe.state
     _cut_off(proxy, SHORT_HOLE_S)
     await probe.ticks(2 * NO_GAP_TICKS)
@@ -193,7 +193,9 @@ async def latency_jitter_loss(rig: Rig) -> Measured:
         probe, stopped, rate_hz = robot.probe, 0, 0.0
         for round_trip_ms in ROUND_TRIPS_MS:
             proxy.set(Chaos(delay_ms=round_trip_ms / 2))
-            await robot.drive(share=HALF_SPEED)  # 100 ms and what this machine adds are too long
+            await robot.until_driving(
+                share=HALF_SPEED
+            )  # 100 ms and what this machine adds are too long
             start = probe.state
             await probe.ticks(DRIVE_TICKS)
             stopped += len(probe.stops(start))
@@ -293,7 +295,7 @@ async def two_commanders_across_a_partition(rig: Rig) -> Measured:
     """Cut the first commander off while it drives, let the second take over, heal the network."""
     robot = await rig.robot("sim")
     probe, near = robot.probe, robot.endpoint
-    await robot.drive()  # all is well, and a client may take over
+    await robot.until_driving()  # all is well, and a client may take over
     async with (
         proxy_to(robot) as (proxy, far),
         connect(far.connect[0], source="first", take=True) as first,
@@ -344,7 +346,7 @@ async def viewer_frozen(rig: Rig) -> Measured:
 async def _filmed(robot: RobotUnderTest, picture: Image | None) -> tuple[float, list[float]]:
     """Return control's period (p99) while pictures are sent, and how long each put took [ms]."""
     probe, puts_ms = robot.probe, list[float]()
-    await robot.drive()
+    await robot.until_driving()
     start = probe.state
     for _ in range(PICTURES):
         began_s = time.perf_counter()
@@ -360,7 +362,7 @@ async def duplicated_and_reordered(rig: Rig) -> Measured:
     """Send everything that drives the robot twice more, in another order."""
     robot = await rig.robot("sim")
     probe = robot.probe
-    await robot.drive()
+    await robot.until_driving()
     before, start = await _refused(robot), probe.state
     async with _copies(robot.endpoint) as sent:
         await probe.ticks(WATCH_TICKS)

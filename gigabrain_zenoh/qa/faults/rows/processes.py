@@ -84,7 +84,7 @@ async def frozen_and_thawed(rig: Rig) -> Measured:
     ticks = LONG_FROZEN_TICKS if rig.long else FROZEN_TICKS
     stop, _ = await _frozen(robot, "decision", ticks)
     decision = await _thawed(robot, stop.distance_m)
-    await robot.drive()
+    await robot.until_driving()
     robot.freeze("driver")
     await asyncio.sleep(ticks * TICK_MS / 1e3)  # the robot's own time stands still with it
     robot.thaw()
@@ -119,7 +119,7 @@ async def safety_killed_or_frozen(rig: Rig) -> Measured:
     robot = await rig.robot("sim")
     killed = await _killed(robot, "safety")
     stop, _ = await _frozen(robot, "safety", 0)
-    enabled = await robot.probe.tries_to_enable()
+    enabled = await robot.probe.count_enables()
     frozen = _figures(stop, await robot.travelled() - stop.distance_m)
     return {**worse_of(killed, frozen), ENABLED_WITHOUT: enabled}
 
@@ -163,7 +163,7 @@ async def recorder_killed(rig: Rig) -> Measured:
 async def _restart_s(robot: RobotUnderTest, victim: str) -> float:
     """Return the time from the freeze until the robot drives with a new process [s]."""
     loop = asyncio.get_running_loop()
-    await robot.drive(ROOM_M)
+    await robot.until_driving(ROOM_M)
     pid = robot.pid(victim)
     robot.freeze(victim)
     frozen_s = loop.time()
@@ -218,9 +218,9 @@ async def gate_killed(rig: Rig) -> Measured:
     born = [state for state in probe.states if state.boot == probe.state.boot]
     still_m = await robot.travelled()
     await robot.until_ready()
-    enabled = await probe.tries_to_enable()
+    enabled = await probe.count_enables()
     await robot.release()
-    await robot.person.enable(probe.bus.process)
+    await robot.operator.enable(probe.bus.process)
     before_s = float((await robot.truth())["motors_moved_s"])
     async with forging(robot.endpoint) as forger:
         for number in range(OLD_COMMANDS):
@@ -252,10 +252,10 @@ async def _without_driver(robot: RobotUnderTest) -> tuple[float, float]:
 
     The time is the physics' own, to within one of its steps.
     """
-    await robot.drive()
+    await robot.until_driving()
     pid, before = robot.pid("driver"), await _prompt_truth(robot)
     robot.kill("driver")
-    after = await robot.after_simulated(AFTER_S)
+    after = await robot.wait_simulated(AFTER_S)
     await robot.until_restarted("driver", pid)
     zero_s = float(after["motors_moved_s"]) - float(before["sim_seconds"])
     return zero_s * 1e3, float(after["distance_m"]) - float(before["distance_m"])
@@ -294,7 +294,7 @@ def _groups(long: bool) -> list[tuple[str, ...]]:
 
 async def _group_killed(robot: RobotUnderTest, victims: tuple[str, ...]) -> Measured:
     probe = robot.probe
-    await robot.drive(ROOM_M)
+    await robot.until_driving(ROOM_M)
     pids = {name: robot.pid(name) for name in victims}
     begin_s = float((await robot.truth())["sim_seconds"])
     for name in victims:
@@ -321,11 +321,11 @@ async def crash_loop(rig: Rig) -> Measured:
     """Kill a process at each start: it is given up after five, and the gate stays shut."""
     deployment = deployment_of(rig.options, "sim")
     async with rig.own_robot(deployment, backoff=Backoff(), checked=False) as robot:
-        await robot.drive()
+        await robot.until_driving()
         usual = await _cpu_percent()
         births, deaths = await _kill_all_starts(robot, "perception")
         await robot.probe.at_rest()
-        enabled = await robot.probe.tries_to_enable()
+        enabled = await robot.probe.count_enables()
         unusual = await _cpu_percent()
         started_again = robot.supervisor.statuses["perception"].pid is not None
     waits = [birth - death for birth, death in zip(births[1:], deaths, strict=False)]
@@ -367,8 +367,8 @@ async def automatic_recovery(rig: Rig) -> Measured:
     longest = 0.0
     for victim in VICTIMS:
         longest = max(longest, await _recovery_s(robot, victim))
-    await robot.drive(ROOM_M)
-    await robot.person.estop("fault suite")
+    await robot.until_driving(ROOM_M)
+    await robot.operator.estop("fault suite")
     await robot.probe.ticks(100)
     unlatched = robot.probe.state.gate.mode != "latched"
     truth = await robot.probe.truth()
@@ -382,7 +382,7 @@ async def automatic_recovery(rig: Rig) -> Measured:
 async def _recovery_s(robot: RobotUnderTest, victim: str) -> float:
     """Return the time from the victim's return until the brain drives, in the robot's time [s]."""
     probe = robot.probe
-    await robot.drive(ROOM_M)
+    await robot.until_driving(ROOM_M)
     start = probe.state
     await robot.kill_and_restart(victim)
     back = probe.state

@@ -85,9 +85,9 @@ async def unauthorised_publisher(rig: Rig) -> Measured:
     other = make_fleet(rig.fresh_folder() / "fleet")
     deployment = replace(deployment_of(rig.options, "sim"), keys=str(fleet))
     async with rig.own_robot(deployment, checked=False) as robot:
-        await robot.drive()
-        await robot.person.enable(take=True)
-        await robot.person.set_base_velocity(0.0)
+        await robot.until_driving()
+        await robot.operator.enable(take=True)
+        await robot.operator.set_base_velocity(0.0)
         await robot.probe.at_rest()
         start = robot.probe.state
         for role in ("viewer", "brain"):
@@ -119,7 +119,7 @@ async def _forge(robot: RobotUnderTest, role: str) -> None:
         for number in range(COMMANDS):
             forger.send(CMD_VEL, forged_command(robot.probe, SPEED, 1_000_000_000 + number))
             if number % AT_ONCE == 0:
-                await robot.person.set_base_velocity(0.0)
+                await robot.operator.set_base_velocity(0.0)
                 await asyncio.sleep(0.02)
 
 
@@ -135,7 +135,7 @@ async def _knock(endpoint: Endpoint) -> None:
 
 async def _denials_unseen(robot: RobotUnderTest) -> int:
     """Return how many of the four intruders are missing in the audit log."""
-    audit = await robot.person.audit()
+    audit = await robot.operator.audit()
     refused = {record.source for record in audit if record.what == "refused"}
     strangers = sum(record.times for record in audit if record.what == "stranger")
     return len({"viewer", "brain"} - refused) + max(0, 2 - strangers)
@@ -178,7 +178,7 @@ async def _recorded(
     robot: RobotUnderTest, endpoint: Endpoint, seconds: float
 ) -> list[tuple[str, bytes]]:
     """Return the traffic while an operator drives slowly and turns."""
-    await robot.drive()
+    await robot.until_driving()
     traffic: list[tuple[str, bytes]] = []
     listener = await ZenohTransport.open(endpoint)
     for topic in REPLAYED:
@@ -193,7 +193,7 @@ async def _replayed(
     robot: RobotUnderTest, endpoint: Endpoint, traffic: list[tuple[str, bytes]]
 ) -> int:
     """Replay traffic while its operator holds the body still; count ticks in which it moves."""
-    await robot.drive()  # all is well, and a client may take over
+    await robot.until_driving()  # all is well, and a client may take over
     probe, topics = robot.probe, {topic.key: topic for topic in REPLAYED}
     sender = await ZenohTransport.open(endpoint)
     try:
@@ -239,7 +239,7 @@ async def idle_and_random_connections(rig: Rig) -> Measured:
     endpoint = robot.endpoint
     host, port = address_of(endpoint)
     pid, loop = robot.pid("router"), asyncio.get_running_loop()
-    await robot.drive()
+    await robot.until_driving()
     start = robot.probe.state
     await asyncio.sleep(WATCH_S)
     calm_ms = robot.probe.control_period_ms(start)

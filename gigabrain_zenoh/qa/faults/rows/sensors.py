@@ -238,7 +238,7 @@ async def battery_and_temperature(rig: Rig) -> Measured:
     async with tampered(rig, "empty-battery", "hot") as robot:
         probe = robot.probe
         for code in ("battery_empty", "motor_hot"):
-            await robot.drive(0.8)
+            await robot.until_driving(0.8)
             next_step(robot)
             await until(lambda: probe.state.gate.mode == "latched", f"latched for {code}")
             wrong += code not in probe.causes
