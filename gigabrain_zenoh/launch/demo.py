@@ -203,7 +203,7 @@ class Demo:
         if not late:
             return ""
         why = ", compiling, once per installation" if self._compiling & set(late) else ""
-        return f"{' and '.join(late)} {'is' if len(late) == 1 else 'are'} getting ready{why}"
+        return f"{' and '.join(late)} {'is' if len(late) == 1 else 'are'} starting up{why}"
 
     def _served(self) -> str:
         """Where the operator page is, once it is there, or how to get it."""

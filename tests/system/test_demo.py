@@ -270,7 +270,7 @@ async def test_the_mapped_area_is_that_of_cells_known_to_be_free_or_taken() -> N
 async def test_a_process_on_its_way_is_named_until_the_gate_is_open() -> None:
     watch = RunMonitor(Net().one)
     assert doing(watch) == "starting"
-    late = "decision is getting ready, compiling, once per installation"
+    late = "decision is starting up, compiling, once per installation"
     assert doing(watch, late) == late
 
 
