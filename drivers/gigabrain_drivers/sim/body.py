@@ -63,7 +63,7 @@ class SimModel:
     lidar: SimLidar | None = field(default_factory=SimLidar)
     battery: SimBattery = field(default_factory=SimBattery)
     motor: SimMotor = field(default_factory=SimMotor)
-    substeps: int = 2  # physics steps in a tick of 10 ms; wheels roll as well on 5 ms as on 1 ms
+    substeps: int = 2  # substeps in a step of 10 ms; wheels roll as well on 5 ms as on 1 ms
 
     def parts(self) -> tuple[tuple[str, str], ...]:
         """(kind, name) of what the model has to have besides base, sensors and lidar."""

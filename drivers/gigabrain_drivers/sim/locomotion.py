@@ -98,7 +98,7 @@ class OdometryReading(NamedTuple):
 class Locomotion(abc.ABC):
     """The body's own firmware: commands to motors, sensors to odometry. It never sees the truth.
 
-    In each tick of 10 ms `act` comes before the physics, `sense` and `wear` after it.
+    In each step of 10 ms `act` comes before the physics, `sense` and `wear` after it.
     """
 
     fallen = False  # whether the body lies on the floor
@@ -113,7 +113,7 @@ class Locomotion(abc.ABC):
 
     @abc.abstractmethod
     def act(self) -> None:
-        """Tell the motors what to do in the next tick."""
+        """Set the motors for the next step."""
 
     @abc.abstractmethod
     def sense(self, imu: ImuSample) -> None:
@@ -121,7 +121,7 @@ class Locomotion(abc.ABC):
 
     @abc.abstractmethod
     def wear(self) -> float:
-        """Warm the motors by the tick's work; returns the current [A] that it took."""
+        """Warm the motors by the work of the step; return the current [A] that it took."""
 
     @abc.abstractmethod
     def odometry(self) -> OdometryReading:
@@ -170,7 +170,7 @@ class Rolling(Locomotion):
         return self._kinematics.to_body(self._target)
 
     def act(self) -> None:
-        """Set the wheel speeds of the next tick."""
+        """Set the wheel speeds of the next step."""
         step = self._body.max_wheel_acceleration * STEP_S
         (left, right), (left_now, right_now) = self._target, self._speed
         self._speed = (
@@ -181,7 +181,7 @@ class Rolling(Locomotion):
         control[self._motors[0]], control[self._motors[1]] = self._speed
 
     def sense(self, imu: ImuSample) -> None:
-        """Count the encoder ticks of the past tick and integrate them at the mid heading."""
+        """Count the encoder ticks of the past step and integrate them at the mid heading."""
         position, counts = self._data.qpos, self._counts
         left = self._counted(float(position[self._angles[0]]), counts[0])
         right = self._counted(float(position[self._angles[1]]), counts[1])

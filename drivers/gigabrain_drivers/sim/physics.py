@@ -1,4 +1,4 @@
-"""A body in a world, one tick of 10 ms at a time. No bus, no clock and no thread of its own."""
+"""A body in a world, one step of 10 ms at a time. No bus, no clock and no thread of its own."""
 
 from typing import Any
 
@@ -39,7 +39,7 @@ class Simulation:
     def __init__(self, body: SimModel, world: World, seed: int) -> None:
         self.model = compile_scene(body, world)
         self.data = mujoco.MjData(self.model)
-        self._ticks, self._substeps = 0, body.substeps
+        self._steps, self._substeps = 0, body.substeps
         self._locomotion = make_locomotion(body, self.model, self.data)
         self._height = int(self.model.joint(f"{ROBOT}free").qposadr[0]) + 2
         self._battery = Battery(body.battery)
@@ -57,7 +57,7 @@ class Simulation:
     @property
     def time_ns(self) -> int:
         """Simulated time since the start."""
-        return self._ticks * STEP_NS
+        return self._steps * STEP_NS
 
     @property
     def person_stood(self) -> int:
@@ -88,7 +88,7 @@ class Simulation:
             self._place_person()
         self._locomotion.act()
         mujoco.mj_step(self.model, self.data, nstep=self._substeps)
-        self._ticks += 1
+        self._steps += 1
         self._check()
         self._sample = self._imu.sample()
         self._locomotion.sense(self._sample)
@@ -113,7 +113,7 @@ class Simulation:
         return self._locomotion.velocity()
 
     def imu(self) -> ImuSample:
-        """The inertial unit's sample of this tick."""
+        """The inertial unit's sample of this step."""
         return self._sample
 
     def motors(self) -> tuple[Motor, ...]:

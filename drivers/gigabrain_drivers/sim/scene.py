@@ -96,7 +96,7 @@ class Person:
         self._since_m = NEW_MEETING_M
 
     def advance(self, robot_distance: Callable[[float, float], float]) -> Pose:
-        """Walk for one tick; `robot_distance(x, y)` is from a point to the robot's edge [m]."""
+        """Walk for one step; `robot_distance(x, y)` is from a point to the robot's edge [m]."""
         walked = (self._walked + PERSON_SPEED * STEP_S) % self._path.length
         ahead = self._path.at(walked)
         gap = robot_distance(ahead.x, ahead.y)

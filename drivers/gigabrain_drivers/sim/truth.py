@@ -16,7 +16,7 @@ MAX_CLEARANCE_M = 10.0  # larger clearances count as this
 
 
 class Truth:
-    """Contacts, clearance and path of the robot. `update` once a tick.
+    """Contacts, clearance and path of the robot. `update` once a step.
 
     contacts: how often the robot touched something else than the floor; sliding along one thing
     is one contact, touching it again half a second later another. touching: right now.
@@ -38,7 +38,7 @@ class Truth:
         ]
         self._half_sizes = _half_sizes(model, self._obstacles)
         self._last_touch: dict[int, int] = {}
-        self._ticks = 0
+        self._steps = 0
         self.contacts, self.touching = 0, False
         self.min_clearance_m, self.distance_m = MAX_CLEARANCE_M, 0.0
         mujoco.mj_forward(model, data)
@@ -64,16 +64,16 @@ class Truth:
 
     def update(self) -> None:
         """Account for the step that was just simulated."""
-        self._ticks += 1
+        self._steps += 1
         pose = self.pose()
         self.distance_m += math.hypot(pose.x - self._position.x, pose.y - self._position.y)
         self._position = pose
         self._touch()
-        if self._ticks % CLEARANCE_STEPS == 0:
+        if self._steps % CLEARANCE_STEPS == 0:
             self._clear()
 
     def _touch(self) -> None:
-        """Count contacts between the robot and obstacles that begin in this tick."""
+        """Count contacts between the robot and obstacles that begin in this step."""
         pairs = self._data.contact.geom
         with_obstacle = self._is_obstacle[pairs]
         self.touching = bool(with_obstacle.any())
@@ -82,9 +82,9 @@ class Truth:
         self.min_clearance_m = 0.0
         for pair in pairs[with_obstacle.any(axis=1)]:
             thing = int(pair[self._is_obstacle[pair]][0])
-            if self._ticks - self._last_touch.get(thing, -NEW_CONTACT_STEPS) >= NEW_CONTACT_STEPS:
+            if self._steps - self._last_touch.get(thing, -NEW_CONTACT_STEPS) >= NEW_CONTACT_STEPS:
                 self.contacts += 1
-            self._last_touch[thing] = self._ticks
+            self._last_touch[thing] = self._steps
 
     def _clear(self) -> None:
         """Measure what may be nearer than the nearest so far, exactly."""
