@@ -76,8 +76,8 @@ def step(
         memory = replace(memory, operator=True, basis=state.tick)  # the operator sees the robot
     memory = replace(memory, enabled_tick=memory.enabled_tick or state.tick)
     limits = limits_of(body)
-    memory, wish = _wish(body, memory, inputs, intent)
-    target = clamp(wish, limits, inputs.caps)
+    memory, wanted = _wanted_velocity(body, memory, inputs, intent)
+    target = clamp(wanted, limits, inputs.caps)
     setpoint = ramp(memory.before, target, limits, TICK_S * memory.elapsed_ticks)
     if memory.enabled_tick == state.tick:  # the first command after enabling is zero
         setpoint = ZERO
@@ -157,7 +157,7 @@ def _follows(memory: ControlMemory, intent: Intent, teleop: Velocity | None) -> 
     return intent.follow and not teleop and not memory.operator
 
 
-def _wish(
+def _wanted_velocity(
     body: BodyDescription, memory: ControlMemory, inputs: ControlInputs, intent: Intent | None
 ) -> tuple[ControlMemory, Velocity]:
     """Return the velocity that the operator wants, else decision, else zero."""
@@ -166,8 +166,8 @@ def _wish(
         start = memory.history.at(state.boot, intent.basis)
         if start is None:
             return memory, ZERO
-        wish = track(body, intent, state, start, memory.sent)
-        return replace(memory, off_track=wish is None), wish or ZERO
+        wanted = track(body, intent, state, start, memory.sent)
+        return replace(memory, off_track=wanted is None), wanted or ZERO
     memory = replace(memory, off_track=False)
     if teleop:
         return memory, teleop

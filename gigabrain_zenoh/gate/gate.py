@@ -103,16 +103,16 @@ NAN_STORM_COUNT, NAN_STORM_TICKS = 5, 50  # five in a second
 
 def step(config: GateConfig, state: GateState, event: Event) -> tuple[GateState, Outcome]:
     """Process one event. The new state decides whether the body may move, and how fast."""
-    taken, outcome = _take(config, state, event)
-    if taken is state:
+    after, outcome = _handle(config, state, event)
+    if after is state:
         return state, outcome
-    if taken.mode == "enabled":
-        found = stop_reasons(config, taken, taken.commander)
-        taken = _stop(taken, found) if found else taken
-    return replace(taken, output=_output(config, taken)), outcome
+    if after.mode == "enabled":
+        found = stop_reasons(config, after, after.commander)
+        after = _stop(after, found) if found else after
+    return replace(after, output=_output(config, after)), outcome
 
 
-def _take(config: GateConfig, state: GateState, event: Event) -> tuple[GateState, Outcome]:
+def _handle(config: GateConfig, state: GateState, event: Event) -> tuple[GateState, Outcome]:
     match event:
         case Tick():
             return _tick(config, state, event), Outcome()
@@ -200,11 +200,13 @@ def _output(config: GateConfig, state: GateState) -> Velocity:
     """
     if state.mode in ("latched", "idle"):
         return ZERO
-    target, asked = ZERO, state.command
+    target, command = ZERO, state.command
     calm = state.tick - state.enabled_tick < CALM_TICKS
-    if state.mode == "enabled" and asked and state.safety and not calm:
+    if state.mode == "enabled" and command and state.safety and not calm:
         target = clamp(
-            Velocity(linear_x=asked.linear_x, linear_y=asked.linear_y, angular_z=asked.angular_z),
+            Velocity(
+                linear_x=command.linear_x, linear_y=command.linear_y, angular_z=command.angular_z
+            ),
             config.limits,
             state.safety.caps,
         )

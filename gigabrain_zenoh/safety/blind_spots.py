@@ -153,16 +153,16 @@ def known_free(
     body: BodyDescription, lidar: Lidar, housing_m: float, views: PastViews, points: Floats
 ) -> NDArray[np.bool_]:
     """Return which of `points` (n, 2) [m], in the body's present frame, are known to be free."""
-    found, asked = np.zeros(len(points), bool), np.arange(len(points))
+    found, pending = np.zeros(len(points), bool), np.arange(len(points))
     hull = edges(body.footprint)
     for view in reversed(views[:-1]):
-        if not asked.size:
+        if not pending.size:
             break
-        placed = transform(from_pose(relative(view.pose, views[-1].pose)), points[asked])
+        placed = transform(from_pose(relative(view.pose, views[-1].pose)), points[pending])
         stood = depth(hull, placed) < 0
         through, hit = _seen(lidar, housing_m, view.scan, placed)
-        found[asked[stood | (through & ~hit)]] = True
-        asked = asked[~(stood | through | hit)]
+        found[pending[stood | (through & ~hit)]] = True
+        pending = pending[~(stood | through | hit)]
     return found
 
 
