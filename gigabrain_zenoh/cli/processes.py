@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 from cyclopts import Parameter
 
-from gigabrain_zenoh.bus.zenoh.config import router_config, secured
+from gigabrain_zenoh.bus.zenoh.config import router_config, secured, session_config
 from gigabrain_zenoh.cli.options import Level, Seed, World, checked, print_progress
 from gigabrain_zenoh.config.settings import (
     ButtonConfig,
@@ -72,6 +72,7 @@ class ProcessOptions(HostOptions):
     def run(self, name: str, settings: dict[str, Any]) -> int:
         """Connect, and run the process `name` until a signal; return its exit code."""
         endpoint = find_endpoint(self.connect, self.namespace, self.folder)
+        session_config(endpoint)  # refuse a wrong address before starting
         return self.run_at(endpoint, name, settings)
 
 
