@@ -27,7 +27,7 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def limits_of(body: BodyDescription) -> Limits:
-    """The limits that a body's file states."""
+    """Return the limits of `body`."""
     return Limits(
         linear_speed=body.max_linear_speed,
         lateral_speed=body.max_lateral_speed,
@@ -50,16 +50,16 @@ def at_rest(measured: Velocity) -> bool:
 
 
 def rim_speed(body: BodyDescription) -> float:
-    """How fast a wheel of a differential base may roll [m/s]; inf where that is no matter."""
+    """Return the greatest rolling speed of a differential base's wheel [m/s]; inf for others."""
     if body.max_rim_speed is None or body.drive_type != "differential":
         return math.inf
     return body.max_rim_speed
 
 
 def clamp(velocity: Velocity, limits: Limits, caps: SpeedCaps = NO_CAPS) -> Velocity:
-    """`velocity` within the body's speeds and the caps of the moment, axis by axis.
+    """Return `velocity` within the body's speeds and the present caps, axis by axis.
 
-    Where a wheel would still be too fast, the body is slower along the same curve.
+    If a wheel would still be too fast, the body is slower along the same curve.
     """
     turning = limits.angular_speed if caps.rotation is None else caps.rotation
     turning = min(turning, limits.angular_speed)
@@ -109,7 +109,7 @@ def _within_rim_speed(current: Velocity, step: Velocity, limits: Limits) -> Velo
 
 
 def slowed(current: Velocity, target: Velocity, limits: Limits, dt: float) -> Velocity:
-    """The same where nothing may speed up: an axis on its way to more, or round, stays as it is."""
+    """Return `ramp` without speeding up: an axis that would gain speed or reverse keeps its own."""
     return ramp(
         current,
         Velocity(
@@ -133,7 +133,7 @@ def _within(value: float, limit: float, below: float | None, above: float | None
 
 
 def _approach(current: float, target: float, up: float, down: float) -> float:
-    """One step. It ends at zero on the way to the other side: braking comes first."""
+    """Return one step of an axis; it stops at zero before it reverses."""
     if current * target < 0:
         target = 0.0
     highest = current + (up if current >= 0 else down)

@@ -16,17 +16,17 @@ def from_pose(pose: Pose) -> Floats:
 
 
 def wrap(angle: Floats) -> Floats:
-    """The same angles within -pi to pi [rad]."""
+    """Return the same angles within -pi to pi [rad]."""
     return np.asarray(np.remainder(angle + np.pi, 2 * np.pi) - np.pi)
 
 
 def wrapped(pose: Floats) -> Floats:
-    """The same poses, their yaw within -pi to pi."""
+    """Return the same poses, their yaw within -pi to pi."""
     return np.concatenate((pose[..., :2], wrap(pose[..., 2:])), axis=-1)
 
 
 def compose(first: Floats, second: Floats) -> Floats:
-    """Where `second`, a pose in the frame of `first`, is in the frame that `first` is in."""
+    """Transform pose `second` from the frame `first` to the parent frame."""
     cos, sin = np.cos(first[..., 2]), np.sin(first[..., 2])
     x = first[..., 0] + cos * second[..., 0] - sin * second[..., 1]
     y = first[..., 1] + sin * second[..., 0] + cos * second[..., 1]
@@ -34,7 +34,7 @@ def compose(first: Floats, second: Floats) -> Floats:
 
 
 def inverse(pose: Floats) -> Floats:
-    """The frame that `pose` is in, seen from `pose`."""
+    """Return the inverse transform: the parent frame as seen from `pose`."""
     cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
     x = -cos * pose[..., 0] - sin * pose[..., 1]
     y = sin * pose[..., 0] - cos * pose[..., 1]
@@ -47,28 +47,28 @@ def _of(x: Floats, y: Floats, yaw: Floats) -> Floats:
 
 
 def between(first: Floats, second: Floats) -> Floats:
-    """`second` in the frame of `first`, both being in one frame."""
+    """Return `second` relative to `first`, both given in the same frame."""
     return compose(inverse(first), second)
 
 
 def rotation(yaw: float) -> Floats:
-    """The (3, 3) matrix that turns x and y by `yaw` and leaves the third as it is."""
+    """Return the (3, 3) matrix that turns x and y by `yaw` and keeps the third."""
     cos, sin = float(np.cos(yaw)), float(np.sin(yaw))
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 def turned(covariance: Floats, yaw: float) -> Floats:
-    """A (3, 3) covariance of x, y, yaw, its axes turned by `yaw`."""
+    """Return a (3, 3) covariance of x, y, yaw with its axes turned by `yaw`."""
     turn = rotation(yaw)
     return np.asarray(turn @ covariance @ turn.T)
 
 
 def inverse_of(matrix: Floats) -> Floats:
-    """The inverse of a (3, 3) covariance or information matrix."""
+    """Return the inverse of a (3, 3) covariance or information matrix."""
     return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
 
 
 def transform(pose: Floats, points: NDArray[np.floating]) -> Floats:
-    """Points (n, 2) of the frame `pose`, in the frame that `pose` is in."""
+    """Transform points (n, 2) from the frame `pose` to its parent frame."""
     turn = rotation(float(pose[2]))[:2, :2]
     return np.asarray(points @ turn.T + pose[:2], dtype=np.float64)

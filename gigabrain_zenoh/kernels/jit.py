@@ -51,20 +51,19 @@ numba = _import_numba()
 
 
 def kernel(function: F) -> F:
-    """Compile `function` at its first call, without the GIL while it runs.
+    """Compile `function` at its first call; it runs without the GIL.
 
-    What was compiled is kept in NUMBA_CACHE_DIR, or in the user's cache folder; where neither can
-    be written it is compiled anew in each process.
+    The result is kept in NUMBA_CACHE_DIR, or in the user's cache folder. If neither can be written,
+    each process compiles again.
     """
     return _compiled(function, lean=False)
 
 
 def lean_kernel(function: F) -> F:
-    """Compile a `function` that makes no arrays and is called very often, by kernels.
+    """Compile a `function` that makes no arrays and is called very often by kernels.
 
-    It is compiled into those that call it, and does not count references to the arrays that it is
-    given: with some of them in tuples both took longer than the work. One that makes arrays is
-    refused by numba.
+    It is inlined into its callers, and does not count references to its arrays: counting took
+    longer than the work. Numba refuses one that makes arrays.
     """
     return _compiled(function, lean=True)
 
@@ -79,9 +78,9 @@ def _compiled(function: F, *, lean: bool) -> F:
 
 
 def cache_folder() -> Path | None:
-    """A folder for kernels of exactly these sources; None for a user without a home.
+    """Return the cache folder for kernels of exactly these sources; None for a user without a home.
 
-    Numba notices a change in a kernel's own file and none in those that it calls.
+    Numba notices changes in a kernel's own file only, not in those of the kernels it calls.
     """
     try:
         return user_cache_path("gigabrain") / f"kernels-{_digest()}"
@@ -90,9 +89,9 @@ def cache_folder() -> Path | None:
 
 
 def mark_of(warm_up: str) -> Path | None:
-    """The file that says that all of `warm_up` is kept, for this processor.
+    """Return the file that marks all of `warm_up` as compiled for this processor.
 
-    None where nothing can be kept.
+    None if nothing can be kept.
     """
     from llvmlite.binding import get_host_cpu_name
 

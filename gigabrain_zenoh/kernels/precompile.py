@@ -20,9 +20,9 @@ QUIET_S = 5.0  # of compiling, before people are told
 
 
 async def ensure_compiled(warm_up: str) -> None:
-    """Call the function at "module:name", which runs all kernels once, in another thread.
+    """Compile and warm up all that the function at "module:name" calls, beside the event loop.
 
-    Logs it where that takes long. Raises ConfigError where something for it is not installed.
+    Logs if that takes long. Raises ConfigError if a package for it is not installed.
     """
     try:
         if await asyncio.to_thread(_is_missing, warm_up):
@@ -33,12 +33,12 @@ async def ensure_compiled(warm_up: str) -> None:
 
 
 def missing_package(error: ModuleNotFoundError) -> ConfigError:
-    """What to install."""
+    """Return an error that says what to install."""
     return ConfigError(f"navigation needs {error.name}: pip install 'gigabrain-zenoh[nav]'")
 
 
 def _is_missing(warm_up: str) -> bool:
-    """Return whether some of it is not compiled yet and the result can be kept."""
+    """Return whether a kernel is still to be compiled, and can be kept."""
     from gigabrain_zenoh.kernels.jit import mark_of  # numba: only who drives by kernels pays
 
     mark = mark_of(warm_up)
@@ -63,7 +63,7 @@ async def _log_if_slow(work: Awaitable[object]) -> None:
 
 
 async def compile_in_child(warm_up: str) -> int:
-    """Compile in a process of its own; its exit code. What it cannot do is to be done here."""
+    """Compile in a child process, and return its exit code."""
     paths = os.pathsep.join(path for path in sys.path if path)
     child = await asyncio.create_subprocess_exec(
         *(sys.executable, "-P", "-m"),  # -P: nothing is imported from the current folder
@@ -88,7 +88,7 @@ async def compile_in_child(warm_up: str) -> int:
 
 
 def compile_all(warm_up: str) -> None:
-    """Compile here, and mark it as done where it is kept. Raises ModuleNotFoundError."""
+    """Compile here, and mark it as done where it can be kept. Raises ModuleNotFoundError."""
     from gigabrain_zenoh.kernels.jit import mark_of
 
     find(warm_up)()

@@ -64,7 +64,7 @@ class Autosave:
         self.bytes = 0  # of the last one
 
     def found(self, boot: int) -> Iterator[tuple[SaveHead, Arrays]]:
-        """The maps that were saved in a start of the driver, the newest first."""
+        """Yield the maps saved in one start of the driver, the newest first."""
         heads = {path: head for path in self._slots if (head := _head(path))}
         good = [path for path, head in heads.items() if head.boot == boot]
         for path in sorted(good, key=lambda path: heads[path].tick, reverse=True):
@@ -79,13 +79,13 @@ class Autosave:
             yield heads[path], arrays
 
     def due(self, boot: int, tick: int) -> bool:
-        """Whether it is time to save."""
+        """Return whether it is time to save."""
         self._finish(tick)
         new = self._done is None or self._done.boot != boot
         return self._job is None and (new or tick >= self._next_tick)
 
     def save(self, boot: int, tick: int, odometry: Floats, still: "MapSnapshot") -> None:
-        """Begin to save a map as it was at a tick, unless it is as it was saved last."""
+        """Begin to save a map as of one tick, unless it has not changed since the last save."""
         place = None if still.pose is None else _triple(still.pose)
         head = SaveHead(
             boot=boot, tick=tick, odometry=_triple(odometry), place=place, changes=still.changes
@@ -100,7 +100,7 @@ class Autosave:
         self._job = self._pool.submit(_write, self._slots[0], head, still)
 
     def report(self) -> dict[str, float]:
-        """Figures for people."""
+        """Return counters for health reports."""
         return {"saves": self.saves, "saved_mb": round(self.bytes / 1e6, 1)}
 
     def close(self) -> None:
@@ -140,7 +140,7 @@ def _triple(pose: Floats) -> Triple:
 
 
 def _head(path: Path) -> SaveHead | None:
-    """What a file says of itself; nothing where there is none, or none that can be read."""
+    """Return the header of a file, or None without a readable file."""
     if not path.exists():
         return None
     try:
@@ -152,7 +152,7 @@ def _head(path: Path) -> SaveHead | None:
 
 
 def _write(path: Path, head: SaveHead, still: "MapSnapshot") -> int:
-    """The size of the file [bytes]. Raises OSError and ValueError."""
+    """Write the file and return its size [bytes]. Raises OSError and ValueError."""
     make_folder(path.parent)
     arrays = still.freeze()
     wanted = sum(values.nbytes for values in arrays.values()) + KEEP_FREE_BYTES
@@ -173,7 +173,7 @@ def _unsaved(why: str) -> Cause:
 
 
 def _alike(one: SaveHead, other: SaveHead) -> bool:
-    """Whether neither the map nor the robot's place has changed much."""
+    """Return whether neither the map nor the robot's place has changed much."""
     x, y, yaw = (b - a for a, b in zip(one.odometry, other.odometry, strict=True))
     moved = math.hypot(x, y) > MOVED_M or abs(math.remainder(yaw, math.tau)) > MOVED_RAD
     found = one.place is None and other.place is not None

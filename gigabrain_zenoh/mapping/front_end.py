@@ -91,30 +91,31 @@ class DriftSinceMatch:
 
     @property
     def covariance(self) -> Floats:
-        """Of the odometry since; generous, as wheels slip and bad odometry is common."""
+        """The covariance of odometry since then; generous, as wheels slip."""
         away, turn = 0.1 + 0.2 * self.travel, 0.1 + 0.3 * self.turn
         return np.diag((away**2, away**2, turn**2))
 
     @property
     def broken(self) -> bool:
-        """Whether nothing joins what comes to what was before: the robot was carried off.
+        """Whether the robot was carried off, so that nothing joins the two parts.
 
-        Scans that fit neither the map nor one another say nothing: trees in the wind, a slope.
+        Scans that fit neither the map nor one another prove nothing, such as leaves in the wind or
+        a slope.
         """
         return (self.misses >= MISSES and self.far) or self.misses >= MISSES_STANDING
 
     @property
     def far(self) -> bool:
-        """Whether what was matched last may be out of sight by now."""
+        """Whether the last matched scan may be out of sight by now."""
         return self.travel > MISSED_TRAVEL or self.turn > MISSED_TURN
 
     def after_break(self) -> Floats:
-        """The covariance of the link over a break."""
+        """Return the covariance of the link over a break."""
         return self.covariance if self.blind else UNKNOWN
 
     @property
     def window(self) -> Window:
-        """Where to search: the farther odometry has moved, the wider."""
+        """The search window, which grows with the distance driven by odometry."""
         effort = min(1.0, self.travel / 0.5 + self.turn / 0.3)
         return Window(0.15 + 0.2 * effort, 0.12 + 0.23 * effort)
 
@@ -134,7 +135,7 @@ class FrontEnd:
         self.pose = pose
 
     def add(self, scan: Scan, delta: Floats, noise: Floats | None = None) -> tuple[ScanMatch, bool]:
-        """Where the scan lies, after odometry has moved by `delta`; and whether to keep it.
+        """Match a scan after odometry has moved by `delta`; return also whether to keep it.
 
         `noise` is the covariance of `delta` in its own frame, if it is known.
         """
@@ -153,7 +154,7 @@ class FrontEnd:
         return match, far
 
     def place(self, pose: Floats) -> None:
-        """The robot is about here, and odometry until now says nothing of it."""
+        """Move the robot to about `pose`; odometry until now no longer counts."""
         self.pose, self._noise = pose, None
 
     def keep(self, scan: Scan, alone: bool) -> None:
@@ -190,7 +191,7 @@ class FrontEnd:
 
     @property
     def held(self) -> tuple[list[Scan], list[Floats]]:
-        """The scans of the local map, and where they are in the front end's frame."""
+        """The scans of the local map, and their poses in the front end's frame."""
         return self._scans, self._poses
 
     def _match(self, local: LocalMap, scan: Scan, guess: Floats) -> ScanMatch:
@@ -217,10 +218,10 @@ class FrontEnd:
         found: SearchResult,
         match: ScanMatch | None,
     ) -> ScanMatch:
-        """Where a scan lies of which little fits: where it looks through nothing that is there.
+        """Match a scan of which little fits, by the share of the map that it looks through.
 
-        What fits best is no proof then, for a scan that shows much that is new fits the better the
-        farther it slides back over what is known. So odometry is followed until it is contradicted.
+        A scan that shows mostly new area fits better the further it slides back over known area, so
+        a good fit proves nothing. Odometry is kept until it is contradicted.
         """
         wrong = seen_through(
             local.buckets.points, scan.points, match.pose if match else wrapped(guess)
@@ -245,9 +246,9 @@ class FrontEnd:
     def _turned(
         self, local: LocalMap, scan: Scan, guess: Floats, found: SearchResult, wrong: float
     ) -> tuple[ScanMatch | None, float]:
-        """Where odometry leads if it is off by a turn, and the least that is looked through there.
+        """Match with other turns of odometry; return also the least share looked through.
 
-        A small turn takes what is far out of reach of ICP, and lets beams pass through walls.
+        A small turn puts distant points out of ICP's reach, and makes beams pass through walls.
         """
         covariance = self._adrift.covariance
         turn = float(np.sqrt(covariance[2, 2]))
@@ -266,7 +267,7 @@ class FrontEnd:
     def _led(
         self, local: LocalMap, scan: Scan, guess: Floats, found: SearchResult
     ) -> ScanMatch | None:
-        """Where odometry leads, unless the scan contradicts that or shows next to nothing known."""
+        """Match where odometry leads; None if the scan contradicts it or shows little known."""
         covariance = self._adrift.covariance
         fit = _fit(local, scan, guess, guess, covariance)
         if fit.inliers < LEAST_INLIERS or _apart(fit.pose, guess) > MOVED:
@@ -278,9 +279,9 @@ class FrontEnd:
     def _recover(
         self, local: LocalMap, scan: Scan, guess: Floats, least: float, wrong: float
     ) -> ScanMatch | None:
-        """Where the scan fits beyond doubt, wide round the guess and where the robot was before.
+        """Search widely around the guess and the last pose for a match beyond doubt.
 
-        It has to fit better than `least`, and contradict less than `wrong`, if that is known.
+        It must score at least `least`, and look through less than `wrong`, if that is known.
         """
         least = max(least, SURE_SCORE)
         points = thinned(scan.points, WIDELY)
@@ -296,7 +297,7 @@ class FrontEnd:
         return _matched(fit, found, UNKNOWN, "recovered")
 
     def _lost(self, scan: Scan, guess: Floats, found: SearchResult) -> ScanMatch:
-        """By odometry alone, as long as that goes."""
+        """Continue by odometry alone, until the sequence counts as broken."""
         self._adrift = self._adrift.missed(self._fits_missed(scan, guess))
         self._missed = scan, guess
         if self._adrift.broken:
@@ -314,7 +315,7 @@ class FrontEnd:
         return fit.inliers >= SURE_INLIERS
 
     def _summed(self, noise: Floats | None, delta: Floats) -> Floats | None:
-        """The odometry's covariance since a scan was matched, in the axes of the pose now."""
+        """Return the covariance of odometry since the last match, in the present pose's axes."""
         if noise is None or self._noise is None:
             return None
         turn = rotation(-float(delta[2]))
@@ -330,7 +331,7 @@ class FrontEnd:
 
 
 def _likely(off: Floats, covariance: Floats) -> bool:
-    """Whether odometry of this covariance may have been `off` by so much, in the same axes."""
+    """Return whether odometry of this covariance may be `off` by that much, in the same axes."""
     off = wrapped(off)
     return bool(off @ inverse_of(covariance) @ off < CONTRADICTED)
 
@@ -343,7 +344,7 @@ def _fit(
 
 
 def _plain(fit: IcpResult, found: SearchResult, covariance: Floats) -> ScanMatch | None:
-    """Where a search and ICP from there have put the scan, unless both have failed."""
+    """Return the match by search and ICP, or None if both have failed."""
     near = found.score > LEAST_SCORE and _apart(fit.pose, found.pose) <= MOVED
     if near and fit.inliers >= INLIERS:
         return _matched(fit, found, covariance, "matched")

@@ -112,7 +112,7 @@ def _bounds(
 
 
 def _turned(points: Points, headings: Floats, cell: float) -> NDArray[np.int64]:
-    """How many cells away from the body's own each point is (headings, points, 2)."""
+    """Return the offset of each point from the body in cells (headings, points, 2)."""
     cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
     x, y = points[:, 0][None, :], points[:, 1][None, :]
     turned = np.stack((cos * x - sin * y, sin * x + cos * y), axis=-1)
@@ -120,7 +120,7 @@ def _turned(points: Points, headings: Floats, cell: float) -> NDArray[np.int64]:
 
 
 def _best_blocks(bounds: Bytes) -> NDArray[np.int64]:
-    """The blocks worth a look (n, 3) as heading, row and column, the best first."""
+    """Return the promising blocks (n, 3) as heading, row and column, the best first."""
     flat = bounds.ravel()
     worth = np.flatnonzero(flat >= round(255 * LEAST))
     order = np.argsort(-flat[worth].astype(np.int16), kind="stable")[:MOST_BLOCKS]
@@ -128,7 +128,7 @@ def _best_blocks(bounds: Bytes) -> NDArray[np.int64]:
 
 
 def apart(pose: Floats, others: Iterable[Floats]) -> bool:
-    """Whether `pose` is none of the others."""
+    """Return whether `pose` is far from all `others`."""
     for other in others:
         off = pose - other
         near = math.hypot(off[0], off[1]) < APART_M
@@ -142,7 +142,7 @@ def _near(one: Floats, other: Floats) -> bool:
 
 
 def _distinct(field: LikelihoodField, fits: list[FieldFit]) -> list[FieldFit]:
-    """The best of those that lie together, the best first, but for what the scan speaks against."""
+    """Return the best fit of each place, the best first, without those the scan contradicts."""
     possible = [one for one in fits if one.shown >= SHOWN and one.likely >= _least(one.shown)]
     most = min((one.wrong for one in possible), default=0.0) + AGAINST
     found: list[FieldFit] = []
@@ -154,7 +154,10 @@ def _distinct(field: LikelihoodField, fits: list[FieldFit]) -> list[FieldFit]:
 
 
 def _outdone(field: LikelihoodField, one: FieldFit, found: list[FieldFit]) -> bool:
-    """Whether little is shown of `one`, all of the best, and the map is not built alike there."""
+    """Return whether another place is shown whole and fits, and is not the twin of this one.
+
+    `one` is mostly not shown, and the map does not match itself when moved there.
+    """
     if one.shown >= JUDGED or not found:
         return False
     best = found[0]
@@ -163,12 +166,12 @@ def _outdone(field: LikelihoodField, one: FieldFit, found: list[FieldFit]) -> bo
 
 
 def _least(shown: float) -> float:
-    """How well what is shown has to fit: the less that is, the better."""
+    """Return the least score of what is shown: the less is shown, the higher."""
     return LEAST + (LEAST_SHOWN - LEAST) * max(0.0, 1.0 - shown / JUDGED)
 
 
 def _standing(field: LikelihoodField) -> NDArray[np.bool_]:
-    """Where the body may be: on free ground, and past its edge where that is not shown."""
+    """Return the cells for the body: free ground, and unknown cells just past its edge."""
     standing = field.free.astype(np.uint8)
     open_ground = (field.free | ~field.shown).astype(np.uint8)
     for _ in range(round(BEYOND_M / field.cell)):  # step by step, as walls are in the way
@@ -209,7 +212,7 @@ def _inside(
     places: NDArray[np.int64],
     bounds: Bytes,
 ) -> tuple[Floats, NDArray[np.int64]]:
-    """The best score in each block, and its cell as x, y; blocks that cannot win are left at 0."""
+    """Return the best score in each block and its cell (x, y); 0 for blocks that cannot win."""
     height, width = image.shape
     count, best = offsets.shape[1], 0.0
     scores, cells = np.zeros(len(places)), np.zeros((len(places), 2), np.int64)
@@ -231,7 +234,7 @@ def _inside(
 
 @kernel
 def _total(image: Bytes, offsets: NDArray[np.int64], x: int, y: int, enough: float) -> int:
-    """The sum over all points, or 0 as soon as `enough` is out of reach, or if few are shown."""
+    """Return the sum over all points; 0 if `enough` is out of reach or few are shown."""
     height, width = image.shape
     count, total, shown = len(offsets), 0, 0
     for k in range(count):

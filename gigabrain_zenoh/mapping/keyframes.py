@@ -36,7 +36,7 @@ class Scan:
 
     @classmethod
     def of(cls, points: NDArray[np.floating], free: NDArray[np.floating] | None = None) -> "Scan":
-        """The scan with these hits, (n, 2) in beam order; ValueError for another shape or NaN."""
+        """Make a scan of hits (n, 2) in beam order; ValueError for another shape or NaN."""
         kept = pairs("points", points)
         ends = np.empty((0, 2), np.float32) if free is None else pairs("free", free)
         return cls(kept, normals(kept), ends)
@@ -59,12 +59,12 @@ class View:
 
     @property
     def beams(self) -> Beams:
-        """The scan without its normals."""
+        """The beams of the scan, without its normals."""
         return Beams(self.scan.points, self.scan.free, self.sensor)
 
 
 def pairs(name: str, values: NDArray[np.floating]) -> Points:
-    """A copy of `values` as (n, 2) points; ValueError for another shape or NaN."""
+    """Return a copy of `values` as (n, 2) points; ValueError for another shape or NaN."""
     if values.ndim != 2 or values.shape[1] != 2:
         raise ValueError(f"{name}: expected shape (n, 2), got {values.shape}")
     if not np.isfinite(values).all():
@@ -75,10 +75,10 @@ def pairs(name: str, values: NDArray[np.floating]) -> Points:
 def from_beams(
     angles: Floats, ranges: Floats, range_min: float, range_max: float, free_range: float = 0.0
 ) -> Scan:
-    """The scan of beams at `angles` [rad]; ValueError unless there are as many `ranges` [m].
+    """Return the scan of beams at `angles` [rad]; ValueError unless `ranges` [m] match.
 
-    A beam that hit nothing within `range_max` counts as free up to `free_range`. One that is nearer
-    than `range_min`, or NaN, says nothing.
+    A beam that hit nothing within `range_max` counts as free up to `free_range`. One shorter than
+    `range_min`, or NaN, is left out.
     """
     if angles.shape != ranges.shape or angles.ndim != 1:
         raise ValueError(f"expected {angles.shape[0]} ranges, got {ranges.shape}")
@@ -89,7 +89,7 @@ def from_beams(
 
 
 def thinned(points: Points, most: int) -> Points:
-    """At most so many of the points, evenly by beam."""
+    """Return at most `most` of the points, evenly spaced by beam."""
     if len(points) <= most:
         return points
     return points[_evenly(len(points), most)]
@@ -101,7 +101,7 @@ def _evenly(count: int, most: int) -> NDArray[np.intp]:
 
 
 def normals(points: Points) -> Points:
-    """The normal at each point, from the line through its neighbours in beam order."""
+    """Return the normal at each point, of the line through its neighbours in beam order."""
     if len(points) < FEWEST:
         return np.zeros_like(points)
     bearings = np.arctan2(points[:, 1], points[:, 0])
@@ -112,7 +112,7 @@ def normals(points: Points) -> Points:
 
 @kernel
 def _normals(points: Points, between: float) -> Points:
-    """`between` [rad] beams: where they are far apart, so are neighbours on a line."""
+    """Fit lines; where beams, `between` [rad] apart, are far apart, so are neighbours."""
     count = len(points)
     found = np.zeros((count, 2), np.float32)
     for k in range(count):
@@ -138,10 +138,10 @@ def _normals(points: Points, between: float) -> Points:
 
 
 def seen_through(shown: Points, scan: Points, pose: Floats) -> float:
-    """The share of the points `shown` (n, 2) that a scan at `pose` has looked through.
+    """Return the share of the points `shown` (n, 2) that a scan at `pose` looks through.
 
-    Only points in its view count: not those behind what it has hit. `scan` (m, 2) is in the body's
-    frame. NaN where hardly anything is in view.
+    Only points in its view count, not those behind its hits. `scan` (m, 2) is in the body's frame.
+    NaN if hardly any point is in view.
     """
     nearest, farthest = _ends(scan)
     through, hit = _look(shown, nearest, farthest, pose)
@@ -164,7 +164,7 @@ def _bin(x: float, y: float) -> int:
 
 @kernel
 def _ends(scan: Points) -> tuple[Floats, Floats]:
-    """How far the beams about each bearing have reached, at least and at most."""
+    """Return the least and the greatest range of the beams around each bearing."""
     low, high = np.full(BINS, np.inf), np.full(BINS, -np.inf)
     for x, y in scan:
         away, at = np.sqrt(x * x + y * y), _bin(x, y)
@@ -176,7 +176,7 @@ def _ends(scan: Points) -> tuple[Floats, Floats]:
 
 @kernel
 def _look(shown: Points, low: Floats, high: Floats, pose: Floats) -> tuple[int, int]:
-    """How many points beams have passed through, and how many they have hit."""
+    """Count the points that beams have passed through, and those that they have hit."""
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     through = hit = 0
     for k in range(len(shown)):
@@ -215,7 +215,7 @@ class Keyframe:
 
     @property
     def scan(self) -> Scan:
-        """The scan; its normals are found anew, as kept they would need as much room as points."""
+        """The scan. Its normals are computed again, as storing them would double the memory."""
         return Scan(self.points, normals(self.points), self.free)
 
 
@@ -230,7 +230,7 @@ class KeyframePolicy:
     length: float = 4.0  # [m] of travel, between the two
 
     def first(self, poses: Floats) -> int:
-        """The first of the poses (n, 3) that the local map still holds."""
+        """Return the index of the first of the poses (n, 3) that the local map still holds."""
         steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
         behind = np.append(np.cumsum(steps[::-1])[::-1], 0.0)  # travel from each to the last
         age = np.arange(len(poses))[::-1]
@@ -239,7 +239,7 @@ class KeyframePolicy:
 
 
 def keyframes_to_arrays(keyframes: Sequence[Keyframe]) -> dict[str, NDArray[np.generic]]:
-    """All of the keyframes."""
+    """Return all keyframes as arrays, to be saved."""
     return {
         **edges_to_arrays("link", [keyframe.link for keyframe in keyframes]),
         "travel": np.array([keyframe.travel for keyframe in keyframes]),
@@ -252,7 +252,7 @@ def keyframes_to_arrays(keyframes: Sequence[Keyframe]) -> dict[str, NDArray[np.g
 
 
 def keyframes_from_arrays(arrays: Arrays) -> list[Keyframe]:
-    """The keyframes again; KeyError or ValueError if the arrays do not belong together."""
+    """Restore keyframes; KeyError or ValueError if the arrays do not belong together."""
     links = edges_from_arrays("link", arrays)
     points = split(arrays["points"], arrays["points_each"])
     free = split(arrays["free"], arrays["free_each"])
@@ -264,7 +264,7 @@ def keyframes_from_arrays(arrays: Arrays) -> list[Keyframe]:
 
 
 def edges_to_arrays(name: str, edges: Sequence[Edge]) -> dict[str, NDArray[np.generic]]:
-    """The edges as three arrays whose names begin with `name`."""
+    """Return the edges as arrays whose names begin with `name`."""
     return {
         f"{name}_ends": np.array([(e.first, e.second) for e in edges], np.int32).reshape(-1, 2),
         f"{name}_relative": np.array([e.relative for e in edges]).reshape(-1, 3),
@@ -274,7 +274,7 @@ def edges_to_arrays(name: str, edges: Sequence[Edge]) -> dict[str, NDArray[np.ge
 
 
 def edges_from_arrays(name: str, arrays: Arrays) -> list[Edge]:
-    """The edges again."""
+    """Restore edges from arrays."""
     ends = arrays[f"{name}_ends"].astype(int)
     relative = arrays[f"{name}_relative"].astype(np.float64)
     covariance = arrays[f"{name}_covariance"].astype(np.float64)
@@ -290,7 +290,7 @@ def edges_from_arrays(name: str, arrays: Arrays) -> list[Edge]:
 
 
 def shaped(arrays: Arrays, name: str, *shape: int) -> Floats:
-    """One of the arrays; KeyError without it, ValueError if it is of another shape."""
+    """Return one of the arrays; KeyError without it, ValueError for another shape."""
     values = arrays[name].astype(np.float64)
     if values.shape != shape:
         raise ValueError(f"{name} of shape {values.shape}, expected {shape}")
@@ -302,7 +302,7 @@ def _joined(parts: Iterable[Points]) -> Points:
 
 
 def split(rows: NDArray[np.generic], each: NDArray[np.generic]) -> list[Points]:
-    """Points (n, 2) of all scans, scan by scan; ValueError for what no lidar has seen."""
+    """Split points (n, 2) by scan; ValueError for impossible points."""
     counts, points = each.astype(int), rows.astype(np.float32)
     if points.shape != (counts.sum(), 2) or (counts < 0).any():
         raise ValueError(f"expected {counts.sum()} points, got {points.shape}")

@@ -56,7 +56,7 @@ class FieldFit(NamedTuple):
 
 
 def field_of(cells: NDArray[np.int8], cell: float, origin: tuple[float, float]) -> LikelihoodField:
-    """The field of an occupancy grid (height, width): 0 free to 100 occupied, -1 unknown."""
+    """Make the field of an occupancy grid (height, width): 0 to 100 occupied, -1 unknown."""
     walls = cells >= OCCUPIED
     if walls.any():
         open_ground = np.where(walls, 0, 1).astype(np.uint8)
@@ -96,7 +96,7 @@ def contradiction(field: LikelihoodField, beams: Beams, pose: Floats) -> float:
 
 
 def clearance(field: LikelihoodField, pose: Floats) -> float:
-    """How far the body at `pose` (3,) is from the nearest wall, to a cell [m]."""
+    """Return the distance of the body at `pose` (3,) to the nearest wall, to a cell [m]."""
     column, row = np.floor((pose[:2] - field.origin) / field.cell).astype(int)
     height, width = field.distance.shape
     if not (0 <= row < height and 0 <= column < width):
@@ -141,7 +141,7 @@ def _distance_and_slope(distance: Distances, x: float, y: float) -> tuple[float,
 
 @kernel
 def _is_shown(shown: NDArray[np.bool_], x: float, y: float) -> bool:
-    """Whether the map shows what is at (x, y) in cells."""
+    """Return whether the map shows the place (x, y), in cells."""
     height, width = shown.shape
     column, row = int(np.floor(x)), int(np.floor(y))
     return 0 <= row < height and 0 <= column < width and bool(shown[row, column])
@@ -211,7 +211,7 @@ def _pierced(field: LikelihoodField, beams: Beams, pose: Floats) -> float:
 
 
 def is_self_similar(field: LikelihoodField, move: Floats) -> bool:
-    """Whether the map may well go on as itself moved by `move` (3,), in its own frame."""
+    """Return whether the map matches itself when shifted by `move` (3,), in its own frame."""
     rows, columns = np.nonzero(field.distance < field.cell / 2)
     chosen = np.linspace(0, len(rows) - 1, min(MAX_WALL_CELLS, len(rows))).astype(np.intp)
     walls = np.column_stack((columns[chosen], rows[chosen])) * field.cell + field.cell / 2
@@ -225,7 +225,7 @@ def is_self_similar(field: LikelihoodField, move: Floats) -> bool:
 
 
 def _compared(field: LikelihoodField, points: Floats) -> tuple[Floats, int]:
-    """The points (n, 2) that lie on walls, and how many lie amid free ground."""
+    """Return the points (n, 2) on walls, and the number of those amid free ground."""
     columns, rows = np.floor((points - field.origin) / field.cell).astype(np.intp).T
     height, width = field.distance.shape
     inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)

@@ -73,12 +73,12 @@ def build(
     sigma: float,
     room: Bytes | None = None,
 ) -> LocalMap:
-    """The map of `scans` at `poses` (m, 3) within reach of `centre`.
+    """Build the map of `scans` at `poses` (m, 3) within reach of `centre`.
 
-    The likelihood of a hit is exp(-d²/2s²): d to the nearest point, s `sigma`. Scans are laid onto
-    the means of what shares a cell. To choose one of it by the order of the beams would be wrong:
-    of those along a wall the later are the nearer on one side and the farther on the other, and a
-    robot between two walls would be turned a little by each scan. Its images are in `room`, see
+    The likelihood of a hit is exp(-d²/2s²), with d the distance to the nearest point and s `sigma`.
+    Scans are matched to the mean of the points in a cell. Choosing one point by beam order would be
+    biased: along a wall the later beams are nearer on one side and farther on the other, so a robot
+    between two walls would turn a little with each scan. The images use the memory `room`, see
     image_buffer.
     """
     points, normals, low, high = _placed(
@@ -101,7 +101,7 @@ def build(
 
 
 def _blank(height: int, width: int, room: Bytes | None) -> Bytes:
-    """Two images of zeros (2, height, width)."""
+    """Return two images of zeros (2, height, width)."""
     if room is None or room.size < 2 * height * width:
         return np.zeros((2, height, width), np.uint8)
     blank = room[: 2 * height * width].reshape(2, height, width)
@@ -113,9 +113,9 @@ def _blank(height: int, width: int, room: Bytes | None) -> Bytes:
 def _placed(
     points: Points, normals: Points, counts: NDArray[np.int64], poses: Floats, centre: Floats
 ) -> tuple[Points, Points, Points, Points]:
-    """Points and normals of scans, so many of each, at their poses, and where they lie between.
+    """Transform points and normals of scans to their poses; return also the extent.
 
-    What is out of reach of `centre` is left out.
+    `counts` is the number of each scan's points. Points out of reach of `centre` are left out.
     """
     moved, turned = np.empty_like(points), np.empty_like(normals)
     low, high = np.full(2, np.inf, np.float32), np.full(2, -np.inf, np.float32)
@@ -150,7 +150,7 @@ def _buckets(points: Points, normals: Points, low: Points, high: Points) -> Buck
 def _merged(
     points: Points, normals: Points, origin: Floats, cell: float, width: int
 ) -> tuple[Points, Points, Points, Points]:
-    """The mean of the points with a normal in each cell, its normal, and where they lie between."""
+    """Return mean and normal of the points with a normal in each cell, and the extent."""
     bits = 1
     while 1 << bits < 2 * len(points):
         bits += 1
@@ -212,7 +212,7 @@ def _sorted(
 
 @lru_cache(maxsize=4)
 def _blobs(cell: float, sigma: float) -> tuple[Bytes, Bytes]:
-    """How likely hits are round a point (n, n), and the most of each block there."""
+    """Return the likelihood of hits around a point (n, n), and the maximum of each block."""
     reach = int(np.ceil(2.5 * sigma / cell))
     along = np.arange(-reach, reach + 1) * cell
     likely = np.exp(-(along[:, None] ** 2 + along**2) / (2 * sigma**2))

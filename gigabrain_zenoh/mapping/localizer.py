@@ -90,12 +90,12 @@ class Localizer:
 
     @property
     def wants_search(self) -> bool:
-        """Whether somebody should search the whole map now."""
+        """Whether the whole map should be searched now."""
         return not self._places and self._unsearched >= SEARCH_INTERVAL_SCANS
 
     @property
     def place(self) -> Place:
-        """What is known now."""
+        """The present estimate."""
         if self._localized:
             here = self._places[0]
             return Place(here.pose, here.covariance, True)
@@ -107,7 +107,7 @@ class Localizer:
         self._places, self._localized, self.why = [Hypothesis(pose, covariance)], True, ""
 
     def lose(self, why: str) -> None:
-        """Believe nothing any more; search at once."""
+        """Search the whole map for the robot."""
         if self._places:
             self._last = self._places[0]
         self._places, self._localized, self.why = [], False, why
@@ -133,7 +133,7 @@ class Localizer:
         self.why = _in_words(len(poses))
 
     def step(self, view: View, motion: Floats, noise: Floats) -> Place:
-        """One scan, after a `motion` (3,) of that covariance (3, 3), in its own frame."""
+        """Process one scan after a `motion` (3,) of covariance `noise` (3, 3), in its own frame."""
         self._unsearched += 1
         self._moved = compose(self._moved, motion)
         seen = len(view.scan.points) >= FEWEST_POINTS
@@ -148,7 +148,7 @@ class Localizer:
         return self.place
 
     def _doubt(self) -> None:
-        """Whether the one place is still right."""
+        """Give up the one place if it no longer fits or is too uncertain."""
         here = self._places[0]
         if here.bad >= LOST_SCANS:
             self.lose("what is seen is not where the robot was thought to be")
@@ -181,9 +181,9 @@ class Localizer:
             self.why = _in_words(len(self._places))
 
     def _sure(self) -> Hypothesis | None:
-        """The place where the robot is: the only one left, or the one where odometry has it.
+        """Return the only place left, or that of odometry, once it has fitted for some scans.
 
-        What spoke against the latter is over if it fits again: somebody stood in the robot's view.
+        Earlier contradictions of the latter do not count: a person may have stood in the view.
         """
         for one in self._places:
             if one.good >= SURE_SCANS and (one.continues or len(self._places) == 1):
@@ -191,23 +191,23 @@ class Localizer:
         return None
 
     def _gone(self, one: Hypothesis, best: Hypothesis) -> bool:
-        """Whether `one` has led off what is shown, to where the map gives no reason to be."""
+        """Return whether `one` has left the mapped area without support from the map's symmetry."""
         if one.shown >= SHOWN or one.bad % GONE_SCANS != GONE_SCANS - 1 or not best.good:
             return False
         return not is_self_similar(self.map, compose(one.pose, inverse(best.pose)))
 
 
 def _possible(one: Hypothesis) -> bool:
-    """Whether neither beams rule the place out, nor some of them and a bad fit together.
+    """Return whether a place remains possible: neither beams nor a bad fit rule it out.
 
-    A bad fit alone may come of walls that the map shows badly, as at its edge.
+    A bad fit alone may come from walls that the map shows badly, as at its edge.
     """
     most = AGAINST_ODOMETRY if one.continues else AGAINST
     return one.against < most and (one.bad < LOST_SCANS or one.wrong < DOUBTED_WRONG)
 
 
 def _continuing(poses: list[Floats], last: Floats) -> int | None:
-    """Which of the places is nearest to where odometry has the robot, if one is near."""
+    """Return the index of the place nearest to odometry's, if one is near."""
     off = [between(last, pose).tolist() for pose in poses]
     away = [math.hypot(x, y) if abs(yaw) < BUMPED_RAD else math.inf for x, y, yaw in off]
     nearest = min(range(len(away)), key=away.__getitem__, default=None)
@@ -220,7 +220,7 @@ def _in_words(count: int) -> str:
 
 
 def _predicted(one: Hypothesis, motion: Floats, noise: Floats) -> Hypothesis:
-    """Where `one` is after `motion`."""
+    """Return `one` after `motion`."""
     pose = compose(one.pose, motion)
     turn = np.eye(3)
     turn[0, 2], turn[1, 2] = one.pose[1] - pose[1], pose[0] - one.pose[0]
@@ -229,7 +229,7 @@ def _predicted(one: Hypothesis, motion: Floats, noise: Floats) -> Hypothesis:
 
 
 def _followed(into: LikelihoodField, one: Hypothesis, view: View | None) -> Hypothesis:
-    """`one` moved to where the scan fits best, unless it fits nowhere near."""
+    """Return `one` moved to where the scan fits best, unless it fits nowhere near."""
     if view is None:
         return one
     prior = _inverse(one.covariance)
@@ -275,7 +275,7 @@ class BackgroundLocalizer:
         self._lost = 0  # how often
 
     def step(self, view: View, motion: Floats, noise: Floats) -> Place:
-        """One scan, after a `motion` (3,) of that covariance (3, 3), in its own frame."""
+        """Process one scan, and start a search of the whole map when it is needed."""
         self._moved = compose(self._moved, motion)
         self.last = None if self.last is None else compose(self.last, motion)
         place = self._localizer.step(view, motion, noise)
@@ -286,7 +286,7 @@ class BackgroundLocalizer:
         return place
 
     def lose(self, why: str) -> None:
-        """The robot may be anywhere; a search that is under way is too late."""
+        """Search the whole map for the robot; discard the result of a running search."""
         self._lost += 1
         self._localizer.lose(why)
 
@@ -316,11 +316,11 @@ class KidnapDetector:
 
     @property
     def certain(self) -> bool:
-        """Whether the robot is somewhere else."""
+        """Whether the robot is certainly somewhere else."""
         return self.scans >= KIDNAPPED_SCANS
 
     def look(self, grid: LogOddsGrid, view: View, pose: Floats) -> bool:
-        """Whether the scan does not belong at `pose`, where odometry has the robot."""
+        """Return whether the scan does not belong at `pose`, where odometry has the robot."""
         cells, corner = grid.around(float(pose[0]), float(pose[1]), JUDGED_RADIUS_M)
         if not cells.size:
             return False

@@ -120,7 +120,7 @@ class LoopSearch:
         return sure
 
     def _confirmed(self, loop: Edge, poses: Floats) -> list[Edge]:
-        """The loop and its witnesses, or nothing as long as it has none and would need one."""
+        """Return the loop with its witnesses, or nothing while it needs one and has none."""
         witnesses = [w for w in self.waiting if w.second != loop.second and _agree(loop, w, poses)]
         if not witnesses and not _is_small(loop, poses):
             self.waiting.append(loop)
@@ -139,7 +139,7 @@ def _candidates(poses: Floats, travel: Floats, here: int) -> list[int]:
 
 
 def around(travel: Floats, there: int, end: int) -> slice:
-    """The keyframes before `end` that make up the place of one of them."""
+    """Return the keyframes before `end` that make up the place of keyframe `there`."""
     first, last = there, there
     while last - first + 1 < MAX_PLACE_KEYFRAMES:
         if (
@@ -164,10 +164,10 @@ def _attempt(
     turn: float,
     away: float,
 ) -> Edge | None:
-    """The loop from `there` to `here`, if the scan of the one fits into the place of the other.
+    """Return the loop from `there` to `here` if the scan of `here` fits into that place.
 
-    The variances of the drift, `turn` and `away`, decide where the place leaves a direction open;
-    the loop's own covariance does not count them, as the graph does already.
+    The drift's variances, `turn` and `away`, decide where the place leaves a direction open. The
+    loop's covariance does not include them, as the graph already does.
     """
     place = around(travel, there, here)
     scans = [keyframe.scan for keyframe in keyframes[place]]

@@ -89,26 +89,26 @@ class SavedMap:
 
 
 def path_of(name: str) -> Path:
-    """The YAML file of a map by its name, or by its path if it looks like one."""
+    """Return the YAML file of a map by its name, or by its path if it looks like one."""
     if "/" in name or name.endswith((".yaml", ".yml")):
         return Path(name)
     return saved_map_path(name)
 
 
 def saved_map_path(name: str) -> Path:
-    """The YAML file of a map that was saved, or is to be, under a name."""
+    """Return the YAML file of a saved map's name."""
     return state_dir() / "maps" / f"{name}.yaml"
 
 
 def in_words(found: SavedMap) -> str:
-    """How large a map is, for people."""
+    """Return the size of a map as text."""
     height, width = (cells * found.resolution for cells in found.cells.shape)
     area = np.count_nonzero(_free(found)) * found.resolution**2
     return f"{width:.1f} x {height:.1f} m, {area:.1f} m² of it free"
 
 
 def load(path: Path) -> SavedMap:
-    """The map that a YAML file describes. Raises ConfigError, in one line."""
+    """Load the map that a YAML file describes. Raises ConfigError, in one line."""
     _finish(path)
     about = config.load(path, MapYaml)
     if about.origin[2] != 0:
@@ -125,7 +125,7 @@ def load(path: Path) -> SavedMap:
 
 
 def load_graph(path: Path) -> dict[str, NDArray[Any]]:
-    """The pose graph beside the YAML file `path`. Raises ConfigError, in one line."""
+    """Load the pose graph beside the YAML file `path`. Raises ConfigError, in one line."""
     _finish(path)
     file = path.with_suffix(GRAPH)
     graph = read_arrays(file, "the pose graph to go on with; expected it beside the YAML file")
@@ -160,7 +160,7 @@ def save(path: Path, found: SavedMap, graph: Arrays, *, replace: bool = False) -
 
 
 def map_problem(found: SavedMap) -> str:
-    """Why this is no map worth keeping, or an empty text."""
+    """Return why a map is not worth saving, or an empty text."""
     area = np.count_nonzero(_free(found)) * found.resolution**2
     if area < LEAST_FREE_M2:
         return f"the map is empty: {area:.2f} m² of it are free"
@@ -184,7 +184,7 @@ def _stamp(found: SavedMap) -> NDArray[np.uint8]:
 
 
 def _files(path: Path, found: SavedMap, graph: Arrays) -> dict[str, bytes]:
-    """What to write, by name."""
+    """Return the content of each file, by name."""
     height, width = found.cells.shape
     grey = np.full((height, width), UNKNOWN, np.uint8)
     grey[found.cells >= OCCUPIED_PERCENT] = OCCUPIED
@@ -244,7 +244,7 @@ def _complete(path: Path) -> Path:
 
 
 def read_pgm(file: Path) -> NDArray[np.uint8]:
-    """The grey values of a file (height, width), the top row first. Raises ConfigError."""
+    """Read the grey values of a file (height, width), the top row first. Raises ConfigError."""
     try:
         data = read_bounded(file, MAX_PIXELS + MAX_HEADER_BYTES)
     except OSError as error:
@@ -265,7 +265,7 @@ def read_pgm(file: Path) -> NDArray[np.uint8]:
 
 
 def read_arrays(path: Path, what: str, only: str = "") -> dict[str, NDArray[Any]]:
-    """The arrays in a file, which holds `what`; `only` one of them, if it is named.
+    """Read the arrays of a file, or `only` one of them; `what` names the file's content.
 
     Raises ConfigError, in one line.
     """
@@ -291,7 +291,7 @@ def write_arrays(file: BinaryIO, arrays: Arrays, *, compress: bool) -> None:
 
 
 def arrays_bytes(arrays: Arrays) -> bytes:
-    """The content of a compressed file. Raises ValueError, as `write_arrays` does."""
+    """Return the content of a compressed file. Raises ValueError, as `write_arrays` does."""
     content = io.BytesIO()
     write_arrays(content, arrays, compress=True)
     return content.getvalue()
@@ -330,7 +330,7 @@ def _directory_bytes(file: BinaryIO) -> int:
 
 
 def _read_array(name: str, members: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
-    """One array, if it holds plain numbers; else one of READ_ERRORS."""
+    """Read one array of plain numbers. Raises one of READ_ERRORS for other content."""
     with members.open(info) as stream:
         shape, fortran, dtype = NPY_HEADERS[np.lib.format.read_magic(stream)](stream)
         if dtype.kind not in "biuf" or min(shape, default=0) < 0:

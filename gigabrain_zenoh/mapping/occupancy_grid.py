@@ -49,7 +49,7 @@ class LogOddsGrid:
     def of(
         cls, log_odds: Cells, known: NDArray[np.bool_], origin: tuple[float, float]
     ) -> "LogOddsGrid":
-        """A grid as it was saved."""
+        """Restore a saved grid."""
         grid = cls()
         grid.origin_x, grid.origin_y = origin
         grid.log_odds = np.array(log_odds, np.int8)
@@ -57,7 +57,7 @@ class LogOddsGrid:
         return grid
 
     def still(self) -> "LogOddsGrid":
-        """A copy that stays as it is."""
+        """Return a copy."""
         held = LogOddsGrid()
         held.origin_x, held.origin_y, held.full = self.origin_x, self.origin_y, self.full
         held.log_odds, held._stamps = self.log_odds.copy(), self._stamps.copy()
@@ -65,9 +65,10 @@ class LogOddsGrid:
         return held
 
     def draw(self, sensor: Floats, hits: Points, free: Points) -> None:
-        """One scan from `sensor`, a pose in the map; the ends of its beams in the sensor's frame.
+        """Draw one scan from `sensor`, a pose in the map; beams are in the sensor's frame.
 
-        `hits` (n, 2) is where beams ended [m], `free` (m, 2) how far others were seen to go.
+        `hits` (n, 2) are the ends of beams [m], `free` (m, 2) how far other beams are known to be
+        free.
         """
         ends, clear = transform(sensor, hits), transform(sensor, free)
         around = np.vstack((sensor[None, :2], ends, clear))
@@ -79,17 +80,17 @@ class LogOddsGrid:
         _draw(self.log_odds, self._stamps, self._scans, start, cells, far)
 
     def known(self) -> NDArray[np.bool_]:
-        """Which cells some beam has touched (height, width)."""
+        """Return which cells a beam has touched (height, width)."""
         return self._stamps > 0
 
     def percent(self) -> Cells:
-        """0 free to 100 occupied, -1 unknown (height, width)."""
+        """Return the cells (height, width): 0 free to 100 occupied, -1 unknown."""
         shown = np.empty(self.log_odds.shape, np.int8)
         _show(self.log_odds, self._stamps, PERCENT, shown)
         return shown
 
     def around(self, x: float, y: float, reach: float) -> tuple[Cells, tuple[float, float]]:
-        """What `percent` is within a square of `reach` [m] round a place, and its corner."""
+        """Return `percent` of a square of `reach` [m] around a place, and its corner."""
         height, width = self.log_odds.shape
         left = min(max(int((x - reach - self.origin_x) / CELL), 0), width)
         low = min(max(int((y - reach - self.origin_y) / CELL), 0), height)
@@ -100,7 +101,7 @@ class LogOddsGrid:
         return shown, (self.origin_x + left * CELL, self.origin_y + low * CELL)
 
     def message(self) -> OccupancyGrid:
-        """The grid as others see it."""
+        """Return the grid as a message."""
         height, width = self.log_odds.shape
         return OccupancyGrid(
             resolution=CELL,
@@ -131,7 +132,7 @@ class LogOddsGrid:
 
 
 def _missing(low: float, high: float, origin: float, count: int) -> tuple[int, int]:
-    """How many cells are wanted before and after those that there are."""
+    """Return how many cells to add before and after the existing ones."""
     before = math.floor((origin - low) / CELL) + 1 if low < origin else 0
     after = math.floor((high - origin) / CELL) + 1 - count
     return _rounded(before), _rounded(after)
@@ -142,7 +143,7 @@ def _rounded(cells: int) -> int:
 
 
 def _cells(points: Floats, corner: Floats) -> NDArray[np.int64]:
-    """The cells (n, 2) as x, y that `points` [m] lie in."""
+    """Return the cells (n, 2) of `points` [m] as x, y."""
     return np.floor((points - corner) / CELL).astype(np.int64)
 
 
@@ -235,11 +236,11 @@ class GridScans:
         return len(self._kept)
 
     def all(self) -> list[GridScan]:
-        """As they are now."""
+        """Return the scans in the order in which they were added."""
         return list(self._kept.values())
 
     def add(self, view: View, keyframe: int, relative: Floats, pose: Floats) -> GridScan:
-        """One more, seen from `pose` in the map; while the robot stands, the newest is enough."""
+        """Add a scan seen from `pose` in the map; at rest it replaces the last."""
         sweep = GridScan(keyframe, relative, view.scan.points, view.scan.free, view.sensor)
         if self._standing:
             self._kept.popitem()
@@ -263,13 +264,13 @@ class GridScans:
         return numbers
 
     def still(self) -> "GridScans":
-        """A copy to be frozen, which stays as it is."""
+        """Return a copy for `freeze`."""
         held = GridScans()
         held._kept, held.seen = dict(self._kept), self.seen
         return held
 
     def freeze(self) -> dict[str, NDArray[Any]]:
-        """All of them, in arrays."""
+        """Return all scans as arrays, to be saved."""
         empty, kept = np.empty((0, 2), np.float32), self.all()
         return {
             "sweep_keyframes": np.array([one.keyframe for one in kept], np.int32),
@@ -283,7 +284,7 @@ class GridScans:
 
     @classmethod
     def thaw(cls, arrays: Mapping[str, NDArray[Any]], poses: Floats) -> "GridScans":
-        """What was frozen, keyframes being at `poses` (n, 3) in the map.
+        """Restore saved scans, with keyframes at `poses` (n, 3) in the map.
 
         Raises KeyError or ValueError if the arrays do not belong together.
         """

@@ -58,7 +58,7 @@ class OdometryFusion:
 
     @property
     def newest(self) -> OdometrySample | None:
-        """The last moment."""
+        """The last sample."""
         return self._moments[-1] if self._moments else None
 
     def add(self, state: RobotState, body: BodyDescription) -> None:
@@ -89,9 +89,9 @@ class OdometryFusion:
         return abs(self._slip) > SLIP_RATE
 
     def at(self, tick: int) -> OdometrySample | None:
-        """The moment of `tick`; between two states it is on the way from one to the other.
+        """Return the sample of `tick`, interpolated between two states.
 
-        None where it is not known (yet), or where too many states are missing.
+        None if it is not known yet, or if too many states are missing.
         """
         moments = self._moments
         place = bisect_left(moments, tick, key=lambda moment: moment.tick)
@@ -117,7 +117,7 @@ class OdometryFusion:
         return state.imu.angular_velocity[2] - self.bias if state.imu else None
 
     def _turn(self, state: RobotState, step: Floats, ticks: int) -> float | None:
-        """How much the body has turned since the last state, by its gyro [rad]."""
+        """Return the turn since the last state by the gyro [rad]."""
         before, self._rate = self._rate, self._turn_rate(state)
         if before is None or self._rate is None or ticks > GYRO_TICKS:
             return None
@@ -129,7 +129,7 @@ class OdometryFusion:
         return turn
 
     def _learn_bias(self, step: Floats, rate: float) -> bool:
-        """Whether the body is at rest, when what the gyro says is nothing but its bias."""
+        """Learn the gyro's bias at rest; return whether the body is at rest."""
         self._rest = self._rest + 1 if not step.any() else 0
         if self._rest < REST_TICKS or abs(rate) > (REST_RATE if self._calibrated else FIRST_RATE):
             return False
@@ -140,32 +140,32 @@ class OdometryFusion:
 
 
 def way(last: OdometrySample, moment: OdometrySample) -> tuple[Floats, Floats]:
-    """The way (3,) from one moment to another, and its covariance (3, 3) in its own frame."""
+    """Return the motion (3,) between two samples, and its covariance (3, 3) in its own frame."""
     step = between(last.fused, moment.fused)
     aided = moment.unaided == last.unaided
     return step, uncertainty(step, slipping=moment.slipping, gyro=aided)
 
 
 def jumped(step: Floats, seconds: float, body: BodyDescription) -> bool:
-    """Whether `step` (3,) in so many seconds is more than this body can do."""
+    """Return whether `step` (3,) within `seconds` is more than this body can do."""
     fastest = max(body.max_linear_speed, body.max_lateral_speed)
     far = math.hypot(float(step[0]), float(step[1])) > JUMP_FACTOR * fastest * seconds + JUMP_M
     return far or abs(float(step[2])) > JUMP_FACTOR * body.max_angular_speed * seconds + JUMP_RAD
 
 
 def advanced(pose: Floats, step: Floats, turn: float) -> Floats:
-    """`pose` after a small `step` of the wheels during which the body turned by `turn` [rad].
+    """Return `pose` after a small `step` of the wheels while the body turned by `turn` [rad].
 
-    The way is taken at the middle of the turn, whatever the wheels made of that.
+    The step's direction is that at the middle of the turn.
     """
     along = compose(np.array((0.0, 0.0, (turn - float(step[2])) / 2)), step)
     return compose(pose, np.array((along[0], along[1], turn)))
 
 
 def uncertainty(step: Floats, *, slipping: bool, gyro: bool = False) -> Floats:
-    """The covariance (3, 3) of `step` in its own frame: about 5 % of the way and of the turn.
+    """Return the covariance (3, 3) of `step` in its own frame: about 5 % of its length and turn.
 
-    With a gyro the turn is that much better known as GYRO says.
+    With a gyro the deviation of the turn is multiplied by GYRO.
     """
     factor = SLIPPING if slipping else 1.0
     way, turn = math.hypot(float(step[0]), float(step[1])), abs(float(step[2]))

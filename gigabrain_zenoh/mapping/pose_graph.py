@@ -97,7 +97,10 @@ class Graph:
             return True
 
     def _settled(self, isam: gtsam.ISAM2, solved: int) -> bool:
-        """Whether a piece of work, of which so many poses have been solved for, is the last."""
+        """Update until the rounds are done or the piece is full; return whether they are done.
+
+        `solved` poses of this piece have been solved for already.
+        """
         while self._rounds:
             if solved and solved + self._round > PIECE:
                 return False
@@ -218,11 +221,11 @@ class Drift:
         self._ways[edge.second].append((edge.first, turn, away))
 
     def explains(self, loop: Edge, poses: Floats) -> bool:
-        """Whether drift may have brought about what closing `loop` would correct."""
+        """Return whether drift may explain the correction that closing `loop` would make."""
         return explained(loop, poses, *self.between(loop.first, loop.second, poses))
 
     def between(self, first: int, second: int, poses: Floats) -> tuple[float, float]:
-        """The variance of yaw and of place on the least uncertain way (Dijkstra)."""
+        """Return the variance of yaw and of place on the least uncertain path (Dijkstra)."""
         turn, away = self._spread(second, poses, first)
         if not np.isfinite(turn[first]):
             raise ValueError(f"no way from keyframe {first} to {second}")

@@ -69,10 +69,10 @@ def search(
     least: float = -np.inf,
     most: int = SEARCHED,
 ) -> SearchResult:
-    """The pose within the window whose points fall on the likeliest cells.
+    """Search the window for the pose whose points fall on the likeliest cells.
 
-    The guess, with a score of 0, where none scores `least`, which saves most of the search. At
-    most `most` of the points are searched with.
+    Returns the guess, with a score of 0, if no pose scores `least`, which saves most of the search.
+    At most `most` of the points are used.
     """
     if not len(points):
         return SearchResult(guess, 0.0)
@@ -213,7 +213,7 @@ def _nearest(local: Buckets, x: float, y: float, gate: float, known: int) -> int
 
 @lean_kernel
 def _away(local: Points, k: int, x: float, y: float) -> float:
-    """The squared distance of a point from (x, y)."""
+    """Return the squared distance of a point from (x, y)."""
     dx, dy = local[k, 0] - x, local[k, 1] - y
     away: float = dx * dx + dy * dy
     return away

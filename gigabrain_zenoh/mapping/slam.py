@@ -96,29 +96,29 @@ class Slam:
 
     @property
     def poses(self) -> Floats:
-        """Where the keyframes are in the map, (n, 3)."""
+        """The poses of the keyframes in the map, (n, 3)."""
         return np.array(self._poses).reshape(-1, 3)
 
     def poses_from(self, first: int) -> list[Floats]:
-        """Where the keyframes from the `first` on are in the map, (3,) each."""
+        """Return the poses of the keyframes from `first` on in the map, (3,) each."""
         return self._poses[first:]
 
     @property
     def pose(self) -> Floats:
-        """Where the robot was at the last scan, in the map as it is now. There is a keyframe."""
+        """The robot's pose at the last scan in the present map. Needs a keyframe."""
         keyframe, placed = self._anchor
         return compose(self._poses[keyframe], between(placed, self._front.pose))
 
     @property
     def smooth(self) -> Floats:
-        """Where the robot is in a frame that drifts and never jumps."""
+        """The robot's pose in a frame that drifts and never jumps."""
         return compose(self._smooth, self._front.pose)
 
     def add(self, scan: Scan, delta: Floats, noise: Floats | None = None) -> Estimate:
-        """Where the robot is, odometry having moved by `delta` (x, y, yaw) since the last scan.
+        """Add a scan after odometry has moved by `delta` (x, y, yaw).
 
-        `noise` (3, 3) is the covariance of `delta` in its own frame. Without it odometry is taken
-        for bad, and counts next to nothing where there is anything to match.
+        `noise` (3, 3) is the covariance of `delta` in its own frame. Without it odometry is assumed
+        to be bad, and counts little where there is anything to match.
         """
         if not np.isfinite(delta).all():
             raise ValueError(f"odometry: expected finite numbers, got {delta}")
@@ -144,7 +144,7 @@ class Slam:
         )
 
     def relocate(self, pose: Floats) -> None:
-        """The robot is at `pose` in the map, whatever was known before: match to what is there."""
+        """Put the robot at `pose` in the map, and match to the keyframes there."""
         travel = np.array([keyframe.travel for keyframe in self.keyframes])
         poses = self.poses
         away = np.hypot(*(poses[:, :2] - pose[:2]).T)
@@ -218,17 +218,17 @@ class Slam:
 
     @property
     def rebuilt(self) -> int:
-        """How often the optimiser has failed and was rebuilt."""
+        """The number of times the optimiser has failed and was rebuilt."""
         return self._graph.rebuilt
 
     @property
     def failure(self) -> str:
-        """Why no loop closes any more, or an empty text."""
+        """The reason why no more loops are closed, or an empty text."""
         return self._graph.failure
 
     @property
     def behind(self) -> int:
-        """Keyframes that no loop was looked for from yet, and loops that are not closed yet."""
+        """The number of keyframes to search from, plus one if found loops are not closed yet."""
         return len(self.keyframes) - len(self._graph.poses) + bool(self._closing)
 
     def apply(self, correction: Correction) -> None:
@@ -242,7 +242,7 @@ class Slam:
         self.revision += 1
 
     def still(self) -> "Slam":
-        """A copy, good for `freeze` only, that stays as it is. Not while `close_loops` runs."""
+        """Return a copy for `freeze`. Not while `close_loops` runs."""
         held = copy.copy(self)
         held.keyframes, held._poses = list(self.keyframes), list(self._poses)
         held._front, held._graph = copy.copy(self._front), copy.copy(self._graph)
@@ -251,7 +251,7 @@ class Slam:
         return held
 
     def freeze(self) -> dict[str, NDArray[np.generic]]:
-        """All that it takes to go on later, in arrays. Not while `close_loops` runs."""
+        """Return the state as arrays, to be saved. Not while `close_loops` runs."""
         held = {id(keyframe.points): k for k, keyframe in enumerate(self.keyframes)}
         scans, placed = self._front.held
         return {

@@ -55,7 +55,7 @@ class MapSnapshot:
     waiting: list[GridScan]  # to be drawn
 
     def freeze(self) -> dict[str, NDArray[np.generic]]:
-        """All that it takes to go on as if nothing had happened."""
+        """Return everything needed to continue exactly, as arrays."""
         grid, waiting = self.grid, {id(one) for one in self.waiting}
         undrawn = [k for k, one in enumerate(self.sweeps.all()) if id(one) in waiting]
         return {
@@ -69,7 +69,7 @@ class MapSnapshot:
         }
 
     def to_save(self) -> tuple[SavedMap, Arrays]:
-        """The map for people and other programs, and what it takes to go on with it."""
+        """Return the map for other programs, and the arrays needed to continue it."""
         grid = self.grid.still()
         for sweep in self.waiting:
             sweep.draw(grid, self.drawn[sweep.keyframe])
@@ -110,11 +110,10 @@ class SlamMap:
         in_time: InTime = done,
         last: Floats | None = None,
     ) -> "SlamMap":
-        """A map to go on with, saved or kept.
+        """Continue a saved map.
 
-        The robot is at `last` (3,) if its odometry has gone on since; if the next scan does not
-        belong there, it is looked for in the whole map. Raises ConfigError for arrays that are
-        none.
+        The robot is at `last` (3,) if its odometry has continued since. If the next scan does not
+        belong there, the whole map is searched. Raises ConfigError for invalid arrays.
         """
         grown = cls(patience_s, in_time)
         try:
@@ -137,7 +136,7 @@ class SlamMap:
         return grown
 
     def _thaw_grid(self, arrays: Arrays) -> None:
-        """As it was drawn; KeyError or ValueError if the arrays do not belong together."""
+        """Restore the grid; KeyError or ValueError if the arrays do not belong together."""
         odds, known = arrays["grid_odds"], arrays["grid_known"]
         if odds.ndim != 2 or odds.shape != known.shape or max(odds.shape) > MOST_CELLS:
             raise ValueError(f"a grid of shape {odds.shape}")
@@ -184,7 +183,7 @@ class SlamMap:
         self._last = Place(self._last.pose, NOWHERE, False, why)
 
     def _here(self) -> Floats | None:
-        """Where the robot is as far as odometry knows."""
+        """Return the robot's pose as far as odometry knows it."""
         if self._finder:
             return self._finder.last
         return compose(self._slam.pose, self._moved) if self._last.localized else None
@@ -194,7 +193,7 @@ class SlamMap:
         self._wanted = True
 
     def kept(self) -> MapSnapshot | None:
-        """The copy of the map before the last scan, if one was made; only once."""
+        """Return the copy of the map before the last scan, once; None if none was made."""
         still, self._still = self._still, None
         return still
 
@@ -208,7 +207,7 @@ class SlamMap:
         return self._background.idle
 
     def to_save(self) -> tuple[SavedMap, Arrays]:
-        """The map now, as `Still` has it. Raises Refused."""
+        """Return the present map to be saved. Raises Refused."""
         return self.still().to_save()
 
     def still(self) -> MapSnapshot:

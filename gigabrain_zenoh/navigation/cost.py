@@ -132,7 +132,7 @@ def place_cost(
 
 @lean_kernel
 def exponential(x: float) -> float:
-    """The exponential function, to eight digits from -5 to 5: a call of math.exp takes longer."""
+    """Return exp(x), to eight digits from -5 to 5; math.exp takes longer."""
     y = x * (1.0 / 32.0)
     square = y * y
     power = (
@@ -148,7 +148,7 @@ def exponential(x: float) -> float:
 
 @lean_kernel
 def time_cost(scene: Scene, x: float, y: float, yaw: float) -> float:
-    """What a second costs wherever it is; or it would put off the last turn for ever."""
+    """Return the cost of a second away from the goal, so that the last turn is not put off."""
     return 0.0 if _arrived(scene, x, y, yaw) else 0.5 * SECOND
 
 
@@ -163,7 +163,7 @@ def _arrived(scene: Scene, x: float, y: float, yaw: float) -> bool:
 
 @lean_kernel
 def motion_cost(weights: Weights, room: float, vx: float, vy: float, w: float) -> float:
-    """What it costs to move so for a second."""
+    """Return the cost of a second at this velocity, `room` [m] from obstacles."""
     cost = weights.turning * w * w
     over = math.sqrt(vx * vx + vy * vy) - (
         weights.tight_speed + weights.tight_rate * (room - weights.margin)
@@ -194,7 +194,7 @@ def braking_cost(problem: Problem, room: float, motion: MotionState) -> float:
 
 @lean_kernel
 def rest(model: MotionModel, scene: Scene, x: float, y: float) -> float:
-    """The cost of the way from (x, y) to the goal."""
+    """Return the cost of the way from (x, y) to the goal."""
     away = math.hypot(x - scene.goal_x, y - scene.goal_y)
     way = away if away < NEAR_GOAL else cost_to_go_at(scene.field, x, y)
     return SECOND * way / model.forward
@@ -202,7 +202,7 @@ def rest(model: MotionModel, scene: Scene, x: float, y: float) -> float:
 
 @lean_kernel
 def cost_to_go_at(field: DistanceGrid, x: float, y: float) -> float:
-    """The cost to go from (x, y) [m]; beyond the rim that of the rim."""
+    """Return the cost to go from (x, y) [m]; beyond the rim that of the rim."""
     rows, columns = field.distance.shape
     cell = field.cell
     inner_x = min(max(x, field.x + cell), field.x + (columns - 1) * cell)
@@ -235,14 +235,14 @@ def terminal_cost(problem: Problem, motion: MotionState) -> float:
 
 @lean_kernel
 def _turn_between(one: float, other: float) -> float:
-    """The angle between two directions [rad], 0 to pi."""
+    """Return the angle between two directions [rad], 0 to pi."""
     turn = one - other
     return abs(turn - math.tau * math.floor(turn / math.tau + 0.5))
 
 
 @lean_kernel
 def disc_contact_cost(weights: Weights, seconds: float, share: float) -> float:
-    """What a contact with a moving thing costs, so late and after such a share of the plan."""
+    """Return the cost of a contact with a disc after `seconds` and that `share` of the plan."""
     if weights.trust > 0.0:
         return TOUCHED_DISC * math.exp(-seconds / weights.trust)
     return TOUCHED_DISC * (1.0 - 0.6 * share)
@@ -252,10 +252,10 @@ def disc_contact_cost(weights: Weights, seconds: float, share: float) -> float:
 def fill_disc_distances(
     weights: Weights, discs: Floats, outline: Outline, seconds: float, state: Floats
 ) -> None:
-    """How near the bodies of a `state` are to `discs` (m, 6), so many `seconds` from now.
+    """Fill in the distances of the bodies of a `state` to `discs` (m, 6) after `seconds`.
 
-    AWAY takes how far each body's box is from the nearest [m], CLOSE, where that is counted, what
-    it costs for a second to be so near to them all.
+    AWAY becomes the distance from each body's box to the nearest [m]. CLOSE, where it counts,
+    becomes the cost of a second that near to all of them.
     """
     for lane in range(LANES):
         state[AWAY + lane], state[CLOSE + lane] = NO_DISC, 0.0
@@ -395,7 +395,7 @@ def price(problem: Problem, rooms: Floats, states: Floats, lane: int, limit: flo
 
 @lean_kernel
 def _contact_cost(share: float) -> float:
-    """What a contact costs after such a share of the plan."""
+    """Return the cost of a contact after that share of the plan."""
     return TOUCHED * (1.0 - 0.7 * share)
 
 

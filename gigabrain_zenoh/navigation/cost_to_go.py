@@ -48,10 +48,10 @@ class CostToGo:
         self, grid: DistanceGrid, half_width: float, goal: tuple[float, float], path: Floats | None,
         ways: Ways | None = None,
     ) -> DistanceGrid:  # fmt: skip
-        """Cost from each place to the goal [m of free way], or to where the path leaves the window.
+        """Return the cost from each place to the goal, or to the path's exit [m of free way].
 
         Without a path, and with the goal outside, every place at the rim counts on free way beyond,
-        or on what the `ways` there cost.
+        or on the cost of the `ways` there.
         """
         cell = grid.cell * COARSER
         _price(grid.distance, np.float32(half_width), np.float32(cell / 2.0 / UNIT), self._halves)
@@ -92,7 +92,7 @@ def seed(
 
 
 def _way_out(points: Floats, inside: NDArray[np.bool_], robot: Floats) -> int:
-    """The last of the path's points before it leaves the window, from the robot on."""
+    """Return the index of the path's last point before it leaves the window."""
     near = np.hypot(*(points - robot).T)
     nearest = int(np.argmin(np.where(inside, near, np.inf)))
     outside = np.flatnonzero(~inside[nearest:])

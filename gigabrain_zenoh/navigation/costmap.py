@@ -39,9 +39,9 @@ Box = tuple[int, int, int, int]  # first row, row after the last, the same of co
 
 
 def squared_distance(cells: Cells, cap: int) -> Singles:
-    """The squared distance in cells to the nearest occupied one of `cells` (h, w), by centres.
+    """Return squared distances in cells to the nearest occupied cell (h, w), by centres.
 
-    It is `cap` squared where that is at least as far.
+    They are at most `cap` squared.
     """
     out = np.empty(cells.shape, np.float32)
     _along_columns(cells, np.float32(cap), out)
@@ -51,7 +51,7 @@ def squared_distance(cells: Cells, cap: int) -> Singles:
 
 @kernel
 def _along_columns(cells: Cells, cap: np.float32, out: Singles) -> None:
-    """The distance to the nearest obstacle in the same column."""
+    """Fill `out` with the distance to the nearest obstacle in the same column."""
     one, zero = np.float32(1), np.float32(0)
     above = np.full(cells.shape[1], cap, np.float32)
     for row in range(cells.shape[0]):
@@ -113,7 +113,7 @@ class Inflation:
 
     @property
     def reach(self) -> float:
-        """How far from an obstacle it still costs something [m]."""
+        """The distance within which an obstacle costs something [m]."""
         return self.fits + self.decay * math.log(NEAR_COST / NEGLIGIBLE_COST)
 
 
@@ -137,14 +137,14 @@ class Costmap:
         return int(row), int(column)
 
     def points(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> Floats:
-        """The centres of cells (n,) in metres, (n, 2)."""
+        """Return the centres of cells (n,) in metres, (n, 2)."""
         x = self.origin_x + (columns + 0.5) * self.resolution
         y = self.origin_y + (rows + 0.5) * self.resolution
         return np.column_stack((x, y))
 
 
 def inflation(body: BodyDescription, unknown: Unknown = "avoid") -> Inflation:
-    """How obstacles weigh for `body`, with the room beside it that safety keeps as well."""
+    """Return the inflation for `body`, including the side margin that safety keeps."""
     edges, margin = sweep.box(body.footprint), body.thresholds.side_margin
     aside, ahead = max(edges.left, -edges.right), max(edges.front, -edges.rear)
     sideways = body.max_lateral_speed > 0 and body.drive_type != "ackermann"
@@ -158,9 +158,9 @@ def costmap(
     points: NDArray[np.floating] | None = None,
     before: Costmap | None = None,
 ) -> Costmap:
-    """The costs of `grid`. `points` [m], (n, 2) in the map's frame, are obstacles besides.
+    """Return the costs of `grid`; `points` [m], (n, 2) in the map's frame, are obstacles too.
 
-    With the costmap `before` only what has changed since is computed; the result is the same.
+    With the costmap `before` only changed parts are computed; the result is the same.
     """
     cells = _with_points(grid, points)
     box = _box_to_renew(before, grid, rules, cells)
@@ -195,7 +195,7 @@ def _with_points(grid: OccupancyGrid, points: NDArray[np.floating] | None) -> Ce
 def _box_to_renew(
     before: Costmap | None, grid: OccupancyGrid, rules: Inflation, cells: Cells
 ) -> Box | None:
-    """The part of the map whose cost may differ from `before`; None for all of it."""
+    """Return the part of the map whose cost may differ from `before`; None for all of it."""
     if before is None or before.inflation != rules or before.cells.shape != cells.shape:
         return None
     if (grid.resolution, grid.origin_x, grid.origin_y) != (
@@ -237,9 +237,9 @@ def _fill(cost: Costs, cells: Cells, rules: Inflation, resolution: float, box: B
 
 
 def _table(rules: Inflation, resolution: float, reach: int) -> Costs:
-    """Cost by the square of the distance to the nearest obstacle in cells, a whole number.
+    """Return the cost by the squared distance in cells to the nearest obstacle.
 
-    Centres are that far apart; the obstacle's cell may be full up to its edge.
+    Distances are between centres; the obstacle's cell may be full up to its edge.
     """
     away = (np.sqrt(np.arange(reach * reach + 1)) - 0.5).clip(0) * resolution
     near = 1 + NEAR_COST * np.exp(-(away - rules.fits) / rules.decay)
@@ -270,7 +270,7 @@ def _look_up(
 
 @kernel
 def _changed(before: Cells, now: Cells) -> Box:
-    """The smallest box with all cells that differ; empty when none does."""
+    """Return the smallest box with all cells that differ; empty without any."""
     height, width = now.shape
     top, bottom, left, right = height, 0, width, 0
     for row in range(height):

@@ -39,18 +39,18 @@ UPDATE_TICKS = 10  # from map to map
 
 
 def is_quick(model: MotionModel) -> bool:
-    """Whether a body looks out for what moves quickly."""
+    """Return whether a body is fast enough to watch quick obstacles."""
     return model.forward > QUICK_BODY_SPEED
 
 
 def moving_quickly(discs: Floats) -> Floats:
-    """Those of the `discs` (m, 6), their velocity x, y [m/s] third and fourth, that are quick."""
+    """Return the quick ones of the `discs` (m, 6), with velocity x, y [m/s] in columns 2 and 3."""
     found: Floats = discs[np.hypot(discs[:, 2], discs[:, 3]) > QUICK_OBSTACLE_SPEED]
     return found
 
 
 def stay_clear(discs: Floats, x: float, y: float) -> bool:
-    """Whether none of the `discs` (m, 6) comes near (x, y) [m] while somebody there looks round."""
+    """Return whether no disc (m, 6) comes near (x, y) [m] while the body looks around."""
     dx, dy, vx, vy = discs[:, 0] - x, discs[:, 1] - y, discs[:, 2], discs[:, 3]
     nearest = -(dx * vx + dy * vy) / np.maximum(vx * vx + vy * vy, 1e-9)
     when = np.clip(nearest, 0.0, HORIZON_S)
@@ -69,7 +69,7 @@ class TrafficMap:
     """What passes near a body, in the frame that is planned in."""
 
     def __init__(self, width: float, fastest: float, sight: float) -> None:
-        """A body so wide [m], which goes so fast [m/s] and sees so far [m]."""
+        """Take a body of `width` [m], top speed `fastest` [m/s] and range `sight` [m]."""
         self._width, self._fastest, self._sight = width, fastest, sight
         self._memory = _empty_memory()
         self._padded = np.empty((CELLS, CELLS + 2), dtype=np.int32)
@@ -87,7 +87,7 @@ class TrafficMap:
 
     @property
     def any(self) -> bool:
-        """Whether anything passes that counts."""
+        """Whether there is traffic."""
         return self._any
 
     def see(self, tick: int, x: float, y: float, discs: Floats) -> None:
@@ -109,7 +109,7 @@ class TrafficMap:
             _pass(self._memory.passed, disc[0] - left, disc[1] - low, amount)
 
     def ways(self, goal: tuple[float, float]) -> Ways | None:
-        """What ways to the goal cost with what passes there; None where nothing does."""
+        """Return the cost of ways to the goal through the traffic; None without traffic."""
         if self._any and self._tick - self._made >= UPDATE_TICKS:
             self._made, self._ways = self._tick, self._priced(goal)
             self._any = self._ways is not None
@@ -149,7 +149,7 @@ def _empty_memory() -> TrafficMemory:
 
 
 def _shifted(by: int) -> tuple[slice, slice]:
-    """Which cells stay in a map that moves on by so many, and where they are then."""
+    """Return the cells that stay when a map moves on, and where they are then."""
     low, high = max(0, by), max(0, min(CELLS, CELLS + by))
     return slice(low, max(low, high)), slice(max(0, -by), max(0, -by) + max(0, high - low))
 

@@ -56,7 +56,7 @@ class DistanceGrid(NamedTuple):
 
 
 def outline_of(footprint: Corners) -> Outline:
-    """The outline of any polygon."""
+    """Return the outline of any polygon."""
     corners = np.array(footprint, dtype=np.float64)
     sides = np.roll(corners, -1, axis=0) - corners
     spacing = max(SPACING, float(np.hypot(*sides.T).sum()) / MOST_POINTS)
@@ -81,14 +81,14 @@ def outline_of(footprint: Corners) -> Outline:
 
 @lean_kernel
 def distance_at(grid: DistanceGrid, x: float, y: float) -> float:
-    """The distance [m] from (x, y) to the nearest obstacle."""
+    """Return the distance [m] from (x, y) to the nearest obstacle."""
     per_cell = 1.0 / grid.cell
     return between(grid.distance, (x - grid.x) * per_cell - 0.5, (y - grid.y) * per_cell - 0.5)
 
 
 @lean_kernel
 def between(distance: Singles, u: float, v: float) -> float:
-    """What `distance` (rows, columns) says between the centers of its cells, (0, 0) first."""
+    """Interpolate `distance` (rows, columns) between cell centers, (0, 0) at the first."""
     rows, columns = distance.shape
     if u < 0.0 or v < 0.0 or u >= columns - 1 or v >= rows - 1:
         return FAR

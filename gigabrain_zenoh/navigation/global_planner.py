@@ -50,7 +50,7 @@ class Unreachable:
 
     @property
     def reason(self) -> str:
-        """The fault and the nearest reachable place, for people."""
+        """The fault and the nearest reachable place, as text."""
         if self.nearest is None:
             return self.fault
         where = f"{self.distance:.2f} m away at ({self.nearest[0]:.2f}, {self.nearest[1]:.2f})"
@@ -64,7 +64,7 @@ class GlobalPlanner:
         self.search = GridSearch()
 
     def plan(self, costmap: Costmap, start: Point, goal: Point) -> Path | Unreachable:
-        """The cheapest path from `start` to `goal`, or why there is none."""
+        """Return the cheapest path from `start` to `goal`, or why there is none."""
         if not all(math.isfinite(value) for value in (*start, *goal)):
             return Unreachable(fault="the goal and the robot's place must be finite numbers")
         begin, end = costmap.cell(*start), costmap.cell(*goal)
@@ -85,7 +85,7 @@ class GlobalPlanner:
         return _path(costmap, corners)
 
     def replan(self, costmap: Costmap, start: Point, goal: Point, path: Path) -> Path | Unreachable:
-        """What is left of `path` while that is free and nothing much better turns up."""
+        """Return the rest of `path` if it is free and no path is much cheaper; or a new one."""
         found = self.plan(costmap, start, goal)
         rest = remaining_path(path, costmap, start)
         if rest is None or tuple(path.points[-1]) != goal or not is_valid(rest, costmap):
@@ -95,9 +95,9 @@ class GlobalPlanner:
         return rest
 
     def field(self, costmap: Costmap, goal: Point) -> Floats | None:
-        """What it costs to get to `goal` from each cell, (height, width) [m in the open].
+        """Return the cost from each cell to `goal`, (height, width) [m in the open].
 
-        None outside the map; inf from where no way leads there.
+        None for a goal outside the map; inf where no way leads to it.
         """
         cell = costmap.cell(*goal)
         if cell is None:
@@ -105,7 +105,7 @@ class GlobalPlanner:
         return self.search.field(costmap.cost, cell, "to") * costmap.resolution
 
     def _nearest(self, costmap: Costmap, goal: Point, why: str) -> Unreachable:
-        """How near to `goal` one gets with what the last search has reached."""
+        """Return the place nearest to `goal` among the cells of the last search."""
         column, row = _in_cells(costmap, np.array((goal,)))[0] - 0.5
         cell = self.search.nearest(costmap.cost, row, column)
         if cell is None:
@@ -116,12 +116,12 @@ class GlobalPlanner:
 
 
 def is_valid(path: Path, costmap: Costmap) -> bool:
-    """Whether all of `path` is still free."""
+    """Return whether all of `path` is still free."""
     return is_free(costmap.cost, _in_cells(costmap, path.points))
 
 
 def remaining_path(path: Path, costmap: Costmap, start: Point) -> Path | None:
-    """`path` from where the robot is now; None if it has strayed from it."""
+    """Return the rest of `path` from the robot on; None if the robot has strayed from it."""
     begin, end = path.points[:-1], path.points[1:]
     along = end - begin
     lengths = (along**2).sum(axis=1)
@@ -152,7 +152,7 @@ def warm_up() -> None:
 
 
 def _goal_problem(costmap: Costmap, goal: Point) -> str:
-    """What is wrong with a goal; nothing if the body fits there."""
+    """Return why the body cannot be at a goal, or an empty text."""
     cell = costmap.cell(*goal)
     if cell is None:
         return "the goal is outside the map"
@@ -167,7 +167,7 @@ def _goal_problem(costmap: Costmap, goal: Point) -> str:
 
 
 def _path(costmap: Costmap, corners: Floats) -> Path:
-    """The path along straight lines between `corners` (n, 2) [m]."""
+    """Return the path along straight lines between `corners` (n, 2) [m]."""
     points = _resampled(corners)
     steps = np.hypot(*np.diff(points, axis=0).T)
     remaining = np.append(np.cumsum(steps[::-1])[::-1], 0.0)
@@ -205,17 +205,17 @@ class Frontier:
 
     @property
     def score(self) -> float:
-        """The lower the better."""
+        """The cost minus the gain; lower is better."""
         return self.cost - SIZE_GAIN * min(self.size, MAX_SIZE_M)
 
 
 def next_frontier(
     costmap: Costmap, robot: Point, blacklist: Iterable[Point], search: GridSearch
 ) -> Frontier | None:
-    """The best frontier; None when everything reachable is explored.
+    """Return the best frontier; None when everything reachable is explored.
 
-    In the blacklist is where the robot could not get to, and where it has been: what is unknown
-    there will stay so.
+    The blacklist holds places that the robot failed to reach, and those it has visited: unknown
+    space there stays unknown.
     """
     return min(
         frontiers(costmap, robot, blacklist, search), key=lambda one: one.score, default=None
@@ -225,7 +225,7 @@ def next_frontier(
 def frontiers(
     costmap: Costmap, robot: Point, blacklist: Iterable[Point], search: GridSearch
 ) -> list[Frontier]:
-    """All frontiers that count, from `robot` [m]."""
+    """Return all frontiers that count, seen from `robot` [m]."""
     start = costmap.cell(*robot)
     if start is None:
         return []
@@ -260,7 +260,7 @@ def _frontier(
 
 
 def _edge(cells: NDArray[np.int8]) -> NDArray[np.bool_]:
-    """Known cells beside an unknown one; beyond the map all is unknown."""
+    """Return the known cells next to an unknown one; outside the map counts as unknown."""
     unknown = np.pad(cells < 0, 1, constant_values=True)
     beside = unknown[:-2, 1:-1] | unknown[2:, 1:-1] | unknown[1:-1, :-2] | unknown[1:-1, 2:]
     edge: NDArray[np.bool_] = beside & (cells >= 0)

@@ -67,7 +67,7 @@ class GridSearch:
         self._memory = SearchMemory(np.empty(0), none, first, np.empty((3, 0), np.int32))
 
     def path(self, cost: Costs, start: Cell, goal: Cell) -> Ints | None:
-        """The cheapest way from cell to cell (row, column), (n, 2); None when there is none."""
+        """Return the cheapest path from cell to cell (row, column), (n, 2); None without one."""
         target = goal[0] * cost.shape[1] + goal[1]
         self._run(cost, start, goal, reverse=False)
         if self._memory.mark[target] < RUN_STRIDE * self._turn + SETTLED_MARK:
@@ -76,9 +76,9 @@ class GridSearch:
         return np.column_stack(np.divmod(cells, np.int32(cost.shape[1])))
 
     def field(self, cost: Costs, cell: Cell, way: Direction) -> Floats:
-        """What the cheapest way costs, "to" `cell` from each or "from" it; inf where none leads.
+        """Return the cost of the cheapest paths "to" `cell` or "from" it; inf without one.
 
-        (height, width), in cells: times the resolution it is metres at cost 1.
+        The shape is (height, width), the unit cells: times the resolution, metres at cost 1.
         """
         self._run(cost, cell, NO_TARGET, reverse=way == "to")
         field = np.where(
@@ -91,7 +91,7 @@ class GridSearch:
         self._run(cost, start, NO_TARGET, reverse=False)
 
     def nearest(self, cost: Costs, row: float, column: float) -> Cell | None:
-        """The cell nearest to a place of all that the last search reached, where the body fits."""
+        """Return the nearest cell that the last search reached and where the body fits."""
         found = _nearest(
             cost,
             self._memory.mark,
@@ -193,7 +193,7 @@ def _put(first: Ints, entries: Ints, entry: int, bucket: int, row: int, column: 
 
 @kernel
 def _may_step(flat: Costs, cell: int, other: int, aside: int, above: int, reverse: bool) -> bool:
-    """Whether a step may be taken. Of a diagonal one both cells beside it must be free as well."""
+    """Return whether a step may be taken; a diagonal one needs both cells beside it free."""
     source, into = (flat[other], flat[cell]) if reverse else (flat[cell], flat[other])
     return (
         _may_enter(source, into)
@@ -204,13 +204,13 @@ def _may_step(flat: Costs, cell: int, other: int, aside: int, above: int, revers
 
 @kernel
 def _may_enter(source: float, into: float) -> bool:
-    """Whether a body may come from a cell of that cost into one of the other."""
+    """Return whether a body may go from a cell of cost `source` into one of cost `into`."""
     return into < LETHAL or into <= source
 
 
 @kernel
 def _bound(row: int, column: int, target: Cell) -> float:
-    """What the way to `target` costs at least: nowhere costs less than 1."""
+    """Return a lower bound of the cost to `target`: no cell costs less than 1."""
     if target[0] == NOWHERE:
         return 0.0
     down, right = abs(row - target[0]), abs(column - target[1])
@@ -219,7 +219,7 @@ def _bound(row: int, column: int, target: Cell) -> float:
 
 @kernel
 def _trace(mark: Ints, width: int, target: int) -> Ints:
-    """The cells from the start to `target`, (n,)."""
+    """Return the cells from the start to `target`, (n,)."""
     count, cell = 1, target
     while mark[cell] % SETTLED_MARK != ROOT_MARK:
         cell -= (
@@ -239,7 +239,7 @@ def _trace(mark: Ints, width: int, target: int) -> Ints:
 
 @kernel
 def _nearest(cost: Costs, mark: Ints, done: int, g: Floats, row: float, column: float) -> int:
-    """The cell that was settled and is nearest; of equals the one that is cheaper to reach."""
+    """Return the nearest settled cell; of equals the one that is cheaper to reach."""
     best, least, flat = NOWHERE, np.inf, cost.ravel()
     width = cost.shape[1]
     for cell in range(flat.size):
@@ -284,7 +284,7 @@ def line_cost(cost: Costs, x: float, y: float, to_x: float, to_y: float) -> tupl
 
 @kernel
 def smooth_path(cost: Costs, points: Floats) -> Floats:
-    """Those of `points` (n, 2) between which the way may go straight."""
+    """Return those of `points` (n, 2) between which the path may go straight."""
     count = len(points)
     spent = np.zeros(count)
     for i in range(1, count):
@@ -337,7 +337,7 @@ def costs_to_go(cost: Costs, points: Floats) -> Floats:
 
 @kernel
 def is_free(cost: Costs, points: Floats) -> bool:
-    """Whether a body may go along `points` (n, 2): at first it may be leaving a tight spot."""
+    """Return whether a body may go along `points` (n, 2). It may leave a tight spot first."""
     if line_cost(cost, points[0, 0], points[0, 1], points[0, 0], points[0, 1])[1] == np.inf:
         return False
     limit = cost[int(points[0, 1]), int(points[0, 0])]

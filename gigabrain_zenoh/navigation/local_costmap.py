@@ -48,7 +48,7 @@ class Chamfer:
         self._cell, self._most = cell, most
 
     def distance(self, free: FreeCells) -> Singles:
-        """How far each cell is from the nearest that is 0 in `free`, by their centres [m]."""
+        """Return the distance of each cell to the nearest 0 in `free`, by their centres [m]."""
         distance = np.empty(free.shape, dtype=np.float32)
         _chamfer(free, self._steps, np.float32(self._cell), np.float32(self._most), distance)
         return distance
@@ -161,7 +161,7 @@ def observe(
 
 @kernel
 def _bin(x: float, y: float) -> int:
-    """Into which of the BEARING_BINS the direction of (x, y) falls: a series is quicker than atan2.
+    """Return the bearing bin of the direction (x, y), by a series that is faster than atan2.
 
     Abramowitz and Stegun, 4.4.47: to 1e-5 rad, a thousandth of a bin.
     """
@@ -178,7 +178,7 @@ def _bin(x: float, y: float) -> int:
 
 @kernel
 def _passed(reach: Floats) -> Floats:
-    """How far all beams round each bin went at least [m]; -1 where none is known to have."""
+    """Return the least range of the beams around each bin [m]; -1 where there are none."""
     passed = np.full(BEARING_BINS, -1.0)
     for k in range(BEARING_BINS):
         for n in (k - 1, k, k + 1):
@@ -190,7 +190,7 @@ def _passed(reach: Floats) -> Floats:
 
 @kernel
 def stays(cells: WindowCells, disc: Floats, tick: int, long_ago: int) -> float:
-    """The share of the cells of `disc` hit at `tick` that were hit `long_ago` already."""
+    """Return the share of a disc's cells hit at `tick` that were hit `long_ago` already."""
     x, y, radius = disc[0], disc[1], disc[4] + DISC_MARGIN_M
     top, bottom, left, end = _box(cells, x, y, radius)
     hit = old = 0
@@ -222,7 +222,7 @@ def take_back(cells: WindowCells, disc: Floats, tick: int) -> None:
 
 @kernel
 def _box(cells: WindowCells, x: float, y: float, radius: float) -> tuple[int, int, int, int]:
-    """The rows and columns that a disc may touch: the first, and that after the last, of each."""
+    """Return the cells that a disc may touch: first row, row after the last; same of columns."""
     rows, columns = cells.level.shape
     top, bottom = (y - radius - cells.y) / CELL_M, (y + radius - cells.y) / CELL_M
     left, end = (x - radius - cells.x) / CELL_M, (x + radius - cells.x) / CELL_M
@@ -247,12 +247,12 @@ class LocalCostmap:
 
     @property
     def x(self) -> float:
-        """Where the window begins [m]."""
+        """The corner of the window [m]."""
         return self._column * CELL_M
 
     @property
     def y(self) -> float:
-        """Where the window begins [m]."""
+        """The corner of the window [m]."""
         return self._row * CELL_M
 
     def see(self, tick: int, place: Pose2D, lidar: tuple[float, float], hits: Floats) -> None:
@@ -261,10 +261,10 @@ class LocalCostmap:
         observe(self._held, _marked(self._held), place, lidar, hits, (tick, tick - self._memory))
 
     def moving(self, tick: int, discs: Floats) -> Floats:
-        """Those of the `discs` (n, 6), x, y [m] first and the radius fifth, that really move.
+        """Return the `discs` (n, 6), with x, y [m] first and the radius fifth, that really move.
 
-        What moves hits cells that were free a moment ago. Posts and corners can be taken for one
-        another, and then seem to move; but they keep hitting the same cells.
+        A moving disc hits cells that were free a moment ago. Posts and corners mistaken for one
+        another seem to move, but keep hitting the same cells.
         """
         held, long_ago = self._held, tick - STATIC_TICKS
         return discs[[stays(held, disc, tick, long_ago) <= MAX_STATIC_SHARE for disc in discs]]
@@ -275,9 +275,9 @@ class LocalCostmap:
             take_back(self._held, disc, tick)
 
     def grid(self, tick: int, known: Floats, moving: Floats) -> DistanceGrid:
-        """The distance to the nearest obstacle, seen or among the `known` points (n, 2) [m].
+        """Return distances to the nearest obstacle, seen or among the `known` points (n, 2) [m].
 
-        What was hit of late on one of the discs `moving` does not count: it will be elsewhere soon.
+        Recent hits on one of the discs `moving` do not count: it will be elsewhere soon.
         """
         free = (self._held.level == 0).view(np.uint8)
         if len(moving):
@@ -311,7 +311,7 @@ def _nothing(side: int) -> WindowCells:
 
 
 def _marked(cells: WindowCells) -> NDArray[np.int64]:
-    """The marked cells (n,), counted along the rows: few of many."""
+    """Return the indices of the marked cells (n,), row by row."""
     return np.flatnonzero(cells.level > 0)
 
 

@@ -68,7 +68,7 @@ class SentCommand(Struct, frozen=True):
 
 
 def no_points() -> Floats:
-    """(0, 2)."""
+    """Return an empty array of points (0, 2)."""
     return np.empty((0, 2))
 
 
@@ -104,7 +104,7 @@ class LocalPlan:
 
 
 def classify_plan(model: MotionModel, track: Floats, dt: float, goal: Goal) -> PlanKind:
-    """What `track` (T + 1, 6) amounts to within the next second."""
+    """Return the kind of motion of `track` (T + 1, 6) within the next second."""
     soon = min(len(track) - 1, max(1, round(SOON_S / dt)))
     begin, end = track[0].tolist(), track[soon].tolist()  # plain numbers are quicker
     made = math.hypot(end[0] - begin[0], end[1] - begin[1])
@@ -118,7 +118,7 @@ def classify_plan(model: MotionModel, track: Floats, dt: float, goal: Goal) -> P
 
 
 def explain_plan(kind: PlanKind, track: Floats, discs: Floats, room: float, left: float) -> str:
-    """Why, with what is in the way: `room` [m] round the body, `left` [m] to go."""
+    """Return the reason of a plan as text: `room` [m] around the body, `left` [m] to go."""
     moving = _nearest_moving(track, discs)
     if left < AT_GOAL_M and not moving and kind in ("waiting", "turning in place"):
         return f"{kind}: at the goal"
@@ -134,7 +134,7 @@ def explain_plan(kind: PlanKind, track: Floats, discs: Floats, room: float, left
 
 
 def _nearest_moving(track: Floats, discs: Floats) -> str:
-    """What moves near the way, if anything does."""
+    """Describe the nearest moving disc; an empty text if none is near."""
     if not len(discs):
         return ""
     away = np.hypot(discs[:, 0] - track[0, 0], discs[:, 1] - track[0, 1]) - discs[:, 4]
@@ -157,7 +157,7 @@ def _side(bearing: float) -> str:
 
 
 def _aside(track: Floats, goal: Goal) -> float:
-    """How far the track leaves the straight way to the goal [m]."""
+    """Return how far the track leaves the straight line to the goal [m]."""
     then: list[tuple[float, float]] = track[:, :2].tolist()
     x, y = then[0]
     dx, dy = goal.x - x, goal.y - y
@@ -195,7 +195,7 @@ class LocalPlanner:
         return Sampler(model, settings.samples, settings.steps, step_duration(model), settings.seed)
 
     def _traffic_of(self) -> dynamic_obstacles.TrafficMap | None:
-        """What a quick body looks out for."""
+        """Return the traffic map of a quick body."""
         lidar, model = self._body.lidar, self._model
         if not dynamic_obstacles.is_quick(model):
             return None
@@ -214,7 +214,7 @@ class LocalPlanner:
         self._anchor, self._anchor_tick = Pose(x=0.0, y=0.0, yaw=0.0), 0
 
     def plan(self, moment: PlanRequest) -> LocalPlan:
-        """What to do at this moment. Raises ValueError for a goal that is no place."""
+        """Plan the motion from this moment on. Raises ValueError for a goal that is not finite."""
         goal = moment.goal
         if not all(math.isfinite(v) for v in (goal.x, goal.y, goal.yaw or 0.0)):
             raise ValueError(f"a goal has finite numbers, got {goal}")
@@ -257,7 +257,7 @@ class LocalPlanner:
         return dynamic_obstacles.WEIGHTS
 
     def _looks_round(self, tick: int) -> bool:
-        """Whether a quick body has yet to see what moves, and where, before it drives off."""
+        """Return whether a quick body must still watch for obstacles before it drives off."""
         if not self._traffic:
             return False
         looks = (
@@ -321,7 +321,7 @@ class LocalPlanner:
         return near and slow and abs(v.angular_z) <= max(0.05, ARRIVED_SPEED_SHARE * model.turning)
 
     def _stuck(self, moment: PlanRequest) -> bool:
-        """Whether it has been in one place for too long."""
+        """Return whether the body has been in one place for too long."""
         here, then = moment.pose, self._anchor
         gone = math.hypot(here.x - then.x, here.y - then.y) > STUCK_RADIUS_M
         if gone or not self._anchor_tick:
@@ -341,7 +341,7 @@ def _standing(reason: str, *, arrived: bool = False, blocked: bool = False) -> L
 
 
 def _trajectory(track: Floats, dt: float) -> tuple[TrajectoryPoint, ...]:
-    """`track` (T + 1, 6) as seen from its first pose."""
+    """Return `track` (T + 1, 6) in the frame of its first pose."""
     rows = track.tolist()  # plain numbers are quicker where they are few
     x, y, yaw, *_ = rows[0]
     cosine, sine = math.cos(yaw), math.sin(yaw)
@@ -362,7 +362,7 @@ def _axes(of: Velocity) -> tuple[float, float, float]:
 
 
 def _discs(obstacles: tuple[Obstacle, ...]) -> Floats:
-    """(m, 6): what moves, and how fast what is known of it fades."""
+    """Return moving obstacles (m, 6), with the growth of their uncertainty."""
     rows = [
         (
             one.x,

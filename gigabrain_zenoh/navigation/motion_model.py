@@ -44,10 +44,9 @@ class MotionModel(NamedTuple):
 
 
 def model_of(body: BodyDescription, speed: float | None = None) -> MotionModel:
-    """The model of `body`, driven no faster than `speed` [m/s].
+    """Return the model of `body`, driven no faster than `speed` [m/s].
 
-    A car reaches its largest yaw rate at full speed with the wheels turned as far as they go: that
-    is its tightest turn.
+    A car's tightest turn is its largest yaw rate at full speed.
     """
     fastest = body.max_linear_speed if speed is None else min(speed, body.max_linear_speed)
     car, limits = body.drive_type == "ackermann", limits_of(body)
@@ -69,7 +68,7 @@ def model_of(body: BodyDescription, speed: float | None = None) -> MotionModel:
 
 
 def delayed_model(model: MotionModel, seconds: float) -> MotionModel:
-    """The model of a body that reacts so much later: its way to a stop stays as long as it was."""
+    """Return the model of a body that reacts later, with speeds that keep the stopping distance."""
     if seconds <= 0.0:
         return model
     reaction, brake = model.reaction_time + seconds, model.deceleration
@@ -87,9 +86,9 @@ def delayed_model(model: MotionModel, seconds: float) -> MotionModel:
 
 @lean_kernel
 def step_toward(before: float, target: float, up: float, down: float) -> float:
-    """`target`, or as near to it as one step from `before` gets.
+    """Return `target`, or the nearest value that one step from `before` reaches.
 
-    A step is several ticks, so that it may go through 0, where a ramp rests for a tick.
+    A step lasts several ticks, so it may pass 0, where a ramp rests for a tick.
     """
     highest = before + (up if before >= 0.0 else down)
     lowest = before - (up if before <= 0.0 else down)
@@ -103,7 +102,7 @@ def feasible(
     target: tuple[float, float, float],
     dt: float,
 ) -> tuple[float, float, float]:
-    """The command nearest to `target` that the body can obey `dt` [s] after `before`."""
+    """Return the command nearest to `target` that the body can obey `dt` [s] after `before`."""
     up, down = model.acceleration * dt, model.deceleration * dt
     turn = model.angular_acceleration * dt
     vx = max(-model.backward, min(model.forward, target[0]))
@@ -129,7 +128,7 @@ class FirstOrderLag(NamedTuple):
 
 
 def first_order_lag(seconds: float, dt: float) -> FirstOrderLag:
-    """The lag of a time constant of so many seconds, for steps of `dt` [s]."""
+    """Return the lag of a time constant of `seconds`, for steps of `dt` [s]."""
     if seconds < 1e-3:
         return FirstOrderLag(0.0, 0.0)
     decay = math.exp(-dt / seconds)
@@ -140,7 +139,7 @@ def first_order_lag(seconds: float, dt: float) -> FirstOrderLag:
 def lagged_step(
     velocity: float, command: float, lag: FirstOrderLag, dt: float
 ) -> tuple[float, float]:
-    """A body's velocity after a step with `command`, and the way that it has made."""
+    """Return the velocity after a step with `command`, and the distance covered."""
     off = velocity - command
     return command + off * lag.decay, command * dt + off * lag.glide
 
@@ -241,7 +240,7 @@ def _ruling_commands(start: InitialState, plans: Floats, t: int, state: Floats) 
 
 @lean_kernel
 def _turn(cosine: float, sine: float, angle: float) -> tuple[float, float]:
-    """A direction turned by less than half a radian; Taylor's series is quicker than sin, cos."""
+    """Turn a direction by less than half a radian; Taylor's series is faster than sin and cos."""
     square = angle * angle
     c = 1.0 - square * (0.5 - square * (1.0 / 24.0 - square * (1.0 / 720.0)))
     s = angle * (1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0 - square * (1.0 / 5040.0))))

@@ -45,7 +45,7 @@ NOISE_SETS = 8  # of noise, drawn once and taken in turn
 def correlated_noise(
     random: np.random.Generator, shape: tuple[int, ...], model: MotionModel
 ) -> NDArray[np.float32]:
-    """Autoregressive noise: neighbouring commands go together."""
+    """Return autoregressive noise, so that neighbouring commands are similar."""
     noise = random.standard_normal(shape, dtype=np.float32)
     for t in range(1, shape[2]):
         noise[:, :, t] = NOISE_KEPT * noise[:, :, t - 1] + NOISE_FRESH * noise[:, :, t]
@@ -61,7 +61,7 @@ def correlated_noise(
 def two_twist_plans(
     random: np.random.Generator, sets: int, samples: int, steps: int, model: MotionModel
 ) -> Floats:
-    """Plans of two twists, (sets, samples, 7): both, and the step in which the second begins.
+    """Return plans (sets, samples, 7) of two twists and the step at which the second begins.
 
     Of every three, one keeps its first twist, and one turns on the spot before it drives on.
     """
@@ -79,7 +79,7 @@ def two_twist_plans(
 
 
 def _twists(random: np.random.Generator, shape: tuple[int, ...], model: MotionModel) -> Floats:
-    """Any twists that the body can have; the faster, the less they turn."""
+    """Return random twists that the body can have; the faster, the less they turn."""
     share = random.random(shape)
     twists = np.empty(shape)
     twists[..., 0] = -model.backward + (model.forward + model.backward) * share[..., 0]
@@ -154,7 +154,7 @@ class Sampler:
         self.last = np.zeros((steps, 3))
 
     def forget(self) -> None:
-        """Begin anew, as if nothing had been planned."""
+        """Discard the last plan."""
         self.last, self._turn = np.zeros_like(self.last), 0
 
     def shift(self, seconds: float) -> None:
@@ -175,7 +175,7 @@ class Sampler:
         scene: Scene,
         start: InitialState,
     ) -> SampledPlan:
-        """The best that was found for a body that can move like `model`."""
+        """Return the best plan found for a body that moves like `model`."""
         noise, simple = self._noise[self._turn], self._simple[self._turn]
         self._turn = (self._turn + 1) % NOISE_SETS
         problem = Problem(model, outline, weights, scene, self.dt)
@@ -186,7 +186,7 @@ class Sampler:
 
 
 def _resampled(plan: Floats, steps: NDArray[np.floating]) -> Floats:
-    """The commands of `plan` (T, 3) at `steps` (T,) and between them; its ends go on for ever."""
+    """Interpolate `plan` (T, 3) at `steps` (T,); beyond its ends it is constant."""
     inside = np.minimum(np.maximum(steps, 0.0), len(plan) - 1.0)
     before = np.minimum(inside.astype(np.int64), len(plan) - 2)
     first, second = plan[before], plan[before + 1]
@@ -231,7 +231,7 @@ def _search(
 
 @kernel
 def _lane_result(plans: Floats, states: Floats, lane: int) -> tuple[Floats, Floats]:
-    """The commands (T, 3) and the track (T + 1, 6) of one lane."""
+    """Return the commands (T, 3) and the track (T + 1, 6) of one lane."""
     steps, axes, _ = plans.shape
     commands, track = np.empty((steps, axes)), np.empty((steps + 1, 2 * axes))
     for t in range(steps):
@@ -276,17 +276,17 @@ def _gather(plans: Floats, costs: Floats, shares: Floats, mean: int, best: int) 
 
 
 def step_duration(model: MotionModel) -> float:
-    """How long one step of a plan is [s]: slow bodies look farther ahead."""
+    """Return the duration of a plan's step [s]; slow bodies look farther ahead."""
     return max(0.05, min(0.1, 0.1 / model.forward))
 
 
 def mean_past_commands(
     sent: Floats, before: tuple[float, float, float], delay: float, dt: float
 ) -> tuple[Floats, float]:
-    """What was sent in each of the last steps, and how much of the next the oldest still rules.
+    """Return the mean command of each past step, and the oldest's share of the next step.
 
-    `sent` (n, 4) are commands with their times [s], 0 for now and earlier ones below, oldest first;
-    each holds until the next, and `before` held before them all.
+    `sent` (n, 4) are times [s], now being 0, and commands, oldest first. Each holds until the next;
+    `before` precedes them all.
     """
     whole = math.floor(delay / dt + 1e-9)
     ends = np.arange(-whole, 1) * dt
