@@ -149,6 +149,11 @@ class Driver(abc.ABC):
             )
         return self.sensors[sensor_name]
 
+    def publish(self, sensor: str, topic: Topic[Any], message: Message) -> None:
+        """Emit a reading of a sensor, and keep it as the newest."""
+        self.sensors[sensor] = message
+        self.emit(topic, message)
+
     def report(self) -> Mapping[str, float | int | str | None]:
         """Return figures that only this driver knows, such as a simulation's truth."""
         return {}

@@ -105,11 +105,7 @@ def open_lidar(driver: Driver, clock: Clock) -> ScanSource | None:
         )
     source = source_class(options.driver)(options, lidar, clock)
 
-    def hand_on(scan: LaserScan) -> None:
-        driver.sensors["scan"] = scan
-        driver.emit(SCAN, scan)
-
-    source.emit = hand_on
+    source.emit = lambda scan: driver.publish("scan", SCAN, scan)
     source.open()
     return source
 

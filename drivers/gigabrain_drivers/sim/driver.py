@@ -165,11 +165,9 @@ class MujocoDriver(Driver):
 
     def _publish(self, reading: Reading) -> None:
         self._state = reading.state or self._state
-        self.sensors["imu"] = reading.imu
-        self.emit(IMU, reading.imu)
+        self.publish("imu", IMU, reading.imu)
         if reading.scan:
-            self.sensors["scan"] = reading.scan
-            self.emit(SCAN, reading.scan)
+            self.publish("scan", SCAN, reading.scan)
 
     def _run_physics(self) -> None:
         """The physics thread. Whatever ends it is raised from `ticks`."""

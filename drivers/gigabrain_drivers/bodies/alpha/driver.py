@@ -12,7 +12,13 @@ from gigabrain_drivers.bodies.alpha import protocol as alpha
 from gigabrain_drivers.bodies.alpha.protocol import AlphaDecoder, AlphaFrame, State
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import LinkOptions, RobotFile, Run
-from gigabrain_drivers.kinematics.legs import JOINT_NAMES, WALKER, LegGeometry, LegOdometry
+from gigabrain_drivers.kinematics.legs import (
+    JOINT_NAMES,
+    WALKER,
+    LegGeometry,
+    LegOdometry,
+    by_joint,
+)
 from gigabrain_drivers.kinematics.wheels import Twist
 from gigabrain_drivers.lidars.base import ScanSource, open_lidar
 from gigabrain_drivers.links.device_clock import DeviceClock, EchoClock
@@ -184,8 +190,7 @@ class AlphaDriver(Driver):
             angular_velocity=senses.angular_velocity,
             linear_acceleration=senses.linear_acceleration,
         )
-        self.sensors["imu"] = imu
-        self.emit(IMU, imu)
+        self.publish("imu", IMU, imu)
         if self._fallen:
             self._fall.begin("the body has fallen over; it stands up when its firmware restarts")
         else:
@@ -205,8 +210,7 @@ class AlphaDriver(Driver):
 def _with(state: RobotState, now: State) -> RobotState:
     """Return `state` with what the body has reported."""
     senses = now.senses
-    positions = (angle for leg in senses.joints for angle in leg)
-    rates = (rate for leg in senses.rates for rate in leg)
+    positions, rates = by_joint(senses.joints), by_joint(senses.rates)
     each = zip(JOINT_NAMES, positions, rates, now.torques, now.temperatures, strict=True)
     return replace(
         state,

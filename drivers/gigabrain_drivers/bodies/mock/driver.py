@@ -115,8 +115,7 @@ class MockBody(Driver):
             period = max(1, round(1 / (lidar.rate_hz * TICK_S)))
             self._next_scan = (self._ticks // period + 1) * period
             if scan := self._look():
-                self.sensors["scan"] = scan
-                self.emit(SCAN, scan)
+                self.publish("scan", SCAN, scan)
 
     def _look(self) -> LaserScan | None:
         """Measure a round room, with a centimetre of noise."""

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 
 import serial
-from msgspec.structs import replace
+from msgspec.structs import asdict, replace
 
 from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
 from gigabrain_drivers.bodies.turtlebot3.protocol import Readings
@@ -50,7 +50,7 @@ GUARD_PERIOD_NS = 20_000_000  # between two checks by the driver
 COMMAND_TIMEOUT_NS = 80_000_000  # without a command; zero is then out by 100 ms
 FLUSH_S = 0.05  # for the last zero to arrive before the port is closed
 JOINTS = ("wheel_left_joint", "wheel_right_joint")
-MAX_PUSHED_FACTOR = 1.5  # times as fast as it can drive a body may be pushed, and
+PUSHED_FACTOR = 1.5  # times as fast as it can drive a body may be pushed, and
 TURN_SLACK_RAD = 0.1  # [rad] more between two readings; counters that jump further were reset
 MAX_IMU_VALUE = 1000.0  # [m/s2] and [rad/s], beyond which an inertial unit is talking nonsense
 
@@ -335,10 +335,8 @@ class OpenCrDriver(Driver):
         turned = self._encoders.turned(now.ticks)
         passed = now.milliseconds - self._milliseconds
         self._milliseconds = now.milliseconds
-        if (
-            max(map(abs, turned))
-            <= MAX_PUSHED_FACTOR * opencr.MAX_WHEEL_SPEED * passed / 1000 + TURN_SLACK_RAD
-        ):
+        furthest = PUSHED_FACTOR * opencr.MAX_WHEEL_SPEED * passed / 1000 + TURN_SLACK_RAD
+        if max(map(abs, turned)) <= furthest:
             self._odometry.add(turned)
         moves = self._base.to_body(now.velocities)
         wheels = zip(JOINTS, now.ticks, now.velocities, strict=True)
@@ -355,13 +353,7 @@ class OpenCrDriver(Driver):
             bumpers=now.bumpers,
         )
         if imu := self._state.imu:
-            message = Imu(
-                orientation=imu.orientation,
-                angular_velocity=imu.angular_velocity,
-                linear_acceleration=imu.linear_acceleration,
-            )
-            self.sensors["imu"] = message
-            self.emit(IMU, message)
+            self.publish("imu", IMU, Imu(**asdict(imu)))
 
 
 def imu_data(now: Readings) -> ImuData | None:
