@@ -37,7 +37,9 @@ class Firmware:
         self.gaits: list[Gait] = []
         self.bytes = bytearray()
         self.untaken: list[Snapshot] = []
-        self.body = SimpleNamespace(snapshot=STANDING, walk=self.gaits.append, fresh=self._fresh)
+        self.body = SimpleNamespace(
+            snapshot=STANDING, walk=self.gaits.append, take_snapshots=self._fresh
+        )
         wire = SimpleNamespace(write=self._write)
         self.device = Alpha(self.body, AlphaOptions(driver="alpha"), wire)  # type: ignore[arg-type]
         self._decoder, self.now_ns = AlphaDecoder(), 0

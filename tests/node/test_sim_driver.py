@@ -34,7 +34,7 @@ async def test_a_report_reads_nothing_that_the_physics_is_at_work_on(
         readers.add(threading.current_thread().name)
         return run_report(simulation, robot, run)
 
-    monkeypatch.setattr(sim_driver, "account_of", account)
+    monkeypatch.setattr(sim_driver, "run_report", account)
     driver = make(seconds=1.0)
     readers.clear()  # before there is a thread
     async with driver:

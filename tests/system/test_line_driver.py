@@ -179,7 +179,7 @@ async def test_a_loss_is_said_once_with_the_reason_and_its_end_once(
         assert caplog.messages == [f"no {tmp_path}/base: is it plugged in?"]
         it.station.set(NO_FAULTS)
         await it.until_connected()
-        assert "heard again" in caplog.text
+        assert "reports again" in caplog.text
 
 
 async def test_an_unchanged_command_is_repeated_at_its_rate_and_a_new_one_goes_at_once(
