@@ -4,7 +4,7 @@ import asyncio
 import itertools
 import math
 from collections import deque
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -240,13 +240,22 @@ class Probe:
 
     def travel_until_rest(self, start: RobotState) -> float:
         """Return the path by odometry from `start` until the body first came to rest [m]."""
-        path, before = 0.0, start
-        for state in self.since(start)[1:]:
-            path += math.hypot(state.pose.x - before.pose.x, state.pose.y - before.pose.y)
-            before = state
-            if at_rest(state):
-                return path
-        raise Failed("the body has not come to rest")
+        path_m = path_until_rest(self.since(start), at_rest)
+        if path_m is None:
+            raise Failed("the body has not come to rest")
+        return path_m
+
+
+def path_until_rest(
+    states: Sequence[RobotState], rests: Callable[[RobotState], bool]
+) -> float | None:
+    """Return the path by odometry from the first state until the body rests [m], if it does."""
+    path_m = 0.0
+    for before, state in itertools.pairwise(states):
+        path_m += math.hypot(state.pose.x - before.pose.x, state.pose.y - before.pose.y)
+        if rests(state):
+            return path_m
+    return None
 
 
 def at_rest(state: RobotState) -> bool:

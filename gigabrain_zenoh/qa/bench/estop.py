@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import math
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -20,6 +19,7 @@ from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.qa.faults.cpu_load import PROGRAM, endpoint_text
 from gigabrain_zenoh.qa.judging import limited, table_of
+from gigabrain_zenoh.qa.probe import path_until_rest
 from gigabrain_zenoh.qa.robot_under_test import LOOPBACK, ProcessGroup, measured_robot
 from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.runtime.managed_process import ProcessSpec
@@ -90,7 +90,7 @@ class _Operator:
             self._trail.clear()
             times.append(await self._press())
             await self._group.until(lambda: any(map(_rests, self._trail)), "the body rests")
-            travels.append(_travel(start, self._trail))
+            travels.append(path_until_rest([start, *self._trail], _rests) or 0.0)
         for _ in range(latched):
             times.append(await self._press())
             await asyncio.sleep(APART_S)
@@ -121,17 +121,6 @@ class _Operator:
 
 def _rests(state: RobotState) -> bool:
     return state.gate.mode == "latched" and abs(state.velocity.linear_x) < STILL
-
-
-def _travel(start: RobotState, trail: list[RobotState]) -> float:
-    """Return the path by odometry until the body first rested [m]."""
-    path, before = 0.0, start
-    for state in trail:
-        path += math.hypot(state.pose.x - before.pose.x, state.pose.y - before.pose.y)
-        before = state
-        if _rests(state):
-            break
-    return path
 
 
 def estop_page(result: EstopResult) -> "Group":
