@@ -129,7 +129,7 @@ async def test_a_robot_that_latches_ends_the_course() -> None:
     gate = GateStatus(mode="latched", causes=(low,))
     net.one.publish(STATE, replace(STILL, gate=gate))
     with pytest.raises(GigabrainError, match="the robot has latched: battery at 5 %"):
-        await sender._while_all_live(asyncio.Event().wait())
+        await sender._while_running(asyncio.Event().wait())
 
 
 def test_a_body_that_drives_for_hours_has_a_large_battery(tmp_path: Path) -> None:
