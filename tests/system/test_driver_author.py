@@ -108,7 +108,7 @@ async def test_a_driver_that_returns_what_it_did_not_send_fails(tmp_path: Path, 
 async def test_a_driver_that_raises_something_else_fails_and_the_kit_goes_on(
     tmp_path: Path, site: Path
 ) -> None:
-    reads = '"""What the body measures."""'
+    reads = '"""Return the measurements of the body."""'
     subject = broken("kit_bad", tmp_path, site, reads, "raise KeyError('battery')")
     async with subject:
         results = await kit.run(subject, lambda result: None)
@@ -120,5 +120,5 @@ async def test_a_driver_that_raises_something_else_fails_and_the_kit_goes_on(
 
 
 def test_the_kit_moves_no_real_body(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="for the links sim and emulated"):
+    with pytest.raises(ConfigError, match="choose link sim or emulated"):
         CheckedRobot("mycustombot", "real", tmp_path)
