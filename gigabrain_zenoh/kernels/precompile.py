@@ -16,7 +16,7 @@ from gigabrain_zenoh.host.this_process import join_in
 from gigabrain_zenoh.plugins import find
 
 log = logging.getLogger(__name__)
-QUIET_S = 5.0  # of compiling, before people are told
+QUIET_S = 5.0  # of compiling, before it is logged
 
 
 async def ensure_compiled(warm_up: str) -> None:
@@ -55,8 +55,8 @@ async def _log_if_slow(work: Awaitable[object]) -> None:
         done, _ = await asyncio.wait((compiling,), timeout=QUIET_S)
         if not done:
             join_in()  # a whole minute is too long to go before others
-            said = {"event": "compiling"}
-            log.info("compiling: the first start takes about a minute", extra={"data": said})
+            data = {"event": "compiling"}
+            log.info("compiling: the first start takes about a minute", extra={"data": data})
         await compiling
     finally:
         compiling.cancel()

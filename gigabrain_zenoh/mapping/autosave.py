@@ -1,4 +1,4 @@
-"""The map that grows, on disk every few seconds: it outlives the process that makes it.
+"""Saves the growing map every few seconds, so that it outlives its process.
 
 Two files take turns, so that a damaged one leaves the one before it. They are good for the same
 start of the driver only: its odometry goes on, and nobody has put the robot elsewhere meanwhile.
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 PERIOD_TICKS = 200  # from one save to the next, at least
 BYTES_A_TICK = 100_000  # 5 MB/s: a map of more than 20 MB is saved less often
 KEEP_FREE_BYTES = 200_000_000  # of the disk, for others
-STALLED_TICKS = 1500  # of a write, then it is told
+STALLED_TICKS = 1500  # of a write, then it is reported
 MOVED_M, MOVED_RAD = 0.3, 0.3  # a robot that moved less in a map that is as it was saves nothing
 HEAD = "head"
 
@@ -40,7 +40,7 @@ Triple = tuple[Finite, Finite, Finite]
 
 
 class SaveHead(Struct, frozen=True, kw_only=True):
-    """When and where a map was saved."""
+    """Time and place of a save."""
 
     boot: Count  # which start of the driver
     tick: Count

@@ -56,7 +56,7 @@ UNKNOWN = np.diag((10.0, 10.0, np.pi)) ** 2  # covariance of a link that nothing
 
 @dataclass(frozen=True, slots=True)
 class ScanMatch:
-    """Where the front end puts a scan, and how it came to that.
+    """Pose of a scan, and how it was found.
 
     matched: by ICP. searched: by search alone. recovered: far from where odometry had it.
     odometry: by odometry alone. broken: no longer joined to what was before.
@@ -72,7 +72,7 @@ class ScanMatch:
 
 @dataclass(frozen=True, slots=True)
 class DriftSinceMatch:
-    """What odometry did since a scan was matched."""
+    """Motion by odometry since a scan was matched."""
 
     misses: int = 0  # scans in a row that fit one another, but not the map
     travel: float = 0.0  # [m]

@@ -20,7 +20,7 @@ FEWEST = 3  # points under a normal
 
 BINS = 360  # of bearing
 MARGIN = 0.3  # [m], what lies nearer than a beam's end by less was hit by it
-FEW = 20  # points in view: of fewer nothing is said
+FEW = 20  # points in view; fewer prove nothing
 
 Arrays = Mapping[str, NDArray[np.generic]]
 REACH_M = 200.0  # of a beam: what it passes is drawn cell by cell
@@ -31,7 +31,7 @@ class Scan:
     """One scan in the body's frame. Points are in the order of the beams, which normals need."""
 
     points: Points  # [m], (n, 2): where beams hit
-    normals: Points  # (n, 2), unit length, sign unknown; zeros where there is none
+    normals: Points  # (n, 2), unit length, sign unknown; zeros where unknown
     free: Points  # [m], (m, 2): how far beams that hit nothing are known to be free
 
     @classmethod
@@ -221,7 +221,7 @@ class Keyframe:
 
 @dataclass(frozen=True, slots=True)
 class KeyframePolicy:
-    """When a scan becomes a keyframe, and how many of them the local map holds."""
+    """Spacing of keyframes, and how many of them the local map holds."""
 
     travel: float = 0.2  # [m]
     turn: float = 0.26  # [rad]
@@ -284,7 +284,7 @@ def edges_from_arrays(name: str, arrays: Arrays) -> list[Edge]:
     if not ((ends >= 0) & (ends < keyframes)).all():
         raise ValueError(f"{name}: joins keyframes that there are not, of {keyframes}")
     if not (np.linalg.eigvalsh(covariance) > 0).all():
-        raise ValueError(f"{name}: a covariance that is none")
+        raise ValueError(f"{name}: expected positive definite covariances")
     rows = zip(ends, relative, covariance, arrays[f"{name}_doubtful"], strict=True)
     return [Edge(int(first), int(second), r, c, bool(d)) for (first, second), r, c, d in rows]
 

@@ -17,13 +17,13 @@ from gigabrain_zenoh.mapping.keyframes import Beams, Points
 from gigabrain_zenoh.mapping.scan_matching import solved
 
 OCCUPIED, FREE = 65, 40  # percent: from here on a wall, and up to here free
-MAX_DISTANCE_M = 2.0  # [m], farther from any wall is not told apart
+MAX_DISTANCE_M = 2.0  # [m], distances from walls are capped
 FIT_SIGMA = 0.1  # [m], how near a hit should be to a wall
 ROBUST_M = 0.1  # [m], hits farther off than that count little (Geman and McClure)
 HIT_SIGMA = 0.1  # [m] of one hit, larger than a lidar's: neighbours err alike
 ITERATIONS, CONVERGED = 20, 1e-4
 BESIDE_M = 0.3  # [m] round a wall a hit is judged by it, even where nothing else is known
-JUDGED = 0.5  # of the hits, at least: of a place that the map shows less of, not much is said
+JUDGED = 0.5  # of the hits, at least; a place that the map shows less of scores lower
 BLUR_M = 0.25  # [m], a beam that ends so much behind a wall has passed through it
 Distances = NDArray[np.float32]
 

@@ -44,7 +44,7 @@ class LikelihoodImage(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LocalMap:
-    """What scans are searched in, and laid onto."""
+    """A map in both forms: an image to search, and points to match."""
 
     image: LikelihoodImage
     buckets: Buckets
@@ -86,7 +86,7 @@ def build(
         np.concatenate([scan.normals for scan in scans]),
         np.array([len(scan.points) for scan in scans]),
         poses,
-        np.array(centre),  # numba compiles anew for one that may not be written
+        np.array(centre),  # numba compiles again for read-only arrays
     )
     if not len(points):
         nothing = np.zeros((1, 1), np.uint8)

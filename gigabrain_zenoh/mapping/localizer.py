@@ -29,12 +29,12 @@ SURE_SCORE, SURE_SCANS = 0.65, 3  # so good a fit for so long, and the only one:
 TOLERANCE = 0.03  # of all beams ruled out, more than elsewhere, say nothing against a place,
 STILL_TOLERANCE, STILL_SCANS = 0.05, 5  # and while the robot stands, it takes more, and some scans
 AGAINST = 0.2  # that much in all speaks against it,
-AGAINST_ODOMETRY = 0.6  # and so much, where odometry has the robot: somebody may stand in its view
+AGAINST_ODOMETRY = 0.6  # and that much at odometry's place: a person may stand in the view
 BUMPED_M, BUMPED_RAD = 0.6, math.radians(45)  # so far off odometry, it may have slipped or been hit
 MOST_WRONG = 0.15  # of all beams ruled out, or it is not sure to be here
 DOUBTED_WRONG = 0.1  # ruled out, where the fit is bad as well, are enough against a place
 WALL_M = 0.08  # so near to a wall there is no body
-SHOWN = 0.1  # of the hits: of a place that the map shows less of, nothing can be said
+SHOWN = 0.1  # of the hits: a place that the map shows less of cannot be judged
 GONE_SCANS = 20  # after so many, it is asked whether that place is likely at all
 VIEW_M, VIEW_RAD = 0.1, math.radians(6)  # farther on, what is seen counts as seen elsewhere
 LOOSE_M, LOOSE_RAD = 0.5, math.radians(20)  # a deviation beyond that is no position
@@ -52,7 +52,7 @@ KIDNAPPED_SCANS = 3  # in a row, then it is certain
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where the robot is, as far as that is known."""
+    """Estimated pose of the robot."""
 
     pose: Floats  # (3,)
     covariance: Floats  # (3, 3), in the map's axes
@@ -62,7 +62,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """One place where the robot may be."""
+    """A possible place of the robot."""
 
     pose: Floats
     covariance: Floats
@@ -103,7 +103,7 @@ class Localizer:
         return Place(best.pose, NOWHERE, False, self.why)
 
     def believe(self, pose: Floats, covariance: Floats) -> None:
-        """Follow this place alone, as somebody else knows that it is right."""
+        """Follow this place alone; it is known to be right."""
         self._places, self._localized, self.why = [Hypothesis(pose, covariance)], True, ""
 
     def lose(self, why: str) -> None:
@@ -259,7 +259,7 @@ def _inverse(matrix: Floats) -> Floats:
 
 
 class BackgroundLocalizer:
-    """Where the robot is in a map that does not change."""
+    """Localizes in a fixed map, and searches it in the background."""
 
     def __init__(
         self,
@@ -270,7 +270,7 @@ class BackgroundLocalizer:
     ) -> None:
         self._localizer = Localizer(field, why)
         self._background = background
-        self._moved = IDENTITY  # since the scan that a search goes by
+        self._moved = IDENTITY  # since the scan that a search uses
         self.last = last  # where it was before it was lost, by odometry: it may still be there
         self._lost = 0  # how often
 

@@ -47,7 +47,7 @@ SMALL_CORRECTION = np.array(
     (0.3, 0.3, 0.1)
 )  # [m], [m], [rad]: a loop that changes less needs no witness
 WITNESS_TOLERANCE = np.array((0.2, 0.2, 0.05))  # [m], [m], [rad], between two witnesses
-WITNESS_TRAVEL_M = 10.0  # [m] of travel, a witness is heard so long
+WITNESS_TRAVEL_M = 10.0  # [m] of travel for which a witness counts
 LOOP = np.diag((0.05, 0.05, 0.01)) ** 2  # covariance beside that of ICP
 OPEN = 0.05  # of what holds the best direction: a place that holds another less is an aisle
 

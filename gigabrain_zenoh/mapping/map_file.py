@@ -141,7 +141,7 @@ def load_graph(path: Path) -> dict[str, NDArray[Any]]:
 def save(path: Path, found: SavedMap, graph: Arrays, *, replace: bool = False) -> None:
     """Write `path`, a YAML file's, and its image and graph. All of it, or nothing.
 
-    Raises Refused for what is no map, or where another one is and `replace` is not said.
+    Raises Refused for an unusable map, or if a map is there and `replace` is False.
     """
     problem = map_problem(found)
     if problem:
@@ -233,7 +233,7 @@ def _finish(path: Path) -> None:
             file.rename(path.with_name(file.name))
         sync_folder(path.parent)
         complete.rmdir()
-    except FileNotFoundError:  # somebody else was quicker, and has finished it
+    except FileNotFoundError:  # another process has finished it
         return
     except OSError as error:
         raise ConfigError(f"{complete}: an unfinished save: {error.strerror}") from None

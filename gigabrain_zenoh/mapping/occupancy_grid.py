@@ -223,7 +223,7 @@ class GridScan:
 
 
 class GridScans:
-    """All sweeps of a map, in the order in which they were seen."""
+    """All drawn scans of a map, in the order in which they were taken."""
 
     def __init__(self) -> None:
         self._kept: dict[int, GridScan] = {}  # by their number

@@ -1,8 +1,8 @@
-"""Odometry and gyro in one: the wheels say how far, the gyro says how much it turned.
+"""Fuses odometry and gyro: distances come from the wheels, turns from the gyro.
 
-Wheels slip and their track is known roughly, which shows in the heading first; a gyro drifts slowly
-and can be read off at rest. Where the two disagree, something slips, and neither length counts. A
-gyro tells rates: where states are missing, only the wheels know how much it turned meanwhile.
+Wheels slip and their track is known roughly, which affects the heading first. A gyro's bias drifts
+slowly and is measured at rest. Where the two disagree, a wheel slips. A gyro measures rates, so
+where states are missing the turn comes from the wheels.
 """
 
 import math
@@ -22,7 +22,7 @@ GAP_TICKS = 25  # no pose is made up between states that lie farther apart,
 GYRO_TICKS = 5  # and no turn from the gyro
 
 REST_TICKS = 25  # without a turn of a wheel, then what the gyro says is its bias
-REST_RATE = 0.02  # [rad/s], faster is no bias: somebody turns the robot
+REST_RATE = 0.02  # [rad/s], faster is no bias: the robot is being turned
 FIRST_RATE = 0.1  # [rad/s], the bias of a gyro that was never at rest before
 BIAS_SHARE = 0.02  # of a new reading at 50 Hz: over about a second
 
@@ -35,7 +35,7 @@ JUMP_FACTOR, JUMP_M, JUMP_RAD = 2.0, 0.2, 0.5  # more than the body can do is no
 
 
 class OdometrySample(NamedTuple):
-    """Where dead reckoning has got to at one tick."""
+    """Dead reckoning at one tick."""
 
     tick: int
     odometry: Floats  # (3,), as the body says it

@@ -19,10 +19,10 @@ from gigabrain_zenoh.mapping.keyframes import Edge
 
 ANCHOR = 1e-3  # [m] and [rad], how firmly the first pose is held
 ROBUST = 1.0  # standard deviations, doubtful edges beyond it lose their weight
-MOVED = 0.01  # [m] and [rad], what moves farther is linearised anew
+MOVED = 0.01  # [m] and [rad], what moves farther is linearised again
 NEVER = 1 << 30  # updates
 ROUNDS = 3  # of that after loops are closed
-PIECE = 1500  # poses solved for anew take some 15 to 40 us each: so many in one go
+PIECE = 1500  # poses solved for in one go; each takes 15 to 40 us
 FAILURES = (RuntimeError, ValueError, IndexError)  # what gtsam's exceptions become in Python
 
 JOINT = 0.03  # [m] and [rad], of every loop
@@ -32,11 +32,11 @@ GATE = 16.3  # 99.9 % of chi-square with three degrees of freedom
 class Graph:
     """Poses of keyframes 0 to n - 1. One thread at a time.
 
-    What closing a loop takes comes in pieces, as gtsam lets nobody else go on meanwhile.
+    Closing a loop is done in pieces, as gtsam blocks all other threads.
 
-    gtsam raises where it takes a system for indeterminate, and is of no use afterwards. The
-    optimiser is rebuilt then, with QR in place of Cholesky: slower, and it solves what Cholesky
-    cannot. Where that fails as well, even without the newest loops, poses stay and no loop closes.
+    gtsam raises for a system that it takes for indeterminate, and cannot be used afterwards. The
+    optimiser is then rebuilt with QR in place of Cholesky: slower, and it solves what Cholesky
+    cannot. If that fails too, even without the newest loops, poses stay and no loop closes.
     """
 
     def __init__(self) -> None:
@@ -188,7 +188,7 @@ def _noise(edge: Edge) -> gtsam.noiseModel.Base:
 
 @dataclass(frozen=True, slots=True)
 class DriftRates:
-    """How fast matched scans may drift at most."""
+    """Upper bounds of the drift of matched scans."""
 
     away: float = 0.05  # [m] per square root of a metre driven
     turn: float = 0.01  # [rad] per square root of a metre driven

@@ -38,7 +38,7 @@ class LatticeHits(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """How far round the guess to search."""
+    """Search range around the guess."""
 
     away: float  # [m], to each side
     turn: float  # [rad], to each side

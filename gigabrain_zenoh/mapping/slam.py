@@ -47,7 +47,7 @@ MOST = 16  # keyframes
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Where the robot was at a scan."""
+    """Pose of the robot at a scan."""
 
     pose: Floats  # in the map as it is now
     covariance: Floats  # (3, 3), of x, y and yaw in the map, against what is mapped round the robot
@@ -61,7 +61,7 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """What closing loops has made of the first keyframes' poses."""
+    """Corrected poses of the first keyframes, after loops were closed."""
 
     poses: Floats  # (n, 3)
     loops: tuple[Edge, ...]
@@ -337,7 +337,7 @@ def _graph_of(keyframes: Sequence[Keyframe], poses: Floats, loops: Sequence[Edge
 
 
 class KnownGround:
-    """The keyframes of a map by place. Corrections move them, so it is told the poses each time."""
+    """Keyframes by place. Corrections move them, so each call takes their poses."""
 
     def __init__(self) -> None:
         self._travel: Floats = np.empty(0)

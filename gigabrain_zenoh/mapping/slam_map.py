@@ -28,9 +28,9 @@ from gigabrain_zenoh.mapping.slam import Correction, Estimate, Slam
 from gigabrain_zenoh.mapping.static_map import warm_up as warm_up_localizing
 
 DRAWN_SCANS = 5  # every so many scans one is drawn, and every keyframe
-DRAWN_AT_ONCE = 8  # sweeps, of those that wait after the map was drawn anew
+DRAWN_AT_ONCE = 8  # sweeps, of those that wait after the map was redrawn
 LOOP_SCANS, KEYFRAME_SCANS, SWEEPS_A_SCAN = 5, 2, 200  # how long the work beside may take
-SHIFT_M, SHIFT_RAD = 0.02, 0.004  # keyframes that moved less need not be drawn anew
+SHIFT_M, SHIFT_RAD = 0.02, 0.004  # keyframes that moved less need not be redrawn
 RATES = DriftRates(away=0.008, turn=0.002)  # of scans every few centimetres, guided by odometry
 FITS = ("matched", "recovered")  # scans that were found otherwise are not drawn
 

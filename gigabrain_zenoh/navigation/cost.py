@@ -54,7 +54,7 @@ DECAYS = 4.0  # times the way over which the cost of being near decays; farther 
 TOUCHED = 300.0  # what a contact costs
 IMPACT = 50.0  # per m/s of a contact
 BRAKE_EVERY = 3  # steps
-AT_EASE = 0.25  # [m], room of more than that is not looked at anew before it can have gone
+AT_EASE = 0.25  # [m], more room is checked again only once it may be used up
 SPARE = 0.003  # [m], less room than at the start is a contact only from here on
 
 
@@ -72,7 +72,7 @@ class Scene(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """What is preferred, by how much."""
+    """Weights of the cost terms."""
 
     margin: float = 0.03  # [m], nearer than this is a contact
     near: float = 3.0  # of having obstacles near, per second

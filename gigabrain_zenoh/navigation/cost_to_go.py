@@ -1,4 +1,4 @@
-"""How costly the way to the goal is from every place in the window."""
+"""Cost to go from every place in the window to the goal."""
 
 import math
 from typing import NamedTuple
@@ -16,7 +16,7 @@ UNIT = (
     1e-5  # [m], of ways while they are compared: whole numbers are added in a quarter of the time
 )
 TIGHT, TIGHT_OVER = 12.0, 0.09  # cost of a place where the body just fits, and its decay [m]
-TOUCHING, INSIDE = 60.0, 400.0  # high and not infinite: whoever stands there must find out
+TOUCHING, INSIDE = 60.0, 400.0  # high and finite: a body there must get out
 
 BEYOND = 1e4  # cost of what is beside the window
 DIAGONAL = math.sqrt(2.0)
@@ -28,7 +28,7 @@ Units = NDArray[np.int32]
 
 
 class Ways(NamedTuple):
-    """What passes round the robot makes of the ways there, on a coarse grid that goes farther."""
+    """Cost of ways through traffic, on a coarse grid larger than the window."""
 
     price: DistanceGrid  # of a metre, 1 where nothing passes
     field: DistanceGrid  # cost to go [m of free way]

@@ -31,7 +31,7 @@ UNKNOWN_COST = (
 MIN_DECAY_M = 0.1  # [m]
 NEGLIGIBLE_COST = 0.05  # what of NEAR_COST may be left off at the end
 MAX_REACH_CELLS = 1000  # an obstacle costs nothing farther away; more would be too much to look at
-REDO_SHARE = 0.5  # of a map: if more of it has changed, all is computed anew
+REDO_SHARE = 0.5  # of a map: if more of it has changed, all of it is computed
 UNKNOWN_COSTS = {"allow": 0.0, "avoid": UNKNOWN_COST, "forbid": LETHAL}
 Unknown = Literal["avoid", "allow", "forbid"]
 Costs = NDArray[np.float32]
@@ -100,7 +100,7 @@ def _along_rows(out: Singles, cap: int) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Inflation:
-    """How obstacles and unknown space weigh for one body."""
+    """Cost of obstacles and unknown space for one body."""
 
     fits: float  # [m] from its centre to an obstacle, at least: it drives past
     turns: float  # [m], at which it also turns on the spot

@@ -59,14 +59,14 @@ def stay_clear(discs: Floats, x: float, y: float) -> bool:
 
 
 class TrafficMemory(NamedTuple):
-    """What was seen, (CELLS, CELLS) each, fading."""
+    """Fading sums of observations, (CELLS, CELLS) each."""
 
     passed: Floats  # [m/s]: times, widths and squares of speeds above what counts, per area
     watched: Floats  # [s]
 
 
 class TrafficMap:
-    """What passes near a body, in the frame that is planned in."""
+    """Traffic near a body, in the planning frame."""
 
     def __init__(self, width: float, fastest: float, sight: float) -> None:
         """Take a body of `width` [m], top speed `fastest` [m/s] and range `sight` [m]."""

@@ -1,4 +1,4 @@
-"""How far the whole outline of a body is from the nearest obstacle."""
+"""Distance of a body's whole outline to the nearest obstacle."""
 
 import math
 from typing import NamedTuple

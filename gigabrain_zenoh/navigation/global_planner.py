@@ -20,7 +20,7 @@ from gigabrain_zenoh.navigation.grid_search import (
 )
 
 POINT_SPACING_M = 0.1  # [m] between the points of a path, at most
-MAX_STRAY_M = 0.5  # [m] off its path: then it is planned anew
+MAX_STRAY_M = 0.5  # [m] off its path, beyond which it is planned again
 SWITCH_COST_RATIO = (
     0.85  # of what the present path costs: a new one must not cost more, or it flips
 )

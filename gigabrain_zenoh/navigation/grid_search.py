@@ -49,7 +49,7 @@ STRAIGHT_TOLERANCE = 1 + 1e-9  # of two ways that cost the same the straight one
 
 
 class SearchMemory(NamedTuple):
-    """What a search fills."""
+    """Buffers of a search."""
 
     g: Floats  # by cell, what the way to it costs
     mark: Ints  # by cell, by what way it was reached, and in what turn

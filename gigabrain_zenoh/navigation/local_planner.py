@@ -1,4 +1,4 @@
-"""Local planner: from what is near now to the motion of the next seconds, and its reason."""
+"""Local planner: plans the motion of the next seconds, and explains it."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -28,7 +28,7 @@ from gigabrain_zenoh.navigation.mppi import SampledPlan, Sampler, mean_past_comm
 
 PlanKind = Literal["going", "going round", "waiting", "backing out", "turning in place", "arrived"]
 
-SOON_S = 1.0  # what the body does within this time is what it is said to do
+SOON_S = 1.0  # the motion within this time is reported
 STILL_SHARE = 0.08  # share of the largest speed that counts as standing
 NAMED_WITHIN_M = 1.5  # [m], what moves within this is named
 AT_GOAL_M = 0.2  # [m], so little is left where only standing and turning are
@@ -44,7 +44,7 @@ ARRIVED_SPEED_SHARE = 0.05  # share of the largest speeds at which a body has ar
 
 
 class LocalSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How the local planner works."""
+    """Settings of the local planner."""
 
     samples: Annotated[int, Meta(ge=64, le=20_000)] = 1000  # plans per cycle
     steps: Annotated[int, Meta(ge=10, le=60)] = 30  # of 0.05 s for quick bodies, 0.1 s for slow
@@ -61,7 +61,7 @@ DEFAULTS = LocalSettings()
 
 
 class SentCommand(Struct, frozen=True):
-    """A command that the body has been given."""
+    """A command sent to the body."""
 
     tick: int  # from which on it holds
     velocity: Velocity
@@ -74,7 +74,7 @@ def no_points() -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class PlanRequest:
-    """All that the local planner goes by, in one frame that does not jump: that of the odometry."""
+    """Inputs of the local planner, in the odometry frame, which does not jump."""
 
     tick: int  # of the scan
     pose: Pose  # of that tick
@@ -92,7 +92,7 @@ class PlanRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class LocalPlan:
-    """What to do now, what will come of it, and why."""
+    """A twist to command, the expected trajectory, and the reason."""
 
     twist: Velocity  # to command now
     trajectory: tuple[TrajectoryPoint, ...]  # expected, in the body's frame of the moment
@@ -168,7 +168,7 @@ def _aside(track: Floats, goal: Goal) -> float:
 
 
 class LocalPlanner:
-    """Drives one body. It keeps what it saw and planned, and no clock."""
+    """Plans for one body. It keeps a costmap and the last plan, and no clock."""
 
     def __init__(self, body: BodyDescription, settings: LocalSettings = DEFAULTS) -> None:
         self._body, self._settings = body, settings
@@ -203,7 +203,7 @@ class LocalPlanner:
         return dynamic_obstacles.TrafficMap(2.0 * self._half_width, model.forward, sight)
 
     def reset(self) -> None:
-        """Forget all that was seen and planned: the odometry has begun anew."""
+        """Discard the costmap and the last plan, as the odometry has restarted."""
         self._window = LocalCostmap(self._settings.window, self._settings.memory)
         self._costs = CostToGo(self._window.cells)
         self._sampler.forget()

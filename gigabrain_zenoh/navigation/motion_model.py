@@ -26,7 +26,7 @@ COMMAND = 3 * LANES
 
 
 class MotionModel(NamedTuple):
-    """What a body's file says of its motion."""
+    """Limits of a body's motion."""
 
     forward: float  # [m/s], fastest
     backward: float  # [m/s], fastest, as a positive number
@@ -145,7 +145,7 @@ def lagged_step(
 
 
 class InitialState(NamedTuple):
-    """Where the body is, how it moves, and what it has still to lagged_step."""
+    """Pose and velocity of the body, and the commands on their way to it."""
 
     x: float  # [m], in the frame that is planned in
     y: float

@@ -31,7 +31,7 @@ from gigabrain_zenoh.navigation.motion_model import (
 
 NOISE_KEPT, NOISE_FRESH = 0.85, 0.53  # of the noise from step to step
 NOISE_SHARE, TURN_NOISE_SHARE = 0.175, 0.3  # of the noise, as a share of the largest speeds
-SIMPLE_EVERY = 4  # every so manieth plan is one twist and then another, and no noise
+SIMPLE_EVERY = 4  # every 4th plan is two constant twists without noise
 BRAKING_LANE = 2  # the plan that brakes
 SHARP_TURN_SHARE = 0.3  # how much of the yaw rate simple plans take at high speed
 
