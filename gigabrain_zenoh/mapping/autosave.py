@@ -1,7 +1,7 @@
 """Saves the growing map every few seconds, so that it outlives its process.
 
 Two files take turns, so that a damaged one leaves the one before it. They are good for the same
-start of the driver only: its odometry goes on, and nobody has put the robot elsewhere meanwhile.
+start of the driver only: after another start the robot may have been moved.
 """
 
 import logging
