@@ -15,6 +15,7 @@ from gigabrain_zenoh.cli.options import (
     JsonFile,
     Seed,
     World,
+    check_names,
     check_positive,
     print_progress,
 )
@@ -104,6 +105,7 @@ def stack(
 
     files.check_result_path(json)
     check_positive(seconds=seconds)
+    check_names([body], [world])
     result = run_async(measure_stack(body, world, seconds, print_progress, goal=goal))
     finish(stack_page(result), result, json)
     return 0
@@ -158,6 +160,7 @@ def bodies(
 
     check_positive(seconds=seconds)
     files.check_result_path(json)
+    check_names(names, [world])
     chosen = names or simulated(link)
     deployment = Deployment(
         link=link, world=world, seed=seed, resume="auto", router="tcp/127.0.0.1:0"

@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gigabrain_zenoh.cli.bench import finish, side_by_side
-from gigabrain_zenoh.cli.options import Body, JsonFile, check_positive, print_progress
+from gigabrain_zenoh.cli.options import Body, JsonFile, check_names, check_positive, print_progress
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host import files
 from gigabrain_zenoh.host.signals import run_async
@@ -123,6 +123,7 @@ def _slam_worlds(
     from gigabrain_zenoh.qa.bench.slam_world import WorldsResult, draw_worlds, map_world
 
     check_positive(minutes=minutes)
+    check_names([body], worlds)
     files.check_result_path(json)
     with Progress(console=Console(stderr=True), transient=True) as progress:
         tasks = [progress.add_task(world, total=minutes) for world in worlds]
@@ -301,6 +302,7 @@ def goals(*, options: GoalsOptions = GOALS, json: JsonFile = None, logs: Path | 
     from gigabrain_zenoh.qa.bench.goals import GoalCourse, measure_goals
 
     check_positive(goals=options.goals, speed=options.speed)
+    check_names(options.bodies, options.worlds)
     files.check_result_path(json)
     course = GoalCourse(
         goals=options.goals,

@@ -13,6 +13,7 @@ from gigabrain_zenoh.cli.options import (
     Level,
     Seed,
     World,
+    check_names,
     check_positive,
     checked,
 )
@@ -56,12 +57,8 @@ class RobotOptions:
 
     def check(self) -> None:
         """Raise ConfigError or UnknownName for a value that does not fit."""
-        from gigabrain_drivers.driver.catalog import load_robot
-        from gigabrain_drivers.sim.worlds import load_world
-
         behaviours.load(self.behaviour)
-        load_robot(self.body)
-        load_world(self.world, 0)
+        check_names([self.body], [self.world])
         check_positive(seconds=self.seconds)
 
     def values(self) -> dict[str, object]:

@@ -13,7 +13,7 @@ import msgspec
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from gigabrain_zenoh.cli.options import JsonFile, print_line, print_table
+from gigabrain_zenoh.cli.options import JsonFile, check_names, print_line, print_table
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host import files
@@ -57,9 +57,8 @@ class SuiteOptions:
     def check(self) -> None:
         """Raise ConfigError if the suite cannot run with these."""
         from gigabrain_drivers.driver.catalog import load_robot, simulated
-        from gigabrain_drivers.sim.worlds import load_world
 
-        load_world(self.world, 0)
+        check_names(worlds=[self.world])
         behaviours.load(self.behaviour)
         if not self.body:
             return

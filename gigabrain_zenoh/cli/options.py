@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -199,6 +199,17 @@ def check_positive(**options: float | None) -> None:
         if value is not None and not 0 < value < 1e9:
             shown = name.replace("_", "-")
             raise ConfigError(f"--{shown}: expected a number above 0, got {value:g}")
+
+
+def check_names(robots: Iterable[str] = (), worlds: Iterable[str] = ()) -> None:
+    """Raise ConfigError or UnknownName for a robot or a simulated world that does not exist."""
+    from gigabrain_drivers.driver.catalog import load_robot
+    from gigabrain_drivers.sim.worlds import load_world
+
+    for robot in robots:
+        load_robot(robot)
+    for world in worlds:
+        load_world(world, 0)
 
 
 def usage_error(error: CycloptsError) -> str:
