@@ -26,18 +26,20 @@ def package_version() -> str:
         return "0+unknown"
 
 
-def plugin_names(shipped: Mapping[str, str], group: str) -> list[str]:
+def plugin_names(shipped: Mapping[str, Any], group: str) -> list[str]:
     """Return the names in a table of shipped objects and of the entry points of a group."""
     return list(dict.fromkeys((*shipped, *(point.name for point in entry_points(group=group)))))
 
 
-def load_plugin(kind: str, name: str, shipped: Mapping[str, str], group: str) -> Any:
+def load_plugin(kind: str, name: str, shipped: Mapping[str, Any], group: str) -> Any:
     """Return the object called `name`: a shipped one, or an entry point of `group`.
 
+    The table of shipped objects holds them, or strings "module:name".
     Raises UnknownName with all names, and ConfigError if it cannot be imported.
     """
     if name in shipped:
-        return find(shipped[name])
+        found = shipped[name]
+        return find(found) if isinstance(found, str) else found
     offered = {point.name: point for point in entry_points(group=group)}
     if name not in offered:
         raise unknown(kind, name, plugin_names(shipped, group))

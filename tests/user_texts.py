@@ -33,7 +33,7 @@ from gigabrain_zenoh.decision.tasks import mission
 from gigabrain_zenoh.diagnostics import doctor, why
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate import causes, gate
-from gigabrain_zenoh.runtime.deployment import Deployment
+from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.safety import catalogue
 from tests.places import ROOT
 from tests.unit.gate.rig import HOT, Rig, driving, enabled, idle

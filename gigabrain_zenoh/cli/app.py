@@ -48,6 +48,7 @@ COMMANDS = {
     "topic pub": ("topic:pub", "Publish a message."),
     "node list": ("node:list_", "List the running processes."),
     "node info": ("node:info", "Describe one process."),
+    "node run": ("processes:run", "Run any process by its name."),
     "param list": ("node:list_params", "List the parameters that can be changed at run time."),
     "param get": ("node:get_param", "Print one parameter."),
     "param set": ("node:set_param", "Change one parameter."),

@@ -219,7 +219,14 @@ def replay(
         process: Process to run.
         deployment: Deployment file with its settings. Default: the recorded settings.
     """
+    import msgspec
+
+    from gigabrain_zenoh.launch.deployment import deployment_path, load_deployment
     from gigabrain_zenoh.launch.processes import node_of
     from gigabrain_zenoh.recording.process_replay import replay_file
 
-    return run_async(replay_file(check, process, deployment, node_of))
+    settings = None
+    if deployment:
+        loaded = load_deployment(deployment_path(deployment))
+        settings = dict(msgspec.to_builtins(loaded.settings(process)))
+    return run_async(replay_file(check, process, settings, node_of))

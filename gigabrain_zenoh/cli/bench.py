@@ -155,8 +155,8 @@ def bodies(
         seconds: Time that each drives [s of its own time].
     """
     from gigabrain_drivers.driver.catalog import simulated
+    from gigabrain_zenoh.launch.deployment import Deployment
     from gigabrain_zenoh.qa.bench.bodies import measure_bodies
-    from gigabrain_zenoh.runtime.deployment import Deployment
 
     check_positive(seconds=seconds)
     files.check_result_path(json)

@@ -23,7 +23,7 @@ from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import check_result_path
 from gigabrain_zenoh.host.signals import run_async
-from gigabrain_zenoh.runtime.deployment import (
+from gigabrain_zenoh.launch.deployment import (
     Deployment,
     deployment_path,
     host_of,
@@ -110,8 +110,7 @@ def demo(*, robot: RobotOptions = ROBOT, view: ViewOptions = VIEW) -> int:
 
     Exit code 1 after a contact, if it did not move, or if a process died.
     """
-    from gigabrain_zenoh.launch.demo import Demo, DemoOptions
-    from gigabrain_zenoh.ui.page.node import with_page
+    from gigabrain_zenoh.launch.demo import Demo, DemoOptions, with_page
 
     robot.check()
     if view.record and view.record.exists():

@@ -136,9 +136,14 @@ def zenohd(
     """
     with _needs_cryptography():
         from gigabrain_zenoh.bus.zenoh.config import configuration
+        from gigabrain_zenoh.config.settings import Endpoint
+        from gigabrain_zenoh.launch.processes import names_by_role
 
     generations = generations_in(find_fleet(dir)) if dir else {}
-    print(configuration(robot or ("",), str(keys), listen, generations), end="")
+    endpoint = Endpoint(
+        listen=(listen,), keys=str(keys), fleet=robot or ("",), names=names_by_role()
+    )
+    print(configuration(endpoint, generations), end="")
 
 
 def _first_use(role: Role, robot: str, folder: Path) -> str:

@@ -80,10 +80,10 @@ LOCAL = RobotAddress()  # the only robot on this machine
 def on_bus(at: RobotAddress, do: Callable[["Bus"], Awaitable[R]], name: str = "") -> R:
     """Run `do` on the bus of a robot, under the name of the tools if none is given."""
     from gigabrain_zenoh.diagnostics.listener import CLIENT_NAME
-    from gigabrain_zenoh.runtime.connect import joined
+    from gigabrain_zenoh.runtime.connect import connect
 
     async def run() -> R:
-        async with joined(at.where(), name or CLIENT_NAME) as (bus, _):
+        async with connect(at.where(), name or CLIENT_NAME) as bus:
             return await do(bus)
 
     return run_async(run())

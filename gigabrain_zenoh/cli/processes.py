@@ -22,7 +22,7 @@ from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host import run_folders
 from gigabrain_zenoh.host.network import exposed, reached_at
-from gigabrain_zenoh.launch.processes import run_process
+from gigabrain_zenoh.launch.processes import names_by_role, process_type, run_process
 from gigabrain_zenoh.runtime.running import announced, find_endpoint
 from gigabrain_zenoh.security.identity_files import identity_in
 
@@ -99,13 +99,33 @@ def router(
     if keys:
         identity_in(Path(keys))
     namespace = process.namespace
-    endpoint = secured(Endpoint(listen=listen, namespace=namespace, keys=keys, fleet=fleet))
+    names = names_by_role() if keys else {}
+    endpoint = secured(
+        Endpoint(listen=listen, namespace=namespace, keys=keys, fleet=fleet, names=names)
+    )
     if not keys and not insecure:
         _refuse_exposed(listen)
     settings = router_config(endpoint, run_folders.state_dir() / "robots" / (namespace or "router"))
     here = Endpoint(connect=(reached_at(listen[0]),), namespace=namespace, keys=keys)
     with announced(namespace or "router", secured(here)):
         return process.run_at(endpoint, "router", msgspec.to_builtins(settings))
+
+
+def run(name: str, /, *, set: tuple[str, ...] = (), process: ProcessOptions = LOCAL) -> int:
+    """Run any process by its name, also one that an installed package offers.
+
+    Example: gigabrain node run recorder --set folder=/data
+
+    Args:
+        name: Name of the process, as in `hosts` of a deployment file.
+        set: Setting of the process, as NAME=VALUE; may be given again.
+    """
+    settings, kind = behaviours.parse_settings(set), process_type(name).settings
+    if kind:
+        settings = msgspec.to_builtins(checked(settings, kind))
+    elif settings:
+        raise ConfigError(f"--set: {name} has no settings")
+    return process.run(name, settings)
 
 
 def perception(*, process: ProcessOptions = LOCAL) -> int:

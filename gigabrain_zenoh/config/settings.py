@@ -22,6 +22,7 @@ class Endpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     namespace: str = ""  # the robot's prefix in the key space
     keys: str = ""  # folder of an identity; without it there is no authentication
     fleet: tuple[str, ...] = ()  # namespaces of other robots that a router serves
+    names: dict[str, tuple[str, ...]] = {}  # of processes, by role: what a router lets publish
     nap_s: float = 0.0  # [s], how long tapped messages may gather before delivery
 
 

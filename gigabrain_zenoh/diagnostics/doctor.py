@@ -39,7 +39,7 @@ from gigabrain_zenoh.diagnostics.robot_view import ProcessHealth
 from gigabrain_zenoh.errors import BusError, ConfigError
 from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.runtime import running
-from gigabrain_zenoh.runtime.connect import Where, joined
+from gigabrain_zenoh.runtime.connect import Where, connect
 from gigabrain_zenoh.security.identity_files import identity_in
 
 Grade = Literal["ok", "hint", "bad"]
@@ -354,7 +354,7 @@ async def inspect_robot(where: Where, seconds: float = WINDOW_S) -> tuple[RobotF
         return RobotFacts(problem=str(error)), where.keys
     router = endpoint.connect[-1]
     try:
-        async with joined(where, CLIENT_NAME) as (bus, _):
+        async with connect(where, CLIENT_NAME) as bus:
             return await _collect(bus, router, seconds), endpoint.keys
     except (BusError, ConfigError) as error:
         problem, port_open = str(error), await _port_open(router)

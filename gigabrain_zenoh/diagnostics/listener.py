@@ -19,7 +19,7 @@ from gigabrain_zenoh.diagnostics.discovery import (
     unknown_topic,
 )
 from gigabrain_zenoh.diagnostics.topic_stats import TopicMonitor, monitored
-from gigabrain_zenoh.runtime.connect import Where, joined
+from gigabrain_zenoh.runtime.connect import Where, connect
 from gigabrain_zenoh.runtime.running import find_endpoint
 
 SNAPSHOT_S = 1.2  # long enough for topics of 1 Hz
@@ -69,7 +69,7 @@ async def open_topic(
     where: Where, name: str, *, looks_on: bool = False
 ) -> AsyncIterator[tuple[Bus, TopicPattern]]:
     """Connect, and find the topic that `name` stands for. Raises BusError and UnknownName."""
-    async with joined(where, CLIENT_NAME, looks_on=looks_on) as (bus, _):
+    async with connect(where, CLIENT_NAME, looks_on=looks_on) as bus:
         found = topic_pattern(name)
         if found is None:
             live_keys = (await snapshot(bus, widest_pattern(where))).live_keys

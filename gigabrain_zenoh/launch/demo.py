@@ -9,22 +9,24 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from gigabrain_schemas.base import TICK_S
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.config.settings import PageConfig
 from gigabrain_zenoh.errors import BodyLost, ConfigError
 from gigabrain_zenoh.host import files
 from gigabrain_zenoh.host.run_folders import new_run_dir
 from gigabrain_zenoh.host.signals import stop_signals
+from gigabrain_zenoh.launch.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.launch.up import LIMIT_S, STOP_S
-from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.runtime.running import announced
 from gigabrain_zenoh.runtime.supervisor import Supervisor
 from gigabrain_zenoh.ui.live_view import DemoView, HeadlessView, LiveView
+from gigabrain_zenoh.ui.page.node import INSTALL, free_port, installed, page_address
 from gigabrain_zenoh.ui.run_report import (
     Observed,
     Report,
@@ -100,6 +102,20 @@ class DemoOptions(Struct, frozen=True, kw_only=True):
     report: Path | None = None
     page: str = ""  # where the operator page is, or how to get it
     keep_stuck: bool = False  # processes without progress are left alone, for a debugger
+
+
+def with_page(deployment: Deployment, port: int, *, login: bool = False) -> tuple[Deployment, str]:
+    """Return the deployment with a page on its first host, and the page's address.
+
+    Without the page's libraries return the deployment as it is, and how to install them. With
+    `login` the address contains the operator's token. Raises ConfigError.
+    """
+    if not installed():
+        return deployment, INSTALL
+    page = PageConfig(port=free_port(port), login=login)
+    (host, names), *others = deployment.hosts.items()
+    hosts = {host: (*names, "page"), **dict(others)}
+    return structs.replace(deployment, hosts=hosts, page=page), page_address(page)
 
 
 class Demo:
@@ -223,9 +239,11 @@ class Demo:
         seconds, page = self._options.seconds, self._options.page
         if not self._live:
             return HeadlessView(watch, seconds, self._served, self._starting_up)
-        faults = self._faults
+        made = self._deployment
+        speed = "" if made.speed == 1.0 else f" · ×{made.speed:g}"
+        title = f"{made.body} · {made.world} · seed {made.seed}{speed}"
         return LiveView(
-            watch, self._supervisor, self._deployment, faults, seconds, page, self._starting_up
+            watch, self._supervisor, title, self._faults, seconds, page, self._starting_up
         )
 
     async def _ask_for_truth(self, watch: RunMonitor, within_s: float) -> Report | None:

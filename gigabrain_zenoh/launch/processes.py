@@ -1,86 +1,223 @@
-"""The processes of a robot, and how one of them is run.
+"""The table of processes: one row says all that is to be known of a process, wherever it is used.
 
 A supervisor starts each as `python -m gigabrain_zenoh.launch.processes CONFIG`, with a
-ProcessConfig in JSON.
+ProcessConfig in JSON. Packages offer theirs as entry points of the group `gigabrain.processes`,
+each a ProcessType.
 """
 
 import os
 import sys
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import msgspec
+from msgspec import structs
 
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.zenoh.config import router_config
 from gigabrain_zenoh.config.renames import renamed_settings
-from gigabrain_zenoh.config.settings import ProcessConfig
+from gigabrain_zenoh.config.settings import (
+    ButtonConfig,
+    DecisionConfig,
+    DriverConfig,
+    EmulatorConfig,
+    FoxgloveConfig,
+    PageConfig,
+    PerceptionConfig,
+    ProcessConfig,
+    RecorderConfig,
+    RelayConfig,
+    RouterConfig,
+)
 from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.host.signals import interrupts
-from gigabrain_zenoh.runtime import process
-from gigabrain_zenoh.runtime.process import MakeBus, Node, ProcessType
+from gigabrain_zenoh.launch.process import MakeBus, Place, ProcessType, run
+from gigabrain_zenoh.plugins import load_plugin, plugin_names
+from gigabrain_zenoh.runtime.replay import Node
 
-PROCESSES = {
+if TYPE_CHECKING:
+    from gigabrain_zenoh.launch.deployment import Deployment
+
+GROUP = "gigabrain.processes"
+MEET = {"perception", "decision"}  # each runs once per robot, so there is one relay at most
+AT_THE_ROBOT = {"router", "driver"}  # no relay between them: a body without its router must stop
+
+
+def _router(_: "Deployment", place: Place) -> RouterConfig:
+    return router_config(place.endpoint, place.state_dir)
+
+
+def _relay(_: "Deployment", place: Place) -> RelayConfig:
+    """Return the relay's settings, which name the router it connects to."""
+    return RelayConfig(router=place.endpoint.connect[-1], keys=place.endpoint.keys)
+
+
+def _driver(deployment: "Deployment", place: Place) -> DriverConfig:
+    return DriverConfig(
+        body=deployment.body,
+        link=deployment.link,
+        world=deployment.world,
+        seed=deployment.seed,
+        speed=deployment.speed,
+        lockstep_timeout_s=deployment.lockstep_timeout_s,
+        seconds=place.seconds,
+        resume=deployment.resume,
+        state_dir=str(place.state_dir),
+        emulator=str(place.ports) if deployment.link == "emulated" else "",
+        button=deployment.button is not None,
+    )
+
+
+def _emulator(deployment: "Deployment", place: Place) -> EmulatorConfig:
+    return EmulatorConfig(
+        body=deployment.body,
+        world=deployment.world,
+        seed=deployment.seed,
+        folder=str(place.ports),
+    )
+
+
+def _recorder(deployment: "Deployment", _: Place) -> RecorderConfig:
+    """Return the recorder's settings, with notes on the other processes that a replay needs."""
+    about = {"perception": deployment.perception, "decision": deployment.decision}
+    notes = {name: msgspec.json.encode(settings).decode() for name, settings in about.items()}
+    plain = {"body": deployment.body, "link": deployment.link, "world": deployment.world}
+    plain["speed"] = f"{deployment.speed:g}"
+    notes |= plain | deployment.recorder.notes
+    return structs.replace(deployment.recorder, notes=notes)
+
+
+def _needs_relay(_: "Deployment", here: set[str]) -> bool:
+    """Return whether a host with these processes runs a relay; never on Windows.
+
+    A relay needs Unix sockets.
+    """
+    return sys.platform != "win32" and here >= MEET and not here & AT_THE_ROBOT
+
+
+def _needs_emulator(deployment: "Deployment", here: set[str]) -> bool:
+    return deployment.link == "emulated" and "driver" in here
+
+
+def _needs_button(deployment: "Deployment", here: set[str]) -> bool:
+    """Return whether an e-stop button runs beside the driver: unless `hosts` says where."""
+    placed = any("button" in names for names in deployment.hosts.values())
+    return deployment.button is not None and "driver" in here and not placed
+
+
+def _maps(deployment: "Deployment") -> bool:
+    return deployment.perception.mapping != "off"
+
+
+def _navigates(deployment: "Deployment") -> bool:
+    from gigabrain_zenoh.decision.behaviours import needs_map  # not needed in each process
+
+    return needs_map(deployment.decision.behaviour)
+
+
+PROCESSES: Mapping[str, ProcessType] = {
     "router": ProcessType(
         "gigabrain_zenoh.runtime.router:run",
-        "gigabrain_zenoh.config.settings:RouterConfig",
+        RouterConfig,
+        derive=_router,
+        default=True,
+        after=(),
         stops=True,
-    ),
-    "relay": ProcessType(
-        "gigabrain_zenoh.runtime.router:run_relay",
-        "gigabrain_zenoh.config.settings:RelayConfig",
-        stops=True,
-    ),
-    "driver": ProcessType(
-        "gigabrain_drivers.driver.process:run",
-        "gigabrain_zenoh.config.settings:DriverConfig",
-        stops=True,
+        stop_last=True,
+        roles=("robot", "router"),
     ),
     "emulator": ProcessType(
         "gigabrain_drivers.emulators.process:run",
-        "gigabrain_zenoh.config.settings:EmulatorConfig",
+        EmulatorConfig,
+        derive=_emulator,
+        named=False,
+        joins=_needs_emulator,
         stops=True,
+        stop_last=True,
+        roles=("robot",),
     ),
-    "button": ProcessType(
-        "gigabrain_drivers.driver.button:run",
-        "gigabrain_zenoh.config.settings:ButtonConfig",
+    "driver": ProcessType(
+        "gigabrain_drivers.driver.process:run",
+        DriverConfig,
+        derive=_driver,
+        default=True,
+        after=("router", "emulator"),
         stops=True,
+        roles=("robot",),
     ),
     "perception": ProcessType(
         "gigabrain_zenoh.perception.node:run",
-        "gigabrain_zenoh.config.settings:PerceptionConfig",
+        PerceptionConfig,
+        default=True,
+        compiles=_maps,
         repeats=True,
+        roles=("robot", "brain"),
     ),
     "decision": ProcessType(
         "gigabrain_zenoh.decision.node:run",
-        "gigabrain_zenoh.config.settings:DecisionConfig",
+        DecisionConfig,
+        default=True,
+        compiles=_navigates,
         repeats=True,
+        roles=("robot", "brain"),
     ),
-    "control": ProcessType("gigabrain_zenoh.control.node:run", stops=True, repeats=True),
-    "safety": ProcessType("gigabrain_zenoh.safety.node:run", stops=True, repeats=True),
+    "relay": ProcessType(
+        "gigabrain_zenoh.runtime.router:run_relay",
+        RelayConfig,
+        derive=_relay,
+        named=False,
+        joins=_needs_relay,
+        after=(),
+        stops=True,
+        stop_last=True,
+        roles=("robot", "brain"),
+    ),
+    "control": ProcessType(
+        "gigabrain_zenoh.control.node:run", default=True, stops=True, repeats=True, roles=("robot",)
+    ),
+    "safety": ProcessType(
+        "gigabrain_zenoh.safety.node:run", default=True, stops=True, repeats=True, roles=("robot",)
+    ),
+    "page": ProcessType("gigabrain_zenoh.ui.page.node:run", PageConfig, looks_on=True),
+    "foxglove": ProcessType("gigabrain_zenoh.ui.foxglove.node:run", FoxgloveConfig, looks_on=True),
     "recorder": ProcessType(
-        "gigabrain_zenoh.recording.node:run",
-        "gigabrain_zenoh.config.settings:RecorderConfig",
-        looks_on=True,
+        "gigabrain_zenoh.recording.node:run", RecorderConfig, derive=_recorder, looks_on=True
     ),
-    "page": ProcessType(
-        "gigabrain_zenoh.ui.page.node:run",
-        "gigabrain_zenoh.config.settings:PageConfig",
-        looks_on=True,
-    ),
-    "foxglove": ProcessType(
-        "gigabrain_zenoh.ui.foxglove.node:run",
-        "gigabrain_zenoh.config.settings:FoxgloveConfig",
-        looks_on=True,
+    "button": ProcessType(
+        "gigabrain_drivers.driver.button:run", ButtonConfig, joins=_needs_button, stops=True
     ),
 }
 
 
+def process_type(name: str) -> ProcessType:
+    """Return the row of a process. Raises UnknownName, and ConfigError if it is broken."""
+    found: ProcessType = load_plugin("process", name, PROCESSES, GROUP)
+    return found
+
+
+def process_types() -> dict[str, ProcessType]:
+    """Return all rows by name, also those that packages offer. Raises ConfigError."""
+    return {name: process_type(name) for name in plugin_names(PROCESSES, GROUP)}
+
+
+def names_by_role() -> dict[str, tuple[str, ...]]:
+    """Return the names under which an identity of each role may run a process."""
+    names: dict[str, tuple[str, ...]] = {}
+    for name, one in process_types().items():
+        for role in one.roles:
+            names[role] = (*names.get(role, ()), name)
+    return names
+
+
 def node_of(config: ProcessConfig) -> Node:
     """Return the node of a process with its settings filled in. Raises ValidationError."""
-    return PROCESSES[config.name].node(renamed_settings(config.settings, config.name))
+    settings: dict[str, Any] = renamed_settings(config.settings, config.name)
+    return process_type(config.name).node(settings)
 
 
 def run_process(config: ProcessConfig, make_bus: MakeBus = Bus) -> int:
     """Run one process until it ends, and return its exit code."""
-    return process.run(config, PROCESSES, make_bus)
+    return run(config, process_type, make_bus)
 
 
 def main() -> None:

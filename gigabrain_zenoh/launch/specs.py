@@ -1,34 +1,18 @@
 """Builds the list of processes that a supervisor runs on one host, with each process's settings."""
 
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec import structs
 
-from gigabrain_zenoh.bus.zenoh.config import router_config
-from gigabrain_zenoh.config.settings import (
-    DriverConfig,
-    EmulatorConfig,
-    Endpoint,
-    ProcessConfig,
-    RecorderConfig,
-)
-from gigabrain_zenoh.decision import behaviours
-from gigabrain_zenoh.runtime.deployment import (
-    ALL,
-    BUTTON,
-    EMULATOR,
-    RELAY,
-    Deployment,
-    behind,
-    between,
-    has_relay,
-    local_endpoint,
-    relay_config,
-)
+from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
+from gigabrain_zenoh.launch.deployment import Deployment, local_endpoint
+from gigabrain_zenoh.launch.process import Place, ProcessType
+from gigabrain_zenoh.launch.processes import names_by_role, process_type, process_types
 from gigabrain_zenoh.runtime.managed_process import ProcessSpec
+from gigabrain_zenoh.runtime.running import local_socket
 
 # -P: a package in the current folder must not shadow an installed one
 COMMAND = (sys.executable, "-P", "-m", "gigabrain_zenoh.launch.processes")
@@ -47,113 +31,69 @@ def process_specs(
 ) -> list[ProcessSpec]:
     """Build the specs of the processes of `host`, in readiness order: the router or relay first."""
     names = _names(deployment, host)
-    settings = dict(_settings(deployment, run_dir, state_dir, seconds))
     specs = []
     for name in names:
-        endpoint, more = _place(deployment, host, name, names, state_dir)
+        row, after = process_type(name), _after(deployment, name, names)
+        place = Place(_endpoint(deployment, host, name, names), run_dir, state_dir, seconds)
         process = ProcessConfig(
             name=name,
-            endpoint=endpoint,
-            settings=settings.get(name, {}) | more,
+            endpoint=place.endpoint,
+            settings=_settings(deployment, name, row, place),
             run_dir=str(run_dir),
             json_console=True,
             level=level,
         )
-        after = _after(deployment, name, names)
+        soon_s = COMPILING_S if row.compiles and row.compiles(deployment) else SOON_S
         specs.append(
             ProcessSpec(
                 name=name,
                 argv=(*COMMAND, msgspec.json.encode(process).decode()),
                 after=after,
                 beats=True,
-                stop_last=name in ("router", RELAY, EMULATOR),
-                ready_timeout_s=_patience_s(deployment, name) if after else LATER_S,
+                stop_last=row.stop_last,
+                ready_timeout_s=soon_s if after else LATER_S,
             )
         )
     return specs
 
 
-def _patience_s(deployment: Deployment, name: str) -> float:
-    """Return how long a process may take until it is ready [s]."""
-    maps = name == "perception" and deployment.perception.mapping != "off"
-    navigates = name == "decision" and behaviours.needs_map(deployment.decision.behaviour)
-    return COMPILING_S if maps or navigates else SOON_S
-
-
 def _names(deployment: Deployment, host: str) -> list[str]:
     """Return the processes of `host`, including those that deployment files need not name."""
-    names: list[str] = sorted(deployment.hosts[host], key=(*ALL, BUTTON).index)
-    placed = any(BUTTON in others for others in deployment.hosts.values())
-    if deployment.button and "driver" in names and not placed:
-        names.append(BUTTON)
-    if deployment.link == "emulated" and "driver" in names:
-        names.insert(names.index("driver"), EMULATOR)
-    if has_relay(names):
-        names.insert(0, RELAY)
-    return names
+    here, types = set(deployment.hosts[host]), process_types()
+    joining = {name for name, row in types.items() if row.joins and row.joins(deployment, here)}
+    order = list(types)
+    return sorted(here | joining, key=lambda name: (not types[name].stop_last, order.index(name)))
 
 
-def _place(
-    deployment: Deployment, host: str, name: str, names: list[str], state_dir: Path
-) -> tuple[Endpoint, dict[str, Any]]:
-    """Return a process's endpoint, and the settings of a router or relay that depend on it."""
+def _endpoint(deployment: Deployment, host: str, name: str, names: list[str]) -> Endpoint:
+    """Return a process's endpoint."""
     endpoint = local_endpoint(deployment, host)
     if name == "router":
-        door = msgspec.structs.replace(
-            endpoint, listen=endpoint.connect[::-1], connect=(), fleet=deployment.fleet
+        return structs.replace(
+            endpoint,
+            listen=endpoint.connect[::-1],
+            connect=(),
+            fleet=deployment.fleet,
+            names=names_by_role() if endpoint.keys else {},
         )
-        return door, msgspec.to_builtins(router_config(door, state_dir))
-    if name == RELAY:
-        return between(endpoint), msgspec.to_builtins(relay_config(endpoint))
-    return (behind(endpoint) if RELAY in names else endpoint), {}
+    if name == "relay":  # it listens on the socket, and connects to the robot's router
+        return structs.replace(endpoint, listen=(local_socket(),))
+    if "relay" in names:  # a Unix socket that only this user can open
+        return structs.replace(endpoint, connect=(local_socket(),), keys="")
+    return endpoint
 
 
 def _after(deployment: Deployment, name: str, names: list[str]) -> tuple[str, ...]:
     """Return the processes that must be ready before this one starts."""
-    first: tuple[str, ...] = ("router", EMULATOR) if name == "driver" else ("router", RELAY)
+    first = process_type(name).after
     if name == "driver" and deployment.recorder.file:  # to record the driver from its first tick
         first = (*first, "recorder")
     return tuple(other for other in first if other in names and other != name)
 
 
-def _settings(
-    deployment: Deployment, run_dir: Path, state_dir: Path, seconds: float | None
-) -> Mapping[str, dict[str, Any]]:
-    ports = str(run_dir / "ports") if deployment.link == "emulated" else ""
-    driver = DriverConfig(
-        body=deployment.body,
-        link=deployment.link,
-        world=deployment.world,
-        seed=deployment.seed,
-        speed=deployment.speed,
-        lockstep_timeout_s=deployment.lockstep_timeout_s,
-        seconds=seconds,
-        resume=deployment.resume,
-        state_dir=str(state_dir),
-        emulator=ports,
-        button=deployment.button is not None,
-    )
-    emulator = EmulatorConfig(
-        body=deployment.body, world=deployment.world, seed=deployment.seed, folder=ports
-    )
-    return {
-        "driver": msgspec.to_builtins(driver),
-        EMULATOR: msgspec.to_builtins(emulator),
-        BUTTON: msgspec.to_builtins(deployment.button) if deployment.button else {},
-        "perception": msgspec.to_builtins(deployment.perception) | {"state_dir": str(state_dir)},
-        "decision": msgspec.to_builtins(deployment.decision) | {"state_dir": str(state_dir)},
-        "recorder": msgspec.to_builtins(with_notes(deployment)),
-        "page": msgspec.to_builtins(deployment.page),
-        "foxglove": msgspec.to_builtins(deployment.foxglove),
-    }
-
-
-def with_notes(deployment: Deployment) -> RecorderConfig:
-    """Return the recorder's settings, with notes on the other processes that a replay needs."""
-    about = {"perception": deployment.perception, "decision": deployment.decision}
-    notes = {name: msgspec.json.encode(settings).decode() for name, settings in about.items()}
-    plain = {"body": deployment.body, "link": deployment.link, "world": deployment.world}
-    plain["speed"] = f"{deployment.speed:g}"
-    return msgspec.structs.replace(
-        deployment.recorder, notes=notes | plain | deployment.recorder.notes
-    )
+def _settings(deployment: Deployment, name: str, row: ProcessType, place: Place) -> dict[str, Any]:
+    made = row.derive(deployment, place) if row.derive else deployment.settings(name)
+    settings: dict[str, Any] = msgspec.to_builtins(made)
+    if "state_dir" in settings:
+        settings["state_dir"] = str(place.state_dir)
+    return settings

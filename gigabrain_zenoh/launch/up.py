@@ -14,14 +14,13 @@ from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import BusError, ConfigError
 from gigabrain_zenoh.host.run_folders import new_run_dir, state_dir
 from gigabrain_zenoh.host.signals import stop_signals
-from gigabrain_zenoh.launch.specs import process_specs
-from gigabrain_zenoh.runtime.deployment import (
-    RELAY,
+from gigabrain_zenoh.launch.deployment import (
     Deployment,
     check_keys,
     local_endpoint,
     with_free_port,
 )
+from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.runtime.running import announced
 from gigabrain_zenoh.runtime.supervisor import Supervisor
 
@@ -91,7 +90,7 @@ class Notifier:
 STOP_S = 1.5  # until processes that do not end are killed
 LIMIT_S = STOP_S + 2.0  # until the supervisor itself is ended by force
 LOOK_S = 0.1
-ROUTERS = {"router", RELAY}  # without the one or the other nobody on the host hears anything
+ROUTERS = {"router", "relay"}  # without the one or the other nobody on the host hears anything
 
 
 async def up(

@@ -13,9 +13,9 @@ import gigabrain_zenoh.recording.arithmetic  # noqa: F401  before anything impor
 from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig, RecorderConfig
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.launch.demo import Demo, DemoOptions
+from gigabrain_zenoh.launch.deployment import ROBOT, Deployment
 from gigabrain_zenoh.launch.processes import node_of
 from gigabrain_zenoh.recording.process_replay import OUTPUTS, replay_process, settings_for
-from gigabrain_zenoh.runtime.deployment import ALL, Deployment
 
 AVOIDS = ("state", "body", "scan", "world", "intent", "cmd_vel", "safety")
 NAVIGATES = (*AVOIDS, "pose", "map", "task", "granted", "heard")
@@ -62,7 +62,7 @@ def record(drive: RecordedDrive, to: Path) -> int:
         speed=2.0,
         resume="auto",
         router="tcp/127.0.0.1:0",
-        hosts={"robot": ALL},
+        hosts={"robot": (*ROBOT, "recorder", "page", "foxglove")},
         recorder=recorder,
         perception=drive.perception,
         decision=drive.decision,

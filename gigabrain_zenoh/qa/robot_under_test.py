@@ -23,10 +23,10 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
 from gigabrain_zenoh.decision.behaviours import needs_map
 from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.launch.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.qa.judging import Failed
 from gigabrain_zenoh.qa.probe import Probe, probing, until
-from gigabrain_zenoh.runtime.deployment import EMULATOR, Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.runtime.managed_process import Backoff, ProcessSpec
 from gigabrain_zenoh.runtime.supervisor import Supervisor
 
@@ -306,7 +306,7 @@ class RobotUnderTest(ProcessGroup):
 
     async def truth(self) -> dict[str, Any]:
         """Return the physics' own values: contacts, distance_m, true_speed and more."""
-        source = EMULATOR if self.deployment.link == "emulated" else "driver"
+        source = "emulator" if self.deployment.link == "emulated" else "driver"
         return dict((await self.probe.describe(source)).report)
 
     async def travelled(self) -> float:

@@ -22,7 +22,7 @@ from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.host.signals import stop_signals
 from gigabrain_zenoh.recording.bag_writer import recover_all
 from gigabrain_zenoh.recording.recorder import Recorder, Status
-from gigabrain_zenoh.runtime.connect import Where, joined
+from gigabrain_zenoh.runtime.connect import Where, connect
 
 log = logging.getLogger(__name__)
 
@@ -143,7 +143,7 @@ async def _count(bus: Bus, recorder: Recorder) -> None:
 async def record(config: RecorderConfig, where: Where, seconds: float | None) -> int:
     """Record until Ctrl-C or for `seconds`; return the exit code. Raises GigabrainError."""
     path = recording_path(config)
-    async with joined(where, "record", looks_on=True) as (bus, _):
+    async with connect(where, "record", looks_on=True) as bus:
         recorder = Recorder(path, config)
         recorder.begin()
         _recover_in_background(path.parent)

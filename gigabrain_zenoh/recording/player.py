@@ -18,7 +18,7 @@ from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.host.signals import run_until, stop_signals
 from gigabrain_zenoh.recording.bag_reader import Bag, Sample, check_magic
 from gigabrain_zenoh.recording.node import key_filter
-from gigabrain_zenoh.runtime.connect import Where, joined
+from gigabrain_zenoh.runtime.connect import Where, connect
 
 DISCOVERY_S = 0.5  # until all subscribers are known, before the first message is sent
 ASK_S = 0.3
@@ -125,7 +125,7 @@ async def check_no_driver(bus: Bus) -> None:
 async def play(path: Path, options: PlayOptions, where: Where, *, beside_robot: bool) -> int:
     """Play to the end or until Ctrl-C; return the exit code. Raises GigabrainError."""
     check_magic(path)
-    async with joined(where, "play") as (bus, transport):
+    async with connect(where, "play") as bus:
         if not beside_robot:
             await check_no_driver(bus)
         player = Player(path, options, transport)

@@ -38,9 +38,7 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.recording.bag_reader import Bag, Sample, samples
 from gigabrain_zenoh.recording.message_tables import message_of, row
-from gigabrain_zenoh.runtime.deployment import deployment_path, load_deployment
-from gigabrain_zenoh.runtime.process import Node
-from gigabrain_zenoh.runtime.replay import Event, replay
+from gigabrain_zenoh.runtime.replay import Event, Node, replay
 from gigabrain_zenoh.safety import health
 
 OUTPUTS: dict[str, tuple[Topic[Any], ...]] = {
@@ -299,16 +297,12 @@ def read_notes(path: Path) -> Mapping[str, str]:
     return bag.notes.get("gigabrain", {})
 
 
-def settings_for(path: Path, process: str, deployment: str | None) -> dict[str, Any]:
-    """Return the settings of a process, from a deployment file or from the recording.
+def settings_for(path: Path, process: str, settings: dict[str, Any] | None) -> dict[str, Any]:
+    """Return the settings of a process for a replay: those given, or those of the recording.
 
     Raises ConfigError if the process has settings and neither holds them.
     """
-    if deployment:
-        loaded = load_deployment(deployment_path(deployment))
-        known = {"perception": loaded.perception, "decision": loaded.decision}
-        settings = dict(msgspec.to_builtins(known.get(process, {})))
-    else:
+    if settings is None:
         notes = read_notes(path)
         if process in PROCESSES_WITH_SETTINGS and process not in notes:
             raise ConfigError(
@@ -329,9 +323,14 @@ def _without_side_effects(settings: dict[str, Any], process: str) -> dict[str, A
     return settings
 
 
-async def replay_file(path: Path, process: str, deployment: str | None, node_of: NodeOf) -> int:
-    """Replay and print the result; return 0 if the process does what it did, else 1."""
-    result = await replay_process(path, process, settings_for(path, process, deployment), node_of)
+async def replay_file(
+    path: Path, process: str, settings: dict[str, Any] | None, node_of: NodeOf
+) -> int:
+    """Replay and print the result; return 0 if the process does what it did, else 1.
+
+    Without `settings` the process gets those of the recording.
+    """
+    result = await replay_process(path, process, settings_for(path, process, settings), node_of)
     for line in report_lines(path, process, result):
         print(line)
     return 0 if result.same else 1

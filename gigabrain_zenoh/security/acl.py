@@ -86,6 +86,7 @@ def role_named(role: str) -> Role:
 
 EVERYTHING = "robot/**"  # all that there is of one robot
 TO_LISTENERS = ("put", "query", "reply", "declare_queryable")
+Names = Mapping[str, Sequence[str]]
 FIRST: Mapping[str, int] = {}  # nobody has been called back
 LOCAL = "local"  # who comes by the router's Unix socket, which only this user can open
 
@@ -97,14 +98,12 @@ class Rights:
     says: tuple[Topic[Any], ...] = ()
     asks: tuple[Service[Any, Any], ...] = (DESCRIBE,)
     answers: tuple[Service[Any, Any], ...] = ()
-    names: tuple[str, ...] = ()  # of the processes that it may be, where a key ends in one
 
 
 BRAIN = Rights(
     says=(WORLD, POSE, MAP, INTENT, TASK, REQUEST_LOG, INPUT_LOG, HEALTH, LOG, ESTOP_SAID),
     asks=(DESCRIBE, ESTOP),
     answers=(GOAL, MISSION, TASK_CHANGE, MAP_SAVE, PARAM, DESCRIBE),
-    names=("perception", "decision", "relay"),
 )
 OPERATOR = Rights(
     says=(TELEOP, BUTTON, CMD_VEL, JOINT_CMD, HEALTH, LOG, ESTOP_SAID),
@@ -121,7 +120,6 @@ OPERATOR = Rights(
         MAP_SAVE,
     ),
     answers=(PARAM, DESCRIBE),
-    names=("page", "foxglove", "recorder", "button"),
 )
 FLEET_WIDE: tuple[Role, ...] = ("operator", "viewer")  # where no robot is named
 Rule = dict[str, Any]
@@ -134,9 +132,14 @@ RIGHTS: Mapping[Role, Rights | None] = {
 
 
 def access_control(
-    robots: Sequence[str], own: str = "", generations: Mapping[str, int] = FIRST
+    robots: Sequence[str],
+    names: Names,
+    own: str = "",
+    generations: Mapping[str, int] = FIRST,
 ) -> dict[str, Any]:
     """Zenoh's `access_control` for a router of these robots (their namespaces); deny by default.
+
+    `names` holds the processes that each role may be, where a key ends in one.
 
     Of each name only one of the `generations` has rights, the first unless told otherwise.
 
@@ -144,7 +147,9 @@ def access_control(
     read its key as well. Beside a router of no robot it is an operator of all.
     """
     of = {
-        common_name(role, robot): list(_rules(role, robot)) for robot in robots for role in RIGHTS
+        common_name(role, robot): list(_rules(role, robot, names.get(role, ())))
+        for robot in robots
+        for role in RIGHTS
     }
     rules = [FLEET_LISTENS, *(rule for each in of.values() for rule in each)]
     subjects, policies = [], []
@@ -188,10 +193,11 @@ def _known(robots: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
                 yield common_name(role, robot), (common_name(role, robot),)
 
 
-def _rules(role: Role, robot: str) -> Iterator[Rule]:
+def _rules(role: Role, robot: str, names: Sequence[str]) -> Iterator[Rule]:
     """One role's rules for one robot."""
     rights, who, everything = RIGHTS[role], common_name(role, robot), under(robot, [EVERYTHING])
-    says, asks, answers = _keys(rights) if rights else ([EVERYTHING], [EVERYTHING], [EVERYTHING])
+    all_keys = [EVERYTHING], [EVERYTHING], [EVERYTHING]
+    says, asks, answers = _keys(rights, names) if rights else all_keys
     yield _rule(f"{who} hears", "egress", TO_LISTENERS, everything)
     # that somebody listens is no secret: a fleet's operator may listen to `**`
     yield _rule(f"{who} is heard", "egress", ["declare_subscriber"], ["**"])
@@ -205,13 +211,13 @@ def _rules(role: Role, robot: str) -> Iterator[Rule]:
             yield _rule(f"{who} {verb}", "ingress", messages, under(robot, keys))
 
 
-def _keys(rights: Rights) -> tuple[list[str], list[str], list[str]]:
+def _keys(rights: Rights, names: Sequence[str]) -> tuple[list[str], list[str], list[str]]:
     """The keys on which a role may say something, ask, and answer."""
     kept = [topic.key for topic in TOPICS if topic.keep]  # whoever comes late asks for these
-    says = [key for topic in rights.says for key in _own(topic, rights)]
+    says = [key for topic in rights.says for key in _own(topic, names)]
     asks = [*kept, *(service.at("*") for service in rights.asks)]
     held = [key for key in says if key in kept]
-    answers = [*held, *(key for service in rights.answers for key in _own(service, rights))]
+    answers = [*held, *(key for service in rights.answers for key in _own(service, names))]
     return says, asks, answers
 
 
@@ -228,8 +234,8 @@ def _rule(name: str, flow: str, messages: Sequence[str], keys: Sequence[str]) ->
 FLEET_LISTENS = _rule("the fleet listens", "ingress", ["declare_subscriber"], ["**"])
 
 
-def _own(of: Topic[Any] | Service[Any, Any], rights: Rights) -> list[str]:
-    return [of.at(name) for name in rights.names] if of.many else [of.key]
+def _own(of: Topic[Any] | Service[Any, Any], names: Sequence[str]) -> list[str]:
+    return [of.at(name) for name in names] if of.many else [of.key]
 
 
 def under(robot: str, keys: Iterable[str]) -> list[str]:

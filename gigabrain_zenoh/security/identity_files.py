@@ -4,7 +4,7 @@ import logging
 import os
 import stat
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -99,15 +99,6 @@ def identity_folder(keys: str, host: str = "") -> Path:
 if TYPE_CHECKING:
     from gigabrain_zenoh.security.identity import Identity
 INSTALL = "keys need more: pip install 'gigabrain-zenoh[keys]'"
-NEEDS: Mapping[str, tuple[Role, ...]] = {
-    "router": ("robot", "router"),
-    "driver": ("robot",),
-    "control": ("robot",),
-    "safety": ("robot",),
-    "perception": ("robot", "brain"),
-    "decision": ("robot", "brain"),
-}
-OTHERS: tuple[Role, ...] = ("robot", "operator")  # for what a person looks at
 
 
 def identity_in(folder: Path) -> "Identity":
@@ -119,14 +110,16 @@ def identity_in(folder: Path) -> "Identity":
     return load(folder)
 
 
-def check_identity(folder: Path, processes: Iterable[str], namespace: str, router: str) -> None:
-    """Whether a host with this identity may run `processes` of the robot `namespace`.
+def check_identity(
+    folder: Path, processes: Mapping[str, Sequence[Role]], namespace: str, router: str
+) -> None:
+    """Check that a host with this identity may run `processes` of the robot `namespace`.
 
-    Raises ConfigError, which names the identity that it takes.
+    `processes` holds the roles that may run each. Raises ConfigError, which names the identity
+    that it takes.
     """
-    identity, processes = identity_in(folder), tuple(processes)
-    for process in processes:
-        roles = NEEDS.get(process, OTHERS)
+    identity = identity_in(folder)
+    for process, roles in processes.items():
         if identity.role not in roles:
             wanted = " or ".join(common_name(role, namespace) for role in roles)
             raise ConfigError(f"{folder} is the identity of {identity.name}; {process} "

@@ -13,7 +13,6 @@ from rich.text import Text
 
 from gigabrain_zenoh.gate.causes import in_words
 from gigabrain_zenoh.host.terminal import LINES, Display, writer
-from gigabrain_zenoh.runtime.deployment import Deployment
 from gigabrain_zenoh.runtime.supervisor import Supervisor
 from gigabrain_zenoh.ui.run_report import RunMonitor
 
@@ -102,7 +101,7 @@ class LiveView:
         self,
         watch: RunMonitor,
         supervisor: Supervisor,
-        deployment: Deployment,
+        title: str,
         faults: Sequence[tuple[float, str]],
         seconds: float | None,
         page: str = "",
@@ -110,7 +109,7 @@ class LiveView:
     ) -> None:
         self._starting = starting
         self._subtitle = f"{page} · Ctrl-C ends it" if page else "Ctrl-C ends it"
-        self._watch, self._supervisor, self._deployment = watch, supervisor, deployment
+        self._watch, self._supervisor, self._title = watch, supervisor, title
         self._faults, self._seconds = faults, seconds
         # drawn on the loop's thread, so that all values are of one time
         self._live = Live(self._page(), screen=True, auto_refresh=False)
@@ -138,9 +137,7 @@ class LiveView:
         """Do nothing: the page lists the faults itself."""
 
     def _page(self) -> Panel:
-        deployment, watch = self._deployment, self._watch
-        speed = "" if deployment.speed == 1.0 else f" · ×{deployment.speed:g}"
-        title = f"{deployment.body} · {deployment.world} · seed {deployment.seed}{speed}"
+        watch = self._watch
         gate = watch.state.newest.gate.mode if watch.state.newest else "idle"
         headline = "bold cyan" if gate == "enabled" else f"bold {GATE_COLOURS[gate]}"
         parts: list[Text | Table] = [
@@ -154,7 +151,7 @@ class LiveView:
         parts += [
             _line(text, "yellow") for at_s, text in self._faults if now_s - at_s < FAULT_SHOWN_S
         ]
-        return Panel(Group(*parts), title=title, subtitle=self._subtitle, padding=(1, 2))
+        return Panel(Group(*parts), title=self._title, subtitle=self._subtitle, padding=(1, 2))
 
     def _figures(self) -> Table:
         watch, state = self._watch, self._watch.state.newest

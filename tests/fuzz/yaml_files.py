@@ -11,7 +11,7 @@ from gigabrain_drivers.driver.catalog import driver_class, link_options, robot_f
 from gigabrain_drivers.driver.robot import LINKS, RobotFile
 from gigabrain_zenoh.config.loading import loads
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.runtime.deployment import Deployment
+from gigabrain_zenoh.launch.deployment import Deployment
 from tests.fuzz.harness import ROOT, split
 
 KINDS = ("deployment", "robot")

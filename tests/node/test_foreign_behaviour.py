@@ -9,7 +9,7 @@ from gigabrain_zenoh.cli.demo import RobotOptions
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError, UnknownName
-from gigabrain_zenoh.runtime.deployment import load_deployment
+from gigabrain_zenoh.launch.deployment import load_deployment
 from tests.node.plane import ROOM, Plane, drawn
 
 SOURCE = '''"""Somebody's behaviours."""

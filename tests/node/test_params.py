@@ -19,8 +19,8 @@ from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.launch.deployment import load_deployment
 from gigabrain_zenoh.navigation.local_planner import LocalPlanner
-from gigabrain_zenoh.runtime.deployment import load_deployment
 from gigabrain_zenoh.runtime.services import LOG_LEVEL, serve_params
 from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import state

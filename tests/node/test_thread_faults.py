@@ -18,7 +18,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import LocalNetwork, LocalTransport
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import DriverConfig, Endpoint, ProcessConfig
-from gigabrain_zenoh.runtime import process
+from gigabrain_zenoh.launch import process
 from gigabrain_zenoh.testing.waiting import until
 
 WAFFLE = "turtlebot3_waffle"

@@ -10,6 +10,7 @@ import zenoh
 from gigabrain_zenoh.bus.zenoh.config import session_config
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.launch.processes import names_by_role
 from gigabrain_zenoh.security.acl import Role
 from gigabrain_zenoh.security.authority import issue, new_fleet
 from gigabrain_zenoh.testing.processes import free_endpoint
@@ -39,7 +40,10 @@ class Site:
     async def open(self) -> None:
         """Start the router."""
         at = Endpoint(
-            listen=(self.address,), keys=str(self.fleet / "router"), fleet=("red", "blue")
+            listen=(self.address,),
+            keys=str(self.fleet / "router"),
+            fleet=("red", "blue"),
+            names=names_by_role(),
         )
         await self._join(at)
 

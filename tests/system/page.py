@@ -11,7 +11,7 @@ from playwright.async_api import BrowserContext, Page, async_playwright
 from websockets.asyncio.client import ClientConnection, connect
 
 from gigabrain_zenoh.config.settings import Endpoint
-from gigabrain_zenoh.runtime.deployment import ROBOT
+from gigabrain_zenoh.launch.deployment import ROBOT
 from gigabrain_zenoh.testing.processes import CommandProcess, Home, endpoint_of, free_port, listens
 from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.ui.page import frames

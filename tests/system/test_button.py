@@ -19,8 +19,8 @@ from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import ButtonConfig
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.launch.specs import process_specs
-from gigabrain_zenoh.runtime.deployment import Deployment
 from gigabrain_zenoh.testing.in_memory import Net, RobotInMemory
 
 MS = 1_000_000

@@ -18,8 +18,8 @@ from gigabrain_schemas.tasks import Task, TaskStatus
 from gigabrain_schemas.topics import MAP, STATE
 from gigabrain_zenoh.launch import demo as demo_module
 from gigabrain_zenoh.launch.demo import Demo, DemoOptions, newest_fault
+from gigabrain_zenoh.launch.deployment import ROBOT, Deployment
 from gigabrain_zenoh.qa.probe import probing
-from gigabrain_zenoh.runtime.deployment import ROBOT, Deployment
 from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.processes import AVOID, CommandProcess, Home, robot_of
 from gigabrain_zenoh.testing.waiting import until

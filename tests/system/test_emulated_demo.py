@@ -7,8 +7,8 @@ import msgspec
 import pytest
 
 from gigabrain_zenoh.config.settings import ProcessConfig
+from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.launch.specs import process_specs
-from gigabrain_zenoh.runtime.deployment import Deployment
 from gigabrain_zenoh.testing.processes import AVOID, Home
 
 

@@ -184,8 +184,8 @@ def _panels(place: object) -> list[str]:
 async def test_a_robot_turns_as_a_viewer_steers_and_a_second_bridge_is_refused(
     home: Home,
 ) -> None:
+    from gigabrain_zenoh.launch.deployment import ROBOT
     from gigabrain_zenoh.qa.probe import probing
-    from gigabrain_zenoh.runtime.deployment import ROBOT
     from gigabrain_zenoh.testing.processes import endpoint_of
 
     layout = home.folder / "robot.json"

@@ -14,8 +14,8 @@ import yaml
 
 from gigabrain_zenoh.config.loading import loads
 from gigabrain_zenoh.host.network import exposed
+from gigabrain_zenoh.launch.deployment import Deployment, load_deployment
 from gigabrain_zenoh.qa.probe import probing
-from gigabrain_zenoh.runtime.deployment import Deployment, load_deployment
 from gigabrain_zenoh.testing.processes import Home, endpoint_of
 from gigabrain_zenoh.testing.waiting import until
 from tests.places import ROOT

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -142,7 +142,7 @@ def security(endpoint: Endpoint, generations: Mapping[str, int]) -> dict[str, An
     }
     if endpoint.listen and not endpoint.connect:  # a relay is checked by the router it connects to
         config["access_control"] = access_control(
-            robots_of(endpoint), endpoint.namespace, generations
+            robots_of(endpoint), endpoint.names, endpoint.namespace, generations
         )
     return config
 
@@ -214,11 +214,9 @@ HEADER = """\
 """
 
 
-def configuration(
-    robots: Sequence[str], keys: str, listen: str, generations: Mapping[str, int] = FIRST
-) -> str:
-    """A file for `zenohd --config`; `keys` is the folder of its identity on its own host."""
-    endpoint = secured(Endpoint(listen=(listen,), keys=keys, fleet=tuple(robots)))
+def configuration(endpoint: Endpoint, generations: Mapping[str, int] = FIRST) -> str:
+    """Return a file for `zenohd --config`; its `keys` are a folder on its own host."""
+    endpoint, robots = secured(endpoint), endpoint.fleet
     settings = session_settings(endpoint) | security(endpoint, generations)
     options = "".join(f" --robot {robot}" for robot in robots if robot)
     return HEADER.format(options=options) + json.dumps(_nested(settings), indent=2) + "\n"

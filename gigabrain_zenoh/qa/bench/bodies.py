@@ -17,9 +17,9 @@ from gigabrain_schemas.topics import CMD_VEL, HEALTH, STATE
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import LinkName
 from gigabrain_zenoh.errors import BodyLost
+from gigabrain_zenoh.launch.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.qa.robot_under_test import ProcessGroup, client
-from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.runtime.managed_process import ProcessSpec
 from gigabrain_zenoh.ui.run_report import RunMonitor
 

@@ -28,6 +28,7 @@ from gigabrain_zenoh.config.settings import DecisionConfig, Endpoint, Perception
 from gigabrain_zenoh.control import node as control
 from gigabrain_zenoh.decision.node import DecisionLoop
 from gigabrain_zenoh.diagnostics.topic_stats import HOPS, ChainMonitor, monitor_chain
+from gigabrain_zenoh.launch.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.launch.processes import PROCESSES
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.perception import node as perception
@@ -40,7 +41,6 @@ from gigabrain_zenoh.qa.robot_under_test import (
     driver_report,
     measured_robot,
 )
-from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.runtime.managed_process import ProcessSpec
 
 if TYPE_CHECKING:

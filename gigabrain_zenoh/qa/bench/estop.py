@@ -21,7 +21,6 @@ from gigabrain_zenoh.qa.faults.cpu_load import PROGRAM, endpoint_text
 from gigabrain_zenoh.qa.judging import limited, table_of
 from gigabrain_zenoh.qa.probe import path_until_rest
 from gigabrain_zenoh.qa.robot_under_test import LOOPBACK, ProcessGroup, measured_robot
-from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.runtime.managed_process import ProcessSpec
 
 if TYPE_CHECKING:

@@ -23,6 +23,7 @@ from gigabrain_zenoh.client.tasks import Tasks
 from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
 from gigabrain_zenoh.errors import BodyLost, GigabrainError, Refused
 from gigabrain_zenoh.geometry.pose import compose, inverse, wrap_angle
+from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.navigation.costmap import costmap, inflation
 from gigabrain_zenoh.navigation.global_planner import Point, warm_up
 from gigabrain_zenoh.navigation.grid_search import GridSearch
@@ -34,7 +35,6 @@ from gigabrain_zenoh.qa.robot_under_test import (
     measured_robot,
     rss_mb,
 )
-from gigabrain_zenoh.runtime.deployment import Deployment
 
 START_S = 600.0  # a robot's processes and its first map, on a busy machine
 MIN_REACHED = 0.99  # share of all goals

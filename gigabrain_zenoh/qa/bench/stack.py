@@ -16,6 +16,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
 from gigabrain_zenoh.decision.goal_server import DRIVE_KERNELS
 from gigabrain_zenoh.kernels.precompile import ensure_compiled
+from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.perception.node import MAP_KERNELS
 from gigabrain_zenoh.qa.judging import Figure, Limit, table_of
 from gigabrain_zenoh.qa.robot_under_test import (
@@ -25,7 +26,6 @@ from gigabrain_zenoh.qa.robot_under_test import (
     driver_report,
     measured_robot,
 )
-from gigabrain_zenoh.runtime.deployment import Deployment
 
 if TYPE_CHECKING:
     from rich.console import Group

@@ -28,6 +28,7 @@ from gigabrain_zenoh.config.settings import (
     Resume,
 )
 from gigabrain_zenoh.decision.behaviours import load, needs_map
+from gigabrain_zenoh.launch.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.qa.judging import Failed, Figure, Skipped, Stage
 from gigabrain_zenoh.qa.probe import Probe, at_rest, until
 from gigabrain_zenoh.qa.proxy.chaos import Chaos
@@ -39,7 +40,6 @@ from gigabrain_zenoh.qa.robot_under_test import (
     RobotUnderTest,
     reconfigured,
 )
-from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.runtime.managed_process import Backoff, ProcessSpec
 
 BROKEN_PROCESS = (sys.executable, "-P", "-m", "gigabrain_zenoh.qa.faults.broken_process")

@@ -4,13 +4,10 @@ import contextlib
 from collections.abc import Callable
 from importlib.util import find_spec
 
-from msgspec.structs import replace
-
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import PageConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.network import reserve_port
-from gigabrain_zenoh.runtime.deployment import Deployment
 from gigabrain_zenoh.ui.page.access import token_file, tokens
 
 LIBRARIES = ("starlette", "uvicorn", "websockets")
@@ -32,20 +29,10 @@ async def run(config: PageConfig, bus: Bus, ready: Callable[[], None]) -> None:
     await serve(config, bus, ready)
 
 
-def with_page(deployment: Deployment, port: int, *, login: bool = False) -> tuple[Deployment, str]:
-    """Return the deployment with a page on its first host, and the page's address.
-
-    Without the page's libraries return the deployment as it is, and how to install them. With
-    `login` the address contains the operator's token. Raises ConfigError.
-    """
-    if not installed():
-        return deployment, INSTALL
-    port = free_port(port)
-    (host, names), *others = deployment.hosts.items()
-    hosts = {host: (*names, "page"), **dict(others)}
-    served = replace(deployment, hosts=hosts, page=PageConfig(port=port, login=login))
-    key = f"/#{tokens(token_file(''))[0].operator}" if login else ""
-    return served, f"http://{HOST}:{port}{key}"
+def page_address(config: PageConfig) -> str:
+    """Return the address of a page on this machine, with the operator's token if it has a login."""
+    key = f"/#{tokens(token_file(''))[0].operator}" if config.login else ""
+    return f"http://{HOST}:{config.port}{key}"
 
 
 def free_port(port: int) -> int:

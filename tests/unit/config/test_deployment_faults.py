@@ -10,7 +10,7 @@ from gigabrain_zenoh.cli.processes import button
 from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.config.settings import ButtonConfig
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.runtime.deployment import Deployment, host_of
+from gigabrain_zenoh.launch.deployment import Deployment, host_of
 
 PORT = "expected a path, or usb:VID:PID[:SERIAL], got"
 

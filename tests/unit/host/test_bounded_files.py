@@ -25,13 +25,13 @@ from gigabrain_zenoh.decision.tasks import mission
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile
 from gigabrain_zenoh.diagnostics import log_reader
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.launch.deployment import Deployment, load_deployment
 from gigabrain_zenoh.mapping import map_file
 from gigabrain_zenoh.qa.bench import slam_logs
 from gigabrain_zenoh.qa.faults.rig import Options
 from gigabrain_zenoh.qa.faults.suite import RunsFile
 from gigabrain_zenoh.recording.bag_reader import MAGIC, Bag, BagDamage, read_records
 from gigabrain_zenoh.runtime import audit
-from gigabrain_zenoh.runtime.deployment import Deployment, load_deployment
 from gigabrain_zenoh.security import identity, identity_files
 from gigabrain_zenoh.security.identity_files import LIST, generations_in
 

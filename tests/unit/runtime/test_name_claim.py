@@ -71,7 +71,7 @@ class SlowTransport(LocalTransport):
 
 
 async def life(network: SlowNetwork, begin_ns: int, stay: asyncio.Event) -> None:
-    """One process, as `gigabrain_zenoh.runtime.process` has it."""
+    """One process, as `gigabrain_zenoh.launch.process` has it."""
     await network.clock.sleep_ns(begin_ns)
     transport = SlowTransport(network)
     claim = NameClaim(Bus(transport, network.clock, "driver"))

@@ -17,7 +17,7 @@ def test_every_topic_and_service_has_somebody_who_may_use_it() -> None:
 
 
 def test_a_router_without_keys_has_no_rules_and_with_them_denies_by_default() -> None:
-    rules = access_control(["red"], "red")
+    rules = access_control(["red"], {}, "red")
     assert rules["default_permission"] == "deny"
     assert {policy["subjects"][0] for policy in rules["policies"]} == {
         "local", "robot@red", "brain@red", "operator@red", "viewer@red", "operator", "viewer",

@@ -10,13 +10,14 @@ from gigabrain_zenoh.cli.faults import proxy
 from gigabrain_zenoh.cli.processes import router
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.launch.specs import process_specs
-from gigabrain_zenoh.runtime.deployment import (
+from gigabrain_zenoh.launch.deployment import (
     Deployment,
     check_keys,
     client_endpoint,
     load_deployment,
 )
+from gigabrain_zenoh.launch.processes import names_by_role
+from gigabrain_zenoh.launch.specs import process_specs
 
 ROOT = Path(__file__).parents[3]
 
@@ -102,5 +103,12 @@ def test_the_committed_router_of_a_larger_site_is_what_the_command_prints() -> N
     from gigabrain_zenoh.bus.zenoh.config import configuration
 
     committed = (ROOT / "deploy" / "zenohd" / "zenohd.json5").read_text()
-    made = configuration(("red", "blue"), "/etc/gigabrain/keys", "tls/0.0.0.0:7447")
+    made = configuration(
+        Endpoint(
+            listen=("tls/0.0.0.0:7447",),
+            keys="/etc/gigabrain/keys",
+            fleet=("red", "blue"),
+            names=names_by_role(),
+        )
+    )
     assert committed == made

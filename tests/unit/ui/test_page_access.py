@@ -16,12 +16,13 @@ from gigabrain_schemas.topics import BODY, TELEOP
 from gigabrain_zenoh.config.settings import PageConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.limits import ZERO
-from gigabrain_zenoh.runtime.deployment import Deployment
+from gigabrain_zenoh.launch.demo import with_page
+from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.waiting import settle
 from gigabrain_zenoh.ui.page.access import Access, check, tokens
 from gigabrain_zenoh.ui.page.frames import GoalRequest, PageRequest, PageView
-from gigabrain_zenoh.ui.page.node import free_port, with_page
+from gigabrain_zenoh.ui.page.node import free_port
 from gigabrain_zenoh.ui.page.server import run
 from gigabrain_zenoh.ui.page.sessions import RequestHandler, Viewer
 from gigabrain_zenoh.ui.steering import RateLimiter, TeleopArbiter

@@ -19,7 +19,6 @@ from gigabrain_zenoh.qa.faults.rig import DRIVES_AGAIN, TRAVEL, Options, Rig, de
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, Skipped, fault_row, worse_of
 from gigabrain_zenoh.qa.probe import until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
-from gigabrain_zenoh.runtime.deployment import Deployment
 
 NEEDS = ("numba", "cv2", "gtsam", "py_trees")  # the extra `nav`
 PLACES = ((0.9, 0.9), (0.9, -0.9), (-0.9, 0.9), (-0.9, -0.9))  # [m], free places of the arena

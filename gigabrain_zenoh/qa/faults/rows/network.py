@@ -46,7 +46,6 @@ from gigabrain_zenoh.qa.probe import PATIENCE_S, until
 from gigabrain_zenoh.qa.proxy.chaos import Chaos
 from gigabrain_zenoh.qa.proxy.tcp import TcpProxy
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
-from gigabrain_zenoh.runtime.deployment import Deployment, with_free_port
 from gigabrain_zenoh.safety.health import HALF_SPEED
 from gigabrain_zenoh.security.acl import Role
 from gigabrain_zenoh.security.authority import issue, new_fleet
@@ -270,7 +269,8 @@ async def _operator_and_viewer(
         async def join(role: Role, connect: str = "", listen: str = "") -> ZenohTransport:
             here = (listen,) if listen else ()
             there = (connect,) if connect else ()
-            endpoint = Endpoint(connect=there, listen=here, keys=str(fleet / role))
+            keys, names = str(fleet / role), names_by_role() if listen else {}
+            endpoint = Endpoint(connect=there, listen=here, keys=keys, names=names)
             transport = await ZenohTransport.open(secured(endpoint))
             stack.push_async_callback(transport.close)
             return transport

@@ -40,7 +40,6 @@ from gigabrain_zenoh.qa.faults.rows.network import make_fleet
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, Skipped, fault_row
 from gigabrain_zenoh.qa.probe import moving, until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
-from gigabrain_zenoh.runtime.deployment import client_endpoint
 from gigabrain_zenoh.runtime.running import folder
 
 SPEED, MOVES = 0.15, 0.01  # [m/s], [m/s] and [rad/s]

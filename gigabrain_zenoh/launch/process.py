@@ -6,12 +6,13 @@ import functools
 import gc
 import logging
 import os
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
+from msgspec import Struct
 
 from gigabrain_schemas.topics import INPUT_LOG, LOG
 from gigabrain_zenoh import logs
@@ -21,37 +22,68 @@ from gigabrain_zenoh.bus.transport import Transport
 from gigabrain_zenoh.bus.zenoh.config import ZENOH_RUNTIME
 from gigabrain_zenoh.bus.zenoh.workarounds import NAP_S
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.config.settings import ProcessConfig
-from gigabrain_zenoh.errors import GigabrainError, unknown
+from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
+from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.host.signals import interrupts, stop_signals
 from gigabrain_zenoh.host.this_process import go_first, join_in, start_first, step_aside
 from gigabrain_zenoh.plugins import find
 from gigabrain_zenoh.runtime.connect import join
 from gigabrain_zenoh.runtime.heartbeat import STDOUT, beat
+from gigabrain_zenoh.runtime.replay import Node
 from gigabrain_zenoh.runtime.services import NameClaim, publish_health, serve_params
+from gigabrain_zenoh.security.acl import Role
+
+if TYPE_CHECKING:
+    from gigabrain_zenoh.launch.deployment import Deployment
 
 log = logging.getLogger("gigabrain")
 
-Node = Callable[[Bus, Callable[[], None]], Awaitable[None]]
 MakeBus = Callable[[Transport, Clock, str], Bus]
 
 
 @dataclass(frozen=True)
-class ProcessType:
-    """Import path of a process's node and of its settings type, if any; imported only when used."""
+class Place:
+    """Where one process of a deployment runs."""
 
-    run: str
-    settings: str = ""
+    endpoint: Endpoint
+    run_dir: Path  # folder of this run's logs
+    state_dir: Path  # folder of what the robot remembers
+    seconds: float | None = None  # [s] of simulated time; None for no limit
+
+    @property
+    def ports(self) -> Path:
+        """Return the folder of an emulator's ports."""
+        return self.run_dir / "ports"
+
+
+@dataclass(frozen=True)
+class ProcessType:
+    """One row of the table of processes: how a process is started, placed, set up and identified.
+
+    Its settings are the part of a deployment file that has its name, or what `derive` makes of the
+    whole deployment. A field `state_dir` of them gets the robot's folder.
+    """
+
+    run: str  # "module:function" of its node, imported only when it runs
+    settings: type[Struct] | None = None
+    derive: Callable[["Deployment", Place], Struct] | None = None
+    default: bool = False  # runs where a deployment says nothing of hosts
+    named: bool = True  # `hosts` may name it
+    joins: Callable[["Deployment", set[str]], bool] | None = None  # added to such a host by itself
+    after: tuple[str, ...] = ("router", "relay")  # which of these must be ready before it starts
+    compiles: Callable[["Deployment"], bool] | None = None  # its first start takes minutes
+    stop_last: bool = False  # the others need it in order to end well
     stops: bool = False  # carries commands and stops: gets a higher priority where permitted
     repeats: bool = False  # can be replayed, so it publishes which input it used
     looks_on: bool = False  # not needed by the robot: naps, and runs at low priority
+    roles: tuple[Role, ...] = ("robot", "operator")  # identities with which a host may run it
 
     def node(self, settings: Mapping[str, Any]) -> Node:
         """Return the process's node with its settings filled in. Raises ValidationError."""
-        run = find(self.run)
-        if not self.settings:
-            return run  # type: ignore[no-any-return]
-        return functools.partial(run, msgspec.convert(settings, find(self.settings)))
+        node = find(self.run)
+        if self.settings is None:
+            return node  # type: ignore[no-any-return]
+        return functools.partial(node, msgspec.convert(settings, self.settings))
 
 
 def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
@@ -62,19 +94,19 @@ def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
         return None
 
 
-def run(config: ProcessConfig, types: Mapping[str, ProcessType], make_bus: MakeBus = Bus) -> int:
+def run(
+    config: ProcessConfig, type_of: Callable[[str], ProcessType], make_bus: MakeBus = Bus
+) -> int:
     """Run one process until it ends, and return its exit code.
 
-    `types` holds all types of processes, by name.
+    `type_of` returns the row of a process, by name.
     """
     gc.disable()  # until ready: objects from imports and set-up are not garbage
     os.environ.setdefault("ZENOH_RUNTIME", ZENOH_RUNTIME)
     try:
         run_dir = Path(config.run_dir) if config.run_dir else None
         logs.setup(config.name, run_dir, json_console=config.json_console, level=config.level)
-        if config.name not in types:
-            raise unknown("process", config.name, types)
-        process_type = types[config.name]
+        process_type = type_of(config.name)
         node = process_type.node(config.settings)
         if process_type.stops:
             go_first()  # like the other branches, before any thread starts: threads inherit it

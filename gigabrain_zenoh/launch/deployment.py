@@ -1,11 +1,9 @@
 """A deployment file: which body on which link, and which process runs on which host."""
 
-import sys
 from collections import Counter
-from collections.abc import Collection
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import msgspec
 from msgspec import Struct, structs
@@ -22,35 +20,18 @@ from gigabrain_zenoh.config.settings import (
     PageConfig,
     PerceptionConfig,
     RecorderConfig,
-    RelayConfig,
     Resume,
     Seed,
     Speed,
 )
 from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.host.network import exposed, host_and_port, reserve_port
+from gigabrain_zenoh.launch.processes import PROCESSES, process_type, process_types
 from gigabrain_zenoh.runtime.running import local_socket
 from gigabrain_zenoh.security.identity_files import check_identity, identity_folder
 
 MOST_HOSTS = 64
-EMULATOR = "emulator"  # runs beside the driver where the link is `emulated`; not in `hosts`
-BUTTON = "button"  # runs beside the driver where there is one, unless `hosts` says where
-ProcessName = Literal[
-    "router",
-    "driver",
-    "perception",
-    "decision",
-    "control",
-    "safety",
-    "recorder",
-    "page",
-    "foxglove",
-    "button",
-]
-ROBOT: tuple[ProcessName, ...] = (
-    "router", "driver", "perception", "decision", "control", "safety",
-)  # fmt: skip
-ALL: tuple[ProcessName, ...] = (*ROBOT, "recorder", "page", "foxglove")
+ROBOT = tuple(name for name, one in PROCESSES.items() if one.default)
 
 
 class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -68,9 +49,7 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     keys: str = ""  # the folder of this host's identity, or of one for each host: TLS for all
     fleet: tuple[str, ...] = ()  # namespaces of other robots that this one's router serves
     insecure: bool = False  # allow a router that other machines can reach, without keys
-    hosts: dict[str, tuple[ProcessName, ...]] = msgspec.field(
-        default_factory=lambda: {"robot": ROBOT}
-    )
+    hosts: dict[str, tuple[str, ...]] = msgspec.field(default_factory=lambda: {"robot": ROBOT})
     button: ButtonConfig | None = None  # an e-stop button; without its word nothing moves
     perception: PerceptionConfig = PerceptionConfig()
     decision: DecisionConfig = DecisionConfig()
@@ -87,8 +66,9 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         twice = sorted(name for name, times in placed.items() if times > 1)
         if twice:
             raise ValueError(f"hosts: {', '.join(twice)} must run once, on one host")
-        if BUTTON in placed and self.button is None:
-            raise ValueError("hosts: a button runs nowhere unless `button: {port: …}` says which")
+        for name in placed:
+            if getattr(self, name, self) is None:
+                raise ValueError(f"hosts: {name} needs settings; add a part `{name}:` to this file")
         if self.button and self.speed != 1.0:
             raise ValueError("button: a person presses it in real time, so leave out `speed`")
         self._check_router()
@@ -98,6 +78,11 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             raise ValueError("resume: auto is for simulation; a real body is enabled by a person")
         if self.speed != 1.0 and self.link != "sim":
             raise ValueError("speed is for the simulation; other links run in real time")
+
+    def settings(self, process: str) -> Struct | dict[str, Any]:
+        """Return the part of the file for `process`; empty where it has none."""
+        part = getattr(self, process, None)
+        return part if isinstance(part, Struct) else {}
 
     def _check_router(self) -> None:
         try:
@@ -112,6 +97,39 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
                 "name `keys:` that `gigabrain keys new` and `keys issue` made, use a loopback "
                 "address, or write `insecure: true`"
             )
+
+
+def deployment_type() -> type[Deployment]:
+    """Return the type of a deployment file, with the processes and parts that packages offer.
+
+    Raises ConfigError for a package that cannot be imported.
+    """
+    types = {name: one for name, one in process_types().items() if one.named}
+    literal, some, by_name = cast(Any, Literal), cast(Any, tuple), cast(Any, dict)
+    names = by_name[str, some[literal[tuple(types)], ...]]
+    hosts = ("hosts", names, msgspec.field(default_factory=lambda: {"robot": ROBOT}))
+    known = Deployment.__struct_fields__
+    parts = [
+        _part(name, one.settings)
+        for name, one in types.items()
+        if one.settings and not one.derive and name not in known
+    ]
+    made: Any = msgspec.defstruct(
+        "Deployment",
+        [hosts, *parts],
+        bases=(Deployment,),
+        frozen=True,
+        kw_only=True,
+        forbid_unknown_fields=True,
+    )
+    return made  # type: ignore[no-any-return]
+
+
+def _part(name: str, settings: type[Struct]) -> tuple[str, Any, Any]:
+    """Return the field of a deployment file for settings; null where they have no defaults."""
+    if any(field.required for field in structs.fields(settings)):
+        return name, settings | None, None
+    return name, settings, msgspec.field(default_factory=settings)
 
 
 def deployment_folder() -> Path:
@@ -139,7 +157,7 @@ def load_deployment(path: Path, keys: str = "") -> Deployment:
 
     Raises ConfigError with file, line and what was expected.
     """
-    loaded = config.load(path, Deployment)
+    loaded = config.load(path, deployment_type())
     if loaded.keys and not keys:
         keys = str(path.absolute().parent / Path(loaded.keys).expanduser())
     return msgspec.structs.replace(loaded, keys=keys)
@@ -194,7 +212,7 @@ def check_keys(deployment: Deployment, host: str) -> None:
     if deployment.keys:
         check_identity(
             identity_folder(deployment.keys, host),
-            deployment.hosts[host],
+            {name: process_type(name).roles for name in deployment.hosts[host]},
             deployment.namespace,
             deployment.router,
         )
@@ -204,32 +222,3 @@ def recorded(path: Path) -> dict[str, Any]:
     """What makes a deployment record itself into one file, raw, for a replay."""
     recorder = {"file": str(path.absolute()), "viewers": False}
     return {"hosts": {"robot": (*ROBOT, "recorder")}, "recorder": recorder}
-
-
-RELAY = "relay"
-MEET = {"perception", "decision"}  # each runs once per robot, so there is one relay at most
-AT_THE_ROBOT = {"router", "driver"}  # no relay between them: a body without its router must stop
-
-
-def has_relay(processes: Collection[str]) -> bool:
-    """Return whether a host with these processes runs a relay; never on Windows.
-
-    A relay needs Unix sockets.
-    """
-    here = set(processes)
-    return sys.platform != "win32" and here >= MEET and not here & AT_THE_ROBOT
-
-
-def behind(endpoint: Endpoint) -> Endpoint:
-    """Return the endpoint of the host's processes: a Unix socket that only this user can open."""
-    return structs.replace(endpoint, connect=(local_socket(),), keys="")
-
-
-def between(endpoint: Endpoint) -> Endpoint:
-    """Return the relay's endpoint: it listens on the socket, and connects to the robot's router."""
-    return structs.replace(endpoint, listen=(local_socket(),))
-
-
-def relay_config(endpoint: Endpoint) -> RelayConfig:
-    """Build the relay's settings, which name the router it connects to."""
-    return RelayConfig(router=endpoint.connect[-1], keys=endpoint.keys)
