@@ -227,7 +227,7 @@ def _rule(name: str, flow: str, messages: Sequence[str], keys: Sequence[str]) ->
         "permission": "allow",
         "flows": [flow],
         "messages": list(messages),
-        "key_exprs": list(keys),
+        "key_exprs": sorted(keys),
     }
 
 
