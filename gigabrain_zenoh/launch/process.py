@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from msgspec import Struct
 
-from gigabrain_schemas.topics import INPUT_LOG, LOG
+from gigabrain_schemas.topics import INPUT_LOG, LOG, Role
 from gigabrain_zenoh import logs
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.input_log import PublishedInputLogger
@@ -31,7 +31,6 @@ from gigabrain_zenoh.runtime.connect import join
 from gigabrain_zenoh.runtime.heartbeat import STDOUT, beat
 from gigabrain_zenoh.runtime.replay import Node
 from gigabrain_zenoh.runtime.services import NameClaim, publish_health, serve_params
-from gigabrain_zenoh.security.acl import Role
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.launch.deployment import Deployment

@@ -21,7 +21,7 @@ from gigabrain_schemas.brain import Intent, Obstacle, OccupancyGrid, PoseInMap, 
 from gigabrain_schemas.safety import LogRecord
 from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_schemas.tasks import TaskStatus
-from gigabrain_schemas.topics import CMD_VEL, INTENT, SAFETY, STATE, WORLD, Topic
+from gigabrain_schemas.topics import Drawing, Topic
 from gigabrain_zenoh.geometry.pose import to_frame
 
 MAP, ODOM, BASE = "map", "odom", "base_link"
@@ -43,7 +43,6 @@ LOG_LEVELS = {
     "error": fox.LogLevel.Error,
     "critical": fox.LogLevel.Fatal,
 }
-PLOTTED_KEYS = {topic.key for topic in (STATE, WORLD, INTENT, CMD_VEL, SAFETY)}
 
 AMBER = fox.Color(r=0.96, g=0.62, b=0.04, a=0.6)
 OBSTACLE_HEIGHT_M = 0.3
@@ -89,30 +88,30 @@ class Drawer:
     def __init__(self) -> None:
         self._odometry = Pose(x=0.0, y=0.0, yaw=0.0)
         self._last_intent = (0, -1)  # boot and basis of the last path drawn
-        self._converters: dict[type[Message], Callable[[Any, str], Iterable[Drawn]]] = {
-            LaserScan: self._scan,
-            OccupancyGrid: self._map,
-            PoseInMap: self._pose,
-            Intent: self._path,
-            WorldModel: self._obstacles,
-            TaskStatus: self._task,
-            Image: self._image,
-            LogRecord: self._log,
-            RobotState: self._state,
-            Body: self._body,
+        self._converters: dict[Drawing, Callable[[Any, str], Iterable[Drawn]]] = {
+            "scan": self._scan,
+            "map": self._map,
+            "pose": self._pose,
+            "path": self._path,
+            "obstacles": self._obstacles,
+            "task": self._task,
+            "image": self._image,
+            "log": self._log,
+            "odometry": self._state,
+            "lidar_frame": self._body,
         }
 
     def draws(self, topic: Topic[Any]) -> bool:
         """Return whether viewers draw anything of a topic."""
-        return topic.key in PLOTTED_KEYS or topic.type in self._converters
+        return topic.plotted or topic.drawing is not None
 
     def draw(self, topic: Topic[Any], message: Message, name: str = "") -> Iterable[Drawn]:
         """Yield the messages that viewers draw of `message`; `name` is that of a camera."""
         if isinstance(message, Intent) and not self._is_new(message):
             return
-        if topic.type in self._converters:
-            yield from self._converters[topic.type](message, name)
-        if topic.key in PLOTTED_KEYS:
+        if topic.drawing:
+            yield from self._converters[topic.drawing](message, name)
+        if topic.plotted:
             yield _numbers(topic, message)
 
     def _is_new(self, intent: Intent) -> bool:

@@ -7,40 +7,11 @@ to all of its own robot; without one there is no session.
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
-from gigabrain_schemas.topics import (
-    AUDIT_LOG,
-    BUTTON,
-    CMD_VEL,
-    DESCRIBE,
-    ENABLE,
-    ESTOP,
-    ESTOP_SAID,
-    GOAL,
-    HEALTH,
-    INPUT_LOG,
-    INTENT,
-    JOINT_CMD,
-    LOG,
-    MAP,
-    MAP_SAVE,
-    MISSION,
-    PARAM,
-    POSE,
-    RELEASE,
-    REQUEST_LOG,
-    TASK,
-    TASK_CHANGE,
-    TELEOP,
-    TOPICS,
-    WORLD,
-    Service,
-    Topic,
-)
+from gigabrain_schemas.topics import ESTOP_SAID, SERVICES, TOPICS, Role, Service, Topic
 from gigabrain_zenoh.errors import ConfigError, unknown
 
-Role = Literal["robot", "brain", "operator", "viewer", "router"]
 ROLES: tuple[Role, ...] = get_args(Role)
 SERVERS: tuple[Role, ...] = ("robot", "router")  # only they may be a router
 MAX_NAME_LENGTH = 64  # characters of a common name (RFC 5280, ub-common-name)
@@ -86,60 +57,49 @@ def role_named(role: str) -> Role:
 
 EVERYTHING = "robot/**"  # all that there is of one robot
 TO_LISTENERS = ("put", "query", "reply", "declare_queryable")
-Names = Mapping[str, Sequence[str]]
 FIRST: Mapping[str, int] = {}  # nobody has been called back
 LOCAL = "local"  # who comes by the router's Unix socket, which only this user can open
 
 
-@dataclass(frozen=True)
-class Rights:
-    """What a role may say of its robot, beyond listening."""
-
-    says: tuple[Topic[Any], ...] = ()
-    asks: tuple[Service[Any, Any], ...] = (DESCRIBE,)
-    answers: tuple[Service[Any, Any], ...] = ()
-
-
-BRAIN = Rights(
-    says=(WORLD, POSE, MAP, INTENT, TASK, REQUEST_LOG, INPUT_LOG, HEALTH, LOG, ESTOP_SAID),
-    asks=(DESCRIBE, ESTOP),
-    answers=(GOAL, MISSION, TASK_CHANGE, MAP_SAVE, PARAM, DESCRIBE),
-)
-OPERATOR = Rights(
-    says=(TELEOP, BUTTON, CMD_VEL, JOINT_CMD, HEALTH, LOG, ESTOP_SAID),
-    asks=(
-        DESCRIBE,
-        AUDIT_LOG,
-        PARAM,
-        ESTOP,
-        RELEASE,
-        ENABLE,
-        GOAL,
-        MISSION,
-        TASK_CHANGE,
-        MAP_SAVE,
-    ),
-    answers=(PARAM, DESCRIBE),
-)
 FLEET_WIDE: tuple[Role, ...] = ("operator", "viewer")  # where no robot is named
+OF_ONE_ROBOT: tuple[Role, ...] = ("robot", "brain", "operator", "viewer")
+PUBLISHED: tuple[Topic[Any], ...] = (*TOPICS, ESTOP_SAID)
 Rule = dict[str, Any]
-RIGHTS: Mapping[Role, Rights | None] = {
-    "robot": None,  # everything below its own name
-    "brain": BRAIN,
-    "operator": OPERATOR,
-    "viewer": Rights(asks=(DESCRIBE, AUDIT_LOG)),
-}
+
+
+@dataclass(frozen=True)
+class Table:
+    """The topics and services whose rights a router grants, and the names of processes by role."""
+
+    names: Mapping[str, Sequence[str]]  # where a key ends in the name of a process
+    topics: Sequence[Topic[Any]] = PUBLISHED
+    services: Sequence[Service[Any, Any]] = SERVICES
+
+    def keys(self, role: Role) -> tuple[list[str], list[str], list[str]]:
+        """Return the keys on which a role may publish, query, and answer.
+
+        The robot itself may do everything below its own name.
+        """
+        if role == "robot":
+            return [EVERYTHING], [EVERYTHING], [EVERYTHING]
+        kept = [topic.key for topic in self.topics if topic.keep]  # asked for by late joiners
+        puts = [k for one in self.topics if role in one.publishers for k in self._own(one, role)]
+        queries = [*kept, *(one.at("*") for one in self.services if role in one.callers)]
+        served = [k for one in self.services if role in one.servers for k in self._own(one, role)]
+        return puts, queries, [*(key for key in puts if key in kept), *served]
+
+    def _own(self, one: Topic[Any] | Service[Any, Any], role: Role) -> list[str]:
+        return [one.at(name) for name in self.names.get(role, ())] if one.many else [one.key]
 
 
 def access_control(
     robots: Sequence[str],
-    names: Names,
+    table: Table,
     own: str = "",
     generations: Mapping[str, int] = FIRST,
 ) -> dict[str, Any]:
     """Zenoh's `access_control` for a router of these robots (their namespaces); deny by default.
 
-    `names` holds the processes that each role may be, where a key ends in one.
 
     Of each name only one of the `generations` has rights, the first unless told otherwise.
 
@@ -147,9 +107,9 @@ def access_control(
     read its key as well. Beside a router of no robot it is an operator of all.
     """
     of = {
-        common_name(role, robot): list(_rules(role, robot, names.get(role, ())))
+        common_name(role, robot): list(_rules(role, robot, table))
         for robot in robots
-        for role in RIGHTS
+        for role in OF_ONE_ROBOT
     }
     rules = [FLEET_LISTENS, *(rule for each in of.values() for rule in each)]
     subjects, policies = [], []
@@ -185,7 +145,7 @@ def _good(name: str, generations: Mapping[str, int]) -> str:
 
 def _known(robots: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Each common name, and those of one robot whose rights it has together."""
-    for role in RIGHTS:
+    for role in OF_ONE_ROBOT:
         if role in FLEET_WIDE:
             yield role, tuple(common_name(role, robot) for robot in robots)
         for robot in robots:
@@ -193,11 +153,10 @@ def _known(robots: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
                 yield common_name(role, robot), (common_name(role, robot),)
 
 
-def _rules(role: Role, robot: str, names: Sequence[str]) -> Iterator[Rule]:
-    """One role's rules for one robot."""
-    rights, who, everything = RIGHTS[role], common_name(role, robot), under(robot, [EVERYTHING])
-    all_keys = [EVERYTHING], [EVERYTHING], [EVERYTHING]
-    says, asks, answers = _keys(rights, names) if rights else all_keys
+def _rules(role: Role, robot: str, table: Table) -> Iterator[Rule]:
+    """Yield one role's rules for one robot."""
+    who, everything = common_name(role, robot), under(robot, [EVERYTHING])
+    says, asks, answers = table.keys(role)
     yield _rule(f"{who} hears", "egress", TO_LISTENERS, everything)
     # that somebody listens is no secret: a fleet's operator may listen to `**`
     yield _rule(f"{who} is heard", "egress", ["declare_subscriber"], ["**"])
@@ -211,16 +170,6 @@ def _rules(role: Role, robot: str, names: Sequence[str]) -> Iterator[Rule]:
             yield _rule(f"{who} {verb}", "ingress", messages, under(robot, keys))
 
 
-def _keys(rights: Rights, names: Sequence[str]) -> tuple[list[str], list[str], list[str]]:
-    """The keys on which a role may say something, ask, and answer."""
-    kept = [topic.key for topic in TOPICS if topic.keep]  # whoever comes late asks for these
-    says = [key for topic in rights.says for key in _own(topic, names)]
-    asks = [*kept, *(service.at("*") for service in rights.asks)]
-    held = [key for key in says if key in kept]
-    answers = [*held, *(key for service in rights.answers for key in _own(service, names))]
-    return says, asks, answers
-
-
 def _rule(name: str, flow: str, messages: Sequence[str], keys: Sequence[str]) -> Rule:
     return {
         "id": name,
@@ -232,10 +181,6 @@ def _rule(name: str, flow: str, messages: Sequence[str], keys: Sequence[str]) ->
 
 
 FLEET_LISTENS = _rule("the fleet listens", "ingress", ["declare_subscriber"], ["**"])
-
-
-def _own(of: Topic[Any] | Service[Any, Any], names: Sequence[str]) -> list[str]:
-    return [of.at(name) for name in names] if of.many else [of.key]
 
 
 def under(robot: str, keys: Iterable[str]) -> list[str]:

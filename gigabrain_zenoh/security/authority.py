@@ -18,10 +18,11 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from gigabrain_schemas.topics import Role
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import replace_file, sync_folder, write_synced
 from gigabrain_zenoh.host.network import host_and_port, is_host, is_ip
-from gigabrain_zenoh.security.acl import MAX_NAME_LENGTH, SERVERS, Role, common_name
+from gigabrain_zenoh.security.acl import MAX_NAME_LENGTH, SERVERS, common_name
 from gigabrain_zenoh.security.identity import read, read_certificate, read_key
 from gigabrain_zenoh.security.identity_files import (
     CA,

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
+from gigabrain_schemas.topics import Role
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import BusError, ConfigError
 from gigabrain_zenoh.host.files import open_regular, read_bounded
 from gigabrain_zenoh.host.network import host_and_port
 from gigabrain_zenoh.host.posix import fcntl
-from gigabrain_zenoh.security.acl import Role, common_name
+from gigabrain_zenoh.security.acl import common_name
 
 log = logging.getLogger(__name__)
 CA, CA_KEY = "ca.crt", "ca.key"

@@ -1,7 +1,7 @@
 """Files for other languages: golden examples of every message, and its JSON Schema.
 
-Golden files hold the example of every message as it is on the wire, in MessagePack and in JSON.
-`python -m gigabrain_schemas.golden` writes them again after an intended change.
+Golden files hold the example of every message as it is on the wire, in JSON and in MessagePack. The
+JSON is written by hand; `python -m gigabrain_schemas.golden` formats it and makes the MessagePack.
 """
 
 import sys
@@ -10,12 +10,15 @@ from typing import Any
 
 import msgspec
 
-from gigabrain_schemas.examples import EXAMPLES
+from gigabrain_schemas.examples import EXAMPLES, FOLDER
 from gigabrain_schemas.topics import SERVICES, TOPICS, Service, Topic, messages
 
 
 def export(folder: Path) -> list[Path]:
-    """Write `<Message>.json` each, `topics.json` and `services.json`; the paths. Raises OSError."""
+    """Write `<Message>.json` each, `topics.json` and `services.json`; return the paths.
+
+    Raises OSError.
+    """
     contents: dict[str, Any] = {m.__name__: msgspec.json.schema(m) for m in messages()}
     contents["topics"] = [_topic(topic) for topic in TOPICS]
     contents["services"] = [_service(service) for service in SERVICES]
@@ -53,11 +56,8 @@ def _write(path: Path, content: Any) -> Path:
     return path
 
 
-FOLDER = Path(__file__).parent / "golden"
-
-
 def files() -> dict[str, bytes]:
-    """What belongs into the golden folder: content by file name."""
+    """Return the content of the golden folder by file name."""
     content: dict[str, bytes] = {}
     for name, message in EXAMPLES.items():
         content[f"{name}.msgpack"] = msgspec.msgpack.encode(message)
@@ -66,7 +66,7 @@ def files() -> dict[str, bytes]:
 
 
 def write(folder: Path) -> None:
-    """Write all of them, and remove those whose message is gone."""
+    """Write all golden files, and remove those whose message is gone."""
     folder.mkdir(parents=True, exist_ok=True)
     wanted = files()
     for path in folder.iterdir():

@@ -1,4 +1,7 @@
-"""The one table of topics. Adding a topic means adding a line here, and nowhere else."""
+"""The one table of topics and services: type, rate, limits, rights and drawing of each.
+
+A line here is all that a topic takes, beside an example of its message in the folder `golden`.
+"""
 
 from dataclasses import dataclass, replace
 from typing import Any, Generic, Literal, TypeVar
@@ -12,6 +15,11 @@ R = TypeVar("R", bound=Message)
 
 KB = 1024
 Priority = Literal["real_time", "interactive_high", "data_high", "data", "background"]
+Role = Literal["robot", "brain", "operator", "viewer", "router"]  # of an identity
+# How viewers show a topic; `recording/drawing.py` has a function for each.
+Drawing = Literal[
+    "scan", "map", "pose", "path", "obstacles", "task", "image", "log", "odometry", "lidar_frame"
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +38,9 @@ class Topic(Generic[M]):
     depth: int = 1  # messages that wait for a busy reader; the oldest give way
     max_bytes: int = 4 * KB  # larger ones are not even decoded
     many: bool = False  # one key per camera or process below this one
+    publishers: tuple[Role, ...] = ()  # may publish it, besides the robot itself
+    drawing: Drawing | None = None
+    plotted: bool = False  # viewers plot its numbers
 
     @property
     def stale_after_ns(self) -> int:
@@ -51,67 +62,93 @@ class Service(Generic[Q, R]):
     priority: Priority = "interactive_high"
     max_bytes: int = 64 * KB  # of the request and of each reply; larger ones are not even decoded
     many: bool = False  # one key per process below this one
+    callers: tuple[Role, ...] = ()  # may ask it, besides the robot itself
+    servers: tuple[Role, ...] = ()  # may answer it, besides the robot itself
 
     def at(self, name: str = "") -> str:
         """The key of this service; at the process `name` where there are many."""
         return f"{self.key}/{name}" if self.many else self.key
 
 
-SCAN = Topic("robot/scan", sensors.LaserScan, 10, missed=2.5, max_bytes=64 * KB)
+BRAIN: tuple[Role, ...] = ("brain",)
+OPERATOR: tuple[Role, ...] = ("operator",)
+BOTH: tuple[Role, ...] = ("brain", "operator")
+ALL: tuple[Role, ...] = ("brain", "operator", "viewer")
+
+SCAN = Topic(
+    "robot/scan", sensors.LaserScan, 10, missed=2.5, max_bytes=64 * KB, drawing="scan",
+)  # fmt: skip
 IMU = Topic("robot/imu", sensors.Imu, 100)
 STATE = Topic(
-    "robot/state", body.RobotState, 50, missed=12.5, keep=True,
-    max_bytes=32 * KB,
+    "robot/state", body.RobotState, 50, missed=12.5, keep=True, max_bytes=32 * KB,
+    drawing="odometry", plotted=True,
 )  # fmt: skip
-BODY = Topic("robot/body", body.Body, 1, keep=True, max_bytes=16 * KB)
-IMAGE = Topic("robot/image", sensors.Image, 10, max_bytes=1024 * KB, many=True, depth=8)
-WORLD = Topic("robot/world", brain.WorldModel, 10, missed=2.5, max_bytes=64 * KB)
-POSE = Topic("robot/pose", brain.PoseInMap, 10)
-MAP = Topic("robot/map", brain.OccupancyGrid, 1, keep=True, max_bytes=8 * 1024 * KB)
-INTENT = Topic("robot/intent", brain.Intent, 50, echo_ns=150_000_000, max_bytes=16 * KB)
-TELEOP = Topic("robot/teleop", brain.Twist, 20, priority="interactive_high", max_bytes=KB)
+BODY = Topic("robot/body", body.Body, 1, keep=True, max_bytes=16 * KB, drawing="lidar_frame")
+IMAGE = Topic(
+    "robot/image", sensors.Image, 10, max_bytes=1024 * KB, many=True, depth=8, drawing="image",
+)  # fmt: skip
+WORLD = Topic(
+    "robot/world", brain.WorldModel, 10, missed=2.5, max_bytes=64 * KB,
+    publishers=BRAIN, drawing="obstacles", plotted=True,
+)  # fmt: skip
+POSE = Topic("robot/pose", brain.PoseInMap, 10, publishers=BRAIN, drawing="pose")
+MAP = Topic(
+    "robot/map", brain.OccupancyGrid, 1, keep=True, max_bytes=8 * 1024 * KB,
+    publishers=BRAIN, drawing="map",
+)  # fmt: skip
+INTENT = Topic(
+    "robot/intent", brain.Intent, 50, echo_ns=150_000_000, max_bytes=16 * KB,
+    publishers=BRAIN, drawing="path", plotted=True,
+)  # fmt: skip
+TELEOP = Topic(
+    "robot/teleop", brain.Twist, 20, priority="interactive_high", max_bytes=KB,
+    publishers=OPERATOR,
+)  # fmt: skip
 CMD_VEL = Topic(
-    "robot/cmd_vel", brain.CmdVel, 50, priority="interactive_high", depth=16, max_bytes=KB
-)
-JOINT_CMD = Topic("robot/joint_cmd", brain.JointCommand, 50, priority="interactive_high", depth=16)
+    "robot/cmd_vel", brain.CmdVel, 50, priority="interactive_high", depth=16, max_bytes=KB,
+    publishers=OPERATOR, plotted=True,
+)  # fmt: skip
+JOINT_CMD = Topic(
+    "robot/joint_cmd", brain.JointCommand, 50, priority="interactive_high", depth=16,
+    publishers=OPERATOR,
+)  # fmt: skip
 SAFETY = Topic(
     "robot/safety", safety.SafetyState, 20, missed=3, priority="interactive_high",
-    max_bytes=16 * KB,
+    max_bytes=16 * KB, plotted=True,
 )  # fmt: skip
-HEALTH = Topic(
-    "robot/health", safety.Health, 1, priority="background", many=True, depth=32, max_bytes=16 * KB
-)
-LOG = Topic("robot/log", safety.LogRecord, 10, priority="background", depth=256, max_bytes=16 * KB)
 # real_time is for what stops the robot, and for nothing that anybody could send by the thousand
 BUTTON = Topic(
     "robot/button", safety.ButtonState, 20, missed=4, priority="real_time", express=True,
-    max_bytes=KB,
+    max_bytes=KB, publishers=OPERATOR,
 )  # fmt: skip
-TASK = Topic("robot/task", tasks.TaskStatus, 5, keep=True, max_bytes=64 * KB)
+HEALTH = Topic(
+    "robot/health", safety.Health, 1, priority="background", many=True, depth=32,
+    max_bytes=16 * KB, publishers=BOTH,
+)  # fmt: skip
+LOG = Topic(
+    "robot/log", safety.LogRecord, 10, priority="background", depth=256, max_bytes=16 * KB,
+    publishers=BOTH, drawing="log",
+)  # fmt: skip
+TASK = Topic(
+    "robot/task", tasks.TaskStatus, 5, keep=True, max_bytes=64 * KB,
+    publishers=BRAIN, drawing="task",
+)  # fmt: skip
 REQUEST_LOG = Topic(
-    "robot/request_log", input_log.AcceptedRequest, 10, depth=256, max_bytes=128 * KB
-)
+    "robot/request_log", input_log.AcceptedRequest, 10, depth=256, max_bytes=128 * KB,
+    publishers=BRAIN,
+)  # fmt: skip
 INPUT_LOG = Topic(
-    "robot/input_log",
-    input_log.InputLog,
-    2,
-    priority="background",
-    many=True,
-    depth=32,
-    max_bytes=64 * KB,
-)
+    "robot/input_log", input_log.InputLog, 2, priority="background", many=True, depth=32,
+    max_bytes=64 * KB, publishers=BRAIN,
+)  # fmt: skip
 AUDIT = Topic("robot/audit", audit.AuditRecord, 10, depth=256)
+TOPICS: tuple[Topic[Any], ...] = tuple(one for one in globals().values() if isinstance(one, Topic))
 
 
 def command_topic(of: body.BodyDescription) -> Topic[brain.CmdVel]:
-    """The topic that a body obeys: CMD_VEL, unless its file says otherwise."""
+    """Return the topic that a body obeys: CMD_VEL, unless its file says otherwise."""
     return CMD_VEL if of.control_topic == CMD_VEL.key else replace(CMD_VEL, key=of.control_topic)
 
-
-TOPICS: tuple[Topic[Any], ...] = (
-    SCAN, IMU, STATE, BODY, IMAGE, WORLD, POSE, MAP, INTENT, TELEOP, CMD_VEL, JOINT_CMD, SAFETY,
-    BUTTON, HEALTH, LOG, TASK, REQUEST_LOG, INPUT_LOG, AUDIT,
-)  # fmt: skip
 
 OLD_KEYS = {"robot/heard": INPUT_LOG.key, "robot/granted": REQUEST_LOG.key}  # until release 0.3
 
@@ -123,40 +160,44 @@ def current_key(key: str) -> str:
     return f"{new}/{rest}" if new and rest else new or key
 
 
-ESTOP = Service("robot/estop", requests.EstopRequest, requests.GateReply, priority="real_time")
-# for clients that can say, but not ask: it stops just the same, and nothing is confirmed
+ESTOP = Service(
+    "robot/estop", requests.EstopRequest, requests.GateReply, priority="real_time", callers=BOTH,
+)  # fmt: skip
+# for clients that can publish but not query: it stops just the same, and nothing is confirmed
 ESTOP_SAID = Topic(
     ESTOP.key, requests.EstopRequest, 10, priority="real_time", congestion="block", express=True,
-    depth=16, max_bytes=KB,
+    depth=16, max_bytes=KB, publishers=BOTH,
 )  # fmt: skip
-RELEASE = Service("robot/release", requests.ReleaseRequest, requests.GateReply)
-ENABLE = Service("robot/enable", requests.EnableRequest, requests.GateReply)
-GOAL = Service("robot/goal", tasks.GoalRequest, tasks.GoalReply)
-MISSION = Service("robot/mission", tasks.MissionRequest, tasks.MissionReply)
-TASK_CHANGE = Service("robot/task_change", tasks.TaskRequest, tasks.TaskReply)
-MAP_SAVE = Service("robot/map_save", requests.MapRequest, requests.MapReply)
+RELEASE = Service("robot/release", requests.ReleaseRequest, requests.GateReply, callers=OPERATOR)
+ENABLE = Service("robot/enable", requests.EnableRequest, requests.GateReply, callers=OPERATOR)
+GOAL = Service("robot/goal", tasks.GoalRequest, tasks.GoalReply, callers=OPERATOR, servers=BRAIN)
+MISSION = Service(
+    "robot/mission", tasks.MissionRequest, tasks.MissionReply, callers=OPERATOR, servers=BRAIN,
+)  # fmt: skip
+TASK_CHANGE = Service(
+    "robot/task_change", tasks.TaskRequest, tasks.TaskReply, callers=OPERATOR, servers=BRAIN,
+)  # fmt: skip
+MAP_SAVE = Service(
+    "robot/map_save", requests.MapRequest, requests.MapReply, callers=OPERATOR, servers=BRAIN,
+)  # fmt: skip
 AUDIT_LOG = Service(
     "robot/audit_log", audit.AuditRequest, audit.AuditPage, priority="background",
-    max_bytes=1024 * KB,
+    max_bytes=1024 * KB, callers=("operator", "viewer"),
 )  # fmt: skip
-PARAM = Service("robot/param", requests.ParamRequest, requests.ParamReply, many=True)
-DESCRIBE = Service("robot/describe", requests.DescribeRequest, requests.Description, many=True)
-
-SERVICES: tuple[Service[Any, Any], ...] = (
-    ESTOP,
-    RELEASE,
-    ENABLE,
-    GOAL,
-    MISSION,
-    TASK_CHANGE,
-    MAP_SAVE,
-    AUDIT_LOG,
-    PARAM,
-    DESCRIBE,
+PARAM = Service(
+    "robot/param", requests.ParamRequest, requests.ParamReply, many=True,
+    callers=OPERATOR, servers=BOTH,
+)  # fmt: skip
+DESCRIBE = Service(
+    "robot/describe", requests.DescribeRequest, requests.Description, many=True,
+    callers=ALL, servers=BOTH,
+)  # fmt: skip
+SERVICES: tuple[Service[Any, Any], ...] = tuple(
+    one for one in globals().values() if isinstance(one, Service)
 )
 
 
 def messages() -> tuple[type[Message], ...]:
-    """Every message type that a topic or a service carries, once."""
+    """Return every message type that a topic or a service carries, once."""
     asked = (side for service in SERVICES for side in (service.request, service.reply))
     return tuple(dict.fromkeys((*(topic.type for topic in TOPICS), *asked)))

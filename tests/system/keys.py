@@ -7,11 +7,11 @@ from pathlib import Path
 
 import zenoh
 
+from gigabrain_schemas.topics import Role
 from gigabrain_zenoh.bus.zenoh.config import session_config
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.launch.processes import names_by_role
-from gigabrain_zenoh.security.acl import Role
 from gigabrain_zenoh.security.authority import issue, new_fleet
 from gigabrain_zenoh.testing.processes import free_endpoint
 

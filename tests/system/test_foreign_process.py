@@ -14,7 +14,7 @@ from gigabrain_zenoh.launch.deployment import Deployment, check_keys, load_deplo
 from gigabrain_zenoh.launch.processes import names_by_role, process_type
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.qa.probe import probing
-from gigabrain_zenoh.security.acl import access_control
+from gigabrain_zenoh.security.acl import Table, access_control
 from gigabrain_zenoh.testing.processes import Home, free_port
 from gigabrain_zenoh.testing.waiting import until
 
@@ -108,7 +108,7 @@ def test_it_has_an_identity_and_the_rights_of_its_role(fleet: Path) -> None:
     check_keys(by_keys("operator@red"), "h")
     with pytest.raises(ConfigError, match="lamp needs that of robot@red or operator@red"):
         check_keys(by_keys("brain@red"), "h")
-    rules = {rule["id"]: rule for rule in access_control(["red"], names_by_role())["rules"]}
+    rules = {rule["id"]: rule for rule in access_control(["red"], Table(names_by_role()))["rules"]}
     assert "red/robot/health/lamp" in rules["operator@red says"]["key_exprs"]
     assert "red/robot/health/lamp" not in rules["brain@red says"]["key_exprs"]
 

@@ -8,11 +8,11 @@ from typing import Any
 
 from msgspec import structs
 
-from gigabrain_schemas.topics import ESTOP_SAID, SERVICES, TOPICS, Priority, Service, Topic
+from gigabrain_schemas.topics import SERVICES, Priority, Service, Topic
 from gigabrain_zenoh.config.settings import Endpoint, RouterConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.network import LOCAL_ENDPOINT, host_and_port
-from gigabrain_zenoh.security.acl import FIRST, access_control, known_names
+from gigabrain_zenoh.security.acl import FIRST, PUBLISHED, Table, access_control, known_names
 from gigabrain_zenoh.security.identity_files import (
     CA,
     CERTIFICATE,
@@ -22,15 +22,14 @@ from gigabrain_zenoh.security.identity_files import (
 )
 
 FAR_TOO_LARGE = 4  # times the size that a reader accepts
-SAID: tuple[Topic[Any], ...] = (*TOPICS, ESTOP_SAID)
 Rule = dict[str, Any]
 
 
 def bounds() -> dict[str, Any]:
     """Return the settings of a router's session that limit messages from others."""
     return {
-        "low_pass_filter": [*_small("put", SAID), *_small("query", SERVICES)],
-        "qos/network": [*_urgent("put", SAID), *_urgent("query", SERVICES)],
+        "low_pass_filter": [*_small("put", PUBLISHED), *_small("query", SERVICES)],
+        "qos/network": [*_urgent("put", PUBLISHED), *_urgent("query", SERVICES)],
     }
 
 
@@ -142,7 +141,7 @@ def security(endpoint: Endpoint, generations: Mapping[str, int]) -> dict[str, An
     }
     if endpoint.listen and not endpoint.connect:  # a relay is checked by the router it connects to
         config["access_control"] = access_control(
-            robots_of(endpoint), endpoint.names, endpoint.namespace, generations
+            robots_of(endpoint), Table(endpoint.names), endpoint.namespace, generations
         )
     return config
 

@@ -1,23 +1,31 @@
 """What each role may say, ask and answer: on a real router, over TLS, key by key."""
 
-from gigabrain_schemas.topics import SERVICES, TOPICS
-from gigabrain_zenoh.security.acl import RIGHTS, access_control, known_names
+from gigabrain_schemas.safety import ButtonState
+from gigabrain_schemas.topics import SERVICES, TOPICS, Topic
+from gigabrain_zenoh.security.acl import PUBLISHED, Table, access_control, known_names
 
 
 def test_every_topic_and_service_has_somebody_who_may_use_it() -> None:
     """A topic that is new has to be somebody's: else it would be the robot's alone, unnoticed."""
-    said = {topic for rights in RIGHTS.values() if rights for topic in rights.says}
-    only_the_robot = {topic.key for topic in TOPICS if topic not in said}
+    only_the_robot = {topic.key for topic in TOPICS if not topic.publishers}
     assert only_the_robot == {
         "robot/scan", "robot/imu", "robot/state", "robot/body", "robot/image", "robot/safety",
         "robot/audit",
     }  # fmt: skip
-    asked = {service for rights in RIGHTS.values() if rights for service in rights.asks}
-    assert asked == set(SERVICES)
+    assert [service.key for service in SERVICES if not service.callers] == []
+
+
+def test_a_topic_declares_who_may_publish_it() -> None:
+    bell = Topic("robot/bell", ButtonState, 1, many=True, publishers=("operator",))
+    table = Table({"operator": ("page",), "brain": ("decision",)}, (*PUBLISHED, bell))
+    rules = {rule["id"]: rule["key_exprs"] for rule in access_control(["red"], table)["rules"]}
+    assert "red/robot/bell/page" in rules["operator@red says"]
+    assert not any("bell" in key for key in rules["brain@red says"])
+    assert "viewer@red says" not in rules
 
 
 def test_a_router_without_keys_has_no_rules_and_with_them_denies_by_default() -> None:
-    rules = access_control(["red"], {}, "red")
+    rules = access_control(["red"], Table({}), "red")
     assert rules["default_permission"] == "deny"
     assert {policy["subjects"][0] for policy in rules["policies"]} == {
         "local", "robot@red", "brain@red", "operator@red", "viewer@red", "operator", "viewer",

@@ -15,7 +15,17 @@ from gigabrain_schemas.base import TICK_MS
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import Twist
 from gigabrain_schemas.sensors import Image
-from gigabrain_schemas.topics import CMD_VEL, IMAGE, INTENT, SAFETY, SCAN, STATE, TELEOP, WORLD
+from gigabrain_schemas.topics import (
+    CMD_VEL,
+    IMAGE,
+    INTENT,
+    SAFETY,
+    SCAN,
+    STATE,
+    TELEOP,
+    WORLD,
+    Role,
+)
 from gigabrain_zenoh.bus.zenoh.config import secured
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.client.robot import connect
@@ -47,7 +57,6 @@ from gigabrain_zenoh.qa.proxy.chaos import Chaos
 from gigabrain_zenoh.qa.proxy.tcp import TcpProxy
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
 from gigabrain_zenoh.safety.health import HALF_SPEED
-from gigabrain_zenoh.security.acl import Role
 from gigabrain_zenoh.security.authority import issue, new_fleet
 
 NO_GAP_TICKS = 5  # up to which the gate waits for a command
