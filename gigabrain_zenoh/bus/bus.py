@@ -66,7 +66,7 @@ class Bus:
     """What a node sees of the outside world. Used on the event loop's thread only."""
 
     def __init__(self, transport: Transport, clock: Clock, process: str = "") -> None:
-        self._transport, self.clock, self.process = transport, clock, process
+        self.transport, self.clock, self.process = transport, clock, process
         self.time = RobotTime()
         self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self.sent: Counter[str] = Counter()
@@ -102,7 +102,7 @@ class Bus:
         payload, encoding = codec.encode(stamped), codec.encoding_of(topic.type)
         if topic.keep:
             self._keep(key, payload, encoding)
-        self._transport.publish(topic, key, payload, encoding)
+        self.transport.publish(topic, key, payload, encoding)
         return stamped
 
     def latest(
@@ -152,9 +152,7 @@ class Bus:
 
         guarded = self._guard(receive)
         if not topic.keep or topic.many:
-            return self._listening(
-                pattern, self._transport.subscribe(pattern, guarded, topic.depth)
-            )
+            return self._listening(pattern, self.transport.subscribe(pattern, guarded, topic.depth))
         live = False
 
         def receive_live(key: str, payload: bytes) -> bool | None:
@@ -163,7 +161,7 @@ class Bus:
             live = live or taken is True
             return taken
 
-        ends = self._transport.subscribe(pattern, receive_live, topic.depth)
+        ends = self.transport.subscribe(pattern, receive_live, topic.depth)
         # what is said counts more than what anybody answers to have kept
         self._fetch(topic, lambda key, payload: None if live else guarded(key, payload))
         return self._listening(pattern, ends)
@@ -173,11 +171,11 @@ class Bus:
 
         Returns the function that ends it.
         """
-        return self._listening(pattern, self._transport.tap(pattern, on_raw))
+        return self._listening(pattern, self.transport.tap(pattern, on_raw))
 
     async def kept(self, topic: Topic[Any]) -> list[bytes]:
         """What those who keep the last value of `topic` hold now."""
-        replies = await self._transport.query(topic.key, b"", "", FETCH_S, topic.priority)
+        replies = await self.transport.query(topic.key, b"", "", FETCH_S, topic.priority)
         return [reply for reply in replies if not isinstance(reply, str)]
 
     def serve(
@@ -203,7 +201,7 @@ class Bus:
                 self._fail(error)
                 raise Refused(f"{self.process or key} failed: {error!r}") from error
 
-        self._transport.serve(key, reply, urgent=service.priority == "real_time")
+        self.transport.serve(key, reply, urgent=service.priority == "real_time")
 
     async def ask(
         self, service: Service[Q, R], request: Q, *, timeout_s: float = 1.0, name: str = ""
@@ -212,7 +210,7 @@ class Bus:
         decode, key = Codec(service.reply, service.max_bytes).decode, service.at(name)
         payload, encoding = codec.encode(request), codec.encoding_of(service.request)
         answers = []
-        for reply in await self._transport.query(
+        for reply in await self.transport.query(
             key, payload, encoding, timeout_s, service.priority
         ):
             if isinstance(reply, str):
@@ -225,13 +223,13 @@ class Bus:
 
     def links(self, on_link: OnLink) -> Close:
         """Call `on_link` for everybody who is linked to this process, or is no more."""
-        return self._transport.links(on_link)
+        return self.transport.links(on_link)
 
     async def close(self) -> None:
         """Leave the network."""
         for task in self._fetching:
             task.cancel()
-        await self._transport.close()
+        await self.transport.close()
 
     def _listening(self, pattern: str, ends: Close) -> Close:
         """Note that somebody listens; the returned function ends that, any number of times."""
@@ -291,7 +289,7 @@ class Bus:
             return self._kept[key], encoding
 
         if first:
-            self._transport.serve(key, answer)
+            self.transport.serve(key, answer)
 
     def _fetch(self, topic: Topic[Any], receive: OnSample) -> None:
         """Ask for the kept value, for a subscriber that comes after it was sent."""

@@ -31,11 +31,10 @@ from gigabrain_zenoh.client.requests import (
     steer,
 )
 from gigabrain_zenoh.client.tasks import Tasks
-from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, NotConfirmed, Refused, Unsupported
 from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of
 from gigabrain_zenoh.runtime.running import find_endpoint
-from gigabrain_zenoh.security.identity_files import may_not_ask, no_router
+from gigabrain_zenoh.security.identity_files import may_not_ask
 
 
 @asynccontextmanager
@@ -56,22 +55,16 @@ async def connect(
     first state is not awaited, so that an e-stop reaches a silent body. Raises BusError without a
     router, ConfigError for invalid keys, and BodyLost without a driver.
     """
-    from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport  # takes a while: only when used
+    # imported only when used, since Zenoh takes a while
+    from gigabrain_zenoh.runtime.connect import connect as connect_bus
 
     endpoint = find_endpoint(connect, namespace, keys)
-    try:
-        transport = await asyncio.wait_for(ZenohTransport.open(endpoint), ROUTER_S)
-    except TimeoutError:
-        raise no_router(endpoint) from None
-    bus = Bus(transport, Clock(), source or f"script-{os.getpid()}")
-    try:
+    async with connect_bus(endpoint, source or f"script-{os.getpid()}") as bus:
         robot = Robot(bus, take=take, keys=endpoint.keys)
         if wait:
             await robot.read_state()
         yield robot
         await robot.stop()
-    finally:
-        await bus.close()
 
 
 class ControlLease:

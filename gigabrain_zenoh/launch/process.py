@@ -18,16 +18,12 @@ from gigabrain_schemas.topics import INPUT_LOG, LOG, Role
 from gigabrain_zenoh import logs
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.input_log import PublishedInputLogger
-from gigabrain_zenoh.bus.transport import Transport
-from gigabrain_zenoh.bus.zenoh.config import ZENOH_RUNTIME
-from gigabrain_zenoh.bus.zenoh.workarounds import NAP_S
-from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.host.signals import interrupts, stop_signals
 from gigabrain_zenoh.host.this_process import go_first, join_in, start_first, step_aside
 from gigabrain_zenoh.plugins import find
-from gigabrain_zenoh.runtime.connect import join
+from gigabrain_zenoh.runtime.connect import MakeBus, connect
 from gigabrain_zenoh.runtime.heartbeat import STDOUT, beat
 from gigabrain_zenoh.runtime.replay import Node
 from gigabrain_zenoh.runtime.services import NameClaim, publish_health, serve_params
@@ -36,8 +32,6 @@ if TYPE_CHECKING:
     from gigabrain_zenoh.launch.deployment import Deployment
 
 log = logging.getLogger("gigabrain")
-
-MakeBus = Callable[[Transport, Clock, str], Bus]
 
 
 @dataclass(frozen=True)
@@ -101,7 +95,6 @@ def run(
     `type_of` returns the row of a process, by name.
     """
     gc.disable()  # until ready: objects from imports and set-up are not garbage
-    os.environ.setdefault("ZENOH_RUNTIME", ZENOH_RUNTIME)
     try:
         run_dir = Path(config.run_dir) if config.run_dir else None
         logs.setup(config.name, run_dir, json_console=config.json_console, level=config.level)
@@ -154,32 +147,31 @@ async def _run(
 async def _work(
     config: ProcessConfig, process_type: ProcessType, node: Node, make_bus: MakeBus
 ) -> None:
-    nap_s = NAP_S if process_type.looks_on else 0.0
-    endpoint = msgspec.structs.replace(config.endpoint, nap_s=nap_s)
-    bus = make_bus(await join(endpoint), Clock(), config.name)
-    handler = logs.BusHandler(functools.partial(bus.publish, LOG), config.name)
-    logging.getLogger().addHandler(handler)
-    if process_type.repeats:
-        say = functools.partial(bus.publish, INPUT_LOG, name=config.name)
-        bus.input_log = PublishedInputLogger(say, bus.clock.unix_ns)
-    try:
-        claim = NameClaim(bus)
-        await claim.take()
-        serve_params(bus)
-        async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(publish_health(bus))
-            tasks.create_task(claim.keep())
-            if config.json_console:
-                out = os.dup(STDOUT)  # the router redirects its standard output to Zenoh's log
-                tasks.create_task(beat(bus.clock, lambda: bus.progress(), out))
-            tasks.create_task(_failure(bus))
-            tasks.create_task(_node(bus, node, process_type))
-    except* GigabrainError as group:
-        raise group.exceptions[0] from None
-    finally:
-        logging.getLogger().removeHandler(handler)
-        bus.input_log.flush()
-        await bus.close()
+    endpoint, looks_on = config.endpoint, process_type.looks_on
+    bus_of = connect(endpoint, config.name, timeout_s=None, looks_on=looks_on, make_bus=make_bus)
+    async with bus_of as bus:
+        handler = logs.BusHandler(functools.partial(bus.publish, LOG), config.name)
+        logging.getLogger().addHandler(handler)
+        if process_type.repeats:
+            say = functools.partial(bus.publish, INPUT_LOG, name=config.name)
+            bus.input_log = PublishedInputLogger(say, bus.clock.unix_ns)
+        try:
+            claim = NameClaim(bus)
+            await claim.take()
+            serve_params(bus)
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(publish_health(bus))
+                tasks.create_task(claim.keep())
+                if config.json_console:
+                    out = os.dup(STDOUT)  # the router redirects its standard output to Zenoh's log
+                    tasks.create_task(beat(bus.clock, lambda: bus.progress(), out))
+                tasks.create_task(_failure(bus))
+                tasks.create_task(_node(bus, node, process_type))
+        except* GigabrainError as group:
+            raise group.exceptions[0] from None
+        finally:
+            logging.getLogger().removeHandler(handler)
+            bus.input_log.flush()
 
 
 async def _failure(bus: Bus) -> None:

@@ -31,8 +31,9 @@ from gigabrain_zenoh.config.settings import (
 )
 from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.host.signals import interrupts
-from gigabrain_zenoh.launch.process import MakeBus, Place, ProcessType, run
+from gigabrain_zenoh.launch.process import Place, ProcessType, run
 from gigabrain_zenoh.plugins import load_plugin, plugin_names
+from gigabrain_zenoh.runtime.connect import MakeBus
 from gigabrain_zenoh.runtime.replay import Node
 
 if TYPE_CHECKING:

@@ -27,13 +27,12 @@ from gigabrain_schemas.topics import (
 )
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import Close
-from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
-from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.qa.judging import Failed
+from gigabrain_zenoh.runtime.connect import connect
 
 PATIENCE_S = 60.0  # far more than anything here takes on a busy machine
 POLL_S = 0.01
@@ -272,10 +271,7 @@ def moving(states: list[RobotState], above: float) -> int:
 @asynccontextmanager
 async def probing(endpoint: Endpoint, name: str = "probe") -> AsyncIterator[Probe]:
     """Join a robot's network; waits for its router and its first state."""
-    bus = Bus(await ZenohTransport.open(endpoint), Clock(), name)
-    try:
+    async with connect(endpoint, name, timeout_s=None) as bus:
         probe = Probe(bus)
         await until(lambda: probe.states, "the robot's first state")
         yield probe
-    finally:
-        await bus.close()

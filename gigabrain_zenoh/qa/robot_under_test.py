@@ -17,9 +17,7 @@ import psutil
 from gigabrain_schemas.requests import DescribeRequest
 from gigabrain_schemas.topics import DESCRIBE
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.client.robot import Robot
-from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
 from gigabrain_zenoh.decision.behaviours import needs_map
 from gigabrain_zenoh.errors import ConfigError, Refused
@@ -27,6 +25,7 @@ from gigabrain_zenoh.launch.deployment import Deployment, client_endpoint, with_
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.qa.judging import Failed
 from gigabrain_zenoh.qa.probe import Probe, probing, until
+from gigabrain_zenoh.runtime.connect import connect
 from gigabrain_zenoh.runtime.managed_process import Backoff, ProcessSpec
 from gigabrain_zenoh.runtime.supervisor import Supervisor
 
@@ -154,11 +153,8 @@ class ProcessGroup:
 @asynccontextmanager
 async def client(endpoint: Endpoint) -> AsyncIterator[Bus]:
     """Open a session that costs the robot nothing until it subscribes to something."""
-    bus = Bus(await ZenohTransport.open(endpoint), Clock(), "bench")
-    try:
+    async with connect(endpoint, "bench", timeout_s=None) as bus:
         yield bus
-    finally:
-        await bus.close()
 
 
 @asynccontextmanager

@@ -128,7 +128,7 @@ async def play(path: Path, options: PlayOptions, where: Where, *, beside_robot: 
     async with connect(where, "play") as bus:
         if not beside_robot:
             await check_no_driver(bus)
-        player = Player(path, options, transport)
+        player = Player(path, options, bus.transport)
         with stop_signals() as stop:
             await run_until(stop, player.play())
     print(f"{player.sent} messages sent, at most {player.late_s * 1e3:.0f} ms late")

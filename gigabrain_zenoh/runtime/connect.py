@@ -1,4 +1,4 @@
-"""The way onto a robot's bus: of its processes, and of tools that come and go."""
+"""The one way onto a robot's bus, for its processes as for tools, scripts and tests."""
 
 import asyncio
 import contextlib
@@ -6,13 +6,14 @@ import logging
 import os
 import socket
 import threading
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager
 from pathlib import Path
 
 from msgspec import Struct, structs
 
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import Transport
 from gigabrain_zenoh.bus.zenoh.config import ZENOH_RUNTIME, session_config
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.bus.zenoh.workarounds import NAP_S
@@ -24,18 +25,63 @@ from gigabrain_zenoh.runtime.running import find_endpoint
 from gigabrain_zenoh.security.identity_files import identity_in, no_router
 
 log = logging.getLogger("gigabrain")
+MakeBus = Callable[[Transport, Clock, str], Bus]
 PATIENCE_S = 1.0  # how long the router may be missing before a warning is logged
 AGAIN_S = 1.0  # between attempts to resolve a host name
+ROUTER_S = 3.0  # how long a router may take to answer
 
 
-async def join(endpoint: Endpoint) -> ZenohTransport:
+class Where(Struct, frozen=True, kw_only=True):
+    """Which robot, as people name it."""
+
+    connect: str | None = None  # its router; without it, the only robot that runs here
+    namespace: str = ""
+    keys: str = ""  # folder of an identity
+
+
+@asynccontextmanager
+async def connect(
+    where: Where | Endpoint,
+    name: str,
+    *,
+    timeout_s: float | None = ROUTER_S,
+    looks_on: bool = False,
+    make_bus: MakeBus = Bus,
+) -> AsyncIterator[Bus]:
+    """Connect to a robot's bus as `name`, and disconnect at the end.
+
+    With `timeout_s` None it waits as long as it takes, and logs what it waits for. With `looks_on`
+    messages are delivered in batches, and the robot's own processes go first. Raises BusError
+    without a router, and ConfigError for keys that are invalid.
+    """
+    if isinstance(where, Where):
+        endpoint = find_endpoint(where.connect, where.namespace, where.keys)
+    else:
+        endpoint = where
+    if looks_on:
+        step_aside()
+        endpoint = structs.replace(endpoint, nap_s=NAP_S)
+    os.environ.setdefault("ZENOH_RUNTIME", ZENOH_RUNTIME)
+    try:
+        opening = ZenohTransport.open(endpoint) if timeout_s else open_session(endpoint)
+        transport = await asyncio.wait_for(opening, timeout_s)
+    except TimeoutError:
+        raise no_router(endpoint) from None
+    bus = make_bus(transport, Clock(), name)
+    try:
+        yield bus
+    finally:
+        await bus.close()
+
+
+async def open_session(endpoint: Endpoint) -> ZenohTransport:
     """Open the session. Log a warning once if the router is missing for longer than PATIENCE_S.
 
     Raises BusError when a router cannot listen. Raises ConfigError for errors that waiting cannot
-    mend, such as invalid keys of this process.
+    fix, such as invalid keys of this process.
     """
     session_config(endpoint)
-    await _know(endpoint.listen)
+    await _wait_for_names(endpoint.listen)
     opening = asyncio.ensure_future(ZenohTransport.open(endpoint))
     try:
         done, _ = await asyncio.wait((opening,), timeout=PATIENCE_S)
@@ -58,11 +104,11 @@ async def unknown_host(endpoints: Iterable[str]) -> str:
     if not hosts:
         return ""
     loop = asyncio.get_running_loop()
-    told: asyncio.Future[str] = loop.create_future()
+    found: asyncio.Future[str] = loop.create_future()
 
     def settle(unknown: str) -> None:
-        if not told.done():
-            told.set_result(unknown)
+        if not found.done():
+            found.set_result(unknown)
 
     def work() -> None:
         unknown = next((host for host in hosts if not _known(host)), "")
@@ -70,7 +116,7 @@ async def unknown_host(endpoints: Iterable[str]) -> str:
             loop.call_soon_threadsafe(settle, unknown)
 
     threading.Thread(target=work, name="resolver", daemon=True).start()
-    return await told
+    return await found
 
 
 def _known(host: str) -> bool:
@@ -81,7 +127,7 @@ def _known(host: str) -> bool:
     return True
 
 
-async def _know(listen: Iterable[str]) -> None:
+async def _wait_for_names(listen: Iterable[str]) -> None:
     """Wait until the router's own listen addresses resolve.
 
     At boot, name resolution may start later than the router.
@@ -89,7 +135,7 @@ async def _know(listen: Iterable[str]) -> None:
     said = ""
     while host := await unknown_host(listen):
         if host != said:
-            _tell(_nobody(host))
+            _warn(_unknown_name(host))
         said = host
         await asyncio.sleep(AGAIN_S)
 
@@ -100,12 +146,12 @@ async def _explain(endpoint: Endpoint, opening: asyncio.Future[ZenohTransport]) 
     try:
         await asyncio.wait((opening, naming), return_when=asyncio.FIRST_COMPLETED)
         if not opening.done():
-            _tell(_nobody(naming.result()) if naming.result() else _no_router(endpoint))
+            _warn(_unknown_name(naming.result()) if naming.result() else _no_router(endpoint))
     finally:
         naming.cancel()
 
 
-def _nobody(host: str) -> str:
+def _unknown_name(host: str) -> str:
     return f"nobody here knows a host {host!r}; waiting for its name (is it spelt right?)"
 
 
@@ -114,40 +160,5 @@ def _no_router(endpoint: Endpoint) -> str:
     return f"no router at {where} yet; waiting for it (start one with: gigabrain router)"
 
 
-def _tell(text: str) -> None:
+def _warn(text: str) -> None:
     log.warning("%s", text, extra={"data": {"event": "waiting"}})
-
-
-ROUTER_S = 3.0  # how long a router may take to answer
-
-
-class Where(Struct, frozen=True, kw_only=True):
-    """Which robot, as people say it."""
-
-    connect: str | None = None  # its router; without it, the only robot that runs here
-    namespace: str = ""
-    keys: str = ""  # the folder of an identity
-
-
-@asynccontextmanager
-async def joined(
-    where: Where, name: str, *, looks_on: bool = False
-) -> AsyncIterator[tuple[Bus, ZenohTransport]]:
-    """A bus of a robot, and the transport below it. Raises BusError where there is none.
-
-    Who `looks_on` lets what he listens to gather, and the robot's own processes go first.
-    """
-    endpoint = find_endpoint(where.connect, where.namespace, where.keys)
-    if looks_on:
-        step_aside()
-        endpoint = structs.replace(endpoint, nap_s=NAP_S)
-    os.environ.setdefault("ZENOH_RUNTIME", ZENOH_RUNTIME)
-    try:
-        transport = await asyncio.wait_for(ZenohTransport.open(endpoint), ROUTER_S)
-    except TimeoutError:
-        raise no_router(endpoint) from None
-    bus = Bus(transport, Clock(), name)
-    try:
-        yield bus, transport
-    finally:
-        await bus.close()

@@ -26,8 +26,8 @@ from gigabrain_zenoh.config.settings import DecisionConfig, DriverConfig, Percep
 from gigabrain_zenoh.control import node as control
 from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.host.threads import Job, done
-from gigabrain_zenoh.launch.process import MakeBus
 from gigabrain_zenoh.perception import node as perception
+from gigabrain_zenoh.runtime.connect import MakeBus
 from gigabrain_zenoh.runtime.replay import Node
 from gigabrain_zenoh.safety import node as safety
 from gigabrain_zenoh.testing.samples import TICK_NS

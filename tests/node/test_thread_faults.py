@@ -92,7 +92,7 @@ async def test_a_handler_that_raises_ends_a_process_that_waits_for_other_things(
         ready()
         await asyncio.Event().wait()
 
-    monkeypatch.setattr(process, "join", join)
+    monkeypatch.setattr("gigabrain_zenoh.runtime.connect.open_session", join)
     config = ProcessConfig(name="control", endpoint=Endpoint())
     work = process._work(config, process.ProcessType("control:run"), node, Bus)
     working = asyncio.ensure_future(asyncio.wait_for(work, PATIENCE_S))

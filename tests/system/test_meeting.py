@@ -58,7 +58,7 @@ async def test_a_router_waits_for_its_own_name_and_says_so_once(
     resolver: Resolver, caplog: pytest.LogCaptureFixture
 ) -> None:
     here = free_endpoint().replace("127.0.0.1", "localhost")
-    joining = asyncio.ensure_future(join(Endpoint(listen=(here,))))
+    joining = asyncio.ensure_future(open_session(Endpoint(listen=(here,))))
     await until(lambda: len(resolver.asked) > 2)
     assert told(caplog) == [NOBODY.format("localhost")]
     resolver.knows = True
@@ -72,7 +72,7 @@ async def test_who_waits_for_a_router_that_has_no_known_name_says_which(
 ) -> None:
     others, here = session_threads(), free_endpoint()
     elsewhere = here.replace("127.0.0.1", "localhost")
-    joining = asyncio.ensure_future(join(Endpoint(connect=(elsewhere,))))
+    joining = asyncio.ensure_future(open_session(Endpoint(connect=(elsewhere,))))
     await until(lambda: bool(told(caplog)))
     assert told(caplog) == [NOBODY.format("localhost")]
     joining.cancel()
@@ -86,4 +86,4 @@ async def test_who_waits_for_a_router_that_has_no_known_name_says_which(
 
 async def test_what_is_no_endpoint_is_not_waited_for() -> None:
     with pytest.raises(ConfigError, match="is not a Zenoh endpoint"):
-        await join(Endpoint(listen=("tcp/bad host!:7447",)))
+        await open_session(Endpoint(listen=("tcp/bad host!:7447",)))
