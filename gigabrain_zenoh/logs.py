@@ -57,8 +57,9 @@ def _text_of(record: logging.LogRecord) -> str:
         return f"{record.msg} {record.args}"
 
 
+# own code: json.dumps, as in structlog, raises on cycles and writes NaN, which is no JSON
 def encode(record: Mapping[str, Any]) -> bytes:
-    """One line of JSON without its newline, whatever the values are; NaN becomes null."""
+    """Return one line of JSON without its newline, whatever the values are; NaN becomes null."""
     try:
         return _ENCODER.encode(record)
     except (TypeError, ValueError, OverflowError, RecursionError):

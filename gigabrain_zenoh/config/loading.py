@@ -1,7 +1,7 @@
 """Configuration: a YAML file becomes a frozen msgspec Struct, or one line says why not.
 
-msgspec says what is wrong, but under a dict it does not say where, and an unknown field it puts
-on the parent's line. This walks the document beside the type and finds the very line.
+Own code: msgspec, like pydantic, names a path and no line, and under a dict not even a path. This
+walks the document beside the type and finds the line.
 """
 
 import difflib

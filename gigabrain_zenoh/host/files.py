@@ -54,6 +54,7 @@ def too_large(path: Path, there: int, most_bytes: int) -> str:
     return f"{path}: {there / 1e6:.1f} MB; expected at most {most_bytes / 1e6:g} MB"
 
 
+# own code: python-atomicwrites, archived 2022, fails where a file system syncs no folders
 NOT_SYNCED = (errno.EINVAL, errno.ENOTSUP)  # from file systems that cannot sync a folder
 
 

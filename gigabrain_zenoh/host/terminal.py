@@ -87,8 +87,9 @@ class LineSplitter:
         return rest
 
 
+# own code: rich's strip_control_codes leaves ESC, which moves the cursor
 def printable(text: object) -> str:
-    """Text from anywhere must not move the cursor of the terminal that shows it."""
+    """Return `text` with control characters escaped, so that it cannot move the cursor."""
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
 
 

@@ -27,6 +27,7 @@ from gigabrain_zenoh.runtime.supervisor import Supervisor
 SHARE = 0.4  # fraction of the watchdog's timeout between two keep-alives
 
 
+# own code: sdnotify 0.3.2 sends blocking and in Latin-1, and leaves NOTIFY_SOCKET to children
 class Notifier:
     """Sends one service's state to its manager. Errors are ignored: the robot continues."""
 

@@ -31,8 +31,9 @@ class Backoff:
     reset_after_s: float = 10.0  # up this long, and the next wait is the first again
 
 
+# own code: tenacity retries a call; a process that ran well for 10 s begins at 0.2 s again
 class RestartPolicy:
-    """What is left of the patience with one process."""
+    """Decides when one process is started again, and when it is given up."""
 
     def __init__(self, backoff: Backoff) -> None:
         self._backoff = backoff

@@ -1,0 +1,94 @@
+"""A stranger who publishes and keeps states of another robot on a driving robot's key."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.topics import STATE
+from gigabrain_zenoh import codec
+from gigabrain_zenoh.testing.in_memory import BRAIN, RobotInMemory
+
+OTHER_BOOT = 4711
+FULL_SPEED = 0.26  # [m/s]
+BURST = 2  # states between two of the robot's own; three that agree would be believed
+
+
+class Stranger:
+    """Publishes states of another start and place, and answers for the kept one."""
+
+    def __init__(self, robot: RobotInMemory) -> None:
+        assert robot.state
+        self._robot, self._state, self.asked = robot, robot.state, 0
+        self._state = self._next()
+
+    def publish(self) -> None:
+        for _ in range(BURST):
+            self._state = self._next()
+            self._robot.network.deliver(STATE.key, codec.encode(self._state))
+
+    def _next(self) -> RobotState:
+        at = Pose(x=50.0, y=50.0, yaw=3.0)
+        seq, tick = self._state.seq + 1, self._state.tick + 1
+        return msgspec.structs.replace(
+            self._state, seq=seq, tick=tick, boot=OTHER_BOOT, basis=tick, pose=at
+        )
+
+    async def answer(self, _: bytes) -> tuple[bytes, str]:
+        self.asked += 1
+        return codec.encode(self._state), ""
+
+
+@contextmanager
+def stranger(robot: RobotInMemory) -> Iterator[Stranger]:
+    made = Stranger(robot)
+    ends = robot.network.serve(STATE.key, made.answer)
+    yield made
+    ends()
+
+
+async def driving(robot: RobotInMemory) -> None:
+    await robot.go(100)
+    assert robot.mode == "enabled"
+    assert robot.body.speeds[-1] == pytest.approx(FULL_SPEED)
+
+
+async def test_a_driving_robot_is_not_confused_by_states_of_another_boot(tmp_path: Path) -> None:
+    async with RobotInMemory(tmp_path) as robot:
+        await driving(robot)
+        with stranger(robot) as other:
+            for _ in range(100):
+                other.publish()
+                (speed,) = await robot.go(1)
+                assert speed == pytest.approx(FULL_SPEED)
+                assert robot.mode == "enabled"
+        own = robot.bus("driver").time
+        for name in BRAIN:
+            time = robot.bus(name).time
+            assert (time.boot, time.tick) == (own.boot, own.tick), name
+        for name in ("perception", "control", "safety"):
+            assert robot.bus(name).counters["refused_ticks"] >= 200, name
+        assert robot.counters["stale_commands_executed"] == 0
+
+
+@pytest.mark.parametrize("name", ["perception", "control"])
+async def test_a_process_that_starts_beside_a_stranger_finds_its_robot(
+    name: str, tmp_path: Path
+) -> None:
+    async with RobotInMemory(tmp_path) as robot:
+        await driving(robot)
+        with stranger(robot) as other:
+            await robot.kill(name)
+            await robot.go(50)
+            assert robot.body.speeds[-1] == 0.0
+            robot.start(name)
+            for _ in range(30):  # five states of the robot for two of the stranger's
+                other.publish()
+                await robot.go(5)
+            assert other.asked > 0
+            assert robot.body.speeds[-1] == pytest.approx(FULL_SPEED)
+            assert robot.bus(name).time.boot == robot.bus("driver").time.boot
