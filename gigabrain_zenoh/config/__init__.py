@@ -1,4 +1,4 @@
-"""Settings of all processes, and YAML files read into them, faults named by file and line.
+"""Settings of all processes, and YAML files read into them; errors name file and line.
 
 It may import host.
 Every room above may import it.

@@ -1,4 +1,4 @@
-"""What the operating system gives: files, signals, child processes, threads, cores, memory.
+"""The operating system: files, signals, child processes, threads, cores, memory.
 
 It imports no other room.
 Every room may import it.

@@ -1,5 +1,5 @@
-"""Starts a robot: the table of processes, their settings, `up` and `demo`.
+"""Starts a robot: the table of processes, deployment files, `up` and `demo`.
 
-It may import all rooms but cli and qa, and names the drivers in the table of processes alone.
+It may import all rooms but cli and qa, and names drivers only in the table of processes.
 Commands and qa may import it.
 """

@@ -1,6 +1,6 @@
 """Bags: recording into MCAP files, reading, playing, converting and replaying them.
 
-It may import bus, config, gate, host, runtime and safety.
+It may import bus, config, gate, geometry, host, logs, runtime and safety.
 Diagnostics, ui, launch, commands and qa may import it.
 """
 

@@ -1,5 +1,5 @@
-"""How a process lives: its frame, supervision, deployments, the router, audit and discovery.
+"""How a process lives: the way onto the bus, services, supervision, the router, and the audit.
 
-It may import bus, config, host and security.
+It may import bus, config, host, logs and security.
 The rooms above, and the drivers, may import it.
 """

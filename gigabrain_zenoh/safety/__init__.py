@@ -2,6 +2,6 @@
 
 `step` puts them side by side, `node` is the process.
 
-It may import bus, gate, geometry and host; never perception, mapping or navigation.
+It may import bus, gate, geometry, host and runtime; never perception, mapping or navigation.
 Launch, recording and qa may import it.
 """
