@@ -7,18 +7,26 @@ robot's router checks messages against the host's certificate, as if processes c
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable
+import os
+import re
+import threading
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
+from gigabrain_schemas.topics import SERVICES, TOPICS
+from gigabrain_zenoh.bus.bridge import Bridge, Mailbox
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import Link
+from gigabrain_zenoh.bus.zenoh.session import log_to_stdout
 from gigabrain_zenoh.config.settings import RelayConfig, RouterConfig
-from gigabrain_zenoh.host.posix import resource
-from gigabrain_zenoh.runtime.access_audit import AccessAudit, zenoh_log
+from gigabrain_zenoh.host.posix import fcntl, resource
 from gigabrain_zenoh.runtime.audit import AuditTrail
 from gigabrain_zenoh.runtime.running import SOCKET
 from gigabrain_zenoh.security.identity_files import identity_in
 
+log = logging.getLogger(__name__)
 FILES = 65536  # one per possible link, including links that never send a message
 FLUSH_NS = 1_000_000_000
 
@@ -57,7 +65,6 @@ def _make_room() -> None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
-log = logging.getLogger(__name__)
 PATIENCE_S = 1.0  # how long the router may be missing before a warning is logged
 
 
@@ -97,3 +104,153 @@ async def run_relay(config: RelayConfig, bus: Bus, ready: Callable[[], None]) ->
         await way.open.wait()
     ready()
     await bus.failed
+
+
+# Zenoh denies without an answer, and reports it only in its log: for access control in two lines of
+# one thread, of which the second makes the first count (zenoh 1.10, net/routing/interceptor).
+DIRECTIVES = "zenoh::net::routing::interceptor=trace,zenoh_link_tls=warn"
+DENIED = re.compile(
+    r"(?:: |Using cached result: )(\w+)(?: on \S+)? is unauthorized to (.+?) \(ingress\) on (.+)"
+)
+TURNED_AWAY = re.compile(r" WARN .*zenoh_link_tls::unicast: (.+?)(?:\. Hint: .*)?$")
+THREAD = re.compile(rb"ThreadId\(\d+\)")
+COLOUR = re.compile(rb"\x1b\[[0-9;]*m")
+LONGEST = 64 * 1024  # bytes of a line; what is longer is no line of Zenoh's
+THREADS = 100  # whose first line is remembered
+
+
+@dataclass(frozen=True)
+class Denied:
+    """Somebody who has a session tried what is not allowed."""
+
+    zid: str
+    what: str  # in Zenoh's words, such as Put
+    key: str
+
+
+@dataclass(frozen=True)
+class TurnedAway:
+    """Somebody did not get a session. Zenoh does not say who, or from where."""
+
+    why: str
+
+
+class ZenohLog:
+    """Cuts the log into lines and picks those that tell of a denial."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+        self._last: dict[bytes, bytes] = {}  # by thread
+
+    def feed(self, data: bytes) -> Iterator[Denied | TurnedAway]:
+        """What the log says of those whom the router does not let in, or not through."""
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        if len(self._rest) > LONGEST:
+            self._rest = b""
+        for line in lines:
+            if seen := self._read(line):
+                yield seen
+
+    def _read(self, line: bytes) -> Denied | TurnedAway | None:
+        thread = THREAD.search(line)
+        if thread is None:
+            return None
+        if b" is unauthorized to " in line:
+            if len(self._last) >= THREADS:
+                self._last.clear()
+            self._last[thread[0]] = line
+            return None
+        if b"Msg intercepted!" in line:
+            denied = DENIED.search(_text(self._last.pop(thread[0], b"")))
+            return Denied(denied[1], denied[2], denied[3]) if denied else None
+        self._last.pop(thread[0], None)
+        away = TURNED_AWAY.search(_text(line)) if b"zenoh_link_tls" in line else None
+        return TurnedAway(away[1]) if away else None
+
+
+def _text(line: bytes) -> str:
+    """Without colours, and without what a terminal might obey."""
+    text = COLOUR.sub(b"", line).decode(errors="replace").rstrip()
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
+STDOUT, CHUNK_BYTES, PIPE_BYTES = 1, 1 << 16, 1 << 20
+WAITING = 1000  # denials that may wait for the loop
+PARTICULAR = re.compile(r"\S*\d\S*")  # words with a digit: addresses, ports, numbers
+TABLE = {*(topic.key for topic in TOPICS), *(service.key for service in SERVICES)}
+Seen = Denied | TurnedAway
+
+
+class AccessAudit:
+    """Tells the audit trail whom the router did not let in, and what it did not let through."""
+
+    def __init__(self, trail: AuditTrail, knows: Collection[str]) -> None:
+        self._trail, self._knows = trail, knows
+        self._links: dict[str, Link] = {}
+
+    def link(self, link: Link) -> None:
+        """Somebody has come, or has gone."""
+        name = link.name or "a local process"
+        if not link.there:
+            if self._links.pop(link.zid, None):
+                log.info("%s at %s has left", name, link.address)
+            return
+        self._links[link.zid] = link
+        if link.name and link.name not in self._knows:
+            text = f"{link.address} has keys of the fleet, but {link.name} has no rights here"
+            self._trail.note("stranger", link.name, text, code="no rights", ok=False)
+            log.warning("%s", text, extra={"data": {"event": "stranger", "source": link.name}})
+        else:
+            log.info("%s has come from %s", name, link.address)
+
+    def seen(self, seen: Seen) -> None:
+        """What Zenoh's log has told."""
+        if isinstance(seen, TurnedAway):
+            text = f"somebody was turned away at the door: {seen.why}"
+            code = PARTICULAR.sub("…", seen.why)
+            self._trail.note("stranger", "unknown", text, code=code, ok=False)
+            return
+        link = self._links.get(seen.zid)
+        name = (link.name or "local") if link else "unknown"
+        where = link.address if link else "an unknown address"
+        verb = seen.what.lower()
+        text = f"{name} at {where} may not {verb} {seen.key}"
+        code = f"{verb} {_of_table(seen.key)}"
+        self._trail.note("refused", name, text, code=code, ok=False)
+
+
+def _of_table(key: str) -> str:
+    """The topic or service that a key belongs to, of whatever robot; a sender chooses the key."""
+    parts = key.split("/")
+    known = ("/".join(parts[at : at + 2]) for at in (0, 1))
+    return next((each for each in known if each in TABLE), "other")
+
+
+@contextmanager
+def zenoh_log(on_seen: Callable[[Seen], None]) -> Iterator[None]:
+    """Read Zenoh's log while the block runs; `on_seen` is called on the loop's thread.
+
+    Zenoh writes it to standard output, whose place a pipe takes for good; nothing else may be
+    written there, since what the log quotes is chosen by strangers. A thread empties the pipe, so
+    that Zenoh never waits for us; of what it has seen the newest wait for a busy loop.
+    """
+    bridge = Bridge()
+    mailbox = Mailbox(bridge, on_seen, WAITING)
+    reads, writes = os.pipe()
+    with contextlib.suppress(OSError, AttributeError):  # other systems have smaller pipes
+        fcntl.fcntl(writes, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+    os.dup2(writes, STDOUT)
+    os.close(writes)
+
+    def work() -> None:
+        parse = ZenohLog()
+        while data := os.read(reads, CHUNK_BYTES):
+            for seen in parse.feed(data):
+                mailbox.put(seen)
+
+    threading.Thread(target=work, name="zenoh-log", daemon=True).start()
+    log_to_stdout(DIRECTIVES)
+    try:
+        yield
+    finally:
+        bridge.close()

@@ -1,4 +1,4 @@
-"""A fleet's own certificate authority: it makes itself, issues identities, and revokes them.
+"""A fleet's own certificate authority: identities are issued, read, checked and revoked.
 
 Certificates are X.509 v3 with EC P-256 keys (RFC 5280); the common name names a role and a robot.
 Routers read revocations from their identity's folder, as Zenoh has none for certificates.
@@ -14,23 +14,28 @@ from pathlib import Path
 
 import msgspec
 from cryptography import x509
+from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+from msgspec import Struct
 
 from gigabrain_schemas.topics import Role
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.files import replace_file, sync_folder, write_synced
+from gigabrain_zenoh.host.files import read_bounded, replace_file, sync_folder, write_synced
 from gigabrain_zenoh.host.network import host_and_port, is_host, is_ip
-from gigabrain_zenoh.security.acl import MAX_NAME_LENGTH, SERVERS, common_name
-from gigabrain_zenoh.security.identity import read, read_certificate, read_key
+from gigabrain_zenoh.security.acl import MAX_NAME_LENGTH, SERVERS, common_name, parse
 from gigabrain_zenoh.security.identity_files import (
     CA,
     CA_KEY,
     CERTIFICATE,
     KEY,
     LIST,
+    REMEDY,
+    check_files,
+    check_private,
     generations_in,
+    unreadable,
 )
 
 CA_DAYS, DAYS = 3650, 365
@@ -229,3 +234,113 @@ def write_list(folder: Path, generations: Mapping[str, int]) -> None:
         replace_file(folder / LIST, content)
     except OSError as error:
         raise ConfigError(f"cannot write {folder / LIST}: {error.strerror}") from None
+
+
+MOST_BYTES = 100_000  # of a key or a certificate
+
+
+class Identity(Struct, frozen=True, kw_only=True):
+    """Somebody whom a fleet's routers know."""
+
+    folder: Path
+    fleet: str
+    name: str  # the common name, such as robot@red
+    role: Role
+    robot: str  # its namespace; empty for the only one, or for all
+    generation: int  # of all who have had this role
+    hosts: tuple[str, ...]  # where it can be connected to
+    expires: datetime.datetime
+
+    def days_left(self, now: datetime.datetime) -> float:
+        """Days until it expires; negative afterwards."""
+        return (self.expires - now) / datetime.timedelta(days=1)
+
+
+def load(folder: Path, now: datetime.datetime | None = None) -> Identity:
+    """The identity in `folder`. Raises ConfigError where it cannot be used, and what to do."""
+    identity, certificate = read(folder)
+    now = now or datetime.datetime.now(datetime.UTC)
+    path = folder / CERTIFICATE
+    if now > identity.expires:
+        raise ConfigError(
+            f"{path} expired on {identity.expires:%Y-%m-%d}; make a new identity with "
+            f"`gigabrain keys issue {identity.role}` and copy its folder here"
+        )
+    if now < certificate.not_valid_before_utc:
+        begins = certificate.not_valid_before_utc
+        raise ConfigError(f"{path} is valid from {begins:%Y-%m-%d}; is this machine's clock right?")
+    authority = read_certificate(folder / CA)
+    try:
+        certificate.verify_directly_issued_by(authority)
+    except (InvalidSignature, ValueError, TypeError):
+        raise ConfigError(f"{path} was not issued by the fleet of {CA}; {REMEDY}") from None
+    if now > authority.not_valid_after_utc:
+        raise ConfigError(
+            f"{folder / CA} expired on {authority.not_valid_after_utc:%Y-%m-%d}; "
+            "make a new fleet with `gigabrain keys new`"
+        )
+    if read_key(folder / KEY).public_key() != certificate.public_key():
+        raise ConfigError(f"{folder / KEY} does not belong to {CERTIFICATE}; {REMEDY}")
+    return identity
+
+
+def read(folder: Path) -> tuple[Identity, x509.Certificate]:
+    """What the certificate in `folder` says, valid or not. Raises ConfigError."""
+    check_files(folder)
+    certificate = read_certificate(folder / CERTIFICATE)
+    name = _attribute(certificate, NameOID.COMMON_NAME)
+    role, robot, generation = parse(name)
+    identity = Identity(
+        folder=folder,
+        fleet=_attribute(certificate, NameOID.ORGANIZATION_NAME),
+        name=name,
+        role=role,
+        robot=robot,
+        generation=generation,
+        hosts=_hosts(certificate),
+        expires=certificate.not_valid_after_utc,
+    )
+    return identity, certificate
+
+
+def read_certificate(path: Path) -> x509.Certificate:
+    """A certificate in PEM. Raises ConfigError."""
+    try:
+        return x509.load_pem_x509_certificate(_bytes(path))
+    except ValueError:
+        raise ConfigError(f"{path} is no certificate; {REMEDY}") from None
+
+
+def read_key(path: Path) -> ec.EllipticCurvePrivateKey:
+    """A private key in PEM. Raises ConfigError, also where others may read it."""
+    data = _bytes(path)
+    check_private(path)
+    try:
+        key = serialization.load_pem_private_key(data, password=None)
+    except (ValueError, TypeError):
+        raise ConfigError(f"{path} is no private key; {REMEDY}") from None
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
+        raise ConfigError(f"{path} is no EC key; {REMEDY}")
+    return key
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return read_bounded(path, MOST_BYTES)
+    except PermissionError:
+        raise unreadable(path) from None
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}; {REMEDY}") from None
+
+
+def _attribute(certificate: x509.Certificate, oid: x509.ObjectIdentifier) -> str:
+    values = certificate.subject.get_attributes_for_oid(oid)
+    return str(values[0].value) if values else ""
+
+
+def _hosts(certificate: x509.Certificate) -> tuple[str, ...]:
+    try:
+        places = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return ()
+    return tuple(str(place.value) for place in places)

@@ -98,14 +98,14 @@ def identity_folder(keys: str, host: str = "") -> Path:
 
 
 if TYPE_CHECKING:
-    from gigabrain_zenoh.security.identity import Identity
+    from gigabrain_zenoh.security.authority import Identity
 INSTALL = "keys need more: pip install 'gigabrain-zenoh[keys]'"
 
 
 def identity_in(folder: Path) -> "Identity":
     """The identity in a folder. Raises ConfigError where it cannot be used."""
     try:  # 150 ms, which only those pay who look at certificates
-        from gigabrain_zenoh.security.identity import load
+        from gigabrain_zenoh.security.authority import load
     except ModuleNotFoundError as error:
         raise ConfigError(f"{error}; {INSTALL}") from None
     return load(folder)

@@ -8,8 +8,8 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import Link, LocalNetwork
 from gigabrain_zenoh.clock import FakeClock
 from gigabrain_zenoh.runtime import audit
-from gigabrain_zenoh.runtime.access_audit import AccessAudit, Denied, TurnedAway, ZenohLog
 from gigabrain_zenoh.runtime.audit import AuditTrail
+from gigabrain_zenoh.runtime.router import AccessAudit, Denied, TurnedAway, ZenohLog
 
 ZID = "4869ee9928fa158cf819ad0d7cad9dc4"
 ACCESS = "2026-11-21T03:07:13.9Z TRACE  rx-0 ThreadId(11) zenoh::net::routing::interceptor"

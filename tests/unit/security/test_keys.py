@@ -15,8 +15,7 @@ from gigabrain_zenoh.cli.keys import issue as issue_command
 from gigabrain_zenoh.cli.keys import new
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.security.authority import issue, new_fleet
-from gigabrain_zenoh.security.identity import load
+from gigabrain_zenoh.security.authority import issue, load, new_fleet
 
 
 @pytest.fixture

@@ -8,8 +8,7 @@ import pytest
 from gigabrain_zenoh.bus.zenoh.config import router_config, session_config
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.security.authority import issue, revoke
-from gigabrain_zenoh.security.identity import read
+from gigabrain_zenoh.security.authority import issue, read, revoke
 
 
 @pytest.fixture
