@@ -33,7 +33,7 @@ from gigabrain_zenoh.decision.tasks import mission
 from gigabrain_zenoh.diagnostics import doctor, why
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate import causes, gate
-from gigabrain_zenoh.launch.deployment import Deployment
+from gigabrain_zenoh.launch.deployment import deployment_type
 from gigabrain_zenoh.safety import catalogue
 from tests.places import ROOT
 from tests.unit.gate.rig import HOT, Rig, driving, enabled, idle
@@ -43,6 +43,7 @@ README = ROOT / "README.md"
 BEGIN, END = "<!-- commands: made by `make golden` -->\n", "<!-- end of commands -->\n"
 WIDTH = 100
 WRONG_ARGUMENTS = ROOT / "tests/data/wrong_arguments.txt"
+Deployment = deployment_type()
 BAD_FILES: dict[str, tuple[Any, str]] = {
     "not YAML": (Deployment, "body: [mock"),
     "empty": (RobotFile, ""),

@@ -97,7 +97,7 @@ GROUPS = {
     "keys": "Issue and revoke identities.",
     "bag": "Read, play and convert recordings.",
     "topic": "Inspect and publish messages.",
-    "node": "Inspect processes.",
+    "node": "Inspect and run processes.",
     "task": "List and control the robot's tasks.",
     "param": "Read and change parameters at run time.",
     "map": "Save and check maps.",

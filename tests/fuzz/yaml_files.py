@@ -11,10 +11,11 @@ from gigabrain_drivers.driver.catalog import driver_class, link_options, robot_f
 from gigabrain_drivers.driver.robot import LINKS, RobotFile
 from gigabrain_zenoh.config.loading import loads
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.launch.deployment import Deployment
+from gigabrain_zenoh.launch.deployment import Deployment, deployment_type
 from tests.fuzz.harness import ROOT, split
 
 KINDS = ("deployment", "robot")
+DEPLOYMENT = deployment_type()
 LONGEST_LINE = 2000  # characters of a complaint
 
 
@@ -44,7 +45,7 @@ def told(complaint: str) -> None:
 
 def deployment(text: str) -> Deployment:
     """As `gigabrain up` reads it."""
-    return loads(text, Deployment, "x.yaml")
+    return loads(text, DEPLOYMENT, "x.yaml")
 
 
 def robot(text: str) -> RobotFile:

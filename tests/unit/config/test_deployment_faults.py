@@ -10,7 +10,7 @@ from gigabrain_zenoh.cli.processes import button
 from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.config.settings import ButtonConfig
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.launch.deployment import Deployment, host_of
+from gigabrain_zenoh.launch.deployment import Deployment, deployment_type, host_of
 
 PORT = "expected a path, or usb:VID:PID[:SERIAL], got"
 
@@ -42,7 +42,7 @@ PORT = "expected a path, or usb:VID:PID[:SERIAL], got"
 )
 def test_a_deployment_is_refused_at_the_line_that_is_wrong(text: str, said: str) -> None:
     with pytest.raises(ConfigError) as error:
-        config.loads(text, Deployment, "f")
+        config.loads(text, deployment_type(), "f")
     assert str(error.value).startswith(said)
 
 
