@@ -11,11 +11,11 @@ class Clock:
     """The host's clocks."""
 
     def now_ns(self) -> int:
-        """Nanoseconds since an arbitrary start; never goes backwards."""
+        """Return the time since an arbitrary start [ns]; it never goes backwards."""
         return time.monotonic_ns()
 
     def unix_ns(self) -> int:
-        """Nanoseconds since 1970, for people and recordings; jumps whenever the clock is set."""
+        """Return the time since 1970 [ns], for people and recordings; it jumps when set."""
         return time.time_ns()
 
     async def sleep_ns(self, duration_ns: int) -> None:
@@ -25,7 +25,7 @@ class Clock:
     async def every(self, period_ns: int) -> AsyncIterator[int]:
         """Yield the current time [ns] each period. Missed periods are skipped, not caught up.
 
-        What follows comes at whole periods from the first again, however late one has been.
+        All later times are whole periods after the first.
         """
         due = self.now_ns()
         while True:
@@ -70,7 +70,7 @@ class FakeClock(Clock):
         self._now = end
 
     def stall(self, duration_ns: int) -> None:
-        """Let time pass in which nobody is woken, as on a machine that stands still."""
+        """Move time forward without waking sleepers, as on a suspended machine."""
         self._now += duration_ns
 
     async def _settle(self) -> None:

@@ -1,4 +1,4 @@
-"""Messages to bytes and back. Whatever a decoder lets through here is valid."""
+"""Encodes messages to bytes and decodes them. A decoded message is valid."""
 
 from collections.abc import Callable
 from typing import Generic, TypeVar
@@ -11,13 +11,13 @@ M = TypeVar("M", bound=Message)
 
 # everything that msgspec raises on hostile input: it is several exceptions, not one
 DECODE_ERRORS = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
-TOLD = 200  # characters of a complaint; it quotes the sender, who may have sent 60 kB
+MAX_ERROR_CHARS = 200  # an error quotes the message, which may have 60 kB
 
 encode = msgspec.msgpack.Encoder().encode
 
 
 def encoding_of(message: type[Message]) -> str:
-    """The Zenoh encoding of a message type."""
+    """Return the Zenoh encoding of a message type."""
     return f"application/msgpack;gigabrain.{message.__name__}"
 
 
@@ -30,14 +30,14 @@ class Codec(Generic[M]):
         self._json: Callable[[bytes], M] = msgspec.json.Decoder(message).decode
 
     def decode(self, payload: bytes) -> M:
-        """The message in `payload`. Raises ValueError with a sentence when it is not a valid one.
+        """Return the message in `payload`. Raises ValueError with a sentence if it is invalid.
 
-        The first byte tells the two apart, since foreign clients rarely set a Zenoh encoding: JSON
-        begins with ASCII, a MessagePack map never does.
+        The first byte decides, since foreign clients rarely set a Zenoh encoding: JSON begins with
+        ASCII, a MessagePack map never does.
         """
         if len(payload) > self.max_bytes:
             raise ValueError(f"{len(payload)} bytes, at most {self.max_bytes} are read")
         try:
             return self._json(payload) if payload[:1] < b"\x80" else self._msgpack(payload)
         except DECODE_ERRORS as error:
-            raise ValueError(str(error)[:TOLD]) from None
+            raise ValueError(str(error)[:MAX_ERROR_CHARS]) from None

@@ -1,14 +1,14 @@
-"""The tree of errors that a user may see. Each says in one line what would have been right.
+"""The tree of errors that a user may see, each in one line with what was expected.
 
 GigabrainError
 ├── ConfigError       a file or an option is wrong (exit code 2)
 │   └── UnknownName   no such robot, world, driver, process or behaviour
 ├── BusError          the router is missing, or its port is taken
-│   └── Ambiguous     several robots run here, and none was named
-├── Refused           the robot said no, and why
+│   └── Ambiguous     several robots run here, and none is named
+├── Refused           the robot refused a request, with the reason
 ├── Unsupported       the body has no such primitive
 ├── BodyLost          the body no longer answers
-├── ClockLost         a process's robot time agrees with no state any more
+├── ClockLost         a process's robot time does not match any state
 └── NotConfirmed      no body has confirmed an e-stop (exit code 3)
 """
 
@@ -34,7 +34,7 @@ class ConfigError(GigabrainError):
 
 
 class UnknownName(ConfigError):
-    """A name that nothing here answers to."""
+    """An unknown name."""
 
 
 class BusError(GigabrainError):
@@ -42,11 +42,11 @@ class BusError(GigabrainError):
 
 
 class Ambiguous(BusError):
-    """Several robots run on this machine, and nobody has said which one is meant."""
+    """Several robots run on this machine, and none is named."""
 
 
 class Refused(GigabrainError):
-    """The robot was asked for something and said no."""
+    """The robot refused a request."""
 
 
 class Unsupported(GigabrainError):
@@ -62,15 +62,15 @@ class ClockLost(GigabrainError):
 
 
 class NotConfirmed(GigabrainError):
-    """An e-stop was pressed and no body has said that it stands: somebody has to act by hand."""
+    """An e-stop was pressed, but no body confirmed it: a person has to act by hand."""
 
     exit_code = 3
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownName:
-    """The error for a name that is not among `known`, with the nearest one as a suggestion.
+    """Return the error for a name that is not `known`, with the nearest one as a suggestion.
 
-    Part of a name is enough: a wafle is a turtlebot3_waffle.
+    Part of a name is enough: `wafle` suggests turtlebot3_waffle.
     """
     names = sorted(known)
     parts = {part: whole for whole in names for part in (*whole.split("_"), whole)}

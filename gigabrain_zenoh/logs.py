@@ -28,14 +28,14 @@ _FORMATTER = logging.Formatter()
 
 
 def level_of(record: logging.LogRecord) -> str:
-    """The name of the nearest of LEVELS that is not above the record's own level."""
+    """Return the highest of LEVELS that is not above the record's own level."""
     return LEVELS[min(max(record.levelno // 10 - 1, 0), len(LEVELS) - 1)]
 
 
 def fields(record: logging.LogRecord, process: str) -> dict[str, Any]:
-    """`{"t": unix_ns, "level", "process", "event", "text"}` and the record's own `data`.
+    """Return `{"t": unix_ns, "level", "process", "event", "text"}` and the record's own `data`.
 
-    `data` comes in by `extra={"data": {...}}`; it names the event, and cannot overwrite the rest.
+    `data` is passed as `extra={"data": {...}}`; it names the event, and overwrites nothing else.
     """
     data = getattr(record, "data", {})
     known: dict[str, Any] = {
@@ -68,7 +68,7 @@ def encode(record: Mapping[str, Any]) -> bytes:
 
 
 def readable(record: Mapping[str, Any], *, colour: bool = False) -> str:
-    """`12:03:44 driver     warning  text key=value`, in local time, without its newline."""
+    """Return `12:03:44 driver     warning  text key=value`, in local time, without a newline."""
     clock = time.strftime("%H:%M:%S", time.localtime(record["t"] / 1e9))
     level, text = str(record["level"]), printable(record.get("text") or record["event"])
     data = [
@@ -83,7 +83,7 @@ def readable(record: Mapping[str, Any], *, colour: bool = False) -> str:
 
 
 def _plain(value: object) -> object:
-    """What msgspec does not know: numpy scalars and arrays as numbers, all else as its repr."""
+    """Convert values that msgspec does not know: numpy to numbers, others to text."""
     to_list = getattr(value, "tolist", None)
     return to_list() if callable(to_list) else str(value)
 
@@ -117,18 +117,18 @@ class Fault:
 
     @property
     def active(self) -> bool:
-        """Whether the fault has begun and not ended."""
+        """Return whether the fault has begun and not ended."""
         return self._times > 0
 
     def begin(self, text: str, data: Mapping[str, Any] | None = None) -> None:
-        """The fault is there; only the first call after an end is logged."""
+        """Begin the fault, or count it again; only the first call after an end is logged."""
         self._times += 1
         if self._times == 1:
             about = {"event": "fault", **(data or {})}
             self._log.log(self._level, "%s", text, extra={"data": about})
 
     def end(self, text: str) -> None:
-        """The fault is gone; logged if it had begun, with how many times it was seen."""
+        """End the fault; if it had begun, log that with the number of its occurrences."""
         times, self._times = self._times, 0
         if times:
             about = {"event": "fault ended", "times": times}
@@ -136,7 +136,7 @@ class Fault:
 
 
 class BusHandler(logging.Handler):
-    """Hands records of level info and above to `publish`, on the loop's thread it was made on."""
+    """Passes records of level info and above to `publish`, on its event loop's thread."""
 
     def __init__(self, publish: Callable[[LogRecord], object], process: str) -> None:
         super().__init__(logging.INFO)
@@ -168,7 +168,7 @@ class BusHandler(logging.Handler):
 
 
 def _message(record: logging.LogRecord, process: str) -> LogRecord:
-    """The record within the bounds of its message: the bus carries the gist, the file the whole."""
+    """Return the record, shortened to the bounds of its message; the file has all of it."""
     known = fields(record, process)
     text = str(known.pop("text"))
     event, level = str(known.pop("event")), known.pop("level")
@@ -208,7 +208,7 @@ class _ReadableFormatter(logging.Formatter):
 
 
 class _File(RotatingFileHandler):
-    """A log file whose disk may fill up: that is said once, and again when there is room."""
+    """A log file that reports a full disk once, and once more when there is room."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, maxBytes=FILE_BYTES, backupCount=OLD_FILES, encoding="utf-8")
@@ -226,10 +226,10 @@ class _File(RotatingFileHandler):
 
 
 class QueuedHandler(QueueHandler):
-    """Formats records where they are logged, and has `sink` write them in a thread of its own.
+    """Formats records where they are logged; `sink` writes them in a thread of its own.
 
-    So a full disk, or a console that nobody reads, holds up neither the event loop nor the end of
-    the process. When `QUEUED_RECORDS` wait, more are dropped; how many is logged later.
+    So a full disk, or a blocked console, delays neither the event loop nor the end of the process.
+    When `QUEUED_RECORDS` wait, more are dropped; their number is logged later.
     """
 
     def __init__(self, sink: logging.Handler, formatter: logging.Formatter, name: str) -> None:
@@ -242,7 +242,7 @@ class QueuedHandler(QueueHandler):
         self._listener.start()
 
     def enqueue(self, record: logging.LogRecord) -> None:
-        """Have the record written, or count it as lost."""
+        """Queue the record, or count it as lost."""
         try:
             self._records.put_nowait(record)
             if self.lost:
@@ -252,20 +252,20 @@ class QueuedHandler(QueueHandler):
             self.lost += 1
 
     def _loss(self) -> logging.LogRecord:
-        """Tell this sink alone: to log it would take the locks of the others."""
+        """Build a record for this sink alone: logging it would take the locks of the others."""
         text, lost = f"{self.lost} records did not reach the {self._name}", self.lost
         record = logging.LogRecord(log.name, logging.WARNING, "", 0, text, None, None)
         record.data = {"event": "log records lost", "lost": lost}
         return self.prepare(record)  # type: ignore[no-any-return]
 
     def flush(self) -> None:
-        """Wait until all is written, `LAST_WORDS_S` at most."""
+        """Wait until all is written, at most `LAST_WORDS_S`."""
         waiting = self._records
         with waiting.all_tasks_done:
             waiting.all_tasks_done.wait_for(lambda: not waiting.unfinished_tasks, LAST_WORDS_S)
 
     def close(self) -> None:
-        """Write what waits, and close the sink; one that hangs is left behind."""
+        """Write all queued records, and close the sink, unless it hangs."""
         self.flush()
         super().close()
         if not self._closed and not self._records.unfinished_tasks:
@@ -278,7 +278,7 @@ class QueuedHandler(QueueHandler):
 def setup(process: str, run_dir: Path | None, *, json_console: bool, level: str = "info") -> None:
     """Log to `<run_dir>/<process>.jsonl` and to stderr; a second call replaces the first.
 
-    Raises ConfigError when the folder cannot be written, UnknownName for a level that is none.
+    Raises ConfigError if the folder cannot be written, and UnknownName for an unknown level.
     """
     if level not in LEVELS:
         raise errors.unknown("log level", level, LEVELS)
@@ -295,7 +295,7 @@ def setup(process: str, run_dir: Path | None, *, json_console: bool, level: str 
 
 
 def flush() -> None:
-    """Wait until what was logged is written, but not for what hangs."""
+    """Wait until all records are written, but not for a sink that hangs."""
     for sink in _sinks():
         sink.flush()
 

@@ -16,7 +16,7 @@ class Waker(Protocol):
     """Something that one thread can make readable for the loop of another."""
 
     def fileno(self) -> int:
-        """What the loop watches."""
+        """Return the file descriptor that the loop watches."""
         ...
 
     def signal(self) -> None:
@@ -39,7 +39,7 @@ class EventFd:
         self._fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
 
     def fileno(self) -> int:
-        """What the loop watches."""
+        """Return the file descriptor that the loop watches."""
         return self._fd
 
     def signal(self) -> None:
@@ -64,7 +64,7 @@ class SocketPair:
         self._write.setblocking(False)
 
     def fileno(self) -> int:
-        """What the loop watches."""
+        """Return the file descriptor that the loop watches."""
         return self._read.fileno()
 
     def signal(self) -> None:

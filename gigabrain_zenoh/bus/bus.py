@@ -126,7 +126,7 @@ FETCH_S = 1.0  # how long the one who keeps a value may take to hand it over
 
 
 class Bus:
-    """What a node sees of the outside world. Used on the event loop's thread only."""
+    """A node's connection to all others. Used on the event loop's thread only."""
 
     def __init__(self, transport: Transport, clock: Clock, process: str = "") -> None:
         self.transport, self.clock, self.process = transport, clock, process
@@ -225,7 +225,7 @@ class Bus:
             return taken
 
         ends = self.transport.subscribe(pattern, receive_live, topic.depth)
-        # what is said counts more than what anybody answers to have kept
+        # a live message counts more than a kept one
         self._fetch(topic, lambda key, payload: None if live else guarded(key, payload))
         return self._listening(pattern, ends)
 
@@ -237,7 +237,7 @@ class Bus:
         return self._listening(pattern, self.transport.tap(pattern, on_raw))
 
     async def kept(self, topic: Topic[Any]) -> list[bytes]:
-        """What those who keep the last value of `topic` hold now."""
+        """Return the last value of `topic` from each process that keeps it."""
         replies = await self.transport.query(topic.key, b"", "", FETCH_S, topic.priority)
         return [reply for reply in replies if not isinstance(reply, str)]
 
@@ -269,7 +269,7 @@ class Bus:
     async def ask(
         self, service: Service[Q, R], request: Q, *, timeout_s: float = 1.0, name: str = ""
     ) -> list[R]:
-        """Every answer that comes in time; none when nobody serves it. Raises Refused, with why."""
+        """Return every answer that arrives in time; none without a server. Raises Refused."""
         decode, key = Codec(service.reply, service.max_bytes).decode, service.at(name)
         payload, encoding = codec.encode(request), codec.encoding_of(service.request)
         answers = []
@@ -285,7 +285,7 @@ class Bus:
         return answers
 
     def links(self, on_link: OnLink) -> Close:
-        """Call `on_link` for everybody who is linked to this process, or is no more."""
+        """Call `on_link` whenever a link to this process opens or closes."""
         return self.transport.links(on_link)
 
     async def close(self) -> None:
@@ -295,7 +295,7 @@ class Bus:
         await self.transport.close()
 
     def _listening(self, pattern: str, ends: Close) -> Close:
-        """Note that somebody listens; the returned function ends that, any number of times."""
+        """Count a subscription; the returned function ends it, and may be called again."""
         self.listens.append(pattern)
         over = False
 
@@ -309,9 +309,9 @@ class Bus:
         return close
 
     def _in_time(self, topic: Topic[Any], message: Message) -> bool:
-        """Move the robot's time. Return whether the message is to be believed.
+        """Move the robot's time. Return whether the message is credible.
 
-        Where it hears nothing but states that it refuses, its own time is wrong: the process ends.
+        If all states are refused for LOST_NS, this process's own time is wrong, and it ends.
         """
         believed, now_ns = self.time.see(message), self.clock.now_ns()
         if not believed:
@@ -329,7 +329,7 @@ class Bus:
         return believed
 
     def _guard(self, receive: OnSample) -> OnSample:
-        """A fault in a node ends its process: `failed` carries it to whoever runs the node."""
+        """Pass an exception of `receive` to `failed`, which ends the process."""
 
         def guarded(key: str, payload: bytes) -> bool | None:
             try:

@@ -17,8 +17,8 @@ class RobotTime:
     """The newest tick that this process has seen, and of which start of the driver.
 
     One message must not move it far: one flipped bit would silence the process for ever. A jump of
-    more than JUMP_TICKS, and a new boot, count once CONFIRMED messages in a row agree and none that
-    continues the present count has come between. Of the very first nothing better is known.
+    more than JUMP_TICKS, and a new boot, count once CONFIRMED messages in a row agree and none
+    between them continues the present count. The very first message is believed.
     """
 
     def __init__(self) -> None:
@@ -29,9 +29,9 @@ class RobotTime:
         self._agree = 0  # how many have made that claim
 
     def see(self, message: Message) -> bool:
-        """Take note of the tick on a message from the driver. Return whether to believe it."""
+        """Update from the tick on a driver's message. Return whether it is credible."""
         if not message.boot:
-            return self.boot == 0  # a driver that has been heard says which start it is
+            return self.boot == 0  # a driver names its start in every message
         if self.boot == 0:
             self._believe(message)
             return True
@@ -44,13 +44,13 @@ class RobotTime:
     def _confirmed(self, message: Message) -> bool:
         by = (type(message), message.seq, message.tick)
         if by == self._claimed_by:
-            return False  # the same message, which somebody else here listens to as well
+            return False  # the same message, at another subscriber of this process
         boot, tick = self._claim or (0, 0)
         agrees = message.boot == boot and abs(message.tick - tick) <= JUMP_TICKS
         self._agree = self._agree + 1 if agrees else 1
         self._claim, self._claimed_by = (message.boot, message.tick), by
         if message.boot == self.boot and message.tick < self.tick:
-            return False  # time does not go back: who is ahead of all others has to begin anew
+            return False  # time does not go back: a process that is ahead has to restart
         if self._agree < CONFIRMED:
             return False
         self._believe(message)
@@ -66,15 +66,15 @@ class Latest(Generic[M]):
 
     def __init__(self, topic: Topic[M], clock: Clock, time: RobotTime) -> None:
         self._topic, self._clock, self._time = topic, clock, time
-        self._by_wall = topic.key == STATE.key  # nothing else tells when the robot's clock stops
+        self._by_wall = topic.key == STATE.key  # nothing else shows that the robot's clock stopped
         self.newest: M | None = None
         self._arrived_ns = 0
         self._arrived_tick = 0
 
     def take(self, message: M) -> bool:
-        """Keep `message` unless it is older than what is held; says whether it was kept.
+        """Keep `message` unless it is older than the held one; return whether it was kept.
 
-        A tick that the robot has not reached yet does not keep others out.
+        A held tick that the robot has not reached yet keeps no other message out.
         """
         held, time = self.newest, self._time
         same_start = held and message.boot and message.boot == held.boot
@@ -87,42 +87,42 @@ class Latest(Generic[M]):
         return True
 
     def _arrival(self, message: M) -> int:
-        """The robot's tick when `message` came, as far as this process can tell."""
+        """Return the robot's tick at which `message` arrived, as far as this process knows."""
         now = self._time.tick
         if not message.boot:
             return now
         if message.boot != self._time.boot:
-            return message.tick  # a start of the driver that is still to be heard of: its own count
-        # whoever lags behind with the robot's states has the true tick only from the message
+            return message.tick  # a start of the driver that is not known yet: its own count
+        # a process that lags behind with states has the true tick only from the message
         return max(now, min(message.tick, now + LEAD_TICKS))
 
     @property
     def current(self) -> M | None:
-        """The newest message, however old, unless it is from another start of the driver."""
+        """Return the newest message of any age, unless it is of another start of the driver."""
         message = self.newest
         return message if message and message.boot in (0, self._time.boot) else None
 
     def age_ns(self) -> int | None:
-        """Age of the newest message [ns]: by the robot's clock, or by arrival where that is more.
+        """Return the age of the newest message [ns], by the robot's clock or by arrival.
 
-        None when there is none, or when it belongs to another start of the driver.
+        The greater one counts. None without a message of this start of the driver.
         """
         message = self.current
         return None if message is None else max(self._silent_ns(message), self._echo_ns(message), 0)
 
     def _silent_ns(self, message: M) -> int:
-        """How long ago the newest message came [ns]."""
+        """Return the time since the newest message arrived [ns]."""
         silent = (self._time.tick - self._arrived_tick) * TICK_NS
         if self._by_wall or not message.boot:
             silent = max(silent, self._clock.now_ns() - self._arrived_ns)
         return silent
 
     def _echo_ns(self, message: M) -> int:
-        """How old the tick is that its sender had seen [ns]."""
+        """Return the age of the tick on the message [ns]."""
         return (self._time.tick - message.tick) * TICK_NS if message.boot else 0
 
     def fresh(self, within_ns: int | None = None) -> M | None:
-        """The newest message, or None once it is older than its promised rate allows."""
+        """Return the newest message; None if it is older than its promised rate allows."""
         message = self.current
         if message is None:
             return None
@@ -143,11 +143,11 @@ class PreviousTick(Generic[M]):
         newest = self._newest
         same_start = newest and newest.boot == message.boot
         if newest and not (same_start and newest.tick >= message.tick):
-            self._before = newest  # what claims to be of the future never comes before anything
+            self._before = newest  # a message of the future precedes none
         self._newest = message
 
     def at(self, boot: int, tick: int, within_ns: int) -> M | None:
-        """The newest of before `tick`, of this boot and no older than `within_ns`."""
+        """Return the newest message before `tick`, of this boot, at most `within_ns` old."""
         for message in (self._newest, self._before):
             if message is None or message.boot != boot:
                 continue

@@ -32,23 +32,23 @@ HIGHEST = 2**63 - 1
 
 
 class InputLogger:
-    """Kept by nobody."""
+    """An input log that keeps nothing."""
 
     live = True  # whether what the node does has effects beside the bus
 
     def note(self, key: str, seq: int) -> None:
-        """A message is looked at."""
+        """Record that a message is used."""
 
     def in_time(self, job: Job, patience_s: float) -> bool:
-        """Whether work beside is done after that long at most. What follows may rest on it."""
+        """Return whether background work is done within that time; the node may use its result."""
         return done(job, patience_s)
 
     def flush(self) -> None:
-        """Say what has not been said yet."""
+        """Publish all entries that are not published yet."""
 
 
 class PublishedInputLogger(InputLogger):
-    """Said on the bus twice a second, as long as there is anything to say."""
+    """Publishes the input log twice a second, if it holds anything."""
 
     def __init__(self, say: Callable[[InputLog], object], unix_ns: Callable[[], int]) -> None:
         self._say, self._unix_ns = say, unix_ns
@@ -58,7 +58,7 @@ class PublishedInputLogger(InputLogger):
         self._began_ns = 0
 
     def note(self, key: str, seq: int) -> None:
-        """A message is looked at; by several parts of a node in turn, it is one."""
+        """Record that a message is used; several uses in a row count as one."""
         if seq and self._last.get(key) == seq:
             return
         put_newest(self._last, key, seq, MOST_KEYS)
@@ -71,7 +71,7 @@ class PublishedInputLogger(InputLogger):
         return there
 
     def flush(self) -> None:
-        """Say what has not been said yet."""
+        """Publish all entries that are not published yet."""
         taken, keys = self._taken, tuple(self._keys)
         if taken:
             self._taken, self._keys = [], {}
@@ -97,15 +97,15 @@ class ReplayedInputLogger(InputLogger):
         self.outcomes: deque[bool] = deque()  # of what is waited for at the present message
 
     def in_time(self, job: Job, patience_s: float) -> bool:
-        """As it was then; of work that nobody waited for then, once it is done."""
+        """Return the recorded outcome; wait for work without one."""
         there = self.outcomes.popleft() if self.outcomes else True
         return there and done(job, None)
 
 
 def log_accepted(bus: "Bus", key: str, request: Message, basis: int) -> None:
-    """Tell that from now on a request counts which was asked on `key`.
+    """Publish that a request on `key` counts from now on.
 
-    `basis` is the tick of the newest world that was thought about.
+    `basis` is the tick of the newest world used.
     """
     text = msgspec.json.encode(request).decode()
     accepted = AcceptedRequest(process=bus.process, service=key, request=text)

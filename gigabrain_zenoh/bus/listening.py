@@ -18,7 +18,7 @@ ROOM = 64  # messages that wait for a slow `async for`; the oldest give way
 
 
 def topic_named(name: str) -> Topic[Any]:
-    """The topic `robot/scan`, or `scan` for short. Raises UnknownName."""
+    """Return the topic `robot/scan`, or `scan` for short. Raises UnknownName."""
     known = {topic.key.removeprefix("robot/"): topic for topic in TOPICS}
     short = current_key(f"robot/{name.removeprefix('robot/')}").removeprefix("robot/")
     if short not in known:
@@ -35,7 +35,7 @@ def topic_of(key: str) -> Topic[Any] | None:
 
 
 async def listen(bus: Bus, topic: Topic[M]) -> AsyncIterator[M]:
-    """Every message on `topic` from the first `anext` on."""
+    """Yield every message on `topic` from the first `anext` on."""
     waiting: deque[M] = deque(maxlen=ROOM)
     arrived = asyncio.Event()
 

@@ -1,4 +1,4 @@
-"""Configuration: a YAML file becomes a frozen msgspec Struct, or one line says why not.
+"""Configuration: a YAML file becomes a frozen msgspec Struct, or an error of one line.
 
 Own code: msgspec, like pydantic, names a path and no line, and under a dict not even a path. This
 walks the document beside the type and finds the line.
@@ -45,7 +45,7 @@ _LIMITS = {
 
 
 def expected(type_: Any) -> str:
-    """What a value of `type_` looks like, with its limits."""
+    """Return words for the values of `type_`, with its limits."""
     return _words(mi.type_info(type_))
 
 
@@ -72,7 +72,7 @@ def _limits(info: mi.Type) -> str:
 
 
 def choices(type_: Any) -> list[Any]:
-    """The values that a Literal or an Enum (also inside a Union) allows; empty for other types."""
+    """Return the values of a Literal or an Enum (also in a Union); empty for other types."""
     return _choices(mi.type_info(type_))
 
 
@@ -85,7 +85,7 @@ def _choices(info: mi.Type) -> list[Any]:
 
 
 def one_of(values: Sequence[Any]) -> str:
-    """`one of 'left', 'right'`, or the only value there is."""
+    """Return `one of 'left', 'right'`, or the only value."""
     return "one of " + ", ".join(map(repr, values)) if len(values) > 1 else repr(values[0])
 
 
@@ -102,7 +102,7 @@ def got(node: Node) -> str:
 
 
 def nearest(name: object, known: Iterable[Any]) -> str:
-    """`; did you mean 'turn'?` where something known is near, or nothing."""
+    """Return `; did you mean 'turn'?` if a known name is similar, else an empty text."""
     names = [k for k in known if isinstance(k, str)]
     close = difflib.get_close_matches(name, names, 1, 0.6) if isinstance(name, str) else []
     return f"; did you mean {close[0]!r}?" if close else ""
@@ -117,7 +117,7 @@ class FieldFault:
 
 
 def find_fault(root: Node, type_: Any) -> FieldFault | None:
-    """The first place, in the order of the file, where `root` cannot be a `type_`."""
+    """Return the first fault, in the order of the file, that keeps `root` from being a `type_`."""
     return _find(root, type_, "", root.line)
 
 
@@ -139,9 +139,9 @@ def _find(node: Node, type_: Any, path: str, key_line: int) -> FieldFault | None
 
 
 def _own_fault(node: Node, path: str, line: int, text: str) -> FieldFault:
-    """What a Struct says of itself; `FIELD: ...` or `FIELD[2]: ...` is about that very line.
+    """Return the line of a Struct's own error, which may begin with `FIELD: ` or `FIELD[2]: `.
 
-    Else it is about the first field that it names and that stands in the file.
+    Otherwise it is the line of the first field of the file that the error names.
     """
     match = re.match(r"(\w+)(?:\[(\d+)\])?: ", text)
     for entry in node.entries or ():
@@ -156,7 +156,7 @@ def _own_fault(node: Node, path: str, line: int, text: str) -> FieldFault:
 
 
 def _wrong_tag(node: Node, structs: list[Any], path: str, key_line: int) -> FieldFault | None:
-    """A union's Structs are told apart by a tag field; without a good one nothing else is said."""
+    """Return the fault of a union's tag field, which selects one of its Structs."""
     tags = [s.__struct_config__.tag for s in structs if s.__struct_config__.tag is not None]
     name = structs[0].__struct_config__.tag_field if tags else ""
     for entry in node.entries or ():
@@ -218,7 +218,7 @@ def _item_types(type_: Any, node: Node) -> list[Any]:
 
 
 def _meant(type_: Any, node: Node) -> Any:
-    """The member of an Annotated, Optional or Union type that a value like `node` is meant for."""
+    """Return the member of an Annotated, Optional or Union type that fits a value like `node`."""
     members = _members(type_)
     if node.entries is not None and (structs := _structs(type_)):
         name = structs[0].__struct_config__.tag_field
@@ -270,7 +270,7 @@ MOST_BYTES = 256 * 1024  # a hundred times what a large robot's file holds
 
 
 def load(path: Path, type: type[T]) -> T:
-    """The `type` that a YAML file describes.
+    """Return the `type` that a YAML file describes.
 
     Raises ConfigError, whose one line reads `FILE:LINE: what is wrong; what was expected`.
     """
@@ -278,7 +278,7 @@ def load(path: Path, type: type[T]) -> T:
 
 
 def read(path: Path) -> str:
-    """The text of a YAML file. Raises ConfigError."""
+    """Return the text of a YAML file. Raises ConfigError."""
     try:
         data = read_bounded(path, MOST_BYTES)
         return data.decode()

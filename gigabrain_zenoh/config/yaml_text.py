@@ -1,7 +1,7 @@
 """YAML without its surprises: one document of plain values, each with its line.
 
 YAML 1.1 reads `12:30` as 750, `010` as 8, `no` as false and the last of two equal keys as the
-only one. Whoever writes a robot's limits must not be surprised, so all of this is refused.
+only one. A robot's limits must not hold surprises, so all of this is refused.
 """
 
 import math
@@ -20,7 +20,7 @@ _NUMBER = re.compile(r"[-+]?(?:(?:0|[1-9][0-9]*)(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-
 
 
 class YamlFault(Exception):
-    """What is wrong with a text and on which line (from 1)."""
+    """An error in a text, with its line (from 1)."""
 
     def __init__(self, line: int, text: str) -> None:
         super().__init__(text)
@@ -48,7 +48,7 @@ class Node:
 
 
 def read(text: str) -> Node:
-    """The one document in `text`. Raises YamlFault."""
+    """Return the one document in `text`. Raises YamlFault."""
     try:
         _refuse_indirections(text)
         root = yaml.compose(text, Loader=_LOADER)
@@ -66,7 +66,7 @@ def read(text: str) -> Node:
 
 
 def _refuse_indirections(text: str) -> None:
-    """Look at the events first: they need no recursion, and still show aliases and tags."""
+    """Check the events first: they need no recursion, and show aliases and tags."""
     depth = documents = 0
     for event in yaml.parse(text, Loader=_LOADER):
         line = _line(event.start_mark)
@@ -122,7 +122,7 @@ def _entries(node: yaml.MappingNode) -> tuple[Entry, ...]:
 
 
 def _scalar(node: yaml.ScalarNode, line: int) -> str | float | bool | None:
-    """The value of one scalar; its tag is the resolver's, for explicit tags are refused."""
+    """Return the value of one scalar; its tag is the resolver's, as explicit tags are refused."""
     kind = node.tag.rsplit(":", 1)[1]
     text: str = node.value
     if kind == "null":
@@ -133,7 +133,7 @@ def _scalar(node: yaml.ScalarNode, line: int) -> str | float | bool | None:
                 line, f"{text!r} is read as a boolean; write true or false, or quote it"
             )
         return text == "true"
-    # `1e3` has no dot, so YAML 1.1 takes it for a string; everybody who writes it means a number.
+    # `1e3` has no dot, so YAML 1.1 takes it for a string; here it is a number
     bare = kind == "str" and not node.style and _NUMBER.fullmatch(text) is not None
     if kind in ("int", "float") or bare:
         return _number(text, kind == "int", line)

@@ -22,9 +22,9 @@ KINDS = (
 
 
 def open_regular(path: Path, most_bytes: int | None = None) -> BinaryIO:
-    """Open a file to be read. Raises OSError, and ConfigError for anything but a regular file.
+    """Open a regular file for reading. Raises OSError.
 
-    Also for one of more than `most_bytes`.
+    Raises ConfigError for other kinds of files, and for more than `most_bytes`.
     """
     fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a FIFO opens at once so
     try:
@@ -41,7 +41,7 @@ def open_regular(path: Path, most_bytes: int | None = None) -> BinaryIO:
 
 
 def read_bounded(path: Path, most_bytes: int) -> bytes:
-    """The content of a regular file. Raises OSError, and ConfigError as `open_regular` does."""
+    """Return the content of a regular file. Raises OSError, and ConfigError like `open_regular`."""
     with open_regular(path, most_bytes) as file:
         data = file.read(most_bytes + 1)  # a file of /proc has no size, and another may grow
     if len(data) > most_bytes:
@@ -50,7 +50,7 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
 
 
 def too_large(path: Path, there: int, most_bytes: int) -> str:
-    """What to say of a file that is."""
+    """Return the error text for a file that is too large."""
     return f"{path}: {there / 1e6:.1f} MB; expected at most {most_bytes / 1e6:g} MB"
 
 
@@ -66,7 +66,7 @@ def replace_file(path: Path, data: bytes, mode: int = 0o644) -> None:
 
 @contextmanager
 def replacing(path: Path, mode: int = 0o644) -> Iterator[BinaryIO]:
-    """A file to write what is to replace `path`, durably, when the block ends. Raises OSError."""
+    """Yield a file that replaces `path`, durably, when the block ends. Raises OSError."""
     draft = path.with_name(f".{path.name}.new")
     try:
         with _synced(draft, mode) as file:
@@ -79,7 +79,7 @@ def replacing(path: Path, mode: int = 0o644) -> Iterator[BinaryIO]:
 
 
 def create_file(path: Path, data: bytes, mode: int = 0o644) -> None:
-    """Write the new file `path`, durably; of several writers one wins, nobody sees half a file.
+    """Write the new file `path`, durably and at once; of several writers one wins.
 
     Raises FileExistsError where it exists, and OSError.
     """

@@ -15,9 +15,9 @@ LONGEST_NAME = 253  # characters (RFC 1035, 2.3.4)
 
 
 def host_and_port(endpoint: str) -> tuple[str, int]:
-    """The host of a Zenoh endpoint, without brackets, and its port; of a Unix socket "" and 0.
+    """Return the host of a Zenoh endpoint, without brackets, and its port; "" and 0 for a socket.
 
-    Raises ValueError for what Zenoh would wait for in vain.
+    Raises ValueError for an endpoint that Zenoh would wait for in vain.
     """
     if LOCAL_ENDPOINT.fullmatch(endpoint):
         return "", 0
@@ -31,7 +31,7 @@ def host_and_port(endpoint: str) -> tuple[str, int]:
 
 
 def is_ip(host: str) -> bool:
-    """Whether it is an IPv4 or IPv6 address, and no name."""
+    """Return whether `host` is an IPv4 or IPv6 address, not a name."""
     try:
         ipaddress.ip_address(host)
     except ValueError:
@@ -40,26 +40,26 @@ def is_ip(host: str) -> bool:
 
 
 def is_host(text: str) -> bool:
-    """Whether it is an IP address, or can be a host's name in DNS (RFC 1123, 2.1)."""
+    """Return whether `text` is an IP address or a possible host name (RFC 1123, 2.1)."""
     labels = text.removesuffix(".").split(".")
     named = all(LABEL.fullmatch(label) for label in labels) and not labels[-1].isdecimal()
     return is_ip(text) or (named and len(text) <= LONGEST_NAME)
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches the address. Of names, only `localhost` is sure to be."""
+    """Return whether only this machine reaches the address; of names, only `localhost` is."""
     return host == "localhost" or (is_ip(host) and ipaddress.ip_address(host).is_loopback)
 
 
 def reached_at(endpoint: str) -> str:
-    """Where this machine reaches whoever listens on an endpoint: loopback for all addresses."""
+    """Return the endpoint at which this machine reaches a listener: loopback for all addresses."""
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
 def exposed(endpoints: Iterable[str]) -> str:
-    """The first of these Zenoh endpoints that other machines can reach, or nothing.
+    """Return the first of these Zenoh endpoints that other machines can reach; empty for none.
 
-    Raises ValueError for one that is none.
+    Raises ValueError for an invalid endpoint.
     """
     for endpoint in endpoints:
         host, _ = host_and_port(endpoint)
@@ -69,11 +69,11 @@ def exposed(endpoints: Iterable[str]) -> str:
 
 
 def reserve_port(host: str, port: int = 0) -> int:
-    """`port` of `host`, an IP address without brackets; with 0 any free one.
+    """Reserve `port` of `host`, an IP address without brackets; with 0 any free one.
 
-    On Linux a socket that is bound and does not listen holds it until this process ends: others may
-    listen there if they ask for that port by its number, and nobody who asks for any port gets it.
-    Elsewhere the port is only known to have been free. Raises OSError where somebody listens.
+    On Linux a socket that is bound but does not listen holds it until this process ends: others may
+    listen there if they name the port, but are never given it as a free one. Elsewhere the port is
+    only known to have been free. Raises OSError if the port is in use.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as holder:

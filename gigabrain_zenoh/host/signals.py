@@ -38,7 +38,7 @@ class Interrupts:
 
     @property
     def exit_code(self) -> int:
-        """The exit code of a command that a signal has ended, as shells have it."""
+        """Return the exit code of a command that a signal has ended, as shells do."""
         return 128 + self.received
 
     def install(self) -> None:
@@ -132,7 +132,7 @@ class Interrupts:
         os._exit(128 + number)
 
     def _unraisable(self, args: "sys.UnraisableHookArgs") -> None:
-        """A KeyboardInterrupt raised where nobody can catch it, such as `__del__`, comes again."""
+        """Raise a KeyboardInterrupt again that was raised where no code can catch it."""
         if not (self.received and isinstance(args.exc_value, KeyboardInterrupt)):
             sys.__unraisablehook__(args)
             return

@@ -1,4 +1,4 @@
-"""A person's terminal: text shown from a thread, lines typed in, and text made harmless."""
+"""A terminal: text written from a thread, lines typed in, control characters escaped."""
 
 import asyncio
 import contextlib
@@ -75,14 +75,14 @@ class LineSplitter:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[bytes]:
-        """The lines that `data` completes, without their newlines; empty ones are left out."""
+        """Return the lines that `data` completes, without newlines and empty lines."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(self._rest) > MAX_LINE_BYTES:
             lines.append(self.end())
         return [line for line in lines if line.strip()]
 
     def end(self) -> bytes:
-        """What came after the last newline."""
+        """Return the rest after the last newline."""
         rest, self._rest = self._rest, b""
         return rest
 

@@ -16,7 +16,7 @@ InTime = Callable[[Future[Any], float], bool]  # whether work is done after so l
 
 
 def done(job: Job, patience_s: float | None) -> bool:
-    """Whether `job` is done after that long at most."""
+    """Return whether `job` is done within `patience_s`."""
     finished, _ = concurrent.futures.wait((job,), patience_s)
     return bool(finished)
 
@@ -29,20 +29,20 @@ class ScheduledWorker:
         self._job: Future[Take] | None = None
         self._left = 0  # scans until the result is due
         self._patience_s, self._in_time = patience_s, in_time
-        self.late = 0  # how often a result was not there when it was due
+        self.late = 0  # how often a result was due and not ready
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is under way."""
+        """Return whether no work is in progress."""
         return self._job is None
 
     @property
     def overdue(self) -> int:
-        """For how many scans a result has been due and not there."""
+        """Return for how many scans a result has been due."""
         return max(0, -self._left) if self._job else 0
 
     def start(self, work: Work, scans: int) -> None:
-        """Begin; the result is due in so many scans."""
+        """Start `work`, whose result is due in `scans` scans."""
         self._job, self._left = self._pool.submit(work), scans
 
     def hasten(self, scans: int) -> None:
@@ -50,7 +50,7 @@ class ScheduledWorker:
         self._left = min(self._left, scans)
 
     def at_scan(self) -> None:
-        """Take the result, when it is due at this scan and there. Raises what the work raised."""
+        """Use the result, if it is due at this scan and ready. Raises what the work raised."""
         if self._job is None:
             return
         self._left -= 1
@@ -63,13 +63,13 @@ class ScheduledWorker:
         job.result()()
 
     def finish(self) -> None:
-        """Take the result of what is under way, however long that takes."""
+        """Wait for the work in progress, and use its result."""
         job, self._job = self._job, None
         if job:
             job.result()()
 
     def close(self) -> None:
-        """End the thread, after what is under way."""
+        """End the thread after the work in progress."""
         self._pool.shutdown()
 
 

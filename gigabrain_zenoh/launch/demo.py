@@ -95,7 +95,7 @@ ANSWER_S, HASTY_S = 5.0, 0.2  # how long the truth may take; and once a person w
 
 
 class DemoOptions(Struct, frozen=True, kw_only=True):
-    """How the demo is run."""
+    """Options of a demo."""
 
     seconds: float | None = None  # of the robot's time; None for until Ctrl-C
     headless: bool = False
@@ -142,9 +142,9 @@ class Demo:
         self._last_fault = ""  # before all were asked to end, the driver's first
 
     async def run(self) -> int:
-        """The exit code: 0 for a run without contact, with motion, with all processes alive.
+        """Run it; return 0 for a run with motion, without contact, with all processes alive.
 
-        A run that a person ends is not judged. Raises GigabrainError when it cannot be started.
+        A run that a person ends is not judged. Raises GigabrainError if it cannot start.
         """
         label = f"{self._deployment.body} in {self._deployment.world}"
         endpoint = client_endpoint(self._deployment)
@@ -163,7 +163,7 @@ class Demo:
         return self._finish(report, stopped=stop.is_set())
 
     async def _join(self, stop: asyncio.Event) -> Bus | None:
-        """A session of our own, or None when the run ended before there was a router."""
+        """Open a session; return None if the run ends before there is a router."""
         opening = asyncio.ensure_future(ZenohTransport.open(client_endpoint(self._deployment)))
         while not opening.done() and not stop.is_set() and not self._supervisor.given_up:
             await asyncio.wait((opening,), timeout=LOOK_S)
@@ -196,7 +196,7 @@ class Demo:
         return await self._ask_for_truth(watch, HASTY_S if stop.is_set() else ANSWER_S)
 
     def _look_at_capacity(self, watch: RunMonitor, view: DemoView) -> None:
-        """Say once that this machine is too small; in lock-step time may wait for the brain."""
+        """Report once that this machine is too small; in lock-step, time may wait for the brain."""
         capacity, known = self._capacity, self._capacity.problem
         if self._starting or self._deployment.speed != 1.0:
             capacity.restart()
@@ -208,12 +208,12 @@ class Demo:
 
     @property
     def _starting(self) -> bool:
-        """Whether a process is on its way: the very first start compiles, and time may wait."""
+        """Return whether a process is starting; the very first start compiles."""
         statuses = self._supervisor.statuses.values()
         return any(status.state in ("waiting", "starting") for status in statuses)
 
     def _starting_up(self) -> str:
-        """Which of the three systems is not there yet, and why that takes long; or nothing."""
+        """Return which of the three systems is starting, and why it takes long; empty for none."""
         statuses = self._supervisor.statuses
         late = [one for one in SYSTEMS if one in statuses and statuses[one].state == "starting"]
         if not late:
@@ -222,7 +222,7 @@ class Demo:
         return f"{' and '.join(late)} {'is' if len(late) == 1 else 'are'} starting up{why}"
 
     def _served(self) -> str:
-        """Where the operator page is, once it is there, or how to get it."""
+        """Return the address of the operator page once it runs, or how to install it."""
         status = self._supervisor.statuses.get("page")
         return self._options.page if status is None or status.state == "ready" else ""
 
@@ -232,7 +232,7 @@ class Demo:
 
     @property
     def _live(self) -> bool:
-        """Whether there is a page in the terminal."""
+        """Return whether the live view is shown in the terminal."""
         return not self._options.headless and sys.stdout.isatty()
 
     def _view(self, watch: RunMonitor) -> DemoView:
@@ -277,7 +277,7 @@ class Demo:
         return make_report(told_of_all, seen)  # the truth is the simulator's, wherever it runs
 
     def _record(self, _name: str, record: Mapping[str, Any]) -> None:
-        """A line of somebody's log."""
+        """Process a log record of a process."""
         event, level = record.get("event"), record.get("level")
         if event == "decision":
             decided = round(record["tick"] * TICK_S, 2), str(record["reason"])
@@ -321,6 +321,6 @@ class Demo:
 
 
 def newest_fault(texts: Iterable[str]) -> str:
-    """The one that tells most of why nothing moved: the driver's newest, else the newest at all."""
+    """Return the driver's newest fault, else the newest of all: the likeliest reason."""
     newest = list(texts)[::-1]
     return next((text for text in newest if text.startswith("driver:")), "".join(newest[:1]))

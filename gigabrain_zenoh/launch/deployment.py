@@ -133,14 +133,14 @@ def _part(name: str, settings: type[Struct]) -> tuple[str, Any, Any]:
 
 
 def deployment_folder() -> Path:
-    """The deployment files that come with the package, in a wheel as in a checkout."""
+    """Return the folder of the shipped deployment files, in a wheel or a checkout."""
     package = Path(str(resources.files("gigabrain_zenoh")))
     installed = package / "deploy"
     return installed if installed.is_dir() else package.parent / "deploy"
 
 
 def deployment_path(name: str) -> Path:
-    """The deployment file at a path, or the one of ours with that name. Raises UnknownName."""
+    """Return the deployment file at a path, or the shipped one of that name. Raises UnknownName."""
     path = Path(name)
     ours = {file.stem: file for file in sorted(deployment_folder().glob("*.yaml"))}
     if not name or (not path.exists() and not name.endswith((".yaml", ".yml"))):
@@ -153,7 +153,7 @@ def deployment_path(name: str) -> Path:
 
 
 def load_deployment(path: Path, keys: str = "") -> Deployment:
-    """Read a deployment file; its keys are found beside it, unless `keys` stand in for them.
+    """Read a deployment file; its keys lie beside it, unless `keys` replaces them.
 
     Raises ConfigError with file, line and what was expected.
     """
@@ -164,7 +164,7 @@ def load_deployment(path: Path, keys: str = "") -> Deployment:
 
 
 def host_of(deployment: Deployment, name: str | None) -> str:
-    """The host to start: `name`, or the only one there is. Raises ConfigError."""
+    """Return the host to start: `name`, or the only one. Raises ConfigError."""
     hosts = deployment.hosts
     if name is None:
         if len(hosts) > 1:
@@ -176,7 +176,7 @@ def host_of(deployment: Deployment, name: str | None) -> str:
 
 
 def with_free_port(deployment: Deployment) -> Deployment:
-    """The deployment with a free port in place of port 0."""
+    """Return the deployment with a free port in place of port 0."""
     protocol, _, address = deployment.router.partition("/")
     host, _, port = address.rpartition(":")
     if port != "0":
@@ -189,7 +189,7 @@ def with_free_port(deployment: Deployment) -> Deployment:
 
 
 def client_endpoint(deployment: Deployment, host: str = "") -> Endpoint:
-    """Where the processes of `host` meet this deployment. Raises ConfigError."""
+    """Return the endpoint at which the processes of `host` connect. Raises ConfigError."""
     keys = str(identity_folder(deployment.keys, host)) if deployment.keys else ""
     return secured(
         Endpoint(connect=(deployment.router,), namespace=deployment.namespace, keys=keys)
@@ -197,9 +197,9 @@ def client_endpoint(deployment: Deployment, host: str = "") -> Endpoint:
 
 
 def local_endpoint(deployment: Deployment, host: str) -> Endpoint:
-    """Where `host` meets it itself: with keys by the Unix socket of its own router, if it has one.
+    """Return the endpoint for `host` itself: with keys the Unix socket of its own router, if any.
 
-    Nobody on the network can be in the way there.
+    No other machine can interfere there.
     """
     endpoint = client_endpoint(deployment, host)
     if not endpoint.keys or "router" not in deployment.hosts[host]:
@@ -208,7 +208,7 @@ def local_endpoint(deployment: Deployment, host: str) -> Endpoint:
 
 
 def check_keys(deployment: Deployment, host: str) -> None:
-    """Whether the identity of `host` is good for what it runs. Raises ConfigError."""
+    """Check that the identity of `host` permits its processes. Raises ConfigError."""
     if deployment.keys:
         check_identity(
             identity_folder(deployment.keys, host),
@@ -219,6 +219,6 @@ def check_keys(deployment: Deployment, host: str) -> None:
 
 
 def recorded(path: Path) -> dict[str, Any]:
-    """What makes a deployment record itself into one file, raw, for a replay."""
+    """Return the fields of a deployment that records itself into one file, for a replay."""
     recorder = {"file": str(path.absolute()), "viewers": False}
     return {"hosts": {"robot": (*ROBOT, "recorder")}, "recorder": recorder}

@@ -1,4 +1,4 @@
-"""The table of processes: one row says all that is to be known of a process, wherever it is used.
+"""The table of processes: one row holds all that launching, settings and rights need.
 
 A supervisor starts each as `python -m gigabrain_zenoh.launch.processes CONFIG`, with a
 ProcessConfig in JSON. Packages offer theirs as entry points of the group `gigabrain.processes`,
@@ -101,7 +101,7 @@ def _needs_emulator(deployment: "Deployment", here: set[str]) -> bool:
 
 
 def _needs_button(deployment: "Deployment", here: set[str]) -> bool:
-    """Return whether an e-stop button runs beside the driver: unless `hosts` says where."""
+    """Return whether an e-stop button runs beside the driver: unless `hosts` places it."""
     placed = any("button" in names for names in deployment.hosts.values())
     return deployment.button is not None and "driver" in here and not placed
 

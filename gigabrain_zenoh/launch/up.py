@@ -91,7 +91,7 @@ class Notifier:
 STOP_S = 1.5  # until processes that do not end are killed
 LIMIT_S = STOP_S + 2.0  # until the supervisor itself is ended by force
 LOOK_S = 0.1
-ROUTERS = {"router", "relay"}  # without the one or the other nobody on the host hears anything
+ROUTERS = {"router", "relay"}  # without one of them no message is delivered on the host
 
 
 async def up(
@@ -102,11 +102,11 @@ async def up(
     *,
     keep_stuck: bool = False,
 ) -> int:
-    """Keep a host's processes running until Ctrl-C; the exit code.
+    """Keep a host's processes running until Ctrl-C; return the exit code.
 
-    What makes no progress is started again, or with `keep_stuck` left to a debugger.
-    Raises ConfigError when what a process was given is wrong, or a folder cannot be written, and
-    BusError when the router cannot run, without which nothing else can.
+    A process without progress is restarted, or with `keep_stuck` left to a debugger. Raises
+    ConfigError for wrong settings and for a folder that cannot be written, and BusError if the
+    router cannot run.
     """
     check_keys(deployment, host)
     if "decision" in deployment.hosts[host]:
@@ -124,7 +124,7 @@ async def up(
         nonlocal refusal
         if record.get("event") == "failed":
             before, refusal = refusal, str(record.get("text", ""))
-            if refusal == before:  # told already, when it was tried the first time
+            if refusal == before:  # printed already, at the first try
                 return
         say(logs.readable(record, colour=False))
 
@@ -150,14 +150,14 @@ async def up(
 
 
 def _hopeless(supervisor: Supervisor) -> bool:
-    """Whether what has been given up leaves nothing to keep running."""
+    """Return whether nothing is left to keep running."""
     return bool(supervisor.misconfigured) or bool(ROUTERS & set(supervisor.given_up))
 
 
 def _report(supervisor: Supervisor, notifier: Notifier, note: Path) -> None:
-    """Tell the service manager how all are doing; what was given up is told, not waited for.
+    """Report the processes' state to the service manager.
 
-    The note of a robot that is well is touched: whoever has no service manager looks at its age.
+    The note of a healthy robot is touched, so that its age shows its health without a manager.
     """
     states = {name: status.state for name, status in supervisor.statuses.items()}
     not_yet = [name for name, state in states.items() if state not in ("ready", "given up")]
@@ -173,5 +173,5 @@ def _report(supervisor: Supervisor, notifier: Notifier, note: Path) -> None:
     if not supervisor.stuck:
         notifier.alive()
     if not told:
-        with contextlib.suppress(OSError):  # somebody has tidied up
+        with contextlib.suppress(OSError):  # removed meanwhile
             os.utime(note)

@@ -1,4 +1,4 @@
-"""How a process lives: the way onto the bus, services, supervision, the router, and the audit.
+"""Life cycle of processes: the way onto the bus, services, supervision, router and audit.
 
 It may import bus, config, host, logs and security.
 The rooms above, and the drivers, may import it.

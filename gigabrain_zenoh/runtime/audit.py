@@ -59,7 +59,7 @@ class AuditFile:
         return ""
 
     def newest(self, count: int) -> tuple[AuditRecord, ...]:
-        """The last `count` entries, oldest first. Blocks."""
+        """Return the last `count` entries, oldest first. Blocks."""
         return read_audit(self._folder.parent, count, self._process)
 
     def _append(self, name: str, records: Sequence[AuditRecord]) -> None:
@@ -74,7 +74,7 @@ class AuditFile:
             os.fsync(file.fileno())
 
     def _place(self, name: str, more: int) -> Path:
-        """The file to append to; begins a new one, and removes the oldest, where one is full."""
+        """Return the file to append to; if it is full, begin a new one and remove the oldest."""
         files = _files(self._folder, name)
         if files and files[-1].stat().st_size + more <= self._max_bytes:
             return files[-1]
@@ -85,9 +85,9 @@ class AuditFile:
 
 
 def read_audit(folder: Path, count: int, process: str = "") -> tuple[AuditRecord, ...]:
-    """The last `count` entries that a robot's folder holds, in order of time.
+    """Return the last `count` entries in a robot's folder, in order of time.
 
-    A line that was torn by a power cut is left out. Raises ConfigError.
+    A line that a power cut has torn is left out. Raises ConfigError.
     """
     names = {process, process + EVENTS}
     if not process:
@@ -134,7 +134,7 @@ def _number(path: Path) -> int:
 
 
 def _torn(path: Path) -> bool:
-    """Whether the file ends in the middle of a line, as a power cut may leave it."""
+    """Return whether the file ends in the middle of a line, as after a power cut."""
     if not path.exists() or not path.stat().st_size:
         return False
     with path.open("rb") as file:
@@ -146,7 +146,7 @@ WIDTH = 8  # of the widest word for what has happened
 
 
 def readable(record: AuditRecord) -> str:
-    """`2026-01-01 00:00:00 tick 205  estop  ann: stopped and latched; e-stop number 2`."""
+    """Return `2026-01-01 00:00:00 tick 205  estop  ann: stopped and latched; e-stop number 2`."""
     when = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(record.stamp_ns / 1e9))
     verdict = "" if record.ok else " [refused]" if record.what != "refused" else ""
     code = f" {record.code}" if record.code else ""
@@ -159,7 +159,7 @@ def readable(record: AuditRecord) -> str:
 
 
 def as_json(record: AuditRecord) -> str:
-    """One object in one line."""
+    """Return the entry as JSON in one line."""
     return msgspec.json.encode(record).decode()
 
 
@@ -176,7 +176,7 @@ Key = tuple[What, str, str]  # what, source, code; no code where all codes of a 
 
 @dataclass
 class _Recent:
-    """What has happened since it was last told, by code."""
+    """Events of one source since its last entry, by code."""
 
     told_ns: int
     codes: Counter[str] = field(default_factory=Counter)
@@ -189,9 +189,9 @@ class _Recent:
 
 
 class AuditTrail:
-    """Writes entries down. Never waits for the disk, and cannot be flooded.
+    """Writes entries. Never waits for the disk, and cannot be flooded.
 
-    `flush` is to be called about as often as a second goes by.
+    Call `flush` about once a second.
     """
 
     def __init__(self, bus: Bus, folder: Path) -> None:
@@ -206,9 +206,9 @@ class AuditTrail:
     def note(
         self, what: What, source: str, text: str = "", *, code: str = "", ok: bool = True
     ) -> None:
-        """Write down that something has happened, and who did it.
+        """Write an entry about an event and its source.
 
-        Of refusals a source has one entry a minute, however many codes it comes with.
+        A source has one entry of refusals a minute, whatever their codes.
         """
         now_ns = self._bus.clock.now_ns()
         source, code, text = source[:64], code[:64], text[:500]
@@ -225,7 +225,7 @@ class AuditTrail:
             self._tell(key, recent, ok)
 
     def flush(self) -> None:
-        """Tell what has happened again, and how often."""
+        """Write the repeated events, with their counts."""
         now_ns = self._bus.clock.now_ns()
         for ok, known in self._recent.items():
             for key, recent in list(known.items()):
@@ -280,5 +280,5 @@ def _quiet_ns(key: Key) -> int:
 
 
 def _tally(codes: Counter[str]) -> str:
-    """`put robot/cmd_vel 199, query robot/release 1`, as far as there is room."""
+    """Return `put robot/cmd_vel 199, query robot/release 1`, as far as there is room."""
     return ", ".join(f"{code} {times}" for code, times in codes.most_common())[:200]

@@ -32,7 +32,7 @@ ROUTER_S = 3.0  # how long a router may take to answer
 
 
 class Where(Struct, frozen=True, kw_only=True):
-    """Which robot, as people name it."""
+    """A robot's address as people give it."""
 
     connect: str | None = None  # its router; without it, the only robot that runs here
     namespace: str = ""

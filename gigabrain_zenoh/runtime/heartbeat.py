@@ -1,8 +1,8 @@
 """A supervised process reports progress to its supervisor once a second.
 
-Progress is judged by what the process does with its input. A loop that turns while scans come in
-and no worlds go out makes none; a process that gets no input has nothing to do, and is well.
-In the supervisor's end of the pipe a beat is a record like any other, which people are not shown.
+Progress is judged by output per input. A loop that runs while scans arrive and no worlds are
+published makes none; a process without input has nothing to do, and is healthy.
+A beat is a log record like any other, which the supervisor does not show.
 """
 
 import os
@@ -41,17 +41,17 @@ class Progress:
 
 
 class Silence:
-    """How long a process has made no progress [s], by the time in which its supervisor ran.
+    """Time without progress of a process [s], counted only while its supervisor ran.
 
-    A machine that stood still, or a supervisor that was stopped, is no reason to kill anybody: of
-    the time between two looks no more counts than `LOOK_S`.
+    A suspended machine or a stopped supervisor is no reason to kill a process: of the time between
+    two checks at most `LOOK_S` counts.
     """
 
     def __init__(self) -> None:
         self.seconds = 0.0
 
     def end(self) -> None:
-        """A beat has come."""
+        """Start again from zero, after a beat."""
         self.seconds = 0.0
 
     def look(self, passed_s: float) -> bool:
@@ -69,5 +69,5 @@ async def beat(clock: Clock, progress: Callable[[], bool], out: int) -> None:
 
 
 def _has_room(out: int) -> bool:
-    """Whether a line fits: a supervisor that stands still must not hold its processes up."""
+    """Return whether a line fits: a stopped supervisor must not block its processes."""
     return bool(select.select((), (out,), (), 0)[1])

@@ -21,7 +21,7 @@ from gigabrain_zenoh.runtime import heartbeat
 
 @dataclass(frozen=True)
 class Backoff:
-    """How long to wait after a death, and how many deaths are too many."""
+    """Pauses after a death, and the number of deaths at which a process is given up."""
 
     first_s: float = 0.2
     factor: float = 2.0
@@ -41,7 +41,7 @@ class RestartPolicy:
         self._next_s = backoff.first_s
 
     def died(self, now_s: float, up_s: float) -> float | None:
-        """Seconds to wait before the next start, or None to give up; `up_s` is since ready."""
+        """Return the seconds before the next start, None to give up; `up_s` is since ready."""
         backoff = self._backoff
         self._deaths.append(now_s)
         while now_s - self._deaths[0] > backoff.window_s:
@@ -57,7 +57,7 @@ _DRAIN_S = 0.2  # what a dead child has written arrives at once; someone else ma
 
 
 def as_record(line: bytes, process: str) -> dict[str, Any]:
-    """The log record in a line of output; what is no log record is itself the text of one."""
+    """Return the log record in a line of output; other lines become the text of a record."""
     known = {"t": time.time_ns(), "level": "info", "process": process, "event": "output"}
     with contextlib.suppress(msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         said = msgspec.json.decode(line)
@@ -96,29 +96,29 @@ class Child(asyncio.SubprocessProtocol):
         return child
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """The process runs and its pipes are joined (asyncio calls this)."""
+        """Note that the process runs and its pipes are open (asyncio calls this)."""
         self._transport = cast(asyncio.SubprocessTransport, transport)
         self.pid = self._transport.get_pid()
 
     def pipe_data_received(self, fd: int, data: bytes) -> None:
-        """Output has come (asyncio calls this)."""
+        """Split output into records (asyncio calls this)."""
         for line in self._lines[fd].feed(data):
             self._on_record(as_record(line, self._name))
 
     def pipe_connection_lost(self, fd: int, exc: Exception | None) -> None:
-        """There will be no more output on `fd` (asyncio calls this)."""
+        """Handle the end of output on `fd` (asyncio calls this)."""
         if rest := self._lines.pop(fd).end():
             self._on_record(as_record(rest, self._name))
         if not self._lines:
             self._drained.set()
 
     def process_exited(self) -> None:
-        """The process has ended and is reaped (asyncio calls this)."""
-        self._signal_group(signal.SIGKILL)  # whatever it has started goes with it
+        """Kill what the process has started, once it is reaped (asyncio calls this)."""
+        self._signal_group(signal.SIGKILL)  # and all that it has started
         self._ended.set()
 
     def send_signal(self, number: int) -> None:
-        """Send a signal to the process and all that it has started; nothing if it has ended."""
+        """Send a signal to the process and all that it has started, unless it has ended."""
         if not self._ended.is_set():
             self._signal_group(number)
 
@@ -128,7 +128,7 @@ class Child(asyncio.SubprocessProtocol):
             os.killpg(self.pid, number)
 
     async def wait(self) -> int:
-        """Wait for its end and its last words; the exit code, or minus the signal's number."""
+        """Wait for its end and last output; return the exit code, or minus the signal's number."""
         await self._ended.wait()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_DRAIN_S):
@@ -162,7 +162,7 @@ class ProcessSpec:
 
 @dataclass
 class ProcessStatus:
-    """How a process is doing now."""
+    """State of a process now."""
 
     name: str
     pid: int | None = None
@@ -174,7 +174,7 @@ class ProcessStatus:
 
 @dataclass
 class Shared:
-    """What the keepers of one supervisor have in common."""
+    """State shared by all processes of one supervisor."""
 
     on_record: OnRecord
     backoff: Backoff
@@ -186,7 +186,7 @@ class Shared:
 
 @dataclass(frozen=True)
 class Death:
-    """An end that nobody asked for."""
+    """An unexpected end."""
 
     text: str  # "ended with exit code 1"
     code: int | None = None  # None: it could not even be started
@@ -200,7 +200,7 @@ class ManagedProcess:
     def __init__(self, spec: ProcessSpec, shared: Shared) -> None:
         self.spec, self.status, self.deaths = spec, ProcessStatus(spec.name), 0
         self.child: Child | None = None
-        # ready, given up or stopping: whoever comes after this one need not wait any longer
+        # ready, given up or stopping: processes after this one need not wait any longer
         self.settled = asyncio.Event()
         self._shared, self._patience = shared, RestartPolicy(shared.backoff)
         self._started_s, self._silence = 0.0, heartbeat.Silence()
@@ -230,7 +230,7 @@ class ManagedProcess:
             await self._shared.halt.wait()
 
     async def _live(self) -> Death:
-        """One life, from start to end."""
+        """Run the process once, from start to end."""
         loop, status = asyncio.get_running_loop(), self.status
         status.state, status.ready_after_s, self._started_s = "starting", None, loop.time()
         try:
@@ -298,7 +298,7 @@ class ManagedProcess:
             self.child.send_signal(signal.SIGKILL)
 
     def _judge(self, death: Death) -> float | None:
-        """Seconds until the next start; None when there will be none."""
+        """Return the seconds until the next start; None to give up."""
         self.deaths += 1
         now_s, backoff = asyncio.get_running_loop().time(), self._shared.backoff
         delay_s = None if death.hopeless else self._patience.died(now_s, death.up_s)
@@ -320,17 +320,17 @@ class ManagedProcess:
         self._shared.on_record(name, record | about)
 
     def ask_to_end(self) -> None:
-        """SIGTERM to the process and what it has started."""
+        """Send SIGTERM to the process and all that it has started."""
         if self.child:
             self.child.send_signal(signal.SIGTERM)
 
     def force_to_end(self) -> None:
-        """SIGKILL where SIGTERM was not enough; also ends a process that is stopped."""
+        """Send SIGKILL, which also ends a process that is stopped."""
         if self.child:
             self._say("warning", "killed", "did not end when asked and is killed")
             self.child.send_signal(signal.SIGKILL)
 
 
 def _in_words(code: int) -> str:
-    """`exit code 1`, `signal 9 (Killed)`."""
+    """Return `exit code 1` or `signal 9 (Killed)`."""
     return f"exit code {code}" if code >= 0 else f"signal {-code} ({signal.strsignal(-code)})"

@@ -121,7 +121,7 @@ THREADS = 100  # whose first line is remembered
 
 @dataclass(frozen=True)
 class Denied:
-    """Somebody who has a session tried what is not allowed."""
+    """A client with a session sent something that it may not send."""
 
     zid: str
     what: str  # in Zenoh's words, such as Put
@@ -130,20 +130,20 @@ class Denied:
 
 @dataclass(frozen=True)
 class TurnedAway:
-    """Somebody did not get a session. Zenoh does not say who, or from where."""
+    """A client did not get a session. Zenoh does not log its name or address."""
 
     why: str
 
 
 class ZenohLog:
-    """Cuts the log into lines and picks those that tell of a denial."""
+    """Finds the denials in the log."""
 
     def __init__(self) -> None:
         self._rest = b""
         self._last: dict[bytes, bytes] = {}  # by thread
 
     def feed(self, data: bytes) -> Iterator[Denied | TurnedAway]:
-        """What the log says of those whom the router does not let in, or not through."""
+        """Yield the denials in more bytes of the log."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(self._rest) > LONGEST:
             self._rest = b""
@@ -169,7 +169,7 @@ class ZenohLog:
 
 
 def _text(line: bytes) -> str:
-    """Without colours, and without what a terminal might obey."""
+    """Return the line without colours and control characters."""
     text = COLOUR.sub(b"", line).decode(errors="replace").rstrip()
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
 
@@ -182,14 +182,14 @@ Seen = Denied | TurnedAway
 
 
 class AccessAudit:
-    """Tells the audit trail whom the router did not let in, and what it did not let through."""
+    """Writes rejected clients and messages to the audit trail."""
 
     def __init__(self, trail: AuditTrail, knows: Collection[str]) -> None:
         self._trail, self._knows = trail, knows
         self._links: dict[str, Link] = {}
 
     def link(self, link: Link) -> None:
-        """Somebody has come, or has gone."""
+        """Log that a client has come or gone; note one without rights."""
         name = link.name or "a local process"
         if not link.there:
             if self._links.pop(link.zid, None):
@@ -204,7 +204,7 @@ class AccessAudit:
             log.info("%s has come from %s", name, link.address)
 
     def seen(self, seen: Seen) -> None:
-        """What Zenoh's log has told."""
+        """Note a denial."""
         if isinstance(seen, TurnedAway):
             text = f"somebody was turned away at the door: {seen.why}"
             code = PARTICULAR.sub("…", seen.why)
@@ -220,7 +220,7 @@ class AccessAudit:
 
 
 def _of_table(key: str) -> str:
-    """The topic or service that a key belongs to, of whatever robot; a sender chooses the key."""
+    """Return the topic or service that a key belongs to, of any robot; senders choose keys."""
     parts = key.split("/")
     known = ("/".join(parts[at : at + 2]) for at in (0, 1))
     return next((each for each in known if each in TABLE), "other")
@@ -230,9 +230,9 @@ def _of_table(key: str) -> str:
 def zenoh_log(on_seen: Callable[[Seen], None]) -> Iterator[None]:
     """Read Zenoh's log while the block runs; `on_seen` is called on the loop's thread.
 
-    Zenoh writes it to standard output, whose place a pipe takes for good; nothing else may be
-    written there, since what the log quotes is chosen by strangers. A thread empties the pipe, so
-    that Zenoh never waits for us; of what it has seen the newest wait for a busy loop.
+    Zenoh writes it to standard output, which a pipe replaces for good; nothing else may be written
+    there, since strangers choose what the log quotes. A thread empties the pipe, so that Zenoh
+    never waits; while the loop is busy, the newest denials wait.
     """
     bridge = Bridge()
     mailbox = Mailbox(bridge, on_seen, WAITING)

@@ -27,7 +27,7 @@ def rss_bytes() -> int:
 
 
 async def publish_health(bus: Bus) -> None:
-    """Until cancelled."""
+    """Publish this process's health once a second, until cancelled."""
     host, pid, began = socket.gethostname(), os.getpid(), bus.clock.now_ns()
     then, cpu = began, time.process_time()
     received, sent = Counter[str](), Counter[str]()

@@ -1,7 +1,7 @@
-"""The roles, what each may do, and the router's rules that follow from it.
+"""The roles, and the router's access rules that follow from the table of topics.
 
-What a role may publish is decided where it enters the router. Everybody with an identity may listen
-to all of its own robot; without one there is no session.
+The router that a message enters checks its right. Every identity may subscribe to all of its own
+robot; without an identity there is no session.
 """
 
 import re
@@ -19,9 +19,9 @@ NAMESPACE = re.compile(r"[\w.-]+(/[\w.-]+)*", re.ASCII)
 
 
 def common_name(role: Role, robot: str = "", generation: int = 1) -> str:
-    """What the certificate says, and all that the router goes by.
+    """Return the common name of a certificate, from which a router derives all rights.
 
-    Raises ConfigError for a robot that cannot be one.
+    Raises ConfigError for an invalid name of a robot.
     """
     if not robot:
         return of_generation(role, generation)
@@ -36,29 +36,29 @@ def common_name(role: Role, robot: str = "", generation: int = 1) -> str:
 
 
 def of_generation(name: str, generation: int) -> str:
-    """A common name of the first generation as it is in another."""
+    """Return a common name of the first generation in another one."""
     return name if generation == 1 else f"{name}~{generation}"
 
 
 def parse(name: str) -> tuple[Role, str, int]:
-    """Role, robot and generation in a common name. Raises UnknownName for a role that is none."""
+    """Return role, robot and generation of a common name. Raises UnknownName."""
     name, _, generation = name.partition("~")
     role, _, robot = name.partition("@")
     return role_named(role), robot, int(generation) if generation.isdecimal() else 1
 
 
 def role_named(role: str) -> Role:
-    """The role of that name. Raises UnknownName."""
+    """Return the role of that name. Raises UnknownName."""
     for one in ROLES:
         if one == role:
             return one
     raise unknown("role", role, ROLES)
 
 
-EVERYTHING = "robot/**"  # all that there is of one robot
+EVERYTHING = "robot/**"  # all keys of one robot
 TO_LISTENERS = ("put", "query", "reply", "declare_queryable")
-FIRST: Mapping[str, int] = {}  # nobody has been called back
-LOCAL = "local"  # who comes by the router's Unix socket, which only this user can open
+FIRST: Mapping[str, int] = {}  # no identity is revoked
+LOCAL = "local"  # clients of the router's Unix socket, which only this user can open
 
 
 FLEET_WIDE: tuple[Role, ...] = ("operator", "viewer")  # where no robot is named
@@ -98,13 +98,11 @@ def access_control(
     own: str = "",
     generations: Mapping[str, int] = FIRST,
 ) -> dict[str, Any]:
-    """Zenoh's `access_control` for a router of these robots (their namespaces); deny by default.
+    """Return Zenoh's `access_control` for a router of these robots (namespaces); deny by default.
 
-
-    Of each name only one of the `generations` has rights, the first unless told otherwise.
-
-    Whoever comes by the Unix socket is the robot `own`: only the user who runs it can, and could
-    read its key as well. Beside a router of no robot it is an operator of all.
+    Of each name only one generation has rights: that in `generations`, else the first. A client of
+    the Unix socket has the rights of the robot `own`: only the user who runs it can connect, and
+    could read its key as well. At a router of no robot it is an operator of all.
     """
     of = {
         common_name(role, robot): list(_rules(role, robot, table))
@@ -135,7 +133,7 @@ def access_control(
 
 
 def known_names(robots: Sequence[str], generations: Mapping[str, int] = FIRST) -> tuple[str, ...]:
-    """The common names that have rights at a router of these robots."""
+    """Return the common names that have rights at a router of these robots."""
     return tuple(_good(name, generations) for name, _ in _known(robots))
 
 
@@ -144,7 +142,7 @@ def _good(name: str, generations: Mapping[str, int]) -> str:
 
 
 def _known(robots: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Each common name, and those of one robot whose rights it has together."""
+    """Yield each common name with those of one robot whose rights it combines."""
     for role in OF_ONE_ROBOT:
         if role in FLEET_WIDE:
             yield role, tuple(common_name(role, robot) for robot in robots)
@@ -158,7 +156,7 @@ def _rules(role: Role, robot: str, table: Table) -> Iterator[Rule]:
     who, everything = common_name(role, robot), under(robot, [EVERYTHING])
     says, asks, answers = table.keys(role)
     yield _rule(f"{who} hears", "egress", TO_LISTENERS, everything)
-    # that somebody listens is no secret: a fleet's operator may listen to `**`
+    # subscriptions are no secret: a fleet's operator may subscribe to `**`
     yield _rule(f"{who} is heard", "egress", ["declare_subscriber"], ["**"])
     yield _rule(f"{who} listens", "ingress", ["declare_subscriber"], everything)
     for verb, messages, keys in (
@@ -184,5 +182,5 @@ FLEET_LISTENS = _rule("the fleet listens", "ingress", ["declare_subscriber"], ["
 
 
 def under(robot: str, keys: Iterable[str]) -> list[str]:
-    """The keys as the router sees them."""
+    """Return the keys as the router has them."""
     return [f"{robot}/{key}" if robot else key for key in keys]

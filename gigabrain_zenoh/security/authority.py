@@ -44,7 +44,7 @@ LOCAL = ("localhost", "127.0.0.1", "::1")
 
 
 def new_fleet(fleet: str, folder: Path) -> None:
-    """Make a fleet's authority in `folder`. Raises ConfigError where there is something already."""
+    """Create a fleet's authority in the new folder `folder`. Raises ConfigError."""
     if not fleet.strip() or len(fleet) > MAX_NAME_LENGTH:
         raise ConfigError(f"fleet {fleet!r}: expected a name of 1 to {MAX_NAME_LENGTH} characters")
     key = ec.generate_private_key(ec.SECP256R1())
@@ -75,7 +75,7 @@ def issue(
     hosts: Sequence[str] = (),
     days: int = DAYS,
 ) -> Path:
-    """Make an identity; returns its folder, which is to be copied to its host.
+    """Create an identity; return its folder, which has to be copied to its host.
 
     `hosts` are the addresses and names under which a router is reached. Raises ConfigError.
     """
@@ -181,7 +181,7 @@ def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 @contextmanager
 def _new_folder(folder: Path) -> Iterator[Path]:
-    """A folder that is there whole or not at all. Raises ConfigError where it exists."""
+    """Yield a folder that appears complete or not at all. Raises ConfigError if it exists."""
     taken = ConfigError(f"{folder} exists already; keys are never overwritten: move it away first")
     if folder.exists():
         raise taken
@@ -209,9 +209,9 @@ def _write(folder: Path, contents: Mapping[str, bytes]) -> None:
 
 
 def revoke(fleet_folder: Path, role: Role, robot: str = "") -> tuple[Path, ...]:
-    """Call back all identities issued so far under a common name; the lists that routers want.
+    """Revoke all identities issued under a common name; return the lists for the routers.
 
-    Raises ConfigError for roles that may be a router: they are believed without a router.
+    Raises ConfigError for roles that may be a router: no router checks those.
     """
     if role in SERVERS:
         raise ConfigError(
@@ -240,24 +240,24 @@ MOST_BYTES = 100_000  # of a key or a certificate
 
 
 class Identity(Struct, frozen=True, kw_only=True):
-    """Somebody whom a fleet's routers know."""
+    """An identity that a fleet's routers accept."""
 
     folder: Path
     fleet: str
     name: str  # the common name, such as robot@red
     role: Role
     robot: str  # its namespace; empty for the only one, or for all
-    generation: int  # of all who have had this role
+    generation: int  # rises with each revocation
     hosts: tuple[str, ...]  # where it can be connected to
     expires: datetime.datetime
 
     def days_left(self, now: datetime.datetime) -> float:
-        """Days until it expires; negative afterwards."""
+        """Return the days until it expires; negative afterwards."""
         return (self.expires - now) / datetime.timedelta(days=1)
 
 
 def load(folder: Path, now: datetime.datetime | None = None) -> Identity:
-    """The identity in `folder`. Raises ConfigError where it cannot be used, and what to do."""
+    """Return the identity in `folder`. Raises ConfigError if it cannot be used."""
     identity, certificate = read(folder)
     now = now or datetime.datetime.now(datetime.UTC)
     path = folder / CERTIFICATE
@@ -285,7 +285,7 @@ def load(folder: Path, now: datetime.datetime | None = None) -> Identity:
 
 
 def read(folder: Path) -> tuple[Identity, x509.Certificate]:
-    """What the certificate in `folder` says, valid or not. Raises ConfigError."""
+    """Return the identity and certificate in `folder`, valid or not. Raises ConfigError."""
     check_files(folder)
     certificate = read_certificate(folder / CERTIFICATE)
     name = _attribute(certificate, NameOID.COMMON_NAME)
@@ -304,7 +304,7 @@ def read(folder: Path) -> tuple[Identity, x509.Certificate]:
 
 
 def read_certificate(path: Path) -> x509.Certificate:
-    """A certificate in PEM. Raises ConfigError."""
+    """Read a certificate in PEM. Raises ConfigError."""
     try:
         return x509.load_pem_x509_certificate(_bytes(path))
     except ValueError:
@@ -312,7 +312,7 @@ def read_certificate(path: Path) -> x509.Certificate:
 
 
 def read_key(path: Path) -> ec.EllipticCurvePrivateKey:
-    """A private key in PEM. Raises ConfigError, also where others may read it."""
+    """Read a private key in PEM. Raises ConfigError, also if others may read it."""
     data = _bytes(path)
     check_private(path)
     try:

@@ -26,7 +26,7 @@ REMEDY = "copy the whole folder that `gigabrain keys issue` made"
 
 
 def check_files(folder: Path) -> None:
-    """Whether all files of an identity are there, and its key is private. Raises ConfigError."""
+    """Check that all files of an identity exist and its key is private. Raises ConfigError."""
     if not folder.is_dir():
         raise ConfigError(
             f"{folder}: no folder with keys; make an identity with `gigabrain keys issue ROLE` "
@@ -45,17 +45,17 @@ def check_files(folder: Path) -> None:
 
 
 def check_private(path: Path) -> None:
-    """Whether a key is its owner's alone. Raises ConfigError."""
+    """Check that only its owner may read a key. Raises ConfigError."""
     mode = stat.S_IMODE(path.stat().st_mode)
     if os.name == "posix" and mode & 0o077:
         raise ConfigError(f"{path} is open to others (mode {mode:04o}); chmod 600 {path}")
 
 
 def made_once(path: Path, content: bytes) -> tuple[bytes, bool]:
-    """What a private file holds, and whether it had to be made, with `content`. Raises ConfigError.
+    """Return a private file's content, and whether it was created with `content`.
 
-    Of several who make it at once one wins, and nobody sees it unfinished. An empty one, as a
-    crash may leave it, is made anew.
+    Of several processes that create it one wins, and none reads it unfinished. An empty file, as
+    after a crash, is replaced. Raises ConfigError.
     """
     try:
         if path.exists() and (found := read_bounded(path, MAX_SECRET_BYTES)):
@@ -72,10 +72,10 @@ def made_once(path: Path, content: bytes) -> tuple[bytes, bool]:
             except FileExistsError:
                 check_private(path)
             with open_regular(path, MAX_SECRET_BYTES) as old:
-                fcntl.flock(old, fcntl.LOCK_EX)  # of several who heal it one does
+                fcntl.flock(old, fcntl.LOCK_EX)  # of several processes that replace it one does
                 found = read_bounded(path, MAX_SECRET_BYTES)
                 if not found:
-                    log.warning("%s was empty; it is made anew", path)
+                    log.warning("%s was empty; replaced it", path)
                     os.link(new.name, f"{new.name}-whole")
                     os.replace(f"{new.name}-whole", path)
                 return found or content, not found
@@ -84,12 +84,12 @@ def made_once(path: Path, content: bytes) -> tuple[bytes, bool]:
 
 
 def unreadable(path: Path) -> ConfigError:
-    """The error for a file that this user may not read."""
+    """Return the error for a file that this user may not read."""
     return ConfigError(f"{path} cannot be read by this user; run as its owner, or chown it")
 
 
 def identity_folder(keys: str, host: str = "") -> Path:
-    """The identity in the folder `keys`, or in its part for `host` where it holds several."""
+    """Return the folder of the identity: `keys`, or its subfolder for `host` if it has several."""
     folder = Path(keys).expanduser()
     of_host = folder / host
     if host and not (folder / CERTIFICATE).exists() and of_host.is_dir():
@@ -103,8 +103,8 @@ INSTALL = "keys need more: pip install 'gigabrain-zenoh[keys]'"
 
 
 def identity_in(folder: Path) -> "Identity":
-    """The identity in a folder. Raises ConfigError where it cannot be used."""
-    try:  # 150 ms, which only those pay who look at certificates
+    """Return the identity in a folder. Raises ConfigError if it cannot be used."""
+    try:  # 150 ms, needed only to read certificates
         from gigabrain_zenoh.security.authority import load
     except ModuleNotFoundError as error:
         raise ConfigError(f"{error}; {INSTALL}") from None
@@ -137,7 +137,7 @@ def check_identity(
 
 
 def no_router(endpoint: Endpoint) -> BusError:
-    """Why no router lets us in. Raises ConfigError where our own keys are at fault."""
+    """Return the error for a silent router. Raises ConfigError for invalid own keys."""
     where, doubt = endpoint.connect[-1], "is the robot running, and without keys?"
     if endpoint.keys:
         identity = identity_in(Path(endpoint.keys))
@@ -146,7 +146,7 @@ def no_router(endpoint: Endpoint) -> BusError:
 
 
 def may_not_ask(keys: str) -> str:
-    """What else may be the reason for silence: a router does not say what it denies."""
+    """Return another possible reason for silence: a router does not report denials."""
     return f"; or {identity_in(Path(keys)).name} may not ask for it" if keys else ""
 
 
@@ -156,7 +156,7 @@ MAX_LIST_BYTES = 1_000_000
 
 
 def generations_in(folder: Path) -> dict[str, int]:
-    """By common name; empty where no list is. Raises ConfigError for one that cannot be read."""
+    """Return the generation by common name; empty without a list. Raises ConfigError."""
     path = folder / LIST
     try:
         return msgspec.json.decode(

@@ -1,4 +1,4 @@
-"""The audit log: who did what to the robot, and what came of it."""
+"""The audit log: actions on the robot, their sources and results."""
 
 from typing import Annotated, Literal
 

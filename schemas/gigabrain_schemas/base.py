@@ -1,8 +1,8 @@
 """The base of all messages, and the bounded types that they share.
 
 A bound on a float refuses NaN and infinity as well, so a message that decodes holds finite numbers.
-Every number has the bound of its kind, and every text and list a greatest length: whoever computes
-with a message need not fear for its memory or its time.
+Every number has the bound of its kind, and every text and list a greatest length, so that no
+message exhausts a reader's memory or time.
 """
 
 from typing import Annotated

@@ -69,7 +69,7 @@ class Battery(Record, frozen=True, kw_only=True):
 
 
 class LinkHealth(Record, frozen=True, kw_only=True):
-    """How the driver's line to the body is doing."""
+    """State of the driver's line to the body."""
 
     connected: bool = True
     age_ms: Milliseconds = 0.0  # since the body was last heard
@@ -79,7 +79,7 @@ class LinkHealth(Record, frozen=True, kw_only=True):
 
 
 class GateStatus(Record, frozen=True, kw_only=True):
-    """What the gate lets through, and why not more."""
+    """The gate's mode, its commander, and what holds the robot back."""
 
     mode: GateMode = "latched"
     causes: Causes = ()
@@ -89,7 +89,7 @@ class GateStatus(Record, frozen=True, kw_only=True):
 
 
 class RobotState(Message, frozen=True, kw_only=True):
-    """What the body measures of itself. Its tick is the robot's clock."""
+    """The body's own measurements. Its tick is the robot's clock."""
 
     robot_type: Name
     pose: Pose  # odometry, since the driver's start
@@ -117,7 +117,7 @@ class Lidar(Record, frozen=True, kw_only=True):
 
 
 class ControlGains(Record, frozen=True, kw_only=True):
-    """How often control commands, and how it corrects the measured velocity."""
+    """Control's rate of commands, and its gains for the measured velocity."""
 
     linear_integral: Gain = 1.5  # [1/s]
     angular_integral: Gain = 1.5  # [1/s]
@@ -221,13 +221,13 @@ class BodyDescription(Record, frozen=True, kw_only=True):
             )
 
     def stopping_distance(self, speed: float) -> float:
-        """L(v) = v T + v² / 2a + margin [m]: how far ahead must be free at `speed` [m/s]."""
+        """Return L(v) = v T + v² / 2a + margin [m], the free length needed at `speed` [m/s]."""
         t, a = self.thresholds.reaction_time, self.max_linear_deceleration
         return speed * t + speed * speed / (2 * a) + self.thresholds.stop_margin
 
 
 def _area(corners: tuple[tuple[float, float], ...]) -> float:
-    """The area that `corners` enclose [m2], by Gauss's formula."""
+    """Return the area that `corners` enclose [m2], by Gauss's formula."""
     return (
         abs(sum(x * corners[i - 1][1] - corners[i - 1][0] * y for i, (x, y) in enumerate(corners)))
         / 2

@@ -1,4 +1,4 @@
-"""What perception, decision and control tell one another."""
+"""Messages of perception, decision and control."""
 
 from typing import Annotated
 
@@ -45,7 +45,7 @@ class Obstacle(Record, frozen=True, kw_only=True):
 
 
 class WorldModel(Message, frozen=True, kw_only=True):
-    """What is round the robot now, in the body's frame."""
+    """The robot's surroundings now, in the body's frame."""
 
     scan_ok: bool
     scan_problem: Text = ""  # why the scan cannot be believed
@@ -94,7 +94,7 @@ class OccupancyGrid(Message, frozen=True, kw_only=True):
 
 
 class TrajectoryPoint(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """What decision expects of the body, in the body's frame at the tick of the intent's basis."""
+    """An expected state of the body, in its frame at the tick of the intent's basis."""
 
     t: Annotated[float, Meta(ge=0.0, le=60.0)]  # [s] from that tick
     x: Coordinate  # [m]
@@ -106,7 +106,7 @@ class TrajectoryPoint(msgspec.Struct, frozen=True, array_like=True, forbid_unkno
 
 
 class ActuationModel(Record, frozen=True, kw_only=True):
-    """How a body answers a commanded velocity: nothing at first, then as a first-order lag."""
+    """Response of a body to a commanded velocity: a delay, then a first-order lag."""
 
     delay: Delay = 0.0  # [s]
     lag: Delay = 0.0  # [s], time constant
@@ -123,7 +123,7 @@ class JointTarget(Record, frozen=True, kw_only=True):
 
 
 class Intent(Message, frozen=True, kw_only=True):
-    """What decision wants, what it expects to come of it, and why."""
+    """Decision's wish, the motion that it expects, and its reason."""
 
     twist: Velocity | None = None
     joints: Annotated[tuple[JointTarget, ...], Meta(max_length=MOST_JOINTS)] = ()

@@ -1,4 +1,4 @@
-"""What a process consumed and accepted, so that a recording of it can be replayed."""
+"""Inputs and requests that a process used, so that a recording of it can be replayed."""
 
 from typing import Annotated
 
@@ -11,7 +11,7 @@ MAX_ENTRIES = 4096  # entries in one message
 
 
 class ConsumedInput(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """One message that a process has looked at, or one piece of work that it has waited for."""
+    """One message that a process has used, or one piece of background work."""
 
     key: Count  # which of the keys
     seq: Count  # the message's own; of work: 1 where it was done in time, 0 where it was not
@@ -19,10 +19,10 @@ class ConsumedInput(Struct, frozen=True, array_like=True, forbid_unknown_fields=
 
 
 class InputLog(Message, frozen=True, kw_only=True):
-    """All that a process has looked at since it last said so, in its own order.
+    """All inputs that a process has used since its last InputLog, in its own order.
 
-    A process that is busy passes over messages, and those on different keys come in any order; only
-    it knows what its words rest on. The key WAITED stands for work beside.
+    A busy process skips messages, and those on different keys arrive in any order; only the process
+    knows what its output rests on. The key WAITED stands for background work.
     """
 
     began_ns: Count  # Unix time of the first entry, by the process's own clock

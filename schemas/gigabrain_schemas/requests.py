@@ -1,4 +1,4 @@
-"""What may be asked of a robot, and what it answers."""
+"""Requests to a robot, and its replies."""
 
 from typing import Annotated, Literal
 
@@ -12,16 +12,16 @@ Figure = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 
 
 class EstopRequest(Message, frozen=True, kw_only=True):
-    """Stop at once, and stay stopped until a person releases it. An empty request will do."""
+    """Stop at once, and stay stopped until a person releases it. It may be empty."""
 
     source: Name = "anonymous"
     reason: Text = ""
 
 
 class ReleaseRequest(Message, frozen=True, kw_only=True):
-    """Let go of a latched gate. It does not move the robot: that takes an enable as well."""
+    """Release a latched gate. The robot moves only after an enable as well."""
 
-    estop_generation: Count  # as seen in robot/state, so that nobody releases a stop unseen
+    estop_generation: Count  # as seen in robot/state, so that no stop is released unseen
     source: Name = "anonymous"
 
 
@@ -29,12 +29,12 @@ class EnableRequest(Message, frozen=True, kw_only=True):
     """Open the gate for the commands of one source."""
 
     source: Name  # "control" for the robot's own brain
-    take: bool = False  # even when somebody else holds the body
+    take: bool = False  # even if another source holds the body
     by: Name = ""  # the person who asks, where the source is the brain: it takes from nobody itself
 
 
 class GateReply(Message, frozen=True, kw_only=True):
-    """What the gate made of a request."""
+    """The gate's answer to a request."""
 
     ok: bool
     text: Text  # a sentence for people
@@ -53,14 +53,14 @@ class MapRequest(Message, frozen=True, kw_only=True):
 
 
 class MapReply(Message, frozen=True, kw_only=True):
-    """Whether it was saved, and where."""
+    """The result of saving a map, with its place."""
 
     ok: bool
     text: Text  # a sentence for people
 
 
 class DescribeRequest(Message, frozen=True, kw_only=True):
-    """Who are you? An empty request will do."""
+    """Ask a process for its description. The request may be empty."""
 
 
 # Asks who else has its name; works; has asked again for some seconds.
@@ -68,7 +68,7 @@ Claim = Literal["starting", "working", "settled"]
 
 
 class Description(Message, frozen=True, kw_only=True):
-    """What a process is, and figures that only it knows."""
+    """A process, and figures that only it knows."""
 
     process: Name
     pid: Count
@@ -85,7 +85,7 @@ class Description(Message, frozen=True, kw_only=True):
 
 
 class ParamRequest(Message, frozen=True, kw_only=True):
-    """Change what a process does while it runs. An empty request only shows what there is."""
+    """Change a parameter of a running process. An empty request only lists all."""
 
     name: Name = ""  # of the parameter to change
     value: Text = ""  # as people type it
@@ -93,7 +93,7 @@ class ParamRequest(Message, frozen=True, kw_only=True):
 
 
 class Param(Record, frozen=True, kw_only=True):
-    """Something that may be changed while a process runs."""
+    """A parameter that may change while a process runs."""
 
     name: Name
     value: Text  # as it is now
@@ -101,7 +101,7 @@ class Param(Record, frozen=True, kw_only=True):
 
 
 class ParamReply(Message, frozen=True, kw_only=True):
-    """Whether it was changed, and all that there is."""
+    """The result of a change, and all parameters."""
 
     ok: bool
     text: Text  # a sentence for people

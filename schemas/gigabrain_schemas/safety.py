@@ -23,7 +23,7 @@ Counts = Annotated[dict[Key, Count], Meta(max_length=256)]
 
 
 class SpeedCaps(Record, frozen=True, kw_only=True):
-    """How fast the body may go in each direction now; None where nothing limits it."""
+    """Greatest speeds in each direction now; None for no limit."""
 
     forward: SpeedCap | None = None  # [m/s]
     backward: SpeedCap | None = None  # [m/s]
@@ -44,7 +44,7 @@ class SafetyState(Message, frozen=True, kw_only=True):
 
 
 class Health(Message, frozen=True, kw_only=True):
-    """How one process is doing, once a second."""
+    """Health of one process, once a second."""
 
     process: Name
     pid: Count
@@ -71,7 +71,7 @@ class LogRecord(Message, frozen=True, kw_only=True):
 
 
 class ButtonState(Message, frozen=True, kw_only=True):
-    """What an e-stop button says. Whoever counts on one takes its silence for a press."""
+    """State of an e-stop button. Where one is required, its silence counts as a press."""
 
     pressed: bool  # also when nothing is known of the contact
     text: Text = ""  # why it counts as pressed

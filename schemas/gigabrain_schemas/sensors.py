@@ -1,4 +1,4 @@
-"""What sensors measure."""
+"""Measurements of sensors."""
 
 from typing import Annotated, Literal
 

@@ -1,4 +1,4 @@
-"""What a robot is sent to do, and how far it has come with it."""
+"""Goals, missions and tasks, and their progress."""
 
 from typing import Annotated, Literal
 
@@ -42,7 +42,7 @@ class GoalRequest(Message, frozen=True, kw_only=True):
 
 
 class GoalReply(Message, frozen=True, kw_only=True):
-    """Whether the robot will go there."""
+    """Whether the robot accepts the goal."""
 
     ok: bool
     text: Text
@@ -59,7 +59,7 @@ class MissionRequest(Message, frozen=True, kw_only=True):
 
 
 class MissionReply(Message, frozen=True, kw_only=True):
-    """Whether the robot will carry it out."""
+    """Whether the robot accepts the mission."""
 
     ok: bool
     text: Text
@@ -75,7 +75,7 @@ class TaskRequest(Message, frozen=True, kw_only=True):
 
 
 class TaskReply(Message, frozen=True, kw_only=True):
-    """What became of it."""
+    """The result of a change."""
 
     ok: bool
     text: Text
@@ -96,7 +96,7 @@ class Task(Record, frozen=True, kw_only=True):
 
 
 class TaskStatus(Message, frozen=True, kw_only=True):
-    """What the robot is at, what comes next, and what was last."""
+    """The current task, the queue, and the last tasks."""
 
     current: Task | None = None  # active or paused
     doing: Text = ""  # the step that it is at, in words

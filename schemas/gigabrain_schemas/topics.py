@@ -34,8 +34,8 @@ class Topic(Generic[M]):
     priority: Priority = "data"
     congestion: Literal["drop", "block"] = "drop"
     express: bool = False  # not batched: for small messages that must not wait
-    keep: bool = False  # the last value is kept for those who join late
-    depth: int = 1  # messages that wait for a busy reader; the oldest give way
+    keep: bool = False  # the last value is kept for late joiners
+    depth: int = 1  # messages that wait for a busy reader; the oldest are dropped
     max_bytes: int = 4 * KB  # larger ones are not even decoded
     many: bool = False  # one key per camera or process below this one
     publishers: tuple[Role, ...] = ()  # may publish it, besides the robot itself
@@ -44,11 +44,11 @@ class Topic(Generic[M]):
 
     @property
     def stale_after_ns(self) -> int:
-        """Age from which the newest message no longer counts [ns]."""
+        """Return the age from which the newest message no longer counts [ns]."""
         return round(self.missed / self.hz * 1e9)
 
     def at(self, name: str = "") -> str:
-        """The key of this topic; of the camera or process `name` where there are many."""
+        """Return the key of this topic; of the camera or process `name` if there are many."""
         return f"{self.key}/{name}" if self.many else self.key
 
 
@@ -66,7 +66,7 @@ class Service(Generic[Q, R]):
     servers: tuple[Role, ...] = ()  # may answer it, besides the robot itself
 
     def at(self, name: str = "") -> str:
-        """The key of this service; at the process `name` where there are many."""
+        """Return the key of this service; at the process `name` if there are many."""
         return f"{self.key}/{name}" if self.many else self.key
 
 
@@ -116,7 +116,7 @@ SAFETY = Topic(
     "robot/safety", safety.SafetyState, 20, missed=3, priority="interactive_high",
     max_bytes=16 * KB, plotted=True,
 )  # fmt: skip
-# real_time is for what stops the robot, and for nothing that anybody could send by the thousand
+# real_time is for what stops the robot, and for nothing that a client may send by the thousand
 BUTTON = Topic(
     "robot/button", safety.ButtonState, 20, missed=4, priority="real_time", express=True,
     max_bytes=KB, publishers=OPERATOR,
@@ -146,7 +146,7 @@ TOPICS: tuple[Topic[Any], ...] = tuple(one for one in globals().values() if isin
 
 
 def command_topic(of: body.BodyDescription) -> Topic[brain.CmdVel]:
-    """Return the topic that a body obeys: CMD_VEL, unless its file says otherwise."""
+    """Return the topic that a body obeys: CMD_VEL, unless its file names another."""
     return CMD_VEL if of.control_topic == CMD_VEL.key else replace(CMD_VEL, key=of.control_topic)
 
 

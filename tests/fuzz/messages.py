@@ -42,7 +42,7 @@ def check(data: bytes) -> None:
 
 def told(complaint: str) -> None:
     """A sentence, and a short one: it quotes the sender."""
-    assert 0 < len(complaint) <= TOLD
+    assert 0 < len(complaint) <= MAX_ERROR_CHARS
 
 
 def finite(message: Message) -> None:

@@ -13,7 +13,7 @@ from gigabrain_zenoh.errors import ConfigError, UnknownName
 from gigabrain_zenoh.launch.deployment import Deployment, check_keys, load_deployment
 from gigabrain_zenoh.launch.processes import names_by_role, process_type
 from gigabrain_zenoh.launch.specs import process_specs
-from gigabrain_zenoh.qa.probe import probing
+from gigabrain_zenoh.runtime.connect import connect
 from gigabrain_zenoh.security.acl import Table, access_control
 from gigabrain_zenoh.testing.processes import Home, free_port
 from gigabrain_zenoh.testing.waiting import until
@@ -121,12 +121,10 @@ async def test_up_starts_it_and_restarts_it_when_it_hangs(tmp_path: Path, packag
     )
     try:
         up = home.start("up", str(file))
-        async with probing(Endpoint(connect=(router,))) as robot:
+        async with connect(Endpoint(connect=(router,)), "test", timeout_s=None) as bus:
 
             async def pid() -> int:
-                (answer,) = await robot.bus.ask(
-                    DESCRIBE, DescribeRequest(), name="lamp", timeout_s=20
-                )
+                (answer,) = await bus.ask(DESCRIBE, DescribeRequest(), name="lamp", timeout_s=20)
                 return answer.pid
 
             await until(lambda: "ready" in up.out and "the lamp at" in up.out, "it runs")

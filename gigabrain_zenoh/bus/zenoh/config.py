@@ -222,7 +222,7 @@ def configuration(endpoint: Endpoint, generations: Mapping[str, int] = FIRST) ->
 
 
 def _nested(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """`{"a/b": 1}` as `{"a": {"b": 1}}`."""
+    """Return `{"a/b": 1}` as `{"a": {"b": 1}}`."""
     root: dict[str, Any] = {}
     for path, value in settings.items():
         *parents, name = path.split("/")
