@@ -175,7 +175,7 @@ class Bus:
         latest = Latest(topic, self.clock, self.time)
 
         def take(_key: str, message: M) -> None:
-            if latest.take(message) and on_new:
+            if latest.store(message) and on_new:
                 on_new(message)
 
         self.subscribe(topic, take, name=name)
@@ -313,7 +313,7 @@ class Bus:
 
         If all states are refused for LOST_NS, this process's own time is wrong, and it ends.
         """
-        believed, now_ns = self.time.see(message), self.clock.now_ns()
+        believed, now_ns = self.time.observe(message), self.clock.now_ns()
         if not believed:
             self.counters["refused_ticks"] += 1
         if topic.key != STATE.key:

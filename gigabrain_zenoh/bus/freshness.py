@@ -28,7 +28,7 @@ class RobotTime:
         self._claimed_by: tuple[type[Message], int, int] | None = None  # and which message it was
         self._agree = 0  # how many have made that claim
 
-    def see(self, message: Message) -> bool:
+    def observe(self, message: Message) -> bool:
         """Update from the tick on a driver's message. Return whether it is credible."""
         if not message.boot:
             return self.boot == 0  # a driver names its start in every message
@@ -71,7 +71,7 @@ class Latest(Generic[M]):
         self._arrived_ns = 0
         self._arrived_tick = 0
 
-    def take(self, message: M) -> bool:
+    def store(self, message: M) -> bool:
         """Keep `message` unless it is older than the held one; return whether it was kept.
 
         A held tick that the robot has not reached yet keeps no other message out.

@@ -73,20 +73,20 @@ class Sampled(Latest[M]):
         """Keep an encoded payload. May be called from any thread."""
         self._raw.append(payload)
 
-    def look(self) -> M | None:
+    def poll(self) -> M | None:
         """Return the newest valid message since the last call; None if there is none."""
         while self._raw:
             try:
                 message = self._codec.decode(self._raw.pop())
             except ValueError:
                 continue
-            if self._robot_time and not self._robot_time.see(message):
+            if self._robot_time and not self._robot_time.observe(message):
                 continue
             self._raw.clear()
-            return message if self.take(message) else None
+            return message if self.store(message) else None
         return None
 
     def fresh(self, within_ns: int | None = SHOWN_NS) -> M | None:
         """Return the newest message if it is recent enough to show, else None."""
-        self.look()
+        self.poll()
         return super().fresh(within_ns)

@@ -94,12 +94,12 @@ class Interrupts:
 
     def _set_handlers(self) -> dict[signal.Signals, Any]:
         return {
-            number: signal.signal(number, self._take)
+            number: signal.signal(number, self._on_signal)
             for number in SIGNALS
             if number != HANGUP or signal.getsignal(number) is not signal.SIG_IGN
         }
 
-    def _take(self, number: int, _frame: FrameType | None) -> None:
+    def _on_signal(self, number: int, _frame: FrameType | None) -> None:
         if not self.received:
             self.received, self._pending = number, True
             if self._wake_fd >= 0:  # an event loop may have replaced the wakeup descriptor

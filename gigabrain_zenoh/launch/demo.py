@@ -54,7 +54,7 @@ class Capacity:
         """Count from the next look on: a process is starting, and time may wait for it."""
         self._last, self._short, self._held = None, 0, False
 
-    def look(self, now_s: float, robot_s: float, *, held: bool) -> None:
+    def compare(self, now_s: float, robot_s: float, *, held: bool) -> None:
         """Compare the wall clock with the robot's.
 
         `held` says that the brain is held back while the processors have no time to spare.
@@ -201,7 +201,7 @@ class Demo:
         if self._starting or self._deployment.speed != 1.0:
             capacity.restart()
             return
-        capacity.look(asyncio.get_running_loop().time(), watch.seconds, held=watch.held_by_load)
+        capacity.compare(asyncio.get_running_loop().time(), watch.seconds, held=watch.held_by_load)
         if capacity.problem != known:
             self._faults.append((time.monotonic(), capacity.problem))
             view.show_fault(capacity.problem)

@@ -157,11 +157,11 @@ async def _work(
             bus.input_log = PublishedInputLogger(say, bus.clock.unix_ns)
         try:
             claim = NameClaim(bus)
-            await claim.take()
+            await claim.acquire()
             serve_params(bus)
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(publish_health(bus))
-                tasks.create_task(claim.keep())
+                tasks.create_task(claim.settle())
                 if config.json_console:
                     out = os.dup(STDOUT)  # the router redirects its standard output to Zenoh's log
                     tasks.create_task(beat(bus.clock, lambda: bus.progress(), out))

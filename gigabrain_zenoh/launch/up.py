@@ -55,13 +55,13 @@ class Notifier:
         """Report that the service is ready; sent only once."""
         if not self._ready:
             self._ready = True
-            self._tell("READY=1")
+            self._send("READY=1")
 
     def status(self, text: str) -> None:
         """Send a status line for people; sent only when it changes."""
         if text != self._status:
             self._status = text
-            self._tell(f"STATUS={text}")
+            self._send(f"STATUS={text}")
 
     def alive(self) -> None:
         """Feed the watchdog, if one is configured and it is due.
@@ -74,13 +74,13 @@ class Notifier:
             return
         if self._fed_s is None or now_s - self._fed_s >= SHARE * self._watchdog_s:
             self._fed_s = now_s
-            self._tell("WATCHDOG=1")
+            self._send("WATCHDOG=1")
 
     def stopping(self) -> None:
         """Report that the service is stopping on request."""
-        self._tell("STOPPING=1")
+        self._send("STOPPING=1")
 
-    def _tell(self, line: str) -> None:
+    def _send(self, line: str) -> None:
         if not self._address:
             return
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as out:

@@ -222,7 +222,7 @@ class AuditTrail:
             recent = known[key] = _Recent(now_ns)
         recent.add(code, text)
         if new or now_ns - recent.told_ns >= _quiet_ns(key):
-            self._tell(key, recent, ok)
+            self._write_entry(key, recent, ok)
 
     def flush(self) -> None:
         """Write the repeated events, with their counts."""
@@ -231,7 +231,7 @@ class AuditTrail:
             for key, recent in list(known.items()):
                 age_ns = now_ns - recent.told_ns
                 if recent.codes and age_ns >= _quiet_ns(key):
-                    self._tell(key, recent, ok)
+                    self._write_entry(key, recent, ok)
                 elif age_ns >= LASTING_NS:
                     del known[key]
 
@@ -240,11 +240,11 @@ class AuditTrail:
         for ok, known in self._recent.items():
             for key, recent in known.items():
                 if recent.codes:
-                    self._tell(key, recent, ok)
+                    self._write_entry(key, recent, ok)
             known.clear()
         await self._scribe.close()
 
-    def _tell(self, key: Key, recent: _Recent, ok: bool) -> None:
+    def _write_entry(self, key: Key, recent: _Recent, ok: bool) -> None:
         what, source, _ = key
         (code, _), *others = recent.codes.most_common()
         kinds = f"; {_tally(recent.codes)}" if others else ""

@@ -54,7 +54,7 @@ class Silence:
         """Start again from zero, after a beat."""
         self.seconds = 0.0
 
-    def look(self, passed_s: float) -> bool:
+    def add(self, passed_s: float) -> bool:
         """Add the time since the last look; return whether the process is stuck."""
         self.seconds += min(passed_s, LOOK_S)
         return self.seconds >= STALL_S

@@ -226,7 +226,7 @@ class ManagedProcess:
             await waiting[0].settled.wait()
         lost = [other.spec.name for other in after if other.status.state == "given up"]
         if lost and not self._shared.halt.is_set():
-            self._say("error", "not started", f"is not started without {lost[0]}")
+            self._report("error", "not started", f"is not started without {lost[0]}")
             await self._shared.halt.wait()
 
     async def _live(self) -> Death:
@@ -259,24 +259,24 @@ class ManagedProcess:
             if self._shared.halt.is_set():
                 return None
             self.child = await Child.start(
-                self.spec.name, self.spec.argv, os.environ | ours, self._take
+                self.spec.name, self.spec.argv, os.environ | ours, self._handle_record
             )
             self.status.pid = self.child.pid
             return self.child
 
-    def look(self, passed_s: float) -> None:
+    def check_progress(self, passed_s: float) -> None:
         """Kill a process without progress; called every `heartbeat.LOOK_S`, or later."""
         if not self.spec.beats or self.status.state != "ready" or self._shared.halt.is_set():
             return
-        before, self.stuck = self.stuck, self._silence.look(passed_s)
+        before, self.stuck = self.stuck, self._silence.add(passed_s)
         if self.stuck and not before and self.child:
             what = "is left alone" if self._shared.keep_stuck else "is killed"
             limit_s = heartbeat.STALL_S
-            self._say("error", "stuck", f"has made no progress for {limit_s:g} s and {what}")
+            self._report("error", "stuck", f"has made no progress for {limit_s:g} s and {what}")
             if not self._shared.keep_stuck:
                 self.child.send_signal(signal.SIGKILL)
 
-    def _take(self, record: dict[str, Any]) -> None:
+    def _handle_record(self, record: dict[str, Any]) -> None:
         if record["event"] == heartbeat.EVENT:
             self._progressed()
             return
@@ -294,7 +294,7 @@ class ManagedProcess:
     def _late(self) -> None:
         if self.status.state == "starting" and self.child and not self._shared.halt.is_set():
             limit_s = self.spec.ready_timeout_s
-            self._say("error", "not ready", f"was not ready within {limit_s:g} s and is killed")
+            self._report("error", "not ready", f"was not ready within {limit_s:g} s and is killed")
             self.child.send_signal(signal.SIGKILL)
 
     def _judge(self, death: Death) -> float | None:
@@ -305,15 +305,17 @@ class ManagedProcess:
         if delay_s is not None:
             self.status.state = "backing off"
             self.settled.clear()
-            self._say("warning", "died", f"{death.text}; next start in {delay_s:g} s", death.code)
+            self._report(
+                "warning", "died", f"{death.text}; next start in {delay_s:g} s", death.code
+            )
             return delay_s
         why = death.hopeless or f"{backoff.deaths} deaths within {backoff.window_s:g} s"
         self.status.state = "given up"
         self.settled.set()
-        self._say("error", "given up", f"{death.text} and is given up: {why}", death.code)
+        self._report("error", "given up", f"{death.text} and is given up: {why}", death.code)
         return None
 
-    def _say(self, level: str, event: str, text: str, exit_code: int | None = None) -> None:
+    def _report(self, level: str, event: str, text: str, exit_code: int | None = None) -> None:
         name = self.spec.name
         record = {"t": time.time_ns(), "level": level, "process": "supervisor", "event": event}
         about = {"text": f"{name} {text}", "child": name, "exit_code": exit_code}
@@ -327,7 +329,7 @@ class ManagedProcess:
     def force_to_end(self) -> None:
         """Send SIGKILL, which also ends a process that is stopped."""
         if self.child:
-            self._say("warning", "killed", "did not end when asked and is killed")
+            self._report("warning", "killed", "did not end when asked and is killed")
             self.child.send_signal(signal.SIGKILL)
 
 

@@ -39,10 +39,10 @@ async def run(config: RouterConfig, bus: Bus, ready: Callable[[], None]) -> None
         await bus.failed
         return
     trail = AuditTrail(bus, Path(config.state_dir))
-    door = AccessAudit(trail, config.knows)
+    access = AccessAudit(trail, config.knows)
     try:
-        with zenoh_log(door.seen):
-            bus.links(door.link)
+        with zenoh_log(access.note_denial):
+            bus.links(access.note_link)
             ready()
             await _keep(bus, trail)
     finally:
@@ -75,7 +75,7 @@ class RouterLink:
         self.open = asyncio.Event()
         self._router = router
 
-    def see(self, link: Link) -> None:
+    def update(self, link: Link) -> None:
         """Update the state when the router's link comes or goes; other links use the socket."""
         if link.address.startswith(SOCKET) or link.there == self.open.is_set():
             return
@@ -93,7 +93,7 @@ async def run_relay(config: RelayConfig, bus: Bus, ready: Callable[[], None]) ->
     Raises ConfigError if the link fails because the host's own keys are invalid.
     """
     way = RouterLink(config.router)
-    bus.links(way.see)
+    bus.links(way.update)
     try:
         await asyncio.wait_for(way.open.wait(), PATIENCE_S)
     except TimeoutError:
@@ -188,7 +188,7 @@ class AccessAudit:
         self._trail, self._knows = trail, knows
         self._links: dict[str, Link] = {}
 
-    def link(self, link: Link) -> None:
+    def note_link(self, link: Link) -> None:
         """Log that a client has come or gone; note one without rights."""
         name = link.name or "a local process"
         if not link.there:
@@ -203,7 +203,7 @@ class AccessAudit:
         else:
             log.info("%s has come from %s", name, link.address)
 
-    def seen(self, seen: Seen) -> None:
+    def note_denial(self, seen: Seen) -> None:
         """Note a denial."""
         if isinstance(seen, TurnedAway):
             text = f"somebody was turned away at the door: {seen.why}"

@@ -69,7 +69,7 @@ class NameClaim:
         self._bus, self.instance = bus, secrets.randbits(62)
         self.claim: Claim = "starting"
 
-    async def take(self) -> None:
+    async def acquire(self) -> None:
         """Serve the name and wait until no other process has it.
 
         Raises ConfigError where another process keeps the name.
@@ -78,8 +78,8 @@ class NameClaim:
         await self._alone()
         self.claim = "working"
 
-    async def keep(self) -> None:
-        """Query the name again after each pause, then settle. Raises ConfigError like `take`."""
+    async def settle(self) -> None:
+        """Query the name again after each pause, then settle. Raises ConfigError like `acquire`."""
         for pause_ns in CONFIRM_NS:
             await self._bus.clock.sleep_ns(pause_ns)
             await self._alone()
@@ -96,7 +96,7 @@ class NameClaim:
         Raises ConfigError if this process has to exit.
         """
         name = self._bus.process
-        others = [other for other in await self._told() if other.instance != self.instance]
+        others = [other for other in await self._answers() if other.instance != self.instance]
         for other in others:
             if _strength(other.claim, other.instance) > _strength(self.claim, self.instance):
                 raise ConfigError(
@@ -105,7 +105,7 @@ class NameClaim:
                 )
         return bool(others)
 
-    async def _told(self) -> list[Description]:
+    async def _answers(self) -> list[Description]:
         """Query every process of this name; retry after a refusal, as during a flood of queries."""
         for _ in range(TRIES):
             try:

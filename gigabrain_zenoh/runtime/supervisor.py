@@ -104,7 +104,7 @@ class Supervisor:
                     await halt.wait()
             passed_s, looked_s = loop.time() - looked_s, loop.time()
             for keeper in self._keepers.values():
-                keeper.look(passed_s)
+                keeper.check_progress(passed_s)
 
     async def stop(self, within_s: float = 1.5) -> None:
         """Stop all processes within `within_s`: first by request, then by force."""

@@ -239,7 +239,7 @@ class InputCollector:
 
     def _on_command(self, _key: str, command: CmdVel) -> None:
         if command.source == BRAIN:
-            self._commands.take(command)
+            self._commands.store(command)
         state = self._states.current
         if state and command.source == state.gate.commander:
             if command.source not in self._by_commander:  # forget the last commander

@@ -48,7 +48,7 @@ class ViewerScene(RobotView):
 
     def steer(self, wanted: Velocity) -> None:
         """Publish the operator's wanted velocity with the newest tick."""
-        self.sampled[STATE].look()
+        self.sampled[STATE].poll()
         steer(self.bus, wanted)
 
     def _receive_image(self, key: str, encoding: str, payload: bytes) -> None:

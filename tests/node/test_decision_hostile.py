@@ -21,7 +21,7 @@ async def test_the_brains_own_commands_count_as_the_gate_lets_them_through() -> 
     net = Net()
     navigator = Navigator(NavigationConfig(), net.two, "navigate")
     for bus in (net.one, net.two):
-        bus.time.see(state(10))
+        bus.time.observe(state(10))
     net.one.publish(BODY, body())
     await settle()
     navigator.observe(state(10))

@@ -137,8 +137,8 @@ async def test_the_frames_join_map_and_robot(bridge: Bridge) -> None:
 
 async def test_a_viewer_sees_the_connection_graph(bridge: Bridge) -> None:
     bridge.robot.publish(SCAN, EXAMPLES["LaserScan"])  # type: ignore[type-var]
-    await NameClaim(bridge.robot).take()
-    await NameClaim(bridge.bus).take()
+    await NameClaim(bridge.robot).acquire()
+    await NameClaim(bridge.bus).acquire()
     async with bridge.viewer() as viewer:
         await viewer.say(op="subscribeConnectionGraph")
         graph = await viewer.connections("robot/scan")

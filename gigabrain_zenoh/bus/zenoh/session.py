@@ -138,7 +138,7 @@ class OpenSession:
         self.cut = False
         self.watch: Any = None  # keeps the listener alive
 
-    def take(self, deliver: Callable[[T], object]) -> Callable[[T], None]:
+    def guard(self, deliver: Callable[[T], object]) -> Callable[[T], None]:
         """Wrap `deliver` to drop messages after the loss, which may arrive under a wrong key."""
 
         def delivered(what: T) -> None:

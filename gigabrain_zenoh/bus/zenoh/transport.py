@@ -71,7 +71,7 @@ class ZenohTransport:
 
         mailbox = Mailbox(self._bridge, deliver, depth)
         return self._lines.declare(
-            lambda line: line.session.declare_subscriber(key, line.take(mailbox.put))
+            lambda line: line.session.declare_subscriber(key, line.guard(mailbox.put))
         )
 
     def tap(self, pattern: str, on_raw: OnRaw) -> Close:
@@ -87,7 +87,7 @@ class ZenohTransport:
         take = self._nap.after_each(deliver) if self._nap else deliver
         return self._lines.declare(
             lambda line: line.session.declare_subscriber(
-                pattern, Callback(line.take(take), indirect=False)
+                pattern, Callback(line.guard(take), indirect=False)
             )
         )
 
@@ -106,7 +106,7 @@ class ZenohTransport:
 
         put, ends = self._questions.serve(run, urgent=urgent)
         undeclare = self._lines.declare(
-            lambda line: line.session.declare_queryable(key, line.take(put), complete=True)
+            lambda line: line.session.declare_queryable(key, line.guard(put), complete=True)
         )
 
         def close() -> None:
@@ -161,7 +161,7 @@ class ZenohTransport:
     def links(self, on_link: OnLink) -> Close:
         """Call `on_link` for every link to another session: existing ones, then each change."""
 
-        def told(event: zenoh.LinkEvent) -> None:
+        def on_event(event: zenoh.LinkEvent) -> None:
             link = event.link
             name = link.auth_identifier or ""
             there = event.kind == zenoh.SampleKind.PUT
@@ -169,7 +169,7 @@ class ZenohTransport:
 
         return self._lines.declare(
             lambda line: line.session.info.declare_link_events_listener(
-                lambda event: self._bridge.post(told, event), history=True
+                lambda event: self._bridge.post(on_event, event), history=True
             )
         )
 

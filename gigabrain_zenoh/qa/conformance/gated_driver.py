@@ -180,7 +180,7 @@ class GatedDriver(Timeline):
     def _on_state(self, _key: str, state: RobotState) -> None:
         self.state, self.tick = state, state.tick
         self.states += 1
-        self._bus.time.see(state)
+        self._bus.time.observe(state)
         if self.states % 2:
             self._bus.publish(SAFETY, SafetyState(verdict="ok"))
         if self.wanted is not None:

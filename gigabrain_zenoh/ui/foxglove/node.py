@@ -65,10 +65,10 @@ class FoxgloveView(ViewerScene):
     def draw_new(self) -> None:
         """Draw everything received since the last call."""
         for topic, sampled in self.sampled.items():
-            if self._has_viewers(topic.key) and (message := sampled.look()):
+            if self._has_viewers(topic.key) and (message := sampled.poll()):
                 self._draw(topic, message)
         for camera, sampled in list(self.images.items()):
-            if self._has_viewers(IMAGE.at(camera)) and (image := sampled.look()):
+            if self._has_viewers(IMAGE.at(camera)) and (image := sampled.poll()):
                 self._draw(IMAGE, image, camera)
 
     def draw_kept(self, channel: str) -> None:

@@ -170,11 +170,11 @@ class PageView(ViewerScene):
     def new_frames(self) -> Iterator[tuple[str, bytes]]:
         """Yield scan and images received since the last call, with their slots."""
         pose, _ = self._newest_pose(self.state.fresh())
-        scan: LaserScan | None = self.sampled[topics.SCAN].look()
+        scan: LaserScan | None = self.sampled[topics.SCAN].poll()
         if scan and pose and self.body:
             yield "scan", scan_frame(scan, self.body.description, pose)
         for camera, sampled in list(self.images.items()):
-            if image := sampled.look():
+            if image := sampled.poll():
                 yield f"image/{camera}", image_frame(camera, image)
 
     def kept_frames(self) -> Iterator[tuple[str, bytes]]:

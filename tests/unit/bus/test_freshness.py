@@ -34,8 +34,8 @@ class Reader:
         self.twists = Latest(TELEOP, self.clock, self.time)
 
     def see(self, tick: int, boot: int = 7) -> None:
-        if self.time.see(state(tick, boot)):
-            self.states.take(state(tick, boot))
+        if self.time.observe(state(tick, boot)):
+            self.states.store(state(tick, boot))
 
     def start_anew(self, tick: int, boot: int) -> None:
         """The driver starts again: its third state is at `tick`, and confirms the first two."""
@@ -57,7 +57,7 @@ def test_nothing_is_fresh_before_anything_came(reader: Reader) -> None:
 
 async def test_a_world_ages_by_the_tick_and_not_by_the_wall(reader: Reader) -> None:
     reader.see(100)
-    assert reader.worlds.take(world(100))
+    assert reader.worlds.store(world(100))
     await reader.clock.advance(3_600_000 * MS)
     assert reader.worlds.age_ns() == 0
     reader.see(112)
@@ -71,14 +71,14 @@ async def test_a_world_ages_by_the_tick_and_not_by_the_wall(reader: Reader) -> N
 
 def test_a_message_that_was_old_when_it_came_is_as_old_as_its_tick_says(reader: Reader) -> None:
     reader.see(100)
-    reader.worlds.take(world(87))
+    reader.worlds.store(world(87))
     assert reader.worlds.age_ns() == 260 * MS
     assert reader.worlds.fresh() is None
 
 
 def test_a_tick_from_the_future_buys_no_more_than_100_ms(reader: Reader) -> None:
     reader.see(100)
-    reader.worlds.take(world(2**62))
+    reader.worlds.store(world(2**62))
     assert reader.worlds.age_ns() == 0
     reader.see(117)
     assert reader.worlds.fresh() == world(2**62)
@@ -88,15 +88,15 @@ def test_a_tick_from_the_future_buys_no_more_than_100_ms(reader: Reader) -> None
 
 def test_whoever_lags_behind_does_not_take_a_new_message_for_an_old_one(reader: Reader) -> None:
     reader.see(100)
-    reader.worlds.take(world(105))  # five states are still to be read
+    reader.worlds.store(world(105))  # five states are still to be read
     reader.see(105)
     assert reader.worlds.age_ns() == 0
 
 
 def test_a_tick_from_the_future_keeps_nothing_out(reader: Reader) -> None:
     reader.see(100)
-    reader.worlds.take(world(2**62))
-    assert reader.worlds.take(world(100))
+    reader.worlds.store(world(2**62))
+    assert reader.worlds.store(world(100))
     assert reader.worlds.fresh() == world(100)
 
 
@@ -104,17 +104,17 @@ def test_a_tick_from_the_future_does_not_keep_out_what_comes_a_little_late(
     reader: Reader,
 ) -> None:
     reader.see(100)
-    reader.worlds.take(world(2**62))
-    assert reader.worlds.take(world(99))
+    reader.worlds.store(world(2**62))
+    assert reader.worlds.store(world(99))
     assert reader.worlds.fresh() == world(99)
 
 
 def test_an_older_tick_does_not_replace_a_newer_one(reader: Reader) -> None:
     reader.see(100)
-    assert reader.worlds.take(world(99))
-    assert not reader.worlds.take(world(98))
+    assert reader.worlds.store(world(99))
+    assert not reader.worlds.store(world(98))
     assert reader.worlds.newest == world(99)
-    assert reader.worlds.take(world(99))
+    assert reader.worlds.store(world(99))
 
 
 async def test_the_state_ages_by_the_wall_as_well_since_nothing_else_tells_of_a_dead_driver(
@@ -132,7 +132,7 @@ async def test_a_message_without_boot_ages_by_the_wall_and_by_the_tick_of_its_ar
     reader: Reader,
 ) -> None:
     reader.see(100)
-    reader.twists.take(Twist(linear_x=0.2))
+    reader.twists.store(Twist(linear_x=0.2))
     assert reader.twists.age_ns() == 0
     reader.see(105)
     assert reader.twists.age_ns() == 100 * MS
@@ -144,14 +144,14 @@ async def test_a_message_without_boot_ages_by_the_wall_and_by_the_tick_of_its_ar
 
 def test_a_limit_of_the_readers_own_may_be_tighter(reader: Reader) -> None:
     reader.see(100)
-    reader.worlds.take(world(95))
+    reader.worlds.store(world(95))
     assert reader.worlds.fresh(within_ns=100 * MS) == world(95)
     assert reader.worlds.fresh(within_ns=100 * MS - 1) is None
 
 
 def test_a_new_start_of_the_driver_discards_all_that_is_held(reader: Reader) -> None:
     reader.see(5000)
-    reader.worlds.take(world(5000))
+    reader.worlds.store(world(5000))
     reader.start_anew(3, boot=8)
     assert (reader.time.boot, reader.time.tick) == (8, 3)
     assert reader.worlds.current is None
@@ -161,7 +161,7 @@ def test_a_new_start_of_the_driver_discards_all_that_is_held(reader: Reader) -> 
 
 def test_a_world_of_a_new_start_waits_until_that_start_is_heard_of(reader: Reader) -> None:
     reader.see(10)
-    reader.worlds.take(world(300, boot=8))
+    reader.worlds.store(world(300, boot=8))
     assert reader.worlds.fresh() is None
     reader.start_anew(301, boot=8)
     assert reader.worlds.age_ns() == 20 * MS
@@ -185,11 +185,11 @@ def test_an_intent_may_have_been_on_its_way_for_150_ms_but_not_silent_for_more_t
 ) -> None:
     intents = Latest(INTENT, reader.clock, reader.time)
     reader.see(107)
-    intents.take(Intent(boot=7, tick=100, behaviour="avoid", reason="free"))
+    intents.store(Intent(boot=7, tick=100, behaviour="avoid", reason="free"))
     assert intents.fresh() is not None  # 140 ms there and back
     reader.see(108)
     assert intents.fresh() is None
-    intents.take(Intent(boot=7, tick=108, behaviour="avoid", reason="free"))
+    intents.store(Intent(boot=7, tick=108, behaviour="avoid", reason="free"))
     reader.see(113)
     assert intents.fresh() is not None
     reader.see(114)

@@ -22,76 +22,76 @@ FAR = 2**37
 @pytest.fixture
 def time() -> RobotTime:
     time = RobotTime()
-    assert time.see(state(100))
+    assert time.observe(state(100))
     return time
 
 
 def test_one_state_of_the_far_future_is_not_believed(time: RobotTime) -> None:
-    assert not time.see(state(FAR))
+    assert not time.observe(state(FAR))
     assert time.tick == 100
-    assert time.see(state(101))
+    assert time.observe(state(101))
     assert time.tick == 101
 
 
 def test_one_scan_of_the_far_future_is_not_believed(time: RobotTime) -> None:
-    assert not time.see(scan(open_space(), FAR))
+    assert not time.observe(scan(open_space(), FAR))
     assert time.tick == 100
 
 
 def test_a_gap_of_up_to_a_second_needs_no_confirmation(time: RobotTime) -> None:
-    assert time.see(state(150))
+    assert time.observe(state(150))
     assert time.tick == 150
 
 
 def test_a_jump_ahead_is_believed_once_the_third_state_agrees(time: RobotTime) -> None:
-    assert [time.see(state(tick)) for tick in (500, 501, 502)] == [False, False, True]
+    assert [time.observe(state(tick)) for tick in (500, 501, 502)] == [False, False, True]
     assert time.tick == 502
 
 
 def test_a_jump_is_not_believed_while_the_present_time_goes_on(time: RobotTime) -> None:
     for n in range(1, 50):
-        assert not time.see(state(FAR + n))
-        assert time.see(state(100 + n))
+        assert not time.observe(state(FAR + n))
+        assert time.observe(state(100 + n))
     assert time.tick == 149
 
 
 def test_states_that_jump_about_confirm_nothing(time: RobotTime) -> None:
-    assert not any(time.see(state(1000 * n)) for n in range(1, 50))
+    assert not any(time.observe(state(1000 * n)) for n in range(1, 50))
     assert time.tick == 100
 
 
 def test_another_boot_is_believed_once_the_third_message_agrees(time: RobotTime) -> None:
-    assert not time.see(state(1, boot=8))
-    assert not time.see(scan(open_space(), 1, boot=8))
-    assert time.see(state(2, boot=8))
+    assert not time.observe(state(1, boot=8))
+    assert not time.observe(scan(open_space(), 1, boot=8))
+    assert time.observe(state(2, boot=8))
     assert (time.boot, time.tick) == (8, 2)
 
 
 def test_one_state_of_another_boot_changes_nothing(time: RobotTime) -> None:
-    assert not time.see(state(3, boot=8))
-    assert time.see(state(101))
-    assert not time.see(state(4, boot=8))
+    assert not time.observe(state(3, boot=8))
+    assert time.observe(state(101))
+    assert not time.observe(state(4, boot=8))
     assert (time.boot, time.tick) == (BOOT, 101)
 
 
 def test_a_message_that_several_here_listen_to_counts_once(time: RobotTime) -> None:
-    assert not any(time.see(state(FAR)) for _ in range(10))
+    assert not any(time.observe(state(FAR)) for _ in range(10))
 
 
 def test_a_first_tick_that_is_repeated_until_the_brain_is_there_is_believed(
     time: RobotTime,
 ) -> None:
     said = [replace(state(1, boot=8), seq=seq) for seq in (1, 2, 3)]
-    assert [time.see(one) for one in said] == [False, False, True]
+    assert [time.observe(one) for one in said] == [False, False, True]
 
 
 def test_a_state_of_no_boot_is_refused_once_a_driver_has_been_heard(time: RobotTime) -> None:
-    assert not time.see(state(101, boot=0))
+    assert not time.observe(state(101, boot=0))
     assert RobotTime().see(state(101, boot=0))
 
 
 def test_time_does_not_go_back(time: RobotTime) -> None:
-    assert not any(time.see(state(tick)) for tick in range(1, 40))
+    assert not any(time.observe(state(tick)) for tick in range(1, 40))
     assert time.tick == 100
 
 
@@ -152,11 +152,11 @@ async def test_who_looks_seldom_confirms_a_jump_by_what_has_come_meanwhile() -> 
     net = Net()
     sampled = Sampled(net.one, STATE)
     say(net, state(100))
-    assert sampled.look() == state(100)
+    assert sampled.poll() == state(100)
     for tick in (500, 501, 502):
         say(net, state(tick))
-    assert sampled.look() == state(500)
+    assert sampled.poll() == state(500)
     say(net, state(FAR))
-    assert sampled.look() is None
+    assert sampled.poll() is None
     say(net, state(503))
-    assert sampled.look() == state(503)
+    assert sampled.poll() == state(503)

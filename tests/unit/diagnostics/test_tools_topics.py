@@ -310,8 +310,8 @@ async def test_a_field_that_is_not_there_ends_echo_with_the_nearest(net: Net) ->
 
 async def test_the_table_names_senders_receivers_sizes_and_strangers(net: Net) -> None:
     net.one.subscribe(STATE, lambda *_: None)
-    await NameClaim(net.one).take()
-    await NameClaim(net.two).take()
+    await NameClaim(net.one).acquire()
+    await NameClaim(net.two).acquire()
     looking = asyncio.ensure_future(snapshot(net.bus("tool"), seconds=0.05))
     await settle()
     net.two.publish(STATE, example(RobotState))
@@ -331,7 +331,7 @@ async def test_flows_are_what_really_goes_from_one_to_another(net: Net) -> None:
     net.one.subscribe(STATE, lambda *_: None)
     net.one.subscribe(SCAN, lambda *_: None)
     for bus in (net.one, net.two):
-        await NameClaim(bus).take()
+        await NameClaim(bus).acquire()
     health = asyncio.ensure_future(publish_health(net.two))
     await net.clock.advance(0)
     for _ in range(10):

@@ -104,7 +104,7 @@ async def test_a_silent_process_differs_from_one_that_is_gone(
     async def do(robot: RobotInMemory) -> None:
         await robot.kill("perception")
         answering = asyncio.ensure_future(
-            NameClaim(Bus(robot.network.transport(), robot.clock, "perception")).take()
+            NameClaim(Bus(robot.network.transport(), robot.clock, "perception")).acquire()
         )
         await robot.go(1)
         await answering

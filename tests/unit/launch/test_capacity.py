@@ -14,7 +14,7 @@ def run(
     """Look ten times a second at a robot whose clock runs at a share of real time."""
     for look in range(10 * seconds + 1):
         now_s = begin_s + look / 10
-        capacity.look(now_s, begin_s + share * look / 10, held=held and look % 10 == 5)
+        capacity.compare(now_s, begin_s + share * look / 10, held=held and look % 10 == 5)
     return capacity.problem
 
 

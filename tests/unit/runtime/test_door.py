@@ -54,7 +54,7 @@ class Rig:
         other.subscribe(AUDIT, lambda _key, record: self.heard.append(record))
         self.trail = AuditTrail(self.bus, folder)
         self.door = AccessAudit(self.trail, {"viewer@red"})
-        self.door.link(Link(ZID, "viewer@red", "tls/127.0.0.1:5", there=True))
+        self.door.note_link(Link(ZID, "viewer@red", "tls/127.0.0.1:5", there=True))
 
 
 async def test_40000_denials_are_one_record_a_minute_and_push_out_no_estop(tmp_path: Path) -> None:
@@ -62,11 +62,11 @@ async def test_40000_denials_are_one_record_a_minute_and_push_out_no_estop(tmp_p
     for what in ("boot", "estop", "release", "enable"):
         rig.trail.note(what, "ann", "before the flood")
     for number in range(40_000):
-        rig.door.seen(Denied(ZID, "Put", f"red/robot/{number}"))
+        rig.door.note_denial(Denied(ZID, "Put", f"red/robot/{number}"))
         if number % 10_000 == 9_999:  # 20 s
             await rig.clock.advance(20_000_000_000)
             rig.trail.flush()
-    rig.door.seen(Denied(ZID, "Query", "red/robot/release/x"))
+    rig.door.note_denial(Denied(ZID, "Query", "red/robot/release/x"))
     refused = [record for record in rig.heard if record.what == "refused"]
     assert [(r.source, r.code, r.times) for r in refused] == [
         ("viewer@red", "put other", 1),
@@ -93,7 +93,7 @@ async def test_why_strangers_are_turned_away_is_told_without_what_they_choose(
 ) -> None:
     rig = Rig(tmp_path)
     for port in range(40_000):
-        rig.door.seen(TurnedAway(f"invalid peer at 10.0.0.1:{port} says {port:x}1"))
+        rig.door.note_denial(TurnedAway(f"invalid peer at 10.0.0.1:{port} says {port:x}1"))
     assert [(r.source, r.code) for r in rig.heard] == [("unknown", "invalid peer at … says …")]
     await rig.trail.close()
 

@@ -52,20 +52,20 @@ def test_who_cannot_work_yet_is_well() -> None:
 
 
 def looks_until_stuck(silence: Silence, passed_s: float) -> int:
-    return next(count for count in range(1, 1000) if silence.look(passed_s))
+    return next(count for count in range(1, 1000) if silence.add(passed_s))
 
 
 def test_five_seconds_without_a_beat_are_too_long() -> None:
     silence = Silence()
     assert looks_until_stuck(silence, LOOK_S) == 20
     silence.end()
-    assert not silence.look(LOOK_S)
+    assert not silence.add(LOOK_S)
 
 
 def test_time_in_which_the_supervisor_stood_still_does_not_count() -> None:
     silence = Silence()
-    assert not any(silence.look(3600.0) for _ in range(19))
-    assert silence.look(3600.0)
+    assert not any(silence.add(3600.0) for _ in range(19))
+    assert silence.add(3600.0)
 
 
 class Ended(Child):
@@ -93,7 +93,7 @@ def keeper_of(said: list[str], *, beats: bool = True, keep_stuck: bool = False) 
 def look(keeper: ManagedProcess, times: int) -> list[int]:
     """Look so often; the signals that the process has got so far."""
     for _ in range(times):
-        keeper.look(LOOK_S)
+        keeper.check_progress(LOOK_S)
     assert isinstance(keeper.child, Ended)
     return keeper.child.signals
 

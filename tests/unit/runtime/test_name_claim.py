@@ -76,8 +76,8 @@ async def life(network: SlowNetwork, begin_ns: int, stay: asyncio.Event) -> None
     transport = SlowTransport(network)
     claim = NameClaim(Bus(transport, network.clock, "driver"))
     try:
-        await claim.take()
-        await claim.keep()
+        await claim.acquire()
+        await claim.settle()
         await stay.wait()
     finally:
         await transport.close()
@@ -139,9 +139,9 @@ async def test_a_refused_question_does_not_say_that_the_name_is_free(
 async def test_who_is_alone_does_not_wait() -> None:
     clock = FakeClock()
     claim = NameClaim(Bus(LocalNetwork().transport(), clock, "driver"))
-    await claim.take()
+    await claim.acquire()
     assert claim.claim == "working"
-    keeping = asyncio.ensure_future(claim.keep())
+    keeping = asyncio.ensure_future(claim.settle())
     await clock.advance(4 * SECOND_NS)
     await keeping
     assert claim.claim == "settled"

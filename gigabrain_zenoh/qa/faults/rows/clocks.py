@@ -159,7 +159,7 @@ async def age_error_ms(bus: Bus, clock: Clock, looks: int) -> float:
 
     def take(_key: str, state: RobotState) -> None:
         for each in (earlier, there, later):
-            each.take(state)
+            each.store(state)
 
     close = bus.subscribe(STATE, take)
     try:
