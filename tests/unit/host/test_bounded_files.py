@@ -32,7 +32,7 @@ from gigabrain_zenoh.qa.faults.rig import Options
 from gigabrain_zenoh.qa.faults.suite import RunsFile
 from gigabrain_zenoh.recording.bag_reader import MAGIC, Bag, BagDamage, read_records
 from gigabrain_zenoh.runtime import audit
-from gigabrain_zenoh.security import identity, identity_files
+from gigabrain_zenoh.security import authority, identity_files
 from gigabrain_zenoh.security.identity_files import LIST, generations_in
 
 YAML = "image: x\nresolution: 0.05\norigin: [0, 0, 0]\n"
@@ -71,7 +71,7 @@ def read_list(path: Path) -> object:
 
 
 def read_key(path: Path) -> object:
-    return identity.read_certificate(path)
+    return authority.read_certificate(path)
 
 
 def read_model(path: Path) -> object:
