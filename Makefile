@@ -133,7 +133,7 @@ bench: setup
 # ---- files that are made ----
 
 golden: setup
-	$(BIN)/python -m gigabrain_schemas.golden
+	$(BIN)/python -m gigabrain_schemas.examples
 	$(BIN)/python -m tests.user_texts
 
 recordings: setup

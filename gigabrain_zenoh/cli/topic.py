@@ -195,7 +195,7 @@ def export(folder: Path) -> None:
     Args:
         folder: Folder to write to; it is created if missing.
     """
-    from gigabrain_schemas.golden import export as write
+    from gigabrain_schemas.examples import export as write
 
     try:
         written = write(folder)

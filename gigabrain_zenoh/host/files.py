@@ -3,6 +3,7 @@
 import errno
 import os
 import stat
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -78,17 +79,16 @@ def replacing(path: Path, mode: int = 0o644) -> Iterator[BinaryIO]:
     sync_folder(path.parent)
 
 
-def create_file(path: Path, data: bytes, mode: int = 0o644) -> None:
-    """Write the new file `path`, durably and at once; of several writers one wins.
+def create_file(path: Path, data: bytes) -> None:
+    """Write the new private file `path`, durably and at once; of several writers one wins.
 
     Raises FileExistsError where it exists, and OSError.
     """
-    draft = path.with_name(f".{path.name}.{os.getpid()}.new")
-    try:
-        write_synced(draft, data, mode)
-        os.link(draft, path)
-    finally:
-        draft.unlink(missing_ok=True)
+    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}-") as draft:  # 0600
+        draft.write(data)
+        draft.flush()
+        os.fsync(draft.fileno())
+        os.link(draft.name, path)
     sync_folder(path.parent)
 
 

@@ -3,7 +3,6 @@
 import logging
 import os
 import stat
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,7 +12,7 @@ import msgspec
 from gigabrain_schemas.topics import Role
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import BusError, ConfigError
-from gigabrain_zenoh.host.files import open_regular, read_bounded
+from gigabrain_zenoh.host.files import create_file, open_regular, read_bounded, replace_file
 from gigabrain_zenoh.host.network import host_and_port
 from gigabrain_zenoh.host.posix import fcntl
 from gigabrain_zenoh.security.acl import common_name
@@ -62,23 +61,18 @@ def made_once(path: Path, content: bytes) -> tuple[bytes, bool]:
             check_private(path)
             return found, False
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}-") as new:  # 0600
-            new.write(content)
-            new.flush()
-            os.fsync(new.fileno())
-            try:
-                os.link(new.name, path)
-                return content, True
-            except FileExistsError:
-                check_private(path)
-            with open_regular(path, MAX_SECRET_BYTES) as old:
-                fcntl.flock(old, fcntl.LOCK_EX)  # of several processes that replace it one does
-                found = read_bounded(path, MAX_SECRET_BYTES)
-                if not found:
-                    log.warning("%s was empty; replaced it", path)
-                    os.link(new.name, f"{new.name}-whole")
-                    os.replace(f"{new.name}-whole", path)
-                return found or content, not found
+        try:
+            create_file(path, content)
+            return content, True
+        except FileExistsError:
+            check_private(path)
+        with open_regular(path, MAX_SECRET_BYTES) as old:
+            fcntl.flock(old, fcntl.LOCK_EX)  # of several processes that replace it one does
+            found = read_bounded(path, MAX_SECRET_BYTES)
+            if not found:
+                log.warning("%s was empty; replaced it", path)
+                replace_file(path, content, 0o600)
+            return found or content, not found
     except OSError as error:
         raise ConfigError(f"cannot read or write {path}: {error.strerror}") from None
 

@@ -77,11 +77,11 @@ def test_on_a_full_disk_the_old_content_stays_and_no_draft(tmp_path: Path, disk:
 
 def test_a_file_is_created_once_whole_and_private(tmp_path: Path, disk: Disk) -> None:
     path = tmp_path / "tokens"
-    files.create_file(path, b"secret", 0o600)
+    files.create_file(path, b"secret")
     assert disk.left(path) == b"secret"
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     with pytest.raises(FileExistsError):
-        files.create_file(path, b"other", 0o600)
+        files.create_file(path, b"other")
     assert path.read_bytes() == b"secret"
     assert [file.name for file in tmp_path.iterdir()] == ["tokens"]
 

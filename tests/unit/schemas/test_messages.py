@@ -3,13 +3,12 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from gigabrain_schemas import golden
+from gigabrain_schemas import examples
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.brain import (
     CmdVel,
 )
-from gigabrain_schemas.examples import EXAMPLES
-from gigabrain_schemas.golden import export
+from gigabrain_schemas.examples import EXAMPLES, export
 from gigabrain_schemas.topics import SERVICES, TOPICS, messages
 from gigabrain_zenoh.qa.faults.hostile import leaves
 from tests.unit.schemas.plain import as_map, codec, dotted, refuses
@@ -152,15 +151,15 @@ def test_every_message_is_frozen_and_documented_and_carries_the_header(
 
 
 def test_the_golden_folder_holds_the_examples_byte_for_byte() -> None:
-    stored = {path.name: path.read_bytes() for path in golden.FOLDER.iterdir()}
-    assert stored == golden.files()
+    stored = {path.name: path.read_bytes() for path in examples.FOLDER.iterdir()}
+    assert stored == examples.files()
     assert len(stored) == 76
 
 
 @by_name
 def test_golden_files_decode_to_the_example(name: str) -> None:
     for kind in ("msgpack", "json"):
-        payload = (golden.FOLDER / f"{name}.{kind}").read_bytes()
+        payload = (examples.FOLDER / f"{name}.{kind}").read_bytes()
         decoded = codec(name).decode(payload)
         # compared encoded: a scan may hold nan, which does not equal itself
         assert msgspec.msgpack.encode(decoded) == msgspec.msgpack.encode(EXAMPLES[name])
@@ -168,9 +167,9 @@ def test_golden_files_decode_to_the_example(name: str) -> None:
 
 def test_writing_the_golden_files_removes_those_of_messages_that_are_gone(tmp_path: Path) -> None:
     (tmp_path / "Gone.json").write_text("{}")
-    golden.write(tmp_path)
+    examples.write(tmp_path)
     assert not (tmp_path / "Gone.json").exists()
-    assert (tmp_path / "CmdVel.msgpack").read_bytes() == golden.files()["CmdVel.msgpack"]
+    assert (tmp_path / "CmdVel.msgpack").read_bytes() == examples.files()["CmdVel.msgpack"]
 
 
 def test_the_wire_format_is_a_map_of_named_fields() -> None:
