@@ -8,8 +8,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from gigabrain_schemas.topics import Role
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.security.acl import Role
 from gigabrain_zenoh.security.identity_files import (
     CA_KEY,
     CERTIFICATE,
@@ -107,7 +107,7 @@ def identities(*, dir: FleetFolder = None) -> int:
         dir: Folder of a fleet or of one identity. Default: the only fleet in this folder.
     """
     with _needs_cryptography():
-        from gigabrain_zenoh.security.identity import list_identities
+        from gigabrain_zenoh.security.authority import list_identities
 
     folder = dir if dir and (dir / CERTIFICATE).exists() else find_fleet(dir)
     all_valid = True

@@ -236,6 +236,7 @@ def write_list(folder: Path, generations: Mapping[str, int]) -> None:
         raise ConfigError(f"cannot write {folder / LIST}: {error.strerror}") from None
 
 
+EXPIRES_SOON_DAYS = 30
 MOST_BYTES = 100_000  # of a key or a certificate
 
 
@@ -344,3 +345,25 @@ def _hosts(certificate: x509.Certificate) -> tuple[str, ...]:
     except x509.ExtensionNotFound:
         return ()
     return tuple(str(place.value) for place in places)
+
+
+def list_identities(folder: Path) -> Iterator[tuple[str, bool]]:
+    """Yield a line for each identity in a fleet's folder, or in its own, and if it is valid."""
+    places = [folder] if (folder / CERTIFICATE).exists() else sorted(folder.iterdir())
+    now, generations = datetime.datetime.now(datetime.UTC), generations_in(folder)
+    for place in places:
+        if not (place / CERTIFICATE).exists():
+            continue
+        try:
+            one = load(place, now)
+        except ConfigError as error:
+            yield f"{place.name:<20} {error}", False
+            continue
+        if one.generation < generations.get(common_name(one.role, one.robot), 1):
+            yield f"{place.name:<20} {one.name} was revoked; delete it", False
+            continue
+        days_left = one.days_left(now)
+        soon = "  SOON" if days_left < EXPIRES_SOON_DAYS else ""
+        hosts = f"  ({', '.join(one.hosts)})" if one.hosts else ""
+        expires = f"expires {one.expires:%Y-%m-%d}, in {days_left:.0f} days{soon}"
+        yield f"{place.name:<20} {f'{one.name} of {one.fleet}':<28} {expires}{hosts}", True

@@ -13,7 +13,7 @@ from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_schemas.topics import messages
-from gigabrain_zenoh.codec import TOLD
+from gigabrain_zenoh.codec import MAX_ERROR_CHARS
 from gigabrain_zenoh.qa.faults.hostile import codec_of, hostile_payloads, leaves
 from tests.fuzz.harness import split
 

@@ -10,7 +10,7 @@ from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.runtime import connect
-from gigabrain_zenoh.runtime.connect import join, unknown_host
+from gigabrain_zenoh.runtime.connect import open_session, unknown_host
 from gigabrain_zenoh.testing.processes import free_endpoint, session_threads
 from gigabrain_zenoh.testing.waiting import until
 

@@ -17,6 +17,7 @@ from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.host.bounded import percentile
+from gigabrain_zenoh.launch.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.qa.faults.cpu_load import PROGRAM, endpoint_text
 from gigabrain_zenoh.qa.judging import limited, table_of
 from gigabrain_zenoh.qa.probe import path_until_rest

@@ -15,6 +15,7 @@ from gigabrain_schemas.brain import PoseInMap
 from gigabrain_schemas.topics import POSE
 from gigabrain_zenoh.client.tasks import Tasks
 from gigabrain_zenoh.geometry.pose import to_frame
+from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.qa.faults.rig import DRIVES_AGAIN, TRAVEL, Options, Rig, deployment_of
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, Skipped, fault_row, worse_of
 from gigabrain_zenoh.qa.probe import until

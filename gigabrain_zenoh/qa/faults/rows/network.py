@@ -32,6 +32,8 @@ from gigabrain_zenoh.client.robot import connect
 from gigabrain_zenoh.codec import encode
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.host.bounded import percentile
+from gigabrain_zenoh.launch.deployment import Deployment, with_free_port
+from gigabrain_zenoh.launch.processes import names_by_role
 from gigabrain_zenoh.qa.faults import cpu_load
 from gigabrain_zenoh.qa.faults.cpu_load import endpoint_text
 from gigabrain_zenoh.qa.faults.rig import (

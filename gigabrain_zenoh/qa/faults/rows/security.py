@@ -28,6 +28,7 @@ from gigabrain_zenoh.codec import encode
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.host.posix import resource
+from gigabrain_zenoh.launch.deployment import client_endpoint
 from gigabrain_zenoh.qa.faults.rig import (
     PERIOD_ADDED,
     Rig,
