@@ -8,7 +8,7 @@ __all__ = ["connect"]
 
 
 def __getattr__(name: str) -> "Any":
-    """`gigabrain_zenoh.connect`, imported when first used: the processes have no need of it."""
+    """Import `gigabrain_zenoh.connect` when it is first used, as processes do not need it."""
     if name == "connect":
         from gigabrain_zenoh.client.robot import connect
 

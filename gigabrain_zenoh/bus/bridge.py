@@ -92,7 +92,7 @@ class Bridge:
         self._queue: deque[tuple[Callable[[Any], object], Any]] = deque()
         self._signalled = False
         self._open = True
-        # held while signalling: the number of a closed descriptor may be somebody else's at once
+        # held while signalling: the number of a closed descriptor may be reused at once
         self._closing = threading.RLock()  # a garbage collection in between may post as well
         self._waker = waker()
         self._loop.add_reader(self._waker.fileno(), self._drain)

@@ -144,7 +144,7 @@ class Bus:
         self.input_log = InputLogger()  # inputs that the node has used
         self.params = Params()  # what may be changed while the process runs
         self.arrived: dict[str, tuple[int, int]] = {}  # boot and tick of the newest, by key
-        # whether work was done since the last call; a loop that turns, where a node says no more
+        # whether work was done since the last call; by default that the loop runs
         self.progress: Callable[[], bool] = lambda: True
         self._refusing_ns = self._refused_ns = 0  # since when, and when last
         self._kept: dict[str, bytes] = {}
@@ -361,7 +361,7 @@ class Bus:
             try:
                 for payload in await self.kept(topic):
                     receive(topic.key, payload)
-            except Exception as error:  # noqa: BLE001 - as in `_guard`: nobody waits for this task
+            except Exception as error:  # noqa: BLE001 - as in `_guard`: no code awaits this task
                 self._fail(error)
 
         task = asyncio.get_running_loop().create_task(fetch())

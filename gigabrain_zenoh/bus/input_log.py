@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from gigabrain_zenoh.bus.bus import Bus
 
 EVERY_NS = 500_000_000  # from one word about it to the next
-ROOM = MAX_ENTRIES // 2  # entries that may wait; one more may be added while they are said
+MAX_WAITING = MAX_ENTRIES // 2  # entries; more may be added while they are published
 MOST_KEYS = 512  # of which the newest number is known
 HIGHEST = 2**63 - 1
 
@@ -50,8 +50,8 @@ class InputLogger:
 class PublishedInputLogger(InputLogger):
     """Publishes the input log twice a second, if it holds anything."""
 
-    def __init__(self, say: Callable[[InputLog], object], unix_ns: Callable[[], int]) -> None:
-        self._say, self._unix_ns = say, unix_ns
+    def __init__(self, publish: Callable[[InputLog], object], unix_ns: Callable[[], int]) -> None:
+        self._publish, self._unix_ns = publish, unix_ns
         self._keys: dict[str, int] = {}
         self._taken: list[ConsumedInput] = []
         self._last: dict[str, int] = {}  # seq by key
@@ -75,12 +75,12 @@ class PublishedInputLogger(InputLogger):
         taken, keys = self._taken, tuple(self._keys)
         if taken:
             self._taken, self._keys = [], {}
-            self._say(InputLog(began_ns=self._began_ns, keys=keys, taken=tuple(taken)))
+            self._publish(InputLog(began_ns=self._began_ns, keys=keys, taken=tuple(taken)))
 
     def _add(self, key: str, seq: int) -> None:
         now_ns = self._unix_ns()
         after_ns = now_ns - self._began_ns
-        if self._taken and (not 0 <= after_ns < EVERY_NS or len(self._taken) >= ROOM):
+        if self._taken and (not 0 <= after_ns < EVERY_NS or len(self._taken) >= MAX_WAITING):
             self.flush()
         if not self._taken:
             self._began_ns, after_ns = now_ns, 0

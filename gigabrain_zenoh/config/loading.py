@@ -67,8 +67,8 @@ def _words(info: mi.Type) -> str:
 
 def _limits(info: mi.Type) -> str:
     given = [(words, getattr(info, name, None)) for name, words in _LIMITS.items()]
-    said = [f"{words} {limit}" for words, limit in given if limit is not None]
-    return " " + " and ".join(said) if said else ""
+    found = [f"{words} {limit}" for words, limit in given if limit is not None]
+    return " " + " and ".join(found) if found else ""
 
 
 def choices(type_: Any) -> list[Any]:
@@ -131,7 +131,7 @@ def _find(node: Node, type_: Any, path: str, key_line: int) -> FieldFault | None
         msgspec.convert(node.value, type_)
     except msgspec.ValidationError as error:
         line = key_line if node.entries or node.items else node.line
-        if structs:  # its fields are right, so its own __post_init__ said no
+        if structs:  # its fields are valid, so its own __post_init__ refused it
             return _own_fault(node, path, line, re.sub(r" - at `[^`]*`$", "", str(error)))
         hint = nearest(node.value, choices(type_))
         return FieldFault(line, _at(path, f"expected {expected(type_)}, got {got(node)}{hint}"))

@@ -37,7 +37,7 @@ from gigabrain_zenoh.ui.run_report import (
 )
 
 CAPACITY_LOOK_S = 1.0
-SHORT_LOOKS = 5  # so many in a row, for a pause of the machine passes
+SHORT_LOOKS = 5  # in a row, because a pause of the machine passes
 KEPT = 0.95  # share of real time that a simulation keeps on a machine that can carry it
 
 
@@ -57,7 +57,7 @@ class Capacity:
     def compare(self, now_s: float, robot_s: float, *, held: bool) -> None:
         """Compare the wall clock with the robot's.
 
-        `held` says that the brain is held back while the processors have no time to spare.
+        With `held` the brain is held back while the processors have no time to spare.
         """
         if self._last is None:
             self._last = self._began = now_s, robot_s
@@ -85,9 +85,9 @@ class Capacity:
 
 
 SYSTEMS = ("perception", "decision", "control")
-LOOK_S = 0.1  # how often the run is looked at
+LOOK_S = 0.1  # period of checks
 RELEASE_FIRST = (
-    "a real body drives only when somebody has released and enabled it: while the demo runs, in "
+    "a real body drives only after a person has released and enabled it: while the demo runs, in "
     "another terminal, `gigabrain release` and `gigabrain enable`"
 )
 STALLED_S = 60.0  # without a tick of the robot's clock
@@ -135,8 +135,8 @@ class Demo:
         self._supervisor = Supervisor(specs, self._record, keep_stuck=options.keep_stuck)
         self._decisions: list[tuple[float, str]] = []
         self._failures: list[str] = []
-        self._compiling: set[str] = set()  # processes that have said so
-        self._refusal = ""  # what a process said before it ended
+        self._compiling: set[str] = set()  # processes that reported it
+        self._refusal = ""  # last error of a process that ended
         self._faults: deque[tuple[float, str]] = deque(maxlen=4)  # when [s], and what
         self._capacity = Capacity()
         self._last_fault = ""  # before all were asked to end, the driver's first
@@ -249,8 +249,8 @@ class Demo:
     async def _ask_for_truth(self, watch: RunMonitor, within_s: float) -> Report | None:
         statuses = self._supervisor.statuses
         names = [name for name, status in statuses.items() if status.state == "ready"]
-        told = await asyncio.gather(*(watch.describe(name, within_s) for name in names))
-        answers = {answer.process: answer.report for answer in told if answer}
+        replies = await asyncio.gather(*(watch.describe(name, within_s) for name in names))
+        answers = {answer.process: answer.report for answer in replies if answer}
         state = watch.state.newest
         if "driver" not in answers and state is None:
             return None

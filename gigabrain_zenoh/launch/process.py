@@ -60,7 +60,7 @@ class ProcessType:
     run: str  # "module:function" of its node, imported only when it runs
     settings: type[Struct] | None = None
     derive: Callable[["Deployment", Place], Struct] | None = None
-    default: bool = False  # runs where a deployment says nothing of hosts
+    default: bool = False  # runs if a deployment names no hosts
     named: bool = True  # `hosts` may name it
     joins: Callable[["Deployment", set[str]], bool] | None = None  # added to such a host by itself
     after: tuple[str, ...] = ("router", "relay")  # which of these must be ready before it starts
@@ -153,8 +153,8 @@ async def _work(
         handler = logs.BusHandler(functools.partial(bus.publish, LOG), config.name)
         logging.getLogger().addHandler(handler)
         if process_type.repeats:
-            say = functools.partial(bus.publish, INPUT_LOG, name=config.name)
-            bus.input_log = PublishedInputLogger(say, bus.clock.unix_ns)
+            publish = functools.partial(bus.publish, INPUT_LOG, name=config.name)
+            bus.input_log = PublishedInputLogger(publish, bus.clock.unix_ns)
         try:
             claim = NameClaim(bus)
             await claim.acquire()

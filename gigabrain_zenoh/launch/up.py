@@ -97,7 +97,7 @@ ROUTERS = {"router", "relay"}  # without one of them no message is delivered on 
 async def up(
     deployment: Deployment,
     host: str,
-    say: Callable[[str], None],
+    print_line: Callable[[str], None],
     level: str = "info",
     *,
     keep_stuck: bool = False,
@@ -126,9 +126,10 @@ async def up(
             before, refusal = refusal, str(record.get("text", ""))
             if refusal == before:  # printed already, at the first try
                 return
-        say(logs.readable(record, colour=False))
+        print_line(logs.readable(record, colour=False))
 
-    say(f"{deployment.body} on {host}: {', '.join(spec.name for spec in specs)}; logs in {run_dir}")
+    names = ", ".join(spec.name for spec in specs)
+    print_line(f"{deployment.body} on {host}: {names}; logs in {run_dir}")
     with (
         stop_signals(LIMIT_S) as stop,
         announced(label, local_endpoint(deployment, host)) as note,
@@ -166,12 +167,12 @@ def _report(supervisor: Supervisor, notifier: Notifier, note: Path) -> None:
         "stuck": supervisor.stuck,
         "not ready": tuple(not_yet),
     }
-    told = [f"{what}: {', '.join(names)}" for what, names in problems.items() if names]
-    notifier.status("; ".join(told) or f"all ready: {', '.join(states)}")
+    problem_texts = [f"{what}: {', '.join(names)}" for what, names in problems.items() if names]
+    notifier.status("; ".join(problem_texts) or f"all ready: {', '.join(states)}")
     if not not_yet:
         notifier.ready()
     if not supervisor.stuck:
         notifier.alive()
-    if not told:
+    if not problem_texts:
         with contextlib.suppress(OSError):  # removed meanwhile
             os.utime(note)

@@ -164,10 +164,10 @@ def as_json(record: AuditRecord) -> str:
 
 
 log = logging.getLogger(__name__)
-AGAIN_NS = 1_000_000_000  # what happens again within this time is counted, not told anew
-LASTING_NS = 60_000_000_000  # the same for what goes on for as long as somebody keeps trying
+AGAIN_NS = 1_000_000_000  # repetitions within this time are only counted
+LASTING_NS = 60_000_000_000  # the same for refusals that go on
 LASTING: tuple[What, ...] = ("refused", "stranger")
-MAX_SOURCES = 100  # entries told apart within that time, of what was granted and of what was not
+MAX_SOURCES = 100  # entries counted apart within that time, of granted and of refused requests
 MAX_CODES = 20  # that one entry counts apart
 ROOM = 1000  # entries that may wait for the disk
 OTHERS, OTHER = "others", "other"

@@ -132,11 +132,11 @@ async def _wait_for_names(listen: Iterable[str]) -> None:
 
     At boot, name resolution may start later than the router.
     """
-    said = ""
+    reported = ""
     while host := await unknown_host(listen):
-        if host != said:
+        if host != reported:
             _warn(_unknown_name(host))
-        said = host
+        reported = host
         await asyncio.sleep(AGAIN_S)
 
 
@@ -152,7 +152,7 @@ async def _explain(endpoint: Endpoint, opening: asyncio.Future[ZenohTransport]) 
 
 
 def _unknown_name(host: str) -> str:
-    return f"nobody here knows a host {host!r}; waiting for its name (is it spelt right?)"
+    return f"cannot resolve host {host!r}; waiting for its name (is it spelt right?)"
 
 
 def _no_router(endpoint: Endpoint) -> str:

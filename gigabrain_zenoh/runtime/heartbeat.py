@@ -15,7 +15,7 @@ from gigabrain_zenoh.clock import Clock
 
 EVENT = "progress"
 PERIOD_NS = 1_000_000_000
-STALL_S = 5.0  # so long without progress, and a process counts as stuck
+STALL_S = 5.0  # without progress for this time a process counts as stuck
 LOOK_S = 0.25  # how often a supervisor looks
 STDOUT = 1
 _LINE = msgspec.json.encode({"event": EVENT, "level": "debug"}) + b"\n"

@@ -60,9 +60,9 @@ def as_record(line: bytes, process: str) -> dict[str, Any]:
     """Return the log record in a line of output; other lines become the text of a record."""
     known = {"t": time.time_ns(), "level": "info", "process": process, "event": "output"}
     with contextlib.suppress(msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        said = msgspec.json.decode(line)
-        if isinstance(said, dict) and isinstance(said.get("event"), str):
-            fit = {k: v for k, v in said.items() if type(v) is type(known.get(k, v))}
+        found = msgspec.json.decode(line)
+        if isinstance(found, dict) and isinstance(found.get("event"), str):
+            fit = {k: v for k, v in found.items() if type(v) is type(known.get(k, v))}
             return known | fit
     return known | {"level": "error", "text": line.decode(errors="replace").rstrip()}
 
@@ -157,7 +157,7 @@ class ProcessSpec:
     after: tuple[str, ...] = ()
     ready_timeout_s: float = 10.0
     stop_last: bool = False  # what the others need in order to end well, such as the router
-    beats: bool = False  # says once a second that it makes progress, and is killed when it does not
+    beats: bool = False  # reports progress once a second, and is killed without it
 
 
 @dataclass

@@ -206,7 +206,7 @@ class AccessAudit:
     def note_denial(self, seen: Seen) -> None:
         """Note a denial."""
         if isinstance(seen, TurnedAway):
-            text = f"somebody was turned away at the door: {seen.why}"
+            text = f"a client was refused a session: {seen.why}"
             code = PARTICULAR.sub("…", seen.why)
             self._trail.note("stranger", "unknown", text, code=code, ok=False)
             return

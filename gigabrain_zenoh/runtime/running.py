@@ -86,11 +86,11 @@ def _check_private(place: Path) -> None:
     """Raise ConfigError where another user could put notes into the folder, or replace it."""
     for one in (place, place.parent):
         with contextlib.suppress(FileNotFoundError):
-            # a link that somebody else planted leads to a folder that may well be ours
+            # a symbolic link of another user may lead to a folder of this one
             owners = {one.lstat().st_uid, one.stat().st_uid}
             if owners != {os.getuid()} or one.stat().st_mode & 0o022:
                 raise ConfigError(
-                    f"{one} belongs to another user, or others may write it, so it cannot say "
+                    f"{one} belongs to another user, or others may write it, so it cannot show "
                     "which robots run; set XDG_RUNTIME_DIR to a folder of your own, of mode 0700"
                 )
 

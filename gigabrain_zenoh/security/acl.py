@@ -154,15 +154,15 @@ def _known(robots: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
 def _rules(role: Role, robot: str, table: Table) -> Iterator[Rule]:
     """Yield one role's rules for one robot."""
     who, everything = common_name(role, robot), under(robot, [EVERYTHING])
-    says, asks, answers = table.keys(role)
+    puts, queries, replies = table.keys(role)
     yield _rule(f"{who} hears", "egress", TO_LISTENERS, everything)
     # subscriptions are no secret: a fleet's operator may subscribe to `**`
     yield _rule(f"{who} is heard", "egress", ["declare_subscriber"], ["**"])
     yield _rule(f"{who} listens", "ingress", ["declare_subscriber"], everything)
     for verb, messages, keys in (
-        ("says", ["put"], says),
-        ("asks", ["query"], asks),
-        ("answers", ["declare_queryable", "reply"], answers),
+        ("says", ["put"], puts),
+        ("asks", ["query"], queries),
+        ("answers", ["declare_queryable", "reply"], replies),
     ):
         if keys:
             yield _rule(f"{who} {verb}", "ingress", messages, under(robot, keys))

@@ -90,7 +90,7 @@ def issue(
     names.append(x509.NameAttribute(NameOID.COMMON_NAME, subject))
     usages = [ExtendedKeyUsageOID.CLIENT_AUTH]
     builder = _builder(x509.Name(names), authority.subject, key.public_key(), days)
-    if role in SERVERS:  # whoever else had this could pass for a router
+    if role in SERVERS:  # a client with this could pass for a router
         usages.append(ExtendedKeyUsageOID.SERVER_AUTH)
         places = [_place(host) for host in dict.fromkeys((*LOCAL, *hosts))]
         builder = builder.add_extension(x509.SubjectAlternativeName(places), critical=False)
@@ -130,7 +130,7 @@ def _check_days(days: int, authority: x509.Certificate) -> None:
     end = authority.not_valid_after_utc
     left = (end - datetime.datetime.now(datetime.UTC)).days
     if days > left:
-        at_most = f"say --days {left} at most, or " if left > 0 else ""
+        at_most = f"use --days {left} at most, or " if left > 0 else ""
         raise ConfigError(
             f"--days {days}: the fleet's own certificate ends on {end:%Y-%m-%d}; {at_most}"
             "make a new fleet with `gigabrain keys new`"

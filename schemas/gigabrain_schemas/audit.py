@@ -13,12 +13,12 @@ What = Literal[
     "estop",
     "release",
     "enable",
-    "take",  # an enable that took the body from somebody else
+    "take",  # an enable that took the body from another source
     "mode",  # the gate's mode has changed
     "raised",  # a cause, by safety, the driver or the gate
     "cleared",
     "refused",  # commands that were not obeyed
-    "stranger",  # somebody who was not let in at all
+    "stranger",  # a client that was refused at the router
 ]
 
 

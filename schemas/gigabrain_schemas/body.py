@@ -72,8 +72,8 @@ class LinkHealth(Record, frozen=True, kw_only=True):
     """State of the driver's line to the body."""
 
     connected: bool = True
-    age_ms: Milliseconds = 0.0  # since the body was last heard
-    late_ms: Milliseconds | None = None  # by which it came later than it can; None: no clock tells
+    age_ms: Milliseconds = 0.0  # since the body's last message
+    late_ms: Milliseconds | None = None  # delay beyond the shortest one; None: no clock to compare
     errors: Count = 0  # frames that were thrown away
     reconnects: Count = 0
 
@@ -84,7 +84,7 @@ class GateStatus(Record, frozen=True, kw_only=True):
     mode: GateMode = "latched"
     causes: Causes = ()
     estop_generation: Count = 0  # how often an e-stop was pressed; a release must name it
-    commander: Name = ""  # whose commands pass; empty for nobody's
+    commander: Name = ""  # whose commands pass; empty for none
     enables: Count = 0  # how often it was enabled since this boot
 
 
@@ -94,7 +94,7 @@ class RobotState(Message, frozen=True, kw_only=True):
     robot_type: Name
     pose: Pose  # odometry, since the driver's start
     velocity: Velocity  # as measured
-    sent: Velocity = Velocity()  # what the body was told last, as its protocol has it
+    sent: Velocity = Velocity()  # last command to the body, as its protocol encodes it
     joints: Annotated[tuple[Joint, ...], Meta(max_length=MOST_JOINTS)] = ()
     battery: Battery | None = None
     imu: ImuData | None = None

@@ -30,7 +30,7 @@ class EnableRequest(Message, frozen=True, kw_only=True):
 
     source: Name  # "control" for the robot's own brain
     take: bool = False  # even if another source holds the body
-    by: Name = ""  # the person who asks, where the source is the brain: it takes from nobody itself
+    by: Name = ""  # the person who asks, if the source is the brain
 
 
 class GateReply(Message, frozen=True, kw_only=True):

@@ -40,7 +40,7 @@ class SafetyState(Message, frozen=True, kw_only=True):
     verdict: Literal["ok", "slow", "stop"]
     caps: SpeedCaps = SpeedCaps()
     causes: Causes = ()  # why the verdict is what it is
-    warnings: Causes = ()  # what will become a cause if nobody acts
+    warnings: Causes = ()  # become causes if no one acts
 
 
 class Health(Message, frozen=True, kw_only=True):

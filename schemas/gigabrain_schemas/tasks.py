@@ -42,7 +42,7 @@ class GoalRequest(Message, frozen=True, kw_only=True):
 
 
 class GoalReply(Message, frozen=True, kw_only=True):
-    """Whether the robot accepts the goal."""
+    """The answer to a goal: accepted or refused, with a text."""
 
     ok: bool
     text: Text
@@ -59,7 +59,7 @@ class MissionRequest(Message, frozen=True, kw_only=True):
 
 
 class MissionReply(Message, frozen=True, kw_only=True):
-    """Whether the robot accepts the mission."""
+    """The answer to a mission: accepted or refused, with a text."""
 
     ok: bool
     text: Text

@@ -14,7 +14,7 @@ from gigabrain_zenoh.runtime.connect import open_session, unknown_host
 from gigabrain_zenoh.testing.processes import free_endpoint, session_threads
 from gigabrain_zenoh.testing.waiting import until
 
-NOBODY = "nobody here knows a host {!r}; waiting for its name (is it spelt right?)"
+NOBODY = "cannot resolve host {!r}; waiting for its name (is it spelt right?)"
 
 
 class Resolver:

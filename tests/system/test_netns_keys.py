@@ -96,7 +96,7 @@ async def test_a_stranger_on_the_network_gets_nothing_and_is_written_down(tmp_pa
                 told = await homes["robot"].run(
                     "audit", "--connect", f"tls/{address}:7447", "--keys", keys
                 )
-                assert "somebody was turned away at the door" in told.out
+                assert "a client was refused a session" in told.out
                 assert robot.state.gate.estop_generation == 0
         finally:
             for home in homes.values():

@@ -149,7 +149,7 @@ class ZenohTransport:
                 express=True,
             )
         except zenoh.ZError as error:  # the session has just been closed
-            log.debug("nobody was asked on %s: %s", key, error)
+            log.debug("no query was sent on %s: %s", key, error)
             return []
         self._asking.add(done)
         try:

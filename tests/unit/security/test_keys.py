@@ -124,7 +124,7 @@ def test_an_identity_is_good_for_a_day_at_least_and_not_beyond_its_fleet(copied:
         with pytest.raises(ConfigError, match=rf"^--days {days}: expected 1 to 3650$"):
             issue(copied, "viewer", days=days)
     end = r"^--days 3650: the fleet's own certificate ends on 20\d\d-\d\d-\d\d; "
-    with pytest.raises(ConfigError, match=end + "say --days 3649 at most, or make a new fleet"):
+    with pytest.raises(ConfigError, match=end + "use --days 3649 at most, or make a new fleet"):
         issue(copied, "viewer", days=3650)
     issue(copied, "viewer", days=3649)
 
