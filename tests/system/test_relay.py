@@ -19,8 +19,8 @@ from gigabrain_zenoh.testing.processes import Home, free_port
 from gigabrain_zenoh.testing.waiting import until
 from tests.system.test_netns import REST_TICKS, STOP_TICKS, Ears
 
-ROBOT: tuple[ProcessName, ...] = ("router", "driver", "control", "safety")
-BRAIN: tuple[ProcessName, ...] = ("perception", "decision")
+ROBOT: tuple[str, ...] = ("router", "driver", "control", "safety")
+BRAIN: tuple[str, ...] = ("perception", "decision")
 
 
 def configs(deployment: Deployment, host: str, folder: Path) -> dict[str, ProcessConfig]:
