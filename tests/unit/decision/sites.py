@@ -141,7 +141,7 @@ class Site:
 
     async def step(self, ticks: int = 5, boot: int = BOOT) -> None:
         self.tick += ticks
-        self.net.one.time.see(state(self.tick, boot=boot))
+        self.net.one.time.observe(state(self.tick, boot=boot))
         self.command, _ = self.service.step(state(self.tick, boot=boot), self.outcome)
         self.outcome = None
         await settle()

@@ -204,7 +204,7 @@ async def test_what_was_granted_is_told_with_the_tick_and_the_world_from_which_i
     site.net.two.subscribe(REQUEST_LOG, lambda _key, granted: told.append(granted))
     await site.step()
     site.service.step(state(7), None, basis=5)
-    site.net.one.time.see(state(7))
+    site.net.one.time.observe(state(7))
     await site.go(3.0)
     await site.change("pause")
     site.wall = "the goal is inside a wall"

@@ -292,7 +292,7 @@ async def test_echo_shows_what_comes_and_ends_after_so_many(net: Net) -> None:
 
 
 async def test_echo_reports_a_silent_topic_after_its_time_limit(net: Net) -> None:
-    await NameClaim(net.two).take()
+    await NameClaim(net.two).acquire()
     how = EchoOptions(within_s=0.01)
     with pytest.raises(BodyLost) as told:
         await echo(net.one, TopicPattern("robot/world", WORLD), how, lambda _: None)

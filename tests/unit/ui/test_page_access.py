@@ -86,7 +86,7 @@ def test_an_empty_file_of_tokens_is_replaced_with_a_warning(
     made, new = tokens(path)
     assert new
     assert tokens(path) == (made, False)
-    assert caplog.messages == [f"{path} was empty; it is made anew"]
+    assert caplog.messages == [f"{path} was empty; replaced it"]
 
 
 async def test_a_page_that_cannot_be_served_makes_no_tokens(tmp_path: Path) -> None:
