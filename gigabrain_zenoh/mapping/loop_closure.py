@@ -8,6 +8,7 @@ of the path must agree on it and on no other (pairwise consistency, J. Mangelson
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,6 +85,14 @@ MIN_SPAN_M = 10.0
 MAX_RIVAL_SHARE = 0.5  # stretches that agree on another place, per stretch that agrees on this one
 
 
+class Trajectory(NamedTuple):
+    """Keyframes with their poses (n, 3) and the distances driven until each (n,) [m]."""
+
+    keyframes: Sequence[Keyframe]
+    poses: Floats
+    travel: Floats
+
+
 class LoopSearch:
     """Looks for loops from each keyframe in turn. One thread at a time."""
 
@@ -96,21 +105,21 @@ class LoopSearch:
     def find(self, keyframes: Sequence[Keyframe], poses: Floats) -> list[Edge]:
         """Loops that end at the last keyframe and are beyond doubt, and those that they confirm."""
         travel = np.array([keyframe.travel for keyframe in keyframes])
-        far = self._places.find(keyframes, poses)
+        trajectory = Trajectory(keyframes, poses, travel)
+        far = self._places.find(trajectory)
         for loop in far:
             self.drift.closed(loop)
-        return far or self._find_near(keyframes, poses, travel)
+        return far or self._find_near(trajectory)
 
-    def _find_near(
-        self, keyframes: Sequence[Keyframe], poses: Floats, travel: Floats
-    ) -> list[Edge]:
+    def _find_near(self, trajectory: Trajectory) -> list[Edge]:
+        keyframes, poses, travel = trajectory
         if travel[-1] - self.searched < SEARCH_SPACING_M:
             return []
         self.searched = float(travel[-1])
         self.waiting = [w for w in self.waiting if travel[-1] - travel[w.second] < WITNESS_TRAVEL_M]
         here = len(keyframes) - 1
         attempts = [
-            _attempt(keyframes, poses, travel, there, here, *self.drift.between(there, here, poses))
+            _attempt(trajectory, there, here, *self.drift.between(there, here, poses))
             for there in _candidates(poses, travel, here)
         ]
         found = [loop for loop in attempts if loop and self.drift.explains(loop, poses)]
@@ -156,19 +165,14 @@ def around(travel: Floats, there: int, end: int) -> slice:
 
 
 def _attempt(
-    keyframes: Sequence[Keyframe],
-    poses: Floats,
-    travel: Floats,
-    there: int,
-    here: int,
-    turn: float,
-    away: float,
+    trajectory: Trajectory, there: int, here: int, turn: float, away: float
 ) -> Edge | None:
     """Return the loop from `there` to `here` if the scan of `here` fits into that place.
 
     The drift's variances, `turn` and `away`, decide where the place leaves a direction open. The
     loop's covariance does not include them, as the graph already does.
     """
+    keyframes, poses, travel = trajectory
     place = around(travel, there, here)
     scans = [keyframe.scan for keyframe in keyframes[place]]
     local = build(scans, between(poses[there], poses[place]), IDENTITY, LOOP_CELL_M, LOOP_SIGMA_M)
@@ -232,25 +236,25 @@ class PlaceSearch:
         self._earlier = False  # whether it is an earlier stretch's turn
         self._again: list[int] = []  # keyframes to search from once more, the last first
 
-    def find(self, keyframes: Sequence[Keyframe], poses: Floats) -> list[Edge]:
+    def find(self, trajectory: Trajectory) -> list[Edge]:
         """Match some more places, and return the loops to one that is beyond doubt.
 
         Every other time it is those of earlier stretches, as long as there are any: a correction
         brings together what was too far apart when it was searched for.
         """
-        travel = np.array([keyframe.travel for keyframe in keyframes])
+        _, poses, travel = trajectory
         waiting = bool(self._again) or self._open[True] is not None
         self._earlier = waiting and not self._earlier
         left = PLACES_PER_KEYFRAME
         while left > 0:
             stretch = self._open[self._earlier]
             if stretch is None:
-                stretch = self._begin(keyframes, poses, travel)
+                stretch = self._begin(trajectory)
                 left = max(left - STRETCH_START_PLACES, 1)
             if stretch is None:
                 return []
             now, later = stretch.places[:left], stretch.places[left:]
-            found = [_match(keyframes, poses, travel, stretch, there) for there in now]
+            found = [_match(trajectory, stretch, there) for there in now]
             stretch.found.extend(one for one in found if one)
             stretch.places[:], left, done = later, left - len(now), not later
             self._open[self._earlier] = None if done else stretch
@@ -262,31 +266,24 @@ class PlaceSearch:
                 return sure
         return []
 
-    def _begin(
-        self, keyframes: Sequence[Keyframe], poses: Floats, travel: Floats
-    ) -> _Stretch | None:
+    def _begin(self, trajectory: Trajectory) -> _Stretch | None:
         """Return the stretch whose turn it is, if there is one."""
+        keyframes, poses, travel = trajectory
         if not self._earlier:
             if travel[-1] - self._searched < STRETCH_SPACING_M:
                 return None
             self._searched = float(travel[-1])
-            return self._begun(keyframes, poses, travel, len(keyframes) - 1)
+            return self._begun(trajectory, len(keyframes) - 1)
         while self._again:
             here = self._again.pop()
             earlier = np.flatnonzero(travel[here] - travel > VISIT_TRAVEL_M)
             if (np.hypot(*(poses[earlier, :2] - poses[here, :2]).T) < NEARBY_M).any():
-                return self._begun(keyframes, poses, travel, here, NEARBY_M)
+                return self._begun(trajectory, here, NEARBY_M)
         return None
 
-    def _begun(
-        self,
-        keyframes: Sequence[Keyframe],
-        poses: Floats,
-        travel: Floats,
-        here: int,
-        within: float = np.inf,
-    ) -> _Stretch | None:
+    def _begun(self, trajectory: Trajectory, here: int, within: float = np.inf) -> _Stretch | None:
         """Return the stretch that ends here, if drift may have hidden a place from it."""
+        _, poses, travel = trajectory
         turn, away = self._drift.spread(here, poses)
         far = np.hypot(*(poses[:, :2] - poses[here, :2]).T)
         reach = SIGMAS * np.sqrt(away)
@@ -295,7 +292,7 @@ class PlaceSearch:
         if not len(near):
             return None
         first = int(np.searchsorted(travel, travel[here] - STRETCH_M))
-        points = _points(keyframes, poses, _spread_indices(first, here + 1), here)
+        points = _points(trajectory, _spread_indices(first, here + 1), here)
         places = self._places(poses, here, near[np.argsort(far[near])])
         return _Stretch(here, points, places, turn, away, [])
 
@@ -351,10 +348,9 @@ def _spread_indices(first: int, end: int) -> list[int]:
     return [int(k) for k in np.linspace(first, end - 1, count)]
 
 
-def _points(
-    keyframes: Sequence[Keyframe], poses: Floats, chosen: Sequence[int], here: int
-) -> Points:
+def _points(trajectory: Trajectory, chosen: Sequence[int], here: int) -> Points:
     """Return the points of the chosen keyframes in the frame of `here`, one in each voxel."""
+    keyframes, poses, _ = trajectory
     placed = [transform(between(poses[here], poses[k]), keyframes[k].points) for k in chosen]
     points = np.concatenate(placed)
     _, first = np.unique(np.floor(points / VOXEL_M), axis=0, return_index=True)
@@ -368,10 +364,9 @@ def _spaced_out(poses: Floats, near: NDArray[np.intp]) -> NDArray[np.intp]:
     return near[np.sort(first)]
 
 
-def _match(
-    keyframes: Sequence[Keyframe], poses: Floats, travel: Floats, stretch: _Stretch, there: int
-) -> tuple[float, Edge] | None:
+def _match(trajectory: Trajectory, stretch: _Stretch, there: int) -> tuple[float, Edge] | None:
     """Return the inliers and the loop from `there`, if the stretch fits into that place."""
+    keyframes, poses, travel = trajectory
     first, end = np.searchsorted(
         travel, (travel[there] - PLACE_RADIUS_M, travel[there] + PLACE_RADIUS_M)
     )

@@ -6,7 +6,7 @@ import pytest
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.geometry.se2 import between, compose
 from gigabrain_zenoh.mapping.keyframes import Edge, Keyframe
-from gigabrain_zenoh.mapping.loop_closure import PlaceSearch
+from gigabrain_zenoh.mapping.loop_closure import PlaceSearch, Trajectory
 from gigabrain_zenoh.mapping.pose_graph import Drift, DriftRates
 from tests.unit.geometry.test_slam import BLOCK, lap
 from tests.unit.mapping.rooms import Lidar, Walls, box, line
@@ -27,7 +27,7 @@ def searched(
         drift.linked(link)
         keyframes.append(Keyframe(scan.points, scan.free, link, float(travel[k]), 0))
         if k >= first:
-            loops += search.find(keyframes, thought[: k + 1])
+            loops += search.find(Trajectory(keyframes, thought[: k + 1], travel[: k + 1]))
     return loops
 
 
