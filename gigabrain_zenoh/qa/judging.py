@@ -213,11 +213,6 @@ class FaultResult(Struct, frozen=True, kw_only=True):
     worst: dict[str, float] = {}  # the greatest of all runs that count, by figure
     tries: tuple[FaultRun, ...] = ()
 
-    @property
-    def seconds(self) -> float:
-        """Wall time of all runs together [s]."""
-        return sum(one.seconds for one in self.tries)
-
 
 def conclude(row: FaultRow, runs: Sequence[FaultRun]) -> FaultResult:
     """Judge the undisturbed runs; all of them where each was disturbed."""

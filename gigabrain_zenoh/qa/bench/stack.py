@@ -4,7 +4,7 @@ import asyncio
 import statistics
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from msgspec import Struct
 
@@ -78,29 +78,17 @@ class StackResult(Struct, frozen=True, kw_only=True):
         return sum(process.cpu for process in self.processes) - (self.physics_cpu or 0.0)
 
 
-class StackTarget(NamedTuple):
-    """A limit and the value that was measured."""
-
-    limit: Limit
-    value: float
-
-    @property
-    def ok(self) -> bool:
-        """True if the value is within the limit."""
-        return self.limit.allows(self.value)
-
-
-def targets(result: StackResult) -> list[StackTarget]:
+def targets(result: StackResult) -> dict[Limit, float]:
     """Return the figures that have a limit. Memory counts in processes without MuJoCo."""
-    found = [StackTarget(READY, result.ready_s), StackTarget(CPU, 100 * result.cpu_without_physics)]
+    found = {READY: result.ready_s, CPU: 100 * result.cpu_without_physics}
     if result.physics_cpu is not None:
-        found.append(StackTarget(PHYSICS, 100 * result.physics_cpu))
+        found[PHYSICS] = 100 * result.physics_cpu
     if goal := result.first_goal:
-        found.append(StackTarget(FIRST_GOAL, goal.accepted_s))
+        found[FIRST_GOAL] = goal.accepted_s
     small = [p for p in result.processes if p.name != SIMULATOR or result.physics_cpu is None]
     largest = max(small, key=lambda process: process.rss_bytes)
     memory = Figure(f"largest without MuJoCo ({largest.name})", "MB").at_most(MAX_RSS_MB)
-    return [*found, StackTarget(memory, largest.rss_bytes / MB)]
+    return {**found, memory: largest.rss_bytes / MB}
 
 
 async def measure_stack(
@@ -207,9 +195,9 @@ def stack_page(result: StackResult) -> "Group":
     for process in result.processes:
         costs.add_row(process.name, f"{process.cpu:.1%}", f"{process.rss_bytes / MB:.0f} MB")
     limits = table_of("figure", "measured", "at most", "")
-    for target in targets(result):
-        (figure, at_most), value = target
-        verdict = Text("ok", style="green") if target.ok else Text("over", style="yellow")
+    for limit, value in targets(result).items():
+        figure, at_most = limit
+        verdict = Text("ok", style="green") if limit.allows(value) else Text("over", style="yellow")
         value_text, limit_text = f"{value:.2f} {figure.unit}", f"{at_most:g} {figure.unit}"
         limits.add_row(figure.name, value_text, limit_text, verdict)
     title = f"\n{result.body} in {result.world} at real time, {result.seconds:g} s"
