@@ -27,7 +27,6 @@ HOLDERS = ("mapping", "navigation", "qa/bench")  # packages with kernels
 
 
 def _import_numba() -> Any:
-    """Import numba, and return its module."""
     with _as_if_missing(*UNUSED):
         for part in PARTS:
             importlib.import_module(part)

@@ -108,7 +108,7 @@ class Autosave:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def _finish(self, tick: int) -> None:
-        """Take the result of what was under way, if it is there."""
+        """Collect the result of a save, if it is done."""
         if self._job is None:
             return
         if not self._job.done():

@@ -74,7 +74,7 @@ def search(field: LikelihoodField, beams: Beams, last: Floats | None = None) -> 
 
 
 def _likely(field: LikelihoodField, hits: Points) -> list[Floats]:
-    """Poses (3,) that put the hits near walls, the best first."""
+    """Return poses (3,) that put the hits near walls, the best first."""
     chosen = hits[np.linspace(0, len(hits) - 1, min(POINTS, len(hits))).astype(np.intp)]
     image = np.round(255 * np.exp(-0.5 * (field.distance / SIGMA) ** 2)).astype(np.uint8)
     image[image == UNKNOWN] += 1

@@ -141,7 +141,6 @@ def _distance_and_slope(distance: Distances, x: float, y: float) -> tuple[float,
 
 @kernel
 def _is_shown(shown: NDArray[np.bool_], x: float, y: float) -> bool:
-    """Return whether the map shows the place (x, y), in cells."""
     height, width = shown.shape
     column, row = int(np.floor(x)), int(np.floor(y))
     return 0 <= row < height and 0 <= column < width and bool(shown[row, column])

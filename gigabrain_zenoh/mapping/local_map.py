@@ -101,7 +101,6 @@ def build(
 
 
 def _blank(height: int, width: int, room: Bytes | None) -> Bytes:
-    """Return two images of zeros (2, height, width)."""
     if room is None or room.size < 2 * height * width:
         return np.zeros((2, height, width), np.uint8)
     blank = room[: 2 * height * width].reshape(2, height, width)

@@ -220,7 +220,6 @@ def _in_words(count: int) -> str:
 
 
 def _predicted(one: Hypothesis, motion: Floats, noise: Floats) -> Hypothesis:
-    """Return `one` after `motion`."""
     pose = compose(one.pose, motion)
     turn = np.eye(3)
     turn[0, 2], turn[1, 2] = one.pose[1] - pose[1], pose[0] - one.pose[0]

@@ -44,9 +44,7 @@ MAX_SLIDE_M = 0.3  # [m], from search to ICP
 MIN_PLACE_KEYFRAMES = 8  # keyframes round a place, and [m] of travel between the two
 MAX_PLACE_KEYFRAMES = 20
 PLACE_TRAVEL_M = 4.0
-SMALL_CORRECTION = np.array(
-    (0.3, 0.3, 0.1)
-)  # [m], [m], [rad]: a loop that changes less needs no witness
+SMALL_CORRECTION = np.array((0.3, 0.3, 0.1))  # [m], [m], [rad]: needs no witness
 WITNESS_TOLERANCE = np.array((0.2, 0.2, 0.05))  # [m], [m], [rad], between two witnesses
 WITNESS_TRAVEL_M = 10.0  # [m] of travel for which a witness counts
 LOOP = np.diag((0.05, 0.05, 0.01)) ** 2  # covariance beside that of ICP

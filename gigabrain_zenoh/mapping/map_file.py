@@ -175,7 +175,7 @@ def _free(found: SavedMap) -> NDArray[np.bool_]:
 
 
 def _stamp(found: SavedMap) -> NDArray[np.uint8]:
-    """Tells a grid from others, as it is when it has been saved."""
+    """Return a hash that identifies a saved grid."""
     full = np.where(found.cells >= OCCUPIED_PERCENT, 100, -1)
     place = f"{found.resolution:.12g} {found.origin_x:.12g} {found.origin_y:.12g}"
     cells = np.where(_free(found), 0, full).astype(np.int8)
@@ -184,7 +184,6 @@ def _stamp(found: SavedMap) -> NDArray[np.uint8]:
 
 
 def _files(path: Path, found: SavedMap, graph: Arrays) -> dict[str, bytes]:
-    """Return the content of each file, by name."""
     height, width = found.cells.shape
     grey = np.full((height, width), UNKNOWN, np.uint8)
     grey[found.cells >= OCCUPIED_PERCENT] = OCCUPIED

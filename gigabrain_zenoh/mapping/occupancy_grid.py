@@ -4,6 +4,7 @@ Thrun, Burgard, Fox: Probabilistic Robotics, chapter 9. Log-odds are tenths and 
 newer scans outweigh older ones. A cell changes once per scan; hits take precedence.
 """
 
+import copy
 import math
 from collections import defaultdict
 from collections.abc import Mapping
@@ -58,10 +59,8 @@ class LogOddsGrid:
 
     def still(self) -> "LogOddsGrid":
         """Return a copy."""
-        held = LogOddsGrid()
-        held.origin_x, held.origin_y, held.full = self.origin_x, self.origin_y, self.full
+        held = copy.copy(self)
         held.log_odds, held._stamps = self.log_odds.copy(), self._stamps.copy()
-        held._scans = self._scans
         return held
 
     def draw(self, sensor: Floats, hits: Points, free: Points) -> None:

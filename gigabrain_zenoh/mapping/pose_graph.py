@@ -151,7 +151,7 @@ def _estimate(isam: gtsam.ISAM2) -> Floats:
 def _linked(
     links: Iterable[Edge], poses: Floats
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """Keyframes by their links, and where they are."""
+    """Return factors and values of keyframes at their poses."""
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for link in links:
         if link.first == link.second:

@@ -213,7 +213,6 @@ def _nearest(local: Buckets, x: float, y: float, gate: float, known: int) -> int
 
 @lean_kernel
 def _away(local: Points, k: int, x: float, y: float) -> float:
-    """Return the squared distance of a point from (x, y)."""
     dx, dy = local[k, 0] - x, local[k, 1] - y
     away: float = dx * dx + dy * dy
     return away

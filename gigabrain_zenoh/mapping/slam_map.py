@@ -275,7 +275,7 @@ class SlamMap:
         return True
 
     def _take(self, view: View, estimate: Estimate) -> None:
-        """Draw the scan, if it is time to and it fits."""
+        """Draw the scan if it is due and fits."""
         if len(self._drawn) < len(self._slam.keyframes):
             self._drawn += self._slam.poses_from(len(self._drawn))
         self._undrawn += 1

@@ -12,9 +12,7 @@ from gigabrain_zenoh.navigation.footprint import DistanceGrid, between
 
 COARSER = 2  # cells of the window per cell of the field, along each axis
 FARTHEST = 1e4  # [m], what cannot be reached
-UNIT = (
-    1e-5  # [m], of ways while they are compared: whole numbers are added in a quarter of the time
-)
+UNIT = 1e-5  # [m], of costs while they are compared: integers take a quarter of the time
 TIGHT, TIGHT_OVER = 12.0, 0.09  # cost of a place where the body just fits, and its decay [m]
 TOUCHING, INSIDE = 60.0, 400.0  # high and finite: a body there must get out
 

@@ -25,9 +25,7 @@ Singles = NDArray[np.float32]
 
 LETHAL = 100.0  # from here on the body does not fit; up to twice that where its centre touches
 NEAR_COST = 12.0  # added where the body just fits
-UNKNOWN_COST = (
-    4.0  # added in unknown space that is avoided: a detour of five times its length is better
-)
+UNKNOWN_COST = 4.0  # added in unknown space that is avoided: worth a detour of five times
 MIN_DECAY_M = 0.1  # [m]
 NEGLIGIBLE_COST = 0.05  # what of NEAR_COST may be left off at the end
 MAX_REACH_CELLS = 1000  # an obstacle costs nothing farther away; more would be too much to look at

@@ -169,7 +169,7 @@ def _add_watched(
 
 @kernel
 def _pass(passed: Floats, x: float, y: float, amount: float) -> None:
-    """Spread what a thing at (x, y) [m] adds over its place."""
+    """Add an obstacle at (x, y) [m] to the traffic around its place."""
     share = amount / (math.pi * PLACE_RADIUS_M * PLACE_RADIUS_M)
     for i in range(_cell(y - PLACE_RADIUS_M), _cell(y + PLACE_RADIUS_M) + 1):
         for j in range(_cell(x - PLACE_RADIUS_M), _cell(x + PLACE_RADIUS_M) + 1):

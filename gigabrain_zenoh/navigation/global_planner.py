@@ -21,9 +21,7 @@ from gigabrain_zenoh.navigation.grid_search import (
 
 POINT_SPACING_M = 0.1  # [m] between the points of a path, at most
 MAX_STRAY_M = 0.5  # [m] off its path, beyond which it is planned again
-SWITCH_COST_RATIO = (
-    0.85  # of what the present path costs: a new one must not cost more, or it flips
-)
+SWITCH_COST_RATIO = 0.85  # of the present path's cost, above which a new path is not taken
 Point = tuple[float, float]  # [m], in the map's frame
 
 BLACKLIST_RADIUS_M = 0.5  # [m]: what is nearer to a place of the blacklist does not count
@@ -268,7 +266,6 @@ def _edge(cells: NDArray[np.int8]) -> NDArray[np.bool_]:
 
 
 def _erase_around(edge: NDArray[np.bool_], costmap: Costmap, x: float, y: float) -> None:
-    """Take away what is near a place."""
     radius = BLACKLIST_RADIUS_M / costmap.resolution
     column = (x - costmap.origin_x) / costmap.resolution - 0.5
     row = (y - costmap.origin_y) / costmap.resolution - 0.5

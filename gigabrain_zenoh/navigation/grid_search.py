@@ -19,16 +19,7 @@ from gigabrain_zenoh.navigation.costmap import LETHAL, Costs
 DIAGONAL = math.sqrt(2.0)
 ROW_STEPS = (0, -1, -1, -1, 0, 1, 1, 1)  # by way: round the compass, the odd ones are diagonal
 COLUMN_STEPS = (1, 1, 0, -1, -1, -1, 0, 1)
-HALF_LENGTHS = (
-    0.5,
-    DIAGONAL / 2,
-    0.5,
-    DIAGONAL / 2,
-    0.5,
-    DIAGONAL / 2,
-    0.5,
-    DIAGONAL / 2,
-)  # its length
+HALF_LENGTHS = (0.5, DIAGONAL / 2) * 4  # half its length
 MAX_BEND = 2  # ways to either side of that by which a cell was reached: behind, nothing is cheaper
 BUCKETS_PER_COST = 12.0  # buckets for a cost of 1
 BUCKETS = 4096  # in a ring: they hold more than any one step can add
@@ -186,7 +177,7 @@ def _search(
 
 @kernel
 def _put(first: Ints, entries: Ints, entry: int, bucket: int, row: int, column: int) -> None:
-    """Lay `entry`, for a cell, on top of a bucket."""
+    """Put `entry`, for a cell, on top of a bucket."""
     entries[0, entry], entries[1, entry] = row, column
     entries[2, entry], first[bucket % BUCKETS] = first[bucket % BUCKETS], entry
 

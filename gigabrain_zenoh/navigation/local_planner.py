@@ -195,7 +195,6 @@ class LocalPlanner:
         return Sampler(model, settings.samples, settings.steps, step_duration(model), settings.seed)
 
     def _traffic_of(self) -> dynamic_obstacles.TrafficMap | None:
-        """Return the traffic map of a quick body."""
         lidar, model = self._body.lidar, self._model
         if not dynamic_obstacles.is_quick(model):
             return None
@@ -260,12 +259,8 @@ class LocalPlanner:
         """Return whether a quick body must still watch for obstacles before it drives off."""
         if not self._traffic:
             return False
-        looks = (
-            dynamic_obstacles.LOOK_AROUND_IN_TRAFFIC_S
-            if self._traffic.any
-            else dynamic_obstacles.LOOK_AROUND_S
-        )
-        return (tick - self._began) * TICK_S < looks
+        traffic, alone = dynamic_obstacles.LOOK_AROUND_IN_TRAFFIC_S, dynamic_obstacles.LOOK_AROUND_S
+        return (tick - self._began) * TICK_S < (traffic if self._traffic.any else alone)
 
     def _scene(self, moment: PlanRequest, discs: Floats) -> Scene:
         goal = moment.goal
@@ -321,7 +316,6 @@ class LocalPlanner:
         return near and slow and abs(v.angular_z) <= max(0.05, ARRIVED_SPEED_SHARE * model.turning)
 
     def _stuck(self, moment: PlanRequest) -> bool:
-        """Return whether the body has been in one place for too long."""
         here, then = moment.pose, self._anchor
         gone = math.hypot(here.x - then.x, here.y - then.y) > STUCK_RADIUS_M
         if gone or not self._anchor_tick:
@@ -380,7 +374,7 @@ def _discs(obstacles: tuple[Obstacle, ...]) -> Floats:
 
 
 def _growth(obstacle: Obstacle) -> float:
-    """Standard deviation of the velocity [m/s]."""
+    """Return the standard deviation of the velocity [m/s]."""
     if not obstacle.covariance:
         return DEFAULT_SPEED_SIGMA
     return math.sqrt(max(0.0, obstacle.covariance[10], obstacle.covariance[15]))
@@ -406,7 +400,7 @@ def warm_up(body: BodyDescription) -> None:
 
 
 def _warm_up_traffic() -> None:
-    """Compile what only quick bodies among quick things call."""
+    """Compile the kernels of quick bodies in traffic."""
     seen, disc = (
         dynamic_obstacles.TrafficMap(1.0, 1.0, 1.0),
         np.array([[0.5, 0.0, 1.0, 0.0, 0.3, 0.0]]),

@@ -11,9 +11,7 @@ from gigabrain_schemas.body import BodyDescription
 from gigabrain_zenoh.geometry.limits import limits_of
 from gigabrain_zenoh.kernels.jit import lean_kernel
 
-ACCELERATION_RESERVE = (
-    0.9  # of the body's accelerations: what is planned must be possible on a bad floor too
-)
+ACCELERATION_RESERVE = 0.9  # of the body's accelerations: plans must work on a bad floor too
 MAX_REVERSE_SPEED = 0.4  # [m/s], no faster backwards: the lidar may not see there
 
 LANES = 8  # plans at a time

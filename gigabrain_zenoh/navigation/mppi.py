@@ -49,11 +49,8 @@ def correlated_noise(
     noise = random.standard_normal(shape, dtype=np.float32)
     for t in range(1, shape[2]):
         noise[:, :, t] = NOISE_KEPT * noise[:, :, t - 1] + NOISE_FRESH * noise[:, :, t]
-    spread = (
-        NOISE_SHARE * model.forward,
-        NOISE_SHARE * model.lateral,
-        TURN_NOISE_SHARE * model.turning,
-    )
+    linear, turn = NOISE_SHARE, TURN_NOISE_SHARE
+    spread = linear * model.forward, linear * model.lateral, turn * model.turning
     scaled: NDArray[np.float32] = noise * np.array(spread, dtype=np.float32)
     return scaled
 
@@ -69,9 +66,8 @@ def two_twist_plans(
     turning = np.arange(samples) // SIMPLE_EVERY % 3
     if model.radius == 0.0:
         first[:, turning == 1, :2] = 0.0
-        second[:, turning == 1, 0] = model.forward * random.random(
-            (sets, int((turning == 1).sum()))
-        )
+        count = int((turning == 1).sum())
+        second[:, turning == 1, 0] = model.forward * random.random((sets, count))
         second[:, turning == 1, 2] = 0.0
     when = random.uniform(1.0, steps, (sets, samples, 1))
     when[:, turning == 0] = steps
