@@ -87,7 +87,7 @@ def test_a_first_tick_that_is_repeated_until_the_brain_is_there_is_believed(
 
 def test_a_state_of_no_boot_is_refused_once_a_driver_has_been_heard(time: RobotTime) -> None:
     assert not time.observe(state(101, boot=0))
-    assert RobotTime().see(state(101, boot=0))
+    assert RobotTime().observe(state(101, boot=0))
 
 
 def test_time_does_not_go_back(time: RobotTime) -> None:

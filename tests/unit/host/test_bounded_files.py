@@ -47,7 +47,7 @@ def read_mission(path: Path) -> object:
 
 
 def read_name(path: Path) -> object:
-    raise located(path, ConfigError("no robot 'x'; known: y"))
+    raise located(path, ConfigError("no robot 'x'; known: y", value="x"))
 
 
 def read_map(path: Path) -> object:

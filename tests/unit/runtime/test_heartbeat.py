@@ -112,7 +112,7 @@ async def test_a_process_that_beats_is_never_killed() -> None:
     keeper = keeper_of([])
     for _ in range(100):
         assert look(keeper, 19) == []
-        keeper._take({"event": "progress"})
+        keeper._handle_record({"event": "progress"})
 
 
 @pytest.mark.parametrize("state", ["starting", "backing off", "given up", "stopped"])
@@ -138,7 +138,7 @@ async def test_a_debugger_has_all_the_time_it_wants() -> None:
     assert look(keeper, 1000) == []
     assert keeper.stuck
     assert said == ["decision has made no progress for 5 s and is left alone"]
-    keeper._take({"event": "progress"})
+    keeper._handle_record({"event": "progress"})
     assert not keeper.stuck
 
 
