@@ -194,5 +194,5 @@ async def test_the_release_goes_by_what_is_known_of_the_e_stop(robot: Probe) -> 
         assert isinstance(script, Robot)
         await script.estop("test")
         await robot.at_rest(ticks=30)
-        assert (await script.release()).text == "released; enable it to move"
+        assert (await script.release()).ok
         await robot.enable_brain()

@@ -108,7 +108,7 @@ async def test_an_e_stop_is_on_disk_when_it_is_confirmed(tmp_path: Path) -> None
     async with RobotInMemory(tmp_path) as robot:
         await driving(robot)
         [reply] = await robot.operator.ask(ESTOP, EstopRequest(source="ann", reason="a child"))
-        assert reply.text == "stopped and latched; e-stop number 1"
+        assert (reply.ok, reply.gate.mode, reply.gate.estop_generation) == (True, "latched", 1)
         on_disk = LatchFile(tmp_path).read()
         assert (on_disk.estop_generation, on_disk.causes[0].code) == (1, "estop")
         assert await robot.go(1) == [0.0]
@@ -132,7 +132,7 @@ async def test_a_disk_that_hangs_holds_up_the_confirmation_and_no_tick(
         assert not asking.done()
         wakes.set()
         [reply] = await asking
-        assert reply.text == "stopped and latched; e-stop number 1"
+        assert (reply.ok, reply.gate.mode, reply.gate.estop_generation) == (True, "latched", 1)
 
 
 async def test_a_disk_that_takes_nothing_stops_no_e_stop_and_is_told(tmp_path: Path) -> None:
@@ -147,7 +147,7 @@ async def test_a_disk_that_takes_nothing_stops_no_e_stop_and_is_told(tmp_path: P
         await robot.go(100)  # tried again once a second
         request = ReleaseRequest(estop_generation=1, source="ann")
         [reply] = await robot.operator.ask(RELEASE, request)
-        assert reply.text == "released; enable it to move"
+        assert (reply.ok, reply.gate.mode) == (True, "idle")
         assert LatchFile(tmp_path).read().estop_generation == 1
 
 
