@@ -1,4 +1,4 @@
-"""Where in the whole map can the robot be, by one scan alone?
+"""Global localization: finds all poses in the map that explain one scan.
 
 Every block of 8 x 8 cells at every heading gets an upper bound of how well the scan may fit there;
 only the best blocks are looked at cell by cell (Olson 2009, Hess et al. 2016).

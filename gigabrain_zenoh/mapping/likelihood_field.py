@@ -1,4 +1,4 @@
-"""Likelihood field of a map (AMCL), the fit of a scan in it, and whether the map resembles itself.
+"""Likelihood field of a map (AMCL), the fit of a scan in it, and self-similarity of the map.
 
 Halls are built alike from both ends. Where half of one is mapped, a robot in the other half sees
 what it would see at the same place in the first.

@@ -1,4 +1,4 @@
-"""The map round the robot that scans are matched to: points in buckets, and a likelihood image."""
+"""Local map that scans are matched to: points in buckets, and a likelihood image."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The map that perception localizes in, as a protocol, and one that was saved."""
+"""Protocol of the maps that perception localizes in, and a saved map."""
 
 from typing import TYPE_CHECKING, Protocol
 

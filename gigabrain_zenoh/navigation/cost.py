@@ -1,4 +1,4 @@
-"""Cost of a plan, in units of which a second is worth 8.
+"""Cost of a plan; one second of driving costs 8.
 
 Looking at the whole outline in each pose takes most of the time. Bounds that need no outline come
 first, for all lanes at once, and decide whether to look.
