@@ -78,19 +78,21 @@ def graph(
         png: Draw a picture to this file.
         everything: Also show health, log and audit, which every process sends.
     """
-    from gigabrain_zenoh.diagnostics import graph as draw
-    from gigabrain_zenoh.diagnostics.discovery import flows
+    from gigabrain_zenoh.diagnostics import discovery
 
     if dot + mermaid + (png is not None) > 1:
         raise ConfigError("choose only one of --dot, --mermaid and --png")
     processes = _find(at)
-    found = draw.chain(flows(processes.described.values(), processes.health), everything=everything)
+    flows = discovery.flows(processes.described.values(), processes.health)
+    shown = discovery.chain_flows(flows, everything=everything)
     if png:
-        draw.write_png(found, png)
+        discovery.write_graph_png(shown, png)
         print_line(str(png))
         return
-    as_lines = draw.as_dot if dot else draw.as_mermaid if mermaid else draw.as_text
-    for line in as_lines(found):
+    as_lines = discovery.graph_as_text
+    if dot or mermaid:
+        as_lines = discovery.graph_as_dot if dot else discovery.graph_as_mermaid
+    for line in as_lines(shown):
         print_line(line)
 
 

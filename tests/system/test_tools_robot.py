@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from gigabrain_drivers.driver.catalog import robot_path
-from gigabrain_zenoh.diagnostics.graph import ORDER
+from gigabrain_zenoh.diagnostics.discovery import ORDER
 from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.qa.probe import Probe, probing
 from gigabrain_zenoh.runtime.running import Running

@@ -35,8 +35,7 @@ from gigabrain_schemas.topics import (
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.config.settings import FoxgloveConfig
-from gigabrain_zenoh.diagnostics.discovery import discover, flows
-from gigabrain_zenoh.diagnostics.graph import chain
+from gigabrain_zenoh.diagnostics.discovery import chain_flows, discover, flows
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.recording.drawing import Drawer, Drawn
 from gigabrain_zenoh.ui.foxglove.access import HOST, Front, hidden_host, topic_to_steer
@@ -113,7 +112,7 @@ async def connection_graph(bus: Bus) -> ConnectionGraph:
     """Return the graph of the robot's processes and the topics between them."""
     senders, receivers = defaultdict[str, set[str]](set), defaultdict[str, set[str]](set)
     processes = await discover(bus)
-    for flow in chain(flows(processes.values(), {})):
+    for flow in chain_flows(flows(processes.values(), {})):
         senders[flow.key].add(flow.sender)
         receivers[flow.key].add(flow.receiver)
     graph = ConnectionGraph()

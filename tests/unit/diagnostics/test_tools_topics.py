@@ -56,7 +56,7 @@ from gigabrain_zenoh.testing.waiting import settle
 WITHOUT_RECORDING = """
 import sys
 sys.modules |= dict.fromkeys(("mcap", "foxglove", "zstandard", "lz4"))
-from gigabrain_zenoh.diagnostics import discovery, doctor, graph, log_reader, publishing
+from gigabrain_zenoh.diagnostics import discovery, doctor, log_reader, publishing
 from gigabrain_zenoh.diagnostics import top, topics, why
 """
 SCAN_BYTES = codec.encode(example(LaserScan))

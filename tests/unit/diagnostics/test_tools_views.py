@@ -17,14 +17,16 @@ from gigabrain_schemas.safety import Health, LogRecord
 from gigabrain_schemas.topics import PARAM
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import node as decision
-from gigabrain_zenoh.diagnostics.discovery import Flow, Processes, describe
-from gigabrain_zenoh.diagnostics.graph import (
-    as_dot,
-    as_mermaid,
-    as_text,
-    chain,
-    positions,
-    write_png,
+from gigabrain_zenoh.diagnostics.discovery import (
+    Flow,
+    Processes,
+    chain_flows,
+    describe,
+    graph_as_dot,
+    graph_as_mermaid,
+    graph_as_text,
+    graph_positions,
+    write_graph_png,
 )
 from gigabrain_zenoh.diagnostics.log_reader import LogFilter, ago_ns, as_line, read, run_folder
 from gigabrain_zenoh.diagnostics.top import (
@@ -51,24 +53,24 @@ FLOWS = [
 
 
 def test_the_graph_is_drawn_as_text_for_graphviz_and_for_mermaid() -> None:
-    found = chain(FLOWS)
-    assert list(as_text(found)) == [
+    found = chain_flows(FLOWS)
+    assert list(graph_as_text(found)) == [
         "control",
         "  cmd_vel       50.0 Hz  -> driver",
         "driver",
         "  scan          10.0 Hz  -> perception, safety",
     ]
-    assert '  "control" -> "driver" [label="cmd_vel 50 Hz"];' in as_dot(found)
-    assert '  control["control"] -->|"cmd_vel 50 Hz"| driver["driver"]' in as_mermaid(found)
-    assert len(chain(FLOWS, everything=True)) == 4
+    assert '  "control" -> "driver" [label="cmd_vel 50 Hz"];' in graph_as_dot(found)
+    assert '  control["control"] -->|"cmd_vel 50 Hz"| driver["driver"]' in graph_as_mermaid(found)
+    assert len(chain_flows(FLOWS, everything=True)) == 4
 
 
 def test_the_graph_is_drawn_into_a_picture(tmp_path: Path) -> None:
-    write_png(FLOWS, tmp_path / "graph.png")
+    write_graph_png(FLOWS, tmp_path / "graph.png")
     assert (tmp_path / "graph.png").read_bytes()[:4] == b"\x89PNG"
     with pytest.raises(ConfigError, match="No such file"):
-        write_png(FLOWS, tmp_path / "nowhere" / "graph.png")
-    assert list(positions(["safety", "tool", "driver"])) == ["driver", "safety", "tool"]
+        write_graph_png(FLOWS, tmp_path / "nowhere" / "graph.png")
+    assert list(graph_positions(["safety", "tool", "driver"])) == ["driver", "safety", "tool"]
 
 
 def test_a_node_is_described_with_what_it_sends_and_counts() -> None:
