@@ -71,7 +71,7 @@ async def test_a_driving_robot_is_not_confused_by_states_of_another_boot(tmp_pat
             time = robot.bus(name).time
             assert time.boot == own.boot, name
             assert own.tick - 2 <= time.tick <= own.tick, name
-        for name in ("perception", "control", "safety"):
+        for name in ("control", "safety"):  # perception without a map needs no state
             assert robot.bus(name).counters["refused_ticks"] >= 200, name
         assert robot.counters["stale_commands_executed"] == 0
 

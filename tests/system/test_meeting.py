@@ -64,7 +64,7 @@ async def test_a_router_waits_for_its_own_name_and_says_so_once(
     resolver.knows = True
     transport = await joining
     await transport.close()
-    assert len([text for text in told(caplog) if "nobody" in text]) == 1
+    assert len([text for text in told(caplog) if "cannot resolve" in text]) == 1
 
 
 async def test_who_waits_for_a_router_that_has_no_known_name_says_which(
