@@ -19,7 +19,7 @@ from gigabrain_zenoh import logs
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.input_log import PublishedInputLogger
 from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
-from gigabrain_zenoh.errors import GigabrainError
+from gigabrain_zenoh.errors import ConfigError, GigabrainError
 from gigabrain_zenoh.host.signals import interrupts, stop_signals
 from gigabrain_zenoh.host.this_process import go_first, join_in, start_first, step_aside
 from gigabrain_zenoh.plugins import find
@@ -112,7 +112,8 @@ def run(
         ):
             runner.run(_run(config, process_type, node, make_bus))
     except GigabrainError as error:
-        log.error("%s", error, extra={"data": {"event": "failed"}})
+        invalid = {"value": error.value} if isinstance(error, ConfigError) and error.value else {}
+        log.error("%s", error, extra={"data": {"event": "failed"} | invalid})
         return error.exit_code
     except Exception as error:
         first = _first(error)

@@ -118,11 +118,13 @@ async def up(
     remembers = state_dir() / "robots" / label
     specs = process_specs(deployment, host, run_dir, remembers, level=level)
 
-    refusal = ""
+    refusal, invalid = "", None  # error of a process, and the invalid value that it names
 
     def show(_name: str, record: Mapping[str, Any]) -> None:
-        nonlocal refusal
+        nonlocal refusal, invalid
         if record.get("event") == "failed":
+            record = dict(record)
+            invalid = record.pop("value", None)
             before, refusal = refusal, str(record.get("text", ""))
             if refusal == before:  # printed already, at the first try
                 return
@@ -144,7 +146,7 @@ async def up(
             await supervisor.stop(STOP_S)
             await running
             if supervisor.misconfigured:
-                raise ConfigError(refusal)
+                raise ConfigError(refusal, value=invalid)
             if lost := ROUTERS & set(supervisor.given_up):
                 raise BusError(refusal or f"the {lost.pop()} keeps dying")
             return 1 if supervisor.given_up else 0
