@@ -147,10 +147,10 @@ async def test_a_viewer_that_never_reads_slows_neither_robot_nor_others(robot: R
     writer.write(bytes((0x82, 0x80 | len(login), 0, 0, 0, 0)) + login)  # masked by zeros
     async with client(robot, VIEWER) as other, probing(robot.endpoint) as seen:
         begin = seen.state.tick
-        moments = 0
-        while moments < 50:
+        states = 0
+        while states < 50:
             frame = await asyncio.wait_for(other.recv(), 20)
-            moments += frame[0] == frames.MOMENT
+            states += frame[0] == frames.STATE
         assert seen.state.boot != 0
         await until(lambda: seen.state.tick - begin >= 200, "the robot's time goes on as well")
     writer.close()
