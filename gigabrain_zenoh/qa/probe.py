@@ -114,7 +114,9 @@ class Probe:
 
     async def describe(self, process: str) -> Description:
         """Return a process's description; waits until it answers. Raises Failed."""
-        for _ in range(round(PATIENCE_S)):
+        loop = asyncio.get_running_loop()
+        end_s = loop.time() + PATIENCE_S
+        while loop.time() < end_s:
             try:
                 replies = await self.bus.ask(DESCRIBE, DescribeRequest(), name=process)
             except Refused:  # no answer in time
