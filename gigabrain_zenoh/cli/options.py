@@ -61,7 +61,7 @@ class RobotAddress:
 
     def robot(self, source: str = "", *, wait: bool = True) -> AbstractAsyncContextManager["Robot"]:
         """Return a connection to the robot; with `wait` it waits for the robot's state."""
-        from gigabrain_zenoh.client.robot import connect
+        from gigabrain_zenoh.client.connection import connect
 
         return connect(
             self.connect, namespace=self.namespace, keys=self.folder, source=source, wait=wait

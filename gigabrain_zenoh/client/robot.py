@@ -1,9 +1,7 @@
 """Python API to a running robot, for scripts and notebooks: the HAL's primitives over Zenoh."""
 
 import asyncio
-import os
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 from typing import Any, TypeVar, overload
 
 from msgspec.structs import asdict
@@ -22,6 +20,7 @@ from gigabrain_schemas.topics import (
 )
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.listening import listen, topic_named
+from gigabrain_zenoh.client.motion import Motion, Reached
 from gigabrain_zenoh.client.requests import (
     ANSWER_S,
     audit_log,
@@ -31,40 +30,9 @@ from gigabrain_zenoh.client.requests import (
     steer,
 )
 from gigabrain_zenoh.client.tasks import Tasks
-from gigabrain_zenoh.errors import BodyLost, NotConfirmed, Refused, Unsupported
+from gigabrain_zenoh.errors import BodyLost, ConfigError, NotConfirmed, Refused, Unsupported
 from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of
-from gigabrain_zenoh.runtime.running import find_endpoint
 from gigabrain_zenoh.security.identity_files import may_not_ask
-
-
-@asynccontextmanager
-async def connect(
-    connect: str | None = None,
-    *,
-    namespace: str = "",
-    keys: str = "",
-    source: str = "",
-    take: bool = False,
-    wait: bool = True,
-) -> AsyncIterator["Robot"]:
-    """Connect to a robot.
-
-    `connect` is its router's Zenoh endpoint; by default the only robot on this machine. `keys` is
-    the folder of this script's identity, if the router requires one. `source` names this script to
-    the gate; with `take` it takes the body over from another commander. With `wait=False` the
-    first state is not awaited, so that an e-stop reaches a silent body. Raises BusError without a
-    router, ConfigError for invalid keys, and BodyLost without a driver.
-    """
-    # imported only when used, since Zenoh takes a while
-    from gigabrain_zenoh.runtime.connect import connect as connect_bus
-
-    endpoint = find_endpoint(connect, namespace, keys)
-    async with connect_bus(endpoint, source or f"script-{os.getpid()}") as bus:
-        robot = Robot(bus, take=take, keys=endpoint.keys)
-        if wait:
-            await robot.read_state()
-        yield robot
-        await robot.stop()
 
 
 class ControlLease:
@@ -125,7 +93,22 @@ class Robot:
         self._arrived = asyncio.Event()
         self.tasks = Tasks(bus, keys)
 
-    async def go_to(self, x: float, y: float, yaw: float | None = None) -> Task:
+    async def move(self, distance: float, *, speed: float | None = None) -> Reached:
+        """Drive straight by `distance` [m]; backwards if it is negative.
+
+        `speed` [m/s] is an upper limit. Returns what odometry has measured and what has held the
+        body back. Raises Refused if the gate does not grant the body, and BodyLost.
+        """
+        return await self._carry_out(distance, 0.0, speed)
+
+    async def turn(self, angle: float, *, speed: float | None = None) -> Reached:
+        """Turn on the spot by `angle` [rad], counter-clockwise if it is positive.
+
+        `speed` [rad/s] is an upper limit. Returns and raises as `move` does.
+        """
+        return await self._carry_out(0.0, angle, speed)
+
+    async def goto(self, x: float, y: float, yaw: float | None = None) -> Task:
         """Send the robot to a pose in its map [m, m, rad]; return the task once it has ended.
 
         Cancelling this call cancels the goal. `tasks` has missions, the queue and progress. Raises
@@ -172,6 +155,17 @@ class Robot:
         enabled again.
         """
         steer(self._bus, wanted)
+
+    async def _carry_out(self, distance: float, angle: float, speed: float | None) -> Reached:
+        if speed is not None and speed <= 0:
+            raise ConfigError(f"speed: expected more than 0, got {speed:g}")
+        motion = Motion(await self.read_body(), await self.read_state(), distance, angle)
+        while not motion.done:
+            wanted = motion.step(await self.read_state(), speed)
+            await self.set_base_velocity(wanted.linear_x, 0.0, wanted.angular_z)
+            await self._ticks(1)
+        await self.stop()
+        return motion.result()
 
     async def stop(self) -> None:
         """Come to rest, if this script drives; it keeps the body."""

@@ -12,7 +12,8 @@ from gigabrain_schemas.base import TICK_S, Message
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL, Topic
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.client.robot import Robot, connect
+from gigabrain_zenoh.client.connection import connect
+from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.diagnostics.discovery import PREFIX, short_name, unknown_topic
 from gigabrain_zenoh.errors import ConfigError, Refused, unknown
 from gigabrain_zenoh.gate.gate import BRAIN

@@ -9,10 +9,10 @@ from collections.abc import AsyncIterator
 import pytest
 
 import gigabrain_zenoh
-from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.sensors import Imu, LaserScan
 from gigabrain_schemas.topics import SCAN
-from gigabrain_zenoh.client.robot import Robot, connect
+from gigabrain_zenoh.client.connection import connect
+from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.errors import (
     BodyLost,
     BusError,
@@ -69,6 +69,34 @@ async def test_a_script_drives_a_square_and_the_brain_goes_on_afterwards(robot: 
         assert max(x) - min(x) > 0.25
     await until(lambda: robot.state.gate.commander == "control", "the brain goes on")
     await robot.driving_straight(speed=0.15, room=0.0)
+
+
+async def test_a_script_moves_and_turns_by_what_odometry_measures(robot: Probe) -> None:
+    async with connect(take=True, source="measured") as script:
+        await script.set_base_velocity(0.0)
+        await robot.at_rest()
+        start = robot.state
+        turned = await script.turn(math.pi / 2)
+        assert (turned.ok, turned.held_back) == (True, ())
+        assert turned.angle == pytest.approx(math.pi / 2, abs=0.04)
+        back = await script.turn(-math.pi / 2)
+        assert abs(math.remainder(back.pose.yaw - start.pose.yaw, math.tau)) < 0.08
+        moved = await script.move(-0.1, speed=0.1)
+        assert moved.distance == pytest.approx(-0.1, abs=0.03)
+
+
+async def test_a_script_without_asyncio_has_the_same_robot(robot: Probe) -> None:
+    def script() -> tuple[str, float, int]:
+        with gigabrain_zenoh.connect(take=True, source="plain") as plain:
+            plain.set_base_velocity(0.0)
+            turned = plain.turn(0.5)
+            scans = list(itertools.islice(plain.topic("scan"), 2))
+            return plain.read_state().gate.commander, turned.angle, len(scans)
+
+    commander, angle, scans = await asyncio.to_thread(script)
+    assert (commander, scans) == ("plain", 2)
+    assert angle == pytest.approx(0.5, abs=0.04)
+    await until(lambda: robot.state.gate.commander == "control", "the brain goes on")
 
 
 async def test_a_script_keeps_the_body_while_it_thinks(robot: Probe) -> None:
@@ -131,7 +159,7 @@ async def test_what_the_robot_says_can_be_listened_to(robot: Probe) -> None:
                 if [b.tick - a.tick for a, b in itertools.pairwise(scans[-3:])] == [5, 5]:
                     break
         assert {type(scan) for scan in scans} == {LaserScan}
-        assert len(ranges(scans[0])) == 360
+        assert len(scans[0].ranges_m) == 360
         assert isinstance(await script.get_sensor_data("imu"), Imu)
         assert isinstance(await anext(script.topic(SCAN)), LaserScan)
         state = await script.read_state()

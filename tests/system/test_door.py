@@ -13,7 +13,7 @@ import pytest
 import zenoh
 
 from gigabrain_schemas.audit import AuditRecord
-from gigabrain_zenoh.client.robot import connect
+from gigabrain_zenoh.client.connection import connect
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import NotConfirmed
 from gigabrain_zenoh.runtime import audit

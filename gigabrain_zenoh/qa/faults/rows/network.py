@@ -28,7 +28,7 @@ from gigabrain_schemas.topics import (
 )
 from gigabrain_zenoh.bus.zenoh.config import secured
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
-from gigabrain_zenoh.client.robot import connect
+from gigabrain_zenoh.client.connection import connect
 from gigabrain_zenoh.codec import encode
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.host.bounded import percentile

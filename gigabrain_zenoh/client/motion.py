@@ -1,0 +1,101 @@
+"""Closed-loop motions for scripts: drive a distance or turn by an angle, measured by odometry."""
+
+import math
+from collections.abc import Sequence
+
+from msgspec import Struct
+
+from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.body import BodyDescription, RobotState
+from gigabrain_zenoh.geometry.limits import ZERO, at_rest
+
+GAIN = 2.0  # [1/s], speed per remaining distance near the goal
+BRAKE_SHARE = 0.5  # of the body's deceleration that is planned with
+POSITION_TOLERANCE, ANGLE_TOLERANCE = 0.01, math.radians(1.0)  # [m], [rad]
+MIN_LINEAR, MIN_ANGULAR = 0.02, 0.05  # [m/s], [rad/s], so that a motion ends
+HEADING_GAIN = 2.0  # [1/s]
+STALL_TICKS = 10 * 50  # without progress
+REST_TICKS = 50  # how long the end of a motion waits until the body is at rest
+
+
+class Reached(Struct, frozen=True, kw_only=True):
+    """Result of a motion, as odometry measured it."""
+
+    distance: float  # [m] along the heading at the start
+    angle: float  # [rad]
+    pose: Pose  # odometry, at the end
+    ok: bool  # within tolerance of what was wanted
+    held_back: tuple[str, ...] = ()  # codes of what stopped the body on the way
+
+
+class Motion:
+    """One motion: gives the velocity for each state, until `done`."""
+
+    def __init__(self, body: BodyDescription, start: RobotState, distance: float, angle: float):
+        self._body, self._start, self._last = body, start.pose, start
+        self._distance, self._angle = distance, angle
+        self._turned, self._yaw = 0.0, start.pose.yaw
+        self._best, self._best_tick = math.inf, start.tick
+        self._end_tick = 0  # when the goal was reached, or given up
+        self._held: dict[str, None] = {}
+
+    def step(self, state: RobotState, speed: float | None = None) -> Velocity:
+        """Return the velocity to send for `state`; zero once the goal is reached or given up."""
+        self._turned += math.remainder(state.pose.yaw - self._yaw, math.tau)
+        self._yaw, self._last = state.pose.yaw, state
+        self._held.update(dict.fromkeys(self._causes(state)))
+        linear_left, angle_left = self._left()
+        self._watch_progress(state, linear_left, angle_left)
+        if self._end_tick:
+            return ZERO
+        body = self._body
+        if self._distance:
+            linear = _approach(linear_left, speed or body.max_linear_speed,
+                               body.max_linear_deceleration, MIN_LINEAR)  # fmt: skip
+            return Velocity(linear_x=linear, angular_z=HEADING_GAIN * angle_left)
+        limit = speed or body.max_angular_speed
+        angular = _approach(angle_left, limit, body.max_angular_acceleration, MIN_ANGULAR)
+        return Velocity(angular_z=angular)
+
+    @property
+    def done(self) -> bool:
+        """Whether the motion has ended and the body is at rest."""
+        if not self._end_tick:
+            return False
+        return at_rest(self._last.velocity) or self._last.tick > self._end_tick + REST_TICKS
+
+    def result(self) -> Reached:
+        """Return what odometry has measured so far."""
+        linear_left, angle_left = self._left()
+        ok = abs(linear_left) <= 2 * POSITION_TOLERANCE and abs(angle_left) <= 2 * ANGLE_TOLERANCE
+        return Reached(
+            distance=self._distance - linear_left,
+            angle=self._turned,
+            pose=self._last.pose,
+            ok=ok,
+            held_back=tuple(self._held),
+        )
+
+    def _left(self) -> tuple[float, float]:
+        """Return the distance [m] and the angle [rad] that are left."""
+        start, pose = self._start, self._last.pose
+        along = (pose.x - start.x) * math.cos(start.yaw) + (pose.y - start.y) * math.sin(start.yaw)
+        return self._distance - along if self._distance else 0.0, self._angle - self._turned
+
+    def _watch_progress(self, state: RobotState, linear_left: float, angle_left: float) -> None:
+        left = abs(linear_left) if self._distance else abs(angle_left)
+        tolerance = POSITION_TOLERANCE if self._distance else ANGLE_TOLERANCE
+        if left < self._best - tolerance:
+            self._best, self._best_tick = left, state.tick
+        stalled = state.tick - self._best_tick > STALL_TICKS
+        if not self._end_tick and (left <= tolerance or stalled):
+            self._end_tick = state.tick
+
+    def _causes(self, state: RobotState) -> Sequence[str]:
+        return [cause.code for cause in state.gate.causes]
+
+
+def _approach(left: float, limit: float, deceleration: float, slowest: float) -> float:
+    """Return a speed that comes to rest after `left`, with its sign."""
+    braking = math.sqrt(2.0 * BRAKE_SHARE * deceleration * abs(left))
+    return math.copysign(min(limit, braking, max(GAIN * abs(left), slowest)), left)
