@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gigabrain_schemas.arrays import Floats, hits
+from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_S, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import Intent, OccupancyGrid, WorldModel
@@ -113,7 +113,7 @@ class RouteSchedule:
             grid=grid,
             body=context.body,
             feedback=feedback,
-            seen=transform(from_pose(here), hits(context.world).astype(np.float64)),
+            seen=transform(from_pose(here), context.world.points().astype(np.float64)),
             held_ticks=self._held_ticks,
             slowed_by=context.slowed_by,
         )
@@ -293,7 +293,7 @@ class Navigator:
             pose=context.pose,
             velocity=context.velocity,
             goal=Goal(x=there.x, y=there.y, yaw=None if goal.yaw is None else there.yaw),
-            hits=hits(context.world).astype(np.float64),
+            hits=context.world.points().astype(np.float64),
             path=transform(from_pose(to_odom), points),
             obstacles=context.world.obstacles,
             response=context.actuation,

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 from msgspec import structs
 
-from gigabrain_schemas.arrays import Floats, cells
+from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import OccupancyGrid
@@ -422,7 +422,7 @@ def enlarged(grid: OccupancyGrid, goal: Goal) -> OccupancyGrid:
     if (width, height) == (grid.width, grid.height) or width * height > MAX_ENLARGED_CELLS:
         return grid
     wide = np.full((height, width), -1, np.int8)
-    wide[rows[0] : height - rows[1], columns[0] : width - columns[1]] = cells(grid)
+    wide[rows[0] : height - rows[1], columns[0] : width - columns[1]] = grid.array()
     return structs.replace(
         grid,
         width=width,

@@ -9,7 +9,6 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from gigabrain_schemas import arrays
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.sensors import Image, LaserScan
@@ -60,11 +59,11 @@ def summary(values: Sequence[float] | NDArray[np.generic]) -> Summary:
 def _array_of(message: Message) -> tuple[str, NDArray[np.generic]] | None:
     """Return the name and the content of a message's array field; None where it has none."""
     if isinstance(message, LaserScan):
-        return "ranges", arrays.ranges(message)
+        return "ranges", message.ranges_m
     if isinstance(message, OccupancyGrid):
-        return "cells", arrays.cells(message)
+        return "cells", message.array()
     if isinstance(message, Image) and message.encoding != "jpeg":
-        return "data", arrays.pixels(message)
+        return "data", message.array()
     return None
 
 

@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_schemas.arrays import Floats, ranges
+from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.sensors import LaserScan
 
@@ -41,7 +41,7 @@ def blind_ahead(lidar: Lidar, scan: LaserScan, nearest: float, cone_deg: float) 
 
     The cone's whole angle is `cone_deg` [deg].
     """
-    values = ranges(scan)
+    values = scan.ranges_m
     cone = _beams_ahead(len(values), scan.angle_min, scan.angle_increment, lidar.yaw, cone_deg)
     seen = int(np.count_nonzero(values[cone] >= nearest))
     if 2 * seen <= len(cone):
@@ -51,7 +51,7 @@ def blind_ahead(lidar: Lidar, scan: LaserScan, nearest: float, cone_deg: float) 
 
 def hits(lidar: Lidar, scan: LaserScan, nearest: float) -> tuple[Floats, Floats]:
     """Return x and y of the hits of `scan` in the body's frame [m], (n,) each."""
-    values = ranges(scan)
+    values = scan.ranges_m
     farthest = min(scan.range_max, lidar.range_max)
     hit = (values >= nearest) & (values <= farthest)  # nan and inf are neither
     cosines, sines = beams(len(values), scan.angle_min, scan.angle_increment, lidar.yaw)

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
-from gigabrain_schemas.arrays import cells as cells_of
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_zenoh.geometry import sweep
@@ -181,7 +180,7 @@ def costmap(
 
 
 def _with_points(grid: OccupancyGrid, points: NDArray[np.floating] | None) -> Cells:
-    cells = cells_of(grid).copy()
+    cells = grid.array().copy()
     if points is not None and len(points):
         at = (points - (grid.origin_x, grid.origin_y)) / grid.resolution
         inside = (at >= 0).all(axis=1) & (at < (grid.width, grid.height)).all(axis=1)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gigabrain_schemas.arrays import Floats, ranges
+from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_NS
 from gigabrain_schemas.body import Body, Lidar, RobotState
 from gigabrain_schemas.brain import OccupancyGrid, PoseInMap
@@ -64,7 +64,7 @@ def chart_of(config: PerceptionConfig, in_time: InTime = done) -> RobotMap:
 
 def view_of(lidar: Lidar, scan: LaserScan, ignore_below: float) -> View:
     """Convert a scan to hit points and the ends of free beams, in the body's frame [m]."""
-    values = ranges(scan)
+    values = scan.ranges_m
     points = np.column_stack(hits(lidar, scan, ignore_below))
     cosines, sines = beams(len(values), scan.angle_min, scan.angle_increment, lidar.yaw)
     sensor = np.array((lidar.x, lidar.y))

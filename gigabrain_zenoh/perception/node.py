@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_schemas.arrays import Floats, hits_bytes, ranges
+from gigabrain_schemas.arrays import Floats, hits_bytes
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import Body, BodyDescription, RobotState
 from gigabrain_schemas.brain import WorldModel
@@ -35,7 +35,7 @@ def step(config: PerceptionConfig, body: BodyDescription, scan: LaserScan) -> Wo
     lidar = body.lidar
     if lidar is None:
         return _unknown("the body has no lidar")
-    values = ranges(scan)
+    values = scan.ranges_m
     problem = scan_problem(lidar, values, config.ignore_below)
     problem = problem or blind_ahead(lidar, scan, config.ignore_below, config.sector_deg)
     if problem:

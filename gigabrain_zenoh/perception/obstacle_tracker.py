@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 from msgspec.structs import replace
 
-from gigabrain_schemas import arrays
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_S, Pose
 from gigabrain_schemas.body import Lidar
@@ -180,7 +179,7 @@ class ObstacleTracker:
         """Return `world` with its obstacles in the parent frame of `pose`, if that is known."""
         if lidar is None or pose is None or not world.scan_ok:
             return world
-        hits = arrays.hits(world).astype(np.float64)
+        hits = world.points().astype(np.float64)
         found = self.update(hits, lidar, scan.angle_increment, pose, scan.boot, scan.basis)
         return replace(world, obstacles=found)
 

@@ -14,7 +14,6 @@ import numpy as np
 from foxglove import Schema
 from foxglove import messages as fox
 
-from gigabrain_schemas import arrays
 from gigabrain_schemas.base import Message, Pose
 from gigabrain_schemas.body import Body, RobotState
 from gigabrain_schemas.brain import Intent, Obstacle, OccupancyGrid, PoseInMap, WorldModel
@@ -120,7 +119,7 @@ class Drawer:
         return before != self._last_intent
 
     def _scan(self, scan: LaserScan, _: str) -> Iterable[Drawn]:
-        ranges = arrays.ranges(scan)
+        ranges = scan.ranges_m
         last = scan.angle_min + scan.angle_increment * (len(ranges) - 1)
         drawn = fox.LaserScan(
             timestamp=stamp(scan),
@@ -261,7 +260,7 @@ def _speed(one: Obstacle) -> float:
 
 def _wall(world: WorldModel, one: Obstacle, odometry: Pose) -> fox.SceneEntity:
     """Draw lines along the points that beams hit."""
-    hits = arrays.hits(world)
+    hits = world.points()
     x, y = to_frame(odometry, one.x, one.y)
     off = np.hypot(hits[:, 0] - x, hits[:, 1] - y)
     near = hits[off < one.radius + MAX_POINT_GAP_M]

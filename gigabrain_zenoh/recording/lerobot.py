@@ -14,7 +14,6 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.sensors import LaserScan
@@ -54,7 +53,7 @@ def frames(path: Path) -> Iterator[LeRobotFrame]:
     for sample in samples(path):
         message = message_of(sample)
         if isinstance(message, LaserScan):
-            seen = np.minimum(ranges(message), np.float32(message.range_max))
+            seen = np.minimum(message.ranges_m, np.float32(message.range_max))
             scan = np.nan_to_num(seen, nan=0.0)
         elif isinstance(message, CmdVel):
             speeds = (message.linear_x, message.linear_y, message.angular_z)

@@ -7,7 +7,6 @@ from typing import Any
 
 import msgspec
 
-from gigabrain_schemas import arrays
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import TOPICS
@@ -34,7 +33,7 @@ def row(message: Message) -> dict[str, Value]:
     values = dict(_flat("", msgspec.to_builtins(message, builtin_types=(bytes,))))
     if isinstance(message, LaserScan):
         del values["ranges"]
-        values |= {f"ranges.{i}": float(r) for i, r in enumerate(arrays.ranges(message))}
+        values |= {f"ranges.{i}": float(r) for i, r in enumerate(message.ranges_m)}
     return values
 
 

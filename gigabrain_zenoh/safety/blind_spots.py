@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from gigabrain_schemas.arrays import Floats, ranges
+from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_NS, Pose
 from gigabrain_schemas.body import BodyDescription, Lidar
 from gigabrain_schemas.sensors import LaserScan
@@ -54,7 +54,7 @@ def update(
     `yaw` is the body's; `last` has the ranges of the scan before, or is empty at the start. Since
     then the body may have moved by `moved_m` [m]. Ranges below `housing_m` are invalid.
     """
-    values = ranges(scan).astype(np.float64)
+    values = scan.ranges_m.astype(np.float64)
     sector = _sectors(lidar, scan, yaw)
     known = values >= housing_m
     if lidar.no_return == "unknown":
@@ -79,7 +79,7 @@ def _first_ranges(lidar: Lidar, values: Floats, sector: NDArray[np.intp]) -> Flo
 
 def _sectors(lidar: Lidar, scan: LaserScan, yaw: float) -> NDArray[np.intp]:
     """Return the sector of each beam (beams,), for a body that is turned by `yaw`."""
-    beams = np.arange(len(ranges(scan)))
+    beams = np.arange(len(scan.ranges_m))
     angles = scan.angle_min + (lidar.yaw + yaw) + scan.angle_increment * beams
     sectors: NDArray[np.intp] = (
         np.floor((angles + ANGLE_EPSILON_RAD) / SECTOR_RAD).astype(np.intp) % SECTORS
@@ -125,7 +125,7 @@ def obstacles(
 
 def remember(views: PastViews, body: BodyDescription, pose: Pose, scan: LaserScan) -> PastViews:
     """Return the views with a new one at `pose`; none if the scan covers the full circle."""
-    if abs(scan.angle_increment) * len(ranges(scan)) > math.tau - MIN_GAP_RAD:
+    if abs(scan.angle_increment) * len(scan.ranges_m) > math.tau - MIN_GAP_RAD:
         return ()
     outer = radius(body.footprint)
     if views and _distance(views[-1].pose, pose, outer) > JUMP_M:
@@ -170,7 +170,7 @@ def _seen(
     lidar: Lidar, housing_m: float, scan: LaserScan, points: Floats
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return which `points` in the body's frame beams passed through, and which they hit."""
-    values = ranges(scan).astype(np.float64)
+    values = scan.ranges_m.astype(np.float64)
     unknown = values < housing_m
     if lidar.no_return == "unknown":
         unknown |= np.isinf(values)

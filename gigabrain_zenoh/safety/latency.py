@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from gigabrain_schemas.arrays import Floats, ranges
+from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_MS, Cause
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.sensors import LaserScan
@@ -180,7 +180,7 @@ def _turn(before: LaserScan, now: LaserScan) -> float | None:
 
 def _profile(scan: LaserScan) -> Floats:
     """Return the ranges (n,) [m], clipped to MAX_RANGE_M."""
-    values = ranges(scan).astype(np.float64)
+    values = scan.ranges_m.astype(np.float64)
     return np.clip(np.nan_to_num(values, nan=MAX_RANGE_M, posinf=MAX_RANGE_M), 0.0, MAX_RANGE_M)
 
 

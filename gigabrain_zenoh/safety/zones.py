@@ -6,7 +6,7 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from gigabrain_schemas.arrays import Floats, ranges
+from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_NS, Cause, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.safety import SpeedCaps
@@ -74,7 +74,7 @@ class ProtectiveField(Struct, frozen=True, kw_only=True):
         lidar = body.lidar
         if lidar is None or scan is None or scan.basis == self.basis or scan.basis > state.tick:
             return self
-        problem = scan_problem(lidar, ranges(scan), HOUSING_M)
+        problem = scan_problem(lidar, scan.ranges_m, HOUSING_M)
         problem = problem or blind_ahead(lidar, scan, HOUSING_M, CONE_DEG)
         now = replace(self, scans=self.scans + 1, basis=scan.basis, problem=problem)
         if problem:

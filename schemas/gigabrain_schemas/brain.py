@@ -1,6 +1,6 @@
 """Messages of perception, decision and control."""
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 from msgspec import Meta
@@ -22,6 +22,11 @@ from gigabrain_schemas.base import (
 )
 from gigabrain_schemas.body import MOST_JOINTS, JointPosition, JointSpeed
 
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+FARTHEST_HIT = 1000.0  # [m]
 Resolution = Annotated[float, Meta(ge=0.001, le=1.0)]  # [m] per cell
 Cells = Annotated[int, Meta(ge=0, le=100_000)]  # along one side
 Delay = Annotated[float, Meta(ge=0.0, le=10.0)]  # [s]
@@ -61,6 +66,17 @@ class WorldModel(Message, frozen=True, kw_only=True):
         if len(self.hits) % 8:
             raise ValueError(f"hits must be pairs of float32, got {len(self.hits)} bytes")
 
+    def points(self) -> "NDArray[np.float32]":
+        """Return the points that beams hit [m], (n, 2) in the body's frame.
+
+        Points with NaN or infinity are left out, so that all can be used in computations.
+        """
+        import numpy as np
+
+        points = np.frombuffer(self.hits, "<f4").reshape(-1, 2)
+        near = (np.abs(points) <= FARTHEST_HIT).all(axis=1)
+        return points if near.all() else points[near]
+
 
 class PoseInMap(Message, frozen=True, kw_only=True):
     """Where the robot is in the map."""
@@ -91,6 +107,12 @@ class OccupancyGrid(Message, frozen=True, kw_only=True):
             raise ValueError(f"{self.width} x {self.height} cells but {len(self.cells)} bytes")
         if self.cells.translate(None, CELL_VALUES):
             raise ValueError("a cell is 0 to 100, or -1")
+
+    def array(self) -> "NDArray[np.int8]":
+        """Return the cells, (height, width), as a read-only view."""
+        import numpy as np
+
+        return np.frombuffer(self.cells, "i1").reshape(self.height, self.width)
 
 
 class TrajectoryPoint(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):

@@ -1,10 +1,14 @@
 """Measurements of sensors."""
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from msgspec import Meta
 
 from gigabrain_schemas.base import Message, Milliseconds, Name, Range, Record
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 RangeMax = Annotated[float, Meta(ge=0.01, le=1000.0)]  # [m]
 BeamAngle = Annotated[float, Meta(ge=-100.0, le=100.0)]  # [rad]
@@ -39,6 +43,30 @@ class LaserScan(Message, frozen=True, kw_only=True):
         if self.range_max <= self.range_min:
             raise ValueError("range_max must be larger than range_min")
 
+    @property
+    def ranges_m(self) -> "NDArray[np.float32]":
+        """The ranges [m], (n,), as a read-only view."""
+        import numpy as np
+
+        return np.frombuffer(self.ranges, "<f4")
+
+    @property
+    def angles(self) -> "NDArray[np.float64]":
+        """The angles of the beams [rad], (n,), counter-clockwise from the sensor's x axis."""
+        import numpy as np
+
+        beams = np.arange(len(self.ranges) // 4, dtype=np.float64)
+        return self.angle_min + self.angle_increment * beams
+
+    def points(self) -> "NDArray[np.float64]":
+        """Return where beams hit something [m], (k, 2), in the sensor's frame."""
+        import numpy as np
+
+        ranges, angles = self.ranges_m.astype(np.float64), self.angles
+        hit = np.isfinite(ranges) & (ranges >= self.range_min) & (ranges <= self.range_max)
+        x, y = ranges[hit] * np.cos(angles[hit]), ranges[hit] * np.sin(angles[hit])
+        return np.column_stack((x, y))
+
 
 class ImuData(Record, frozen=True, kw_only=True):
     """Attitude, turn rate and acceleration of the body."""
@@ -57,6 +85,7 @@ class Imu(Message, frozen=True, kw_only=True):
     linear_acceleration: Accelerations  # [m/s2]
 
 
+DTYPES = {"mono8": "u1", "rgb8": "u1", "bgr8": "u1", "depth16": "<u2", "depth32f": "<f4"}
 PIXEL_BYTES = {"rgb8": 3, "bgr8": 3, "mono8": 1, "depth16": 2, "depth32f": 4}
 
 
@@ -77,3 +106,16 @@ class Image(Message, frozen=True, kw_only=True):
         expected = self.height * self.width * PIXEL_BYTES[self.encoding]
         if len(self.data) != expected:
             raise ValueError(f"{self.encoding} needs {expected} bytes, got {len(self.data)}")
+
+    def array(self) -> "NDArray[np.generic]":
+        """Return the pixels, (height, width) or (height, width, 3), as a read-only view.
+
+        Raises ValueError for a JPEG, which must be decoded first.
+        """
+        import numpy as np
+
+        if self.encoding == "jpeg":
+            raise ValueError("a JPEG must be decoded first, for example by cv2.imdecode")
+        channels = (3,) if self.encoding in ("rgb8", "bgr8") else ()
+        view = np.frombuffer(self.data, DTYPES[self.encoding])
+        return view.reshape(self.height, self.width, *channels)

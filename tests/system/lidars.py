@@ -13,7 +13,6 @@ from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.base import Device, EmulatedBody
 from gigabrain_drivers.emulators.emulator import Station, emulated_body
 from gigabrain_drivers.lidars.serial_source import SerialSource
-from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.clock import Clock
@@ -89,7 +88,7 @@ class Listener:
 def agree(scan: LaserScan, expected: NDArray[np.float32], within: float = 0.06) -> float:
     """The share of beams that agree; at edges, neighbours may see one side or the other."""
     got, seen = (
-        np.nan_to_num(values, nan=-1.0, posinf=99.0) for values in (ranges(scan), expected)
+        np.nan_to_num(values, nan=-1.0, posinf=99.0) for values in (scan.ranges_m, expected)
     )
     near = [np.roll(seen, shift) for shift in (-1, 0, 1)]
     return float(np.mean(np.any([np.abs(got - other) < within for other in near], axis=0)))

@@ -12,7 +12,6 @@ from gigabrain_drivers.lidars.base import SampleBuffer, bin_scan
 from gigabrain_drivers.lidars.ld import protocol as ld
 from gigabrain_drivers.lidars.ld.emulator import LdDevice
 from gigabrain_drivers.lidars.ld.source import Ld19
-from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.body import Lidar
 from gigabrain_zenoh.clock import Clock, FakeClock
 from gigabrain_zenoh.testing.waiting import until
@@ -32,7 +31,7 @@ def test_a_bin_holds_its_nearest_sample_inf_without_a_return_and_nan_without_a_s
     scan = bin_scan(SMALL, angles, [1.0, 0.9, math.inf, 9.0, 0.02, math.nan, -0.0])
 
     np.testing.assert_allclose(
-        ranges(scan), [0.9, math.inf, math.inf, 0.1, math.nan, 0.1, math.nan, math.nan], rtol=1e-6
+        scan.ranges_m, [0.9, math.inf, math.inf, 0.1, math.nan, 0.1, math.nan, math.nan], rtol=1e-6
     )
     assert (scan.angle_min, scan.angle_increment) == (0.0, math.tau / 8)
 
@@ -45,7 +44,7 @@ def test_clockwise_degrees_become_counter_clockwise_bins() -> None:
     scan = turn.add_samples([0.0], [1000], 0, 100 * MS)
 
     assert scan is not None
-    got = ranges(scan)
+    got = scan.ranges_m
     assert (got[0], got[6], got[2]) == (1.0, 2.0, 2.5)
 
 
@@ -113,7 +112,7 @@ def test_a_scan_of_the_emulated_lidar_is_the_scan_of_the_simulation() -> None:
 
     assert len(scans) == 3  # the first turn was not seen to begin, the fifth not to end
     assert agree(scans[-1], truth()) > 0.97
-    assert not np.isnan(ranges(scans[-1])).any()
+    assert not np.isnan(scans[-1].ranges_m).any()
 
 
 async def test_scans_come_over_a_pty_and_again_after_an_unplugged_cable(tmp_path: Path) -> None:
@@ -161,7 +160,7 @@ async def test_bit_errors_and_half_frames_cost_frames_and_nothing_else(tmp_path:
 
         assert listener.source.health.errors > 5
         for scan in scans:
-            missing = np.isnan(ranges(scan)).sum()
+            missing = np.isnan(scan.ranges_m).sum()
             assert agree(scan, real) > 0.97 - missing / 360
 
 

@@ -17,7 +17,6 @@ from gigabrain_drivers.lidars.lds.emulator import Lds01Device, Lds03Device
 from gigabrain_drivers.lidars.lds.lds01 import Lds01
 from gigabrain_drivers.lidars.lds.lds03 import Lds03, trusted
 from gigabrain_drivers.lidars.serial_source import SerialSource
-from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.clock import Clock, FakeClock
@@ -60,7 +59,7 @@ def test_lds01s_last_sample_looks_ahead_and_the_ones_before_to_the_right() -> No
         for turn in range(3)
         for at in range(0, 60, 3)
     ]
-    scan = ranges(scans_of(Lds01(options(), SLOW, clock), clock, pieces)[0])
+    scan = scans_of(Lds01(options(), SLOW, clock), clock, pieces)[0].ranges_m
     assert scan[[0, 1, 90, 270, 359]] == pytest.approx([1.359, 1.358, 1.269, 1.089, 1.0])
 
 
@@ -128,7 +127,7 @@ def test_an_emulated_scan_is_the_simulations(
     assert len(scans) >= 3
     expected = truth()[:: 360 // lidar.beams]
     assert agree(scans[-1], expected, within=0.1) > 0.97
-    assert np.isnan(ranges(scans[-1])).mean() < 0.03
+    assert np.isnan(scans[-1].ranges_m).mean() < 0.03
 
 
 @each

@@ -18,7 +18,6 @@ from gigabrain_drivers.emulators.faults import NO_FAULTS, Faults
 from gigabrain_drivers.sim.body import MujocoOptions, sim_body
 from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.world import World
-from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN
 from gigabrain_zenoh.errors import ConfigError
@@ -160,7 +159,7 @@ async def test_it_drives_in_mujoco_by_bytes_alone(pair: Pair) -> None:
     assert 12.0 < state.battery.voltage < 12.6
     assert [j.temperature is not None for j in state.joints] == [True, True]
     await until(lambda: len(pair.scans) >= 2)
-    assert ranges(pair.scans[-1]).shape == (360,)
+    assert pair.scans[-1].ranges_m.shape == (360,)
 
 
 async def test_the_scan_and_the_base_fail_apart(pair: Pair) -> None:

@@ -18,7 +18,6 @@ from gigabrain_drivers.lidars.rplidar import source as rplidar_source
 from gigabrain_drivers.lidars.rplidar.emulator import RplidarDevice
 from gigabrain_drivers.lidars.rplidar.protocol import DENSE, EXPRESS, STANDARD, Health
 from gigabrain_drivers.lidars.rplidar.source import Rplidar, RplidarOptions
-from gigabrain_schemas.arrays import ranges
 from gigabrain_zenoh.clock import Clock, FakeClock
 from gigabrain_zenoh.testing.waiting import until
 from tests.system.lidars import LIDAR, Listener, agree, emulated, truth
@@ -60,7 +59,7 @@ async def test_a_scan_of_each_model_is_the_scan_of_the_simulation(
         assert isinstance(device, RplidarDevice)
         assert device._mode is not None
         assert device._mode.kind == kind
-        missing = int(np.isnan(ranges(scan)).sum())
+        missing = int(np.isnan(scan.ranges_m).sum())
         assert missing <= (165 if kind == STANDARD and model == "a1" else 0)  # 200 samples a turn
         assert agree(scan, truth()) > 0.97 - missing / 360
         await until(lambda: listener.source.health.connected)

@@ -9,7 +9,6 @@ import pytest
 from gigabrain_drivers.driver.catalog import make_driver, robot_path
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.emulator import Emulator
-from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.sensors import Imu, LaserScan
 from gigabrain_schemas.topics import Topic
@@ -58,7 +57,7 @@ async def test_the_emulated_robot_drives_and_sees(robot: str, tmp_path: Path) ->
             assert any(isinstance(message, Imu) for message in seen)
             assert await driver.get_sensor_data("scan") is scans[-1]
             assert description.lidar
-            assert len(ranges(scans[-1])) == description.lidar.beams
+            assert len(scans[-1].ranges_m) == description.lidar.beams
         await until(lambda: emulator.body.commanded == (0.0, 0.0, 0.0))  # the last zero arrives
 
 

@@ -14,7 +14,6 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from gigabrain_schemas.arrays import hits
 from gigabrain_schemas.base import TICK_S, Velocity
 from gigabrain_schemas.body import GateStatus, RobotState
 from gigabrain_schemas.brain import CmdVel, Intent, WorldModel
@@ -228,7 +227,7 @@ class BarnBrain:
             pose=state.pose,
             velocity=state.velocity,
             goal=self._goal,
-            hits=hits(world).astype(np.float64),
+            hits=world.points().astype(np.float64),
             obstacles=world.obstacles,
             response=self._response.response,
             sent=tuple(SentCommand(tick, velocity) for tick, velocity in sent),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from msgspec import Struct
 
-from gigabrain_schemas.arrays import Floats, cells
+from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_NS
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.brain import OccupancyGrid
@@ -88,7 +88,7 @@ def slope(values: Sequence[float]) -> float:
 
 def occupied(grid: OccupancyGrid) -> int:
     """Count the occupied cells; a wall that is drawn twice has more of them."""
-    return int((cells(grid) >= OCCUPIED).sum())
+    return int((grid.array() >= OCCUPIED).sum())
 
 
 class PoseErrors(Struct, frozen=True, kw_only=True):
@@ -239,7 +239,7 @@ def draw_worlds(worlds: Sequence[MappedWorld], to: Path) -> None:
 
 
 def _draw_world(axes: "Axes", one: MappedWorld) -> None:
-    grid, shown = one.grid, cells(one.grid).astype(np.int16)
+    grid, shown = one.grid, one.grid.array().astype(np.int16)
     shown[shown < 0] = UNKNOWN
     left, low = grid.origin_x, grid.origin_y
     right, high = left + grid.width * grid.resolution, low + grid.height * grid.resolution

@@ -21,7 +21,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from gigabrain_schemas.arrays import ranges, ranges_bytes
+from gigabrain_schemas.arrays import ranges_bytes
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import LaserScan
@@ -94,7 +94,7 @@ class Tampering(NamedTuple):
 
 def _scan(change: Callable[[Ranges], Ranges]) -> Tampering:
     def tamper(scan: LaserScan) -> Message:
-        return replace(scan, ranges=ranges_bytes(change(ranges(scan).copy())))
+        return replace(scan, ranges=ranges_bytes(change(scan.ranges_m.copy())))
 
     return Tampering(SCAN, tamper)
 

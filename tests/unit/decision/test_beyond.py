@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from gigabrain_schemas.arrays import cells
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.decision.route import enlarged
@@ -41,9 +40,9 @@ def test_it_grows_towards_the_goal_and_two_metres_on(
 
 def test_what_was_known_stays_in_its_place_and_all_else_is_unknown() -> None:
     wide = enlarged(small(), Goal(x=-1.5, y=-1.0))
-    assert cells(wide)[5:7, 5:].tolist() == cells(small()).tolist()
-    assert (cells(wide)[:5] == -1).all()
-    assert (cells(wide)[:, :5] == -1).all()
+    assert wide.array()[5:7, 5:].tolist() == small().array().tolist()
+    assert (wide.array()[:5] == -1).all()
+    assert (wide.array()[:, :5] == -1).all()
 
 
 def test_no_map_is_made_for_a_goal_too_far_off() -> None:

@@ -68,7 +68,7 @@ def test_lengths_and_limits_have_to_agree(build: Callable[[], Any], complaint: s
 def test_a_scan_may_hold_inf_and_nan_and_is_read_without_a_copy() -> None:
     message = EXAMPLES["LaserScan"]
     assert isinstance(message, LaserScan)
-    view = arrays.ranges(message)
+    view = message.ranges_m
     assert not view.flags.writeable
     assert not view.flags.owndata
     expected = [0.83, 1.25, 3.49, math.inf, math.inf, math.nan, 2.5, 0.9]
@@ -77,14 +77,14 @@ def test_a_scan_may_hold_inf_and_nan_and_is_read_without_a_copy() -> None:
 
 
 def test_a_map_and_a_picture_are_read_row_by_row() -> None:
-    cells = arrays.cells(grid(4, 2, bytes((0, 0, 100, 255, 0, 37, 100, 255))))
+    cells = grid(4, 2, bytes((0, 0, 100, 255, 0, 37, 100, 255))).array()
     assert cells.tolist() == [[0, 0, 100, -1], [0, 37, 100, -1]]
-    depth = arrays.pixels(image("depth16", 1, 2, b"\x01\x00\x00\x01"))
+    depth = image("depth16", 1, 2, b"\x01\x00\x00\x01").array()
     assert depth.tolist() == [[1, 256]]
-    colours = arrays.pixels(image("rgb8", 1, 2, bytes(range(6))))
+    colours = image("rgb8", 1, 2, bytes(range(6))).array()
     assert colours.tolist() == [[[0, 1, 2], [3, 4, 5]]]
     with pytest.raises(ValueError, match="decoded first"):
-        arrays.pixels(image("jpeg", 1, 2, b"\xff\xd8"))
+        image("jpeg", 1, 2, b"\xff\xd8").array()
 
 
 def test_json_carries_arrays_in_base64() -> None:
@@ -101,7 +101,7 @@ def test_a_trajectory_point_is_a_short_array_on_the_wire() -> None:
 def test_hits_travel_as_pairs() -> None:
     x, y = np.array([0.5, -1.25]), np.array([2.0, 0.25])
     world = WorldModel(scan_ok=True, obstacle_ahead=False, hits=arrays.hits_bytes(x, y))
-    assert arrays.hits(world).tolist() == [[0.5, 2.0], [-1.25, 0.25]]
+    assert world.points().tolist() == [[0.5, 2.0], [-1.25, 0.25]]
     with pytest.raises(ValueError, match="pairs of float32"):
         WorldModel(scan_ok=True, obstacle_ahead=False, hits=bytes(4))
 
@@ -109,4 +109,11 @@ def test_hits_travel_as_pairs() -> None:
 def test_hits_that_are_no_place_are_left_out() -> None:
     x, y = np.array([0.5, np.nan, np.inf, 1e30, 2.0]), np.array([1.0, 0.0, 0.0, 0.0, np.nan])
     world = WorldModel(scan_ok=True, obstacle_ahead=False, hits=arrays.hits_bytes(x, y))
-    assert arrays.hits(world).tolist() == [[0.5, 1.0]]
+    assert world.points().tolist() == [[0.5, 1.0]]
+
+
+def test_a_scan_gives_its_hits_in_the_sensors_frame() -> None:
+    values = np.array((1.0, np.inf, np.nan, 0.05, 2.0))
+    one = scan(arrays.ranges_bytes(values), angle_increment=math.pi / 2)
+    assert one.angles.tolist() == pytest.approx([0, math.pi / 2, math.pi, 1.5 * math.pi, math.tau])
+    assert one.points().round(6).tolist() == [[1.0, 0.0], [2.0, 0.0]]
