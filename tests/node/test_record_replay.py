@@ -10,9 +10,11 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
+from gigabrain_schemas.base import Cause
 from gigabrain_schemas.examples import example
 from gigabrain_schemas.input_log import AcceptedRequest
 from gigabrain_schemas.requests import ParamRequest
+from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import GoalReply, GoalRequest, TaskRequest
 from gigabrain_schemas.topics import (
     GOAL,
@@ -37,6 +39,7 @@ from gigabrain_zenoh.recording.bag_reader import Bag
 from gigabrain_zenoh.recording.message_tables import message_of
 from gigabrain_zenoh.recording.process_replay import (
     OUTPUTS,
+    compare,
     replay_process,
     settings_for,
     with_requests,
@@ -238,3 +241,14 @@ async def test_a_parameter_that_was_changed_meanwhile_is_changed_again(tmp_path:
 
 def unstamped(key: str, payload: bytes) -> dict[str, Any]:
     return dict(msgspec.msgpack.decode(payload)) | {"key": key, "stamp_ns": 0}
+
+
+def test_a_reworded_cause_is_no_difference_and_another_code_is() -> None:
+    def verdict(code: str, text: str) -> SafetyState:
+        return SafetyState(verdict="stop", causes=(Cause(code=code, text=text, remedy=text),))
+
+    recorded = {("robot/safety", 0, 0, 0): verdict("blind", "the lidar is silent")}
+    reworded = {("robot/safety", 0, 0, 0): verdict("blind", "no scan has arrived")}
+    assert compare(recorded, reworded).same
+    other = {("robot/safety", 0, 0, 0): verdict("stale", "the lidar is silent")}
+    assert compare(recorded, other).difference.field == "causes.0.code"
