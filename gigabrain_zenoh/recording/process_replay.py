@@ -1,8 +1,9 @@
 """Feeds recorded input to a node in fake time, and compares its output with the recording.
 
 Not compared are the time of sending (`stamp_ns`), the message number (`seq`), sentences of causes
-(their codes are compared), and warnings of safety about its computer. Of several messages on one key for one tick and basis only the last is
-compared: the number of repetitions depends on the order of two inputs within a tick.
+(their codes are compared), and warnings of safety about its computer. Of several messages on one
+key for one tick and basis only the last is compared: the number of repetitions depends on the
+order of two inputs within a tick.
 """
 
 import re
