@@ -1,9 +1,9 @@
 """Feeds recorded input to a node in fake time, and compares its output with the recording.
 
-Not compared are the time of sending (`stamp_ns`), the message number (`seq`), sentences of causes
-(their codes are compared), and warnings of safety about its computer. Of several messages on one
-key for one tick and basis only the last is compared: the number of repetitions depends on the
-order of two inputs within a tick.
+Not compared are the time of sending (`stamp_ns`), the message number (`seq`), sentences for people
+(the codes and values beside them are), and warnings of safety about its computer. Of several
+messages on one key for one tick and basis only the last is compared: the number of repetitions
+depends on the order of two inputs within a tick.
 """
 
 import re
@@ -50,7 +50,7 @@ OUTPUTS: dict[str, tuple[Topic[Any], ...]] = {
     "safety": (SAFETY,),
 }
 NOT_COMPARED = ("stamp_ns", "seq")
-CAUSE_TEXT = re.compile(r"(causes|warnings)\.\d+\.(text|remedy)")  # the code says what it is
+SENTENCE = re.compile(r"(.*\.)?(text|remedy|reason)")  # field for people, beside codes and numbers
 PROCESSES_WITH_SETTINGS = ("perception", "decision")
 # A process that is busy for a tick skips a state; a replay never is.
 MAX_UNMATCHED_SHARE = 0.1  # of outputs that only the recording or only the replay has
@@ -260,7 +260,7 @@ def compare(
 def _difference(key: str, recorded: Message, replayed: Message) -> Difference | None:
     before, after = row(recorded), row(replayed)
     for field in dict.fromkeys((*before, *after)):
-        if field in NOT_COMPARED or CAUSE_TEXT.fullmatch(field):
+        if field in NOT_COMPARED or SENTENCE.fullmatch(field):
             continue
         if before.get(field) != after.get(field):
             return Difference(
