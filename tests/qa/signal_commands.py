@@ -7,6 +7,7 @@ CALLS = {
     "up": "up {deployment}",
     "router": "router --listen tcp/127.0.0.1:{port}",
     "perception": "perception --connect {router}",
+    "node run": "node run control --connect {router}",
     "decision": "decision --connect {router}",
     "control": "control --connect {router}",
     "safety": "safety --connect {router}",

@@ -67,7 +67,7 @@ class Stage:
     def _start_robot(self) -> None:
         deployment = {"body": "mock", "link": "sim", "resume": "auto"}
         hosts = {"robot": ["router", "driver", "perception", "decision", "control", "safety"]}
-        brain = {"behaviour": "navigate", "begin": "wait"}
+        brain = {"behaviour": "navigate", "settings": {"start": "wait"}}
         values = deployment | {"hosts": hosts, "decision": brain, "perception": {"mapping": "slam"}}
         path = self.home.deployment(**values)
         self.robot = msgspec.json.decode(path.read_bytes())["router"]
