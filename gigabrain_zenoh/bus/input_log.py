@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from gigabrain_schemas.base import Message
-from gigabrain_schemas.input_log import (
+from gigabrain_schemas.logs import (
     MAX_ENTRIES,
     WAITED,
     AcceptedRequest,

@@ -17,7 +17,7 @@ from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.host.signals import run_async
 
 if TYPE_CHECKING:
-    from gigabrain_schemas.audit import AuditRecord
+    from gigabrain_schemas.logs import AuditRecord
 
 MAX_ENTRIES = 1000
 

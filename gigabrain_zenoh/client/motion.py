@@ -28,7 +28,7 @@ class Reached(Struct, frozen=True, kw_only=True):
     held_back: tuple[str, ...] = ()  # codes of what stopped the body on the way
 
 
-class Motion:
+class OdometryMotion:
     """One motion: gives the velocity for each state, until `done`."""
 
     def __init__(self, body: BodyDescription, start: RobotState, distance: float, angle: float):

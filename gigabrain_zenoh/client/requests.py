@@ -5,9 +5,9 @@ from typing import TypeVar
 
 from msgspec.structs import asdict
 
-from gigabrain_schemas.audit import AuditRecord, AuditRequest
 from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.brain import Twist
+from gigabrain_schemas.logs import AuditRecord, AuditRequest
 from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import AUDIT_LOG, ENABLE, ESTOP, RELEASE, TELEOP, Service
 from gigabrain_zenoh.bus.bus import Bus

@@ -6,10 +6,10 @@ from typing import Any, TypeVar, overload
 
 from msgspec.structs import asdict
 
-from gigabrain_schemas.audit import AuditRecord
 from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.body import BodyDescription, GateStatus, Joint, RobotState
 from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.logs import AuditRecord
 from gigabrain_schemas.requests import GateReply
 from gigabrain_schemas.tasks import Task
 from gigabrain_schemas.topics import (
@@ -20,7 +20,7 @@ from gigabrain_schemas.topics import (
 )
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.listening import listen, topic_named
-from gigabrain_zenoh.client.motion import Motion, Reached
+from gigabrain_zenoh.client.motion import OdometryMotion, Reached
 from gigabrain_zenoh.client.requests import (
     ANSWER_S,
     audit_log,
@@ -159,7 +159,7 @@ class Robot:
     async def _carry_out(self, distance: float, angle: float, speed: float | None) -> Reached:
         if speed is not None and speed <= 0:
             raise ConfigError(f"speed: expected more than 0, got {speed:g}")
-        motion = Motion(await self.read_body(), await self.read_state(), distance, angle)
+        motion = OdometryMotion(await self.read_body(), await self.read_state(), distance, angle)
         while not motion.done:
             wanted = motion.step(await self.read_state(), speed)
             await self.set_base_velocity(wanted.linear_x, 0.0, wanted.angular_z)

@@ -35,7 +35,7 @@ log = logging.getLogger("gigabrain")
 
 
 @dataclass(frozen=True)
-class Place:
+class ProcessPlace:
     """Where one process of a deployment runs."""
 
     endpoint: Endpoint
@@ -59,7 +59,7 @@ class ProcessType:
 
     run: str  # "module:function" of its node, imported only when it runs
     settings: type[Struct] | None = None
-    derive: Callable[["Deployment", Place], Struct] | None = None
+    derive: Callable[["Deployment", ProcessPlace], Struct] | None = None
     default: bool = False  # runs if a deployment names no hosts
     named: bool = True  # `hosts` may name it
     joins: Callable[["Deployment", set[str]], bool] | None = None  # added to such a host by itself

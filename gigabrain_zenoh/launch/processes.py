@@ -31,7 +31,7 @@ from gigabrain_zenoh.config.settings import (
 )
 from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.host.signals import interrupts
-from gigabrain_zenoh.launch.process import Place, ProcessType, run
+from gigabrain_zenoh.launch.process import ProcessPlace, ProcessType, run
 from gigabrain_zenoh.plugins import load_plugin, plugin_names
 from gigabrain_zenoh.runtime.connect import MakeBus
 from gigabrain_zenoh.runtime.replay import Node
@@ -44,16 +44,16 @@ MEET = {"perception", "decision"}  # each runs once per robot, so there is one r
 AT_THE_ROBOT = {"router", "driver"}  # no relay between them: a body without its router must stop
 
 
-def _router(_: "Deployment", place: Place) -> RouterConfig:
+def _router(_: "Deployment", place: ProcessPlace) -> RouterConfig:
     return router_config(place.endpoint, place.state_dir)
 
 
-def _relay(_: "Deployment", place: Place) -> RelayConfig:
+def _relay(_: "Deployment", place: ProcessPlace) -> RelayConfig:
     """Return the relay's settings, which name the router it connects to."""
     return RelayConfig(router=place.endpoint.connect[-1], keys=place.endpoint.keys)
 
 
-def _driver(deployment: "Deployment", place: Place) -> DriverConfig:
+def _driver(deployment: "Deployment", place: ProcessPlace) -> DriverConfig:
     return DriverConfig(
         body=deployment.body,
         link=deployment.link,
@@ -69,7 +69,7 @@ def _driver(deployment: "Deployment", place: Place) -> DriverConfig:
     )
 
 
-def _emulator(deployment: "Deployment", place: Place) -> EmulatorConfig:
+def _emulator(deployment: "Deployment", place: ProcessPlace) -> EmulatorConfig:
     return EmulatorConfig(
         body=deployment.body,
         world=deployment.world,
@@ -78,7 +78,7 @@ def _emulator(deployment: "Deployment", place: Place) -> EmulatorConfig:
     )
 
 
-def _recorder(deployment: "Deployment", _: Place) -> RecorderConfig:
+def _recorder(deployment: "Deployment", _: ProcessPlace) -> RecorderConfig:
     """Return the recorder's settings, with notes on the other processes that a replay needs."""
     about = {"perception": deployment.perception, "decision": deployment.decision}
     notes = {name: msgspec.json.encode(settings).decode() for name, settings in about.items()}

@@ -9,7 +9,7 @@ from msgspec import structs
 
 from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
 from gigabrain_zenoh.launch.deployment import Deployment, local_endpoint
-from gigabrain_zenoh.launch.process import Place, ProcessType
+from gigabrain_zenoh.launch.process import ProcessPlace, ProcessType
 from gigabrain_zenoh.launch.processes import names_by_role, process_type, process_types
 from gigabrain_zenoh.runtime.managed_process import ProcessSpec
 from gigabrain_zenoh.runtime.running import local_socket
@@ -34,7 +34,7 @@ def process_specs(
     specs = []
     for name in names:
         row, after = process_type(name), _after(deployment, name, names)
-        place = Place(_endpoint(deployment, host, name, names), run_dir, state_dir, seconds)
+        place = ProcessPlace(_endpoint(deployment, host, name, names), run_dir, state_dir, seconds)
         process = ProcessConfig(
             name=name,
             endpoint=place.endpoint,
@@ -91,7 +91,9 @@ def _after(deployment: Deployment, name: str, names: list[str]) -> tuple[str, ..
     return tuple(other for other in first if other in names and other != name)
 
 
-def _settings(deployment: Deployment, name: str, row: ProcessType, place: Place) -> dict[str, Any]:
+def _settings(
+    deployment: Deployment, name: str, row: ProcessType, place: ProcessPlace
+) -> dict[str, Any]:
     made = row.derive(deployment, place) if row.derive else deployment.settings(name)
     settings: dict[str, Any] = msgspec.to_builtins(made)
     if "state_dir" in settings:

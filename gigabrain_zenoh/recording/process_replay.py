@@ -16,7 +16,7 @@ import msgspec
 from msgspec import Struct
 
 from gigabrain_schemas.base import Message
-from gigabrain_schemas.input_log import WAITED, AcceptedRequest, InputLog
+from gigabrain_schemas.logs import WAITED, AcceptedRequest, InputLog
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import (
     CMD_VEL,

@@ -5,7 +5,7 @@ import contextlib
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 
-from gigabrain_schemas.input_log import WAITED
+from gigabrain_schemas.logs import WAITED
 from gigabrain_schemas.topics import MAP_SAVE, SERVICES
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.input_log import ReplayedInputLogger

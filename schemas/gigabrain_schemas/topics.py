@@ -6,7 +6,7 @@ A line here is all that a topic takes, beside an example of its message in the f
 from dataclasses import dataclass, replace
 from typing import Any, Generic, Literal, TypeVar
 
-from gigabrain_schemas import audit, body, brain, input_log, requests, safety, sensors, tasks
+from gigabrain_schemas import body, brain, logs, requests, safety, sensors, tasks
 from gigabrain_schemas.base import Message
 
 M = TypeVar("M", bound=Message)
@@ -134,14 +134,14 @@ TASK = Topic(
     publishers=BRAIN, drawing="task",
 )  # fmt: skip
 REQUEST_LOG = Topic(
-    "robot/request_log", input_log.AcceptedRequest, 10, depth=256, max_bytes=128 * KB,
+    "robot/request_log", logs.AcceptedRequest, 10, depth=256, max_bytes=128 * KB,
     publishers=BRAIN,
 )  # fmt: skip
 INPUT_LOG = Topic(
-    "robot/input_log", input_log.InputLog, 2, priority="background", many=True, depth=32,
+    "robot/input_log", logs.InputLog, 2, priority="background", many=True, depth=32,
     max_bytes=64 * KB, publishers=BRAIN,
 )  # fmt: skip
-AUDIT = Topic("robot/audit", audit.AuditRecord, 10, depth=256)
+AUDIT = Topic("robot/audit", logs.AuditRecord, 10, depth=256)
 TOPICS: tuple[Topic[Any], ...] = tuple(one for one in globals().values() if isinstance(one, Topic))
 
 
@@ -181,7 +181,7 @@ MAP_SAVE = Service(
     "robot/map_save", requests.MapRequest, requests.MapReply, callers=OPERATOR, servers=BRAIN,
 )  # fmt: skip
 AUDIT_LOG = Service(
-    "robot/audit_log", audit.AuditRequest, audit.AuditPage, priority="background",
+    "robot/audit_log", logs.AuditRequest, logs.AuditPage, priority="background",
     max_bytes=1024 * KB, callers=("operator", "viewer"),
 )  # fmt: skip
 PARAM = Service(

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.base import Cause
 from gigabrain_schemas.examples import example
-from gigabrain_schemas.input_log import AcceptedRequest
+from gigabrain_schemas.logs import AcceptedRequest
 from gigabrain_schemas.requests import ParamRequest
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import GoalReply, GoalRequest, TaskRequest

@@ -12,7 +12,7 @@ import psutil
 import pytest
 import zenoh
 
-from gigabrain_schemas.audit import AuditRecord
+from gigabrain_schemas.logs import AuditRecord
 from gigabrain_zenoh.client.connection import connect
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import NotConfirmed

@@ -10,8 +10,8 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import replace
 
-from gigabrain_schemas.audit import What
 from gigabrain_schemas.base import TICK_NS, Cause
+from gigabrain_schemas.logs import What
 from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import ENABLE, ESTOP, ESTOP_SAID, RELEASE
 from gigabrain_zenoh.bus.bus import Bus

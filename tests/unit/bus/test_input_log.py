@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.examples import example
-from gigabrain_schemas.input_log import WAITED, AcceptedRequest, InputLog
+from gigabrain_schemas.logs import WAITED, AcceptedRequest, InputLog
 from gigabrain_schemas.topics import BODY, GOAL, INPUT_LOG, REQUEST_LOG, SCAN, STATE
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.bus.bus import Bus

@@ -7,7 +7,7 @@ import pytest
 
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, GateStatus, RobotState
-from gigabrain_zenoh.client.motion import Motion, Reached
+from gigabrain_zenoh.client.motion import OdometryMotion, Reached
 from gigabrain_zenoh.gate.causes import SAFETY_STOP
 from gigabrain_zenoh.geometry.limits import clamp, limits_of
 
@@ -56,7 +56,7 @@ def _towards(now: float, wanted: float, step: float) -> float:
 
 
 def run(plant: Plant, distance: float = 0.0, angle: float = 0.0) -> Reached:
-    motion = Motion(BODY, plant.state, distance, angle)
+    motion = OdometryMotion(BODY, plant.state, distance, angle)
     for _ in range(3000):
         plant.follow(motion.step(plant.state))
         if motion.done:

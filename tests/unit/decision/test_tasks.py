@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
-from gigabrain_schemas.input_log import AcceptedRequest
+from gigabrain_schemas.logs import AcceptedRequest
 from gigabrain_schemas.tasks import Goal, GoalReply, GoalRequest
 from gigabrain_schemas.topics import REQUEST_LOG
 from gigabrain_zenoh.decision import goal_server

@@ -9,8 +9,8 @@ import msgspec
 import pytest
 
 from gigabrain_drivers.driver.gatekeeper import LatchFile
-from gigabrain_schemas.audit import AuditRecord
 from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.logs import AuditRecord
 from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import AUDIT, CMD_VEL, ENABLE, ESTOP, ESTOP_SAID, RELEASE
 from gigabrain_zenoh.runtime.audit import read_audit

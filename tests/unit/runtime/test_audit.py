@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from gigabrain_schemas.audit import AuditPage, AuditRecord, AuditRequest
+from gigabrain_schemas.logs import AuditPage, AuditRecord, AuditRequest
 from gigabrain_schemas.topics import AUDIT, AUDIT_LOG
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import LocalNetwork

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from gigabrain_schemas.audit import AuditRecord
+from gigabrain_schemas.logs import AuditRecord
 from gigabrain_schemas.topics import AUDIT
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import Link, LocalNetwork

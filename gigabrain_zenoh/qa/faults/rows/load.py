@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gigabrain_schemas.audit import AuditRequest
 from gigabrain_schemas.base import TICK_NS
+from gigabrain_schemas.logs import AuditRequest
 from gigabrain_schemas.topics import AUDIT_LOG, CMD_VEL, SAFETY, SCAN, STATE, WORLD
 from gigabrain_zenoh.bus.headers import SequenceGaps, header_of
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport

@@ -1,11 +1,51 @@
-"""Inputs and requests that a process used, so that a recording of it can be replayed."""
+"""Logs of a robot: who acted on it, and what each process has consumed for its outputs."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
-from gigabrain_schemas.base import Count, Key, Message, Name
+from gigabrain_schemas.base import Count, Key, Message, Name, Text
 from gigabrain_schemas.tasks import MAX_REQUEST_BYTES
+
+MOST_RECORDS = 1000
+What = Literal[
+    "boot",  # the driver has started
+    "end",  # the driver ends, and leaves the body in its safe state
+    "estop",
+    "release",
+    "enable",
+    "take",  # an enable that took the body from another source
+    "mode",  # the gate's mode has changed
+    "raised",  # a cause, by safety, the driver or the gate
+    "cleared",
+    "refused",  # commands that were not obeyed
+    "stranger",  # a client that was refused at the router
+]
+
+
+class AuditRecord(Message, frozen=True, kw_only=True):
+    """One entry. Its wall time is `stamp_ns`, the robot's time is `boot` and `tick`."""
+
+    process: Name  # that wrote it down
+    what: What
+    source: Name  # who did it, or asked for it
+    ok: bool = True  # whether it was granted
+    code: Name = ""  # of the cause, the mode or the refusal
+    text: Text = ""  # a sentence for people
+    times: Count = 1  # how often it has happened, where the same happens again and again
+
+
+class AuditRequest(Message, frozen=True, kw_only=True):
+    """Asks for the newest entries. An empty request will do."""
+
+    newest: Annotated[int, Meta(ge=1, le=MOST_RECORDS)] = 100
+
+
+class AuditPage(Message, frozen=True, kw_only=True):
+    """The newest entries, oldest first."""
+
+    records: Annotated[tuple[AuditRecord, ...], Meta(max_length=MOST_RECORDS)] = ()
+
 
 MAX_ENTRIES = 4096  # entries in one message
 
