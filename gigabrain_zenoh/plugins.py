@@ -3,10 +3,12 @@
 import importlib
 from collections.abc import Mapping
 from functools import cache
-from importlib.metadata import entry_points
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gigabrain_zenoh.errors import ConfigError, unknown
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoints
 
 
 def find(path: str) -> Any:
@@ -26,9 +28,15 @@ def package_version() -> str:
         return "0+unknown"
 
 
+def _entry_points(group: str) -> "EntryPoints":
+    from importlib.metadata import entry_points  # 1 MB in each process, which few need
+
+    return entry_points(group=group)
+
+
 def plugin_names(shipped: Mapping[str, Any], group: str) -> list[str]:
     """Return the names in a table of shipped objects and of the entry points of a group."""
-    return list(dict.fromkeys((*shipped, *(point.name for point in entry_points(group=group)))))
+    return list(dict.fromkeys((*shipped, *(point.name for point in _entry_points(group)))))
 
 
 def load_plugin(kind: str, name: str, shipped: Mapping[str, Any], group: str) -> Any:
@@ -40,7 +48,7 @@ def load_plugin(kind: str, name: str, shipped: Mapping[str, Any], group: str) ->
     if name in shipped:
         found = shipped[name]
         return find(found) if isinstance(found, str) else found
-    offered = {point.name: point for point in entry_points(group=group)}
+    offered = {point.name: point for point in _entry_points(group)}
     if name not in offered:
         raise unknown(kind, name, plugin_names(shipped, group))
     try:
