@@ -31,7 +31,8 @@ from gigabrain_zenoh.client.requests import (
 )
 from gigabrain_zenoh.client.tasks import Tasks
 from gigabrain_zenoh.errors import BodyLost, ConfigError, NotConfirmed, Refused, Unsupported
-from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of
+from gigabrain_zenoh.gate.gate import STILL_TICKS
+from gigabrain_zenoh.geometry.limits import ZERO, at_rest, clamp, limits_of
 from gigabrain_zenoh.security.identity_files import may_not_ask
 
 
@@ -77,6 +78,7 @@ M = TypeVar("M", bound=Message)
 
 HOLD_TICKS = 50  # how long a requested velocity lasts: one second of the robot's time
 ROUTER_S = 3.0  # timeout of the connection
+REST_TICKS = 150  # timeout for a body to come to rest before a release
 BODY_TICKS = 100  # timeout for `robot/body`, which is published once a second
 
 
@@ -89,6 +91,7 @@ class Robot:
         self._bodies = bus.latest(BODY)
         self._target: Velocity | None = None
         self._until_tick = 0
+        self._pressed = 0  # the number of this script's newest e-stop
         self._lease = ControlLease(bus.process)
         self._arrived = asyncio.Event()
         self.tasks = Tasks(bus, keys)
@@ -174,8 +177,7 @@ class Robot:
         self._target, self._until_tick = ZERO, self._bus.time.tick + HOLD_TICKS
         for _ in range(HOLD_TICKS):
             state = self._states.fresh()
-            at_rest = state and abs(state.velocity.linear_x) + abs(state.velocity.angular_z) < 0.02
-            if state is None or at_rest:
+            if state is None or at_rest(state.velocity):
                 break
             await self._ticks(1)
 
@@ -188,9 +190,13 @@ class Robot:
         return reply
 
     async def release(self) -> GateReply:
-        """Release a latched gate; `enable` is still needed to move. Raises Refused."""
-        generation = (await self.read_state()).gate.estop_generation
-        return await release(self._bus, generation, self._keys)
+        """Release a latched gate once the body has rested; `enable` is still needed to move.
+
+        Raises Refused.
+        """
+        known = max(self._pressed, (await self.read_state()).gate.estop_generation)
+        await self._rest()
+        return await release(self._bus, known, self._keys)
 
     async def estop(self, reason: str = "") -> GateReply:
         """Stop at once and latch; this script's own commands stop first.
@@ -199,9 +205,11 @@ class Robot:
         """
         self._target = None
         try:
-            return await press_estop(self._bus, reason)
+            reply = await press_estop(self._bus, reason)
         except NotConfirmed as error:
             raise NotConfirmed(f"{error}{may_not_ask(self._keys)}") from None
+        self._pressed = reply.gate.estop_generation
+        return reply
 
     async def audit(self, newest: int = 100) -> tuple[AuditRecord, ...]:
         """Return the newest entries of all audit logs, oldest first. Raises BodyLost."""
@@ -288,6 +296,15 @@ class Robot:
             target = ZERO
         command = CmdVel(**asdict(target), source=self._bus.process)
         self._bus.publish(command_topic(body.description), command)
+
+    async def _rest(self) -> None:
+        """Wait until the body has rested as long as a release needs; for three seconds at most."""
+        rested = 0
+        for _ in range(REST_TICKS):
+            rested = rested + 1 if at_rest((await self.read_state()).velocity) else 0
+            if rested > STILL_TICKS:
+                break
+            await self._ticks(1)
 
     async def _ticks(self, count: int) -> None:
         """Wait for `count` states. Raises BodyLost after a second without one."""

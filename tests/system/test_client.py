@@ -217,10 +217,11 @@ async def test_no_robot_no_router_and_no_driver_are_told_apart(
             await script.estop()
 
 
-async def test_the_release_goes_by_what_is_known_of_the_e_stop(robot: Probe) -> None:
-    async with connect() as script:
+async def test_a_release_waits_until_the_body_has_rested(robot: Probe) -> None:
+    async with connect(take=True) as script:
         assert isinstance(script, Robot)
+        await script.set_base_velocity(0.15, 0.0, 0.0)
+        await until(lambda: robot.state.velocity.linear_x > 0.1, "motion")
         await script.estop("test")
-        await robot.at_rest(ticks=30)
         assert (await script.release()).ok
         await robot.enable_brain()
