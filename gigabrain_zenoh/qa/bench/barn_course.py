@@ -48,7 +48,8 @@ JACKAL = BodyDescription(
     lidar=LIDAR,
     # reaction: the time to the next scan, a tick on the bus, the hard plant's delay and most of its
     # lag, which matters less at low speed. A stop from 2 m/s in a turn begins after up to 0.65 s.
-    thresholds=Thresholds(reaction_time=0.26, follow_sustain=0.5),
+    # Its speed follows by the hard plant's delay and lag when all is well.
+    thresholds=Thresholds(reaction_time=0.26, follow_sustain=0.5, response=0.25),
 )
 
 
