@@ -54,6 +54,7 @@ class RestartPolicy:
 
 
 _DRAIN_S = 0.2  # what a dead child has written arrives at once; someone else may hold its pipe
+_REAP_S = 0.2  # a killed process ends at once, unless the kernel waits for a device
 
 
 def as_record(line: bytes, process: str) -> dict[str, Any]:
@@ -138,9 +139,12 @@ class Child(asyncio.SubprocessProtocol):
         return cast(int, transport.get_returncode())
 
     def abandon(self) -> None:
-        """Kill it without waiting for its end; for a loop that is being torn down."""
+        """Kill and reap it without the event loop, which is being torn down."""
         self.send_signal(signal.SIGKILL)
         if self._transport:
+            process = self._transport.get_extra_info("subprocess")
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(_REAP_S)
             self._transport.close()
 
 

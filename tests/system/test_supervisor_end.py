@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+from gigabrain_zenoh.runtime.managed_process import Child
 from gigabrain_zenoh.runtime.supervisor import Backoff, Supervisor
 from gigabrain_zenoh.testing.waiting import until
 from tests.system.children import (
@@ -151,3 +152,10 @@ async def test_an_impatient_second_ctrl_c_leaves_nothing_behind() -> None:
         parent.send_signal(signal.SIGINT)
         await until(lambda: not any(alive(pid) for pid in pids.values()))
         await until(lambda: parent.poll() is not None)
+
+
+async def test_an_abandoned_process_is_reaped_without_the_loop() -> None:
+    child = await Child.start("mine", (sys.executable, "-c", CHILD + SERVE), os.environ, print)
+    child.abandon()
+    with pytest.raises(ProcessLookupError):
+        os.kill(child.pid, 0)
