@@ -194,8 +194,10 @@ class Robot:
 
         Raises Refused.
         """
-        known = max(self._pressed, (await self.read_state()).gate.estop_generation)
-        await self._rest()
+        gate = (await self.read_state()).gate
+        known = max(self._pressed, gate.estop_generation)
+        if gate.mode in ("latched", "stopping") or known > gate.estop_generation:
+            await self._rest()
         return await release(self._bus, known, self._keys)
 
     async def estop(self, reason: str = "") -> GateReply:

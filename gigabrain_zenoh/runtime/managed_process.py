@@ -142,9 +142,9 @@ class Child(asyncio.SubprocessProtocol):
         """Kill and reap it without the event loop, which is being torn down."""
         self.send_signal(signal.SIGKILL)
         if self._transport:
-            process = self._transport.get_extra_info("subprocess")
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(_REAP_S)
+            if process := self._transport.get_extra_info("subprocess"):  # uvloop has none
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(_REAP_S)
             self._transport.close()
 
 

@@ -19,6 +19,7 @@ from tests.system.children import (
     freeze,
     running,
     spec,
+    state,
 )
 
 pytestmark = [
@@ -155,7 +156,24 @@ async def test_an_impatient_second_ctrl_c_leaves_nothing_behind() -> None:
 
 
 async def test_an_abandoned_process_is_reaped_without_the_loop() -> None:
-    child = await Child.start("mine", (sys.executable, "-c", CHILD + SERVE), os.environ, print)
-    child.abandon()
+    child = await _abandoned()
     with pytest.raises(ProcessLookupError):
         os.kill(child.pid, 0)
+
+
+def test_an_abandoned_process_ends_on_uvloop_too() -> None:
+    uvloop = pytest.importorskip("uvloop")
+
+    async def ended() -> bool:
+        child = await _abandoned()
+        await until(lambda: not state(child.pid))  # reaped
+        return True
+
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        assert runner.run(ended())
+
+
+async def _abandoned() -> Child:
+    child = await Child.start("mine", (sys.executable, "-c", CHILD + SERVE), os.environ, print)
+    child.abandon()
+    return child
