@@ -103,7 +103,7 @@ def mission(
     Example: gigabrain mission evening.yaml
 
     Args:
-        file: YAML file; docs/missions.md describes it.
+        file: YAML file; docs/how-to/missions.md describes it.
         check: Only check the file; no robot is needed.
     """
     from gigabrain_zenoh.decision.tasks.mission import load

@@ -174,7 +174,7 @@ def main() -> None:
     pages = [ROOT / name for name in sys.argv[1:]]
     counts: Counter[str] = Counter()
     wrong = []
-    for page in pages or [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
+    for page in pages or [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
         with tempfile.TemporaryDirectory(prefix="docs-") as name:
             found = judge(page, Path(name), counts)
         print(f"{page.name}: {len(found)} failed", *found, sep="\n", flush=True)

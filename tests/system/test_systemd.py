@@ -140,7 +140,7 @@ def test_no_shipped_deployment_listens_beyond_loopback_without_keys() -> None:
 
 
 def test_the_docs_install_a_deployment_with_keys_as_a_service() -> None:
-    docs = (ROOT / "docs" / "many_hosts.md").read_text()
+    docs = (ROOT / "docs" / "how-to" / "many_hosts.md").read_text()
     (installed,) = re.findall(r"install .*(deploy/\S+) /etc/gigabrain/deployment\.yaml", docs)
     deployment = load_deployment(ROOT / installed)
     assert Path(deployment.keys).name == "keys"  # beside the file, where the docs put them

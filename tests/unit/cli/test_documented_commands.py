@@ -17,7 +17,7 @@ ENDS = {"|", "&", "&&", ";", ">", "2>"}
 
 def documented() -> Iterator[str]:
     """Yield the file and each command line in it, without what a shell would do."""
-    for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))):
+    for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/**/*.md"))):
         text = path.read_text()
         lines = [line for block in FENCE.findall(text) for line in block.splitlines()]
         for line in (*lines, *INLINE.findall(text)):

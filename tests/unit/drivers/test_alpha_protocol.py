@@ -16,7 +16,7 @@ from gigabrain_drivers.kinematics.wheels import Twist
 from gigabrain_drivers.links.tcp_link import address
 from gigabrain_zenoh.errors import ConfigError
 
-# the vectors of docs/firmware_alpha.md
+# the vectors of docs/reference/firmware_alpha.md
 STOP_1 = bytes.fromhex("a55a0000020101000000d58d9383")
 WALK_2 = bytes.fromhex(
     "a55a2c00010102000000e8030000cdcccc3d000000000000000066666640"

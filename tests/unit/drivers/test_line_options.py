@@ -186,7 +186,7 @@ def test_a_third_base_takes_fewer_than_twenty_lines() -> None:
 
 
 def test_the_third_base_stands_in_the_docs_as_it_is_here() -> None:
-    page = Path(__file__).parents[3] / "docs" / "firmware_line.md"
+    page = Path(__file__).parents[3] / "docs" / "reference" / "firmware_line.md"
     assert THIRD.read_text() in page.read_text()
 
 

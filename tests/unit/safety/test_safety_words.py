@@ -10,7 +10,7 @@ from gigabrain_schemas.body import Thresholds
 from gigabrain_zenoh.gate import causes
 from gigabrain_zenoh.safety.catalogue import CAUSES, WARNINGS, cause
 
-PAGE = Path(__file__).parents[3] / "docs" / "safety.md"
+PAGE = Path(__file__).parents[3] / "docs" / "explanation" / "safety.md"
 OTHERS = (
     *(value for value in vars(causes).values() if isinstance(value, Cause)),
     causes.estop("NAME"),

@@ -1,7 +1,7 @@
 """Alpha on its real link: a quadruped behind a TCP port that gets a gait fifty times a second.
 
 The driver sends only what is commanded: when commands end, the stream ends, and the firmware stops
-the body 100 ms later (docs/firmware_alpha.md).
+the body 100 ms later (docs/reference/firmware_alpha.md).
 """
 
 import logging

@@ -1,4 +1,4 @@
-"""Alpha's firmware, as docs/firmware_alpha.md asks it to be: a TCP server, and a trot."""
+"""Alpha's firmware, as docs/reference/firmware_alpha.md asks it to be: a TCP server, and a trot."""
 
 from collections import deque
 from pathlib import Path

@@ -1,6 +1,6 @@
 """Alpha's protocol: gaits to the body, its state back, in frames with a CRC-32.
 
-docs/firmware_alpha.md describes it for those who write the firmware. All numbers are little-endian:
+docs/reference/firmware_alpha.md is for those who write the firmware. Numbers are little-endian:
 
     0   2  magic a5 5a          4   1  type                  6   4  sequence, counts up, wraps
     2   2  bytes of payload     5   1  version, 1           10   n  payload, then 4 of CRC-32

@@ -1,7 +1,7 @@
 """A body without code: one text line out, text lines in, all described in the robot's file.
 
 The driver sends only what is commanded: when commands end, the line falls silent, and the firmware
-stops the body (docs/firmware_line.md).
+stops the body (docs/reference/firmware_line.md).
 """
 
 import logging

@@ -1,4 +1,4 @@
-"""The firmware of a base on a text line, as docs/firmware_line.md asks it to be.
+"""The firmware of a base on a text line, as docs/reference/firmware_line.md asks it to be.
 
 It is made from the same templates as the driver, read the other way round.
 """

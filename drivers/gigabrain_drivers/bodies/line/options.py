@@ -32,7 +32,7 @@ POSE = ("x", "y", "yaw")
 
 
 class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The lines to and from the body; see docs/firmware_line.md."""
+    """The lines to and from the body; see docs/reference/firmware_line.md."""
 
     port: str = AUTO  # a path, usb:VID:PID[:SERIAL], or auto
     baud: Annotated[int, Meta(ge=1200, le=4_000_000)] = 115200

@@ -31,7 +31,8 @@ from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest, reconfigured
 from gigabrain_zenoh.runtime.managed_process import ProcessSpec
 from gigabrain_zenoh.safety.tracking_error import WINDOW_TICKS
 
-CHECKSUM = "*{crc16}"  # at the end of a command; docs/firmware_line.md has lines without one
+# at the end of a command; docs/reference/firmware_line.md has lines without one
+CHECKSUM = "*{crc16}"
 LINES, LONG_LINES = 20_000, 1_000_000
 CHUNK = 1000  # lines
 LONGEST_GARBAGE = 64  # bytes
@@ -104,7 +105,7 @@ def _command_line(checksum: str) -> Template:
 def let_through(checksum: str, byte_errors: float, lines: int, seed: int = 0) -> tuple[int, int]:
     """Return (right, wrong) commands read of `lines`, with one flipped bit in a share of bytes.
 
-    A million lines give the table in docs/firmware_line.md.
+    A million lines give the table in docs/reference/firmware_line.md.
     """
     template = _command_line(checksum)
     noise, decoder = np.random.default_rng(seed), LineDecoder((template,))
