@@ -5,7 +5,8 @@ Every number has the bound of its kind, and every text and list a greatest lengt
 message exhausts a reader's memory or time.
 """
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
@@ -31,6 +32,26 @@ Milliseconds = Annotated[float, Meta(ge=0.0, le=1e12)]  # of a line that has bee
 Name = Annotated[str, Meta(max_length=64)]
 Text = Annotated[str, Meta(max_length=500)]
 Key = Annotated[str, Meta(max_length=256)]  # on the bus, or the name of a figure
+
+Shape = tuple[str | int, ...]  # of an array: sizes, and names for those that vary
+
+
+def array_meta(
+    max_bytes: int,
+    dtype: str | Mapping[str, str | None],
+    shape: Shape | Mapping[str, Shape | None],
+    unit: str = "",
+) -> Meta:
+    """Return the bounds of a field that holds an array as bytes, with notes for JSON Schema.
+
+    The notes are `x-dtype` (numpy's name), `x-byte-order`, `x-shape` and `x-unit`. Where they
+    depend on another field they are mappings from its values; null there is no array.
+    """
+    notes: dict[str, Any] = {"x-dtype": dtype, "x-byte-order": "little", "x-shape": shape}
+    if unit:
+        notes["x-unit"] = unit
+    return Meta(max_length=max_bytes, extra_json_schema=notes)
+
 
 TICK_NS = 20_000_000  # one tick of the robot's clock is 20 ms of the body's own time
 TICK_S, TICK_MS = TICK_NS / 1e9, TICK_NS / 1e6

@@ -19,6 +19,7 @@ from gigabrain_schemas.base import (
     Record,
     Text,
     Velocity,
+    array_meta,
 )
 from gigabrain_schemas.body import MOST_JOINTS, JointPosition, JointSpeed
 
@@ -59,7 +60,7 @@ class WorldModel(Message, frozen=True, kw_only=True):
     sectors: Annotated[tuple[Distance | None, ...], Meta(max_length=3600)] = ()
     # [m], nearest hit per equal sector, counter-clockwise, the first centred ahead; None for none
     obstacles: Annotated[tuple[Obstacle, ...], Meta(max_length=256)] = ()
-    hits: Annotated[bytes, Meta(max_length=64 * 1024)] = b""
+    hits: Annotated[bytes, array_meta(64 * 1024, "float32", ("n", 2), "m")] = b""
     # float32 little-endian [m], (n, 2): where beams hit; only for navigation
 
     def __post_init__(self) -> None:
@@ -99,7 +100,7 @@ class OccupancyGrid(Message, frozen=True, kw_only=True):
     height: Cells  # cells
     origin_x: Coordinate  # [m], of the corner of cell (0, 0)
     origin_y: Coordinate  # [m]
-    cells: Annotated[bytes, Meta(max_length=8 * 1024 * 1024)]
+    cells: Annotated[bytes, array_meta(8 * 1024 * 1024, "int8", ("height", "width"))]
     # int8, (height, width) by row: 0 free to 100 occupied, -1 unknown
 
     def __post_init__(self) -> None:

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from msgspec import Meta
 
-from gigabrain_schemas.base import Message, Milliseconds, Name, Range, Record
+from gigabrain_schemas.base import Message, Milliseconds, Name, Range, Record, array_meta
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,7 +31,7 @@ class LaserScan(Message, frozen=True, kw_only=True):
     angle_increment: BeamStep  # [rad]
     range_min: Range  # [m]
     range_max: RangeMax  # [m]
-    ranges: Annotated[bytes, Meta(max_length=64 * 1024)]
+    ranges: Annotated[bytes, array_meta(64 * 1024, "float32", ("n",), "m")]
     # float32 little-endian [m], (n,); inf where nothing was hit, nan where unknown
     late_ms: Milliseconds = 0.0  # how much later than it can it came; 0 without stamps
 
@@ -85,7 +85,15 @@ class Imu(Message, frozen=True, kw_only=True):
     linear_acceleration: Accelerations  # [m/s2]
 
 
-DTYPES = {"mono8": "u1", "rgb8": "u1", "bgr8": "u1", "depth16": "<u2", "depth32f": "<f4"}
+PIXEL_TYPES = {
+    "jpeg": None, "rgb8": "uint8", "bgr8": "uint8", "mono8": "uint8", "depth16": "uint16",
+    "depth32f": "float32",
+}  # fmt: skip
+IMAGE_SHAPE: tuple[str | int, ...] = ("height", "width")
+IMAGE_SHAPES = {
+    "jpeg": None, "rgb8": (*IMAGE_SHAPE, 3), "bgr8": (*IMAGE_SHAPE, 3), "mono8": IMAGE_SHAPE,
+    "depth16": IMAGE_SHAPE, "depth32f": IMAGE_SHAPE,
+}  # fmt: skip
 PIXEL_BYTES = {"rgb8": 3, "bgr8": 3, "mono8": 1, "depth16": 2, "depth32f": 4}
 
 
@@ -96,7 +104,8 @@ class Image(Message, frozen=True, kw_only=True):
     encoding: Literal["jpeg", "rgb8", "bgr8", "mono8", "depth16", "depth32f"]
     height: Pixels  # [px]
     width: Pixels  # [px]
-    data: Annotated[bytes, Meta(max_length=1024 * 1024)]  # row by row, little-endian
+    data: Annotated[bytes, array_meta(1024 * 1024, PIXEL_TYPES, IMAGE_SHAPES)]
+    # row by row, little-endian
 
     def __post_init__(self) -> None:
         if not self.data:
@@ -117,5 +126,5 @@ class Image(Message, frozen=True, kw_only=True):
         if self.encoding == "jpeg":
             raise ValueError("a JPEG must be decoded first, for example by cv2.imdecode")
         channels = (3,) if self.encoding in ("rgb8", "bgr8") else ()
-        view = np.frombuffer(self.data, DTYPES[self.encoding])
+        view = np.frombuffer(self.data, np.dtype(PIXEL_TYPES[self.encoding]).newbyteorder("<"))
         return view.reshape(self.height, self.width, *channels)
