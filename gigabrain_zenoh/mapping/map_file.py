@@ -9,44 +9,34 @@ import hashlib
 import io
 import math
 import os
-import re
 import shutil
 import struct
 import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO, Literal
+from typing import Any, BinaryIO
 
 import numpy as np
-from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from gigabrain_schemas.base import Finite, Fraction
-from gigabrain_zenoh.config import loading as config
+from gigabrain_zenoh.config import map_image
+from gigabrain_zenoh.config.map_image import SavedMap
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.host.files import (
     make_folder,
     open_regular,
-    read_bounded,
     sync_folder,
     write_synced,
 )
 from gigabrain_zenoh.host.run_folders import state_dir
 
-Cells = NDArray[np.int8]
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # grey values, as ROS's map_server writes them
 OCCUPIED_PERCENT, FREE_PERCENT = 65, 40  # from here on, and up to here
 LEAST_FREE_M2, LEAST_WALL_M = 1.0, 1.0  # less than that is no map
 GRAPH = ".graph.npz"
 STAMP = "grid"  # in the graph's file: which grid it belongs to
-
-MAX_PIXELS = 8_000_000  # what a message may carry
-MAX_HEADER_BYTES = 100_000  # bytes, with all its comments
-PGM_GAP = rb"(?:\s|#[^\n]*\n)+"  # white space and comments
-PGM_HEADER = re.compile(rb"P5" + (PGM_GAP + rb"(\d{1,9})") * 3 + rb"\s")
 
 Arrays = Mapping[str, NDArray[Any]]
 MAX_ARRAY_BYTES = 80_000_000  # of all arrays of a file together
@@ -64,28 +54,6 @@ READ_ERRORS = (
     SyntaxError, OverflowError, MemoryError, struct.error, tokenize.TokenError, zlib.error,
     zipfile.BadZipFile,
 )  # fmt: skip
-
-
-class MapYaml(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """ROS's description of a map image."""
-
-    image: Annotated[str, Meta(pattern=r"^[^\0]+$")]
-    resolution: Annotated[float, Meta(ge=0.001, le=1.0)]  # [m] per pixel
-    origin: tuple[Finite, Finite, Finite]  # x, y [m] of the lower left corner, yaw [rad]
-    negate: Annotated[int, Meta(ge=0, le=1)] = 0  # 1 where white is occupied
-    occupied_thresh: Fraction = 0.65
-    free_thresh: Fraction = 0.196
-    mode: Literal["trinary", "scale"] = "trinary"  # both are read as trinary
-
-
-@dataclass(frozen=True, slots=True)
-class SavedMap:
-    """A grid as it lies on disk."""
-
-    cells: Cells  # (height, width), the lowest row first: 0 free, 100 occupied, -1 unknown
-    resolution: float  # [m]
-    origin_x: float  # [m], of the corner of cell (0, 0)
-    origin_y: float  # [m]
 
 
 def path_of(name: str) -> Path:
@@ -110,18 +78,7 @@ def in_words(found: SavedMap) -> str:
 def load(path: Path) -> SavedMap:
     """Load the map that a YAML file describes. Raises ConfigError, in one line."""
     _finish(path)
-    about = config.load(path, MapYaml)
-    if about.origin[2] != 0:
-        raise ConfigError(f"{path}: origin: turned by {about.origin[2]:g} rad; expected yaw 0")
-    if about.free_thresh >= about.occupied_thresh:
-        raise ConfigError(f"{path}: free_thresh must be below occupied_thresh")
-    grey = read_pgm(path.parent / about.image)
-    share = grey / 255 if about.negate else (255 - grey.astype(np.float64)) / 255
-    cells = np.full(grey.shape, -1, np.int8)
-    cells[share > about.occupied_thresh] = 100
-    cells[share < about.free_thresh] = 0
-    upwards = np.ascontiguousarray(cells[::-1])
-    return SavedMap(upwards, about.resolution, about.origin[0], about.origin[1])
+    return map_image.load(path)
 
 
 def load_graph(path: Path) -> dict[str, NDArray[Any]]:
@@ -240,27 +197,6 @@ def _finish(path: Path) -> None:
 
 def _complete(path: Path) -> Path:
     return path.with_name(f".{path.stem}.complete")
-
-
-def read_pgm(file: Path) -> NDArray[np.uint8]:
-    """Read the grey values of a file (height, width), the top row first. Raises ConfigError."""
-    try:
-        data = read_bounded(file, MAX_PIXELS + MAX_HEADER_BYTES)
-    except OSError as error:
-        raise ConfigError(f"{file}: the map's image: {error.strerror}") from None
-    header = PGM_HEADER.match(data)
-    if header is None:
-        raise ConfigError(f"{file}: no binary PGM; expected a header such as 'P5 640 480 255'")
-    width, height, most = (int(number) for number in header.groups())
-    if most != 255:
-        raise ConfigError(f"{file}: a maxval of {most}; expected 255")
-    if not 0 < width * height <= MAX_PIXELS:
-        raise ConfigError(f"{file}: {width} x {height} pixels; expected 1 to {MAX_PIXELS} in all")
-    there = len(data) - header.end()
-    if there != width * height:
-        what = "cut" if there < width * height else "of another size"
-        raise ConfigError(f"{file}: {what}: {there} of {width} x {height} pixels are there")
-    return np.frombuffer(data, np.uint8, offset=header.end()).reshape(height, width)
 
 
 def read_arrays(path: Path, what: str, only: str = "") -> dict[str, NDArray[Any]]:

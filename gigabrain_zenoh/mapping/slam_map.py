@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import Cause
 from gigabrain_schemas.brain import OccupancyGrid
+from gigabrain_zenoh.config.map_image import SavedMap
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.geometry.se2 import IDENTITY, between, compose, wrap
 from gigabrain_zenoh.host.threads import PATIENCE_S, InTime, ScheduledWorker, Take, done
 from gigabrain_zenoh.mapping.keyframes import Scan, View, shaped
 from gigabrain_zenoh.mapping.likelihood_field import field_of
 from gigabrain_zenoh.mapping.localizer import NOWHERE, BackgroundLocalizer, KidnapDetector, Place
-from gigabrain_zenoh.mapping.map_file import Arrays, SavedMap
+from gigabrain_zenoh.mapping.map_file import Arrays
 from gigabrain_zenoh.mapping.occupancy_grid import (
     CELL,
     MOST_CELLS,

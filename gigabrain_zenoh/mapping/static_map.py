@@ -7,6 +7,7 @@ import numpy as np
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import Cause
 from gigabrain_schemas.brain import OccupancyGrid
+from gigabrain_zenoh.config.map_image import SavedMap
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.geometry.se2 import IDENTITY
 from gigabrain_zenoh.host.threads import PATIENCE_S, InTime, ScheduledWorker, done
@@ -14,7 +15,6 @@ from gigabrain_zenoh.mapping.global_localization import search
 from gigabrain_zenoh.mapping.keyframes import Scan, View
 from gigabrain_zenoh.mapping.likelihood_field import contradiction, field_of
 from gigabrain_zenoh.mapping.localizer import BackgroundLocalizer, Place
-from gigabrain_zenoh.mapping.map_file import SavedMap
 from gigabrain_zenoh.mapping.occupancy_grid import CELL, LogOddsGrid
 from gigabrain_zenoh.mapping.occupancy_grid import warm_up as warm_up_grid
 

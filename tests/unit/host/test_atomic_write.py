@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from gigabrain_drivers.driver.gatekeeper import Latched, LatchFile
+from gigabrain_zenoh.config.map_image import SavedMap
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile
 from gigabrain_zenoh.gate.causes import estop
 from gigabrain_zenoh.host import files
 from gigabrain_zenoh.mapping import map_file
-from gigabrain_zenoh.mapping.map_file import SavedMap
 from gigabrain_zenoh.security.authority import write_list
 from gigabrain_zenoh.security.identity_files import LIST
 

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.config.map_image import SavedMap
 from gigabrain_zenoh.geometry.se2 import IDENTITY, compose
 from gigabrain_zenoh.mapping.keyframes import Scan, View
 from gigabrain_zenoh.mapping.localizer import Place
-from gigabrain_zenoh.mapping.map_file import SavedMap
 from gigabrain_zenoh.mapping.occupancy_grid import CELL, LogOddsGrid
 from gigabrain_zenoh.mapping.slam_map import SlamMap
 from gigabrain_zenoh.mapping.static_map import StaticMap

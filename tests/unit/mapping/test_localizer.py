@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from gigabrain_zenoh.config.map_image import SavedMap
 from gigabrain_zenoh.mapping.global_localization import Candidate, search
 from gigabrain_zenoh.mapping.likelihood_field import field_of, fit, is_self_similar
 from gigabrain_zenoh.mapping.localizer import Localizer
-from gigabrain_zenoh.mapping.map_file import SavedMap
 from gigabrain_zenoh.mapping.static_map import StaticMap
 from tests.unit.mapping.houses import (
     BEAMS,

@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from gigabrain_schemas.requests import MapRequest
+from gigabrain_zenoh.config.map_image import SavedMap
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.host import files
 from gigabrain_zenoh.mapping import map_file
-from gigabrain_zenoh.mapping.map_file import SavedMap
 
 GRAPH = {"poses": np.arange(6.0).reshape(2, 3)}
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.config.map_image import SavedMap
 from gigabrain_zenoh.geometry.se2 import IDENTITY, between
 from gigabrain_zenoh.mapping.keyframes import Edge, Keyframe, Scan, View
-from gigabrain_zenoh.mapping.map_file import SavedMap
 from gigabrain_zenoh.mapping.occupancy_grid import GridScans
 from gigabrain_zenoh.mapping.slam import KnownGround
 from gigabrain_zenoh.mapping.slam_map import SlamMap
