@@ -1,5 +1,5 @@
 # make demo    set up, and drive a robot round a room
-# make check   set up; lint, types, contracts and unit tests
+# make check   set up; lint, types, contracts, documentation site and unit tests
 # make test    that, the node tests and the system tests: what to run before a commit is shared
 # make qa      what takes long, for a release; continued where it was stopped
 # make bench   measure this machine
@@ -14,7 +14,7 @@ PYTEST := $(BIN)/pytest
 SIDE_BY_SIDE := -n 2 --dist loadfile
 MAKEFLAGS += --no-print-directory
 
-.PHONY: setup demo lint style rooms types unit node system check test qa qa-tests extremes dockerfile signals \
+.PHONY: setup demo lint style rooms types site unit node system check test qa qa-tests extremes dockerfile signals \
   ci-extra bench faults soak mutation fuzz golden recordings pictures clean
 
 setup: $(WARM)
@@ -57,6 +57,10 @@ rooms: $(INSTALLED)
 types: $(INSTALLED)
 	$(BIN)/mypy
 
+# the documentation: open site/index.html
+site: $(INSTALLED)
+	$(BIN)/python -m docs.site.build
+
 unit: setup
 	$(PYTEST) $(SIDE_BY_SIDE) -q $(or $(ARGS),tests/unit tests/fuzz)
 
@@ -69,6 +73,7 @@ system: setup
 
 check: setup
 	@$(MAKE) lint
+	@$(MAKE) site
 	@$(MAKE) unit
 
 test: check
@@ -144,4 +149,4 @@ pictures: setup
 	$(BIN)/python -m tests.qa.pictures docs/pictures
 
 clean:
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .fuzz .fuzz-* .qa mutants
+	rm -rf $(VENV) .site site .mypy_cache .ruff_cache .pytest_cache .hypothesis .fuzz .fuzz-* .qa mutants
