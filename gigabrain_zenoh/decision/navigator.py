@@ -39,8 +39,9 @@ from gigabrain_zenoh.geometry.pose import compose, inverse
 from gigabrain_zenoh.geometry.se2 import from_pose, transform
 from gigabrain_zenoh.host.threads import ScheduledWorker, Take
 from gigabrain_zenoh.navigation import global_planner, local_planner
-from gigabrain_zenoh.navigation.costmap import Unknown
+from gigabrain_zenoh.navigation.costmap import inflation
 from gigabrain_zenoh.navigation.global_planner import Unreachable
+from gigabrain_zenoh.navigation.local_planner import DEFAULTS, LocalSettings
 
 MAX_SCAN_AGE_TICKS = 10  # of a scan to drive by
 NO_ROUTE = Idle("waiting", "waiting: for a path through the map")
@@ -57,14 +58,16 @@ CELLS_PER_SCAN = 250_000  # every this many cells add one scan until a plan is d
 MIN_DUE_SCANS = 2
 HUNG_SCANS = 200  # a plan that is overdue for this many scans will never finish
 PATIENCE_S = 0.05  # how long a scan waits for a due plan; control waits no longer
+MAX_NEAR_OVER_M = 0.25  # beyond, the clearance within reach of the local planner costs alike
 REPLAN_TICKS = 25  # a route is checked at least twice a second
 
 
 class RouteSchedule:
     """Keeps the present route up to date."""
 
-    def __init__(self, unknown_space: Unknown, bus: Bus) -> None:
-        self._planner = RoutePlanner(unknown_space)
+    def __init__(self, config: NavigationConfig, bus: Bus) -> None:
+        self.inflation = config.inflation  # [m], of the next plan
+        self._planner = RoutePlanner(config.unknown_space)
         self._worker = ScheduledWorker(PATIENCE_S, bus.input_log.in_time)
         self.route: Route | None = None
         self._planned: tuple[int, OccupancyGrid] | None = None  # tick and map of the last plan
@@ -114,6 +117,7 @@ class RouteSchedule:
             body=context.body,
             feedback=feedback,
             seen=transform(from_pose(here), context.world.points().astype(np.float64)),
+            inflation=self.inflation,
             held_ticks=self._held_ticks,
             slowed_by=context.slowed_by,
         )
@@ -157,7 +161,7 @@ class Navigator:
     def __init__(self, config: NavigationConfig, bus: Bus, behaviour: str) -> None:
         self._bus, self._config, self._behaviour = bus, config, behaviour
         self._source = ContextSource(bus)
-        self._routes = RouteSchedule(config.unknown_space, bus)
+        self._routes = RouteSchedule(config, bus)
         self._context: NavigationContext | None = None
         self._boot = 0
         self._seen = False  # a plausible scan has come since the start
@@ -167,10 +171,10 @@ class Navigator:
         self._body: BodyDescription | None = None
 
     def configure(self, config: NavigationConfig) -> None:
-        """Use another speed limit; what the local planner has seen and planned is kept."""
-        self._config = config
-        if self._local:
-            self._local.limit_speed(config.max_linear_speed)
+        """Use other settings; what the local planner has seen and planned is kept."""
+        self._config, self._routes.inflation = config, config.inflation
+        if self._local and self._body:
+            self._local.configure(self._body, _local_settings(config, self._body))
 
     def observe(self, state: RobotState) -> None:
         """Record a robot state; to be called with every state."""
@@ -363,11 +367,13 @@ class Navigator:
     def _local_planner(self, context: NavigationContext) -> local_planner.LocalPlanner:
         body, config = context.body, self._config
         assert body
-        if self._local is None or body != self._body:
-            settings = local_planner.LocalSettings(
-                linear_speed=config.max_linear_speed, samples=config.samples
-            )
-            self._local, self._body = local_planner.LocalPlanner(body, settings), body
+        if self._local and self._body and body == self._body:
+            return self._local
+        settings, before, self._body = _local_settings(config, body), self._body, body
+        if self._local and before and _same_shape(before, body):
+            self._local.configure(body, settings)
+        else:
+            self._local = local_planner.LocalPlanner(body, settings)
         return self._local
 
     def _intent(self, *, twist: Velocity = ZERO, reason: str, **more: Any) -> Intent:
@@ -391,6 +397,21 @@ def _why_not(context: NavigationContext, command: DriveCommand | None) -> Idle |
         late_s = context.late_ticks * TICK_S
         why = f"this host is too busy: its newest scan is {late_s:.2f} s old"
     return Idle("waiting", f"waiting: {why}") if why else None
+
+
+def _local_settings(config: NavigationConfig, body: BodyDescription) -> LocalSettings:
+    usual = inflation(body).decay
+    wanted = inflation(body, beyond=config.inflation).decay
+    return LocalSettings(
+        linear_speed=config.max_linear_speed,
+        samples=config.samples,
+        aggressiveness=config.aggressiveness,
+        near_over=min(DEFAULTS.near_over * wanted / usual, MAX_NEAR_OVER_M),
+    )
+
+
+def _same_shape(one: BodyDescription, other: BodyDescription) -> bool:
+    return (one.footprint, one.lidar) == (other.footprint, other.lidar)
 
 
 def _errors(command: DriveCommand, here: Pose) -> tuple[float | None, float | None]:

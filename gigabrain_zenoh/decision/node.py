@@ -20,6 +20,7 @@ from gigabrain_zenoh.runtime.heartbeat import Progress
 
 log = logging.getLogger(__name__)
 
+SETTINGS_KEY = "decision.settings"  # place of a behaviour's settings in a deployment file
 RENAMED_PARAMS = {  # by behaviour; removed in 0.3, like the words in config/renames.py
     "avoid": {"linear_speed": "max_linear_speed", "angular_speed": "max_angular_speed"},
     "navigate": {"speed_limit": "max_linear_speed"},
@@ -76,7 +77,9 @@ class DecisionLoop:
     def serve_params(self, bus: Bus) -> None:
         """Offer the behaviour's parameters on the bus."""
         for name, expected in self._type.PARAMS.items():
-            bus.params.add_field(name, expected, lambda: self._settings, self.configure)
+            bus.params.add_field(
+                name, expected, lambda: self._settings, self.configure, section=SETTINGS_KEY
+            )
         for old, new in RENAMED_PARAMS.get(self.intent.behaviour, {}).items():
             bus.params.rename(old, new)
 

@@ -168,6 +168,7 @@ class RouteRequest:
     body: BodyDescription
     feedback: RouteFeedback | None  # of the last route
     seen: Floats  # (n, 2) [m], hits of the newest scan, in the map
+    inflation: float | None = None  # [m], see NavigationConfig
     held_ticks: int = 0  # since the last route, in which the body could not follow it
     slowed_by: str = ""  # causes that safety reports, for people
 
@@ -213,9 +214,8 @@ class RoutePlanner:
         self, grid: OccupancyGrid, body: BodyDescription, here: Pose, goal: Goal
     ) -> PathCheck | Unreachable:
         """Return the length of the path to a goal, or why there is none."""
-        costs = costmap(
-            self._enlarged(grid, goal), inflation(body, self._unknown_space), before=None
-        )
+        rules = inflation(body, self._unknown_space)
+        costs = costmap(self._enlarged(grid, goal), rules, before=None)
         start, planner = (here.x, here.y), GlobalPlanner()
         found, offset = planner.plan(costs, start, (goal.x, goal.y)), ""
         if isinstance(found, Unreachable) and found.nearest and found.distance <= ARRIVED_M:
@@ -253,11 +253,12 @@ class RoutePlanner:
             self._blocking = np.empty((0, 2))
 
     def _update_costmap(self, request: RouteRequest) -> Costmap:
-        key = (request.grid, request.body, self._blocking_tick if len(self._blocking) else 0)
+        blocked = self._blocking_tick if len(self._blocking) else 0
+        key = (request.grid, request.body, blocked, request.inflation)
         known = self._costmap_key
         same = known and all(a is b or a == b for a, b in zip(key, known, strict=True))
         if self._costmap is None or not same:
-            rules = inflation(request.body, self._unknown_space)
+            rules = inflation(request.body, self._unknown_space, request.inflation)
             self._costmap = costmap(request.grid, rules, self._blocking, self._costmap)
             self._costmap_key = key
         return self._costmap

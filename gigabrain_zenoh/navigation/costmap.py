@@ -27,6 +27,7 @@ NEAR_COST = 12.0  # added where the body just fits
 UNKNOWN_COST = 4.0  # added in unknown space that is avoided: worth a detour of five times
 MIN_DECAY_M = 0.1  # [m]
 NEGLIGIBLE_COST = 0.05  # what of NEAR_COST may be left off at the end
+DECAYS = math.log(NEAR_COST / NEGLIGIBLE_COST)  # lengths of decay within the reach
 MAX_REACH_CELLS = 1000  # an obstacle costs nothing farther away; more would be too much to look at
 REDO_SHARE = 0.5  # of a map: if more of it has changed, all of it is computed
 UNKNOWN_COSTS = {"allow": 0.0, "avoid": UNKNOWN_COST, "forbid": LETHAL}
@@ -102,16 +103,19 @@ class Inflation:
     fits: float  # [m] from its centre to an obstacle, at least: it drives past
     turns: float  # [m], at which it also turns on the spot
     unknown: Unknown = "avoid"
+    beyond: float | None = None  # [m] past `fits`, where obstacles still cost; None: by the shape
 
     @property
     def decay(self) -> float:
         """Over how many metres the cost falls to 1/e."""
+        if self.beyond is not None:
+            return self.beyond / DECAYS
         return max(MIN_DECAY_M, self.turns - self.fits)
 
     @property
     def reach(self) -> float:
         """The distance within which an obstacle costs something [m]."""
-        return self.fits + self.decay * math.log(NEAR_COST / NEGLIGIBLE_COST)
+        return self.fits + self.decay * DECAYS
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -140,13 +144,19 @@ class Costmap:
         return np.column_stack((x, y))
 
 
-def inflation(body: BodyDescription, unknown: Unknown = "avoid") -> Inflation:
-    """Return the inflation for `body`, including the side margin that safety keeps."""
+def inflation(
+    body: BodyDescription, unknown: Unknown = "avoid", beyond: float | None = None
+) -> Inflation:
+    """Return the inflation for `body`, including the side margin that safety keeps.
+
+    Obstacles cost something up to `beyond` [m] farther than the body needs; None: by its shape.
+    """
     edges, margin = sweep.box(body.footprint), body.thresholds.side_margin
     aside, ahead = max(edges.left, -edges.right), max(edges.front, -edges.rear)
     sideways = body.max_lateral_speed > 0 and body.drive_type != "ackermann"
     fits = (min(aside, ahead) if sideways else aside) + margin
-    return Inflation(fits=fits, turns=sweep.radius(body.footprint) + margin, unknown=unknown)
+    turns = sweep.radius(body.footprint) + margin
+    return Inflation(fits=fits, turns=turns, unknown=unknown, beyond=beyond)
 
 
 def costmap(

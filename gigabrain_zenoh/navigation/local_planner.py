@@ -5,10 +5,10 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import numpy as np
-from msgspec import Meta, Struct, structs
+from msgspec import Meta, Struct
 
 from gigabrain_schemas.arrays import Floats
-from gigabrain_schemas.base import TICK_S, Pose, Positive, Velocity
+from gigabrain_schemas.base import TICK_S, Fraction, Pose, Positive, Velocity
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import ActuationModel, Obstacle, TrajectoryPoint
 from gigabrain_schemas.tasks import Goal
@@ -40,6 +40,7 @@ DEFAULT_SPEED_SIGMA = 0.05  # [m/s], standard deviation of a velocity that comes
 MAX_GROWTH_SPEED = 0.3  # [m/s], of a disc: how fast what is known of it fades at most
 STUCK_RADIUS_M = 0.3  # [m], who gets no farther than this is in one place
 MAKING_WAY = "making way: it looks round for what moves"
+STANDARD = Weights()
 ARRIVED_SPEED_SHARE = 0.05  # share of the largest speeds at which a body has arrived
 
 
@@ -51,6 +52,8 @@ class LocalSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     window: Annotated[float, Meta(ge=2.0, le=20.0)] = 8.0  # [m], side of what is looked at
     memory: Positive = 10.0  # [s], how long what no beam can check is believed
     linear_speed: Positive | None = None  # [m/s], no faster; the body's own limit holds as well
+    aggressiveness: Fraction = 0.5  # see `weights_of` and `model_of`; 1: fast in tight places
+    near_over: Positive = STANDARD.near_over  # [m], over which the cost of obstacles falls to 1/e
     position_tolerance: Positive = 0.1  # [m]
     yaw_tolerance: Positive = 0.1  # [rad]
     stuck_after: Positive = 5.0  # [s] in one place, then another way is wanted
@@ -58,6 +61,21 @@ class LocalSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 DEFAULTS = LocalSettings()
+
+
+def weights_of(settings: LocalSettings, base: Weights = STANDARD) -> Weights:
+    """Return the weights of a planner's costs.
+
+    An aggressiveness of 1 halves the cost of obstacles near by and doubles the speed in tight
+    places; 0 does the opposite. What counts as a contact stays.
+    """
+    factor = 2.0 ** (2.0 * settings.aggressiveness - 1.0)
+    return base._replace(
+        near=base.near / factor,
+        near_over=base.near_over * settings.near_over / STANDARD.near_over,
+        tight_speed=base.tight_speed * factor,
+        tight_rate=base.tight_rate * factor,
+    )
 
 
 class SentCommand(Struct, frozen=True):
@@ -172,20 +190,24 @@ class LocalPlanner:
 
     def __init__(self, body: BodyDescription, settings: LocalSettings = DEFAULTS) -> None:
         self._body, self._settings = body, settings
-        self._model = model_of(body, settings.linear_speed)
+        self._model = model_of(body, settings.linear_speed, settings.aggressiveness)
         self._outline = outline_of(body.footprint)
         self._lidar = (body.lidar.x, body.lidar.y) if body.lidar else (0.0, 0.0)
         half_y = (self._outline.left - self._outline.right) / 2
         half_x = (self._outline.front - self._outline.rear) / 2
         self._half_width = min(half_x, half_y) if self._model.lateral > 0 else half_y
         self._sampler, self._traffic = self._sampler_of(), self._traffic_of()
-        self._weights = Weights()
+        self._weights = weights_of(settings)
         self.reset()
 
-    def limit_speed(self, linear_speed: float | None) -> None:
-        """Drive no faster than this [m/s] from now on; what was seen and planned is kept."""
-        self._settings = structs.replace(self._settings, linear_speed=linear_speed)
-        self._model = model_of(self._body, linear_speed)
+    def configure(self, body: BodyDescription, settings: LocalSettings) -> None:
+        """Use other limits, or other settings than window and memory, from now on.
+
+        What was seen and planned is kept. The body must have its footprint and lidar still.
+        """
+        self._body, self._settings = body, settings
+        self._model = model_of(body, settings.linear_speed, settings.aggressiveness)
+        self._weights = weights_of(settings)
         before = self._sampler
         self._sampler, self._traffic = self._sampler_of(), self._traffic_of()
         self._sampler.last, self._sampler.dt = before.last, before.dt
@@ -253,7 +275,7 @@ class LocalPlanner:
             return self._weights
         self._window.take_back(tick, quick)
         self._sampler.step_by(dynamic_obstacles.HORIZON_S / self._settings.steps)
-        return dynamic_obstacles.WEIGHTS
+        return weights_of(self._settings, dynamic_obstacles.WEIGHTS)
 
     def _looks_round(self, tick: int) -> bool:
         """Return whether a quick body must still watch for obstacles before it drives off."""

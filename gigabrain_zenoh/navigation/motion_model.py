@@ -12,6 +12,7 @@ from gigabrain_zenoh.geometry.limits import limits_of
 from gigabrain_zenoh.kernels.jit import lean_kernel
 
 ACCELERATION_RESERVE = 0.9  # of the body's accelerations: plans must work on a bad floor too
+GENTLEST_SHARE = 0.4  # of that reserve, at an aggressiveness of 0
 MAX_REVERSE_SPEED = 0.4  # [m/s], no faster backwards: the lidar may not see there
 
 LANES = 8  # plans at a time
@@ -41,21 +42,27 @@ class MotionModel(NamedTuple):
     half_track: float  # [m], from its middle to a wheel
 
 
-def model_of(body: BodyDescription, speed: float | None = None) -> MotionModel:
+def model_of(
+    body: BodyDescription, speed: float | None = None, aggressiveness: float = 0.5
+) -> MotionModel:
     """Return the model of `body`, driven no faster than `speed` [m/s].
+
+    Below an `aggressiveness` of 0.5, to 0, it gains speed ever more gently.
 
     A car's tightest turn is its largest yaw rate at full speed.
     """
     fastest = body.max_linear_speed if speed is None else min(speed, body.max_linear_speed)
+    eager = min(1.0, 2.0 * aggressiveness)
+    gain = ACCELERATION_RESERVE * (GENTLEST_SHARE + (1.0 - GENTLEST_SHARE) * eager)
     car, limits = body.drive_type == "ackermann", limits_of(body)
     return MotionModel(
         forward=fastest,
         backward=min(MAX_REVERSE_SPEED, 0.5 * fastest),
         lateral=0.0 if car else min(body.max_lateral_speed, fastest),
         turning=body.max_angular_speed,
-        acceleration=ACCELERATION_RESERVE * body.max_linear_acceleration,
+        acceleration=gain * body.max_linear_acceleration,
         deceleration=ACCELERATION_RESERVE * body.max_linear_deceleration,
-        angular_acceleration=ACCELERATION_RESERVE * body.max_angular_acceleration,
+        angular_acceleration=gain * body.max_angular_acceleration,
         radius=body.max_linear_speed / body.max_angular_speed if car else 0.0,
         reaction_time=body.thresholds.reaction_time,
         margin=body.thresholds.stop_margin,

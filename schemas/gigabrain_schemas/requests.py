@@ -98,6 +98,8 @@ class Param(Record, frozen=True, kw_only=True):
     name: Name
     value: Text  # as it is now
     expected: Text  # what it may be, in words
+    key: Name = ""  # its dotted place in a deployment file; empty if it has none
+    initial: Text = ""  # its value when the process started
 
 
 class ParamReply(Message, frozen=True, kw_only=True):

@@ -73,6 +73,7 @@ class Plane:
         self.start = at  # where the odometry begins
         self.velocity, self.tick, self.localized = Velocity(), 0, True
         self.intent = Intent(behaviour="none", reason="")
+        self.intents: list[Intent] = []  # one a scan
         self.status = TaskStatus()
         self.gate = DRIVING
         self.travelled = 0.0
@@ -159,6 +160,8 @@ class Plane:
         await bench.clock.advance(TICK_NS)
 
     def _hear_intent(self, _key: str, intent: Intent) -> None:
+        if intent.basis != self.intent.basis:
+            self.intents.append(intent)
         self.intent = intent
 
     def _hear_status(self, _key: str, status: TaskStatus) -> None:

@@ -4,11 +4,13 @@ import dataclasses
 import functools
 import logging
 from collections.abc import Awaitable, Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 from msgspec.structs import replace
 
 from gigabrain_schemas.base import Velocity
@@ -24,10 +26,12 @@ from gigabrain_zenoh.navigation.local_planner import LocalPlanner
 from gigabrain_zenoh.runtime.services import LOG_LEVEL, serve_params
 from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import state
-from tests.node.plane import Plane, drawn
+from tests.node.plane import Cells, Plane, drawn
 from tests.unit.navigation.drives import QUICK, WAFFLE, Drive, wall
 
 HALL = drawn("####################\n" + "#..................#\n" * 12 + "####################")
+PILLAR = HALL.copy()
+PILLAR[22:24, 46:50] = 100
 MORE_ROOM_LEFT = (0.8, 3.0, 3.0, 1.0, 1.0, 1.0)
 
 
@@ -96,6 +100,41 @@ async def route_speed() -> None:
         assert plane.velocity.linear_x > 0.2
 
 
+async def inflation() -> None:
+    """Past a pillar beside its straight way it keeps more room."""
+    near, far = [
+        await passing({"inflation": value}, at=(1.2, 1.6, 0.0), goal=(3.8, 1.6), cells=PILLAR)
+        for value in ("0.1", "1.5")
+    ]
+    assert far.closest > near.closest + 0.05
+
+
+async def aggressiveness() -> None:
+    """Gently it gains less speed from scan to scan."""
+    gains = []
+    for value in ("0", "0.5"):
+        plane = await passing({"aggressiveness": value}, at=(1.2, 1.6, 0.0), goal=(2.6, 1.6))
+        wanted = [one.twist.linear_x for one in plane.intents if one.twist]
+        gains.append(max(after - before for before, after in pairwise(wanted)))
+    assert 0.0 < gains[0] < 0.6 * gains[1]
+
+
+async def passing(
+    changes: dict[str, str],
+    at: tuple[float, float, float],
+    goal: tuple[float, float],
+    cells: Cells = HALL,
+) -> Plane:
+    """The robot after it has driven to a goal, with parameters set before."""
+    async with Plane(cells, at=at) as plane:
+        await plane.go(0.2)
+        for name, value in changes.items():
+            plane.bench.bus.params.change(name, value)
+        await plane.ask(GOAL, GoalRequest(x=goal[0], y=goal[1]))
+        await plane.until("succeeded", seconds=60.0)
+    return plane
+
+
 async def log_level() -> None:
     async with NodeBench(functools.partial(decision.run, DecisionConfig())) as bench:
         serve_params(bench.bus)
@@ -112,6 +151,8 @@ OBEYED: dict[tuple[str, str], Callable[[], Awaitable[None]]] = {
     ("avoid", "max_angular_speed"): max_angular_speed,
     ("avoid", "turn"): turn,
     ("navigate", "max_linear_speed"): route_speed,
+    ("navigate", "inflation"): inflation,
+    ("navigate", "aggressiveness"): aggressiveness,
 }
 
 
@@ -134,8 +175,8 @@ async def test_the_log_level_of_a_process_is_obeyed(root_level: None) -> None:
 @pytest.mark.parametrize(
     ("behaviour", "foreign", "known"),
     [
-        ("navigate", "max_angular_speed", "max_linear_speed"),
-        ("navigate", "turn", "max_linear_speed"),
+        ("navigate", "max_angular_speed", "max_linear_speed, inflation, aggressiveness"),
+        ("navigate", "turn", "max_linear_speed, inflation, aggressiveness"),
         ("avoid", "samples", "max_linear_speed, max_angular_speed, turn"),
     ],
 )
@@ -158,7 +199,7 @@ def test_a_speed_limit_is_set_without_forgetting_what_was_seen() -> None:
     seen = drive.moment()
     unseen = dataclasses.replace(seen, hits=np.empty((0, 2)))
     drive.planner.plan(seen)
-    drive.planner.limit_speed(0.2)
+    drive.planner.configure(WAFFLE, structs.replace(QUICK, linear_speed=0.2))
     assert drive.planner.plan(unseen).remaining > 3.5
     assert LocalPlanner(WAFFLE, QUICK).plan(unseen).remaining == pytest.approx(3.0, abs=0.1)
 

@@ -239,6 +239,27 @@ async def test_a_parameter_that_was_changed_meanwhile_is_changed_again(tmp_path:
     assert [unstamped(*one) for one in now] == [unstamped(*one) for one in then]
 
 
+@pytest.mark.parametrize("process", ["decision", "control", "safety"])
+async def test_a_limit_of_the_body_that_was_changed_meanwhile_is_in_the_recording(
+    tmp_path: Path, process: str
+) -> None:
+    topics = {topic.key for topic in OUTPUTS[process]}
+    async with RobotInMemory(tmp_path) as robot:
+        events = record(robot.network, robot.clock)
+        await robot.go(100)
+        serve_params(robot.bus("driver"))
+        for name, value in (("max_linear_speed", "0.1"), ("stop_margin", "3.0")):
+            change = ParamRequest(name=name, value=value, source="ann")
+            assert (await robot.operator.ask(PARAM, change, name="driver"))[0].ok
+            speeds = await robot.go(100)
+    assert speeds[-1] == 0.0
+    then = [(key, data) for _, key, data in events if key in topics]
+    heard = with_requests([event for event in events if event[1] not in topics])
+    now = [one for one in await replay(BRAIN[process], heard, process) if one[0] in topics]
+    assert len(now) > 100
+    assert [unstamped(*one) for one in now] == [unstamped(*one) for one in then]
+
+
 def unstamped(key: str, payload: bytes) -> dict[str, Any]:
     return dict(msgspec.msgpack.decode(payload)) | {"key": key, "stamp_ns": 0}
 

@@ -20,6 +20,7 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate import causes as why
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.gate.gate import GateState
+from gigabrain_zenoh.geometry.limits import Limits
 from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file
 from gigabrain_zenoh.host.threads import BackgroundWriter
 from gigabrain_zenoh.logs import Fault
@@ -171,6 +172,10 @@ class Gatekeeper:
         )
         self._bus.serve(RELEASE, self._on_release)
         self._bus.serve(ENABLE, self._on_enable)
+
+    def limit(self, limits: Limits) -> None:
+        """Let no command exceed other limits from now on; a faster body is slowed at its ramp."""
+        self._config = replace(self._config, limits=limits)
 
     def step(self, event: gate.Event) -> gate.Outcome:
         """Step the gate by one event."""

@@ -4,6 +4,7 @@ import asyncio
 import functools
 import logging
 import math
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -26,10 +27,12 @@ from gigabrain_schemas.brain import CmdVel, JointCommand
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import BODY, JOINT_CMD, SAFETY, SCAN, STATE, Topic, command_topic
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.params import shown
 from gigabrain_zenoh.config.settings import DriverConfig
-from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.gate import causes as why
 from gigabrain_zenoh.gate import gate
+from gigabrain_zenoh.geometry.body_settings import SETTINGS, restricted, setting_of
 from gigabrain_zenoh.geometry.limits import ZERO, limits_of
 from gigabrain_zenoh.geometry.stopping import scan_limit_ns
 from gigabrain_zenoh.runtime.heartbeat import Progress
@@ -48,6 +51,7 @@ class DriverProcess:
     def __init__(self, config: DriverConfig, robot: RobotFile, driver: Driver, bus: Bus) -> None:
         self._config, self._robot, self._driver, self._bus = config, robot, driver, bus
         self._body = Body(description=robot.description(), link=config.link)
+        self._settings: dict[str, float] = {}  # of the body that were changed, by path
         gate_config = gate.GateConfig(
             limits=limits_of(robot),
             basis_ns=scan_limit_ns(robot),
@@ -84,11 +88,46 @@ class DriverProcess:
         bus.subscribe(JOINT_CMD, self._on_joint_command)
         bus.latest(SAFETY, self._on_safety)
         self._gatekeeper.serve(self._driver.stop)
+        self._serve_settings()
         bus.publish(BODY, self._body)
         ready()
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._run_ticks())
             tasks.create_task(self._apply_commands())
+
+    def _serve_settings(self) -> None:
+        """Offer the settings of the body that may change while it runs."""
+        file = self._robot.description()
+        for path, one in SETTINGS.items():
+            bound = setting_of(file, path)
+            if not bound:  # a body that cannot move so has no limit for it
+                continue
+            side = "at least" if one.at_least else "above 0, at most"
+            expected = f"a number, {side} {bound:g} [{one.unit}], the body's own {one.kind}"
+            self._bus.params.add(
+                path.rpartition(".")[2],
+                expected,
+                functools.partial(self._setting, path),
+                functools.partial(self._change_setting, path),
+                key=f"robot.{path}",
+            )
+
+    def _setting(self, path: str) -> str:
+        return shown(setting_of(self._body.description, path))
+
+    def _change_setting(self, path: str, text: str) -> None:
+        """Have gate, safety, planner and control obey another value from now on.
+
+        Raises Refused for one that is less safe than the body's own, and ValueError.
+        """
+        settings = self._settings | {path: float(text)}
+        try:
+            description = restricted(self._robot.description(), settings)
+        except ValueError as error:
+            raise Refused(re.sub(r" - at `[^`]*`$", "", str(error))) from None
+        self._settings, self._body = settings, replace(self._body, description=description)
+        self._gatekeeper.limit(limits_of(description))
+        self._bus.publish(BODY, self._body)
 
     async def _run_ticks(self) -> None:
         async for passed in self._driver.ticks(self._bus.clock):

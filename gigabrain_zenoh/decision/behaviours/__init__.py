@@ -14,7 +14,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol, cast
 import msgspec
 from msgspec import Meta, Struct
 
-from gigabrain_schemas.base import Pose
+from gigabrain_schemas.base import Fraction, Pose
 from gigabrain_schemas.brain import Intent, WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import Goal, Task
@@ -117,6 +117,10 @@ class NavigationConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Settings of a behaviour that drives by a map; perception must have `mapping` on."""
 
     max_linear_speed: SpeedLimit | None = None  # [m/s]; the body's own limit applies too
+    # [m], how far beyond the body's own width obstacles are avoided where there is room; null: by
+    # the body's shape
+    inflation: Annotated[float, Meta(ge=0.05, le=3.0)] | None = None
+    aggressiveness: Fraction = 0.5  # 0: gently, with more room; 1: faster where it is tight
     # paths through unknown cells; with `allow` also to goals beyond the map
     unknown_space: Literal["avoid", "allow", "forbid"] = "avoid"
     samples: Annotated[int, Meta(ge=64, le=20_000)] = 1000  # candidate plans per scan
@@ -130,6 +134,8 @@ class Navigate:
     Config = NavigationConfig
     PARAMS: ClassVar[Mapping[str, str]] = {
         "max_linear_speed": "a number above 0, up to 10 [m/s], or null for the body's limit alone",
+        "inflation": "a number from 0.05 to 3 [m] beyond the body's width, or null",
+        "aggressiveness": "a number from 0, gentle, to 1, quick in tight places",
     }
     DEMO: ClassVar[Mapping[str, Any]] = {"start": "explore"}
 
