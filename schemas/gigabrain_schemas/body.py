@@ -24,7 +24,9 @@ from gigabrain_schemas.base import (
 from gigabrain_schemas.sensors import ImuData, RangeMax
 
 GateMode = Literal["latched", "idle", "enabled", "stopping"]
-DriveType = Literal["differential", "omni", "mecanum", "ackermann", "quadruped", "arm"]
+DriveType = Literal[
+    "differential", "skid_steer", "omni", "mecanum", "ackermann", "quadruped", "arm"
+]
 SafeState = Literal["stop", "hold", "park", "limp"]
 # Of thresholds: what would as good as switch a monitor off, or is in another unit, is refused.
 PerCent = Annotated[float, Meta(ge=1.0, le=100.0)]

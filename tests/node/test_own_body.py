@@ -111,10 +111,10 @@ def test_a_model_whose_wheels_are_others_is_told(
 
 
 def test_a_drive_that_has_no_physics_is_called_so(tmp_path: Path) -> None:
-    own = mine(tmp_path, ("drive_type: differential", "drive_type: mecanum\nwheel_base: 0.3"))
+    own = mine(tmp_path, ("drive_type: differential", "drive_type: arm"))
     text = Path(own).read_text()
     Path(own).write_text(text[: text.index("real:")])
-    with pytest.raises(ConfigError, match=r"drive_type 'mecanum' cannot be simulated in MuJoCo"):
+    with pytest.raises(ConfigError, match=r"drive_type 'arm' cannot be simulated in MuJoCo"):
         compiled(own, tmp_path)
 
 

@@ -28,6 +28,8 @@ class RobotFile(BodyDescription, frozen=True, kw_only=True, forbid_unknown_field
     summary: str  # one line, for `gigabrain robots`
     wheel_base: NonNegative = 0.0  # [m], front to rear, of mecanum and Ackermann bases
     wheel_radius: NonNegative = 0.0  # [m]
+    effective_track: NonNegative = 0.0
+    # [m], of a skid-steered base: the separation of rolling wheels that would turn it as much
     joints: tuple[JointLimits, ...] = ()
     sim: dict[str, Any] | None = None
     emulated: dict[str, Any] | None = None

@@ -16,6 +16,7 @@ from gigabrain_schemas.base import Pose
 
 MEASURES = {  # of each drive type with wheels
     "differential": ("wheel_radius", "wheel_separation"),
+    "skid_steer": ("wheel_radius", "wheel_separation"),
     "mecanum": ("wheel_radius", "wheel_separation", "wheel_base"),
     "omni": ("wheel_radius", "wheel_separation"),
     "ackermann": ("wheel_radius", "wheel_base"),
@@ -63,6 +64,29 @@ class Differential(Base):
         left, right = wheels
         forward, turn = (left + right) / 2 * self.radius, (right - left) * self.radius
         return Twist(forward, 0.0, turn / self.separation)
+
+
+@dataclass(frozen=True)
+class SkidSteer(Base):
+    """Four fixed wheels that scrub over the floor in turns; those of a side turn alike."""
+
+    radius: float  # [m]
+    effective_track: float  # [m], between rolling wheels that would turn the body as much
+
+    wheels = ("front_left", "front_right", "rear_left", "rear_right")
+
+    def to_wheels(self, twist: Twist) -> tuple[float, ...]:
+        """(front left, front right, rear left, rear right) [rad/s]."""
+        return 2 * self._rolling.to_wheels(twist)
+
+    def to_body(self, wheels: tuple[float, ...]) -> Twist:
+        """Linear along x and turning about z, by the mean of each side."""
+        front_left, front_right, rear_left, rear_right = wheels
+        return self._rolling.to_body(((front_left + rear_left) / 2, (front_right + rear_right) / 2))
+
+    @property
+    def _rolling(self) -> Differential:
+        return Differential(self.radius, self.effective_track)
 
 
 @dataclass(frozen=True)
@@ -147,6 +171,38 @@ class Ackermann(Base):
         return Twist(forward, 0.0, forward * math.tan(steering) / self.wheel_base)
 
 
+@dataclass(frozen=True)
+class AckermannAxles(Base):
+    """All four corners of a car: both rear wheels drive, both front wheels steer.
+
+    Each front wheel steers at its own angle, so that all wheels roll round one center. The wheels'
+    values are speeds [rad/s] and angles [rad], positive to the left.
+    """
+
+    car: Ackermann
+    separation: float  # [m], left to right
+
+    wheels = ("rear_left", "rear_right", "steer_left", "steer_right")
+
+    def to_wheels(self, twist: Twist) -> tuple[float, ...]:
+        """(rear left, rear right [rad/s], front left, front right [rad])."""
+        drive, steering = self.car.to_wheels(twist)
+        bend = math.tan(steering) / self.car.wheel_base  # [1/m], of the middle of the rear axle
+        inner = 0.5 * self.separation * bend
+        along = self.car.wheel_base * bend
+        left, right = math.atan2(along, 1.0 - inner), math.atan2(along, 1.0 + inner)
+        return drive * (1.0 - inner), drive * (1.0 + inner), left, right
+
+    def to_body(self, wheels: tuple[float, ...]) -> Twist:
+        """The velocity of the middle of the rear axle, by its wheels and the steering angles."""
+        rear_left, rear_right, left, right = wheels
+        base, half = self.car.wheel_base, 0.5 * self.separation
+        bend_left = math.tan(left) / (base + half * math.tan(left))
+        bend_right = math.tan(right) / (base - half * math.tan(right))
+        forward = (rear_left + rear_right) / 2 * self.car.radius
+        return Twist(forward, 0.0, forward * (bend_left + bend_right) / 2)
+
+
 def missing_measures(robot: RobotFile) -> list[str]:
     """The measures of its wheels that a robot's file does not give."""
     return [name for name in MEASURES.get(robot.drive_type, ()) if not getattr(robot, name)]
@@ -159,6 +215,8 @@ def wheels_of(robot: RobotFile) -> Base | None:
     radius, across, along = robot.wheel_radius, robot.wheel_separation, robot.wheel_base
     if robot.drive_type == "differential":
         return Differential(radius, across)
+    if robot.drive_type == "skid_steer":
+        return SkidSteer(radius, robot.effective_track or across)
     if robot.drive_type == "mecanum":
         return Mecanum(radius, across, along)
     if robot.drive_type == "omni":

@@ -1,17 +1,39 @@
 """Bodies for the simulation: a model and the figures of its parts, from a robot's file."""
 
+import math
 from dataclasses import dataclass, field, replace
-from typing import Annotated
+from typing import Annotated, Any
 
 from msgspec import Meta
 
 from gigabrain_drivers.driver.robot import LinkOptions, RobotFile, Run
 from gigabrain_drivers.kinematics.legs import JOINT_NAMES, LEGS, WALKER, LegGeometry, Walker
+from gigabrain_drivers.kinematics.wheels import (
+    Ackermann,
+    AckermannAxles,
+    Base,
+    Differential,
+    Mecanum,
+    Omni,
+    SkidSteer,
+    Twist,
+    missing_measures,
+    wheels_of,
+)
 from gigabrain_schemas.base import NonNegative, Percentage, Positive
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import read_bounded
 
-SIMULATED = ("differential", "quadruped")  # drive types
+WHEELS = {  # drive types on wheels, and the driven parts of their models
+    "differential": ("wheel_left", "wheel_right"),
+    "skid_steer": tuple(f"wheel_{name}" for name in SkidSteer.wheels),
+    "mecanum": tuple(f"wheel_{name}" for name in Mecanum.wheels),
+    "omni": tuple(f"wheel_{name}" for name in Omni.wheels),
+    "ackermann": ("wheel_rear_left", "wheel_rear_right", "steer_left", "steer_right"),
+}
+SIMULATED = (*WHEELS, "quadruped")
+ROLLERS = ("mecanum", "omni")  # wheels with rollers on them
+SPARE_WHEEL_SPEED = 1.25  # times what the body's largest speeds, all at once, ask of a wheel
 MAX_MODEL_BYTES = 10_000_000
 
 
@@ -72,32 +94,44 @@ class SimModel:
 
 @dataclass(frozen=True, kw_only=True)
 class SimBody(SimModel):
-    """A differential-drive body for the simulation.
+    """A body on wheels for the simulation.
 
-    The base's origin lies between the wheels. Each name of `wheels` (left, right) is a body,
-    an actuator and, with `_joint` after it, a joint. `wheel_radius` and `wheel_separation` are
-    what the base's own kinematics believes; the truth is in the model.
+    The base's origin is that of its  Each name of `wheels` is a body, an actuator and,
+    with `_joint` after it, a joint; those of wheels are geoms as well. `wheel_radius` and
+    `wheel_separation` are what the base's own kinematics believes; the truth is in the model.
     """
 
     wheel_radius: float  # [m], turns commands into wheel speeds
     wheel_separation: float  # [m]
+    base: Base | None = None  # None: differential
     odometry_wheel_radius: float | None = None  # [m], turns encoder ticks into metres
     wheel_scale: float = 1.0  # true wheel radius / radius in the model: worn or swollen tyres
     max_wheel_speed: float = 9.0  # [rad/s]
     max_wheel_acceleration: float = 60.0  # [rad/s2]
-    wheels: tuple[str, str] = ("wheel_left", "wheel_right")
+    wheels: tuple[str, ...] = WHEELS["differential"]
+    gyro_heading: bool = False  # odometry turns by the gyroscope, as scrubbing wheels cannot say
     encoder_ticks: int = 4096  # per turn
 
+    @property
+    def kinematics(self) -> Base:
+        """The base's own"""
+        return self.base or Differential(self.wheel_radius, self.wheel_separation)
+
+    @property
+    def rolling(self) -> tuple[str, ...]:
+        """Those of `wheels` that roll."""
+        return tuple(name for name in self.wheels if name.startswith("wheel"))
+
     def parts(self) -> tuple[tuple[str, str], ...]:
-        """Wheels."""
+        """Wheels, and what steers."""
         return tuple(
             part
-            for wheel in self.wheels
+            for name in self.wheels
             for part in (
-                ("body", wheel),
-                ("geom", wheel),
-                ("joint", f"{wheel}_joint"),
-                ("actuator", wheel),
+                ("body", name),
+                *((("geom", name),) if name in self.rolling else ()),
+                ("joint", f"{name}_joint"),
+                ("actuator", name),
             )
         )
 
@@ -168,7 +202,7 @@ def sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimModel:
     if robot.drive_type not in SIMULATED:
         raise ConfigError(
             f"{robot.robot_type}: drive_type {robot.drive_type!r} cannot be simulated in MuJoCo; "
-            f"{' and '.join(SIMULATED)} can; a skid-steered base is differential"
+            f"{', '.join(SIMULATED)} can"
         )
     if robot.drive_type == "quadruped":
         battery = replace(
@@ -177,6 +211,9 @@ def sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimModel:
             percentage=options.battery_percentage,
         )
         return SimQuadruped(model=model, path=str(path), lidar=lidar, battery=battery)
+    battery = SimBattery(
+        capacity_ah=options.battery_capacity, percentage=options.battery_percentage
+    )
     return SimBody(
         model=model,
         path=str(path),
@@ -185,10 +222,37 @@ def sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimModel:
         odometry_wheel_radius=options.odometry_wheel_radius,
         wheel_scale=options.wheel_scale,
         lidar=lidar,
-        battery=SimBattery(
-            capacity_ah=options.battery_capacity, percentage=options.battery_percentage
-        ),
+        battery=battery,
+        **({} if robot.drive_type == "differential" else _wheels(robot, options)),
     )
+
+
+def _wheels(robot: RobotFile, options: MujocoOptions) -> dict[str, Any]:
+    """Return the fields of a base on more than two wheels. Raises ConfigError."""
+    who, drive = robot.robot_type, robot.drive_type
+    missing = missing_measures(robot)
+    if not robot.wheel_separation and "wheel_separation" not in missing:
+        missing.append("wheel_separation")
+    if missing:
+        raise ConfigError(
+            f"{who}: drive_type {drive!r} needs its {' and '.join(missing)}, in metres"
+        )
+    if drive in ROLLERS and options.wheel_scale != 1.0:
+        raise ConfigError(f"{who}: wheel_scale: wheels with rollers cannot be scaled; remove it")
+    base = wheels_of(robot)
+    assert base
+    fastest = Twist(robot.max_linear_speed, robot.max_lateral_speed, robot.max_angular_speed)
+    if isinstance(base, Ackermann):
+        steering = math.atan(robot.wheel_base * fastest.angular_z / fastest.linear_x)
+        car = replace(base, max_steering=steering)
+        base = AckermannAxles(car, robot.wheel_separation)
+    speeds = base.to_wheels(fastest)
+    return {
+        "base": base,
+        "wheels": WHEELS[drive],
+        "max_wheel_speed": SPARE_WHEEL_SPEED * max(map(abs, speeds)),
+        "gyro_heading": drive == "skid_steer",
+    }
 
 
 def _sim_lidar(robot: RobotFile, options: MujocoOptions) -> SimLidar | None:

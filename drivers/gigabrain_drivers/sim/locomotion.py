@@ -10,7 +10,7 @@ import numpy as np
 
 from gigabrain_drivers.kinematics.legs import JOINT_NAMES, LEGS, Gait, Senses, by_joint, by_leg
 from gigabrain_drivers.kinematics.trot import Trot
-from gigabrain_drivers.kinematics.wheels import Differential, Twist
+from gigabrain_drivers.kinematics.wheels import Twist
 from gigabrain_drivers.sim import STEP_S
 from gigabrain_drivers.sim.body import SimBattery, SimBody, SimMotor, SimQuadruped
 from gigabrain_drivers.sim.scene import ROBOT
@@ -140,59 +140,55 @@ class Locomotion(abc.ABC):
         return ()
 
 
-class Rolling(Locomotion):
-    """A differential base: two wheel motors and their incremental encoders, left and right.
+class Wheels(Locomotion):
+    """Motors of wheels, and of their steering, with encoders; nothing limits how they slip.
 
-    The wheels get to what is commanded at their greatest acceleration; nothing goes sideways.
+    Wheels get to what is commanded at their greatest acceleration.
     """
 
     def __init__(self, body: SimBody, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         self._body, self._data = body, data
-        self._kinematics = Differential(body.wheel_radius, body.wheel_separation)
+        self._kinematics = body.kinematics
         self._angles = [int(model.joint(f"{ROBOT}{n}_joint").qposadr[0]) for n in body.wheels]
         self._motors = [int(model.actuator(f"{ROBOT}{n}").id) for n in body.wheels]
         self._heat = [MotorHeat(body.motor) for _ in body.wheels]
         self._angle_per_tick = math.tau / body.encoder_ticks
-        radius = body.odometry_wheel_radius or body.wheel_radius
-        self._metres_per_tick = self._angle_per_tick * radius
-        self._target = self._speed = (0.0, 0.0)  # [rad/s]
-        self._counts = (0, 0)
-        self._past = deque([(0, 0)] * (VELOCITY_TICKS + 1), maxlen=VELOCITY_TICKS + 1)
+        count = len(body.wheels)
+        self._rolling = len(body.rolling)  # they come first; what steers after them
+        self._target = self._speed = (0.0,) * count  # [rad/s]; [rad] of what steers
+        self._counts = (0,) * count
+        self._past = deque([self._counts] * (VELOCITY_TICKS + 1), maxlen=VELOCITY_TICKS + 1)
         self._x = self._y = self._yaw = 0.0
 
     def command(self, twist: Twist) -> Twist:
-        """Aim for a velocity; both wheels slow down alike if one would be too fast."""
-        left, right = self._kinematics.to_wheels(twist)
-        scale = max(abs(left), abs(right)) / self._body.max_wheel_speed
+        """Aim for a velocity; all wheels slow down alike if one would be too fast."""
+        wheels = self._kinematics.to_wheels(twist)
+        speeds = wheels[: self._rolling]
+        scale = max(map(abs, speeds)) / self._body.max_wheel_speed
         if scale > 1:
-            left, right = left / scale, right / scale
-        self._target = (left, right)
+            speeds = tuple(speed / scale for speed in speeds)
+        steering = wheels[self._rolling :] if any(speeds) else self._target[self._rolling :]
+        self._target = (*speeds, *steering)
         return self._kinematics.to_body(self._target)
 
     def act(self) -> None:
-        """Set the wheel speeds of the next step."""
-        step = self._body.max_wheel_acceleration * STEP_S
-        (left, right), (left_now, right_now) = self._target, self._speed
-        self._speed = (
-            left_now + min(max(left - left_now, -step), step),
-            right_now + min(max(right - right_now, -step), step),
+        """Set the wheel speeds and the steering of the next step."""
+        step, control = self._body.max_wheel_acceleration * STEP_S, self._data.ctrl
+        self._speed = tuple(
+            now + min(max(target - now, -step), step)
+            for target, now in zip(self._target, self._speed, strict=True)
         )
-        control = self._data.ctrl
-        control[self._motors[0]], control[self._motors[1]] = self._speed
+        for motor, speed in zip(self._motors, self._speed, strict=True):
+            control[motor] = speed
 
     def sense(self, imu: ImuSample) -> None:
-        """Count the encoder ticks of the past step and integrate them at the mid heading."""
-        position, counts = self._data.qpos, self._counts
-        left = self._counted(float(position[self._angles[0]]), counts[0])
-        right = self._counted(float(position[self._angles[1]]), counts[1])
-        moved = (left + right - counts[0] - counts[1]) / 2 * self._metres_per_tick
-        self._counts = (left, right)
+        """Count the encoder ticks of the past step."""
+        position = self._data.qpos
+        self._counts = tuple(
+            self._counted(float(position[angle]), count)
+            for angle, count in zip(self._angles, self._counts, strict=True)
+        )
         self._past.append(self._counts)
-        yaw = (right - left) * self._metres_per_tick / self._body.wheel_separation
-        middle = (yaw + self._yaw) / 2
-        self._x += moved * math.cos(middle)
-        self._y += moved * math.sin(middle)
-        self._yaw = yaw
 
     def _counted(self, angle: float, count: int) -> int:
         """The new count; it moves by whole ticks only, so a wheel at rest does not flicker."""
@@ -207,19 +203,8 @@ class Rolling(Locomotion):
             current += heat.warm(share * abs(speed), effort[motor])
         return current
 
-    def odometry(self) -> OdometryReading:
-        """Return pose and velocity by the wheel encoders alone."""
-        left, right = self._speeds(self._metres_per_tick)
-        turn = (right - left) / self._body.wheel_separation
-        return OdometryReading(self._x, self._y, self._yaw, (left + right) / 2, turn)
-
-    def velocity(self) -> Twist:
-        """Return the velocity by the wheel encoders alone."""
-        odometry = self.odometry()
-        return Twist(odometry.linear_x, 0.0, odometry.angular_z)
-
     def motors(self) -> tuple[Motor, ...]:
-        """Return left and right wheel."""
+        """Return all wheels, and what steers."""
         effort = self._data.actuator_force
         speeds = self._speeds(self._angle_per_tick)
         parts = zip(self._body.wheels, self._counts, speeds, self._motors, self._heat, strict=True)
@@ -234,11 +219,86 @@ class Rolling(Locomotion):
             for name, count, speed, motor, heat in parts
         )
 
-    def _speeds(self, per_tick: float) -> tuple[float, float]:
-        """The speed of both wheels, in units of `per_tick` a second."""
-        (left, right), (left_then, right_then) = self._counts, self._past[0]
+    def _speeds(self, per_tick: float) -> tuple[float, ...]:
+        """The speed of all motors, in units of `per_tick` a second."""
         per_second = per_tick / (VELOCITY_TICKS * STEP_S)
-        return (left - left_then) * per_second, (right - right_then) * per_second
+        pairs = zip(self._counts, self._past[0], strict=True)
+        return tuple((now - then) * per_second for now, then in pairs)
+
+
+class Rolling(Wheels):
+    """A differential base: two wheels, left and right; nothing goes sideways."""
+
+    def __init__(self, body: SimBody, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        super().__init__(body, model, data)
+        radius = body.odometry_wheel_radius or body.wheel_radius
+        self._metres_per_tick = self._angle_per_tick * radius
+
+    def sense(self, imu: ImuSample) -> None:
+        """Integrate the encoder ticks of the past step at the mid heading."""
+        before = self._counts
+        super().sense(imu)
+        left, right = self._counts
+        moved = (left + right - before[0] - before[1]) / 2 * self._metres_per_tick
+        yaw = (right - left) * self._metres_per_tick / self._body.wheel_separation
+        middle = (yaw + self._yaw) / 2
+        self._x += moved * math.cos(middle)
+        self._y += moved * math.sin(middle)
+        self._yaw = yaw
+
+    def odometry(self) -> OdometryReading:
+        """Return pose and velocity by the wheel encoders alone."""
+        left, right = self._speeds(self._metres_per_tick)
+        turn = (right - left) / self._body.wheel_separation
+        return OdometryReading(self._x, self._y, self._yaw, (left + right) / 2, turn)
+
+    def velocity(self) -> Twist:
+        """Return the velocity by the wheel encoders alone."""
+        odometry = self.odometry()
+        return Twist(odometry.linear_x, 0.0, odometry.angular_z)
+
+
+class FreeRolling(Wheels):
+    """Any other base on wheels, by its kinematics; the gyroscope turns one whose wheels scrub."""
+
+    def __init__(self, body: SimBody, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        super().__init__(body, model, data)
+        self._scale = (body.odometry_wheel_radius or body.wheel_radius) / body.wheel_radius
+        self._turns: deque[float] = deque([0.0] * VELOCITY_TICKS, maxlen=VELOCITY_TICKS)  # [rad/s]
+
+    def sense(self, imu: ImuSample) -> None:
+        """Integrate the encoder ticks of the past step, or the gyroscope, at the mid heading."""
+        before = self._counts
+        super().sense(imu)
+        moved = self._body_motion(before, 1.0)
+        self._turns.append(imu.angular_velocity[2])
+        turn = imu.angular_velocity[2] * STEP_S if self._body.gyro_heading else moved.angular_z
+        middle = self._yaw + turn / 2
+        cos, sin = math.cos(middle), math.sin(middle)
+        self._x += cos * moved.linear_x - sin * moved.linear_y
+        self._y += sin * moved.linear_x + cos * moved.linear_y
+        self._yaw += turn
+
+    def odometry(self) -> OdometryReading:
+        """Return pose and velocity by encoders, and the gyroscope where it counts."""
+        velocity = self.velocity()
+        return OdometryReading(self._x, self._y, self._yaw, velocity.linear_x, velocity.angular_z)
+
+    def velocity(self) -> Twist:
+        """Return the mean velocity of the last 50 ms."""
+        moved = self._body_motion(self._past[0], VELOCITY_TICKS * STEP_S)
+        if not self._body.gyro_heading:
+            return moved
+        turn = sum(self._turns) / len(self._turns)
+        return moved._replace(angular_z=turn)
+
+    def _body_motion(self, since: tuple[int, ...], seconds: float) -> Twist:
+        """Return the motion since the counts `since`, over `seconds`; what steers has its angle."""
+        first, unit = self._rolling, self._angle_per_tick
+        pairs = zip(self._counts[:first], since[:first], strict=True)
+        rolled = [(now - then) * unit * self._scale / seconds for now, then in pairs]
+        steers = [count * unit for count in self._counts[first:]]
+        return self._kinematics.to_body((*rolled, *steers))
 
 
 class Walking(Locomotion):

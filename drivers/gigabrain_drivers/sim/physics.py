@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.kinematics.legs import Gait
-from gigabrain_drivers.kinematics.wheels import Twist
+from gigabrain_drivers.kinematics.wheels import Differential, Twist
 from gigabrain_drivers.sim import STEP_NS
 from gigabrain_drivers.sim.body import (
     SimBody,
@@ -18,6 +18,7 @@ from gigabrain_drivers.sim.body import (
 from gigabrain_drivers.sim.locomotion import (
     Battery,
     Charge,
+    FreeRolling,
     Locomotion,
     Motor,
     OdometryReading,
@@ -153,7 +154,8 @@ class Simulation:
 def make_locomotion(body: SimModel, model: mujoco.MjModel, data: mujoco.MjData) -> Locomotion:
     """Return the locomotion of a body. Raises ConfigError for an unknown kind."""
     if isinstance(body, SimBody):
-        return Rolling(body, model, data)
+        kind = Rolling if isinstance(body.kinematics, Differential) else FreeRolling
+        return kind(body, model, data)
     if isinstance(body, SimQuadruped):
         return Walking(body, model, data)
     raise ConfigError(f"{type(body).__name__} has neither wheels nor legs")

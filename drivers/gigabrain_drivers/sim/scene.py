@@ -136,7 +136,7 @@ def _robot_spec(body: SimModel) -> mujoco.MjSpec:
     if not isinstance(body, SimBody):
         return spec
     _compare_wheels(spec, body)
-    for name in body.wheels:
+    for name in body.rolling:
         wheel = spec.body(name)
         radius = spec.geom(name).size[0]
         wheel.pos[2] -= radius * (1 - body.wheel_scale)
@@ -147,7 +147,7 @@ def _robot_spec(body: SimModel) -> mujoco.MjSpec:
 
 def _compare_wheels(spec: mujoco.MjSpec, body: SimBody) -> None:
     """Warn where the wheels of the model are not those of the robot's file."""
-    left, right = (spec.body(name) for name in body.wheels)
+    left, right = (spec.body(name) for name in body.rolling[:2])
     apart = math.dist(left.pos[:2], right.pos[:2])
     pairs = [("wheel_separation", body.wheel_separation, apart)]
     if body.wheel_scale == 1.0 and body.odometry_wheel_radius is None:  # else it is on purpose

@@ -222,12 +222,14 @@ async def opens(checked: CheckedRobot) -> Finding:
 
 
 async def obeys(checked: CheckedRobot) -> Finding:
-    """Drive forward, then turn: the measured speed reaches the commanded one."""
+    """Drive forward, sideways where it can, and turn: the measured speed reaches the commanded."""
     robot, measured_texts = checked.file, []
-    wishes = (
-        ("linear_x", Velocity(linear_x=0.5 * robot.max_linear_speed)),
-        ("angular_z", Velocity(angular_z=-0.5 * robot.max_angular_speed)),
-    )
+    along, turn = 0.5 * robot.max_linear_speed, -0.5 * robot.max_angular_speed
+    car = robot.drive_type == "ackermann"  # it turns only as it drives
+    wishes = [("linear_x", Velocity(linear_x=along))]
+    if robot.max_lateral_speed:
+        wishes.append(("linear_y", Velocity(linear_y=0.5 * robot.max_lateral_speed)))
+    wishes.append(("angular_z", Velocity(linear_x=along if car else 0.0, angular_z=turn)))
     async with DriverSession(checked) as it:
         await it.connected()
         for axis, wish in wishes:

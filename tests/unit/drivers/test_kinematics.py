@@ -11,10 +11,12 @@ from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.kinematics.legs import Walker
 from gigabrain_drivers.kinematics.wheels import (
     Ackermann,
+    AckermannAxles,
     Base,
     Differential,
     Mecanum,
     Omni,
+    SkidSteer,
     Twist,
     wheels_of,
 )
@@ -53,6 +55,28 @@ def test_ackermann_there_and_back(
     base = Ackermann(radius, wheel_base)
     twist = Twist(forward, 0.0, forward * math.tan(steering) / wheel_base)
     assert close(base.to_body(base.to_wheels(twist)), twist)
+
+
+@given(speeds, st.floats(-0.75, 0.75), lengths, lengths, st.floats(0.02, 0.5))
+def test_all_corners_of_a_car_there_and_back(
+    forward: float, steering: float, radius: float, wheel_base: float, share: float
+) -> None:
+    base = AckermannAxles(Ackermann(radius, wheel_base), share * wheel_base)
+    twist = Twist(forward, 0.0, forward * math.tan(steering) / wheel_base)
+    assert close(base.to_body(base.to_wheels(twist)), twist)
+
+
+def test_the_inner_front_wheel_of_a_car_steers_more_and_its_rear_wheel_rolls_slower() -> None:
+    base = AckermannAxles(Ackermann(0.05, 0.26), 0.2)
+    rear_left, rear_right, left, right = base.to_wheels(Twist(0.45, 0.0, 1.0))
+    assert (rear_left, rear_right) == pytest.approx((7.0, 11.0))
+    assert (left, right) == pytest.approx((math.atan(0.26 / 0.35), math.atan(0.26 / 0.55)))
+
+
+@given(twists, lengths, lengths)
+def test_skid_steer_there_and_back(twist: Twist, radius: float, track: float) -> None:
+    base = SkidSteer(radius, track)
+    assert close(base.to_body(base.to_wheels(twist)), twist._replace(linear_y=0.0))
 
 
 @given(twists)
