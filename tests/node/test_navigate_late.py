@@ -10,7 +10,7 @@ from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.tasks import GoalRequest
 from gigabrain_schemas.topics import GOAL, MAP
-from gigabrain_zenoh.decision import navigator as navigating
+from gigabrain_zenoh.decision import route_schedule
 from gigabrain_zenoh.decision.behaviours import NavigationConfig
 from gigabrain_zenoh.decision.navigator import NO_ROUTE, Navigator
 from gigabrain_zenoh.decision.route import Route, RoutePlanner, RouteRequest
@@ -84,7 +84,7 @@ async def ticks_to_a_way(monkeypatch: pytest.MonkeyPatch, thinks_s: float) -> li
         return plan(planner, request)
 
     monkeypatch.setattr(RoutePlanner, "plan", slowly)
-    monkeypatch.setattr(navigating, "PATIENCE_S", 30.0)
+    monkeypatch.setattr(route_schedule, "PATIENCE_S", 30.0)
     ticks = []
     async with Plane(LARGE) as plane:
         await plane.go(0.2)

@@ -1,0 +1,112 @@
+"""Keeps the route of the present command up to date, in a worker thread for large maps."""
+
+import numpy as np
+
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.brain import OccupancyGrid
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.decision.behaviours import DriveCommand, NavigationConfig
+from gigabrain_zenoh.decision.context import NavigationContext
+from gigabrain_zenoh.decision.route import Route, RouteFeedback, RoutePlanner, RouteRequest
+from gigabrain_zenoh.geometry.se2 import from_pose, transform
+from gigabrain_zenoh.host.threads import ScheduledWorker, Take
+
+SMALL_MAP_CELLS = 60_000  # routes in larger maps are planned in a worker thread,
+CELLS_PER_SCAN = 250_000  # every this many cells add one scan until a plan is due
+MIN_DUE_SCANS = 2
+HUNG_SCANS = 200  # a plan that is overdue for this many scans will never finish
+PATIENCE_S = 0.05  # how long a scan waits for a due plan; control waits no longer
+REPLAN_TICKS = 25  # a route is checked at least twice a second
+
+
+class RouteSchedule:
+    """Keeps the present route up to date."""
+
+    def __init__(self, config: NavigationConfig, bus: Bus) -> None:
+        self.inflation = config.inflation  # [m], of the next plan
+        self._planner = RoutePlanner(config.unknown_space)
+        self._worker = ScheduledWorker(PATIENCE_S, bus.input_log.in_time)
+        self.route: Route | None = None
+        self._planned: tuple[int, OccupancyGrid] | None = None  # tick and map of the last plan
+        self._feedback: RouteFeedback | None = None
+        self._stands = False  # the route was not followed in the last step
+        self._counted = (0, 0)  # boot and tick until which `_held_ticks` has counted
+        self._held_ticks = 0  # since the last request
+
+    def at_scan(self) -> None:
+        """Take the route from the worker thread, if it is due at this scan."""
+        self._worker.at_scan()
+
+    def count_held(self, boot: int, tick: int, held: str) -> None:
+        """Add the ticks since the last call if the body did not follow its route in them."""
+        counted_boot, counted = self._counted
+        if boot != counted_boot:
+            counted, self._held_ticks = tick, 0
+        if held or self._stands:
+            self._held_ticks += max(0, tick - counted)
+        self._counted = boot, max(tick, counted)
+
+    def report(self, feedback: RouteFeedback | None) -> None:
+        """Record how the present route was driven in this step; None if it was not."""
+        self._feedback = feedback or self._feedback
+        route = self.route
+        self._stands = feedback is None and route is not None and route.points is not None
+
+    def request(
+        self, context: NavigationContext, here: Pose, command: DriveCommand, grid: OccupancyGrid
+    ) -> None:
+        """Plan a route if one is due; in a large map it becomes `route` at a later scan."""
+        cells = grid.width * grid.height
+        scans = MIN_DUE_SCANS + cells // CELLS_PER_SCAN
+        if not self._worker.idle:  # maybe with a larger map, which this one has replaced
+            self._worker.hasten(scans)
+            return
+        if not self._due(command, context.tick, grid):
+            return
+        assert context.world
+        assert context.body
+        self._planned, feedback, self._feedback = (context.tick, grid), self._feedback, None
+        request = RouteRequest(
+            tick=context.tick,
+            command=command,
+            here=here,
+            grid=grid,
+            body=context.body,
+            feedback=feedback,
+            seen=transform(from_pose(here), context.world.points().astype(np.float64)),
+            inflation=self.inflation,
+            held_ticks=self._held_ticks,
+            slowed_by=context.slowed_by,
+        )
+        self._held_ticks = 0
+        if cells <= SMALL_MAP_CELLS:
+            self.route = self._planner.plan(request)
+        else:
+            self._worker.start(lambda: self._plan(request), scans)
+
+    def close(self) -> None:
+        """Stop the worker thread."""
+        self._worker.close()
+
+    @property
+    def hung(self) -> bool:
+        """Whether the plan in the worker thread will never finish."""
+        return self._worker.overdue > HUNG_SCANS
+
+    def _plan(self, request: RouteRequest) -> Take:
+        """Plan in the worker thread; return a function that installs the route."""
+        route = self._planner.plan(request)
+
+        def take() -> None:
+            self.route = route
+
+        return take
+
+    def _due(self, command: DriveCommand, tick: int, grid: OccupancyGrid) -> bool:
+        route = self.route
+        if route is None or self._planned is None or route.number != command.number:
+            return True
+        before, known = self._planned
+        if self._feedback and self._feedback.arrived and self._feedback.version == route.version:
+            return True
+        return grid is not known or not 0 <= tick - before < REPLAN_TICKS
