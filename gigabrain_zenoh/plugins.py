@@ -43,7 +43,7 @@ def load_plugin(kind: str, name: str, shipped: Mapping[str, Any], group: str) ->
     """Return the object called `name`: a shipped one, or an entry point of `group`.
 
     The table of shipped objects holds them, or strings "module:name".
-    Raises UnknownName with all names, and ConfigError if it cannot be imported.
+    Raises UnknownName with all names, and ConfigError if its import fails in any way.
     """
     if name in shipped:
         found = shipped[name]
@@ -53,5 +53,6 @@ def load_plugin(kind: str, name: str, shipped: Mapping[str, Any], group: str) ->
         raise unknown(kind, name, plugin_names(shipped, group))
     try:
         return offered[name].load()
-    except (ImportError, AttributeError) as error:
-        raise ConfigError(f"{kind} {name!r} of {offered[name].value}: {error}") from None
+    except Exception as error:  # noqa: BLE001 - a package may raise anything
+        what = error if isinstance(error, ImportError | AttributeError) else repr(error)
+        raise ConfigError(f"{kind} {name!r} of {offered[name].value}: {what}") from None

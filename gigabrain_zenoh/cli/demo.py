@@ -165,7 +165,8 @@ def up(
             def put(line: str) -> None:
                 display.put(f"{line}\n")
 
-            return run_async(run(loaded, where, put, level, keep_stuck=keep_stuck))
+            file = str(path.absolute())
+            return run_async(run(loaded, where, put, level, keep_stuck=keep_stuck, file=file))
     except ConfigError as error:
         raise located(path, error) from None
 

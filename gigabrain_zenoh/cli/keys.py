@@ -47,6 +47,7 @@ def issue(
     name: str = "",
     host: tuple[str, ...] = (),
     robot: str = "",
+    process: str = "",
     days: int = 365,
     dir: FleetFolder = None,
 ) -> None:
@@ -56,24 +57,31 @@ def issue(
 
     Roles: robot: all processes of a robot. brain: perception and decision.
     operator: drive, stop and release. viewer: receive only. router: the router
-    of a site, on a host of its own.
+    of a site, on a host of its own. process: a process of your own: receives
+    all, and sends what it declares.
 
     Args:
         role: Role of the identity.
         name: Name of its folder. Default: role and robot.
         host: Address or name under which others reach the router there; may be given again.
         robot: Namespace of the robot. Without it, an operator or viewer is for all robots.
+        process: Name of the process of your own, for the role process.
         days: Days until it expires.
     """
     with _needs_cryptography():
         from gigabrain_zenoh.security import authority
 
-    folder = authority.issue(find_fleet(dir), role, robot=robot, name=name, hosts=host, days=days)
+    folder = authority.issue(
+        find_fleet(dir), role, robot=robot, process=process, name=name, hosts=host, days=days
+    )
+    if process:
+        print(f"{folder}: copy it to its host, as `{process}` in the folder of the host's identity")
+        return
     print(f"{folder}: copy it to its host, and keep others from reading it")
     print(f"next: {_first_use(role, robot, folder)}")
 
 
-def revoke(role: Role, *, robot: str = "", dir: FleetFolder = None) -> None:
+def revoke(role: Role, *, robot: str = "", process: str = "", dir: FleetFolder = None) -> None:
     """Revoke all identities of a role, such as those of a lost laptop. New ones are valid.
 
     Example: gigabrain keys revoke operator
@@ -81,19 +89,21 @@ def revoke(role: Role, *, robot: str = "", dir: FleetFolder = None) -> None:
     Routers refuse them once they have the new list and are restarted.
 
     Args:
-        role: Role of the identities: brain, operator or viewer.
+        role: Role of the identities: brain, operator, viewer or process.
         robot: Namespace of the robot, for identities that name one.
+        process: Name of the process, for the role process.
     """
     with _needs_cryptography():
         from gigabrain_zenoh.security import authority
 
     folder = find_fleet(dir)
-    lists = authority.revoke(folder, role, robot)
+    lists = authority.revoke(folder, role, robot, process)
     for path in lists:
         print(f"{path}: copy it to that identity's folder on its host, and restart its router")
     if not lists:
         print("no identity of a router here; those issued from now on include the list")
-    option = f" --robot {robot}" if robot else ""
+    option = f" --process {process}" if process else ""
+    option += f" --robot {robot}" if robot else ""
     print(f"next, for those who keep access: gigabrain keys issue {role}{option}"
           f" --dir {_quoted(folder)}")  # fmt: skip
 
@@ -137,11 +147,15 @@ def zenohd(
     with _needs_cryptography():
         from gigabrain_zenoh.bus.zenoh.config import configuration
         from gigabrain_zenoh.config.settings import Endpoint
-        from gigabrain_zenoh.launch.processes import names_by_role
+        from gigabrain_zenoh.launch.processes import grants, names_by_role
 
     generations = generations_in(find_fleet(dir)) if dir else {}
     endpoint = Endpoint(
-        listen=(listen,), keys=str(keys), fleet=robot or ("",), names=names_by_role()
+        listen=(listen,),
+        keys=str(keys),
+        fleet=robot or ("",),
+        names=names_by_role(),
+        grants=grants(),
     )
     print(configuration(endpoint, generations), end="")
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import msgspec
 from cyclopts import Parameter
+from msgspec import structs
 
 from gigabrain_zenoh.bus.zenoh.config import router_config, secured, session_config
 from gigabrain_zenoh.cli.options import Level, Seed, World, checked, print_progress
@@ -22,7 +23,7 @@ from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host import run_folders
 from gigabrain_zenoh.host.network import exposed, reached_at
-from gigabrain_zenoh.launch.processes import names_by_role, process_type, run_process
+from gigabrain_zenoh.launch.processes import grants, names_by_role, process_type, run_process
 from gigabrain_zenoh.runtime.running import announced, find_endpoint
 from gigabrain_zenoh.security.identity_files import identity_in
 
@@ -100,9 +101,8 @@ def router(
         identity_in(Path(keys))
     namespace = process.namespace
     names = names_by_role() if keys else {}
-    endpoint = secured(
-        Endpoint(listen=listen, namespace=namespace, keys=keys, fleet=fleet, names=names)
-    )
+    at = Endpoint(listen=listen, namespace=namespace, keys=keys, fleet=fleet)
+    endpoint = secured(structs.replace(at, names=names, grants=grants()))
     if not keys and not insecure:
         _refuse_exposed(listen)
     settings = router_config(endpoint, run_folders.state_dir() / "robots" / (namespace or "router"))

@@ -139,20 +139,36 @@ def _find(node: Node, type_: Any, path: str, key_line: int) -> FieldFault | None
 
 
 def _own_fault(node: Node, path: str, line: int, text: str) -> FieldFault:
-    """Return the line of a Struct's own error, which may begin with `FIELD: ` or `FIELD[2]: `.
+    """Return the line of a Struct's own error, which may begin with a path: `FIELD.PART[2]: `.
 
     Otherwise it is the line of the first field of the file that the error names.
     """
-    match = re.match(r"(\w+)(?:\[(\d+)\])?: ", text)
-    for entry in node.entries or ():
-        if match and entry.key == match[1]:
-            items = entry.node.items or ()
-            number = int(match[2]) if match[2] else len(items)
-            at = items[number].line if number < len(items) else entry.line
-            return FieldFault(at, _join(path, text))
+    match = re.match(r"(\w+(?:\.\w+|\[\d+\])*): ", text)
+    if match and (at := line_of(node, re.findall(r"\w+", match[1]))):
+        return FieldFault(at, _join(path, text))
     lines = {entry.key: entry.line for entry in node.entries or ()}
     named = (lines[word] for word in re.findall(r"\w+", text) if word in lines)
     return FieldFault(next(named, line), _at(path, text))
+
+
+def line_of(node: Node, path: Sequence[str]) -> int | None:
+    """Return the line of the last part of `path` that the document has; None if it has none."""
+    found = None
+    for part in path:
+        entry = next((one for one in node.entries or () if one.key == part), None)
+        if entry:
+            found, node = entry.line, entry.node
+        elif node.items and part.isdecimal() and int(part) < len(node.items):
+            node = node.items[int(part)]
+            found = node.line
+        else:
+            break
+    return found
+
+
+def line_in(path: Path, place: Sequence[str]) -> int | None:
+    """Return the line of a part of a YAML file, or of the nearest part around it that is there."""
+    return line_of(yaml_text.read(read(path)), place)
 
 
 def _wrong_tag(node: Node, structs: list[Any], path: str, key_line: int) -> FieldFault | None:

@@ -23,6 +23,7 @@ class Endpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     keys: str = ""  # folder of an identity; without it there is no authentication
     fleet: tuple[str, ...] = ()  # namespaces of other robots that a router serves
     names: dict[str, tuple[str, ...]] = {}  # of processes, by role: what a router lets publish
+    grants: dict[str, tuple[str, ...]] = {}  # keys that processes of one's own write, by name
     nap_s: float = 0.0  # [s], how long tapped messages may gather before delivery
 
 
@@ -31,6 +32,7 @@ class RouterConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     state_dir: str = ""  # folder of its log of rejected clients
     knows: tuple[str, ...] = ()  # common names that have rights; without keys there is no check
+    watches: tuple[str, ...] = ()  # processes of one's own, whose silence it reports
 
 
 class RelayConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -137,6 +139,25 @@ class RecorderConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     notes: dict[str, str] = {}  # stored in the file, for replay
 
 
+OwnName = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
+ModuleName = Annotated[str, Meta(pattern=r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*(:[A-Za-z_]\w*)?$")]
+
+
+class OwnProcess(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One entry of `processes` in a deployment file: a process of one's own."""
+
+    module: ModuleName  # with a coroutine `run(config, bus, ready)`; another one: MODULE:NAME
+    settings: dict[str, Any] = {}  # of the module; see its Config
+    writes: tuple[str, ...] = ()  # keys that it may publish, ask or serve, where the robot has keys
+
+
+class OwnPerceptor(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One entry of `perceptors` in a deployment file: a perception step in its own process."""
+
+    perceptor: str = ""  # offered by an installed package; empty: the name of the entry
+    settings: dict[str, Any] = {}  # of the perceptor; see its Config
+
+
 class ProcessConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Complete configuration of one process."""
 
@@ -146,3 +167,6 @@ class ProcessConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     run_dir: str | None = None  # folder of its log file; without it there is no log file
     json_console: bool = False  # JSON log lines on the console, for a supervisor to read
     level: str = "info"
+    module: str = ""  # of a process of one's own, instead of a row of the table of processes
+    perceptor: str = ""  # of a process that runs one
+    file: str = ""  # deployment file with the settings of either, for errors

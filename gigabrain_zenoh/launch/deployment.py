@@ -1,6 +1,7 @@
 """A deployment file: which body on which link, and which process runs on which host."""
 
 from collections import Counter
+from collections.abc import Iterable
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -10,6 +11,7 @@ from msgspec import Struct, structs
 
 from gigabrain_zenoh.bus.zenoh.config import secured
 from gigabrain_zenoh.config import loading as config
+from gigabrain_zenoh.config import yaml_text
 from gigabrain_zenoh.config.settings import (
     ButtonConfig,
     DecisionConfig,
@@ -17,6 +19,9 @@ from gigabrain_zenoh.config.settings import (
     FoxgloveConfig,
     LinkName,
     LockstepTimeout,
+    OwnName,
+    OwnPerceptor,
+    OwnProcess,
     PageConfig,
     PerceptionConfig,
     RecorderConfig,
@@ -26,9 +31,20 @@ from gigabrain_zenoh.config.settings import (
 )
 from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.host.network import exposed, host_and_port, reserve_port
-from gigabrain_zenoh.launch.processes import PROCESSES, process_type, process_types
+from gigabrain_zenoh.launch.own_processes import MODULES, PERCEPTORS, check_entries
+from gigabrain_zenoh.launch.processes import (
+    GROUP,
+    PROCESSES,
+    deployed_type,
+    process_types,
+)
+from gigabrain_zenoh.plugins import plugin_names
 from gigabrain_zenoh.runtime.running import local_socket
-from gigabrain_zenoh.security.identity_files import check_identity, identity_folder
+from gigabrain_zenoh.security.identity_files import (
+    check_identity,
+    check_own_identity,
+    identity_folder,
+)
 
 MOST_HOSTS = 64
 ROBOT = tuple(name for name, one in PROCESSES.items() if one.default)
@@ -56,12 +72,16 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     recorder: RecorderConfig = RecorderConfig()
     page: PageConfig = PageConfig()
     foxglove: FoxgloveConfig = FoxgloveConfig()
+    # of one's own; where there is one host, it runs those that `hosts` does not name
+    processes: dict[OwnName, OwnProcess] = {}
+    perceptors: dict[OwnName, OwnPerceptor] = {}
 
     def __post_init__(self) -> None:
         if not self.hosts:
             raise ValueError("hosts: expected at least one, with the processes that it runs")
         if len(self.hosts) > MOST_HOSTS:
             raise ValueError(f"hosts: {len(self.hosts)} of them; expected at most {MOST_HOSTS}")
+        self._place_own()
         placed = Counter(name for names in self.hosts.values() for name in names)
         twice = sorted(name for name, times in placed.items() if times > 1)
         if twice:
@@ -78,6 +98,18 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             raise ValueError("resume: auto is for simulation; a real body is enabled by a person")
         if self.speed != 1.0 and self.link != "sim":
             raise ValueError("speed is for the simulation; other links run in real time")
+
+    def _place_own(self) -> None:
+        """Check the processes of one's own, and put those that have no host on the only one."""
+        check_entries(self.processes, self.perceptors, PROCESSES)
+        placed = {name for names in self.hosts.values() for name in names}
+        left = [one for one in (*self.processes, *self.perceptors) if one not in placed]
+        if left and len(self.hosts) > 1:
+            where = ", ".join(self.hosts)
+            raise ValueError(f"hosts: {left[0]} is on none; name it in one of: {where}")
+        if left:
+            ((host, names),) = self.hosts.items()
+            structs.force_setattr(self, "hosts", {host: (*names, *left)})
 
     def settings(self, process: str) -> Struct | dict[str, Any]:
         """Return the part of the file for `process`; empty where it has none."""
@@ -99,14 +131,15 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             )
 
 
-def deployment_type() -> type[Deployment]:
+def deployment_type(own: Iterable[str] = ()) -> type[Deployment]:
     """Return the type of a deployment file, with the processes and parts that packages offer.
 
-    Raises ConfigError for a package that cannot be imported.
+    `own` are the names of its own processes and perceptors, which `hosts` may name as well.
     """
     types = {name: one for name, one in process_types().items() if one.named}
+    broken = set(plugin_names({}, GROUP)) - set(types)  # its error comes where it is to run
     literal, some, by_name = cast(Any, Literal), cast(Any, tuple), cast(Any, dict)
-    names = by_name[str, some[literal[tuple(types)], ...]]
+    names = by_name[str, some[literal[(*types, *sorted(broken), *own)], ...]]
     hosts = ("hosts", names, msgspec.field(default_factory=lambda: {"robot": ROBOT}))
     known = Deployment.__struct_fields__
     parts = [
@@ -157,10 +190,21 @@ def load_deployment(path: Path, keys: str = "") -> Deployment:
 
     Raises ConfigError with file, line and what was expected.
     """
-    loaded = config.load(path, deployment_type())
+    text = config.read(path)
+    loaded = config.loads(text, deployment_type(_own_names(text)), str(path))
     if loaded.keys and not keys:
         keys = str(path.absolute().parent / Path(loaded.keys).expanduser())
     return msgspec.structs.replace(loaded, keys=keys)
+
+
+def _own_names(text: str) -> list[str]:
+    """Return the names of the processes of one's own in a file, which may still be invalid."""
+    try:
+        root = yaml_text.read(text)
+    except yaml_text.YamlFault:
+        return []  # reported with its line when the file is read as a whole
+    parts = (one.node for one in root.entries or () if one.key in (MODULES, PERCEPTORS))
+    return [entry.key for part in parts for entry in part.entries or ()]
 
 
 def host_of(deployment: Deployment, name: str | None) -> str:
@@ -209,13 +253,15 @@ def local_endpoint(deployment: Deployment, host: str) -> Endpoint:
 
 def check_keys(deployment: Deployment, host: str) -> None:
     """Check that the identity of `host` permits its processes. Raises ConfigError."""
-    if deployment.keys:
-        check_identity(
-            identity_folder(deployment.keys, host),
-            {name: process_type(name).roles for name in deployment.hosts[host]},
-            deployment.namespace,
-            deployment.router,
-        )
+    if not deployment.keys:
+        return
+    folder = identity_folder(deployment.keys, host)
+    rows = {name: deployed_type(deployment, name) for name in deployment.hosts[host]}
+    ours = {name: row.roles for name, row in rows.items() if not row.own}
+    check_identity(folder, ours, deployment.namespace, deployment.router)
+    for name, row in rows.items():
+        if row.own:
+            check_own_identity(folder / name, name, deployment.namespace)
 
 
 def recorded(path: Path) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import functools
 import gc
 import logging
 import os
+import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,7 @@ from gigabrain_zenoh.runtime.connect import MakeBus, connect
 from gigabrain_zenoh.runtime.heartbeat import STDOUT, beat
 from gigabrain_zenoh.runtime.replay import Node
 from gigabrain_zenoh.runtime.services import NameClaim, publish_health, serve_params
+from gigabrain_zenoh.security.acl import check_write
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.launch.deployment import Deployment
@@ -69,7 +71,19 @@ class ProcessType:
     stops: bool = False  # carries commands and stops: gets a higher priority where permitted
     repeats: bool = False  # can be replayed, so it publishes which input it used
     looks_on: bool = False  # not needed by the robot: naps, and runs at low priority
-    roles: tuple[Role, ...] = ("robot", "operator")  # identities with which a host may run it
+    # identities with which a host may run it; `process` is one of its own, in a subfolder of the
+    # host's that has the name of the process
+    roles: tuple[Role, ...] = ("process",)
+    writes: tuple[str, ...] = ()  # keys that an identity of its own may publish, ask or serve
+
+    def __post_init__(self) -> None:
+        for key in self.writes:
+            check_write(key)
+
+    @property
+    def own(self) -> bool:
+        """Whether it is a process of one's own, with an identity of its own."""
+        return "process" in self.roles
 
     def node(self, settings: Mapping[str, Any]) -> Node:
         """Return the process's node with its settings filled in. Raises ValidationError."""
@@ -87,22 +101,30 @@ def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
         return None
 
 
-def run(
-    config: ProcessConfig, type_of: Callable[[str], ProcessType], make_bus: MakeBus = Bus
-) -> int:
+Load = Callable[[ProcessConfig], tuple[ProcessType, Node]]
+
+
+class _ReportedError(Exception):
+    """An error that ended the node, and is logged already."""
+
+    def __init__(self, exit_code: int) -> None:
+        super().__init__()
+        self.exit_code = exit_code
+
+
+def run(config: ProcessConfig, load: Load, make_bus: MakeBus = Bus) -> int:
     """Run one process until it ends, and return its exit code.
 
-    `type_of` returns the row of a process, by name.
+    `load` returns its row, and its node with the settings filled in.
     """
     gc.disable()  # until ready: objects from imports and set-up are not garbage
     try:
         run_dir = Path(config.run_dir) if config.run_dir else None
         logs.setup(config.name, run_dir, json_console=config.json_console, level=config.level)
-        process_type = type_of(config.name)
-        node = process_type.node(config.settings)
+        process_type, node = load(config)
         if process_type.stops:
             go_first()  # like the other branches, before any thread starts: threads inherit it
-        elif process_type.looks_on:
+        elif process_type.looks_on or process_type.own:
             step_aside()
         else:
             start_first()
@@ -111,18 +133,29 @@ def run(
             asyncio.Runner(loop_factory=loop_factory()) as runner,
         ):
             runner.run(_run(config, process_type, node, make_bus))
-    except GigabrainError as error:
-        invalid = {"value": error.value} if isinstance(error, ConfigError) and error.value else {}
-        log.error("%s", error, extra={"data": {"event": "failed"} | invalid})
+    except _ReportedError as error:
         return error.exit_code
-    except Exception as error:
-        first = _first(error)
-        log.critical("died of %s: %s", type(first).__name__, first, exc_info=True)
-        return 1
+    except Exception as error:  # noqa: BLE001 - logged, and the process ends
+        return _report(error)
     finally:
         logs.flush()
         gc.enable()
     return 0
+
+
+def _report(error: Exception) -> int:
+    """Log what ends the process; return its exit code."""
+    first = _first(error)
+    if isinstance(first, GigabrainError):
+        invalid = {"value": first.value} if isinstance(first, ConfigError) and first.value else {}
+        log.error("%s", first, extra={"data": {"event": "failed"} | invalid})
+        return first.exit_code
+    frames = traceback.extract_tb(first.__traceback__)
+    where = f", in {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""
+    notes = "".join(f" ({note})" for note in getattr(first, "__notes__", ()))
+    text = f"died of {type(first).__name__}: {first}{where}{notes}"
+    log.critical("%s", text, exc_info=error, extra={"data": {"event": "died"}})
+    return 1
 
 
 def _first(error: BaseException) -> BaseException:
@@ -168,8 +201,8 @@ async def _work(
                     tasks.create_task(beat(bus.clock, lambda: bus.progress(), out))
                 tasks.create_task(_failure(bus))
                 tasks.create_task(_node(bus, node, process_type))
-        except* GigabrainError as group:
-            raise group.exceptions[0] from None
+        except Exception as error:  # noqa: BLE001 - logged while the bus still takes it
+            raise _ReportedError(_report(error)) from None
         finally:
             logging.getLogger().removeHandler(handler)
             bus.input_log.flush()

@@ -5,6 +5,7 @@ ProcessConfig in JSON. Packages offer theirs as entry points of the group `gigab
 each a ProcessType.
 """
 
+import contextlib
 import os
 import sys
 from collections.abc import Mapping
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from msgspec import structs
 
+from gigabrain_schemas.topics import Role
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.zenoh.config import router_config
 from gigabrain_zenoh.config.renames import renamed_settings
@@ -29,8 +31,10 @@ from gigabrain_zenoh.config.settings import (
     RelayConfig,
     RouterConfig,
 )
+from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.host.signals import interrupts
+from gigabrain_zenoh.launch.own_processes import load_own, own_type
 from gigabrain_zenoh.launch.process import ProcessPlace, ProcessType, run
 from gigabrain_zenoh.plugins import load_plugin, plugin_names
 from gigabrain_zenoh.runtime.connect import MakeBus
@@ -40,12 +44,14 @@ if TYPE_CHECKING:
     from gigabrain_zenoh.launch.deployment import Deployment
 
 GROUP = "gigabrain.processes"
+OPERATED: tuple[Role, ...] = ("robot", "operator")
 MEET = {"perception", "decision"}  # each runs once per robot, so there is one relay at most
 AT_THE_ROBOT = {"router", "driver"}  # no relay between them: a body without its router must stop
 
 
-def _router(_: "Deployment", place: ProcessPlace) -> RouterConfig:
-    return router_config(place.endpoint, place.state_dir)
+def _router(deployment: "Deployment", place: ProcessPlace) -> RouterConfig:
+    config = router_config(place.endpoint, place.state_dir)
+    return structs.replace(config, watches=tuple(own_processes(deployment)))
 
 
 def _relay(_: "Deployment", place: ProcessPlace) -> RelayConfig:
@@ -179,13 +185,25 @@ PROCESSES: Mapping[str, ProcessType] = {
     "safety": ProcessType(
         "gigabrain_zenoh.safety.node:run", default=True, stops=True, repeats=True, roles=("robot",)
     ),
-    "page": ProcessType("gigabrain_zenoh.ui.page.node:run", PageConfig, looks_on=True),
-    "foxglove": ProcessType("gigabrain_zenoh.ui.foxglove.node:run", FoxgloveConfig, looks_on=True),
+    "page": ProcessType(
+        "gigabrain_zenoh.ui.page.node:run", PageConfig, looks_on=True, roles=OPERATED
+    ),
+    "foxglove": ProcessType(
+        "gigabrain_zenoh.ui.foxglove.node:run", FoxgloveConfig, looks_on=True, roles=OPERATED
+    ),
     "recorder": ProcessType(
-        "gigabrain_zenoh.recording.node:run", RecorderConfig, derive=_recorder, looks_on=True
+        "gigabrain_zenoh.recording.node:run",
+        RecorderConfig,
+        derive=_recorder,
+        looks_on=True,
+        roles=OPERATED,
     ),
     "button": ProcessType(
-        "gigabrain_drivers.driver.button:run", ButtonConfig, joins=_needs_button, stops=True
+        "gigabrain_drivers.driver.button:run",
+        ButtonConfig,
+        joins=_needs_button,
+        stops=True,
+        roles=OPERATED,
     ),
 }
 
@@ -197,8 +215,35 @@ def process_type(name: str) -> ProcessType:
 
 
 def process_types() -> dict[str, ProcessType]:
-    """Return all rows by name, also those that packages offer. Raises ConfigError."""
-    return {name: process_type(name) for name in plugin_names(PROCESSES, GROUP)}
+    """Return all rows by name, also those that packages offer; a broken package is left out."""
+    rows = {}
+    for name in plugin_names(PROCESSES, GROUP):
+        with contextlib.suppress(ConfigError):  # raised again where a deployment names it
+            rows[name] = process_type(name)
+    return rows
+
+
+def deployed_type(deployment: "Deployment", name: str) -> ProcessType:
+    """Return the row of a process that `hosts` of a deployment names, also of one's own.
+
+    Raises UnknownName and ConfigError.
+    """
+    return own_type(deployment, name) or process_type(name)
+
+
+def own_processes(deployment: "Deployment") -> dict[str, ProcessType]:
+    """Return the processes of one's own that run on any host of a deployment, by name."""
+    placed = (name for names in deployment.hosts.values() for name in names)
+    rows = {name: deployed_type(deployment, name) for name in placed}
+    return {name: row for name, row in rows.items() if row.own}
+
+
+def grants(deployment: "Deployment | None" = None) -> dict[str, tuple[str, ...]]:
+    """Return the keys that processes of one's own write, by name: of packages, and of the file."""
+    rows = {name: row for name, row in process_types().items() if row.own}
+    if deployment:
+        rows |= own_processes(deployment)
+    return {name: row.writes for name, row in rows.items()}
 
 
 def names_by_role() -> dict[str, tuple[str, ...]]:
@@ -216,9 +261,16 @@ def node_of(config: ProcessConfig) -> Node:
     return process_type(config.name).node(settings)
 
 
+def load_process(config: ProcessConfig) -> tuple[ProcessType, Node]:
+    """Return the row of a process, and its node. Raises ValidationError and ConfigError."""
+    if config.module or config.perceptor:
+        return load_own(config)
+    return process_type(config.name), node_of(config)
+
+
 def run_process(config: ProcessConfig, make_bus: MakeBus = Bus) -> int:
     """Run one process until it ends, and return its exit code."""
-    return run(config, process_type, make_bus)
+    return run(config, load_process, make_bus)
 
 
 def main() -> None:

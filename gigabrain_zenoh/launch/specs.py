@@ -9,8 +9,14 @@ from msgspec import structs
 
 from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
 from gigabrain_zenoh.launch.deployment import Deployment, local_endpoint
+from gigabrain_zenoh.launch.own_processes import own_config
 from gigabrain_zenoh.launch.process import ProcessPlace, ProcessType
-from gigabrain_zenoh.launch.processes import names_by_role, process_type, process_types
+from gigabrain_zenoh.launch.processes import (
+    deployed_type,
+    grants,
+    names_by_role,
+    process_types,
+)
 from gigabrain_zenoh.runtime.managed_process import ProcessSpec
 from gigabrain_zenoh.runtime.running import local_socket
 
@@ -28,12 +34,16 @@ def process_specs(
     *,
     seconds: float | None = None,
     level: str = "info",
+    file: str = "",
 ) -> list[ProcessSpec]:
-    """Build the specs of the processes of `host`, in readiness order: the router or relay first."""
+    """Build the specs of the processes of `host`, in readiness order: the router or relay first.
+
+    `file` is the deployment file, for errors of processes of one's own.
+    """
     names = _names(deployment, host)
     specs = []
     for name in names:
-        row, after = process_type(name), _after(deployment, name, names)
+        row, after = deployed_type(deployment, name), _after(deployment, name, names)
         place = ProcessPlace(_endpoint(deployment, host, name, names), run_dir, state_dir, seconds)
         process = ProcessConfig(
             name=name,
@@ -43,6 +53,7 @@ def process_specs(
             json_console=True,
             level=level,
         )
+        process = structs.replace(process, **own_config(deployment, name, file))
         soon_s = COMPILING_S if row.compiles and row.compiles(deployment) else SOON_S
         specs.append(
             ProcessSpec(
@@ -51,6 +62,7 @@ def process_specs(
                 after=after,
                 beats=True,
                 stop_last=row.stop_last,
+                optional=row.own,
                 ready_timeout_s=soon_s if after else LATER_S,
             )
         )
@@ -62,7 +74,10 @@ def _names(deployment: Deployment, host: str) -> list[str]:
     here, types = set(deployment.hosts[host]), process_types()
     joining = {name for name, row in types.items() if row.joins and row.joins(deployment, here)}
     order = list(types)
-    return sorted(here | joining, key=lambda name: (not types[name].stop_last, order.index(name)))
+    own = [name for name in deployment.hosts[host] if name not in types]
+    ours = (here | joining) - {*own}
+    first = sorted(ours, key=lambda name: (not types[name].stop_last, order.index(name)))
+    return [*first, *own]
 
 
 def _endpoint(deployment: Deployment, host: str, name: str, names: list[str]) -> Endpoint:
@@ -75,9 +90,13 @@ def _endpoint(deployment: Deployment, host: str, name: str, names: list[str]) ->
             connect=(),
             fleet=deployment.fleet,
             names=names_by_role() if endpoint.keys else {},
+            grants=grants(deployment),
         )
     if name == "relay":  # it listens on the socket, and connects to the robot's router
         return structs.replace(endpoint, listen=(local_socket(),))
+    if endpoint.keys and deployed_type(deployment, name).own:
+        keys = Path(endpoint.keys) / name
+        return structs.replace(endpoint, connect=endpoint.connect[-1:], keys=str(keys))
     if "relay" in names:  # a Unix socket that only this user can open
         return structs.replace(endpoint, connect=(local_socket(),), keys="")
     return endpoint
@@ -85,7 +104,7 @@ def _endpoint(deployment: Deployment, host: str, name: str, names: list[str]) ->
 
 def _after(deployment: Deployment, name: str, names: list[str]) -> tuple[str, ...]:
     """Return the processes that must be ready before this one starts."""
-    first = process_type(name).after
+    first = deployed_type(deployment, name).after
     if name == "driver" and deployment.recorder.file:  # to record the driver from its first tick
         first = (*first, "recorder")
     return tuple(other for other in first if other in names and other != name)

@@ -20,6 +20,7 @@ from gigabrain_zenoh.launch.deployment import (
     local_endpoint,
     with_free_port,
 )
+from gigabrain_zenoh.launch.own_processes import check_installed
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.runtime.running import announced
 from gigabrain_zenoh.runtime.supervisor import Supervisor
@@ -101,14 +102,17 @@ async def up(
     level: str = "info",
     *,
     keep_stuck: bool = False,
+    file: str = "",
 ) -> int:
     """Keep a host's processes running until Ctrl-C; return the exit code.
 
-    A process without progress is restarted, or with `keep_stuck` left to a debugger. Raises
+    A process without progress is restarted, or with `keep_stuck` left to a debugger. `file` is the
+    deployment file, for errors. Raises
     ConfigError for wrong settings and for a folder that cannot be written, and BusError if the
     router cannot run.
     """
     check_keys(deployment, host)
+    check_installed(deployment, host, file)
     if "decision" in deployment.hosts[host]:
         behaviours.check(deployment.decision)
     deployment = with_free_port(deployment)
@@ -116,7 +120,7 @@ async def up(
     notifier = Notifier.from_environment()
     run_dir = new_run_dir(None, label)
     remembers = state_dir() / "robots" / label
-    specs = process_specs(deployment, host, run_dir, remembers, level=level)
+    specs = process_specs(deployment, host, run_dir, remembers, level=level, file=file)
 
     refusal, invalid = "", None  # error of a process, and the invalid value that it names
 

@@ -161,6 +161,7 @@ class ProcessSpec:
     after: tuple[str, ...] = ()
     ready_timeout_s: float = 10.0
     stop_last: bool = False  # what the others need in order to end well, such as the router
+    optional: bool = False  # the robot goes on without it, also where its settings are wrong
     beats: bool = False  # reports progress once a second, and is killed without it
 
 

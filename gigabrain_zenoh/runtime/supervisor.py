@@ -59,8 +59,13 @@ class Supervisor:
 
     @property
     def misconfigured(self) -> tuple[str, ...]:
-        """Return the names of processes given up for a wrong configuration (exit code 2)."""
-        given_up = (self.statuses[name] for name in self.given_up)
+        """Return the names of processes given up for a wrong configuration (exit code 2).
+
+        Those without which the robot goes on do not count.
+        """
+        keepers = self._keepers
+        needed = (name for name in self.given_up if not keepers[name].spec.optional)
+        given_up = (self.statuses[name] for name in needed)
         return tuple(s.name for s in given_up if s.last_exit == ConfigError.exit_code)
 
     @property

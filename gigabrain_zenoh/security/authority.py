@@ -71,18 +71,21 @@ def issue(
     role: Role,
     *,
     robot: str = "",
+    process: str = "",
     name: str = "",
     hosts: Sequence[str] = (),
     days: int = DAYS,
 ) -> Path:
     """Create an identity; return its folder, which has to be copied to its host.
 
-    `hosts` are the addresses and names under which a router is reached. Raises ConfigError.
+    `hosts` are the addresses and names under which a router is reached. `process` is the name of
+    the process of one's own that an identity of the role process is for. Raises ConfigError.
     """
     if hosts and role not in SERVERS:
         raise ConfigError(f"--host: only a {' or a '.join(SERVERS)} is connected to")
     generations = generations_in(fleet_folder)
-    subject = common_name(role, robot, generations.get(common_name(role, robot), 1))
+    first = common_name(role, robot, process=process)
+    subject = common_name(role, robot, generations.get(first, 1), process)
     authority = read_certificate(fleet_folder / CA)
     _check_days(days, authority)
     key = ec.generate_private_key(ec.SECP256R1())
@@ -208,7 +211,7 @@ def _write(folder: Path, contents: Mapping[str, bytes]) -> None:
         write_synced(folder / name, data, mode)
 
 
-def revoke(fleet_folder: Path, role: Role, robot: str = "") -> tuple[Path, ...]:
+def revoke(fleet_folder: Path, role: Role, robot: str = "", process: str = "") -> tuple[Path, ...]:
     """Revoke all identities issued under a common name; return the lists for the routers.
 
     Raises ConfigError for roles that may be a router: no router checks those.
@@ -218,7 +221,7 @@ def revoke(fleet_folder: Path, role: Role, robot: str = "") -> tuple[Path, ...]:
             f"keys of a {role} can also pass for a router, which no list prevents; "
             "make a new fleet with `gigabrain keys new`"
         )
-    name, known = common_name(role, robot), generations_in(fleet_folder)
+    name, known = common_name(role, robot, process=process), generations_in(fleet_folder)
     generations = {**known, name: known.get(name, 1) + 1}
     places = [place.parent for place in sorted(fleet_folder.glob(f"*/{CERTIFICATE}"))]
     routers = [place for place in places if read(place)[0].role in SERVERS]
@@ -248,6 +251,7 @@ class Identity(Struct, frozen=True, kw_only=True):
     name: str  # the common name, such as robot@red
     role: Role
     robot: str  # its namespace; empty for the only one, or for all
+    process: str  # that a `process` identity is for; else empty
     generation: int  # rises with each revocation
     hosts: tuple[str, ...]  # where it can be connected to
     expires: datetime.datetime
@@ -290,14 +294,15 @@ def read(folder: Path) -> tuple[Identity, x509.Certificate]:
     check_files(folder)
     certificate = read_certificate(folder / CERTIFICATE)
     name = _attribute(certificate, NameOID.COMMON_NAME)
-    role, robot, generation = parse(name)
+    parts = parse(name)
     identity = Identity(
         folder=folder,
         fleet=_attribute(certificate, NameOID.ORGANIZATION_NAME),
         name=name,
-        role=role,
-        robot=robot,
-        generation=generation,
+        role=parts.role,
+        robot=parts.robot,
+        process=parts.process,
+        generation=parts.generation,
         hosts=_hosts(certificate),
         expires=certificate.not_valid_after_utc,
     )
@@ -347,6 +352,11 @@ def _hosts(certificate: x509.Certificate) -> tuple[str, ...]:
     return tuple(str(place.value) for place in places)
 
 
+def _first(one: Identity) -> str:
+    """Return its common name in the first generation."""
+    return common_name(one.role, one.robot, process=one.process)
+
+
 def list_identities(folder: Path) -> Iterator[tuple[str, bool]]:
     """Yield a line for each identity in a fleet's folder, or in its own, and if it is valid."""
     places = [folder] if (folder / CERTIFICATE).exists() else sorted(folder.iterdir())
@@ -359,7 +369,7 @@ def list_identities(folder: Path) -> Iterator[tuple[str, bool]]:
         except ConfigError as error:
             yield f"{place.name:<20} {error}", False
             continue
-        if one.generation < generations.get(common_name(one.role, one.robot), 1):
+        if one.generation < generations.get(_first(one), 1):
             yield f"{place.name:<20} {one.name} was revoked; delete it", False
             continue
         days_left = one.days_left(now)

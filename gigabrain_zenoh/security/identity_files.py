@@ -130,6 +130,21 @@ def check_identity(
         )
 
 
+def check_own_identity(folder: Path, process: str, namespace: str) -> None:
+    """Check that a process of one's own has its identity in `folder`. Raises ConfigError."""
+    wanted = common_name("process", namespace, process=process)
+    if not folder.is_dir():
+        robot = f" --robot {namespace}" if namespace else ""
+        raise ConfigError(
+            f"{process} needs an identity of its own; make one with `gigabrain keys issue process "
+            f"--process {process}{robot}`, and copy its folder to {folder}"
+        )
+    identity = identity_in(folder)
+    name = common_name(identity.role, identity.robot, process=identity.process)
+    if name != wanted:
+        raise ConfigError(f"{folder} is the identity of {identity.name}; expected {wanted}")
+
+
 def no_router(endpoint: Endpoint) -> BusError:
     """Return the error for a silent router. Raises ConfigError for invalid own keys."""
     where, doubt = endpoint.connect[-1], "is the robot running, and without keys?"

@@ -50,6 +50,20 @@ class Obstacle(Record, frozen=True, kw_only=True):
             raise ValueError(f"covariance needs 16 values or none, got {len(self.covariance)}")
 
 
+class DetectedObject(Obstacle, frozen=True, kw_only=True):
+    """Something that a perceptor has found."""
+
+    label: Name  # what it is, such as person
+    confidence: Fraction = 1.0
+    avoid: bool = False  # the planner keeps clear of it, as of an obstacle
+
+
+class Objects(Message, frozen=True, kw_only=True):
+    """What a perceptor finds in one scan. Its basis is the tick of that scan."""
+
+    objects: Annotated[tuple[DetectedObject, ...], Meta(max_length=256)]
+
+
 class WorldModel(Message, frozen=True, kw_only=True):
     """The robot's surroundings now, in the body's frame."""
 

@@ -15,7 +15,7 @@ R = TypeVar("R", bound=Message)
 
 KB = 1024
 Priority = Literal["real_time", "interactive_high", "data_high", "data", "background"]
-Role = Literal["robot", "brain", "operator", "viewer", "router"]  # of an identity
+Role = Literal["robot", "brain", "operator", "viewer", "router", "process"]  # of an identity
 # How viewers show a topic; `recording/drawing.py` has a function for each.
 Drawing = Literal[
     "scan", "map", "pose", "path", "obstacles", "task", "image", "log", "odometry", "lidar_frame"
@@ -90,6 +90,10 @@ IMAGE = Topic(
 WORLD = Topic(
     "robot/world", brain.WorldModel, 10, missed=2.5, max_bytes=64 * KB,
     publishers=BRAIN, drawing="obstacles", plotted=True,
+)  # fmt: skip
+OBJECTS = Topic(
+    "robot/objects", brain.Objects, 10, missed=5.0, max_bytes=64 * KB, many=True,
+    publishers=BRAIN,
 )  # fmt: skip
 POSE = Topic("robot/pose", brain.PoseInMap, 10, publishers=BRAIN, drawing="pose")
 MAP = Topic(

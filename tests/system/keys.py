@@ -15,6 +15,7 @@ from gigabrain_zenoh.launch.processes import names_by_role
 from gigabrain_zenoh.security.authority import issue, new_fleet
 from gigabrain_zenoh.testing.processes import free_endpoint
 
+WRITES = {"mine": ("robot/intent", "robot/goal", "robot/lamp/**")}  # of a process of one's own
 OF_RED: tuple[Role, ...] = ("robot", "brain", "operator", "viewer")
 
 
@@ -23,6 +24,7 @@ def make_fleet(folder: Path, name: str) -> Path:
     new_fleet(name, folder)
     for role in OF_RED:
         issue(folder, role, robot="red")
+    issue(folder, "process", robot="red", process="mine")
     for robot in ("blue", "green"):  # of green nobody will have heard
         issue(folder, "robot", robot=robot)
     for role in ("operator", "router"):
@@ -44,6 +46,7 @@ class Site:
             keys=str(self.fleet / "router"),
             fleet=("red", "blue"),
             names=names_by_role(),
+            grants=WRITES,
         )
         await self._join(at)
 

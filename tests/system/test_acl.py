@@ -15,8 +15,8 @@ from gigabrain_zenoh.testing.waiting import until
 from tests.system.keys import Site, make_fleet, raw, site
 
 SAYS = {
-    "brain": "world pose map intent task request_log input_log/perception health/perception log "
-    "estop",
+    "brain": "world objects/perception pose map intent task request_log input_log/perception "
+    "health/perception log estop",
     "operator": "teleop cmd_vel joint_cmd button log estop",
     "viewer": "",
 }
@@ -83,6 +83,53 @@ async def test_each_role_may_ask_its_own_questions_and_no_others(net: Site) -> N
         await asked_until_answered(session, "red/robot/describe/driver")  # declared last of all
         answered = {key for key in ASKED if await ask(session, f"red/{key}")}
         assert answered == {f"robot/{name}" for name in expected.split()}
+
+
+async def test_a_process_of_ones_own_writes_and_asks_what_it_declares_and_no_more(
+    net: Site,
+) -> None:
+    robot = await net.client("robot@red", "red")
+    mine = net.raw("process.mine@red")
+    ear = SampleCollector(robot, "robot/**")
+    own = ["robot/lamp/on", "robot/health/mine"]
+    said, declared = [*SAID, *own], {"robot/intent", "robot/log", *own}
+    for key in [*ASKED, "robot/lamp/ask"]:
+        robot.serve(key, answer)
+
+    def say_all() -> None:
+        for key in said:
+            mine.put(f"red/{key}", b"x")
+
+    await asked_until_answered(mine, "red/robot/lamp/ask")  # declared last of all
+    await repeat(say_all, lambda: {key for key, _ in ear.samples} >= declared)
+    say_all()
+    await asked_until_answered(mine, "red/robot/lamp/ask")  # after all it has said
+    await until(lambda: {key for key, _ in ear.samples} == declared)
+    answered = {key for key in ASKED if await ask(mine, f"red/{key}")}
+    assert answered == {"robot/goal", "robot/describe/driver"}
+
+
+async def test_a_process_of_ones_own_sees_all_of_its_robot_and_answers_for_itself(
+    net: Site,
+) -> None:
+    red, blue = await net.client("robot@red", "red"), await net.client("robot@blue", "blue")
+    mine = await net.client("process.mine@red", "red")
+    ear = SampleCollector(mine, "robot/**")
+    for key in ("robot/estop", "robot/describe/driver", "robot/describe/mine"):
+        mine.serve(key, answer)
+
+    def send() -> None:
+        for publish in (red.publish, blue.publish):
+            for topic in TOPICS:
+                publish(topic, topic.at("driver"), b"x", "")
+
+    wanted = {topic.at("driver") for topic in TOPICS}
+    await repeat(send, lambda: {key for key, _ in ear.samples} >= wanted)
+    assert len({key for key, _ in ear.samples}) == len(wanted)
+    operator = net.raw("operator@red")
+    await asked_until_answered(operator, "red/robot/describe/mine")
+    assert await ask(operator, "red/robot/estop") == []
+    assert await ask(operator, "red/robot/describe/driver") == []
 
 
 async def test_nobody_but_the_robot_answers_for_its_gate(net: Site) -> None:

@@ -1,6 +1,7 @@
 """A package may bring a process of its own: entry point `gigabrain.processes`, one row."""
 
 import os
+import shutil
 from pathlib import Path
 
 import msgspec
@@ -11,10 +12,11 @@ from gigabrain_schemas.topics import DESCRIBE
 from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
 from gigabrain_zenoh.errors import ConfigError, UnknownName
 from gigabrain_zenoh.launch.deployment import Deployment, check_keys, load_deployment
-from gigabrain_zenoh.launch.processes import names_by_role, process_type
+from gigabrain_zenoh.launch.processes import grants, names_by_role, process_type
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.runtime.connect import connect
 from gigabrain_zenoh.security.acl import Table, access_control
+from gigabrain_zenoh.security.authority import issue, new_fleet
 from gigabrain_zenoh.testing.processes import Home, free_port
 from gigabrain_zenoh.testing.waiting import until
 
@@ -32,7 +34,7 @@ class LampConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     state_dir: str = ""
 
 
-LAMP = ProcessType("lamp_node:run", LampConfig, looks_on=True)
+LAMP = ProcessType("lamp_node:run", LampConfig, looks_on=True, writes=("robot/lamp/**",))
 '''
 NODE = '''"""A lamp that hangs once it is told to."""
 
@@ -100,17 +102,27 @@ def test_its_settings_are_a_part_of_deployment_files_and_checked_like_ours(tmp_p
         process_type("lamb")
 
 
-def test_it_has_an_identity_and_the_rights_of_its_role(fleet: Path) -> None:
-    def by_keys(name: str) -> Deployment:
-        keys, hosts = str(fleet / name), {"h": ("lamp",)}
-        return Deployment(namespace="red", keys=keys, hosts=hosts)
+def test_it_needs_an_identity_of_its_own_beside_that_of_its_host(tmp_path: Path) -> None:
+    fleet, host = tmp_path / "home", tmp_path / "home" / "robot@red"
+    new_fleet("home", fleet)
+    issue(fleet, "robot", robot="red")
+    deployment = Deployment(namespace="red", keys=str(host), hosts={"h": ("lamp",)})
+    with pytest.raises(ConfigError, match="keys issue process --process lamp --robot red`, and"):
+        check_keys(deployment, "h")
+    shutil.copytree(issue(fleet, "process", robot="red", process="bulb"), host / "lamp")
+    with pytest.raises(ConfigError, match=r"process\.bulb@red; expected process\.lamp@red"):
+        check_keys(deployment, "h")
+    shutil.rmtree(host / "lamp")
+    shutil.copytree(issue(fleet, "process", robot="red", process="lamp"), host / "lamp")
+    check_keys(deployment, "h")
 
-    check_keys(by_keys("operator@red"), "h")
-    with pytest.raises(ConfigError, match="lamp needs that of robot@red or operator@red"):
-        check_keys(by_keys("brain@red"), "h")
-    rules = {rule["id"]: rule for rule in access_control(["red"], Table(names_by_role()))["rules"]}
-    assert "red/robot/health/lamp" in rules["operator@red says"]["key_exprs"]
-    assert "red/robot/health/lamp" not in rules["brain@red says"]["key_exprs"]
+
+def test_it_writes_what_its_row_declares_and_what_tells_of_itself() -> None:
+    table = Table(names_by_role(), grants=grants())
+    rules = {rule["id"]: rule for rule in access_control(["red"], table)["rules"]}
+    assert rules["process.lamp@red says"]["key_exprs"] == [
+        "red/robot/health/lamp", "red/robot/lamp/**", "red/robot/log",
+    ]  # fmt: skip
 
 
 async def test_up_starts_it_and_restarts_it_when_it_hangs(tmp_path: Path, package: Path) -> None:

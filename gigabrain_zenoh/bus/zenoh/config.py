@@ -12,7 +12,15 @@ from gigabrain_schemas.topics import SERVICES, Priority, Service, Topic
 from gigabrain_zenoh.config.settings import Endpoint, RouterConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.network import LOCAL_ENDPOINT, host_and_port
-from gigabrain_zenoh.security.acl import FIRST, PUBLISHED, Table, access_control, known_names
+from gigabrain_zenoh.security.acl import (
+    FIRST,
+    PUBLISHED,
+    Grants,
+    Table,
+    access_control,
+    known_names,
+    own_topics,
+)
 from gigabrain_zenoh.security.identity_files import (
     CA,
     CERTIFICATE,
@@ -25,11 +33,12 @@ FAR_TOO_LARGE = 4  # times the size that a reader accepts
 Rule = dict[str, Any]
 
 
-def bounds() -> dict[str, Any]:
+def bounds(grants: Grants) -> dict[str, Any]:
     """Return the settings of a router's session that limit messages from others."""
+    topics = (*PUBLISHED, *own_topics(grants))
     return {
-        "low_pass_filter": [*_small("put", PUBLISHED), *_small("query", SERVICES)],
-        "qos/network": [*_urgent("put", PUBLISHED), *_urgent("query", SERVICES)],
+        "low_pass_filter": [*_small("put", topics), *_small("query", SERVICES)],
+        "qos/network": [*_urgent("put", topics), *_urgent("query", SERVICES)],
     }
 
 
@@ -121,7 +130,7 @@ def session_settings(endpoint: Endpoint) -> dict[str, Any]:
     if endpoint.listen and (endpoint.keys or endpoint.connect):
         config["adminspace/enabled"] = False
     if endpoint.listen:
-        config |= bounds()
+        config |= bounds(endpoint.grants)
     if endpoint.namespace:
         config["namespace"] = endpoint.namespace
     return config
@@ -140,8 +149,9 @@ def security(endpoint: Endpoint, generations: Mapping[str, int]) -> dict[str, An
         }
     }
     if endpoint.listen and not endpoint.connect:  # a relay is checked by the router it connects to
+        table = Table(endpoint.names, grants=endpoint.grants)
         config["access_control"] = access_control(
-            robots_of(endpoint), Table(endpoint.names), endpoint.namespace, generations
+            robots_of(endpoint), table, endpoint.namespace, generations
         )
     return config
 
@@ -154,10 +164,12 @@ def robots_of(endpoint: Endpoint) -> tuple[str, ...]:
 
 def router_config(endpoint: Endpoint, state_dir: Path) -> RouterConfig:
     """Build the router process's settings, with the names that have rights in its session."""
+    watches = tuple(endpoint.grants)
     if not endpoint.keys:
-        return RouterConfig(state_dir=str(state_dir))
-    knows = known_names(robots_of(endpoint), generations_in(Path(endpoint.keys)))
-    return RouterConfig(state_dir=str(state_dir), knows=knows)
+        return RouterConfig(state_dir=str(state_dir), watches=watches)
+    generations = generations_in(Path(endpoint.keys))
+    knows = known_names(robots_of(endpoint), generations, endpoint.grants)
+    return RouterConfig(state_dir=str(state_dir), knows=knows, watches=watches)
 
 
 def secured(endpoint: Endpoint) -> Endpoint:

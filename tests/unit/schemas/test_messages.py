@@ -23,6 +23,7 @@ REQUIRED: dict[str, set[str]] = {
     "RobotState": {"robot_type", "pose", "velocity"},
     "Body": {"description", "link"},
     "WorldModel": {"scan_ok", "obstacle_ahead"},
+    "Objects": {"objects"},
     "PoseInMap": {"x", "y", "yaw", "covariance"},
     "OccupancyGrid": {"resolution", "width", "height", "origin_x", "origin_y", "cells"},
     "Intent": {"behaviour", "reason"},
@@ -71,6 +72,7 @@ def test_the_table_holds_the_keys_and_rates_of_the_design() -> None:
         "robot/body": ("Body", 1),
         "robot/image/*": ("Image", 10),
         "robot/world": ("WorldModel", 10),
+        "robot/objects/*": ("Objects", 10),
         "robot/pose": ("PoseInMap", 10),
         "robot/map": ("OccupancyGrid", 1),
         "robot/intent": ("Intent", 50),
@@ -101,6 +103,7 @@ def test_a_value_stops_counting_after_so_many_missed_periods() -> None:
         "robot/body": 5_000_000_000,
         "robot/image": 500_000_000,
         "robot/world": 250_000_000,
+        "robot/objects": 500_000_000,
         "robot/pose": 500_000_000,
         "robot/map": 5_000_000_000,
         "robot/intent": 100_000_000,
@@ -153,7 +156,7 @@ def test_every_message_is_frozen_and_documented_and_carries_the_header(
 def test_the_golden_folder_holds_the_examples_byte_for_byte() -> None:
     stored = {path.name: path.read_bytes() for path in examples.FOLDER.iterdir()}
     assert stored == examples.files()
-    assert len(stored) == 76
+    assert len(stored) == 78
 
 
 @by_name

@@ -1,0 +1,151 @@
+"""Processes of one's own: modules and perceptors that a deployment file names.
+
+They run in the same frame as ours. Their code is imported by their own process alone, so that a
+module that raises or hangs costs nobody else anything.
+"""
+
+import functools
+import importlib
+from collections.abc import Collection, Mapping
+from importlib.machinery import PathFinder
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+from msgspec import Struct
+
+from gigabrain_schemas.topics import OBJECTS
+from gigabrain_zenoh.config import loading
+from gigabrain_zenoh.config.settings import OwnPerceptor, OwnProcess, ProcessConfig
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.launch.process import ProcessType
+from gigabrain_zenoh.runtime.replay import Node
+from gigabrain_zenoh.security.acl import check_write
+
+if TYPE_CHECKING:
+    from gigabrain_zenoh.launch.deployment import Deployment
+
+MOST_OWN = 32  # of one robot
+MODULES, PERCEPTORS = "processes", "perceptors"  # parts of a deployment file
+OWN = ProcessType("")
+
+
+def check_entries(
+    processes: Mapping[str, OwnProcess],
+    perceptors: Mapping[str, OwnPerceptor],
+    known: Collection[str],
+) -> None:
+    """Raise ValueError, which begins with the place in the file, for entries that do not fit."""
+    names = [*processes, *perceptors]
+    if len(names) > MOST_OWN:
+        raise ValueError(f"processes: {len(names)} of one's own; expected at most {MOST_OWN}")
+    for part, entries in ((MODULES, processes), (PERCEPTORS, perceptors)):
+        for name in entries:
+            if name in known or names.count(name) > 1:
+                raise ValueError(f"{part}.{name}: a process has that name already; choose another")
+    for name, entry in processes.items():
+        for i, key in enumerate(entry.writes):
+            try:
+                check_write(key)
+            except ValueError as error:
+                raise ValueError(f"{MODULES}.{name}.writes[{i}]: {error}") from None
+
+
+def own_type(deployment: "Deployment", name: str) -> ProcessType | None:
+    """Return the row of a process of one's own that the deployment file names, else None."""
+    if entry := deployment.processes.get(name):
+        return ProcessType(entry.module, writes=entry.writes)
+    if name in deployment.perceptors:
+        return ProcessType("", writes=(OBJECTS.at(name),))
+    return None
+
+
+def own_config(deployment: "Deployment", name: str, file: str) -> dict[str, Any]:
+    """Return the fields of a ProcessConfig that say what a process of one's own runs."""
+    if entry := deployment.processes.get(name):
+        return {"module": entry.module, "settings": entry.settings, "file": file}
+    if perceptor := deployment.perceptors.get(name):
+        return {
+            "perceptor": perceptor.perceptor or name,
+            "settings": perceptor.settings,
+            "file": file,
+        }
+    return {}
+
+
+def check_installed(deployment: "Deployment", host: str, file: str) -> None:
+    """Raise ConfigError for a module or perceptor that this host lacks, without importing it."""
+    from gigabrain_zenoh.perception.perceptors import check_known
+
+    for name in deployment.hosts[host]:
+        if entry := deployment.processes.get(name):
+            module = entry.module.partition(":")[0]
+            if not _exists(module):
+                text = f"no module {module!r} is installed; `pip install` its package"
+                raise _at(file, (MODULES, name, "module"), text)
+        elif perceptor := deployment.perceptors.get(name):
+            try:
+                check_known(perceptor.perceptor or name)
+            except ConfigError as error:
+                raise _at(file, (PERCEPTORS, name, "perceptor"), str(error)) from None
+
+
+def _exists(module: str) -> bool:
+    """Return whether a module can be found. Its package is not imported."""
+    top, *parts = module.split(".")
+    try:
+        spec = find_spec(top)
+    except (ImportError, ValueError):
+        return False
+    path = top
+    for part in parts:
+        if spec is None or spec.submodule_search_locations is None:
+            return False
+        path = f"{path}.{part}"
+        spec = PathFinder.find_spec(path, list(spec.submodule_search_locations))
+    return spec is not None
+
+
+def load_own(config: ProcessConfig) -> tuple[ProcessType, Node]:
+    """Return the row and the node of a process of one's own. Raises ConfigError."""
+    if config.perceptor:
+        from gigabrain_zenoh.perception import perceptors
+
+        perceptor = perceptors.load(config.perceptor)
+        made = _settings(config, perceptor.Config, (PERCEPTORS, config.name, "settings"))
+        return OWN, functools.partial(perceptors.run, perceptor(made))
+    path, _, function = config.module.partition(":")
+    place = (MODULES, config.name, "module")
+    try:
+        module = importlib.import_module(path)
+    except ImportError as error:
+        raise _at(config.file, place, f"cannot import {path}: {error}") from None
+    node = getattr(module, function or "run", None)
+    if not callable(node):
+        text = f"{path} has no coroutine {function or 'run'!r}; expected run(config, bus, ready)"
+        raise _at(config.file, place, text)
+    kind = getattr(module, "Config", NoSettings)
+    made = _settings(config, kind, (MODULES, config.name, "settings"))
+    return OWN, functools.partial(node, made)
+
+
+class NoSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of a module without a Config."""
+
+
+def _settings(config: ProcessConfig, kind: type[Struct], place: tuple[str, ...]) -> Struct:
+    """Return settings as the Struct `kind`. Raises ConfigError with file and line."""
+    try:
+        return msgspec.convert(config.settings, kind)
+    except msgspec.ValidationError as error:
+        text = f"{'.'.join(place)}: {error}"
+    if config.file:  # the same, with the line
+        loading.loads(loading.read(Path(config.file)), kind, config.file, at=place)
+    raise ConfigError(text)
+
+
+def _at(file: str, place: tuple[str, ...], text: str) -> ConfigError:
+    """Return an error with the line of `place` in the deployment file."""
+    line = loading.line_in(Path(file), place) if file else None
+    return ConfigError(f"{f'{file}:{line}: ' if line else ''}{'.'.join(place)}: {text}")

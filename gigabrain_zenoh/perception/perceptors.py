@@ -1,0 +1,120 @@
+"""Perceptors: perception steps that packages offer, each run by a process of its own.
+
+A perceptor looks for things in each scan, and what it finds is published on
+`robot/objects/<name>`. Behaviours get these objects, and the planner keeps clear of those that
+are to be avoided. One that raises or hangs costs only itself. Packages offer theirs as entry points
+of the group `gigabrain.perceptors`.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol, cast
+
+from msgspec import Struct
+
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.body import BodyDescription, RobotState
+from gigabrain_schemas.brain import DetectedObject, Objects, WorldModel
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_schemas.topics import BODY, OBJECTS, SCAN, STATE, WORLD
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.errors import unknown
+from gigabrain_zenoh.geometry.pose import PoseHistory
+from gigabrain_zenoh.plugins import load_plugin, plugin_names
+
+GROUP = "gigabrain.perceptors"
+SHIPPED: Mapping[str, Any] = {}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PerceptorInputs:
+    """Inputs of a perceptor at one scan."""
+
+    scan: LaserScan
+    world: WorldModel  # what perception has made of that scan, in the body's frame
+    pose: Pose  # of the body at the scan, in the odometry frame
+    body: BodyDescription
+
+
+class Perceptor(Protocol):
+    """Finds objects, one step per scan. It has its own memory, no clock and no bus."""
+
+    Config: ClassVar[type[Struct]]
+
+    def __init__(self, config: Any) -> None: ...
+
+    def step(self, inputs: PerceptorInputs) -> Sequence[DetectedObject]:
+        """Return what is there now, in the odometry frame."""
+        ...
+
+
+def check_known(name: str) -> None:
+    """Raise UnknownName where no installed package offers the perceptor; import nothing."""
+    if name not in (known := plugin_names(SHIPPED, GROUP)):
+        raise unknown("perceptor", name, known)
+
+
+def load(name: str) -> type[Perceptor]:
+    """Return the perceptor called `name`. Raises UnknownName, and ConfigError if it is broken."""
+    return cast("type[Perceptor]", load_plugin("perceptor", name, SHIPPED, GROUP))
+
+
+class PerceptorLoop:
+    """Steps a perceptor once per world, when the state of its tick is there as well."""
+
+    def __init__(self, perceptor: Perceptor) -> None:
+        self._perceptor = perceptor
+        self._history = PoseHistory()
+        self._waiting: tuple[LaserScan, WorldModel] | None = None
+        self._scan: LaserScan | None = None
+
+    def add_scan(self, scan: LaserScan) -> None:
+        """Keep a scan until the world that rests on it comes."""
+        self._scan = scan
+
+    def add_world(self, world: WorldModel) -> None:
+        """Keep a world until the state of its tick comes."""
+        scan = self._scan
+        found = scan and (scan.boot, scan.basis) == (world.boot, world.basis)
+        self._waiting = (scan, world) if scan and found else None
+
+    def add_state(self, state: RobotState) -> None:
+        """Add the odometry."""
+        self._history = self._history.then(state)
+
+    def step(self, body: BodyDescription) -> tuple[Objects, int] | None:
+        """Return what the perceptor finds, with its basis; None while something is missing."""
+        if self._waiting is None:
+            return None
+        scan, world = self._waiting
+        pose = self._history.at(scan.boot, scan.basis)
+        if pose is None:
+            return None
+        self._waiting = None
+        found = self._perceptor.step(PerceptorInputs(scan=scan, world=world, pose=pose, body=body))
+        return Objects(objects=tuple(found)), world.basis
+
+
+async def run(perceptor: Perceptor, bus: Bus, ready: Callable[[], None]) -> None:
+    """Publish what a perceptor finds in each scan, until the process ends."""
+    loop, body = PerceptorLoop(perceptor), bus.latest(BODY)
+
+    def look() -> None:
+        found = loop.step(body.current.description) if body.current else None
+        if found:
+            objects, basis = found
+            bus.publish(OBJECTS, objects, basis=basis, name=bus.process)
+
+    def on_world(world: WorldModel) -> None:
+        loop.add_world(world)
+        look()
+
+    def on_state(state: RobotState) -> None:
+        loop.add_state(state)
+        look()
+
+    bus.latest(SCAN, loop.add_scan)
+    bus.latest(WORLD, on_world)
+    bus.latest(STATE, on_state)
+    ready()
+    await bus.failed

@@ -1,0 +1,137 @@
+"""Processes of one's own in a deployment file: where they run, and errors with their line."""
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.launch.deployment import load_deployment
+from gigabrain_zenoh.launch.own_processes import check_installed, load_own
+from gigabrain_zenoh.launch.processes import own_processes
+from gigabrain_zenoh.launch.specs import process_specs
+
+MODULE = '''"""A lamp."""
+
+from msgspec import Struct
+
+
+class Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the lamp."""
+
+    watts: float = 5.0
+
+
+async def run(config, bus, ready):
+    """Shine."""
+'''
+HEAD = "router: tcp/127.0.0.1:7447\n"
+MINE = HEAD + "processes:\n  mine:\n    module: my_lamp.node\n"
+
+
+@pytest.fixture(autouse=True)
+def lamp(site: Path) -> None:
+    """What pip makes of the package."""
+    (site / "my_lamp").mkdir()
+    (site / "my_lamp" / "__init__.py").write_text("raise RuntimeError('nobody may import this')\n")
+    (site / "my_lamp" / "node.py").write_text(MODULE)
+    (site / "lone_lamp.py").write_text(MODULE)
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "robot.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_the_only_host_runs_it_and_its_row_is_like_ours(tmp_path: Path) -> None:
+    text = MINE + "    settings: {watts: 7}\n    writes: [robot/lamp/**]\n"
+    path = written(tmp_path, text)
+    deployment = load_deployment(path)
+    check_installed(deployment, "robot", str(path))
+    assert deployment.hosts["robot"][-1] == "mine"
+    assert own_processes(deployment)["mine"].writes == ("robot/lamp/**",)
+    *ours, spec = process_specs(deployment, "robot", tmp_path, tmp_path, file=str(path))
+    assert (spec.name, spec.after, spec.beats, spec.optional) == ("mine", ("router",), True, True)
+    assert not any(one.optional for one in ours)
+    config = msgspec.json.decode(spec.argv[-1], type=ProcessConfig)
+    assert (config.module, config.settings) == ("my_lamp.node", {"watts": 7})
+    router = msgspec.json.decode(ours[0].argv[-1], type=ProcessConfig)
+    assert router.settings["watches"] == ["mine"]
+    assert router.endpoint.grants["mine"] == ("robot/lamp/**",)
+
+
+def test_hosts_may_place_it_and_several_hosts_must(tmp_path: Path) -> None:
+    hosts = "hosts: {robot: [router, driver], laptop: [perception%s]}\n"
+    placed = load_deployment(written(tmp_path, MINE + hosts % ", mine"))
+    assert placed.hosts["laptop"] == ("perception", "mine")
+    with pytest.raises(ConfigError, match=r"robot\.yaml:5: hosts: mine is on none; name it in one"):
+        load_deployment(written(tmp_path, MINE + hosts % ""))
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (MINE + "    modul: x\n", r":5: unknown field 'modul'; did you mean 'module'\?"),
+        (HEAD + "processes:\n  mine: {}\n", r":3: processes\.mine: missing field 'module'"),
+        (HEAD + "processes:\n  Mine: {module: a}\n", r":3: processes: expected a string matching"),
+        (HEAD + "processes:\n  mine:\n    module: a-b\n", r":4: processes\.mine\.module: expected"),
+        (HEAD + "processes:\n  driver: {module: a}\n", r":3: processes\.driver: a process has tha"),
+        (MINE + "perceptors:\n  mine: {}\n", r":3: processes\.mine: a process has that name alre"),
+        (
+            MINE + "    writes:\n    - robot/intent\n    - robot/state/x\n",
+            r":7: processes\.mine\.writes\[1\]: expected robot/state, got 'robot/state/x'",
+        ),
+        (MINE + "    writes: [lamp]\n", r":5: processes\.mine\.writes\[0\]: expected a key below"),
+        (MINE + "    writes: ['robot/**']\n", r":5: .*expected a name after robot/, got"),
+        (MINE + "    writes: [robot/image/**]\n", r":5: .*expected robot/image/NAME, got"),
+        (MINE + "hosts: {robot: [mime]}\n", r":5: .*got 'mime'; did you mean 'mine'\?"),
+    ],
+)
+def test_an_error_names_its_line(text: str, complaint: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=rf"robot\.yaml{complaint}"):
+        load_deployment(written(tmp_path, text))
+
+
+@pytest.mark.parametrize("module", ["no_lamp", "my_lamp.nod", "my_lamp.node.deeper", "my_lamp:x.y"])
+def test_a_module_that_is_not_installed_is_found_before_anything_starts(
+    module: str, tmp_path: Path
+) -> None:
+    path = written(tmp_path, MINE.replace("my_lamp.node", module))
+    with pytest.raises(ConfigError, match=r"robot\.yaml:4: processes\.mine\.module: "):
+        check_installed(load_deployment(path), "robot", str(path))
+
+
+def test_a_perceptor_that_no_package_offers_is_found_before_anything_starts(
+    tmp_path: Path,
+) -> None:
+    path = written(tmp_path, HEAD + "perceptors:\n  people: {}\n")
+    with pytest.raises(ConfigError, match=r"robot\.yaml:3: .*no perceptor 'people'"):
+        check_installed(load_deployment(path), "robot", str(path))
+
+
+def config_of(path: Path) -> ProcessConfig:
+    """What the supervisor hands to `mine`."""
+    entry = load_deployment(path).processes["mine"]
+    return ProcessConfig(
+        name="mine",
+        endpoint=Endpoint(),
+        module=entry.module,
+        settings=entry.settings,
+        file=str(path),
+    )
+
+
+def test_its_own_process_finds_its_settings_wrong_and_names_the_line(tmp_path: Path) -> None:
+    text = MINE.replace("my_lamp.node", "lone_lamp") + "    settings:\n      watts: %s\n"
+    _, node = load_own(config_of(written(tmp_path, text % 3)))
+    assert node.args[0].watts == 3.0  # type: ignore[attr-defined]
+    with pytest.raises(ConfigError, match=r"robot\.yaml:6: watts: expected a number, got 'much'"):
+        load_own(config_of(written(tmp_path, text % "much")))
+
+
+def test_a_module_without_its_coroutine_says_what_is_expected(tmp_path: Path) -> None:
+    path = written(tmp_path, MINE.replace("my_lamp.node", "lone_lamp:shine"))
+    with pytest.raises(ConfigError, match=r":4: .*has no coroutine 'shine'; expected run\(config"):
+        load_own(config_of(path))
