@@ -1,11 +1,10 @@
 """Closed-loop motions for scripts: drive a distance or turn by an angle, measured by odometry."""
 
 import math
-from collections.abc import Sequence
 
 from msgspec import Struct
 
-from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.base import Causes, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_zenoh.geometry.limits import ZERO, at_rest
 
@@ -39,11 +38,15 @@ class OdometryMotion:
         self._end_tick = 0  # when the goal was reached, or given up
         self._held: dict[str, None] = {}
 
-    def step(self, state: RobotState, speed: float | None = None) -> Velocity:
-        """Return the velocity to send for `state`; zero once the goal is reached or given up."""
+    def step(self, state: RobotState, speed: float | None = None, safety: Causes = ()) -> Velocity:
+        """Return the velocity to send for `state`; zero once the goal is reached or given up.
+
+        `safety` has the causes of safety's verdict: an obstacle limits only motion towards it.
+        """
         self._turned += math.remainder(state.pose.yaw - self._yaw, math.tau)
         self._yaw, self._last = state.pose.yaw, state
-        self._held.update(dict.fromkeys(self._causes(state)))
+        self._held.update(dict.fromkeys(one.code for one in state.gate.causes))
+        self._held.update({one.code: None for one in safety if one.code == self._zone})
         linear_left, angle_left = self._left()
         self._watch_progress(state, linear_left, angle_left)
         if self._end_tick:
@@ -91,8 +94,12 @@ class OdometryMotion:
         if not self._end_tick and (left <= tolerance or stalled):
             self._end_tick = state.tick
 
-    def _causes(self, state: RobotState) -> Sequence[str]:
-        return [cause.code for cause in state.gate.causes]
+    @property
+    def _zone(self) -> str:
+        """The code of an obstacle in the direction of the motion."""
+        if self._distance:
+            return "zone_ahead" if self._distance > 0 else "zone_behind"
+        return "zone_turn_left" if self._angle > 0 else "zone_turn_right"
 
 
 def _approach(left: float, limit: float, deceleration: float, slowest: float) -> float:

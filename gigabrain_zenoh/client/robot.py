@@ -14,6 +14,7 @@ from gigabrain_schemas.requests import GateReply
 from gigabrain_schemas.tasks import Task
 from gigabrain_schemas.topics import (
     BODY,
+    SAFETY,
     STATE,
     Topic,
     command_topic,
@@ -88,7 +89,7 @@ class Robot:
     def __init__(self, bus: Bus, *, take: bool = False, keys: str = "") -> None:
         self._bus, self._take, self._keys = bus, take, keys
         self._states = bus.latest(STATE, self._repeat)
-        self._bodies = bus.latest(BODY)
+        self._bodies, self._safety = bus.latest(BODY), bus.latest(SAFETY)
         self._target: Velocity | None = None
         self._until_tick = 0
         self._pressed = 0  # the number of this script's newest e-stop
@@ -164,7 +165,9 @@ class Robot:
             raise ConfigError(f"speed: expected more than 0, got {speed:g}")
         motion = OdometryMotion(await self.read_body(), await self.read_state(), distance, angle)
         while not motion.done:
-            wanted = motion.step(await self.read_state(), speed)
+            verdict = self._safety.fresh()
+            causes = verdict.causes if verdict else ()
+            wanted = motion.step(await self.read_state(), speed, causes)
             await self.set_base_velocity(wanted.linear_x, 0.0, wanted.angular_z)
             await self._ticks(1)
         await self.stop()

@@ -5,7 +5,7 @@ from collections import deque
 
 import pytest
 
-from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.base import Cause, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, GateStatus, RobotState
 from gigabrain_zenoh.client.motion import OdometryMotion, Reached
 from gigabrain_zenoh.gate.causes import SAFETY_STOP
@@ -89,3 +89,19 @@ def test_a_motion_that_is_held_for_good_gives_up_and_says_how_far_it_came() -> N
     reached = run(Plant(held=(150, 10**9)), 2.0)
     assert (reached.ok, reached.held_back) == (False, ("safety_stop",))
     assert 0.05 < reached.distance < 0.5
+
+
+AHEAD = Cause(code="zone_ahead", text="obstacle ahead of the body")
+
+
+@pytest.mark.parametrize(
+    ("distance", "angle", "held_back"),
+    [(1.0, 0.0, ("zone_ahead",)), (-1.0, 0.0, ()), (0.0, 1.0, ())],
+)
+def test_an_obstacle_is_named_by_a_motion_towards_it(
+    distance: float, angle: float, held_back: tuple[str, ...]
+) -> None:
+    plant = Plant()
+    motion = OdometryMotion(BODY, plant.state, distance, angle)
+    motion.step(plant.state, safety=(AHEAD,))
+    assert motion.result().held_back == held_back

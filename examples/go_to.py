@@ -1,0 +1,13 @@
+"""Send the robot to a place in its map, and print what it reached."""
+
+import sys
+
+import gigabrain_zenoh
+
+x, y = (float(word) for word in sys.argv[1:3]) if len(sys.argv) > 2 else (0.5, 0.0)
+
+with gigabrain_zenoh.connect() as robot:
+    task = robot.goto(x, y)  # plans round obstacles; returns once the task has ended
+    print(task.state, "-", task.reason)
+    if task.position_error is not None:
+        print(f"{task.position_error:.2f} m from the goal")

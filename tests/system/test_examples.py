@@ -1,0 +1,139 @@
+"""Each program and notebook of `examples/` runs beside a simulated robot."""
+
+import ast
+import asyncio
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.testing.processes import CommandProcess, Home, robot_of
+from tests.places import ROOT
+
+EXAMPLES = ROOT / "examples"
+LONGEST_S = 300.0
+
+
+class Example(NamedTuple):
+    """How a program is run, and what it leaves."""
+
+    arguments: tuple[str, ...] = ()  # ENDPOINT and DRIVE stand for those of the robot
+    prints: str = ""
+    makes: tuple[str, ...] = ()
+
+
+PROGRAMS = {
+    "battery_watch": Example(prints="%"),
+    "draw_map": Example(makes=("map.png",)),
+    "estop": Example(prints="refused: "),
+    "follow_task": Example(prints="going to (0.40, -0.30)"),
+    "go_to": Example(prints="succeeded"),
+    "look_round": Example(makes=("points.npy",)),
+    "mission": Example(prints="going to here"),
+    "no_package": Example(("ENDPOINT",), prints="tick "),
+    "patrol": Example(prints="start: succeeded"),
+    "pause_when_near": Example(prints="is cancelled"),
+    "plot_speed": Example(makes=("speed.png",)),
+    "read_recording": Example(("DRIVE",), prints="states over"),
+    "save_scans": Example(prints="scans.npy: 20 scans", makes=("scans.npy", "angles.npy")),
+    "square": Example(prints="side 4: "),
+    "wall_follower": Example(prints="ahead "),
+    "who_drives": Example(prints="drives: my-script"),
+}
+NOTEBOOKS = ("first_look", "recording")
+
+
+def test_every_example_is_run() -> None:
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == {*PROGRAMS}
+    assert {path.stem for path in EXAMPLES.glob("*.ipynb")} == {*NOTEBOOKS}
+    tests = "".join(path.read_text() for path in (ROOT / "tests").rglob("*.py"))
+    folders = [path.name for path in EXAMPLES.iterdir() if path.is_dir() and path.name[0] != "_"]
+    assert [name for name in folders if f"examples/{name}" not in tests] == []
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_a_program_is_short_and_says_what_it_shows(name: str) -> None:
+    source = (EXAMPLES / f"{name}.py").read_text()
+    assert source.count("\n") < 60
+    assert (ast.get_docstring(ast.parse(source)) or "").split("\n")[0][-1] in ".:"
+
+
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_a_notebook_holds_no_outputs(name: str) -> None:
+    cells = json.loads((EXAMPLES / f"{name}.ipynb").read_text())["cells"]
+    code = [cell for cell in cells if cell["cell_type"] == "code"]
+    assert [(cell["outputs"], cell["execution_count"]) for cell in code] == [([], None)] * len(code)
+
+
+class Robot(NamedTuple):
+    """A robot that maps and drives, with its recording so far."""
+
+    home: Home
+    endpoint: Endpoint
+    drive: Path
+
+    @property
+    def environment(self) -> dict[str, str]:
+        scripts = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+        return self.home.environment | {"PATH": scripts}
+
+
+@pytest.fixture(scope="module")
+def robot(shared_home: Home) -> Iterator[Robot]:
+    drive = shared_home.folder / "drive.mcap"
+    demo = shared_home.start("demo", "--headless", "--no-page", "--record", str(drive))
+    yield Robot(shared_home, asyncio.run(ready(shared_home, demo)), drive)
+    demo.close()
+
+
+async def ready(home: Home, demo: CommandProcess) -> Endpoint:
+    """Wait until the robot may drive and has a map; return its endpoint."""
+    endpoint = await robot_of(home, demo)
+    for _ in range(60):
+        shown = await home.run("topic", "echo", "state", "-n", "1", "--fields", "gate.mode")
+        drawn = await home.run("topic", "echo", "map", "-n", "1", "--within", "5")
+        if "enabled" in shown.out and drawn.out:
+            return endpoint
+    raise TimeoutError("the robot does not drive")
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_a_program_runs_beside_a_robot(name: str, robot: Robot, tmp_path: Path) -> None:
+    example = PROGRAMS[name]
+    drive = shutil.copy(robot.drive, tmp_path) if "DRIVE" in example.arguments else ""
+    places = {"ENDPOINT": robot.endpoint.connect[0], "DRIVE": str(drive)}
+    done = subprocess.run(
+        (sys.executable, EXAMPLES / f"{name}.py", *(places[one] for one in example.arguments)),
+        cwd=tmp_path,
+        env=robot.environment,
+        capture_output=True,
+        text=True,
+        timeout=LONGEST_S,
+    )
+    assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
+    assert example.prints in done.stdout
+    assert [made for made in example.makes if not (tmp_path / made).stat().st_size] == []
+
+
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_a_notebook_runs_beside_a_robot(
+    name: str, robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for key, value in robot.environment.items():
+        monkeypatch.setenv(key, value)
+    notebook = nbformat.read(EXAMPLES / f"{name}.ipynb", as_version=4)
+    client = NotebookClient(
+        notebook, timeout=LONGEST_S, resources={"metadata": {"path": str(tmp_path)}}
+    )
+    client.execute()
+    outputs = [cell.outputs for cell in notebook.cells if cell.cell_type == "code"]
+    assert [index for index, shown in enumerate(outputs[1:]) if not shown] == []
