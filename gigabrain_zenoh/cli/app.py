@@ -52,6 +52,8 @@ COMMANDS = {
     "param list": ("node:list_params", "List the parameters that can be changed at run time."),
     "param get": ("node:get_param", "Print one parameter."),
     "param set": ("node:set_param", "Change one parameter."),
+    "param save": ("node:save_params", "Save the changed parameters to a file."),
+    "config": ("config:config", "Print all settings, and where each comes from."),
     "map save": ("map:save", "Save the map that the robot makes."),
     "map info": ("map:info", "Check a saved map, and print its size."),
     "record": ("bag:record", "Record a robot's messages to an MCAP file, until Ctrl-C."),

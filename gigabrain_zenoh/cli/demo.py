@@ -7,6 +7,13 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from gigabrain_zenoh.cli.config import (
+    Sets,
+    SettingsFiles,
+    merged_file,
+    merged_values,
+    rows_of,
+)
 from gigabrain_zenoh.cli.options import (
     Body,
     KeepStuck,
@@ -27,7 +34,6 @@ from gigabrain_zenoh.launch.deployment import (
     Deployment,
     deployment_path,
     host_of,
-    load_deployment,
     recorded,
 )
 
@@ -50,8 +56,8 @@ class RobotOptions:
     "How long time waits for the brain [s]; longer for a slow machine."
     behaviour: str = "navigate"
     "Behaviour: `navigate`, or `avoid`, which makes no map."
-    set: tuple[str, ...] = ()
-    "Setting of the behaviour, as NAME=VALUE; may be given again."
+    set: Sets = ()
+    settings: SettingsFiles = ()
     resume: Resume | None = None
     "Drive on after a stop whose cause has passed. Default: auto; manual with --link real."
 
@@ -63,8 +69,7 @@ class RobotOptions:
 
     def values(self) -> dict[str, object]:
         """Return the fields of a Deployment, unchecked."""
-        defaults = behaviours.load(self.behaviour).DEMO
-        settings = {**defaults, **behaviours.parse_settings(self.set)}
+        settings = dict(behaviours.load(self.behaviour).DEMO)
         values: dict[str, object] = {
             "body": self.body,
             "link": self.link,
@@ -116,8 +121,9 @@ def demo(*, robot: RobotOptions = ROBOT, view: ViewOptions = VIEW) -> int:
     if view.record and view.record.exists():
         raise ConfigError(f"--record: {view.record} exists; choose another file")
     values = robot.values() | (recorded(view.record) if view.record else {})
-    deployment, address = checked(values, Deployment), ""
-    behaviours.check(deployment.decision)
+    checked(values, Deployment)
+    merged = merged_values(values, robot.settings, robot.set)
+    deployment, address = merged.deployment, ""
     if view.page or (view.page is None and not view.headless):
         checked({"port": view.port}, PageConfig)
         deployment, address = with_page(deployment, view.port, login=view.login)
@@ -126,6 +132,7 @@ def demo(*, robot: RobotOptions = ROBOT, view: ViewOptions = VIEW) -> int:
         headless=view.headless,
         report=view.report,
         page=address,
+        rows=rows_of(merged, deployment),
         keep_stuck=view.keep_stuck,
     )
     return run_async(Demo(deployment, options).run())
@@ -135,6 +142,8 @@ def up(
     deployment: str,
     *,
     host: str | None = None,
+    set: Sets = (),
+    settings: SettingsFiles = (),
     keys: Path | None = None,
     level: Level = "info",
     keep_stuck: KeepStuck = False,
@@ -154,19 +163,21 @@ def up(
     from gigabrain_zenoh.host.terminal import LINES, Display, writer
     from gigabrain_zenoh.launch.up import up as run
 
-    path = deployment_path(deployment)
-    loaded = load_deployment(path, str(keys.expanduser().absolute()) if keys else "")
+    merged = merged_file(deployment, settings, set, keys)
+    path, loaded = deployment_path(deployment), merged.deployment
     try:
         where = host_of(loaded, host)
         if "decision" in loaded.hosts[where]:
-            behaviours.check(loaded.decision, path)
+            merged.check_behaviour()
+        rows = rows_of(merged, robot="driver" in loaded.hosts[where])
         with Display(writer(sys.stdout), LINES) as display:
 
             def put(line: str) -> None:
                 display.put(f"{line}\n")
 
             file = str(path.absolute())
-            return run_async(run(loaded, where, put, level, keep_stuck=keep_stuck, file=file))
+            running = run(loaded, where, put, level, keep_stuck=keep_stuck, file=file, rows=rows)
+            return run_async(running)
     except ConfigError as error:
         raise located(path, error) from None
 

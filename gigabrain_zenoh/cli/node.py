@@ -153,9 +153,9 @@ def list_params(process: ProcessOrAll = "", /, *, at: RobotAddress = LOCAL) -> N
 
     Example: gigabrain param list decision
     """
-    for name, reply in sorted(_ask(at, process).items()):
+    for name, reply in sorted(ask_params(at, process).items()):
         for one in reply.params:
-            print_line(f"{name:<12} {one.name:<14} {one.value:<10} {one.expected}")
+            print_line(f"{name:<12} {one.name:<24} {one.value:<10} {one.expected}")
 
 
 def get_param(process: Process, name: str, /, *, at: RobotAddress = LOCAL) -> None:
@@ -166,14 +166,22 @@ def get_param(process: Process, name: str, /, *, at: RobotAddress = LOCAL) -> No
     Args:
         name: Name of the parameter.
     """
-    reply = _ask(at, process)[process]
+    reply = ask_params(at, process)[process]
     params = {one.name: one for one in reply.params}
     if name not in params:
         raise unknown("parameter", name, params)
     print_line(params[name].value)
 
 
-def set_param(process: Process, name: str, value: str, /, *, at: RobotAddress = LOCAL) -> None:
+def set_param(
+    process: Process,
+    name: str,
+    value: str,
+    /,
+    *,
+    save: Path | None = None,
+    at: RobotAddress = LOCAL,
+) -> None:
     """Change one parameter, until the process ends.
 
     Example: gigabrain param set decision max_linear_speed 0.15
@@ -181,15 +189,36 @@ def set_param(process: Process, name: str, value: str, /, *, at: RobotAddress = 
     Args:
         name: Name of the parameter.
         value: New value.
+        save: File to save it in, with all other changed parameters; see `param save`.
     """
-    reply = _ask(at, process, name, value)[process]
+    reply = ask_params(at, process, name, value)[process]
     if not reply.ok:
         raise Refused(f"{process}: {reply.text}")
     print_line(f"{process}: {reply.text}")
+    if save:
+        save_params(save, at=at)
 
 
-def _ask(
-    at: RobotAddress, process: str, name: str = "", value: str = ""
+def save_params(file: Path, /, *, at: RobotAddress = LOCAL) -> None:
+    """Save the parameters that were changed, for `up --settings` and `demo --settings`.
+
+    Example: gigabrain param save slow.yaml
+
+    Args:
+        file: File to write. What it holds already stays, unless the same was changed again.
+    """
+    from gigabrain_zenoh.cli.config import with_values
+
+    params = [one for reply in ask_params(at).values() for one in reply.params if one.key]
+    changed = {one.key: one.value for one in params if one.value != one.initial}
+    if not changed:
+        raise Refused("no parameter of this robot was changed, so there is nothing to save")
+    file.write_text(with_values(file, changed), encoding="utf-8")
+    print_line(f"saved {', '.join(sorted(changed))} in {file}")
+
+
+def ask_params(
+    at: RobotAddress, process: str = "", name: str = "", value: str = ""
 ) -> "dict[str, ParamReply]":
     """Return the replies of one process, or of all without a name."""
     import getpass

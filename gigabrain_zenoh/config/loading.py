@@ -8,7 +8,7 @@ import difflib
 import re
 import types
 import typing
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -186,9 +186,9 @@ def _wrong_tag(node: Node, structs: list[Any], path: str, key_line: int) -> Fiel
 
 
 def _inside(node: Node, type_: Any, path: str, key_line: int) -> Iterator[FieldFault]:
-    if node.entries is not None and _is_struct(type_):
+    if node.entries is not None and is_struct(type_):
         yield from _in_struct(node, node.entries, type_, path, key_line)
-    elif node.entries is not None and _is_mapping(type_):
+    elif node.entries is not None and is_mapping(type_):
         for entry in node.entries:
             yield from _in_entry(entry, typing.get_args(type_), path)
     elif node.items is not None and _is_list(type_):
@@ -235,32 +235,35 @@ def _item_types(type_: Any, node: Node) -> list[Any]:
 
 def _meant(type_: Any, node: Node) -> Any:
     """Return the member of an Annotated, Optional or Union type that fits a value like `node`."""
-    members = _members(type_)
+    members = members_of(type_)
     if node.entries is not None and (structs := _structs(type_)):
         name = structs[0].__struct_config__.tag_field
         tag = node.value.get(name) if len(structs) > 1 else structs[0].__struct_config__.tag
         return next(s for s in structs if s.__struct_config__.tag == tag)
-    fits = _is_list if node.entries is None else _is_mapping
+    fits = _is_list if node.entries is None else is_mapping
     return next((member for member in members if fits(member)), None)
 
 
-def _members(type_: Any) -> list[Any]:
+def members_of(type_: Any) -> list[Any]:
+    """Return the members of an Annotated, Optional or Union type, or the type itself."""
     if typing.get_origin(type_) is typing.Annotated:
-        return _members(typing.get_args(type_)[0])
+        return members_of(typing.get_args(type_)[0])
     if typing.get_origin(type_) in (typing.Union, types.UnionType):
-        return [part for member in typing.get_args(type_) for part in _members(member)]
+        return [part for member in typing.get_args(type_) for part in members_of(member)]
     return [type_]
 
 
 def _structs(type_: Any) -> list[Any]:
-    return [member for member in _members(type_) if _is_struct(member)]
+    return [member for member in members_of(type_) if is_struct(member)]
 
 
-def _is_struct(type_: Any) -> bool:
+def is_struct(type_: Any) -> bool:
+    """Return whether a type is a Struct."""
     return isinstance(type_, type) and issubclass(type_, msgspec.Struct)
 
 
-def _is_mapping(type_: Any) -> bool:
+def is_mapping(type_: Any) -> bool:
+    """Return whether a type is a dict or another mapping."""
     return _is_a(type_, Mapping)
 
 
@@ -313,21 +316,40 @@ def loads(text: str, type: type[T], source: str, at: Sequence[str] = ()) -> T:
 
     With `at`, such as ("decision", "settings"), only that section is read; missing ones are empty.
     """
+    root = part(document(text, source), at)
+    return converted(root, type, lambda line: f"{source}:{line}")
+
+
+def document(text: str, source: str) -> Node:
+    """Return the tree of a YAML text, in present words. Raises ConfigError with its line."""
     try:
-        root = renamed_fields(yaml_text.read(text), source)
-        for name in at:
-            found = (entry.node for entry in root.entries or () if entry.key == name)
-            root = next(found, yaml_text.Node(root.line, {}, entries=()))
-        return msgspec.convert(root.value, type)
+        return renamed_fields(yaml_text.read(text), source)
     except yaml_text.YamlFault as fault:
-        raise _error(source, fault.line, str(fault)) from None
+        raise _error(f"{source}:{fault.line}", str(fault)) from None
+
+
+def part(root: Node, at: Sequence[str]) -> Node:
+    """Return a section of a tree; a missing one is empty."""
+    for name in at:
+        found = (entry.node for entry in root.entries or () if entry.key == name)
+        root = next(found, Node(root.line, {}, entries=()))
+    return root
+
+
+def converted(root: Node, type: type[T], place: Callable[[int], str]) -> T:
+    """Return the `type` that a tree describes; `place` returns the words for one of its lines.
+
+    Raises ConfigError.
+    """
+    try:
+        return msgspec.convert(root.value, type)
     except msgspec.ValidationError as error:
         where = find_fault(root, type) or FieldFault(root.line, str(error))
-        raise _error(source, where.line, where.text) from None
+        raise _error(place(where.line), where.text) from None
 
 
-def _error(source: str, line: int, text: str) -> ConfigError:
-    return ConfigError(" ".join(f"{source}:{line}: {text}".split()))
+def _error(place: str, text: str) -> ConfigError:
+    return ConfigError(" ".join(f"{place}: {text}".split()))
 
 
 def _nearest(path: Path) -> str:

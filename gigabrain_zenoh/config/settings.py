@@ -82,6 +82,7 @@ class DriverConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     state_dir: str  # folder where it saves the causes that latched it
     emulator: str = ""  # folder of the emulator's ports, if the link is `emulated`
     button: bool = False  # an e-stop button must be present
+    robot: dict[str, Any] = {}  # fields of the body's file that are other here
 
 
 class ButtonConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -122,6 +123,7 @@ class EmulatorConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     world: str = "arena"
     seed: Seed = 0
     folder: str  # folder where its ports appear
+    robot: dict[str, Any] = {}  # fields of the body's file that are other here
 
 
 class RecorderConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

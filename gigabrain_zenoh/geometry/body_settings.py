@@ -4,6 +4,7 @@ The driver publishes the changed description, so gate, safety, planner and contr
 values.
 """
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -19,6 +20,7 @@ class BodySetting(NamedTuple):
     unit: str
     kind: str  # of the bound, in words
     at_least: bool = False  # the file's value is the least one; otherwise the greatest
+    live: bool = True  # may change while the body runs; otherwise at the start only
 
 
 SETTINGS = {
@@ -29,15 +31,36 @@ SETTINGS = {
     "thresholds.stop_margin": BodySetting("m", "need", at_least=True),
     "thresholds.side_margin": BodySetting("m", "need", at_least=True),
     "thresholds.resume_margin": BodySetting("m", "need", at_least=True),
+    "max_rim_speed": BodySetting("m/s", "limit", live=False),
+    "max_linear_deceleration": BodySetting("m/s2", "limit", live=False),
+    "max_angular_acceleration": BodySetting("rad/s2", "limit", live=False),
+    "thresholds.reaction_time": BodySetting("s", "need", at_least=True, live=False),
 }
 
 
 def setting_of(body: BodyDescription, path: str) -> float:
-    """Return the value of a field such as `thresholds.stop_margin`."""
+    """Return the value of a field such as `thresholds.stop_margin`; inf for no limit."""
     value: Any = body
     for name in path.split("."):
         value = getattr(value, name)
-    return float(value)
+    return math.inf if value is None else float(value)
+
+
+def split(changes: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, Any]]:
+    """Return the live settings in changes of a robot's file, by path, and all other changes."""
+    settings: dict[str, float] = {}
+    rest = dict(changes)
+    for path, one in SETTINGS.items():
+        if not one.live:
+            continue
+        section, _, name = path.rpartition(".")
+        place = rest.get(section, {}) if section else rest
+        if name not in place:
+            continue
+        settings[path] = place[name]
+        kept = {key: value for key, value in place.items() if key != name}
+        rest = {**rest, section: kept} if section else kept
+    return settings, rest
 
 
 def check_safe(file: BodyDescription, wanted: BodyDescription) -> None:

@@ -15,12 +15,14 @@ from gigabrain_schemas.base import TICK_S
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.config.layers import Row
 from gigabrain_zenoh.config.settings import PageConfig
 from gigabrain_zenoh.errors import BodyLost, ConfigError
 from gigabrain_zenoh.host import files
 from gigabrain_zenoh.host.run_folders import new_run_dir
 from gigabrain_zenoh.host.signals import stop_signals
 from gigabrain_zenoh.launch.deployment import Deployment, client_endpoint, with_free_port
+from gigabrain_zenoh.launch.merging import write_rows
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.launch.up import LIMIT_S, STOP_S
 from gigabrain_zenoh.runtime.running import announced
@@ -101,6 +103,7 @@ class DemoOptions(Struct, frozen=True, kw_only=True):
     headless: bool = False
     report: Path | None = None
     page: str = ""  # where the operator page is, or how to get it
+    rows: tuple[Row, ...] = ()  # the settings and their sources, for `gigabrain config`
     keep_stuck: bool = False  # processes without progress are left alone, for a debugger
 
 
@@ -125,6 +128,7 @@ class Demo:
         self._deployment, self._options = with_free_port(deployment), options
         files.check_result_path(options.report)
         self._run_dir = new_run_dir(None, "demo")
+        write_rows(self._run_dir, options.rows)
         specs = process_specs(
             self._deployment,
             "robot",
@@ -148,7 +152,7 @@ class Demo:
         """
         label = f"{self._deployment.body} in {self._deployment.world}"
         endpoint = client_endpoint(self._deployment)
-        with stop_signals(LIMIT_S) as stop, announced(label, endpoint):
+        with stop_signals(LIMIT_S) as stop, announced(label, endpoint, self._run_dir):
             async with self._supervisor:
                 running = asyncio.ensure_future(self._supervisor.run())
                 bus = await self._join(stop)

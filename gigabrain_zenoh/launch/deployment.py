@@ -11,7 +11,6 @@ from msgspec import Struct, structs
 
 from gigabrain_zenoh.bus.zenoh.config import secured
 from gigabrain_zenoh.config import loading as config
-from gigabrain_zenoh.config import yaml_text
 from gigabrain_zenoh.config.settings import (
     ButtonConfig,
     DecisionConfig,
@@ -29,6 +28,7 @@ from gigabrain_zenoh.config.settings import (
     Seed,
     Speed,
 )
+from gigabrain_zenoh.config.yaml_text import Node
 from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.host.network import exposed, host_and_port, reserve_port
 from gigabrain_zenoh.launch.own_processes import MODULES, PERCEPTORS, check_entries
@@ -67,6 +67,7 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     insecure: bool = False  # allow a router that other machines can reach, without keys
     hosts: dict[str, tuple[str, ...]] = msgspec.field(default_factory=lambda: {"robot": ROBOT})
     button: ButtonConfig | None = None  # an e-stop button; without its word nothing moves
+    robot: dict[str, Any] = {}  # fields of the body's file that are other here, never less safe
     perception: PerceptionConfig = PerceptionConfig()
     decision: DecisionConfig = DecisionConfig()
     recorder: RecorderConfig = RecorderConfig()
@@ -190,19 +191,20 @@ def load_deployment(path: Path, keys: str = "") -> Deployment:
 
     Raises ConfigError with file, line and what was expected.
     """
-    text = config.read(path)
-    loaded = config.loads(text, deployment_type(_own_names(text)), str(path))
+    root = config.document(config.read(path), str(path))
+    kind = deployment_type(own_names(root))
+    return with_keys(config.converted(root, kind, lambda line: f"{path}:{line}"), path, keys)
+
+
+def with_keys(loaded: Deployment, path: Path, keys: str = "") -> Deployment:
+    """Return the deployment of a file with its keys beside it, unless `keys` replaces them."""
     if loaded.keys and not keys:
         keys = str(path.absolute().parent / Path(loaded.keys).expanduser())
     return msgspec.structs.replace(loaded, keys=keys)
 
 
-def _own_names(text: str) -> list[str]:
+def own_names(root: Node) -> list[str]:
     """Return the names of the processes of one's own in a file, which may still be invalid."""
-    try:
-        root = yaml_text.read(text)
-    except yaml_text.YamlFault:
-        return []  # reported with its line when the file is read as a whole
     parts = (one.node for one in root.entries or () if one.key in (MODULES, PERCEPTORS))
     return [entry.key for part in parts for entry in part.entries or ()]
 

@@ -32,6 +32,7 @@ from gigabrain_zenoh.config.settings import (
     RouterConfig,
 )
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.geometry.body_settings import split
 from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.host.signals import interrupts
 from gigabrain_zenoh.launch.own_processes import load_own, own_type
@@ -72,6 +73,7 @@ def _driver(deployment: "Deployment", place: ProcessPlace) -> DriverConfig:
         state_dir=str(place.state_dir),
         emulator=str(place.ports) if deployment.link == "emulated" else "",
         button=deployment.button is not None,
+        robot=deployment.robot,
     )
 
 
@@ -81,6 +83,7 @@ def _emulator(deployment: "Deployment", place: ProcessPlace) -> EmulatorConfig:
         world=deployment.world,
         seed=deployment.seed,
         folder=str(place.ports),
+        robot=split(deployment.robot)[1],
     )
 
 

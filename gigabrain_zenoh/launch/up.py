@@ -5,11 +5,12 @@ import contextlib
 import os
 import socket
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
 from gigabrain_zenoh import logs
+from gigabrain_zenoh.config.layers import Row
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import BusError, ConfigError
 from gigabrain_zenoh.host.run_folders import new_run_dir, state_dir
@@ -20,6 +21,7 @@ from gigabrain_zenoh.launch.deployment import (
     local_endpoint,
     with_free_port,
 )
+from gigabrain_zenoh.launch.merging import write_rows
 from gigabrain_zenoh.launch.own_processes import check_installed
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.runtime.running import announced
@@ -103,13 +105,14 @@ async def up(
     *,
     keep_stuck: bool = False,
     file: str = "",
+    rows: Sequence[Row] = (),
 ) -> int:
     """Keep a host's processes running until Ctrl-C; return the exit code.
 
     A process without progress is restarted, or with `keep_stuck` left to a debugger. `file` is the
-    deployment file, for errors. Raises
-    ConfigError for wrong settings and for a folder that cannot be written, and BusError if the
-    router cannot run.
+    deployment file, for errors; `rows` are the settings and their sources, for `gigabrain config`.
+    Raises ConfigError for wrong settings and for a folder that cannot be written, and BusError if
+    the router cannot run.
     """
     check_keys(deployment, host)
     check_installed(deployment, host, file)
@@ -119,6 +122,7 @@ async def up(
     label = deployment.namespace or deployment.body.replace("/", "-")
     notifier = Notifier.from_environment()
     run_dir = new_run_dir(None, label)
+    write_rows(run_dir, rows)
     remembers = state_dir() / "robots" / label
     specs = process_specs(deployment, host, run_dir, remembers, level=level, file=file)
 
@@ -138,7 +142,7 @@ async def up(
     print_line(f"{deployment.body} on {host}: {names}; logs in {run_dir}")
     with (
         stop_signals(LIMIT_S) as stop,
-        announced(label, local_endpoint(deployment, host)) as note,
+        announced(label, local_endpoint(deployment, host), run_dir) as note,
     ):
         async with Supervisor(specs, show, keep_stuck=keep_stuck) as supervisor:
             running = asyncio.ensure_future(supervisor.run())

@@ -30,6 +30,7 @@ class Running(Struct, frozen=True, kw_only=True):
     pid: Pid  # of its supervisor, or of a router that was started by hand
     label: str  # name shown to users
     endpoint: Endpoint
+    run_dir: str = ""  # folder of its logs
 
 
 def folder() -> Path:
@@ -46,13 +47,14 @@ def local_socket() -> str:
 
 
 @contextmanager
-def announced(label: str, endpoint: Endpoint) -> Iterator[Path]:
+def announced(label: str, endpoint: Endpoint, run_dir: Path | None = None) -> Iterator[Path]:
     """Keep a note on disk while the block runs, and yield its path. Raises ConfigError.
 
     The note stays locked while this process lives, because its pid may be reused afterwards.
     """
     note = folder() / f"{os.getpid()}.json"
-    robot = Running(pid=os.getpid(), label=label, endpoint=endpoint)
+    run = str(run_dir) if run_dir else ""
+    robot = Running(pid=os.getpid(), label=label, endpoint=endpoint, run_dir=run)
     try:
         for place in (note.parent.parent, note.parent):
             place.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -141,6 +143,11 @@ def find_endpoint(connect: str | None, namespace: str = "", keys: str = "") -> E
     if connect:
         folder = str(Path(keys).expanduser().absolute()) if keys else ""
         return secured(Endpoint(connect=(connect,), namespace=namespace, keys=folder))
+    return find_running(namespace).endpoint
+
+
+def find_running(namespace: str = "") -> Running:
+    """Return the only robot on this machine. Raises BusError for none, Ambiguous for several."""
     robots = [r for r in running() if not namespace or r.endpoint.namespace == namespace]
     if not robots:
         raise BusError("no robot runs here; start one with `gigabrain demo`, or name its router")
@@ -148,7 +155,7 @@ def find_endpoint(connect: str | None, namespace: str = "", keys: str = "") -> E
     if len(nearest) > 1:
         where = ", ".join(f"{r.endpoint.connect[-1]} ({r.label})" for r in nearest.values())
         raise Ambiguous(f"several robots run here; choose one with --connect: {where}")
-    return next(iter(nearest.values())).endpoint
+    return next(iter(nearest.values()))
 
 
 def _place(robot: Running) -> tuple[str, str]:

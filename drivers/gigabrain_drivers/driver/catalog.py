@@ -2,6 +2,7 @@
 
 import difflib
 import importlib.util
+from collections.abc import Mapping
 from importlib import resources
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -16,9 +17,11 @@ from gigabrain_drivers.driver.robot import LINKS, LinkOptions, RobotFile, Run
 from gigabrain_drivers.lidars.base import check_turns, source_class
 from gigabrain_drivers.links.serial_link import AUTO
 from gigabrain_zenoh.config import loading as config
+from gigabrain_zenoh.config.layers import Layers
 from gigabrain_zenoh.config.loading import located
 from gigabrain_zenoh.config.settings import LinkName
 from gigabrain_zenoh.errors import ConfigError, UnknownName, unknown
+from gigabrain_zenoh.geometry.body_settings import check_safe
 from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.plugins import load_plugin, plugin_names
 
@@ -117,23 +120,40 @@ def load_link(name: str, run: Run) -> tuple[RobotFile, type[Driver], LinkOptions
     """A robot, the driver of the link of `run`, its options and the file's folder.
 
     A link `emulated` that the file does not have is its `real` one with the emulator's ports.
+    Raises ConfigError, also for changes of the file that make the body less safe.
+    """
+    path = robot_path(name)
+    return load_layers(path, robot_layers(path, run.changes), run)
+
+
+def robot_layers(path: Path, changes: Mapping[str, Any] | None = None) -> Layers:
+    """Return the settings of a robot's file, with `changes` of this run. Raises ConfigError."""
+    layers = Layers(str(path))
+    layers.add(config.document(config.read(path), str(path)), lambda line: f"{path}:{line}")
+    if changes:
+        layers.add_values(changes, f"{path}, as changed by `robot` of the deployment")
+    return layers
+
+
+def link_type(name: str, link: LinkName) -> type[RobotFile]:
+    """Return the type of a robot's file with the options of one link's driver.
+
     Raises ConfigError.
     """
     path = robot_path(name)
-    robot = config.load(path, RobotFile)
-    if run.link not in robot_links(robot):
-        has = ", ".join(robot_links(robot)) or "none"
-        raise ConfigError(f"{robot.robot_type} has no link {run.link!r}; it has: {has}")
-    borrowed = run.link == "emulated" and robot.emulated is None
-    section: LinkName = "real" if borrowed else run.link
-    driver = _driver_of(path, section, getattr(robot, section))
+    return _exact_type(path, robot_layers(path), link)
+
+
+def load_layers(
+    path: Path, layers: Layers, run: Run
+) -> tuple[RobotFile, type[Driver], LinkOptions, Path]:
+    """Return the same of a robot's file with what is laid over it. Raises ConfigError."""
+    robot = layers.convert(RobotFile)
+    section, borrowed = _section(robot, run.link)
+    driver = _driver_of(path, layers, section, getattr(robot, section))
     # read once more, now that it is known what this driver's part looks like: errors name the line
-    try:
-        own = link_options(driver, robot, getattr(robot, section))
-    except ConfigError as error:
-        raise located(path, error) from None
-    exact = _with_section(section, own)
-    options = getattr(config.load(path, exact), section)
+    options = getattr(layers.convert(_exact_type(path, layers, run.link)), section)
+    _check_safe(path, layers, robot)
     if options.lidar:
         robot = msgspec.structs.replace(robot, lidar=options.lidar)
     if borrowed:
@@ -154,14 +174,43 @@ def _with_section(section: LinkName, type_: Any) -> type[RobotFile]:
     return cast("type[RobotFile]", exact)
 
 
-def _driver_of(path: Path, section: LinkName, link: dict[str, Any]) -> type[Driver]:
+def _section(robot: RobotFile, link: LinkName) -> tuple[LinkName, bool]:
+    """Return the part of the file for a link, and whether it is another link's."""
+    if link not in robot_links(robot):
+        has = ", ".join(robot_links(robot)) or "none"
+        raise ConfigError(f"{robot.robot_type} has no link {link!r}; it has: {has}")
+    borrowed = link == "emulated" and robot.emulated is None
+    return ("real" if borrowed else link), borrowed
+
+
+def _exact_type(path: Path, layers: Layers, link: LinkName) -> type[RobotFile]:
+    robot = layers.convert(RobotFile)
+    section, _ = _section(robot, link)
+    driver = _driver_of(path, layers, section, getattr(robot, section))
+    try:
+        own = link_options(driver, robot, getattr(robot, section))
+    except ConfigError as error:
+        raise located(path, error) from None
+    return _with_section(section, own)
+
+
+def _check_safe(path: Path, layers: Layers, robot: RobotFile) -> None:
+    """Raise ConfigError where what is laid over a robot's file makes the body less safe."""
+    try:
+        check_safe(config.load(path, RobotFile).description(), robot.description())
+    except ValueError as error:
+        key = str(error).partition(":")[0]
+        raise ConfigError(f"{layers.source_of(key.split('.'))}: {error}") from None
+
+
+def _driver_of(path: Path, layers: Layers, section: LinkName, link: dict[str, Any]) -> type[Driver]:
     """The driver that a link names. Raises ConfigError with file and line."""
     if not isinstance(link.get("driver"), str):
         others = [key for key in link if not difflib.get_close_matches(key, ["driver"])]
         fields: list[tuple[str, Any] | tuple[str, Any, Any]] = [("driver", str)]
         fields += [(key, Any, None) for key in others if key.isidentifier()]
         named = msgspec.defstruct("Link", fields, kw_only=True, forbid_unknown_fields=True)
-        config.load(path, _with_section(section, named))  # which refuses it
+        layers.convert(_with_section(section, named))  # which refuses it
     try:
         return driver_class(link["driver"])
     except ConfigError as error:

@@ -32,7 +32,7 @@ from gigabrain_zenoh.config.settings import DriverConfig
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.gate import causes as why
 from gigabrain_zenoh.gate import gate
-from gigabrain_zenoh.geometry.body_settings import SETTINGS, restricted, setting_of
+from gigabrain_zenoh.geometry.body_settings import SETTINGS, restricted, setting_of, split
 from gigabrain_zenoh.geometry.limits import ZERO, limits_of
 from gigabrain_zenoh.geometry.stopping import scan_limit_ns
 from gigabrain_zenoh.runtime.heartbeat import Progress
@@ -41,6 +41,7 @@ log = logging.getLogger(__name__)
 
 R = TypeVar("R", bound=Struct)
 Bounds = tuple[float, float]
+PATH = r" - at `[^`]*`$"  # that msgspec adds to an error
 BODY_EVERY_TICKS = 50  # once a second
 STALE_NS = 250_000_000  # the echo's 150 ms and the watchdog's 100: older must never move the body
 
@@ -50,10 +51,11 @@ class DriverProcess:
 
     def __init__(self, config: DriverConfig, robot: RobotFile, driver: Driver, bus: Bus) -> None:
         self._config, self._robot, self._driver, self._bus = config, robot, driver, bus
-        self._body = Body(description=robot.description(), link=config.link)
-        self._settings: dict[str, float] = {}  # of the body that were changed, by path
+        self._settings, _ = split(config.robot)  # of the body that are not its file's, by path
+        description = restricted(robot.description(), self._settings)
+        self._body = Body(description=description, link=config.link)
         gate_config = gate.GateConfig(
-            limits=limits_of(robot),
+            limits=limits_of(description),
             basis_ns=scan_limit_ns(robot),
             auto_resume=config.resume == "auto",
         )
@@ -100,7 +102,7 @@ class DriverProcess:
         file = self._robot.description()
         for path, one in SETTINGS.items():
             bound = setting_of(file, path)
-            if not bound:  # a body that cannot move so has no limit for it
+            if not one.live or not bound:  # a body that cannot move so has no limit for it
                 continue
             side = "at least" if one.at_least else "above 0, at most"
             expected = f"a number, {side} {bound:g} [{one.unit}], the body's own {one.kind}"
@@ -124,7 +126,7 @@ class DriverProcess:
         try:
             description = restricted(self._robot.description(), settings)
         except ValueError as error:
-            raise Refused(re.sub(r" - at `[^`]*`$", "", str(error))) from None
+            raise Refused(re.sub(PATH, "", str(error))) from None
         self._settings, self._body = settings, replace(self._body, description=description)
         self._gatekeeper.limit(limits_of(description))
         self._bus.publish(BODY, self._body)
@@ -297,6 +299,7 @@ async def run(config: DriverConfig, bus: Bus, ready: Callable[[], None]) -> None
         speed=config.speed,
         seconds=config.seconds,
         emulator=config.emulator or str(ports_folder(config.body)),
+        changes=split(config.robot)[1],
     )
     robot, driver = make_driver(config.body, where)
     if not driver.can(robot.safe_state):
@@ -305,7 +308,11 @@ async def run(config: DriverConfig, bus: Bus, ready: Callable[[], None]) -> None
             f"safe_state: {robot.safe_state} is more than {type(driver).__name__} can do; "
             f"expected one of: {known}"
         )
-    await DriverProcess(config, robot, driver, bus).run(ready)
+    try:
+        process = DriverProcess(config, robot, driver, bus)
+    except ValueError as error:
+        raise ConfigError(f"robot: {re.sub(PATH, '', str(error))}") from None
+    await process.run(ready)
 
 
 class RawSpeeds(msgspec.Struct):

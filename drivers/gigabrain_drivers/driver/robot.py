@@ -73,3 +73,4 @@ class Run(Struct, frozen=True, kw_only=True):
     speed: float = 1.0  # of real time; other than 1 means lock-step
     seconds: float | None = None  # of simulated time, then it holds still
     emulator: str = ""  # the folder of the emulator's ports, where the link is `emulated`
+    changes: dict[str, Any] = {}  # fields of the robot's file that are other in this run

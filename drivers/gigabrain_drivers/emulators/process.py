@@ -81,6 +81,7 @@ def make_emulator(config: EmulatorConfig) -> Emulator:
             world=config.world,
             seed=config.seed,
             emulator=config.folder,
+            changes=config.robot,
         ),
     )
 

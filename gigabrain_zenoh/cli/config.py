@@ -1,0 +1,179 @@
+"""`gigabrain config`, and the settings that `up` and `demo` merge."""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from gigabrain_zenoh.cli.node import ask_params
+from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, print_line
+from gigabrain_zenoh.errors import ConfigError, UnknownName
+
+if TYPE_CHECKING:
+    from msgspec import Struct
+
+    from gigabrain_zenoh.config.layers import Row
+    from gigabrain_zenoh.config.settings import LinkName
+    from gigabrain_zenoh.launch.deployment import Deployment
+    from gigabrain_zenoh.launch.merging import MergedDeployment
+
+Sets = Annotated[
+    tuple[str, ...],
+    Parameter(help="Any setting, as KEY=VALUE, such as stop_margin=0.1; may be given again."),
+]
+SettingsFiles = Annotated[
+    tuple[Path, ...],
+    Parameter(help="File with further settings, as `param save` writes; may be given again."),
+]
+MAX_WIDTH = 60  # of a column
+
+
+def config(
+    deployment: str = "",
+    *,
+    settings: SettingsFiles = (),
+    set: Sets = (),
+    at: RobotAddress = LOCAL,
+) -> None:
+    """Print all settings of a deployment, and where each value comes from.
+
+    Example: gigabrain config demo --set seed=3
+
+    Without a deployment it prints the settings of the robot that runs on this machine, with its
+    parameters as they are now.
+
+    Args:
+        deployment: Deployment file, or the name of a known one.
+    """
+    if deployment:
+        merged = merged_file(deployment, settings, set)
+        merged.check_behaviour()
+        rows: Iterable[Row] = rows_of(merged)
+    elif settings or set:
+        raise ConfigError("--set and --settings need a deployment file; expected its name first")
+    else:
+        rows = _running_rows(at)
+    cells = [
+        (row.key, json.dumps(row.value, ensure_ascii=False), _near(row.source))
+        for row in sorted(rows, key=lambda row: row.key)
+    ]
+    widths = [min(MAX_WIDTH, max(len(cell[i]) for cell in cells)) for i in range(2)]
+    for key, value, source in cells:
+        print_line(f"{key:<{widths[0]}}  {value:<{widths[1]}}  {source}")
+
+
+def _near(source: str) -> str:
+    """Return a place with its file as seen from the present folder."""
+    path = Path(source)
+    if path.is_absolute() and path.is_relative_to(Path.cwd()):
+        return str(path.relative_to(Path.cwd()))
+    return source
+
+
+def merged_file(
+    name: str, files: Sequence[Path], sets: Sequence[str], keys: Path | None = None
+) -> "MergedDeployment":
+    """Return a deployment file with what is laid over it. Raises ConfigError."""
+    from gigabrain_zenoh.launch.deployment import deployment_path
+    from gigabrain_zenoh.launch.merging import file_layers, merge
+
+    path = deployment_path(name)
+    folder = str(keys.expanduser().absolute()) if keys else ""
+    return merge(file_layers(path), files, sets, robot_type, path, folder)
+
+
+def merged_values(
+    values: Mapping[str, Any], files: Sequence[Path], sets: Sequence[str]
+) -> "MergedDeployment":
+    """Return the deployment of a demo with what is laid over it. Raises ConfigError."""
+    from gigabrain_zenoh.launch.merging import merge, value_layers
+
+    merged = merge(value_layers(values, "gigabrain demo"), files, sets, robot_type)
+    merged.check_behaviour()
+    return merged
+
+
+def rows_of(
+    merged: "MergedDeployment", deployment: "Deployment | None" = None, *, robot: bool = True
+) -> tuple["Row", ...]:
+    """Return all settings of a deployment with their sources, those of the robot's file too.
+
+    Raises ConfigError, also for settings of the robot that cannot be.
+    """
+    from gigabrain_drivers.driver.catalog import (
+        link_type,
+        load_layers,
+        robot_layers,
+        robot_path,
+    )
+    from gigabrain_drivers.driver.robot import Run
+    from gigabrain_zenoh.config.loading import part
+    from gigabrain_zenoh.decision import behaviours
+    from gigabrain_zenoh.launch.merging import SETTINGS
+
+    layers, made = merged.layers, deployment or merged.deployment
+    rows = [row for row in layers.rows(made) if not row.key.startswith("robot")]
+    with suppress(UnknownName):  # its package may be on another host
+        kind = behaviours.load(made.decision.behaviour).Config
+        settings = layers.convert(kind, SETTINGS.split("."))
+        rows = [row for row in rows if not row.key.startswith(SETTINGS)]
+        rows += layers.rows(settings, SETTINGS.split("."))
+    if not robot:
+        return tuple(rows)
+    path = robot_path(made.body)
+    own = robot_layers(path)
+    if made.robot:
+        own.add(part(layers.root, ("robot",)), layers.place)
+    load_layers(path, own, Run(folder=Path(), link=made.link))  # which refuses what is unsafe
+    whole = own.convert(link_type(made.body, made.link))
+    rows += [row._replace(key=f"robot.{row.key}") for row in own.rows(whole)]
+    return tuple(rows)
+
+
+def robot_type(body: str, link: "LinkName") -> "type[Struct]":
+    """Return the type of a robot's file, with the options of a link. Raises ConfigError."""
+    from gigabrain_drivers.driver.catalog import link_type
+
+    return link_type(body, link)
+
+
+def _running_rows(at: RobotAddress) -> list["Row"]:
+    from gigabrain_zenoh.launch.merging import read_rows
+    from gigabrain_zenoh.runtime.running import find_running
+
+    if at.connect:
+        raise ConfigError("--connect: settings are kept where the robot was started; see `param`")
+    robot = find_running(at.namespace)
+    if not robot.run_dir:
+        raise ConfigError(f"{robot.label} was not started by `up` or `demo`; see `param list`")
+    rows = {row.key: row for row in read_rows(Path(robot.run_dir))}
+    for reply in ask_params(at).values():
+        for one in reply.params:
+            if one.key in rows and one.value != one.initial:
+                source = f"param, was {one.initial}"
+                rows[one.key] = rows[one.key]._replace(value=_value(one.value), source=source)
+    return list(rows.values())
+
+
+def with_values(path: Path, values: Mapping[str, str]) -> str:
+    """Return the YAML of a settings file with other values, given as text by dotted key."""
+    import yaml
+
+    from gigabrain_zenoh.config.layers import Layers, assignment
+    from gigabrain_zenoh.config.loading import document, read
+
+    layers = Layers(str(path))
+    if path.exists():
+        layers.add(document(read(path), str(path)), lambda line: f"{path}:{line}")
+    for key, text in values.items():
+        layers.add(assignment(f"{key}={text}").nested(), lambda _: "param")
+    return yaml.safe_dump(layers.root.value, sort_keys=False)
+
+
+def _value(text: str) -> Any:
+    from gigabrain_zenoh.config.layers import assignment
+
+    return assignment(f"value={text}").node.value

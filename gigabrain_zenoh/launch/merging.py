@@ -1,0 +1,110 @@
+"""A deployment as it is started: its file, then settings files, then `--set`."""
+
+import contextlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+from msgspec import Struct
+
+from gigabrain_zenoh.codec import DECODE_ERRORS
+from gigabrain_zenoh.config import loading
+from gigabrain_zenoh.config.layers import Layers, Row, assignment, full_key, keys_of
+from gigabrain_zenoh.config.settings import LinkName
+from gigabrain_zenoh.decision import behaviours
+from gigabrain_zenoh.errors import ConfigError, UnknownName
+from gigabrain_zenoh.host.files import read_bounded, replace_file
+from gigabrain_zenoh.launch.deployment import Deployment, deployment_type, own_names, with_keys
+
+ROWS_FILE, MAX_ROWS_BYTES = "config.json", 1_000_000
+SETTINGS = "decision.settings"
+# returns the type of a robot's file, for its name or path and the link
+RobotType = Callable[[str, LinkName], type[Struct]]
+
+
+class MergedDeployment(NamedTuple):
+    """A deployment, and where each of its values comes from."""
+
+    layers: Layers
+    deployment: Deployment
+
+    def check_behaviour(self) -> None:
+        """Raise ConfigError or UnknownName if the behaviour cannot run so, with the place."""
+        kind = behaviours.load(self.deployment.decision.behaviour).Config
+        self.layers.convert(kind, SETTINGS.split("."))
+        behaviours.check(self.deployment.decision)
+
+
+def file_layers(path: Path) -> Layers:
+    """Return the settings of a deployment file. Raises ConfigError."""
+    layers = Layers(str(path))
+    _add_file(layers, path)
+    return layers
+
+
+def value_layers(values: Mapping[str, Any], source: str) -> Layers:
+    """Return settings given by a command."""
+    layers = Layers(source)
+    layers.add_values(values, source)
+    return layers
+
+
+def merge(
+    layers: Layers,
+    files: Sequence[Path],
+    sets: Iterable[str],
+    robot_type: RobotType,
+    path: Path | None = None,
+    keys: str = "",
+) -> MergedDeployment:
+    """Lay settings files and `--set KEY=VALUE` over a deployment; `path` is its file.
+
+    Raises ConfigError and UnknownName, with the place of the value.
+    """
+    for file in files:
+        _add_file(layers, file)
+    for text in sets:
+        one = assignment(text)
+        key = full_key(one.key, _keys(layers, robot_type), SETTINGS)
+        layers.add(one._replace(key=key).nested(), lambda _, text=text: f"--set {text}")  # type: ignore[misc]
+    deployment = layers.convert(_type_of(layers))
+    if path:
+        deployment = with_keys(deployment, path, keys)
+    return MergedDeployment(layers, deployment)
+
+
+def write_rows(run_dir: Path, rows: Sequence[Row]) -> None:
+    """Keep the settings of a run, and where they come from, in its folder."""
+    if rows:
+        replace_file(run_dir / ROWS_FILE, msgspec.json.encode(rows))
+
+
+def read_rows(run_dir: Path) -> list[Row]:
+    """Return the settings of a run. Raises ConfigError where they are not kept."""
+    path = run_dir / ROWS_FILE
+    try:
+        return msgspec.json.decode(read_bounded(path, MAX_ROWS_BYTES), type=list[Row])
+    except (OSError, *DECODE_ERRORS):
+        raise ConfigError(f"{path} cannot be read; name the robot's deployment file") from None
+
+
+def _add_file(layers: Layers, path: Path) -> None:
+    root = loading.document(loading.read(path), str(path))
+    if root.entries is None:
+        raise ConfigError(f"{path}:{root.line}: expected a mapping of settings")
+    layers.add(root, lambda line: f"{path}:{line}")
+
+
+def _type_of(layers: Layers) -> type[Deployment]:
+    return deployment_type(own_names(layers.root))
+
+
+def _keys(layers: Layers, robot_type: RobotType) -> list[str]:
+    """Return all keys that may be set, as the settings are now."""
+    kind = _type_of(layers)
+    now = layers.convert(kind)
+    known = {"robot": robot_type(now.body, now.link)}
+    with contextlib.suppress(UnknownName):  # its package may be on another host
+        known[SETTINGS] = behaviours.load(now.decision.behaviour).Config
+    return list(keys_of(kind, known))
