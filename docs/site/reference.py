@@ -17,10 +17,10 @@ from gigabrain_drivers.lidars.base import source_class
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.topics import SERVICES, TOPICS, messages
 from gigabrain_zenoh.cli.app import COMMANDS, make_app
+from gigabrain_zenoh.config.map_image import MapYaml
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.decision.tasks.mission import Mission, PatrolFile
 from gigabrain_zenoh.launch.deployment import Deployment
-from gigabrain_zenoh.mapping.map_file import MapYaml
 
 Lines = Iterator[str]
 EXAMPLES = Path(__file__).parents[2] / "examples"
