@@ -39,6 +39,7 @@ from gigabrain_zenoh.decision.behaviours import (
     WaitReason,
     describe_end,
 )
+from gigabrain_zenoh.decision.detected_objects import ObjectsByPerceptor
 from gigabrain_zenoh.decision.node import InputSource
 from gigabrain_zenoh.decision.tasks import mission as missions
 from gigabrain_zenoh.decision.tasks.mission import Mission
@@ -242,6 +243,7 @@ class GoalServer(InputSource):
         state: RobotState,
         world: WorldModel | None,
         verdict: SafetyState | None,
+        objects: ObjectsByPerceptor,
     ) -> StepResult:
         """Advance the queue and step the behaviour with the command that it wants."""
         if self._config.start == "explore" and not self._started:
@@ -256,6 +258,7 @@ class GoalServer(InputSource):
                 world=world,
                 pose=context.pose,
                 must_charge=context.must_charge,
+                objects=objects,
                 command=command,
                 drive=lambda wanted: navigator.drive(wanted, idle),
             )

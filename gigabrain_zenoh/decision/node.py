@@ -14,10 +14,12 @@ from gigabrain_zenoh.bus.freshness import PreviousTick
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.decision.behaviours import Behaviour, Inputs, StepResult, battery_nearly_empty
+from gigabrain_zenoh.decision.detected_objects import DetectedObjects, ObjectsByPerceptor
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.stopping import scan_limit_ns
 from gigabrain_zenoh.runtime.heartbeat import Progress
 
+NO_OBJECTS: ObjectsByPerceptor = {}
 log = logging.getLogger(__name__)
 
 SETTINGS_KEY = "decision.settings"  # place of a behaviour's settings in a deployment file
@@ -45,10 +47,13 @@ class InputSource:
         state: RobotState,
         world: WorldModel | None,
         verdict: SafetyState | None,
+        objects: ObjectsByPerceptor,
     ) -> StepResult:
         """Step the behaviour once with the present inputs."""
         must_charge = battery_nearly_empty(verdict)
-        return behaviour.step(Inputs(world=world, pose=state.pose, must_charge=must_charge))
+        return behaviour.step(
+            Inputs(world=world, pose=state.pose, must_charge=must_charge, objects=objects)
+        )
 
     @property
     def hung(self) -> bool:
@@ -66,7 +71,7 @@ class DecisionLoop:
     """
 
     def __init__(self, config: DecisionConfig, source: InputSource | None = None) -> None:
-        self._type = behaviours.load(config.behaviour)
+        self._name, self._type = config.behaviour, behaviours.load(config.behaviour)
         self._settings = behaviours.settings_of(config)
         self._source = source or InputSource()
         self._behaviour, self._boot = self._type(self._settings), 0
@@ -94,6 +99,7 @@ class DecisionLoop:
         state: RobotState,
         world: WorldModel | None,
         verdict: SafetyState | None = None,
+        objects: ObjectsByPerceptor = NO_OBJECTS,
     ) -> None:
         """Form a new intent if there is a new world."""
         if state.boot != self._boot:  # the driver has restarted, and with it the odometry
@@ -102,7 +108,12 @@ class DecisionLoop:
             if world.basis == self.basis or world.basis > state.tick:
                 return
             self.basis = world.basis
-        self.intent, outcome = self._source.step(self._behaviour, state, world, verdict)
+        try:
+            step = self._source.step(self._behaviour, state, world, verdict, objects)
+        except Exception as error:
+            error.add_note(f"behaviour {self._name!r}")
+            raise
+        self.intent, outcome = step
         self.activity = outcome.activity
 
 
@@ -148,7 +159,9 @@ def _serve(config: DecisionConfig, bus: Bus, source: InputSource) -> None:
             return
         source.observe(state)
         verdict = verdicts.at(state.boot, state.tick, SAFETY.stale_after_ns)
-        loop.step(state, newest_world(), verdict)
+        objects.observe(state)
+        world = newest_world()
+        loop.step(state, world and objects.merged(world), verdict, objects.fresh())
         bus.publish(INTENT, loop.intent, basis=loop.basis)
         if loop.activity != logged:
             logged, reason = loop.activity, loop.intent.reason
@@ -164,7 +177,7 @@ def _serve(config: DecisionConfig, bus: Bus, source: InputSource) -> None:
     def received() -> tuple[object, ...]:
         return bus.arrived.get(STATE.key), bus.arrived.get(WORLD.key)
 
-    bodies = bus.latest(BODY)
+    bodies, objects = bus.latest(BODY), DetectedObjects(bus)
     states = bus.latest(STATE, decide)
     worlds = bus.latest(WORLD, on_world)
     bus.latest(SAFETY, verdicts.receive)

@@ -5,7 +5,7 @@ runs. Packages offer theirs as entry points of the group `gigabrain.behaviours`.
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,7 +15,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from gigabrain_schemas.base import Fraction, Pose
-from gigabrain_schemas.brain import Intent, WorldModel
+from gigabrain_schemas.brain import Intent, Objects, WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import Goal, Task
 from gigabrain_zenoh.config import loading
@@ -90,6 +90,7 @@ class Inputs:
     world: WorldModel | None  # None while perception is silent
     pose: Pose  # in the odometry frame, at the same tick
     must_charge: bool = False  # the battery is nearly empty
+    objects: Mapping[str, Objects] = field(default_factory=dict)  # by perceptor, if fresh
     # for behaviours with a NavigationConfig:
     command: DriveCommand | None = None  # what the task queue wants
     drive: Drive | None = None  # carries out a command: one step of the navigator
