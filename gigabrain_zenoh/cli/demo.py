@@ -24,7 +24,7 @@ from gigabrain_zenoh.cli.options import (
     check_positive,
     checked,
 )
-from gigabrain_zenoh.config.loading import located
+from gigabrain_zenoh.config.loading import beside, located
 from gigabrain_zenoh.config.settings import LinkName, PageConfig, Resume
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
@@ -73,7 +73,7 @@ class RobotOptions:
         values: dict[str, object] = {
             "body": self.body,
             "link": self.link,
-            "world": self.world,
+            "world": beside(self.world, Path()),
             "seed": self.seed,
             "speed": self.speed,
             "lockstep_timeout_s": self.lockstep_timeout,

@@ -158,7 +158,9 @@ Output = Annotated[Path | None, Parameter(alias="-o")]
 Body = Annotated[
     str, Parameter(help="Name of the robot, or path of its YAML file; see `gigabrain robots`.")
 ]
-World = Annotated[str, Parameter(help="Simulated world; see `gigabrain worlds`.")]
+World = Annotated[
+    str, Parameter(help="Simulated world, or path of a world file; see `gigabrain worlds`.")
+]
 Seed = Annotated[int, Parameter(help="Random seed of the start pose and the sensor noise.")]
 KeepStuck = Annotated[
     bool,

@@ -296,6 +296,19 @@ def load(path: Path, type: type[T]) -> T:
     return loads(read(path), type, str(path))
 
 
+FILE_ENDINGS = (".yaml", ".yml", ".xml", ".mjcf", ".png", ".pgm")
+
+
+def names_file(name: str) -> bool:
+    """Return whether a setting that is a name or a path is a path."""
+    return "/" in name or name.endswith(FILE_ENDINGS)
+
+
+def beside(name: str, folder: Path) -> str:
+    """Return a setting with its path, if it is one, taken from `folder`."""
+    return str(folder.absolute() / Path(name).expanduser()) if names_file(name) else name
+
+
 def read(path: Path) -> str:
     """Return the text of a YAML file. Raises ConfigError."""
     try:

@@ -187,7 +187,7 @@ def deployment_path(name: str) -> Path:
 
 
 def load_deployment(path: Path, keys: str = "") -> Deployment:
-    """Read a deployment file; its keys lie beside it, unless `keys` replaces them.
+    """Read a deployment file; keys and world lie beside it, unless `keys` replaces the former.
 
     Raises ConfigError with file, line and what was expected.
     """
@@ -200,7 +200,8 @@ def with_keys(loaded: Deployment, path: Path, keys: str = "") -> Deployment:
     """Return the deployment of a file with its keys beside it, unless `keys` replaces them."""
     if loaded.keys and not keys:
         keys = str(path.absolute().parent / Path(loaded.keys).expanduser())
-    return msgspec.structs.replace(loaded, keys=keys)
+    world = config.beside(loaded.world, path.absolute().parent)
+    return msgspec.structs.replace(loaded, keys=keys, world=world)
 
 
 def own_names(root: Node) -> list[str]:

@@ -49,7 +49,8 @@ def test_the_bodies_have_the_sizes_of_their_data_sheets() -> None:
         assert (measured.front, measured.rear, measured.half_width) == pytest.approx(footprint)
         assert simulation.data.site("robot/lidar").xpos == pytest.approx(lidar)
         assert simulation.model.body("robot/base").subtreemass[0] == pytest.approx(mass)
-        own = simulation.model.geom_bodyid != 0
+        base = simulation.model.body("robot/base").id
+        own = simulation.model.body_rootid[simulation.model.geom_bodyid] == base
         assert set(simulation.model.geom_group[own]) == {2}
 
 

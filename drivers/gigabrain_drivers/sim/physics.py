@@ -28,7 +28,7 @@ from gigabrain_drivers.sim.locomotion import (
 from gigabrain_drivers.sim.scene import PERSON, ROBOT, Person, compile_scene, yaw_quaternion
 from gigabrain_drivers.sim.sensors import Imu, ImuSample, Lidar
 from gigabrain_drivers.sim.truth import Truth
-from gigabrain_drivers.sim.world import ClosedPath, Stream, World, generator
+from gigabrain_drivers.sim.world import Stream, World, generator
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
 
 EDGE_OF_THE_WORLD_M = 1e3
@@ -44,9 +44,17 @@ class Simulation:
         self._locomotion = make_locomotion(body, self.model, self.data)
         self._height = int(self.model.joint(f"{ROBOT}free").qposadr[0]) + 2
         self._battery = Battery(body.battery)
-        self._person = Person(ClosedPath(world.path), world.person_start) if world.path else None
-        self._place_person()
+        self._people = {
+            self.model.body(f"{PERSON}{number + 1 if number else ''}").id: Person(walk)
+            for number, walk in enumerate(world.people)
+        }
+        self._place_people()
         self.truth = Truth(self.model, self.data)
+        if world.start_fixed and self.truth.touching:
+            raise ConfigError(
+                f"world {world.name}: the robot touches something at its start "
+                f"({world.start.x:g}, {world.start.y:g}); expected a `start` with room round it"
+            )
         self._imu = Imu(self.model, self.data, world.start.yaw, generator(seed, Stream.IMU))
         self._sample = self._imu.sample()
         self._lidar = (
@@ -60,10 +68,14 @@ class Simulation:
         """Simulated time since the start."""
         return self._steps * STEP_NS
 
+    def people(self) -> tuple[Person, ...]:
+        """Return those who walk in this world."""
+        return tuple(self._people.values())
+
     @property
     def person_stood(self) -> int:
-        """The number of times that the person had to stand for the robot."""
-        return self._person.stood if self._person else 0
+        """The number of times that people had to stand for the robot."""
+        return sum(person.stood for person in self._people.values())
 
     def command(self, linear_x: float, angular_z: float) -> tuple[float, float]:
         """Drive without going sideways; returns (forward, turning), see `drive`."""
@@ -83,10 +95,11 @@ class Simulation:
 
     def advance(self) -> None:
         """Simulate the next 10 ms. Raises BodyLost when the physics diverges."""
-        if self._person:
+        if self._people:
             robot = self.truth.pose()
-            self._person.advance(lambda x, y: self.truth.footprint.distance(robot, x, y))
-            self._place_person()
+            for person in self._people.values():
+                person.advance(lambda x, y: self.truth.footprint.distance(robot, x, y))
+            self._place_people()
         self._locomotion.act()
         mujoco.mj_step(self.model, self.data, nstep=self._substeps)
         self._steps += 1
@@ -138,11 +151,11 @@ class Simulation:
         """Return whether the robot touches anything but the floor right now."""
         return self.truth.touching
 
-    def _place_person(self) -> None:
-        if self._person:
-            pose, place = self._person.pose, self.model.body(PERSON).mocapid[0]
-            self.data.mocap_pos[place, :2] = pose.x, pose.y
-            self.data.mocap_quat[place] = yaw_quaternion(pose)
+    def _place_people(self) -> None:
+        for body, person in self._people.items():
+            place = self.model.body_mocapid[body]
+            self.data.mocap_pos[place, :2] = person.pose.x, person.pose.y
+            self.data.mocap_quat[place] = yaw_quaternion(person.pose)
 
     def _check(self) -> None:
         """A diverging simulation shows as NaN, or as a robot that flies away."""

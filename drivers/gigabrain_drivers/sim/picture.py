@@ -2,9 +2,7 @@
 
 import importlib
 import math
-import struct
 import sys
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +16,7 @@ from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.sim.body import SimModel, sim_body
 from gigabrain_drivers.sim.driver import MujocoDriver
 from gigabrain_drivers.sim.physics import Simulation
+from gigabrain_drivers.sim.png import png
 from gigabrain_drivers.sim.world import Pose, World, clearance
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_zenoh.errors import ConfigError, Unsupported
@@ -55,27 +54,8 @@ def _light(model: mujoco.MjModel, robot: Pose) -> None:
     """Put the sun over the robot and spend the whole shadow map there."""
     model.vis.quality.shadowsize = 8192
     model.vis.map.shadowclip = SHADOW_REACH_M / model.stat.extent
-    model.light_pos[:] = np.array([robot.x, robot.y, 0]) - SUN_M * model.light_dir
-
-
-def png(pixels: NDArray[np.uint8]) -> bytes:
-    """An image (height, width, 3) as a PNG file, each row stored as what differs from the last."""
-    height, width, _ = pixels.shape
-    rows = pixels.reshape(height, width * 3)
-    above = np.vstack([np.zeros_like(rows[:1]), rows[:-1]])
-    filtered = np.hstack([np.full((height, 1), 2, np.uint8), rows - above])  # 2: the filter "up"
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # 8 bits of red, green, blue
-    chunks = (
-        (b"IHDR", header),
-        (b"IDAT", zlib.compress(filtered.tobytes(), 9)),
-        (b"IEND", b""),
-    )
-    return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(kind, content) for kind, content in chunks)
-
-
-def _chunk(kind: bytes, content: bytes) -> bytes:
-    check = struct.pack(">I", zlib.crc32(kind + content))
-    return struct.pack(">I", len(content)) + kind + content + check
+    suns = model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    model.light_pos[suns] = np.array([robot.x, robot.y, 0]) - SUN_M * model.light_dir[suns]
 
 
 @contextmanager
@@ -137,9 +117,9 @@ def _camera(world: World, robot: Pose) -> mujoco.MjvCamera:
     return camera
 
 
-def portray(body: str, world: str, seed: int, png: Path) -> None:
+def portray(body: str, world: str, seed: int, file: Path) -> None:
     """Draw a robot in its world. Raises ConfigError, and Unsupported without a MuJoCo model."""
     robot, driver = make_driver(body, Run(folder=Path(), world=world, seed=seed))
     if not isinstance(driver, MujocoDriver):
         raise Unsupported(f"{body} has no MuJoCo model to draw")
-    render(sim_body(robot, driver.options, driver.run), load_world(world, seed), seed, png)
+    render(sim_body(robot, driver.options, driver.run), load_world(world, seed), seed, file)

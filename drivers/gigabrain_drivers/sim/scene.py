@@ -3,42 +3,32 @@
 import logging
 import math
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import mujoco
 
 from gigabrain_drivers.sim import STEP_S
 from gigabrain_drivers.sim.body import SimBody, SimModel
-from gigabrain_drivers.sim.world import Box, ClosedPath, Pose, Shape, World
+from gigabrain_drivers.sim.mjcf_world import has_floor, load_model, model_error
+from gigabrain_drivers.sim.world import Box, ClosedPath, Light, Pose, Shape, Walk, World
+from gigabrain_drivers.sim.world_file import MATERIALS
 from gigabrain_zenoh.errors import ConfigError
 
 log = logging.getLogger(__name__)
 
 FLOOR = "floor"  # name of the floor's geom, material and texture
 
-MATERIALS = {
-    "wall": (0.93, 0.92, 0.89),
-    "wood": (0.66, 0.47, 0.28),
-    "dark_wood": (0.36, 0.24, 0.16),
-    "carton": (0.76, 0.60, 0.42),
-    "white": (0.95, 0.95, 0.95),
-    "black": (0.06, 0.06, 0.07),
-    "steel": (0.66, 0.69, 0.72),
-    "blue": (0.20, 0.36, 0.60),
-    "teal": (0.13, 0.52, 0.53),
-    "green": (0.38, 0.56, 0.36),
-    "leaf": (0.20, 0.46, 0.20),
-    "clay": (0.72, 0.38, 0.26),
-    "orange": (0.90, 0.48, 0.16),
-    "yellow": (0.94, 0.76, 0.26),
-    "skin": (0.86, 0.66, 0.53),
-}
-
+SUN = Light((0.62, 0.60, 0.56), direction=(0.30, 0.38, -0.87))
 PERSON_RADIUS_M = 0.25
-PERSON_SPEED = 0.8  # [m/s]
 PERSON_GAP_M = 0.5  # from the person's side to the robot's outer edge
 NEW_MEETING_M = 1.0  # walked since it last stood: standing again is another meeting
 ROBOT = "robot/"  # prefix of all names of the robot's model
-PERSON = "person"
+MODEL = "world/"  # prefix of all names of the world's own model
+PERSON = "person"  # body of the first; the others have a number behind it
+SPARE = "spare/"  # prefix of what people may put in while it runs
+SPARE_THINGS, SPARE_PEOPLE = 12, 4  # each costs time in every step
+SPARE_M = 0.01  # size of a spare that is not in use
 MAX_MISMATCH = 0.05  # share by which two measures differ that should be the same
 PERSON_HEIGHT_M = 1.45  # to the shoulders
 
@@ -66,43 +56,48 @@ def add_materials(spec: mujoco.MjSpec, world: World) -> None:
     repeat = (0.5 / world.check[0], 0.5 / world.check[1])  # a texture holds two checks each way
     floor = spec.add_material(name=FLOOR, texrepeat=repeat, texuniform=True, reflectance=0.04)
     floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = FLOOR
-    for name, colour in MATERIALS.items():
+    for name, colour in (MATERIALS | dict(world.materials)).items():
         spec.add_material(name=name, rgba=(*colour, 1), specular=0.2, shininess=0.3)
 
 
-def add_light(spec: mujoco.MjSpec) -> None:
-    """A low sun that casts shadows, and soft light from the camera."""
+def add_lights(spec: mujoco.MjSpec, world: World) -> None:
+    """Add the world's lights, or a low sun that casts shadows; and soft light from the camera."""
     spec.visual.headlight.ambient = (0.45, 0.45, 0.46)
     spec.visual.headlight.diffuse = (0.30, 0.30, 0.30)
     spec.visual.headlight.specular = (0.1, 0.1, 0.1)
-    spec.worldbody.add_light(
-        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        pos=(0, 0, 5),
-        dir=(0.30, 0.38, -0.87),
-        diffuse=(0.62, 0.60, 0.56),
-        specular=(0.25, 0.25, 0.25),
-        castshadow=True,
-    )
+    has_own = world.lights or (world.model and spec.lights)
+    for light in world.lights if has_own else (SUN,):
+        lamp = light.position is not None
+        kind = mujoco.mjtLightType
+        spec.worldbody.add_light(
+            type=kind.mjLIGHT_SPOT if lamp else kind.mjLIGHT_DIRECTIONAL,
+            pos=light.position or (0, 0, 5),
+            dir=light.direction,
+            cutoff=80,
+            diffuse=light.colour,
+            specular=(0.25, 0.25, 0.25),
+            castshadow=not lamp,
+        )
 
 
 class Person:
-    """Walks a closed path at 0.8 m/s, and stands while one more step would come too close."""
+    """Walks a closed path, and stands while one more step would come too close to the robot."""
 
-    def __init__(self, path: ClosedPath, start: float) -> None:
-        self._path = path
-        self._walked = start
-        self.pose = path.at(start)
+    def __init__(self, walk: Walk) -> None:
+        self._path, self._step_m = ClosedPath(walk.corners), walk.speed * STEP_S
+        self._walked = walk.start
+        self.pose = self._path.at(walk.start)
         self.stood = 0  # how often it had to, for the robot
         self._since_m = NEW_MEETING_M
 
     def advance(self, robot_distance: Callable[[float, float], float]) -> Pose:
         """Walk for one step; `robot_distance(x, y)` is from a point to the robot's edge [m]."""
-        walked = (self._walked + PERSON_SPEED * STEP_S) % self._path.length
+        walked = (self._walked + self._step_m) % self._path.length
         ahead = self._path.at(walked)
         gap = robot_distance(ahead.x, ahead.y)
         if gap >= PERSON_GAP_M + PERSON_RADIUS_M or gap > robot_distance(self.pose.x, self.pose.y):
             self._walked, self.pose = walked, ahead
-            self._since_m += PERSON_SPEED * STEP_S
+            self._since_m += self._step_m
         else:
             self.stood += self._since_m >= NEW_MEETING_M
             self._since_m = 0.0
@@ -180,19 +175,48 @@ def _check_names(spec: mujoco.MjSpec, body: SimModel) -> None:
 
 
 def world_spec(world: World) -> mujoco.MjSpec:
-    """The world alone, not compiled, for one robot to be attached to."""
+    """The world alone, not compiled, for one robot to be attached to. Raises ConfigError."""
     spec = mujoco.MjSpec()
     spec.modelname = world.name
     _set_options(spec)
     add_materials(spec, world)
-    add_light(spec)
-    plane = mujoco.mjtGeom.mjGEOM_PLANE
-    spec.worldbody.add_geom(name=FLOOR, type=plane, size=(0, 0, 0.05), material=FLOOR)
+    if not (world.model and _attach_model(spec, world.model)):
+        plane = mujoco.mjtGeom.mjGEOM_PLANE
+        spec.worldbody.add_geom(name=FLOOR, type=plane, size=(0, 0, 0.05), material=FLOOR)
+    add_lights(spec, world)
     for shape in world.everything():
         _add_shape(spec, shape)
-    if world.path:
-        _add_person(spec)
+    for number in range(len(world.people)):
+        _add_person(spec, f"{PERSON}{number + 1 if number else ''}")
+    _add_spares(spec, world)
     return spec
+
+
+def _attach_model(spec: mujoco.MjSpec, path: Path) -> bool:
+    """Attach the world's own model; return whether it brings a floor. Raises ConfigError."""
+    child = load_model(path)
+    for key in list(child.keys):
+        child.delete(key)
+    child.option, floor = mujoco.MjSpec().option, has_floor(child)
+    try:
+        spec.attach(child, prefix=MODEL, frame=spec.worldbody.add_frame())
+    except ValueError as error:
+        raise model_error(path, error) from None
+    return floor
+
+
+def _add_spares(spec: mujoco.MjSpec, world: World) -> None:
+    """Add bodies that no sensor sees and nothing touches, for what people put in later."""
+    middle = (*world.middle, 0.0)
+    for number in range(SPARE_THINGS):
+        name = f"{SPARE}thing{number}"
+        body = spec.worldbody.add_body(name=name, mocap=True, pos=middle)
+        body.add_geom(
+            name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=(SPARE_M, SPARE_M, SPARE_M),
+            rgba=(0, 0, 0, 0), contype=0, conaffinity=0,
+        )  # fmt: skip
+    for number in range(SPARE_PEOPLE):
+        _add_person(spec, f"{SPARE}person{number}", middle)
 
 
 def _set_options(spec: mujoco.MjSpec) -> None:
@@ -222,29 +246,38 @@ def _add_shape(spec: mujoco.MjSpec, shape: Shape) -> None:
         geom.size = (shape.radius, half, 0)
 
 
-def _add_person(spec: mujoco.MjSpec) -> None:
-    """A figure as wide at the floor as at the hips, so that a low lidar sees what can be hit."""
-    person = spec.worldbody.add_body(name=PERSON, mocap=True)
+FIGURE = ("blue", "skin", "dark_wood")  # colours of a person's parts
+
+
+def _add_person(
+    spec: mujoco.MjSpec, name: str, spare_at: tuple[float, float, float] | None = None
+) -> None:
+    """A figure as wide at the floor as at the hips, so that a low lidar sees what can be hit.
+
+    Nobody sees or touches a spare one before it is used.
+    """
+    person = spec.worldbody.add_body(name=name, mocap=True, pos=spare_at or (0, 0, 0))
+    look: Any = {"rgba": (0, 0, 0, 0), "contype": 0, "conaffinity": 0}
+    looks = [look] * len(FIGURE)
+    if spare_at is None:
+        body, *others = ({"material": material} for material in FIGURE)
+        looks = [body, *({**other, "contype": 0, "conaffinity": 0} for other in others)]
     person.add_geom(
-        name=PERSON,
+        name=name,
         type=mujoco.mjtGeom.mjGEOM_CAPSULE,
         size=(PERSON_RADIUS_M, 0, 0),
-        material="blue",
         fromto=(0, 0, 0, 0, 0, PERSON_HEIGHT_M - PERSON_RADIUS_M),
+        **looks[0],
     )
     person.add_geom(
         type=mujoco.mjtGeom.mjGEOM_SPHERE,
         size=(0.14, 0, 0),
-        material="skin",
         pos=(0, 0, PERSON_HEIGHT_M + 0.1),
-        contype=0,
-        conaffinity=0,
+        **looks[1],
     )
     person.add_geom(
         type=mujoco.mjtGeom.mjGEOM_ELLIPSOID,
         size=(0.16, 0.15, 0.1),
-        material="dark_wood",
         pos=(-0.02, 0, PERSON_HEIGHT_M + 0.18),
-        contype=0,
-        conaffinity=0,
+        **looks[2],
     )

@@ -7,11 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_drivers.sim import STEP_NS
-from gigabrain_drivers.sim.scene import FLOOR, ROBOT
+from gigabrain_drivers.sim.mjcf_world import UPRIGHT, is_floor
+from gigabrain_drivers.sim.scene import ROBOT
 from gigabrain_drivers.sim.world import Footprint, Pose
 
 NEW_CONTACT_STEPS = 500_000_000 // STEP_NS  # contact again after half a second is a new contact
 CLEARANCE_STEPS = 100_000_000 // STEP_NS
+MEASURED = [  # types whose sizes along x and y are known
+    mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE,
+    mujoco.mjtGeom.mjGEOM_SPHERE,
+]  # fmt: skip
 MAX_CLEARANCE_M = 10.0  # larger clearances count as this
 
 
@@ -29,19 +34,18 @@ class Truth:
         self._base = model.body(f"{ROBOT}base").id
         self._place = model.joint(f"{ROBOT}free").qposadr[0]
         self._velocity = model.joint(f"{ROBOT}free").dofadr[0]
-        is_robot = model.body_rootid[model.geom_bodyid] == self._base
-        self._is_obstacle = ~is_robot & (model.geom_contype != 0)
-        self._is_obstacle[model.geom(FLOOR).id] = False
-        self._obstacles = np.flatnonzero(self._is_obstacle)
+        self._is_robot = model.body_rootid[model.geom_bodyid] == self._base
+        floor = np.array([is_floor(model, geom) for geom in range(model.ngeom)])
+        self._may_be_obstacle = ~self._is_robot & ~floor
         self._hull = [
             geom for geom in range(model.ngeom) if model.geom(geom).name.startswith(f"{ROBOT}hull_")
         ]
-        self._half_sizes = _half_sizes(model, self._obstacles)
         self._last_touch: dict[int, int] = {}
         self._steps = 0
         self.contacts, self.touching = 0, False
         self.min_clearance_m, self.distance_m = MAX_CLEARANCE_M, 0.0
         mujoco.mj_forward(model, data)
+        self.find_obstacles()
         self.footprint = self._measure_footprint()
         self._reach = math.hypot(
             max(self.footprint.front, -self.footprint.rear), self.footprint.half_width
@@ -49,6 +53,28 @@ class Truth:
         self._position = self.pose()
         self._touch()
         self._clear()
+
+    def find_obstacles(self) -> None:
+        """Look again at what can be touched, after a change of the model."""
+        model = self._model
+        self._is_obstacle = self._may_be_obstacle & (model.geom_contype != 0)
+        self._obstacles = np.flatnonzero(self._is_obstacle)
+        self._half_sizes = _half_sizes(model, self._obstacles)
+        upright = np.abs(self._data.geom_xmat[self._obstacles, 8]) > UPRIGHT
+        boxes = np.isin(model.geom_type[self._obstacles], MEASURED)
+        others = ~(upright & boxes)  # of an MJCF world
+        self._half_sizes[others] = model.geom_rbound[self._obstacles[others], None]
+
+    def distance_to(self, geom: int) -> float:
+        """Return the distance from the robot's outline to a geom [m], at most 1; 0 if it touches.
+
+        Positions in the data must be those of now.
+        """
+        gaps = (
+            mujoco.mj_geomDistance(self._model, self._data, hull, geom, 1.0, None)
+            for hull in self._hull
+        )
+        return max(min(gaps, default=1.0), 0.0)
 
     def pose(self) -> Pose:
         """Return the pose of the base in the world."""
@@ -75,7 +101,8 @@ class Truth:
     def _touch(self) -> None:
         """Count contacts between the robot and obstacles that begin in this step."""
         pairs = self._data.contact.geom
-        with_obstacle = self._is_obstacle[pairs]
+        # things of an MJCF world touch each other and the floor, too
+        with_obstacle = self._is_obstacle[pairs] & self._is_robot[pairs[:, ::-1]]
         self.touching = bool(with_obstacle.any())
         if not self.touching:
             return

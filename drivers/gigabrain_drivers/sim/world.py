@@ -2,15 +2,18 @@
 
 import bisect
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import IntEnum
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 WALL_HEIGHT = 0.6  # [m], well above the plane of any lidar here
 WALL_HALF = 0.05  # [m]
+WALKING_SPEED = 0.8  # [m/s]
 Corners = tuple[tuple[float, float], ...]
 Colour = tuple[float, float, float]
 
@@ -66,7 +69,7 @@ Shape = Box | Cylinder
 
 def clearance(shapes: Iterable[Shape], x: float, y: float) -> float:
     """The distance from a point to the nearest shape that stands on the floor [m]."""
-    return min(shape.distance(x, y) for shape in shapes if shape.bottom == 0)
+    return min((s.distance(x, y) for s in shapes if s.bottom == 0), default=math.inf)
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,32 +128,65 @@ def generator(seed: int, stream: Stream) -> np.random.Generator:
 ORIGIN = Pose(0.0, 0.0, 0.0)
 
 
+@dataclass(frozen=True, slots=True)
+class Walk:
+    """The way of a person, round and round a closed path."""
+
+    corners: Corners
+    speed: float = WALKING_SPEED  # [m/s]
+    start: float = 0.0  # along the path [m]
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """A lamp at `position`, or a sun from anywhere in `direction`."""
+
+    colour: Colour
+    position: tuple[float, float, float] | None = None  # [m]
+    direction: tuple[float, float, float] = (0.0, 0.0, -1.0)
+
+
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """A place for a robot; the origin is in its middle. Lengths in metres."""
+    """A place for a robot. Lengths in metres."""
 
     name: str
     description: str
-    half_x: float  # to the inner face of the outer walls
+    half_x: float  # of the floor, to the inner face of the outer walls
     half_y: float
+    middle: tuple[float, float] = (0.0, 0.0)  # of the floor
     shapes: tuple[Shape, ...]  # all but the outer walls
+    outer_walls: bool = True
     wall_height: float = WALL_HEIGHT
     floor: tuple[Colour, Colour] = ((0.62, 0.66, 0.70), (0.58, 0.62, 0.66))  # its two checks
     check: tuple[float, float] = (0.5, 0.5)  # size of one
-    path: Corners = ()  # the person's, closed; empty: no person
+    materials: Mapping[str, Colour] = field(default_factory=dict)  # beside those of every world
+    people: tuple[Walk, ...] = ()
+    lights: tuple[Light, ...] = ()  # none: a low sun
     start: Pose = ORIGIN  # of the robot
-    person_start: float = 0.0  # along the path [m]
+    start_fixed: bool = False  # by the world's file; else a seed draws it
+    free: NDArray[np.float64] | None = field(default=None, compare=False)
+    # (n, 2), where a start may be; None: anywhere
+    model: Path | None = None  # MJCF file that is part of this world
+    outlines: tuple[Shape, ...] = ()  # of the things in it
 
     def walls(self) -> tuple[Box, ...]:
         """The four outer walls."""
+        if not self.outer_walls:
+            return ()
         x, y, half, height = self.half_x, self.half_y, WALL_HALF, self.wall_height
+        east, north = self.middle
         return (
-            Box(0, y + half, x + 2 * half, half, height),
-            Box(0, -y - half, x + 2 * half, half, height),
-            Box(x + half, 0, half, y, height),
-            Box(-x - half, 0, half, y, height),
+            Box(east, north + y + half, x + 2 * half, half, height),
+            Box(east, north - y - half, x + 2 * half, half, height),
+            Box(east + x + half, north, half, y, height),
+            Box(east - x - half, north, half, y, height),
         )
 
     def everything(self) -> tuple[Shape, ...]:
         """Return all shapes, the outer walls included."""
         return (*self.walls(), *self.shapes)
+
+    def obstacles(self) -> tuple[Shape, ...]:
+        """Return everything that a robot may bump into, with the outlines of the model's things."""
+        return (*self.everything(), *self.outlines)

@@ -1,0 +1,120 @@
+"""MJCF models as worlds, or as parts of worlds: loaded, bounded and measured."""
+
+import logging
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from gigabrain_drivers.sim.world import Box, Shape, World
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.files import read_bounded
+
+MAX_MODEL_BYTES = 10_000_000
+MAX_GEOMS, MAX_EXTENT_M = 10_000, 400.0
+LOW_M, HIGH_M = 0.02, 1.0  # what stands between them is in a robot's way
+UPRIGHT = 0.999  # cosine of the tilt up to which a thing stands upright
+log = logging.getLogger(__name__)
+
+FLOOR_NAME = re.compile(r"(^|/)(floor|ground)\d*$")  # of geoms that a robot stands on
+COUNT = re.compile(rb"\bcount\s*=\s*[\"']([\d\s]{1,60})[\"']")  # of replicated parts
+PLANE = mujoco.mjtGeom.mjGEOM_PLANE
+
+
+def load_model(path: Path) -> mujoco.MjSpec:
+    """Return the MJCF of a world. Raises ConfigError, with the line where MuJoCo names it."""
+    mujoco.set_mju_user_warning(log.warning)  # instead of a file
+    try:
+        text = read_bounded(path, MAX_MODEL_BYTES)
+        counts = [int(number) for each in COUNT.findall(text) for number in each.split()]
+        if math.prod(counts) > MAX_GEOMS:
+            raise ConfigError(f"{path}: it repeats parts more than {MAX_GEOMS} times")
+        return mujoco.MjSpec.from_file(str(path))
+    except OSError as error:
+        raise ConfigError(f"{path}: the world's model: {error.strerror}") from None
+    except ValueError as error:
+        raise model_error(path, error) from None
+
+
+def model_error(path: Path, error: ValueError) -> ConfigError:
+    """Return MuJoCo's complaint in one line, with the line of the file if it is named."""
+    text = " ".join(str(error).split())[:300]
+    line = re.search(r"[Ll]ine(?: number=|:? )(\d+)", text)
+    return ConfigError(f"{path}{f':{line[1]}' if line else ''}: not a usable MJCF model: {text}")
+
+
+def measured(world: World) -> World:
+    """Return the world with the outlines of its model's things, and grown to hold them.
+
+    Raises ConfigError.
+    """
+    assert world.model
+    try:
+        model = load_model(world.model).compile()
+    except ValueError as error:
+        raise model_error(world.model, error) from None
+    if model.ngeom > MAX_GEOMS:
+        raise ConfigError(f"{world.model}: {model.ngeom} geoms; expected at most {MAX_GEOMS}")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    outlines = _outlines(model, data)
+    if not all(abs(value) <= MAX_EXTENT_M for one in outlines for value in _bounds(one)):
+        raise ConfigError(
+            f"{world.model}: it reaches further than {MAX_EXTENT_M:g} m from its origin"
+        )
+    east, north = world.middle
+    own = Box(east, north, max(world.half_x, 1.0), max(world.half_y, 1.0), 0.0)
+    low_x, low_y, high_x, high_y = np.array([_bounds(one) for one in (own, *outlines)]).T
+    box = float(low_x.min()), float(low_y.min()), float(high_x.max()), float(high_y.max())
+    return replace(
+        world,
+        outlines=outlines,
+        middle=((box[0] + box[2]) / 2, (box[1] + box[3]) / 2),
+        half_x=(box[2] - box[0]) / 2,
+        half_y=(box[3] - box[1]) / 2,
+    )
+
+
+def is_floor(model: mujoco.MjModel, geom: int) -> bool:
+    """Return whether a geom is floor: a plane, or called floor or ground."""
+    name = model.geom(geom).name
+    return bool(model.geom_type[geom] == PLANE or FLOOR_NAME.search(name))
+
+
+def has_floor(spec: mujoco.MjSpec) -> bool:
+    """Return whether a model brings its own floor."""
+    return any(geom.type == PLANE or FLOOR_NAME.search(geom.name) for geom in spec.geoms)
+
+
+def _outlines(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Shape, ...]:
+    """Return a box round each thing that is in a robot's way."""
+    found = []
+    for geom in range(model.ngeom):
+        if not (model.geom_contype[geom] or model.geom_conaffinity[geom]) or is_floor(model, geom):
+            continue
+        axes, offset = data.geom_xmat[geom].reshape(3, 3), model.geom_aabb[geom, :3]
+        half = model.geom_aabb[geom, 3:]
+        middle = data.geom_xpos[geom] + axes @ offset
+        upright = abs(axes[2, 2]) > UPRIGHT
+        reach = np.abs(axes) @ half
+        if middle[2] - reach[2] > HIGH_M or middle[2] + reach[2] < LOW_M:
+            continue
+        size = half if upright else reach
+        yaw = float(np.arctan2(axes[1, 0], axes[0, 0])) if upright else 0.0
+        found.append(Box(
+            float(middle[0]), float(middle[1]), float(size[0]), float(size[1]),
+            float(2 * reach[2]), yaw=yaw,
+        ))  # fmt: skip
+    return tuple(found)
+
+
+def _bounds(shape: Shape) -> tuple[float, float, float, float]:
+    """Return the least and greatest x and y that a box may reach: x, y, x, y."""
+    assert isinstance(shape, Box)
+    cos, sin = abs(np.cos(shape.yaw)), abs(np.sin(shape.yaw))
+    reach_x = float(cos * shape.half_x + sin * shape.half_y)
+    reach_y = float(sin * shape.half_x + cos * shape.half_y)
+    return shape.x - reach_x, shape.y - reach_y, shape.x + reach_x, shape.y + reach_y
