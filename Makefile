@@ -140,6 +140,7 @@ bench: setup
 golden: setup
 	$(BIN)/python -m gigabrain_schemas.examples
 	$(BIN)/python -m tests.user_texts
+	$(BIN)/python -m docs.site.benchmarks
 
 recordings: setup
 	$(BIN)/python -m gigabrain_zenoh.qa.drives tests/recordings
