@@ -24,7 +24,8 @@ def test_every_result_is_on_one_page() -> None:
 def test_a_table_names_command_date_and_machine() -> None:
     for path in benchmarks.RESULTS.glob("*.json"):
         one = benchmarks.load(path.stem)
-        assert one.command and one.machine and one.date.startswith("20"), path
+        assert min(len(one.command), len(one.machine)) > 0, path
+        assert one.date.startswith("20"), path
         assert {len(row) for row in one.rows} == {len(one.columns)}, path
 
 
