@@ -8,8 +8,15 @@ from msgspec.structs import asdict
 from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.brain import Twist
 from gigabrain_schemas.logs import AuditRecord, AuditRequest
-from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
-from gigabrain_schemas.topics import AUDIT_LOG, ENABLE, ESTOP, RELEASE, TELEOP, Service
+from gigabrain_schemas.requests import (
+    EnableRequest,
+    EstopRequest,
+    GateReply,
+    Param,
+    ParamRequest,
+    ReleaseRequest,
+)
+from gigabrain_schemas.topics import AUDIT_LOG, ENABLE, ESTOP, PARAM, RELEASE, TELEOP, Service
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.errors import BodyLost, NotConfirmed, Refused
 from gigabrain_zenoh.runtime.audit import in_order
@@ -54,6 +61,23 @@ async def release(bus: Bus, estop_generation: int, keys: str = "") -> GateReply:
     """Release the gate from the e-stop of that number. Raises Refused and BodyLost."""
     request = ReleaseRequest(estop_generation=estop_generation, source=bus.process)
     return await ask_gate(bus, RELEASE, request, keys)
+
+
+async def params(bus: Bus, process: str) -> tuple[Param, ...]:
+    """Return the parameters of a process; none if it does not answer."""
+    replies = await bus.ask(PARAM, ParamRequest(), timeout_s=ANSWER_S, name=process)
+    return replies[0].params if replies else ()
+
+
+async def set_param(bus: Bus, process: str, name: str, value: str) -> str:
+    """Change a parameter; return a sentence for people. Raises Refused and BodyLost."""
+    request = ParamRequest(name=name, value=value, source=bus.process)
+    replies = await bus.ask(PARAM, request, timeout_s=ANSWER_S, name=process)
+    if not replies:
+        raise BodyLost(f"no answer from {process}; is it running?")
+    if not replies[0].ok:
+        raise Refused(f"{process}: {replies[0].text}")
+    return f"{process}: {replies[0].text}"
 
 
 def steer(bus: Bus, wanted: Velocity) -> None:

@@ -4,11 +4,14 @@ import os
 import re
 import signal
 from collections.abc import AsyncIterator, Iterator
+from urllib.parse import unquote
 
 import pytest
 import pytest_asyncio
-from playwright.async_api import Page
+from playwright.async_api import Page, expect
 
+from gigabrain_schemas.topics import BODY
+from gigabrain_zenoh.config import yaml_text
 from gigabrain_zenoh.qa.probe import Probe, at_rest, probing
 from gigabrain_zenoh.testing.processes import Home
 from gigabrain_zenoh.testing.waiting import until
@@ -90,6 +93,35 @@ async def test_a_held_key_drives_and_letting_go_stops(chromium: Browser, seen: P
     await seen.at_rest()
     assert (seen.state.gate.mode, seen.state.gate.commander) == ("enabled", "control")
     assert "viewer" not in await text(page, "doing")
+
+
+async def test_settings_are_changed_refused_and_offered_as_a_file(
+    chromium: Browser, seen: Probe
+) -> None:
+    page = await chromium.open()
+    bodies = seen.bus.latest(BODY)
+    await page.click("#tab-settings")
+    margin = page.get_by_label("stop_margin of driver")
+    await margin.fill("0.02")
+    await margin.press("Enter")
+    await told(page, "setting-reply", "below the body's own need, 0.08 m")
+    await expect(margin).to_have_value("0.08")
+    assert not await page.is_visible("#save-settings")
+    await margin.fill("0.12")
+    await margin.press("Enter")
+    await told(page, "setting-reply", "driver: stop_margin is 0.12 now, it was 0.08")
+    await page.wait_for_selector("#settings tr.changed")
+    await until(
+        lambda: bodies.newest and bodies.newest.description.thresholds.stop_margin == 0.12,
+        "the body has another margin",
+    )
+    file = await page.get_attribute("#save-settings", "href")
+    assert file
+    saved = yaml_text.read(unquote(file.partition(",")[2])).value
+    assert saved == {"robot": {"thresholds": {"stop_margin": 0.12}}}
+    await margin.fill("0.08")
+    await margin.press("Enter")
+    await page.wait_for_selector("#save-settings", state="hidden")
 
 
 async def test_a_window_that_loses_the_focus_lets_all_keys_go(

@@ -10,9 +10,10 @@ from msgspec import Meta, Struct
 from msgspec.structs import replace
 
 from gigabrain_schemas import topics
-from gigabrain_schemas.base import Count, Finite, Message, Pose, Text, Velocity
+from gigabrain_schemas.base import Count, Finite, Message, Name, Pose, Text, Velocity
 from gigabrain_schemas.body import Body, BodyDescription, RobotState
 from gigabrain_schemas.brain import Intent, OccupancyGrid, WorldModel
+from gigabrain_schemas.requests import Param
 from gigabrain_schemas.safety import Health, LogRecord, SafetyState
 from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_schemas.tasks import GoalRequest
@@ -60,9 +61,19 @@ class PageRequest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """Request to the robot."""
 
     id: Annotated[int, Meta(ge=0, le=2**31)]
-    what: Literal["estop", "release", "enable", "take", "goal", "cancel"]
+    what: Literal["estop", "release", "enable", "take", "goal", "cancel", "settings", "set"]
     estop_generation: Count = 0  # as the page shows it: a newer e-stop is not released unseen
     goal: GoalRequest | None = None
+    process: Name = ""  # of a setting
+    name: Name = ""
+    value: Text = ""
+
+
+class Setting(Struct, frozen=True, kw_only=True):
+    """A parameter of a running process that a settings file may keep."""
+
+    process: str
+    param: Param
 
 
 class PageReply(Struct, frozen=True, kw_only=True):
@@ -73,6 +84,7 @@ class PageReply(Struct, frozen=True, kw_only=True):
     ok: bool
     text: Text
     robot: str = ""  # type of the robot that confirmed it
+    settings: tuple[Setting, ...] = ()  # of the robot; answers `settings`
     not_confirmed: bool = False  # an e-stop without confirmation; the text gives the remedy
 
 

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import itertools
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from msgspec.structs import replace
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -12,13 +12,20 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from gigabrain_schemas.tasks import GoalReply, TaskReply, TaskRequest
 from gigabrain_schemas.topics import GOAL, TASK_CHANGE
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.client.requests import ANSWER_S, enable, press_estop, release
+from gigabrain_zenoh.client.requests import (
+    ANSWER_S,
+    enable,
+    params,
+    press_estop,
+    release,
+    set_param,
+)
 from gigabrain_zenoh.errors import BodyLost, GigabrainError, NotConfirmed, Refused
 from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.plugins import package_version
 from gigabrain_zenoh.ui.page import frames
 from gigabrain_zenoh.ui.page.access import Access, Role
-from gigabrain_zenoh.ui.page.frames import PageReply, PageRequest, PageView
+from gigabrain_zenoh.ui.page.frames import PageReply, PageRequest, PageView, Setting
 from gigabrain_zenoh.ui.steering import RateLimiter, TeleopArbiter
 
 log = logging.getLogger(__name__)
@@ -64,14 +71,18 @@ class Viewer:
 class RequestHandler:
     """Carries out the requests of operators."""
 
-    def __init__(self, bus: Bus) -> None:
-        self._bus = bus
+    def __init__(self, bus: Bus, processes: Callable[[], Iterable[str]] = tuple) -> None:
+        self._bus, self._processes = bus, processes
 
     async def handle(self, request: PageRequest) -> PageReply:
         """Carry out a request. Errors are part of the reply."""
         ok, robot, unconfirmed = True, "", False
+        settings: tuple[Setting, ...] = ()
         try:
-            text, robot = await self._carry_out(request)
+            if request.what == "settings":
+                text, settings = "", await self._settings()
+            else:
+                text, robot = await self._carry_out(request)
         except GigabrainError as error:
             ok, text, unconfirmed = False, str(error), isinstance(error, NotConfirmed)
         return PageReply(
@@ -80,6 +91,7 @@ class RequestHandler:
             ok=ok,
             text=text[:MAX_REPLY_CHARS],
             robot=robot,
+            settings=settings,
             not_confirmed=unconfirmed,
         )
 
@@ -88,6 +100,9 @@ class RequestHandler:
             return await self._goal(request), ""
         if request.what == "cancel":
             return await self._cancel(), ""
+        if request.what == "set":
+            names = request.process, request.name, request.value
+            return await set_param(self._bus, *names), ""
         if request.what == "estop":
             reply = await press_estop(self._bus, "operator page")
         elif request.what == "release":
@@ -95,6 +110,17 @@ class RequestHandler:
         else:
             reply = await enable(self._bus, BRAIN, take=request.what == "take")
         return reply.text, reply.robot_type
+
+    async def _settings(self) -> tuple[Setting, ...]:
+        """Return the settings of all processes that a file can keep."""
+        names = sorted(self._processes())
+        answers = await asyncio.gather(*(params(self._bus, name) for name in names))
+        return tuple(
+            Setting(process=name, param=one)
+            for name, found in zip(names, answers, strict=True)
+            for one in found
+            if one.key
+        )
 
     async def _cancel(self) -> str:
         change = TaskRequest(do="cancel", source=self._bus.process)
@@ -129,8 +155,8 @@ class Sessions:
         self._loop = asyncio.get_running_loop()
         self._rates = RateLimiter()
         self.viewers: list[Viewer] = []
-        self._handler = RequestHandler(bus)
         self._view = PageView(bus, self.send, self._introduce_all)
+        self._handler = RequestHandler(bus, self._view.health.keys)
         self._arbiter = TeleopArbiter(self._view)
 
     def send(self, slot: str, frame: bytes) -> None:

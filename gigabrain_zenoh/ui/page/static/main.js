@@ -3,6 +3,7 @@ import { Drive } from './drive.js'
 import { Link } from './link.js'
 import { MapView } from './map.js'
 import { $, setText, showFigures, showGate, showHealth, showImage, showLogLine, showSafety, showTables, showTask } from './panels.js'
+import { Settings } from './settings.js'
 
 const STOP_TIMEOUT_MS = 2500 // the server gives up after two seconds
 const BY_HAND = 'press the hardware e-stop or cut the power'
@@ -60,6 +61,8 @@ const link = new Link({
   },
   login() { $('login').showModal() },
 }, stored('token'))
+
+const settings = new Settings((what, more) => link.request(what, more))
 
 const drive = new Drive({
   stick: $('stick'),
@@ -147,6 +150,10 @@ function selectTab(tab) {
     $(other.getAttribute('aria-controls')).hidden = other !== tab
   }
   showTables()
+  showSettings()
+}
+function showSettings() {
+  if (!$('settings').hidden && link.live && !viewOnly()) settings.refresh()
 }
 tabs.forEach((tab, i) => {
   tab.addEventListener('click', () => selectTab(tab))
@@ -159,3 +166,4 @@ tabs.forEach((tab, i) => {
   })
 })
 setInterval(showTables, 1000)
+setInterval(showSettings, 2000) // others may change them too
