@@ -5,20 +5,21 @@ import contextlib
 import errno
 import socket
 import struct
+from collections.abc import Sequence
 from pathlib import Path
-
-from aiohappyeyeballs import start_connection
+from typing import Any
 
 from gigabrain_drivers.links.link import Link, LinkProblem, describe_error
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import read_bounded
 
-CONNECT_TIMEOUT_S = 1.0
-HAPPY_EYEBALLS_S = 0.1  # after which the next address of a name is tried beside the one before
+CONNECT_TIMEOUT_S = 1.0  # for all addresses of a name, in equal parts
 QUIET_NS = 200_000_000  # a frozen peer goes on acknowledging; only its own bytes show it alive
 LINGER_DISCARD = struct.pack("ii", 1, 0)  # linger on, for 0 s: unsent bytes are dropped
 MAX_ADDRESS_BYTES = 256  # of a file with an address
+
+AddressInfo = tuple[socket.AddressFamily, socket.SocketKind, int, str, Any]  # of getaddrinfo
 
 
 class TcpLink(Link):
@@ -39,7 +40,7 @@ class TcpLink(Link):
         try:
             async with asyncio.timeout(CONNECT_TIMEOUT_S):
                 found = await loop.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM)
-                self._socket = await start_connection(found, happy_eyeballs_delay=HAPPY_EYEBALLS_S)
+                self._socket = await _connected(found, CONNECT_TIMEOUT_S / len(found))
         except TimeoutError:
             raise LinkProblem(f"no answer from {self}: is it switched on?") from None
         except (socket.gaierror, UnicodeError) as error:
@@ -81,6 +82,26 @@ class AddressLink(TcpLink):
         if "/" in self._where:
             self._host, self._port = written(Path(self._where))
         return await super()._connect()
+
+
+async def _connected(found: Sequence[AddressInfo], within_s: float) -> socket.socket:
+    """Return a socket that is connected to the first address that answers. Raises OSError."""
+    loop, problem = asyncio.get_running_loop(), OSError(errno.EADDRNOTAVAIL, "no address")
+    for family, kind, protocol, _, where in found:
+        tried = socket.socket(family, kind, protocol)
+        tried.setblocking(False)
+        try:
+            async with asyncio.timeout(within_s):
+                await loop.sock_connect(tried, where)
+        except OSError as error:  # a timeout, too
+            tried.close()
+            problem = error
+        except asyncio.CancelledError:
+            tried.close()
+            raise
+        else:
+            return tried
+    raise problem
 
 
 def address(text: str) -> tuple[str, int]:
