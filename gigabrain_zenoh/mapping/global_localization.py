@@ -8,12 +8,12 @@ import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.geometry.se2 import compose, inverse, wrap
+from gigabrain_zenoh.kernels.images import dilated
 from gigabrain_zenoh.kernels.jit import kernel
 from gigabrain_zenoh.mapping.keyframes import Beams, Points
 from gigabrain_zenoh.mapping.likelihood_field import (
@@ -102,13 +102,11 @@ def _bounds(
     reach = float(np.percentile(np.hypot(points[:, 0], points[:, 1]), 75))
     finest = min(max(STEP_M / max(reach, STEP_M), FINEST_RAD), COARSEST_RAD)
     headings = np.arange(0.0, math.tau, math.tau / math.ceil(math.tau / finest))
-    best_within = cv2.dilate(image, np.ones((BLOCK, BLOCK), np.uint8), anchor=(0, 0))
-    some_free = cv2.dilate(
-        standing.astype(np.uint8), np.ones((BLOCK, BLOCK), np.uint8), anchor=(0, 0)
-    )
-    blocks = np.array(some_free[::BLOCK, ::BLOCK], np.uint8)
+    best_within = dilated(image, 0, BLOCK - 1)
+    some_free = dilated(standing.view(np.uint8), 0, BLOCK - 1)
     offsets = _turned(points, headings, cell)
-    return _coarse(np.array(best_within, np.uint8), blocks, offsets), headings
+    blocks = some_free[::BLOCK, ::BLOCK].copy()
+    return _coarse(best_within, blocks, offsets), headings
 
 
 def _turned(points: Points, headings: Floats, cell: float) -> NDArray[np.int64]:
@@ -175,8 +173,7 @@ def _standing(field: LikelihoodField) -> NDArray[np.bool_]:
     standing = field.free.astype(np.uint8)
     open_ground = (field.free | ~field.shown).astype(np.uint8)
     for _ in range(round(BEYOND_M / field.cell)):  # step by step, as walls are in the way
-        grown = cv2.dilate(standing, np.ones((3, 3), np.uint8))
-        standing = np.minimum(np.array(grown, np.uint8), open_ground)
+        standing = np.minimum(dilated(standing, 1, 1), open_ground)
     return standing.astype(np.bool_)
 
 

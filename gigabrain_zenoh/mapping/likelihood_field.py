@@ -4,14 +4,15 @@ Halls are built alike from both ends. Where half of one is mapped, a robot in th
 what it would see at the same place in the first.
 """
 
+import math
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.geometry.se2 import inverse, transform
+from gigabrain_zenoh.kernels.images import squared_distance
 from gigabrain_zenoh.kernels.jit import kernel
 from gigabrain_zenoh.mapping.keyframes import Beams, Points
 from gigabrain_zenoh.mapping.scan_matching import solved
@@ -57,13 +58,10 @@ class FieldFit(NamedTuple):
 
 def field_of(cells: NDArray[np.int8], cell: float, origin: tuple[float, float]) -> LikelihoodField:
     """Make the field of an occupancy grid (height, width): 0 to 100 occupied, -1 unknown."""
-    walls = cells >= OCCUPIED
-    if walls.any():
-        open_ground = np.where(walls, 0, 1).astype(np.uint8)
-        distance = cv2.distanceTransform(open_ground, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        metres = np.minimum(distance * cell, MAX_DISTANCE_M).astype(np.float32)
-    else:
-        metres = np.full(cells.shape, MAX_DISTANCE_M, np.float32)
+    reach = math.ceil(MAX_DISTANCE_M / cell) + 1
+    walls = np.where(cells >= OCCUPIED, np.int8(100), np.int8(0))
+    distance = np.sqrt(squared_distance(walls, reach)) * np.float32(cell)
+    metres = np.minimum(distance, np.float32(MAX_DISTANCE_M))
     free = (cells >= 0) & (cells <= FREE)
     shown = (cells >= 0) | (metres <= BESIDE_M)
     return LikelihoodField(metres, free, shown, np.array(origin, np.float64), cell)

@@ -3,14 +3,15 @@
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.brain import OccupancyGrid
-from gigabrain_zenoh.navigation.costmap import LETHAL, OCCUPIED_PERCENT, Costmap, Inflation
+from gigabrain_zenoh.kernels.images import OCCUPIED_PERCENT, Ints, connected_parts
+from gigabrain_zenoh.navigation.costmap import LETHAL, Costmap, Inflation
 from gigabrain_zenoh.navigation.costmap import costmap as make_costmap
 from gigabrain_zenoh.navigation.grid_search import (
     GridSearch,
@@ -147,6 +148,7 @@ def warm_up() -> None:
         planner.replan(now, (0.1, 0.1), (1.0, 0.1), path)
     planner.plan(now, (0.1, 0.1), (3.9, 3.9))
     planner.field(now, (0.1, 0.1))
+    frontiers(now, (0.1, 0.1), (), GridSearch())
 
 
 def _goal_problem(costmap: Costmap, goal: Point) -> str:
@@ -232,27 +234,24 @@ def frontiers(
     edge = _edge(costmap.cells) & (known < LETHAL) & np.isfinite(way)
     for x, y in blacklist:
         _erase_around(edge, costmap, x, y)
-    count, labels, stats, middles = cv2.connectedComponentsWithStats(edge.view(np.uint8))
+    cells, begins = connected_parts(edge)
     found = []
-    for label in range(1, count):
-        size = float(stats[label, cv2.CC_STAT_AREA]) * costmap.resolution
+    for begin, end in pairwise(begins.tolist()):
+        size = (end - begin) * costmap.resolution
         if size >= 2 * costmap.inflation.fits:
-            left, top, width, height = stats[label, : cv2.CC_STAT_AREA]
-            part = slice(top, top + height), slice(left, left + width)
-            rows, columns = np.nonzero(labels[part] == label)
-            found.append(_frontier(costmap, way, rows + top, columns + left, middles[label], size))
+            rows, columns = np.divmod(np.sort(cells[begin:end]), edge.shape[1])
+            found.append(_frontier(costmap, way, rows, columns, size))
     return found
 
 
 def _frontier(
     costmap: Costmap,
     way: Floats,
-    rows: NDArray[np.intp],
-    columns: NDArray[np.intp],
-    middle: Floats,
+    rows: Ints,
+    columns: Ints,
     size: float,
 ) -> Frontier:
-    best = int(np.hypot(columns - middle[0], rows - middle[1]).argmin())
+    best = int(np.hypot(columns - columns.mean(), rows - rows.mean()).argmin())
     x, y = costmap.points(rows[best : best + 1], columns[best : best + 1])[0]
     return Frontier(x=float(x), y=float(y), size=size, cost=float(way[rows[best], columns[best]]))
 

@@ -8,7 +8,6 @@ this took 0.20 ms (320 x 320 cells), and differs in the last bits.
 import math
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -283,8 +282,8 @@ class LocalCostmap:
         if len(moving):
             near = np.zeros_like(free)
             for x, y, radius in moving[:, [0, 1, 4]].tolist():
-                at = round((x - self.x) / CELL_M), round((y - self.y) / CELL_M)
-                cv2.circle(near, at, math.ceil((radius + DISC_MARGIN_M) / CELL_M), 1, cv2.FILLED)
+                column, row = round((x - self.x) / CELL_M), round((y - self.y) / CELL_M)
+                fill_disc(near, row, column, math.ceil((radius + DISC_MARGIN_M) / CELL_M))
             free |= near & (self._held.since > tick - STATIC_TICKS)
         if len(known):
             cells = np.floor((known - (self.x, self.y)) / CELL_M).astype(np.int64)
@@ -303,6 +302,15 @@ class LocalCostmap:
         _carry(self._held, self._spare, down, right)
         self._row, self._column, self._empty = row, column, False
         self._held, self._spare = self._spare._replace(x=self.x, y=self.y), self._held
+
+
+def fill_disc(cells: FreeCells, row: int, column: int, radius: int) -> None:
+    """Set the cells within `radius` cells of one, as far as they are there."""
+    top, left = max(row - radius, 0), max(column - radius, 0)
+    part = cells[top : max(row + radius + 1, 0), left : max(column + radius + 1, 0)]
+    y = np.arange(part.shape[0])[:, None] + top - row
+    x = np.arange(part.shape[1]) + left - column
+    part[x * x + y * y <= radius * radius] = 1
 
 
 def _nothing(side: int) -> WindowCells:

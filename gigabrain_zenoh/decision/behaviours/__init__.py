@@ -29,7 +29,7 @@ SHIPPED = {  # name in a deployment file -> "module:class"
     "navigate": "gigabrain_zenoh.decision.behaviours:Navigate",
 }
 
-NAVIGATION_PACKAGES = ("numba", "cv2", "py_trees")
+NAVIGATION_PACKAGES = ("numba", "py_trees")
 
 SpeedLimit = Annotated[float, Meta(gt=0, le=10)]  # [m/s] or [rad/s]
 DriveKind = Literal["goto", "explore", "visit"]  # `visit`: a random reachable place

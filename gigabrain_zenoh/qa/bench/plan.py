@@ -4,19 +4,21 @@ import itertools
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path as File
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import cv2
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
 from gigabrain_schemas.brain import OccupancyGrid
-from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.navigation.costmap import LETHAL, Costmap, Costs, Inflation, costmap
 from gigabrain_zenoh.navigation.global_planner import GlobalPlanner, Path, Point, warm_up
 from gigabrain_zenoh.navigation.grid_search import GridSearch, Ints
+from gigabrain_zenoh.qa.bench.slam_logs import draw_side_by_side
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 RULES = Inflation(fits=0.2, turns=0.3)
 ROUNDS = 7  # of each operation on the same map
@@ -112,8 +114,8 @@ def measure_plan(
         show(f"{size} x {size} cells")
         one, made, paths = _measure(size, queries, np.random.default_rng(seed))
         figures.append(one)
-    if png is not None and not cv2.imwrite(str(png), _drawing(made, paths)):
-        raise ConfigError(f"cannot write {png}")
+    if png is not None:
+        draw_side_by_side([(made, paths)], 1, _draw, png)
     return PlanResult(seed=seed, sizes=tuple(figures))
 
 
@@ -203,17 +205,15 @@ def _paid(cost: Costs, cells: Ints | None) -> float:
     return float((np.hypot(*np.diff(cells, axis=0).T) * (on[1:] + on[:-1]) / 2).sum())
 
 
-def _drawing(made: Costmap, paths: list[Path]) -> NDArray[np.uint8]:
-    """Return a picture of the costs, dark where high, and of the paths in colours."""
-    grey = (255 - 12 * made.cost.clip(1, 14)).astype(np.uint8)
+def _draw(axes: "Axes", drawn: tuple[Costmap, list[Path]]) -> None:
+    """Draw costs, dark where high, and paths in colours."""
+    made, paths = drawn
+    grey = 255 - 12 * made.cost.clip(1, 14)
     grey[made.cells > 0] = 0
-    picture = np.repeat(grey[:, :, np.newaxis], 3, axis=2)
-    for i, path in enumerate(paths):
-        hue = np.array([[[180 * i // len(paths), 255, 220]]], np.uint8)
-        colour = tuple(int(v) for v in cv2.cvtColor(hue, cv2.COLOR_HSV2BGR)[0, 0])
-        places = np.rint(path.points / made.resolution - 0.5).astype(np.int32)
-        cv2.polylines(picture, [places], False, colour, 3)
-    return picture[::-1]
+    height, width = (side * made.resolution for side in grey.shape)
+    axes.imshow(grey, "gray", origin="lower", extent=(0.0, width, 0.0, height))
+    for number, path in enumerate(paths, 1):
+        axes.plot(*path.points.T, label=f"path {number}")
 
 
 def office(size: int, rng: np.random.Generator) -> Cells:

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from gigabrain_schemas.body import BodyDescription
+from gigabrain_zenoh.kernels.images import squared_distance
 from gigabrain_zenoh.navigation.costmap import (
     Inflation,
     Unknown,
     costmap,
     inflation,
-    squared_distance,
 )
 from tests.unit.navigation.grids import drawn, empty, grid_of
 

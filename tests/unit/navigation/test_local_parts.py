@@ -19,7 +19,7 @@ from gigabrain_zenoh.navigation.footprint import (
     middle_of,
     outline_of,
 )
-from gigabrain_zenoh.navigation.local_costmap import Chamfer, LocalCostmap, Pose2D
+from gigabrain_zenoh.navigation.local_costmap import Chamfer, LocalCostmap, Pose2D, fill_disc
 from gigabrain_zenoh.navigation.motion_model import (
     delayed_model,
     feasible,
@@ -288,3 +288,12 @@ def test_a_goal_that_is_a_hundred_kilometres_off_is_as_far_as_anything() -> None
     grid = LocalCostmap(4.0, 10.0).grid(1, NOTHING, NOBODY)
     field = CostToGo(160).field(grid, 0.15, (1e5, -1e5), None).distance
     assert 9_990.0 < field.min() <= field.max() <= 10_010.0
+
+
+@pytest.mark.parametrize("row", [-20, -3, 0, 20, 39, 60])
+@pytest.mark.parametrize("radius", [0, 1, 5, 30, 80])
+def test_a_disc_is_the_one_that_opencv_fills(row: int, radius: int) -> None:
+    mine, theirs = np.zeros((40, 30), np.uint8), np.zeros((40, 30), np.uint8)
+    fill_disc(mine, row, 7, radius)
+    cv2.circle(theirs, (7, row), radius, 1, cv2.FILLED)
+    np.testing.assert_array_equal(mine, theirs)

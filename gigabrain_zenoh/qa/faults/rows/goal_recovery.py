@@ -21,7 +21,7 @@ from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, Skipped, fault_
 from gigabrain_zenoh.qa.probe import until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
 
-NEEDS = ("numba", "cv2", "gtsam", "py_trees")  # the extra `nav`
+NEEDS = ("numba", "gtsam", "py_trees")  # the extra `nav`
 PLACES = ((0.9, 0.9), (0.9, -0.9), (-0.9, 0.9), (-0.9, -0.9))  # [m], free places of the arena
 MIN_SPEED = 0.12  # [m/s], of a robot that counts as under way
 DEATHS = (("decision", 0.4), ("perception", 1.0))  # [m] from the start
