@@ -54,6 +54,7 @@ class PerceptionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     mapping: Literal["off", "slam", "localize"] = "off"  # build a map, or localize in a saved one
     map: str = ""  # YAML file of a saved map to localize in; `slam` extends it
     state_dir: str = ""  # folder where `slam` saves the map every few seconds; empty: no saves
+    compile_first: bool = False  # wait for compiled kernels; always at speeds other than 1
 
     def __post_init__(self) -> None:
         if self.map and self.mapping == "off":
@@ -66,6 +67,7 @@ class DecisionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     behaviour: str = "avoid"  # shipped, or offered by an installed package
     settings: dict[str, Any] = {}  # of the behaviour; see its Config
     state_dir: str = ""  # folder where it saves its tasks; empty: not saved
+    compile_first: bool = False  # wait for compiled kernels; always at speeds other than 1
 
 
 class DriverConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

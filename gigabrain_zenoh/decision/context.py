@@ -15,9 +15,8 @@ from gigabrain_zenoh.bus.freshness import PreviousTick
 from gigabrain_zenoh.decision.actuation_model import ActuationEstimator
 from gigabrain_zenoh.decision.behaviours import WaitReason, battery_nearly_empty
 from gigabrain_zenoh.gate.state import BRAIN
-from gigabrain_zenoh.geometry.limits import clamp, limits_of
+from gigabrain_zenoh.geometry.limits import SentCommand, clamp, limits_of
 from gigabrain_zenoh.geometry.pose import PoseHistory, compose, inverse, velocity_of
-from gigabrain_zenoh.navigation.local_planner import SentCommand
 
 MAX_POSE_AGE_NS = 1_000_000_000
 SENT_TICKS = 25  # local planning uses the commands of the last half second
@@ -155,6 +154,11 @@ class ContextSource:
     def lost(self) -> WaitReason | None:
         """Why the robot's pose in the map is unknown now; None if it is known."""
         return self._map_from_odom(self._bus.time.boot, self._bus.time.tick)[1]
+
+    def oriented(self, state: RobotState) -> bool:
+        """Return whether there are a map and a pose in it."""
+        lost = self._map_from_odom(state.boot, state.tick)[1]
+        return lost is None and self.grid(state.boot, state.tick) is not None
 
     def grid(self, boot: int, tick: int) -> OccupancyGrid | None:
         """Return the newest map from before `tick`, or from an earlier run of the driver.

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.base import TICK_S, Message
 from gigabrain_schemas.body import RobotState
-from gigabrain_schemas.brain import WorldModel
+from gigabrain_schemas.brain import Intent, WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import (
     Goal,
@@ -28,6 +28,7 @@ from gigabrain_schemas.topics import GOAL, MISSION, STATE, TASK, TASK_CHANGE, Se
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.freshness import PreviousTick
 from gigabrain_zenoh.bus.input_log import log_accepted
+from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision.behaviours import (
     Behaviour,
     DriveCommand,
@@ -37,8 +38,11 @@ from gigabrain_zenoh.decision.behaviours import (
     StepOutcome,
     StepResult,
     WaitReason,
+    battery_nearly_empty,
     describe_end,
 )
+from gigabrain_zenoh.decision.behaviours.avoid import Avoid, AvoidConfig
+from gigabrain_zenoh.decision.context import ContextSource
 from gigabrain_zenoh.decision.detected_objects import ObjectsByPerceptor
 from gigabrain_zenoh.decision.node import InputSource
 from gigabrain_zenoh.decision.tasks import mission as missions
@@ -47,7 +51,7 @@ from gigabrain_zenoh.decision.tasks.scripts import Scripts
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile, TaskQueue
 from gigabrain_zenoh.errors import GigabrainError, Refused
 from gigabrain_zenoh.host.threads import BackgroundWriter
-from gigabrain_zenoh.kernels.precompile import ensure_compiled
+from gigabrain_zenoh.kernels.precompile import Kernels
 from gigabrain_zenoh.logs import Fault
 
 if TYPE_CHECKING:
@@ -56,6 +60,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 DRIVE_KERNELS = "gigabrain_zenoh.decision.navigator:warm_up"  # calls each kernel once
+COMPILING = "mapping and planning compile meanwhile, once per installation"
+FIRST_MAP_TICKS = 3000  # how long after the kernels a first map may come
 STATUS_TICKS = 10  # robot/task is published at 5 Hz
 STARTING_STATUS_NS = 200_000_000  # the same while the kernels compile
 POSE_TIMEOUT_NS, POLL_NS = 700_000_000, 50_000_000  # wait for a first pose in the map
@@ -86,9 +92,19 @@ class TaskServer:
         bus.serve(TASK_CHANGE, self._on_change)
 
     def publish_starting(self) -> None:
-        """Publish the status while nothing can drive yet."""
+        """Publish the status while nothing can drive by a map yet."""
         self._waits = f"waiting: {WaitReason.STARTING}"
         self._publish()
+
+    def wait(self, state: RobotState) -> None:
+        """Publish that status at its rate; called with every step that does not advance tasks."""
+        self._tick = state.tick
+        if not 0 <= state.tick - self._status_tick < STATUS_TICKS:
+            self.publish_starting()
+
+    def unused(self, boot: int) -> bool:
+        """Return whether there is no task, nor was there one in this start of the driver."""
+        return self._queue.is_unused(boot)
 
     def step(
         self, state: RobotState, outcome: StepOutcome | None, basis: int = 0
@@ -112,7 +128,7 @@ class TaskServer:
 
     def begin(self, mission: Mission, label: str, boot: int) -> None:
         """Start a mission, unless there were tasks in this start of the driver."""
-        if self._queue.is_unused(boot):
+        if self.unused(boot):
             self._queue.add_mission(mission, label, "queue", "itself")
 
     async def close(self) -> None:
@@ -207,35 +223,49 @@ class TaskServer:
 
 
 class GoalServer(InputSource):
-    """Input source of behaviours that drive by a map: the task queue and the navigator."""
+    """Input source of behaviours that drive by a map: the task queue and the navigator.
 
-    def __init__(
-        self, config: NavigationConfig, bus: Bus, behaviour: str, *, state_dir: str = ""
-    ) -> None:
-        self._bus, self._config, self._name = bus, config, behaviour
-        self._tasks = TaskServer(bus, self.check, folder=state_dir, scripts=config.scripts)
-        self._navigator: Navigator | None = None  # once the kernels are compiled
+    At the first start of an installation the robot can drive before the kernels are compiled: with
+    `start: explore` it then roams by `avoid`, until there is a map or somebody gives it a task.
+    """
+
+    def __init__(self, settings: NavigationConfig, bus: Bus, config: DecisionConfig) -> None:
+        self._bus, self._config, self._name = bus, settings, config.behaviour
+        self._tasks = TaskServer(bus, self.check, folder=config.state_dir, scripts=settings.scripts)
+        self._source = ContextSource(bus)
+        self._kernels = Kernels(DRIVE_KERNELS, bus.input_log.in_time)
+        self._compile_first = config.compile_first or not bus.input_log.live
+        self._avoid = Avoid(_roaming(settings))  # drives without a map
+        self._began_late = False  # there were steps without the kernels
+        self._loaded_tick: int | None = None  # of the first step with them
+        self._navigator: Navigator | None = None  # once the kernels are loaded
         self._outcome: StepOutcome | None = None  # of the last command
         self._started = False
 
-    async def warm_up(self) -> None:
-        """Import and compile everything that driving needs. Raises ConfigError."""
+    async def prepare(self) -> None:
+        """Load the kernels, or begin to compile them. Raises ConfigError."""
         publishing = asyncio.ensure_future(self._publish_starting())
         try:
-            await ensure_compiled(DRIVE_KERNELS)
+            await self._kernels.load(wait=self._compile_first)
         finally:
             publishing.cancel()
-        from gigabrain_zenoh.decision.navigator import Navigator  # imports numba
+        if not self._kernels.beside:
+            self._make_navigator()
 
-        self._navigator = Navigator(self._config, self._bus, self._name)
+    async def finish_preparing(self) -> None:
+        """Return once the kernels are loaded. Raises ConfigError."""
+        await self._kernels.finish()
 
     def configure(self, config: NavigationConfig) -> None:
         """Use another speed limit from now on."""
-        self._ready.configure(config)
+        self._config = config
+        self._avoid.configure(_roaming(config))
+        if self._navigator:
+            self._navigator.configure(config)
 
     def observe(self, state: RobotState) -> None:
         """Record a robot state; to be called with every state."""
-        self._ready.observe(state)
+        self._source.observe(state)
 
     def step(
         self,
@@ -246,12 +276,14 @@ class GoalServer(InputSource):
         objects: ObjectsByPerceptor,
     ) -> StepResult:
         """Advance the queue and step the behaviour with the command that it wants."""
+        navigator = self._make_navigator() if self._kernels.loaded else None
+        if navigator is None or self._awaits_map(state):
+            return self._start_up(state, world, verdict)
         if self._config.start == "explore" and not self._started:
             self._tasks.begin(missions.explore_mission(), "roaming", state.boot)
         self._started = True
         tick = world.basis if world else state.tick
         command, idle = self._tasks.step(state, self._outcome, tick)
-        navigator = self._ready
         context = navigator.at_scan(state, world, verdict)
         intent, outcome = behaviour.step(
             Inputs(
@@ -266,13 +298,46 @@ class GoalServer(InputSource):
         self._outcome = outcome if command else None
         return intent, outcome
 
+    def _make_navigator(self) -> "Navigator":
+        if self._navigator is None:
+            from gigabrain_zenoh.decision.navigator import Navigator  # imports numba
+
+            self._navigator = Navigator(self._config, self._bus, self._source, self._name)
+        return self._navigator
+
+    def _awaits_map(self, state: RobotState) -> bool:
+        """Return whether perception may still be compiling: then there is no first map."""
+        if self._loaded_tick is None:
+            self._loaded_tick = state.tick
+        late = state.tick - self._loaded_tick
+        if self._began_late and 0 <= late < FIRST_MAP_TICKS:
+            self._began_late = not self._source.oriented(state)
+            return self._began_late
+        return False
+
+    def _start_up(
+        self, state: RobotState, world: WorldModel | None, verdict: SafetyState | None
+    ) -> StepResult:
+        """Roam without a map, if the robot may explore and has no task; else stand."""
+        self._began_late = True
+        self._tasks.wait(state)
+        if self._config.start != "explore" or not self._tasks.unused(state.boot):
+            text = f"waiting: {WaitReason.STARTING}"
+            intent = Intent(behaviour=self._name, reason=text)
+            return intent, StepOutcome(activity="waiting", reason=text)
+        must_charge = battery_nearly_empty(verdict)
+        inputs = Inputs(world=world, pose=state.pose, must_charge=must_charge)
+        intent, outcome = self._avoid.step(inputs)
+        return replace(intent, reason=f"{intent.reason}; {COMPILING}"), outcome
+
     @property
     def hung(self) -> bool:
         """Whether the plan in the worker thread will never finish."""
         return self._navigator is not None and self._navigator.hung
 
     async def close(self) -> None:
-        """Close the task server after its last write, then stop the worker thread."""
+        """Close the task server after its last write, then stop all work beside the loop."""
+        await self._kernels.close()
         await self._tasks.close()
         if self._navigator:
             self._navigator.close()
@@ -280,23 +345,18 @@ class GoalServer(InputSource):
     async def check(self, goal: Goal | None) -> str:
         """Return how the robot would reach `goal`, for people; see CheckGoal. Raises Refused."""
         for _ in range(POSE_TIMEOUT_NS // POLL_NS):
-            if waits := self._waits:
+            if (waits := self._waits) or self._navigator is None:
                 return f"accepted; {waits}"
-            if self._ready.located:
+            if self._navigator.located:
                 break
             await self._bus.clock.sleep_ns(POLL_NS)
         else:
-            raise Refused(self._ready.lost)
+            raise Refused(self._source.lost or WaitReason.NO_MAP)
         if goal is None:
             return ""
-        found = await self._ready.check(goal)
+        found = await self._navigator.check(goal)
         offset = f"; {found.offset}" if found.offset else ""
         return f"on the way, {found.length_m:.1f} m{offset}"
-
-    @property
-    def _ready(self) -> "Navigator":
-        assert self._navigator
-        return self._navigator
 
     @property
     def _waits(self) -> WaitReason | None:
@@ -306,6 +366,15 @@ class GoalServer(InputSource):
         while True:
             self._tasks.publish_starting()
             await self._bus.clock.sleep_ns(STARTING_STATUS_NS)
+
+
+def _roaming(config: NavigationConfig) -> AvoidConfig:
+    """Return settings for driving without a map, within the speed limit."""
+    slow = AvoidConfig(turn="clearer")
+    limit = config.max_linear_speed
+    return (
+        slow if limit is None else replace(slow, max_linear_speed=min(slow.max_linear_speed, limit))
+    )
 
 
 class TopicCache:

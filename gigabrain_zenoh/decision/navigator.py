@@ -57,9 +57,11 @@ ANY_BODY = BodyDescription(
 class Navigator:
     """Drives one robot by its map."""
 
-    def __init__(self, config: NavigationConfig, bus: Bus, behaviour: str) -> None:
+    def __init__(
+        self, config: NavigationConfig, bus: Bus, source: ContextSource, behaviour: str
+    ) -> None:
         self._bus, self._config, self._behaviour = bus, config, behaviour
-        self._source = ContextSource(bus)
+        self._source = source  # which its owner feeds with states
         self._routes = RouteSchedule(config, bus)
         self._context: NavigationContext | None = None
         self._boot = 0
@@ -74,10 +76,6 @@ class Navigator:
         self._config, self._routes.inflation = config, config.inflation
         if self._local and self._body:
             self._local.configure(self._body, _local_settings(config, self._body))
-
-    def observe(self, state: RobotState) -> None:
-        """Record a robot state; to be called with every state."""
-        self._source.observe(state)
 
     def at_scan(
         self, state: RobotState, world: WorldModel | None, verdict: SafetyState | None

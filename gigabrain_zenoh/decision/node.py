@@ -1,5 +1,6 @@
 """Decision node: steps the configured behaviour once per world model, and publishes intents."""
 
+import asyncio
 import logging
 from collections.abc import Callable
 from typing import Any
@@ -32,8 +33,11 @@ RENAMED_PARAMS = {  # by behaviour; removed in 0.3, like the words in config/ren
 class InputSource:
     """Steps a behaviour with its inputs: here the world model and the odometry alone."""
 
-    async def warm_up(self) -> None:
-        """Prepare everything that takes long, before anything drives."""
+    async def prepare(self) -> None:
+        """Prepare what must be there before the first step."""
+
+    async def finish_preparing(self) -> None:
+        """Return once everything is prepared that takes long. Raises what fails in it."""
 
     def configure(self, config: Any) -> None:
         """Use other settings from now on."""
@@ -121,10 +125,10 @@ async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> No
     """Publish an intent at once for each world, and repeat it at each state."""
     source = input_source(config, bus)
     try:
-        await source.warm_up()
+        await source.prepare()
         _serve(config, bus, source)
         ready()
-        await bus.failed
+        await asyncio.gather(bus.failed, source.finish_preparing())
     finally:
         await source.close()
 
@@ -140,7 +144,7 @@ def input_source(config: DecisionConfig, bus: Bus) -> InputSource:
         raise ConfigError(
             f"behaviour {config.behaviour} needs {error.name}; pip install 'gigabrain-zenoh[nav]'"
         ) from None
-    return GoalServer(settings, bus, config.behaviour, state_dir=config.state_dir)
+    return GoalServer(settings, bus, config)
 
 
 def _serve(config: DecisionConfig, bus: Bus, source: InputSource) -> None:

@@ -26,6 +26,13 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True):
     half_track: float = 0.0  # [m], from its middle to a wheel
 
 
+class SentCommand(msgspec.Struct, frozen=True):
+    """A command sent to the body."""
+
+    tick: int  # from which on it holds
+    velocity: Velocity
+
+
 def limits_of(body: BodyDescription) -> Limits:
     """Return the limits of `body`."""
     return Limits(

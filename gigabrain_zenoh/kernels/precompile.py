@@ -1,4 +1,4 @@
-"""Compiles kernels before the robot drives, in a child process where the result can be kept.
+"""Compiles kernels before a process uses them, in a child process where the result can be kept.
 
 A compiler leaves some 200 MB behind in its process.
 """
@@ -13,10 +13,71 @@ from collections.abc import Awaitable
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.host.this_process import join_in
+from gigabrain_zenoh.host.threads import InTime, Job
 from gigabrain_zenoh.plugins import find
 
 log = logging.getLogger(__name__)
 QUIET_S = 5.0  # of compiling, before it is logged
+LAST_NICE = 19  # gets what the robot leaves of the processors
+
+
+class Kernels:
+    """All kernels that the function at "module:name" calls, for a process that can work meanwhile.
+
+    Whether a scan already has them goes through `in_time`, so that a replay has them at the same
+    scan.
+    """
+
+    def __init__(self, warm_up: str, in_time: InTime) -> None:
+        self._warm_up, self._in_time = warm_up, in_time
+        self._job: Job = Job()
+        self._loading: asyncio.Future[None] | None = None
+        self._loaded = False
+        self.beside = False  # whether the process has worked without them
+
+    async def load(self, *, wait: bool) -> None:
+        """Load them. Where they are still to be compiled, return at once unless `wait`.
+
+        Raises ConfigError if a package for them is not installed.
+        """
+        try:
+            self.beside = not wait and await asyncio.to_thread(_is_missing, self._warm_up)
+        except ModuleNotFoundError as error:
+            raise missing_package(error) from None
+        if self.beside:
+            self._loading = asyncio.ensure_future(self._compile_beside())
+        else:
+            await ensure_compiled(self._warm_up)
+            self._job.set_result(None)
+
+    async def finish(self) -> None:
+        """Return once they are loaded. Raises ConfigError as above."""
+        if self._loading:
+            await self._loading
+
+    async def close(self) -> None:
+        """Stop compiling."""
+        if self._loading:
+            self._loading.cancel()
+            await asyncio.wait((self._loading,))
+
+    @property
+    def loaded(self) -> bool:
+        """Whether they can be used from the present scan on."""
+        self._loaded = self._loaded or self._in_time(self._job, 0.0)
+        return self._loaded
+
+    async def _compile_beside(self) -> None:
+        join_in()
+        data = {"event": "compiling"}
+        log.info("compiling, once per installation; works meanwhile", extra={"data": data})
+        await compile_in_child(self._warm_up, step_aside=True)
+        try:
+            await asyncio.to_thread(_call, self._warm_up)
+        except ModuleNotFoundError as error:
+            raise missing_package(error) from None
+        self._job.set_result(None)
+        log.info("compiled", extra={"data": {"event": "compiled"}})
 
 
 async def ensure_compiled(warm_up: str) -> None:
@@ -62,14 +123,15 @@ async def _log_if_slow(work: Awaitable[object]) -> None:
         compiling.cancel()
 
 
-async def compile_in_child(warm_up: str) -> int:
-    """Compile in a child process, and return its exit code."""
+async def compile_in_child(warm_up: str, *, step_aside: bool = False) -> int:
+    """Compile in a child process, and return its exit code; with `step_aside` others go first."""
     paths = os.pathsep.join(path for path in sys.path if path)
     child = await asyncio.create_subprocess_exec(
         *(sys.executable, "-P", "-m"),  # -P: nothing is imported from the current folder
         __name__,
         warm_up,
         str(os.getpid()),
+        *(("aside",) if step_aside else ()),
         env={**os.environ, "PYTHONPATH": paths},
         stdin=asyncio.subprocess.DEVNULL,
         stdout=asyncio.subprocess.DEVNULL,
@@ -100,4 +162,6 @@ def compile_all(warm_up: str) -> None:
 
 if __name__ == "__main__":
     this_process.die_with_parent(int(sys.argv[2]))
+    if sys.argv[3:]:
+        os.nice(LAST_NICE)
     compile_all(sys.argv[1])

@@ -184,6 +184,7 @@ class Demo:
         with view:
             while not (stop.is_set() or self._supervisor.given_up or self._over(watch)):
                 view.show()
+                watch.note_start_times()
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(stop.wait(), LOOK_S)
                 self._look_at_capacity(watch, view)
@@ -202,7 +203,7 @@ class Demo:
     def _look_at_capacity(self, watch: RunMonitor, view: DemoView) -> None:
         """Report once that this machine is too small; in lock-step, time may wait for the brain."""
         capacity, known = self._capacity, self._capacity.problem
-        if self._starting or self._deployment.speed != 1.0:
+        if self._starting or self._compiling or self._deployment.speed != 1.0:
             capacity.restart()
             return
         capacity.compare(asyncio.get_running_loop().time(), watch.seconds, held=watch.held_by_load)
@@ -275,6 +276,7 @@ class Demo:
             restarts=sum(status.restarts for status in statuses.values()),
             mapped_m2=watch.mapped_m2,
             tasks=watch.task.current,
+            start=watch.start_times,
             problem=watch.problem,
             rejected=sum(int(report.get("rejected_messages") or 0) for report in answers.values()),
         )
@@ -290,6 +292,8 @@ class Demo:
             self._decisions.append(decided)
         if event == "compiling":
             self._compiling.add(str(record["process"]))
+        if event == "compiled":
+            self._compiling.discard(str(record["process"]))
         if event == "failed":
             self._refusal = str(record.get("text", ""))
         if event in ("given up", "died"):

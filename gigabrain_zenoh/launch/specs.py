@@ -117,4 +117,6 @@ def _settings(
     settings: dict[str, Any] = msgspec.to_builtins(made)
     if "state_dir" in settings:
         settings["state_dir"] = str(place.state_dir)
+    if deployment.speed != 1.0 and "compile_first" in settings:  # time waits in lock-step
+        settings["compile_first"] = True
     return settings

@@ -12,6 +12,7 @@ from gigabrain_schemas.base import TICK_S, Fraction, Pose, Positive, Velocity
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import ActuationModel, Obstacle, TrajectoryPoint
 from gigabrain_schemas.tasks import Goal
+from gigabrain_zenoh.geometry.limits import SentCommand
 from gigabrain_zenoh.navigation import dynamic_obstacles
 from gigabrain_zenoh.navigation.cost import Scene, Weights, cost_to_go_at
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
@@ -76,13 +77,6 @@ def weights_of(settings: LocalSettings, base: Weights = STANDARD) -> Weights:
         tight_speed=base.tight_speed * factor,
         tight_rate=base.tight_rate * factor,
     )
-
-
-class SentCommand(Struct, frozen=True):
-    """A command sent to the body."""
-
-    tick: int  # from which on it holds
-    velocity: Velocity
 
 
 def no_points() -> Floats:

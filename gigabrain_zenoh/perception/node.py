@@ -1,9 +1,10 @@
 """Perception node: turns each scan into a world model, and checks whether the scan is plausible."""
 
+import asyncio
 import math
 from collections.abc import Callable
-from contextlib import closing
-from functools import lru_cache
+from contextlib import AsyncExitStack, closing
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,7 +20,7 @@ from gigabrain_zenoh.bus.bus import Bus, Latest
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.geometry.pose import PlacedScans
 from gigabrain_zenoh.geometry.scan import EDGE, blind_ahead, hits, scan_problem
-from gigabrain_zenoh.kernels.precompile import ensure_compiled
+from gigabrain_zenoh.kernels.precompile import Kernels
 from gigabrain_zenoh.perception.obstacle_tracker import ObstacleTracker
 from gigabrain_zenoh.runtime.heartbeat import Progress
 
@@ -108,18 +109,39 @@ async def run(config: PerceptionConfig, bus: Bus, ready: Callable[[], None]) -> 
         ready()
         await bus.failed
         return
-    await ensure_compiled(MAP_KERNELS if config.mapping == "slam" else LOCALIZE_KERNELS)
-    from gigabrain_zenoh.perception.mapper import Mapper  # imports numba: for maps only
+    maps = config.mapping == "slam"
+    kernels = Kernels(MAP_KERNELS if maps else LOCALIZE_KERNELS, bus.input_log.in_time)
+    # a saved map is checked before anything drives by it
+    await kernels.load(wait=config.compile_first or bool(config.map) or not bus.input_log.live)
+    async with AsyncExitStack() as stack:
+        stack.push_async_callback(kernels.close)
 
-    with closing(Mapper(config, bus, body)) as mapper:
-        _follow(config, bus, body, mapper)
+        @cache
+        def mapper() -> "Mapper":
+            from gigabrain_zenoh.perception.mapper import Mapper  # imports numba: for maps only
+
+            return stack.enter_context(closing(Mapper(config, bus, body)))
+
+        if not kernels.beside:
+            mapper()
+        _follow(config, bus, body, kernels, mapper)
         ready()
-        await bus.failed
+        await asyncio.gather(bus.failed, kernels.finish())
 
 
-def _follow(config: PerceptionConfig, bus: Bus, body: Latest[Body], mapper: "Mapper") -> None:
-    """Publish world models with obstacles placed by odometry; then pass each scan to the mapper."""
+def _follow(
+    config: PerceptionConfig,
+    bus: Bus,
+    body: Latest[Body],
+    kernels: Kernels,
+    make_mapper: "Callable[[], Mapper]",
+) -> None:
+    """Publish world models with obstacles placed by odometry; then pass each scan to the mapper.
+
+    The mapper begins at the first state that finds its kernels loaded.
+    """
     tracker = ObstacleTracker()
+    mapper: Mapper | None = None
 
     def on_scan(scan: LaserScan, pose: Pose | None) -> None:
         if body.current:
@@ -127,12 +149,21 @@ def _follow(config: PerceptionConfig, bus: Bus, body: Latest[Body], mapper: "Map
             world = step(config, description, scan)
             world = tracker.add_obstacles(world, description.lidar, scan, pose)
             bus.publish(WORLD, world, basis=scan.basis)
-            mapper.process_scan(scan, world.scan_problem)
+            if mapper:
+                mapper.process_scan(scan, world.scan_problem)
 
     def on_state(state: RobotState) -> None:
-        mapper.add_state(state)
+        nonlocal mapper
+        if mapper is None and kernels.loaded:
+            mapper = make_mapper()
+        if mapper:
+            mapper.add_state(state)
         placed.state(state)
 
-    placed = PlacedScans(on_scan, lambda scan: mapper.skip_future_scan(scan, bus.time.tick))
+    def skip(scan: LaserScan) -> None:
+        if mapper:
+            mapper.skip_future_scan(scan, bus.time.tick)
+
+    placed = PlacedScans(on_scan, skip)
     bus.latest(STATE, on_state)
     bus.latest(SCAN, placed.scan)

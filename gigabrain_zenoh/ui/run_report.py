@@ -2,10 +2,12 @@
 
 import asyncio
 import contextlib
+import time
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
-from msgspec import Struct
+import psutil
+from msgspec import Struct, structs
 
 from gigabrain_schemas.base import TICK_S, Message
 from gigabrain_schemas.body import RobotState
@@ -30,13 +32,24 @@ M = TypeVar("M", bound=Message)
 
 UNKNOWN_CELL = b"\xff"
 ASK_S, ASK_PAUSE_S = 1.0, 0.1  # timeout of one query, and pause before the next
+STARTED_S = psutil.Process().create_time()
 MIN_DISTANCE_M = 0.05  # a shorter distance counts as no motion
+
+
+class StartTimes(Struct, frozen=True, kw_only=True):
+    """Seconds of wall time since the command was started; None for what has not happened."""
+
+    state_s: float | None = None  # first state of the body
+    motion_s: float | None = None  # MIN_DISTANCE_M driven
+    metre_s: float | None = None  # the first metre driven
+    path_s: float | None = None  # first path planned in the robot's own map
 
 
 class RunMonitor(RobotView):
     """Newest messages of a robot, and the distance that it has driven."""
 
     def __init__(self, bus: Bus) -> None:
+        self.start_times = StartTimes()
         self.distance_m = 0.0  # by odometry
         self.turns = 0  # turns on the spot that the brain decided on
         self._turning = False
@@ -70,6 +83,20 @@ class RunMonitor(RobotView):
         if grid is None:
             return None
         return (len(grid.cells) - grid.cells.count(UNKNOWN_CELL)) * grid.resolution**2
+
+    def note_start_times(self) -> None:
+        """Note what has happened since the last call."""
+        task = self.task.current
+        happened = {
+            "state_s": self.state.newest is not None,
+            "motion_s": self.distance_m >= MIN_DISTANCE_M,
+            "metre_s": self.distance_m >= 1.0,
+            "path_s": task is not None and task.path != (),
+        }
+        known = {name for name in happened if getattr(self.start_times, name) is not None}
+        now_s = round(time.time() - STARTED_S, 2)
+        new = {name: now_s for name, there in happened.items() if there and name not in known}
+        self.start_times = structs.replace(self.start_times, **new)
 
     @property
     def held_by_load(self) -> bool:
@@ -135,6 +162,7 @@ class Observed(Struct, frozen=True, kw_only=True):
     problem: str = ""  # why the run could not be watched to its end
     mapped_m2: float | None = None  # None unless a map is built
     tasks: TaskStatus | None = None  # None where no process has tasks
+    start: StartTimes = StartTimes()
     answered: bool = True  # the driver answered the final request for its report
 
 
@@ -163,6 +191,7 @@ class Report(Struct, frozen=True, kw_only=True):
     decisions: tuple[tuple[float, str], ...]  # simulated time [s] and the decision in words
     mapped_m2: float | None = None  # area of the map known to be free or occupied
     tasks_done: int = 0  # among the last 16 that ended: goals reached and missions completed
+    start: StartTimes = StartTimes()
     verdict: str  # "ok", or the faults in words
 
     @property
@@ -194,6 +223,7 @@ def make_report(truth: Mapping[str, Any], seen: Observed) -> Report:
         decisions=seen.decisions,
         mapped_m2=None if seen.mapped_m2 is None else round(seen.mapped_m2, 1),
         tasks_done=_succeeded(seen.tasks),
+        start=seen.start,
         verdict=_verdict(distance, contacts or 0, seen),
     )
 

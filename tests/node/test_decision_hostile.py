@@ -8,8 +8,7 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.tasks import GoalRequest
 from gigabrain_schemas.topics import BODY, CMD_VEL, GOAL
 from gigabrain_zenoh import codec
-from gigabrain_zenoh.decision.behaviours import NavigationConfig
-from gigabrain_zenoh.decision.navigator import Navigator
+from gigabrain_zenoh.decision.context import ContextSource
 from gigabrain_zenoh.qa.faults.hostile import chosen_extremes
 from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.samples import body, state
@@ -19,18 +18,17 @@ from tests.node.plane import ROOM, Plane, as_map, drawn
 
 async def test_the_brains_own_commands_count_as_the_gate_lets_them_through() -> None:
     net = Net()
-    navigator = Navigator(NavigationConfig(), net.two, "navigate")
+    source = ContextSource(net.two)
     for bus in (net.one, net.two):
         bus.time.observe(state(10))
     net.one.publish(BODY, body())
     await settle()
-    navigator.observe(state(10))
+    source.observe(state(10))
     net.one.publish(CMD_VEL, CmdVel(linear_x=90.0, angular_z=-90.0, source="control"))
     net.one.publish(CMD_VEL, CmdVel(linear_x=-90.0, source="stranger"))
     await settle()
-    navigator.observe(state(11))
-    context = navigator.at_scan(state(11), None, None)
-    navigator.close()
+    source.observe(state(11))
+    context = source.at_scan(state(11), None, None)
     assert [(one.tick, one.velocity) for one in context.sent] == [
         (10, Velocity(linear_x=0.26, angular_z=-1.82))
     ]

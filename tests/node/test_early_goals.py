@@ -12,10 +12,10 @@ from gigabrain_schemas.topics import GOAL, INTENT, MISSION, TASK
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.cli.task import progress
 from gigabrain_zenoh.config.settings import DecisionConfig
-from gigabrain_zenoh.decision import goal_server
 from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.decision.behaviours import WaitReason
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.kernels import precompile
 from gigabrain_zenoh.kernels.precompile import ensure_compiled
 from gigabrain_zenoh.testing.in_memory import NodeBench
 from tests.node.plane import ROOM, Plane, drawn
@@ -33,7 +33,7 @@ async def test_a_goal_is_taken_while_decision_still_gets_ready(
         await warm.wait()
         await ensure_compiled(warm_up)
 
-    monkeypatch.setattr(goal_server, "ensure_compiled", compiled_later)
+    monkeypatch.setattr(precompile, "ensure_compiled", compiled_later)
     told: list[TaskStatus] = []
     async with NodeBench(functools.partial(decision.run, NAVIGATE)) as bench:
         operator = Bus(bench.network.transport(), bench.clock, "operator")
@@ -98,7 +98,7 @@ async def test_what_is_missing_is_named_with_what_to_install(
 SERVES = """
 import sys
 import gigabrain_zenoh.decision.goal_server
-print(*(name for name in ("numpy", "numba", "cv2", "scipy") if name in sys.modules))
+print(*(name for name in ("numba", "gtsam", "scipy") if name in sys.modules))
 """
 
 

@@ -11,8 +11,8 @@ from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.tasks import GoalRequest
 from gigabrain_schemas.topics import GOAL, MAP
 from gigabrain_zenoh.decision import route_schedule
-from gigabrain_zenoh.decision.behaviours import NavigationConfig
-from gigabrain_zenoh.decision.navigator import NO_ROUTE, Navigator
+from gigabrain_zenoh.decision.context import ContextSource
+from gigabrain_zenoh.decision.navigator import NO_ROUTE
 from gigabrain_zenoh.decision.route import Route, RoutePlanner, RouteRequest
 from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.samples import BOOT, state
@@ -123,18 +123,17 @@ async def test_a_plan_for_a_huge_map_does_not_delay_the_first_one_for_the_real_m
 
 async def test_it_plans_with_the_place_and_the_speed_of_the_scan_however_late_that_is() -> None:
     net = Net()
-    navigator = Navigator(NavigationConfig(), net.one, "navigate")
+    source = ContextSource(net.one)
     states = [state(tick, v=0.01 * tick, pose=(0.1 * tick, 0.0, 0.0)) for tick in range(1, 8)]
     for one in states:
-        navigator.observe(one)
+        source.observe(one)
     seen = WorldModel(scan_ok=True, obstacle_ahead=False, boot=BOOT, tick=5, basis=5)
-    now = navigator.at_scan(states[-1], seen, None)
+    now = source.at_scan(states[-1], seen, None)
     assert (now.pose.x, now.velocity.linear_x) == (0.5, 0.05)
     assert now.late_ticks == 2
     assert now.may_reverse
     caps = SpeedCaps(backward=0.0)
-    held = navigator.at_scan(states[-1], seen, SafetyState(verdict="slow", caps=caps))
+    held = source.at_scan(states[-1], seen, SafetyState(verdict="slow", caps=caps))
     assert not held.may_reverse
-    navigator.close()
     await net.one.close()
     await net.two.close()

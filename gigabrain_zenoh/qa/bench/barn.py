@@ -27,15 +27,10 @@ from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.decision.actuation_model import ActuationEstimator
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate.gate import BRAIN
-from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of, ramp
+from gigabrain_zenoh.geometry.limits import ZERO, SentCommand, clamp, limits_of, ramp
 from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.navigation import local_planner
-from gigabrain_zenoh.navigation.local_planner import (
-    LocalPlanner,
-    LocalSettings,
-    PlanRequest,
-    SentCommand,
-)
+from gigabrain_zenoh.navigation.local_planner import LocalPlanner, LocalSettings, PlanRequest
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.perception.obstacle_tracker import ObstacleTracker
 from gigabrain_zenoh.qa.bench.barn_course import (
