@@ -121,8 +121,8 @@ def _holonomic(planned: Velocity, error: Pose) -> Velocity:
 
 
 def _within_turning_circle(body: BodyDescription, wish: Velocity) -> Velocity:
-    """Limit a car's turn rate to its tightest curve: full speed with the largest yaw rate."""
+    """Limit a car's turn rate to its tightest curve."""
     if body.drive_type != "ackermann":
         return wish
-    most = abs(wish.linear_x) * body.max_angular_speed / body.max_linear_speed
+    most = abs(wish.linear_x) / body.turning_radius
     return Velocity(linear_x=wish.linear_x, angular_z=max(-most, min(most, wish.angular_z)))

@@ -37,7 +37,7 @@ from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.geometry.pose import compose, inverse
 from gigabrain_zenoh.geometry.se2 import from_pose, transform
-from gigabrain_zenoh.navigation import global_planner, local_planner
+from gigabrain_zenoh.navigation import car_planner, global_planner, local_planner
 from gigabrain_zenoh.navigation.costmap import inflation
 from gigabrain_zenoh.navigation.global_planner import Unreachable
 from gigabrain_zenoh.navigation.local_planner import DEFAULTS, LocalSettings
@@ -189,6 +189,8 @@ class Navigator:
         assert context.world
         to_odom = inverse(context.map_from_odom)
         there = compose(to_odom, Pose(x=goal.x, y=goal.y, yaw=goal.yaw or 0.0))
+        turned, headings = np.array((to_odom.yaw, 0.0)), route.headings
+        headings = None if headings is None else headings + turned
         moment = local_planner.PlanRequest(
             tick=context.tick,
             pose=context.pose,
@@ -196,6 +198,7 @@ class Navigator:
             goal=Goal(x=there.x, y=there.y, yaw=None if goal.yaw is None else there.yaw),
             hits=context.world.points().astype(np.float64),
             path=transform(from_pose(to_odom), points),
+            headings=headings,
             obstacles=context.world.obstacles,
             response=context.actuation,
             sent=context.sent,
@@ -337,4 +340,5 @@ def _thinned(points: Floats) -> tuple[tuple[float, float], ...]:
 def warm_up() -> None:
     """Call every kernel of planning and driving once, so that it is compiled."""
     global_planner.warm_up()
+    car_planner.warm_up()
     local_planner.warm_up(ANY_BODY)

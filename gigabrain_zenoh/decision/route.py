@@ -15,8 +15,9 @@ from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.decision.behaviours import DriveCommand
 from gigabrain_zenoh.decision.give_way import GiveWay
 from gigabrain_zenoh.navigation.costmap import Costmap, Unknown, costmap, inflation
-from gigabrain_zenoh.navigation.global_planner import GlobalPlanner, Path, Unreachable, frontiers
+from gigabrain_zenoh.navigation.global_planner import Path, Unreachable, frontiers
 from gigabrain_zenoh.navigation.local_planner import LocalSettings
+from gigabrain_zenoh.navigation.path_planner import PathPlanner
 
 GIVE_UP_TICKS = 1500  # 30 s of driving without progress
 NO_PROGRESS = "no progress for 30 s"
@@ -87,6 +88,7 @@ class Route:
     version: int  # changes with the destination
     goal: Goal | None = None
     points: Floats | None = None  # (n, 2) [m] in the map
+    headings: Floats | None = None  # (n, 2), of a car, see navigation.global_planner.Path
     state: Literal["running", "done", "failed"] = "running"
     reason: str = ""  # for people
     activity: str = ""  # of a temporary destination, at which the command is not done
@@ -130,7 +132,7 @@ class RoutePlanner:
     """Plans routes for one command after the other. Not thread-safe."""
 
     def __init__(self, unknown_space: Unknown = "avoid") -> None:
-        self._planner, self._unknown_space = GlobalPlanner(), unknown_space
+        self._planner, self._unknown_space = PathPlanner(), unknown_space
         self._costmap: Costmap | None = None
         self._costmap_key: tuple[object, ...] = ()
         self._blocking: Floats = np.empty((0, 2))  # hits that blocked a route
@@ -161,11 +163,12 @@ class RoutePlanner:
         """Return the length of the path to a goal, or why there is none."""
         rules = inflation(body, self._unknown_space)
         costs = costmap(self._enlarged(grid, goal), rules, before=None)
-        start, planner = (here.x, here.y), GlobalPlanner()
-        found, offset = planner.plan(costs, start, (goal.x, goal.y)), ""
+        planner = PathPlanner()
+        found, offset = planner.plan(costs, body, here, goal), ""
         if isinstance(found, Unreachable) and found.nearest and found.distance <= ARRIVED_M:
             offset = _offset(found)
-            found = planner.plan(costs, start, found.nearest)
+            x, y = found.nearest
+            found = planner.plan(costs, body, here, Goal(x=x, y=y, yaw=goal.yaw))
         if isinstance(found, Unreachable):
             return found
         return PathCheck(length_m=float(found.remaining[0]), offset=offset)
@@ -211,7 +214,7 @@ class RoutePlanner:
     def _to_goal(self, goal: Goal, request: RouteRequest, costs: Costmap) -> Route:
         first, requested = self._goal is None, goal
         goal, offset = self._settled or (goal, "")
-        found = self._find(goal, request.here, costs)
+        found = self._find(goal, request, costs)
         away = None if first else self._giving_way(goal, request, costs)
         if away:
             return away
@@ -219,7 +222,7 @@ class RoutePlanner:
         if isinstance(found, Unreachable) and found.nearest and found.distance <= near:
             offset = _offset(found)
             goal = Goal(x=found.nearest[0], y=found.nearest[1], yaw=goal.yaw)
-            found = self._planner.plan(costs, (request.here.x, request.here.y), found.nearest)
+            found = self._planner.plan(costs, request.body, request.here, goal)
         if isinstance(found, Unreachable):
             if first or self._progress.stuck(request.tick, GIVE_UP_TICKS):
                 return self._route(state="failed", reason=found.reason)
@@ -260,19 +263,18 @@ class RoutePlanner:
             self._progress, self._last_path = ProgressMonitor(request.tick), None
             self._version += 1
         place = self._give_way.place
-        way = self._planner.plan(costs, here, (place.x, place.y)) if place else None
+        way = self._planner.plan(costs, request.body, request.here, place) if place else None
         if place is None or not isinstance(way, Path):
             return None
         return self._go(place, way, "the goal is occupied", "giving way")
 
     def _approach(self, found: Unreachable, request: RouteRequest, costs: Costmap) -> Route:
         """Return a route to the nearest reachable place, to see whether the goal is free again."""
-        here, nearest = (request.here.x, request.here.y), found.nearest
-        way = self._planner.plan(costs, here, nearest) if nearest else None
-        if nearest is None or not isinstance(way, Path):
+        place = Goal(x=found.nearest[0], y=found.nearest[1]) if found.nearest else None
+        way = self._planner.plan(costs, request.body, request.here, place) if place else None
+        if place is None or not isinstance(way, Path):
             return self._route(reason=found.reason)
-        x, y = nearest
-        return self._go(Goal(x=x, y=y), way, found.fault, "checking whether the goal is free")
+        return self._go(place, way, found.fault, "checking whether the goal is free")
 
     def _explore(self, request: RouteRequest, costs: Costmap) -> Route:
         """Return a route to the best frontier."""
@@ -291,7 +293,7 @@ class RoutePlanner:
                 and math.hypot(goal.x - self._goal.x, goal.y - self._goal.y) > SAME_FRONTIER_M
             ):
                 self._drop_frontier(request.tick)
-            found = self._find(goal, request.here, costs)
+            found = self._find(goal, request, costs)
             if isinstance(found, Path):
                 self._progress.measure(float(found.remaining[0]), request.tick)
                 return self._go(goal, found)
@@ -321,12 +323,12 @@ class RoutePlanner:
                 best = same
         return Goal(x=best.x, y=best.y)
 
-    def _find(self, goal: Goal, here: Pose, costs: Costmap) -> Path | Unreachable:
-        start, end = (here.x, here.y), (goal.x, goal.y)
+    def _find(self, goal: Goal, request: RouteRequest, costs: Costmap) -> Path | Unreachable:
+        here, body = request.here, request.body
         if self._path is None or goal != self._goal:
-            found = self._planner.plan(costs, start, end)
+            found = self._planner.plan(costs, body, here, goal)
         else:
-            found = self._planner.replan(costs, start, end, self._path)
+            found = self._planner.replan(costs, body, here, goal, self._path)
         self._goal = goal
         self._path = found if isinstance(found, Path) else None
         return found
@@ -337,13 +339,16 @@ class RoutePlanner:
         self._version += 1
 
     def _go(self, goal: Goal, path: Path, reason: str = "", activity: str = "") -> Route:
-        return self._route(goal=goal, points=path.points, reason=reason, activity=activity)
+        points, headings = path.points, path.headings
+        return self._route(
+            goal=goal, points=points, headings=headings, reason=reason, activity=activity
+        )
 
     def _route(self, **fields: Any) -> Route:
         return Route(number=self._number, version=self._version, **fields)
 
 
-def _random_place(request: RouteRequest, costs: Costmap, planner: GlobalPlanner) -> Goal:
+def _random_place(request: RouteRequest, costs: Costmap, planner: PathPlanner) -> Goal:
     """Return a random reachable place away from obstacles; the robot's own if there is none."""
     start, here = costs.cell(request.here.x, request.here.y), request.here
     if start is not None:

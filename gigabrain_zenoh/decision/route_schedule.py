@@ -79,7 +79,8 @@ class RouteSchedule:
             slowed_by=context.slowed_by,
         )
         self._held_ticks = 0
-        if cells <= SMALL_MAP_CELLS:
+        car = context.body.drive_type == "ackermann"  # poses take longer to plan than places
+        if cells <= SMALL_MAP_CELLS and not car:
             self.route = self._planner.plan(request)
         else:
             self._worker.start(lambda: self._plan(request), scans)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import NONE, lean_kernel
+from gigabrain_zenoh.navigation.car_track import no_track, way_left
 from gigabrain_zenoh.navigation.footprint import (
     ROOM,
     STRETCH,
@@ -69,6 +70,7 @@ class Scene(NamedTuple):
     goal_yaw: float  # [rad]; nan where any will do
     tolerance: float  # [m]
     yaw_tolerance: float  # [rad]
+    track: Floats = no_track()  # (n, 4), that a car follows, see car_track
 
 
 class Weights(NamedTuple):
@@ -193,8 +195,10 @@ def braking_cost(problem: Problem, room: float, motion: MotionState) -> float:
 
 
 @lean_kernel
-def rest(model: MotionModel, scene: Scene, x: float, y: float) -> float:
-    """Return the cost of the way from (x, y) to the goal."""
+def rest(model: MotionModel, scene: Scene, x: float, y: float, yaw: float) -> float:
+    """Return the cost of the way from a pose to the goal; the yaw counts for a car alone."""
+    if len(scene.track) > 0:
+        return SECOND * way_left(scene.track, model.radius, x, y, yaw) / model.forward
     away = math.hypot(x - scene.goal_x, y - scene.goal_y)
     way = away if away < NEAR_GOAL else cost_to_go_at(scene.field, x, y)
     return SECOND * way / model.forward
@@ -218,9 +222,11 @@ def terminal_cost(problem: Problem, motion: MotionState) -> float:
     """
     model, weights, scene = problem.model, problem.weights, problem.scene
     (x, y, cosine, sine), yaw, vx, vy = motion.at, motion.yaw, motion.vx, motion.vy
-    cost = rest(model, scene, x, y)
+    cost = rest(model, scene, x, y, yaw)
     dx, dy = scene.goal_x - x, scene.goal_y - y
     near = math.hypot(dx, dy) < NEAR_GOAL
+    if len(scene.track) > 0:
+        return cost + (0.5 * SECOND * abs(vx) / model.forward if near else 0.0)
     if not math.isnan(scene.goal_yaw):
         arrives = yaw if near else math.atan2(dy, dx)
         cost += SECOND * _turn_between(arrives, scene.goal_yaw) / model.turning
@@ -380,10 +386,11 @@ def price(problem: Problem, rooms: Floats, states: Floats, lane: int, limit: flo
             slack = room - AT_EASE
         away = one[AWAY + lane]
         if room < least:
-            cost += _contact_cost(t / steps) + rest(model, scene, x, y)
+            cost += _contact_cost(t / steps) + rest(model, scene, x, y, motion.yaw)
             return cost + IMPACT * math.hypot(vx, vy)
         if away < least_disc:
-            return cost + disc_contact_cost(weights, t * dt, t / steps) + rest(model, scene, x, y)
+            left = rest(model, scene, x, y, motion.yaw)
+            return cost + disc_contact_cost(weights, t * dt, t / steps) + left
         cost += dt * one[CLOSE + lane]
         cost += dt * place_cost(weights, scene, room, away, motion)
         cost += dt * motion_cost(weights, room, vx, vy, motion.w)
@@ -417,7 +424,7 @@ def _lower_bounds(
         one = states[t]
         middle, struck = one[MIDDLE + lane], one[AWAY + lane] < least[1]
         if middle < may or struck:
-            left = spent + rest(model, scene, one[X + lane], one[Y + lane])
+            left = spent + rest(model, scene, one[X + lane], one[Y + lane], one[YAW + lane])
             if middle < may:
                 touching = min(touching, left + _contact_cost(t / steps))
             if struck:

@@ -37,6 +37,8 @@ class Path:
     points: Floats  # (n, 2) [m], from where the robot is to the goal
     remaining: Floats  # (n,) [m] from each to the goal
     cost: Floats  # (n,) the same, weighted: metres in the open
+    headings: Floats | None = None
+    # (n, 2), of a car: its heading [rad], and 1 where it drives on to there, -1 where it reverses
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +71,7 @@ class GlobalPlanner:
         begin, end = costmap.cell(*start), costmap.cell(*goal)
         if begin is None:
             return Unreachable(fault="the robot is outside the map")
-        fault = _goal_problem(costmap, goal)
+        fault = goal_problem(costmap, goal)
         if fault or end is None:
             self.search.reach(costmap.cost, begin)
             return self._nearest(costmap, goal, fault)
@@ -151,7 +153,7 @@ def warm_up() -> None:
     frontiers(now, (0.1, 0.1), (), GridSearch())
 
 
-def _goal_problem(costmap: Costmap, goal: Point) -> str:
+def goal_problem(costmap: Costmap, goal: Point) -> str:
     """Return why the body cannot be at a goal, or an empty text."""
     cell = costmap.cell(*goal)
     if cell is None:

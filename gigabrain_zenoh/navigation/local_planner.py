@@ -14,6 +14,7 @@ from gigabrain_schemas.brain import ActuationModel, Obstacle, TrajectoryPoint
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.geometry.limits import SentCommand
 from gigabrain_zenoh.navigation import dynamic_obstacles
+from gigabrain_zenoh.navigation.car_track import no_track, track_of
 from gigabrain_zenoh.navigation.cost import Scene, Weights, cost_to_go_at
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
 from gigabrain_zenoh.navigation.footprint import Placement, clearance, outline_of
@@ -94,6 +95,7 @@ class PlanRequest:
     goal: Goal
     hits: Floats  # (n, 2) [m], in the body's frame
     path: Floats | None = None  # (k, 2) [m], to the goal; without one it looks for its own
+    headings: Floats | None = None  # (k, 2), of a car's path, see `Path`
     known: Floats = field(default_factory=no_points)  # (m, 2) [m], obstacles of the map near by
     obstacles: tuple[Obstacle, ...] = ()
     response: ActuationModel = field(default_factory=ActuationModel)
@@ -246,7 +248,7 @@ class LocalPlanner:
         if looks_round:
             if weights is self._weights or dynamic_obstacles.stay_clear(discs, place.x, place.y):
                 return _standing("waiting: it looks round for what moves")
-            moment = replace(moment, goal=Goal(x=place.x, y=place.y), path=None)
+            moment = replace(moment, goal=Goal(x=place.x, y=place.y), path=None, headings=None)
         scene = self._scene(moment, discs)
         model = delayed_model(self._model, moment.delayed)
         planned = self._sampler.plan(
@@ -285,7 +287,16 @@ class LocalPlanner:
         field = self._costs.field(grid, self._half_width, (goal.x, goal.y), moment.path, ways)
         yaw = math.nan if goal.yaw is None else goal.yaw
         near, turned = self._settings.position_tolerance, self._settings.yaw_tolerance
-        return Scene(grid, field, discs, goal.x, goal.y, yaw, near, turned)
+        return Scene(grid, field, discs, goal.x, goal.y, yaw, near, turned, self._track(moment))
+
+    def _track(self, moment: PlanRequest) -> Floats:
+        """Return what a car follows; other bodies go by the cost to go alone."""
+        if moment.path is None or moment.headings is None:
+            return no_track()
+        pose = moment.pose
+        return track_of(
+            moment.path, moment.headings, (pose.x, pose.y, pose.yaw), self._model.radius
+        )
 
     def _start(self, moment: PlanRequest, place: Pose2D) -> InitialState:
         v, sent, dt = moment.velocity, moment.sent, self._sampler.dt

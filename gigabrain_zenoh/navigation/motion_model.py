@@ -48,8 +48,6 @@ def model_of(
     """Return the model of `body`, driven no faster than `speed` [m/s].
 
     Below an `aggressiveness` of 0.5, to 0, it gains speed ever more gently.
-
-    A car's tightest turn is its largest yaw rate at full speed.
     """
     fastest = body.max_linear_speed if speed is None else min(speed, body.max_linear_speed)
     eager = min(1.0, 2.0 * aggressiveness)
@@ -63,7 +61,7 @@ def model_of(
         acceleration=gain * body.max_linear_acceleration,
         deceleration=ACCELERATION_RESERVE * body.max_linear_deceleration,
         angular_acceleration=gain * body.max_angular_acceleration,
-        radius=body.max_linear_speed / body.max_angular_speed if car else 0.0,
+        radius=body.turning_radius,
         reaction_time=body.thresholds.reaction_time,
         margin=body.thresholds.stop_margin,
         side_margin=body.thresholds.side_margin,

@@ -194,6 +194,8 @@ class BodyDescription(Record, frozen=True, kw_only=True):
     # [m], left to right; of omni wheels, to the next one
     max_rim_speed: SpeedLimit | None = None
     # [m/s], of a wheel of a differential base; None: it has its largest speeds both at once
+    min_turning_radius: Annotated[float, Meta(ge=0.0, le=100.0)] = 0.0
+    # [m], of an Ackermann base; 0: max_linear_speed / max_angular_speed
     lidar: Lidar | None = None
     thresholds: Thresholds = DEFAULT
     control: ControlGains = ControlGains()
@@ -221,6 +223,13 @@ class BodyDescription(Record, frozen=True, kw_only=True):
                 f"max_linear_speed: it takes {needs:.2f} m to stop from it, "
                 f"and the lidar sees no farther than {self.lidar.range_max:g} m"
             )
+
+    @property
+    def turning_radius(self) -> float:
+        """The radius of the tightest turn [m]; 0 for bodies that turn on the spot."""
+        if self.drive_type != "ackermann":
+            return 0.0
+        return self.min_turning_radius or self.max_linear_speed / self.max_angular_speed
 
     def stopping_distance(self, speed: float) -> float:
         """Return L(v) = v T + v² / 2a + margin [m], the free length needed at `speed` [m/s]."""

@@ -243,7 +243,7 @@ def _wheels(robot: RobotFile, options: MujocoOptions) -> dict[str, Any]:
     assert base
     fastest = Twist(robot.max_linear_speed, robot.max_lateral_speed, robot.max_angular_speed)
     if isinstance(base, Ackermann):
-        steering = math.atan(robot.wheel_base * fastest.angular_z / fastest.linear_x)
+        steering = math.atan(robot.wheel_base / robot.turning_radius)
         car = replace(base, max_steering=steering)
         base = AckermannAxles(car, robot.wheel_separation)
     speeds = base.to_wheels(fastest)

@@ -1,0 +1,52 @@
+"""The path that a car follows: what is left of it from any pose near it."""
+
+import math
+
+import numpy as np
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.kernels.jit import lean_kernel
+
+AHEAD_M = 4.0  # [m] of path that count; what is left behind that is added
+REVERSE_WEIGHT = 1.5  # of a metre in reverse, where one forwards is 1
+OFF_WEIGHT = 2.5  # [m] of path for each metre off it: a car gets back to it by a longer way
+TURN_WEIGHT = 1.5  # [m] of path for each metre of the arc by which it is turned
+
+
+def no_track() -> Floats:
+    """Return the track of bodies that follow none."""
+    return np.empty((0, 4))
+
+
+def track_of(
+    path: Floats, headings: Floats, pose: tuple[float, float, float], radius: float
+) -> Floats:
+    """Return the track (n, 4) along a path: x, y [m], yaw [rad] and what is left [m].
+
+    `path` (k, 2) [m] and `headings` (k, 2), see `Path`; it begins at the pose of the path that is
+    nearest to the car's.
+    """
+    turn = headings[:, 0] - pose[2]
+    turn -= math.tau * np.floor(turn / math.tau + 0.5)
+    off = np.hypot(path[:, 0] - pose[0], path[:, 1] - pose[1]) + radius * np.abs(turn)
+    first = min(int(off.argmin()), len(path) - 1)
+    steps = np.hypot(*np.diff(path[first:], axis=0).T)
+    gone = np.concatenate(([0.0], np.cumsum(steps)))
+    counts = np.where(headings[first + 1 :, 1] < 0.0, REVERSE_WEIGHT * steps, steps)
+    left = np.append(np.cumsum(counts[::-1])[::-1], 0.0)
+    count = max(1, int(np.searchsorted(gone, AHEAD_M)))
+    rest = slice(first, first + count)
+    return np.column_stack((path[rest], headings[rest, 0], left[:count]))
+
+
+@lean_kernel
+def way_left(track: Floats, radius: float, x: float, y: float, yaw: float) -> float:
+    """Return what is left [m] from a pose, by way of the best pose of the track."""
+    least = math.inf
+    for n in range(len(track)):
+        dx, dy = track[n, 0] - x, track[n, 1] - y
+        turn = (track[n, 2] - yaw) / math.tau
+        turn = math.tau * abs(turn - math.floor(turn + 0.5))
+        off = OFF_WEIGHT * math.sqrt(dx * dx + dy * dy) + TURN_WEIGHT * radius * turn
+        least = min(least, track[n, 3] + off)
+    return least

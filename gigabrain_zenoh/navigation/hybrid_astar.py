@@ -1,0 +1,299 @@
+"""Hybrid A*: paths of a car from pose to pose, with its turning radius and in reverse.
+
+Dolgov, Thrun, Montemerlo and Diebel, Practical search techniques in path planning for autonomous
+driving, 2008. Nodes are poses, one for each bin of place and heading; they are left by arcs of
+constant curvature, and by a Reeds-Shepp path to the goal where that is free.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.kernels.jit import kernel, lean_kernel
+from gigabrain_zenoh.navigation.costmap import Costs
+from gigabrain_zenoh.navigation.reeds_shepp import SEGMENTS, TINY, along, best_word
+
+BIN_M, HEADINGS = 0.1, 72  # bins of place [m] and heading
+STEP_M = 0.2  # [m], of an arc: it leaves its bin of place
+SAMPLE_M = 0.05  # [m], between poses that are looked at, and in the result
+BENDS = (-1.0, -0.5, 0.0, 0.5, 1.0)  # of an arc, in units of the tightest
+REVERSE_COST = 1.5  # of a metre, where one forwards costs 1
+SWITCH_COST = 0.4  # [m], of a change of direction
+BEND_COST = 0.05  # [m], of changing from straight to the tightest turn
+EXPAND_M = 1.0  # from the goal a Reeds-Shepp path is tried at every node; farther off more seldom
+PATIENCE = 3000  # nodes after a way to the goal is known, until it is taken
+MAX_NODES = 1 << 17
+TABLE = 1 << 19  # of nodes, by their bin
+SHOT = len(BENDS) * 2  # the move of a node that a Reeds-Shepp path led to
+ROOT = -1
+GOAL_HEADINGS = 16  # tried, where any heading will do
+LEAVE_M = 0.5  # [m] round start and goal, where less room than usual may have to do
+Ints = NDArray[np.int64]
+Singles = NDArray[np.float32]
+Pose = tuple[float, float, float]  # x, y [m], yaw [rad]
+
+
+class Car(NamedTuple):
+    """What a car needs: discs along its middle line that cover it, and its tightest turn."""
+
+    radius: float  # [m], of the tightest turn
+    first: float  # [m], from the origin to the middle of the first disc
+    spacing: float  # [m], between them
+    discs: int
+    room: float  # [m], from their middles to an obstacle
+    middle: float  # [m], from the origin to the body's middle
+
+
+class Terrain(NamedTuple):
+    """Where a car may be, by cells of a map."""
+
+    distance: Singles  # (h, w) [m], to the nearest obstacle
+    cost: Costs  # (h, w), of a metre
+    to_go: Floats  # (h, w) [m at cost 1], from each cell to the goal; inf where none leads there
+    resolution: float  # [m]
+    origin_x: float  # [m]
+    origin_y: float
+
+
+class Nodes(NamedTuple):
+    """Memory of a search."""
+
+    pose: Floats  # (n, 3)
+    g: Floats  # (n,), cost so far [m]
+    link: Ints  # (n, 3): parent, move, and whether it is closed
+    table: Ints  # (TABLE, 2): bin, node
+    heap: Floats  # (2 n, 2): f, node
+
+
+def nodes() -> Nodes:
+    """Return the memory of a search."""
+    return Nodes(
+        np.empty((MAX_NODES, 3)),
+        np.empty(MAX_NODES),
+        np.empty((MAX_NODES, 3), np.int64),
+        np.empty((TABLE, 2), np.int64),
+        np.empty((4 * MAX_NODES, 2)),
+    )
+
+
+@lean_kernel
+def _cell(terrain: Terrain, x: float, y: float) -> tuple[int, int, bool]:
+    """Return row and column at (x, y), and whether they are inside."""
+    row = math.floor((y - terrain.origin_y) / terrain.resolution)
+    column = math.floor((x - terrain.origin_x) / terrain.resolution)
+    rows, columns = terrain.distance.shape
+    inside = row >= 0 and row < rows and column >= 0 and column < columns
+    return row, column, inside
+
+
+@lean_kernel
+def room_at(terrain: Terrain, car: Car, x: float, y: float, yaw: float) -> float:
+    """Return the distance [m] of the nearest of the car's discs' middles to an obstacle.
+
+    It is -1 where one of them is outside the map.
+    """
+    cosine, sine, least = math.cos(yaw), math.sin(yaw), math.inf
+    for n in range(car.discs):
+        ahead = car.first + n * car.spacing
+        row, column, inside = _cell(terrain, x + ahead * cosine, y + ahead * sine)
+        if not inside:
+            return -1.0
+        least = min(least, float(terrain.distance[row, column]))
+    return least
+
+
+@lean_kernel
+def _cost_at(terrain: Terrain, car: Car, x: float, y: float, yaw: float) -> float:
+    row, column, inside = _cell(
+        terrain, x + car.middle * math.cos(yaw), y + car.middle * math.sin(yaw)
+    )
+    return float(terrain.cost[row, column]) if inside else math.inf
+
+
+@lean_kernel
+def drive(
+    terrain: Terrain, car: Car, start: Pose, bend: float, length: float, needs: Floats
+) -> tuple[float, float, float, float]:
+    """Return the pose after an arc, and its cost; inf where the car does not fit.
+
+    `needs` (3, 3): the place of start and goal, and the room near them [m]; that elsewhere, last.
+    """
+    count = max(1, math.ceil(abs(length) / SAMPLE_M))
+    step, cost = length / count, 0.0
+    x, y, yaw = start
+    for _ in range(count):
+        x, y, yaw = along(x, y, yaw, bend, step)
+        needed = needs[2, 2]
+        for end in range(2):
+            if math.hypot(x - needs[end, 0], y - needs[end, 1]) < LEAVE_M:
+                needed = min(needed, needs[end, 2])
+        if room_at(terrain, car, x, y, yaw) < needed:
+            return x, y, yaw, math.inf
+        cost += abs(step) * _cost_at(terrain, car, x, y, yaw)
+    return x, y, yaw, cost if length > 0.0 else REVERSE_COST * cost
+
+
+@lean_kernel
+def _bin(terrain: Terrain, x: float, y: float, yaw: float) -> int:
+    column = int((x - terrain.origin_x) / BIN_M)
+    row = int((y - terrain.origin_y) / BIN_M)
+    turn = yaw / math.tau
+    heading = int((turn - math.floor(turn)) * HEADINGS) % HEADINGS
+    return (row * 100_000 + column) * HEADINGS + heading
+
+
+@lean_kernel
+def _slot(table: Ints, key: int) -> int:
+    """Return the slot of a bin, or the free one where it would be."""
+    slot = (key * 2654435761) % TABLE
+    while table[slot, 0] != key and table[slot, 0] != -1:
+        slot = (slot + 1) % TABLE
+    return slot
+
+
+@lean_kernel
+def _push(heap: Floats, size: int, f: float, node: int) -> None:
+    at = size
+    while at > 0:
+        up = (at - 1) // 2
+        if heap[up, 0] <= f:
+            break
+        heap[at, 0], heap[at, 1] = heap[up, 0], heap[up, 1]
+        at = up
+    heap[at, 0], heap[at, 1] = f, node
+
+
+@lean_kernel
+def _pop(heap: Floats, size: int) -> int:
+    """Take the best of `size` entries away, and return its node."""
+    top, last = int(heap[0, 1]), size - 1
+    f, node, at = heap[last, 0], heap[last, 1], 0
+    while True:
+        down = 2 * at + 1
+        if down >= last:
+            break
+        if down + 1 < last and heap[down + 1, 0] < heap[down, 0]:
+            down += 1
+        if heap[down, 0] >= f:
+            break
+        heap[at, 0], heap[at, 1] = heap[down, 0], heap[down, 1]
+        at = down
+    heap[at, 0], heap[at, 1] = f, node
+    return top
+
+
+@kernel
+def _to_goal(
+    terrain: Terrain, car: Car, pose: Pose, goal: Pose, needs: Floats, lengths: Floats,
+    turns: Floats,
+) -> tuple[float, float]:  # fmt: skip
+    """Fill in the Reeds-Shepp word to the goal; return its cost, and the heading at its end.
+
+    The cost is inf where the word is not free. With a goal of any heading, the cheapest is taken.
+    """
+    x, y, yaw = pose
+    cosine, sine, any_yaw = math.cos(yaw), math.sin(yaw), math.isnan(goal[2])
+    dx, dy = (goal[0] - x) / car.radius, (goal[1] - y) / car.radius
+    there_x, there_y = cosine * dx + sine * dy, cosine * dy - sine * dx
+    prices = (REVERSE_COST, SWITCH_COST / car.radius)
+    least, best, tried = math.inf, goal[2], GOAL_HEADINGS if any_yaw else 1
+    for n in range(tried):
+        to_yaw = yaw + n * math.tau / GOAL_HEADINGS if any_yaw else goal[2]
+        cost = best_word(there_x, there_y, to_yaw - yaw, prices, lengths, turns)
+        if cost < least:
+            least, best = cost, to_yaw
+    if any_yaw:
+        best_word(there_x, there_y, best - yaw, prices, lengths, turns)
+    total, before = 0.0, 0.0
+    for n in range(SEGMENTS):
+        if abs(lengths[n]) < TINY:
+            continue
+        length, bend = lengths[n] * car.radius, turns[n] / car.radius
+        x, y, yaw, cost = drive(terrain, car, (x, y, yaw), bend, length, needs)
+        total += cost + (SWITCH_COST if before * length < 0.0 else 0.0)
+        before = length
+        if total == math.inf:
+            break
+    return total, best
+
+
+@lean_kernel
+def _estimate(terrain: Terrain, car: Car, pose: Pose, goal: Pose) -> float:
+    """Return the cost to the goal as if the car could turn on the spot."""
+    row, column, inside = _cell(terrain, pose[0], pose[1])
+    straight = math.hypot(goal[0] - pose[0], goal[1] - pose[1])
+    if not inside or terrain.to_go[row, column] == math.inf:
+        return straight
+    turn = 0.0
+    if not math.isnan(goal[2]):
+        off = (goal[2] - pose[2]) / math.tau
+        turn = car.radius * math.tau * abs(off - math.floor(off + 0.5))
+    return max(float(terrain.to_go[row, column]), straight, turn)
+
+
+@kernel
+def search(
+    terrain: Terrain, car: Car, start: Pose, goal: Pose, needs: Floats, memory: Nodes
+) -> int:
+    """Return the node at the goal, with links back to the start; ROOT if no way leads there."""
+    pose, g, link, table, heap = memory
+    lengths, turns = np.empty(SEGMENTS), np.empty(SEGMENTS)
+    table[:, 0] = -1
+    count, size, found, patience = 1, 1, ROOT, PATIENCE
+    pose[0, 0], pose[0, 1], pose[0, 2] = start
+    g[0], link[0, 0], link[0, 1], link[0, 2] = 0.0, ROOT, ROOT, 0
+    slot = _slot(table, _bin(terrain, start[0], start[1], start[2]))
+    table[slot, 0], table[slot, 1] = _bin(terrain, start[0], start[1], start[2]), 0
+    _push(heap, 0, _estimate(terrain, car, start, goal), 0)
+    while size > 0 and count < MAX_NODES - 2 * len(BENDS) - 1 and size < len(heap) - 32:
+        node = _pop(heap, size)
+        size -= 1
+        if link[node, 1] == SHOT:
+            return node
+        if link[node, 2]:
+            continue
+        link[node, 2] = 1
+        if found != ROOT:
+            patience -= 1
+            if patience == 0:
+                return found
+        here = (pose[node, 0], pose[node, 1], pose[node, 2])
+        left, move = _estimate(terrain, car, here, goal), link[node, 1]
+        if node % max(1, int(left / EXPAND_M)) == 0:
+            shot, to_yaw = _to_goal(terrain, car, here, goal, needs, lengths, turns)
+            total = g[node] + shot
+            first = 0.0
+            for n in range(SEGMENTS):
+                first = lengths[n] if first == 0.0 and abs(lengths[n]) > TINY else first
+            if move >= 0 and (first < 0.0) != (move >= len(BENDS)):
+                total += SWITCH_COST
+            if total < math.inf and (found == ROOT or total < g[found]):
+                pose[count, 0], pose[count, 1], pose[count, 2] = goal[0], goal[1], to_yaw
+                g[count], link[count, 0], link[count, 1], link[count, 2] = total, node, SHOT, 0
+                _push(heap, size, total, count)
+                found, count, size = count, count + 1, size + 1
+        for to in range(2 * len(BENDS)):
+            share, reverse = BENDS[to % len(BENDS)], to >= len(BENDS)
+            length = -STEP_M if reverse else STEP_M
+            x, y, yaw, cost = drive(terrain, car, here, share / car.radius, length, needs)
+            if cost == math.inf:
+                continue
+            if move >= 0:
+                cost += SWITCH_COST if reverse != (move >= len(BENDS)) else 0.0
+                cost += BEND_COST * abs(share - BENDS[move % len(BENDS)])
+            key = _bin(terrain, x, y, yaw)
+            slot = _slot(table, key)
+            other, total = table[slot, 1], g[node] + cost
+            if table[slot, 0] == key and (link[other, 2] or g[other] <= total):
+                continue
+            pose[count, 0], pose[count, 1], pose[count, 2] = x, y, yaw
+            g[count], link[count, 0], link[count, 1], link[count, 2] = total, node, to, 0
+            if table[slot, 0] == key:
+                link[other, 2] = 1  # this one is cheaper
+            table[slot, 0], table[slot, 1] = key, count
+            _push(heap, size, total + _estimate(terrain, car, (x, y, yaw), goal), count)
+            count, size = count + 1, size + 1
+    return found

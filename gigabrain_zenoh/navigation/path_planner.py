@@ -1,0 +1,44 @@
+"""Plans paths for any body: over cells for bodies that turn on the spot, over poses for cars."""
+
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.body import BodyDescription
+from gigabrain_schemas.tasks import Goal
+from gigabrain_zenoh.navigation.car_planner import CarPlanner
+from gigabrain_zenoh.navigation.costmap import Costmap
+from gigabrain_zenoh.navigation.global_planner import GlobalPlanner, Path, Unreachable
+from gigabrain_zenoh.navigation.grid_search import GridSearch
+
+
+class PathPlanner:
+    """Plans with the same memory again and again. Not for two threads at once."""
+
+    def __init__(self) -> None:
+        self._cells = GlobalPlanner()
+        self._car: CarPlanner | None = None
+
+    @property
+    def search(self) -> GridSearch:
+        """The search over cells, whatever the body."""
+        return self._cells.search
+
+    def plan(
+        self, costmap: Costmap, body: BodyDescription, here: Pose, goal: Goal
+    ) -> Path | Unreachable:
+        """Return the cheapest path to a goal, or why there is none."""
+        if body.drive_type == "ackermann":
+            return self._planner_of_cars().plan(costmap, body, here, goal)
+        return self._cells.plan(costmap, (here.x, here.y), (goal.x, goal.y))
+
+    def replan(
+        self, costmap: Costmap, body: BodyDescription, here: Pose, goal: Goal, path: Path
+    ) -> Path | Unreachable:
+        """Return the rest of `path` to the same goal if that still will do; or a new path."""
+        if body.drive_type != "ackermann":
+            return self._cells.replan(costmap, (here.x, here.y), (goal.x, goal.y), path)
+        if path.headings is None:
+            return self._planner_of_cars().plan(costmap, body, here, goal)
+        return self._planner_of_cars().replan(costmap, body, here, goal, path)
+
+    def _planner_of_cars(self) -> CarPlanner:
+        self._car = self._car or CarPlanner()  # its memory is some 30 MB
+        return self._car
