@@ -282,7 +282,7 @@ def setup(process: str, run_dir: Path | None, *, json_console: bool, level: str 
     """
     if level not in LEVELS:
         raise errors.unknown("log level", level, LEVELS)
-    sinks = [] if run_dir is None else [_file(process, run_dir)]
+    sinks = [] if run_dir is None else [file_sink(process, run_dir)]
     console = _JsonFormatter(process) if json_console else _ReadableFormatter(process, _colour())
     sinks.append(QueuedHandler(logging.StreamHandler(sys.stderr), console, "console"))
     root = logging.getLogger()
@@ -304,7 +304,8 @@ def _sinks() -> list[QueuedHandler]:
     return [one for one in logging.getLogger().handlers if isinstance(one, QueuedHandler)]
 
 
-def _file(process: str, run_dir: Path) -> QueuedHandler:
+def file_sink(process: str, run_dir: Path) -> QueuedHandler:
+    """Return a handler that writes `<run_dir>/<process>.jsonl`. Raises ConfigError."""
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
         file = _File(run_dir / f"{process}.jsonl")

@@ -4,6 +4,7 @@ import asyncio
 import logging
 from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping
+from types import TracebackType
 from typing import Any, TypeVar
 
 import msgspec
@@ -69,6 +70,7 @@ class Bus:
         self.transport, self.clock, self.process = transport, clock, process
         self.time = RobotTime()
         self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._failed_at: tuple[BaseException | None, TracebackType | None] = None, None
         self.sent: Counter[str] = Counter()
         self.received: Counter[str] = Counter()
         self._rejections = Rejections(clock)
@@ -280,6 +282,13 @@ class Bus:
     def _fail(self, error: Exception) -> None:
         if not self.failed.done():
             self.failed.set_exception(error)
+            self._failed_at = error, error.__traceback__
+
+    def restore_traceback(self, error: BaseException) -> None:
+        """Give the exception of `failed` its own traceback, which a second `await` takes away."""
+        failed, traceback = self._failed_at
+        if error is failed:
+            error.__traceback__ = traceback
 
     def _keep(self, key: str, payload: bytes, encoding: str) -> None:
         first = key not in self._kept

@@ -131,7 +131,7 @@ def examine(machine: MachineFacts, robot: RobotFacts) -> list[Diagnosis]:
     checks = (
         _python(machine), _libraries(machine), _folders(machine), _serial(machine),
         _multicast(machine), _certificate(machine), _router(robot), _processes(robot),
-        _rates(robot), _clocks(robot), _load(robot),
+        _problems(robot), _rates(robot), _clocks(robot), _load(robot),
     )  # fmt: skip
     return list(itertools.chain.from_iterable(checks))
 
@@ -260,6 +260,12 @@ def _processes(robot: RobotFacts) -> Iterator[Diagnosis]:
     if len(versions) > 1:
         cure = "install the same version on all hosts"
         yield _bad("versions", f"the processes differ: {', '.join(sorted(versions))}", cure)
+
+
+def _problems(robot: RobotFacts) -> Iterator[Diagnosis]:
+    for process, health in robot.health.items():
+        for problem in health.problems:
+            yield _bad(process, problem.text, problem.remedy)
 
 
 def _rates(robot: RobotFacts) -> Iterator[Diagnosis]:

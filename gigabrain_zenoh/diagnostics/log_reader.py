@@ -39,7 +39,7 @@ class LogFilter(msgspec.Struct, frozen=True, kw_only=True):
     def accepts(self, line: Line) -> bool:
         """Return whether to show a line."""
         return (
-            self.process in ("", line["process"])
+            self.process in ("", line["process"], line.get("child"))  # as the supervisor saw it
             and LEVELS.index(line["level"]) >= LEVELS.index(self.level)
             and line["t"] >= self.since_ns
         )

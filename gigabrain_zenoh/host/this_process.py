@@ -5,6 +5,7 @@ A supervised process calls `die_with_supervisor` first, so this module imports n
 
 import contextlib
 import ctypes
+import faulthandler
 import os
 import signal
 import sys
@@ -13,6 +14,7 @@ import time
 from pathlib import Path
 
 SUPERVISOR_VARIABLE = "GIGABRAIN_SUPERVISOR"  # the supervisor puts its pid there
+STACK_SIGNAL = getattr(signal, "SIGUSR2", None)  # Windows has none
 _PR_SET_PDEATHSIG = 1  # prctl(2)
 
 
@@ -59,6 +61,12 @@ def _kill_on_parent_death() -> bool:
     return bool(
         libc.prctl(_PR_SET_PDEATHSIG, ctypes.c_ulong(signal.SIGKILL), zero, zero, zero) == 0
     )
+
+
+def show_stack_on_request() -> None:
+    """Have STACK_SIGNAL print where the main thread is, also while it hangs in Python code."""
+    if STACK_SIGNAL:
+        faulthandler.register(STACK_SIGNAL, all_threads=False)
 
 
 def _die() -> None:

@@ -24,6 +24,7 @@ from gigabrain_zenoh.host.signals import stop_signals
 from gigabrain_zenoh.launch.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.launch.merging import write_rows
 from gigabrain_zenoh.launch.specs import process_specs
+from gigabrain_zenoh.launch.supervisor_log import SupervisorLog
 from gigabrain_zenoh.launch.up import LIMIT_S, STOP_S
 from gigabrain_zenoh.runtime.running import announced
 from gigabrain_zenoh.runtime.supervisor import Supervisor
@@ -136,6 +137,7 @@ class Demo:
             self._run_dir / "state",
             seconds=options.seconds,
         )
+        self._log = SupervisorLog(self._run_dir)
         self._supervisor = Supervisor(specs, self._record, keep_stuck=options.keep_stuck)
         self._decisions: list[tuple[float, str]] = []
         self._failures: list[str] = []
@@ -164,6 +166,7 @@ class Demo:
                     await running
                     if closing:
                         await closing
+        self._log.close()
         return self._finish(report, stopped=stop.is_set())
 
     async def _join(self, stop: asyncio.Event) -> Bus | None:
@@ -284,6 +287,7 @@ class Demo:
 
     def _record(self, _name: str, record: Mapping[str, Any]) -> None:
         """Process a log record of a process."""
+        self._log.add(record)
         event, level = record.get("event"), record.get("level")
         if event == "decision":
             decided = round(record["tick"] * TICK_S, 2), str(record["reason"])

@@ -202,6 +202,7 @@ async def _work(
                 tasks.create_task(_failure(bus))
                 tasks.create_task(_node(bus, node, process_type))
         except Exception as error:  # noqa: BLE001 - logged while the bus still takes it
+            bus.restore_traceback(_first(error))
             raise _ReportedError(_report(error)) from None
         finally:
             logging.getLogger().removeHandler(handler)

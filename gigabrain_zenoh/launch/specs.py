@@ -61,6 +61,7 @@ def process_specs(
                 argv=(*COMMAND, msgspec.json.encode(process).decode()),
                 after=after,
                 beats=True,
+                shows_stack=True,
                 stop_last=row.stop_last,
                 optional=row.own,
                 ready_timeout_s=soon_s if after else LATER_S,

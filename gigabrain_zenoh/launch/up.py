@@ -24,6 +24,7 @@ from gigabrain_zenoh.launch.deployment import (
 from gigabrain_zenoh.launch.merging import write_rows
 from gigabrain_zenoh.launch.own_processes import check_installed
 from gigabrain_zenoh.launch.specs import process_specs
+from gigabrain_zenoh.launch.supervisor_log import SupervisorLog
 from gigabrain_zenoh.runtime.running import announced
 from gigabrain_zenoh.runtime.supervisor import Supervisor
 
@@ -126,10 +127,12 @@ async def up(
     remembers = state_dir() / "robots" / label
     specs = process_specs(deployment, host, run_dir, remembers, level=level, file=file)
 
+    kept = SupervisorLog(run_dir)
     refusal, invalid = "", None  # error of a process, and the invalid value that it names
 
     def show(_name: str, record: Mapping[str, Any]) -> None:
         nonlocal refusal, invalid
+        kept.add(record)
         if record.get("event") == "failed":
             record = dict(record)
             invalid = record.pop("value", None)
@@ -153,6 +156,7 @@ async def up(
             notifier.stopping()
             await supervisor.stop(STOP_S)
             await running
+            kept.close()
             if supervisor.misconfigured:
                 raise ConfigError(refusal, value=invalid)
             if lost := ROUTERS & set(supervisor.given_up):

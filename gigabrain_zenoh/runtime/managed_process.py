@@ -54,6 +54,7 @@ class RestartPolicy:
 
 
 _DRAIN_S = 0.2  # what a dead child has written arrives at once; someone else may hold its pipe
+_STACK_S = 0.2  # how long a stuck process has to print where it is
 _REAP_S = 0.2  # a killed process ends at once, unless the kernel waits for a device
 
 
@@ -123,6 +124,12 @@ class Child(asyncio.SubprocessProtocol):
         if not self._ended.is_set():
             self._signal_group(number)
 
+    def show_stack(self) -> None:
+        """Have the process print where it is; see `this_process.show_stack_on_request`."""
+        if this_process.STACK_SIGNAL and not self._ended.is_set():
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.kill(self.pid, this_process.STACK_SIGNAL)
+
     def _signal_group(self, number: int) -> None:
         # macOS answers EPERM where Linux answers ESRCH for a group that is gone
         with contextlib.suppress(ProcessLookupError, PermissionError):
@@ -162,6 +169,7 @@ class ProcessSpec:
     ready_timeout_s: float = 10.0
     stop_last: bool = False  # what the others need in order to end well, such as the router
     optional: bool = False  # the robot goes on without it, also where its settings are wrong
+    shows_stack: bool = False  # prints where it is on `this_process.STACK_SIGNAL`
     beats: bool = False  # reports progress once a second, and is killed without it
 
 
@@ -279,7 +287,16 @@ class ManagedProcess:
             limit_s = heartbeat.STALL_S
             self._report("error", "stuck", f"has made no progress for {limit_s:g} s and {what}")
             if not self._shared.keep_stuck:
-                self.child.send_signal(signal.SIGKILL)
+                self._kill_stuck(self.child)
+
+    def _kill_stuck(self, child: Child) -> None:
+        """Kill a process that hangs; it first prints where."""
+        if not self.spec.shows_stack:
+            child.send_signal(signal.SIGKILL)
+            return
+        child.show_stack()
+        later = asyncio.get_running_loop().call_later
+        later(_STACK_S, child.send_signal, signal.SIGKILL)
 
     def _handle_record(self, record: dict[str, Any]) -> None:
         if record["event"] == heartbeat.EVENT:

@@ -23,6 +23,7 @@ from gigabrain_zenoh.bus.zenoh.session import log_to_stdout
 from gigabrain_zenoh.config.settings import RelayConfig, RouterConfig
 from gigabrain_zenoh.host.posix import fcntl, resource
 from gigabrain_zenoh.runtime.audit import AuditTrail
+from gigabrain_zenoh.runtime.process_watch import ProcessWatch
 from gigabrain_zenoh.runtime.running import SOCKET
 from gigabrain_zenoh.security.identity_files import identity_in
 
@@ -34,9 +35,10 @@ FLUSH_NS = 1_000_000_000
 async def run(config: RouterConfig, bus: Bus, ready: Callable[[], None]) -> None:
     """Run access control, if keys are configured; the session itself does the routing."""
     _make_room()
+    watch = ProcessWatch(bus, config.watches)
     if not config.knows:
         ready()
-        await bus.failed
+        await _keep(bus, watch.look)
         return
     trail = AuditTrail(bus, Path(config.state_dir))
     access = AccessAudit(trail, config.knows)
@@ -44,14 +46,16 @@ async def run(config: RouterConfig, bus: Bus, ready: Callable[[], None]) -> None
         with zenoh_log(access.note_denial):
             bus.links(access.note_link)
             ready()
-            await _keep(bus, trail)
+            await _keep(bus, watch.look, trail.flush)
     finally:
         await trail.close()
 
 
-async def _keep(bus: Bus, trail: AuditTrail) -> None:
+async def _keep(bus: Bus, *work: Callable[[], object]) -> None:
+    """Do `work` once a second until the bus fails."""
     async for _ in bus.clock.every(FLUSH_NS):
-        trail.flush()
+        for do in work:
+            do()
         if bus.failed.done():
             bus.failed.result()
 

@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
+from gigabrain_schemas.base import Cause
 from gigabrain_schemas.examples import example
 from gigabrain_schemas.requests import Description
 from gigabrain_schemas.safety import Health
@@ -39,6 +40,7 @@ MACHINE = MachineFacts(
 
 def health(name: str, **other: Any) -> Health:
     told = replace(example(Health), process=name, sent_hz=SENT[name], rejected={}, cpu=0.03)
+    told = replace(told, problems=())
     return replace(told, **other)
 
 
@@ -55,6 +57,13 @@ EXPIRED = Certificate(folder="keys/red", problem="identity.crt expired on 2026-0
 
 def found(machine: MachineFacts = MACHINE, robot: RobotFacts = ROBOT) -> list[Diagnosis]:
     return [one for one in examine(machine, robot) if one.grade != "ok"]
+
+
+def test_what_a_process_reports_is_found_with_its_cure() -> None:
+    problem = Cause(code="process_silent", text="mine died of KeyError", remedy="read its log")
+    robot = replace(ROBOT, health={"router": health("router", problems=(problem,))})
+    (one,) = [one for one in found(robot=robot) if one.cure == "read its log"]
+    assert (one.grade, one.about, one.text) == ("bad", "router", "mine died of KeyError")
 
 
 def test_a_healthy_machine_and_robot_have_only_good_results() -> None:

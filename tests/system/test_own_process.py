@@ -1,0 +1,245 @@
+"""A process of one's own that raises or hangs costs only itself, and is named everywhere."""
+
+import asyncio
+import os
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+
+from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.safety import Health, LogRecord
+from gigabrain_schemas.topics import HEALTH, LOG, STATE
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.runtime.connect import connect
+from gigabrain_zenoh.testing.processes import CommandProcess, Home, free_port
+from gigabrain_zenoh.testing.waiting import until
+
+SOURCE = '''"""Bad company: raises or hangs, as the file `how` says."""
+
+import time
+from pathlib import Path
+
+from msgspec import Struct
+
+
+class Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings."""
+
+    how: str
+
+
+def act(config):
+    how = Path(config.how)
+    while how.exists():
+        if how.read_text() == "raise":
+            raise ValueError("as asked")
+        time.sleep(0.05)
+
+
+async def run(config, bus, ready):
+    ready()
+    async for _ in bus.clock.every(50_000_000):
+        act(config)
+
+
+class Perceptor:
+    """The same, in each scan."""
+
+    Config = Config
+
+    def __init__(self, config):
+        self.config = config
+
+    def step(self, inputs):
+        act(self.config)
+        return ()
+
+
+class Behaviour:
+    """The same; else it drives."""
+
+    Config = Config
+    PARAMS = {}
+    DEMO = {}
+
+    def __init__(self, config):
+        self.config = config
+
+    def configure(self, config):
+        pass
+
+    def step(self, inputs):
+        from gigabrain_schemas.base import Velocity
+        from gigabrain_schemas.brain import Intent
+        from gigabrain_zenoh.decision.behaviours import StepOutcome
+
+        act(self.config)
+        intent = Intent(twist=Velocity(angular_z=0.3), behaviour="bad", reason="turning")
+        return intent, StepOutcome(activity="turning")
+'''
+ENTRY_POINTS = """[gigabrain.perceptors]
+bad = bad_company:Perceptor
+[gigabrain.behaviours]
+bad = bad_company:Behaviour
+"""
+
+
+class HomeWithPackage(Home):
+    """A user's folders, where the package is installed."""
+
+    def __init__(self, folder: Path, site: Path) -> None:
+        super().__init__(folder)
+        self._site = site
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """The environment of its processes."""
+        found = super().environment
+        return found | {"PYTHONPATH": f"{found['PYTHONPATH']}{os.pathsep}{self._site}"}
+
+
+class Robot:
+    """A running robot, and what was heard of it."""
+
+    def __init__(self, home: Home, bus: Bus, up: CommandProcess, how: Path) -> None:
+        self.home, self.bus, self.up, self.how = home, bus, up, how
+        self.states: list[RobotState] = []
+        self.health: dict[str, Health] = {}
+        self.log: list[LogRecord] = []
+        bus.subscribe(STATE, lambda _key, state: self.states.append(state))
+        bus.subscribe(HEALTH, lambda _key, one: self.health.update({one.process: one}))
+        bus.subscribe(LOG, lambda _key, one: self.log.append(one))
+
+    async def drives(self) -> None:
+        """Wait until it drives."""
+        await until(lambda: self.states and self.states[-1].gate.mode == "enabled", "it drives")
+        self.states.clear()
+
+    def others(self, name: str) -> set[int]:
+        """The pids of all processes but one."""
+        return set(self.home.processes()) - set(self.home.processes(name))
+
+    @property
+    def never_stopped(self) -> bool:
+        """Whether the gate let it drive all the time."""
+        return {state.gate.mode for state in self.states} == {"enabled"}
+
+    @property
+    def moves(self) -> bool:
+        """Whether it moves now, and may."""
+        now = self.states[-1]
+        return now.gate.mode == "enabled" and now.velocity.angular_z > 0.25
+
+    @property
+    def problems(self) -> str:
+        """What the router says of silent processes."""
+        router = self.health.get("router")
+        return "; ".join(one.text for one in router.problems) if router else ""
+
+
+@pytest.fixture
+async def start(tmp_path: Path) -> AsyncIterator[object]:
+    """Start a robot with these parts of a deployment file."""
+    site, how = tmp_path / "site", tmp_path / "how"
+    info = site / "bad_company-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: bad-company\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(ENTRY_POINTS)
+    (site / "bad_company.py").write_text(SOURCE)
+    home = HomeWithPackage(tmp_path / "home", site)
+    router = f"tcp/127.0.0.1:{free_port()}"
+    settings = {"how": str(how)}
+    parts: dict[str, object] = {
+        "mine": {"processes": {"mine": {"module": "bad_company", "settings": settings}}},
+        "bad": {"perceptors": {"bad": {"settings": settings}}},
+        "decision": {"decision": {"behaviour": "bad", "settings": settings}},
+    }
+    async with asyncio.timeout(120):
+        stack = []
+
+        async def begin(name: str) -> Robot:
+            file = home.deployment(
+                body="mock",
+                router=router,
+                resume="auto",
+                **parts[name],  # type: ignore[arg-type]
+            )
+            up = home.start("up", str(file))
+            session = connect(Endpoint(connect=(router,)), "test", timeout_s=None)
+            stack.append(session)
+            robot = Robot(home, await session.__aenter__(), up, how)
+            await robot.drives()
+            await until(lambda: home.processes(name), "it runs")
+            await until(lambda: name in robot.health, "it reports")
+            return robot
+
+        try:
+            yield begin
+        finally:
+            for session in stack:
+                await session.__aexit__(None, None, None)
+            home.close()
+
+
+@pytest.mark.parametrize("name", ["mine", "bad"])
+async def test_one_that_raises_is_named_and_restarted_and_the_robot_drives_on(
+    name: str, start: object
+) -> None:
+    robot = await start(name)  # type: ignore[operator]
+    others, before = robot.others(name), robot.home.processes(name)
+    robot.how.write_text("raise")
+    await until(lambda: [one for one in robot.log if one.event == "died"], "it is heard on the bus")
+    (died, *_) = [one for one in robot.log if one.event == "died"]
+    assert died.process == name
+    assert died.text == "died of ValueError: as asked, in bad_company.py:19"
+    robot.how.unlink()
+    await until(lambda: robot.home.processes(name) not in ([], before), "it is restarted")
+    assert robot.others(name) == others
+    assert robot.never_stopped
+
+
+@pytest.mark.parametrize("name", ["mine", "bad"])
+async def test_one_that_hangs_is_named_shows_where_and_the_robot_drives_on(
+    name: str, start: object
+) -> None:
+    robot = await start(name)  # type: ignore[operator]
+    others, before = robot.others(name), robot.home.processes(name)
+    robot.how.write_text("hang")
+    await until(lambda: f"{name} is silent" in robot.problems, "the router names it")
+    await until(lambda: f"{name} has made no progress for 5 s" in robot.up.out, "it is killed")
+    await until(lambda: 'bad_company.py", line' in robot.up.out, "where it hung is shown")
+    robot.how.unlink()
+    await until(lambda: robot.home.processes(name) not in ([], before), "it is restarted")
+    await until(lambda: not robot.problems, "it is well again")
+    assert robot.others(name) == others
+    assert robot.never_stopped
+    log = await robot.home.run("log", "--process", name)
+    assert f"{name} has made no progress for 5 s" in log.out
+
+
+async def test_one_that_always_raises_is_given_up_and_the_robot_drives_on(start: object) -> None:
+    robot = await start("mine")  # type: ignore[operator]
+    robot.how.write_text("raise")
+    await until(lambda: "is given up: 5 deaths" in robot.up.out, "it is given up")
+    await until(lambda: "mine died of ValueError: as asked" in robot.problems, "it is named")
+    assert robot.never_stopped
+    why = await robot.home.run("why")
+    assert "mine died of ValueError: as asked, in bad_company.py:19" in why.out
+
+
+@pytest.mark.parametrize("how", ["raise", "hang"])
+async def test_a_behaviour_that_fails_stops_the_robot_and_nothing_else(
+    how: str, start: object
+) -> None:
+    robot = await start("decision")  # type: ignore[operator]
+    others, before = robot.others("decision"), robot.home.processes("decision")
+    robot.how.write_text(how)
+    await until(lambda: robot.states and not robot.moves, "it stands")
+    named = "(behaviour 'bad')" if how == "raise" else 'bad_company.py", line'
+    await until(lambda: named in robot.up.out, "the behaviour is named")
+    robot.how.unlink()
+    await until(lambda: robot.home.processes("decision") not in ([], before), "it is restarted")
+    await until(lambda: robot.moves, "it drives again")
+    assert robot.others("decision") == others
