@@ -1,21 +1,16 @@
 """Runs the commands and programs of README.md and docs/: `python -m tests.qa.documentation`.
 
-A block of `sh` or `python` is run in a folder of its page, a line of `sh` at a time. An HTML
-comment before it changes that:
-
-    <!-- run: robot -->       beside a robot that drives
-    <!-- run: 5 s -->         each line is ended by Ctrl-C after 5 s
-    <!-- run: robot, 5 s -->  both
-    <!-- file: NAME -->       the block is such a file, for the blocks of the page
-    <!-- not run: REASON -->  it needs hardware, other hosts, hours, ...
-
-Blocks without a language, and of other languages, are output or a part of a file. Pages may be
-named behind the command. Ends with 1 where something fails.
+A block of `sh` or `python` is run in a folder of its page, a line of `sh` at a time; `blocks.py`
+says what a comment before a block changes. A line that ends in `&` runs until the end of its block.
+All pages share one robot. Other blocks are checked. Pages may be named behind the command. Prints
+how many blocks were run, and which need hardware; ends with 1 where something fails.
 """
 
 import contextlib
 import os
 import re
+import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -24,84 +19,52 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from tests.places import ROOT
+from tests.qa.blocks import RUN, Block, blocks, pages, problem
 
-BLOCK = re.compile(
-    r"^(?:<!-- (?P<mark>[^\n]*) -->\n)?```(?P<language>\w*)\n(?P<text>.*?)^```",
-    re.MULTILINE | re.DOTALL,
-)
 LINE_S = 180.0  # for a line or a program
 JUDGES = ("gigabrain why", "gigabrain doctor")  # their exit code says what is wrong
 USAGE, INTERRUPTED = 2, 130
 MODE = "gigabrain topic echo state -n 1 --fields gate.mode"
+Words = str | Sequence[str]
 
 
-class Block(NamedTuple):
-    """A fenced block of a page."""
-
-    line: int
-    language: str
-    text: str
-    verb: str  # "run", "not run", "file" or ""
-    value: str
-
-
-def blocks(page: Path) -> Iterator[Block]:
-    """Yield the blocks of a page with what their comments say."""
-    text = page.read_text("utf-8")
-    for found in BLOCK.finditer(text):
-        verb, _, value = (found["mark"] or "").partition(": ")
-        line = text.count("\n", 0, found.start("language")) + 1
-        verb = verb if verb in ("run", "not run", "file") else ""
-        yield Block(line, found["language"], found["text"], verb, value)
-
-
-class Place:
-    """The folder of a page, and a robot in it once one is asked for."""
+class Home:
+    """The folders of a user, and a robot in them once one is asked for."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        (folder / "deploy").symlink_to(ROOT / "deploy")
         self._robot: subprocess.Popen[bytes] | None = None
+        self._driven = False  # the robot has been enabled
 
-    @property
-    def _environment(self) -> dict[str, str]:
+    def environment(self, place: Path, robot: bool) -> dict[str, str]:
+        """Return the environment of a page in `place`; with `robot` it sees the robot."""
+        run = self.folder / "run" if robot else place / "run"
+        run.mkdir(exist_ok=True, mode=0o700)
         return os.environ | {
             "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+            "PYTHONPATH": str(place / "site"),
+            "XDG_RUNTIME_DIR": str(run),
             "XDG_STATE_HOME": str(self.folder / "state"),
-            "XDG_RUNTIME_DIR": str(self.folder / "run"),
             "XDG_DATA_HOME": str(self.folder / "data"),
             "XDG_CONFIG_HOME": str(self.folder / "config"),
         }
 
-    def start(
-        self, words: str | Sequence[str], out: int = subprocess.PIPE
-    ) -> subprocess.Popen[bytes]:
-        """Start a line of a shell, or a program, in a process group of its own."""
-        return subprocess.Popen(
-            words,
-            shell=isinstance(words, str),
-            executable="/bin/bash" if isinstance(words, str) else None,
-            cwd=self.folder,
-            env=self._environment,
-            stdin=subprocess.DEVNULL,
-            stdout=out,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
-
     def robot(self) -> None:
         """Start a robot, unless it runs, and wait until it may drive."""
-        if self._robot:
-            return
-        self._robot = self.start("exec gigabrain demo --headless", subprocess.DEVNULL)
+        environment = self.environment(self.folder, robot=True)
+        if not self._robot:
+            words = "exec gigabrain demo --headless --no-page"
+            self._robot = start(words, self.folder, environment, subprocess.DEVNULL)
         end_s = time.monotonic() + LINE_S
-        while b"enabled" not in self.start(MODE).communicate()[0]:
+        while b"enabled" not in start(MODE, self.folder, environment).communicate()[0]:
             if time.monotonic() > end_s:
                 raise TimeoutError("no robot drives")
+            if self._driven:  # a page has stopped it
+                start("gigabrain release; gigabrain enable", self.folder, environment).wait()
             time.sleep(0.5)
+        self._driven = True
 
     def close(self) -> None:
         """End the robot."""
@@ -110,9 +73,26 @@ class Place:
             self._robot.wait(60)
 
 
-def run(place: Place, words: str | Sequence[str], after_s: float) -> str:
+def start(
+    words: Words, folder: Path, environment: dict[str, str], out: int = subprocess.PIPE
+) -> subprocess.Popen[bytes]:
+    """Start a line of a shell, or a program, in a process group of its own."""
+    return subprocess.Popen(
+        words,
+        shell=isinstance(words, str),
+        executable="/bin/bash" if isinstance(words, str) else None,
+        cwd=folder,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=out,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,
+    )
+
+
+def run(words: Words, folder: Path, environment: dict[str, str], after_s: float) -> str:
     """Run something, to its end or until Ctrl-C; return what is wrong, or an empty text."""
-    process = place.start(words)
+    process = start(words, folder, environment)
     judges = isinstance(words, str) and words.startswith(JUDGES)
     good = {*range(INTERRUPTED)} - {USAGE} if judges else {0}
     try:
@@ -120,67 +100,114 @@ def run(place: Place, words: str | Sequence[str], after_s: float) -> str:
     except subprocess.TimeoutExpired:
         good = {0, INTERRUPTED} if after_s else set()
         os.killpg(process.pid, signal.SIGINT)
-        try:
-            out, _ = process.communicate(timeout=30)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            out, _ = process.communicate()
+        out = _end_of(process)
     if process.returncode in good and b"Traceback" not in out:
         return ""
     return f"exit code {process.returncode}\n{out.decode(errors='replace')[-1500:]}"
 
 
-def try_block(place: Place, block: Block) -> str:
+def _end_of(process: subprocess.Popen[bytes]) -> bytes:
+    try:
+        return process.communicate(timeout=30)[0]
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        return process.communicate()[0]
+
+
+def as_installed(line: str) -> str:
+    """Return a line of `pip install` that installs into the page's own folder, or only asks."""
+    words = shlex.split(line, comments=True)
+    if words[:2] != ["pip", "install"]:
+        return line
+    what = shlex.join(word for word in words[2:] if word != "-e")
+    pip = "python -m pip --disable-pip-version-check"
+    if Path(words[-1]).name == words[-1] and "[" not in words[-1]:
+        return f"{pip} install --quiet --no-deps --target site ./{what}"
+    return f"{pip} install --dry-run --no-index {what}"
+
+
+def run_block(home: Home, folder: Path, block: Block) -> str:
     """Run a block; return what is wrong, or an empty text."""
-    if "robot" in block.value:
-        place.robot()
+    robot = "robot" in block.value
+    if robot:
+        home.robot()
+    environment = home.environment(folder, robot)
     ended = re.search(r"(\d+) s", block.value)
     after_s = float(ended[1]) if ended else 0.0
     if block.language == "python":
-        (place.folder / "program.py").write_text(block.text)
-        return run(place, (sys.executable, "program.py"), after_s)
-    for line in block.text.splitlines():
-        if line.startswith("pip install"):
-            continue  # this is installed
-        if problem := run(place, line, after_s):
-            return f"{line}\n{problem}"
+        (folder / "program.py").write_text(block.text)
+        return run((sys.executable, "program.py"), folder, environment, after_s)
+    with contextlib.ExitStack() as behind:
+        for line in block.text.splitlines():
+            if line.endswith("&"):
+                process = start(line[:-1], folder, environment, subprocess.DEVNULL)
+                behind.callback(_end_of, process)
+                behind.callback(os.killpg, process.pid, signal.SIGINT)
+                time.sleep(3)
+            elif wrong := run(as_installed(line), folder, environment, after_s):
+                return f"{line}\n{wrong}"
     return ""
 
 
-def judge(page: Path, folder: Path, counts: Counter[str]) -> list[str]:
-    """Run what is to be run of a page; return what is wrong."""
-    wrong, place = [], Place(folder)
-    with contextlib.closing(place):
-        for block in sorted(blocks(page), key=lambda block: block.verb != "file"):
-            if block.verb == "file":
-                path = folder / block.value
-                path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_text(block.text)
-                counts["file"] += 1
-            elif block.verb == "not run":
-                counts[f"not run: {block.value}"] += 1
-            elif block.language not in ("sh", "python"):
-                counts["output, or a part of a file"] += 1
-            elif problem := try_block(place, block):
-                counts["FAILED"] += 1
-                wrong.append(f"{page.name}:{block.line}: {problem}")
-            else:
-                counts["run"] += 1
-    return wrong
+def data_of(block: Block) -> Path | None:
+    """Return the folder of the data that a block needs, where it is there."""
+    root = os.environ.get("GIGABRAIN_DATA")
+    folder = Path(root or "", block.value.partition(",")[0])
+    return folder if root and folder.is_dir() else None
+
+
+def judge(home: Home, page: Path, folder: Path) -> Iterator[tuple[str, str]]:
+    """Run what is to be run of a page; yield the kind of each block and what is wrong with it."""
+    (folder / "deploy").symlink_to(ROOT / "deploy")
+    found = list(blocks(page))
+    for block in found:
+        if block.verb == "file":
+            path = folder / block.value
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(block.text)
+    for block in found:
+        if wrong := problem(block):
+            yield "FAILED", f"{page.name}:{block.line}: {wrong}"
+        elif block.verb == "not run":
+            yield f"not run: {block.value}", ""
+        elif block.language == "text":
+            yield "output", ""
+        elif block.verb == "file" or block.language not in RUN:
+            yield f"checked: {block.language}", ""
+        elif block.verb == "data" and not data_of(block):
+            yield "not run: data that is not here", ""
+        else:
+            if source := block.verb == "data" and data_of(block):
+                for path in source.iterdir():
+                    with contextlib.suppress(FileExistsError):
+                        (folder / path.name).symlink_to(path)
+            began_s = time.monotonic()
+            wrong = run_block(home, folder, block)
+            print(f"{page.name}:{block.line}: {time.monotonic() - began_s:.0f} s", flush=True)
+            yield "FAILED" if wrong else "run", wrong and f"{page.name}:{block.line}: {wrong}"
 
 
 def main() -> None:
     """Run all pages, print the counts and what failed."""
-    pages = [ROOT / name for name in sys.argv[1:]]
+    chosen = [ROOT / name for name in sys.argv[1:]] or pages()
     counts: Counter[str] = Counter()
     wrong = []
-    for page in pages or [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
-        with tempfile.TemporaryDirectory(prefix="docs-") as name:
-            found = judge(page, Path(name), counts)
-        print(f"{page.name}: {len(found)} failed", *found, sep="\n", flush=True)
-        wrong += found
+    with tempfile.TemporaryDirectory(prefix="docs-") as name:
+        home = Home(Path(name))
+        with contextlib.closing(home):
+            for number, page in enumerate(chosen):
+                folder = Path(name, f"page{number}")
+                folder.mkdir()
+                for kind, text in judge(home, page, folder):
+                    counts[kind] += 1
+                    if text:
+                        print(text, flush=True)
+                        wrong.append(text)
+                shutil.rmtree(folder, ignore_errors=True)
     for kind, count in sorted(counts.items()):
         print(f"{count:4} {kind}")
+    hardware = sum(count for kind, count in counts.items() if "hardware" in kind)
+    print(f"{hardware} blocks need hardware; {len(wrong)} failed", *wrong, sep="\n")
     sys.exit(1 if wrong else 0)
 
 

@@ -1,0 +1,154 @@
+"""The fenced blocks of README.md and docs/, and what their comments say about them.
+
+    <!-- run: robot -->         run beside a robot that drives
+    <!-- run: 5 s -->           each line is ended by Ctrl-C after 5 s
+    <!-- run: robot, 5 s -->    both
+    <!-- file: NAME -->         the block is such a file, for the blocks of the page
+    <!-- data: FOLDER/NAME -->  run with such a file of the folder GIGABRAIN_DATA
+    <!-- not run: hardware (WHAT) -->  it needs hardware, other hosts, or root
+    <!-- robot.yaml -->         the block is a part of a robot.yaml
+
+Without a comment a block of `sh` or `python` is run, and YAML is a deployment file or a part of
+one. A block of `text` is output, or a drawing.
+"""
+
+import ast
+import json
+import re
+import shutil
+import subprocess
+import tempfile
+import tomllib
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from gigabrain_drivers.driver.catalog import load_link
+from gigabrain_drivers.driver.robot import RobotFile, Run
+from gigabrain_drivers.sim.world_file import WorldFile
+from gigabrain_zenoh.config import loading
+from gigabrain_zenoh.config.map_image import MapYaml
+from gigabrain_zenoh.decision.tasks.mission import Mission, PatrolFile
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.launch.deployment import deployment_type
+from tests.places import ROOT
+
+BLOCK = re.compile(
+    r"^(?:<!-- (?P<mark>[^\n]*) -->\n)?(?P<indent> *)```(?P<language>[\w]*)(?P<rest>[^\n]*)\n"
+    r"(?P<text>.*?)^(?P=indent)```$",
+    re.MULTILINE | re.DOTALL,
+)
+VERBS = ("run", "not run", "file", "data", "robot.yaml")
+NOT_RUN = ("hardware (", "what CI runs itself")
+PART_OF = ROOT / "drivers/gigabrain_drivers/bodies/mycustombot"  # what a part of a robot.yaml joins
+
+
+class Block(NamedTuple):
+    """A fenced block of a page."""
+
+    page: Path
+    line: int
+    language: str
+    text: str
+    verb: str  # one of VERBS, or ""
+    value: str
+
+
+def pages() -> list[Path]:
+    """Return all pages whose blocks are checked and run."""
+    return [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def blocks(page: Path) -> Iterator[Block]:
+    """Yield the blocks of a page with what their comments say."""
+    text = page.read_text("utf-8")
+    for found in BLOCK.finditer(text):
+        verb, _, value = (found["mark"] or "").partition(": ")
+        line = text.count("\n", 0, found.start("language")) + 1
+        verb = verb if verb in VERBS else ""
+        yield Block(page, line, found["language"], found["text"], verb, value)
+
+
+def problem(block: Block) -> str:
+    """Return what is wrong with a block before it is run; empty for nothing."""
+    if block.verb == "not run" and not block.value.startswith(NOT_RUN):
+        return f"not run: expected one of {NOT_RUN}, got {block.value!r}"
+    if block.language not in READERS:
+        known = ", ".join(READERS)
+        return f"a block of {block.language or 'no language'}; expected one of {known}"
+    try:
+        READERS[block.language](block)
+    except (SyntaxError, ValueError, ConfigError, ElementTree.ParseError) as error:
+        return str(error)
+    return ""
+
+
+def _read_yaml(block: Block) -> None:
+    if block.verb == "robot.yaml":
+        return _read_part_of_robot(block.text)
+    types = [deployment_type(), Mission, PatrolFile, RobotFile, MapYaml, WorldFile]
+    if block.verb != "file":
+        types = types[:1]
+    errors = []
+    for one in types:
+        try:
+            loading.loads(block.text, one, block.value or "block")
+            return None
+        except ConfigError as error:
+            errors.append(f"{one.__name__}: {error}")
+    raise ValueError("; ".join(errors))
+
+
+def _read_part_of_robot(text: str) -> None:
+    """Raise ConfigError unless a robot's file with these fields can be loaded on its real link."""
+    with tempfile.TemporaryDirectory(prefix="docs-") as name:
+        folder = Path(name) / "robot"
+        shutil.copytree(PART_OF, folder)
+        file = folder / "robot.yaml"
+        file.write_text(yaml.safe_dump(_joined(yaml.safe_load(file.read_text()), text)))
+        load_link(str(file), Run(folder=folder, link="real"))
+
+
+def _joined(whole: dict[str, Any], text: str) -> dict[str, Any]:
+    """Return the fields of a robot's file with those of `text`; a link joins one of its driver."""
+    part = yaml.safe_load(text)
+    for key, value in part.items():
+        old = whole.get(key)
+        if (
+            isinstance(old, dict)
+            and isinstance(value, dict)
+            and old.get("driver") == value.get("driver")
+        ):
+            part[key] = old | value
+    return whole | part
+
+
+def _compile_c(block: Block) -> None:
+    compiler = shutil.which("cc")
+    if not compiler:
+        return
+    source = f"#include <stddef.h>\n#include <stdint.h>\n{block.text}"
+    options = ("-fsyntax-only", "-Wall", "-Werror", "-x", "c", "-")
+    done = subprocess.run((compiler, *options), input=source, capture_output=True, text=True)
+    if done.returncode:
+        raise ValueError(done.stderr)
+
+
+def _nothing(block: Block) -> None:
+    """Read nothing: a shell, or output."""
+
+
+READERS: dict[str, Callable[[Block], Any]] = {
+    "sh": _nothing,
+    "python": lambda block: ast.parse(block.text),
+    "yaml": _read_yaml,
+    "toml": lambda block: tomllib.loads(block.text),
+    "json": lambda block: json.loads(block.text),
+    "xml": lambda block: ElementTree.fromstring(block.text),
+    "c": _compile_c,
+    "text": _nothing,
+}
+RUN = ("sh", "python")  # all others are checked only
