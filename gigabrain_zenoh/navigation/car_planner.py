@@ -10,15 +10,9 @@ from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.geometry import sweep
+from gigabrain_zenoh.kernels.images import OCCUPIED_PERCENT, Singles, squared_distance
 from gigabrain_zenoh.navigation import hybrid_astar as hybrid
-from gigabrain_zenoh.navigation.costmap import (
-    LETHAL,
-    OCCUPIED_PERCENT,
-    Costmap,
-    Inflation,
-    Singles,
-    squared_distance,
-)
+from gigabrain_zenoh.navigation.costmap import LETHAL, Costmap, Inflation
 from gigabrain_zenoh.navigation.costmap import costmap as make_costmap
 from gigabrain_zenoh.navigation.global_planner import Path, Unreachable, goal_problem
 from gigabrain_zenoh.navigation.grid_search import GridSearch
