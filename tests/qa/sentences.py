@@ -1,0 +1,73 @@
+"""How long the sentences of README.md and docs/ are: `python -m tests.qa.sentences`.
+
+Code, tables, headings, links' targets and comments are no sentences. An item of a list is one by
+itself; a colon before a list or a block ends one. Prints each page's mean and the longest.
+"""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from statistics import fmean
+
+from tests.places import ROOT
+from tests.qa.blocks import pages
+
+FENCE = re.compile(r"^ *```.*?^ *```$", re.MULTILINE | re.DOTALL)
+COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
+LINK = re.compile(r"!?\[([^\]]*)\]\([^)]*\)")
+CODE = re.compile(r"`[^`]*`")
+END = re.compile(r"(?<=[.!?])[)\"”*_]*\s+(?=[A-Z`(*\"“0-9])|(?<=:)\s*$")
+ABBREVIATIONS = re.compile(r"\b(e\.g|i\.e|etc|vs|al|No)\.")
+WORD = re.compile(r"[\w'./%°×-]*\w[\w'./%°×-]*")
+MEAN, PAGE_MEAN = 18.0, 20.0  # [words], of all sentences and of those of one page
+
+
+def sentences(text: str) -> Iterator[str]:
+    """Yield the sentences of a page."""
+    for part in _paragraphs(text):
+        for sentence in END.split(part):
+            if sentence and len(WORD.findall(sentence)) > 1:
+                yield sentence.strip()
+
+
+def words(sentence: str) -> int:
+    """Return how many words a sentence has; a piece of code is one."""
+    return len(WORD.findall(sentence))
+
+
+def _paragraphs(text: str) -> Iterator[str]:
+    """Yield paragraphs and items of lists, each in one line."""
+    text = COMMENT.sub("", FENCE.sub("\n", text))
+    text = CODE.sub("Code", LINK.sub(r"\1", ABBREVIATIONS.sub(r"\1", text)))
+    lines: list[str] = []
+    for line in [*text.splitlines(), ""]:
+        stripped = line.strip()
+        item = re.match(r"([-*]|\d+\.) ", stripped)
+        if item or not stripped or stripped.startswith(("#", "|", "!")):
+            if lines:
+                yield " ".join(lines)
+            lines = [stripped[item.end() :]] if item else []
+        else:
+            lines.append(stripped)
+
+
+def mean(page: Path) -> float:
+    """Return the mean length of a page's sentences [words]; 0 without any."""
+    found = [words(one) for one in sentences(page.read_text("utf-8"))]
+    return fmean(found) if found else 0.0
+
+
+def main() -> None:
+    """Print the mean of each page and of all, and the longest sentences."""
+    found = [
+        (words(one), page.name, one) for page in pages() for one in sentences(page.read_text())
+    ]
+    for page in pages():
+        print(f"{mean(page):5.1f}  {page.relative_to(ROOT)}")
+    print(f"{fmean(count for count, *_ in found):5.1f}  of {len(found)} sentences")
+    for count, name, sentence in sorted(found, reverse=True)[:30]:
+        print(f"\n{count} {name}: {sentence}")
+
+
+if __name__ == "__main__":
+    main()
