@@ -300,8 +300,8 @@ FILE_ENDINGS = (".yaml", ".yml", ".xml", ".mjcf", ".png", ".pgm")
 
 
 def names_file(name: str) -> bool:
-    """Return whether a setting that is a name or a path is a path."""
-    return "/" in name or name.endswith(FILE_ENDINGS)
+    """Return whether a setting that is a name or a file is a file."""
+    return name.endswith(FILE_ENDINGS)
 
 
 def beside(name: str, folder: Path) -> str:

@@ -6,7 +6,7 @@ A line here is all that a topic takes, beside an example of its message in the f
 from dataclasses import dataclass, replace
 from typing import Any, Generic, Literal, TypeVar
 
-from gigabrain_schemas import body, brain, logs, requests, safety, sensors, tasks
+from gigabrain_schemas import body, brain, logs, requests, safety, sensors, sim, tasks
 from gigabrain_schemas.base import Message
 
 M = TypeVar("M", bound=Message)
@@ -145,6 +145,10 @@ INPUT_LOG = Topic(
     "robot/input_log", logs.InputLog, 2, priority="background", many=True, depth=32,
     max_bytes=64 * KB, publishers=BRAIN,
 )  # fmt: skip
+SIM_SCENE = Topic(
+    "robot/sim_scene", sim.SimScene, 1, priority="background", keep=True, max_bytes=8 * 1024 * KB,
+)  # fmt: skip
+SIM_POSES = Topic("robot/sim_poses", sim.SimPoses, 10, max_bytes=32 * KB)
 AUDIT = Topic("robot/audit", logs.AuditRecord, 10, depth=256)
 TOPICS: tuple[Topic[Any], ...] = tuple(one for one in globals().values() if isinstance(one, Topic))
 
@@ -184,6 +188,7 @@ TASK_CHANGE = Service(
 MAP_SAVE = Service(
     "robot/map_save", requests.MapRequest, requests.MapReply, callers=OPERATOR, servers=BRAIN,
 )  # fmt: skip
+SIM_CHANGE = Service("robot/sim_change", sim.SimRequest, sim.SimReply, callers=OPERATOR)
 AUDIT_LOG = Service(
     "robot/audit_log", logs.AuditRequest, logs.AuditPage, priority="background",
     max_bytes=1024 * KB, callers=("operator", "viewer"),

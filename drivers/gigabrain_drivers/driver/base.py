@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Self
 from gigabrain_drivers.driver.robot import LinkOptions, RobotFile, Run
 from gigabrain_schemas.base import TICK_NS, Message, Velocity
 from gigabrain_schemas.body import Joint, RobotState, SafeState
+from gigabrain_schemas.sim import SimReply, SimRequest
 from gigabrain_schemas.topics import Topic
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import GigabrainError, Unsupported
@@ -139,6 +140,11 @@ class Driver(abc.ABC):
     async def get_joint_states(self) -> tuple[Joint, ...]:
         """Return all joints as measured. Raises BodyLost."""
         return (await self.read_state()).joints
+
+    async def change_world(self, request: SimRequest) -> SimReply:
+        """Change the simulated world that the body is in. Raises Unsupported, and Refused."""
+        what = "a real body" if self.run.link == "real" else f"{type(self).__name__}, no simulation"
+        raise Unsupported(f"{self.robot.robot_type} has no simulated world: it is {what}")
 
     async def get_sensor_data(self, sensor_name: str) -> Message | None:
         """Return the newest reading of a sensor, or None before its first. Raises Unsupported."""

@@ -19,6 +19,7 @@ from gigabrain_drivers.driver.catalog import make_driver, ports_folder
 from gigabrain_drivers.driver.gatekeeper import Gatekeeper
 from gigabrain_drivers.driver.lockstep import REPEAT_S, Lockstep, RoundTrip
 from gigabrain_drivers.driver.robot import RobotFile, Run
+from gigabrain_drivers.driver.world_requests import serve_world
 from gigabrain_drivers.links.frames import describe_command
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.base import Message
@@ -90,6 +91,8 @@ class DriverProcess:
         bus.subscribe(JOINT_CMD, self._on_joint_command)
         bus.latest(SAFETY, self._on_safety)
         self._gatekeeper.serve(self._driver.stop)
+        if self._config.link != "emulated":  # the emulator has the world then
+            serve_world(bus, self._driver.change_world)
         self._serve_settings()
         bus.publish(BODY, self._body)
         ready()

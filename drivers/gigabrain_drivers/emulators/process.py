@@ -8,8 +8,11 @@ from pathlib import Path
 import msgspec
 
 from gigabrain_drivers.driver.robot import Run
+from gigabrain_drivers.driver.world_requests import serve_world
+from gigabrain_drivers.emulators.base import Snapshot
 from gigabrain_drivers.emulators.emulator import Emulator
 from gigabrain_drivers.emulators.faults import Faults
+from gigabrain_drivers.sim.live_world import LiveWorld, News
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import EmulatorConfig
 from gigabrain_zenoh.errors import BodyLost, ConfigError
@@ -29,8 +32,25 @@ async def run(config: EmulatorConfig, bus: Bus, ready: Callable[[], None]) -> No
         bus.report = emulator.report
         physics = emulator.body.simulation
         bus.progress = Progress(lambda: (bus.clock.now_ns(),), lambda: physics.time_ns)
+        serve_world(bus, show_world(emulator, config.world, bus).change)
         ready()
         await watch(emulator, Path(config.folder) / FAULTS_FILE)
+
+
+def show_world(emulator: Emulator, name: str, bus: Bus) -> LiveWorld:
+    """Publish the emulated world for viewers, from the physics thread on."""
+    world, loop = LiveWorld(emulator.body.simulation, name), asyncio.get_running_loop()
+
+    def publish(news: News) -> None:
+        for topic, message in news:
+            bus.publish(topic, message)
+
+    def step(_: Snapshot) -> None:
+        if news := world.step():
+            loop.call_soon_threadsafe(publish, news)
+
+    emulator.body.on_step.append(step)
+    return world
 
 
 async def emulate(config: EmulatorConfig, say: Callable[[str], None]) -> None:

@@ -5,8 +5,8 @@ import contextlib
 import math
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
-from typing import NamedTuple, TypeVar
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +15,18 @@ from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.sim import STEP_NS, STEP_S, Pace
 from gigabrain_drivers.sim.body import MujocoOptions, sim_body
+from gigabrain_drivers.sim.live_world import LiveWorld
 from gigabrain_drivers.sim.physics import Simulation, run_report
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.arrays import ranges_bytes
-from gigabrain_schemas.base import TICK_NS, Pose, Velocity
+from gigabrain_schemas.base import TICK_NS, Message, Pose, Velocity
 from gigabrain_schemas.body import Battery, Joint, Lidar, RobotState
 from gigabrain_schemas.sensors import Imu, ImuData, LaserScan
-from gigabrain_schemas.topics import IMU, SCAN
+from gigabrain_schemas.sim import SimReply, SimRequest
+from gigabrain_schemas.topics import IMU, SCAN, Topic
 from gigabrain_zenoh.bus.bridge import Bridge
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import BodyLost, ConfigError
+from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 
 T = TypeVar("T")
 STEPS_PER_TICK = TICK_NS // STEP_NS  # physics steps per tick of the robot's clock
@@ -63,6 +65,7 @@ class Reading(NamedTuple):
     imu: Imu
     scan: LaserScan | None = None  # when the lidar has finished a turn, between two states
     state: RobotState | None = None  # with the last step of a tick
+    news: Sequence[tuple[Topic[Any], Message]] = ()  # of the world, for viewers
 
 
 class MujocoDriver(Driver):
@@ -79,6 +82,7 @@ class MujocoDriver(Driver):
         self.lockstep = run.speed != 1.0
         world = load_world(run.world, run.seed)
         self._simulation = Simulation(sim_body(robot, options, run), world, run.seed)
+        self._world = LiveWorld(self._simulation, run.world)
         period_ns = 1e9 / robot.lidar.rate_hz if robot.lidar else math.inf
         self._scan_ticks = period_ns / TICK_NS
         self._next_scan = self._scan_ticks
@@ -101,6 +105,8 @@ class MujocoDriver(Driver):
         self.sensors["imu"] = self._imu()
         if self.robot.lidar:
             self.sensors["scan"] = self._scan()
+        for topic, message in self._world.scene():
+            self.emit(topic, message)
 
     async def close(self) -> None:
         """End the physics thread."""
@@ -159,6 +165,12 @@ class MujocoDriver(Driver):
             raise BodyLost("the simulation is not open")
         return self._state
 
+    async def change_world(self, request: SimRequest) -> SimReply:
+        """Change the world between two steps. Raises Refused."""
+        if self.finished:
+            raise Refused("the simulation has ended")
+        return await self._world.change(request)
+
     def report(self) -> Mapping[str, float | int | str | None]:
         """The truth of the run so far."""
         return self._account | {"physics_cpu_s": round(self._physics_s, 3)}
@@ -168,6 +180,8 @@ class MujocoDriver(Driver):
         self.publish("imu", IMU, reading.imu)
         if reading.scan:
             self.publish("scan", SCAN, reading.scan)
+        for topic, message in reading.news:
+            self.emit(topic, message)
 
     def _run_physics(self) -> None:
         """The physics thread. Whatever ends it is raised from `ticks`."""
@@ -200,14 +214,15 @@ class MujocoDriver(Driver):
         self._timed(self._simulation.advance)
         if self._simulation.fallen:
             raise BodyLost(f"fell over after {self._simulation.time_ns / 1e9:.2f} s")
+        news = self._world.step()
         if last:
             self._account = run_report(self._simulation, self.robot, self.run)
-            return Reading(self._imu(), state=self._read_state())
+            return Reading(self._imu(), state=self._read_state(), news=news)
         # a lidar is not synchronous with the states; between two of them the cores are idle
         due = self._ticks >= self._next_scan
         if due:
             self._next_scan += self._scan_ticks
-        return Reading(self._imu(), scan=self._scan() if due else None)
+        return Reading(self._imu(), scan=self._scan() if due else None, news=news)
 
     def _timed(self, work: Callable[[], T]) -> T:
         """Run a piece of physics and add its CPU time to the report."""

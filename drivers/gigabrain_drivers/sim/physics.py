@@ -27,6 +27,7 @@ from gigabrain_drivers.sim.locomotion import (
 )
 from gigabrain_drivers.sim.scene import PERSON, ROBOT, Person, compile_scene, yaw_quaternion
 from gigabrain_drivers.sim.sensors import Imu, ImuSample, Lidar
+from gigabrain_drivers.sim.things import Things
 from gigabrain_drivers.sim.truth import Truth
 from gigabrain_drivers.sim.world import Stream, World, generator
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
@@ -48,8 +49,10 @@ class Simulation:
             self.model.body(f"{PERSON}{number + 1 if number else ''}").id: Person(walk)
             for number, walk in enumerate(world.people)
         }
+        self._stood_before = 0  # times that people stood who are gone
         self._place_people()
         self.truth = Truth(self.model, self.data)
+        self.things = Things(self.model, self.data, world, self.truth, self._set_walking)
         if world.start_fixed and self.truth.touching:
             raise ConfigError(
                 f"world {world.name}: the robot touches something at its start "
@@ -75,7 +78,7 @@ class Simulation:
     @property
     def person_stood(self) -> int:
         """The number of times that people had to stand for the robot."""
-        return sum(person.stood for person in self._people.values())
+        return self._stood_before + sum(person.stood for person in self._people.values())
 
     def command(self, linear_x: float, angular_z: float) -> tuple[float, float]:
         """Drive without going sideways; returns (forward, turning), see `drive`."""
@@ -150,6 +153,13 @@ class Simulation:
     def bumper(self) -> bool:
         """Return whether the robot touches anything but the floor right now."""
         return self.truth.touching
+
+    def _set_walking(self, body: int, person: Person | None) -> None:
+        """Have a spare body walk, or no longer."""
+        if person:
+            self._people[body] = person
+        elif body in self._people:
+            self._stood_before += self._people.pop(body).stood
 
     def _place_people(self) -> None:
         for body, person in self._people.items():

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.examples import EXAMPLES
-from gigabrain_schemas.topics import MAP, TOPICS, Topic
+from gigabrain_schemas.topics import MAP, SIM_SCENE, TOPICS, Topic
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.qa.faults.hostile import leaves, replaced
 from tests.unit.schemas.plain import as_map, at, codec, dotted, maps, numbers, refuses
@@ -28,7 +28,8 @@ NULLABLE = {
     "Description.report.distance_m", "Description.report.contacts",
 }  # fmt: skip
 WILL_DO_EMPTY = {
-    "EstopRequest", "DescribeRequest", "AuditRequest", "AuditPage", "ParamRequest", "TaskStatus",
+    "EstopRequest", "DescribeRequest", "AuditRequest", "AuditPage", "ParamRequest", "SimRequest",
+    "TaskStatus",
 }  # fmt: skip
 REPORT = ("Description.report.distance_m", "Description.report.contacts")  # texts as well
 
@@ -136,7 +137,7 @@ def test_what_is_larger_than_its_topic_allows_is_not_even_decoded(topic: Topic[A
     decode = Codec(topic.type, topic.max_bytes).decode
     with pytest.raises(ValueError, match=f"^{topic.max_bytes + 1} bytes, at most"):
         decode(b"{" * (topic.max_bytes + 1))
-    most = 8 * 1024 * 1024 if topic is MAP else 1024 * 1024
+    most = 8 * 1024 * 1024 if topic in (MAP, SIM_SCENE) else 1024 * 1024
     assert topic.max_bytes <= most
     with pytest.raises(ValueError, match=rf"^{most + 1} bytes, at most"):
         decode(b"\x80" * (most + 1))

@@ -57,6 +57,10 @@ REQUIRED: dict[str, set[str]] = {
     "TaskStatus": set(),
     "ParamRequest": set(),
     "ParamReply": {"ok", "text"},
+    "SimScene": {"version", "world", "bodies", "kinds", "owners", "sizes", "places", "colours"},
+    "SimPoses": {"version", "poses"},
+    "SimRequest": set(),
+    "SimReply": {"ok", "text"},
     "DescribeRequest": set(),
     "Description": {"process", "pid", "host", "version"},
 }  # fmt: skip
@@ -86,12 +90,14 @@ def test_the_table_holds_the_keys_and_rates_of_the_design() -> None:
         "robot/task": ("TaskStatus", 5),
         "robot/request_log": ("AcceptedRequest", 10),
         "robot/input_log/*": ("InputLog", 2),
+        "robot/sim_scene": ("SimScene", 1),
+        "robot/sim_poses": ("SimPoses", 10),
         "robot/audit": ("AuditRecord", 10),
     }
     assert [service.at("*") for service in SERVICES] == [
         "robot/estop", "robot/release", "robot/enable", "robot/goal", "robot/mission",
-        "robot/task_change", "robot/map_save", "robot/audit_log", "robot/param/*",
-        "robot/describe/*",
+        "robot/task_change", "robot/map_save", "robot/sim_change", "robot/audit_log",
+        "robot/param/*", "robot/describe/*",
     ]  # fmt: skip
 
 
@@ -117,6 +123,8 @@ def test_a_value_stops_counting_after_so_many_missed_periods() -> None:
         "robot/task": 1_000_000_000,
         "robot/request_log": 500_000_000,
         "robot/input_log": 2_500_000_000,
+        "robot/sim_scene": 5_000_000_000,
+        "robot/sim_poses": 500_000_000,
         "robot/audit": 500_000_000,
     }
 
@@ -156,7 +164,7 @@ def test_every_message_is_frozen_and_documented_and_carries_the_header(
 def test_the_golden_folder_holds_the_examples_byte_for_byte() -> None:
     stored = {path.name: path.read_bytes() for path in examples.FOLDER.iterdir()}
     assert stored == examples.files()
-    assert len(stored) == 78
+    assert len(stored) == 86
 
 
 @by_name

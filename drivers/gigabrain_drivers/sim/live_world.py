@@ -1,0 +1,91 @@
+"""A simulated world for people: what viewers see of it, and what is changed while it runs."""
+
+import asyncio
+import contextlib
+from collections import deque
+from typing import Any
+
+from gigabrain_drivers.sim import STEP_NS
+from gigabrain_drivers.sim.physics import Simulation
+from gigabrain_drivers.sim.scene_message import SceneWriter
+from gigabrain_schemas.base import Message, Pose
+from gigabrain_schemas.sim import SimReply, SimRequest
+from gigabrain_schemas.topics import SIM_POSES, SIM_SCENE, Topic
+from gigabrain_zenoh.errors import Refused
+
+POSES_STEPS = 100_000_000 // STEP_NS
+ANSWER_S = 2.0
+MAX_WAITING = 32  # requests
+News = list[tuple[Topic[Any], Message]]
+
+
+class LiveWorld:
+    """Changes a world between two steps of its physics, and describes it.
+
+    `step` belongs into the physics thread, `change` onto the loop; `scene` into whichever begins.
+    """
+
+    def __init__(self, simulation: Simulation, world: str) -> None:
+        self._simulation = simulation
+        self._writer = SceneWriter(simulation.model, simulation.data, world)
+        self._waiting: deque[tuple[SimRequest, asyncio.Future[SimReply]]] = deque()
+        self._steps, self._shown = 0, -1  # the newest version that viewers know
+
+    def scene(self) -> News:
+        """Return the whole scene, and the poses in it."""
+        things = self._simulation.things
+        self._shown = things.version
+        scene = self._writer.scene(things.version, things.all(), things.bodies())
+        return [(SIM_SCENE, scene), (SIM_POSES, self._writer.poses(things.version))]
+
+    def step(self) -> News:
+        """Carry out what was asked for; return the messages of this step."""
+        while self._waiting:
+            request, future = self._waiting.popleft()
+            reply = self._carry_out(request)
+            future.get_loop().call_soon_threadsafe(_answer, future, reply)
+        self._steps += 1
+        if self._simulation.things.version != self._shown:
+            return self.scene()
+        if self._steps % POSES_STEPS == 0:
+            return [(SIM_POSES, self._writer.poses(self._shown))]
+        return []
+
+    async def change(self, request: SimRequest) -> SimReply:
+        """Carry out a request between two steps. Raises Refused if time stands still."""
+        if len(self._waiting) >= MAX_WAITING:
+            raise Refused("too many requests to the world are waiting; try again")
+        future = asyncio.get_running_loop().create_future()
+        self._waiting.append((request, future))
+        try:
+            return await asyncio.wait_for(future, ANSWER_S)
+        except TimeoutError:
+            with contextlib.suppress(ValueError):  # it is being carried out
+                self._waiting.remove((request, future))
+            raise Refused("the simulation stands still, so its world cannot be changed") from None
+
+    def _carry_out(self, request: SimRequest) -> SimReply:
+        things, ok = self._simulation.things, True
+        try:
+            text = self._changed(request)
+        except Refused as error:
+            ok, text = False, str(error)
+        pose = self._simulation.truth.pose()
+        robot = Pose(x=pose.x, y=pose.y, yaw=pose.yaw)
+        return SimReply(ok=ok, text=text[:500], things=things.all(), robot=robot)
+
+    def _changed(self, request: SimRequest) -> str:
+        things = self._simulation.things
+        if request.do == "add":
+            if request.thing is None:
+                raise Refused("nothing to add; expected a `thing`")
+            added = things.add(request.thing)
+            return f"{added.name} is at ({added.x:g}, {added.y:g})"
+        if request.do == "remove":
+            return f"{things.remove(request.name).name} is gone"
+        return f"{len(things.all())} things were put in"
+
+
+def _answer(future: "asyncio.Future[SimReply]", reply: SimReply) -> None:
+    if not future.done():
+        future.set_result(reply)

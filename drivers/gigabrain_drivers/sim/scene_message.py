@@ -1,0 +1,122 @@
+"""A compiled scene as a message for viewers, and the poses of its bodies."""
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_drivers.sim.scene import FLOOR, SPARE
+from gigabrain_schemas.sim import MAX_MESH_BYTES, SHAPE_KINDS, SceneMesh, SimPoses, SimScene, Thing
+
+TYPES = {
+    mujoco.mjtGeom.mjGEOM_PLANE: "plane",
+    mujoco.mjtGeom.mjGEOM_BOX: "box",
+    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
+    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
+    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID: "ellipsoid",
+    mujoco.mjtGeom.mjGEOM_MESH: "mesh",
+}
+SHOWN_GROUPS = 3  # MuJoCo's viewers draw geom groups 0 to 2
+FLOOR_COLOUR = (0.66, 0.62, 0.56, 1.0)  # where only a texture has one
+
+
+class SceneWriter:
+    """Writes what viewers draw. Shapes of other types, such as height fields, are left out."""
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, world: str) -> None:
+        self._model, self._data, self._world = model, data, world
+        moving = (model.body_weldid != 0) | (model.body_mocapid >= 0)
+        for body in range(1, model.nbody):  # what is fixed to a mocap body moves with it
+            moving[body] |= moving[model.body_parentid[body]]
+        spare = [model.body(body).name.startswith(SPARE) for body in range(model.nbody)]
+        self._moving, self._spare = moving, np.array(spare)
+        self._bodies = self._moving_bodies(frozenset())
+        self._meshes: list[SceneMesh] = []
+        self._mesh_numbers: dict[int, int] = {}
+        self._mesh_bytes = 0
+
+    def scene(self, version: int, things: tuple[Thing, ...], used: frozenset[int]) -> SimScene:
+        """Return the scene with the spare bodies `used`, and have `poses` tell of these bodies."""
+        model = self._model
+        self._bodies = self._moving_bodies(used)
+        numbers = np.zeros(model.nbody, np.uint16)
+        numbers[self._bodies] = np.arange(1, len(self._bodies) + 1)
+        rows = [row for geom in range(model.ngeom) if (row := self._row(geom, used))]
+        kinds, geoms, sizes = (list(column) for column in zip(*rows, strict=True))
+        owners = model.geom_bodyid[geoms]
+        return SimScene(
+            version=version,
+            world=self._world[-256:],
+            bodies=("world", *(model.body(body).name[:128] for body in self._bodies)),
+            kinds=bytes(kinds),
+            owners=numbers[owners].astype("<u2").tobytes(),
+            sizes=np.array(sizes, "<f4").tobytes(),
+            places=np.array([self._place(geom) for geom in geoms], "<f4").tobytes(),
+            colours=np.array([self._colour(geom) for geom in geoms]).tobytes(),
+            meshes=tuple(self._meshes),
+            things=things,
+        )
+
+    def poses(self, version: int) -> SimPoses:
+        """Return where the moving bodies of the last scene are now."""
+        data, bodies = self._data, self._bodies
+        poses = np.hstack((data.xpos[bodies], data.xquat[bodies])).astype("<f4")
+        return SimPoses(version=version, poses=poses.tobytes())
+
+    def _moving_bodies(self, used: frozenset[int]) -> NDArray[np.int64]:
+        return np.array([
+            body for body in np.flatnonzero(self._moving)
+            if body in used or not self._spare[body]
+        ], np.int64)  # fmt: skip
+
+    def _row(self, geom: int, used: frozenset[int]) -> tuple[int, int, list[float]] | None:
+        """Return kind, geom and sizes; None for what is not drawn."""
+        model = self._model
+        kind = TYPES.get(mujoco.mjtGeom(int(model.geom_type[geom])))
+        body = int(model.geom_bodyid[geom])
+        hidden = self._spare[body] and body not in used
+        if kind is None or hidden or model.geom_group[geom] >= SHOWN_GROUPS:
+            return None
+        if self._colour(geom)[3] == 0:
+            return None
+        sizes = model.geom_size[geom].tolist()
+        if kind == "mesh":
+            number = self._mesh(int(model.geom_dataid[geom]))
+            if number is None:
+                kind, sizes = "box", model.geom_aabb[geom, 3:].tolist()
+            else:
+                sizes = [float(number), 0.0, 0.0]
+        return SHAPE_KINDS.index(kind), geom, sizes
+
+    def _mesh(self, mesh: int) -> int | None:
+        """Return a mesh's number in the scene; None where its meshes would be too large."""
+        model = self._model
+        if mesh not in self._mesh_numbers:
+            vertex, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
+            vertices = model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]]
+            faces = model.mesh_face[face : face + model.mesh_facenum[mesh]]
+            size = 4 * (vertices.size + faces.size)
+            if self._mesh_bytes + size > MAX_MESH_BYTES:
+                return None
+            self._mesh_bytes += size
+            self._mesh_numbers[mesh] = len(self._meshes)
+            self._meshes.append(SceneMesh(
+                vertices=vertices.astype("<f4").tobytes(), faces=faces.astype("<u4").tobytes(),
+            ))  # fmt: skip
+        return self._mesh_numbers[mesh]
+
+    def _place(self, geom: int) -> NDArray[np.float64]:
+        """Return the pose of a geom on its body, or in the world where that does not move."""
+        model, data = self._model, self._data
+        if self._moving[model.geom_bodyid[geom]]:
+            return np.concatenate((model.geom_pos[geom], model.geom_quat[geom]))
+        quaternion = np.empty(4)
+        mujoco.mju_mat2Quat(quaternion, data.geom_xmat[geom])
+        return np.concatenate((data.geom_xpos[geom], quaternion))
+
+    def _colour(self, geom: int) -> NDArray[np.uint8]:
+        model, material = self._model, int(self._model.geom_matid[geom])
+        colour = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
+        if model.geom(geom).name == FLOOR:
+            colour = np.array(FLOOR_COLOUR)
+        return np.asarray(np.clip(colour * 255, 0, 255).round(), np.uint8)

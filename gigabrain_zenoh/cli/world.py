@@ -1,0 +1,108 @@
+"""`gigabrain world`: obstacles and people in a running simulation."""
+
+import getpass
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, checked, on_bus, print_line
+from gigabrain_zenoh.errors import BodyLost, Refused
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from gigabrain_schemas.sim import SimReply, SimRequest, Thing
+
+ANSWER_S = 3.0
+NO_WORLD = (
+    "no process has a simulated world here; start a simulation with `gigabrain demo`, and check "
+    "that your keys are an operator's"
+)
+
+
+def add(
+    kind: Literal["box", "cylinder", "person"],
+    x: float,
+    y: float,
+    /,
+    *,
+    size: tuple[float, float, float] | None = None,
+    yaw: float = 0.0,
+    to: Annotated[tuple[tuple[float, float], ...], Parameter(show_default=False)] = (),
+    speed: float = 0.8,
+    name: str = "",
+    at: RobotAddress = LOCAL,
+) -> None:
+    """Put an obstacle or a person into the simulated world, while the robot drives.
+
+    Example: gigabrain world add person 1.5 2 --to 1.5 -2
+
+    Places are in the frame of the world, in metres, as in a world file.
+    `gigabrain world list` says where the robot is.
+
+    Args:
+        kind: What to put in.
+        x: Its middle [m].
+        y: Its middle [m].
+        size: Size along its x and y, and its height [m]. Default: 0.3 0.3 0.5.
+        yaw: Angle by which it is turned [rad].
+        to: Place that a person walks to, and back from [m]; may be given again.
+        speed: Speed of a person [m/s].
+        name: Name to remove it by. Default: its kind and a number.
+    """
+    from gigabrain_schemas.sim import SimRequest, Thing
+
+    values: dict[str, object] = {
+        "kind": kind, "x": x, "y": y, "yaw": yaw, "path": to, "speed": speed,
+    }  # fmt: skip
+    values |= {"size": size} if size else {}
+    values |= {"name": name} if name else {}
+    request = SimRequest(do="add", thing=checked(values, Thing), source=getpass.getuser())
+    print_line(_ask(request, at).text)
+
+
+def remove(name: str, /, *, at: RobotAddress = LOCAL) -> None:
+    """Take something out of the simulated world that was put in by hand.
+
+    Example: gigabrain world remove box1
+
+    Args:
+        name: Its name; see `gigabrain world list`.
+    """
+    from gigabrain_schemas.sim import SimRequest
+
+    fields = {"do": "remove", "name": name, "source": getpass.getuser()}
+    print_line(_ask(checked(fields, SimRequest), at).text)
+
+
+def list_(*, at: RobotAddress = LOCAL) -> None:
+    """List what was put into the simulated world by hand, and where the robot is in it.
+
+    Example: gigabrain world list
+    """
+    from gigabrain_schemas.sim import SimRequest
+
+    reply = _ask(SimRequest(source=getpass.getuser()), at)
+    if robot := reply.robot:
+        print_line(f"{'robot':<12} at ({robot.x:.2f}, {robot.y:.2f}), yaw {robot.yaw:.2f}")
+    for thing in reply.things:
+        print_line(_in_words(thing))
+
+
+def _in_words(thing: "Thing") -> str:
+    where = f"{thing.name:<12} at ({thing.x:.2f}, {thing.y:.2f})"
+    if thing.kind == "person":
+        ways = ", ".join(f"({x:.2f}, {y:.2f})" for x, y in thing.path)
+        return f"{where}, walks to {ways} at {thing.speed:g} m/s" if ways else f"{where}, stands"
+    return f"{where}, {thing.size[0]:g} x {thing.size[1]:g} x {thing.size[2]:g} m"
+
+
+def _ask(request: "SimRequest", at: RobotAddress) -> "SimReply":
+    """Return the granted request's reply. Raises BodyLost, and Refused with the reason."""
+    from gigabrain_schemas.topics import SIM_CHANGE
+
+    replies = on_bus(at, lambda bus: bus.ask(SIM_CHANGE, request, timeout_s=ANSWER_S))
+    if not replies:
+        raise BodyLost(NO_WORLD)
+    if not replies[0].ok:
+        raise Refused(replies[0].text)
+    return replies[0]
