@@ -105,8 +105,7 @@ def test_a_model_whose_wheels_are_others_is_told(
         compiled(own, tmp_path)
     (warning,) = caplog.messages
     assert warning == (
-        f"{tmp_path}/model.xml: the wheels have a wheel_radius of 0.080 m here, "
-        "and of 0.160 m in the robot's file"
+        f"{tmp_path}/model.xml: wheel_radius is 0.080 m here, and 0.160 m in the robot's file"
     )
 
 
@@ -121,6 +120,6 @@ def test_a_drive_that_has_no_physics_is_called_so(tmp_path: Path) -> None:
 def test_a_model_that_lacks_parts_is_named(tmp_path: Path) -> None:
     own = mine(tmp_path)
     model = tmp_path / "model.xml"
-    model.write_text(model.read_text().replace('name="wheel_left"', 'name="left"'))
-    with pytest.raises(ConfigError, match=r"model\.xml: this MJCF model cannot be used: it has no"):
+    model.write_text(model.read_text().replace("wheel_left_joint", "left"))
+    with pytest.raises(ConfigError, match=r"model\.xml: the model has no joint 'wheel_left_joint'"):
         compiled(own, tmp_path)

@@ -241,8 +241,8 @@ def test_a_model_that_is_none_is_refused() -> None:
 
 
 def test_a_model_without_the_parts_that_are_driven_is_refused_by_their_names() -> None:
-    model = waffle().model.replace("wheel_left", "left_wheel").replace('"gyro"', '"gyroscope"')
-    with pytest.raises(ConfigError, match=r"no body 'wheel_left'.* no sensor 'gyro'"):
+    model = waffle().model.replace("wheel_left", "left_wheel").replace("lidar", "laser")
+    with pytest.raises(ConfigError, match=r"no joint 'wheel_left_joint'.* no site 'lidar'"):
         Simulation(replace(waffle(), model=model), room(), 0)
 
 

@@ -113,7 +113,10 @@ def driver_class(name: str) -> type[Driver]:
 def make_driver(name: str, run: Run) -> tuple[RobotFile, Driver]:
     """The robot called `name` and the driver of its link. Raises ConfigError."""
     robot, driver, options, folder = load_link(name, run)
-    return robot, driver(robot, options, msgspec.structs.replace(run, folder=folder))
+    try:
+        return robot, driver(robot, options, msgspec.structs.replace(run, folder=folder))
+    except ConfigError as error:  # of what the file names, such as a model
+        raise located(robot_path(name), error) from None
 
 
 def load_link(name: str, run: Run) -> tuple[RobotFile, type[Driver], LinkOptions, Path]:

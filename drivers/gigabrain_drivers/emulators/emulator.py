@@ -22,6 +22,7 @@ from gigabrain_drivers.sim.body import MujocoOptions, SimBattery, sim_body
 from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.config.loading import located
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.posix import fcntl
 from gigabrain_zenoh.plugins import load_plugin
@@ -45,7 +46,10 @@ def emulated_body(name: str, run: Run) -> EmulatedBody:
     _, _, real, _ = catalog.load_link(name, replace(run, link="emulated"))
     if volts := real.battery_volts():
         body = dataclasses.replace(body, battery=_charged(body.battery, *volts))
-    return EmulatedBody(robot, Simulation(body, world, run.seed), run)
+    try:
+        return EmulatedBody(robot, Simulation(body, world, run.seed), run)
+    except ConfigError as error:  # of the model that the file names
+        raise located(catalog.robot_path(name), error) from None
 
 
 def _charged(battery: SimBattery, empty: float, full: float) -> SimBattery:

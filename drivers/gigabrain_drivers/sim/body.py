@@ -1,10 +1,12 @@
 """Bodies for the simulation: a model and the figures of its parts, from a robot's file."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
-from msgspec import Meta
+import msgspec
+from msgspec import Meta, Struct
 
 from gigabrain_drivers.driver.robot import LinkOptions, RobotFile, Run
 from gigabrain_drivers.kinematics.legs import JOINT_NAMES, LEGS, WALKER, LegGeometry, Walker
@@ -46,6 +48,8 @@ class SimLidar:
     range_min: float = 0.12  # [m]
     range_max: float = 3.5  # [m]
     noise_m: float = 0.01  # standard deviation of a range
+    mount: tuple[float, float, float] | None = None  # x, y [m] and yaw [rad], by the robot's file
+    height: float | None = None  # [m] above the floor, for a model without a site for it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +77,14 @@ class SimMotor:
     ambient_celsius: float = 25.0
 
 
+class PartNames(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a moving part is called in a model: its joint, and what else is not found by it."""
+
+    joint: str
+    actuator: str = ""
+    geom: str = ""  # by which a wheel rolls
+
+
 @dataclass(frozen=True, kw_only=True)
 class SimModel:
     """The figures of every body. Its model's base body is `base`, with the free joint `free`.
@@ -82,6 +94,9 @@ class SimModel:
 
     model: str  # MJCF
     path: str = "the model"  # where it came from, for people
+    named_by: str = ""  # the value by which the robot's file names the model
+    names: Mapping[str, str | PartNames] = field(default_factory=dict)  # of parts in the model
+    footprint: tuple[tuple[float, float], ...] = ()  # [m], by the robot's file
     lidar: SimLidar | None = field(default_factory=SimLidar)
     battery: SimBattery = field(default_factory=SimBattery)
     motor: SimMotor = field(default_factory=SimMotor)
@@ -103,10 +118,12 @@ class SimBody(SimModel):
 
     wheel_radius: float  # [m], turns commands into wheel speeds
     wheel_separation: float  # [m]
+    wheel_base: float = 0.0  # [m], by the robot's file
     base: Base | None = None  # None: differential
     odometry_wheel_radius: float | None = None  # [m], turns encoder ticks into metres
     wheel_scale: float = 1.0  # true wheel radius / radius in the model: worn or swollen tyres
     max_wheel_speed: float = 9.0  # [rad/s]
+    needed_wheel_speed: float = 0.0  # [rad/s], which its largest speeds ask for, one at a time
     max_wheel_acceleration: float = 60.0  # [rad/s2]
     wheels: tuple[str, ...] = WHEELS["differential"]
     gyro_heading: bool = False  # odometry turns by the gyroscope, as scrubbing wheels cannot say
@@ -179,6 +196,10 @@ class MujocoOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_field
     """The simulator's part of a robot's file."""
 
     model: str = "model.xml"  # MJCF, beside the robot's file
+    names: Mapping[str, str | PartNames] = msgspec.field(
+        default_factory=dict
+    )  # of parts that the model calls by other names
+    lidar_height: Positive | None = None  # [m] above the floor, for a model without a lidar's site
     battery_capacity: Positive = 1.8  # [Ah]
     battery_percentage: Percentage = 100.0  # [%], at the start
     lidar_noise: NonNegative = 0.01  # [m], standard deviation
@@ -199,6 +220,13 @@ def sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimModel:
             "its own or that of a body like it; `model` names it"
         ) from None
     lidar = _sim_lidar(robot, options)
+    found: dict[str, Any] = {
+        "model": model,
+        "path": str(path),
+        "named_by": options.model if options.model != "model.xml" else options.driver,
+        "names": options.names,
+        "footprint": robot.footprint,
+    }
     if robot.drive_type not in SIMULATED:
         raise ConfigError(
             f"{robot.robot_type}: drive_type {robot.drive_type!r} cannot be simulated in MuJoCo; "
@@ -210,21 +238,35 @@ def sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimModel:
             capacity_ah=options.battery_capacity,
             percentage=options.battery_percentage,
         )
-        return SimQuadruped(model=model, path=str(path), lidar=lidar, battery=battery)
+        return SimQuadruped(lidar=lidar, battery=battery, **found)
     battery = SimBattery(
         capacity_ah=options.battery_capacity, percentage=options.battery_percentage
     )
     return SimBody(
-        model=model,
-        path=str(path),
         wheel_radius=robot.wheel_radius,
+        wheel_base=robot.wheel_base,
         wheel_separation=robot.wheel_separation,
         odometry_wheel_radius=options.odometry_wheel_radius,
         wheel_scale=options.wheel_scale,
         lidar=lidar,
         battery=battery,
-        **({} if robot.drive_type == "differential" else _wheels(robot, options)),
+        **found,
+        **(_two_wheels(robot) if robot.drive_type == "differential" else _wheels(robot, options)),
     )
+
+
+def _two_wheels(robot: RobotFile) -> dict[str, Any]:
+    """Return the wheel speeds of a differential base. Raises ConfigError."""
+    missing = [name for name in ("wheel_radius", "wheel_separation") if not getattr(robot, name)]
+    if missing:
+        raise ConfigError(f"{robot.robot_type}: {' and '.join(missing)}: missing, in metres")
+    turning = robot.max_angular_speed * robot.wheel_separation / 2
+    needed = max(robot.max_linear_speed, turning) / robot.wheel_radius
+    fastest = needed * SPARE_WHEEL_SPEED if needed > SimBody.max_wheel_speed else 0.0
+    return {
+        "needed_wheel_speed": needed,
+        "max_wheel_speed": max(SimBody.max_wheel_speed, fastest),
+    }
 
 
 def _wheels(robot: RobotFile, options: MujocoOptions) -> dict[str, Any]:
@@ -250,6 +292,7 @@ def _wheels(robot: RobotFile, options: MujocoOptions) -> dict[str, Any]:
     return {
         "base": base,
         "wheels": WHEELS[drive],
+        "needed_wheel_speed": robot.max_linear_speed / robot.wheel_radius,
         "max_wheel_speed": SPARE_WHEEL_SPEED * max(map(abs, speeds)),
         "gyro_heading": drive == "skid_steer",
     }
@@ -265,4 +308,6 @@ def _sim_lidar(robot: RobotFile, options: MujocoOptions) -> SimLidar | None:
         range_min=lidar.range_min,
         range_max=lidar.range_max,
         noise_m=options.lidar_noise,
+        mount=(lidar.x, lidar.y, lidar.yaw),
+        height=options.lidar_height,
     )

@@ -11,6 +11,8 @@ import mujoco
 from gigabrain_drivers.sim import STEP_S
 from gigabrain_drivers.sim.body import SimBody, SimModel
 from gigabrain_drivers.sim.mjcf_world import has_floor, load_model, model_error
+from gigabrain_drivers.sim.model_measures import align, mismatches
+from gigabrain_drivers.sim.model_parts import PartFinder
 from gigabrain_drivers.sim.world import Box, ClosedPath, Light, Pose, Shape, Walk, World
 from gigabrain_drivers.sim.world_file import MATERIALS
 from gigabrain_zenoh.errors import ConfigError
@@ -23,13 +25,13 @@ SUN = Light((0.62, 0.60, 0.56), direction=(0.30, 0.38, -0.87))
 PERSON_RADIUS_M = 0.25
 PERSON_GAP_M = 0.5  # from the person's side to the robot's outer edge
 NEW_MEETING_M = 1.0  # walked since it last stood: standing again is another meeting
+WORLDS_OWN = ("option", "njmax", "nconmax", "memory")  # parts of a model
 ROBOT = "robot/"  # prefix of all names of the robot's model
 MODEL = "world/"  # prefix of all names of the world's own model
 PERSON = "person"  # body of the first; the others have a number behind it
 SPARE = "spare/"  # prefix of what people may put in while it runs
 SPARE_THINGS, SPARE_PEOPLE = 12, 4  # each costs time in every step
 SPARE_M = 0.01  # size of a spare that is not in use
-MAX_MISMATCH = 0.05  # share by which two measures differ that should be the same
 PERSON_HEIGHT_M = 1.45  # to the shoulders
 
 
@@ -112,11 +114,16 @@ def compile_scene(body: SimModel, world: World) -> mujoco.MjModel:
     start = world.start
     try:
         robot = _robot_spec(body)
+        for name in WORLDS_OWN:  # those of the robot do not count
+            setattr(robot, name, getattr(spec, name))
         frame = spec.worldbody.add_frame(pos=(start.x, start.y, 0), quat=yaw_quaternion(start))
         spec.attach(robot, prefix=ROBOT, frame=frame)
         return spec.compile()
     except ValueError as error:
-        raise ConfigError(f"{body.path}: this MJCF model cannot be used: {error}") from error
+        problem = " ".join(str(error).split())[:300]
+        raise ConfigError(
+            f"{body.path}: this MJCF model cannot be used: {problem}", value=body.named_by
+        ) from error
 
 
 def yaw_quaternion(pose: Pose) -> tuple[float, float, float, float]:
@@ -126,11 +133,14 @@ def yaw_quaternion(pose: Pose) -> tuple[float, float, float, float]:
 
 def _robot_spec(body: SimModel) -> mujoco.MjSpec:
     """The robot's own model; worn wheels are smaller and hang lower, so the base stays level."""
-    spec = mujoco.MjSpec.from_string(body.model)
-    _check_names(spec, body)
+    on_disk = Path(body.path).is_file()  # where its meshes and includes are found
+    spec = mujoco.MjSpec.from_file(body.path) if on_disk else mujoco.MjSpec.from_string(body.model)
+    PartFinder(spec, body).fit()
+    align(spec, body)
+    for text in mismatches(spec, body):
+        log.warning("%s: %s", body.path, text)
     if not isinstance(body, SimBody):
         return spec
-    _compare_wheels(spec, body)
     for name in body.rolling:
         wheel = spec.body(name)
         radius = spec.geom(name).size[0]
@@ -138,40 +148,6 @@ def _robot_spec(body: SimModel) -> mujoco.MjSpec:
         for geom in wheel.geoms:
             geom.size = geom.size * body.wheel_scale
     return spec
-
-
-def _compare_wheels(spec: mujoco.MjSpec, body: SimBody) -> None:
-    """Warn where the wheels of the model are not those of the robot's file."""
-    left, right = (spec.body(name) for name in body.rolling[:2])
-    apart = math.dist(left.pos[:2], right.pos[:2])
-    pairs = [("wheel_separation", body.wheel_separation, apart)]
-    if body.wheel_scale == 1.0 and body.odometry_wheel_radius is None:  # else it is on purpose
-        pairs.append(("wheel_radius", body.wheel_radius, spec.geom(body.wheels[0]).size[0]))
-    for name, told, is_in_model in pairs:
-        if abs(told / is_in_model - 1.0) > MAX_MISMATCH:
-            log.warning(
-                "%s: the wheels have a %s of %.3f m here, and of %.3f m in the robot's file",
-                body.path, name, is_in_model, told,
-            )  # fmt: skip
-
-
-def _check_names(spec: mujoco.MjSpec, body: SimModel) -> None:
-    """Raises ValueError naming what the model must have and has not."""
-    wanted = [("body", "base"), ("joint", "free"), *body.parts()]
-    wanted += [("sensor", name) for name in ("gyro", "accelerometer", "attitude")]
-    if body.lidar:
-        wanted.append(("site", "lidar"))
-    find = {
-        "body": spec.body,
-        "joint": spec.joint,
-        "geom": spec.geom,
-        "actuator": spec.actuator,
-        "sensor": spec.sensor,
-        "site": spec.site,
-    }
-    missing = [f"{kind} {name!r}" for kind, name in wanted if find[kind](name) is None]
-    if missing:
-        raise ValueError(f"it has no {', no '.join(missing)}")
 
 
 def world_spec(world: World) -> mujoco.MjSpec:
