@@ -6,17 +6,10 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, checked, on_bus, print_line
-from gigabrain_zenoh.errors import BodyLost, Refused
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from gigabrain_schemas.sim import SimReply, SimRequest, Thing
-
-ANSWER_S = 3.0
-NO_WORLD = (
-    "no process has a simulated world here; start a simulation with `gigabrain demo`, and check "
-    "that your keys are an operator's"
-)
 
 
 def add(
@@ -97,12 +90,6 @@ def _in_words(thing: "Thing") -> str:
 
 
 def _ask(request: "SimRequest", at: RobotAddress) -> "SimReply":
-    """Return the granted request's reply. Raises BodyLost, and Refused with the reason."""
-    from gigabrain_schemas.topics import SIM_CHANGE
+    from gigabrain_zenoh.client.requests import change_world
 
-    replies = on_bus(at, lambda bus: bus.ask(SIM_CHANGE, request, timeout_s=ANSWER_S))
-    if not replies:
-        raise BodyLost(NO_WORLD)
-    if not replies[0].ok:
-        raise Refused(replies[0].text)
-    return replies[0]
+    return on_bus(at, lambda bus: change_world(bus, request, at.folder))

@@ -16,7 +16,17 @@ from gigabrain_schemas.requests import (
     ParamRequest,
     ReleaseRequest,
 )
-from gigabrain_schemas.topics import AUDIT_LOG, ENABLE, ESTOP, PARAM, RELEASE, TELEOP, Service
+from gigabrain_schemas.sim import SimReply, SimRequest
+from gigabrain_schemas.topics import (
+    AUDIT_LOG,
+    ENABLE,
+    ESTOP,
+    PARAM,
+    RELEASE,
+    SIM_CHANGE,
+    TELEOP,
+    Service,
+)
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.errors import BodyLost, NotConfirmed, Refused
 from gigabrain_zenoh.runtime.audit import in_order
@@ -25,6 +35,7 @@ from gigabrain_zenoh.security.identity_files import may_not_ask
 Q = TypeVar("Q", bound=Message)
 
 ANSWER_S = 1.0  # timeout of an answer
+WORLD_ANSWER_S = 3.0  # time may stand still for 2 s before the driver gives up
 
 FIRST_S, AGAIN_S = 0.15, 0.05  # until the e-stop request is repeated, and between repetitions
 GIVE_UP_S = 2.0
@@ -83,6 +94,17 @@ async def set_param(bus: Bus, process: str, name: str, value: str) -> str:
 def steer(bus: Bus, wanted: Velocity) -> None:
     """Publish the velocity that an operator wants of the robot's own control."""
     bus.publish(TELEOP, Twist(**asdict(wanted)))
+
+
+async def change_world(bus: Bus, request: SimRequest, keys: str = "") -> SimReply:
+    """Change a simulated world, or list what was put in. Raises Refused and BodyLost."""
+    replies = await bus.ask(SIM_CHANGE, request, timeout_s=WORLD_ANSWER_S)
+    if not replies:
+        doubt = may_not_ask(keys) or "; a simulation starts with `gigabrain demo`"
+        raise BodyLost(f"no process has a simulated world here{doubt}")
+    if not replies[0].ok:
+        raise Refused(replies[0].text)
+    return replies[0]
 
 
 async def audit_log(bus: Bus, newest: int) -> tuple[AuditRecord, ...]:

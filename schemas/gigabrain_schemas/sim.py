@@ -43,6 +43,7 @@ class SimScene(Message, frozen=True, kw_only=True):
     """The shapes of a simulated world, for viewers. The robot itself does not look at it.
 
     Body 0 does not move; those behind it are where the newest SimPoses of this version has them.
+    A thing's body has its name.
     """
 
     version: Count  # counts its changes

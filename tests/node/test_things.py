@@ -94,8 +94,8 @@ def test_a_person_without_a_way_stands() -> None:
         (Thing(x=0.1), "the robot is in the way"),
         (Thing(kind="cylinder", x=0.3, size=(0.4, 0.4, 0.4)), "the robot is in the way"),
         (Thing(kind="person", x=0.6), "the robot is in the way"),
-        (Thing(x=5.0), r"\(5, 0\) is outside the world; expected x from -3.4 to 3.4"),
-        (Thing(kind="person", x=1, path=((9.0, 9.0),)), r"\(9, 9\) is outside the world"),
+        (Thing(x=5.0), r"\(5.00, 0.00\) is outside the world; expected x from -3.4 to 3.4"),
+        (Thing(kind="person", x=1, path=((9.0, 9.0),)), r"\(9.00, 9.00\) is outside the world"),
         (Thing(kind="person", x=2, path=((2.0, 0.0),)), "shorter than 0.2 m"),
     ],
 )
@@ -159,6 +159,7 @@ def test_viewers_get_the_scene_and_the_poses_of_what_moves() -> None:
     assert isinstance(scene, SimScene)
     assert shapes(scene, 1) == boxes + 1
     assert [thing.name for thing in scene.things] == ["crate"]
+    assert "crate" in scene.bodies
     one.things.remove("crate")
     (_, scene), _ = live.scene()
     assert isinstance(scene, SimScene)

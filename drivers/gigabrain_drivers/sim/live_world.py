@@ -80,7 +80,7 @@ class LiveWorld:
             if request.thing is None:
                 raise Refused("nothing to add; expected a `thing`")
             added = things.add(request.thing)
-            return f"{added.name} is at ({added.x:g}, {added.y:g})"
+            return f"{added.name} is at ({added.x:.2f}, {added.y:.2f})"
         if request.do == "remove":
             return f"{things.remove(request.name).name} is gone"
         return f"{len(things.all())} things were put in"

@@ -1,10 +1,12 @@
 """A compiled scene as a message for viewers, and the poses of its bodies."""
 
+from collections.abc import Collection, Mapping
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_drivers.sim.scene import FLOOR, SPARE
+from gigabrain_drivers.sim.scene import SPARE
 from gigabrain_schemas.sim import MAX_MESH_BYTES, SHAPE_KINDS, SceneMesh, SimPoses, SimScene, Thing
 
 TYPES = {
@@ -17,7 +19,6 @@ TYPES = {
     mujoco.mjtGeom.mjGEOM_MESH: "mesh",
 }
 SHOWN_GROUPS = 3  # MuJoCo's viewers draw geom groups 0 to 2
-FLOOR_COLOUR = (0.66, 0.62, 0.56, 1.0)  # where only a texture has one
 
 
 class SceneWriter:
@@ -30,15 +31,20 @@ class SceneWriter:
             moving[body] |= moving[model.body_parentid[body]]
         spare = [model.body(body).name.startswith(SPARE) for body in range(model.nbody)]
         self._moving, self._spare = moving, np.array(spare)
-        self._bodies = self._moving_bodies(frozenset())
+        self._bodies = self._moving_bodies(())
         self._meshes: list[SceneMesh] = []
         self._mesh_numbers: dict[int, int] = {}
         self._mesh_bytes = 0
+        self._means: dict[int, NDArray[np.float64]] = {}  # colours of textures
 
-    def scene(self, version: int, things: tuple[Thing, ...], used: frozenset[int]) -> SimScene:
-        """Return the scene with the spare bodies `used`, and have `poses` tell of these bodies."""
+    def scene(self, version: int, things: tuple[Thing, ...], used: Mapping[int, str]) -> SimScene:
+        """Return the scene with the spare bodies `used`, and have `poses` tell of these bodies.
+
+        A body in use has the name of its thing.
+        """
         model = self._model
         self._bodies = self._moving_bodies(used)
+        bodies = self._bodies.tolist()
         numbers = np.zeros(model.nbody, np.uint16)
         numbers[self._bodies] = np.arange(1, len(self._bodies) + 1)
         rows = [row for geom in range(model.ngeom) if (row := self._row(geom, used))]
@@ -47,7 +53,7 @@ class SceneWriter:
         return SimScene(
             version=version,
             world=self._world[-256:],
-            bodies=("world", *(model.body(body).name[:128] for body in self._bodies)),
+            bodies=("world", *(used.get(body, model.body(body).name[:128]) for body in bodies)),
             kinds=bytes(kinds),
             owners=numbers[owners].astype("<u2").tobytes(),
             sizes=np.array(sizes, "<f4").tobytes(),
@@ -63,13 +69,13 @@ class SceneWriter:
         poses = np.hstack((data.xpos[bodies], data.xquat[bodies])).astype("<f4")
         return SimPoses(version=version, poses=poses.tobytes())
 
-    def _moving_bodies(self, used: frozenset[int]) -> NDArray[np.int64]:
+    def _moving_bodies(self, used: Collection[int]) -> NDArray[np.int64]:
         return np.array([
             body for body in np.flatnonzero(self._moving)
             if body in used or not self._spare[body]
         ], np.int64)  # fmt: skip
 
-    def _row(self, geom: int, used: frozenset[int]) -> tuple[int, int, list[float]] | None:
+    def _row(self, geom: int, used: Collection[int]) -> tuple[int, int, list[float]] | None:
         """Return kind, geom and sizes; None for what is not drawn."""
         model = self._model
         kind = TYPES.get(mujoco.mjtGeom(int(model.geom_type[geom])))
@@ -117,6 +123,19 @@ class SceneWriter:
     def _colour(self, geom: int) -> NDArray[np.uint8]:
         model, material = self._model, int(self._model.geom_matid[geom])
         colour = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
-        if model.geom(geom).name == FLOOR:
-            colour = np.array(FLOOR_COLOUR)
+        texture = -1 if material < 0 else int(model.mat_texid[material].max())
+        if texture >= 0:  # viewers draw plain colours
+            colour = np.append(colour[:3] * self._mean(texture), colour[3])
         return np.asarray(np.clip(colour * 255, 0, 255).round(), np.uint8)
+
+    def _mean(self, texture: int) -> NDArray[np.float64]:
+        """Return the mean colour of a texture, of 0 to 1."""
+        if texture in self._means:
+            return self._means[texture]
+        model = self._model
+        channels = int(model.tex_nchannel[texture])
+        size = int(model.tex_height[texture]) * int(model.tex_width[texture]) * channels
+        start = int(model.tex_adr[texture])
+        mean = model.tex_data[start : start + size].reshape(-1, channels).mean(axis=0) / 255
+        self._means[texture] = np.resize(mean[:3], 3)
+        return self._means[texture]

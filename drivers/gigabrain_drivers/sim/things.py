@@ -66,9 +66,9 @@ class Things:
         """Return what is in the world, where it was put."""
         return tuple(used.thing for used in self._used.values())
 
-    def bodies(self) -> frozenset[int]:
-        """Return the numbers of the bodies in use."""
-        return frozenset(used.body for used in self._used.values())
+    def bodies(self) -> dict[int, str]:
+        """Return the names of things by the numbers of their bodies."""
+        return {used.body: name for name, used in self._used.items()}
 
     def add(self, thing: Thing) -> Thing:
         """Put something in; return it with its name. Raises Refused."""
@@ -86,7 +86,7 @@ class Things:
         if gap < needed:
             self._hide(body)
             raise Refused(
-                f"the robot is in the way at ({thing.x:g}, {thing.y:g}): {gap:.2f} m from it; "
+                f"the robot is in the way at ({thing.x:.2f}, {thing.y:.2f}): {gap:.2f} m from it; "
                 f"expected at least {needed:g} m"
             )
         spare.pop(0)
@@ -127,9 +127,9 @@ class Things:
         for x, y in points:
             if abs(x - middle_x) > reach_x or abs(y - middle_y) > reach_y:
                 raise Refused(
-                    f"({x:g}, {y:g}) is outside the world; expected x from "
-                    f"{middle_x - reach_x:g} to {middle_x + reach_x:g} and y from "
-                    f"{middle_y - reach_y:g} to {middle_y + reach_y:g}"
+                    f"({x:.2f}, {y:.2f}) is outside the world; expected x from "
+                    f"{middle_x - reach_x:.1f} to {middle_x + reach_x:.1f} and y from "
+                    f"{middle_y - reach_y:.1f} to {middle_y + reach_y:.1f}"
                 )
         if thing.path and ClosedPath(points).length < MIN_WALK_M:
             raise Refused(f"the way of the person is shorter than {MIN_WALK_M:g} m")

@@ -16,12 +16,14 @@ from gigabrain_schemas.brain import Intent, OccupancyGrid, WorldModel
 from gigabrain_schemas.requests import Param
 from gigabrain_schemas.safety import Health, LogRecord, SafetyState
 from gigabrain_schemas.sensors import Image, LaserScan
+from gigabrain_schemas.sim import SimPoses, SimRequest
 from gigabrain_schemas.tasks import GoalRequest
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.ui.steering import ViewerScene
 
 ABOUT, STATE, SCAN, MAP, HEALTH, LOG, REPLY, IMAGE, TASK = range(1, 10)  # to the browser
+SCENE, POSES = 10, 11
 LOGIN, DRIVE, ASK = range(1, 4)  # from the browser
 MAX_KEPT_LINES = 30  # of the log, for viewers that connect later
 
@@ -61,9 +63,12 @@ class PageRequest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """Request to the robot."""
 
     id: Annotated[int, Meta(ge=0, le=2**31)]
-    what: Literal["estop", "release", "enable", "take", "goal", "cancel", "settings", "set"]
+    what: Literal[
+        "estop", "release", "enable", "take", "goal", "cancel", "settings", "set", "world"
+    ]
     estop_generation: Count = 0  # as the page shows it: a newer e-stop is not released unseen
     goal: GoalRequest | None = None
+    world: SimRequest | None = None
     process: Name = ""  # of a setting
     name: Name = ""
     value: Text = ""
@@ -121,6 +126,11 @@ def image_frame(camera: str, image: Image) -> bytes:
     return head + image.data
 
 
+def poses_frame(poses: SimPoses) -> bytes:
+    """Return the poses of a scene's bodies: 4 bytes, the scene's version, then float32."""
+    return struct.pack("<4BI", POSES, 0, 0, 0, poses.version % 2**32) + poses.poses
+
+
 class _Drive(Struct, frozen=True, array_like=True):
     x: Finite
     y: Finite
@@ -156,11 +166,13 @@ class PageView(ViewerScene):
         on_body: Callable[[], None] = lambda: None,
     ) -> None:
         self._send, self._on_body = send, on_body
-        self._kept: dict[str, bytes] = {}  # map and task, by slot
+        self._kept: dict[str, bytes] = {}  # map, task and scene, by slot
         self._lines: list[bytes] = []
         self._described: BodyDescription | None = None
         self._numbers = itertools.count()
         super().__init__(bus)
+        self.newest_of(topics.SIM_POSES)
+        bus.latest(topics.SIM_SCENE, lambda scene: self._keep("scene", as_json(SCENE, scene)))
 
     def state_frame(self, driving: int, viewers: int) -> bytes:
         """Return the present state of the robot."""
@@ -180,11 +192,13 @@ class PageView(ViewerScene):
         return as_json(STATE, content)
 
     def new_frames(self) -> Iterator[tuple[str, bytes]]:
-        """Yield scan and images received since the last call, with their slots."""
+        """Yield scan, poses and images received since the last call, with their slots."""
         pose, _ = self._newest_pose(self.state.fresh())
         scan: LaserScan | None = self.sampled[topics.SCAN].poll()
         if scan and pose and self.body:
             yield "scan", scan_frame(scan, self.body.description, pose)
+        if poses := self.sampled[topics.SIM_POSES].poll():
+            yield "poses", poses_frame(poses)
         for camera, sampled in list(self.images.items()):
             if image := sampled.poll():
                 yield f"image/{camera}", image_frame(camera, image)

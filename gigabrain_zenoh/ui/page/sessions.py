@@ -9,11 +9,13 @@ from collections.abc import Callable, Iterable, Sequence
 from msgspec.structs import replace
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from gigabrain_schemas.sim import SimRequest
 from gigabrain_schemas.tasks import GoalReply, TaskReply, TaskRequest
 from gigabrain_schemas.topics import GOAL, TASK_CHANGE
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.client.requests import (
     ANSWER_S,
+    change_world,
     enable,
     params,
     press_estop,
@@ -103,6 +105,9 @@ class RequestHandler:
         if request.what == "set":
             names = request.process, request.name, request.value
             return await set_param(self._bus, *names), ""
+        if request.what == "world":
+            wanted = replace(request.world or SimRequest(), source=self._bus.process)
+            return (await change_world(self._bus, wanted)).text, ""
         if request.what == "estop":
             reply = await press_estop(self._bus, "operator page")
         elif request.what == "release":

@@ -4,6 +4,7 @@ import { Link } from './link.js'
 import { MapView } from './map.js'
 import { $, setText, showFigures, showGate, showHealth, showImage, showLogLine, showSafety, showTables, showTask } from './panels.js'
 import { Settings } from './settings.js'
+import { WorldView } from './world_view.js'
 
 const STOP_TIMEOUT_MS = 2500 // the server gives up after two seconds
 const BY_HAND = 'press the hardware e-stop or cut the power'
@@ -17,6 +18,10 @@ const token = decodeURIComponent(location.hash.slice(1))
 if (token) { store('token', token); history.replaceState(null, '', location.pathname) }
 
 const map = new MapView($('map'), sendGoal)
+const world = new WorldView($('world'), {
+  change: (request) => link.request('world', { world: request }),
+  say: (text, ok) => show($('goal'), text, `note${ok ? '' : ' bad'}`),
+})
 const link = new Link({
   about(info) {
     about = info
@@ -44,6 +49,11 @@ const link = new Link({
   health: showHealth,
   log: showLogLine,
   image: showImage,
+  scene(scene) {
+    world.setScene(scene)
+    $('show-world').hidden = false
+  },
+  poses: (version, poses) => world.setPoses(version, poses),
   reply: showReply,
   connection(status) {
     const live = status === 'live'
@@ -125,11 +135,28 @@ $('estop').addEventListener('pointerdown', (event) => { event.preventDefault(); 
 $('estop').addEventListener('click', (event) => { if (event.detail === 0) stop() }) // by keyboard or by a screen reader
 for (const what of ['release', 'enable', 'take', 'cancel']) $(what).addEventListener('click', () => request(what))
 $('speed-share').addEventListener('input', () => setText($('percent'), `${$('speed-share').value} %`))
-$('zoom-in').addEventListener('click', () => map.zoom(1.3))
-$('zoom-out').addEventListener('click', () => map.zoom(1 / 1.3))
+const view = () => (world.shown ? world : map)
+$('zoom-in').addEventListener('click', () => view().zoom(1.3))
+$('zoom-out').addEventListener('click', () => view().zoom(1 / 1.3))
 for (const [id, option] of [['follow', 'follow'], ['move-map', 'dragMoves']]) {
-  $(id).addEventListener('click', () => { map[option] = !map[option]; $(id).setAttribute('aria-pressed', map[option]) })
+  $(id).addEventListener('click', () => {
+    world[option] = map[option] = !map[option]
+    $(id).setAttribute('aria-pressed', map[option])
+  })
 }
+$('show-world').addEventListener('click', () => {
+  const problem = world.show(!world.shown)
+  if (problem) show($('goal'), problem, 'note bad')
+  $('show-world').setAttribute('aria-pressed', world.shown)
+  $('world-tools').hidden = !world.shown || viewOnly()
+  $('move-map').hidden = document.querySelector('.legend').hidden = world.shown
+})
+const tools = [...document.querySelectorAll('[data-tool]')]
+for (const button of tools) button.addEventListener('click', () => {
+  world.tool = world.tool === button.dataset.tool ? '' : button.dataset.tool
+  $('world').classList.toggle('placing', world.tool !== '')
+  for (const each of tools) each.setAttribute('aria-pressed', each.dataset.tool === world.tool)
+})
 $('login').addEventListener('close', () => { link.token = $('token').value; store('token', link.token); link.open() })
 
 $('theme').addEventListener('click', () => {
@@ -138,6 +165,7 @@ $('theme').addEventListener('click', () => {
   root.dataset.theme = dark ? 'light' : 'dark'
   try { localStorage.setItem('theme', root.dataset.theme) } catch { /* private mode */ }
   map.recolour()
+  world.draw()
 })
 try { const theme = localStorage.getItem('theme'); if (theme) { document.documentElement.dataset.theme = theme; map.recolour() } } catch { /* private mode */ }
 matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => map.recolour())
