@@ -106,11 +106,12 @@ def mission(
         file: YAML file; docs/how-to/missions.md describes it.
         check: Only check the file; no robot is needed.
     """
-    from gigabrain_zenoh.decision.tasks.mission import load
+    from gigabrain_zenoh.decision.tasks.mission import load, map_places
 
-    load(file)  # refuse a wrong file before connecting
+    loaded, _ = load(file)  # refuse a wrong file before connecting
     if check:
-        print_line(f"{file}: valid")
+        needs = ", ".join(sorted(set(map_places(loaded))))
+        print_line(f"{file}: valid{f'; the map must have the places {needs}' if needs else ''}")
         return
     _send(at, lambda tasks: tasks.carry_out(file, how=mode), wait)
 

@@ -10,10 +10,12 @@ from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import ActuationModel, CmdVel, OccupancyGrid, PoseInMap, WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import BODY, MAP, POSE, STATE, command_topic
+from gigabrain_schemas.zones import Zone
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.freshness import PreviousTick
 from gigabrain_zenoh.decision.actuation_model import ActuationEstimator
 from gigabrain_zenoh.decision.behaviours import WaitReason, battery_nearly_empty
+from gigabrain_zenoh.decision.zones import ZoneSource
 from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.geometry.limits import SentCommand, clamp, limits_of
 from gigabrain_zenoh.geometry.pose import PoseHistory, compose, inverse, velocity_of
@@ -44,6 +46,7 @@ class NavigationContext:
     sent: tuple[SentCommand, ...]
     held: str  # why the body does not follow decision, for people; empty while it does
     slowed_by: str  # causes that safety reports, for people
+    zones: tuple[Zone, ...]
 
     @property
     def here(self) -> Pose | None:
@@ -90,8 +93,8 @@ class ScanLatency:
 class ContextSource:
     """Collects the navigator's inputs from the bus."""
 
-    def __init__(self, bus: Bus) -> None:
-        self._bus = bus
+    def __init__(self, bus: Bus, zones: ZoneSource) -> None:
+        self._bus, self._zones = bus, zones
         self._estimator, self._history = ActuationEstimator(), PoseHistory()
         self._states: deque[RobotState] = deque(maxlen=SENT_TICKS)
         self._latency = ScanLatency()
@@ -142,6 +145,7 @@ class ContextSource:
             sent=tuple(SentCommand(*one) for one in sent),
             held=self._held(state),
             slowed_by="; ".join(one.text for one in verdict.causes)[:300] if verdict else "",
+            zones=self._zones.at(state.boot, tick).zones,
         )
 
     @property

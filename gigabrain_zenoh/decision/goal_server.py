@@ -49,6 +49,7 @@ from gigabrain_zenoh.decision.tasks import mission as missions
 from gigabrain_zenoh.decision.tasks.mission import Mission
 from gigabrain_zenoh.decision.tasks.scripts import Scripts
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile, TaskQueue
+from gigabrain_zenoh.decision.zones import ZoneSource
 from gigabrain_zenoh.errors import GigabrainError, Refused
 from gigabrain_zenoh.host.threads import BackgroundWriter
 from gigabrain_zenoh.kernels.precompile import Kernels
@@ -75,8 +76,10 @@ CheckGoal = Callable[[Goal | None], Awaitable[str]]
 class TaskServer:
     """Serves tasks on the bus: keeps the queue, publishes its status and writes it to disk."""
 
-    def __init__(self, bus: Bus, check: CheckGoal, *, folder: str = "", scripts: str = "") -> None:
-        self._bus, self._check = bus, check
+    def __init__(
+        self, bus: Bus, check: CheckGoal, zones: ZoneSource, *, folder: str = "", scripts: str = ""
+    ) -> None:
+        self._bus, self._check, self._zones = bus, check, zones
         self._scripts, self._topics, file = Scripts(scripts), TopicCache(bus), TaskFile(folder)
         saved, problem = file.read()
         if problem:
@@ -86,6 +89,7 @@ class TaskServer:
         self._written, self._write_fault = saved, Fault(log)
         self._boot = self._tick = self._status_tick = self._basis = 0
         self._logged: set[str] = set()  # tasks whose end was logged
+        self._maps_loaded: int | None = None  # see Zones
         self._waits = ""  # what all tasks wait for, before the first step
         bus.serve(GOAL, self._on_goal)
         bus.serve(MISSION, self._on_mission)
@@ -120,11 +124,22 @@ class TaskServer:
         if not same_boot:
             self._queue.restart(state.boot)
             self._status_tick = 0
+        self._drop_if_moved()
         self._topics.observe(state)
         wanted = self._queue.step(seconds, outcome)
         if not 0 <= state.tick - self._status_tick < STATUS_TICKS or self._just_ended():
             self._publish()
         return wanted
+
+    def _drop_if_moved(self) -> None:
+        """Cancel all tasks if another map was loaded: their coordinates mean other places."""
+        loaded = self._zones.maps_loaded(self._boot, self._tick)
+        if loaded is None or loaded == self._maps_loaded:
+            return
+        before, self._maps_loaded = self._maps_loaded, loaded
+        if before is not None and self._queue.status.current:
+            text = self._queue.cancel("all", "loading another map")
+            log.warning("%s: another map was loaded", text, extra={"data": {"event": "task"}})
 
     def begin(self, mission: Mission, label: str, boot: int) -> None:
         """Start a mission, unless there were tasks in this start of the driver."""
@@ -167,21 +182,28 @@ class TaskServer:
             self._write_fault.end("tasks are saved again")
 
     async def _on_goal(self, request: GoalRequest) -> GoalReply:
-        goal = Goal(x=request.x, y=request.y, yaw=request.yaw)
         try:
+            goal = self._goal_of(request)
             path = await self._check(goal)
-            name = self._queue.add_goal(goal, request.how, request.source)
+            name = self._queue.add_goal(goal, request.how, request.source, request.place)
         except GigabrainError as error:
             _log_refusal("goal", request.source, error)
             return GoalReply(ok=False, text=str(error)[:500])
         self._accept(name, GOAL, request)
         return GoalReply(ok=True, text=f"{name}: {path}"[:500], goal=name)
 
+    def _goal_of(self, request: GoalRequest) -> Goal:
+        """Return the goal that is asked for. Raises Refused for a place that is not there."""
+        if request.x is None or request.y is None:
+            return self._zones.goal(request.place, request.yaw)
+        return Goal(x=request.x, y=request.y, yaw=request.yaw)
+
     async def _on_mission(self, request: MissionRequest) -> MissionReply:
         label = request.label or "mission"
         try:
             # a long one takes a tenth of a second to parse, which no scan should wait for
-            mission = await asyncio.to_thread(missions.loads, request.mission, label)
+            places = self._zones.newest.places
+            mission = await asyncio.to_thread(missions.loads, request.mission, label, places)
             for script in mission.scripts:
                 self._scripts.path(script)
             if mission.drives:
@@ -231,8 +253,11 @@ class GoalServer(InputSource):
 
     def __init__(self, settings: NavigationConfig, bus: Bus, config: DecisionConfig) -> None:
         self._bus, self._config, self._name = bus, settings, config.behaviour
-        self._tasks = TaskServer(bus, self.check, folder=config.state_dir, scripts=settings.scripts)
-        self._source = ContextSource(bus)
+        self._zones = ZoneSource(bus)
+        self._tasks = TaskServer(
+            bus, self.check, self._zones, folder=config.state_dir, scripts=settings.scripts
+        )
+        self._source = ContextSource(bus, self._zones)
         self._kernels = Kernels(DRIVE_KERNELS, bus.input_log.in_time)
         self._compile_first = config.compile_first or not bus.input_log.live
         self._avoid = Avoid(_roaming(settings))  # drives without a map
@@ -302,7 +327,9 @@ class GoalServer(InputSource):
         if self._navigator is None:
             from gigabrain_zenoh.decision.navigator import Navigator  # imports numba
 
-            self._navigator = Navigator(self._config, self._bus, self._source, self._name)
+            self._navigator = Navigator(
+                self._config, self._bus, self._source, self._name, self._zones
+            )
         return self._navigator
 
     def _awaits_map(self, state: RobotState) -> bool:

@@ -15,6 +15,7 @@ from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import Intent, WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import MOST_POINTS, Goal
+from gigabrain_schemas.zones import Zone
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.decision.behaviours import (
     DriveCommand,
@@ -33,6 +34,7 @@ from gigabrain_zenoh.decision.route import (
     RoutePlanner,
 )
 from gigabrain_zenoh.decision.route_schedule import RouteSchedule
+from gigabrain_zenoh.decision.zones import ZoneSource
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.geometry.pose import compose, inverse
@@ -41,6 +43,7 @@ from gigabrain_zenoh.navigation import car_planner, global_planner, local_planne
 from gigabrain_zenoh.navigation.costmap import inflation
 from gigabrain_zenoh.navigation.global_planner import Unreachable
 from gigabrain_zenoh.navigation.local_planner import DEFAULTS, LocalSettings
+from gigabrain_zenoh.navigation.zones import NO_ZONES, SpeedCap, ZoneMap
 
 MAX_SCAN_AGE_TICKS = 10  # of a scan to drive by
 MAX_NEAR_OVER_M = 0.25  # beyond, the clearance within reach of the local planner costs alike
@@ -58,10 +61,16 @@ class Navigator:
     """Drives one robot by its map."""
 
     def __init__(
-        self, config: NavigationConfig, bus: Bus, source: ContextSource, behaviour: str
+        self,
+        config: NavigationConfig,
+        bus: Bus,
+        source: ContextSource,
+        behaviour: str,
+        zones: ZoneSource,
     ) -> None:
         self._bus, self._config, self._behaviour = bus, config, behaviour
-        self._source = source  # which its owner feeds with states
+        self._source, self._zones = source, zones  # its owner feeds the source with states
+        self._zone_map, self._zoned = NO_ZONES, tuple[Zone, ...]()  # and the zones in that map
         self._routes = RouteSchedule(config, bus)
         self._context: NavigationContext | None = None
         self._boot = 0
@@ -88,6 +97,9 @@ class Navigator:
             self._routes.at_scan()
         self._context = context = self._source.at_scan(state, world, verdict)
         self._routes.count_held(state.boot, context.tick, context.held)
+        if context.zones is not self._zoned and context.zones != self._zoned:
+            self._zone_map = ZoneMap(context.zones)
+        self._zoned = context.zones
         return context
 
     def drive(self, command: DriveCommand | None, idle: Idle) -> StepResult:
@@ -137,13 +149,14 @@ class Navigator:
 
     async def check(self, goal: Goal) -> PathCheck:
         """Return the path to `goal`. Raises Refused, with the reason, if there is none."""
-        grid = self._source.grid(self._bus.time.boot, self._bus.time.tick + 1)
+        now = self._bus.time.boot, self._bus.time.tick + 1
+        grid, zones = self._source.grid(*now), ZoneMap(self._zones.newest.zones)
         body, here = self._source.body, self._context.here if self._context else None
         if grid is None or body is None or here is None:
             raise Refused(self.lost)
         # a second planner, as the first may be planning in the worker thread
         routes = RoutePlanner(self._config.unknown_space)
-        found = await asyncio.to_thread(routes.check, grid, body, here, goal)
+        found = await asyncio.to_thread(routes.check, grid, body, here, goal, zones)
         if isinstance(found, Unreachable):
             raise Refused(found.reason)
         return found
@@ -156,7 +169,7 @@ class Navigator:
             grid = self._source.grid(world.boot, world.basis)
             self._oriented = self._oriented or grid is not None
             if command and grid:
-                self._routes.request(context, here, command, grid)
+                self._routes.request(context, here, command, grid, self._zone_map)
         return self._routes.route
 
     def _stand(self, command: DriveCommand | None, why: Idle) -> StepResult:
@@ -188,6 +201,12 @@ class Navigator:
         assert context.map_from_odom
         assert context.world
         to_odom = inverse(context.map_from_odom)
+        here = compose(context.map_from_odom, context.pose)
+        cap = self._speed_cap(context, here, points)
+        reach = DEFAULTS.window
+        around = here.x, here.y, reach
+        keepouts = self._zone_map.keepouts_near(*around)
+        lanes = self._zone_map.lanes_beside(*around, _rest_of(points, here)[1:])
         there = compose(to_odom, Pose(x=goal.x, y=goal.y, yaw=goal.yaw or 0.0))
         turned, headings = np.array((to_odom.yaw, 0.0)), route.headings
         headings = None if headings is None else headings + turned
@@ -204,6 +223,9 @@ class Navigator:
             sent=context.sent,
             delayed=context.delayed_s,
             may_back=context.may_reverse,
+            keepouts=tuple(transform(from_pose(to_odom), one) for one in keepouts),
+            avoid=tuple(transform(from_pose(to_odom), one) for one in lanes),
+            max_speed=cap.speed if cap else None,
         )
         plan = self._local_planner(context).plan(moment)
         self._routes.report(
@@ -218,6 +240,8 @@ class Navigator:
         headline = f"{route.activity}: {route.reason}" if route.activity else outcome.activity
         late = context.delayed_s
         slow = f"; slower: this host is late by {late:.2f} s" if late else ""
+        if cap and cap.speed < self._fastest(context):
+            slow += f"; at most {cap.speed:.2f} m/s: speed zone {cap.zone!r}"
         intent = self._intent(
             twist=plan.twist,
             trajectory=plan.trajectory,
@@ -245,7 +269,7 @@ class Navigator:
         distance_m = float(np.hypot(*np.diff(left, axis=0).T).sum())
         self._longest_m = max(self._longest_m, distance_m, 1e-6)
         arrived = plan.arrived and command.kind != "explore" and not route.activity
-        speed = min(self._config.max_linear_speed or math.inf, context.body.max_linear_speed)
+        speed = self._fastest(context)
         place = describe_goal(route.goal)
         driving = "exploring" if command.kind == "explore" else f"going to {place}"
         at = f"at {place}, {route.reason}" if route.reason else f"at {place}"
@@ -262,6 +286,21 @@ class Navigator:
             path=_thinned(left),
             position_error=position_error,
             heading_error=heading_error,
+        )
+
+    def _fastest(self, context: NavigationContext) -> float:
+        assert context.body
+        return min(self._config.max_linear_speed or math.inf, context.body.max_linear_speed)
+
+    def _speed_cap(self, context: NavigationContext, here: Pose, points: Floats) -> SpeedCap | None:
+        assert context.body
+        v, body = context.velocity, context.body
+        return self._zone_map.speed_cap(
+            here,
+            body.footprint,
+            _rest_of(points, here),
+            math.hypot(v.linear_x, v.linear_y),
+            body.max_linear_deceleration,
         )
 
     def _local_planner(self, context: NavigationContext) -> local_planner.LocalPlanner:

@@ -14,10 +14,19 @@ from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.decision.behaviours import DriveCommand
 from gigabrain_zenoh.decision.give_way import GiveWay
-from gigabrain_zenoh.navigation.costmap import Costmap, Unknown, costmap, inflation
-from gigabrain_zenoh.navigation.global_planner import Path, Unreachable, frontiers
+from gigabrain_zenoh.decision.progress import AT_GOAL_M, ProgressMonitor
+from gigabrain_zenoh.navigation.costmap import (
+    Costmap,
+    Unknown,
+    ZoneOverlay,
+    costmap,
+    inflation,
+    with_zones,
+)
+from gigabrain_zenoh.navigation.global_planner import NO_WAY, Path, Unreachable, frontiers
 from gigabrain_zenoh.navigation.local_planner import LocalSettings
 from gigabrain_zenoh.navigation.path_planner import PathPlanner
+from gigabrain_zenoh.navigation.zones import NO_ZONES, ZoneMap
 
 GIVE_UP_TICKS = 1500  # 30 s of driving without progress
 NO_PROGRESS = "no progress for 30 s"
@@ -33,51 +42,7 @@ OCCUPIED_TICKS = 500  # 10 s without progress towards an occupied goal
 GOAL_MARGIN_M = 2.0  # of unknown space around a goal outside the map
 MAX_ENLARGED_CELLS = 4_000_000
 
-PROGRESS_M = 0.3  # a smaller gain is no progress
-DETOUR_M = 1.0  # a path that is longer than the last plan by this is another way
-AT_GOAL_M = 0.05  # of path left where the robot only has to turn and stop
-MAX_TIMER_RESTARTS = 3  # for detours and arrivals, until the robot is nearer than ever
-
 Point = tuple[float, float]
-
-
-class ProgressMonitor:
-    """Measures for how long the remaining path has not become shorter.
-
-    The timer restarts for a detour that has become necessary, and when the goal is reached, also
-    after giving way there.
-    """
-
-    def __init__(self, tick: int) -> None:
-        self._since_tick = tick  # of the last progress
-        self._best_m = self._nearest_m = self._remaining_m = math.inf  # ever, on this way, and now
-        self._restarts = 0
-        self._was_held = False
-
-    def measure(self, remaining_m: float, tick: int) -> None:
-        """Record the length of the remaining path [m]."""
-        if self._was_held and remaining_m > self._remaining_m:  # an operator has driven it away
-            self._nearest_m += remaining_m - self._remaining_m
-            self._best_m += remaining_m - self._remaining_m
-        self._was_held = False
-        if remaining_m < self._best_m - PROGRESS_M:
-            self._best_m, self._restarts = remaining_m, 0
-        detour = remaining_m > self._remaining_m + DETOUR_M
-        arrival = remaining_m <= AT_GOAL_M < self._remaining_m
-        restart = (detour or arrival) and self._restarts < MAX_TIMER_RESTARTS
-        self._restarts += restart
-        self._remaining_m = remaining_m
-        if restart or remaining_m < self._nearest_m - PROGRESS_M:
-            self._nearest_m, self._since_tick = remaining_m, tick
-
-    def hold(self, ticks: int) -> None:
-        """Leave out `ticks` in which the robot could not follow the route."""
-        self._since_tick += ticks
-        self._was_held = self._was_held or ticks > 0
-
-    def stuck(self, tick: int, ticks: int) -> bool:
-        """Return whether there has been no progress for more than `ticks`."""
-        return tick - self._since_tick > ticks
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -115,6 +80,7 @@ class RouteRequest:
     body: BodyDescription
     feedback: RouteFeedback | None  # of the last route
     seen: Floats  # (n, 2) [m], hits of the newest scan, in the map
+    zones: ZoneMap = NO_ZONES
     inflation: float | None = None  # [m], see NavigationConfig
     held_ticks: int = 0  # since the last route, in which the body could not follow it
     slowed_by: str = ""  # causes that safety reports, for people
@@ -134,7 +100,12 @@ class RoutePlanner:
     def __init__(self, unknown_space: Unknown = "avoid") -> None:
         self._planner, self._unknown_space = PathPlanner(), unknown_space
         self._costmap: Costmap | None = None
+        self._bare: Costmap | None = None  # the same without zones
         self._costmap_key: tuple[object, ...] = ()
+        self._overlay: ZoneOverlay | None = None
+        self._overlay_key: tuple[object, ...] = ()
+        self._zones = NO_ZONES
+        self._rezoned = False  # the zones have changed since the last plan
         self._blocking: Floats = np.empty((0, 2))  # hits that blocked a route
         self._blocking_tick = 0
         self._version = 0
@@ -158,11 +129,17 @@ class RoutePlanner:
         return self._explore(request, costs)
 
     def check(
-        self, grid: OccupancyGrid, body: BodyDescription, here: Pose, goal: Goal
+        self,
+        grid: OccupancyGrid,
+        body: BodyDescription,
+        here: Pose,
+        goal: Goal,
+        zones: ZoneMap = NO_ZONES,
     ) -> PathCheck | Unreachable:
         """Return the length of the path to a goal, or why there is none."""
-        rules = inflation(body, self._unknown_space)
-        costs = costmap(self._enlarged(grid, goal), rules, before=None)
+        rules, grid = inflation(body, self._unknown_space), self._enlarged(grid, goal)
+        bare = costmap(grid, rules, before=None)
+        costs = with_zones(bare, zones.overlay(grid, rules))
         planner = PathPlanner()
         found, offset = planner.plan(costs, body, here, goal), ""
         if isinstance(found, Unreachable) and found.nearest and found.distance <= ARRIVED_M:
@@ -170,7 +147,7 @@ class RoutePlanner:
             x, y = found.nearest
             found = planner.plan(costs, body, here, Goal(x=x, y=y, yaw=goal.yaw))
         if isinstance(found, Unreachable):
-            return found
+            return explained(found, zones, bare, body, here, goal)
         return PathCheck(length_m=float(found.remaining[0]), offset=offset)
 
     def _enlarged(self, grid: OccupancyGrid, goal: Goal) -> OccupancyGrid:
@@ -194,6 +171,9 @@ class RoutePlanner:
         feedback = request.feedback
         passed, self._last_tick = max(0, request.tick - self._last_tick), request.tick
         self._progress.hold(min(request.held_ticks, passed))
+        self._rezoned = request.zones is not self._zones
+        if self._rezoned:  # what was planned without them does not count any more
+            self._zones, self._path, self._last_path = request.zones, None, None
         self._doing = feedback.reason if feedback else self._doing
         if feedback and feedback.blocked and feedback.version == self._version:
             self._blocking, self._blocking_tick = request.seen, request.tick
@@ -202,14 +182,24 @@ class RoutePlanner:
 
     def _update_costmap(self, request: RouteRequest) -> Costmap:
         blocked = self._blocking_tick if len(self._blocking) else 0
-        key = (request.grid, request.body, blocked, request.inflation)
+        key = (request.grid, request.body, blocked, request.inflation, request.zones)
         known = self._costmap_key
         same = known and all(a is b or a == b for a, b in zip(key, known, strict=True))
         if self._costmap is None or not same:
             rules = inflation(request.body, self._unknown_space, request.inflation)
-            self._costmap = costmap(request.grid, rules, self._blocking, self._costmap)
+            self._bare = costmap(request.grid, rules, self._blocking, self._bare)
+            self._costmap = with_zones(self._bare, self._zone_overlay(request, self._bare))
             self._costmap_key = key
         return self._costmap
+
+    def _zone_overlay(self, request: RouteRequest, bare: Costmap) -> ZoneOverlay | None:
+        """Return the overlay of the zones; it is computed when they or the grid's edges change."""
+        shape = (bare.resolution, bare.origin_x, bare.origin_y, bare.cost.shape)
+        key = (request.zones, bare.inflation, *shape)
+        if key != self._overlay_key:
+            self._overlay = request.zones.overlay(request.grid, bare.inflation)
+            self._overlay_key = key
+        return self._overlay
 
     def _to_goal(self, goal: Goal, request: RouteRequest, costs: Costmap) -> Route:
         first, requested = self._goal is None, goal
@@ -224,8 +214,12 @@ class RoutePlanner:
             goal = Goal(x=found.nearest[0], y=found.nearest[1], yaw=goal.yaw)
             found = self._planner.plan(costs, request.body, request.here, goal)
         if isinstance(found, Unreachable):
-            if first or self._progress.stuck(request.tick, GIVE_UP_TICKS):
-                return self._route(state="failed", reason=found.reason)
+            assert self._bare
+            around = self._zones, self._bare, request.body, request.here
+            why = explained(found, *around, goal)
+            closed = self._rezoned and why is not found
+            if first or closed or self._progress.stuck(request.tick, GIVE_UP_TICKS):
+                return self._route(state="failed", reason=why.reason)
             if self._last_path:  # noise closes narrow ways in the map; the scan shows them
                 return self._go(goal, self._last_path)
             return self._approach(found, request, costs)
@@ -346,6 +340,20 @@ class RoutePlanner:
 
     def _route(self, **fields: Any) -> Route:
         return Route(number=self._number, version=self._version, **fields)
+
+
+def explained(
+    found: Unreachable, zones: ZoneMap, bare: Costmap, body: BodyDescription, here: Pose, goal: Goal
+) -> Unreachable:
+    """Return `found` with the zone that closes the way, if it is one; `bare` is without zones."""
+    if problem := zones.problem(goal.x, goal.y, bare.inflation.fits):
+        return replace(found, fault=f"the goal {problem}")
+    if found.fault != NO_WAY or zones.empty:
+        return found
+    path = PathPlanner().plan(bare, body, here, goal)
+    if isinstance(path, Unreachable):
+        return found
+    return replace(found, fault=f"{NO_WAY} {zones.in_the_way(path.points)}")
 
 
 def _random_place(request: RouteRequest, costs: Costmap, planner: PathPlanner) -> Goal:

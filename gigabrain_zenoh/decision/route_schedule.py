@@ -10,6 +10,7 @@ from gigabrain_zenoh.decision.context import NavigationContext
 from gigabrain_zenoh.decision.route import Route, RouteFeedback, RoutePlanner, RouteRequest
 from gigabrain_zenoh.geometry.se2 import from_pose, transform
 from gigabrain_zenoh.host.threads import ScheduledWorker, Take
+from gigabrain_zenoh.navigation.zones import ZoneMap
 
 SMALL_MAP_CELLS = 60_000  # routes in larger maps are planned in a worker thread,
 CELLS_PER_SCAN = 250_000  # every this many cells add one scan until a plan is due
@@ -27,7 +28,8 @@ class RouteSchedule:
         self._planner = RoutePlanner(config.unknown_space)
         self._worker = ScheduledWorker(PATIENCE_S, bus.input_log.in_time)
         self.route: Route | None = None
-        self._planned: tuple[int, OccupancyGrid] | None = None  # tick and map of the last plan
+        self._planned: tuple[int, OccupancyGrid, ZoneMap] | None = None  # tick, map and zones of
+        # the last plan
         self._feedback: RouteFeedback | None = None
         self._stands = False  # the route was not followed in the last step
         self._counted = (0, 0)  # boot and tick until which `_held_ticks` has counted
@@ -53,7 +55,12 @@ class RouteSchedule:
         self._stands = feedback is None and route is not None and route.points is not None
 
     def request(
-        self, context: NavigationContext, here: Pose, command: DriveCommand, grid: OccupancyGrid
+        self,
+        context: NavigationContext,
+        here: Pose,
+        command: DriveCommand,
+        grid: OccupancyGrid,
+        zones: ZoneMap,
     ) -> None:
         """Plan a route if one is due; in a large map it becomes `route` at a later scan."""
         cells = grid.width * grid.height
@@ -61,11 +68,12 @@ class RouteSchedule:
         if not self._worker.idle:  # maybe with a larger map, which this one has replaced
             self._worker.hasten(scans)
             return
-        if not self._due(command, context.tick, grid):
+        if not self._due(command, context.tick, grid, zones):
             return
         assert context.world
         assert context.body
-        self._planned, feedback, self._feedback = (context.tick, grid), self._feedback, None
+        self._planned = context.tick, grid, zones
+        feedback, self._feedback = self._feedback, None
         request = RouteRequest(
             tick=context.tick,
             command=command,
@@ -74,6 +82,7 @@ class RouteSchedule:
             body=context.body,
             feedback=feedback,
             seen=transform(from_pose(here), context.world.points().astype(np.float64)),
+            zones=zones,
             inflation=self.inflation,
             held_ticks=self._held_ticks,
             slowed_by=context.slowed_by,
@@ -103,11 +112,12 @@ class RouteSchedule:
 
         return take
 
-    def _due(self, command: DriveCommand, tick: int, grid: OccupancyGrid) -> bool:
+    def _due(self, command: DriveCommand, tick: int, grid: OccupancyGrid, zones: ZoneMap) -> bool:
         route = self.route
         if route is None or self._planned is None or route.number != command.number:
             return True
-        before, known = self._planned
+        before, known, rules = self._planned
         if self._feedback and self._feedback.arrived and self._feedback.version == route.version:
             return True
-        return grid is not known or not 0 <= tick - before < REPLAN_TICKS
+        changed = grid is not known or zones is not rules
+        return changed or not 0 <= tick - before < REPLAN_TICKS

@@ -14,7 +14,7 @@ from gigabrain_zenoh.kernels.images import OCCUPIED_PERCENT, Singles, squared_di
 from gigabrain_zenoh.navigation import hybrid_astar as hybrid
 from gigabrain_zenoh.navigation.costmap import LETHAL, Costmap, Inflation
 from gigabrain_zenoh.navigation.costmap import costmap as make_costmap
-from gigabrain_zenoh.navigation.global_planner import Path, Unreachable, goal_problem
+from gigabrain_zenoh.navigation.global_planner import NO_WAY, Path, Unreachable, goal_problem
 from gigabrain_zenoh.navigation.grid_search import GridSearch
 from gigabrain_zenoh.navigation.reeds_shepp import SEGMENTS, TINY, along, best_word
 
@@ -68,9 +68,9 @@ class CarPlanner:
         if here is None:
             return Unreachable(fault="the robot is outside the map")
         car = car_of(body)
-        to_go = self._grid.field(costmap.cost, cell, "to") * costmap.resolution
+        to_go = self._grid.field(costmap.cost, cell, "to", costmap.against) * costmap.resolution
         if to_go[here] == math.inf and costmap.cost[here] < LETHAL:
-            return Unreachable(fault="no way leads to the goal")
+            return Unreachable(fault=NO_WAY)
         terrain = self._terrain(costmap, to_go)
         begin, end = _pose(start), (goal.x, goal.y, math.nan if goal.yaw is None else goal.yaw)
         needs = _needs(terrain, car, begin, end)
@@ -104,6 +104,8 @@ class CarPlanner:
             cells = costmap.cells
             if costmap.inflation.unknown == "forbid":
                 cells = np.where(cells < 0, np.int8(OCCUPIED_PERCENT), cells)
+            if costmap.keepouts is not None:
+                cells = np.maximum(cells, costmap.keepouts)
             squares = squared_distance(cells, math.ceil(FAR_M / resolution) + 1)
             distance = ((np.sqrt(squares) - 0.5) * resolution).astype(np.float32)
             self._known = costmap, distance

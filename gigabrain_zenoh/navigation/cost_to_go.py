@@ -1,6 +1,7 @@
 """Cost to go from every place in the window to the goal."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import kernel
 from gigabrain_zenoh.navigation.footprint import DistanceGrid, between
+from gigabrain_zenoh.navigation.zones import fill
 
 COARSER = 2  # cells of the window per cell of the field, along each axis
 FARTHEST = 1e4  # [m], what cannot be reached
@@ -44,15 +46,17 @@ class CostToGo:
 
     def field(
         self, grid: DistanceGrid, half_width: float, goal: tuple[float, float], path: Floats | None,
-        ways: Ways | None = None,
+        ways: Ways | None = None, avoid: Sequence[Floats] = (),
     ) -> DistanceGrid:  # fmt: skip
         """Return the cost from each place to the goal, or to the path's exit [m of free way].
 
         Without a path, and with the goal outside, every place at the rim counts on free way beyond,
-        or on the cost of the `ways` there.
+        or on the cost of the `ways` there. Polygons `avoid` (n, 2) [m] cost as much as touching.
         """
         cell = grid.cell * COARSER
         _price(grid.distance, np.float32(half_width), np.float32(cell / 2.0 / UNIT), self._halves)
+        if len(avoid):
+            self._raise_costs(avoid, cell, (grid.x, grid.y))
         self._padded.fill(round(FARTHEST / UNIT))
         inner = self._padded[:, 1:-1]
         found = seed(inner, cell, (grid.x, grid.y), goal, path)
@@ -63,6 +67,18 @@ class CostToGo:
         sweep(self._halves, self._padded, self._spans)
         np.multiply(self._padded[:, 1:-1], np.float32(UNIT), out=self._field, casting="unsafe")
         return DistanceGrid(self._field, cell, grid.x, grid.y)
+
+    def _raise_costs(
+        self, polygons: Sequence[Floats], cell: float, corner: tuple[float, float]
+    ) -> None:
+        """Make ways through `polygons` expensive."""
+        mask = np.zeros(self._field.shape, np.uint8)
+        for corners in polygons:
+            fill(mask, (corners - corner) / cell, 1)
+        for halves, half in zip(self._halves, (0.5, DIAGONAL / 2), strict=True):
+            inner = halves[:, 1:-1]
+            least = np.int32(TOUCHING * half * cell / UNIT)
+            np.maximum(inner, least, out=inner, where=mask > 0)
 
 
 def seed(

@@ -4,7 +4,8 @@ Obstacles are inflated by the body's half width; beyond, cost falls with distanc
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -28,7 +29,14 @@ REDO_SHARE = 0.5  # of a map: if more of it has changed, all of it is computed
 UNKNOWN_COSTS = {"allow": 0.0, "avoid": UNKNOWN_COST, "forbid": LETHAL}
 Unknown = Literal["avoid", "allow", "forbid"]
 Costs = NDArray[np.float32]
+WayBits = NDArray[np.uint8]  # bit n of a cell is way n of `grid_search`
+NO_LANES: WayBits = np.zeros((0, 0), np.uint8)
 Box = tuple[int, int, int, int]  # first row, row after the last, the same of columns
+
+
+def no_problem(_x: float, _y: float) -> str:
+    """Return an empty text: no zone forbids a place."""
+    return ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +62,16 @@ class Inflation:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class ZoneOverlay:
+    """The zones of a map on the cells of a costmap; see `zones.ZoneMap`."""
+
+    cost: Costs | None  # (height, width), least cost of each cell; None without keep-out zones
+    keepouts: Cells | None  # (height, width), 100 in keep-out zones; None without any
+    against: WayBits  # (height, width), by cell the ways that lanes forbid; (0, 0) without lanes
+    problem: Callable[[float, float], str]  # why the body must not be at (x, y) [m], or ""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Costmap:
     """A map as a planner sees it. Rows go with y, columns with x."""
 
@@ -63,6 +81,9 @@ class Costmap:
     inflation: Inflation
     cells: Cells  # (height, width): the map's, with extra obstacles in it
     cost: Costs  # (height, width)
+    against: WayBits = field(default_factory=lambda: NO_LANES)  # see ZoneOverlay
+    zone_problem: Callable[[float, float], str] = no_problem  # likewise
+    keepouts: Cells | None = None  # likewise
 
     def cell(self, x: float, y: float) -> tuple[int, int] | None:
         """Row and column at (x, y) [m]; None outside the map, and for what is not a number."""
@@ -122,6 +143,25 @@ def costmap(
         cells=cells,
         cost=cost,
     )
+
+
+def with_zones(costs: Costmap, overlay: ZoneOverlay | None) -> Costmap:
+    """Return `costs` with zones in them."""
+    if overlay is None:
+        return costs
+    cost = costs.cost if overlay.cost is None else np.maximum(costs.cost, overlay.cost)
+    return replace(
+        costs, cost=cost, against=overlay.against, zone_problem=overlay.problem,
+        keepouts=overlay.keepouts,
+    )  # fmt: skip
+
+
+def clearance_costs(occupied: Cells, rules: Inflation, resolution: float) -> Costs:
+    """Return costs (height, width) by the distance to `occupied` cells, LETHAL at most."""
+    reach = _reach_cells(rules, resolution)
+    table = np.minimum(_table(rules, resolution, reach), np.float32(LETHAL))
+    costs: Costs = table[squared_distance(occupied, reach).astype(np.int32)]
+    return costs
 
 
 def _with_points(grid: OccupancyGrid, points: NDArray[np.floating] | None) -> Cells:

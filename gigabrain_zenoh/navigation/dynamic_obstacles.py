@@ -11,6 +11,7 @@ import numpy as np
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_NS
+from gigabrain_schemas.brain import Obstacle
 from gigabrain_zenoh.kernels.jit import kernel
 from gigabrain_zenoh.navigation.cost import Weights
 from gigabrain_zenoh.navigation.cost_to_go import FARTHEST, UNIT, Ways, seed, sweep
@@ -36,6 +37,11 @@ RISK_COST = 1200.0  # [s2/m], what the faster ones cost, by the square of how mu
 MIN_TRAFFIC = 1e-3  # [m/s2], less than that is no traffic
 LONGEST_GAP_S = 1.0  # between scans; in a longer one nothing was watched
 UPDATE_TICKS = 10  # from map to map
+
+MOVING_SPEED = 0.15  # [m/s], slower things are part of the grid
+MOVING_SIGMAS = 3.0  # standard deviations of its velocity that a thing must be faster than to move
+DEFAULT_SPEED_SIGMA = 0.05  # [m/s], standard deviation of a velocity that comes without
+MAX_GROWTH_SPEED = 0.3  # [m/s], of a disc: how fast what is known of it fades at most
 
 
 def is_quick(model: MotionModel) -> bool:
@@ -181,3 +187,28 @@ def _pass(passed: Floats, x: float, y: float, amount: float) -> None:
 @kernel
 def _cell(at: float) -> int:
     return max(0, min(CELLS - 1, math.floor(at / CELL_M)))
+
+
+def discs_of(obstacles: tuple[Obstacle, ...]) -> Floats:
+    """Return moving obstacles (m, 6), with the growth of their uncertainty."""
+    rows = [
+        (
+            one.x,
+            one.y,
+            one.velocity_x,
+            one.velocity_y,
+            one.radius,
+            min(MAX_GROWTH_SPEED, _growth(one)),
+        )
+        for one in obstacles
+        if math.hypot(one.velocity_x, one.velocity_y)
+        > max(MOVING_SPEED, MOVING_SIGMAS * _growth(one))
+    ]
+    return np.array(rows, dtype=np.float64).reshape(-1, 6)
+
+
+def _growth(obstacle: Obstacle) -> float:
+    """Return the standard deviation of the velocity [m/s]."""
+    if not obstacle.covariance:
+        return DEFAULT_SPEED_SIGMA
+    return math.sqrt(max(0.0, obstacle.covariance[10], obstacle.covariance[15]))

@@ -24,6 +24,7 @@ POINT_SPACING_M = 0.1  # [m] between the points of a path, at most
 MAX_STRAY_M = 0.5  # [m] off its path, beyond which it is planned again
 SWITCH_COST_RATIO = 0.85  # of the present path's cost, above which a new path is not taken
 Point = tuple[float, float]  # [m], in the map's frame
+NO_WAY = "no way leads to the goal"
 
 BLACKLIST_RADIUS_M = 0.5  # [m]: what is nearer to a place of the blacklist does not count
 SIZE_GAIN = 1.0  # a metre of frontier is worth a metre of way
@@ -73,15 +74,15 @@ class GlobalPlanner:
             return Unreachable(fault="the robot is outside the map")
         fault = goal_problem(costmap, goal)
         if fault or end is None:
-            self.search.reach(costmap.cost, begin)
+            self.search.reach(costmap.cost, begin, costmap.against)
             return self._nearest(costmap, goal, fault)
-        cells = self.search.path(costmap.cost, begin, end)
+        cells = self.search.path(costmap.cost, begin, end, costmap.against)
         if cells is None:
-            return self._nearest(costmap, goal, "no way leads to the goal")
+            return self._nearest(costmap, goal, NO_WAY)
         places = np.column_stack((cells[:, 1] + 0.5, cells[:, 0] + 0.5))
         places = np.vstack((places[:1], places)) if len(places) == 1 else places
         places[0], places[-1] = _in_cells(costmap, np.array((start, goal)))
-        corners = _in_metres(costmap, smooth_path(costmap.cost, places))
+        corners = _in_metres(costmap, smooth_path(costmap.cost, places, costmap.against))
         corners[0], corners[-1] = start, goal  # exactly
         return _path(costmap, corners)
 
@@ -103,7 +104,7 @@ class GlobalPlanner:
         cell = costmap.cell(*goal)
         if cell is None:
             return None
-        return self.search.field(costmap.cost, cell, "to") * costmap.resolution
+        return self.search.field(costmap.cost, cell, "to", costmap.against) * costmap.resolution
 
     def _nearest(self, costmap: Costmap, goal: Point, why: str) -> Unreachable:
         """Return the place nearest to `goal` among the cells of the last search."""
@@ -118,7 +119,7 @@ class GlobalPlanner:
 
 def is_valid(path: Path, costmap: Costmap) -> bool:
     """Return whether all of `path` is still free."""
-    return is_free(costmap.cost, _in_cells(costmap, path.points))
+    return is_free(costmap.cost, _in_cells(costmap, path.points), costmap.against)
 
 
 def remaining_path(path: Path, costmap: Costmap, start: Point) -> Path | None:
@@ -160,6 +161,8 @@ def goal_problem(costmap: Costmap, goal: Point) -> str:
         return "the goal is outside the map"
     if costmap.cells[cell] >= OCCUPIED_PERCENT:
         return "the goal is inside something"
+    if costmap.cost[cell] >= LETHAL and (problem := costmap.zone_problem(*goal)):
+        return f"the goal {problem}"
     if costmap.cost[cell] > LETHAL:
         fits = costmap.inflation.fits
         return f"the goal is too close to something: the body needs {fits:.2f} m"
@@ -173,7 +176,9 @@ def _path(costmap: Costmap, corners: Floats) -> Path:
     points = _resampled(corners)
     steps = np.hypot(*np.diff(points, axis=0).T)
     remaining = np.append(np.cumsum(steps[::-1])[::-1], 0.0)
-    cost = costs_to_go(costmap.cost, _in_cells(costmap, points)) * costmap.resolution
+    cost = (
+        costs_to_go(costmap.cost, _in_cells(costmap, points), costmap.against) * costmap.resolution
+    )
     return Path(points=points, remaining=remaining, cost=cost)
 
 
@@ -232,7 +237,7 @@ def frontiers(
     if start is None:
         return []
     known = np.where(costmap.cells < 0, np.float32(LETHAL), costmap.cost)
-    way = search.field(known, start, "from") * costmap.resolution
+    way = search.field(known, start, "from", costmap.against) * costmap.resolution
     edge = _edge(costmap.cells) & (known < LETHAL) & np.isfinite(way)
     for x, y in blacklist:
         _erase_around(edge, costmap, x, y)

@@ -2,8 +2,9 @@
 
 A step costs its length in cells times the mean cost of both cells. Corners are not cut. From cells
 of cost LETHAL or more a path may lead to lower cost only, so that a body too close to something
-can leave. Open cells lie in buckets by total cost, in half the time of a heap. Smoothing keeps
-straight lines that cost no more than the cells.
+can leave. One-way lanes forbid some of the eight ways in their cells. Open cells lie in buckets by
+total cost, in half the time of a heap. Smoothing keeps straight lines that cost no more than the
+cells.
 """
 
 import math
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import NONE, kernel
-from gigabrain_zenoh.navigation.costmap import LETHAL, Costs
+from gigabrain_zenoh.navigation.costmap import LETHAL, NO_LANES, Costs, WayBits
 
 DIAGONAL = math.sqrt(2.0)
 ROW_STEPS = (0, -1, -1, -1, 0, 1, 1, 1)  # by way: round the compass, the odd ones are diagonal
@@ -36,6 +37,8 @@ Ints = NDArray[np.int32]
 Cell = tuple[int, int]  # row, column
 Direction = Literal["from", "to"]
 
+CORNER = 1e-6  # cells of a line within a cell: so little only touches its corner
+SAME_WAY = 1e-6  # of 45 degrees: a direction so near to one of the eight ways is that way
 STRAIGHT_TOLERANCE = 1 + 1e-9  # of two ways that cost the same the straight one
 
 
@@ -57,29 +60,34 @@ class GridSearch:
         none, first = np.empty(0, np.int32), np.empty(BUCKETS, np.int32)
         self._memory = SearchMemory(np.empty(0), none, first, np.empty((3, 0), np.int32))
 
-    def path(self, cost: Costs, start: Cell, goal: Cell) -> Ints | None:
-        """Return the cheapest path from cell to cell (row, column), (n, 2); None without one."""
+    def path(
+        self, cost: Costs, start: Cell, goal: Cell, against: WayBits = NO_LANES
+    ) -> Ints | None:
+        """Return the cheapest path from cell to cell (row, column), (n, 2); None without one.
+
+        Here and below, `against` holds the ways that lanes forbid, if there are any.
+        """
         target = goal[0] * cost.shape[1] + goal[1]
-        self._run(cost, start, goal, reverse=False)
+        self._run(cost, start, goal, against, reverse=False)
         if self._memory.mark[target] < RUN_STRIDE * self._turn + SETTLED_MARK:
             return None
         cells = _trace(self._memory.mark, cost.shape[1], target)
         return np.column_stack(np.divmod(cells, np.int32(cost.shape[1])))
 
-    def field(self, cost: Costs, cell: Cell, way: Direction) -> Floats:
+    def field(self, cost: Costs, cell: Cell, way: Direction, against: WayBits = NO_LANES) -> Floats:
         """Return the cost of the cheapest paths "to" `cell` or "from" it; inf without one.
 
         The shape is (height, width), the unit cells: times the resolution, metres at cost 1.
         """
-        self._run(cost, cell, NO_TARGET, reverse=way == "to")
+        self._run(cost, cell, NO_TARGET, against, reverse=way == "to")
         field = np.where(
             self._memory.mark >= RUN_STRIDE * self._turn + SETTLED_MARK, self._memory.g, np.inf
         )
         return field.reshape(cost.shape)
 
-    def reach(self, cost: Costs, start: Cell) -> None:
+    def reach(self, cost: Costs, start: Cell, against: WayBits = NO_LANES) -> None:
         """Go wherever a way leads from `start`, for `nearest` to be asked."""
-        self._run(cost, start, NO_TARGET, reverse=False)
+        self._run(cost, start, NO_TARGET, against, reverse=False)
 
     def nearest(self, cost: Costs, row: float, column: float) -> Cell | None:
         """Return the nearest cell that the last search reached and where the body fits."""
@@ -93,7 +101,9 @@ class GridSearch:
         )
         return None if found == NOWHERE else divmod(found, cost.shape[1])
 
-    def _run(self, cost: Costs, start: Cell, target: Cell, *, reverse: bool) -> None:
+    def _run(
+        self, cost: Costs, start: Cell, target: Cell, against: WayBits, *, reverse: bool
+    ) -> None:
         if cost.shape != self._shape:
             self._make_room(cost.shape)
         cost = np.ascontiguousarray(cost)
@@ -101,10 +111,9 @@ class GridSearch:
             if self._turn >= LAST_RUN:
                 self._memory.mark[:] = self._turn = 0
             self._turn += 1
-            if (
-                _search(cost, start, target, reverse, RUN_STRIDE * self._turn, self._memory)
-                != OUT_OF_ENTRIES
-            ):
+            turn = RUN_STRIDE * self._turn
+            found = _search(cost, against, start, target, reverse, turn, self._memory)
+            if found != OUT_OF_ENTRIES:
                 return
             more = np.empty((3, 2 * self._memory.entries.shape[1]), np.int32)
             self._memory = self._memory._replace(entries=more)
@@ -121,10 +130,12 @@ class GridSearch:
 
 @kernel
 def _search(
-    cost: Costs, start: Cell, target: Cell, reverse: bool, turn: int, held: SearchMemory
-) -> int:
+    cost: Costs, against: WayBits, start: Cell, target: Cell, reverse: bool, turn: int,
+    held: SearchMemory,
+) -> int:  # fmt: skip
     """Settle cells until no way to `target` is cheaper; return how many, or OUT_OF_ENTRIES."""
     (height, width), flat, (g, mark, first, entries) = cost.shape, cost.ravel(), held
+    lanes, opposite = against.ravel(), 4 if reverse else 0
     first[:] = NOWHERE
     at, best = start[0] * width + start[1], np.inf  # what the way to `target` costs, so far
     g[at], mark[at] = 0.0, turn + ROOT_MARK
@@ -155,6 +166,8 @@ def _search(
             other = down * width + right
             found = base + HALF_LENGTHS[to] * here + HALF_LENGTHS[to] * flat[other]
             if mark[other] >= turn and found >= g[other] - SUM_TOLERANCE:
+                continue
+            if lanes.size and (lanes[cell] | lanes[other]) >> (to + opposite & 7) & 1:
                 continue
             if not _may_step(
                 flat, cell, other, row * width + right, down * width + column, reverse
@@ -242,10 +255,16 @@ def _nearest(cost: Costs, mark: Ints, done: int, g: Floats, row: float, column: 
 
 
 @kernel
-def line_cost(cost: Costs, x: float, y: float, to_x: float, to_y: float) -> tuple[float, float]:
-    """Return the cost of a straight line and the highest cost on it; inf outside the map."""
+def line_cost(
+    cost: Costs, x: float, y: float, to_x: float, to_y: float, against: WayBits
+) -> tuple[float, float]:
+    """Return the cost of a straight line and the highest cost on it.
+
+    Both are inf outside the map; the latter is where the line goes against a lane.
+    """
     height, width = cost.shape
     length = math.hypot(to_x - x, to_y - y)
+    ways = _ways_of(to_x - x, to_y - y) if against.size else 0
     column, row = math.floor(x), math.floor(y)
     right, down = (1 if to_x > x else -1), (1 if to_y > y else -1)
     every_x = abs(length / (to_x - x)) if to_x != x else np.inf
@@ -257,6 +276,8 @@ def line_cost(cost: Costs, x: float, y: float, to_x: float, to_y: float) -> tupl
         if not (0 <= row < height and 0 <= column < width):
             return np.inf, np.inf
         here, until = cost[row, column], min(next_x, next_y, length)
+        if until - gone > CORNER and against.size and against[row, column] & ways:
+            worst = np.inf
         spent += (until - gone) * here
         worst = max(worst, here)
         if until >= length:
@@ -274,7 +295,17 @@ def line_cost(cost: Costs, x: float, y: float, to_x: float, to_y: float) -> tupl
 
 
 @kernel
-def smooth_path(cost: Costs, points: Floats) -> Floats:
+def _ways_of(right: float, down: float) -> int:
+    """Return the bits of the one or two ways that a straight line is made of; 0 without length."""
+    if right == 0.0 and down == 0.0:
+        return 0
+    way = math.atan2(-down, right) * (4 / math.pi) + 8.0
+    low, high = math.floor(way + SAME_WAY), math.ceil(way - SAME_WAY)
+    return 1 << (low & 7) | 1 << (high & 7)
+
+
+@kernel
+def smooth_path(cost: Costs, points: Floats, against: WayBits) -> Floats:
     """Return those of `points` (n, 2) between which the path may go straight."""
     count = len(points)
     spent = np.zeros(count)
@@ -284,26 +315,26 @@ def smooth_path(cost: Costs, points: Floats) -> Floats:
         spent[i] = spent[i - 1] + mean * math.hypot(to_x - x, to_y - y)
     kept, size, at = np.zeros(count, np.int64), 1, int(NONE)
     while at < count - 1:
-        at = _farthest(cost, points, spent, at)
+        at = _farthest(cost, points, spent, at, against)
         kept[size] = at
         size += 1
     return points[kept[:size]]
 
 
 @kernel
-def _farthest(cost: Costs, points: Floats, spent: Floats, at: int) -> int:
+def _farthest(cost: Costs, points: Floats, spent: Floats, at: int, against: WayBits) -> int:
     """Return the farthest point found that a straight line leads to: doubled steps, then halved."""
     last = len(points) - 1
     good, bad, hop = at + 1, last + 1, 2
     while good < last:
         tried = min(at + hop, last)
-        if not _is_straight(cost, points, spent, at, tried):
+        if not _is_straight(cost, points, spent, at, tried, against):
             bad = tried
             break
         good, hop = tried, 2 * hop
     while bad - good > 1:
         middle = (good + bad) // 2
-        if _is_straight(cost, points, spent, at, middle):
+        if _is_straight(cost, points, spent, at, middle, against):
             good = middle
         else:
             bad = middle
@@ -311,30 +342,34 @@ def _farthest(cost: Costs, points: Floats, spent: Floats, at: int) -> int:
 
 
 @kernel
-def _is_straight(cost: Costs, points: Floats, spent: Floats, at: int, to: int) -> bool:
-    value, worst = line_cost(cost, points[at, 0], points[at, 1], points[to, 0], points[to, 1])
+def _is_straight(
+    cost: Costs, points: Floats, spent: Floats, at: int, to: int, against: WayBits
+) -> bool:
+    x, y, to_x, to_y = points[at, 0], points[at, 1], points[to, 0], points[to, 1]
+    value, worst = line_cost(cost, x, y, to_x, to_y, against)
     return worst < LETHAL and value <= (spent[to] - spent[at]) * STRAIGHT_TOLERANCE
 
 
 @kernel
-def costs_to_go(cost: Costs, points: Floats) -> Floats:
+def costs_to_go(cost: Costs, points: Floats, against: WayBits) -> Floats:
     """Return the cost left to the end of a path from each of its `points` (n, 2), as (n,)."""
     left = np.zeros(len(points))
     for i in range(len(points) - 2, -1, -1):
         x, y, to_x, to_y = points[i, 0], points[i, 1], points[i + 1, 0], points[i + 1, 1]
-        left[i] = left[i + 1] + line_cost(cost, x, y, to_x, to_y)[0]
+        left[i] = left[i + 1] + line_cost(cost, x, y, to_x, to_y, against)[0]
     return left
 
 
 @kernel
-def is_free(cost: Costs, points: Floats) -> bool:
+def is_free(cost: Costs, points: Floats, against: WayBits) -> bool:
     """Return whether a body may go along `points` (n, 2). It may leave a tight spot first."""
-    if line_cost(cost, points[0, 0], points[0, 1], points[0, 0], points[0, 1])[1] == np.inf:
+    x, y = points[0, 0], points[0, 1]
+    if line_cost(cost, x, y, x, y, against)[1] == np.inf:
         return False
     limit = cost[int(points[0, 1]), int(points[0, 0])]
     for i in range(len(points) - 1):
         x, y, to_x, to_y = points[i, 0], points[i, 1], points[i + 1, 0], points[i + 1, 1]
-        worst = line_cost(cost, x, y, to_x, to_y)[1]
+        worst = line_cost(cost, x, y, to_x, to_y, against)[1]
         if worst == np.inf or (worst >= LETHAL and worst > limit):
             return False
         limit = cost[int(to_y), int(to_x)]

@@ -13,6 +13,7 @@ from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import ActuationModel, Obstacle, TrajectoryPoint
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.geometry.limits import SentCommand
+from gigabrain_zenoh.geometry.se2 import from_pose, transform
 from gigabrain_zenoh.navigation import dynamic_obstacles
 from gigabrain_zenoh.navigation.car_track import no_track, track_of
 from gigabrain_zenoh.navigation.cost import Scene, Weights, cost_to_go_at
@@ -25,6 +26,7 @@ from gigabrain_zenoh.navigation.motion_model import (
     delayed_model,
     first_order_lag,
     model_of,
+    slowed_model,
 )
 from gigabrain_zenoh.navigation.mppi import SampledPlan, Sampler, mean_past_commands, step_duration
 
@@ -36,11 +38,8 @@ NAMED_WITHIN_M = 1.5  # [m], what moves within this is named
 AT_GOAL_M = 0.2  # [m], so little is left where only standing and turning are
 DETOUR_M = 0.15  # [m], so far off the straight way is round something
 
-MOVING_SPEED = 0.15  # [m/s], slower things are part of the grid
-MOVING_SIGMAS = 3.0  # standard deviations of its velocity that a thing must be faster than to move
-DEFAULT_SPEED_SIGMA = 0.05  # [m/s], standard deviation of a velocity that comes without
-MAX_GROWTH_SPEED = 0.3  # [m/s], of a disc: how fast what is known of it fades at most
 STUCK_RADIUS_M = 0.3  # [m], who gets no farther than this is in one place
+SLOW_PATIENCE = 2.0  # times as long as a speed zone makes it take to get out of one place
 MAKING_WAY = "making way: it looks round for what moves"
 STANDARD = Weights()
 ARRIVED_SPEED_SHARE = 0.05  # share of the largest speeds at which a body has arrived
@@ -98,6 +97,9 @@ class PlanRequest:
     headings: Floats | None = None  # (k, 2), of a car's path, see `Path`
     known: Floats = field(default_factory=no_points)  # (m, 2) [m], obstacles of the map near by
     obstacles: tuple[Obstacle, ...] = ()
+    keepouts: tuple[Floats, ...] = ()  # polygons (k, 2) [m] that the body must not enter
+    avoid: tuple[Floats, ...] = ()  # polygons (k, 2) [m] that no way should lead through
+    max_speed: float | None = None  # [m/s], of a speed zone; the other limits hold as well
     response: ActuationModel = field(default_factory=ActuationModel)
     sent: tuple[SentCommand, ...] = ()  # oldest first; those of the last 0.5 s are enough
     delayed: float = 0.0  # [s], how much later than usual what is planned will be obeyed
@@ -188,6 +190,7 @@ class LocalPlanner:
         self._body, self._settings = body, settings
         self._model = model_of(body, settings.linear_speed, settings.aggressiveness)
         self._outline = outline_of(body.footprint)
+        self._rim = np.vstack((body.footprint, self._outline.groups[:, [1, 4]]))  # (n, 2) [m]
         self._lidar = (body.lidar.x, body.lidar.y) if body.lidar else (0.0, 0.0)
         half_y = (self._outline.left - self._outline.right) / 2
         half_x = (self._outline.front - self._outline.rear) / 2
@@ -237,11 +240,12 @@ class LocalPlanner:
             raise ValueError(f"a goal has finite numbers, got {goal}")
         self._pass_time(moment)
         place = Pose2D(moment.pose.x, moment.pose.y, moment.pose.yaw)
-        discs = _discs(moment.obstacles)
+        discs = dynamic_obstacles.discs_of(moment.obstacles)
         hits = np.ascontiguousarray(moment.hits, dtype=np.float64)
         self._window.see(moment.tick, place, self._lidar, hits)
         discs = self._window.moving(moment.tick, discs)
-        weights = self._look_out(moment.tick, place, discs)
+        model = slowed_model(self._model, moment.max_speed)
+        weights = self._look_out(moment.tick, place, discs, model)
         if self._arrived(moment):
             return _standing("arrived: at the goal", arrived=True)
         looks_round = self._looks_round(moment.tick)
@@ -250,7 +254,7 @@ class LocalPlanner:
                 return _standing("waiting: it looks round for what moves")
             moment = replace(moment, goal=Goal(x=place.x, y=place.y), path=None, headings=None)
         scene = self._scene(moment, discs)
-        model = delayed_model(self._model, moment.delayed)
+        model = delayed_model(model, moment.delayed)
         planned = self._sampler.plan(
             model if moment.may_back else model._replace(backward=0.0),
             self._outline,
@@ -261,13 +265,13 @@ class LocalPlanner:
         answer = self._answer(moment, scene, planned)
         return replace(answer, reason=MAKING_WAY) if looks_round else answer
 
-    def _look_out(self, tick: int, place: Pose2D, discs: Floats) -> Weights:
+    def _look_out(self, tick: int, place: Pose2D, discs: Floats, model: MotionModel) -> Weights:
         """Get ready for what moves: a quick body among quick things plans in another way."""
         quick = dynamic_obstacles.moving_quickly(discs) if self._traffic else discs[:0]
         if self._traffic:
             self._traffic.see(tick, place.x, place.y, quick)
         if not len(quick):
-            self._sampler.step_by(step_duration(self._model))
+            self._sampler.step_by(step_duration(model))
             return self._weights
         self._window.take_back(tick, quick)
         self._sampler.step_by(dynamic_obstacles.HORIZON_S / self._settings.steps)
@@ -282,9 +286,11 @@ class LocalPlanner:
 
     def _scene(self, moment: PlanRequest, discs: Floats) -> Scene:
         goal = moment.goal
-        grid = self._window.grid(moment.tick, moment.known, discs)
+        body = transform(from_pose(moment.pose), self._rim)
+        grid = self._window.grid(moment.tick, moment.known, discs, moment.keepouts, body)
         ways = self._traffic.ways((goal.x, goal.y)) if self._traffic else None
-        field = self._costs.field(grid, self._half_width, (goal.x, goal.y), moment.path, ways)
+        to, aside = (goal.x, goal.y), self._half_width
+        field = self._costs.field(grid, aside, to, moment.path, ways, moment.avoid)
         yaw = math.nan if goal.yaw is None else goal.yaw
         near, turned = self._settings.position_tolerance, self._settings.yaw_tolerance
         return Scene(grid, field, discs, goal.x, goal.y, yaw, near, turned, self._track(moment))
@@ -347,7 +353,10 @@ class LocalPlanner:
         gone = math.hypot(here.x - then.x, here.y - then.y) > STUCK_RADIUS_M
         if gone or not self._anchor_tick:
             self._anchor, self._anchor_tick = here, moment.tick
-        return (moment.tick - self._anchor_tick) * TICK_S > self._settings.stuck_after
+        patience = self._settings.stuck_after
+        if moment.max_speed:
+            patience = max(patience, SLOW_PATIENCE * STUCK_RADIUS_M / moment.max_speed)
+        return (moment.tick - self._anchor_tick) * TICK_S > patience
 
 
 def _standing(reason: str, *, arrived: bool = False, blocked: bool = False) -> LocalPlan:
@@ -380,31 +389,6 @@ def _trajectory(track: Floats, dt: float) -> tuple[TrajectoryPoint, ...]:
 
 def _axes(of: Velocity) -> tuple[float, float, float]:
     return of.linear_x, of.linear_y, of.angular_z
-
-
-def _discs(obstacles: tuple[Obstacle, ...]) -> Floats:
-    """Return moving obstacles (m, 6), with the growth of their uncertainty."""
-    rows = [
-        (
-            one.x,
-            one.y,
-            one.velocity_x,
-            one.velocity_y,
-            one.radius,
-            min(MAX_GROWTH_SPEED, _growth(one)),
-        )
-        for one in obstacles
-        if math.hypot(one.velocity_x, one.velocity_y)
-        > max(MOVING_SPEED, MOVING_SIGMAS * _growth(one))
-    ]
-    return np.array(rows, dtype=np.float64).reshape(-1, 6)
-
-
-def _growth(obstacle: Obstacle) -> float:
-    """Return the standard deviation of the velocity [m/s]."""
-    if not obstacle.covariance:
-        return DEFAULT_SPEED_SIGMA
-    return math.sqrt(max(0.0, obstacle.covariance[10], obstacle.covariance[15]))
 
 
 def warm_up(body: BodyDescription) -> None:

@@ -13,6 +13,7 @@ from gigabrain_zenoh.kernels.jit import lean_kernel
 
 ACCELERATION_RESERVE = 0.9  # of the body's accelerations: plans must work on a bad floor too
 GENTLEST_SHARE = 0.4  # of that reserve, at an aggressiveness of 0
+LEAST_SPEED = 0.01  # [m/s]; a body that may drive at all may drive so fast
 MAX_REVERSE_SPEED = 0.4  # [m/s], no faster backwards: the lidar may not see there
 
 LANES = 8  # plans at a time
@@ -67,6 +68,16 @@ def model_of(
         side_margin=body.thresholds.side_margin,
         rim=limits.rim_speed,
         half_track=limits.half_track,
+    )
+
+
+def slowed_model(model: MotionModel, speed: float | None) -> MotionModel:
+    """Return the model of a body that must not drive faster than `speed` [m/s]."""
+    if speed is None or speed >= model.forward:
+        return model
+    slow = max(speed, LEAST_SPEED)
+    return model._replace(
+        forward=slow, backward=min(model.backward, slow), lateral=min(model.lateral, slow)
     )
 
 

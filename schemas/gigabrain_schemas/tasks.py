@@ -32,13 +32,18 @@ class Goal(Record, frozen=True, kw_only=True):
 
 
 class GoalRequest(Message, frozen=True, kw_only=True):
-    """Go there."""
+    """Go there: to coordinates, or to a named place of the map."""
 
-    x: Coordinate  # [m], in the map
-    y: Coordinate  # [m]
-    yaw: Angle | None = None  # [rad]; None for any
+    x: Coordinate | None = None  # [m], in the map
+    y: Coordinate | None = None  # [m]
+    yaw: Angle | None = None  # [rad]; None for any, or for that of the place
+    place: Name = ""  # instead of x and y; see robot/zones
     how: How = "replace"
     source: Name = "anonymous"
+
+    def __post_init__(self) -> None:
+        if (self.x is None) != (self.y is None) or (self.x is None) != bool(self.place):
+            raise ValueError("expected x and y, or a place")
 
 
 class GoalReply(Message, frozen=True, kw_only=True):

@@ -6,7 +6,7 @@ A line here is all that a topic takes, beside an example of its message in the f
 from dataclasses import dataclass, replace
 from typing import Any, Generic, Literal, TypeVar
 
-from gigabrain_schemas import body, brain, logs, requests, safety, sensors, sim, tasks
+from gigabrain_schemas import body, brain, logs, requests, safety, sensors, sim, tasks, zones
 from gigabrain_schemas.base import Message
 
 M = TypeVar("M", bound=Message)
@@ -18,8 +18,9 @@ Priority = Literal["real_time", "interactive_high", "data_high", "data", "backgr
 Role = Literal["robot", "brain", "operator", "viewer", "router", "process"]  # of an identity
 # How viewers show a topic; `recording/drawing.py` has a function for each.
 Drawing = Literal[
-    "scan", "map", "pose", "path", "obstacles", "task", "image", "log", "odometry", "lidar_frame"
-]
+    "scan", "map", "zones", "pose", "path", "obstacles", "task", "image", "log", "odometry",
+    "lidar_frame",
+]  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +100,10 @@ POSE = Topic("robot/pose", brain.PoseInMap, 10, publishers=BRAIN, drawing="pose"
 MAP = Topic(
     "robot/map", brain.OccupancyGrid, 1, keep=True, max_bytes=8 * 1024 * KB,
     publishers=BRAIN, drawing="map",
+)  # fmt: skip
+ZONES = Topic(
+    "robot/zones", zones.Zones, 0.5, keep=True, max_bytes=256 * KB,
+    publishers=BRAIN, drawing="zones",
 )  # fmt: skip
 INTENT = Topic(
     "robot/intent", brain.Intent, 50, echo_ns=150_000_000, max_bytes=16 * KB,
@@ -189,6 +194,16 @@ MAP_SAVE = Service(
     "robot/map_save", requests.MapRequest, requests.MapReply, callers=OPERATOR, servers=BRAIN,
 )  # fmt: skip
 SIM_CHANGE = Service("robot/sim_change", sim.SimRequest, sim.SimReply, callers=OPERATOR)
+MAP_LOAD = Service(
+    "robot/map_load", zones.MapLoadRequest, requests.MapReply, callers=OPERATOR, servers=BRAIN,
+)  # fmt: skip
+MAP_LIST = Service(
+    "robot/map_list", zones.MapListRequest, zones.MapListReply, max_bytes=256 * KB,
+    callers=("operator", "viewer"), servers=BRAIN,
+)  # fmt: skip
+ZONES_CHANGE = Service(
+    "robot/zones_change", zones.ZonesRequest, zones.ZonesReply, callers=OPERATOR, servers=BRAIN,
+)  # fmt: skip
 AUDIT_LOG = Service(
     "robot/audit_log", logs.AuditRequest, logs.AuditPage, priority="background",
     max_bytes=1024 * KB, callers=("operator", "viewer"),

@@ -14,6 +14,7 @@ from gigabrain_zenoh.decision import route_schedule
 from gigabrain_zenoh.decision.context import ContextSource
 from gigabrain_zenoh.decision.navigator import NO_ROUTE
 from gigabrain_zenoh.decision.route import Route, RoutePlanner, RouteRequest
+from gigabrain_zenoh.decision.zones import ZoneSource
 from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.samples import BOOT, state
 from tests.node.plane import ROOM, Plane, as_map, drawn
@@ -123,7 +124,7 @@ async def test_a_plan_for_a_huge_map_does_not_delay_the_first_one_for_the_real_m
 
 async def test_it_plans_with_the_place_and_the_speed_of_the_scan_however_late_that_is() -> None:
     net = Net()
-    source = ContextSource(net.one)
+    source = ContextSource(net.one, ZoneSource(net.one))
     states = [state(tick, v=0.01 * tick, pose=(0.1 * tick, 0.0, 0.0)) for tick in range(1, 8)]
     for one in states:
         source.observe(one)

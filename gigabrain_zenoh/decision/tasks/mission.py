@@ -3,15 +3,17 @@
 Checks that need more than one step, such as names of places and the depth of trees, come last.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 from msgspec import Meta, Struct
+from msgspec.structs import replace
 
 from gigabrain_schemas.base import Finite, Name, Percentage
 from gigabrain_schemas.tasks import Goal
+from gigabrain_schemas.zones import Place as MapPlace
 from gigabrain_zenoh.config import loading, yaml_text
 from gigabrain_zenoh.decision.tasks import conditions
 from gigabrain_zenoh.errors import ConfigError, unknown
@@ -192,10 +194,13 @@ def patrol_mission(patrol: PatrolFile, loops: int | None) -> str:
 
 
 def load(path: Path) -> tuple[Mission, str]:
-    """Return the mission in a file, and its text. Raises ConfigError with file and line."""
+    """Return the mission in a file, and its text. Raises ConfigError with file and line.
+
+    Names of places that are not in the file may be those of the robot's map: it checks them.
+    """
     text = loading.read(path)
     refuse_long(text, str(path))
-    return loads(text, str(path)), text
+    return loads(text, str(path), None), text
 
 
 def refuse_long(text: str, source: str) -> None:
@@ -204,27 +209,43 @@ def refuse_long(text: str, source: str) -> None:
         raise ConfigError(f"{source}: {size} bytes; expected at most {MAX_BYTES}")
 
 
-def loads(text: str, source: str) -> Mission:
-    """Return the mission in a YAML text; `source` names it in errors. Raises ConfigError."""
+def loads(text: str, source: str, places: Iterable[MapPlace] | None = ()) -> Mission:
+    """Return the mission in a YAML text; `source` names it in errors. Raises ConfigError.
+
+    The `places` of the map that it names are added to its own, which come first; None if they are
+    not known.
+    """
     mission = loading.loads(text, Mission, source)
-    for keys, problem in _problems(mission):
+    named = set(map_places(mission))
+    if places is not None:
+        used = {one.name: _point(one) for one in places if one.name in named}
+        mission = replace(mission, places={**used, **mission.places})
+    for keys, problem in _problems(mission, frozenset(named if places is None else ())):
         raise ConfigError(f"{source}:{_line(text, keys)}: {_dotted(keys)}: {problem}")
     return mission
 
 
+def map_places(mission: Mission) -> Iterator[str]:
+    """Yield the names of places that are not the mission's own, so must be the map's."""
+    for _, step in _steps(mission):
+        for _, place in _places(step):
+            if isinstance(place, str) and place not in mission.places:
+                yield place
+
+
+def _point(place: MapPlace) -> Point:
+    return (place.x, place.y) if place.yaw is None else (place.x, place.y, place.yaw)
+
+
 def load_patrol(path: Path) -> PatrolFile:
-    """Return the patrol in a file. Raises ConfigError with file and line."""
-    text = loading.read(path)
-    patrol = loading.loads(text, PatrolFile, str(path))
-    for i, place in enumerate(patrol.points):
-        if problem := _unknown_place(place, patrol.places):
-            raise ConfigError(f"{path}:{_line(text, ('points', i))}: points[{i}]: {problem}")
-    return patrol
+    """Return the patrol in a file. Raises ConfigError with file and line; see `load`."""
+    return loading.loads(loading.read(path), PatrolFile, str(path))
 
 
-def _problems(mission: Mission) -> Iterator[tuple[Keys, str]]:
+def _problems(mission: Mission, elsewhere: frozenset[str]) -> Iterator[tuple[Keys, str]]:
+    """Yield all problems; the places `elsewhere` are not checked."""
     for keys, step in _steps(mission):
-        yield from _in_step(keys, step, mission)
+        yield from _in_step(keys, step, mission, elsewhere)
     depths: dict[str, int] = {}
     for name in mission.trees:
         if problem := _tree_problem(name, mission, (), depths):
@@ -235,10 +256,12 @@ def _problems(mission: Mission) -> Iterator[tuple[Keys, str]]:
         yield ("do",), f"more than {MAX_STEPS} steps once every tree is written out"
 
 
-def _in_step(keys: Keys, step: Step, mission: Mission) -> Iterator[tuple[Keys, str]]:
+def _in_step(
+    keys: Keys, step: Step, mission: Mission, elsewhere: frozenset[str]
+) -> Iterator[tuple[Keys, str]]:
     for more, place in _places(step):
-        if problem := _unknown_place(place, mission.places):
-            yield (*keys, *more), problem
+        if isinstance(place, str) and place not in mission.places and place not in elsewhere:
+            yield (*keys, *more), str(unknown("place", place, mission.places or ("none",)))
     for more, text in _conditions(step):
         try:
             conditions.parse(text)
@@ -247,12 +270,6 @@ def _in_step(keys: Keys, step: Step, mission: Mission) -> Iterator[tuple[Keys, s
     if step.tree is not None and step.tree not in mission.trees:
         known = mission.trees or ("none",)
         yield (*keys, "tree"), str(unknown("tree", step.tree, known))
-
-
-def _unknown_place(place: Place, places: dict[str, Any]) -> str:
-    if not isinstance(place, str) or place in places:
-        return ""
-    return str(unknown("place", place, places or ("none",)))
 
 
 def _places(step: Step) -> Iterator[tuple[Keys, Place]]:

@@ -119,9 +119,10 @@ class TaskQueue:
                 job.held, job.why_held = True, AFTER_A_RESTART
         self._boot, self._from_disk = boot, []
 
-    def add_goal(self, goal: Goal, how: How, source: str) -> str:
-        """Add a goal, and return its name. Raises Refused if the queue is full."""
-        return self._add("goal", goal_mission(goal), describe_goal(goal), how, source)
+    def add_goal(self, goal: Goal, how: How, source: str, place: str = "") -> str:
+        """Add a goal, maybe with a `place` name; return its name. Raises Refused if it is full."""
+        label = f"{place} {describe_goal(goal)}".strip()[:64]
+        return self._add("goal", goal_mission(goal), label, how, source)
 
     def add_mission(self, mission: Mission, label: str, how: How, source: str) -> str:
         """Add a mission, and return its name. Raises Refused if the queue is full."""

@@ -25,6 +25,7 @@ from gigabrain_zenoh.decision.goal_server import TaskServer
 from gigabrain_zenoh.decision.tasks import mission as missions
 from gigabrain_zenoh.decision.tasks.mission import Script
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskQueue
+from gigabrain_zenoh.decision.zones import ZoneSource
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.samples import BOOT, state
@@ -113,7 +114,9 @@ class Site:
     def __init__(self, folder: Path, *, scripts: str = "") -> None:
         self.net = Net()
         self.wall, self.lost = "", ""
-        self.service = TaskServer(self.net.one, self._check, folder=str(folder), scripts=scripts)
+        self.service = TaskServer(
+            self.net.one, self._check, ZoneSource(self.net.one), folder=str(folder), scripts=scripts
+        )
         self.told: list[TaskStatus] = []
         self.net.two.subscribe(TASK, lambda _key, status: self.told.append(status))
         self.tick, self.command, self.outcome = 0, None, None

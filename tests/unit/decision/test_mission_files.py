@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from gigabrain_schemas.zones import Place
 from gigabrain_zenoh.decision.tasks import mission as missions
 from gigabrain_zenoh.errors import ConfigError
 
@@ -91,6 +92,7 @@ def test_a_file_says_which_mission_and_which_programs_it_needs(tmp_path: Path) -
     file.write_text(f"# {'x' * 60_000}\ndo: [{{wait: 3}}]")
     with pytest.raises(ConfigError, match=r"m\.yaml: 60018 bytes; expected at most 60000"):
         missions.load(file)
-    file.write_text("points: [[1, 2], b]")
-    with pytest.raises(ConfigError, match=r"m.yaml:1: points\[1\]: no place 'b'"):
-        missions.load_patrol(file)
+    file.write_text("do: [{goto: b}, {patrol: {points: [a, c]}}]\nplaces: {a: [1, 2]}")
+    assert sorted(missions.map_places(missions.load(file)[0])) == ["b", "c"]  # the map may have it
+    with pytest.raises(ConfigError, match=r"x:1: do\[0\].goto: no place 'b'"):
+        missions.loads(file.read_text(), "x", [Place(name="c", x=1.0, y=0.0)])

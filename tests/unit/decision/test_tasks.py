@@ -10,6 +10,7 @@ import pytest
 from gigabrain_schemas.logs import AcceptedRequest
 from gigabrain_schemas.tasks import Goal, GoalReply, GoalRequest
 from gigabrain_schemas.topics import REQUEST_LOG
+from gigabrain_schemas.zones import Place
 from gigabrain_zenoh.decision import goal_server
 from gigabrain_zenoh.decision.behaviours import StepOutcome
 from gigabrain_zenoh.decision.tasks import mission
@@ -49,9 +50,9 @@ async def test_the_loop_goes_on_while_a_mission_is_read(
 ) -> None:
     readers: list[bool] = []
 
-    def loads(text: str, source: str) -> Mission:
+    def loads(text: str, source: str, places: tuple[Place, ...]) -> Mission:
         readers.append(threading.current_thread() is threading.main_thread())
-        return mission.loads(text, source)
+        return mission.loads(text, source, places)
 
     monkeypatch.setattr(
         goal_server, "missions", SimpleNamespace(**{**vars(mission), "loads": loads})

@@ -23,14 +23,16 @@ NULLABLE = {
     "SafetyState.caps.forward", "SafetyState.caps.backward", "SafetyState.caps.left",
     "SafetyState.caps.right", "SafetyState.caps.rotation",
     "SafetyState.caps.turn_left", "SafetyState.caps.turn_right",
-    "GoalRequest.yaw", "TaskStatus.distance_remaining", "TaskStatus.eta", "TaskStatus.goal.yaw",
+    "GoalRequest.yaw", "Zones.places.0.yaw",
+    "TaskStatus.distance_remaining", "TaskStatus.eta", "TaskStatus.goal.yaw",
     "TaskStatus.done.0.position_error", "TaskStatus.done.0.heading_error",
     "Description.report.distance_m", "Description.report.contacts",
 }  # fmt: skip
 WILL_DO_EMPTY = {
     "EstopRequest", "DescribeRequest", "AuditRequest", "AuditPage", "ParamRequest", "SimRequest",
-    "TaskStatus",
+    "TaskStatus", "Zones", "MapListRequest", "MapListReply",
 }  # fmt: skip
+NEEDS_ONE = {"GoalRequest", "ZonesRequest"}  # of several fields
 REPORT = ("Description.report.distance_m", "Description.report.contacts")  # texts as well
 
 # maps whose keys are free, such as rates by key
@@ -110,7 +112,8 @@ def test_random_bytes_are_refused_that_do_not_spell_out_what_is_required(
 ) -> None:
     fields = msgspec.structs.fields(type(EXAMPLES[name]))
     required = [field.encode_name.encode() for field in fields if field.required]
-    assert bool(required) == (name not in WILL_DO_EMPTY)
+    assert bool(required) == (name not in WILL_DO_EMPTY | NEEDS_ONE)
+    assert refuses(name, b"{}") == (name not in WILL_DO_EMPTY)
     if not refuses(name, payload):
         assert all(word in payload for word in required)
 
@@ -247,6 +250,19 @@ def test_a_complaint_about_a_hostile_message_is_short() -> None:
         ("Intent", "trajectory", [[0.5, 0.0, 0.0, 0.0]] * 257),
         ("Intent", "progress", 1.01),
         ("SafetyState", "verdict", "fine"),
+        ("GoalRequest", "place", "kitchen"),
+        ("ZonesRequest", "remove", "lab"),
+        ("Zones", "places", [{"name": "lab", "x": 0.0, "y": 0.0}]),
+        ("Zones", "zones", [{"name": "a", "kind": "keepout", "points": [[0, 0], [1, 0]]}]),
+        ("Zones", "zones", [{"name": "../a", "kind": "keepout", "points": [[0, 0]] * 3}]),
+        ("Zones", "zones", [{"name": "a", "kind": "keepout", "points": [[0, 0]] * 257}]),
+        ("Zones", "zones", [{"name": "a", "kind": "speed", "points": [[0, 0]] * 3}]),
+        ("Zones", "zones", [{"name": "a", "kind": "one_way", "points": [[0, 0]] * 3}]),
+        (
+            "Zones",
+            "zones",
+            [{"name": str(i), "kind": "keepout", "points": [[0, 0]] * 256} for i in range(33)],
+        ),
     ],
 )
 def test_lengths_that_do_not_agree_are_refused_on_the_wire(

@@ -1,0 +1,71 @@
+"""Polygons in the plane: corners (n, 2) [m], closed from the last to the first."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_schemas.arrays import Floats
+
+LEAST_AREA_M2 = 1e-4
+
+
+def problem(corners: Floats) -> str:
+    """Return why corners make no simple polygon, or an empty text."""
+    if edges_cross(corners):
+        return "its edges cross"
+    return "it has no area" if abs(area(corners)) < LEAST_AREA_M2 else ""
+
+
+def area(corners: Floats) -> float:
+    """Return the area [m2], negative for a clockwise polygon."""
+    x, y = (corners - corners[0]).T  # small numbers keep their digits
+    return float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
+
+
+def edges_cross(corners: Floats) -> bool:
+    """Return whether any two edges cross or touch, besides neighbours at their corner."""
+    begin, end = corners, np.roll(corners, -1, axis=0)
+    count = len(corners)
+    for first in range(count - 2):
+        others = np.arange(first + 2, count - (first == 0))
+        if len(others) and _meet(begin[first], end[first], begin[others], end[others]).any():
+            return True
+    return False
+
+
+def _meet(a: Floats, b: Floats, c: Floats, d: Floats) -> NDArray[np.bool_]:
+    """Return which of the segments `c`-`d`, (n, 2) each, meet the segment `a`-`b`."""
+    of_c, of_d = _side(a, b, c), _side(a, b, d)
+    of_a, of_b = _side(c, d, a), _side(c, d, b)
+    boxes = (np.maximum(c, d) >= np.minimum(a, b)) & (np.minimum(c, d) <= np.maximum(a, b))
+    found: NDArray[np.bool_] = (of_c * of_d <= 0) & (of_a * of_b <= 0) & boxes.all(axis=1)
+    return found
+
+
+def _side(a: Floats, b: Floats, point: Floats) -> Floats:
+    """Return 1 where `point` is left of the line from `a` to `b`, -1 right of it, 0 on it."""
+    along, off = b - a, point - a
+    side: Floats = np.sign(along[..., 0] * off[..., 1] - along[..., 1] * off[..., 0])
+    return side
+
+
+def contains(corners: Floats, points: Floats) -> NDArray[np.bool_]:
+    """Return which of `points` (m, 2) are inside, by the even-odd rule."""
+    inside = np.zeros(len(points), np.bool_)
+    x, y = points.T
+    for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        beside = np.flatnonzero((ay > y) != (by > y))
+        share = (y[beside] - ay) / (by - ay)
+        inside[beside] ^= x[beside] < ax + share * (bx - ax)
+    return inside
+
+
+def distance(corners: Floats, points: Floats) -> Floats:
+    """Return the distance of each of `points` (m, 2) to the polygon [m]; 0 inside."""
+    begin, along = corners, np.roll(corners, -1, axis=0) - corners
+    length = np.maximum((along**2).sum(axis=1), 1e-12)
+    off = points[:, None] - begin
+    share = ((off * along).sum(axis=2) / length).clip(0, 1)
+    away = off - share[..., None] * along
+    nearest = np.hypot(away[..., 0], away[..., 1]).min(axis=1)
+    found: Floats = np.where(contains(corners, points), 0.0, nearest)
+    return found

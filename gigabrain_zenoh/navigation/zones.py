@@ -1,0 +1,296 @@
+"""Zones of a map for the planners: cells to keep out of, lanes, and speed limits.
+
+A zone map is made once for each change of the zones, and its overlay once for each shape of the
+grid: neither once for each plan.
+"""
+
+import itertools
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.brain import OccupancyGrid
+from gigabrain_schemas.zones import Zone
+from gigabrain_zenoh.geometry import polygon
+from gigabrain_zenoh.geometry.se2 import from_pose, transform
+from gigabrain_zenoh.geometry.sweep import Corners
+from gigabrain_zenoh.navigation.costmap import (
+    NO_LANES,
+    Inflation,
+    WayBits,
+    ZoneOverlay,
+    clearance_costs,
+)
+from gigabrain_zenoh.navigation.grid_search import COLUMN_STEPS, ROW_STEPS
+
+EDGE_STEP = 0.5  # cells between the points of an edge, whose cells are filled too
+AGAINST_COSINE = -0.2  # of the angle between a way and a lane, from where on it goes against it
+MAX_NAMED = 3  # lanes, in a text
+LEAST_USE_M = 0.5  # [m] along a lane, from where on a path uses it
+OCCUPIED = 100  # of a cell to keep out of
+
+REACTION_S = 0.3  # before the body slows down for a speed zone
+BRAKING_SHARE = 0.5  # of its deceleration, with which it slows down
+LEAST_LOOK_M = 1.0  # [m] of the path that are looked at for speed zones
+
+Mask = NDArray[np.uint8]
+Box = tuple[float, float, float, float]  # least x and y [m], greatest x and y
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Area:
+    """A zone with its polygon, or the middle of its lane."""
+
+    zone: Zone
+    corners: Floats  # (n, 2) [m]
+    box: Box
+
+    def near(self, x: float, y: float, reach: float) -> bool:
+        """Return whether its box is within `reach` [m] of a place."""
+        left, bottom, right, top = self.box
+        return left - reach <= x <= right + reach and bottom - reach <= y <= top + reach
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpeedCap:
+    """The speed that a zone allows now."""
+
+    speed: float  # [m/s]
+    zone: str  # its name
+
+
+class ZoneMap:
+    """The zones of one map, ready for planning. It does not change."""
+
+    def __init__(self, zones: Iterable[Zone]) -> None:
+        areas = [_area(zone) for zone in zones]
+        self.keepouts = [one for one in areas if one.zone.kind == "keepout"]
+        self.speeds = [one for one in areas if one.zone.kind == "speed"]
+        self.lanes = [one for one in areas if one.zone.kind == "one_way"]
+
+    @property
+    def empty(self) -> bool:
+        """Whether no zone restricts where the body may drive."""
+        return not self.keepouts and not self.lanes
+
+    def overlay(self, grid: OccupancyGrid, rules: Inflation) -> ZoneOverlay | None:
+        """Return the zones on the cells of `grid`; None without keep-out zones and lanes."""
+        if self.empty:
+            return None
+        cost = cells = None
+        if self.keepouts:
+            cells = self._occupied(grid)
+            cost = clearance_costs(cells, rules, grid.resolution)
+        return ZoneOverlay(
+            cost=cost,
+            keepouts=cells,
+            against=self._against(grid) if self.lanes else NO_LANES,
+            problem=lambda x, y: self.problem(x, y, rules.fits),
+        )
+
+    def problem(self, x: float, y: float, fits: float) -> str:
+        """Return why the body must not be at (x, y) [m], or an empty text.
+
+        It needs `fits` [m] from its centre.
+        """
+        place = np.array(((x, y),))
+        for area in self.keepouts:
+            if not area.near(x, y, fits):
+                continue
+            away = float(polygon.distance(area.corners, place)[0])
+            if away == 0.0:
+                return f"lies in keep-out zone {area.zone.name!r}"
+            if away < fits:
+                name, needs = area.zone.name, f"the body needs {fits:.2f} m"
+                return f"is {away:.2f} m from keep-out zone {name!r}; {needs}"
+        return ""
+
+    def in_the_way(self, path: Floats) -> str:
+        """Return which zone a `path` (n, 2) [m] does not respect, as text."""
+        for area in self.keepouts:
+            if polygon.contains(area.corners, path).any():
+                return f"without entering keep-out zone {area.zone.name!r}"
+        names = ", ".join(repr(area.zone.name) for area in self.lanes[:MAX_NAMED])
+        lanes = f" or going against one-way lane {names}" if names else ""
+        return f"that keeps clear of the keep-out zones{lanes}"
+
+    def keepouts_near(self, x: float, y: float, reach: float) -> tuple[Floats, ...]:
+        """Return the polygons to keep out of within `reach` [m] of a place, (n, 2) [m] each."""
+        return tuple(area.corners for area in self.keepouts if area.near(x, y, reach))
+
+    def lanes_beside(self, x: float, y: float, reach: float, path: Floats) -> tuple[Floats, ...]:
+        """Return the parts of lanes near a place along which a `path` (n, 2) [m] does not lead.
+
+        A path leads past a lane that it must not go against, or out of it, or across. The local
+        planner knows no directions, and would take the shorter way through it.
+        """
+        found: list[Floats] = []
+        for area in self.lanes:
+            assert area.zone.lane_width
+            if area.near(x, y, reach + area.zone.lane_width):
+                parts = list(_lane_parts(area.corners, area.zone.lane_width))
+                if not any(_leads_along(path, part.corners, part.ahead) for part in parts):
+                    found += [part.corners for part in parts]
+        return tuple(found)
+
+    def speed_cap(
+        self, here: Pose, footprint: Corners, path: Floats, speed: float, deceleration: float
+    ) -> SpeedCap | None:
+        """Return the lowest speed that a zone allows, there or on the way to it; None without one.
+
+        The body drives with `speed` [m/s] along `path` (n, 2) [m], which begins where it is.
+        """
+        if not self.speeds:
+            return None
+        outline = transform(from_pose(here), np.array(footprint))
+        brake = BRAKING_SHARE * deceleration
+        reach = float(np.hypot(*np.array(footprint).T).max())
+        look = LEAST_LOOK_M + reach + speed * REACTION_S + speed**2 / (2 * brake)
+        gone = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))))
+        ahead, gone = path[gone <= look], gone[gone <= look]
+        caps = []
+        for area in self.speeds:
+            assert area.zone.max_speed
+            if not area.near(here.x, here.y, look):
+                continue
+            away = _way_to(area, outline, ahead, gone - reach)
+            left = max(0.0, away - speed * REACTION_S)
+            allowed = math.sqrt(area.zone.max_speed**2 + 2 * brake * left)
+            caps.append(SpeedCap(speed=allowed, zone=area.zone.name))
+        return min(caps, key=lambda cap: cap.speed, default=None)
+
+    def _occupied(self, grid: OccupancyGrid) -> NDArray[np.int8]:
+        cells = np.zeros((grid.height, grid.width), np.uint8)
+        for area in self.keepouts:
+            fill(cells, _in_cells(grid, area.corners), OCCUPIED)
+        return cells.view(np.int8)
+
+    def _against(self, grid: OccupancyGrid) -> WayBits:
+        """Return the ways that lanes forbid; where a lane bends, those that both parts forbid."""
+        found = np.zeros((grid.height, grid.width), np.uint8)
+        for area in self.lanes:
+            assert area.zone.lane_width
+            lane = np.full_like(found, 255)
+            covered = np.zeros_like(found)
+            for part in _lane_parts(area.corners, area.zone.lane_width):
+                drawn = np.zeros_like(found)
+                fill(drawn, _in_cells(grid, part.corners), 1)
+                lane[drawn == 1] &= np.uint8(part.against)
+                covered |= drawn
+            found |= np.where(covered == 1, lane, np.uint8(0))
+        return found
+
+
+def _area(zone: Zone) -> Area:
+    corners = np.array(zone.points)
+    (left, bottom), (right, top) = corners.min(axis=0), corners.max(axis=0)
+    box = float(left), float(bottom), float(right), float(top)
+    return Area(zone=zone, corners=corners, box=box)
+
+
+def _way_to(area: Area, outline: Floats, ahead: Floats, gone: Floats) -> float:
+    """Return the way to an area along a path [m]: 0 inside, inf if it is not on the path."""
+    touches = polygon.contains(outline, area.corners).any()
+    if touches or polygon.contains(area.corners, outline).any():
+        return 0.0
+    inside = np.flatnonzero(polygon.contains(area.corners, ahead))
+    return max(0.0, float(gone[inside[0]])) if len(inside) else math.inf
+
+
+class LanePart(NamedTuple):
+    """A straight part of a one-way lane."""
+
+    corners: Floats  # (4, 2) [m]
+    ahead: Floats  # (2,), its direction, of length 1
+    against: int  # bits of the ways that it forbids
+
+
+def _leads_along(path: Floats, corners: Floats, ahead: Floats) -> bool:
+    """Return whether a path (n, 2) [m] makes way along the direction of a lane's part."""
+    inside = polygon.contains(corners, path)
+    steps = np.diff(path, axis=0)[inside[1:] & inside[:-1]]
+    return float((steps @ ahead).sum()) > LEAST_USE_M
+
+
+def _lane_parts(middle: Floats, width: float) -> Iterator[LanePart]:
+    """Yield the straight parts of a lane."""
+    for begin, end in itertools.pairwise(middle):
+        along = end - begin
+        length = float(np.hypot(*along))
+        if length == 0.0:
+            continue
+        ahead = along / length
+        aside = np.array((-ahead[1], ahead[0])) * width / 2
+        bits = 0
+        for way, (down, right) in enumerate(zip(ROW_STEPS, COLUMN_STEPS, strict=True)):
+            cosine = (right * ahead[0] + down * ahead[1]) / math.hypot(right, down)
+            bits |= int(cosine < AGAINST_COSINE) << way
+        corners = np.array((begin + aside, begin - aside, end - aside, end + aside))
+        yield LanePart(corners, ahead, bits)
+
+
+def _in_cells(grid: OccupancyGrid, corners: Floats) -> Floats:
+    found: Floats = (corners - (grid.origin_x, grid.origin_y)) / grid.resolution
+    return found
+
+
+def fill(cells: Mask, corners: Floats, value: int) -> None:
+    """Fill a polygon, (n, 2) in cells, in `cells` (height, width), with those that it touches."""
+    height, width = cells.shape
+    inside = clipped(corners, (-1.0, -1.0, width + 1.0, height + 1.0))
+    if not len(inside):
+        return
+    left, top = np.maximum(inside.min(axis=0), 0).astype(np.intp)
+    right, bottom = np.floor(inside.max(axis=0)).astype(np.intp) + 1
+    part = cells[top:bottom, left:right]
+    if part.size:
+        part[_covered(inside - (left, top), part.shape)] = value
+
+
+def _covered(corners: Floats, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return the cells (height, width) whose middle is in a polygon, or that an edge crosses."""
+    height, width = shape
+    ends = np.roll(corners, -1, axis=0)
+    crossings = np.zeros((height, width + 1), np.uint8)  # before a cell's middle, modulo 256
+    for (x, y), (to_x, to_y) in zip(corners, ends, strict=True):
+        first, last = sorted((math.ceil(y - 0.5), math.ceil(to_y - 0.5)))
+        if first < last:
+            rows = np.arange(max(first, 0), min(last, height))
+            at = x + (rows + 0.5 - y) / (to_y - y) * (to_x - x)
+            crossings[rows, np.ceil(at - 0.5).astype(np.intp).clip(0, width)] += 1
+    covered: NDArray[np.bool_] = np.cumsum(crossings[:, :-1], axis=1, dtype=np.uint8) & 1 == 1
+    counts = np.ceil(np.abs(ends - corners).max(axis=1) / EDGE_STEP).astype(np.intp) + 1
+    edge = np.repeat(np.arange(len(corners)), counts)
+    share = (np.arange(len(edge)) - np.repeat(np.cumsum(counts) - counts, counts)) / counts[edge]
+    points = corners[edge] + share[:, None] * (ends - corners)[edge]
+    points = points[((points >= 0) & (points < (width, height))).all(axis=1)]
+    columns, rows = points.astype(np.intp).T
+    covered[rows, columns] = True
+    return covered
+
+
+def clipped(corners: Floats, box: Box) -> Floats:
+    """Return the part of a polygon (n, 2) within `box` (m, 2).
+
+    Sutherland and Hodgman, Reentrant polygon clipping, CACM 1974.
+    """
+    for axis, limit, sign in ((0, box[0], 1), (1, box[1], 1), (0, box[2], -1), (1, box[3], -1)):
+        if not len(corners):
+            break
+        ends = np.roll(corners, -1, axis=0)
+        room, then = sign * (corners[:, axis] - limit), sign * (ends[:, axis] - limit)
+        crosses = (room < 0) != (then < 0)
+        share = room / np.where(crosses, room - then, 1.0)
+        meets = corners + share[:, None] * (ends - corners)
+        both = np.stack((corners, meets), axis=1).reshape(-1, 2)
+        corners = both[np.stack((room >= 0, crosses), axis=1).ravel()]
+    return corners
+
+
+NO_ZONES = ZoneMap(())

@@ -1,0 +1,228 @@
+"""Zones and places: decision drives a body in a flat world by them, in fake time."""
+
+import math
+
+import numpy as np
+import pytest
+
+from gigabrain_schemas.tasks import GoalRequest, MissionRequest
+from gigabrain_schemas.topics import GOAL, MISSION, ZONES
+from gigabrain_schemas.zones import Place, Zone, Zones
+from gigabrain_zenoh.geometry import polygon
+from gigabrain_zenoh.geometry.se2 import transform
+from gigabrain_zenoh.testing.samples import WAFFLE
+from tests.node.plane import ROOM, Plane, drawn
+
+CELLS = drawn(ROOM)  # 5.0 x 2.0 m
+HALL = np.zeros((120, 160), np.int8)  # 8 x 6 m
+HALL[[0, -1]] = HALL[:, [0, -1]] = 100
+
+
+def box(name: str, x: float, y: float, to_x: float, to_y: float, **more: float) -> Zone:
+    kind = "speed" if "max_speed" in more else "keepout"
+    return Zone(name=name, kind=kind, points=((x, y), (to_x, y), (to_x, to_y), (x, to_y)), **more)
+
+
+def send(plane: Plane, *zones: Zone, places: tuple[Place, ...] = (), loaded: int = 0) -> None:
+    message = Zones(
+        zones=zones, places=places, boot=plane.boot, tick=plane.tick, maps_loaded=loaded
+    )
+    plane.bench.send(ZONES, message)
+
+
+def corners(plane: Plane) -> np.ndarray:
+    return transform(np.array((plane.x, plane.y, plane.yaw)), np.array(WAFFLE.footprint))
+
+
+async def drive(plane: Plane, zone: Zone, seconds: float) -> tuple[float, float]:
+    """Return the least distance of the body to a zone [m], and its greatest speed in it [m/s]."""
+    shape, least, fastest = np.array(zone.points), math.inf, 0.0
+    for _ in range(round(seconds * 10)):
+        await plane.go(0.1)
+        here = float(polygon.distance(shape, corners(plane)).min())
+        least = min(least, here)
+        fastest = max(fastest, plane.velocity.linear_x) if here == 0.0 else fastest
+        if not plane.status.current and plane.status.done:
+            break
+    return least, fastest
+
+
+@pytest.mark.parametrize("order", [1, -1])
+async def test_it_drives_round_a_keep_out_zone_and_enters_it_nowhere(order: int) -> None:
+    lab = box("lab", 3.0, 1.5, 5.0, 6.0)
+    lab = Zone(name="lab", kind="keepout", points=lab.points[::order])
+    async with Plane(HALL, at=(1.0, 3.5, 0.0)) as plane:
+        await plane.go(0.2)
+        send(plane, lab)
+        await plane.go(0.2)
+        reply = await plane.ask(GOAL, GoalRequest(x=7.0, y=3.5))
+        assert reply.ok, reply.text
+        least, _ = await drive(plane, lab, 90)
+        assert plane.status.done[0].state == "succeeded"
+        assert least > 0.0
+
+
+async def test_a_goal_in_a_keep_out_zone_is_refused_by_its_name() -> None:
+    async with Plane(HALL, at=(1.0, 3.0, 0.0)) as plane:
+        send(plane, box("lab", 4.0, 2.0, 6.0, 4.0))
+        await plane.go(0.4)
+        reply = await plane.ask(GOAL, GoalRequest(x=5.0, y=3.0))
+        assert not reply.ok
+        assert reply.text.startswith("the goal lies in keep-out zone 'lab'; nearest reachable")
+        reply = await plane.ask(GOAL, GoalRequest(x=3.95, y=3.0))
+        assert reply.ok is False
+        assert reply.text.startswith("the goal is 0.05 m from keep-out zone 'lab'; the body needs")
+
+
+async def test_a_goal_behind_zones_is_refused_with_the_zone_in_the_way() -> None:
+    async with Plane(HALL, at=(1.0, 3.0, 0.0)) as plane:
+        send(plane, box("wall", 4.0, -1.0, 4.5, 9.0))
+        await plane.go(0.4)
+        reply = await plane.ask(GOAL, GoalRequest(x=7.0, y=3.0))
+        assert not reply.ok
+        assert reply.text.startswith(
+            "no way leads to the goal without entering keep-out zone 'wall'; nearest reachable"
+        )
+
+
+async def test_a_zone_over_its_goal_ends_the_task_with_the_reason() -> None:
+    async with Plane(HALL, at=(1.0, 3.0, 0.0)) as plane:
+        await plane.go(0.2)
+        assert (await plane.ask(GOAL, GoalRequest(x=7.0, y=3.0))).ok
+        await plane.go(3.0)
+        send(plane, box("lab", 6.0, 2.0, 7.9, 4.0))
+        await plane.until("failed", seconds=2)
+        assert plane.status.done[0].reason.startswith("the goal lies in keep-out zone 'lab'")
+        assert plane.x < 6.0
+
+
+async def test_a_zone_ahead_is_avoided_although_the_old_path_leads_through_it() -> None:
+    async with Plane(HALL, at=(1.0, 3.0, 0.0)) as plane:
+        await plane.go(0.2)
+        await plane.ask(GOAL, GoalRequest(x=7.0, y=3.0))
+        await plane.go(5.0)
+        ahead = box("spill", plane.x + 0.5, 2.5, plane.x + 1.5, 3.5)
+        send(plane, ahead)
+        least, _ = await drive(plane, ahead, 60)
+        assert plane.status.done[0].state == "succeeded"
+        assert least > 0.0
+
+
+async def test_a_robot_inside_a_zone_leaves_it_by_the_shortest_way() -> None:
+    lab = box("lab", 1.0, 1.0, 6.0, 5.0)
+    async with Plane(HALL, at=(2.0, 3.0, 0.0)) as plane:
+        send(plane, lab)
+        await plane.go(0.4)
+        assert plane.travelled == 0.0  # it does not drive by itself
+        reply = await plane.ask(GOAL, GoalRequest(x=7.0, y=3.0))
+        assert reply.ok, reply.text
+        most_x, inside = 0.0, True
+        while inside:
+            await plane.go(0.1)
+            inside = bool(polygon.distance(np.array(lab.points), corners(plane)).min() == 0.0)
+            most_x = max(most_x, plane.x)
+        assert plane.x < 1.0  # and not through the zone to the goal
+        assert most_x < 2.3
+        least, _ = await drive(plane, lab, 90)
+        assert plane.status.done[0].state == "succeeded"
+        assert least > 0.0
+
+
+async def test_a_robot_leaving_a_zone_sees_the_obstacles_in_it() -> None:
+    cells = HALL.copy()
+    cells[40:80, 30:32] = 100  # a wall between the robot and the nearest edge
+    async with Plane(cells, at=(2.0, 3.0, 0.0)) as plane:
+        send(plane, box("lab", 1.0, 0.1, 6.0, 5.9))
+        await plane.go(0.4)
+        assert (await plane.ask(GOAL, GoalRequest(x=7.0, y=3.0))).ok
+        await plane.until("succeeded", seconds=120)
+        assert plane.closest > 0.1
+
+
+async def test_zones_over_the_whole_map_leave_no_goal() -> None:
+    async with Plane(HALL, at=(2.0, 3.0, 0.0)) as plane:
+        send(plane, box("all", -100.0, -1e5, 1e5, 1e5))
+        await plane.go(0.4)
+        reply = await plane.ask(GOAL, GoalRequest(x=7.0, y=3.0))
+        assert reply.text.startswith("the goal lies in keep-out zone 'all'")
+        send(plane)
+        await plane.go(0.4)
+        assert (await plane.ask(GOAL, GoalRequest(x=7.0, y=3.0))).ok
+
+
+async def test_the_body_is_slow_in_a_speed_zone_and_before_it() -> None:
+    ramp = box("ramp", 3.0, 0.0, 5.0, 6.0, max_speed=0.1)
+    async with Plane(HALL, at=(1.0, 3.0, 0.0)) as plane:
+        send(plane, ramp)
+        await plane.go(0.4)
+        await plane.ask(GOAL, GoalRequest(x=7.0, y=3.0))
+        _, fastest = await drive(plane, ramp, 120)
+        assert plane.status.done[0].state == "succeeded"
+        assert 0.08 < fastest < 0.106
+        reasons = {one.reason for one in plane.intents}
+        assert any("at most 0.10 m/s: speed zone 'ramp'" in reason for reason in reasons)
+
+
+async def test_a_one_way_lane_is_driven_along_and_gone_round_against() -> None:
+    lane = Zone(name="lane", kind="one_way", points=((2.0, 3.0), (6.0, 3.0)), lane_width=2.0)
+
+    async def passes(start: float, goal: float) -> float:
+        """Return how far the body went off the middle of the lane, at its half."""
+        async with Plane(HALL, at=(start, 3.0, 0.0)) as plane:
+            send(plane, lane)
+            await plane.go(0.4)
+            assert (await plane.ask(GOAL, GoalRequest(x=goal, y=3.0))).ok
+            before, off = plane.x, math.nan
+            while plane.status.current or not plane.status.done:
+                await plane.go(0.1)
+                if (before - 4.0) * (plane.x - 4.0) <= 0.0 and math.isnan(off):
+                    off = abs(plane.y - 3.0)
+            assert plane.status.done[0].state == "succeeded"
+            return off
+
+    assert await passes(1.0, 7.0) < 0.3
+    assert await passes(7.0, 1.0) > 0.85  # a corner of it may be cut
+
+
+async def test_a_goal_against_the_only_lane_is_refused_by_its_name() -> None:
+    lane = Zone(name="door", kind="one_way", points=((3.0, 3.0), (5.0, 3.0)), lane_width=6.0)
+    async with Plane(HALL, at=(7.0, 3.0, 0.0)) as plane:
+        send(plane, lane)
+        await plane.go(0.4)
+        reply = await plane.ask(GOAL, GoalRequest(x=1.0, y=3.0))
+        assert not reply.ok
+        assert "against one-way lane 'door'" in reply.text
+
+
+async def test_named_places_are_goals_and_parts_of_missions() -> None:
+    kitchen = Place(name="kitchen", x=3.0, y=2.0, yaw=1.5)
+    mission = "places: {here: [1.0, 3.0]}\ndo: [{goto: kitchen}, {goto: here}]"
+    async with Plane(HALL, at=(1.0, 3.0, 0.0)) as plane:
+        await plane.go(0.2)
+        reply = await plane.ask(GOAL, GoalRequest(place="kitchen"))
+        assert (reply.ok, reply.text) == (False, "no place 'kitchen'; known: none")
+        send(plane, places=(kitchen, Place(name="dock", x=1.0, y=1.0)))
+        await plane.go(0.2)
+        reply = await plane.ask(GOAL, GoalRequest(place="kichen"))
+        assert reply.text == "no place 'kichen'; did you mean 'kitchen'? known: dock, kitchen"
+        assert (await plane.ask(GOAL, GoalRequest(place="kitchen"))).ok
+        await plane.until("succeeded", seconds=60)
+        assert math.hypot(plane.x - 3.0, plane.y - 2.0) < 0.15
+        assert abs(plane.yaw - 1.5) < 0.15
+        assert plane.status.done[0].label == "kitchen (3.00, 2.00, 1.50 rad)"
+        assert (await plane.ask(MISSION, MissionRequest(mission=mission))).ok
+        send(plane)  # the mission has taken the place with it
+        await plane.until("succeeded", seconds=90)
+        assert math.hypot(plane.x - 1.0, plane.y - 3.0) < 0.15
+        reply = await plane.ask(MISSION, MissionRequest(mission=mission, label="round"))
+        assert reply.text == "round:2: do[0].goto: no place 'kitchen'; known: here"
+
+
+async def test_another_map_cancels_all_tasks() -> None:
+    async with Plane(HALL, at=(1.0, 3.0, 0.0)) as plane:
+        send(plane, loaded=1)
+        await plane.go(0.2)
+        await plane.ask(GOAL, GoalRequest(x=7.0, y=3.0))
+        await plane.go(1.0)
+        send(plane, loaded=2)
+        await plane.until("cancelled", seconds=2)
