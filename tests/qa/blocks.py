@@ -6,10 +6,9 @@
     <!-- file: NAME -->         the block is such a file, for the blocks of the page
     <!-- data: FOLDER/NAME -->  run with such a file of the folder GIGABRAIN_DATA
     <!-- not run: hardware (WHAT) -->  it needs hardware, other hosts, or root
-    <!-- robot.yaml -->         the block is a part of a robot.yaml
 
-Without a comment a block of `sh` or `python` is run, and YAML is a deployment file or a part of
-one. A block of `text` is output, or a drawing.
+Without a comment a block of `sh` or `python` is run. YAML must be a file that is read here, or a
+part of a robot.yaml. A block of `text` is output, or a drawing.
 """
 
 import ast
@@ -41,7 +40,7 @@ BLOCK = re.compile(
     r"(?P<text>.*?)^(?P=indent)```$",
     re.MULTILINE | re.DOTALL,
 )
-VERBS = ("run", "not run", "file", "data", "robot.yaml")
+VERBS = ("run", "not run", "file", "data")
 NOT_RUN = ("hardware (", "what CI runs itself")
 PART_OF = ROOT / "drivers/gigabrain_drivers/bodies/mycustombot"  # what a part of a robot.yaml joins
 
@@ -87,34 +86,32 @@ def problem(block: Block) -> str:
 
 
 def _read_yaml(block: Block) -> None:
-    if block.verb == "robot.yaml":
-        return _read_part_of_robot(block.text)
-    types = [deployment_type(), Mission, PatrolFile, RobotFile, MapYaml, WorldFile]
-    if block.verb != "file":
-        types = types[:1]
     errors = []
-    for one in types:
+    for one in (deployment_type(), Mission, PatrolFile, RobotFile, MapYaml, WorldFile):
         try:
             loading.loads(block.text, one, block.value or "block")
-            return None
+            return
         except ConfigError as error:
             errors.append(f"{one.__name__}: {error}")
-    raise ValueError("; ".join(errors))
+    try:
+        _read_part_of_robot(block.text)
+    except ConfigError as error:
+        raise ValueError("; ".join([*errors, f"a part of robot.yaml: {error}"])) from None
 
 
 def _read_part_of_robot(text: str) -> None:
-    """Raise ConfigError unless a robot's file with these fields can be loaded on its real link."""
+    """Raise ConfigError unless a robot's file with these fields can be loaded."""
+    part = yaml.safe_load(text)
     with tempfile.TemporaryDirectory(prefix="docs-") as name:
         folder = Path(name) / "robot"
         shutil.copytree(PART_OF, folder)
         file = folder / "robot.yaml"
-        file.write_text(yaml.safe_dump(_joined(yaml.safe_load(file.read_text()), text)))
-        load_link(str(file), Run(folder=folder, link="real"))
+        file.write_text(yaml.safe_dump(_joined(yaml.safe_load(file.read_text()), part)))
+        load_link(str(file), Run(folder=folder, link="sim" if "sim" in part else "real"))
 
 
-def _joined(whole: dict[str, Any], text: str) -> dict[str, Any]:
-    """Return the fields of a robot's file with those of `text`; a link joins one of its driver."""
-    part = yaml.safe_load(text)
+def _joined(whole: dict[str, Any], part: dict[str, Any]) -> dict[str, Any]:
+    """Return the fields of a robot's file with those of `part`; a link joins one of its driver."""
     for key, value in part.items():
         old = whole.get(key)
         if (
