@@ -258,12 +258,12 @@ def test_geometry_that_contradicts_the_model_is_a_warning_with_both_numbers(
 def test_an_outline_that_contradicts_the_file_is_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    named = MODEL.replace('<geom class="collision" type="box" pos="-.05', '<geom name="hull_box" '
-                          'class="collision" type="box" pos="-.05')  # fmt: skip
+    box = 'pos="-.05 0 .12" size=".18 .14 .06" mass="0"'
+    wide = MODEL.replace(box, box.replace("-.05 0", "-.05 .1"))
     with caplog.at_level(logging.WARNING):
-        simulated(written(tmp_path, model=named))
-    left = "the left side of the footprint is 0.140 m here, and 0.200 m in the robot's file"
-    assert f"{tmp_path}/cart.xml: {left}" in caplog.messages
+        simulated(written(tmp_path, model=wide))
+    left = "the left side of the footprint is 0.240 m here, and 0.200 m in the robot's file"
+    assert caplog.messages == [f"{tmp_path}/cart.xml: {left}"]
 
 
 def test_a_servo_that_is_too_slow_for_the_file_is_a_warning(

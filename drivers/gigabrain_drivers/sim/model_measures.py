@@ -15,7 +15,6 @@ MAX_SHARE = 0.05  # by which two lengths differ that should be the same
 MAX_OFF_M, MAX_OFF_RAD = 0.02, 0.05  # the same of places and angles
 IMU_SENSORS = ("gyro", "accelerometer", "attitude")
 UPRIGHT = 0.7  # cosine from which an axis counts as along another
-HULL = "hull_"
 
 
 class ModelMeasures:
@@ -69,12 +68,11 @@ class ModelMeasures:
         low, high = self._model.actuator_ctrlrange[number].tolist()
         return low, high
 
-    def hull(self) -> tuple[float, float, float, float] | None:
-        """Return front, rear, left and right edge of the hull [m]; None without one."""
+    def outline(self) -> tuple[float, float, float, float]:
+        """Return front, rear, left and right edge of all that can touch things [m]."""
         model = self._model
-        geoms = [i for i in range(model.ngeom) if model.geom(i).name.startswith(HULL)]
-        if not geoms:
-            return None
+        touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+        geoms = np.flatnonzero(touching & (model.geom_rbound > 0.0))
         half = model.geom_aabb[geoms, 3:]
         axes = np.abs(self._axes.T @ self._data.geom_xmat[geoms].reshape(-1, 3, 3))
         reach = np.einsum("nij,nj->ni", axes, half)
@@ -128,12 +126,11 @@ def mismatches(spec: mujoco.MjSpec, body: SimModel) -> Iterator[str]:
         yield from _wheels(measures, body)
     if body.lidar and body.lidar.mount:
         yield from _lidar(measures, body.lidar.mount)
-    hull = measures.hull()
-    if hull and body.footprint:
+    if body.footprint:
         x, y = zip(*body.footprint, strict=True)
         edges = ("front", max(x)), ("rear", min(x)), ("left side", max(y)), ("right side", min(y))
-        for (edge, told), is_in_model in zip(edges, hull, strict=True):
-            if abs(told - is_in_model) > MAX_OFF_M:
+        for (edge, told), is_in_model in zip(edges, measures.outline(), strict=True):
+            if abs(is_in_model) > abs(told) + MAX_OFF_M:  # a wider footprint is only careful
                 yield _differs(f"the {edge} of the footprint", is_in_model, told)
 
 

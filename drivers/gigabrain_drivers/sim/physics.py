@@ -1,5 +1,6 @@
 """A body in a world, one step of 10 ms at a time. No bus, no clock and no thread of its own."""
 
+from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -32,6 +33,8 @@ from gigabrain_drivers.sim.truth import Truth
 from gigabrain_drivers.sim.world import Stream, World, generator
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
 
+GRAVITY = 9.81  # [m/s2]
+STALL_AMPERES, STALL_SHARE = 1.4, 4.0  # of the usual motor; times its gear's friction
 EDGE_OF_THE_WORLD_M = 1e3
 
 
@@ -40,6 +43,7 @@ class Simulation:
 
     def __init__(self, body: SimModel, world: World, seed: int) -> None:
         self.model = compile_scene(body, world)
+        body = with_motors(body, self.model)
         self.data = mujoco.MjData(self.model)
         self._steps, self._substeps = 0, body.substeps
         self._locomotion = make_locomotion(body, self.model, self.data)
@@ -172,6 +176,19 @@ class Simulation:
         x, y, z = self.data.qpos[self._height - 2 : self._height + 1].tolist()
         if not (abs(x) < EDGE_OF_THE_WORLD_M and abs(y) < EDGE_OF_THE_WORLD_M and abs(z) < 1):
             raise BodyLost(f"the simulation diverged after {self.time_ns / 1e9:.2f} s")
+
+
+def with_motors(body: SimModel, model: mujoco.MjModel) -> SimModel:
+    """Return a body of somebody else's model with motors for its weight and its gears' friction."""
+    if not body.names or not isinstance(body, SimBody):
+        return body
+    mass = float(model.body_subtreemass[model.body(f"{ROBOT}base").id])
+    grip = mass * GRAVITY * body.wheel_radius  # [N m], of all wheels
+    wheels = [int(model.joint(f"{ROBOT}{name}_joint").dofadr[0]) for name in body.rolling]
+    friction = float(model.dof_frictionloss[wheels].max())
+    stall = grip + STALL_SHARE * friction
+    torque = max(stall / STALL_AMPERES, body.motor.torque_per_ampere)
+    return replace(body, motor=replace(body.motor, torque_per_ampere=torque))
 
 
 def make_locomotion(body: SimModel, model: mujoco.MjModel, data: mujoco.MjData) -> Locomotion:
