@@ -11,11 +11,15 @@ import serial
 from msgspec.structs import replace
 
 from gigabrain_drivers.bodies.line.conversion import LineCommand, LineReport, SentWording
-from gigabrain_drivers.bodies.line.options import BITS_PER_BYTE, LineOptions, check_lines
+from gigabrain_drivers.bodies.line.options import (
+    BITS_PER_BYTE,
+    LineOptions,
+    base_of,
+    check_lines,
+)
 from gigabrain_drivers.bodies.line.protocol import LineDecoder, describe
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import RobotFile, Run
-from gigabrain_drivers.kinematics.wheels import wheels_of
 from gigabrain_drivers.lidars.base import ScanSource, open_lidar
 from gigabrain_drivers.links.frames import Spelling, Wording
 from gigabrain_drivers.links.link import Liveness
@@ -46,7 +50,7 @@ class LineDriver(Driver):
 
     def __init__(self, robot: RobotFile, options: LineOptions, run: Run) -> None:
         super().__init__(robot, options, run)
-        base = wheels_of(robot)
+        base = base_of(options, robot)
         self._command = LineCommand(options.command_template(), base)
         self._decoder = LineDecoder(options.state_templates())
         self._clock = Clock()

@@ -5,15 +5,15 @@ It is made from the same templates as the driver, read the other way round.
 
 import math
 from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from gigabrain_drivers.bodies.line.conversion import LineCommand
-from gigabrain_drivers.bodies.line.options import LineOptions
+from gigabrain_drivers.bodies.line.options import SIDES, WHEEL_PARTS, LineOptions, base_of
 from gigabrain_drivers.bodies.line.protocol import MAX_LINE_BYTES, Field
 from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Wire
 from gigabrain_drivers.emulators.ports import Pty
-from gigabrain_drivers.kinematics.wheels import wheels_of
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.geometry.limits import clamp, limits_of
 
@@ -36,7 +36,7 @@ class LineBase(Device):
         super().__init__(body, options, wire)
         self._options: LineOptions = options
         self._command = options.command_template()
-        self._said = LineCommand(self._command, wheels_of(body.robot))
+        self._said = LineCommand(self._command, base_of(options, body.robot))
         self._state = options.state_templates()
         self._limits = limits_of(body.robot)
         self._state_ns = round(1e9 / options.state_hz)
@@ -120,6 +120,7 @@ class LineBase(Device):
             values[f"{name}_velocity"] = wheel.velocity
             values[f"{name}_effort"] = wheel.effort
             values[f"{name}_temperature"] = wheel.temperature
+        values |= _sides(values)
         values["battery_voltage"] = shot.battery.voltage - self.sag_volts
         values["battery_percentage"] = shot.battery.percentage
         values["battery_current"] = shot.battery.current
@@ -138,3 +139,15 @@ class LineBase(Device):
         span = 1 << self._options.tick_bits
         count = (round(value / field.factor) + span // 2) % span - span // 2
         return count * field.factor
+
+
+def _sides(values: Mapping[str, float]) -> dict[str, float]:
+    """Return the means of all wheels of a side, where the board has one motor for them."""
+    found = {}
+    for side in SIDES:
+        end = side.removeprefix("wheel")
+        for part in WHEEL_PARTS:
+            of_side = [value for name, value in values.items() if name.endswith(end + part)]
+            if of_side and side + part not in values:
+                found[side + part] = sum(of_side) / len(of_side)
+    return found

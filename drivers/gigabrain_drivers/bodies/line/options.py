@@ -17,7 +17,15 @@ from gigabrain_drivers.bodies.line.protocol import (
     Template,
 )
 from gigabrain_drivers.driver.robot import LinkOptions, RobotFile
-from gigabrain_drivers.kinematics.wheels import Ackermann, Base, Twist, missing_measures, wheels_of
+from gigabrain_drivers.kinematics.wheels import (
+    Ackermann,
+    Base,
+    Differential,
+    SkidSteer,
+    Twist,
+    missing_measures,
+    wheels_of,
+)
 from gigabrain_drivers.links.serial_link import AUTO, check_port
 from gigabrain_schemas.base import Name, Positive
 
@@ -28,6 +36,7 @@ BITS_PER_BYTE = 10  # 8N1
 
 MAX_STEP_SHARE = 0.1  # of the greatest speed: the largest step of a command
 WHEEL_PARTS = ("_position", "_velocity", "_effort", "_temperature")
+SIDES = ("wheel_left", "wheel_right")
 POSE = ("x", "y", "yaw")
 
 
@@ -134,7 +143,9 @@ def _template(field: str, text: str, known: dict[str, str], turn: float | None) 
 
 def check_lines(options: LineOptions, robot: RobotFile) -> None:
     """Check the lines against the body: its wheels, steps, odometry and lidar."""
-    base, command, state = wheels_of(robot), options.command_template(), options.state_templates()
+    base, command, state = (
+        base_of(options, robot), options.command_template(), options.state_templates(),
+    )  # fmt: skip
     for field, template in {"command": command, **_numbered(state)}.items():
         _check_wheels(field, template, robot, base)
     _check_command(command, robot, base)
@@ -146,6 +157,16 @@ def check_lines(options: LineOptions, robot: RobotFile) -> None:
             "scan: `lidar` says that the body has one; expected where its scans come from, such "
             "as {driver: ld19, port: usb:10c4:ea60}, or no `lidar`"
         )
+
+
+def base_of(options: LineOptions, robot: RobotFile) -> Base | None:
+    """Return the wheels that the lines know; those of a side may be one to a skid-steered base."""
+    base = wheels_of(robot)
+    templates = (options.command_template(), *options.state_templates())
+    sides = any(name.startswith(SIDES) for template in templates for name in template.names)
+    if isinstance(base, SkidSteer) and sides:
+        return Differential(base.radius, base.effective_track)
+    return base
 
 
 def speed_fields(base: Base) -> tuple[str, ...]:
