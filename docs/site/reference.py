@@ -9,12 +9,11 @@ from typing import Any
 import msgspec
 
 import gigabrain_zenoh
-from docs.site.structs import anchor, cell, declared, nested, section
+from docs.site.structs import anchor, cell, header, nested, section
 from gigabrain_drivers import DRIVERS, LIDARS
 from gigabrain_drivers.driver.catalog import driver_class
 from gigabrain_drivers.driver.robot import RobotFile
 from gigabrain_drivers.lidars.base import source_class
-from gigabrain_schemas.base import Message
 from gigabrain_schemas.topics import SERVICES, TOPICS, messages
 from gigabrain_zenoh.cli.app import COMMANDS, make_app
 from gigabrain_zenoh.config.map_image import MapYaml
@@ -117,9 +116,9 @@ def message_page() -> Lines:
         "also has the header below, which the bus fills in. `gigabrain schema export DIR` writes",
         "JSON Schemas.",
     )
-    yield from ("", "## Header", "", "| field | default | meaning |", "|---|---|---|")
-    for name, default, about in declared(Message):
-        yield f"| `{name}` | `{default}` | {cell(about)} |"
+    yield from ("", "## Header", "", "| field | type | meaning |", "|---|---|---|")
+    for one in header():
+        yield f"| `{one.name}` | {cell(one.kind)} | {cell(one.about)} |"
     yield from _sections(messages())
 
 

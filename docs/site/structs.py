@@ -3,6 +3,7 @@
 import ast
 import functools
 import importlib
+import json
 import re
 import tokenize
 from collections.abc import Iterator
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
-from msgspec import inspect
+from msgspec import NODEFAULT, inspect
 
 from gigabrain_schemas.base import Message
 
@@ -22,6 +23,9 @@ ATOMS = {
     "NoneType": "null",
     "AnyType": "anything",
 }
+
+
+Comments = dict[int, tuple[str, bool]]  # by line: the text, and whether it is alone
 
 
 class Field(NamedTuple):
@@ -52,14 +56,27 @@ def fields(kind: type[msgspec.Struct]) -> Iterator[Field]:
     info = inspect.type_info(kind)
     assert isinstance(info, inspect.StructType)
     types = {one.name: one.type for one in info.fields}
+    defaults = {one.name: _default(one) for one in info.fields}
     for base in reversed(kind.__mro__):
         if base is Message or not base.__module__.startswith("gigabrain_"):
             continue
-        for name, default, comment in declared(base):
+        for name, comment in comments_of(base):
             if name in types:
                 unit = UNIT.match(comment)
                 about = comment[unit.end() :] if unit else comment
-                yield Field(name, text_of(types[name]), unit[1] if unit else "", default, about)
+                about = about or _about(types[name])
+                yield Field(
+                    name, text_of(types[name]), unit[1] if unit else "", defaults[name], about
+                )
+
+
+def header() -> Iterator[Field]:
+    """Yield the fields that every message has."""
+    info = inspect.type_info(Message)
+    assert isinstance(info, inspect.StructType)
+    comments = dict(comments_of(Message))
+    for one in info.fields:
+        yield Field(one.name, text_of(one.type), "", _default(one), comments[one.name])
 
 
 def nested(kind: type[msgspec.Struct]) -> list[type[msgspec.Struct]]:
@@ -114,41 +131,53 @@ def _bounds(one: Any) -> str:
     return " " + ", ".join(limits) if limits else f" up to {longest}" if longest else ""
 
 
-def declared(kind: type) -> Iterator[tuple[str, str, str]]:
-    """Yield name, default and comment of the fields in the body of a class."""
+def comments_of(kind: type) -> Iterator[tuple[str, str]]:
+    """Yield the name and the comment of each field in the body of a class."""
     path = Path(importlib.import_module(kind.__module__).__file__ or "")
     classes, comments = _source(path)
     node = classes.get(kind.__name__)
     for one in node.body if node else ():
         if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name):
-            default = ast.unparse(one.value) if one.value else ""
-            yield one.target.id, _default(default), _comment(one, comments)
+            yield one.target.id, _comment(one, comments)
 
 
-def _comment(one: ast.AnnAssign, comments: dict[int, tuple[str, bool]]) -> str:
-    """Return the comment behind a field, or the lines of their own around it."""
-    lines = range(one.lineno, (one.end_lineno or one.lineno) + 1)
-    behind = [comments[line][0] for line in lines if line in comments]
+def _comment(one: ast.AnnAssign, comments: Comments) -> str:
+    """Return the comment behind a field, or that below it with a unit, or that above it."""
+    end = one.end_lineno or one.lineno
+    behind = [comments[line][0] for line in range(one.lineno, end + 1) if line in comments]
     if behind:
         return " ".join(behind)
-    last, text = lines[-1] + 1, ""
-    while last in comments and comments[last][1] and comments[last][0].startswith("["):
-        text, last = f"{text} {comments[last][0]}".strip(), last + 1
-    return text
+
+    def alone(line: int, step: int, *, unit: bool) -> Iterator[str]:
+        while line in comments and comments[line][1] and comments[line][0].startswith("[") == unit:
+            yield comments[line][0]
+            line += step
+
+    below = list(alone(end + 1, 1, unit=True))
+    above = list(alone(one.lineno - 1, -1, unit=False))
+    return " ".join(below or reversed(above))
 
 
-def _default(source: str) -> str:
-    """Return a default as a reader of YAML knows it."""
-    factory = re.fullmatch(r"(?:msgspec\.)?field\(default_factory=(?:lambda: )?(.*)\)", source)
-    text = factory[1] if factory else source
-    words = {"True": "true", "False": "false", "None": "null", "()": "[]", "dict": "{}"}
-    if re.fullmatch(r"\w+\(\)|[A-Z_]+", text):
+def _default(one: inspect.Field) -> str:
+    """Return a default as a reader of YAML knows it; empty for a field that is required."""
+    if one.required:
+        return ""
+    value = one.default if one.default is not NODEFAULT else one.default_factory()
+    if isinstance(value, msgspec.Struct):
         return "its defaults"
-    return words.get(text, text.replace("'", '"'))
+    return json.dumps(value, ensure_ascii=False, default=repr)
+
+
+def _about(one: Any) -> str:
+    """Return what a Struct is about, for a field without a comment of its own."""
+    for part in (one, *getattr(one, "types", ())):
+        if isinstance(part, inspect.StructType):
+            return (part.cls.__doc__ or "").partition("\n")[0]
+    return ""
 
 
 @functools.cache
-def _source(path: Path) -> tuple[dict[str, ast.ClassDef], dict[int, tuple[str, bool]]]:
+def _source(path: Path) -> tuple[dict[str, ast.ClassDef], Comments]:
     """Return the classes of a module, and its comments by line: text, and whether it is alone."""
     tree = ast.parse(path.read_text("utf-8"))
     with path.open("rb") as file:

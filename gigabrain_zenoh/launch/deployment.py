@@ -53,18 +53,19 @@ ROBOT = tuple(name for name, one in PROCESSES.items() if one.default)
 class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A whole deployment file."""
 
-    body: str = "turtlebot3_waffle"
-    link: LinkName = "sim"
-    world: str = "arena"
-    seed: Seed = 0
-    speed: Speed = 1.0
+    body: str = "turtlebot3_waffle"  # a known robot, or the path of its robot.yaml
+    link: LinkName = "sim"  # simulated, the real driver on an emulator, or the hardware
+    world: str = "arena"  # of the simulation: a known world, or the path of a world file
+    seed: Seed = 0  # of the start pose and the sensor noise in the simulation
+    speed: Speed = 1.0  # simulated over real time; not 1: time waits for the brain
     lockstep_timeout_s: LockstepTimeout = 0.15  # longer: the same decisions on a slow machine, too
-    resume: Resume = "manual"
+    resume: Resume = "manual"  # who drives on after a stop: a person, or `auto` in simulation
     namespace: str = ""  # the robot's own part of the key space, where one router serves several
     router: str = "tcp/127.0.0.1:7447"  # where it listens; port 0 for any, where all is on one host
     keys: str = ""  # the folder of this host's identity, or of one for each host: TLS for all
     fleet: tuple[str, ...] = ()  # namespaces of other robots that this one's router serves
     insecure: bool = False  # allow a router that other machines can reach, without keys
+    # the processes of each host, by its name
     hosts: dict[str, tuple[str, ...]] = msgspec.field(default_factory=lambda: {"robot": ROBOT})
     button: ButtonConfig | None = None  # an e-stop button; without its word nothing moves
     robot: dict[str, Any] = {}  # fields of the body's file that are other here, never less safe

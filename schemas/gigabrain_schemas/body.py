@@ -180,8 +180,8 @@ DEFAULT = Thresholds()
 class BodyDescription(Record, frozen=True, kw_only=True):
     """Everything that the brain has to know of a body. The common part of a robot's YAML file."""
 
-    robot_type: Name
-    drive_type: DriveType
+    robot_type: Name  # what it is called
+    drive_type: DriveType  # how it moves
     footprint: Annotated[tuple[tuple[Offset, Offset], ...], Meta(min_length=3, max_length=64)]
     # [m], corners in the body's frame, in order
     max_linear_speed: SpeedLimit  # [m/s]
@@ -199,7 +199,7 @@ class BodyDescription(Record, frozen=True, kw_only=True):
     lidar: Lidar | None = None
     thresholds: Thresholds = DEFAULT
     control: ControlGains = ControlGains()
-    safe_state: SafeState = "stop"
+    safe_state: SafeState = "stop"  # what the driver brings it to when it ends
     control_topic: Key = "robot/cmd_vel"  # the key that its driver obeys
 
     def __post_init__(self) -> None:

@@ -147,9 +147,9 @@ class Step(Part, frozen=True, kw_only=True):
 class Mission(Part, frozen=True, kw_only=True):
     """A mission file."""
 
-    places: dict[Name, Point] = {}
-    trees: dict[Name, Steps] = {}
-    do: Steps
+    places: dict[Name, Point] = {}  # names of places: x, y [m] and optionally yaw [rad]
+    trees: dict[Name, Steps] = {}  # names of steps that are used several times
+    do: Steps  # in order
 
     def goal(self, place: Place) -> Goal:
         """Return the goal of a place, given by name or coordinates."""
@@ -170,8 +170,8 @@ class Mission(Part, frozen=True, kw_only=True):
 class PatrolFile(Part, frozen=True, kw_only=True):
     """The file of `gigabrain patrol`."""
 
-    places: dict[Name, Point] = {}
-    points: Places
+    places: dict[Name, Point] = {}  # names of places: x, y [m] and optionally yaw [rad]
+    points: Places  # names, or x, y and optionally yaw
     wait: Pause = 0.0  # [s] at each
 
 
