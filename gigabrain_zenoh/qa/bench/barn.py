@@ -29,6 +29,7 @@ from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.geometry.limits import ZERO, SentCommand, clamp, limits_of, ramp
 from gigabrain_zenoh.host.bounded import percentile
+from gigabrain_zenoh.host.signals import end_on_interrupt
 from gigabrain_zenoh.navigation import local_planner
 from gigabrain_zenoh.navigation.local_planner import LocalPlanner, LocalSettings, PlanRequest
 from gigabrain_zenoh.perception import node as perception
@@ -101,9 +102,10 @@ def measure_barn(
     """
     drive = drive_nodes if nodes else drive_functions
     done = []
-    with ProcessPoolExecutor(jobs, get_context("spawn"), initializer=_warm_up) as pool:
+    context = get_context("spawn")
+    with ProcessPoolExecutor(jobs, context, initializer=end_on_interrupt) as pool:
         waiting = [
-            pool.submit(drive, world, trial, PLANTS[plant], samples)
+            pool.submit(_when_warm, drive, world, trial, PLANTS[plant], samples)
             for world in worlds
             for trial in range(trials)
         ]
@@ -114,6 +116,12 @@ def measure_barn(
     return BarnResult(plant=PLANTS[plant], samples=samples, trials=tuple(done))
 
 
+def _when_warm(drive: Callable[..., BarnTrial], *arguments: object) -> BarnTrial:
+    _warm_up()
+    return drive(*arguments)
+
+
+@functools.cache
 def _warm_up() -> None:
     """Compile and freeze existing objects, as a robot's process does before it drives."""
     local_planner.warm_up(JACKAL)
