@@ -1,7 +1,9 @@
 """Workarounds for costs and faults of Zenoh 1.10, each with its reason."""
 
+import atexit
 import contextlib
 import ctypes
+import functools
 import os
 import socket
 import stat
@@ -49,6 +51,25 @@ def keep_thread_state() -> None:
     if not getattr(_here, "stays", False):
         _here.stays = True
         ctypes.pythonapi.PyGILState_Ensure()
+
+
+CALLBACK_THREAD = "pyo3-closure"  # in the name of a thread that Zenoh starts for a callback
+ENDING_S = 0.5
+
+
+# such a thread ends after its session is closed; one that came back to Python during the
+# interpreter's end aborted 1 of 30 short scripts ("FATAL: exception not rethrown")
+@functools.cache
+def await_callback_threads_at_exit() -> None:
+    """Have this process wait, at its end, for the threads of callbacks."""
+    atexit.register(_await_callback_threads)
+
+
+def _await_callback_threads() -> None:
+    end_s = time.monotonic() + ENDING_S
+    for thread in threading.enumerate():
+        if CALLBACK_THREAD in thread.name:
+            thread.join(max(0.0, end_s - time.monotonic()))
 
 
 T = TypeVar("T")
