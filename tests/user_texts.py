@@ -92,7 +92,6 @@ OLD_ARGUMENTS = (
     "decision --turn left",
     "decision --begin roam",
     "warm",
-    "view",
     "render --png x.png",
     "goto 1 2 --how queue",
     "explore --how queue",

@@ -36,6 +36,7 @@ COMMANDS = {
     "audit": ("gate:audit", "Show who did what to the robot."),
     "teleop": ("views:teleop", "Drive the robot by keyboard or gamepad."),
     "page": ("views:page", "Serve the operator page: the robot in a browser."),
+    "view": ("views:view", "Open a live window of the simulation, or save a picture of it."),
     "foxglove": ("views:foxglove", "Show the robot live in Foxglove or Lichtblick."),
     "why": ("diagnose:why", "Say why the robot does not move."),
     "doctor": ("diagnose:doctor", "Check this machine and the robot, and say what to fix."),

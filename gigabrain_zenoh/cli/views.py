@@ -1,4 +1,4 @@
-"""`gigabrain teleop`, `page` and `foxglove`: views of a robot for people."""
+"""`gigabrain teleop`, `page`, `view` and `foxglove`: views of a robot for people."""
 
 import getpass
 import sys
@@ -123,6 +123,27 @@ def foxglove(
         print(f"{layout}: import it as a layout, and open a connection to ws://127.0.0.1:{port}")
         return 0
     return _run("foxglove", config, at)
+
+
+def view(*, picture: Path | None = None, at: RobotAddress = LOCAL) -> None:
+    """Open a live window of the robot's simulation, until it is closed.
+
+    Example: gigabrain view
+
+    A process of its own: the simulation never waits for it. Where there is no
+    display, see the 3-D view of the operator page, or save a picture.
+
+    Args:
+        picture: Save one picture of the simulation, as it is now, to this PNG file instead.
+    """
+    from gigabrain_drivers.sim.window import check_display, show
+    from gigabrain_zenoh.cli.options import on_bus, print_line
+    from gigabrain_zenoh.host.files import check_result_path
+
+    check_result_path(picture)
+    if picture is None:
+        check_display()
+    on_bus(at, lambda bus: show(bus, picture, print_line), "view")
 
 
 def _run(name: str, config: Any, at: RobotAddress) -> int:

@@ -72,7 +72,6 @@ CLI_WORDS: tuple[Rename, ...] = (
     Rename("decision --turn", "--set", _TURNS),
     Rename("decision --begin", "--set", {"wait": "start=wait", "roam": "start=explore"}),
     Rename("warm", "precompile"),
-    Rename("view", "render"),
     Rename("render --png", "--file"),
     Rename("goto --how", "--mode"),
     Rename("explore --how", "--mode"),

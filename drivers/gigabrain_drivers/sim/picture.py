@@ -3,7 +3,7 @@
 import importlib
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -35,16 +35,33 @@ def render(
     """Write a PNG of the robot at its start. Raises ConfigError where nothing can be drawn."""
     simulation = Simulation(body, world, seed)
     model, data = simulation.model, simulation.data
-    model.vis.global_.offwidth, model.vis.global_.offheight = (
-        width * SUPERSAMPLING,
-        height * SUPERSAMPLING,
-    )
     model.vis.global_.fovy, model.vis.map.zfar = FIELD_OF_VIEW_DEG, 3.0
     robot = simulation.truth.pose()
     _light(model, robot)
     mujoco.mj_forward(model, data)
+    save_picture(model, data, _camera(world, robot), path, width=width, height=height)
+
+
+def save_picture(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    camera: mujoco.MjvCamera,
+    path: Path,
+    add: Callable[[mujoco.MjvScene], None] = lambda _: None,
+    *,
+    width: int = 1280,
+    height: int = 720,
+) -> None:
+    """Write what a camera sees to a PNG; `add` adds shapes of its own.
+
+    Raises ConfigError where nothing can be drawn.
+    """
+    model.vis.global_.offwidth, model.vis.global_.offheight = (
+        width * SUPERSAMPLING,
+        height * SUPERSAMPLING,
+    )
     with _graphics(width * SUPERSAMPLING, height * SUPERSAMPLING):
-        fine = _draw(model, data, _camera(world, robot))
+        fine = _draw(model, data, camera, add)
     pixels = fine.reshape(height, SUPERSAMPLING, width, SUPERSAMPLING, 3).mean(axis=(1, 3)).round()
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(png(pixels.astype(np.uint8)))
@@ -79,13 +96,17 @@ def _graphics(width: int, height: int) -> Iterator[None]:
 
 
 def _draw(
-    model: mujoco.MjModel, data: mujoco.MjData, camera: mujoco.MjvCamera
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    camera: mujoco.MjvCamera,
+    add: Callable[[mujoco.MjvScene], None],
 ) -> NDArray[np.uint8]:
     width, height = model.vis.global_.offwidth, model.vis.global_.offheight
-    scene = mujoco.MjvScene(model, maxgeom=1000)
+    scene = mujoco.MjvScene(model, maxgeom=max(1000, 2 * model.ngeom))
     scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 1
     everything = mujoco.mjtCatBit.mjCAT_ALL.value
     mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, camera, everything, scene)
+    add(scene)
     pixels, whole = np.empty((height, width, 3), np.uint8), mujoco.MjrRect(0, 0, width, height)
     context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
     try:

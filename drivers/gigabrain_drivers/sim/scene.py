@@ -35,8 +35,8 @@ SPARE_M = 0.01  # size of a spare that is not in use
 PERSON_HEIGHT_M = 1.45  # to the shoulders
 
 
-def add_materials(spec: mujoco.MjSpec, world: World) -> None:
-    """Sky, the floor's checks, and a material for each colour that a shape may name."""
+def add_sky(spec: mujoco.MjSpec) -> None:
+    """Add a sky that is lighter above."""
     spec.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
@@ -46,6 +46,11 @@ def add_materials(spec: mujoco.MjSpec, world: World) -> None:
         width=64,
         height=384,
     )
+
+
+def add_materials(spec: mujoco.MjSpec, world: World) -> None:
+    """Sky, the floor's checks, and a material for each colour that a shape may name."""
+    add_sky(spec)
     spec.add_texture(
         name=FLOOR,
         type=mujoco.mjtTexture.mjTEXTURE_2D,
