@@ -17,6 +17,7 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PROJECT = {"CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md"}  # below `project/` on the site
 LINK = re.compile(r"(?<=\]\()([^)\s#:]+)(?=[)#])")
+FILE = re.compile(r"^<!-- file: (\S+) -->\n```(\w+)$", re.MULTILINE)
 CODE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 
 
@@ -42,13 +43,13 @@ def assemble(pages: Path) -> None:
 
 
 def relinked(source: Path, path: Path) -> str:
-    """Return the text of a page, with links that lead to the same places from `path`."""
+    """Return the text of a page: links lead to the same places from `path`, files have names."""
 
     def moved(link: re.Match[str]) -> str:
         target = Path(os.path.normpath(source.parent / link[1]))
         return os.path.relpath(place_of(target), path.parent)
 
-    text = source.read_text("utf-8")
+    text = FILE.sub(r"```\2 title='\1'", source.read_text("utf-8"))
     pieces, at = [], 0
     for code in CODE.finditer(text):
         pieces += [LINK.sub(moved, text[at : code.start()]), code[0]]

@@ -1,6 +1,7 @@
 """Reference pages that are made from the code."""
 
 import inspect
+import json
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -23,6 +24,10 @@ from gigabrain_zenoh.launch.deployment import Deployment
 
 Lines = Iterator[str]
 EXAMPLES = Path(__file__).parents[2] / "examples"
+LANGUAGES = {
+    ".py": "python", ".ipynb": "python", ".yaml": "yaml", ".toml": "toml", ".c": "c", ".js": "js",
+    ".html": "html", ".md": "markdown", ".sh": "sh",
+}  # fmt: skip
 
 
 # ---- the command line ----
@@ -215,13 +220,27 @@ def python() -> Lines:
 
 
 def examples() -> Lines:
-    """Yield the page of the programs in `examples/`."""
-    yield from ("# Examples", "", "Each runs beside `gigabrain demo`, and is run by the tests.", "")
+    """Yield the page of the programs, notebooks and folders in `examples/`."""
+    yield from ("# Examples", "", "Each runs beside `gigabrain demo`, and is run by the tests.")
     for path in sorted(EXAMPLES.glob("*.py")):
-        source = path.read_text("utf-8")
-        about, _, code = source.removeprefix('"""').partition('"""\n')
-        yield from (f"## {path.stem}", "", about.strip(), "", f"```python title='{path.name}'")
-        yield from (code.strip(), "```", "")
+        about, _, code = path.read_text("utf-8").removeprefix('"""').partition('"""\n')
+        yield from ("", f"## {path.stem}", "", about.strip(), "", *_code(path.name, code))
+    for path in sorted(EXAMPLES.glob("*.ipynb")):
+        yield from ("", f"## {path.name}")
+        for one in json.loads(path.read_text("utf-8"))["cells"]:
+            text = "".join(one["source"])
+            code = one["cell_type"] == "code"
+            yield from ("", *(_code(path.name, text) if code else [re.sub("^#", "###", text)]))
+    for folder in sorted(path for path in EXAMPLES.iterdir() if path.is_dir()):
+        files = sorted(path for path in folder.rglob("*") if path.suffix in LANGUAGES)
+        for path in files:
+            name = str(path.relative_to(EXAMPLES))
+            yield from ("", f"## {name}", "", *_code(name, path.read_text("utf-8")))
+
+
+def _code(title: str, text: str) -> Lines:
+    language = LANGUAGES[Path(title).suffix]
+    yield from (f"````{language} title='{title}'", text.strip(), "````")
 
 
 PAGES = {

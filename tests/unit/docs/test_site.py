@@ -67,6 +67,10 @@ def test_links_follow_a_page_to_its_place_on_the_site(
         "[a](../project/CHANGELOG.md#x) [b](../reference/examples.md) [c](../index.md)"
         "\n```\n[d](kept)\n```\n"
     )
+    page.write_text("<!-- file: a/b.yaml -->\n```yaml\na: 1\n```\n")
+    assert build.relinked(page, Path("how-to/tools.md")) == (
+        "```yaml title='a/b.yaml'\na: 1\n```\n"
+    )
     page.write_text("[a](../../deploy/demo.yaml)")
     with pytest.raises(ValueError, match=r"deploy/demo\.yaml is not on the site"):
         build.relinked(page, Path("how-to/tools.md"))
