@@ -1,5 +1,5 @@
-# make demo    set up, and drive a robot round a room
-# make check   set up; lint, types, contracts, documentation site and unit tests
+# make demo    install what it needs, and drive a robot round a room
+# make check   install the rest; lint, types, contracts, documentation site and unit tests
 # make test    that, the node tests and the system tests: what to run before a commit is shared
 # make qa      what takes long, for a release; continued where it was stopped
 # make bench   measure this machine
@@ -8,6 +8,7 @@
 VENV := .venv
 BIN := $(VENV)/bin
 PYTHON ?= python3
+DEMO := $(VENV)/.demo
 INSTALLED := $(VENV)/.installed
 WARM := $(VENV)/.done
 PYTEST := $(BIN)/pytest
@@ -15,29 +16,34 @@ SIDE_BY_SIDE := -n 2 --dist loadfile
 MAKEFLAGS += --no-print-directory
 
 .PHONY: setup demo lint style rooms types site unit node system check test qa qa-tests extremes dockerfile signals \
-  ci-extra bench faults soak mutation fuzz golden recordings pictures clean
+  ci-extra first-starts bench faults soak mutation fuzz golden recordings pictures clean
 
 setup: $(WARM)
 
+$(DEMO): EXTRAS := sim,nav,page
+$(INSTALLED): EXTRAS := all,dev
+
 # uv where it is installed, pip otherwise
-$(INSTALLED): pyproject.toml
+$(DEMO) $(INSTALLED): pyproject.toml
+	@echo 'installing into $(VENV), which takes up to a minute'
 	@if command -v uv >/dev/null; then \
 	  uv venv --quiet --allow-existing --python '>=3.11' $(VENV) && \
-	  uv pip install --quiet --python $(BIN)/python -e '.[all,dev]'; \
+	  uv pip install --quiet --python $(BIN)/python -e '.[$(EXTRAS)]'; \
 	else \
 	  $(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	    { echo 'Python 3.11 or newer is needed; name it: make PYTHON=python3.12 $(MAKECMDGOALS)'; exit 1; }; \
 	  $(PYTHON) -m venv $(VENV) && \
-	  $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[all,dev]'; \
+	  $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS)]'; \
 	fi
-	@touch $@
+	@touch $(DEMO) $@
 
 # the kernels, compiled once
 $(WARM): $(INSTALLED)
 	@$(BIN)/gigabrain precompile
 	@touch $@
 
-demo: setup
+# compiles the kernels itself, while the robot drives
+demo: $(DEMO)
 	@$(BIN)/gigabrain demo $(ARGS)
 
 # ---- checks ----
@@ -126,10 +132,14 @@ fuzz: setup
 	  $(BIN)/python $$target -max_total_time=$(FUZZ_S) -verbosity=0 -print_final_stats=1 || exit 1; \
 	done
 
-# what CI runs behind `make test`: the wheel in an empty environment, and what the pages say to run
-ci-extra: setup
-	$(BIN)/python -m tests.qa.wheel
+# what CI runs behind `make test`: first starts in empty environments, and what the pages say to run
+ci-extra: setup first-starts
 	$(BIN)/python -m tests.qa.documentation
+
+# from the sdist, from the wheel by each Python that is found, for one command, and `make demo`
+first-starts: setup
+	$(BIN)/python -m tests.qa.first_start --way wheel --tool pip
+	$(BIN)/python -m tests.qa.first_start --way make sdist tool --tool uv --python $(PYTHON)
 
 bench: setup
 	$(BIN)/gigabrain bench chain
