@@ -8,8 +8,8 @@ or touches something. How long anything took is only printed.
 import contextlib
 import json
 import os
-import signal
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
