@@ -23,7 +23,7 @@ PREFIX = "robot/"
 COMMAND_OF_SERVICE = {  # services that people take for topics, and the commands that call them
     "estop": "estop", "release": "release", "enable": "enable", "goal": "goto X Y",
     "mission": "mission FILE", "task_change": "task", "map_save": "map save",
-    "param": "param", "audit_log": "audit", "describe": "node info",
+    "param": "param", "audit_log": "audit", "describe": "node info", "sim_change": "world",
 }  # fmt: skip
 INSTALL_MATPLOTLIB = "for pictures install: pip install 'gigabrain-zenoh[record]'"
 INK, PLAIN = "#1e293b", {"facecolor": "white", "edgecolor": "none", "pad": 1}

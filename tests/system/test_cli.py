@@ -10,6 +10,7 @@ from importlib.metadata import version
 import pytest
 from cyclopts import App
 
+from gigabrain_drivers.driver.catalog import robot_files
 from gigabrain_zenoh.cli.app import COMMANDS, make_app
 from gigabrain_zenoh.testing.processes import GIGABRAIN, Home, free_port
 
@@ -70,16 +71,12 @@ async def test_what_is_mistyped_is_refused_in_one_line(
 
 async def test_robots_and_worlds_are_listed(home: Home) -> None:
     robots = (await home.run("robots")).out.splitlines()
-    assert [line.split()[0] for line in robots] == [
-        "alpha",
-        "mock",
-        "mycustombot",
-        "turtlebot3_burger",
-        "turtlebot3_waffle",
-    ]
+    assert [line.split()[0] for line in robots] == list(robot_files())
     assert all(re.search(r"  \S.* \(sim.*\)  /.*robot\.yaml$", line) for line in robots)
     worlds = (await home.run("worlds")).out.splitlines()
-    assert [line.split()[0] for line in worlds] == ["arena", "house", "warehouse", "random:SEED"]
+    assert [line.split()[0] for line in worlds] == [
+        "arena", "house", "warehouse", "random:SEED", "FILE",
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

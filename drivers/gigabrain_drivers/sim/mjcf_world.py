@@ -14,7 +14,7 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import read_bounded
 
 MAX_MODEL_BYTES = 10_000_000
-MAX_GEOMS, MAX_EXTENT_M = 10_000, 400.0
+MAX_GEOMS, MAX_BODIES, MAX_EXTENT_M = 10_000, 800, 400.0
 LOW_M, HIGH_M = 0.02, 1.0  # what stands between them is in a robot's way
 UPRIGHT = 0.999  # cosine of the tilt up to which a thing stands upright
 log = logging.getLogger(__name__)
@@ -58,6 +58,8 @@ def measured(world: World) -> World:
         raise model_error(world.model, error) from None
     if model.ngeom > MAX_GEOMS:
         raise ConfigError(f"{world.model}: {model.ngeom} geoms; expected at most {MAX_GEOMS}")
+    if model.nbody > MAX_BODIES:
+        raise ConfigError(f"{world.model}: {model.nbody} bodies; expected at most {MAX_BODIES}")
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     outlines = _outlines(model, data)

@@ -1,6 +1,7 @@
 """A compiled scene as a message for viewers, and the poses of its bodies."""
 
 from collections.abc import Collection, Mapping
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -21,6 +22,16 @@ TYPES = {
 SHOWN_GROUPS = 3  # MuJoCo's viewers draw geom groups 0 to 2
 
 
+class _Rows(NamedTuple):
+    """Shapes, one a row of each array."""
+
+    kinds: NDArray[np.uint8]
+    bodies: NDArray[np.int64]  # MuJoCo's numbers
+    sizes: NDArray[np.float32]
+    places: NDArray[np.float32]
+    colours: NDArray[np.uint8]
+
+
 class SceneWriter:
     """Writes what viewers draw. Shapes of other types, such as height fields, are left out."""
 
@@ -36,29 +47,32 @@ class SceneWriter:
         self._mesh_numbers: dict[int, int] = {}
         self._mesh_bytes = 0
         self._means: dict[int, NDArray[np.float64]] = {}  # colours of textures
+        owner_is_spare = self._spare[model.geom_bodyid]
+        self._lasting = self._rows(np.flatnonzero(~owner_is_spare).tolist())
 
     def scene(self, version: int, things: tuple[Thing, ...], used: Mapping[int, str]) -> SimScene:
         """Return the scene with the spare bodies `used`, and have `poses` tell of these bodies.
 
-        A body in use has the name of its thing.
+        A body in use has the name of its thing. Only the shapes of things are looked at again.
         """
         model = self._model
         self._bodies = self._moving_bodies(used)
         bodies = self._bodies.tolist()
         numbers = np.zeros(model.nbody, np.uint16)
         numbers[self._bodies] = np.arange(1, len(self._bodies) + 1)
-        rows = [row for geom in range(model.ngeom) if (row := self._row(geom, used))]
-        kinds, geoms, sizes = (list(column) for column in zip(*rows, strict=True))
-        owners = model.geom_bodyid[geoms]
+        mine = np.isin(model.geom_bodyid, list(used))
+        rows = _Rows(*map(np.concatenate, zip(  # type: ignore[arg-type]
+            self._lasting, self._rows(np.flatnonzero(mine).tolist()), strict=True,
+        )))  # fmt: skip
         return SimScene(
             version=version,
             world=self._world[-256:],
             bodies=("world", *(used.get(body, model.body(body).name[:128]) for body in bodies)),
-            kinds=bytes(kinds),
-            owners=numbers[owners].astype("<u2").tobytes(),
-            sizes=np.array(sizes, "<f4").tobytes(),
-            places=np.array([self._place(geom) for geom in geoms], "<f4").tobytes(),
-            colours=np.array([self._colour(geom) for geom in geoms]).tobytes(),
+            kinds=rows.kinds.tobytes(),
+            owners=numbers[rows.bodies].astype("<u2").tobytes(),
+            sizes=rows.sizes.tobytes(),
+            places=rows.places.tobytes(),
+            colours=rows.colours.tobytes(),
             meshes=tuple(self._meshes),
             things=things,
         )
@@ -75,15 +89,23 @@ class SceneWriter:
             if body in used or not self._spare[body]
         ], np.int64)  # fmt: skip
 
-    def _row(self, geom: int, used: Collection[int]) -> tuple[int, int, list[float]] | None:
-        """Return kind, geom and sizes; None for what is not drawn."""
+    def _rows(self, geoms: list[int]) -> "_Rows":
+        """Return the shapes of those geoms that are drawn."""
+        found = [(geom, *shape) for geom in geoms if (shape := self._shape(geom))]
+        drawn = [geom for geom, _, _ in found]
+        return _Rows(
+            kinds=np.array([kind for _, kind, _ in found], np.uint8),
+            bodies=np.array(self._model.geom_bodyid[drawn], np.int64),
+            sizes=np.array([size for _, _, size in found], "<f4").reshape(-1, 3),
+            places=np.array([self._place(geom) for geom in drawn], "<f4").reshape(-1, 7),
+            colours=np.array([self._colour(geom) for geom in drawn], np.uint8).reshape(-1, 4),
+        )
+
+    def _shape(self, geom: int) -> tuple[int, list[float]] | None:
+        """Return kind and sizes; None for what is not drawn."""
         model = self._model
         kind = TYPES.get(mujoco.mjtGeom(int(model.geom_type[geom])))
-        body = int(model.geom_bodyid[geom])
-        hidden = self._spare[body] and body not in used
-        if kind is None or hidden or model.geom_group[geom] >= SHOWN_GROUPS:
-            return None
-        if self._colour(geom)[3] == 0:
+        if kind is None or model.geom_group[geom] >= SHOWN_GROUPS or self._colour(geom)[3] == 0:
             return None
         sizes = model.geom_size[geom].tolist()
         if kind == "mesh":
@@ -92,7 +114,7 @@ class SceneWriter:
                 kind, sizes = "box", model.geom_aabb[geom, 3:].tolist()
             else:
                 sizes = [float(number), 0.0, 0.0]
-        return SHAPE_KINDS.index(kind), geom, sizes
+        return SHAPE_KINDS.index(kind), sizes
 
     def _mesh(self, mesh: int) -> int | None:
         """Return a mesh's number in the scene; None where its meshes would be too large."""

@@ -14,8 +14,8 @@ from gigabrain_drivers.sim.world import Footprint, Pose
 NEW_CONTACT_STEPS = 500_000_000 // STEP_NS  # contact again after half a second is a new contact
 CLEARANCE_STEPS = 100_000_000 // STEP_NS
 MEASURED = [  # types whose sizes along x and y are known
-    mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE,
-    mujoco.mjtGeom.mjGEOM_SPHERE,
+    mujoco.mjtGeom.mjGEOM_BOX.value, mujoco.mjtGeom.mjGEOM_CYLINDER.value, mujoco.mjtGeom.mjGEOM_CAPSULE.value,
+    mujoco.mjtGeom.mjGEOM_SPHERE.value,
 ]  # fmt: skip
 MAX_CLEARANCE_M = 10.0  # larger clearances count as this
 
@@ -143,6 +143,6 @@ class Truth:
 def _half_sizes(model: mujoco.MjModel, geoms: NDArray[np.int64] | list[int]) -> NDArray[np.float64]:
     """Half the size of each upright geom along its own x and y (n, 2) [m]."""
     size = model.geom_size[geoms][:, :2].copy()
-    round_ones = model.geom_type[geoms] != mujoco.mjtGeom.mjGEOM_BOX
+    round_ones = model.geom_type[geoms] != mujoco.mjtGeom.mjGEOM_BOX.value
     size[round_ones, 1] = size[round_ones, 0]
     return np.asarray(size, np.float64)
