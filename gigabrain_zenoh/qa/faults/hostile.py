@@ -354,6 +354,8 @@ def _pairs(to: Topic[Any]) -> Iterator[tuple[str, tuple[Change, ...]]]:
 
 def _places(of: Any, value: Any, path: Path) -> Iterator[tuple[Path, str, Any]]:
     """Yield the path to every field of `value`, and each of its extremes with a name."""
+    if isinstance(of, inspect.Metadata):  # notes for schemas
+        of = of.type
     if isinstance(of, inspect.Metadata):  # notes for JSON Schema, as of arrays
         of = of.type
     if isinstance(of, inspect.UnionType):
