@@ -1,6 +1,7 @@
-"""What must hold for whatever stands in a robot's file or in a deployment file."""
+"""What must hold for whatever stands in the file of a robot, a deployment or a world."""
 
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +10,14 @@ import yaml
 
 from gigabrain_drivers.driver.catalog import driver_class, link_options, robot_files
 from gigabrain_drivers.driver.robot import LINKS, RobotFile
+from gigabrain_drivers.sim.world_file import WorldFile, build_world
+from gigabrain_drivers.sim.worlds import NAMED_WORLDS, shipped_world
 from gigabrain_zenoh.config.loading import loads
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.launch.deployment import Deployment, deployment_type
 from tests.fuzz.harness import ROOT, split
 
-KINDS = ("deployment", "robot")
+KINDS = ("deployment", "robot", "world")
 DEPLOYMENT = deployment_type()
 LONGEST_LINE = 2000  # characters of a complaint
 
@@ -26,7 +29,7 @@ def check(data: bytes) -> None:
         text = rest.decode()
     except UnicodeDecodeError:  # which `load` refuses before anything else
         return
-    read = deployment if kind == "deployment" else robot
+    read: Callable[[str], Any] = {"deployment": deployment, "world": world}.get(kind, robot)
     try:
         value = read(text)
     except ConfigError as error:
@@ -46,6 +49,15 @@ def told(complaint: str) -> None:
 def deployment(text: str) -> Deployment:
     """As `gigabrain up` reads it."""
     return loads(text, DEPLOYMENT, "x.yaml")
+
+
+def world(text: str) -> WorldFile:
+    """As the simulator reads it, down to its shapes; maps and models are files of their own."""
+    found = loads(text, WorldFile, "x.yaml")
+    alone = msgspec.structs.replace(found, map="", model="", size=found.size or (1.0, 1.0))
+    made = build_world(alone, Path("x.yaml"))
+    assert all(math.isfinite(one.distance(0.0, 0.0)) for one in made.everything())
+    return found
 
 
 def robot(text: str) -> RobotFile:
@@ -73,3 +85,5 @@ def seeds() -> Iterator[bytes]:
         yield b"robot\n" + path.read_bytes()
     for path in sorted(Path(ROOT / "deploy").glob("*.yaml")):
         yield b"deployment\n" + path.read_bytes()
+    for name in NAMED_WORLDS:
+        yield b"world\n" + shipped_world(name).read_bytes()

@@ -14,8 +14,8 @@ from gigabrain_drivers.sim.world import Footprint, Pose
 NEW_CONTACT_STEPS = 500_000_000 // STEP_NS  # contact again after half a second is a new contact
 CLEARANCE_STEPS = 100_000_000 // STEP_NS
 MEASURED = [  # types whose sizes along x and y are known
-    mujoco.mjtGeom.mjGEOM_BOX.value, mujoco.mjtGeom.mjGEOM_CYLINDER.value, mujoco.mjtGeom.mjGEOM_CAPSULE.value,
-    mujoco.mjtGeom.mjGEOM_SPHERE.value,
+    mujoco.mjtGeom.mjGEOM_BOX.value, mujoco.mjtGeom.mjGEOM_CYLINDER.value,
+    mujoco.mjtGeom.mjGEOM_CAPSULE.value, mujoco.mjtGeom.mjGEOM_SPHERE.value,
 ]  # fmt: skip
 MAX_CLEARANCE_M = 10.0  # larger clearances count as this
 
