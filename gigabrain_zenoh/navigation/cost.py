@@ -5,22 +5,21 @@ first, for all lanes at once, and decide whether to look.
 """
 
 import math
-from typing import NamedTuple
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import NONE, lean_kernel
-from gigabrain_zenoh.navigation.car_track import no_track, way_left
+from gigabrain_zenoh.navigation.car_track import way_left
 from gigabrain_zenoh.navigation.footprint import (
     ROOM,
     STRETCH,
     UNSURE,
     DistanceGrid,
     Outline,
-    Placement,
     between,
     clearance_of,
     distance_at,
     free_ahead,
+    free_along,
 )
 from gigabrain_zenoh.navigation.motion_model import (
     AWAY,
@@ -39,10 +38,18 @@ from gigabrain_zenoh.navigation.motion_model import (
     X,
     Y,
 )
+from gigabrain_zenoh.navigation.planning_problem import (
+    MotionState,
+    Problem,
+    Scene,
+    Weights,
+    motion_of,
+)
 
 SECOND = 8.0  # what a second costs
 LOOK_AHEAD = 0.25  # [m], from where the last pose's heading is judged
 NEAR_GOAL = 0.2  # [m], nearer the field is too coarse
+NEXT_WAY, FAR_WAY = 0.5, 3.0  # [m], of the way as it goes from here, and of the rest, straight on
 SLOW = 0.05  # [m/s], slower than this it always stops in time
 NO_DISC = 1e3  # [m], where nothing moves
 DISC_ROOM = 1.5  # [m], what moves farther away makes no difference
@@ -57,66 +64,6 @@ IMPACT = 50.0  # per m/s of a contact
 BRAKE_EVERY = 3  # steps
 AT_EASE = 0.25  # [m], more room is checked again only once it may be used up
 SPARE = 0.003  # [m], less room than at the start is a contact only from here on
-
-
-class Scene(NamedTuple):
-    """Everything around the body, and the goal."""
-
-    grid: DistanceGrid  # distances to what stands still
-    field: DistanceGrid  # cost to go [m]
-    discs: Floats  # (m, 6): x, y [m], velocity x, y [m/s], radius [m] and its growth [m/s]
-    goal_x: float  # [m]
-    goal_y: float
-    goal_yaw: float  # [rad]; nan where any will do
-    tolerance: float  # [m]
-    yaw_tolerance: float  # [rad]
-    track: Floats = no_track()  # (n, 4), that a car follows, see car_track
-
-
-class Weights(NamedTuple):
-    """Weights of the cost terms."""
-
-    margin: float = 0.03  # [m], nearer than this is a contact
-    near: float = 3.0  # of having obstacles near, per second
-    near_over: float = 0.08  # [m], over which that decays
-    tight: float = 1.5  # of speed in tight places, per second
-    tight_speed: float = 0.45  # [m/s], always allowed
-    tight_rate: float = 4.0  # [1/s], more speed per metre of room
-    turning: float = 0.02  # per (rad/s)2 and second
-    backwards: float = 1.0  # per m
-    heading: float = 0.8  # of facing away from the goal, in units of the time it takes to turn
-    disc: float = 3.0  # of having moving things near, per second
-    disc_over: float = 0.3  # [m]
-    disc_margin: float = 0.02  # [m]
-    disc_lead: float = 0.0  # [s], so much farther per m/s of a thing's speed
-    trust: float = 0.0  # [s], over which what is foreseen of them fades; 0 where it does not
-
-
-class Problem(NamedTuple):
-    """Everything that the cost of a plan depends on."""
-
-    model: MotionModel
-    outline: Outline
-    weights: Weights
-    scene: Scene
-    dt: float  # [s], of a step
-
-
-class MotionState(NamedTuple):
-    """Pose and velocity of a body at one step."""
-
-    at: Placement
-    yaw: float  # [rad]
-    vx: float  # [m/s]
-    vy: float
-    w: float  # [rad/s]
-
-
-@lean_kernel
-def motion_of(state: Floats, lane: int) -> MotionState:
-    """Return one lane of a `state` (STATE,)."""
-    at = Placement(state[X + lane], state[Y + lane], state[COSINE + lane], state[SINE + lane])
-    return MotionState(at, state[YAW + lane], state[VX + lane], state[VY + lane], state[W + lane])
 
 
 @lean_kernel
@@ -188,7 +135,10 @@ def braking_cost(problem: Problem, room: float, motion: MotionState) -> float:
         return 0.0
     sign = 1.0 if vx >= 0.0 else -1.0
     grid, side = problem.scene.grid, model.side_margin
-    free = free_ahead(grid, problem.outline, motion.at, sign, side, needs)
+    if model.strafes:
+        free = free_along(grid, problem.outline, motion.at, (vx / speed, vy / speed), side, needs)
+    else:
+        free = free_ahead(grid, problem.outline, motion.at, sign, side, needs)
     allowed = math.sqrt((brake * t) ** 2 + 2.0 * brake * max(0.0, free - model.margin)) - brake * t
     over = max(0.0, speed - allowed) / model.forward
     return TOO_FAST * over * over
@@ -227,16 +177,33 @@ def terminal_cost(problem: Problem, motion: MotionState) -> float:
     near = math.hypot(dx, dy) < NEAR_GOAL
     if len(scene.track) > 0:
         return cost + (0.5 * SECOND * abs(vx) / model.forward if near else 0.0)
-    if not math.isnan(scene.goal_yaw):
+    last_turn, any_yaw = 0.0, math.isnan(scene.goal_yaw)
+    if not any_yaw:
         arrives = yaw if near else math.atan2(dy, dx)
-        cost += SECOND * _turn_between(arrives, scene.goal_yaw) / model.turning
+        last_turn = SECOND * _turn_between(arrives, scene.goal_yaw) / model.turning
     if near:
-        return cost + 0.5 * SECOND * math.hypot(vx, vy) / model.forward
+        return cost + last_turn + 0.5 * SECOND * math.hypot(vx, vy) / model.forward
     here = cost_to_go_at(scene.field, x, y)
     ahead = cost_to_go_at(scene.field, x + LOOK_AHEAD * cosine, y + LOOK_AHEAD * sine)
     rise = max(-1.0, min(1.0, (ahead - here) / LOOK_AHEAD))
     turn = 0.5 * math.pi * (1.0 + rise)
-    return cost + SECOND * weights.heading * turn / model.turning
+    facing = SECOND * weights.heading * turn / model.turning
+    if model.strafes and not any_yaw:
+        direct = SECOND * _turn_between(yaw, scene.goal_yaw) / model.turning
+        after = _turn_between(math.atan2(dy, dx), scene.goal_yaw)
+        aside = _strafing_cost(model, turn, min(here, NEXT_WAY))
+        aside += _strafing_cost(model, after, min(here - NEXT_WAY, FAR_WAY))
+        return cost + min(max(facing + last_turn, direct), direct + aside)
+    return cost + last_turn + facing
+
+
+@lean_kernel
+def _strafing_cost(model: MotionModel, turn: float, way: float) -> float:
+    """Return what it costs to go `way` [m] turned away from it by `turn` [rad]."""
+    ahead, aside = math.cos(turn), abs(math.sin(turn))
+    along = model.forward if ahead >= 0.0 else model.backward
+    slowness = math.hypot(ahead / max(along, SLOW), aside / max(model.lateral, SLOW))
+    return SECOND * max(0.0, way) * max(0.0, slowness - 1.0 / model.forward)
 
 
 @lean_kernel

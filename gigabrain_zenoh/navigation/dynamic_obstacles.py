@@ -13,10 +13,10 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_NS
 from gigabrain_schemas.brain import Obstacle
 from gigabrain_zenoh.kernels.jit import kernel
-from gigabrain_zenoh.navigation.cost import Weights
 from gigabrain_zenoh.navigation.cost_to_go import FARTHEST, UNIT, Ways, seed, sweep
 from gigabrain_zenoh.navigation.footprint import DistanceGrid
 from gigabrain_zenoh.navigation.motion_model import MotionModel
+from gigabrain_zenoh.navigation.planning_problem import Weights
 
 QUICK_BODY_SPEED = 1.0  # [m/s], a body that can go faster is quick
 QUICK_OBSTACLE_SPEED = 0.3  # [m/s]

@@ -220,3 +220,32 @@ def free_ahead(
             return gone
         gone += max(room, 0.05)
     return reach
+
+
+@lean_kernel
+def free_along(
+    grid: DistanceGrid, outline: Outline, at: Placement, way: tuple[float, float],
+    side_margin: float, reach: float,
+) -> float:  # fmt: skip
+    """Return the free way in any direction of the body's frame, as `free_ahead` does ahead.
+
+    `way` is that direction, of length 1.
+    """
+    x, y, cosine, sine = at
+    long, wide = (outline.front - outline.rear) / 2, (outline.left - outline.right) / 2
+    half = abs(way[0]) * wide + abs(way[1]) * long
+    edge = min(long / max(abs(way[0]), 1e-6), wide / max(abs(way[1]), 1e-6))
+    along_x = cosine * way[0] - sine * way[1]
+    along_y = sine * way[0] + cosine * way[1]
+    x += cosine * outline.center_x - sine * outline.center_y
+    y += sine * outline.center_x + cosine * outline.center_y
+    begin = edge - half
+    gone, rows, columns = 0.0, grid.distance.shape[0], grid.distance.shape[1]
+    end = min(reach, (rows + columns) * grid.cell + 2.0 * outline.far)
+    while gone < end:
+        px, py = x + along_x * (begin + gone), y + along_y * (begin + gone)
+        room = distance_at(grid, px, py) - half - side_margin
+        if room <= 0.0:
+            return gone
+        gone += max(room, 0.05)
+    return reach

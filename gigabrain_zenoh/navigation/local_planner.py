@@ -16,7 +16,7 @@ from gigabrain_zenoh.geometry.limits import SentCommand
 from gigabrain_zenoh.geometry.se2 import from_pose, transform
 from gigabrain_zenoh.navigation import dynamic_obstacles
 from gigabrain_zenoh.navigation.car_track import no_track, track_of
-from gigabrain_zenoh.navigation.cost import Scene, Weights, cost_to_go_at
+from gigabrain_zenoh.navigation.cost import SECOND, cost_to_go_at
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
 from gigabrain_zenoh.navigation.footprint import Placement, clearance, outline_of
 from gigabrain_zenoh.navigation.local_costmap import LocalCostmap, Pose2D
@@ -29,6 +29,7 @@ from gigabrain_zenoh.navigation.motion_model import (
     slowed_model,
 )
 from gigabrain_zenoh.navigation.mppi import SampledPlan, Sampler, mean_past_commands, step_duration
+from gigabrain_zenoh.navigation.planning_problem import Scene, Weights
 
 PlanKind = Literal["going", "going round", "waiting", "backing out", "turning in place", "arrived"]
 
@@ -38,6 +39,7 @@ NAMED_WITHIN_M = 1.5  # [m], what moves within this is named
 AT_GOAL_M = 0.2  # [m], so little is left where only standing and turning are
 DETOUR_M = 0.15  # [m], so far off the straight way is round something
 
+TURN_COST_SHARE = 1.0  # of time, at full turn, where a strafing body has a heading to keep
 STUCK_RADIUS_M = 0.3  # [m], who gets no farther than this is in one place
 SLOW_PATIENCE = 2.0  # times as long as a speed zone makes it take to get out of one place
 MAKING_WAY = "making way: it looks round for what moves"
@@ -253,6 +255,8 @@ class LocalPlanner:
             if weights is self._weights or dynamic_obstacles.stay_clear(discs, place.x, place.y):
                 return _standing("waiting: it looks round for what moves")
             moment = replace(moment, goal=Goal(x=place.x, y=place.y), path=None, headings=None)
+        if self._model.strafes and moment.goal.yaw is not None:
+            weights = weights._replace(turning=TURN_COST_SHARE * SECOND / self._model.turning**2)
         scene = self._scene(moment, discs)
         model = delayed_model(model, moment.delayed)
         planned = self._sampler.plan(

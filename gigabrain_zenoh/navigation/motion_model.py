@@ -15,6 +15,8 @@ ACCELERATION_RESERVE = 0.9  # of the body's accelerations: plans must work on a 
 GENTLEST_SHARE = 0.4  # of that reserve, at an aggressiveness of 0
 LEAST_SPEED = 0.01  # [m/s]; a body that may drive at all may drive so fast
 MAX_REVERSE_SPEED = 0.4  # [m/s], no faster backwards: the lidar may not see there
+SLOWEST = 0.001  # [m/s], where it must not reverse
+STRAFING = ("mecanum", "omni")  # drive types
 
 LANES = 8  # plans at a time
 X, Y, YAW, VX, VY, W = range(0, 6 * LANES, LANES)  # where the lanes of each begin in a state:
@@ -41,6 +43,7 @@ class MotionModel(NamedTuple):
     side_margin: float  # [m], kept free beside it
     rim: float  # [m/s], fastest of each wheel of a differential base; inf for others
     half_track: float  # [m], from its middle to a wheel
+    strafes: bool  # it is made to go sideways, and need not face its way
 
 
 def model_of(
@@ -68,6 +71,7 @@ def model_of(
         side_margin=body.thresholds.side_margin,
         rim=limits.rim_speed,
         half_track=limits.half_track,
+        strafes=body.drive_type in STRAFING and body.max_lateral_speed > 0.0,
     )
 
 
@@ -122,6 +126,11 @@ def feasible(
     vx = max(-model.backward, min(model.forward, target[0]))
     vy = max(-model.lateral, min(model.lateral, target[1]))
     w = max(-model.turning, min(model.turning, target[2]))
+    if model.strafes:  # no faster aslant than straight on
+        along = vx / (model.forward if vx > 0.0 else max(model.backward, SLOWEST))
+        slant = math.sqrt(along * along + (vy / model.lateral) ** 2)
+        if slant > 1.0:
+            vx, vy = vx / slant, vy / slant
     rim = abs(vx) + abs(w) * model.half_track
     if rim > model.rim:
         vx, w = vx * model.rim / rim, w * model.rim / rim

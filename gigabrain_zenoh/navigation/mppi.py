@@ -11,14 +11,7 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import NONE, kernel, lean_kernel
-from gigabrain_zenoh.navigation.cost import (
-    Problem,
-    Scene,
-    Weights,
-    evaluate_surroundings,
-    fill_clearances,
-    price,
-)
+from gigabrain_zenoh.navigation.cost import evaluate_surroundings, fill_clearances, price
 from gigabrain_zenoh.navigation.footprint import Outline
 from gigabrain_zenoh.navigation.motion_model import (
     LANES,
@@ -28,6 +21,7 @@ from gigabrain_zenoh.navigation.motion_model import (
     make_feasible,
     simulate,
 )
+from gigabrain_zenoh.navigation.planning_problem import Problem, Scene, Weights
 
 NOISE_KEPT, NOISE_FRESH = 0.85, 0.53  # of the noise from step to step
 NOISE_SHARE, TURN_NOISE_SHARE = 0.175, 0.3  # of the noise, as a share of the largest speeds
@@ -50,7 +44,8 @@ def correlated_noise(
     for t in range(1, shape[2]):
         noise[:, :, t] = NOISE_KEPT * noise[:, :, t - 1] + NOISE_FRESH * noise[:, :, t]
     linear, turn = NOISE_SHARE, TURN_NOISE_SHARE
-    spread = linear * model.forward, linear * model.lateral, turn * model.turning
+    lateral = TURN_NOISE_SHARE if model.strafes else linear
+    spread = linear * model.forward, lateral * model.lateral, turn * model.turning
     scaled: NDArray[np.float32] = noise * np.array(spread, dtype=np.float32)
     return scaled
 
@@ -60,7 +55,8 @@ def two_twist_plans(
 ) -> Floats:
     """Return plans (sets, samples, 7) of two twists and the step at which the second begins.
 
-    Of every three, one keeps its first twist, and one turns on the spot before it drives on.
+    Of every three, one keeps its first twist, and one turns on the spot before it drives on. Of
+    bodies that strafe, the third does not turn.
     """
     first, second = (_twists(random, (sets, samples, 3), model) for _ in range(2))
     turning = np.arange(samples) // SIMPLE_EVERY % 3
@@ -69,6 +65,8 @@ def two_twist_plans(
         count = int((turning == 1).sum())
         second[:, turning == 1, 0] = model.forward * random.random((sets, count))
         second[:, turning == 1, 2] = 0.0
+    if model.strafes:
+        first[:, turning == 2, 2] = second[:, turning == 2, 2] = 0.0
     when = random.uniform(1.0, steps, (sets, samples, 1))
     when[:, turning == 0] = steps
     return np.concatenate([first, second, when], axis=2)

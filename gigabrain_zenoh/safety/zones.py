@@ -130,16 +130,26 @@ def _free(body: BodyDescription, points: Floats, motion: Motion) -> Free:
     }
     for twist in {axes(motion.measured), axes(motion.requested)}:
         way = _arc(body, points, twist)
-        direction = "forward" if twist[0] > 0 else "backward"
-        known = free[direction]
-        if way is not None:
-            free[direction] = way if known is None else min(way, known)
+        if way is None:
+            continue
+        speed = math.hypot(twist[0], twist[1])
+        ways = (
+            ("forward" if twist[0] > 0 else "backward", abs(twist[0])),
+            ("left" if twist[1] > 0 else "right", abs(twist[1])),
+        )
+        for direction, along in ways:
+            known = free[direction]
+            if along >= MIN_ARC_LINEAR:
+                part = way * along / speed
+                free[direction] = part if known is None else min(part, known)
     return free
 
 
 def _arc(body: BodyDescription, points: Floats, twist: Axes) -> float | None:
-    """Return the free distance along a curve [m]; None without a curve or an obstacle."""
-    if abs(twist[0]) < MIN_ARC_LINEAR or abs(twist[2]) < MIN_ARC_ANGULAR:
+    """Return the free distance along a curve or a slant [m]; None without one or an obstacle."""
+    ahead, aside = (abs(speed) >= MIN_ARC_LINEAR for speed in twist[:2])
+    bends = abs(twist[2]) >= MIN_ARC_ANGULAR
+    if not (ahead and aside) and not (bends and (ahead or aside)):
         return None
     limits, reach = body.thresholds, brakes(body)["forward"].reach
     return arc(body.footprint, points, limits.side_margin, reach, twist)

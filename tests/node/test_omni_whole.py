@@ -97,9 +97,13 @@ async def _safety(bus: Bus, ready: Callable[[], None]) -> None:
 
 
 def nodes(body: Body, folder: Path) -> dict[str, Node]:
-    settings = DecisionConfig(behaviour="navigate", settings={"unknown_space": "allow"})
+    settings = DecisionConfig(
+        behaviour="navigate", settings={"unknown_space": "allow"}, compile_first=True
+    )
     return {
-        "perception": functools.partial(perception.run, PerceptionConfig(mapping="slam")),
+        "perception": functools.partial(
+            perception.run, PerceptionConfig(mapping="slam", compile_first=True)
+        ),
         "decision": functools.partial(decision.run, settings),
         "control": control.run,
         "safety": _safety,

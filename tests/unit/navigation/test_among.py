@@ -11,7 +11,7 @@ from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import Obstacle
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.navigation import cost, dynamic_obstacles
-from gigabrain_zenoh.navigation.cost import NO_DISC, Weights
+from gigabrain_zenoh.navigation.cost import NO_DISC
 from gigabrain_zenoh.navigation.footprint import outline_of
 from gigabrain_zenoh.navigation.local_costmap import LocalCostmap, Pose2D
 from gigabrain_zenoh.navigation.local_planner import (
@@ -22,6 +22,7 @@ from gigabrain_zenoh.navigation.local_planner import (
 )
 from gigabrain_zenoh.navigation.motion_model import AWAY, CLOSE, COSINE, LANES, STATE, X, model_of
 from gigabrain_zenoh.navigation.mppi import Sampler
+from gigabrain_zenoh.navigation.planning_problem import Weights
 from gigabrain_zenoh.qa.bench.barn import drive_functions
 from gigabrain_zenoh.qa.bench.barn_course import HARD, JACKAL, BarnWorld, MovingDisc
 from tests.unit.navigation.drives import OMNI, WAFFLE, wall

@@ -8,14 +8,7 @@ import pytest
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import kernel
-from gigabrain_zenoh.navigation.cost import (
-    Problem,
-    Scene,
-    Weights,
-    evaluate_surroundings,
-    fill_clearances,
-    price,
-)
+from gigabrain_zenoh.navigation.cost import evaluate_surroundings, fill_clearances, price
 from gigabrain_zenoh.navigation.dynamic_obstacles import WEIGHTS
 from gigabrain_zenoh.navigation.footprint import DistanceGrid, Outline, outline_of
 from gigabrain_zenoh.navigation.motion_model import (
@@ -28,6 +21,7 @@ from gigabrain_zenoh.navigation.motion_model import (
     model_of,
     simulate,
 )
+from gigabrain_zenoh.navigation.planning_problem import Problem, Scene, Weights
 from gigabrain_zenoh.qa.bench.barn_course import JACKAL
 
 STEPS, DT, BLOCKS = 30, 0.05, 25

@@ -40,6 +40,24 @@ def test_each_way_has_its_zone(
     assert {getattr(patrol.verdict.caps, other) for other in others} == {None}
 
 
+def test_a_slant_is_stopped_by_what_neither_the_way_ahead_nor_that_aside_meets() -> None:
+    """A post off the front left corner: in no strip of the body, and on its slanting way."""
+    post = near(45, 0.32)
+    slant, ahead, aside = Patrol(OMNI), Patrol(OMNI), Patrol(OMNI)
+    for patrol, told in (
+        (slant, Velocity(linear_x=0.2, linear_y=0.2)),
+        (ahead, Velocity(linear_x=0.2)),
+        (aside, Velocity(linear_y=0.2)),
+    ):
+        patrol.go(20, told=told)
+    assert slant.go(5, told=Velocity(linear_x=0.2, linear_y=0.2), values=post) == [
+        "zone_ahead",
+        "zone_left",
+    ]
+    assert ahead.go(5, told=Velocity(linear_x=0.2), values=post) == []
+    assert aside.go(5, told=Velocity(linear_y=0.2), values=post) == []
+
+
 def test_a_body_that_cannot_go_sideways_has_no_caps_for_it() -> None:
     patrol = Patrol()
     patrol.go(5, values=near(90, 0.17))
