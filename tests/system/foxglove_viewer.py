@@ -10,6 +10,7 @@ from websockets.asyncio.client import ClientConnection
 
 PATIENCE_S = 20.0
 MESSAGE = struct.Struct("<BIQ")  # opcode 1, subscription, time [ns]
+CALL = struct.Struct("<BIII")  # opcode 2 or 3, service, call, length of the encoding
 SAY = struct.Struct("<BI")  # opcode 1, channel
 
 
@@ -23,6 +24,9 @@ class Viewer:
         self.server: dict[str, Any] = {}
         self._subscribed: dict[int, str] = {}
         self._messages: dict[str, list[bytes]] = {}
+        self.services: dict[str, int] = {}
+        self._calls, self._answers = 0, dict[int, dict[str, Any]]()
+        self._parameters: dict[str, list[dict[str, Any]]] = {}  # by the request
 
     async def say(self, **values: object) -> None:
         await self._socket.send(json.dumps(values))
@@ -56,9 +60,40 @@ class Viewer:
         data = content if isinstance(content, bytes) else json.dumps(content).encode()
         await self._socket.send(SAY.pack(1, channel) + data)
 
+    async def call(self, service: str, content: object = None) -> dict[str, Any]:
+        """What a service answers."""
+        while service not in self.services:
+            await self._hear()
+        self._calls += 1
+        head = CALL.pack(2, self.services[service], self._calls, 4) + b"json"
+        await self._socket.send(head + json.dumps(content or {}).encode())
+        while self._calls not in self._answers:
+            await self._hear()
+        return self._answers[self._calls]
+
+    async def parameters(self, *names: str) -> dict[str, Any]:
+        """The values of parameters, by name."""
+        await self.say(op="getParameters", parameterNames=names, id="get")
+        return await self._values("get")
+
+    async def set_parameters(self, **values: object) -> dict[str, Any]:
+        """The values after they were to be set; two underscores stand for a dot."""
+        wanted = [{"name": n.replace("__", "."), "value": v} for n, v in values.items()]
+        await self.say(op="setParameters", parameters=wanted, id="set")
+        return await self._values("set")
+
+    async def _values(self, request: str) -> dict[str, Any]:
+        while request not in self._parameters:
+            await self._hear()
+        return {one["name"]: one.get("value") for one in self._parameters.pop(request)}
+
     async def _hear(self) -> None:
         frame = await asyncio.wait_for(self._socket.recv(), PATIENCE_S)
         if isinstance(frame, bytes):
+            if frame[0] == 3:
+                _, _, call, length = CALL.unpack_from(frame)
+                self._answers[call] = json.loads(frame[CALL.size + length :])
+                return
             opcode, number, _ = MESSAGE.unpack_from(frame)
             assert opcode == 1
             self._messages.setdefault(self._subscribed[number], []).append(frame[MESSAGE.size :])
@@ -70,6 +105,10 @@ class Viewer:
             self.graph = told
         elif told["op"] == "serverInfo":
             self.server = told
+        elif told["op"] == "advertiseServices":
+            self.services |= {one["name"]: one["id"] for one in told["services"]}
+        elif told["op"] == "parameterValues":
+            self._parameters[told.get("id", "")] = told["parameters"]
 
 
 def fields(data: bytes) -> Iterator[tuple[int, Any]]:

@@ -5,23 +5,39 @@ import json
 import math
 import stat
 import struct
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from websockets.asyncio.client import connect
 
 from gigabrain_schemas.arrays import hits_bytes
-from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.base import Message, Pose, Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import Obstacle, OccupancyGrid, PoseInMap, WorldModel
-from gigabrain_schemas.examples import EXAMPLES
+from gigabrain_schemas.examples import EXAMPLES, example
+from gigabrain_schemas.requests import GateReply
+from gigabrain_schemas.safety import Health
 from gigabrain_schemas.sensors import Image, LaserScan
-from gigabrain_schemas.topics import IMAGE, LOG, MAP, POSE, SCAN, STATE, TASK, WORLD
+from gigabrain_schemas.topics import (
+    ENABLE,
+    ESTOP,
+    HEALTH,
+    IMAGE,
+    LOG,
+    MAP,
+    POSE,
+    RELEASE,
+    SCAN,
+    STATE,
+    TASK,
+    WORLD,
+)
 from gigabrain_zenoh.config.settings import FoxgloveConfig
-from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.runtime.services import NameClaim
+from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.runtime.services import NameClaim, serve_params
 from gigabrain_zenoh.testing.processes import Home, free_port, listens
 from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.ui.foxglove.access import topic_to_steer, write_layout
@@ -29,6 +45,7 @@ from gigabrain_zenoh.ui.page.access import token_file, tokens
 from tests.system.foxglove_bridge import Bridge, bridged, hold
 from tests.system.foxglove_viewer import Viewer, fields
 
+STANDING = RobotState(robot_type="waffle", pose=Pose(x=0.0, y=0.0, yaw=0.0), velocity=Velocity())
 LEFT = {"linear": {"x": 0, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0.5}}
 
 
@@ -68,7 +85,74 @@ async def test_every_kind_of_message_has_a_channel_to_be_drawn_from(bridge: Brid
         for topic in ("scan", "map", "pose", "tf", "obstacles", "way", "image/front", "log",
                       "state_numbers", "world_numbers"):  # fmt: skip
             assert await viewer.channel(f"/viz/{topic}")
-    assert viewer.server["capabilities"] == ["clientPublish", "connectionGraph"]
+    assert viewer.server["capabilities"] == [
+        "clientPublish", "connectionGraph", "parameters", "parametersSubscribe", "services",
+    ]  # fmt: skip
+
+
+async def steering(bridge: Bridge, viewer: Viewer) -> None:
+    """The viewer has the layout with the secret."""
+    await viewer.publish_on(topic_to_steer(bridge.config))
+    await hold(viewer, LEFT, lambda: bridge.steered)
+
+
+async def test_services_are_for_viewers_with_the_layout(bridge: Bridge) -> None:
+    asked: list[str] = []
+
+    def grant(what: str) -> Callable[[Message], Awaitable[GateReply]]:
+        async def answer(_: Message) -> GateReply:
+            asked.append(what)
+            gate = replace(example(GateReply).gate, mode="latched")
+            return GateReply(ok=True, text=f"{what} done", robot_type="waffle", gate=gate)
+
+        return answer
+
+    for service in (ESTOP, RELEASE, ENABLE):
+        bridge.robot.serve(service, grant(service.key))
+    bridge.robot.publish(STATE, STANDING)
+    async with bridge.viewer() as viewer:
+        for name in ("/estop", "/release", "/enable"):
+            answer = await viewer.call(name)
+            assert (answer["ok"], asked) == (False, [])
+            assert "layout file" in answer["text"]
+        await steering(bridge, viewer)
+        bridge.robot.publish(STATE, STANDING)
+        for name in ("/estop", "/release", "/enable"):
+            assert await viewer.call(name) == {"ok": True, "text": f"robot{name} done"}
+    assert set(asked) == {"robot/estop", "robot/release", "robot/enable"}
+
+
+async def test_a_service_says_why_it_is_refused(bridge: Bridge) -> None:
+    async with bridge.viewer() as viewer:
+        await steering(bridge, viewer)
+        answer = await viewer.call("/release")  # no driver serves it, and no state is fresh
+        assert answer["ok"] is False
+        assert answer["text"]
+
+
+async def test_parameters_are_shown_to_all_and_set_by_viewers_with_the_layout(
+    bridge: Bridge,
+) -> None:
+    speeds = [0.26]
+
+    def put(text: str) -> None:
+        if float(text) > 0.26:
+            raise Refused("above the body's own limit")
+        speeds.append(float(text))
+
+    bridge.robot.params.add("speed", "a number", lambda: f"{speeds[-1]:g}", put, key="robot.speed")
+    serve_params(bridge.robot)
+    health = replace(example(Health), process="driver")
+    bridge.robot.publish(HEALTH, health, name="driver")
+    async with bridge.viewer() as viewer:
+        assert (await viewer.parameters())["driver.speed"] == 0.26
+        assert await viewer.set_parameters(driver__speed=0.1) == {"driver.speed": 0.26}
+        await steering(bridge, viewer)
+        assert await viewer.set_parameters(driver__speed=0.1) == {"driver.speed": 0.1}
+        assert await viewer.set_parameters(driver__speed=0.5) == {"driver.speed": 0.1}
+        assert await viewer.set_parameters(driver__nonsense=1) == {}
+        assert await viewer.parameters("driver.speed") == {"driver.speed": 0.1}
+    assert speeds == [0.26, 0.1]
 
 
 async def test_a_late_subscriber_gets_the_map(bridge: Bridge) -> None:

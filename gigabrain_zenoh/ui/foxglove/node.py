@@ -20,6 +20,7 @@ from foxglove.websocket import (
     ChannelView,
     Client,
     ClientChannel,
+    Parameter,
     ServerListener,
     WebSocketServer,
 )
@@ -39,6 +40,7 @@ from gigabrain_zenoh.diagnostics.discovery import chain_flows, discover, flows
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.recording.drawing import Drawer, Drawn
 from gigabrain_zenoh.ui.foxglove.access import HOST, Front, hidden_host, topic_to_steer
+from gigabrain_zenoh.ui.foxglove.requests import REFRESH_NS, FoxgloveRequests
 from gigabrain_zenoh.ui.steering import RateLimiter, TeleopArbiter, ViewerScene
 
 log = logging.getLogger(__name__)
@@ -157,7 +159,14 @@ class FoxgloveSteering(ServerListener):
         self._rates = RateLimiter()
         self._channels: set[tuple[int, int]] = set()  # viewer and channel that may steer
         self._refused: set[int] = set()  # viewers whose refusal was logged
-        self.graph_wanted = False
+        self.graph_wanted = self.parameters_wanted = False
+        self.requests = FoxgloveRequests(
+            view.bus, view.state.fresh, view.health.keys, self.may_steer
+        )
+
+    def may_steer(self, viewer: int) -> bool:
+        """Return whether a viewer publishes on the secret topic. In any thread."""
+        return any(viewer == known for known, _ in tuple(self._channels))
 
     def close(self) -> None:
         """End steering."""
@@ -174,6 +183,25 @@ class FoxgloveSteering(ServerListener):
     def on_connection_graph_unsubscribe(self) -> None:
         """Stop publishing the graph of processes."""
         self.graph_wanted = False
+
+    def on_get_parameters(
+        self, client: Client, param_names: list[str], request_id: str | None = None
+    ) -> list[Parameter]:
+        """Return parameters by name; all without names."""
+        return self.requests.get(param_names)
+
+    def on_set_parameters(
+        self, client: Client, parameters: list[Parameter], request_id: str | None = None
+    ) -> list[Parameter]:
+        """Set parameters for a viewer that may steer."""
+        return self.requests.set(client.id, parameters)
+
+    def on_parameters_subscribe(self, param_names: list[str]) -> None:
+        """Begin to publish changes of parameters."""
+        self.parameters_wanted = True
+
+    def on_parameters_unsubscribe(self, param_names: list[str]) -> None:
+        """Go on to publish changes: others may be subscribed to more."""
 
     def on_client_advertise(self, client: Client, channel: ClientChannel) -> None:
         """Admit a viewer that advertises the secret topic."""
@@ -226,14 +254,20 @@ class FoxgloveSteering(ServerListener):
             log.warning("viewer %d may not steer: %s", viewer, reason)
 
 
-def start(host: str, context: foxglove.Context, listener: ServerListener) -> WebSocketServer:
+def start(host: str, context: foxglove.Context, listener: FoxgloveSteering) -> WebSocketServer:
     """Start the server, in threads of its own. Raises ConfigError if it cannot listen."""
     try:
         return foxglove.start_server(
             name=NAME,
             host=host,
             port=0,
-            capabilities=[Capability.ClientPublish, Capability.ConnectionGraph],
+            capabilities=[
+                Capability.ClientPublish,
+                Capability.ConnectionGraph,
+                Capability.Parameters,
+                Capability.Services,
+            ],
+            services=listener.requests.services(),
             server_listener=listener,
             supported_encodings=["json"],
             context=context,
@@ -260,6 +294,7 @@ async def run(config: FoxgloveConfig, bus: Bus, ready: Callable[[], None]) -> No
     tasks = [
         asyncio.ensure_future(_draw(bus, view)),
         asyncio.ensure_future(_publish_graph(bus, steering, server)),
+        asyncio.ensure_future(_publish_parameters(bus, steering, server)),
     ]
     log.info("viewers connect to ws://%s:%d", HOST, port)
     ready()
@@ -286,3 +321,11 @@ async def _publish_graph(bus: Bus, steering: FoxgloveSteering, server: WebSocket
     async for _ in bus.clock.every(GRAPH_INTERVAL_NS):
         if steering.graph_wanted:
             server.publish_connection_graph(await connection_graph(bus))
+
+
+async def _publish_parameters(
+    bus: Bus, steering: FoxgloveSteering, server: WebSocketServer
+) -> None:
+    async for _ in bus.clock.every(REFRESH_NS):
+        if steering.parameters_wanted and (changed := await steering.requests.refresh()):
+            server.publish_parameter_values(changed)
