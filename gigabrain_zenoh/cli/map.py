@@ -1,4 +1,4 @@
-"""`gigabrain map`: saves and checks maps; `precompile`: the kernels that make and use them."""
+"""`gigabrain map`: saves, lists, loads and checks maps; `precompile`: compiles the kernels."""
 
 import asyncio
 import time
@@ -7,6 +7,10 @@ from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, on_bus, print_line
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 from gigabrain_zenoh.host.signals import run_async
 
+NO_MAPPING = (
+    "no process makes or uses a map; set perception: {mapping: slam} or {mapping: localize}, "
+    "and check that your keys may ask"
+)
 SAVE_TIMEOUT_S = 20.0  # a large map takes long to write
 
 
@@ -38,10 +42,57 @@ def save(name: str, /, *, at: RobotAddress = LOCAL, replace: bool = False) -> No
 
     replies = on_bus(at, lambda bus: bus.ask(MAP_SAVE, request, timeout_s=SAVE_TIMEOUT_S))
     if not replies:
-        raise BodyLost(
-            "no process makes a map; set perception: {mapping: slam}, "
-            "and check that your keys may ask"
-        )
+        raise BodyLost(NO_MAPPING)
+    if not replies[0].ok:
+        raise Refused(replies[0].text)
+    print_line(replies[0].text)
+
+
+def list_() -> None:
+    """List the saved maps of this machine.
+
+    Example: gigabrain map list
+    """
+    from gigabrain_zenoh.mapping import map_file
+    from gigabrain_zenoh.mapping.map_list import as_line, saved_maps
+
+    maps, more = saved_maps()
+    for one in maps:
+        print_line(as_line(one))
+    if more:
+        print_line(f"{more} more in {map_file.folder()}")
+    if not maps:
+        print_line(f"no maps in {map_file.folder()}; save one with `gigabrain map save NAME`")
+
+
+def load(name: str, /, *, proceed: bool = False, at: RobotAddress = LOCAL) -> None:
+    """Let a running robot use a saved map of perception's host.
+
+    Example: gigabrain map load office
+
+    All tasks are cancelled, as their coordinates mean other places. The robot searches itself in
+    the map.
+
+    Args:
+        name: Name of the map.
+        proceed: Continue mapping from it. Default: only localize in it.
+    """
+    import getpass
+
+    import msgspec
+
+    from gigabrain_schemas.topics import MAP_LOAD
+    from gigabrain_schemas.zones import MapLoadRequest
+
+    mapping = "slam" if proceed else "localize"
+    try:
+        fields = {"name": name, "mapping": mapping, "source": getpass.getuser()}
+        request = msgspec.convert(fields, MapLoadRequest)
+    except msgspec.ValidationError:
+        raise ConfigError(f"invalid map name {name!r}; see `gigabrain map list`") from None
+    replies = on_bus(at, lambda bus: bus.ask(MAP_LOAD, request, timeout_s=SAVE_TIMEOUT_S))
+    if not replies:
+        raise BodyLost(NO_MAPPING)
     if not replies[0].ok:
         raise Refused(replies[0].text)
     print_line(replies[0].text)
@@ -55,13 +106,16 @@ def info(name: str, /) -> None:
     Args:
         name: Name of the map, or path of its YAML file.
     """
-    from gigabrain_zenoh.mapping import map_file
+    from gigabrain_zenoh.mapping import map_file, zone_file
 
     path = map_file.path_of(name)
     saved = map_file.load(path)
     if problem := map_file.map_problem(saved):
         raise ConfigError(f"{path}: {problem}")
     print_line(f"{path}: {map_file.in_words(saved)}, {saved.resolution:g} m per cell")
+    zones = zone_file.load(path)
+    if zones.zones or zones.places:
+        print_line(zone_file.listed(zones.zones, zones.places))
     if not path.with_suffix(map_file.GRAPH).exists():
         print_line("no pose graph: usable for localization, not to continue mapping")
         return

@@ -33,8 +33,8 @@ TaskNameOrAll = Annotated[
 
 
 def goto(
-    x: Coordinate,
-    y: Coordinate,
+    place: Annotated[str, Parameter(allow_leading_hyphen=True)],
+    y: Annotated[float | None, Parameter(allow_leading_hyphen=True)] = None,
     yaw: Annotated[float | None, Parameter(allow_leading_hyphen=True)] = None,
     /,
     *,
@@ -46,13 +46,24 @@ def goto(
 
     Example: gigabrain goto 3.0 1.5 1.57
 
+    Example: gigabrain goto kitchen
+
     Exit code 0 on arrival.
 
     Args:
-        x: Place in the map [m].
-        y: Place in the map [m].
-        yaw: Heading on arrival [rad]. Default: any.
+        place: Place in the map: x [m], or the name of a place; see `gigabrain place list`.
+        y: Place in the map [m], if x is given.
+        yaw: Heading on arrival [rad]. Default: any, or that of the named place.
     """
+    if y is None:
+        _send(at, lambda tasks: tasks.go_to_place(place, how=mode), wait)
+        return
+    try:
+        x = float(place)
+    except ValueError:
+        raise ConfigError(
+            f"goto: expected two numbers, or the name of a place; got {place!r}"
+        ) from None
     _send(at, lambda tasks: tasks.go_to(x, y, yaw, how=mode), wait)
 
 

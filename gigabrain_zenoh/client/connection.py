@@ -60,8 +60,8 @@ class SyncRobot:
         """Turn on the spot by `angle` [rad], counter-clockwise if it is positive."""
         return self._run(self._robot.turn(angle, speed=speed))
 
-    def goto(self, x: float, y: float, yaw: float | None = None) -> Task:
-        """Send the robot to a pose in its map [m, m, rad], and wait until it arrives."""
+    def goto(self, x: float | str, y: float | None = None, yaw: float | None = None) -> Task:
+        """Send the robot to a pose [m, m, rad] or a place's name, and wait until it arrives."""
         return self._run(self._robot.goto(x, y, yaw))
 
     def drive(self, linear_x: float = 0.0, angular_z: float = 0.0, *, seconds: float) -> None:

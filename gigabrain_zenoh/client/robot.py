@@ -112,13 +112,18 @@ class Robot:
         """
         return await self._carry_out(0.0, angle, speed)
 
-    async def goto(self, x: float, y: float, yaw: float | None = None) -> Task:
-        """Send the robot to a pose in its map [m, m, rad]; return the task once it has ended.
+    async def goto(self, x: float | str, y: float | None = None, yaw: float | None = None) -> Task:
+        """Send the robot to a pose [m, m, rad] or a named place; return the task once it has ended.
 
         Cancelling this call cancels the goal. `tasks` has missions, the queue and progress. Raises
         Refused, and BodyLost if no process serves goals.
         """
-        name = await self.tasks.go_to(x, y, yaw)
+        if isinstance(x, str):
+            name = await self.tasks.go_to_place(x, yaw)
+        elif y is None:
+            raise ConfigError("goto: expected x and y, or the name of a place")
+        else:
+            name = await self.tasks.go_to(x, y, yaw)
         try:
             return await self.tasks.result(name)
         except asyncio.CancelledError:

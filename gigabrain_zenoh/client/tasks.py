@@ -20,6 +20,7 @@ from gigabrain_zenoh.client.requests import ANSWER_S
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 from gigabrain_zenoh.security.identity_files import may_not_ask
 
+MAX_NAME_CHARS = 64
 LARGEST = 1e9  # limit of coordinates on the bus
 PLAN_S = 5.0  # how long path planning in a large map may take
 SILENT_S = 5.0  # after this long without a task status, the robot counts as lost
@@ -65,8 +66,19 @@ class Tasks:
         if not all(abs(value) <= LARGEST for value in given):
             numbers = " ".join(f"{value:g}" for value in given)
             raise ConfigError(f"a goal takes numbers up to {LARGEST:g}, got {numbers}")
+        return await self._go(GoalRequest(x=x, y=y, yaw=yaw, how=how, source=self._bus.process))
+
+    async def go_to_place(
+        self, name: str, yaw: float | None = None, *, how: How = "replace"
+    ) -> str:
+        """Send the robot to a named place of its map; return the task's name. Raises Refused."""
+        if not name or len(name) > MAX_NAME_CHARS:
+            raise ConfigError(f"a place has a name of 1 to {MAX_NAME_CHARS} characters")
+        request = GoalRequest(place=name, yaw=yaw, how=how, source=self._bus.process)
+        return await self._go(request)
+
+    async def _go(self, request: GoalRequest) -> str:
         self._listen()
-        request = GoalRequest(x=x, y=y, yaw=yaw, how=how, source=self._bus.process)
         reply = await self._ask(GOAL, request, PLAN_S)
         if not reply.ok:
             raise Refused(reply.text)

@@ -42,6 +42,9 @@ class RelayConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     keys: str = ""  # folder of the host's identity
 
 
+MappingMode = Literal["off", "slam", "localize"]
+
+
 class PerceptionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings in the `perception` part of a deployment file."""
 
@@ -51,7 +54,7 @@ class PerceptionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     corridor: NonNegative = 0.45  # [m], length of the strip ahead that must be free to turn in
     turning_room: NonNegative = 0.04  # [m], clearance around the circle that a turning body sweeps
     sectors: Annotated[int, Meta(ge=4, le=360)] = 12  # in the full circle, the first centred ahead
-    mapping: Literal["off", "slam", "localize"] = "off"  # build a map, or localize in a saved one
+    mapping: MappingMode = "off"  # build a map, or localize in a saved one
     map: str = ""  # YAML file of a saved map to localize in; `slam` extends it
     state_dir: str = ""  # folder where `slam` saves the map every few seconds; empty: no saves
     compile_first: bool = False  # wait for compiled kernels; always at speeds other than 1

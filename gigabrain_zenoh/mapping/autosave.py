@@ -99,6 +99,12 @@ class Autosave:
         self._doing = head
         self._job = self._pool.submit(_write, self._slots[0], head, still)
 
+    def discard(self) -> None:
+        """Remove what was saved: another map takes its place."""
+        for path in self._slots:
+            path.unlink(missing_ok=True)
+        self._done = None
+
     def report(self) -> dict[str, float]:
         """Return counters for health reports."""
         return {"saves": self.saves, "saved_mb": round(self.bytes / 1e6, 1)}

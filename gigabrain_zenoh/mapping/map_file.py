@@ -36,6 +36,7 @@ OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # grey values, as ROS's map_server writes
 OCCUPIED_PERCENT, FREE_PERCENT = 65, 40  # from here on, and up to here
 LEAST_FREE_M2, LEAST_WALL_M = 1.0, 1.0  # less than that is no map
 GRAPH = ".graph.npz"
+ZONES = ".zones.yaml"  # see zone_file
 STAMP = "grid"  # in the graph's file: which grid it belongs to
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -63,9 +64,14 @@ def path_of(name: str) -> Path:
     return saved_map_path(name)
 
 
+def folder() -> Path:
+    """Return the folder of saved maps."""
+    return state_dir() / "maps"
+
+
 def saved_map_path(name: str) -> Path:
     """Return the YAML file of a saved map's name."""
-    return state_dir() / "maps" / f"{name}.yaml"
+    return folder() / f"{name}.yaml"
 
 
 def in_words(found: SavedMap) -> str:
@@ -95,8 +101,10 @@ def load_graph(path: Path) -> dict[str, NDArray[Any]]:
     return graph
 
 
-def save(path: Path, found: SavedMap, graph: Arrays, *, replace: bool = False) -> None:
-    """Write `path`, a YAML file's, and its image and graph. All of it, or nothing.
+def save(
+    path: Path, found: SavedMap, graph: Arrays, *, replace: bool = False, zones: bytes = b""
+) -> None:
+    """Write `path`, a YAML file's, and its image, graph and zones. All of it, or nothing.
 
     Raises Refused for an unusable map, or if a map is there and `replace` is False.
     """
@@ -108,7 +116,8 @@ def save(path: Path, found: SavedMap, graph: Arrays, *, replace: bool = False) -
         _finish(path)
         if path.exists() and not replace:
             raise Refused(f"not saved: there is a map {path} already; --replace overwrites it")
-        _commit(path, _files(path, found, graph))
+        beside = {path.with_suffix(ZONES).name: zones} if zones else {}
+        _commit(path, {**_files(path, found, graph), **beside})
     except ValueError as error:
         raise Refused(f"not saved: {error}") from None
     except OSError as error:

@@ -202,6 +202,10 @@ class SlamMap:
         """See RobotMap."""
         return self._grid.message()
 
+    def keyframes(self) -> tuple[int, Floats]:
+        """See RobotMap."""
+        return self._renewals, np.array(self._drawn).reshape(-1, 3)
+
     def settle(self) -> bool:
         """See RobotMap."""
         self._settling = True

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from gigabrain_zenoh.mapping.slam_map import MapSnapshot  # and gtsam: only who makes maps pays
 
 BEAMS, ROOM_M = 60, 1.0
+NO_POSES: Floats = np.empty((0, 3))
 
 
 class RobotMap(Protocol):
@@ -35,6 +36,14 @@ class RobotMap(Protocol):
 
     def grid(self) -> OccupancyGrid:
         """Return the map as a message."""
+
+    def keyframes(self) -> tuple[int, Floats]:
+        """Return the poses of the keyframes as they are in the grid (n, 3), and their version.
+
+        The version changes when poses do, not when there are more. A map that never changes has
+        none.
+        """
+        return 0, NO_POSES
 
     def settle(self) -> bool:
         """Start no background work until `still`; return whether none is running."""

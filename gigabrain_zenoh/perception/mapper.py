@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from msgspec.structs import replace
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_NS
@@ -16,7 +17,8 @@ from gigabrain_schemas.body import Body, Lidar, RobotState
 from gigabrain_schemas.brain import OccupancyGrid, PoseInMap
 from gigabrain_schemas.requests import MapReply, MapRequest
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_schemas.topics import MAP, MAP_SAVE, POSE
+from gigabrain_schemas.topics import MAP, MAP_LIST, MAP_LOAD, MAP_SAVE, POSE
+from gigabrain_schemas.zones import MapListReply, MapListRequest, MapLoadRequest
 from gigabrain_zenoh.bus.bus import Bus, Latest
 from gigabrain_zenoh.bus.input_log import log_accepted
 from gigabrain_zenoh.config.settings import PerceptionConfig
@@ -24,12 +26,17 @@ from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.geometry.scan import beams, hits
 from gigabrain_zenoh.host.bounded import NewestValues
 from gigabrain_zenoh.host.threads import InTime, done
-from gigabrain_zenoh.mapping import map_file
+from gigabrain_zenoh.kernels.precompile import ensure_compiled
+from gigabrain_zenoh.mapping import map_file, zone_file
 from gigabrain_zenoh.mapping.autosave import Autosave, refuse
 from gigabrain_zenoh.mapping.keyframes import Scan, View
 from gigabrain_zenoh.mapping.localizer import Place
+from gigabrain_zenoh.mapping.map_list import saved_maps
 from gigabrain_zenoh.mapping.odometry import OdometryFusion, OdometrySample, way
 from gigabrain_zenoh.mapping.static_map import RobotMap, StaticMap
+from gigabrain_zenoh.mapping.zone_file import ZoneFile
+from gigabrain_zenoh.perception.node import LOCALIZE_KERNELS, MAP_KERNELS
+from gigabrain_zenoh.perception.zone_keeper import ZoneKeeper
 
 log = logging.getLogger(__name__)
 
@@ -62,6 +69,11 @@ def chart_of(config: PerceptionConfig, in_time: InTime = done) -> RobotMap:
     return SlamMap(in_time=in_time)
 
 
+def _loaded(config: PerceptionConfig, in_time: InTime) -> tuple[RobotMap, ZoneFile]:
+    """Load a map and its zones. Raises ConfigError."""
+    return chart_of(config, in_time), zone_file.load(map_file.path_of(config.map))
+
+
 def view_of(lidar: Lidar, scan: LaserScan, ignore_below: float) -> View:
     """Convert a scan to hit points and the ends of free beams, in the body's frame [m]."""
     values = scan.ranges_m
@@ -86,14 +98,18 @@ class Mapper:
         self._mapped = False  # this process has processed a scan, or restored a map
         self._published: OccupancyGrid | None = None
         self._checked_tick = self._sent_tick = 0
-        saves = config.mapping == "slam" and config.state_dir and bus.input_log.live
-        self._autosave = Autosave(Path(config.state_dir)) if saves else None
+        self._autosave = self._autosave_of(config)
         self._before: OdometrySample | None = None  # at the last scan in a restored map
         self._logged, self._left_out = "", ""
         self._early = False  # the first scan arrived without its odometry
         self._took_ms = NewestValues(TIMED)
         self._saving = asyncio.Lock()  # concurrent saves would write to the same files
+        self._zones = ZoneKeeper(bus, config.state_dir, lambda: self._tick)
+        found = zone_file.load(map_file.path_of(config.map)) if config.map else ZoneFile()
+        self._zones.use_map(config.map, config.mapping, found, loaded=False)
         bus.serve(MAP_SAVE, self._save)
+        bus.serve(MAP_LOAD, self._load)
+        bus.serve(MAP_LIST, self._list)
         bus.report = self._report
 
     def process_scan(self, scan: LaserScan, problem: str) -> None:
@@ -127,6 +143,14 @@ class Mapper:
             self._reset_odometry(state.boot)
             self._fusion.add(state, body.description)
 
+    def _autosave_of(self, config: PerceptionConfig) -> Autosave | None:
+        saves = config.mapping == "slam" and config.state_dir and self._bus.input_log.live
+        return Autosave(Path(config.state_dir)) if saves else None
+
+    @property
+    def _tick(self) -> int:
+        return self._last.tick if self._last else 0
+
     def _reset_odometry(self, boot: int) -> None:
         """Reset the odometry when the driver has restarted; the map is kept.
 
@@ -138,8 +162,20 @@ class Mapper:
             self._chart.lose("the driver has restarted")
         self._boot, self._fusion, self._last, self._published = boot, OdometryFusion(), None, None
         self._before, self._early = None, False
-        if self._autosave and not self._mapped:
+        if not self._mapped and self._bus.input_log.live:
+            self._resume(boot)
+        self._zones.set_boot(boot)
+
+    def _resume(self, boot: int) -> None:
+        """Resume the map and the zones of an earlier process of this run of the driver."""
+        kept = self._zones.restore(boot)
+        if kept and kept.maps_loaded:  # another map than that of the settings
+            self._use(replace(self._config, map=kept.map, mapping=kept.mapping), loaded=False)
+        if self._autosave:
             self._resume_map(self._autosave, boot)
+        found = self._config.mapping == "localize" and kept and kept.map == self._zones.map
+        if kept and (self._mapped or found):
+            self._zones.resume(kept)
 
     def _resume_map(self, autosave: Autosave, boot: int) -> None:
         """Resume the newest intact map that was saved during this run of the driver, if any."""
@@ -214,7 +250,10 @@ class Mapper:
         self._checked_tick = tick
         self._log_problems()
         grid = self._chart.grid()
+        self._zones.follow(*self._chart.keyframes())
         due = grid != self._published or tick >= self._sent_tick + MAP_AGAIN_TICKS
+        if grid.cells:
+            self._zones.publish(tick)
         if due and grid.cells:
             self._bus.publish(MAP, grid, basis=tick)
             self._published, self._sent_tick = grid, tick
@@ -224,6 +263,7 @@ class Mapper:
         problems, known = self._chart.problems(), self._bus.problems
         if self._autosave and self._autosave.problem:
             problems = (*problems, self._autosave.problem)
+        problems = (*problems, *self._zones.problems())
         for problem in problems:
             if problem.code not in {one.code for one in known}:
                 log.warning("%s", problem.text, extra={"data": {"event": problem.code}})
@@ -249,7 +289,7 @@ class Mapper:
             log.warning("scan not mapped: %s", why, extra={"data": {"event": "scan"}})
 
     async def _save(self, request: MapRequest) -> MapReply:
-        log_accepted(self._bus, MAP_SAVE.key, request, self._last.tick if self._last else 0)
+        log_accepted(self._bus, MAP_SAVE.key, request, self._tick)
         path = map_file.saved_map_path(request.name)
         same = bool(self._config.map) and path == map_file.path_of(self._config.map)
         try:
@@ -258,6 +298,7 @@ class Mapper:
         except Refused as error:
             log.warning("map for %s: %s", request.source, error, extra={"data": {"event": "map"}})
             return MapReply(ok=False, text=str(error)[:500])
+        self._zones.saved_as(request.name)
         log.info("map by %s: %s", request.source, text, extra={"data": {"event": "map"}})
         return MapReply(ok=True, text=text[:500])
 
@@ -268,8 +309,48 @@ class Mapper:
             await self._bus.clock.sleep_ns(SETTLE_NS)
         saved, graph = await asyncio.to_thread(self._chart.still().to_save)
         if self._bus.input_log.live:
-            await asyncio.to_thread(map_file.save, path, saved, graph, replace=replace)
+            zones = zone_file.encoded(self._zones.present)
+            await asyncio.to_thread(map_file.save, path, saved, graph, replace=replace, zones=zones)
         return f"saved {path}: {map_file.in_words(saved)}"
+
+    async def _list(self, _request: MapListRequest) -> MapListReply:
+        maps, more = await asyncio.to_thread(saved_maps)
+        text = f"{more} more are not listed" if more else ""
+        return MapListReply(maps=tuple(maps), present=self._zones.map, text=text)
+
+    async def _load(self, request: MapLoadRequest) -> MapReply:
+        config = replace(self._config, map=request.name, mapping=request.mapping)
+        try:
+            async with self._saving:
+                await ensure_compiled(MAP_KERNELS if config.mapping == "slam" else LOCALIZE_KERNELS)
+                made = await asyncio.to_thread(_loaded, config, self._bus.input_log.in_time)
+        except ConfigError as error:
+            text = f"not loaded: {error}"
+            log.warning("map for %s: %s", request.source, text, extra={"data": {"event": "map"}})
+            return MapReply(ok=False, text=text[:500])
+        log_accepted(self._bus, MAP_LOAD.key, request, self._tick)
+        self._use(config, made)
+        if self._autosave:
+            self._autosave.discard()
+        text = f"loaded {request.name}; looking for the robot in it"
+        log.info("map by %s: %s", request.source, text, extra={"data": {"event": "map"}})
+        return MapReply(ok=True, text=text)
+
+    def _use(
+        self,
+        config: PerceptionConfig,
+        made: "tuple[RobotMap, ZoneFile] | None" = None,
+        *,
+        loaded: bool = True,
+    ) -> None:
+        """Use another map from now on. Raises ConfigError."""
+        chart, zones = made or _loaded(config, self._bus.input_log.in_time)
+        self._chart.close()
+        if self._autosave:
+            self._autosave.close()
+        self._config, self._chart, self._blank = config, chart, False
+        self._autosave, self._published = self._autosave_of(config), None
+        self._zones.use_map(config.map, config.mapping, zones, loaded=loaded)
 
     def _report(self) -> dict[str, float | int | str | None]:
         times = {f"map_ms_p{p}": self._took_ms.percentile(p / 100) for p in (50, 99)}

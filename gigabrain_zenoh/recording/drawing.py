@@ -21,6 +21,7 @@ from gigabrain_schemas.safety import LogRecord
 from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_schemas.tasks import TaskStatus
 from gigabrain_schemas.topics import Drawing, Topic
+from gigabrain_schemas.zones import Place, Zone, Zones
 from gigabrain_zenoh.geometry.pose import to_frame
 
 MAP, ODOM, BASE = "map", "odom", "base_link"
@@ -44,6 +45,13 @@ LOG_LEVELS = {
 }
 
 AMBER = fox.Color(r=0.96, g=0.62, b=0.04, a=0.6)
+ZONE_COLOURS = {
+    "keepout": fox.Color(r=0.77, g=0.08, b=0.11, a=0.8),
+    "speed": fox.Color(r=0.96, g=0.62, b=0.04, a=0.8),
+    "one_way": fox.Color(r=0.04, g=0.37, b=0.49, a=0.3),
+}
+PLACE_COLOUR = fox.Color(r=0.04, g=0.37, b=0.49, a=1.0)
+PLACE_LENGTH_M, LABEL_SIZE_M = 0.4, 0.25
 OBSTACLE_HEIGHT_M = 0.3
 LINE_WIDTH_M = 0.08
 ARROW_TIME_S = 1.0  # an arrow reaches to where an obstacle will be then
@@ -86,10 +94,12 @@ class Drawer:
 
     def __init__(self) -> None:
         self._odometry = Pose(x=0.0, y=0.0, yaw=0.0)
+        self._zones_drawn: set[str] = set()  # ids
         self._last_intent = (0, -1)  # boot and basis of the last path drawn
         self._converters: dict[Drawing, Callable[[Any, str], Iterable[Drawn]]] = {
             "scan": self._scan,
             "map": self._map,
+            "zones": self._zones,
             "pose": self._pose,
             "path": self._path,
             "obstacles": self._obstacles,
@@ -146,6 +156,22 @@ class Drawer:
             data=CELL_COLOURS[cells].tobytes(),
         )
         yield _drawn("map", drawn)
+
+    def _zones(self, zones: Zones, _: str) -> Iterable[Drawn]:
+        """Draw the edges of zones, the direction of lanes, and the places, each with its name."""
+        entities = [_zone_entity(zones, one) for one in zones.zones]
+        entities += [_place_entity(zones, one) for one in zones.places]
+        names = {entity.id for entity in entities}
+        gone = [
+            fox.SceneEntityDeletion(
+                timestamp=stamp(zones),
+                type=fox.SceneEntityDeletionType.MatchingId,
+                id=name,
+            )
+            for name in sorted(self._zones_drawn - names)
+        ]
+        self._zones_drawn = names
+        yield _drawn("zones", fox.SceneUpdate(entities=entities, deletions=gone))
 
     def _pose(self, pose: PoseInMap, _: str) -> Iterable[Drawn]:
         here = pose_of(pose.x, pose.y, pose.yaw)
@@ -274,6 +300,50 @@ def _wall(world: WorldModel, one: Obstacle, odometry: Pose) -> fox.SceneEntity:
     return fox.SceneEntity(
         timestamp=stamp(world), frame_id=BASE, id=str(one.id), lifetime=OBSTACLE_LIFETIME,
         lines=[lines],
+    )  # fmt: skip
+
+
+def _zone_entity(zones: Zones, zone: Zone) -> fox.SceneEntity:
+    """Draw the edges of a zone, or the middle of a lane with an arrow at its end."""
+    lane, colour = zone.kind == "one_way", ZONE_COLOURS[zone.kind]
+    kind = fox.LinePrimitiveLineType.LineStrip if lane else fox.LinePrimitiveLineType.LineLoop
+    line = fox.LinePrimitive(
+        type=kind, points=[fox.Point3(x=x, y=y, z=0.02) for x, y in zone.points],
+        thickness=(zone.lane_width or 0.0) if lane else LINE_WIDTH_M, color=colour,
+    )  # fmt: skip
+    arrows = []
+    if lane:
+        (x, y), (to_x, to_y) = zone.points[-2:]
+        arrows = [_arrow(x, y, math.atan2(to_y - y, to_x - x), math.hypot(to_x - x, to_y - y))]
+    x, y = zone.points[0]
+    label = zone.name if zone.max_speed is None else f"{zone.name}: {zone.max_speed:g} m/s"
+    return fox.SceneEntity(
+        timestamp=stamp(zones), frame_id=MAP, id=zone.name, lines=[line], arrows=arrows,
+        texts=[_label(x, y, label)],
+    )  # fmt: skip
+
+
+def _place_entity(zones: Zones, place: Place) -> fox.SceneEntity:
+    """Draw an arrow along the heading of a place, or a dot."""
+    length = PLACE_LENGTH_M if place.yaw is not None else LINE_WIDTH_M
+    return fox.SceneEntity(
+        timestamp=stamp(zones), frame_id=MAP, id=place.name,
+        arrows=[_arrow(place.x, place.y, place.yaw or 0.0, length)],
+        texts=[_label(place.x, place.y, place.name)],
+    )  # fmt: skip
+
+
+def _arrow(x: float, y: float, yaw: float, length: float) -> fox.ArrowPrimitive:
+    return fox.ArrowPrimitive(
+        pose=pose_of(x, y, yaw), shaft_length=length, shaft_diameter=0.04,
+        head_length=0.1, head_diameter=0.1, color=PLACE_COLOUR,
+    )  # fmt: skip
+
+
+def _label(x: float, y: float, text: str) -> fox.TextPrimitive:
+    return fox.TextPrimitive(
+        pose=pose_of(x, y, 0.0), billboard=True, font_size=LABEL_SIZE_M, color=PLACE_COLOUR,
+        text=text,
     )  # fmt: skip
 
 

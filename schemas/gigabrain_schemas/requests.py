@@ -46,7 +46,7 @@ class MapRequest(Message, frozen=True, kw_only=True):
     """Save the map, with the pose graph, where perception runs."""
 
     name: Annotated[
-        str, Meta(pattern=r"^(?!.*\.ya?ml$)\w[\w.-]*$(?!\n)", max_length=64)
+        str, Meta(pattern=r"^(?!.*\.(ya?ml|zones)$)\w[\w.-]*$(?!\n)", max_length=64)
     ]  # of its files, without ending
     replace: bool = False  # another map of that name
     source: Name = "anonymous"

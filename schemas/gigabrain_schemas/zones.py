@@ -134,6 +134,6 @@ class MapListReply(Message, frozen=True, kw_only=True):
 class MapLoadRequest(Message, frozen=True, kw_only=True):
     """Use a saved map from now on: find the robot in it, and continue it if asked to."""
 
-    name: Annotated[str, Meta(pattern=r"^(?!.*\.ya?ml$)\w[\w.-]*$(?!\n)", max_length=64)]
+    name: Annotated[str, Meta(pattern=r"^(?!.*\.(ya?ml|zones)$)\w[\w.-]*$(?!\n)", max_length=64)]
     mapping: Literal["localize", "slam"] = "localize"
     source: Name = "anonymous"

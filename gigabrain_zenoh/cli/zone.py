@@ -1,0 +1,164 @@
+"""`gigabrain place` and `gigabrain zone`: named places and zones of the robot's map."""
+
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, on_bus, print_line
+from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
+
+if TYPE_CHECKING:
+    from gigabrain_schemas.zones import Zones
+    from gigabrain_zenoh.bus.bus import Bus
+
+Number = Annotated[float | None, Parameter(allow_leading_hyphen=True)]
+Numbers = Annotated[list[float], Parameter(allow_leading_hyphen=True)]
+ANSWER_S = 5.0
+WAIT_S = 3.0  # for the robot's pose
+
+
+def list_(*, at: RobotAddress = LOCAL) -> None:
+    """List the named places and zones of the robot's map.
+
+    Example: gigabrain place list
+    """
+    zones = on_bus(at, _zones)
+    for place in zones.places:
+        yaw = "" if place.yaw is None else f", {place.yaw:.2f} rad"
+        print_line(f"{place.name:<20} place     ({place.x:.2f}, {place.y:.2f}{yaw})")
+    for zone in zones.zones:
+        more = "" if zone.max_speed is None else f", {zone.max_speed:g} m/s"
+        more += "" if zone.lane_width is None else f", {zone.lane_width:g} m wide"
+        print_line(f"{zone.name:<20} {zone.kind:<9} {len(zone.points)} points{more}")
+    if not zones.places and not zones.zones:
+        print_line("no places and no zones")
+
+
+def add(
+    name: str,
+    x: Number = None,
+    y: Number = None,
+    yaw: Number = None,
+    /,
+    *,
+    replace: bool = False,
+    at: RobotAddress = LOCAL,
+) -> None:
+    """Name a place of the map: the robot's own, or a given one.
+
+    Example: gigabrain place add kitchen 3.0 1.5 1.57
+
+    Args:
+        name: Name of the place, for `gigabrain goto NAME` and for missions.
+        x: Place in the map [m]. Default: where the robot is, with its heading.
+        y: Place in the map [m].
+        yaw: Heading on arrival [rad]. Default: any.
+        replace: Replace a place or zone of the same name.
+    """
+    if x is not None and y is None:
+        raise ConfigError("a place takes x and y; expected both numbers, or none")
+
+    async def change(bus: "Bus") -> str:
+        place = {"x": x, "y": y, "yaw": yaw} if x is not None else await _here(bus)
+        return await _ask(bus, {"place": {"name": name, **place}, "replace": replace})
+
+    print_line(on_bus(at, change))
+
+
+def remove(name: str, /, *, at: RobotAddress = LOCAL) -> None:
+    """Remove a named place or a zone.
+
+    Example: gigabrain place remove kitchen
+
+    Args:
+        name: Name of the place or zone.
+    """
+    print_line(on_bus(at, lambda bus: _ask(bus, {"remove": name})))
+
+
+def add_zone(
+    name: str,
+    kind: Literal["keepout", "speed", "one_way"],
+    points: Numbers,
+    /,
+    *,
+    max_speed: float | None = None,
+    width: float | None = None,
+    replace: bool = False,
+    at: RobotAddress = LOCAL,
+) -> None:
+    """Add a keep-out zone, a speed zone or a one-way lane.
+
+    Example: gigabrain zone add lab keepout 2 1 4 1 4 3 2 3
+
+    Args:
+        name: Name of the zone.
+        kind: What the zone does.
+        points: Corners x y x y ... in the map [m]; of a lane, points from its start to its end.
+        max_speed: Speed limit of a speed zone [m/s].
+        width: Width of a lane [m].
+        replace: Replace a zone or place of the same name.
+    """
+    if len(points) % 2:
+        raise ConfigError(f"{len(points)} numbers; expected pairs x y")
+    zone = {
+        "name": name,
+        "kind": kind,
+        "points": list(zip(points[::2], points[1::2], strict=True)),
+        "max_speed": max_speed,
+        "lane_width": width,
+    }
+    print_line(on_bus(at, lambda bus: _ask(bus, {"zone": zone, "replace": replace})))
+
+
+async def _zones(bus: "Bus") -> "Zones":
+    """Return the kept zones. Raises BodyLost."""
+    from gigabrain_schemas.topics import ZONES
+    from gigabrain_zenoh.cli.map import NO_MAPPING
+    from gigabrain_zenoh.codec import Codec
+
+    kept = await bus.kept(ZONES)
+    if not kept:
+        raise BodyLost(NO_MAPPING)
+    found: Zones = Codec(ZONES.type, ZONES.max_bytes).decode(kept[0])
+    return found
+
+
+async def _here(bus: "Bus") -> dict[str, Any]:
+    """Return the robot's pose in its map. Raises BodyLost and Refused."""
+    import asyncio
+
+    from gigabrain_schemas.brain import PoseInMap
+    from gigabrain_schemas.topics import POSE
+
+    found: asyncio.Future[PoseInMap] = asyncio.get_running_loop().create_future()
+    bus.subscribe(POSE, lambda _key, pose: None if found.done() else found.set_result(pose))
+    try:
+        pose = await asyncio.wait_for(found, WAIT_S)
+    except TimeoutError:
+        raise BodyLost("no pose in a map from the robot; give x and y") from None
+    if not pose.localized:
+        raise Refused("the robot does not know where it is; give x and y")
+    return {"x": pose.x, "y": pose.y, "yaw": pose.yaw}
+
+
+async def _ask(bus: "Bus", fields: dict[str, Any]) -> str:
+    """Ask for a change; return the answer as text. Raises ConfigError, BodyLost and Refused."""
+    import getpass
+
+    import msgspec
+
+    from gigabrain_schemas.topics import ZONES_CHANGE
+    from gigabrain_schemas.zones import ZonesRequest
+    from gigabrain_zenoh.cli.map import NO_MAPPING
+
+    try:
+        request = msgspec.convert({**fields, "source": getpass.getuser()}, ZonesRequest)
+    except (ValueError, OverflowError) as error:  # msgspec.ValidationError is one
+        raise ConfigError(f"not a valid place or zone: {error}") from None
+    replies = await bus.ask(ZONES_CHANGE, request, timeout_s=ANSWER_S)
+    if not replies:
+        raise BodyLost(NO_MAPPING)
+    if not replies[0].ok:
+        raise Refused(replies[0].text)
+    return replies[0].text

@@ -1,0 +1,258 @@
+"""Perception keeps zones and places with its map, and loads maps while it runs."""
+
+import asyncio
+import math
+from collections.abc import Awaitable
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import pytest
+
+from gigabrain_schemas.base import Message
+from gigabrain_schemas.topics import MAP_LIST, MAP_LOAD, POSE, ZONES, ZONES_CHANGE, Topic
+from gigabrain_schemas.zones import (
+    MapListRequest,
+    MapLoadRequest,
+    Place,
+    Zone,
+    Zones,
+    ZonesReply,
+    ZonesRequest,
+)
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.codec import Codec
+from gigabrain_zenoh.config.settings import PerceptionConfig
+from gigabrain_zenoh.mapping import map_file, zone_file
+from gigabrain_zenoh.mapping.zone_file import ZoneFile
+from gigabrain_zenoh.perception.zone_keeper import ZoneKeeper
+from gigabrain_zenoh.testing.in_memory import Net
+from tests.node.mapping_robot import Robot
+
+T = TypeVar("T")
+M = TypeVar("M", bound=Message)
+LAB = Zone(name="lab", kind="keepout", points=((1.0, 1.0), (2.0, 1.0), (2.0, 2.0)))
+KITCHEN = Place(name="kitchen", x=3.0, y=2.5, yaw=0.5)
+
+
+async def patiently(robot: Robot, asking: Awaitable[T]) -> T:
+    task = asyncio.ensure_future(asking)
+    async with asyncio.timeout(60):
+        while not task.done():
+            await robot.clock.advance(20_000_000)
+            await asyncio.sleep(0.005)
+    return task.result()
+
+
+async def ask(robot: Robot, service, request: Message):  # type: ignore[no-untyped-def]
+    bus = Bus(robot.network.transport(), robot.clock, "test")
+    replies = await patiently(robot, bus.ask(service, request, timeout_s=600.0))
+    await bus.close()
+    return replies[0]
+
+
+def last(robot: Robot, topic: Topic[M]) -> M:
+    """Return the newest message that was published on `topic` at all."""
+    payload = next(data for key, data in reversed(robot.network.sent) if key == topic.key)
+    return Codec(topic.type, topic.max_bytes).decode(payload)
+
+
+async def newest(robot: Robot) -> Zones:
+    await robot.clock.advance(0)
+    return last(robot, ZONES)
+
+
+@pytest.fixture(autouse=True)
+def _own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+
+
+async def test_zones_are_published_saved_with_the_map_and_loaded_with_it() -> None:
+    async with Robot() as robot:
+        robot.say()
+        robot.drive(20)
+        assert (await newest(robot)).zones == ()
+        assert (await ask(robot, ZONES_CHANGE, ZonesRequest(zone=LAB))).ok
+        reply = await ask(robot, ZONES_CHANGE, ZonesRequest(place=KITCHEN))
+        assert reply == ZonesReply(ok=True, text="added 'kitchen'; save the map to keep it")
+        now = await newest(robot)
+        assert ([one.name for one in now.zones], now.map) == (["lab"], "")
+        assert (await robot.save("house")).ok
+        reply = await ask(robot, ZONES_CHANGE, ZonesRequest(remove="lab"))
+        assert reply.text == "removed 'lab', kept with the map house"
+    kept = zone_file.load(map_file.saved_map_path("house"))
+    assert (kept.zones, kept.places) == ((), (KITCHEN,))
+    async with Robot(PerceptionConfig(mapping="localize", map="house")) as robot:
+        robot.say()
+        robot.drive(3, still=True)
+        now = await newest(robot)
+        assert (now.places, now.map, now.maps_loaded) == ((KITCHEN,), "house", 0)
+
+
+@pytest.mark.parametrize(
+    ("zone", "why"),
+    [
+        (
+            Zone(name="bow", kind="keepout", points=((0, 0), (1, 1), (1, 0), (0, 1))),
+            "zone 'bow': its edges cross; draw a polygon whose edges do not cross",
+        ),
+        (
+            Zone(name="lab", kind="keepout", points=((0, 0), (1, 1), (1, 0))),
+            "'lab' is there already; replace it, or choose another name",
+        ),
+        (
+            Zone(name="dot", kind="one_way", points=((1, 1), (1, 1)), lane_width=1.0),
+            "zone 'dot': its points are all the same; a lane needs a direction",
+        ),
+    ],
+)
+async def test_zones_that_make_no_sense_are_refused_and_change_nothing(
+    zone: Zone, why: str
+) -> None:
+    async with Robot() as robot:
+        robot.say()
+        robot.drive(20)
+        assert (await ask(robot, ZONES_CHANGE, ZonesRequest(zone=LAB, source="ann"))).ok
+        assert (await ask(robot, ZONES_CHANGE, ZonesRequest(zone=zone, source="bob"))).text == why
+        reply = await ask(robot, ZONES_CHANGE, ZonesRequest(remove="lap"))
+        assert reply.text == "no zone or place 'lap'; did you mean 'lab'? known: lab"
+        assert [one.name for one in (await newest(robot)).zones] == ["lab"]
+
+
+async def test_no_more_zones_than_a_message_holds_are_accepted() -> None:
+    ring = tuple(
+        (round(9 * math.cos(a), 3), round(9 * math.sin(a), 3))
+        for a in np.linspace(0, 2 * math.pi, 256, endpoint=False)
+    )
+    async with Robot() as robot:
+        robot.say()
+        robot.drive(20)
+        replies = [
+            await ask(
+                robot,
+                ZONES_CHANGE,
+                ZonesRequest(zone=Zone(name=f"z{i}", kind="keepout", points=ring)),
+            )
+            for i in range(34)
+        ]
+        assert [one.ok for one in replies] == [True] * 32 + [False] * 2
+        assert "vertices in all zones; expected at most 8192" in replies[-1].text
+        assert len((await newest(robot)).zones) == 32
+
+
+async def test_maps_are_listed_and_loaded_while_it_runs(tmp_path: Path) -> None:
+    async with Robot(PerceptionConfig(mapping="slam", state_dir=str(tmp_path / "robot"))) as robot:
+        robot.say()
+        robot.drive(40)
+        await ask(robot, ZONES_CHANGE, ZonesRequest(place=KITCHEN))
+        assert (await robot.save("house")).ok
+        map_file.saved_map_path("broken").write_text("image: nowhere.pgm\n")
+        zone_file.path_beside(map_file.saved_map_path("alone")).write_text("version: 1\n")
+        listed = await ask(robot, MAP_LIST, MapListRequest())
+        assert [(one.name, bool(one.problem), one.places) for one in listed.maps] == [
+            ("broken", True, 0),
+            ("house", False, 1),
+        ]
+        assert listed.present == "house"
+        reply = await ask(robot, MAP_LOAD, MapLoadRequest(name="broken"))
+        assert not reply.ok
+        assert reply.text.startswith("not loaded: ")
+        assert not (await ask(robot, MAP_LOAD, MapLoadRequest(name="nowhere"))).ok
+        reply = await ask(robot, MAP_LOAD, MapLoadRequest(name="house"))
+        assert reply.text == "loaded house; looking for the robot in it"
+        robot.drive(1)
+        assert not last(robot, POSE).localized
+        for _ in range(60):
+            robot.drive(1, still=True)
+            await robot.clock.advance(100_000_000)
+            await asyncio.sleep(0.02)
+            if last(robot, POSE).localized:
+                break
+        assert last(robot, POSE).localized
+        now = await newest(robot)
+        assert (now.map, now.maps_loaded, now.places) == ("house", 1, (KITCHEN,))
+        await robot.restart()  # with the map that was loaded, not that of its settings
+        await robot.ready()
+        robot.say()
+        robot.drive(3, still=True)
+        now = await newest(robot)
+        assert (now.map, now.maps_loaded, now.places) == ("house", 1, (KITCHEN,))
+
+
+async def test_zones_move_with_the_keyframe_beside_them() -> None:
+    net = Net()
+    keeper = ZoneKeeper(net.one, "", lambda: 0)
+    keeper.use_map("", "slam", ZoneFile(zones=(LAB,), places=(KITCHEN,)), loaded=False)
+    poses = np.array(((0.0, 0.0, 0.0), (3.0, 2.0, 0.0)))
+    keeper.follow(0, poses)
+    assert keeper.present.zones == (LAB,)
+    corrected = poses + np.array(((0.0, 0.0, 0.0), (0.5, 0.0, 0.1)))
+    keeper.follow(1, corrected)
+    place = keeper.present.places[0]
+    assert place.yaw == pytest.approx(0.6)
+    assert (place.x, place.y) == pytest.approx(
+        (3.5 - 0.5 * math.sin(0.1), 2.0 + 0.5 * math.cos(0.1))
+    )
+    keeper.follow(2, poses)
+    assert keeper.present.places[0].x == pytest.approx(3.0)
+    keeper.follow(3, poses + 0.001)  # too little to be published
+    assert keeper.present.places[0].x == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("version: 2\n", "house.zones.yaml:1: version"),
+        ("zones: [{name: a, kind: wall, points: [[0,0],[1,0],[1,1]]}]", "kind"),
+        ("zones: [{name: a, kind: keepout, points: [[0,0],[.nan,0],[1,1]]}]", "finite"),
+        ("zones: [{name: a, kind: keepout, points: [[0,0],[1,1],[1,0],[0,1]]}]", "edges cross"),
+        ("places: [{name: ../a, x: 0, y: 0}]", "name"),
+        ("places: [{name: a, x: 0, y: 0}, {name: a, x: 0, y: 0}]", "two zones or places"),
+        ("\0\xff", "house.zones.yaml"),
+        ("x" * 300_000, "house.zones.yaml"),
+    ],
+)
+def test_a_file_of_zones_that_is_wrong_is_refused_in_one_line(text: str, why: str) -> None:
+    path = map_file.saved_map_path("house")
+    path.parent.mkdir(parents=True)
+    zone_file.path_beside(path).write_text(text)
+    with pytest.raises(zone_file.ConfigError, match=why) as caught:
+        zone_file.load(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_written_is_read_again() -> None:
+    zones = ZoneFile(
+        zones=(
+            LAB,
+            Zone(
+                name="no",
+                kind="speed",
+                points=((-1e5, 0.0), (1.0, 1e5), (0.5, 0.25)),
+                max_speed=0.1,
+            ),
+            Zone(name="1e3", kind="one_way", points=((0.0, 1.0), (2.0, 3.0)), lane_width=1.25),
+        ),
+        places=(KITCHEN, Place(name="Küche 2", x=0.0, y=-1.0)),
+    )  # fmt: skip
+    path = map_file.saved_map_path("house")
+    zone_file.save(path, zones)
+    assert zone_file.load(path) == zones
+
+
+async def test_a_growing_maps_zones_outlive_its_process(tmp_path: Path) -> None:
+    async with Robot(PerceptionConfig(mapping="slam", state_dir=str(tmp_path / "robot"))) as robot:
+        robot.say()
+        robot.drive(60)
+        assert (await ask(robot, ZONES_CHANGE, ZonesRequest(zone=LAB))).ok
+        for _ in range(40):
+            robot.drive(10)
+            await robot.clock.advance(100_000_000)
+            await asyncio.sleep(0.05)
+            if list((tmp_path / "robot").glob("map_*.npz")):
+                break
+        await robot.restart()
+        await robot.ready()
+        robot.say()
+        robot.drive(3)
+        assert (await newest(robot)).zones == (LAB,)
