@@ -161,7 +161,7 @@ class Drawer:
         """Draw the edges of zones, the direction of lanes, and the places, each with its name."""
         entities = [_zone_entity(zones, one) for one in zones.zones]
         entities += [_place_entity(zones, one) for one in zones.places]
-        names = {entity.id for entity in entities}
+        names = {one.name for one in zones.zones} | {one.name for one in zones.places}
         gone = [
             fox.SceneEntityDeletion(
                 timestamp=stamp(zones),
