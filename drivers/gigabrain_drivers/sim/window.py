@@ -17,6 +17,7 @@ from gigabrain_zenoh.errors import BodyLost, ConfigError
 
 FRAME_S = 0.04
 WAIT_S = 5.0  # for the scene
+SILENT_S = 5.0
 ELSEWHERE = (
     "use the 3-D view of the operator page, or `gigabrain view --picture FILE`, or run this "
     "where there is a display, with --connect"
@@ -62,7 +63,7 @@ async def show(bus: Bus, picture: Path | None, say: Callable[[str], None]) -> No
         await asyncio.to_thread(made.save, picture)
         say(str(picture))
         return
-    while made := await _window(made, scenes, poses):  # type: ignore[assignment]
+    while made := await _window(made, scenes, poses, say):  # type: ignore[assignment]
         pass
 
 
@@ -87,7 +88,10 @@ async def _placed(made: SceneModel, scenes: Latest[SimScene], poses: Latest[SimP
 
 
 async def _window(
-    made: SceneModel, scenes: Latest[SimScene], poses: Latest[SimPoses]
+    made: SceneModel,
+    scenes: Latest[SimScene],
+    poses: Latest[SimPoses],
+    say: Callable[[str], None],
 ) -> SceneModel | None:
     """Show one world; return the next one if the robot is now in another, else None."""
     import mujoco.viewer
@@ -100,8 +104,15 @@ async def _window(
         await _placed(made, scenes, poses)
         with viewer.lock():
             made.aim(viewer.cam)
+        loop = asyncio.get_running_loop()
+        newest, moved_s, told = poses.newest, loop.time(), False
         while viewer.is_running():
             scene = scenes.newest
+            if poses.newest is not newest:
+                newest, moved_s, told = poses.newest, loop.time(), False
+            elif loop.time() - moved_s > SILENT_S and not told:
+                say("the simulation is silent; the window shows its last state")
+                told = True
             if scene and scene is not made.scene and not made.update(scene):
                 return SceneModel(scene)
             with viewer.lock():

@@ -61,7 +61,7 @@ export class Camera {
   target = [0, 0, 0]
   distance = 6
   azimuth = -2.2 // [rad], from where it looks
-  elevation = 0.75
+  elevation = 0.95
 
   get eye() {
     const flat = this.distance * Math.cos(this.elevation)
