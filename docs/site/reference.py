@@ -17,6 +17,7 @@ from gigabrain_drivers.driver.robot import RobotFile
 from gigabrain_drivers.lidars.base import source_class
 from gigabrain_schemas.topics import SERVICES, TOPICS, messages
 from gigabrain_zenoh.cli.app import COMMANDS, make_app
+from gigabrain_zenoh.cli.options import default_text
 from gigabrain_zenoh.config.map_image import MapYaml
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.decision.tasks.mission import Mission, PatrolFile
@@ -55,19 +56,21 @@ def _command(app: Any, command: str) -> Lines:
         return
     yield from ("", "| argument | type | default | meaning |", "|---|---|---|---|")
     for one in arguments:
-        names = ", ".join(f"`{cell(name)}`" for name in one.names)
+        negative = one.parameter.negative or ()
+        names = ", ".join(
+            f"`{cell(name)}`"
+            for name in one.names
+            if name in negative or not name.startswith(("--no-", "--empty-"))
+        )
         default = "required" if one.required else _default_of(one)
         about = " ".join((one.parameter.help or "").split())
         yield f"| {names} | {cell(_type_name(one.hint))} | {default} | {cell(about)} |"
 
 
 def _default_of(argument: Any) -> str:
-    shown = argument.parameter.show_default
     value = argument.field_info.default
-    if value is inspect.Parameter.empty or value is None or value in ("", ()):
-        return ""
-    text = shown(value) if callable(shown) else value
-    return f"`{cell(str(text))}`"
+    text = None if value is inspect.Parameter.empty else default_text(value)
+    return "" if text is None else f"`{cell(text)}`"
 
 
 def _type_name(hint: Any) -> str:

@@ -33,7 +33,9 @@ def test_every_page_is_in_the_navigation_once() -> None:
 def test_the_page_of_commands_has_each_with_its_options() -> None:
     page = "\n".join(reference.cli())
     assert re.findall(r"^## gigabrain (.*)$", page, re.MULTILINE) == [*COMMANDS]
-    assert re.search(r"^\| `X`.*\| number \| required \| Place in the map \[m\]\. \|$", page, re.M)
+    assert "--empty-" not in page
+    assert "| `--wait`, `--no-wait` | yes or no | `True` |" in page
+    assert "| `--seconds` | number | `10.0` | Length of each run [s]. |" in page
 
 
 def test_a_field_has_its_bounds_unit_and_default() -> None:
