@@ -15,6 +15,7 @@ from gigabrain_drivers import DRIVERS, LIDARS
 from gigabrain_drivers.driver.catalog import driver_class
 from gigabrain_drivers.driver.robot import RobotFile
 from gigabrain_drivers.lidars.base import source_class
+from gigabrain_drivers.sim.world_file import WorldFile
 from gigabrain_schemas.topics import SERVICES, TOPICS, messages
 from gigabrain_zenoh.cli.app import COMMANDS, make_app
 from gigabrain_zenoh.cli.options import default_text
@@ -179,6 +180,15 @@ def robot_file() -> Lines:
         yield from section(source_class(name).Options, f"A scan with driver: {name}")
 
 
+def world_file() -> Lines:
+    """Yield the page of the fields of a world file."""
+    yield from ("# Fields of a world file", "")
+    yield "[Worlds of your own](../how-to/worlds.md) shows how to write one."
+    yield from section(WorldFile, "The file")
+    for kind in nested(WorldFile):
+        yield from section(kind)
+
+
 def mission_file() -> Lines:
     """Yield the page of the fields of missions, patrols and saved maps."""
     yield from ("# Fields of missions, patrols and maps", "")
@@ -252,6 +262,7 @@ PAGES = {
     "messages": message_page,
     "deployment_file": deployment_file,
     "robot_file": robot_file,
+    "world_file": world_file,
     "mission_file": mission_file,
     "python": python,
     "examples": examples,

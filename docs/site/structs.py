@@ -56,6 +56,7 @@ def fields(kind: type[msgspec.Struct]) -> Iterator[Field]:
     info = inspect.type_info(kind)
     assert isinstance(info, inspect.StructType)
     types = {one.name: one.type for one in info.fields}
+    written = {one.name: one.encode_name for one in info.fields}
     defaults = {one.name: _default(one) for one in info.fields}
     for base in reversed(kind.__mro__):
         if base is Message or not base.__module__.startswith("gigabrain_"):
@@ -66,7 +67,11 @@ def fields(kind: type[msgspec.Struct]) -> Iterator[Field]:
                 about = comment[unit.end() :] if unit else comment
                 about = about or _about(types[name])
                 yield Field(
-                    name, text_of(types[name]), unit[1] if unit else "", defaults[name], about
+                    written[name],
+                    text_of(types[name]),
+                    unit[1] if unit else "",
+                    defaults[name],
+                    about,
                 )
 
 

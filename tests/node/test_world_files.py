@@ -113,6 +113,8 @@ def test_a_robot_drives_in_it_among_all_its_people(tmp_path: Path) -> None:
             r":6: walls\[0\].doors\[0\]: it ends at 2.4 m",
         ),
         ("size: [6, 4]\npeople:\n  - path: [[1, 1], [1, 1]]\n", r":3: people\[0\].path: 0 m round"),
+        ("size: [6, 4]\nwall_height: 0\n", r":2: wall_height: expected a number >= 0.05"),
+        ("size: [6, 4]\nmaterials: {floor: [0, 0, 0]}\n", r":2: materials: 'floor' is there"),
         ("size: [1, 1]\n", "found no place for the robot"),
         ("size: [6, 4]\nmap: none.yaml\n", "none.yaml: no such file"),
         ("size: [6, 4]\nmodel: none.xml\n", "none.xml: the world's model: No such file"),

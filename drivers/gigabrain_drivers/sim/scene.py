@@ -14,12 +14,10 @@ from gigabrain_drivers.sim.mjcf_world import has_floor, load_model, model_error
 from gigabrain_drivers.sim.model_measures import align, mismatches
 from gigabrain_drivers.sim.model_parts import PartFinder
 from gigabrain_drivers.sim.world import Box, ClosedPath, Light, Pose, Shape, Walk, World
-from gigabrain_drivers.sim.world_file import MATERIALS
+from gigabrain_drivers.sim.world_file import FLOOR, MATERIALS
 from gigabrain_zenoh.errors import ConfigError
 
 log = logging.getLogger(__name__)
-
-FLOOR = "floor"  # name of the floor's geom, material and texture
 
 SUN = Light((0.62, 0.60, 0.56), direction=(0.30, 0.38, -0.87))
 PERSON_RADIUS_M = 0.25

@@ -31,10 +31,12 @@ MOST_M = 400.0  # from the origin to anything in a world
 MAX_SHAPES, MAX_PEOPLE, MAX_LIGHTS, MAX_CORNERS = 4000, 16, 8, 100
 MIN_PATH_M = 0.5
 LEAF_HALF = 0.02  # [m], of a closed door
+FLOOR = "floor"  # name of the floor's geom, material and texture
 
 Place = Annotated[float, Meta(ge=-MOST_M, le=MOST_M)]  # [m]
 Size = Annotated[float, Meta(ge=0.005, le=2 * MOST_M)]  # [m]
-Height = Annotated[float, Meta(ge=0.0, le=20.0)]  # [m]
+Height = Annotated[float, Meta(ge=0.0, le=20.0)]  # [m], above the floor
+WallHeight = Annotated[float, Meta(ge=0.05, le=20.0)]  # [m]
 Angle = Annotated[float, Meta(ge=-10.0, le=10.0)]  # [rad]
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 Point = tuple[Place, Place]  # x, y [m]
@@ -78,7 +80,7 @@ class WallPart(_Part, frozen=True, kw_only=True):
     begin: Point = field(name="from")
     end: Point = field(name="to")
     thickness: Annotated[float, Meta(ge=0.01, le=5.0)] = 2 * WALL_HALF  # [m]
-    height: Height | None = None  # [m], of all walls of the file where it has none
+    height: WallHeight | None = None  # [m], of all walls of the file where it has none
     material: Material = "wall"
     doors: Annotated[tuple[DoorPart, ...], Meta(max_length=50)] = ()
 
@@ -156,7 +158,7 @@ class BoxPart(_Part, frozen=True, kw_only=True):
         if not (by_size or by_edges):
             raise ValueError("expected either `at` and `size`, or `x`, `y` and `z`")
         for name, pair in zip("xyz", edges, strict=True):
-            if pair and pair[1] - pair[0] < 0.001:
+            if pair and pair[1] - pair[0] < 0.0009:
                 raise ValueError(f"{name}: from {pair[0]:g} to {pair[1]:g}; expected to be larger")
         if by_edges and (self.yaw or self.bottom):
             raise ValueError("`yaw` and `bottom` are for a box with `at` and `size`")
@@ -230,7 +232,7 @@ class WorldFile(_Part, frozen=True, kw_only=True):
     description: Annotated[str, Meta(max_length=200)] = ""
     size: tuple[Size, Size] | None = None  # of the floor inside the outer walls [m]
     outer_walls: bool = True
-    wall_height: Height = WALL_HEIGHT  # [m]
+    wall_height: WallHeight = WALL_HEIGHT  # [m]
     floor: FloorPart = FloorPart()
     materials: Annotated[dict[Material, Rgb], Meta(max_length=100)] = field(default_factory=dict)
     start: tuple[Place, Place, Angle] | None = None  # of the robot: x, y [m], yaw [rad]
@@ -246,7 +248,7 @@ class WorldFile(_Part, frozen=True, kw_only=True):
         if self.size is None and not (self.map or self.model):
             raise ValueError("size: missing; expected the floor's [x, y] in metres")
         for name in self.materials:
-            if name in MATERIALS:
+            if name in (*MATERIALS, FLOOR):
                 raise ValueError(f"materials: {name!r} is there already; choose another name")
         known = (*MATERIALS, *self.materials)
         for part in ("walls", "boxes", "cylinders"):
