@@ -277,6 +277,8 @@ class GoalsOptions:
     "Simulated over real time."
     seed: int = 0
     "Random seed of the start pose, the sensor noise and the goals."
+    headings: bool = False
+    "All goals have a heading, and the body's own motions reach them in the true world."
 
 
 GOALS = GoalsOptions()
@@ -287,6 +289,7 @@ def goals(*, options: GoalsOptions = GOALS, json: JsonFile = None, logs: Path | 
 
     Example: gigabrain bench goals --bodies alpha --worlds house --goals 10 --speed 1
     Example: gigabrain bench goals --bodies turtlebot3_waffle --worlds house --hours 8
+    Example: gigabrain bench goals --bodies ackermann_car --worlds house --goals 30 --headings
 
     Columns: time to map the world, goals reached, contacts, least clearance,
     mean time per goal, largest error of position and heading at rest (against
@@ -310,6 +313,7 @@ def goals(*, options: GoalsOptions = GOALS, json: JsonFile = None, logs: Path | 
         hours=options.hours,
         speed=options.speed,
         seed=options.seed,
+        headings=options.headings,
         logs=logs,
     )
     result = run_async(measure_goals(options.bodies, options.worlds, course, print_progress))

@@ -14,7 +14,9 @@ import numpy as np
 import yaml
 from msgspec import Struct
 
-from gigabrain_drivers.driver.catalog import robot_path
+from gigabrain_drivers.driver.catalog import load_robot, robot_path
+from gigabrain_drivers.sim.worlds import load_world
+from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_NS, Pose
 from gigabrain_schemas.tasks import Goal
 from gigabrain_schemas.topics import BODY, MAP, POSE, STATE
@@ -27,6 +29,7 @@ from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.navigation.costmap import costmap, inflation
 from gigabrain_zenoh.navigation.global_planner import Point, warm_up
 from gigabrain_zenoh.navigation.grid_search import GridSearch
+from gigabrain_zenoh.qa.bench.reachable import reachable_poses
 from gigabrain_zenoh.qa.bench.slam_world import GrowthSampler, MapGrowth
 from gigabrain_zenoh.qa.robot_under_test import (
     LOOPBACK,
@@ -56,6 +59,7 @@ class GoalCourse(Struct, frozen=True, kw_only=True):
     hours: float = 0.0  # of the robot's time, at least
     speed: float = 5.0
     seed: int = 0
+    headings: bool = False  # all goals have one, and the body's own motions reach them
     logs: Path | None = None  # folder of the processes' logs
 
 
@@ -174,7 +178,11 @@ async def _run(deployment: Deployment, course: GoalCourse, show: Progress) -> Go
         show(f"{name}: starting")
         began_s = asyncio.get_running_loop().time()
         async with measured_robot(deployment, folder, START_S) as (group, bus):
-            sender = GoalSender(bus, group, deployment.seed)
+            poses = None
+            if course.headings:
+                robot, world = load_robot(who), load_world(deployment.world, deployment.seed)
+                poses = reachable_poses(robot.description(), world)
+            sender = GoalSender(bus, group, deployment.seed, poses)
             await group.until(lambda: sender.is_localized, "a map, and the robot in it", START_S)
             show(f"{name}: exploring")
             explored = await sender.explore()
@@ -227,9 +235,15 @@ def _folder(course: GoalCourse, name: str) -> Iterator[Path]:
 
 
 class GoalSender:
-    """Sends a robot to random goals; every other one has a heading."""
+    """Sends a robot to random goals; every other one has a heading.
 
-    def __init__(self, bus: Bus, group: ProcessGroup, seed: int) -> None:
+    With `poses` (n, 3) in the world, the goals are some of them, all with their heading.
+    """
+
+    def __init__(
+        self, bus: Bus, group: ProcessGroup, seed: int, poses: Floats | None = None
+    ) -> None:
+        self._reachable = poses
         self._bus, self._group, self._tasks = bus, group, Tasks(bus, silent_s=MAX_SILENCE_S)
         self._maps, self._poses, self._bodies = bus.latest(MAP), bus.latest(POSE), bus.latest(BODY)
         self._states = bus.latest(STATE)  # also sets the boot that all other messages must have
@@ -264,9 +278,7 @@ class GoalSender:
     async def send(self) -> None:
         """Send it to a random goal, and wait for the result."""
         # a person who blocks all ways walks on after a while
-        x, y = await self._retried(GigabrainError, self._random_place)
-        yaw = float(self._random.uniform(-math.pi, math.pi)) if self.sent % 2 else None
-        goal = Goal(x=x, y=y, yaw=yaw)
+        goal = await self._retried(GigabrainError, self._random_goal)
         self.sent += 1
         reason = await self._go(goal)
         if not reason:
@@ -345,6 +357,24 @@ class GoalSender:
         pose = self._poses.current
         assert pose
         return Pose(x=pose.x, y=pose.y, yaw=pose.yaw)
+
+    async def _random_goal(self) -> Goal:
+        if self._reachable is not None:
+            return await self._reachable_goal(self._reachable)
+        x, y = await self._random_place()
+        yaw = float(self._random.uniform(-math.pi, math.pi)) if self.sent % 2 else None
+        return Goal(x=x, y=y, yaw=yaw)
+
+    async def _reachable_goal(self, poses: Floats) -> Goal:
+        """Return one of `poses` in the map, away from the robot."""
+        assert self._world_from_map
+        here = await self._true_pose()
+        far = poses[np.hypot(poses[:, 0] - here.x, poses[:, 1] - here.y) > MIN_DISTANCE_M]
+        if not len(far):
+            raise GigabrainError("the body's own motions lead nowhere from where it starts")
+        x, y, yaw = far[int(self._random.integers(len(far)))].tolist()
+        there = compose(inverse(self._world_from_map), Pose(x=x, y=y, yaw=yaw))
+        return Goal(x=there.x, y=there.y, yaw=wrap_angle(there.yaw))
 
     async def _random_place(self) -> Point:
         """Return a reachable place in the map where the body can turn."""
