@@ -56,6 +56,8 @@ class RobotOptions:
     "How long time waits for the brain [s]; longer for a slow machine."
     behaviour: str = "navigate"
     "Behaviour: `navigate`, or `avoid`, which makes no map."
+    map: str = ""
+    "Saved map to find the robot in, instead of making one; see `gigabrain map list`."
     set: Sets = ()
     settings: SettingsFiles = ()
     resume: Resume | None = None
@@ -82,6 +84,8 @@ class RobotOptions:
         }
         if behaviours.needs_map(self.behaviour):
             values["perception"] = {"mapping": "slam"}
+        if self.map:
+            values["perception"] = {"mapping": "localize", "map": checked_map(self.map)}
         return values | {"decision": {"behaviour": self.behaviour, "settings": settings}}
 
 
@@ -106,6 +110,19 @@ class ViewOptions:
 
 
 ROBOT, VIEW = RobotOptions(), ViewOptions()
+
+
+def checked_map(name: str) -> str:
+    """Return the name of a saved map, or the path of its file. Raises ConfigError."""
+    from gigabrain_zenoh.errors import unknown
+    from gigabrain_zenoh.mapping import map_file
+    from gigabrain_zenoh.mapping.map_list import saved_maps
+
+    path = map_file.path_of(name)
+    if not path.is_file():
+        raise unknown("map", name, [one.name for one in saved_maps()[0]] or ["none"])
+    map_file.load(path)
+    return name if path == map_file.saved_map_path(name) else str(path.absolute())
 
 
 def demo(*, robot: RobotOptions = ROBOT, view: ViewOptions = VIEW) -> int:
@@ -142,6 +159,7 @@ def up(
     deployment: str,
     *,
     host: str | None = None,
+    map: str = "",
     set: Sets = (),
     settings: SettingsFiles = (),
     keys: Path | None = None,
@@ -157,12 +175,16 @@ def up(
     Args:
         deployment: Deployment file, or the name of a known one.
         host: Which of the file's hosts this is; required if it has several.
+        map: Saved map to localize in, instead of what the file says of maps.
         keys: Folder of this host's identity, instead of the one in the file.
         level: Lowest level to log.
     """
     from gigabrain_zenoh.host.terminal import LINES, Display, writer
     from gigabrain_zenoh.launch.up import up as run
 
+    if map:
+        place = checked_map(map)
+        set = (*set, "perception.mapping=localize", f"perception.map={place}")
     merged = merged_file(deployment, settings, set, keys)
     path, loaded = deployment_path(deployment), merged.deployment
     try:

@@ -4,14 +4,8 @@ import asyncio
 import time
 
 from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, on_bus, print_line
-from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
+from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.signals import run_async
-
-NO_MAPPING = (
-    "no process makes or uses a map; set perception: {mapping: slam} or {mapping: localize}, "
-    "and check that your keys may ask"
-)
-SAVE_TIMEOUT_S = 20.0  # a large map takes long to write
 
 
 def save(name: str, /, *, at: RobotAddress = LOCAL, replace: bool = False) -> None:
@@ -27,25 +21,10 @@ def save(name: str, /, *, at: RobotAddress = LOCAL, replace: bool = False) -> No
     """
     import getpass
 
-    import msgspec
+    from gigabrain_zenoh.client.zones import save_map
 
-    from gigabrain_schemas.requests import MapRequest
-    from gigabrain_schemas.topics import MAP_SAVE
-
-    try:
-        fields = {"name": name, "replace": replace, "source": getpass.getuser()}
-        request = msgspec.convert(fields, MapRequest)
-    except msgspec.ValidationError:
-        raise ConfigError(
-            f"invalid map name {name!r}; expected letters, digits, - _ . and no file extension"
-        ) from None
-
-    replies = on_bus(at, lambda bus: bus.ask(MAP_SAVE, request, timeout_s=SAVE_TIMEOUT_S))
-    if not replies:
-        raise BodyLost(NO_MAPPING)
-    if not replies[0].ok:
-        raise Refused(replies[0].text)
-    print_line(replies[0].text)
+    user = getpass.getuser()
+    print_line(on_bus(at, lambda bus: save_map(bus, name, replace=replace, source=user)))
 
 
 def list_() -> None:
@@ -79,23 +58,10 @@ def load(name: str, /, *, proceed: bool = False, at: RobotAddress = LOCAL) -> No
     """
     import getpass
 
-    import msgspec
+    from gigabrain_zenoh.client.zones import load_map
 
-    from gigabrain_schemas.topics import MAP_LOAD
-    from gigabrain_schemas.zones import MapLoadRequest
-
-    mapping = "slam" if proceed else "localize"
-    try:
-        fields = {"name": name, "mapping": mapping, "source": getpass.getuser()}
-        request = msgspec.convert(fields, MapLoadRequest)
-    except msgspec.ValidationError:
-        raise ConfigError(f"invalid map name {name!r}; see `gigabrain map list`") from None
-    replies = on_bus(at, lambda bus: bus.ask(MAP_LOAD, request, timeout_s=SAVE_TIMEOUT_S))
-    if not replies:
-        raise BodyLost(NO_MAPPING)
-    if not replies[0].ok:
-        raise Refused(replies[0].text)
-    print_line(replies[0].text)
+    user, mapping = getpass.getuser(), "slam" if proceed else "localize"
+    print_line(on_bus(at, lambda bus: load_map(bus, name, mapping=mapping, source=user)))
 
 
 def info(name: str, /) -> None:

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
 
 Number = Annotated[float | None, Parameter(allow_leading_hyphen=True)]
 Numbers = Annotated[list[float], Parameter(allow_leading_hyphen=True)]
-ANSWER_S = 5.0
 WAIT_S = 3.0  # for the robot's pose
 
 
@@ -114,7 +113,7 @@ def add_zone(
 async def _zones(bus: "Bus") -> "Zones":
     """Return the kept zones. Raises BodyLost."""
     from gigabrain_schemas.topics import ZONES
-    from gigabrain_zenoh.cli.map import NO_MAPPING
+    from gigabrain_zenoh.client.zones import NO_MAPPING
     from gigabrain_zenoh.codec import Codec
 
     kept = await bus.kept(ZONES)
@@ -148,17 +147,11 @@ async def _ask(bus: "Bus", fields: dict[str, Any]) -> str:
 
     import msgspec
 
-    from gigabrain_schemas.topics import ZONES_CHANGE
     from gigabrain_schemas.zones import ZonesRequest
-    from gigabrain_zenoh.cli.map import NO_MAPPING
+    from gigabrain_zenoh.client.zones import change_zones
 
     try:
         request = msgspec.convert({**fields, "source": getpass.getuser()}, ZonesRequest)
     except (ValueError, OverflowError) as error:  # msgspec.ValidationError is one
         raise ConfigError(f"not a valid place or zone: {error}") from None
-    replies = await bus.ask(ZONES_CHANGE, request, timeout_s=ANSWER_S)
-    if not replies:
-        raise BodyLost(NO_MAPPING)
-    if not replies[0].ok:
-        raise Refused(replies[0].text)
-    return replies[0].text
+    return await change_zones(bus, request)

@@ -18,12 +18,13 @@ from gigabrain_schemas.safety import Health, LogRecord, SafetyState
 from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_schemas.sim import SimPoses, SimRequest
 from gigabrain_schemas.tasks import GoalRequest
+from gigabrain_schemas.zones import SavedMapInfo, Zones, ZonesRequest
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.ui.steering import ViewerScene
 
 ABOUT, STATE, SCAN, MAP, HEALTH, LOG, REPLY, IMAGE, TASK = range(1, 10)  # to the browser
-SCENE, POSES = 10, 11
+SCENE, POSES, ZONES = 10, 11, 12
 LOGIN, DRIVE, ASK = range(1, 4)  # from the browser
 MAX_KEPT_LINES = 30  # of the log, for viewers that connect later
 
@@ -64,13 +65,15 @@ class PageRequest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     id: Annotated[int, Meta(ge=0, le=2**31)]
     what: Literal[
-        "estop", "release", "enable", "take", "goal", "cancel", "settings", "set", "world"
-    ]
+        "estop", "release", "enable", "take", "goal", "cancel", "settings", "set", "world",
+        "zones", "maps", "map_save", "map_load",
+    ]  # fmt: skip
     estop_generation: Count = 0  # as the page shows it: a newer e-stop is not released unseen
     goal: GoalRequest | None = None
     world: SimRequest | None = None
+    zones: ZonesRequest | None = None
     process: Name = ""  # of a setting
-    name: Name = ""
+    name: Name = ""  # of a setting, or of a map
     value: Text = ""
 
 
@@ -90,6 +93,7 @@ class PageReply(Struct, frozen=True, kw_only=True):
     text: Text
     robot: str = ""  # type of the robot that confirmed it
     settings: tuple[Setting, ...] = ()  # of the robot; answers `settings`
+    maps: tuple[SavedMapInfo, ...] = ()  # answers `maps`
     not_confirmed: bool = False  # an e-stop without confirmation; the text gives the remedy
 
 
@@ -170,7 +174,9 @@ class PageView(ViewerScene):
         self._lines: list[bytes] = []
         self._described: BodyDescription | None = None
         self._numbers = itertools.count()
+        self._zones = Zones()
         super().__init__(bus)
+        bus.latest(topics.ZONES, self._on_zones)
         self.newest_of(topics.SIM_POSES)
         bus.latest(topics.SIM_SCENE, lambda scene: self._keep("scene", as_json(SCENE, scene)))
 
@@ -225,6 +231,12 @@ class PageView(ViewerScene):
             self._keep("map", map_frame(message))
         else:
             self._keep("task", as_json(TASK, message))
+
+    def _on_zones(self, zones: Zones) -> None:
+        """Send zones that have changed; they are published again and again."""
+        before, self._zones = self._zones, zones
+        if (zones.zones, zones.places, zones.map) != (before.zones, before.places, before.map):
+            self._keep("zones", as_json(ZONES, zones))
 
     def _keep(self, slot: str, frame: bytes) -> None:
         self._kept[slot] = frame

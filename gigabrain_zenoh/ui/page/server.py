@@ -28,6 +28,7 @@ log = logging.getLogger(__name__)
 STATIC = Path(__file__).parent / "static"
 MAX_CONNECTIONS = 512  # of all kinds
 MAX_SILENT = 64  # connections without a request; the oldest gives way to the newest
+MAX_FRAME_BYTES = 16_384  # from a browser: a zone with all its corners
 REQUEST_TIMEOUT_S = 5.0
 FRAME_INTERVAL_NS = 100_000_000
 HEADERS = {
@@ -158,7 +159,7 @@ def _server(config: PageConfig, access: Access, sessions: Sessions) -> _Server:
             lifespan="off",
             http=ImpatientProtocol,
             ws="websockets-sansio",
-            ws_max_size=4096,
+            ws_max_size=MAX_FRAME_BYTES,
             ws_per_message_deflate=False,
             timeout_graceful_shutdown=1,
             limit_concurrency=MAX_CONNECTIONS,

@@ -12,6 +12,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from gigabrain_schemas.sim import SimRequest
 from gigabrain_schemas.tasks import GoalReply, TaskReply, TaskRequest
 from gigabrain_schemas.topics import GOAL, TASK_CHANGE
+from gigabrain_schemas.zones import SavedMapInfo
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.client.requests import (
     ANSWER_S,
@@ -22,6 +23,7 @@ from gigabrain_zenoh.client.requests import (
     release,
     set_param,
 )
+from gigabrain_zenoh.client.zones import change_zones, load_map, save_map, saved_maps
 from gigabrain_zenoh.errors import BodyLost, GigabrainError, NotConfirmed, Refused
 from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.plugins import package_version
@@ -80,9 +82,12 @@ class RequestHandler:
         """Carry out a request. Errors are part of the reply."""
         ok, robot, unconfirmed = True, "", False
         settings: tuple[Setting, ...] = ()
+        maps: tuple[SavedMapInfo, ...] = ()
         try:
             if request.what == "settings":
                 text, settings = "", await self._settings()
+            elif request.what == "maps":
+                text, maps = "", (await saved_maps(self._bus)).maps
             else:
                 text, robot = await self._carry_out(request)
         except GigabrainError as error:
@@ -94,6 +99,7 @@ class RequestHandler:
             text=text[:MAX_REPLY_CHARS],
             robot=robot,
             settings=settings,
+            maps=maps,
             not_confirmed=unconfirmed,
         )
 
@@ -105,6 +111,12 @@ class RequestHandler:
         if request.what == "set":
             names = request.process, request.name, request.value
             return await set_param(self._bus, *names), ""
+        if request.what == "zones":
+            return await self._change_zones(request), ""
+        if request.what == "map_save":
+            return await save_map(self._bus, request.name, replace=request.value == "replace"), ""
+        if request.what == "map_load":
+            return await load_map(self._bus, request.name), ""
         if request.what == "world":
             wanted = replace(request.world or SimRequest(), source=self._bus.process)
             return (await change_world(self._bus, wanted)).text, ""
@@ -115,6 +127,12 @@ class RequestHandler:
         else:
             reply = await enable(self._bus, BRAIN, take=request.what == "take")
         return reply.text, reply.robot_type
+
+    async def _change_zones(self, request: PageRequest) -> str:
+        if request.zones is None:
+            raise Refused("a change of zones needs a zone, a place or a name")
+        wanted = replace(request.zones, source=self._bus.process)
+        return await change_zones(self._bus, wanted)
 
     async def _settings(self) -> tuple[Setting, ...]:
         """Return the settings of all processes that a file can keep."""

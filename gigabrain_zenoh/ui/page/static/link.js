@@ -1,5 +1,5 @@
 // The WebSocket. A frame is a byte for its kind, then its content. Nothing is queued while it is down.
-const ABOUT = 1, STATE = 2, SCAN = 3, MAP = 4, HEALTH = 5, LOG = 6, REPLY = 7, IMAGE = 8, TASK = 9, SCENE = 10, POSES = 11
+const ABOUT = 1, STATE = 2, SCAN = 3, MAP = 4, HEALTH = 5, LOG = 6, REPLY = 7, IMAGE = 8, TASK = 9, SCENE = 10, POSES = 11, ZONES = 12
 const LOGIN = 1, DRIVE = 2, ASK = 3
 const SILENT_AFTER_MS = 1000, RETRY_MS = [300, 600, 1200, 2500], FULL_RETRY_MS = 5000
 const WRONG_TOKEN = 4401, FULL = 4429 // codes of a closed WebSocket
@@ -13,7 +13,7 @@ export class Link {
   #pending = new Map() // by the id of a request: what resolves it
   #receivedMs = 0
 
-  /** `on` has about, robot, scan, map, task, health, log, image, scene, poses, reply, connection(status) and login(). */
+  /** `on` has about, robot, scan, map, task, health, log, image, scene, poses, zones, reply, connection(status) and login(). */
   constructor(on, token) {
     this.on = on
     this.token = token
@@ -70,6 +70,7 @@ export class Link {
     else if (kind === SCAN) this.on.scan(new Float32Array(data, 4, 9), new Float32Array(data, 40))
     else if (kind === MAP) this.on.map(new DataView(data, 4, 20), new Int8Array(data, 24))
     else if (kind === TASK) this.on.task(json())
+    else if (kind === ZONES) this.on.zones(json())
     else if (kind === SCENE) this.on.scene(json())
     else if (kind === POSES) this.on.poses(new DataView(data).getUint32(4, true), new Float32Array(data, 8))
     else if (kind === HEALTH) this.on.health(json())

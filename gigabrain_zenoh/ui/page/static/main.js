@@ -5,6 +5,7 @@ import { MapView } from './map.js'
 import { $, setText, showFigures, showGate, showHealth, showImage, showLogLine, showSafety, showTables, showTask } from './panels.js'
 import { Settings } from './settings.js'
 import { WorldView } from './world_view.js'
+import { Zones } from './zones.js'
 
 const STOP_TIMEOUT_MS = 2500 // the server gives up after two seconds
 const BY_HAND = 'press the hardware e-stop or cut the power'
@@ -22,6 +23,10 @@ const world = new WorldView($('world'), {
   change: (request) => link.request('world', { world: request }),
   say: (text, ok) => show($('goal'), text, `note${ok ? '' : ' bad'}`),
 })
+const zones = new Zones(map, {
+  request: (what, more, timeoutMs) => link.request(what, more, timeoutMs),
+  say: (text, ok) => show($('zone-note'), text, `note${ok ? '' : ' bad'}`),
+})
 const link = new Link({
   about(info) {
     about = info
@@ -29,6 +34,7 @@ const link = new Link({
     setText($('robot'), info.body ? `${info.body.robot_type} · ${info.link}` : 'gigabrain')
     document.title = `${info.body?.robot_type ?? 'gigabrain'}${viewOnly() ? ' (view only)' : ''}`
     $('estop').disabled = viewOnly()
+    $('edit-zones').hidden = viewOnly()
     $('estop').querySelector('small').textContent = viewOnly() ? 'view only: this token cannot stop the robot' : 'space bar'
   },
   robot(now) {
@@ -53,6 +59,7 @@ const link = new Link({
     world.setScene(scene)
     $('show-world').hidden = false
   },
+  zones: (now) => zones.set(now),
   poses: (version, poses) => world.setPoses(version, poses),
   reply: showReply,
   connection(status) {

@@ -18,6 +18,8 @@ export class MapView {
   constructor(canvas, onGoal) {
     this.canvas = canvas
     this.onGoal = onGoal
+    this.layers = [] // functions that draw more, in metres
+    this.tool = null // takes a click instead of the goal
     this.follow = true
     this.dragMoves = false // a drag moves the map and sets no goal
     this.clear()
@@ -127,6 +129,7 @@ export class MapView {
     this.pixel = 1 / this.#scale
     this.#paintGrid(pen, w, h)
     this.#paintSurroundings(pen)
+    for (const paint of this.layers) paint(pen)
     const pose = this.robot?.pose
     if (pose) {
       pen.save()
@@ -246,7 +249,7 @@ export class MapView {
     this.#pointers.delete(event.pointerId)
     const goal = this.#drag?.goal
     this.#drag = null
-    if (goal && completed) this.onGoal(goal)
+    if (goal && completed) (this.tool ?? this.onGoal)(goal)
     this.draw()
   }
 
