@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +13,7 @@ from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.config import loading
 from gigabrain_zenoh.config.layers import Layers, Row, assignment, full_key, keys_of
 from gigabrain_zenoh.config.settings import LinkName
+from gigabrain_zenoh.config.yaml_text import Node
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError, UnknownName
 from gigabrain_zenoh.host.files import read_bounded, replace_file
@@ -67,7 +69,8 @@ def merge(
     for text in sets:
         one = assignment(text)
         key = full_key(one.key, _keys(layers, robot_type), SETTINGS)
-        layers.add(one._replace(key=key).nested(), lambda _, text=text: f"--set {text}")  # type: ignore[misc]
+        value = with_world(one._replace(key=key).nested(), Path())
+        layers.add(value, lambda _, text=text: f"--set {text}")  # type: ignore[misc]
     deployment = layers.convert(_type_of(layers))
     if path:
         deployment = with_keys(deployment, path, keys)
@@ -93,7 +96,18 @@ def _add_file(layers: Layers, path: Path) -> None:
     root = loading.document(loading.read(path), str(path))
     if root.entries is None:
         raise ConfigError(f"{path}:{root.line}: expected a mapping of settings")
-    layers.add(root, lambda line: f"{path}:{line}")
+    layers.add(with_world(root, path.absolute().parent), lambda line: f"{path}:{line}")
+
+
+def with_world(root: Node, folder: Path) -> Node:
+    """Return settings in which the file of a world, if they name one, is taken from `folder`."""
+    entries = tuple(
+        replace(one, node=replace(one.node, value=loading.beside(one.node.value, folder)))
+        if one.key == "world" and isinstance(one.node.value, str)
+        else one
+        for one in root.entries or ()
+    )
+    return replace(root, entries=entries, value={one.key: one.node.value for one in entries})
 
 
 def _type_of(layers: Layers) -> type[Deployment]:
