@@ -14,7 +14,12 @@ from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.topics import BODY, INTENT, SAFETY, STATE, TELEOP, command_topic
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.freshness import PreviousTick
-from gigabrain_zenoh.control.tracking import LONGEST_DELAY_TICKS, track, turn_correction
+from gigabrain_zenoh.control.tracking import (
+    LONGEST_DELAY_TICKS,
+    track,
+    turn_correction,
+    within_turning_circle,
+)
 from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.geometry.limits import NO_CAPS, ZERO, clamp, limits_of, ramp
 from gigabrain_zenoh.geometry.pose import PoseHistory, velocity_of
@@ -170,10 +175,10 @@ def _wanted_velocity(
         return replace(memory, off_track=wanted is None), wanted or ZERO
     memory = replace(memory, off_track=False)
     if teleop:
-        return memory, teleop
+        return memory, within_turning_circle(body, teleop)
     if memory.operator or intent is None or intent.twist is None:
         return memory, ZERO
-    return memory, intent.twist
+    return memory, within_turning_circle(body, intent.twist)
 
 
 def _command(velocity: Velocity, *, operator: bool = False) -> CmdVel:

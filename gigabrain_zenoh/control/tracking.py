@@ -49,7 +49,7 @@ def track(
     planned = _without_lag(before, after, intent.response)
     if body.max_lateral_speed > 0 and body.drive_type != "ackermann":
         return _holonomic(planned, error)
-    return _within_turning_circle(body, _unicycle(planned, error))
+    return within_turning_circle(body, _unicycle(planned, error))
 
 
 def turn_correction(turn_gain: float) -> float:
@@ -120,7 +120,7 @@ def _holonomic(planned: Velocity, error: Pose) -> Velocity:
     )
 
 
-def _within_turning_circle(body: BodyDescription, wish: Velocity) -> Velocity:
+def within_turning_circle(body: BodyDescription, wish: Velocity) -> Velocity:
     """Limit a car's turn rate to its tightest curve."""
     if body.drive_type != "ackermann":
         return wish

@@ -345,10 +345,15 @@ class GoalServer(InputSource):
     def _start_up(
         self, state: RobotState, world: WorldModel | None, verdict: SafetyState | None
     ) -> StepResult:
-        """Roam without a map, if the robot may explore and has no task; else stand."""
+        """Roam without a map, if the robot may explore and has no task; else stand.
+
+        A car stands as well: it cannot turn away on the spot.
+        """
         self._began_late = True
         self._tasks.wait(state)
-        if self._config.start != "explore" or not self._tasks.unused(state.boot):
+        body = self._source.body
+        car = body is not None and body.turning_radius > 0.0
+        if self._config.start != "explore" or not self._tasks.unused(state.boot) or car:
             text = f"waiting: {WaitReason.STARTING}"
             intent = Intent(behaviour=self._name, reason=text)
             return intent, StepOutcome(activity="waiting", reason=text)

@@ -10,7 +10,7 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.brain import Intent, JointTarget
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_zenoh.control.node import ControlMemory
-from gigabrain_zenoh.testing.samples import DRIVING
+from gigabrain_zenoh.testing.samples import DRIVING, WAFFLE
 from tests.unit.control.straight import SHUT, Drive, want
 
 
@@ -26,6 +26,18 @@ def test_turning_is_ramped_as_well() -> None:
     assert turns == pytest.approx(
         [0, -0.06, -0.12, -0.18, -0.24, -0.3, -0.36, -0.42, -0.48, -0.5, -0.5]
     )
+
+
+def test_a_car_is_told_to_turn_only_as_it_drives() -> None:
+    car = replace(WAFFLE, drive_type="ackermann", min_turning_radius=0.5)
+    drive = Drive(car)
+    for twist in (want(w=1.0), want(0.2, 1.0)):
+        for _ in range(50):
+            command = drive.go(twist)
+    assert command.linear_x == pytest.approx(0.2)
+    assert command.angular_z == pytest.approx(0.4)
+    on_the_spot = Drive(car)
+    assert {on_the_spot.go(teleop=Velocity(angular_z=1.0)).angular_z for _ in range(20)} == {0.0}
 
 
 def test_it_signs_its_commands_and_knows_what_they_rest_on() -> None:
