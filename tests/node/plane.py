@@ -80,7 +80,7 @@ class Plane:
         self.closest = math.inf  # [m], from the body's middle to anything
         self.maps = True  # whether perception makes any
         self.maps_sent = False  # and whether the last one has been sent
-        self.boot = BOOT
+        self.boot, self.description = BOOT, WAFFLE
         self.late_ticks = 0  # that worlds and places take on their way
         self._on_the_way: list[tuple[int, WorldModel, PoseInMap]] = []
 
@@ -142,7 +142,7 @@ class Plane:
         self._move()
         bench = self.bench
         if self.tick % 50 == 2:
-            bench.send(BODY, body(boot=self.boot))
+            bench.send(BODY, body(self.description, boot=self.boot))
             if self.maps and not self.maps_sent:
                 bench.send(MAP, as_map(self.known, self.tick, self.boot))
         x, y, yaw = self._odometry()

@@ -1,12 +1,14 @@
 """Models of others, in the style of public collections: driven by a table of names, unedited."""
 
+import dataclasses
 import logging
 import math
+import re
 from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers.driver.catalog import load_link, make_driver
+from gigabrain_drivers.driver.catalog import load_link, load_robot, make_driver, robot_files
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.sim.body import MujocoOptions, sim_body
 from gigabrain_drivers.sim.driver import MujocoDriver
@@ -297,3 +299,35 @@ async def test_meshes_and_included_files_lie_beside_the_model(tmp_path: Path) ->
     _, driver = make_driver(written(tmp_path, model=model), Run(folder=Path()))
     assert isinstance(driver, MujocoDriver)
     await driver.close()
+
+
+BODIES = [name for name in robot_files() if (load_robot(name).sim or {}).get("driver") == "mujoco"]
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_every_body_drives_the_same_by_other_names(name: str, tmp_path: Path) -> None:
+    """Each part of the model has another name, and the table says which."""
+    robot, _, options, folder = load_link(name, Run(folder=Path()))
+    assert isinstance(options, MujocoOptions)
+    body = sim_body(robot, options, Run(folder=folder))
+    parts = {name for kind, name in body.parts() if kind == "actuator"}
+    joints = {name for kind, name in body.parts() if kind == "joint"}
+    sensors = {name for kind, name in body.parts() if kind == "sensor"}
+    named = {"base", "free", "lidar", "gyro", "accelerometer", "attitude"}
+    words = sorted(parts | joints | sensors | named, key=len, reverse=True)
+    other = re.sub(rf'"({"|".join(words)})"', r'"their_\1"', body.model)
+    assert other != body.model
+    table = {key: f"their_{key}" for key in ("base", "lidar", "gyro", "accelerometer", "attitude")}
+    table |= {key: f"their_{key}" for key in sensors}
+    table |= {key: f"their_{f'{key}_joint' if f'{key}_joint' in joints else key}" for key in parts}
+    path = tmp_path / "model.xml"
+    path.write_text(other)
+    renamed = dataclasses.replace(body, model=other, path=str(path), names=table, motor=body.motor)
+    poses = []
+    for one in (body, renamed):
+        simulation = Simulation(one, ROOM, 3)
+        for _ in range(100):
+            simulation.command(0.2, 0.3)
+            simulation.advance()
+        poses.append((simulation.truth.pose(), simulation.odometry(), simulation.scan().tolist()))
+    assert poses[0] == poses[1]

@@ -21,6 +21,7 @@ from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.geometry.body_settings import restricted
 from gigabrain_zenoh.launch.deployment import load_deployment
 from gigabrain_zenoh.navigation.local_planner import LocalPlanner
 from gigabrain_zenoh.runtime.services import LOG_LEVEL, serve_params
@@ -202,6 +203,19 @@ def test_a_speed_limit_is_set_without_forgetting_what_was_seen() -> None:
     drive.planner.configure(WAFFLE, structs.replace(QUICK, linear_speed=0.2))
     assert drive.planner.plan(unseen).remaining > 3.5
     assert LocalPlanner(WAFFLE, QUICK).plan(unseen).remaining == pytest.approx(3.0, abs=0.1)
+
+
+async def test_a_planner_obeys_a_body_that_has_become_slower_on_its_way() -> None:
+    async with Plane(HALL, at=(0.6, 1.6, 0.0)) as plane:
+        await plane.go(0.2)
+        await plane.ask(GOAL, GoalRequest(x=4.2, y=1.6))
+        await plane.go(3.0)
+        assert plane.velocity.linear_x > 0.2
+        plane.description = restricted(plane.description, {"max_linear_speed": 0.05})
+        await plane.go(2.0)
+        assert 0.03 < plane.velocity.linear_x < 0.055
+        assert plane.status.current
+        assert plane.status.current.state == "active"
 
 
 @pytest.mark.parametrize(

@@ -179,6 +179,8 @@ class PartFinder:
                 self._missing("geom", part.geom, key, named)
             return geom
         touching = [one for one in geoms if one.contype or one.conaffinity]
+        if not touching and geoms and joint.parent.bodies:  # its rollers touch
+            return max(geoms, key=lambda one: float(one.size[0]))
         if len(touching) != 1:
             what = "several geoms that touch" if touching else "no geom that touches"
             name = joint.parent.name
