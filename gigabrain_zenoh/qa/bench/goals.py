@@ -175,13 +175,14 @@ async def _run(deployment: Deployment, course: GoalCourse, show: Progress) -> Go
         if course.hours:
             body = str(with_capacity(robot_path(deployment.body), folder / "body"))
             deployment = msgspec.structs.replace(deployment, body=body)
+        poses = None
+        if course.headings:
+            robot, place = load_robot(who), load_world(deployment.world, deployment.seed)
+            poses = reachable_poses(robot.description(), place)
+            show(f"{name}: {len(poses)} poses that it reaches")
         show(f"{name}: starting")
         began_s = asyncio.get_running_loop().time()
         async with measured_robot(deployment, folder, START_S) as (group, bus):
-            poses = None
-            if course.headings:
-                robot, world = load_robot(who), load_world(deployment.world, deployment.seed)
-                poses = reachable_poses(robot.description(), world)
             sender = GoalSender(bus, group, deployment.seed, poses)
             await group.until(lambda: sender.is_localized, "a map, and the robot in it", START_S)
             show(f"{name}: exploring")
