@@ -19,7 +19,7 @@ from tests.system.page import VIEWER, Browser, Robot, browser, needs_browser
 
 pytestmark = [needs_browser, pytest.mark.asyncio(loop_scope="module")]
 
-LOOKS = 100
+LOOKS = 300
 
 
 @pytest.fixture(scope="module")

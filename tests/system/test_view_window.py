@@ -86,7 +86,7 @@ async def test_a_window_shows_the_running_simulation_which_never_waits_for_it(
             await until(lambda: len(seen.states) > before + 100, "the robot goes on")
             window.send_signal(signal.SIGCONT)
             window.send_signal(signal.SIGINT)
-            window.communicate(timeout=30)
+            window.communicate(timeout=60)
             assert window.returncode in (0, 130)
     finally:
         robot.close()
