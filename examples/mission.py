@@ -8,7 +8,7 @@ MISSION = """
 places: {here: [0.0, 0.0], there: [0.4, 0.0]}
 do:
   - timeout:
-      seconds: 40
+      seconds: 120
       do:
         - goto: there
         - wait: 1

@@ -1,4 +1,4 @@
-"""Explore, but pause for as long as something is near.
+"""Patrol between two places, but pause for as long as something is near.
 
 Safety keeps the robot from touching anything by itself. This keeps a larger distance.
 """
@@ -8,11 +8,12 @@ import asyncio
 import gigabrain_zenoh
 
 NEAR_M, SCANS = 1.0, 100  # ten scans a second
+PATROL = "do: [{patrol: {points: [[0, 0], [0.5, 0.3]]}}]"  # without `loops`: for ever
 
 
 async def main() -> None:
     async with gigabrain_zenoh.connect() as robot:
-        task = await robot.tasks.explore()
+        task = await robot.tasks.carry_out(PATROL, label="patrol")
         paused = False
         scans = 0
         async for world in robot.topic("world"):
