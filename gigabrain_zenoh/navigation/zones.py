@@ -18,7 +18,6 @@ from gigabrain_schemas.base import Pose
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.zones import Zone
 from gigabrain_zenoh.geometry import polygon
-from gigabrain_zenoh.geometry.se2 import from_pose, transform
 from gigabrain_zenoh.geometry.sweep import Corners
 from gigabrain_zenoh.navigation.costmap import (
     NO_LANES,
@@ -43,6 +42,26 @@ Mask = NDArray[np.uint8]
 Box = tuple[float, float, float, float]  # least x and y [m], greatest x and y
 
 
+class LanePart(NamedTuple):
+    """A straight part of a one-way lane."""
+
+    corners: Floats  # (4, 2) [m]
+    begin: Floats  # (2,) [m], the middle of its first edge
+    ahead: Floats  # (2,), its direction, of length 1
+    length: float  # [m]
+    half_width: float  # [m]
+    against: int  # bits of the ways that it forbids
+
+    def leads_along(self, path: Floats) -> bool:
+        """Return whether a path (n, 2) [m] makes way along the direction of this part."""
+        x, y = self.ahead
+        off = path - self.begin
+        along, aside = off @ self.ahead, np.abs(off @ np.array((-y, x)))
+        inside = (along >= 0) & (along <= self.length) & (aside <= self.half_width)
+        both = inside[1:] & inside[:-1]
+        return bool(both.any()) and float(np.diff(along)[both].sum()) > LEAST_USE_M
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Area:
     """A zone with its polygon, or the middle of its lane."""
@@ -50,6 +69,7 @@ class Area:
     zone: Zone
     corners: Floats  # (n, 2) [m]
     box: Box
+    parts: tuple[LanePart, ...] = ()  # of a lane
 
     def near(self, x: float, y: float, reach: float) -> bool:
         """Return whether its box is within `reach` [m] of a place."""
@@ -131,12 +151,12 @@ class ZoneMap:
         planner knows no directions, and would take the shorter way through it.
         """
         found: list[Floats] = []
+        path = path[(np.abs(path - (x, y)) <= reach).all(axis=1)]
         for area in self.lanes:
             assert area.zone.lane_width
-            if area.near(x, y, reach + area.zone.lane_width):
-                parts = list(_lane_parts(area.corners, area.zone.lane_width))
-                if not any(_leads_along(path, part.corners, part.ahead) for part in parts):
-                    found += [part.corners for part in parts]
+            near = area.near(x, y, reach + area.zone.lane_width)
+            if near and not any(part.leads_along(path) for part in area.parts):
+                found += [part.corners for part in area.parts]
         return tuple(found)
 
     def speed_cap(
@@ -144,11 +164,11 @@ class ZoneMap:
     ) -> SpeedCap | None:
         """Return the lowest speed that a zone allows, there or on the way to it; None without one.
 
-        The body drives with `speed` [m/s] along `path` (n, 2) [m], which begins where it is.
+        The body drives with `speed` [m/s] along `path` (n, 2) [m], which begins where it is. A zone
+        counts where the body could touch it when it turns.
         """
         if not self.speeds:
             return None
-        outline = transform(from_pose(here), np.array(footprint))
         brake = BRAKING_SHARE * deceleration
         reach = float(np.hypot(*np.array(footprint).T).max())
         look = LEAST_LOOK_M + reach + speed * REACTION_S + speed**2 / (2 * brake)
@@ -159,7 +179,10 @@ class ZoneMap:
             assert area.zone.max_speed
             if not area.near(here.x, here.y, look):
                 continue
-            away = _way_to(area, outline, ahead, gone - reach)
+            touches = np.flatnonzero(polygon.distance(area.corners, ahead) <= reach)
+            if not len(touches):
+                continue
+            away = float(gone[touches[0]])
             left = max(0.0, away - speed * REACTION_S)
             allowed = math.sqrt(area.zone.max_speed**2 + 2 * brake * left)
             caps.append(SpeedCap(speed=allowed, zone=area.zone.name))
@@ -175,15 +198,17 @@ class ZoneMap:
         """Return the ways that lanes forbid; where a lane bends, those that both parts forbid."""
         found = np.zeros((grid.height, grid.width), np.uint8)
         for area in self.lanes:
-            assert area.zone.lane_width
-            lane = np.full_like(found, 255)
-            covered = np.zeros_like(found)
-            for part in _lane_parts(area.corners, area.zone.lane_width):
-                drawn = np.zeros_like(found)
-                fill(drawn, _in_cells(grid, part.corners), 1)
+            outlines = [_in_cells(grid, part.corners) for part in area.parts]
+            low = np.floor(np.min([one.min(axis=0) for one in outlines], axis=0)).clip(0)
+            high = np.max([one.max(axis=0) for one in outlines], axis=0).clip(low) + 1
+            window = found[int(low[1]) : int(high[1]) + 1, int(low[0]) : int(high[0]) + 1]
+            lane, covered = np.full_like(window, 255), np.zeros_like(window)
+            for part, outline in zip(area.parts, outlines, strict=True):
+                drawn = np.zeros_like(window)
+                fill(drawn, outline - low, 1)
                 lane[drawn == 1] &= np.uint8(part.against)
                 covered |= drawn
-            found |= np.where(covered == 1, lane, np.uint8(0))
+            window |= np.where(covered == 1, lane, np.uint8(0))
         return found
 
 
@@ -191,31 +216,8 @@ def _area(zone: Zone) -> Area:
     corners = np.array(zone.points)
     (left, bottom), (right, top) = corners.min(axis=0), corners.max(axis=0)
     box = float(left), float(bottom), float(right), float(top)
-    return Area(zone=zone, corners=corners, box=box)
-
-
-def _way_to(area: Area, outline: Floats, ahead: Floats, gone: Floats) -> float:
-    """Return the way to an area along a path [m]: 0 inside, inf if it is not on the path."""
-    touches = polygon.contains(outline, area.corners).any()
-    if touches or polygon.contains(area.corners, outline).any():
-        return 0.0
-    inside = np.flatnonzero(polygon.contains(area.corners, ahead))
-    return max(0.0, float(gone[inside[0]])) if len(inside) else math.inf
-
-
-class LanePart(NamedTuple):
-    """A straight part of a one-way lane."""
-
-    corners: Floats  # (4, 2) [m]
-    ahead: Floats  # (2,), its direction, of length 1
-    against: int  # bits of the ways that it forbids
-
-
-def _leads_along(path: Floats, corners: Floats, ahead: Floats) -> bool:
-    """Return whether a path (n, 2) [m] makes way along the direction of a lane's part."""
-    inside = polygon.contains(corners, path)
-    steps = np.diff(path, axis=0)[inside[1:] & inside[:-1]]
-    return float((steps @ ahead).sum()) > LEAST_USE_M
+    parts = tuple(_lane_parts(corners, zone.lane_width)) if zone.lane_width else ()
+    return Area(zone=zone, corners=corners, box=box, parts=parts)
 
 
 def _lane_parts(middle: Floats, width: float) -> Iterator[LanePart]:
@@ -232,7 +234,7 @@ def _lane_parts(middle: Floats, width: float) -> Iterator[LanePart]:
             cosine = (right * ahead[0] + down * ahead[1]) / math.hypot(right, down)
             bits |= int(cosine < AGAINST_COSINE) << way
         corners = np.array((begin + aside, begin - aside, end - aside, end + aside))
-        yield LanePart(corners, ahead, bits)
+        yield LanePart(corners, begin, ahead, length, width / 2, bits)
 
 
 def _in_cells(grid: OccupancyGrid, corners: Floats) -> Floats:
@@ -258,21 +260,29 @@ def _covered(corners: Floats, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     height, width = shape
     ends = np.roll(corners, -1, axis=0)
     crossings = np.zeros((height, width + 1), np.uint8)  # before a cell's middle, modulo 256
-    for (x, y), (to_x, to_y) in zip(corners, ends, strict=True):
-        first, last = sorted((math.ceil(y - 0.5), math.ceil(to_y - 0.5)))
-        if first < last:
-            rows = np.arange(max(first, 0), min(last, height))
-            at = x + (rows + 0.5 - y) / (to_y - y) * (to_x - x)
-            crossings[rows, np.ceil(at - 0.5).astype(np.intp).clip(0, width)] += 1
+    both = np.ceil(np.stack((corners[:, 1], ends[:, 1])) - 0.5).clip(0, height).astype(np.intp)
+    first, last = both.min(axis=0), both.max(axis=0)
+    edge, rows = _spread(last - first)
+    rows += first[edge]
+    (x, y), (to_x, to_y) = corners[edge].T, ends[edge].T
+    at = x + (rows + 0.5 - y) / np.where(to_y == y, 1.0, to_y - y) * (to_x - x)
+    columns = np.ceil(at - 0.5).clip(0, width).astype(np.intp)
+    np.add.at(crossings, (rows, columns), np.uint8(1))
     covered: NDArray[np.bool_] = np.cumsum(crossings[:, :-1], axis=1, dtype=np.uint8) & 1 == 1
     counts = np.ceil(np.abs(ends - corners).max(axis=1) / EDGE_STEP).astype(np.intp) + 1
-    edge = np.repeat(np.arange(len(corners)), counts)
-    share = (np.arange(len(edge)) - np.repeat(np.cumsum(counts) - counts, counts)) / counts[edge]
+    edge, step = _spread(counts)
+    share = step / counts[edge]
     points = corners[edge] + share[:, None] * (ends - corners)[edge]
     points = points[((points >= 0) & (points < (width, height))).all(axis=1)]
     columns, rows = points.astype(np.intp).T
     covered[rows, columns] = True
     return covered
+
+
+def _spread(counts: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return each index as often as `counts` (n,) says, and how often it has come before."""
+    index = np.repeat(np.arange(len(counts)), counts)
+    return index, np.arange(len(index)) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
 def clipped(corners: Floats, box: Box) -> Floats:

@@ -1,17 +1,23 @@
 """Zones and places: decision drives a body in a flat world by them, in fake time."""
 
+import functools
 import math
 
 import numpy as np
 import pytest
 
 from gigabrain_schemas.tasks import GoalRequest, MissionRequest
-from gigabrain_schemas.topics import GOAL, MISSION, ZONES
+from gigabrain_schemas.topics import GOAL, INTENT, MISSION, TASK, ZONES
 from gigabrain_schemas.zones import Place, Zone, Zones
+from gigabrain_zenoh.config.settings import DecisionConfig
+from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.geometry import polygon
 from gigabrain_zenoh.geometry.se2 import transform
+from gigabrain_zenoh.recording.process_replay import with_requests
+from gigabrain_zenoh.runtime.replay import record, replay
 from gigabrain_zenoh.testing.samples import WAFFLE
 from tests.node.plane import ROOM, Plane, drawn
+from tests.node.test_record_replay import unstamped
 
 CELLS = drawn(ROOM)  # 5.0 x 2.0 m
 HALL = np.zeros((120, 160), np.int8)  # 8 x 6 m
@@ -226,3 +232,25 @@ async def test_another_map_cancels_all_tasks() -> None:
         await plane.go(1.0)
         send(plane, loaded=2)
         await plane.until("cancelled", seconds=2)
+
+
+async def test_a_replay_with_zones_that_change_meanwhile_decides_the_same() -> None:
+    async with Plane(HALL, at=(1.0, 3.0, 0.0)) as plane:
+        events = record(plane.bench.network, plane.bench.clock)
+        await plane.go(0.4)
+        send(plane, places=(Place(name="far", x=7.0, y=3.0),))
+        await plane.go(0.2)
+        assert (await plane.ask(GOAL, GoalRequest(place="far", source="ann"))).ok
+        await plane.go(3.0)
+        before = plane.status.path
+        slow = box("slow", 1.5, 0.0, 2.5, 6.0, max_speed=0.1)
+        send(plane, box("spill", 3.0, 2.0, 4.0, 4.0), slow)
+        await plane.go(4.0)
+        assert plane.status.path != before
+        assert "speed zone 'slow'" in plane.intent.reason
+    then = [unstamped(key, data) for _, key, data in events if key == INTENT.key]
+    inputs = with_requests([event for event in events if event[1] not in (INTENT.key, TASK.key)])
+    assert ZONES.key in {key for _, key, _ in inputs}
+    node = functools.partial(decision.run, DecisionConfig(behaviour="navigate"))
+    now = [unstamped(key, data) for key, data in await replay(node, inputs) if key == INTENT.key]
+    assert now == then

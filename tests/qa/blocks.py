@@ -33,6 +33,7 @@ from gigabrain_zenoh.config.map_image import MapYaml
 from gigabrain_zenoh.decision.tasks.mission import Mission, PatrolFile
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.launch.deployment import deployment_type
+from gigabrain_zenoh.mapping.zone_file import ZoneFile
 from tests.places import ROOT
 
 BLOCK = re.compile(
@@ -87,7 +88,8 @@ def problem(block: Block) -> str:
 
 def _read_yaml(block: Block) -> None:
     errors = []
-    for one in (deployment_type(), Mission, PatrolFile, RobotFile, MapYaml, WorldFile):
+    kinds = (deployment_type(), Mission, PatrolFile, RobotFile, MapYaml, WorldFile, ZoneFile)
+    for one in kinds:
         try:
             loading.loads(block.text, one, block.value or "block")
             return
