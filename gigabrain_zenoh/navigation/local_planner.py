@@ -135,8 +135,13 @@ def classify_plan(model: MotionModel, track: Floats, dt: float, goal: Goal) -> P
     return "going round" if _aside(track, goal) > DETOUR_M else "going"
 
 
-def explain_plan(kind: PlanKind, track: Floats, discs: Floats, room: float, left: float) -> str:
-    """Return the reason of a plan as text: `room` [m] around the body, `left` [m] to go."""
+def explain_plan(
+    kind: PlanKind, track: Floats, discs: Floats, room: float, left: float, *, follows: bool = False
+) -> str:
+    """Return the reason of a plan as text: `room` [m] around the body, `left` [m] to go.
+
+    A car `follows` a path that may lead back.
+    """
     moving = _nearest_moving(track, discs)
     if left < AT_GOAL_M and not moving and kind in ("waiting", "turning in place"):
         return f"{kind}: at the goal"
@@ -144,6 +149,8 @@ def explain_plan(kind: PlanKind, track: Floats, discs: Floats, room: float, left
         return f"waiting: {moving}" if moving else f"waiting: no way on, {room:.2f} m of room"
     if kind == "going round":
         return f"going round: {moving or f'something {room:.2f} m away'}"
+    if kind == "backing out" and follows and not moving:
+        return f"backing: the path leads back, {left:.1f} m to go"
     if kind == "backing out":
         return f"backing out: {moving or f'no way on ahead, {room:.2f} m of room'}"
     if kind == "turning in place":
@@ -331,7 +338,9 @@ class LocalPlanner:
             twist=Velocity(linear_x=vx, linear_y=vy, angular_z=w),
             trajectory=_trajectory(planned.track, self._sampler.dt),
             kind=kind,
-            reason=explain_plan(kind, planned.track, scene.discs, room, left),
+            reason=explain_plan(
+                kind, planned.track, scene.discs, room, left, follows=len(scene.track) > 0
+            ),
             blocked=blocked,
             remaining=left,
         )
