@@ -85,6 +85,7 @@ COMMANDS = {
     "driver test": ("driver:test", "Run the conformance checks on a driver."),
     "driver trace": ("driver:trace", "Print the bytes on a robot's line, decoded."),
     "emulate": ("driver:emulate", "Emulate a robot's hardware on serial and TCP ports."),
+    "process new": ("processes:new", "Create the package of a process, perceptor or behaviour."),
     "keys new": ("keys:new", "Create the authority of a fleet, which issues identities."),
     "keys issue": ("keys:issue", "Issue an identity: a folder to copy to its host."),
     "keys revoke": ("keys:revoke", "Revoke all identities of a role."),
@@ -106,6 +107,7 @@ COMMANDS = {
 }
 GROUPS = {
     "driver": "Run, create and check drivers.",
+    "process": "Create processes of your own.",
     "keys": "Issue and revoke identities.",
     "bag": "Read, play and convert recordings.",
     "topic": "Inspect and publish messages.",

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 from cyclopts import Parameter
@@ -126,6 +126,28 @@ def run(name: str, /, *, set: tuple[str, ...] = (), process: ProcessOptions = LO
     elif settings:
         raise ConfigError(f"--set: {name} has no settings")
     return process.run(name, settings)
+
+
+def new(
+    name: str,
+    *,
+    kind: Literal["process", "perceptor", "behaviour"] = "process",
+    folder: Path = Path(),
+) -> None:
+    """Create the package of a process, perceptor or behaviour, with a test that passes.
+
+    Example: gigabrain process new lamp
+
+    Existing files are not overwritten.
+
+    Args:
+        name: Its name: lower-case letters, digits, underscores.
+        kind: A whole process, a perception step, or what decides where to drive.
+        folder: Where to create the package's folder.
+    """
+    from gigabrain_zenoh.qa.scaffold.packages import write_package
+
+    print(f"{write_package(kind, name, folder)}: README.md describes the next steps")
 
 
 def perception(*, process: ProcessOptions = LOCAL) -> int:

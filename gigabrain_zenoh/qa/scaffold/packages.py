@@ -1,0 +1,68 @@
+"""The package of a new process, perceptor or behaviour: it runs, and its test passes, as it is."""
+
+import keyword
+import re
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from string import Template
+from typing import Literal
+
+from gigabrain_zenoh.errors import ConfigError
+
+Kind = Literal["process", "perceptor", "behaviour"]
+PACKAGE_NAME = re.compile(r"[a-z][a-z0-9_]{0,30}[a-z0-9]")
+GROUPS: Mapping[Kind, tuple[str, str]] = {  # entry points, and what one names
+    "process": ("gigabrain.processes", "row:ROW"),
+    "perceptor": ("gigabrain.perceptors", "perceptor:${camel}"),
+    "behaviour": ("gigabrain.behaviours", "behaviour:${camel}"),
+}
+COMMON = {"pyproject.toml.txt": "pyproject.toml", "init.py.txt": "${package}/__init__.py"}
+FILES: Mapping[Kind, Mapping[str, str]] = {  # source and target of each file
+    "process": {
+        "process_readme.md.txt": "README.md",
+        "row.py.txt": "${package}/row.py",
+        "node.py.txt": "${package}/node.py",
+        "test_node.py.txt": "tests/test_node.py",
+    },
+    "perceptor": {
+        "perceptor_readme.md.txt": "README.md",
+        "perceptor.py.txt": "${package}/perceptor.py",
+        "test_perceptor.py.txt": "tests/test_perceptor.py",
+    },
+    "behaviour": {
+        "behaviour_readme.md.txt": "README.md",
+        "behaviour.py.txt": "${package}/behaviour.py",
+        "test_behaviour.py.txt": "tests/test_behaviour.py",
+    },
+}
+
+
+def write_package(kind: Kind, name: str, folder: Path) -> Path:
+    """Create the folder NAME-KIND and return it. Raises ConfigError if it exists."""
+    if not PACKAGE_NAME.fullmatch(name) or keyword.iskeyword(name):
+        raise ConfigError(
+            f"{name!r}: expected lower-case letters, digits and underscores, such as my_lamp"
+        )
+    path = folder / f"{name.replace('_', '-')}-{kind}"
+    words = {
+        "name": name,
+        "kind": kind,
+        "package": f"{name}_{kind}",
+        "dashed": path.name,
+        "camel": "".join(part.capitalize() for part in name.split("_")),
+    }
+    group, where = GROUPS[kind]
+    words |= {"group": group, "where": Template(where).substitute(words)}
+    try:
+        path.mkdir(parents=True)
+        for source, target in (COMMON | FILES[kind]).items():
+            text = (resources.files(__package__) / "template" / source).read_text(encoding="utf-8")
+            file = path / Template(target).substitute(words)
+            file.parent.mkdir(exist_ok=True)
+            file.write_text(Template(text).substitute(words), encoding="utf-8")
+    except FileExistsError:
+        raise ConfigError(f"{path} exists; nothing was written") from None
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error.strerror}") from None
+    return path

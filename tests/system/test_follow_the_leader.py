@@ -1,0 +1,81 @@
+"""The example `examples/follow_the_leader`: two plug-ins follow a person through a hall."""
+
+import asyncio
+import math
+import os
+import shutil
+import tomllib
+from pathlib import Path
+
+import numpy as np
+
+from gigabrain_schemas.requests import DescribeRequest
+from gigabrain_schemas.sim import SimPoses
+from gigabrain_schemas.topics import DESCRIBE, SIM_POSES, STATE
+from gigabrain_zenoh.runtime.connect import connect
+from gigabrain_zenoh.testing.processes import Home, robot_of
+from gigabrain_zenoh.testing.waiting import until
+from tests.places import ROOT
+
+EXAMPLE = ROOT / "examples/follow_the_leader"
+WAY_M = 6.0  # round two corners
+NEAREST_M, FARTHEST_M = 0.5, 1.6  # from middle to middle; both are some 0.2 m round
+
+
+class HomeWithExample(Home):
+    """A user's folders, where the example is installed."""
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """The environment of its processes."""
+        found = super().environment
+        return found | {"PYTHONPATH": f"{found['PYTHONPATH']}{os.pathsep}{self.folder / 'site'}"}
+
+
+def install(site: Path) -> None:
+    """What pip makes of the example."""
+    project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text())["project"]
+    info = site / "follow_the_leader-0.1.0.dist-info"
+    info.mkdir(parents=True)
+    lines = []
+    for group, points in project["entry-points"].items():
+        lines += [f"[{group}]", *(f"{name} = {where}" for name, where in points.items())]
+    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    (info / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    )
+    shutil.copy(EXAMPLE / "follow_the_leader.py", site)
+
+
+async def test_it_follows_a_person_round_corners_keeps_its_distance_and_touches_nobody(
+    tmp_path: Path,
+) -> None:
+    home = HomeWithExample(tmp_path)
+    install(home.folder / "site")
+    distances: list[float] = []  # by the physics, from the person to the robot
+    way = [0.0, 0.0]  # of the person, and of the robot [m]
+    last: list[np.ndarray] = []
+
+    def measure(_key: str, message: SimPoses) -> None:
+        person, robot = np.frombuffer(message.poses, "<f4").reshape(-1, 7)[:2, :2]
+        distances.append(math.dist(person, robot))
+        if last:
+            for i, (now, before) in enumerate(zip((person, robot), last, strict=True)):
+                way[i] += math.dist(now, before)
+        last[:] = person, robot
+
+    try:
+        file = shutil.copytree(EXAMPLE, tmp_path / "example") / "follow.yaml"
+        up = home.start("up", str(file), "--set", "router=tcp/127.0.0.1:0")
+        async with asyncio.timeout(240), connect(await robot_of(home, up), "test") as bus:
+            states = bus.latest(STATE)
+            await until(lambda: states.newest and states.newest.gate.mode == "enabled", "it may")
+            bus.subscribe(SIM_POSES, measure)
+            await until(lambda: way[0] > WAY_M, "the person has walked", within_s=180)
+            (driver,) = await bus.ask(DESCRIBE, DescribeRequest(), timeout_s=10, name="driver")
+    finally:
+        home.close()
+    assert driver.report["contacts"] == 0
+    assert min(distances) > NEAREST_M
+    assert max(distances) < FARTHEST_M
+    assert way[1] > 0.7 * WAY_M  # it cuts corners
