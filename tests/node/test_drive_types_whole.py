@@ -17,8 +17,8 @@ def world(half_x: float, half_y: float, start: Pose, *boxes: Box) -> World:
 
 
 async def test_a_car_turns_round_in_a_dead_end(tmp_path: Path) -> None:
-    """A lane of 1.4 m: half a circle of the car needs 0.9 m and its own length."""
-    plant = MujocoPlant("ackermann_car", world(2.5, 0.7, Pose(1.2, 0.0, 0.0)))
+    """A lane of 1.1 m: half a circle of the car takes 0.9 m between its middles, and more."""
+    plant = MujocoPlant("ackermann_car", world(2.5, 0.55, Pose(1.2, 0.0, 0.0)))
     status = await send_to(plant, (-2.4, 0.0, math.pi), tmp_path, 90.0)
     assert status.done, status
     assert status.done[0].state == "succeeded", status
