@@ -27,7 +27,8 @@ from gigabrain_zenoh.launch.deployment import Deployment
 Lines = Iterator[str]
 EXAMPLES = Path(__file__).parents[2] / "examples"
 LANGUAGES = {
-    ".py": "python", ".ipynb": "python", ".yaml": "yaml", ".toml": "toml", ".c": "c", ".js": "js", ".mjs": "js",
+    ".py": "python", ".ipynb": "python", ".yaml": "yaml", ".toml": "toml", ".c": "c", ".js": "js",
+    ".mjs": "js",
     ".html": "html", ".md": "markdown", ".sh": "sh",
 }  # fmt: skip
 

@@ -56,7 +56,7 @@ def write_package(kind: Kind, name: str, folder: Path) -> Path:
     words |= {"group": group, "where": Template(where).substitute(words)}
     try:
         path.mkdir(parents=True)
-        for source, target in (COMMON | FILES[kind]).items():
+        for source, target in {**COMMON, **FILES[kind]}.items():
             text = (resources.files(__package__) / "template" / source).read_text(encoding="utf-8")
             file = path / Template(target).substitute(words)
             file.parent.mkdir(exist_ok=True)
