@@ -226,12 +226,13 @@ async def test_a_robot_that_stands_writes_no_more(tmp_path: Path) -> None:
         assert robot.report("saves") == saves
 
 
-async def test_two_files_are_all_that_the_disk_holds(tmp_path: Path) -> None:
+async def test_two_maps_and_the_zones_are_all_that_the_disk_holds(tmp_path: Path) -> None:
     async with Walking(tmp_path / "state") as robot:
         robot.say()
         await robot.drive_until_saved(saves=4)
         await robot.look(50)
-    assert {path.name for path in (tmp_path / "state").iterdir()} == {"map_0.npz", "map_1.npz"}
+    names = {path.name for path in (tmp_path / "state").iterdir()}
+    assert names == {"map_0.npz", "map_1.npz", "zones.json"}
 
 
 async def test_a_disk_that_fills_up_is_told_once_and_mapping_goes_on(
