@@ -136,6 +136,10 @@ class Mapper:
         if self._autosave:
             self._autosave.close()
 
+    async def finish_writing(self) -> None:
+        """Return once the zones are written."""
+        await self._zones.finish_writing()
+
     def add_state(self, state: RobotState) -> None:
         """Add a robot state; must be called before `process_scan` for scans of the same tick."""
         body = self._bodies.current

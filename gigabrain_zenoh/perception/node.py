@@ -120,7 +120,9 @@ async def run(config: PerceptionConfig, bus: Bus, ready: Callable[[], None]) -> 
         def mapper() -> "Mapper":
             from gigabrain_zenoh.perception.mapper import Mapper  # imports numba: for maps only
 
-            return stack.enter_context(closing(Mapper(config, bus, body)))
+            made = stack.enter_context(closing(Mapper(config, bus, body)))
+            stack.push_async_callback(made.finish_writing)
+            return made
 
         if not kernels.beside:
             mapper()

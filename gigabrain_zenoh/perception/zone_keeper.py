@@ -148,6 +148,10 @@ class ZoneKeeper:
             self._now = self._bus.publish(ZONES, self._now, basis=tick)
             self._sent_tick = tick
 
+    async def finish_writing(self) -> None:
+        """Return once all is written."""
+        await self._writer.close()
+
     @property
     def map(self) -> str:
         """The name of the map in use; empty for one that was never saved."""
