@@ -198,18 +198,18 @@ class Navigator:
         goal: Goal,
         points: Floats,
     ) -> StepResult:
+        """Drive along a route that leads to its goal."""
         assert context.map_from_odom
         assert context.world
         to_odom = inverse(context.map_from_odom)
         here = compose(context.map_from_odom, context.pose)
         cap = self._speed_cap(context, here, points)
-        reach = DEFAULTS.window
-        around = here.x, here.y, reach
+        around = here.x, here.y, DEFAULTS.window
         keepouts = self._zone_map.keepouts_near(*around)
         lanes = self._zone_map.lanes_beside(*around, _rest_of(points, here)[1:])
         there = compose(to_odom, Pose(x=goal.x, y=goal.y, yaw=goal.yaw or 0.0))
-        turned, headings = np.array((to_odom.yaw, 0.0)), route.headings
-        headings = None if headings is None else headings + turned
+        headings = route.headings
+        headings = None if headings is None else headings + np.array((to_odom.yaw, 0.0))
         moment = local_planner.PlanRequest(
             tick=context.tick,
             pose=context.pose,
@@ -230,27 +230,29 @@ class Navigator:
         plan = self._local_planner(context).plan(moment)
         self._routes.report(
             RouteFeedback(
-                version=route.version,
-                arrived=plan.arrived,
-                blocked=plan.blocked,
+                version=route.version, arrived=plan.arrived, blocked=plan.blocked,
                 reason=plan.reason,
             )
-        )
+        )  # fmt: skip
         outcome = self._outcome(context, command, route, plan)
         headline = f"{route.activity}: {route.reason}" if route.activity else outcome.activity
-        late = context.delayed_s
-        slow = f"; slower: this host is late by {late:.2f} s" if late else ""
-        if cap and cap.speed < self._fastest(context):
-            slow += f"; at most {cap.speed:.2f} m/s: speed zone {cap.zone!r}"
         intent = self._intent(
             twist=plan.twist,
             trajectory=plan.trajectory,
             follow=bool(plan.trajectory),
             response=context.actuation,
             progress=outcome.progress,
-            reason=f"{headline}: {plan.reason}{slow}"[:500],
+            reason=f"{headline}: {plan.reason}{self._slowed(context, cap)}"[:500],
         )
         return intent, outcome
+
+    def _slowed(self, context: NavigationContext, cap: SpeedCap | None) -> str:
+        """Return what makes the robot slower, as the end of a text."""
+        late_s = context.delayed_s
+        slow = f"; slower: this host is late by {late_s:.2f} s" if late_s else ""
+        if cap and cap.speed < self._fastest(context):
+            slow += f"; at most {cap.speed:.2f} m/s: speed zone {cap.zone!r}"
+        return slow
 
     def _outcome(
         self,

@@ -148,15 +148,13 @@ def _search(
             now += 1
             continue
         row, column, first[now % BUCKETS] = entries[0, top], entries[1, top], entries[2, top]
-        entries[2, top], free, count = free, top, count - 1
-        cell = row * width + column
+        entries[2, top], free, count, cell = free, top, count - 1, row * width + column
         base, here, way = g[cell], flat[cell], mark[cell] - turn
         if way >= SETTLED_MARK:
             continue  # a duplicate: it was reached at less meanwhile
         if base + _bound(row, column, target) >= best - SUM_TOLERANCE and (row, column) != target:
             continue
-        mark[cell] += SETTLED_MARK
-        settled += 1
+        mark[cell], settled = mark[cell] + SETTLED_MARK, settled + 1
         begin, end = (0, 8) if way == ROOT_MARK else (way - MAX_BEND, way + MAX_BEND + 1)
         for onward in range(begin, end):
             to = onward & 7

@@ -235,6 +235,23 @@ def _estimate(terrain: Terrain, car: Car, pose: Pose, goal: Pose) -> float:
 
 
 @kernel
+def _set(memory: Nodes, node: int, at: Pose, cost: float, parent: int, move: int) -> None:
+    """Set a node that is open: its pose, the cost of its way, and the last step of that."""
+    pose, g, link = memory[0], memory[1], memory[2]
+    pose[node, 0], pose[node, 1], pose[node, 2] = at
+    g[node], link[node, 0], link[node, 1], link[node, 2] = cost, parent, move, 0
+
+
+@kernel
+def _begins_in_reverse(lengths: Floats) -> bool:
+    """Return whether the first segment of some length is driven backwards."""
+    for length in lengths:
+        if abs(length) > TINY:
+            return bool(length < 0.0)
+    return False
+
+
+@kernel
 def search(
     terrain: Terrain, car: Car, start: Pose, goal: Pose, needs: Floats, memory: Nodes
 ) -> int:
@@ -243,10 +260,10 @@ def search(
     lengths, turns = np.empty(SEGMENTS), np.empty(SEGMENTS)
     table[:, 0] = -1
     count, size, found, patience = 1, 1, ROOT, PATIENCE
-    pose[0, 0], pose[0, 1], pose[0, 2] = start
-    g[0], link[0, 0], link[0, 1], link[0, 2] = 0.0, ROOT, ROOT, 0
-    slot = _slot(table, _bin(terrain, start[0], start[1], start[2]))
-    table[slot, 0], table[slot, 1] = _bin(terrain, start[0], start[1], start[2]), 0
+    _set(memory, 0, start, 0.0, ROOT, ROOT)
+    key = _bin(terrain, start[0], start[1], start[2])
+    slot = _slot(table, key)
+    table[slot, 0], table[slot, 1] = key, 0
     _push(heap, 0, _estimate(terrain, car, start, goal), 0)
     while size > 0 and count < MAX_NODES - 2 * len(BENDS) - 1 and size < len(heap) - 32:
         node = _pop(heap, size)
@@ -255,43 +272,35 @@ def search(
             return node
         if link[node, 2]:
             continue
-        link[node, 2] = 1
-        if found != ROOT:
-            patience -= 1
-            if patience == 0:
-                return found
+        link[node, 2], patience = 1, patience - (found != ROOT)
+        if patience == 0:
+            return found
         here = (pose[node, 0], pose[node, 1], pose[node, 2])
-        left, move = _estimate(terrain, car, here, goal), link[node, 1]
-        if node % max(1, int(left / EXPAND_M)) == 0:
+        move = link[node, 1]
+        if node % max(1, int(_estimate(terrain, car, here, goal) / EXPAND_M)) == 0:
             shot, to_yaw = _to_goal(terrain, car, here, goal, needs, lengths, turns)
             total = g[node] + shot
-            first = 0.0
-            for n in range(SEGMENTS):
-                first = lengths[n] if first == 0.0 and abs(lengths[n]) > TINY else first
-            if move >= 0 and (first < 0.0) != (move >= len(BENDS)):
+            if move >= 0 and _begins_in_reverse(lengths) != (move >= len(BENDS)):
                 total += SWITCH_COST
             if total < math.inf and (found == ROOT or total < g[found]):
-                pose[count, 0], pose[count, 1], pose[count, 2] = goal[0], goal[1], to_yaw
-                g[count], link[count, 0], link[count, 1], link[count, 2] = total, node, SHOT, 0
+                _set(memory, count, (goal[0], goal[1], to_yaw), total, node, SHOT)
                 _push(heap, size, total, count)
                 found, count, size = count, count + 1, size + 1
         for to in range(2 * len(BENDS)):
-            share, reverse = BENDS[to % len(BENDS)], to >= len(BENDS)
-            length = -STEP_M if reverse else STEP_M
+            share, length = BENDS[to % len(BENDS)], STEP_M if to < len(BENDS) else -STEP_M
             x, y, yaw, cost = drive(terrain, car, here, share / car.radius, length, needs)
             if cost == math.inf:
                 continue
             if move >= 0:
-                cost += SWITCH_COST if reverse != (move >= len(BENDS)) else 0.0
+                cost += SWITCH_COST if (length < 0.0) != (move >= len(BENDS)) else 0.0
                 cost += BEND_COST * abs(share - BENDS[move % len(BENDS)])
             key = _bin(terrain, x, y, yaw)
             slot = _slot(table, key)
-            other, total = table[slot, 1], g[node] + cost
-            if table[slot, 0] == key and (link[other, 2] or g[other] <= total):
+            other, total, known = table[slot, 1], g[node] + cost, table[slot, 0] == key
+            if known and (link[other, 2] or g[other] <= total):
                 continue
-            pose[count, 0], pose[count, 1], pose[count, 2] = x, y, yaw
-            g[count], link[count, 0], link[count, 1], link[count, 2] = total, node, to, 0
-            if table[slot, 0] == key:
+            _set(memory, count, (x, y, yaw), total, node, to)
+            if known:
                 link[other, 2] = 1  # this one is cheaper
             table[slot, 0], table[slot, 1] = key, count
             _push(heap, size, total + _estimate(terrain, car, (x, y, yaw), goal), count)

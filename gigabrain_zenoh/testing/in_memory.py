@@ -52,8 +52,8 @@ class PatientJournal(InputLogger):
     """
 
     def in_time(self, job: Job, patience_s: float) -> bool:
-        """Wait for `job`, whatever patience the node has."""
-        return done(job, PATIENCE_S)
+        """Wait for `job`, whatever patience the node has; with none it only looks."""
+        return done(job, PATIENCE_S if patience_s else 0.0)
 
 
 class Net:

@@ -7,7 +7,7 @@ import pytest
 
 from gigabrain_drivers.sim.body import SimBody
 from gigabrain_drivers.sim.physics import Simulation
-from gigabrain_drivers.sim.world import Box, Shape, Walk, World
+from gigabrain_drivers.sim.world import Box, Shape, WalkingPath, World
 
 
 def waffle() -> SimBody:
@@ -54,7 +54,7 @@ def test_passing_close_is_measured_to_a_millimetre_and_is_no_contact() -> None:
 
 def test_the_person_counts_as_a_contact_and_never_comes_nearer_by_himself() -> None:
     path = ((3.0, 0.0), (-3.0, 0.0), (-3.0, 3.0), (3.0, 3.0))
-    world = replace(room(), people=(Walk(path),))
+    world = replace(room(), people=(WalkingPath(path),))
     standing = Simulation(waffle(), world, 0)
     run(standing, 5)
     assert standing.truth.contacts == 0

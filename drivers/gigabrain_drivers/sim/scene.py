@@ -13,7 +13,7 @@ from gigabrain_drivers.sim.body import SimBody, SimModel
 from gigabrain_drivers.sim.mjcf_world import has_floor, load_model, model_error
 from gigabrain_drivers.sim.model_measures import align, mismatches
 from gigabrain_drivers.sim.model_parts import PartFinder
-from gigabrain_drivers.sim.world import Box, ClosedPath, Light, Pose, Shape, Walk, World
+from gigabrain_drivers.sim.world import Box, ClosedPath, Light, Pose, Shape, WalkingPath, World
 from gigabrain_drivers.sim.world_file import FLOOR, MATERIALS
 from gigabrain_zenoh.errors import ConfigError
 
@@ -88,7 +88,7 @@ def add_lights(spec: mujoco.MjSpec, world: World) -> None:
 class Person:
     """Walks a closed path, and stands while one more step would come too close to the robot."""
 
-    def __init__(self, walk: Walk) -> None:
+    def __init__(self, walk: WalkingPath) -> None:
         self._path, self._step_m = ClosedPath(walk.corners), walk.speed * STEP_S
         self._walked = walk.start
         self.pose = self._path.at(walk.start)

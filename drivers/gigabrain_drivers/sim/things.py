@@ -18,7 +18,7 @@ from gigabrain_drivers.sim.scene import (
     yaw_quaternion,
 )
 from gigabrain_drivers.sim.truth import Truth
-from gigabrain_drivers.sim.world import ClosedPath, Colour, Pose, Walk, World
+from gigabrain_drivers.sim.world import ClosedPath, Colour, Pose, WalkingPath, World
 from gigabrain_drivers.sim.world_file import MATERIALS
 from gigabrain_schemas.sim import Thing
 from gigabrain_zenoh.errors import Refused
@@ -92,7 +92,7 @@ class Things:
         spare.pop(0)
         self._used[thing.name] = Used(thing, body)
         if thing.kind == "person" and thing.path:
-            self._walk(body, Person(Walk(((thing.x, thing.y), *thing.path), thing.speed)))
+            self._walk(body, Person(WalkingPath(((thing.x, thing.y), *thing.path), thing.speed)))
         self._changed()
         return thing
 

@@ -129,7 +129,7 @@ ORIGIN = Pose(0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Walk:
+class WalkingPath:
     """The way of a person, round and round a closed path."""
 
     corners: Corners
@@ -161,7 +161,7 @@ class World:
     floor: tuple[Colour, Colour] = ((0.62, 0.66, 0.70), (0.58, 0.62, 0.66))  # its two checks
     check: tuple[float, float] = (0.5, 0.5)  # size of one
     materials: Mapping[str, Colour] = field(default_factory=dict)  # beside those of every world
-    people: tuple[Walk, ...] = ()
+    people: tuple[WalkingPath, ...] = ()
     lights: tuple[Light, ...] = ()  # none: a low sun
     start: Pose = ORIGIN  # of the robot
     start_fixed: bool = False  # by the world's file; else a seed draws it

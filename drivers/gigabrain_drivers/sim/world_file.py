@@ -20,7 +20,7 @@ from gigabrain_drivers.sim.world import (
     Light,
     Pose,
     Shape,
-    Walk,
+    WalkingPath,
     World,
 )
 from gigabrain_zenoh.config import loading as config
@@ -290,7 +290,7 @@ def build_world(file: WorldFile, path: Path) -> World:
         floor=file.floor.colours,
         check=file.floor.check,
         materials=file.materials,
-        people=tuple(Walk(one.path, one.speed) for one in file.people),
+        people=tuple(WalkingPath(one.path, one.speed) for one in file.people),
         lights=tuple(one.light() for one in file.lights),
         start=Pose(*(file.start or (0.0, 0.0, 0.0))),
         start_fixed=file.start is not None,

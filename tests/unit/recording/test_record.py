@@ -101,6 +101,7 @@ def test_every_kind_of_message_is_drawn_for_viewers(tmp_path: Path) -> None:
     assert drawn == {
         "/viz/scan": "foxglove.LaserScan",
         "/viz/map": "foxglove.Grid",
+        "/viz/zones": "foxglove.SceneUpdate",
         "/viz/pose": "foxglove.PoseInFrame",
         "/viz/path": "foxglove.PosesInFrame",
         "/viz/image/front": "foxglove.RawImage",
