@@ -9,6 +9,7 @@ from gigabrain_schemas.tasks import GoalRequest
 from gigabrain_schemas.topics import BODY, CMD_VEL, GOAL
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.decision.context import ContextSource
+from gigabrain_zenoh.decision.zones import ZoneSource
 from gigabrain_zenoh.qa.faults.hostile import chosen_extremes
 from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.samples import body, state
@@ -18,7 +19,7 @@ from tests.node.plane import ROOM, Plane, as_map, drawn
 
 async def test_the_brains_own_commands_count_as_the_gate_lets_them_through() -> None:
     net = Net()
-    source = ContextSource(net.two)
+    source = ContextSource(net.two, ZoneSource(net.two))
     for bus in (net.one, net.two):
         bus.time.observe(state(10))
     net.one.publish(BODY, body())

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from gigabrain_schemas.brain import Intent
+from gigabrain_zenoh.cli.config import merged_values
 from gigabrain_zenoh.cli.demo import RobotOptions
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import behaviours
@@ -119,9 +120,9 @@ def test_a_demonstration_uses_its_settings_and_its_needs() -> None:
     spin = RobotOptions(behaviour="spin").values()
     assert spin["decision"] == {"behaviour": "spin", "settings": {"rate": 0.25}}
     assert "perception" not in spin
-    there = RobotOptions(behaviour="there", set=("x=2.5",)).values()
-    assert there["decision"] == {"behaviour": "there", "settings": {"x": 2.5, "y": 1.0}}
-    assert there["perception"] == {"mapping": "slam"}
+    there = merged_values(RobotOptions(behaviour="there").values(), (), ("x=2.5",)).deployment
+    assert there.decision.settings == {"x": 2.5, "y": 1.0}
+    assert there.perception.mapping == "slam"
 
 
 def test_its_name_and_its_settings_are_checked_like_ours() -> None:

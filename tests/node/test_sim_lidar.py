@@ -9,7 +9,7 @@ import pytest
 
 from gigabrain_drivers.sim.body import SimBody, SimLidar
 from gigabrain_drivers.sim.physics import Simulation
-from gigabrain_drivers.sim.world import Cylinder, Pose, Shape, Walk, World
+from gigabrain_drivers.sim.world import Cylinder, Pose, Shape, WalkingPath, World
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_zenoh.errors import Unsupported
 
@@ -101,7 +101,7 @@ def test_the_walking_person_is_seen_where_he_is_now() -> None:
         half_x=20,
         half_y=20,
         shapes=(),
-        people=(Walk(((3, -8), (3, 8), (9, 8), (9, -8)), start=7.2),),
+        people=(WalkingPath(((3, -8), (3, 8), (9, 8), (9, -8)), start=7.2),),
         start=Pose(0.064, 0, 0),
     )
     simulation = Simulation(waffle(EXACT), world, 0)

@@ -13,7 +13,7 @@ from gigabrain_drivers.sim.world import (
     Cylinder,
     Footprint,
     Pose,
-    Walk,
+    WalkingPath,
     clearance,
 )
 from gigabrain_drivers.sim.worlds import load_world, world_names
@@ -114,14 +114,14 @@ def test_a_closed_path_is_walked_by_arc_length_and_wraps() -> None:
 
 
 def test_the_person_walks_80_cm_in_a_second() -> None:
-    person = Person(Walk(((0, 0), (10, 0), (10, 1), (0, 1)), start=0.0))
+    person = Person(WalkingPath(((0, 0), (10, 0), (10, 1), (0, 1)), start=0.0))
     for _ in range(100):
         person.advance(lambda x, y: 5.0)
     assert person.pose == pytest.approx((0.8, 0, 0))
 
 
 def test_the_person_stops_half_a_metre_from_the_robot_and_goes_on_when_it_is_gone() -> None:
-    person = Person(Walk(((0, 0), (10, 0), (10, 1), (0, 1)), start=0.0))
+    person = Person(WalkingPath(((0, 0), (10, 0), (10, 1), (0, 1)), start=0.0))
     for _ in range(1000):
         person.advance(lambda x, y: math.hypot(x - 3.0, y))
     assert 3.0 - person.pose.x - 0.25 == pytest.approx(0.5, abs=0.009)
@@ -132,14 +132,14 @@ def test_the_person_stops_half_a_metre_from_the_robot_and_goes_on_when_it_is_gon
 
 
 def test_the_person_may_walk_away_from_a_robot_that_came_too_close() -> None:
-    person = Person(Walk(((0, 0), (10, 0), (10, 1), (0, 1)), start=1.0))
+    person = Person(WalkingPath(((0, 0), (10, 0), (10, 1), (0, 1)), start=1.0))
     for _ in range(100):
         person.advance(lambda x, y: math.hypot(x - 0.6, y))
     assert person.pose.x == pytest.approx(1.8)
 
 
 def test_standing_for_the_robot_counts_once_until_the_person_has_walked_on() -> None:
-    person = Person(Walk(((0, 0), (10, 0), (10, 1), (0, 1)), start=0.0))
+    person = Person(WalkingPath(((0, 0), (10, 0), (10, 1), (0, 1)), start=0.0))
     for _ in range(100):
         person.advance(lambda x, y: max(0.0, 1.0 - x))
     assert person.stood == 1
