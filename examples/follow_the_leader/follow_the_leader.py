@@ -120,7 +120,7 @@ class FollowConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class Follow:
-    """Keeps its distance to the leader, and faces it."""
+    """Keeps its distance to the leader, backing away where it must, and faces it."""
 
     Config = FollowConfig
     PARAMS: ClassVar[Mapping[str, str]] = {"distance": "a number [m]"}
@@ -149,7 +149,7 @@ class Follow:
         wanted = 0.8 * (away - self._config.distance) + max(0.0, forward)
         wanted *= max(0.0, math.cos(bearing))  # it turns first
         twist = Velocity(
-            linear_x=min(max(wanted, 0.0), self._config.max_linear_speed),
+            linear_x=clamped(wanted, self._config.max_linear_speed),
             angular_z=clamped(1.5 * bearing, self._config.max_angular_speed),
         )
         text = f"following, {away:.2f} m behind"
