@@ -44,6 +44,7 @@ from gigabrain_zenoh.decision.behaviours import (
 from gigabrain_zenoh.decision.behaviours.avoid import Avoid, AvoidConfig
 from gigabrain_zenoh.decision.context import ContextSource
 from gigabrain_zenoh.decision.detected_objects import ObjectsByPerceptor
+from gigabrain_zenoh.decision.drive_kernels import DriveKernels
 from gigabrain_zenoh.decision.node import InputSource
 from gigabrain_zenoh.decision.tasks import mission as missions
 from gigabrain_zenoh.decision.tasks.mission import Mission
@@ -52,7 +53,6 @@ from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile, TaskQueue
 from gigabrain_zenoh.decision.zones import ZoneSource
 from gigabrain_zenoh.errors import GigabrainError, Refused
 from gigabrain_zenoh.host.threads import BackgroundWriter
-from gigabrain_zenoh.kernels.precompile import Kernels
 from gigabrain_zenoh.logs import Fault
 
 if TYPE_CHECKING:
@@ -60,7 +60,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-DRIVE_KERNELS = "gigabrain_zenoh.decision.navigator:warm_up"  # calls each kernel once
 COMPILING = "mapping and planning compile meanwhile, once per installation"
 FIRST_MAP_TICKS = 3000  # how long after the kernels a first map may come
 STATUS_TICKS = 10  # robot/task is published at 5 Hz
@@ -258,7 +257,7 @@ class GoalServer(InputSource):
             bus, self.check, self._zones, folder=config.state_dir, scripts=settings.scripts
         )
         self._source = ContextSource(bus, self._zones)
-        self._kernels = Kernels(DRIVE_KERNELS, bus.input_log.in_time)
+        self._kernels = DriveKernels(bus.input_log.in_time)
         self._compile_first = config.compile_first or not bus.input_log.live
         self._avoid = Avoid(_roaming(settings))  # drives without a map
         self._began_late = False  # there were steps without the kernels
@@ -271,10 +270,10 @@ class GoalServer(InputSource):
         """Load the kernels, or begin to compile them. Raises ConfigError."""
         publishing = asyncio.ensure_future(self._publish_starting())
         try:
-            await self._kernels.load(wait=self._compile_first)
+            loaded = await self._kernels.load(wait=self._compile_first)
         finally:
             publishing.cancel()
-        if not self._kernels.beside:
+        if loaded:
             self._make_navigator()
 
     async def finish_preparing(self) -> None:
@@ -301,9 +300,10 @@ class GoalServer(InputSource):
         objects: ObjectsByPerceptor,
     ) -> StepResult:
         """Advance the queue and step the behaviour with the command that it wants."""
-        navigator = self._make_navigator() if self._kernels.loaded else None
-        if navigator is None or self._awaits_map(state):
+        loaded = self._kernels.loaded(self._source.body)
+        if not loaded or self._awaits_map(state):
             return self._start_up(state, world, verdict)
+        navigator = self._make_navigator()
         if self._config.start == "explore" and not self._started:
             self._tasks.begin(missions.explore_mission(), "roaming", state.boot)
         self._started = True

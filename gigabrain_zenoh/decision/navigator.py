@@ -39,7 +39,7 @@ from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.geometry.pose import compose, inverse
 from gigabrain_zenoh.geometry.se2 import from_pose, transform
-from gigabrain_zenoh.navigation import car_planner, global_planner, local_planner
+from gigabrain_zenoh.navigation import global_planner, local_planner
 from gigabrain_zenoh.navigation.costmap import inflation
 from gigabrain_zenoh.navigation.global_planner import Unreachable
 from gigabrain_zenoh.navigation.local_planner import DEFAULTS, LocalSettings
@@ -379,7 +379,6 @@ def _thinned(points: Floats) -> tuple[tuple[float, float], ...]:
 
 
 def warm_up() -> None:
-    """Call every kernel of planning and driving once, so that it is compiled."""
+    """Call every kernel that all bodies need for planning and driving, so that it is compiled."""
     global_planner.warm_up()
-    car_planner.warm_up()
     local_planner.warm_up(ANY_BODY)

@@ -45,10 +45,15 @@ class Kernels:
         except ModuleNotFoundError as error:
             raise missing_package(error) from None
         if self.beside:
-            self._loading = asyncio.ensure_future(self._compile_beside())
+            self.begin()
         else:
             await ensure_compiled(self._warm_up)
             self._job.set_result(None)
+
+    def begin(self) -> None:
+        """Begin to load them, unless that was done; compile them in between where necessary."""
+        if not self._loading and not self._job.done():
+            self._loading = asyncio.ensure_future(self._load_beside())
 
     async def finish(self) -> None:
         """Return once they are loaded. Raises ConfigError as above."""
@@ -63,21 +68,24 @@ class Kernels:
 
     @property
     def loaded(self) -> bool:
-        """Whether they can be used from the present scan on."""
+        """Whether they can be used from the present scan on. Raises ConfigError as above."""
+        if self._loading and self._loading.done():
+            self._loading.result()
         self._loaded = self._loaded or self._in_time(self._job, 0.0)
         return self._loaded
 
-    async def _compile_beside(self) -> None:
-        join_in()
-        data = {"event": "compiling"}
-        log.info("compiling, once per installation; works meanwhile", extra={"data": data})
-        await compile_in_child(self._warm_up, step_aside=True)
+    async def _load_beside(self) -> None:
         try:
+            if await asyncio.to_thread(_is_missing, self._warm_up):
+                join_in()
+                data = {"event": "compiling"}
+                log.info("compiling, once per installation; works meanwhile", extra={"data": data})
+                await compile_in_child(self._warm_up, step_aside=True)
+                log.info("compiled", extra={"data": {"event": "compiled"}})
             await asyncio.to_thread(_call, self._warm_up)
         except ModuleNotFoundError as error:
             raise missing_package(error) from None
         self._job.set_result(None)
-        log.info("compiled", extra={"data": {"event": "compiled"}})
 
 
 async def ensure_compiled(warm_up: str) -> None:

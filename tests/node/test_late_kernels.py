@@ -3,6 +3,7 @@
 import asyncio
 
 import pytest
+from msgspec.structs import replace
 
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.requests import MapRequest
@@ -12,15 +13,18 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.input_log import InputLogger
 from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
 from gigabrain_zenoh.decision.behaviours import WaitReason
+from gigabrain_zenoh.decision.drive_kernels import CAR_KERNELS, DRIVE_KERNELS, DriveKernels
 from gigabrain_zenoh.decision.goal_server import COMPILING, FIRST_MAP_TICKS
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.kernels import precompile
 from gigabrain_zenoh.plugins import find
 from gigabrain_zenoh.testing import in_memory
+from gigabrain_zenoh.testing.samples import WAFFLE
 from tests.node.mapping_robot import Robot
 from tests.node.plane import ROOM, Plane, drawn
 
 CELLS = drawn(ROOM)
+CAR = replace(WAFFLE, drive_type="ackermann", min_turning_radius=0.4)
 EXPLORES = DecisionConfig(behaviour="navigate", settings={"start": "explore"})
 
 
@@ -29,13 +33,13 @@ class Compiler:
 
     def __init__(self) -> None:
         self.may_end, self.began = asyncio.Event(), 0
-        self.missing = True
+        self.compiled: list[str] = []
         self._loaded, self._loop = asyncio.Event(), asyncio.get_running_loop()
 
-    async def compile(self, _warm_up: str, *, step_aside: bool = False) -> int:
+    async def compile(self, warm_up: str, *, step_aside: bool = False) -> int:
         self.began += 1
         await self.may_end.wait()
-        self.missing = False
+        self.compiled.append(warm_up)
         return 0
 
     def load(self, warm_up: str) -> None:
@@ -53,7 +57,7 @@ class Compiler:
 @pytest.fixture
 async def compiler(monkeypatch: pytest.MonkeyPatch) -> Compiler:
     made = Compiler()
-    monkeypatch.setattr(precompile, "_is_missing", lambda _: made.missing)
+    monkeypatch.setattr(precompile, "_is_missing", lambda warm_up: warm_up not in made.compiled)
     monkeypatch.setattr(precompile, "compile_in_child", made.compile)
     monkeypatch.setattr(precompile, "_call", made.load)
     monkeypatch.setattr(in_memory, "PatientJournal", InputLogger)
@@ -123,7 +127,7 @@ async def test_in_lock_step_all_is_compiled_first(compiler: Compiler) -> None:
     compiler.may_end.set()
     config = DecisionConfig(behaviour="navigate", compile_first=True)
     async with Plane(CELLS, config=config) as plane:
-        assert not compiler.missing
+        assert compiler.compiled
         await plane.ask(GOAL, GoalRequest(x=4.0, y=0.8))
         await plane.until("succeeded", seconds=60)
 
@@ -147,7 +151,7 @@ async def test_perception_with_a_saved_map_compiles_first(compiler: Compiler) ->
     with pytest.raises(ConfigError, match="nowhere"):
         async with Robot(config):
             raise AssertionError("it is ready")
-    assert not compiler.missing
+    assert compiler.compiled
 
 
 async def test_a_package_that_is_missing_is_named(
@@ -162,4 +166,22 @@ async def test_a_package_that_is_missing_is_named(
     await kernels.load(wait=False)
     with pytest.raises(ConfigError, match="gtsam"):
         await kernels.finish()
-    assert not kernels.loaded
+    with pytest.raises(ConfigError, match="gtsam"):
+        assert kernels.loaded
+
+
+async def test_a_car_has_its_own_kernels_compiled_once_it_is_known(compiler: Compiler) -> None:
+    compiler.may_end.set()
+    async with Plane(CELLS, config=EXPLORES) as plane:
+        plane.description = CAR
+        await compiler.end()
+        assert compiler.compiled == [DRIVE_KERNELS]
+        await plane.go(1.0)
+        assert compiler.compiled == [DRIVE_KERNELS, CAR_KERNELS]
+
+
+async def test_in_lock_step_those_of_cars_are_compiled_first_too(compiler: Compiler) -> None:
+    compiler.may_end.set()
+    kernels = DriveKernels(InputLogger().in_time)
+    assert await kernels.load(wait=True)
+    assert kernels.loaded(CAR)

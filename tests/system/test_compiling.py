@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("numba")
 
 from gigabrain_zenoh.cli import map as map_commands
-from gigabrain_zenoh.decision.goal_server import DRIVE_KERNELS
+from gigabrain_zenoh.decision.drive_kernels import CAR_KERNELS, DRIVE_KERNELS, TRAFFIC_KERNELS
 from gigabrain_zenoh.kernels import jit, precompile
 from gigabrain_zenoh.kernels import jit as kernels
 from gigabrain_zenoh.perception.node import LOCALIZE_KERNELS, MAP_KERNELS
@@ -26,6 +26,7 @@ def warm_up():
         print(os.getpid(), file=file)
 """
 WARM_UP = "counted:warm_up"
+WARM_UPS = (MAP_KERNELS, LOCALIZE_KERNELS, DRIVE_KERNELS, CAR_KERNELS, TRAFFIC_KERNELS)
 
 
 @pytest.fixture
@@ -77,7 +78,7 @@ def test_what_was_compiled_beforehand_is_not_compiled_at_the_start(calls: Path) 
     assert mark.exists()
 
 
-@pytest.mark.parametrize("warm_up", [MAP_KERNELS, LOCALIZE_KERNELS, DRIVE_KERNELS])
+@pytest.mark.parametrize("warm_up", WARM_UPS)
 def test_what_is_to_be_called_is_there(warm_up: str) -> None:
     assert isinstance(find(warm_up), types.FunctionType)
 
@@ -95,7 +96,7 @@ def test_what_is_compiled_beforehand_is_what_each_process_calls(
     monkeypatch.setattr(precompile, "compile_in_child", in_child)
     monkeypatch.setattr(precompile, "compile_all", done.append)
     map_commands.precompile()
-    assert sorted(tried) == sorted((MAP_KERNELS, LOCALIZE_KERNELS, DRIVE_KERNELS))
+    assert sorted(tried) == sorted(WARM_UPS)
     assert done == (tried if code else [])  # what a child cannot do
     assert capsys.readouterr().out.count(" s\n") == 2
 

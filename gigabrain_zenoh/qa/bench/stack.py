@@ -14,7 +14,7 @@ from gigabrain_schemas.tasks import GoalRequest
 from gigabrain_schemas.topics import GOAL, HEALTH, INTENT
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
-from gigabrain_zenoh.decision.goal_server import DRIVE_KERNELS
+from gigabrain_zenoh.decision.drive_kernels import DRIVE_KERNELS
 from gigabrain_zenoh.kernels.precompile import ensure_compiled
 from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.perception.node import MAP_KERNELS
