@@ -16,25 +16,25 @@ SIDE_BY_SIDE := -n 2 --dist loadfile
 MAKEFLAGS += --no-print-directory
 
 .PHONY: setup demo lint style rooms types site unit node system check test qa qa-tests extremes dockerfile signals \
-  ci-extra first-starts bench faults soak mutation fuzz golden recordings pictures clean
+  ci-extra slow first-starts bench faults soak mutation fuzz golden recordings pictures clean
 
 setup: $(WARM)
 
 $(DEMO): EXTRAS := sim,nav,page
 $(INSTALLED): EXTRAS := all,dev
 
-# uv where it is installed, pip otherwise
+# by uv, which pip fetches where there is none: it takes a third of pip's time
 $(DEMO) $(INSTALLED): pyproject.toml
 	@echo 'installing into $(VENV), which takes up to a minute'
 	@if command -v uv >/dev/null; then \
-	  uv venv --quiet --allow-existing --python '>=3.11' $(VENV) && \
-	  uv pip install --quiet --python $(BIN)/python -e '.[$(EXTRAS)]'; \
+	  uv venv --quiet --allow-existing --python '>=3.11' $(VENV); \
 	else \
 	  $(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	    { echo 'Python 3.11 or newer is needed; name it: make PYTHON=python3.12 $(MAKECMDGOALS)'; exit 1; }; \
 	  $(PYTHON) -m venv $(VENV) && \
-	  $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS)]'; \
+	  $(BIN)/python -m pip install --quiet --disable-pip-version-check uv; \
 	fi
+	@PATH="$$PATH:$(BIN)" uv pip install --quiet --python $(BIN)/python -e '.[$(EXTRAS)]'
 	@touch $(DEMO) $@
 
 # the kernels, compiled once
@@ -95,7 +95,7 @@ qa: setup
 # where it was stopped, with what failed or was not reached
 PASSED ?= .qa/passed_tests
 qa-tests: setup
-	$(PYTEST) -q -m 'qa or hypothesis' --hypothesis-profile=qa --passed $(PASSED) $(ARGS)
+	$(PYTEST) -q -m 'qa or slow or hypothesis' --hypothesis-profile=qa --passed $(PASSED) $(ARGS)
 
 # every extreme value in every message
 extremes: setup
@@ -132,9 +132,13 @@ fuzz: setup
 	  $(BIN)/python $$target -max_total_time=$(FUZZ_S) -verbosity=0 -print_final_stats=1 || exit 1; \
 	done
 
-# what CI runs behind `make test`: first starts in empty environments, and what the pages say to run
-ci-extra: setup first-starts
+# what CI runs behind `make test`: slow tests, first starts in empty environments, and what the pages
+# say to run
+ci-extra: setup slow first-starts
 	$(BIN)/python -m tests.qa.documentation
+
+slow: setup
+	$(PYTEST) $(SIDE_BY_SIDE) -q -m 'slow and not qa' $(or $(ARGS),tests)
 
 # from the sdist, from the wheel by each Python that is found, for one command, and `make demo`
 first-starts: setup

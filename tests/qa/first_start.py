@@ -29,8 +29,9 @@ Way = Literal["make", "wheel", "sdist", "tool"]
 EXTRAS = "[sim,nav,page]"
 OWN = ("VIRTUAL_ENV", "PYTHON", "GIGABRAIN", "XDG")  # variables that begin so are left out
 CACHES = ("XDG_CACHE_HOME", "XDG_STATE_HOME", "XDG_RUNTIME_DIR", "PIP_CACHE_DIR", "UV_CACHE_DIR")
+FOR_A_PATH_S = 10.0  # that it explores until it is ended
 LONGEST_S = 240  # until it has a map, on a busy machine
-MAKE_INTERRUPTED = 2  # exit code
+ENDED = (0, 2, -signal.SIGINT)  # exit codes after Ctrl-C: of the command, and two of make
 MINORS = range(11, 15)  # of Python 3
 Command = tuple[str | Path, ...]
 
@@ -93,9 +94,11 @@ def first_start(python: Path, tool: Tool, way: Way, built: Path) -> tuple[str, .
                         demo.wait(1.0)
                     if demo.returncode is not None or explores(folder):
                         break
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    demo.wait(FOR_A_PATH_S)
                 if demo.returncode is None:
                     os.killpg(demo.pid, signal.SIGINT)
-            if demo.returncode not in (0, MAKE_INTERRUPTED):
+            if demo.returncode not in ENDED:
                 raise subprocess.CalledProcessError(demo.returncode, command)
 
         if way == "make":
@@ -118,7 +121,7 @@ def first_start(python: Path, tool: Tool, way: Way, built: Path) -> tuple[str, .
 def explores(folder: Path) -> bool:
     """Return whether a log in `folder` says that a robot drives by its own map."""
     logs = folder.glob("xdg_state_home/**/decision.jsonl")
-    return any("exploring: going" in log.read_text() for log in logs)
+    return any('"exploring: ' in log.read_text() for log in logs)
 
 
 def commands(

@@ -63,6 +63,7 @@ def test_the_example_of_the_docs_is_this_one() -> None:
     assert FOUR_WHEELS + LINES in page
 
 
+@pytest.mark.slow
 async def test_a_board_with_whole_revolutions_and_ticks_passes_the_kit(tmp_path: Path) -> None:
     two = written(tmp_path / "two", TWO_WHEELS, "turtlebot3_waffle")
     four = written(tmp_path / "four", FOUR_WHEELS, "skid_rover")

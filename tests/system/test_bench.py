@@ -8,6 +8,7 @@ import pytest
 from gigabrain_zenoh.testing.processes import Home
 
 
+@pytest.mark.slow
 async def test_the_chain_is_timed_beside_a_bare_relay(home: Home, tmp_path: Path) -> None:
     report = tmp_path / "chain.json"
     options = ("--seconds", "1", "--rounds", "1", "--rates", "50", "--json", str(report))
@@ -25,6 +26,7 @@ async def test_the_chain_is_timed_beside_a_bare_relay(home: Home, tmp_path: Path
     assert "ratio p50" in command.out
 
 
+@pytest.mark.slow
 async def test_a_whole_robot_is_measured(home: Home, tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     pytest.importorskip("gtsam")

@@ -106,6 +106,7 @@ async def ready(home: Home, demo: CommandProcess) -> Endpoint:
     raise TimeoutError("the robot does not drive")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_a_program_runs_beside_a_robot(name: str, robot: Robot, tmp_path: Path) -> None:
     example = PROGRAMS[name]
@@ -124,6 +125,7 @@ def test_a_program_runs_beside_a_robot(name: str, robot: Robot, tmp_path: Path) 
     assert [made for made in example.makes if not (tmp_path / made).stat().st_size] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_a_notebook_runs_beside_a_robot(
     name: str, robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -28,6 +28,7 @@ def results(
     return {result.number: result for result in done}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", ROWS)
 def test_the_robot_stops_whatever_breaks(fault: FaultRow, results: dict[int, FaultResult]) -> None:
     result = results[fault.number]

@@ -23,6 +23,7 @@ async def home_of_robot(home: Home) -> AsyncIterator[Home]:
         yield home
 
 
+@pytest.mark.slow
 async def test_a_robot_that_explores_is_sent_elsewhere_and_says_what_became_of_it(
     home_of_robot: Home, tmp_path: Path
 ) -> None:

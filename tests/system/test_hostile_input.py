@@ -77,6 +77,7 @@ async def stranger_at(endpoint: Endpoint) -> AsyncIterator[tuple[ZenohTransport,
     await bus.close()
 
 
+@pytest.mark.slow
 async def test_a_flood_on_every_key_is_dropped_and_counted_and_the_robot_drives_on(
     home: Home,
 ) -> None:

@@ -153,6 +153,7 @@ async def test_a_killed_router_stops_the_robot_which_drives_again_soon_after_its
     await nothing_stale_or_touched(robot)
 
 
+@pytest.mark.slow
 async def test_with_manual_resume_no_fault_of_the_network_ends_in_motion(tmp_path: Path) -> None:
     with network("robot", "brain", subnet=78) as net, ExitStack() as stack:
         site = Site(stack, net, tmp_path, "manual")
@@ -202,6 +203,7 @@ CLEAR_LINKS = [link for link in LINKS if link[2] is not None]
 LOOK_TICKS, LOOKS = 100, 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "links",
     [

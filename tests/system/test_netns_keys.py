@@ -3,6 +3,8 @@
 import re
 from pathlib import Path
 
+import pytest
+
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.qa.probe import probing
@@ -29,6 +31,7 @@ def keyed(folder: Path, address: str) -> Path:
     return file
 
 
+@pytest.mark.slow
 async def test_three_hosts_with_keys_drive_and_each_may_do_what_it_is_there_for(
     tmp_path: Path,
 ) -> None:

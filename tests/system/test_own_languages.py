@@ -44,6 +44,7 @@ def run(*command: str) -> str:
     return ran.stdout
 
 
+@pytest.mark.slow
 async def test_a_decision_in_plain_python_drives(robot: Robot) -> None:
     speeds: list[float] = []
     async with connect(Endpoint(connect=(robot.router,)), "test", timeout_s=None) as bus:
@@ -55,6 +56,7 @@ async def test_a_decision_in_plain_python_drives(robot: Robot) -> None:
 
 
 @pytest.mark.skipif(NODE is None, reason="there is no Node here")
+@pytest.mark.slow
 async def test_javascript_sees_the_robot_through_the_page(robot: Robot) -> None:
     assert NODE
     flags = () if "function" in run(NODE, "-p", "typeof WebSocket") else WEBSOCKET_FLAG

@@ -219,6 +219,7 @@ async def test_one_that_hangs_is_named_shows_where_and_the_robot_drives_on(
     assert f"{name} has made no progress for 5 s" in log.out
 
 
+@pytest.mark.slow
 async def test_one_that_always_raises_is_given_up_and_the_robot_drives_on(start: object) -> None:
     robot = await start("mine")  # type: ignore[operator]
     robot.how.write_text("raise")

@@ -244,6 +244,7 @@ async def test_a_joystick_pressed_while_the_robot_stops_for_a_moment_steers_when
     await seen.at_rest()
 
 
+@pytest.mark.slow
 async def test_a_key_held_while_the_robot_was_latched_must_be_pressed_again(
     chromium: Browser, seen: Probe
 ) -> None:

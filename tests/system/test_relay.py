@@ -84,6 +84,7 @@ async def relay_lost(robot: Probe, *, killed: bool) -> None:
     assert (truth["stale_commands_executed"], truth["contacts"]) == (0, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "secure",
     [
