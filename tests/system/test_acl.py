@@ -24,7 +24,7 @@ ASKS = {
     "brain": "estop describe/driver",
     "operator": "estop release enable goal mission task_change map_save map_list map_load "
     "zones_change sim_change audit_log param/driver describe/driver",
-    "viewer": "audit_log describe/driver",
+    "viewer": "map_list audit_log describe/driver",
 }
 SAID = [topic.at("perception") for topic in (*TOPICS, ESTOP_SAID)]
 ASKED = [service.at("driver") for service in SERVICES]
