@@ -7,9 +7,10 @@ TYPE_CHECKING = False  # as in `typing`: a command handles signals before it imp
 if TYPE_CHECKING:
     from typing import Any
 
-    from gigabrain_zenoh.client.connection import Connection, SyncRobot, connect
+    from gigabrain_zenoh.client.connection import Connection, connect
     from gigabrain_zenoh.client.motion import Reached
     from gigabrain_zenoh.client.robot import Robot
+    from gigabrain_zenoh.client.sync_robot import SyncRobot
     from gigabrain_zenoh.errors import (
         BodyLost,
         BusError,
@@ -37,7 +38,7 @@ __all__ = [
 _MODULES = {
     "connect": "client.connection",
     "Connection": "client.connection",
-    "SyncRobot": "client.connection",
+    "SyncRobot": "client.sync_robot",
     "Reached": "client.motion",
     "Robot": "client.robot",
 }

@@ -6,6 +6,7 @@ from msgspec import Struct
 
 from gigabrain_schemas.base import Causes, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState
+from gigabrain_zenoh.errors import Unsupported
 from gigabrain_zenoh.geometry.limits import ZERO, at_rest
 
 GAIN = 2.0  # [1/s], speed per remaining distance near the goal
@@ -28,9 +29,17 @@ class Reached(Struct, frozen=True, kw_only=True):
 
 
 class OdometryMotion:
-    """One motion: gives the velocity for each state, until `done`."""
+    """One motion: gives the velocity for each state, until `done`.
+
+    Raises Unsupported for a turn of a body that cannot turn on the spot.
+    """
 
     def __init__(self, body: BodyDescription, start: RobotState, distance: float, angle: float):
+        if not distance and body.turning_radius:
+            raise Unsupported(
+                f"{body.robot_type} cannot turn on the spot: its tightest turn has a radius of "
+                f"{body.turning_radius:.2f} m; use `goto` with a heading, or `drive`"
+            )
         self._body, self._start, self._last = body, start.pose, start
         self._distance, self._angle = distance, angle
         self._turned, self._yaw = 0.0, start.pose.yaw

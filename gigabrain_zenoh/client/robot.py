@@ -108,7 +108,8 @@ class Robot:
     async def turn(self, angle: float, *, speed: float | None = None) -> Reached:
         """Turn on the spot by `angle` [rad], counter-clockwise if it is positive.
 
-        `speed` [rad/s] is an upper limit. Returns and raises as `move` does.
+        `speed` [rad/s] is an upper limit. Returns and raises as `move` does, and raises Unsupported
+        for a body that cannot turn on the spot.
         """
         return await self._carry_out(0.0, angle, speed)
 

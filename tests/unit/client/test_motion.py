@@ -4,10 +4,12 @@ import math
 from collections import deque
 
 import pytest
+from msgspec.structs import replace
 
 from gigabrain_schemas.base import Cause, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, GateStatus, RobotState
 from gigabrain_zenoh.client.motion import OdometryMotion, Reached
+from gigabrain_zenoh.errors import Unsupported
 from gigabrain_zenoh.gate.causes import SAFETY_STOP
 from gigabrain_zenoh.geometry.limits import clamp, limits_of
 
@@ -105,3 +107,10 @@ def test_an_obstacle_is_named_by_a_motion_towards_it(
     motion = OdometryMotion(BODY, plant.state, distance, angle)
     motion.step(plant.state, safety=(AHEAD,))
     assert motion.result().held_back == held_back
+
+
+def test_a_car_is_not_asked_to_turn_on_the_spot() -> None:
+    car, start = replace(BODY, drive_type="ackermann", min_turning_radius=0.4), Plant().state
+    with pytest.raises(Unsupported, match=r"toy cannot turn on the spot: .* 0\.40 m"):
+        OdometryMotion(car, start, 0.0, math.pi)
+    assert OdometryMotion(car, start, 0.5, 0.0).step(start).linear_x > 0

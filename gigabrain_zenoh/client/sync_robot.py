@@ -1,0 +1,185 @@
+"""A robot for scripts and notebooks without asyncio: each call returns when it is done."""
+
+import asyncio
+import threading
+from collections.abc import AsyncIterator, Coroutine, Iterator
+from pathlib import Path
+from typing import Any, TypeVar, overload
+
+from gigabrain_schemas.base import Message, Velocity
+from gigabrain_schemas.body import BodyDescription, Joint, RobotState
+from gigabrain_schemas.logs import AuditRecord
+from gigabrain_schemas.requests import GateReply
+from gigabrain_schemas.tasks import How, Task, TaskStatus
+from gigabrain_schemas.topics import Topic
+from gigabrain_zenoh.client.motion import Reached
+from gigabrain_zenoh.client.robot import Robot
+from gigabrain_zenoh.client.tasks import OnStatus, Tasks
+
+M = TypeVar("M", bound=Message)
+T = TypeVar("T")
+
+
+class EventLoopThread:
+    """An event loop in a thread of its own, which runs coroutines for other threads."""
+
+    def __init__(self) -> None:
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(
+            target=self._loop.run_forever, name="gigabrain", daemon=True
+        )
+        self._thread.start()
+
+    def run(self, coroutine: Coroutine[Any, Any, T]) -> T:
+        """Run `coroutine` and return its result; an interrupt cancels it."""
+        future = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
+        try:
+            return future.result()
+        except BaseException:
+            future.cancel()
+            raise
+
+    def close(self) -> None:
+        """Stop the loop and its thread."""
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+
+class SyncTasks:
+    """The tasks of one robot; each call returns when it is done. See `Tasks` for details."""
+
+    def __init__(self, tasks: Tasks, loop: EventLoopThread) -> None:
+        self._tasks, self._run = tasks, loop.run
+
+    def go_to(self, x: float, y: float, yaw: float | None = None, *, how: How = "replace") -> str:
+        """Send the robot to a pose in the map [m, m, rad]; return the task's name."""
+        return self._run(self._tasks.go_to(x, y, yaw, how=how))
+
+    def go_to_place(self, name: str, yaw: float | None = None, *, how: How = "replace") -> str:
+        """Send the robot to a named place of the map; return the task's name."""
+        return self._run(self._tasks.go_to_place(name, yaw, how=how))
+
+    def carry_out(
+        self, mission: str | Path, *, how: How = "replace", label: str = "mission"
+    ) -> str:
+        """Start a mission, given as a file or as its text; return the task's name."""
+        return self._run(self._tasks.carry_out(mission, how=how, label=label))
+
+    def explore(self, *, how: How = "replace") -> str:
+        """Start exploring until nothing unknown is reachable; return the task's name."""
+        return self._run(self._tasks.explore(how=how))
+
+    def cancel(self, task: str = "") -> str:
+        """Cancel a task by name, the current one (empty name), or `all`; return the reply."""
+        return self._run(self._tasks.cancel(task))
+
+    def pause(self, task: str = "") -> str:
+        """Pause a task; return the reply in words."""
+        return self._run(self._tasks.pause(task))
+
+    def resume(self, task: str = "") -> str:
+        """Resume a paused task; return the reply in words."""
+        return self._run(self._tasks.resume(task))
+
+    def status(self) -> TaskStatus:
+        """Return the current, the waiting and the most recent ended tasks."""
+        return self._run(self._tasks.status())
+
+    def result(self, task: str, on_status: OnStatus | None = None) -> Task:
+        """Wait until a task has ended, and return it."""
+        return self._run(self._tasks.result(task, on_status))
+
+
+class SyncRobot:
+    """A running robot; each call returns when it is done. See `Robot` for details."""
+
+    def __init__(self, robot: Robot, loop: EventLoopThread) -> None:
+        self._robot, self._run = robot, loop.run
+        self.tasks = SyncTasks(robot.tasks, loop)
+
+    def move(self, distance: float, *, speed: float | None = None) -> Reached:
+        """Drive straight by `distance` [m], backwards if it is negative."""
+        return self._run(self._robot.move(distance, speed=speed))
+
+    def turn(self, angle: float, *, speed: float | None = None) -> Reached:
+        """Turn on the spot by `angle` [rad], counter-clockwise if it is positive."""
+        return self._run(self._robot.turn(angle, speed=speed))
+
+    def goto(self, x: float | str, y: float | None = None, yaw: float | None = None) -> Task:
+        """Send the robot to a pose [m, m, rad] or a place's name, and wait until it arrives."""
+        return self._run(self._robot.goto(x, y, yaw))
+
+    def drive(self, linear_x: float = 0.0, angular_z: float = 0.0, *, seconds: float) -> None:
+        """Drive [m/s, rad/s] for `seconds` of the robot's time, then stop."""
+        self._run(self._robot.drive(linear_x, angular_z, seconds=seconds))
+
+    def set_base_velocity(
+        self, linear_x: float, linear_y: float = 0.0, angular_z: float = 0.0
+    ) -> Velocity:
+        """Drive [m/s, m/s, rad/s] for one second, or until the next call."""
+        return self._run(self._robot.set_base_velocity(linear_x, linear_y, angular_z))
+
+    def steer(self, wanted: Velocity) -> None:
+        """Publish an operator's velocity to the robot's control; repeat at 20 Hz."""
+        self._robot.steer(wanted)
+
+    def stop(self) -> None:
+        """Come to rest."""
+        self._run(self._robot.stop())
+
+    def estop(self, reason: str = "") -> GateReply:
+        """Stop at once and latch."""
+        return self._run(self._robot.estop(reason))
+
+    def release(self) -> GateReply:
+        """Release a latched robot."""
+        return self._run(self._robot.release())
+
+    def enable(self, source: str = "", *, take: bool = False) -> GateReply:
+        """Ask for the body, for this script or for `source`."""
+        return self._run(self._robot.enable(source, take=take))
+
+    def audit(self, newest: int = 100) -> tuple[AuditRecord, ...]:
+        """Return the newest entries of all audit logs, oldest first."""
+        return self._run(self._robot.audit(newest))
+
+    @property
+    def state(self) -> RobotState | None:
+        """The newest state; None while the robot is silent."""
+        return self._robot.state
+
+    def read_state(self) -> RobotState:
+        """Return the newest state."""
+        return self._run(self._robot.read_state())
+
+    def read_body(self) -> BodyDescription:
+        """Return the body's limits, footprint and sensors."""
+        return self._run(self._robot.read_body())
+
+    def get_joint_states(self) -> tuple[Joint, ...]:
+        """Return all measured joints."""
+        return self._run(self._robot.get_joint_states())
+
+    def get_sensor_data(self, sensor_name: str) -> Message:
+        """Return the next message of `scan`, `imu` or another topic."""
+        return self._run(self._robot.get_sensor_data(sensor_name))
+
+    @overload
+    def topic(self, topic: Topic[M]) -> Iterator[M]: ...
+
+    @overload
+    def topic(self, topic: str) -> Iterator[Any]: ...
+
+    def topic(self, topic: Topic[M] | str) -> Iterator[M]:
+        """Yield each message on a topic: `for scan in robot.topic("scan")`."""
+        messages = self._robot.topic(topic)
+        while True:
+            try:
+                yield self._run(_next_of(messages))
+            except StopAsyncIteration:
+                return
+
+
+async def _next_of(messages: AsyncIterator[M]) -> M:
+    return await anext(messages)
