@@ -127,7 +127,7 @@ def log(
     With --follow it continues with new lines of all hosts, until Ctrl-C.
 
     Args:
-        run: Folder of the run, or part of its name. Default: the newest run.
+        run: Folder of the run, or part of its name. Default: the one that runs, or the newest.
         level: Lowest level: debug, info, warning, error or critical.
         since: Maximum age: 90s, 10m, 2h, 1d.
         newest: Number of lines.

@@ -19,6 +19,7 @@ from gigabrain_zenoh.host.files import open_regular
 from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.host.signals import stop_signals
 from gigabrain_zenoh.logs import FILE_BYTES, LEVELS
+from gigabrain_zenoh.runtime.running import running
 
 LOG_FILES = "*.jsonl*"  # driver.jsonl, and the older driver.jsonl.1
 UNITS_S = {"s": 1, "m": 60, "h": 3600, "d": 86400}
@@ -54,9 +55,10 @@ def ago_ns(text: str, now_ns: int) -> int:
 
 
 def run_folder(name: str = "") -> Path:
-    """Return the folder of a run, by path or part of its name; the newest one without a name.
+    """Return the folder of a run, by path or part of its name.
 
-    Raises ConfigError and UnknownName.
+    Without a name it is the newest of those that run now, or else the newest of all. Raises
+    ConfigError and UnknownName.
     """
     if name and Path(name).is_dir():
         if not any(Path(name).glob(LOG_FILES)):
@@ -69,7 +71,8 @@ def run_folder(name: str = "") -> Path:
     found = [run for run in runs if name in run.name]
     if not found:
         raise unknown("run", name, [run.name for run in runs[-5:]])
-    return found[-1]
+    live = {robot.run_dir for robot in running()} if not name else set()
+    return next((run for run in reversed(found) if str(run) in live), found[-1])
 
 
 def read(folder: Path, wanted: LogFilter, newest: int) -> list[Line]:

@@ -15,7 +15,7 @@ from gigabrain_schemas.examples import example
 from gigabrain_schemas.requests import Description, ParamReply, ParamRequest
 from gigabrain_schemas.safety import Health, LogRecord
 from gigabrain_schemas.topics import PARAM
-from gigabrain_zenoh.config.settings import DecisionConfig
+from gigabrain_zenoh.config.settings import DecisionConfig, Endpoint
 from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.diagnostics.discovery import (
     Flow,
@@ -41,6 +41,7 @@ from gigabrain_zenoh.diagnostics.top import (
 )
 from gigabrain_zenoh.diagnostics.top_app import TopApp
 from gigabrain_zenoh.errors import ConfigError, Refused, UnknownName
+from gigabrain_zenoh.runtime.running import announced
 from gigabrain_zenoh.runtime.services import serve_params
 from gigabrain_zenoh.testing.in_memory import Net
 
@@ -149,6 +150,7 @@ def line(t: int, process: str = "driver", level: str = "info", **more: object) -
 def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Make a state folder with an old run and a new one."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "run"))
     base = tmp_path / "gigabrain" / "runs"
     for name in ("20260101T000000Z-demo-1", "20260102T000000Z-red-2"):
         (base / name).mkdir(parents=True)
@@ -169,6 +171,16 @@ def test_the_log_of_the_newest_run_is_read_in_the_order_of_time(runs: Path) -> N
     assert [e["t"] for e in read(folder, LogFilter(level="warning"), 9)] == [20, 30]
     assert [e["t"] for e in read(folder, LogFilter(since_ns=20), 9)] == [20, 30]
     assert run_folder("demo") == runs / "20260101T000000Z-demo-1"
+
+
+def test_the_log_of_a_run_that_goes_on_is_preferred_to_a_newer_one_that_has_ended(
+    runs: Path,
+) -> None:
+    older = runs / "20260101T000000Z-demo-1"
+    with announced("waffle", Endpoint(), older):
+        assert run_folder() == older
+        assert run_folder("red") == runs / "20260102T000000Z-red-2"
+    assert run_folder().name == "20260102T000000Z-red-2"
 
 
 def test_what_is_not_there_to_be_read_is_answered_with_what_is(runs: Path) -> None:
