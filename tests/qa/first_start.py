@@ -57,6 +57,7 @@ def main(
     for name in ("first state", "motion", "metre", "path", "verdict"):
         table.add_column(name)
     failed = 0
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # ends the robot too
     with tempfile.TemporaryDirectory(prefix="built-") as built:
         build = (sys.executable, "-m", "build", "--outdir", built, ROOT)
         subprocess.run(build, check=True, stdout=subprocess.DEVNULL)
@@ -89,15 +90,17 @@ def first_start(python: Path, tool: Tool, way: Way, built: Path) -> tuple[str, .
             """Drive until it explores by its map, then end it as Ctrl-C does."""
             command = list(map(str, words))
             with subprocess.Popen(command, cwd=at, env=environment, start_new_session=True) as demo:
-                for _ in range(LONGEST_S):
+                try:
+                    for _ in range(LONGEST_S):
+                        with contextlib.suppress(subprocess.TimeoutExpired):
+                            demo.wait(1.0)
+                        if demo.returncode is not None or explores(folder):
+                            break
                     with contextlib.suppress(subprocess.TimeoutExpired):
-                        demo.wait(1.0)
-                    if demo.returncode is not None or explores(folder):
-                        break
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    demo.wait(FOR_A_PATH_S)
-                if demo.returncode is None:
-                    os.killpg(demo.pid, signal.SIGINT)
+                        demo.wait(FOR_A_PATH_S)
+                finally:
+                    if demo.returncode is None:
+                        os.killpg(demo.pid, signal.SIGINT)
             if demo.returncode not in ENDED:
                 raise subprocess.CalledProcessError(demo.returncode, command)
 
