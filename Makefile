@@ -137,6 +137,7 @@ fuzz: setup
 ci-extra: setup slow first-starts
 	$(BIN)/python -m tests.qa.documentation
 
+# tests of some 12 s and more
 slow: setup
 	$(PYTEST) $(SIDE_BY_SIDE) -q -m 'slow and not qa' $(or $(ARGS),tests)
 

@@ -97,20 +97,20 @@ def precompile() -> None:
     Example: gigabrain precompile
 
     The compiled code is kept in the user's cache folder, or in NUMBA_CACHE_DIR.
-    After an update it is compiled again, at the latest at the first start,
-    before the robot drives.
+    After an update it is compiled again, at the latest at the first start, while
+    the robot drives.
     """
     run_async(_compile_all())
 
 
 async def _compile_all() -> None:
-    from gigabrain_zenoh.decision.drive_kernels import CAR_KERNELS, DRIVE_KERNELS, TRAFFIC_KERNELS
+    from gigabrain_zenoh.decision.drive_kernels import CAR_KERNELS, DRIVE_KERNELS
     from gigabrain_zenoh.perception.node import LOCALIZE_KERNELS, MAP_KERNELS
 
     print_line("compiling, which takes up to a minute")
     await asyncio.gather(  # they share no kernel
         _compile("mapping", MAP_KERNELS, LOCALIZE_KERNELS),
-        _compile("planning and driving", DRIVE_KERNELS, CAR_KERNELS, TRAFFIC_KERNELS),
+        _compile("planning and driving", DRIVE_KERNELS, CAR_KERNELS),
     )
 
 

@@ -2,7 +2,7 @@
 
 import asyncio
 import threading
-from collections.abc import AsyncIterator, Coroutine, Iterator
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
@@ -122,7 +122,7 @@ class SyncRobot:
 
     def steer(self, wanted: Velocity) -> None:
         """Publish an operator's velocity to the robot's control; repeat at 20 Hz."""
-        self._robot.steer(wanted)
+        self._run(_called(lambda: self._robot.steer(wanted)))
 
     def stop(self) -> None:
         """Come to rest."""
@@ -183,3 +183,7 @@ class SyncRobot:
 
 async def _next_of(messages: AsyncIterator[M]) -> M:
     return await anext(messages)
+
+
+async def _called(function: Callable[[], T]) -> T:
+    return function()

@@ -260,6 +260,7 @@ class GoalServer(InputSource):
         self._kernels = DriveKernels(bus.input_log.in_time)
         self._compile_first = config.compile_first or not bus.input_log.live
         self._avoid = Avoid(_roaming(settings))  # drives without a map
+        self._loaded = False  # the kernels that this body needs
         self._began_late = False  # there were steps without the kernels
         self._loaded_tick: int | None = None  # of the first step with them
         self._navigator: Navigator | None = None  # once the kernels are loaded
@@ -270,10 +271,10 @@ class GoalServer(InputSource):
         """Load the kernels, or begin to compile them. Raises ConfigError."""
         publishing = asyncio.ensure_future(self._publish_starting())
         try:
-            loaded = await self._kernels.load(wait=self._compile_first)
+            self._loaded = await self._kernels.load(wait=self._compile_first)
         finally:
             publishing.cancel()
-        if loaded:
+        if self._loaded:
             self._make_navigator()
 
     async def finish_preparing(self) -> None:
@@ -300,8 +301,8 @@ class GoalServer(InputSource):
         objects: ObjectsByPerceptor,
     ) -> StepResult:
         """Advance the queue and step the behaviour with the command that it wants."""
-        loaded = self._kernels.loaded(self._source.body)
-        if not loaded or self._awaits_map(state):
+        self._loaded = self._kernels.loaded(self._source.body)
+        if not self._loaded or self._awaits_map(state):
             return self._start_up(state, world, verdict)
         navigator = self._make_navigator()
         if self._config.start == "explore" and not self._started:
@@ -392,7 +393,9 @@ class GoalServer(InputSource):
 
     @property
     def _waits(self) -> WaitReason | None:
-        return self._navigator.waits if self._navigator else WaitReason.STARTING
+        if self._navigator is None or not self._loaded:
+            return WaitReason.STARTING
+        return self._navigator.waits
 
     async def _publish_starting(self) -> None:
         while True:

@@ -200,40 +200,18 @@ class Navigator:
     ) -> StepResult:
         """Drive along a route that leads to its goal."""
         assert context.map_from_odom
-        assert context.world
-        to_odom = inverse(context.map_from_odom)
         here = compose(context.map_from_odom, context.pose)
         cap = self._speed_cap(context, here, points)
-        around = here.x, here.y, DEFAULTS.window
-        keepouts = self._zone_map.keepouts_near(*around)
-        lanes = self._zone_map.lanes_beside(*around, _rest_of(points, here)[1:])
-        there = compose(to_odom, Pose(x=goal.x, y=goal.y, yaw=goal.yaw or 0.0))
-        headings = route.headings
-        headings = None if headings is None else headings + np.array((to_odom.yaw, 0.0))
-        moment = local_planner.PlanRequest(
-            tick=context.tick,
-            pose=context.pose,
-            velocity=context.velocity,
-            goal=Goal(x=there.x, y=there.y, yaw=None if goal.yaw is None else there.yaw),
-            hits=context.world.points().astype(np.float64),
-            path=transform(from_pose(to_odom), points),
-            headings=headings,
-            obstacles=context.world.obstacles,
-            response=context.actuation,
-            sent=context.sent,
-            delayed=context.delayed_s,
-            may_back=context.may_reverse,
-            keepouts=tuple(transform(from_pose(to_odom), one) for one in keepouts),
-            avoid=tuple(transform(from_pose(to_odom), one) for one in lanes),
-            max_speed=cap.speed if cap else None,
-        )
-        plan = self._local_planner(context).plan(moment)
+        request = self._request(context, here, route, goal, points, cap)
+        plan = self._local_planner(context).plan(request)
         self._routes.report(
             RouteFeedback(
-                version=route.version, arrived=plan.arrived, blocked=plan.blocked,
+                version=route.version,
+                arrived=plan.arrived,
+                blocked=plan.blocked,
                 reason=plan.reason,
             )
-        )  # fmt: skip
+        )
         outcome = self._outcome(context, command, route, plan)
         headline = f"{route.activity}: {route.reason}" if route.activity else outcome.activity
         intent = self._intent(
@@ -245,6 +223,43 @@ class Navigator:
             reason=f"{headline}: {plan.reason}{self._slowed(context, cap)}"[:500],
         )
         return intent, outcome
+
+    def _request(
+        self,
+        context: NavigationContext,
+        here: Pose,
+        route: Route,
+        goal: Goal,
+        points: Floats,
+        cap: SpeedCap | None,
+    ) -> local_planner.PlanRequest:
+        """Return what the local planner needs, in the odometry's frame; `here` is in the map's."""
+        assert context.map_from_odom
+        assert context.world
+        to_odom = inverse(context.map_from_odom)
+        move = from_pose(to_odom)
+        around = here.x, here.y, DEFAULTS.window
+        keepouts = self._zone_map.keepouts_near(*around)
+        lanes = self._zone_map.lanes_beside(*around, _rest_of(points, here)[1:])
+        there = compose(to_odom, Pose(x=goal.x, y=goal.y, yaw=goal.yaw or 0.0))
+        headings = route.headings
+        return local_planner.PlanRequest(
+            tick=context.tick,
+            pose=context.pose,
+            velocity=context.velocity,
+            goal=Goal(x=there.x, y=there.y, yaw=None if goal.yaw is None else there.yaw),
+            hits=context.world.points().astype(np.float64),
+            path=transform(move, points),
+            headings=None if headings is None else headings + np.array((to_odom.yaw, 0.0)),
+            obstacles=context.world.obstacles,
+            response=context.actuation,
+            sent=context.sent,
+            delayed=context.delayed_s,
+            may_back=context.may_reverse,
+            keepouts=tuple(transform(move, one) for one in keepouts),
+            avoid=tuple(transform(move, one) for one in lanes),
+            max_speed=cap.speed if cap else None,
+        )
 
     def _slowed(self, context: NavigationContext, cap: SpeedCap | None) -> str:
         """Return what makes the robot slower, as the end of a text."""

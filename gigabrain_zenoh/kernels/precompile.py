@@ -51,7 +51,7 @@ class Kernels:
             self._job.set_result(None)
 
     def begin(self) -> None:
-        """Begin to load them, unless that was done; compile them in between where necessary."""
+        """Begin to load them beside the event loop, and to compile what is missing; once."""
         if not self._loading and not self._job.done():
             self._loading = asyncio.ensure_future(self._load_beside())
 
@@ -68,7 +68,7 @@ class Kernels:
 
     @property
     def loaded(self) -> bool:
-        """Whether they can be used from the present scan on. Raises ConfigError as above."""
+        """True from the scan on at which they can be used. Raises ConfigError as above."""
         if self._loading and self._loading.done():
             self._loading.result()
         self._loaded = self._loaded or self._in_time(self._job, 0.0)

@@ -406,6 +406,7 @@ def _axes(of: Velocity) -> tuple[float, float, float]:
 
 def warm_up(body: BodyDescription) -> None:
     """Compile all that a driving robot will call, with `body`'s own shapes."""
+    _warm_up_traffic()
     goal, here = Goal(x=0.5, y=0.0), Pose(x=0.0, y=0.0, yaw=0.0)
     planner = LocalPlanner(body, LocalSettings(samples=64, steps=10, window=2.0))
     for tick, x in ((1, 0.9), (51, 0.7)):  # once it has looked round
@@ -422,8 +423,8 @@ def warm_up(body: BodyDescription) -> None:
         )
 
 
-def warm_up_traffic() -> None:
-    """Compile what only quick bodies call, in traffic."""
+def _warm_up_traffic() -> None:
+    """Compile the kernels of quick bodies in traffic."""
     seen, disc = (
         dynamic_obstacles.TrafficMap(1.0, 1.0, 1.0),
         np.array([[0.5, 0.0, 1.0, 0.0, 0.3, 0.0]]),

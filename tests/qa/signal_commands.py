@@ -69,7 +69,7 @@ CALLS = {
     "world add": "world add box 1.5 1.5",
     "world list": "world list",
     "world remove": "world remove box0",
-    "view": "view",
+    "view": "view --picture {file}.png",
     "proxy": "proxy {robot}",
     "robots": "robots",
     "worlds": "worlds",
@@ -101,5 +101,8 @@ OWN_CODES = {
     "why": range(10, 20),
     **dict.fromkeys(("goto", "explore", "patrol", "mission"), (1,)),
     **dict.fromkeys(("task cancel", "task pause", "task resume", "map save", "map info"), (1, 2)),
+    # without a map, a simulation, or what is named
+    **dict.fromkeys(("map load", "view", "world add", "world list", "world remove"), (1, 2)),
+    **dict.fromkeys(("place add", "place list", "place remove", "zone add", "param save"), (1, 2)),
     **dict.fromkeys(("estop", "release", "enable", "topic pub", "doctor", "driver test"), (1, 3)),
 }

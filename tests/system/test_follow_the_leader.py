@@ -1,6 +1,7 @@
 """The example `examples/follow_the_leader`: two plug-ins follow a person through a hall."""
 
 import asyncio
+import importlib
 import math
 import os
 import shutil
@@ -10,9 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.brain import DetectedObject, Objects, WorldModel
 from gigabrain_schemas.requests import DescribeRequest
 from gigabrain_schemas.sim import SimPoses
 from gigabrain_schemas.topics import DESCRIBE, SIM_POSES, STATE
+from gigabrain_zenoh.decision.behaviours import Inputs
 from gigabrain_zenoh.runtime.connect import connect
 from gigabrain_zenoh.testing.processes import Home, robot_of
 from gigabrain_zenoh.testing.waiting import until
@@ -46,6 +50,20 @@ def install(site: Path) -> None:
         f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
     )
     shutil.copy(EXAMPLE / "follow_the_leader.py", site)
+
+
+def test_it_backs_away_from_a_leader_who_comes_nearer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLE)
+    example = importlib.import_module("follow_the_leader")
+    for away, sign in ((0.6, -1.0), (1.5, 1.0)):
+        leader = DetectedObject(
+            id=1, x=away, y=0.0, velocity_x=0.0, velocity_y=0.0, radius=0.25, label="leader"
+        )
+        objects = {"leader": Objects(objects=(leader,))}
+        world = WorldModel(scan_ok=True, obstacle_ahead=False)
+        inputs = Inputs(world=world, pose=Pose(x=0.0, y=0.0, yaw=0.0), objects=objects)
+        intent, _ = example.Follow(example.FollowConfig()).step(inputs)
+        assert math.copysign(1.0, intent.twist.linear_x) == sign
 
 
 @pytest.mark.slow

@@ -48,7 +48,6 @@ def test_where_nothing_quick_was_seen_ways_cost_what_they_are_long() -> None:
 
 def test_what_is_compiled_before_it_drives_is_all_that_it_will_call() -> None:
     local_planner.warm_up(ANY_BODY)
-    local_planner.warm_up_traffic()
     kernels: list[Any] = [dynamic_obstacles._add_watched, dynamic_obstacles._pass]
     kernels += [cost_to_go._scale_costs, cost_to_go._seed_rim]
     before = [len(kernel.signatures) for kernel in kernels]
