@@ -191,7 +191,14 @@ class Robot:
             await self._ticks(1)
 
     async def enable(self, source: str = "", *, take: bool = False) -> GateReply:
-        """Ask the gate for the body, for this script or for `source`. Raises Refused."""
+        """Ask the gate for the body, for this script or for `source`, once it no longer stops.
+
+        Raises Refused and BodyLost.
+        """
+        for _ in range(HOLD_TICKS):
+            if (await self.read_state()).gate.mode != "stopping":
+                break
+            await self._ticks(1)
         source = source or self._bus.process
         reply = await enable(self._bus, source, take=take, keys=self._keys)
         if source == self._bus.process:
@@ -280,18 +287,13 @@ class Robot:
         return listen(self._bus, topic_named(topic) if isinstance(topic, str) else topic)
 
     async def _acquire(self) -> None:
-        """Ask the gate for the body, once it has finished stopping."""
-        state = await self.read_state()
+        """Ask the gate for the body, unless another commander has taken it."""
         if self._lease.lost:
+            state = await self.read_state()
             holder = state.gate.commander or "an e-stop"
             raise Refused(
                 f"{state.robot_type}: {holder} has the body; ask again with enable(take=True)"
             )
-        for _ in range(HOLD_TICKS):
-            if state.gate.mode != "stopping":
-                break
-            await self._ticks(1)
-            state = await self.read_state()
         await self.enable(take=self._take)
 
     def _repeat(self, state: RobotState) -> None:

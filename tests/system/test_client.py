@@ -117,6 +117,16 @@ async def test_without_take_it_is_refused_and_told_who_drives(robot: Probe) -> N
     assert robot.state.gate.commander == "control"
 
 
+async def test_a_script_gets_the_body_that_still_stops_for_the_last_one(robot: Probe) -> None:
+    async with connect(source="next") as after:
+        async with connect(take=True, source="last") as last:
+            await last.set_base_velocity(0.0, angular_z=1.0)
+            await robot.ticks(25)
+        await until(lambda: robot.state.gate.mode == "stopping", "the gate stops")
+        assert (await after.enable(take=True)).gate.commander == "next"
+    await until(lambda: robot.state.gate.commander == "control", "the brain goes on")
+
+
 async def test_a_script_that_was_taken_over_does_not_take_the_body_back(robot: Probe) -> None:
     async with connect(take=True, source="script") as script, connect(source="person") as person:
         await script.set_base_velocity(0.1)
