@@ -127,27 +127,14 @@ async def up(
     remembers = state_dir() / "robots" / label
     specs = process_specs(deployment, host, run_dir, remembers, level=level, file=file)
 
-    kept = SupervisorLog(run_dir)
-    refusal, invalid = "", None  # error of a process, and the invalid value that it names
-
-    def show(_name: str, record: Mapping[str, Any]) -> None:
-        nonlocal refusal, invalid
-        kept.add(record)
-        if record.get("event") == "failed":
-            record = dict(record)
-            invalid = record.pop("value", None)
-            before, refusal = refusal, str(record.get("text", ""))
-            if refusal == before:  # printed already, at the first try
-                return
-        print_line(logs.readable(record, colour=False))
-
+    records = _Records(run_dir, print_line)
     names = ", ".join(spec.name for spec in specs)
     print_line(f"{deployment.body} on {host}: {names}; logs in {run_dir}")
     with (
         stop_signals(LIMIT_S) as stop,
         announced(label, local_endpoint(deployment, host), run_dir) as note,
     ):
-        async with Supervisor(specs, show, keep_stuck=keep_stuck) as supervisor:
+        async with Supervisor(specs, records.add, keep_stuck=keep_stuck) as supervisor:
             running = asyncio.ensure_future(supervisor.run())
             while not stop.is_set() and not running.done() and not _hopeless(supervisor):
                 _report(supervisor, notifier, note)
@@ -156,12 +143,39 @@ async def up(
             notifier.stopping()
             await supervisor.stop(STOP_S)
             await running
-            kept.close()
-            if supervisor.misconfigured:
-                raise ConfigError(refusal, value=invalid)
-            if lost := ROUTERS & set(supervisor.given_up):
-                raise BusError(refusal or f"the {lost.pop()} keeps dying")
+            records.close()
+            records.check(supervisor)
             return 1 if supervisor.given_up else 0
+
+
+class _Records:
+    """Logs and prints what processes report, and keeps why one of them refused to start."""
+
+    def __init__(self, run_dir: Path, print_line: Callable[[str], None]) -> None:
+        self._log, self._print_line = SupervisorLog(run_dir), print_line
+        self._refusal, self._invalid = "", None  # the last one, and the invalid value that it names
+
+    def add(self, _name: str, record: Mapping[str, Any]) -> None:
+        """Process a record of a process."""
+        self._log.add(record)
+        if record.get("event") == "failed":
+            record = dict(record)
+            self._invalid = record.pop("value", None)
+            before, self._refusal = self._refusal, str(record.get("text", ""))
+            if self._refusal == before:  # printed already, at the first try
+                return
+        self._print_line(logs.readable(record, colour=False))
+
+    def check(self, supervisor: Supervisor) -> None:
+        """Raise ConfigError for wrong settings of a process, and BusError for a lost router."""
+        if supervisor.misconfigured:
+            raise ConfigError(self._refusal, value=self._invalid)
+        if lost := ROUTERS & set(supervisor.given_up):
+            raise BusError(self._refusal or f"the {lost.pop()} keeps dying")
+
+    def close(self) -> None:
+        """Write what is left."""
+        self._log.close()
 
 
 def _hopeless(supervisor: Supervisor) -> bool:

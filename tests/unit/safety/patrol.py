@@ -1,7 +1,7 @@
 """Safety over time: one state a tick, a scan every fifth, and a body that does as it is told."""
 
 import numpy as np
-from msgspec.structs import replace
+from msgspec.structs import asdict, replace
 from numpy.typing import NDArray
 
 from gigabrain_schemas.base import Pose, Velocity
@@ -78,12 +78,7 @@ class Patrol:
                 self.state, tick=self.tick, basis=self.tick, gate=gate, link=link, sent=asked
             )
             command = CmdVel(
-                linear_x=asked.linear_x,
-                linear_y=asked.linear_y,
-                angular_z=asked.angular_z,
-                source="control",
-                boot=self.state.boot,
-                tick=self.tick - 1,
+                **asdict(asked), source="control", boot=self.state.boot, tick=self.tick - 1
             )
             seen = self.tick - self.tick % 5
             looked = scan(open_space() if values is None else values, seen)
