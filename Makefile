@@ -24,6 +24,7 @@ $(DEMO): EXTRAS := sim,nav,page
 $(INSTALLED): EXTRAS := all,dev
 
 # by uv, which pip fetches where there is none: it takes a third of pip's time
+# with pip, which uv leaves out: the tutorials install more by it
 $(DEMO) $(INSTALLED): pyproject.toml
 	@echo 'installing into $(VENV), which takes up to a minute'
 	@if command -v uv >/dev/null; then \
@@ -34,7 +35,7 @@ $(DEMO) $(INSTALLED): pyproject.toml
 	  $(PYTHON) -m venv $(VENV) && \
 	  $(BIN)/python -m pip install --quiet --disable-pip-version-check uv; \
 	fi
-	@PATH="$$PATH:$(BIN)" uv pip install --quiet --python $(BIN)/python -e '.[$(EXTRAS)]'
+	@PATH="$$PATH:$(BIN)" uv pip install --quiet --python $(BIN)/python -e '.[$(EXTRAS)]' pip
 	@touch $(DEMO) $@
 
 # the kernels, compiled once
