@@ -217,6 +217,9 @@ export class Zones {
     pen.scale(this.map.pixel, -this.map.pixel)
     pen.font = '12px system-ui, sans-serif'
     pen.textAlign = 'center'
+    pen.lineWidth = 3
+    pen.strokeStyle = this.map.colour.floor
+    pen.strokeText(text, 0, 4)
     pen.fillStyle = this.map.colour.ink
     pen.fillText(text, 0, 4)
     pen.restore()
