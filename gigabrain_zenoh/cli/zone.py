@@ -1,5 +1,6 @@
 """`gigabrain place` and `gigabrain zone`: named places and zones of the robot's map."""
 
+import re
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
@@ -100,6 +101,10 @@ def add_zone(
     """
     if len(points) % 2:
         raise ConfigError(f"{len(points)} numbers; expected pairs x y")
+    if kind == "speed" and max_speed is None:
+        raise ConfigError("a speed zone needs a limit; add --max-speed [m/s]")
+    if kind == "one_way" and width is None:
+        raise ConfigError("a lane needs a width; add --width [m]")
     zone = {
         "name": name,
         "kind": kind,
@@ -153,5 +158,6 @@ async def _ask(bus: "Bus", fields: dict[str, Any]) -> str:
     try:
         request = msgspec.convert({**fields, "source": getpass.getuser()}, ZonesRequest)
     except (ValueError, OverflowError) as error:  # msgspec.ValidationError is one
-        raise ConfigError(f"not a valid place or zone: {error}") from None
+        text = re.sub(r" - at `\$\.(zone|place)`$", "", str(error))
+        raise ConfigError(f"not a valid place or zone: {text}") from None
     return await change_zones(bus, request)

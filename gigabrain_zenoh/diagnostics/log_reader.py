@@ -69,6 +69,8 @@ def run_folder(name: str = "") -> Path:
     if not runs:
         raise ConfigError(f"{base}: no logs of any run; start one with `gigabrain demo`")
     found = [run for run in runs if name in run.name]
+    if not found and any((run / f"{name}.jsonl").exists() for run in runs):
+        raise ConfigError(f"no run {name!r}; did you mean `--process {name}`?")
     if not found:
         raise unknown("run", name, [run.name for run in runs[-5:]])
     live = {robot.run_dir for robot in running()} if not name else set()

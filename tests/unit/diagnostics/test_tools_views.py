@@ -186,6 +186,8 @@ def test_the_log_of_a_run_that_goes_on_is_preferred_to_a_newer_one_that_has_ende
 def test_what_is_not_there_to_be_read_is_answered_with_what_is(runs: Path) -> None:
     with pytest.raises(UnknownName, match="no run 'blue'"):
         run_folder("blue")
+    with pytest.raises(ConfigError, match="no run 'driver'; did you mean `--process driver`"):
+        run_folder("driver")
     with pytest.raises(UnknownName, match="did you mean 'driver'"):
         read(run_folder(), LogFilter(process="drivr"), 9)
     with pytest.raises(UnknownName, match="did you mean 'warning'"):
