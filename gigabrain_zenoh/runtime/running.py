@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Annotated, BinaryIO
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, structs
 
-from gigabrain_zenoh.bus.zenoh.config import secured
+from gigabrain_zenoh.bus.zenoh.config import SECURE, secured
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError
@@ -138,12 +138,16 @@ def find_endpoint(connect: str | None, namespace: str = "", keys: str = "") -> E
     """Return the endpoint given by `connect`, or that of the only robot on this machine.
 
     Raises BusError where there is no robot, Ambiguous where there are several. `keys` is the folder
-    of the client's identity, for a router that requires one.
+    of the client's identity, for a router that requires one. A client that names its identity is
+    limited to its role: it then does not use the local socket, which has the robot's rights.
     """
+    identity = str(Path(keys).expanduser().absolute()) if keys else ""
     if connect:
-        folder = str(Path(keys).expanduser().absolute()) if keys else ""
-        return secured(Endpoint(connect=(connect,), namespace=namespace, keys=folder))
-    return find_running(namespace).endpoint
+        return secured(Endpoint(connect=(connect,), namespace=namespace, keys=identity))
+    endpoint = find_running(namespace).endpoint
+    if identity and endpoint.connect[-1].startswith(SECURE):
+        return structs.replace(endpoint, connect=endpoint.connect[-1:], keys=identity)
+    return endpoint
 
 
 def find_running(namespace: str = "") -> Running:

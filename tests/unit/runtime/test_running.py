@@ -48,6 +48,18 @@ def test_a_robot_is_found_for_as_long_as_its_supervisor_says(notes: Path) -> Non
     assert list(notes.iterdir()) == []
 
 
+def test_a_client_that_names_its_identity_does_not_get_the_rights_of_the_local_socket(
+    notes: Path,
+) -> None:
+    """`release --keys home/viewer` on the robot's own host must be refused as elsewhere."""
+    ways = ("unixsock-stream//run/1.sock", "tls/127.0.0.1:7467")
+    with announced("waffle", Endpoint(connect=ways, namespace="red")):
+        as_viewer = find_endpoint(None, keys="/home/viewer")
+        assert find_endpoint(None).connect == ways
+    expected = Endpoint(connect=ways[1:], namespace="red", keys="/home/viewer")
+    assert as_viewer == expected
+
+
 def test_a_note_whose_pid_is_used_again_is_that_of_a_dead_supervisor(notes: Path) -> None:
     leave_note(notes, os.getppid(), "ghost")  # a process that lives, and has left no note
     assert running() == []
