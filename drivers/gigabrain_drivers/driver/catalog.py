@@ -64,6 +64,8 @@ def robot_path(name: str) -> Path:
             raise UnknownName(
                 f"no robot {name!r} yet: its package has to be installed: pip install -e {package}"
             )
+        if (file := Path(name) / "robot.yaml").is_file():
+            raise UnknownName(f"no robot {name!r}; did you mean {str(file)!r}?")
         raise unknown("robot", name, known)
     return known[name]
 

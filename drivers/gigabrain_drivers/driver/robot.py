@@ -1,14 +1,18 @@
 """A robot's YAML file: what the body is, and by which links it can be reached."""
 
+import math
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from gigabrain_drivers.links.serial_link import AUTO, check_port
-from gigabrain_schemas.base import Finite, Name, NonNegative, Positive
+from gigabrain_schemas.base import Finite, Name, Positive
 from gigabrain_schemas.body import BodyDescription, Lidar
 from gigabrain_zenoh.config.settings import LinkName
+
+Length = Annotated[float, Meta(ge=0.0, le=10.0)]  # [m], of a part of a body
+WheelRadius = Annotated[float, Meta(ge=0.0, le=2.0)]  # [m]
 
 LINKS: tuple[LinkName, ...] = ("sim", "emulated", "real")
 
@@ -26,14 +30,22 @@ class RobotFile(BodyDescription, frozen=True, kw_only=True, forbid_unknown_field
     """A whole robot.yaml. Each link names its driver; the rest of it is the driver's own."""
 
     summary: str  # one line, for `gigabrain robots`
-    wheel_base: NonNegative = 0.0  # [m], front to rear, of mecanum and Ackermann bases
-    wheel_radius: NonNegative = 0.0  # [m]
-    effective_track: NonNegative = 0.0
+    wheel_base: Length = 0.0  # [m], front to rear, of mecanum and Ackermann bases
+    wheel_radius: WheelRadius = 0.0  # [m]
+    effective_track: Length = 0.0
     # [m], of a skid-steered base: the separation of rolling wheels that would turn it as much
     joints: tuple[JointLimits, ...] = ()
     sim: dict[str, Any] | None = None
     emulated: dict[str, Any] | None = None
     real: dict[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.lidar and abs(self.lidar.yaw) > 2 * math.pi:
+            raise ValueError(
+                f"lidar: yaw: expected radians, within one turn, got {self.lidar.yaw:g}; "
+                f"{self.lidar.yaw:g} degrees are {math.radians(self.lidar.yaw):.3g}"
+            )
 
     def description(self) -> BodyDescription:
         """Return the part that the brain uses."""

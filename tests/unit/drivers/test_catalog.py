@@ -45,6 +45,38 @@ def test_a_mistyped_robot_suggests_the_right_one() -> None:
         catalog.load_robot("tutlebot3_waffle")
 
 
+def test_the_folder_of_a_robot_suggests_its_file(tmp_path: Path) -> None:
+    (tmp_path / "robot.yaml").write_text("")
+    with pytest.raises(UnknownName, match=r"did you mean '.*/robot\.yaml'"):
+        catalog.load_robot(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("line", "wrong"),
+    [
+        ("wheel_radius: 0.033", "wheel_radius: 33"),  # millimetres
+        ("x: -0.064", "yaw: 90"),  # degrees
+    ],
+)
+def test_other_units_are_refused(line: str, wrong: str, tmp_path: Path) -> None:
+    text = catalog.robot_path("turtlebot3_waffle").read_text()
+    assert line in text
+    mine = tmp_path / "robot.yaml"
+    mine.write_text(text.replace(line, wrong))
+    with pytest.raises(ConfigError, match=f"{wrong.partition(':')[0]}: expected"):
+        catalog.load_robot(str(mine))
+
+
+async def test_a_body_in_memory_moves_sideways_where_its_file_says_so(tmp_path: Path) -> None:
+    text = catalog.robot_path("mock").read_text()
+    mine = tmp_path / "robot.yaml"
+    mine.write_text(text + "max_lateral_speed: 0.2\n")
+    _, driver = catalog.make_driver(str(mine), Run(folder=Path()))
+    async with driver as body:
+        sent = await body.set_base_velocity(0.0, 0.1, 0.0)
+        assert (sent.linear_y, (await body.read_state()).velocity.linear_y) == (0.1, 0.1)
+
+
 def test_a_mistyped_driver_suggests_the_right_one(tmp_path: Path) -> None:
     mine = tmp_path / "robot.yaml"
     mine.write_text(

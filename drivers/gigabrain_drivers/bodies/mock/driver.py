@@ -81,9 +81,11 @@ class MockBody(Driver):
         """Take the velocity at once."""
         if not self._open:
             raise BodyLost("the mock is not open")
-        to = self.bounded(linear_x, 0.0, angular_z)
+        to = self.bounded(linear_x, linear_y, angular_z)
         self._velocity = Velocity(
-            linear_x=to.linear_x * self._gain, angular_z=to.angular_z * self._gain
+            linear_x=to.linear_x * self._gain,
+            linear_y=to.linear_y * self._gain,
+            angular_z=to.angular_z * self._gain,
         )
         return to
 
@@ -102,8 +104,8 @@ class MockBody(Driver):
         v, pose = self._velocity, self._pose
         yaw = pose.yaw + v.angular_z * TICK_S / 2
         self._pose = Pose(
-            x=pose.x + v.linear_x * math.cos(yaw) * TICK_S,
-            y=pose.y + v.linear_x * math.sin(yaw) * TICK_S,
+            x=pose.x + (v.linear_x * math.cos(yaw) - v.linear_y * math.sin(yaw)) * TICK_S,
+            y=pose.y + (v.linear_x * math.sin(yaw) + v.linear_y * math.cos(yaw)) * TICK_S,
             yaw=math.remainder(pose.yaw + v.angular_z * TICK_S, 2 * math.pi),
         )
         self._ticks += 1
