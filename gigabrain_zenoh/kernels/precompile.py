@@ -20,6 +20,7 @@ from gigabrain_zenoh.plugins import find
 log = logging.getLogger(__name__)
 QUIET_S = 5.0  # of compiling, before it is logged
 COLLECT_AFTER = 100_000  # new objects; by the standard 700 compiling takes a tenth longer
+TRIES = 2  # to compile, if the child is killed
 LAST_NICE = 19  # gets what the robot leaves of the processors
 
 
@@ -79,15 +80,24 @@ class Kernels:
     async def _load_beside(self) -> None:
         try:
             if await asyncio.to_thread(_is_missing, self._warm_up):
-                join_in()
-                data = {"event": "compiling"}
-                log.info("compiling, once per installation; works meanwhile", extra={"data": data})
-                await compile_in_child(self._warm_up, step_aside=True)
-                log.info("compiled", extra={"data": {"event": "compiled"}})
+                await self._compile_aside()
             await asyncio.to_thread(_call, self._warm_up)
         except ModuleNotFoundError as error:
             raise missing_package(error) from None
         self._job.set_result(None)
+
+    async def _compile_aside(self) -> None:
+        """Compile in a child; once more if it is killed, as compiling here delays the process."""
+        join_in()
+        data = {"event": "compiling"}
+        log.info("compiling, once per installation; works meanwhile", extra={"data": data})
+        for _ in range(TRIES):
+            code = await compile_in_child(self._warm_up, step_aside=True)
+            if code == 0:
+                log.info("compiled", extra={"data": {"event": "compiled"}})
+            if code >= 0:
+                return
+            log.warning("compiling was ended by signal %d", -code)
 
 
 async def ensure_compiled(warm_up: str) -> None:

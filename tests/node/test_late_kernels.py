@@ -33,12 +33,16 @@ class Compiler:
 
     def __init__(self) -> None:
         self.may_end, self.began = asyncio.Event(), 0
+        self.kills = 0  # of the next children
         self.compiled: list[str] = []
         self._loaded, self._loop = asyncio.Event(), asyncio.get_running_loop()
 
     async def compile(self, warm_up: str, *, step_aside: bool = False) -> int:
         self.began += 1
         await self.may_end.wait()
+        if self.kills:
+            self.kills -= 1
+            return -9
         self.compiled.append(warm_up)
         return 0
 
@@ -185,3 +189,24 @@ async def test_in_lock_step_those_of_cars_are_compiled_first_too(compiler: Compi
     kernels = DriveKernels(InputLogger().in_time)
     assert await kernels.load(wait=True)
     assert kernels.loaded(CAR)
+
+
+@pytest.mark.parametrize(("kills", "said"), [(1, ["compiled"]), (2, [])])
+async def test_a_child_that_is_killed_while_it_compiles_starts_once_more(
+    compiler: Compiler,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    kills: int,
+    said: list[str],
+) -> None:
+    monkeypatch.setattr(precompile, "_call", lambda warm_up: None)
+    compiler.kills = kills
+    compiler.may_end.set()
+    kernels = precompile.Kernels("some:kernels", lambda job, _budget: job.done())
+    with caplog.at_level("INFO", precompile.__name__):
+        await kernels.load(wait=False)
+        await kernels.finish()
+    assert kernels.loaded
+    assert compiler.began == 2
+    assert caplog.messages.count("compiling was ended by signal 9") == kills
+    assert [text for text in caplog.messages if text == "compiled"] == said
