@@ -56,15 +56,22 @@ def goto(
         yaw: Heading on arrival [rad]. Default: any, or that of the named place.
     """
     if y is None:
+        if _is_number(place):
+            raise ConfigError(f"goto: Y is missing: expected two numbers, or a name; got {place!r}")
         _send(at, lambda tasks: tasks.go_to_place(place, how=mode), wait)
         return
-    try:
-        x = float(place)
-    except ValueError:
-        raise ConfigError(
-            f"goto: expected two numbers, or the name of a place; got {place!r}"
-        ) from None
+    if not _is_number(place):
+        raise ConfigError(f"goto: expected two numbers, or the name of a place; got {place!r}")
+    x = float(place)
     _send(at, lambda tasks: tasks.go_to(x, y, yaw, how=mode), wait)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def explore(*, mode: Mode = "replace", wait: Wait = True, at: RobotAddress = LOCAL) -> None:

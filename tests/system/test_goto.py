@@ -33,6 +33,8 @@ async def test_a_robot_that_explores_is_sent_elsewhere_and_says_what_became_of_i
     assert said.startswith("goal-2 has succeeded: at (0.00, 0.00) (position error 0.")
     assert there.err == ""
     assert await there.ended() == 0
+    half = await home.run("goto", "0.5")
+    assert await half.ended() == 2
     outside = await home.run("goto", "50", "-50")
     assert outside.err.startswith("gigabrain: the goal is outside the map; nearest reachable point")
     assert await outside.ended() == 1
