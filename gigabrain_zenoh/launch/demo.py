@@ -142,6 +142,7 @@ class Demo:
         self._decisions: list[tuple[float, str]] = []
         self._failures: list[str] = []
         self._compiling: set[str] = set()  # processes that reported it
+        self._mismatches: dict[str, None] = {}  # between model and robot file, in order
         self._refusal = ""  # last error of a process that ended
         self._faults: deque[tuple[float, str]] = deque(maxlen=4)  # when [s], and what
         self._capacity = Capacity()
@@ -298,6 +299,8 @@ class Demo:
             self._compiling.add(str(record["process"]))
         if event == "compiled":
             self._compiling.discard(str(record["process"]))
+        if event == "mismatch":
+            self._mismatches[str(record.get("text", ""))] = None
         if event == "failed":
             self._refusal = str(record.get("text", ""))
         if event in ("given up", "died"):
@@ -312,6 +315,8 @@ class Demo:
         if report:
             files.write_result(report, self._options.report)
             print(summary(report))
+        for text in self._mismatches:
+            print(f"warning: {text}", file=sys.stderr)
         if stopped and report is None:
             print("ended; the driver did not answer, so there is no report", file=sys.stderr)
         if stopped:

@@ -326,3 +326,15 @@ async def test_where_the_page_is_is_said_once_and_not_before_it_is_there(
     assert said == [0, 1, 0]
     await net.one.close()
     await net.two.close()
+
+
+def test_a_model_that_contradicts_the_robots_file_is_said_once_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    demo = Demo(Deployment(router="tcp/127.0.0.1:0"), DemoOptions(headless=True))
+    record = {"process": "driver", "level": "warning", "event": "mismatch", "text": "a.xml: 1 m"}
+    demo._record("driver", record)
+    demo._record("driver", record)  # of a driver that was started again
+    demo._finish(None, stopped=True)
+    assert capfd.readouterr().err.count("warning: a.xml: 1 m\n") == 1

@@ -141,7 +141,7 @@ def _robot_spec(body: SimModel) -> mujoco.MjSpec:
     PartFinder(spec, body).fit()
     align(spec, body)
     for text in mismatches(spec, body):
-        log.warning("%s: %s", body.path, text)
+        log.warning("%s: %s", body.path, text, extra={"data": {"event": "mismatch"}})
     if not isinstance(body, SimBody):
         return spec
     for name in body.rolling:
