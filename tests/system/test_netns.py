@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from gigabrain_schemas.brain import CmdVel
-from gigabrain_schemas.topics import CMD_VEL
+from gigabrain_schemas.brain import CmdVel, Intent
+from gigabrain_schemas.topics import CMD_VEL, INTENT
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.qa.probe import Probe, at_rest, probing
@@ -60,22 +60,21 @@ class Site:
 
 
 class Ears:
-    """What control says to the gate, and what of decision's it rests on."""
+    """What decision says to control, and control to the gate."""
 
     def __init__(self, robot: Probe) -> None:
-        self.commands: deque[CmdVel] = deque(maxlen=10_000)
+        self.commands, self.intents = deque[CmdVel](maxlen=10_000), deque[Intent](maxlen=10_000)
         robot.bus.subscribe(CMD_VEL, lambda _key, command: self.commands.append(command))
+        robot.bus.subscribe(INTENT, lambda _key, intent: self.intents.append(intent))
 
-    def silence(self, after: int) -> tuple[int, int]:
-        """When control heard decision for the last time before it fell silent, and then again.
+    def silence(self, back: int) -> tuple[int, int]:
+        """The tick of decision's last word before the tick `back`, and when control heard it again.
 
-        It answers each intent at once, with what that rests on; who listens from elsewhere may have
-        heard the same intent a tick sooner, or one that came too late for control.
+        A brain that is cut off sees no tick after that, so what it says then is as old as the cut.
         """
+        last = max(intent.tick for intent in self.intents if intent.tick < back)
         heard = [b.tick for a, b in pairwise(self.commands) if b.basis > a.basis]
-        ticks = [after, *(tick for tick in heard if tick >= after)]
-        gaps = ((a, b) for a, b in pairwise(ticks) if b - a > STOP_TICKS)
-        return next(gaps, (ticks[-1], ticks[-1]))
+        return last, next((tick for tick in heard if tick >= back), back)
 
 
 @pytest.fixture(scope="module")
@@ -122,8 +121,8 @@ async def test_a_brain_that_is_cut_off_stops_the_robot_and_holds_up_nobody_else(
     site.net.join("brain")
     back = robot.state.tick
     await drives_again(robot, back)
-    last, first = ears.silence(start)
-    late = [c.linear_x for c in ears.commands if last + STOP_TICKS <= c.tick < min(first, back)]
+    last, first = ears.silence(back)
+    late = [c.linear_x for c in ears.commands if last + STOP_TICKS <= c.tick < first]
     assert all(speed < 0.2 for speed in late)  # slower than it drove, from the first one on
     standing = [s for s in robot.states if last + STOP_TICKS + REST_TICKS <= s.tick <= back]
     assert all(at_rest(state) for state in standing)
