@@ -67,14 +67,14 @@ class Ears:
         robot.bus.subscribe(CMD_VEL, lambda _key, command: self.commands.append(command))
         robot.bus.subscribe(INTENT, lambda _key, intent: self.intents.append(intent))
 
-    def silence(self, back: int) -> tuple[int, int]:
-        """The tick of decision's last word before the tick `back`, and when control heard it again.
+    def silence(self, after: int) -> tuple[int, int]:
+        """The ticks of decision's last word before it fell silent, and of the first one afterwards.
 
         A brain that is cut off sees no tick after that, so what it says then is as old as the cut.
         """
-        last = max(intent.tick for intent in self.intents if intent.tick < back)
-        heard = [b.tick for a, b in pairwise(self.commands) if b.basis > a.basis]
-        return last, next((tick for tick in heard if tick >= back), back)
+        ticks = [after, *(intent.tick for intent in self.intents if intent.tick >= after)]
+        gaps = ((a, b) for a, b in pairwise(ticks) if b - a > STOP_TICKS)
+        return next(gaps, (ticks[-1], ticks[-1]))
 
 
 @pytest.fixture(scope="module")
@@ -121,8 +121,8 @@ async def test_a_brain_that_is_cut_off_stops_the_robot_and_holds_up_nobody_else(
     site.net.join("brain")
     back = robot.state.tick
     await drives_again(robot, back)
-    last, first = ears.silence(back)
-    late = [c.linear_x for c in ears.commands if last + STOP_TICKS <= c.tick < first]
+    last, first = ears.silence(start)
+    late = [c.linear_x for c in ears.commands if last + STOP_TICKS <= c.tick < min(first, back)]
     assert all(speed < 0.2 for speed in late)  # slower than it drove, from the first one on
     standing = [s for s in robot.states if last + STOP_TICKS + REST_TICKS <= s.tick <= back]
     assert all(at_rest(state) for state in standing)
