@@ -220,6 +220,7 @@ def replay(
         deployment: Deployment file with its settings. Default: the recorded settings.
     """
     import msgspec
+    from rich.console import Console
 
     from gigabrain_zenoh.launch.deployment import deployment_path, load_deployment
     from gigabrain_zenoh.launch.processes import node_of
@@ -229,4 +230,5 @@ def replay(
     if deployment:
         loaded = load_deployment(deployment_path(deployment))
         settings = dict(msgspec.to_builtins(loaded.settings(process)))
-    return run_async(replay_file(check, process, settings, node_of))
+    with Console(stderr=True).status(f"replaying {process}; the first time takes a minute"):
+        return run_async(replay_file(check, process, settings, node_of))
