@@ -211,7 +211,8 @@ class ZoneKeeper:
             items, verb = others, "removed"
         else:
             if there and not request.replace:
-                raise Refused(f"{name!r} is there already; --replace overwrites it")
+                remedy = "replace it (--replace), or choose another name"
+                raise Refused(f"{name!r} is there already; {remedy}")
             if request.zone and (problem := zone_file.zone_problem(request.zone)):
                 raise Refused(f"zone {name!r}: {problem}")
             items = (*others, _anchored(new, self._poses))

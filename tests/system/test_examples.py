@@ -67,6 +67,16 @@ def test_a_program_is_short_and_says_what_it_shows(name: str) -> None:
     assert (ast.get_docstring(ast.parse(source)) or "").split("\n")[0][-1] in ".:"
 
 
+def test_the_index_says_of_each_program_what_the_program_says() -> None:
+    index = (EXAMPLES / "README.md").read_text()
+    said = {
+        name: (ast.get_docstring(ast.parse((EXAMPLES / f"{name}.py").read_text())) or "")
+        for name in PROGRAMS
+    }
+    rows = {f"| `{name}.py` | {text.splitlines()[0]} |" for name, text in said.items()}
+    assert rows - set(index.splitlines()) == set()
+
+
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_a_notebook_holds_no_outputs(name: str) -> None:
     cells = json.loads((EXAMPLES / f"{name}.ipynb").read_text())["cells"]

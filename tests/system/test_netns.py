@@ -60,7 +60,7 @@ class Site:
 
 
 class Ears:
-    """What decision says to control, and control to the gate."""
+    """Keeps the intents and commands that a probe receives."""
 
     def __init__(self, robot: Probe) -> None:
         self.commands, self.intents = deque[CmdVel](maxlen=10_000), deque[Intent](maxlen=10_000)
@@ -68,9 +68,9 @@ class Ears:
         robot.bus.subscribe(INTENT, lambda _key, intent: self.intents.append(intent))
 
     def silence(self, after: int) -> tuple[int, int]:
-        """The ticks of decision's last word before it fell silent, and of the first one afterwards.
+        """Return the ticks of the last intent before a silence, and of the first one after it.
 
-        A brain that is cut off sees no tick after that, so what it says then is as old as the cut.
+        A brain that is cut off receives no newer tick, so its intents are then as old as the cut.
         """
         ticks = [after, *(intent.tick for intent in self.intents if intent.tick >= after)]
         gaps = ((a, b) for a, b in pairwise(ticks) if b - a > STOP_TICKS)
