@@ -6,7 +6,6 @@ from msgspec import Meta
 
 from gigabrain_schemas.base import (
     AccelerationLimit,
-    Angle,
     Causes,
     Count,
     Message,
@@ -33,6 +32,7 @@ PerCent = Annotated[float, Meta(ge=1.0, le=100.0)]
 Celsius = Annotated[float, Meta(ge=20.0, le=120.0)]
 Sustain = Annotated[float, Meta(ge=0.02, le=10.0)]  # [s]
 Age = Annotated[float, Meta(ge=0.02, le=2.0)]  # [s]
+MountingAngle = Annotated[float, Meta(ge=-6.2832, le=6.2832)]  # [rad], within one turn
 Shock = Annotated[float, Meta(ge=1.0, le=200.0)]  # [m/s2]
 Margin = Annotated[float, Meta(ge=0.01, le=10.0)]  # [m]
 Gain = Annotated[float, Meta(ge=0.0, le=1000.0)]  # [1/s]
@@ -114,7 +114,7 @@ class Lidar(Record, frozen=True, kw_only=True):
     range_max: RangeMax  # [m]
     x: Offset = 0.0  # [m], mounting in the body's frame
     y: Offset = 0.0  # [m]
-    yaw: Angle = 0.0  # [rad]
+    yaw: MountingAngle = 0.0  # [rad]
     no_return: Literal["free", "unknown"] = "free"  # what an infinite range of this sensor means
 
 

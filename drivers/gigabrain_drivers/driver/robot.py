@@ -1,6 +1,5 @@
 """A robot's YAML file: what the body is, and by which links it can be reached."""
 
-import math
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -38,14 +37,6 @@ class RobotFile(BodyDescription, frozen=True, kw_only=True, forbid_unknown_field
     sim: dict[str, Any] | None = None
     emulated: dict[str, Any] | None = None
     real: dict[str, Any] | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.lidar and abs(self.lidar.yaw) > 2 * math.pi:
-            raise ValueError(
-                f"lidar: yaw: expected radians, within one turn, got {self.lidar.yaw:g}; "
-                f"{self.lidar.yaw:g} degrees are {math.radians(self.lidar.yaw):.3g}"
-            )
 
     def description(self) -> BodyDescription:
         """Return the part that the brain uses."""

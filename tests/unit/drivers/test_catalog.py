@@ -52,19 +52,20 @@ def test_the_folder_of_a_robot_suggests_its_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "wrong"),
+    ("line", "wrong", "field"),
     [
-        ("wheel_radius: 0.033", "wheel_radius: 33"),  # millimetres
-        ("x: -0.064", "yaw: 90"),  # degrees
+        ("wheel_radius: 0.033", "wheel_radius: 33", "wheel_radius"),  # millimetres
+        ("range_max: 3.5, x: -0.064", "range_max: 3.5, yaw: 90", "yaw"),  # degrees, of the lidar
+        ("range_max: 8.0, x: -0.064", "range_max: 8.0, yaw: 90", "yaw"),  # and of a link's lidar
     ],
 )
-def test_other_units_are_refused(line: str, wrong: str, tmp_path: Path) -> None:
+def test_other_units_are_refused(line: str, wrong: str, field: str, tmp_path: Path) -> None:
     text = catalog.robot_path("turtlebot3_waffle").read_text()
     assert line in text
     mine = tmp_path / "robot.yaml"
     mine.write_text(text.replace(line, wrong))
-    with pytest.raises(ConfigError, match=f"{wrong.partition(':')[0]}: expected"):
-        catalog.load_robot(str(mine))
+    with pytest.raises(ConfigError, match=f"{field}: expected"):
+        catalog.make_driver(str(mine), Run(folder=Path(), link="real"))
 
 
 async def test_a_body_in_memory_moves_sideways_where_its_file_says_so(tmp_path: Path) -> None:
