@@ -312,7 +312,7 @@ async def robot() -> AsyncIterator[ZenohNetwork]:
 
 def session_threads() -> set[threading.Thread]:
     """Return the threads of this process that open or close a session."""
-    return {thread for thread in threading.enumerate() if thread.name == "zenoh-session"}
+    return {thread for thread in threading.enumerate() if thread.name.startswith("zenoh-")}
 
 
 class SampleCollector:

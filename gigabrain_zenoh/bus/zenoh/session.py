@@ -21,7 +21,7 @@ import zenoh
 from gigabrain_zenoh.bus.bridge import Bridge
 from gigabrain_zenoh.bus.transport import Close
 from gigabrain_zenoh.bus.zenoh.config import explain, plain, session_config
-from gigabrain_zenoh.bus.zenoh.workarounds import disable_linger
+from gigabrain_zenoh.bus.zenoh.workarounds import CLOSING_THREAD, disable_linger
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import BusError, ConfigError
 
@@ -69,7 +69,7 @@ async def open_session(endpoint: Endpoint) -> zenoh.Session:
             if session:
                 _close(session)
 
-    _in_thread(work)
+    _in_thread(work, "zenoh-open")
     try:
         return await asyncio.shield(opened)
     except zenoh.ZError as error:
@@ -82,11 +82,11 @@ async def open_session(endpoint: Endpoint) -> zenoh.Session:
 def _discard(opened: asyncio.Future[zenoh.Session]) -> None:
     """Close a session whose opening was cancelled."""
     if opened.exception() is None:
-        _in_thread(functools.partial(_close, opened.result()))
+        _in_thread(functools.partial(_close, opened.result()), CLOSING_THREAD)
 
 
-def _in_thread(work: Callable[[], None]) -> None:
-    threading.Thread(target=work, name="zenoh-session", daemon=True).start()
+def _in_thread(work: Callable[[], None], name: str) -> None:
+    threading.Thread(target=work, name=name, daemon=True).start()
 
 
 def _close(session: zenoh.Session) -> None:
@@ -109,7 +109,7 @@ async def close_session(session: zenoh.Session) -> None:
         with contextlib.suppress(RuntimeError):  # the loop is closed
             loop.call_soon_threadsafe(done.set)
 
-    _in_thread(work)
+    _in_thread(work, CLOSING_THREAD)
     try:
         await asyncio.wait_for(done.wait(), CLOSE_S)
     except TimeoutError:

@@ -14,7 +14,7 @@ from gigabrain_zenoh.bus.transport import Answer, Close, Link, OnLink, OnRaw, On
 from gigabrain_zenoh.bus.zenoh.session import ReconnectingSession, open_session
 from gigabrain_zenoh.bus.zenoh.workarounds import (
     ReceiveThrottle,
-    await_callback_threads_at_exit,
+    await_zenoh_threads_at_exit,
     keep_thread_state,
 )
 from gigabrain_zenoh.config.settings import Endpoint
@@ -48,7 +48,7 @@ class ZenohTransport:
     @classmethod
     async def open(cls, endpoint: Endpoint) -> "ZenohTransport":
         """Open a session, waiting for its router. Raises BusError."""
-        await_callback_threads_at_exit()
+        await_zenoh_threads_at_exit()
         return cls(await open_session(endpoint), endpoint)
 
     def publish(self, topic: Topic[Any], key: str, payload: bytes, encoding: str) -> None:

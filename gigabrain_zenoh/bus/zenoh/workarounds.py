@@ -54,22 +54,25 @@ def keep_thread_state() -> None:
 
 
 CALLBACK_THREAD = "pyo3-closure"  # in the name of a thread that Zenoh starts for a callback
-ENDING_S = 0.5
+CLOSING_THREAD = "zenoh-close"  # name of a thread of ours that closes a session
+CALLBACK_ENDS_S = 0.5  # after its session is closed
+CLOSING_ENDS_S = 10.0  # on a link that loses packets
 
 
-# such a thread ends after its session is closed; one that came back to Python during the
-# interpreter's end aborted 1 of 30 short scripts ("FATAL: exception not rethrown")
+# a thread that came back to Python from Zenoh during the interpreter's end aborted 1 of 30 short
+# scripts, and 5 of 12 whose session was still closing ("FATAL: exception not rethrown")
 @functools.cache
-def await_callback_threads_at_exit() -> None:
-    """Have this process wait, at its end, for the threads of callbacks."""
-    atexit.register(_await_callback_threads)
+def await_zenoh_threads_at_exit() -> None:
+    """Have this process wait, at its end, for the threads that close sessions or run callbacks."""
+    atexit.register(_await_zenoh_threads)
 
 
-def _await_callback_threads() -> None:
-    end_s = time.monotonic() + ENDING_S
-    for thread in threading.enumerate():
-        if CALLBACK_THREAD in thread.name:
-            thread.join(max(0.0, end_s - time.monotonic()))
+def _await_zenoh_threads() -> None:
+    for name, longest_s in ((CLOSING_THREAD, CLOSING_ENDS_S), (CALLBACK_THREAD, CALLBACK_ENDS_S)):
+        end_s = time.monotonic() + longest_s
+        for thread in threading.enumerate():
+            if name in thread.name:
+                thread.join(max(0.0, end_s - time.monotonic()))
 
 
 T = TypeVar("T")
