@@ -7,6 +7,7 @@ similar). A new session keeps no state of the old one.
 """
 
 import asyncio
+import atexit
 import contextlib
 import functools
 import json
@@ -21,7 +22,11 @@ import zenoh
 from gigabrain_zenoh.bus.bridge import Bridge
 from gigabrain_zenoh.bus.transport import Close
 from gigabrain_zenoh.bus.zenoh.config import explain, plain, session_config
-from gigabrain_zenoh.bus.zenoh.workarounds import CLOSING_THREAD, disable_linger
+from gigabrain_zenoh.bus.zenoh.workarounds import (
+    CLOSING_THREAD,
+    await_zenoh_threads,
+    disable_linger,
+)
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import BusError, ConfigError
 
@@ -41,12 +46,28 @@ def _config(endpoint: Endpoint) -> zenoh.Config:
     return config
 
 
+_open: set[zenoh.Session] = set()  # those of this process that nobody began to close
+
+
+@functools.cache
+def _close_at_exit() -> None:
+    """Have this process close at its end what is still open; see `await_zenoh_threads`."""
+    atexit.register(_close_all)
+
+
+def _close_all() -> None:
+    for session in tuple(_open):
+        _in_thread(functools.partial(_close, session), CLOSING_THREAD)
+    await_zenoh_threads()
+
+
 async def open_session(endpoint: Endpoint) -> zenoh.Session:
     """Open a session, waiting for the router without a time limit.
 
     Uses a daemon thread rather than the loop's executor, so that the process can exit meanwhile.
     Raises BusError when a router cannot listen, ConfigError for an endpoint that is not valid.
     """
+    _close_at_exit()
     config = _config(endpoint)
     loop = asyncio.get_running_loop()
     opened: asyncio.Future[zenoh.Session] = loop.create_future()
@@ -61,6 +82,7 @@ async def open_session(endpoint: Endpoint) -> zenoh.Session:
         session, fault = None, None
         try:
             session = zenoh.open(config)
+            _open.add(session)
         except zenoh.ZError as error:
             fault = error
         try:
@@ -90,6 +112,7 @@ def _in_thread(work: Callable[[], None], name: str) -> None:
 
 
 def _close(session: zenoh.Session) -> None:
+    _open.discard(session)
     try:
         session.close()
     except zenoh.ZError as error:

@@ -1,4 +1,4 @@
-"""Bus transport over Zenoh. Only this module, `zenoh_session` and `zenoh_line` import zenoh."""
+"""Bus transport over Zenoh. Only this module and `session` import zenoh."""
 
 import asyncio
 import contextlib
@@ -12,11 +12,7 @@ from gigabrain_schemas.topics import Priority, Topic
 from gigabrain_zenoh.bus.bridge import Bridge, Mailbox, QueryQueue
 from gigabrain_zenoh.bus.transport import Answer, Close, Link, OnLink, OnRaw, OnSample
 from gigabrain_zenoh.bus.zenoh.session import ReconnectingSession, open_session
-from gigabrain_zenoh.bus.zenoh.workarounds import (
-    ReceiveThrottle,
-    await_zenoh_threads_at_exit,
-    keep_thread_state,
-)
+from gigabrain_zenoh.bus.zenoh.workarounds import ReceiveThrottle, keep_thread_state
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import GigabrainError
 
@@ -48,7 +44,6 @@ class ZenohTransport:
     @classmethod
     async def open(cls, endpoint: Endpoint) -> "ZenohTransport":
         """Open a session, waiting for its router. Raises BusError."""
-        await_zenoh_threads_at_exit()
         return cls(await open_session(endpoint), endpoint)
 
     def publish(self, topic: Topic[Any], key: str, payload: bytes, encoding: str) -> None:

@@ -1,9 +1,7 @@
 """Workarounds for costs and faults of Zenoh 1.10, each with its reason."""
 
-import atexit
 import contextlib
 import ctypes
-import functools
 import os
 import socket
 import stat
@@ -59,15 +57,10 @@ CALLBACK_ENDS_S = 0.5  # after its session is closed
 CLOSING_ENDS_S = 10.0  # on a link that loses packets
 
 
-# a thread that came back to Python from Zenoh during the interpreter's end aborted 1 of 30 short
-# scripts, and 5 of 12 whose session was still closing ("FATAL: exception not rethrown")
-@functools.cache
-def await_zenoh_threads_at_exit() -> None:
-    """Have this process wait, at its end, for the threads that close sessions or run callbacks."""
-    atexit.register(_await_zenoh_threads)
-
-
-def _await_zenoh_threads() -> None:
+# a thread that comes back to Python from Zenoh during the interpreter's end aborts the process
+# ("FATAL: exception not rethrown")
+def await_zenoh_threads() -> None:
+    """Wait until no thread of this process closes a session or runs a callback."""
     for name, longest_s in ((CLOSING_THREAD, CLOSING_ENDS_S), (CALLBACK_THREAD, CALLBACK_ENDS_S)):
         end_s = time.monotonic() + longest_s
         for thread in threading.enumerate():
