@@ -243,6 +243,26 @@ def _set(memory: Nodes, node: int, at: Pose, cost: float, parent: int, move: int
 
 
 @kernel
+def _begin(terrain: Terrain, start: Pose, estimate: float, memory: Nodes) -> None:
+    """Forget all nodes, and open one at the start."""
+    table, heap = memory[3], memory[4]
+    table[:, 0] = -1
+    _set(memory, 0, start, 0.0, ROOT, ROOT)
+    key = _bin(terrain, start[0], start[1], start[2])
+    slot = _slot(table, key)
+    table[slot, 0], table[slot, 1] = key, 0
+    _push(heap, 0, estimate, 0)
+
+
+@kernel
+def _with_change(cost: float, move: int, to: int) -> float:
+    """Return a step's cost with that of changing from `move` to `to`: direction and bend."""
+    if (move >= len(BENDS)) != (to >= len(BENDS)):
+        cost += SWITCH_COST
+    return cost + BEND_COST * abs(BENDS[to % len(BENDS)] - BENDS[move % len(BENDS)])
+
+
+@kernel
 def _begins_in_reverse(lengths: Floats) -> bool:
     """Return whether the first segment of some length is driven backwards."""
     for length in lengths:
@@ -258,13 +278,8 @@ def search(
     """Return the node at the goal, with links back to the start; ROOT if no way leads there."""
     pose, g, link, table, heap = memory
     lengths, turns = np.empty(SEGMENTS), np.empty(SEGMENTS)
-    table[:, 0] = -1
+    _begin(terrain, start, _estimate(terrain, car, start, goal), memory)
     count, size, found, patience = 1, 1, ROOT, PATIENCE
-    _set(memory, 0, start, 0.0, ROOT, ROOT)
-    key = _bin(terrain, start[0], start[1], start[2])
-    slot = _slot(table, key)
-    table[slot, 0], table[slot, 1] = key, 0
-    _push(heap, 0, _estimate(terrain, car, start, goal), 0)
     while size > 0 and count < MAX_NODES - 2 * len(BENDS) - 1 and size < len(heap) - 32:
         node = _pop(heap, size)
         size -= 1
@@ -292,8 +307,7 @@ def search(
             if cost == math.inf:
                 continue
             if move >= 0:
-                cost += SWITCH_COST if (length < 0.0) != (move >= len(BENDS)) else 0.0
-                cost += BEND_COST * abs(share - BENDS[move % len(BENDS)])
+                cost = _with_change(cost, move, to)
             key = _bin(terrain, x, y, yaw)
             slot = _slot(table, key)
             other, total, known = table[slot, 1], g[node] + cost, table[slot, 0] == key
