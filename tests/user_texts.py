@@ -302,35 +302,38 @@ def _doctor() -> Iterator[str]:
     yield ""
 
 
-def _why() -> Iterator[str]:
-    state, still = example(RobotState), Velocity(linear_x=0.0, linear_y=0.0, angular_z=0.0)
+def _moving() -> why.ChainFacts:
+    """Return a chain that is whole, of a robot that should drive forward."""
+    still = Velocity(linear_x=0.0, linear_y=0.0, angular_z=0.0)
     forward = replace(still, linear_x=0.2)
-    gate_of = GateStatus(mode="enabled", commander="control")
-    state = replace(state, velocity=still, gate=gate_of)
-    world = replace(example(WorldModel), scan_ok=True, obstacle_ahead=False)
-    intent = replace(example(Intent), twist=forward, reason="forward 0.20 m/s")
-    command = replace(example(CmdVel), source="control", linear_x=0.2, angular_z=0.0)
-    ok = SafetyState(verdict="ok")
+    gate = GateStatus(mode="enabled", commander="control")
+    return why.ChainFacts(
+        state=replace(example(RobotState), velocity=still, gate=gate),
+        scan_age_ms=60.0,
+        world=replace(example(WorldModel), scan_ok=True, obstacle_ahead=False),
+        intent=replace(example(Intent), twist=forward, reason="forward 0.20 m/s"),
+        command=replace(example(CmdVel), source="control", linear_x=0.2, angular_z=0.0),
+        fastest=forward,
+        safety=SafetyState(verdict="ok"),
+    )
+
+
+def _chains() -> dict[str, why.ChainFacts]:
+    """Return chains of which each is broken, or rests, at another link."""
+    good = _moving()
+    state, world, command = good.state, good.world, good.command
+    still, gate = state.velocity, state.gate
     tasks = replace(example(TaskStatus), current=None, drives=False, doing="waiting")
     task = Task(
         id="goal-1", kind="goal", label="1 2", source="ann", state="paused", reason="by ann"
     )
-    rest = replace(intent, twist=still, reason="no path")
-    good = why.ChainFacts(
-        state=state,
-        scan_age_ms=60.0,
-        world=world,
-        intent=intent,
-        command=command,
-        fastest=forward,
-        safety=ok,
-    )
+    rest = replace(good.intent, twist=still, reason="no path")
     zone, lidar = catalogue.cause("zone_ahead"), catalogue.cause("scan_lost")
     blocked = SafetyState(verdict="ok", caps=SpeedCaps(forward=0.0), causes=(zone,))
     stop = SafetyState(verdict="stop", causes=(lidar,))
     lost = replace(state, link=replace(state.link, connected=False, age_ms=3000.0))
     silent = {name: example(Description) for name in ("driver", "perception")}
-    for title, facts in {
+    return {
         "no router": why.ChainFacts(router="no router answers"),
         "no driver": replace(good, state=None),
         "driver silent": replace(good, state=None, described=silent),
@@ -355,11 +358,15 @@ def _why() -> Iterator[str]:
         ),
         "idle": replace(good, state=replace(state, gate=GateStatus(mode="idle"))),
         "ann stands": replace(
-            good, state=replace(state, gate=replace(gate_of, commander="ann")), fastest=still
+            good, state=replace(state, gate=replace(gate, commander="ann")), fastest=still
         ),
         "stuck": good,
         "strangers": replace(good, strangers=("eve",)),
-    }.items():
+    }
+
+
+def _why() -> Iterator[str]:
+    for title, facts in _chains().items():
         verdict = why.judge(facts)
         found = verdict.broken or verdict.waits
         text = f"{found.link}: {found.text} -> {found.remedy}" if found else "it moves"
