@@ -49,6 +49,10 @@ class Refused(GigabrainError):
     """The robot refused a request."""
 
 
+class StillStopping(Refused):
+    """The gate still brakes; ask again when it has stopped."""
+
+
 class Unsupported(GigabrainError):
     """This body does not have the primitive that was called."""
 

@@ -28,7 +28,7 @@ from gigabrain_schemas.topics import (
     Service,
 )
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.errors import BodyLost, NotConfirmed, Refused
+from gigabrain_zenoh.errors import BodyLost, NotConfirmed, Refused, StillStopping
 from gigabrain_zenoh.runtime.audit import in_order
 from gigabrain_zenoh.security.identity_files import may_not_ask
 
@@ -50,16 +50,18 @@ async def ask_gate(
 ) -> GateReply:
     """Return the granted request's reply.
 
-    Raises Refused with the gate's reason, and BodyLost without an answer, which may be for lack of
-    rights of `keys`.
+    Raises Refused with the gate's reason, StillStopping if that will pass, and BodyLost without an
+    answer, which may be for lack of rights of `keys`.
     """
     replies = await bus.ask(service, request, timeout_s=ANSWER_S)
     if not replies:
         doubt = may_not_ask(keys) or "; is it running?"
         raise BodyLost(f"no driver answers {service.key}{doubt}")
-    if not replies[0].ok:
-        raise Refused(f"{replies[0].robot_type}: {replies[0].text}")
-    return replies[0]
+    reply = replies[0]
+    if not reply.ok:
+        kind = StillStopping if reply.gate.mode == "stopping" else Refused
+        raise kind(f"{reply.robot_type}: {reply.text}")
+    return reply
 
 
 async def enable(bus: Bus, source: str, *, take: bool = False, keys: str = "") -> GateReply:

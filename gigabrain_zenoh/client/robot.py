@@ -1,7 +1,8 @@
 """Python API to a running robot, for scripts and notebooks: the HAL's primitives over Zenoh."""
 
 import asyncio
-from collections.abc import AsyncIterator
+import contextlib
+from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any, TypeVar, overload
 
 from msgspec.structs import asdict
@@ -31,7 +32,14 @@ from gigabrain_zenoh.client.requests import (
     steer,
 )
 from gigabrain_zenoh.client.tasks import Tasks
-from gigabrain_zenoh.errors import BodyLost, ConfigError, NotConfirmed, Refused, Unsupported
+from gigabrain_zenoh.errors import (
+    BodyLost,
+    ConfigError,
+    NotConfirmed,
+    Refused,
+    StillStopping,
+    Unsupported,
+)
 from gigabrain_zenoh.gate.gate import STILL_TICKS
 from gigabrain_zenoh.geometry.limits import ZERO, at_rest, clamp, limits_of
 from gigabrain_zenoh.security.identity_files import may_not_ask
@@ -195,12 +203,10 @@ class Robot:
 
         Raises Refused and BodyLost.
         """
-        for _ in range(HOLD_TICKS):
-            if (await self.read_state()).gate.mode != "stopping":
-                break
-            await self._ticks(1)
         source = source or self._bus.process
-        reply = await enable(self._bus, source, take=take, keys=self._keys)
+        reply = await self._once_stopped(
+            lambda: enable(self._bus, source, take=take, keys=self._keys)
+        )
         if source == self._bus.process:
             self._lease.granted(self._bus.time.boot, reply.gate)
         return reply
@@ -214,7 +220,7 @@ class Robot:
         known = max(self._pressed, gate.estop_generation)
         if gate.mode in ("latched", "stopping") or known > gate.estop_generation:
             await self._rest()
-        return await release(self._bus, known, self._keys)
+        return await self._once_stopped(lambda: release(self._bus, known, self._keys))
 
     async def estop(self, reason: str = "") -> GateReply:
         """Stop at once and latch; this script's own commands stop first.
@@ -309,6 +315,15 @@ class Robot:
             target = ZERO
         command = CmdVel(**asdict(target), source=self._bus.process)
         self._bus.publish(command_topic(body.description), command)
+
+    async def _once_stopped(self, ask: Callable[[], Awaitable[GateReply]]) -> GateReply:
+        """Ask the gate once it no longer stops, by its newest state and by its answer."""
+        for _ in range(HOLD_TICKS):
+            if (await self.read_state()).gate.mode != "stopping":
+                with contextlib.suppress(StillStopping):  # the answer is newer than the state
+                    return await ask()
+            await self._ticks(1)
+        return await ask()
 
     async def _rest(self) -> None:
         """Wait until the body has rested as long as a release needs; for three seconds at most."""
