@@ -1,11 +1,12 @@
 """The robot for scripts without asyncio offers all that the asynchronous one does."""
 
+import asyncio
 import inspect
 
 import pytest
 
 from gigabrain_zenoh.client.robot import Robot
-from gigabrain_zenoh.client.sync_robot import SyncRobot, SyncTasks
+from gigabrain_zenoh.client.sync_robot import EventLoopThread, SyncRobot, SyncTasks
 from gigabrain_zenoh.client.tasks import Tasks
 
 UNSUPPORTED = {"set_joint_position"}  # no driver obeys it yet
@@ -26,3 +27,22 @@ def public(kind: type) -> dict[str, list[tuple[str, object, object]]]:
 def test_each_method_is_there_with_the_same_parameters(sync: type, asynchronous: type) -> None:
     wanted = public(asynchronous)
     assert public(sync) == {name: wanted[name] for name in wanted.keys() - UNSUPPORTED}
+
+
+def test_closing_ends_what_an_interrupt_left_running() -> None:
+    thread, ended = EventLoopThread(), []
+
+    async def forever() -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            ended.append(True)
+
+    async def start() -> asyncio.Task[None]:
+        task = asyncio.ensure_future(forever())
+        await asyncio.sleep(0)
+        return task
+
+    task = thread.run(start())
+    thread.close()
+    assert (ended, task.cancelled()) == ([True], True)
