@@ -1,5 +1,6 @@
 """The body: what it is, and what it is doing."""
 
+import math
 from typing import Annotated, Literal
 
 from msgspec import Meta
@@ -118,6 +119,49 @@ class Lidar(Record, frozen=True, kw_only=True):
     no_return: Literal["free", "unknown"] = "free"  # what an infinite range of this sensor means
 
 
+Side = Annotated[int, Meta(ge=16, le=4096, multiple_of=2)]  # [px] of a picture
+PixelOffset = Annotated[float, Meta(ge=-1e5, le=1e5)]  # [px]
+FocalLength = Annotated[float, Meta(ge=1.0, le=1e5)]  # [px]
+FieldOfView = Annotated[float, Meta(ge=0.1, le=3.0)]  # [rad]
+Coefficient = Annotated[float, Meta(ge=-100.0, le=100.0)]  # of distortion
+CameraName = Annotated[str, Meta(pattern=r"^[A-Za-z]\w*$(?!\n)", max_length=32)]
+MOST_CAMERAS = 8
+
+
+class Camera(Record, frozen=True, kw_only=True):
+    """A camera: how it sees, and where it sits (REP-103: it looks along its own x axis)."""
+
+    name: CameraName
+    width: Side = 320
+    height: Side = 240
+    rate_hz: Annotated[float, Meta(ge=0.5, le=120.0)] = 10.0
+    field_of_view: FieldOfView = 1.047  # [rad], horizontal, where `intrinsics` are not given
+    intrinsics: tuple[FocalLength, FocalLength, PixelOffset, PixelOffset] | None = None
+    # [px]: fx, fy, cx, cy of its calibration
+    distortion: Annotated[tuple[Coefficient, ...], Meta(max_length=8)] = ()  # k1, k2, p1, p2, k3
+    depth: bool = False  # measures the depth of each pixel too
+    depth_min: Range = 0.25  # [m]; nearer, the depth is unknown
+    depth_max: RangeMax = 6.0  # [m]
+    x: Offset = 0.0  # [m], mounting in the body's frame, z from the floor
+    y: Offset = 0.0  # [m]
+    z: Offset = 0.0  # [m]
+    roll: Angle = 0.0  # [rad]
+    pitch: Angle = 0.0  # [rad], positive looks down
+    yaw: Angle = 0.0  # [rad]
+
+    def __post_init__(self) -> None:
+        if self.depth_max <= self.depth_min:
+            raise ValueError("depth_max must be larger than depth_min")
+
+    @property
+    def pinhole(self) -> tuple[float, float, float, float]:
+        """The intrinsics fx, fy, cx, cy [px], from the field of view where none were measured."""
+        if self.intrinsics:
+            return self.intrinsics
+        focal = self.width / 2 / math.tan(self.field_of_view / 2)
+        return focal, focal, (self.width - 1) / 2, (self.height - 1) / 2
+
+
 class ControlGains(Record, frozen=True, kw_only=True):
     """Control's rate of commands, and its gains for the measured velocity."""
 
@@ -196,7 +240,9 @@ class BodyDescription(Record, frozen=True, kw_only=True):
     # [m/s], of a wheel of a differential base; None: it has its largest speeds both at once
     min_turning_radius: Annotated[float, Meta(ge=0.0, le=100.0)] = 0.0
     # [m], of an Ackermann base; 0: max_linear_speed / max_angular_speed
+    body_height: Annotated[float, Meta(ge=0.01, le=10.0)] = 0.5  # [m], of its highest part
     lidar: Lidar | None = None
+    cameras: Annotated[tuple[Camera, ...], Meta(max_length=MOST_CAMERAS)] = ()
     thresholds: Thresholds = DEFAULT
     control: ControlGains = ControlGains()
     safe_state: SafeState = "stop"  # what the driver brings it to when it ends
@@ -215,6 +261,8 @@ class BodyDescription(Record, frozen=True, kw_only=True):
                     f"thresholds: {name}: it is never so far off as {off:g}, "
                     f"for its largest speed is {speed:g}"
                 )
+        if len({camera.name for camera in self.cameras}) < len(self.cameras):
+            raise ValueError("cameras: each needs a name of its own")
         if self.lidar is None:
             return
         needs = self.stopping_distance(self.max_linear_speed)

@@ -1,6 +1,6 @@
 """Messages of perception, decision and control."""
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 from msgspec import Meta
@@ -21,7 +21,7 @@ from gigabrain_schemas.base import (
     Velocity,
     array_meta,
 )
-from gigabrain_schemas.body import MOST_JOINTS, JointPosition, JointSpeed
+from gigabrain_schemas.body import MOST_CAMERAS, MOST_JOINTS, JointPosition, JointSpeed
 
 if TYPE_CHECKING:
     import numpy as np
@@ -64,6 +64,38 @@ class Objects(Message, frozen=True, kw_only=True):
     objects: Annotated[tuple[DetectedObject, ...], Meta(max_length=256)]
 
 
+Height = Annotated[float, Meta(ge=-10.0, le=10.0)]  # [m] above the floor
+Corner = tuple[Coordinate, Coordinate]
+
+
+class Contour(Record, frozen=True, kw_only=True):
+    """The outline of something that a camera saw above the floor, or of a hole in it.
+
+    What lies below the floor, such as a step down, has a negative `bottom`.
+    """
+
+    polygon: Annotated[tuple[Corner, ...], Meta(min_length=3, max_length=64)]
+    # [m], in the body's frame, counter-clockwise
+    bottom: Height  # [m] above the floor
+    top: Height  # [m]
+    age: Annotated[float, Meta(ge=0.0, le=1e6)] = 0.0  # [s] since it was last seen
+    confidence: Fraction = 1.0
+    track: Count = 0  # the same from picture to picture
+    source: Literal["depth", "floor_colour"] = "depth"  # by colour alone it has no height
+
+    def __post_init__(self) -> None:
+        if self.top < self.bottom:
+            raise ValueError("top must not be below bottom")
+
+
+class CameraStatus(Record, frozen=True, kw_only=True):
+    """Whether a camera can be believed."""
+
+    name: Name
+    ok: bool
+    problem: Text = ""  # why not: covered, frozen, no picture
+
+
 class WorldModel(Message, frozen=True, kw_only=True):
     """The robot's surroundings now, in the body's frame."""
 
@@ -74,6 +106,8 @@ class WorldModel(Message, frozen=True, kw_only=True):
     sectors: Annotated[tuple[Distance | None, ...], Meta(max_length=3600)] = ()
     # [m], nearest hit per equal sector, counter-clockwise, the first centred ahead; None for none
     obstacles: Annotated[tuple[Obstacle, ...], Meta(max_length=256)] = ()
+    contours: Annotated[tuple[Contour, ...], Meta(max_length=128)] = ()
+    cameras: Annotated[tuple[CameraStatus, ...], Meta(max_length=MOST_CAMERAS)] = ()
     hits: Annotated[bytes, array_meta(64 * 1024, "float32", ("n", 2), "m")] = b""
     # float32 little-endian [m], (n, 2): where beams hit; only for navigation
 

@@ -6,7 +6,18 @@ A line here is all that a topic takes, beside an example of its message in the f
 from dataclasses import dataclass, replace
 from typing import Any, Generic, Literal, TypeVar
 
-from gigabrain_schemas import body, brain, logs, requests, safety, sensors, sim, tasks, zones
+from gigabrain_schemas import (
+    body,
+    brain,
+    logs,
+    requests,
+    safety,
+    sensors,
+    sim,
+    tasks,
+    vision,
+    zones,
+)
 from gigabrain_schemas.base import Message
 
 M = TypeVar("M", bound=Message)
@@ -88,6 +99,10 @@ BODY = Topic("robot/body", body.Body, 1, keep=True, max_bytes=16 * KB, drawing="
 IMAGE = Topic(
     "robot/image", sensors.Image, 10, max_bytes=1024 * KB, many=True, depth=8, drawing="image",
 )  # fmt: skip
+DEPTH = Topic(
+    "robot/depth", vision.DepthImage, 10, missed=2.5, max_bytes=1024 * KB, many=True, depth=2,
+)  # fmt: skip
+CAMERA = Topic("robot/camera", vision.CameraInfo, 1, keep=True, max_bytes=4 * KB, many=True)
 WORLD = Topic(
     "robot/world", brain.WorldModel, 10, missed=2.5, max_bytes=64 * KB,
     publishers=BRAIN, drawing="obstacles", plotted=True,

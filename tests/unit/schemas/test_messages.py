@@ -20,6 +20,8 @@ REQUIRED: dict[str, set[str]] = {
     "LaserScan": {"angle_min", "angle_increment", "range_min", "range_max", "ranges"},
     "Imu": {"orientation", "angular_velocity", "linear_acceleration"},
     "Image": {"frame_id", "encoding", "height", "width", "data"},
+    "DepthImage": {"frame_id", "height", "width", "planes"},
+    "CameraInfo": {"camera"},
     "RobotState": {"robot_type", "pose", "velocity"},
     "Body": {"description", "link"},
     "WorldModel": {"scan_ok", "obstacle_ahead"},
@@ -86,6 +88,8 @@ def test_the_table_holds_the_keys_and_rates_of_the_design() -> None:
         "robot/state": ("RobotState", 50),
         "robot/body": ("Body", 1),
         "robot/image/*": ("Image", 10),
+        "robot/depth/*": ("DepthImage", 10),
+        "robot/camera/*": ("CameraInfo", 1),
         "robot/world": ("WorldModel", 10),
         "robot/objects/*": ("Objects", 10),
         "robot/pose": ("PoseInMap", 10),
@@ -121,6 +125,8 @@ def test_a_value_stops_counting_after_so_many_missed_periods() -> None:
         "robot/state": 250_000_000,
         "robot/body": 5_000_000_000,
         "robot/image": 500_000_000,
+        "robot/depth": 250_000_000,
+        "robot/camera": 5_000_000_000,
         "robot/world": 250_000_000,
         "robot/objects": 500_000_000,
         "robot/pose": 500_000_000,
@@ -184,7 +190,7 @@ def test_every_message_is_frozen_and_documented_and_carries_the_header(
 def test_the_golden_folder_holds_the_examples_byte_for_byte() -> None:
     stored = {path.name: path.read_bytes() for path in examples.FOLDER.iterdir()}
     assert stored == examples.files()
-    assert len(stored) == 98
+    assert len(stored) == 102
 
 
 @by_name

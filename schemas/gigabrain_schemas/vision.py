@@ -1,0 +1,75 @@
+"""What cameras see: depth pictures, and how a camera sees. Pictures are `sensors.Image`."""
+
+import zlib
+from typing import TYPE_CHECKING, Annotated
+
+from msgspec import Meta
+
+from gigabrain_schemas.base import Message, Name
+from gigabrain_schemas.body import Camera, CameraName, Side
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+MAX_PLANE_BYTES = 256 * 1024
+Plane = Annotated[bytes, Meta(max_length=MAX_PLANE_BYTES)]
+
+
+class DepthImage(Message, frozen=True, kw_only=True):
+    """The depth of each pixel along the camera's axis [mm]; 0 is unknown. Compressed without loss.
+
+    It comes as four planes, each a quarter of the picture: of every block of two by two pixels the
+    first one, the second one, and so on by row. The first plane alone is the picture at half the
+    width and height, for readers that cannot wait. A plane is uint16 by row, compressed by zlib.
+    """
+
+    frame_id: Name
+    height: Side  # [px]
+    width: Side  # [px]
+    planes: tuple[Plane, Plane, Plane, Plane]
+
+    def quarter(self) -> "NDArray[np.uint16]":
+        """Return the first plane [mm], (height / 2, width / 2). Raises ValueError if broken."""
+        return _unpacked(self.planes[0], self.height // 2, self.width // 2)
+
+    def array(self) -> "NDArray[np.uint16]":
+        """Return all pixels [mm], (height, width). Raises ValueError if a plane is broken."""
+        import numpy as np
+
+        pixels = np.empty((self.height, self.width), np.uint16)
+        for number, plane in enumerate(self.planes):
+            row, column = divmod(number, 2)
+            pixels[row::2, column::2] = _unpacked(plane, self.height // 2, self.width // 2)
+        return pixels
+
+
+def pack_depth(depth: "NDArray[np.uint16]") -> tuple[bytes, bytes, bytes, bytes]:
+    """Return the planes of a DepthImage for `depth` [mm], (height, width), both even."""
+    one, two, three, four = (
+        zlib.compress(depth[row::2, column::2].astype("<u2").tobytes(), 1)
+        for row in (0, 1)
+        for column in (0, 1)
+    )
+    return one, two, three, four
+
+
+def _unpacked(data: bytes, height: int, width: int) -> "NDArray[np.uint16]":
+    import numpy as np
+
+    size = 2 * height * width
+    unpacker = zlib.decompressobj()
+    try:
+        plain = unpacker.decompress(data, size + 1)  # no more than it may be: no bomb
+    except zlib.error as error:
+        raise ValueError(f"a plane of depth cannot be unpacked: {error}") from None
+    if len(plain) != size or not unpacker.eof:
+        raise ValueError(f"a plane of depth needs {size} bytes, got {len(plain)}")
+    return np.frombuffer(plain, "<u2").reshape(height, width)
+
+
+class CameraInfo(Message, frozen=True, kw_only=True):
+    """How a camera sees and where it sits. The last value is kept for those who join late."""
+
+    camera: Camera
+    source: CameraName = "mujoco"  # what its pictures come from
