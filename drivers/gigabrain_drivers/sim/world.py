@@ -118,6 +118,7 @@ class Stream(IntEnum):
     START = 1
     LIDAR = 2
     IMU = 3
+    CAMERA = 4
 
 
 def generator(seed: int, stream: Stream) -> np.random.Generator:
