@@ -18,6 +18,7 @@ from gigabrain_schemas.base import (
     Name,
     Record,
     Text,
+    Tick,
     Velocity,
     array_meta,
 )
@@ -94,6 +95,7 @@ class CameraStatus(Record, frozen=True, kw_only=True):
     name: Name
     ok: bool
     problem: Text = ""  # why not: covered, frozen, no picture
+    exposure: Tick = 0  # of its newest picture whose contours are in the world; 0 for none
 
 
 class WorldModel(Message, frozen=True, kw_only=True):

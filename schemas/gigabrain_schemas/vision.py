@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from msgspec import Meta
 
-from gigabrain_schemas.base import Message, Name
+from gigabrain_schemas.base import Message, Name, Text
 from gigabrain_schemas.body import Camera, CameraName, Side
 
 if TYPE_CHECKING:
@@ -73,3 +73,4 @@ class CameraInfo(Message, frozen=True, kw_only=True):
 
     camera: Camera
     source: CameraName = "mujoco"  # what its pictures come from
+    problem: Text = ""  # why it gives no pictures now: covered, frozen, no picture
