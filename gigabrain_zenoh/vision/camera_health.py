@@ -148,5 +148,5 @@ def _fingerprint(picture: NDArray[np.uint8] | None, depth: NDArray[np.uint16] | 
     mark = 0
     for pixels in (picture, depth):
         if pixels is not None:
-            mark = zlib.crc32(np.ascontiguousarray(pixels[::STEP_PX]), mark)
+            mark = zlib.crc32(pixels[::STEP_PX].tobytes(), mark)
     return mark
