@@ -2,6 +2,7 @@
 
 `step` puts them side by side, `node` is the process.
 
-It may import bus, gate, geometry, host and runtime; never perception, mapping or navigation.
+It may import bus, gate, geometry, host and runtime; never perception, vision, mapping or
+navigation: what cameras measure it judges by its own code, in `depth`.
 Launch, recording and qa may import it.
 """

@@ -73,6 +73,26 @@ CAUSES = _causes(
         "the lidar's data are late",
         "check its cable, its adapter and the computer's load",
     ),
+    (
+        "camera_lost",
+        "no picture of a camera for too long; the body does not go where it should look",
+        "check that the camera process runs, its log, and the camera's cable",
+    ),
+    (
+        "camera_blind",
+        "a camera sees nothing; the body does not go where it should look",
+        "uncover and clean it, light the room, or back away from what is before it",
+    ),
+    (
+        "camera_frozen",
+        "a camera repeats one picture; the body does not go where it should look",
+        "start the camera process again, or plug the camera in again",
+    ),
+    (
+        "camera_wrong",
+        "a camera's pictures are not those that the body's file describes",
+        "correct the camera in the body's file, or what sends its pictures",
+    ),
     ("zone_ahead", "obstacle ahead of the body", _MAKE_ROOM),
     ("zone_behind", "obstacle behind the body", _MAKE_ROOM),
     ("zone_left", "obstacle to the left of the body", _MAKE_ROOM),

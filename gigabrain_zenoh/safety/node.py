@@ -18,6 +18,7 @@ from gigabrain_schemas.sensors import Imu
 from gigabrain_schemas.topics import (
     BODY,
     CMD_VEL,
+    DEPTH,
     HEALTH,
     IMAGE,
     IMU,
@@ -32,6 +33,7 @@ from gigabrain_schemas.topics import (
     Topic,
     command_topic,
 )
+from gigabrain_schemas.vision import DepthImage
 from gigabrain_zenoh.bus.bus import Bus, Latest
 from gigabrain_zenoh.bus.freshness import LEAD_TICKS, PreviousTick
 from gigabrain_zenoh.gate.causes import in_words
@@ -39,6 +41,7 @@ from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.geometry.stopping import REPEAT_TICKS, scan_limit_ns
 from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.runtime.heartbeat import Progress
+from gigabrain_zenoh.safety.cameras import Picture, Pictures, depth_cameras
 from gigabrain_zenoh.safety.health import SYSTEMS, Bases, Host, horizontal
 from gigabrain_zenoh.safety.step import SafetyInputs, SafetyMemory, step
 
@@ -161,7 +164,9 @@ class InputCollector:
     """Keeps the newest messages; calls `on_new` with each state and each scan."""
 
     def __init__(self, bus: Bus, on_new: Callable[[Message], None], probe: HostProbe) -> None:
-        self._bus, self._probe = bus, probe
+        self._bus, self._probe, self._on_new = bus, probe, on_new
+        self._pictures: dict[str, Latest[DepthImage]] = {}  # by camera of the body
+        self._sees = False  # it listens to pictures
         self._by_commander: dict[str, PreviousTick[CmdVel]] = {}
         # age [ticks] and source; tick, and horizontal acceleration [m/s2]
         self._echoes: deque[tuple[int, str]] = deque(maxlen=MAX_KEPT)
@@ -191,6 +196,7 @@ class InputCollector:
             state=state,
             scan=self._scans.current,
             scan_age_ns=self._scans.age_ns(),
+            pictures=self._newest_pictures(),
             silent=self._silent(body),
             bases=self._bases(),
             command=(
@@ -200,6 +206,10 @@ class InputCollector:
             shock=self._shock(state),
             host=self._probe(self._bus.clock.now_ns()),
         )
+
+    def _newest_pictures(self) -> Pictures:
+        newest = ((name, one.current, one.age_ns()) for name, one in self._pictures.items())
+        return {name: Picture(image=image, age_ns=age or 0) for name, image, age in newest if image}
 
     def _silent(self, body: BodyDescription) -> tuple[str, ...]:
         beat_ns = round(body.thresholds.heartbeat * 1e9)
@@ -253,8 +263,26 @@ class InputCollector:
         if imu.boot == time.boot and imu.tick <= time.tick + LEAD_TICKS:
             self._shocks.append((imu.tick, horizontal(imu.linear_acceleration)))
 
+    def _on_picture(self, key: str, image: DepthImage) -> None:
+        """Keep a picture. One of the future is not: it would keep the present ones out."""
+        latest = self._pictures.get(key.removeprefix(f"{DEPTH.key}/"))
+        if latest is None or max(image.basis, image.tick) > self._bus.time.tick + LEAD_TICKS:
+            self._bus.counters["refused_pictures"] += 1
+            return
+        before = latest.current
+        if before is not None and image.basis <= before.basis:
+            self._bus.counters["repeated_pictures"] += 1
+        elif latest.store(image):
+            self._on_new(image)
+
     def _on_body(self, body: Body) -> None:
-        """Subscribe to the topic that the body's driver obeys, if it is not the usual one."""
+        """Subscribe to its cameras, and to the topic that its driver obeys if it is another."""
+        names = [camera.name for camera in depth_cameras(body.description)]
+        if names != list(self._pictures):
+            self._pictures = {n: Latest(DEPTH, self._bus.clock, self._bus.time) for n in names}
+        if names and not self._sees:
+            self._sees = True
+            self._bus.subscribe(DEPTH, self._on_picture)
         topic = command_topic(body.description)
         if topic.key == self._command_key:
             return

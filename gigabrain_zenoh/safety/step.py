@@ -11,6 +11,7 @@ from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.geometry.limits import NO_CAPS, ZERO
 from gigabrain_zenoh.geometry.pose import PoseHistory, velocity_of
 from gigabrain_zenoh.geometry.stopping import scan_limit_ns
+from gigabrain_zenoh.safety.cameras import NO_PICTURES, Pictures
 from gigabrain_zenoh.safety.catalogue import MAX_STEP_TICKS, cause
 from gigabrain_zenoh.safety.health import (
     Attitude,
@@ -34,6 +35,7 @@ class SafetyInputs(Struct, frozen=True, kw_only=True):
     state: RobotState
     scan: LaserScan | None = None  # newest of this boot, however old
     scan_age_ns: int | None = None
+    pictures: Pictures = NO_PICTURES  # newest of this boot by camera, however old
     silent: tuple[str, ...] = ()  # systems of the brain without fresh messages
     bases: Bases = Bases()
     command: CmdVel | None = None  # the commander's newest of an earlier tick
@@ -105,7 +107,7 @@ def _observe(body: BodyDescription, memory: SafetyMemory, inputs: SafetyInputs) 
         latency=latency,
         progress=memory.progress.then(inputs.bases, elapsed),
         history=history,
-        field=memory.field.then(body, inputs.scan, state, history, motion),
+        field=memory.field.then(body, inputs.scan, state, history, motion, inputs.pictures),
     )
 
 

@@ -1,4 +1,7 @@
-"""The protective field: free distance in each direction at each scan, and the speeds it allows."""
+"""The protective field: free distance in each direction, and the speeds it allows.
+
+It is computed at each scan, and where cameras measure depth at each picture.
+"""
 
 import math
 
@@ -8,7 +11,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_NS, Cause, Velocity
-from gigabrain_schemas.body import BodyDescription, RobotState
+from gigabrain_schemas.body import BodyDescription, Lidar, RobotState
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.geometry.pose import PoseHistory, axes
@@ -16,6 +19,7 @@ from gigabrain_zenoh.geometry.scan import blind_ahead, hits, scan_problem
 from gigabrain_zenoh.geometry.stopping import brakes
 from gigabrain_zenoh.geometry.sweep import arc, straight, turning
 from gigabrain_zenoh.safety import blind_spots
+from gigabrain_zenoh.safety.cameras import NO_PICTURES, Cameras, Pictures, depth_cameras
 from gigabrain_zenoh.safety.catalogue import cause
 from gigabrain_zenoh.safety.tracking_error import Axes
 
@@ -48,15 +52,18 @@ class Motion(Struct, frozen=True, kw_only=True):
 
 
 class ProtectiveField(Struct, frozen=True, kw_only=True):
-    """The newest scan's free distances, and the directions in which the body has stopped."""
+    """The newest free distances, and the directions in which the body has stopped."""
 
     scans: int = 0  # processed so far
     basis: int = 0  # tick of the newest
     problem: str = ""  # why that one is not plausible
-    free: Free = {}
+    by_scan: Free = {}  # what it leaves free
+    free: Free = {}  # what is left by what cameras saw, too
+    by_camera: frozenset[str] = frozenset()  # directions in which that is the nearest
     stopped: frozenset[str] = frozenset()
     sectors: blind_spots.Ranges = ()
     past: blind_spots.PastViews = ()
+    cameras: Cameras = Cameras()
 
     def then(
         self,
@@ -65,20 +72,38 @@ class ProtectiveField(Struct, frozen=True, kw_only=True):
         state: RobotState,
         history: PoseHistory,
         motion: Motion,
+        pictures: Pictures = NO_PICTURES,
     ) -> "ProtectiveField":
-        """Return the field after a new scan, once the state of its tick has come.
+        """Return the field after a new scan or picture, once the state of its tick has come.
 
-        Zones depend on the speed at that tick. Until the next scan the speed caps keep the body
+        Zones depend on the speed at that tick. Until the next one the speed caps keep the body
         from gaining more speed than its zone allows.
         """
-        lidar = body.lidar
-        if lidar is None or scan is None or scan.basis == self.basis or scan.basis > state.tick:
-            return self
+        now = self
+        if scan and body.lidar and scan.basis != self.basis and scan.basis <= state.tick:
+            now = self._scanned(body, body.lidar, scan, state, history, motion)
+        if depth_cameras(body):
+            cameras = self.cameras.then(body, pictures, state, history)
+            now = replace(now, cameras=cameras)
+            if now.basis == self.basis and cameras.seen == self.cameras.seen:
+                return now
+        return self if now is self else now._closed(body, state, motion)
+
+    def _scanned(
+        self,
+        body: BodyDescription,
+        lidar: Lidar,
+        scan: LaserScan,
+        state: RobotState,
+        history: PoseHistory,
+        motion: Motion,
+    ) -> "ProtectiveField":
+        """Return the field with what one scan leaves free."""
         problem = scan_problem(lidar, scan.ranges_m, HOUSING_M)
         problem = problem or blind_ahead(lidar, scan, HOUSING_M, CONE_DEG)
         now = replace(self, scans=self.scans + 1, basis=scan.basis, problem=problem)
         if problem:
-            return replace(now, free={}, stopped=frozenset())
+            return replace(now, by_scan={})
         elapsed_s = max(0, scan.basis - self.basis) * TICK_NS / 1e9 if self.basis else 0.0
         moved = elapsed_s * math.hypot(motion.measured.linear_x, motion.measured.linear_y)
         pose = history.at(state.boot, scan.basis) or state.pose
@@ -89,12 +114,24 @@ class ProtectiveField(Struct, frozen=True, kw_only=True):
         seen = np.stack(hits(lidar, scan, HOUSING_M), axis=1)
         dark = blind_spots.obstacles(body, pose.yaw, sectors, unknown, HOUSING_M, past)
         free = _free(body, np.concatenate([seen, dark]), motion)
+        return replace(now, by_scan=free, sectors=sectors, past=past)
+
+    def _closed(
+        self, body: BodyDescription, state: RobotState, motion: Motion
+    ) -> "ProtectiveField":
+        """Return the field with the nearest of scan and cameras, and the directions it closes."""
+        free, nearer = self.by_scan, set[str]()
+        points = self.cameras.obstacles(state.pose)
+        if len(points):
+            seen = _free(body, points, motion)
+            nearer = {way for way, far in seen.items() if _shorter(far, free.get(way))}
+            free = {**free, **{way: seen[way] for way in nearer}}
         stopped = frozenset(
-            direction
-            for direction, brake in brakes(body).items()
-            if brake.in_zone(free[direction], motion.towards(direction), direction in self.stopped)
+            way
+            for way, brake in brakes(body).items()
+            if brake.in_zone(free.get(way), motion.towards(way), way in self.stopped)
         )
-        return replace(now, free=free, stopped=stopped, sectors=sectors, past=past)
+        return replace(self, free=free, by_camera=frozenset(nearer), stopped=stopped)
 
     def caps(self, body: BodyDescription) -> SpeedCaps:
         """Return the largest speed in each direction."""
@@ -102,6 +139,7 @@ class ProtectiveField(Struct, frozen=True, kw_only=True):
             direction: brake.cap(self.free.get(direction), direction in self.stopped)
             for direction, brake in brakes(body).items()
         }
+        allowed.update((way, 0.0) for way in self.cameras.blind & allowed.keys())
         return SpeedCaps(**allowed)
 
     @property
@@ -110,9 +148,16 @@ class ProtectiveField(Struct, frozen=True, kw_only=True):
         found = []
         for direction, (code, side) in ZONES.items():
             if direction in self.stopped:
-                free = self.free[direction] or 0.0
-                found.append(cause(code, f"obstacle {free:.2f} m {side}" if side else ""))
-        return tuple(found)
+                free = self.free.get(direction) or 0.0
+                text = f"obstacle {free:.2f} m {side}" if side else cause(code).text
+                by = ", seen by a camera" if direction in self.by_camera else ""
+                found.append(cause(code, f"{text}{by}"))
+        return (*found, *self.cameras.causes)
+
+
+def _shorter(one: float | None, other: float | None) -> bool:
+    """Return whether `one` leaves less free than `other`; None is all free."""
+    return one is not None and (other is None or one < other)
 
 
 def _free(body: BodyDescription, points: Floats, motion: Motion) -> Free:

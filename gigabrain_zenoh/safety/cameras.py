@@ -1,0 +1,286 @@
+"""Monitor of the cameras with depth: whether each is to be believed, and what they have seen.
+
+Obstacles are remembered in the frame of the odometry until a picture shows that they are gone, or
+they are out of reach: a camera looks ahead, and the body drives over what it saw, or backs into it.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import TICK_NS, Cause, Pose
+from gigabrain_schemas.body import BodyDescription, Camera, RobotState
+from gigabrain_schemas.vision import DepthImage
+from gigabrain_zenoh.geometry.pose import PoseHistory, relative
+from gigabrain_zenoh.geometry.se2 import from_pose, transform
+from gigabrain_zenoh.geometry.sweep import depth as outside
+from gigabrain_zenoh.geometry.sweep import edges
+from gigabrain_zenoh.safety.catalogue import cause
+from gigabrain_zenoh.safety.depth import (
+    Mask,
+    Sighting,
+    Up,
+    blind,
+    reach_of,
+    seen_through,
+    sight,
+    view_of,
+)
+
+LATE_PERIODS = 2.5  # of a camera without a picture, unless the allowed age of scans is longer
+MIN_PERIOD_SHARE = 0.5  # of its period: pictures that come faster are skipped
+FROZEN_M, FROZEN_RAD = 0.02, math.radians(2)  # moved while the picture stays exactly the same
+UP_STEP = 0.01  # of the vertical's x and y: 0.6 deg, to which a tilt counts
+WAYS = {"forward": 0.0, "left": math.pi / 2, "backward": math.pi, "right": -math.pi / 2}
+LEAST_SIDE = math.radians(45)  # from its axis, to which a camera must see at least
+CELL_M = 0.02  # of points nearer than this one is kept
+NEAR_M = 0.04  # within which two sightings of a doubtful point confirm each other
+PENDING, BELIEVED = 1, 3  # levels; from 2 on a point counts, and each look through it takes one
+PENDING_PERIODS = 2.5  # after which a doubtful point that was not seen again is dropped
+DRIFT_M = 0.02  # inside the footprint: what stands there can be no thing
+JUMP_M = 0.5  # between two pictures: the odometry has restarted
+MAX_POINTS = 1500
+CHECK_TICKS = 5  # without pictures, between two looks at what is remembered
+
+
+class Picture(Struct, frozen=True, kw_only=True):
+    """The newest picture of a camera, and its age."""
+
+    image: DepthImage
+    age_ns: int = 0  # by arrival
+
+
+Pictures = Mapping[str, Picture]
+NO_PICTURES: Pictures = {}
+
+
+class Marks(NamedTuple):
+    """Remembered points, in the frame of the odometry."""
+
+    points: Floats  # (n, 3) [m]
+    hole: Mask  # (n,)
+    level: NDArray[np.int8]  # (n,)
+    tick: NDArray[np.int64]  # (n,), of the last sighting
+
+    def where(self, keep: Mask) -> "Marks":
+        """Return the marks that `keep` (n,) names."""
+        if keep.all():
+            return self
+        return Marks(self.points[keep], self.hole[keep], self.level[keep], self.tick[keep])
+
+
+NO_MARKS = Marks(np.empty((0, 3)), np.empty(0, bool), np.empty(0, np.int8), np.empty(0, np.int64))
+
+
+class CameraState(Struct, frozen=True, kw_only=True):
+    """What is known of one camera."""
+
+    basis: int = 0  # tick of the newest picture; 0 before the first
+    code: str = ""  # of the cause for which that one cannot be believed
+    text: str = ""
+    plane: bytes = b""  # of that picture, as it came
+    since: Pose | None = None  # where the body was when that plane first came
+
+
+class Cameras(Struct, frozen=True, kw_only=True):
+    """All cameras with depth of a body, and what they have seen."""
+
+    states: Mapping[str, CameraState] = {}
+    marks: Marks = NO_MARKS
+    pose: Pose | None = None  # at the newest picture
+    checked: int = 0  # tick at which `obstacles` were last wanted
+    pictures: int = 0  # that were looked at
+    causes: tuple[Cause, ...] = ()
+    blind: frozenset[str] = frozenset()  # directions that a camera should see, and does not
+
+    def then(
+        self, body: BodyDescription, pictures: Pictures, state: RobotState, history: PoseHistory
+    ) -> "Cameras":
+        """Return the monitor after one more state, or picture."""
+        now = self
+        for camera in depth_cameras(body):
+            picture = pictures.get(camera.name)
+            if picture and now._due(camera, picture.image, state):
+                now = now._with(body, camera, picture.image, state, history)
+        causes, dark = [], set[str]()
+        for camera in depth_cameras(body):
+            if found := now._cause(body, camera, pictures.get(camera.name), state):
+                causes.append(found)
+                dark |= directions(camera)
+        now = replace(now, causes=tuple(causes), blind=frozenset(dark))
+        if now.pictures != self.pictures or state.tick - self.checked >= CHECK_TICKS:
+            now = replace(now, checked=state.tick, marks=_kept(body, now.marks, state))
+        return now
+
+    @property
+    def seen(self) -> tuple[int, int]:
+        """Changes where the obstacles have to be looked at again."""
+        return self.pictures, self.checked
+
+    def obstacles(self, pose: Pose) -> Floats:
+        """Return what stands or gapes around a body at `pose`, (n, 2) [m] in its frame."""
+        points = self.marks.points[self.marks.level > PENDING, :2]
+        return transform(from_pose(relative(pose, Pose(x=0.0, y=0.0, yaw=0.0))), points)
+
+    def _due(self, camera: Camera, image: DepthImage, state: RobotState) -> bool:
+        """Return whether a picture is new, of the past, and not of a flood."""
+        before = self.states.get(camera.name, CameraState()).basis
+        period = 1e9 / camera.rate_hz / TICK_NS
+        least = MIN_PERIOD_SHARE * period if before else 1
+        return before + least <= image.basis <= state.tick
+
+    def _with(
+        self,
+        body: BodyDescription,
+        camera: Camera,
+        image: DepthImage,
+        state: RobotState,
+        history: PoseHistory,
+    ) -> "Cameras":
+        """Look at one picture."""
+        before = self.states.get(camera.name, CameraState())
+        pose = history.at(state.boot, image.basis) or state.pose
+        same = image.planes[0] == before.plane
+        since = before.since if same and before.since else pose
+        marks, code, text = self.marks, "", ""
+        if self.pose and math.hypot(pose.x - self.pose.x, pose.y - self.pose.y) > JUMP_M:
+            marks = NO_MARKS
+        wanted = (camera.width, camera.height)
+        if (image.width, image.height) != wanted:
+            code = "camera_wrong"
+            text = f"has {image.width} x {image.height} pixels, its file {wanted[0]} x {wanted[1]}"
+        elif same and _moved(since, pose):
+            code, text = "camera_frozen", "repeats one picture while the body moves"
+        else:
+            marks, code, text = _look(body, camera, image, (pose, _up(state)), marks)
+        seen = CameraState(
+            basis=image.basis, code=code, text=text, plane=image.planes[0], since=since
+        )
+        states = {**self.states, camera.name: seen}
+        return replace(self, states=states, marks=marks, pose=pose, pictures=self.pictures + 1)
+
+    def _cause(
+        self, body: BodyDescription, camera: Camera, picture: Picture | None, state: RobotState
+    ) -> Cause | None:
+        """Return why a camera cannot be believed now."""
+        seen = self.states.get(camera.name)
+        limit_ns = max(body.thresholds.scan_age * 1e9, LATE_PERIODS * 1e9 / camera.rate_hz)
+        if seen is None or picture is None:
+            return cause("camera_lost", f"no picture of camera {camera.name} has come yet")
+        age_ns = max(picture.age_ns, (state.tick - seen.basis) * TICK_NS)
+        if age_ns > limit_ns:
+            late = f"no picture of camera {camera.name} for more than {limit_ns / 1e6:.0f} ms"
+            future = picture.image.basis > state.tick
+            return cause("camera_lost", f"{late}; the newest is of the future" if future else late)
+        return cause(seen.code, f"camera {camera.name} {seen.text}") if seen.code else None
+
+
+def depth_cameras(body: BodyDescription) -> tuple[Camera, ...]:
+    """Return the cameras of `body` that measure depth."""
+    return tuple(camera for camera in body.cameras if camera.depth)
+
+
+def directions(camera: Camera) -> set[str]:
+    """Return the directions of motion that a camera should see."""
+    fx, *_ = camera.pinhole
+    side = max(math.atan2(camera.width / 2, fx), LEAST_SIDE) + 1e-6
+    return {
+        way for way, yaw in WAYS.items() if abs(math.remainder(yaw - camera.yaw, math.tau)) <= side
+    }
+
+
+def _up(state: RobotState) -> Up:
+    """Return x and y of the vertical in the body's frame, in steps; (0, 0) for a level body."""
+    if state.imu is None:
+        return 0.0, 0.0
+    x, y, z, w = state.imu.orientation
+    ups = (2 * (x * z - w * y), 2 * (y * z + w * x))
+    first, second = (round(max(-0.5, min(0.5, up)) / UP_STEP) * UP_STEP for up in ups)
+    return first, second
+
+
+def _moved(since: Pose, pose: Pose) -> bool:
+    way = math.hypot(pose.x - since.x, pose.y - since.y)
+    return way > FROZEN_M or abs(math.remainder(pose.yaw - since.yaw, math.tau)) > FROZEN_RAD
+
+
+def _look(
+    body: BodyDescription, camera: Camera, image: DepthImage, place: tuple[Pose, Up], marks: Marks
+) -> tuple[Marks, str, str]:
+    """Return the marks after a picture from a `place`, and the code and text of its fault."""
+    try:
+        picture = image.quarter()
+    except ValueError as error:
+        return marks, "camera_wrong", f"sends what is no picture: {error}"[:300]
+    pose, up = place
+    view = view_of(body, camera, up)
+    dark = blind(camera, view, picture)
+    wanted = view._replace(sure=np.zeros_like(view.sure)) if dark else view
+    found = sight(body, camera, wanted, picture)
+    if len(marks.level):
+        here = _in_frame(pose, marks.points)
+        gone = seen_through(camera, view, picture, here, marks.hole)
+        marks = marks._replace(level=(marks.level - gone).astype(np.int8))
+        marks = marks.where(marks.level > 0)
+    oldest = image.basis - PENDING_PERIODS * 1e9 / camera.rate_hz / TICK_NS
+    marks = _merged(marks, found, pose, image.basis)
+    marks = marks.where((marks.level > PENDING) | (marks.tick >= oldest))
+    if dark:
+        return marks, "camera_blind", "sees neither the floor nor anything before it"
+    return marks, "", ""
+
+
+def _in_frame(pose: Pose, points: Floats) -> Floats:
+    """Return `points` (n, 3) of the odometry's frame in that of a body at `pose`."""
+    origin = from_pose(relative(pose, Pose(x=0.0, y=0.0, yaw=0.0)))
+    return np.column_stack((transform(origin, points[:, :2]), points[:, 2]))
+
+
+def _merged(marks: Marks, found: Sighting, pose: Pose, tick: int) -> Marks:
+    """Return `marks` with what was found from `pose`; what is doubtful waits for a second look."""
+    if not len(found.points):
+        return marks
+    points = np.column_stack((transform(from_pose(pose), found.points[:, :2]), found.points[:, 2]))
+    sure = found.sure.copy()
+    doubt = np.flatnonzero(~sure)
+    if len(doubt) and len(marks.points):
+        off = points[doubt, None, :2] - marks.points[None, :, :2]
+        near = (off**2).sum(axis=-1) <= NEAR_M**2
+        near &= found.hole[doubt, None] == marks.hole
+        sure[doubt] = near.any(axis=1)
+    level = np.where(sure, BELIEVED, PENDING).astype(np.int8)
+    order = np.argsort(~sure, kind="stable")  # of two in a cell the sure one is kept
+    all_marks = Marks(
+        np.concatenate((points[order], marks.points)),
+        np.concatenate((found.hole[order], marks.hole)),
+        np.concatenate((level[order], marks.level)),
+        np.concatenate((np.full(len(points), tick), marks.tick)),
+    )
+    cells = np.floor(all_marks.points[:, :2] / CELL_M).astype(np.int64)
+    keys = (cells[:, 0] * (1 << 31) + cells[:, 1]) * 2 + all_marks.hole
+    believed = np.flatnonzero(all_marks.level > PENDING)
+    pending = np.flatnonzero(all_marks.level <= PENDING)
+    ranked = np.concatenate((believed, pending))
+    _, first = np.unique(keys[ranked], return_index=True)
+    keep = np.zeros(len(keys), bool)
+    keep[ranked[first]] = True
+    return all_marks.where(keep)
+
+
+def _kept(body: BodyDescription, marks: Marks, state: RobotState) -> Marks:
+    """Return the marks in reach; no thing is where the body stands, but it may be over a hole."""
+    if not len(marks.level):
+        return marks
+    here = _in_frame(state.pose, marks.points)[:, :2]
+    away = np.hypot(here[:, 0], here[:, 1])
+    keep = away <= reach_of(body)
+    keep &= marks.hole | (outside(edges(body.footprint), here) > -DRIFT_M)
+    if np.count_nonzero(keep) > MAX_POINTS:
+        keep &= away <= np.partition(away[keep], MAX_POINTS)[MAX_POINTS]
+    return marks.where(keep)

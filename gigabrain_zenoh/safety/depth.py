@@ -1,0 +1,334 @@
+"""Obstacles in one depth picture: what stands above the floor, and where the floor is missing.
+
+Safety's own code, by numpy alone, on the picture at half its width and height. All that it decides
+about a pixel is a depth that was computed once for the camera's place: nearer than `above` the
+pixel shows something that stands on the floor, beyond `below` it looks through a hole in it.
+"""
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.body import BodyDescription, Camera
+from gigabrain_zenoh.geometry.stopping import brakes
+from gigabrain_zenoh.geometry.sweep import depth as outside
+from gigabrain_zenoh.geometry.sweep import edges, radius
+
+MOUNT_M, MOUNT_RAD = 0.005, math.radians(0.5)  # to which the mounting of a camera is known
+NOISE_PER_M2, SIGMAS = 0.0015, 3.0  # [1/m], the deviation of a depth z is this times z^2
+MEMORY_M = 0.3  # beyond the stopping distance, what is seen is remembered
+UNDISTORT_STEPS = 20
+NEVER = 65535  # [mm], a depth that no pixel has
+SURE_NEAR_M, SURE_SHARE = 0.05, 0.8  # beyond depth_min, of depth_max: the floor must be seen there
+ALIKE_M, ALIKE_SHARE = 0.015, 0.02  # by which depths on one surface differ from pixel to pixel
+BESIDE, SURELY_BESIDE = 2, 4  # of 8 neighbours alike: to be believed if confirmed, at once
+HOLE_BESIDE, SURE_HOLE_BESIDE = 3, 6  # the same of holes
+BLIND_FLOOR, BLIND = 0.8, 0.95  # share of unknown pixels
+GAP_PX = 5  # side of a square without any floor that is no flaw of the picture
+
+Pixels = NDArray[np.uint16]
+Mask = NDArray[np.bool_]
+Up = tuple[float, float]  # x and y of the vertical in the body's frame; (0, 0) for a level body
+
+
+class View(NamedTuple):
+    """A camera on a body; arrays are (height / 2, width / 2), by pixel."""
+
+    mount: Floats  # (3,) [m], in the body's frame, z from the floor
+    rays: NDArray[np.float32]  # (h, w, 3), from there for each metre of depth
+    flat: NDArray[np.float32]  # (h, w), length of `rays` in the plane
+    above: Pixels  # [mm], any depth below this one shows something that stands on the floor
+    own: Pixels  # [mm], up to here it is the body itself
+    within: Pixels  # [mm], up to here that is an obstacle: in reach, and not over the body
+    below: Pixels  # [mm], a depth beyond this one shows a hole; NEVER beyond reach
+    floor: NDArray[np.float32]  # (h, w) [m], depth at which the ray meets the floor
+    sure: Mask  # the floor is so near that it must be seen, or what stands on it
+    upright: bool  # columns of the picture are vertical
+
+
+class Sighting(NamedTuple):
+    """Points of obstacles in one picture, in the body's frame."""
+
+    points: Floats  # (n, 3) [m]; of a hole its edge on the floor
+    hole: Mask  # (n,)
+    sure: Mask  # (n,), enough of it is seen to believe it at once
+
+
+def reach_of(body: BodyDescription) -> float:
+    """Return how far from the body's middle obstacles are remembered [m]."""
+    return brakes(body)["forward"].reach + radius(body.footprint) + MEMORY_M
+
+
+@lru_cache(maxsize=64)
+def view_of(body: BodyDescription, camera: Camera, up: Up = (0.0, 0.0)) -> View:
+    """Return the view of a camera on a body, whose vertical is `up` in its own frame.
+
+    The floor is where the height above it is 0 within a tolerance t that grows with the depth z:
+
+        t(z) = 5 mm + tan(0.5 deg) (|a| + |b|) z + 3 * 1.5 mm / m^2 z^2 |s|
+
+    by the mounting's place, its pitch and roll (a and b are the ray's ways ahead and aside per
+    metre of depth), and the noise of the depth (s is its way up). Straight ahead of a camera 0.1 m
+    up that is 10 mm at 0.5 m, 15 mm at 1 m and 24 mm at 2 m: a thing of 3 cm counts up to 2.5 m,
+    if it fills three pixels. A body that is tilted stands on a slope, or on a sill: nothing is an
+    obstacle that would be the floor of one of the two.
+    """
+    mount, rays = np.array((camera.x, camera.y, camera.z)), _rays(camera)
+    level = _floor(camera, body, mount, rays, np.array((0.0, 0.0, 1.0)))
+    if up != (0.0, 0.0):
+        z = math.sqrt(max(0.0, 1.0 - up[0] ** 2 - up[1] ** 2))
+        tilted = _floor(camera, body, mount, rays, np.array((*up, z)))
+        level = (
+            np.minimum(level[0], tilted[0]),
+            np.minimum(level[1], tilted[1]),
+            np.maximum(level[2], tilted[2]),
+            level[3],
+        )
+    above, top, below, floor = level
+    flat = np.hypot(rays[..., 0], rays[..., 1])
+    within = np.minimum(np.minimum(above, top), _reach(mount, rays, reach_of(body)))
+    crossing = mount[:2] + np.minimum(floor, 1e6)[..., None] * rays[..., :2]
+    away = np.hypot(crossing[..., 0], crossing[..., 1])
+    near = (away <= reach_of(body)) & (outside(edges(body.footprint), crossing) > 0)
+    sure = near & (floor >= camera.depth_min + SURE_NEAR_M)
+    sure &= floor <= SURE_SHARE * camera.depth_max
+    return View(
+        mount=mount,
+        rays=rays.astype(np.float32),
+        flat=flat.astype(np.float32),
+        above=_millimetres(above),
+        own=_millimetres(_inside(body, mount, rays)),
+        within=_millimetres(np.minimum(within, camera.depth_max)),
+        below=np.where(near, _millimetres(below), np.uint16(NEVER)),
+        floor=floor.astype(np.float32),
+        sure=sure,
+        upright=abs(math.cos(camera.roll)) >= abs(math.sin(camera.roll)),
+    )
+
+
+def _rays(camera: Camera) -> Floats:
+    """Return the direction of every second pixel in the body's frame, (h, w, 3), 1 m of depth."""
+    fx, fy, cx, cy = camera.pinhole
+    right, down = np.meshgrid(
+        (np.arange(0, camera.width, 2) - cx) / fx, (np.arange(0, camera.height, 2) - cy) / fy
+    )
+    seen_x, seen_y = right, down
+    for _ in range(UNDISTORT_STEPS if camera.distortion else 0):
+        x, y = _distorted(camera, right, down)
+        right, down = right + (seen_x - x), down + (seen_y - y)
+    return np.stack([np.ones_like(right), -right, -down], axis=-1) @ turn_of(camera).T
+
+
+def _distorted(camera: Camera, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """Return where a lens shows what is at x (right) and y (down), 1 m before it."""
+    k1, k2, p1, p2, k3 = (*camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
+    square = x * x + y * y
+    radial = 1.0 + square * (k1 + square * (k2 + square * k3))
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x),
+        y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y,
+    )
+
+
+@lru_cache(maxsize=16)
+def turn_of(camera: Camera) -> Floats:
+    """Return the matrix (3, 3) that turns the camera's frame into the body's."""
+    (cr, sr), (cp, sp), (cy, sy) = (
+        (math.cos(angle), math.sin(angle)) for angle in (camera.roll, camera.pitch, camera.yaw)
+    )
+    roll = np.array(((1.0, 0.0, 0.0), (0.0, cr, -sr), (0.0, sr, cr)))
+    pitch = np.array(((cp, 0.0, sp), (0.0, 1.0, 0.0), (-sp, 0.0, cp)))
+    yaw = np.array(((cy, -sy, 0.0), (sy, cy, 0.0), (0.0, 0.0, 1.0)))
+    turn: Floats = yaw @ pitch @ roll
+    return turn
+
+
+def _floor(
+    camera: Camera, body: BodyDescription, mount: Floats, rays: Floats, up: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return depths by pixel [m]: above the floor, below the body's top, below the floor; floor.
+
+    The height at depth z is h + s z, and its tolerance t + a z + q z^2.
+    """
+    height, slope = float(mount @ up), rays @ up
+    ahead = np.array((math.cos(camera.yaw), math.sin(camera.yaw)))
+    aside = np.array((-ahead[1], ahead[0]))
+    way = np.abs(rays[..., :2] @ ahead) + np.abs(rays[..., :2] @ aside)
+    angle, noise = math.tan(MOUNT_RAD) * way, SIGMAS * NOISE_PER_M2 * np.abs(slope)
+    room = max(0.0, max(body.body_height, height) - height)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        standing = max(0.0, height - MOUNT_M)
+        falls = angle - slope
+        above = 2 * standing / (falls + np.sqrt(falls**2 + 4 * noise * standing))
+        rises = slope - angle
+        top = 2 * room / (rises + np.sqrt(rises**2 - 4 * noise * room))
+        sinks = -slope - angle
+        sunk = height + MOUNT_M
+        below = 2 * sunk / (sinks + np.sqrt(sinks**2 - 4 * noise * sunk))
+        floor = np.where(slope < 0, -height / slope, np.inf)
+    return (
+        np.where(np.isfinite(above), above, np.inf),
+        np.where((rises > 0) & np.isfinite(top), top, np.inf),
+        np.where((sinks > 0) & np.isfinite(below), below, np.inf),
+        floor,
+    )
+
+
+def _reach(mount: Floats, rays: Floats, reach: float) -> Floats:
+    """Return the depths (h, w) [m] at which rays leave the circle of `reach` [m] round the body."""
+    a = (rays[..., :2] ** 2).sum(axis=-1)
+    b = rays[..., :2] @ mount[:2]
+    c = float(mount[:2] @ mount[:2]) - reach * reach
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = (-b + np.sqrt(b * b - a * c)) / a
+    return np.where(np.isfinite(depth), np.maximum(depth, 0.0), np.inf)
+
+
+def _inside(body: BodyDescription, mount: Floats, rays: Floats) -> Floats:
+    """Return the depths (h, w) [m] up to which rays are over the body's footprint; 0 without."""
+    hull = edges(body.footprint)
+    room = hull.offsets - hull.normals @ mount[:2]
+    if (room <= 0).any():
+        return np.zeros(rays.shape[:2])
+    towards = rays[..., :2] @ hull.normals.T
+    with np.errstate(divide="ignore"):
+        leaves: Floats = np.where(towards > 0, room / towards, np.inf).min(axis=-1)
+    return leaves
+
+
+def _millimetres(depth: Floats) -> Pixels:
+    return np.clip(np.nan_to_num(depth, posinf=NEVER) * 1000.0, 0, NEVER).astype(np.uint16)
+
+
+def unknown(camera: Camera, picture: Pixels) -> Mask:
+    """Return the pixels (h, w) without a depth that the camera can measure."""
+    dark: Mask = (picture == 0) | (picture > _farthest(camera))
+    return dark
+
+
+def _farthest(camera: Camera) -> int:
+    return min(NEVER - 1, round(camera.depth_max * 1000.0))
+
+
+def blind(camera: Camera, view: View, picture: Pixels) -> bool:
+    """Return whether next to nothing is known of the floor that must be seen.
+
+    A camera that looks over it is blind where next to nothing is known at all.
+    """
+    dark = unknown(camera, picture)
+    floor = dark[view.sure]
+    watched, share = (floor, BLIND_FLOOR) if 20 * floor.size >= dark.size else (dark, BLIND)
+    return bool(np.count_nonzero(watched) > share * watched.size)
+
+
+def sight(body: BodyDescription, camera: Camera, view: View, picture: Pixels) -> Sighting:
+    """Return the nearest obstacle points in each column of a picture (h, w) [mm].
+
+    A point needs neighbours: a single pixel is noise.
+    """
+    dark = unknown(camera, picture)
+    hull = edges(body.footprint)
+    # 0 wraps round: it is no depth
+    stands = ((picture - np.uint16(1)) < view.within) & (picture > view.own)
+    found: list[tuple[Floats, bool, bool]] = []
+    if stands.any():
+        beside = _alike(stands, picture)
+        metres = picture * np.float32(0.001)
+        for mask, sure in ((beside >= SURELY_BESIDE, True), (beside >= BESIDE, False)):
+            points = _nearest(view, mask & stands, metres)
+            found.append((points[outside(hull, points[:, :2]) > 0], False, sure))
+    hole = (picture > view.below) & ~dark
+    holes = _beside(hole) if hole.any() else hole.view(np.uint8)
+    gap = _squares(hole | (dark & view.sure))
+    for mask, sure in (
+        (hole & (holes >= SURE_HOLE_BESIDE), True),
+        ((hole & (holes >= HOLE_BESIDE)) | gap, False),
+    ):
+        if mask.any():
+            found.append((_nearest(view, mask, view.floor), True, sure))
+    if not found:
+        return Sighting(np.empty((0, 3)), np.empty(0, bool), np.empty(0, bool))
+    counts = [len(points) for points, _, _ in found]
+    return Sighting(
+        np.concatenate([points for points, _, _ in found]),
+        np.repeat([is_hole for _, is_hole, _ in found], counts),
+        np.repeat([sure for _, _, sure in found], counts),
+    )
+
+
+def _nearest(view: View, mask: Mask, metres: NDArray[np.float32]) -> Floats:
+    """Return the nearest point (n, 3) [m] of `mask` in each column, at depths `metres` (h, w)."""
+    away = np.where(mask, metres * view.flat, np.float32(np.inf))
+    if not view.upright:
+        away, metres, rays = away.T, metres.T, view.rays.transpose(1, 0, 2)
+    else:
+        rays = view.rays
+    row, column = away.argmin(axis=0), np.arange(away.shape[1])
+    seen = np.isfinite(away[row, column])
+    row, column = row[seen], column[seen]
+    points: Floats = view.mount + metres[row, column, None].astype(np.float64) * rays[row, column]
+    return points
+
+
+def _beside(mask: Mask) -> NDArray[np.uint8]:
+    """Return how many of its 8 neighbours are in `mask` too, for each of its pixels."""
+    padded = np.pad(mask.view(np.uint8), 1, mode="edge")
+    rows = padded[:-2] + padded[1:-1] + padded[2:]
+    around: NDArray[np.uint8] = rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
+    return around - mask
+
+
+def _squares(mask: Mask) -> Mask:
+    """Return the middles of all squares of GAP_PX pixels that are in `mask`."""
+    found = np.pad(mask, GAP_PX // 2, mode="edge")
+    for _ in range(GAP_PX - 1):
+        found = found[1:, 1:] & found[:-1, 1:] & found[1:, :-1] & found[:-1, :-1]
+    return found
+
+
+def _alike(mask: Mask, picture: Pixels) -> NDArray[np.uint8]:
+    """Return how many of its 8 neighbours in `mask` have about its depth, for each pixel."""
+    count = np.zeros(mask.shape, np.uint8)
+    depth = picture.astype(np.int32)
+    most = depth // round(1 / ALIKE_SHARE) + round(1000 * ALIKE_M)
+    here, there = slice(None, -1), slice(1, None)
+    whole = slice(None)
+    for one, other in (
+        ((whole, here), (whole, there)),
+        ((here, whole), (there, whole)),
+        ((here, here), (there, there)),
+        ((here, there), (there, here)),
+    ):
+        alike = np.abs(depth[one] - depth[other]) <= most[one]
+        alike &= mask[one] & mask[other]
+        count[one] += alike
+        count[other] += alike
+    return count
+
+
+def seen_through(camera: Camera, view: View, picture: Pixels, points: Floats, hole: Mask) -> Mask:
+    """Return which `points` (n, 3) [m] in the body's frame the picture shows to be gone.
+
+    A thing is gone where the picture looks past it, or shows the floor; a hole where the picture
+    shows the floor. What is unknown shows nothing.
+    """
+    seen = (points - view.mount) @ turn_of(camera)
+    fx, fy, cx, cy = camera.pinhole
+    depth = np.maximum(seen[:, 0], 1e-6)
+    right, down = _distorted(camera, -seen[:, 1] / depth, -seen[:, 2] / depth)
+    height, width = picture.shape
+    column = np.rint((cx + fx * right) / 2).clip(-1, width).astype(np.intp)
+    row = np.rint((cy + fy * down) / 2).clip(-1, height).astype(np.intp)
+    inside = (seen[:, 0] > 0.05) & (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    row, column = np.where(inside, row, 0), np.where(inside, column, 0)
+    shown = picture[row, column]
+    margin = 0.02 + SIGMAS * NOISE_PER_M2 * depth * depth
+    past = shown > 1000.0 * (depth + margin)
+    on_floor = shown > view.above[row, column]
+    gone = np.where(hole, on_floor & (shown <= view.below[row, column]), past | on_floor)
+    result: Mask = inside & (shown > 0) & gone
+    return result
