@@ -1,0 +1,83 @@
+"""The floor: a plane, fitted to each depth picture and remembered from one to the next.
+
+In the body's frame it would be z = 0, were the mounting known exactly and did the body not tilt.
+Both are known well enough that a table top, a wall or a ramp is never within reach of the fit.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_schemas.arrays import Floats
+
+OFFSET_M, SLOPE = 0.004, 0.006  # standard deviations before the first picture: 4 mm, 0.35 degrees
+MAX_OFFSET_M, MAX_SLOPE = 0.015, 0.028  # 1.5 cm and 1.6 degrees: mounting and tilt together
+WALK_OFFSET_M, WALK_SLOPE = 0.0007, 0.0015  # standard deviations of the change per picture
+ROUGH_M = 0.003  # standard deviation of a real floor from its plane
+REACHES_M = (0.6, 1.0, 1.6, 2.4, 3.2, 3.2)  # outwards from what is sure to what is not
+GATE = 3.0  # standard deviations from the plane, beyond which a point is not floor
+INDEPENDENT = 60.0  # a picture counts as no more than this many independent points
+LEAST_POINTS = 60  # with fewer the floor is not in view
+
+
+@dataclass(frozen=True, slots=True)
+class FloorPlane:
+    """Height of the floor, `offset` + `slope_x` x + `slope_y` y, in the body's frame."""
+
+    coefficients: Floats  # (3,): offset [m], slope_x, slope_y
+    covariance: Floats  # (3, 3)
+    seen: bool = False  # in the newest picture
+
+    def sigma(self, x: NDArray[np.floating], y: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Return the standard deviation of its height at points [m]."""
+        c = self.covariance
+        variance = c[0, 0] + 2 * (c[0, 1] * x + c[0, 2] * y + c[1, 2] * x * y)
+        variance = variance + c[1, 1] * x * x + c[2, 2] * y * y
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def unseen_floor() -> FloorPlane:
+    """Return what is known before the first picture."""
+    return FloorPlane(np.zeros(3), np.diag((OFFSET_M, SLOPE, SLOPE)) ** 2)
+
+
+def fit_floor(before: FloorPlane, points: Floats, sigma: Floats) -> FloorPlane:
+    """Return the floor in a picture of `points` (n, 3) in the body's frame.
+
+    `sigma` (n,) is the standard deviation of each height [m]. The fit begins at the floor before
+    and goes outwards, so that only what continues the floor nearby is taken for floor. Where too
+    little of it is in view, it stays as it was.
+    """
+    walk = np.diag((WALK_OFFSET_M, WALK_SLOPE, WALK_SLOPE)) ** 2
+    predicted = FloorPlane(before.coefficients, _bounded(before.covariance + walk))
+    x, y, z = points.T
+    distance = np.hypot(x, y)
+    design = np.stack((np.ones_like(x), x, y))
+    noise = sigma * sigma + ROUGH_M * ROUGH_M
+    spread = np.square(np.clip(distance, 0.3, 1.6))  # near ones are many
+    information = np.linalg.inv(predicted.covariance)
+    now = predicted
+    for reach in REACHES_M:
+        off = z - now.coefficients @ design
+        gate = GATE * np.sqrt(now.sigma(x, y) ** 2 + noise)
+        inlying = np.maximum(1.0 - np.square(off / gate), 0.0) * (distance < reach)  # Tukey
+        weight = np.square(inlying) * spread
+        total = float(weight.sum())
+        if np.count_nonzero(inlying) < LEAST_POINTS or total <= 0.0:
+            continue
+        weight *= INDEPENDENT / total / noise
+        weighed = design * weight
+        precision = information + weighed @ design.T
+        covariance = np.linalg.inv(precision)
+        solved = covariance @ (information @ predicted.coefficients + weighed @ z)
+        limits = np.array((MAX_OFFSET_M, MAX_SLOPE, MAX_SLOPE))
+        now = FloorPlane(np.clip(solved, -limits, limits), covariance, seen=True)
+    return now
+
+
+def _bounded(covariance: Floats) -> Floats:
+    """Return a covariance that is no larger than before the first picture, axis by axis."""
+    most = np.array((OFFSET_M, SLOPE, SLOPE))
+    shrink = np.minimum(1.0, most / np.sqrt(np.diag(covariance)))
+    return np.asarray(covariance * np.outer(shrink, shrink))

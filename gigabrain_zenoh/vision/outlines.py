@@ -1,0 +1,139 @@
+"""Groups of cells and their outlines: polygons that are nearly convex."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_schemas.arrays import Floats
+
+LINK_M = 0.05  # cells of this size that touch belong together
+DIRECTIONS = 16  # of an outline's corners; those of boxes are always among them
+SPLIT_ROUNDS = 6
+HOLLOW_M = 0.07  # most that an outline is off its cells, along a part of an edge
+EDGE_M, EDGE_PARTS = 0.15, 5  # shorter edges are not looked at; parts of the others
+Labels = NDArray[np.intp]
+_angles = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
+AXES: Floats = np.stack((np.cos(_angles), np.sin(_angles)))
+
+
+def connected(places: Floats) -> Labels:
+    """Return the number of the group of each place (n, 2) [m]; groups are LINK_M apart."""
+    if not len(places):
+        return np.empty(0, np.intp)
+    index = np.floor(places / LINK_M).astype(np.int64)
+    index -= index.min(axis=0)
+    width = int(index[:, 1].max()) + 3
+    flat = (index[:, 0] + 1) * width + index[:, 1] + 1
+    used, of_place = np.unique(flat, return_inverse=True)
+    begins, ends = [], []
+    for step in (1, width - 1, width, width + 1):
+        at = np.minimum(np.searchsorted(used, used + step), len(used) - 1)
+        linked = np.flatnonzero(used[at] == used + step)
+        begins.append(linked)
+        ends.append(at[linked])
+    labels = _joined(len(used), np.concatenate(begins), np.concatenate(ends))
+    _, numbers = np.unique(labels, return_inverse=True)
+    return np.asarray(numbers[of_place], np.intp)
+
+
+def _joined(count: int, begin: Labels, end: Labels) -> Labels:
+    """Return the least number that is linked with each of `count` numbers."""
+    labels = np.arange(count)
+    while True:
+        least = np.minimum(labels[begin], labels[end])
+        joined = labels.copy()
+        np.minimum.at(joined, labels[begin], least)
+        np.minimum.at(joined, labels[end], least)
+        joined = joined[joined]
+        if np.array_equal(joined, labels):
+            return labels
+        labels = joined
+
+
+def split(low: Floats, high: Floats, labels: Labels) -> Labels:
+    """Return finer groups of the boxes from `low` to `high` (n, 2), so that none is hollow."""
+    middle = (low + high) / 2
+    labels = labels.copy()
+    open_ = np.arange(len(labels))  # boxes of groups that may be hollow
+    for _ in range(SPLIT_ROUNDS):
+        order = open_[np.argsort(labels[open_], kind="stable")]
+        first = np.flatnonzero(np.diff(labels[order], prepend=-1))
+        outline = support_polygons(low[order], high[order], first)
+        hollow = _hollow(middle[order], outline, first)
+        if not hollow.any():
+            break
+        open_ = _halve(middle, labels, order, first, hollow)
+    return labels
+
+
+def _hollow(middle: Floats, outline: Floats, first: Labels) -> NDArray[np.bool_]:
+    """Return which groups have an outline with an edge that is far from all their boxes."""
+    group = np.repeat(np.arange(len(first)), np.diff(first, append=len(middle)))
+    edge = np.roll(outline, -1, axis=1) - outline
+    length = np.hypot(edge[..., 0], edge[..., 1])
+    which, side = np.nonzero(length > EDGE_M)
+    nearest = np.full((len(first), DIRECTIONS, EDGE_PARTS), np.inf)
+    for number in np.unique(side):
+        long = np.zeros(len(first), np.bool_)
+        long[which[side == number]] = True
+        at = np.flatnonzero(long[group])
+        of = group[at]
+        direction = edge[of, number] / length[of, number][:, None]
+        off = middle[at] - outline[of, number]
+        along = (off * direction).sum(axis=1) / length[of, number]
+        inward = direction[:, 0] * off[:, 1] - direction[:, 1] * off[:, 0]
+        part = np.clip((along * EDGE_PARTS).astype(np.intp), 0, EDGE_PARTS - 1)
+        np.minimum.at(nearest, (of, number, part), inward)
+    return np.asarray(np.any(np.isfinite(nearest) & (nearest > HOLLOW_M), axis=(1, 2)))
+
+
+def _halve(
+    middle: Floats, labels: Labels, order: Labels, first: Labels, hollow: NDArray[np.bool_]
+) -> Labels:
+    """Split hollow groups across their longer axis, where they bend; return their boxes."""
+    ends = np.append(first[1:], len(order))
+    fresh = int(labels.max()) + 1
+    touched = []
+    for group in np.flatnonzero(hollow):
+        members = order[first[group] : ends[group]]
+        centred = middle[members] - middle[members].mean(axis=0)
+        _, axes = np.linalg.eigh(centred.T @ centred)
+        along, across = centred @ axes[:, 1], centred @ axes[:, 0]
+        cut = along[np.argmax(np.abs(across))]
+        span = float(np.ptp(along))
+        if min(cut - along.min(), along.max() - cut) < span / 8:
+            cut = 0.0
+        labels[members[along > cut]] = fresh
+        fresh += 1
+        touched.append(members)
+    return np.concatenate(touched)
+
+
+def support_polygons(low: Floats, high: Floats, first: Labels) -> Floats:
+    """Return outlines (groups, DIRECTIONS, 2) of boxes from `low` to `high` (n, 2), in groups.
+
+    `first` is where each group begins. The corners are the outermost ones in as many directions,
+    counter-clockwise; some of them are the same.
+    """
+    outline = np.empty((len(first), DIRECTIONS, 2))
+    size = np.diff(first, append=len(low))
+    for number in range(DIRECTIONS):
+        axis = AXES[:, number]
+        corner = np.where(axis >= 0.0, high, low)
+        reach = corner @ axis
+        outermost = np.maximum.reduceat(reach, first)
+        at = np.flatnonzero(reach == np.repeat(outermost, size))
+        group = np.searchsorted(first, at, side="right") - 1
+        _, chosen = np.unique(group, return_index=True)
+        outline[:, number] = corner[at[chosen]]
+    return outline
+
+
+def distinct(outline: Floats) -> list[tuple[float, float]]:
+    """Return the corners of an outline (n, 2) without those that repeat or lie on an edge."""
+    corners = [outline[0]]
+    for corner in outline[1:]:
+        if np.abs(corner - corners[-1]).max() > 1e-6:
+            corners.append(corner)
+    if len(corners) > 1 and np.abs(corners[0] - corners[-1]).max() <= 1e-6:
+        corners.pop()
+    return [(float(x), float(y)) for x, y in corners]
