@@ -40,6 +40,7 @@ from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.geometry.pose import compose, inverse
 from gigabrain_zenoh.geometry.se2 import from_pose, transform
 from gigabrain_zenoh.navigation import global_planner, local_planner
+from gigabrain_zenoh.navigation.contours import placed
 from gigabrain_zenoh.navigation.costmap import inflation
 from gigabrain_zenoh.navigation.global_planner import Unreachable
 from gigabrain_zenoh.navigation.local_planner import DEFAULTS, LocalSettings
@@ -252,6 +253,7 @@ class Navigator:
             path=transform(move, points),
             headings=None if headings is None else headings + np.array((to_odom.yaw, 0.0)),
             obstacles=context.world.obstacles,
+            contours=placed(context.world.contours, context.pose),
             response=context.actuation,
             sent=context.sent,
             delayed=context.delayed_s,

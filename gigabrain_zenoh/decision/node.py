@@ -15,6 +15,7 @@ from gigabrain_zenoh.bus.freshness import PreviousTick
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.decision.behaviours import Behaviour, Inputs, StepResult, battery_nearly_empty
+from gigabrain_zenoh.decision.contours import ContourFilter
 from gigabrain_zenoh.decision.detected_objects import DetectedObjects, ObjectsByPerceptor
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.stopping import scan_limit_ns
@@ -156,6 +157,10 @@ def _serve(config: DecisionConfig, bus: Bus, source: InputSource) -> None:
         body = bodies.current
         return worlds.fresh(scan_limit_ns(body.description) if body else None)
 
+    def merged(world: WorldModel) -> WorldModel:
+        body = bodies.current
+        return contours.merged(objects.merged(world), body.description if body else None)
+
     def decide(_: Message) -> None:
         nonlocal logged
         state = states.fresh()
@@ -165,7 +170,7 @@ def _serve(config: DecisionConfig, bus: Bus, source: InputSource) -> None:
         verdict = verdicts.at(state.boot, state.tick, SAFETY.stale_after_ns)
         objects.observe(state)
         world = newest_world()
-        loop.step(state, world and objects.merged(world), verdict, objects.fresh())
+        loop.step(state, world and merged(world), verdict, objects.fresh())
         bus.publish(INTENT, loop.intent, basis=loop.basis)
         if loop.activity != logged:
             logged, reason = loop.activity, loop.intent.reason
@@ -182,6 +187,7 @@ def _serve(config: DecisionConfig, bus: Bus, source: InputSource) -> None:
         return bus.arrived.get(STATE.key), bus.arrived.get(WORLD.key)
 
     bodies, objects = bus.latest(BODY), DetectedObjects(bus)
+    contours = ContourFilter(bus.counters)
     states = bus.latest(STATE, decide)
     worlds = bus.latest(WORLD, on_world)
     bus.latest(SAFETY, verdicts.receive)

@@ -15,6 +15,7 @@ from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.decision.behaviours import DriveCommand
 from gigabrain_zenoh.decision.give_way import GiveWay
 from gigabrain_zenoh.decision.progress import AT_GOAL_M, ProgressMonitor
+from gigabrain_zenoh.navigation.contours import ContourMemory
 from gigabrain_zenoh.navigation.costmap import (
     Costmap,
     Unknown,
@@ -80,6 +81,7 @@ class RouteRequest:
     body: BodyDescription
     feedback: RouteFeedback | None  # of the last route
     seen: Floats  # (n, 2) [m], hits of the newest scan, in the map
+    contours: tuple[Floats, ...] = ()  # polygons (n, 2) [m] in the map, seen by cameras
     zones: ZoneMap = NO_ZONES
     inflation: float | None = None  # [m], see NavigationConfig
     held_ticks: int = 0  # since the last route, in which the body could not follow it
@@ -108,6 +110,7 @@ class RoutePlanner:
         self._rezoned = False  # the zones have changed since the last plan
         self._blocking: Floats = np.empty((0, 2))  # hits that blocked a route
         self._blocking_tick = 0
+        self._contours = ContourMemory()
         self._version = 0
         self._reset(0, 0)
 
@@ -115,8 +118,11 @@ class RoutePlanner:
         """Return the route for a command, from the robot's place."""
         restarted = request.tick < self._last_tick  # of the driver
         command = request.command
+        if restarted:
+            self._contours.forget()
         if restarted or command.number != self._number:
             self._reset(command.number, request.tick)
+        self._contours.update(request.tick, request.here, request.body, request.contours)
         self._update(request)
         if command.goal:
             request = replace(request, grid=self._enlarged(request.grid, command.goal))
@@ -182,12 +188,14 @@ class RoutePlanner:
 
     def _update_costmap(self, request: RouteRequest) -> Costmap:
         blocked = self._blocking_tick if len(self._blocking) else 0
-        key = (request.grid, request.body, blocked, request.inflation, request.zones)
+        seen = self._contours.version
+        key = (request.grid, request.body, blocked, seen, request.inflation, request.zones)
         known = self._costmap_key
         same = known and all(a is b or a == b for a, b in zip(key, known, strict=True))
         if self._costmap is None or not same:
             rules = inflation(request.body, self._unknown_space, request.inflation)
-            self._bare = costmap(request.grid, rules, self._blocking, self._bare)
+            points = np.concatenate((self._blocking, self._contours.points))
+            self._bare = costmap(request.grid, rules, points, self._bare)
             self._costmap = with_zones(self._bare, self._zone_overlay(request, self._bare))
             self._costmap_key = key
         return self._costmap

@@ -10,6 +10,7 @@ from gigabrain_zenoh.decision.context import NavigationContext
 from gigabrain_zenoh.decision.route import Route, RouteFeedback, RoutePlanner, RouteRequest
 from gigabrain_zenoh.geometry.se2 import from_pose, transform
 from gigabrain_zenoh.host.threads import ScheduledWorker, Take
+from gigabrain_zenoh.navigation.contours import placed
 from gigabrain_zenoh.navigation.zones import ZoneMap
 
 SMALL_MAP_CELLS = 60_000  # routes in larger maps are planned in a worker thread,
@@ -82,6 +83,7 @@ class RouteSchedule:
             body=context.body,
             feedback=feedback,
             seen=transform(from_pose(here), context.world.points().astype(np.float64)),
+            contours=placed(context.world.contours, here),
             zones=zones,
             inflation=self.inflation,
             held_ticks=self._held_ticks,

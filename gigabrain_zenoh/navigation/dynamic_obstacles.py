@@ -41,6 +41,7 @@ UPDATE_TICKS = 10  # from map to map
 MOVING_SPEED = 0.15  # [m/s], slower things are part of the grid
 MOVING_SIGMAS = 3.0  # standard deviations of its velocity that a thing must be faster than to move
 DEFAULT_SPEED_SIGMA = 0.05  # [m/s], standard deviation of a velocity that comes without
+MOVING_MARGIN_M = 0.1  # [m], from the rim of a disc: the middle of its own contour
 MAX_GROWTH_SPEED = 0.3  # [m/s], of a disc: how fast what is known of it fades at most
 
 
@@ -53,6 +54,16 @@ def moving_quickly(discs: Floats) -> Floats:
     """Return the quick ones of the `discs` (m, 6), with velocity x, y [m/s] in columns 2 and 3."""
     found: Floats = discs[np.hypot(discs[:, 2], discs[:, 3]) > QUICK_OBSTACLE_SPEED]
     return found
+
+
+def standing(polygons: tuple[Floats, ...], discs: Floats) -> tuple[Floats, ...]:
+    """Return the `polygons` (k, 2) [m] whose middle is in none of the `discs` (m, 6) that move."""
+    if not polygons or not len(discs):
+        return polygons
+    middles = np.array([polygon.mean(axis=0) for polygon in polygons])
+    away = np.hypot(*(middles[:, None] - discs[:, :2]).transpose(2, 0, 1))
+    inside = (away <= discs[:, 4] + MOVING_MARGIN_M).any(axis=1)
+    return tuple(polygon for polygon, moves in zip(polygons, inside, strict=True) if not moves)
 
 
 def stay_clear(discs: Floats, x: float, y: float) -> bool:

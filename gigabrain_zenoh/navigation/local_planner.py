@@ -99,6 +99,7 @@ class PlanRequest:
     headings: Floats | None = None  # (k, 2), of a car's path, see `Path`
     known: Floats = field(default_factory=no_points)  # (m, 2) [m], obstacles of the map near by
     obstacles: tuple[Obstacle, ...] = ()
+    contours: tuple[Floats, ...] = ()  # polygons (k, 2) [m] of what cameras see now
     keepouts: tuple[Floats, ...] = ()  # polygons (k, 2) [m] that the body must not enter
     avoid: tuple[Floats, ...] = ()  # polygons (k, 2) [m] that no way should lead through
     max_speed: float | None = None  # [m/s], of a speed zone; the other limits hold as well
@@ -298,7 +299,8 @@ class LocalPlanner:
     def _scene(self, moment: PlanRequest, discs: Floats) -> Scene:
         goal = moment.goal
         body = transform(from_pose(moment.pose), self._rim)
-        grid = self._window.grid(moment.tick, moment.known, discs, moment.keepouts, body)
+        closed = (*moment.keepouts, *dynamic_obstacles.standing(moment.contours, discs))
+        grid = self._window.grid(moment.tick, moment.known, discs, closed, body)
         ways = self._traffic.ways((goal.x, goal.y)) if self._traffic else None
         to, aside = (goal.x, goal.y), self._half_width
         field = self._costs.field(grid, aside, to, moment.path, ways, moment.avoid)

@@ -1,0 +1,95 @@
+"""Contours of cameras, as behaviours take them: what bars the way, beside what the scan shows."""
+
+import logging
+import math
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from msgspec.structs import replace
+
+from gigabrain_schemas.body import BodyDescription
+from gigabrain_schemas.brain import Contour, WorldModel
+from gigabrain_zenoh.config.settings import PerceptionConfig
+from gigabrain_zenoh.logs import Fault
+
+if TYPE_CHECKING:
+    from gigabrain_schemas.arrays import Floats
+
+FARTHEST_M = 100.0  # of a corner from the body: no camera measures farther
+POINT_M = 0.05  # between the points of an edge that are looked at
+MAX_EDGE_POINTS = 200
+AHEAD = PerceptionConfig()  # the cone and the strip that count as ahead, as of the scan
+REFUSED = "refused_contours"
+log = logging.getLogger(__name__)
+
+
+class ContourFilter:
+    """Adds to each world what its contours mean for a body, and refuses impossible ones."""
+
+    def __init__(self, counters: Counter[str]) -> None:
+        self._counters, self._fault = counters, Fault(log)
+
+    def merged(self, world: WorldModel, body: BodyDescription | None) -> WorldModel:
+        """Return `world` with the contours that bar the way, also in what is ahead and around."""
+        if not world.contours:
+            return world
+        possible = [one for one in world.contours if _possible(one)]
+        if refused := len(world.contours) - len(possible):
+            self._counters[REFUSED] += refused
+            far = f"corners more than {FARTHEST_M:.0f} m from the body"
+            self._fault.begin(f"refused {refused} contours with {far}; check perception")
+        else:
+            self._fault.end("all contours are possible again")
+        height = body.body_height if body else math.inf
+        barring = tuple(one for one in possible if one.bottom < height)
+        return with_contours(replace(world, contours=barring), body)
+
+
+def _possible(contour: Contour) -> bool:
+    return all(math.hypot(x, y) <= FARTHEST_M for x, y in contour.polygon)
+
+
+def with_contours(world: WorldModel, body: BodyDescription | None) -> WorldModel:
+    """Return `world` with its contours in `obstacle_ahead`, `distance_ahead` and `sectors`."""
+    if not world.contours or not world.scan_ok or body is None:
+        return world
+    import numpy as np  # not needed without cameras
+
+    front = max(x for x, _ in body.footprint)
+    radius = max(math.hypot(x, y) for x, y in body.footprint)
+    points = np.concatenate([_outline(one) for one in world.contours])
+    x, y = points.T
+    distance, bearing = np.hypot(x, y), np.arctan2(y, x)
+    cone = (np.abs(bearing) <= math.radians(AHEAD.sector_deg) / 2) & (distance <= AHEAD.ahead)
+    strip = (x > 0) & (x <= front + AHEAD.corridor)
+    strip &= np.abs(y) <= radius + AHEAD.turning_room
+    ahead = distance[cone | strip]
+    nearest = world.distance_ahead
+    if ahead.size:
+        seen = float(ahead.min())
+        nearest = seen if nearest is None else min(seen, nearest)
+    sectors = list(world.sectors)
+    if count := len(sectors):
+        index = np.floor(bearing * (count / math.tau) + 0.5).astype(int) % count
+        for sector in set(index.tolist()):
+            seen, before = float(distance[index == sector].min()), sectors[sector]
+            sectors[sector] = seen if before is None else min(seen, before)
+    return replace(
+        world,
+        obstacle_ahead=world.obstacle_ahead or ahead.size > 0,
+        distance_ahead=nearest,
+        sectors=tuple(sectors),
+    )
+
+
+def _outline(contour: Contour) -> "Floats":
+    """Return points (n, 2) [m] along the edges of a contour."""
+    import numpy as np
+
+    corners = np.array(contour.polygon)
+    ends = np.roll(corners, -1, axis=0)
+    found = []
+    for begin, end in zip(corners, ends, strict=True):
+        count = min(MAX_EDGE_POINTS, 1 + math.ceil(math.dist(begin, end) / POINT_M))
+        found.append(begin + np.linspace(0.0, 1.0, count, endpoint=False)[:, None] * (end - begin))
+    return np.concatenate(found)

@@ -1,0 +1,96 @@
+"""Contours that cameras see, as the planners take them: polygons, and a memory for the routes."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import TICK_NS, Pose
+from gigabrain_schemas.body import BodyDescription
+from gigabrain_schemas.brain import Contour
+from gigabrain_zenoh.geometry.se2 import from_pose, transform
+from gigabrain_zenoh.navigation.zones import fill
+
+CELL_M = 0.05  # of remembered points
+NEAR_M = 1.5  # of the body, within which perception itself remembers what is there
+FAR_M = 10.0  # beyond, contours do not matter to routes yet
+KEPT_TICKS = 60_000_000_000 // TICK_NS  # a contour that is out of sight
+MAX_POINTS = 20_000
+
+
+def placed(contours: Sequence[Contour], pose: Pose) -> tuple[Floats, ...]:
+    """Return the polygons (n, 2) [m] of `contours`, seen from a body at `pose`."""
+    return tuple(transform(from_pose(pose), np.array(one.polygon)) for one in contours)
+
+
+class ContourMemory:
+    """Points (n, 2) [m] in the map that contours cover, or have covered where nobody looks now.
+
+    What is near the body or in view of a camera, and no contour any more, is gone. Without that
+    memory a route would lead back through what blocks it as soon as the body has turned away.
+    """
+
+    def __init__(self) -> None:
+        self.version = 0  # changes with the points
+        self._cells = np.empty((0, 2), np.int64)
+        self._ticks = np.empty(0, np.int64)
+
+    def forget(self) -> None:
+        """Forget all."""
+        self.version += len(self._cells) > 0
+        self._cells, self._ticks = self._cells[:0], self._ticks[:0]
+
+    @property
+    def points(self) -> Floats:
+        """The middles of the cells (n, 2) [m]."""
+        found: Floats = (self._cells.astype(np.float64) + 0.5) * CELL_M
+        return found
+
+    def update(
+        self, tick: int, here: Pose, body: BodyDescription, contours: Sequence[Floats]
+    ) -> None:
+        """Take in all polygons (n, 2) [m] of the map that are contours now, seen from `here`."""
+        if not len(contours) and not len(self._cells):
+            return
+        fresh = _cells_of(contours, here)
+        kept = (
+            (tick - self._ticks <= KEPT_TICKS)
+            & (tick >= self._ticks)
+            & ~_watched(body, here, self.points)
+        )
+        cells = np.concatenate((fresh, self._cells[kept]))
+        ticks = np.concatenate((np.full(len(fresh), tick), self._ticks[kept]))
+        cells, first = np.unique(cells, axis=0, return_index=True)
+        ticks = ticks[first]
+        if len(cells) > MAX_POINTS:
+            newest = np.sort(np.argsort(-ticks, kind="stable")[:MAX_POINTS])
+            cells, ticks = cells[newest], ticks[newest]
+        if not np.array_equal(cells, self._cells):
+            self.version += 1
+        self._cells, self._ticks = cells, ticks
+
+
+def _cells_of(contours: Sequence[Floats], here: Pose) -> NDArray[np.int64]:
+    """Return the cells (n, 2), columns first, that polygons cover within FAR_M of `here`."""
+    side = round(2 * FAR_M / CELL_M)
+    corner = np.floor((np.array((here.x, here.y)) - FAR_M) / CELL_M).astype(np.float64)
+    covered = np.zeros((side, side), np.uint8)
+    for polygon in contours:
+        fill(covered, polygon / CELL_M - corner, 1)
+    rows, columns = np.nonzero(covered)
+    return np.column_stack((columns, rows)).astype(np.int64) + corner.astype(np.int64)
+
+
+def _watched(body: BodyDescription, here: Pose, points: Floats) -> NDArray[np.bool_]:
+    """Return which `points` (n, 2) of the map a body at `here` would have as contours still."""
+    away = points - (here.x, here.y)
+    distance = np.hypot(away[:, 0], away[:, 1])
+    bearing = np.arctan2(away[:, 1], away[:, 0]) - here.yaw
+    watched = distance <= NEAR_M
+    for camera in body.cameras:
+        half = math.atan2(camera.width / 2, camera.pinhole[0])
+        off = np.abs(np.remainder(bearing - camera.yaw + math.pi, math.tau) - math.pi)
+        watched |= (off <= half) & (distance <= camera.depth_max)
+    return watched
