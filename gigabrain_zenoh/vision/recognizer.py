@@ -1,0 +1,125 @@
+"""Finds things of known classes in a picture, by a small net that `cv2.dnn` runs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.vision.labels import CLASSES
+
+WEIGHTS = Path(__file__).parent / "weights" / "things.onnx"
+WIDTH_PX, HEIGHT_PX, STRIDE_PX = 320, 240, 4
+UNIT_PX = 16.0  # distance to a side at raw 0
+RAW_LIMITS = (-4.0, 3.5)  # of raw distances
+MAX_CANDIDATES = 200  # before overlapping ones are dropped
+MIN_CONFIDENCE, MAX_OVERLAP = 0.3, 0.5
+GREY = (114, 114, 114)  # around pictures of another shape
+
+Picture = NDArray[np.uint8]
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Found:
+    """Things found in one picture, the surest first.
+
+    boxes: float32 (n, 4), left, top, right, bottom [px of the picture]; labels: int64 (n,),
+    indices into CLASSES; confidences: float32 (n,), 0 to 1.
+    """
+
+    boxes: Floats
+    labels: NDArray[np.int64]
+    confidences: Floats
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def names(self) -> tuple[str, ...]:
+        """Return the class of each."""
+        return tuple(CLASSES[label] for label in self.labels)
+
+
+class Recognizer:
+    """The shipped net, or another of its layout. Raises ConfigError if it cannot be loaded.
+
+    One picture costs some 10 ms of a core at 320 x 240; it is for one thread.
+    """
+
+    def __init__(self, weights: Path = WEIGHTS, *, min_confidence: float = MIN_CONFIDENCE) -> None:
+        try:
+            self._net = cv2.dnn.readNetFromONNX(str(weights))
+        except cv2.error as error:
+            why = str(error).split("error:")[-1].strip().splitlines()[0][:120]
+            raise ConfigError(f"{weights}: no net that cv2.dnn can run: {why}") from error
+        self._min_confidence = min_confidence
+
+    def find(self, picture: Picture) -> Found:
+        """Find things in a picture (h, w, 3), RGB, of any size."""
+        if (
+            picture.ndim != 3
+            or picture.shape[2] != 3
+            or picture.dtype != np.uint8
+            or not picture.size
+        ):
+            raise ValueError(f"a picture is uint8 (h, w, 3), not {picture.dtype} {picture.shape}")
+        fitted, scale, left, top = fit(picture)
+        self._net.setInput(cv2.dnn.blobFromImage(fitted, 1 / 255.0))
+        found = decode(np.asarray(self._net.forward())[0], self._min_confidence)
+        height, width = picture.shape[:2]
+        moved = (found.boxes - np.array([left, top, left, top], np.float32)) / scale
+        boxes = np.clip(moved, 0, [width, height, width, height]).astype(np.float32)
+        return Found(boxes, found.labels, found.confidences)
+
+
+def fit(picture: Picture) -> tuple[Picture, float, int, int]:
+    """Scale a picture to the net's size, grey around it; return it, scale, left and top [px]."""
+    height, width = picture.shape[:2]
+    if (height, width) == (HEIGHT_PX, WIDTH_PX):
+        return picture, 1.0, 0, 0
+    scale = min(WIDTH_PX / width, HEIGHT_PX / height)
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    small = cv2.resize(picture, size, interpolation=how)
+    left, top = (WIDTH_PX - size[0]) // 2, (HEIGHT_PX - size[1]) // 2
+    canvas = np.full((HEIGHT_PX, WIDTH_PX, 3), GREY, np.uint8)
+    canvas[top : top + size[1], left : left + size[0]] = small
+    return canvas, scale, left, top
+
+
+def decode(raw: Floats, min_confidence: float = MIN_CONFIDENCE) -> Found:
+    """Return what the net's answer (classes + 4, h, w) says, overlapping boxes dropped.
+
+    Logits of classes come first, then the logarithms of distances to left, top, right, bottom.
+    """
+    classes = len(raw) - 4
+    odds = np.log(min_confidence) - np.log1p(-min_confidence)
+    labels, rows, columns = np.nonzero(raw[:classes] > odds)
+    logits = raw[labels, rows, columns]
+    best = np.argsort(-logits, kind="stable")[:MAX_CANDIDATES]
+    labels, rows, columns, logits = labels[best], rows[best], columns[best], logits[best]
+    d = UNIT_PX * np.exp(np.clip(raw[classes:, rows, columns], *RAW_LIMITS))
+    x, y = (columns + 0.5) * STRIDE_PX, (rows + 0.5) * STRIDE_PX
+    boxes = np.stack([x - d[0], y - d[1], x + d[2], y + d[3]], axis=1)
+    height, width = raw.shape[1] * STRIDE_PX, raw.shape[2] * STRIDE_PX
+    boxes = np.clip(boxes, 0, [width, height, width, height]).astype(np.float32)
+    confidences = (1 / (1 + np.exp(-logits))).astype(np.float32)
+    kept = suppress(boxes, labels, confidences)
+    return Found(boxes[kept], labels[kept].astype(np.int64), confidences[kept])
+
+
+def suppress(
+    boxes: Floats, labels: NDArray[np.int64], confidences: Floats, overlap: float = MAX_OVERLAP
+) -> NDArray[np.int64]:
+    """Return the boxes to keep, surest first: of those of one class that overlap, the surest."""
+    if not len(boxes):
+        return np.zeros(0, np.int64)
+    sized = np.concatenate([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], axis=1)
+    kept: Sequence[int] = cv2.dnn.NMSBoxesBatched(
+        sized.tolist(), confidences.tolist(), labels.tolist(), 0.0, overlap
+    )
+    index = np.asarray(kept, np.int64).ravel()
+    return index[np.argsort(-confidences[index], kind="stable")]
