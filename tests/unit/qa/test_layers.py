@@ -21,7 +21,11 @@ ONLY_IN = {
         "gigabrain_zenoh/qa/bench/relay.py",
         "gigabrain_zenoh/testing/processes.py",
     ),
-    "mujoco": ("drivers/gigabrain_drivers/sim/", "gigabrain_zenoh/qa/bench/jackal.py"),
+    "mujoco": (
+        "drivers/gigabrain_drivers/sim/",
+        "gigabrain_zenoh/qa/bench/jackal.py",
+        "gigabrain_zenoh/qa/train/",
+    ),
 }
 
 

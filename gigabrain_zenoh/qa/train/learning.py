@@ -1,0 +1,148 @@
+"""Training: losses, the optimiser's step, and the loop over pictures."""
+
+import logging
+import pickle
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from gigabrain_zenoh.qa.train import net
+from gigabrain_zenoh.qa.train.pictures import Labelled
+from gigabrain_zenoh.qa.train.studio import HEIGHT, WIDTH
+from gigabrain_zenoh.qa.train.targets import STRIDE_PX, augment, targets
+from gigabrain_zenoh.vision.labels import CLASSES
+
+BATCH = 16
+PEAK_RATE, WEIGHT_DECAY, WARM_UP_STEPS = 2.5e-3, 2e-2, 200
+BOX_WEIGHT = 4.0
+AVERAGED = 0.998  # of the weights that are exported, a step
+SAVE_EVERY_STEPS = 250
+UNIT_PX = 16.0  # distance of a side at raw 0
+log = logging.getLogger(__name__)
+
+
+class State(NamedTuple):
+    """All that a step changes."""
+
+    params: net.Params
+    moments: net.Params
+    averaged: net.Params
+    optimiser: Any
+
+
+Batch = tuple[Any, ...]
+
+
+def heat_loss(logits: Any, heat: Any, mask: Any) -> Any:
+    """Penalty-reduced focal loss of CenterNet, for one thing in the mean."""
+    p = jnp.clip(jax.nn.sigmoid(logits), 1e-4, 1 - 1e-4)
+    peak = heat > 0.999
+    right = jnp.where(peak, (1 - p) ** 2 * -jnp.log(p), 0.0)
+    wrong = jnp.where(peak, 0.0, (1 - heat) ** 4 * p**2 * -jnp.log(1 - p))
+    return ((right + wrong) * mask).sum() / jnp.maximum(peak.sum(), 1)
+
+
+def corners(raw: Any) -> Any:
+    """Return boxes (n, h, w, 4) [px] from raw distances to left, top, right, bottom."""
+    d = UNIT_PX * jnp.exp(jnp.clip(raw, -4.0, 3.5))
+    x = (jnp.arange(raw.shape[2]) + 0.5) * STRIDE_PX
+    y = (jnp.arange(raw.shape[1]) + 0.5)[:, None] * STRIDE_PX
+    return jnp.stack([x - d[..., 0], y - d[..., 1], x + d[..., 2], y + d[..., 3]], -1)
+
+
+def box_loss(found: Any, wanted: Any, weights: Any) -> Any:
+    """Generalised IoU loss, weighted."""
+    low, high = (
+        jnp.maximum(found[..., :2], wanted[..., :2]),
+        jnp.minimum(found[..., 2:], wanted[..., 2:]),
+    )
+    both = jnp.prod(jnp.maximum(high - low, 0), -1)
+    area = [jnp.prod(jnp.maximum(b[..., 2:] - b[..., :2], 0), -1) for b in (found, wanted)]
+    union = area[0] + area[1] - both
+    hull = jnp.prod(
+        jnp.maximum(found[..., 2:], wanted[..., 2:]) - jnp.minimum(found[..., :2], wanted[..., :2]),
+        -1,
+    )
+    overlap = both / jnp.maximum(union, 1e-3) - (hull - union) / jnp.maximum(hull, 1e-3)
+    return ((1 - overlap) * weights).sum() / jnp.maximum(weights.sum(), 1e-3)
+
+
+def loss(params: net.Params, moments: net.Params, batch: Batch) -> tuple[Any, tuple[Any, Any, Any]]:
+    """Return the loss of a batch, and the new moments and both parts of the loss."""
+    pictures, heat, mask, boxes, weights = batch
+    out, new = net.apply(params, moments, pictures.astype(jnp.float32) / 255, True)
+    first = heat_loss(out[..., : len(CLASSES)], heat, mask)
+    second = box_loss(corners(out[..., len(CLASSES) :]), boxes, weights)
+    return first + BOX_WEIGHT * second, (new, first, second)
+
+
+@partial(jax.jit, static_argnums=0, donate_argnums=1)
+def step(optimiser: Any, state: State, batch: Batch) -> tuple[State, Any]:
+    """Do one step; return the new state and (heat loss, box loss)."""
+    grads, (moments, first, second) = jax.grad(loss, has_aux=True)(
+        state.params, state.moments, batch
+    )
+    updates, inner = optimiser.update(grads, state.optimiser, state.params)
+    params = optax.apply_updates(state.params, updates)
+    averaged = jax.tree.map(lambda a, p: AVERAGED * a + (1 - AVERAGED) * p, state.averaged, params)
+    return State(params, moments, averaged, inner), jnp.stack([first, second])
+
+
+def batches(pictures: Sequence[Labelled], steps: range, seed: int) -> Iterator[Batch]:
+    """Yield batches for steps; made by a thread beside training, one ahead."""
+
+    def make(number: int) -> Batch:
+        rng = np.random.default_rng([seed, number])
+        made = [augment(rng, pictures[k]) for k in rng.integers(len(pictures), size=BATCH)]
+        parts = [targets(one, HEIGHT, WIDTH) for _, one in made]
+        return (
+            np.stack([p for p, _ in made]),
+            *(np.stack(part) for part in zip(*parts, strict=True)),
+        )
+
+    with ThreadPoolExecutor(1) as pool:
+        ahead = [pool.submit(make, number) for number in steps[:2]]
+        for number in steps:
+            done = ahead.pop(0).result()
+            if number + 2 in steps:
+                ahead.append(pool.submit(make, number + 2))
+            yield done
+
+
+def learn(pictures: Sequence[Labelled], steps: int, folder: Path, seed: int = 0) -> State:
+    """Train for some steps; goes on from the folder's checkpoint where there is one."""
+    folder.mkdir(parents=True, exist_ok=True)
+    checkpoint = folder / "checkpoint.pickle"
+    rate = optax.warmup_cosine_decay_schedule(0.0, PEAK_RATE, WARM_UP_STEPS, steps, PEAK_RATE / 100)
+    optimiser = optax.chain(
+        optax.clip_by_global_norm(10.0), optax.adamw(rate, weight_decay=WEIGHT_DECAY)
+    )
+    params, moments = net.init(seed)
+    state, first = State(params, moments, params, optimiser.init(params)), 0
+    if checkpoint.exists():
+        first, leaves = pickle.loads(checkpoint.read_bytes())
+        state = jax.tree.unflatten(jax.tree.structure(state), leaves)
+    state = State(*jax.tree.map(jnp.array, tuple(state)))
+    begun, sums = time.monotonic(), np.zeros(2)
+    for number, batch in zip(
+        range(first, steps), batches(pictures, range(first, steps), seed), strict=True
+    ):
+        state, parts = step(optimiser, state, batch)
+        sums += np.asarray(parts)
+        if (number + 1) % 50 == 0:
+            pace = (time.monotonic() - begun) / (number + 1 - first)
+            log.info("step %d: heat %.3f, box %.3f, %.2f s a step", number + 1, *sums / 50, pace)
+            sums[:] = 0
+        if (number + 1) % SAVE_EVERY_STEPS == 0 or number + 1 == steps:
+            leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
+            checkpoint.with_suffix(".part").write_bytes(pickle.dumps((number + 1, leaves)))
+            checkpoint.with_suffix(".part").replace(checkpoint)
+    return state

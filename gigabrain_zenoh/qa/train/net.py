@@ -1,0 +1,204 @@
+"""The net: a small centre-based detector, described once for training and for export.
+
+A picture of 240 x 320 gives 60 x 80 cells of 4 px. Each has a logit for each class, which is
+highest at the middle of a thing, and the distances to the four sides of its box. The way to
+stride 16 sees 230 px around a cell. Training: TTFNet (Liu et al. 2020, arXiv 1909.00700).
+"""
+
+from collections.abc import Mapping
+from typing import Any, Protocol, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from gigabrain_zenoh.vision.labels import CLASSES
+
+T = TypeVar("T")
+OUTPUTS = len(CLASSES) + 4
+PRIOR = -4.0  # logit of a class at the start: nearly all cells are empty
+MOMENTUM, EPSILON = 0.95, 1e-3
+Params = dict[str, dict[str, Any]]
+
+
+class Ops(Protocol[T]):
+    """What the net is built of; a tensor is T."""
+
+    def conv(
+        self,
+        x: T,
+        name: str,
+        channels: int,
+        *,
+        size: int = 3,
+        stride: int = 1,
+        dilation: int = 1,
+        normed: bool = True,
+    ) -> T:
+        """Convolve; keeps height and width at stride 1."""
+
+    def relu(self, x: T) -> T:
+        """Cut below zero."""
+
+    def add(self, a: T, b: T) -> T:
+        """Add two tensors of one shape."""
+
+    def double(self, x: T) -> T:
+        """Repeat each cell twice in both directions."""
+
+
+def network(ops: Ops[T], picture: T) -> T:
+    """Build the net for a picture (n, 240, 320, 3), 0 to 1; returns (n, 60, 80, OUTPUTS)."""
+    x = ops.relu(ops.conv(picture, "stem", 16, stride=2))
+    fine = _block(ops, ops.relu(ops.conv(x, "down4", 32, stride=2)), "fine", 32)
+    middle = _block(ops, ops.relu(ops.conv(fine, "down8", 64, stride=2)), "middle", 64)
+    deep = _block(ops, ops.relu(ops.conv(middle, "down16", 72, stride=2)), "deep", 72)
+    deep = _block(ops, deep, "wide", 72, dilation=2)
+    top = ops.double(ops.conv(deep, "deep_in", 48, size=1))
+    middle = ops.relu(ops.add(top, ops.conv(middle, "middle_in", 48, size=1)))
+    middle = ops.relu(ops.conv(middle, "merge8", 32))
+    fine = ops.relu(ops.add(ops.double(middle), ops.conv(fine, "fine_in", 32, size=1)))
+    fine = ops.relu(ops.conv(fine, "merge4", 32))
+    return ops.conv(fine, "out", OUTPUTS, size=1, normed=False)
+
+
+def _block(ops: Ops[T], x: T, name: str, channels: int, dilation: int = 1) -> T:
+    """Add what two convolutions make of x."""
+    y = ops.relu(ops.conv(x, f"{name}1", channels, dilation=dilation))
+    return ops.relu(ops.add(x, ops.conv(y, f"{name}2", channels, dilation=dilation)))
+
+
+class JaxOps:
+    """The net in JAX. `training` uses the batch's own mean and variance, kept in `moments`."""
+
+    def __init__(self, params: Params, moments: Params, training: bool) -> None:
+        self._params, self._old, self._training = params, moments, training
+        self.moments: Params = {}
+
+    def conv(
+        self,
+        x: jax.Array,
+        name: str,
+        channels: int,
+        *,
+        size: int = 3,
+        stride: int = 1,
+        dilation: int = 1,
+        normed: bool = True,
+    ) -> jax.Array:
+        """Convolve, then normalise over the batch unless not `normed`."""
+        pad, own = dilation * (size // 2), self._params[name]
+        y = lax.conv_general_dilated(
+            x,
+            own["w"],
+            (stride, stride),
+            ((pad, pad), (pad, pad)),
+            rhs_dilation=(dilation, dilation),
+            dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        )
+        if not normed:
+            return y + own["b"]
+        old = self._old[name]
+        mean, variance = old["mean"], old["variance"]
+        if self._training:
+            mean = y.mean((0, 1, 2))
+            variance = (y * y).mean((0, 1, 2)) - mean * mean  # in one pass: a quarter of the time
+            variance = jnp.maximum(variance, 0)
+            self.moments[name] = {
+                "mean": MOMENTUM * old["mean"] + (1 - MOMENTUM) * mean,
+                "variance": MOMENTUM * old["variance"] + (1 - MOMENTUM) * variance,
+            }
+        scale = own["scale"] * lax.rsqrt(variance + EPSILON)
+        return y * scale + (own["b"] - mean * scale)
+
+    def relu(self, x: jax.Array) -> jax.Array:
+        """Cut below zero."""
+        return jnp.maximum(x, 0)
+
+    def add(self, a: jax.Array, b: jax.Array) -> jax.Array:
+        """Add."""
+        return a + b
+
+    def double(self, x: jax.Array) -> jax.Array:
+        """Repeat cells."""
+        n, h, w, c = x.shape
+        wide = jnp.broadcast_to(x[:, :, None, :, None], (n, h, 2, w, 2, c))
+        return wide.reshape(n, 2 * h, 2 * w, c)
+
+
+class _Sizes:
+    """Walks through the net with tensors that are numbers of channels, and makes weights."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self.params: Params = {}
+        self.moments: Params = {}
+
+    def conv(
+        self,
+        x: int,
+        name: str,
+        channels: int,
+        *,
+        size: int = 3,
+        stride: int = 1,
+        dilation: int = 1,
+        normed: bool = True,
+    ) -> int:
+        spread = (2 / (size * size * x)) ** 0.5 if normed else 0.01
+        own = {
+            "w": self._rng.normal(0, spread, (size, size, x, channels)).astype(np.float32),
+            "b": np.zeros(channels, np.float32),
+        }
+        if normed:
+            own["scale"] = np.full(channels, 0.5 if name.endswith("2") else 1.0, np.float32)
+            self.moments[name] = {
+                "mean": np.zeros(channels, np.float32),
+                "variance": np.ones(channels, np.float32),
+            }
+        else:
+            own["b"][: len(CLASSES)] = PRIOR
+        self.params[name] = own
+        return channels
+
+    def relu(self, x: int) -> int:
+        return x
+
+    def add(self, a: int, b: int) -> int:
+        assert a == b, "sums need equal channels"
+        return a
+
+    def double(self, x: int) -> int:
+        return x
+
+
+def init(seed: int) -> tuple[Params, Params]:
+    """Return the weights and moments of a new net."""
+    sizes = _Sizes(np.random.default_rng(seed))
+    network(sizes, 3)
+    return sizes.params, sizes.moments
+
+
+def parameters(params: Mapping[str, Mapping[str, Any]]) -> int:
+    """Return how many numbers the exported net has (scales are folded into weights)."""
+    return sum(own["w"].size + own["b"].size for own in params.values())
+
+
+def apply(params: Params, moments: Params, picture: Any, training: bool) -> tuple[Any, Params]:
+    """Run the net; return its outputs and, in training, the new moments."""
+    ops = JaxOps(params, moments, training)
+    return network(ops, picture), ops.moments or moments
+
+
+def fold(params: Params, moments: Params) -> dict[str, tuple[Any, Any]]:
+    """Return weights (h, w, in, out) and bias of each convolution, normalisation folded in."""
+    folded = {}
+    for name, own in params.items():
+        w, b = np.asarray(own["w"]), np.asarray(own["b"])
+        if "scale" in own:
+            moment = {key: np.asarray(value) for key, value in moments[name].items()}
+            scale = np.asarray(own["scale"]) / np.sqrt(moment["variance"] + EPSILON)
+            w, b = w * scale, b - moment["mean"] * scale
+        folded[name] = (w, b)
+    return folded

@@ -1,0 +1,367 @@
+"""Draws a scene in a studio: room, lights, camera, paints, poses; and renders it with its truth."""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_zenoh.qa.train import textures
+from gigabrain_zenoh.qa.train.distractors import FURNITURE, OCCLUDERS, is_table
+from gigabrain_zenoh.qa.train.looks import Random, about
+from gigabrain_zenoh.qa.train.studio import HEIGHT, RGB, WIDTH, Studio, Thing
+from gigabrain_zenoh.vision.labels import CLASSES
+
+FAR_M = 4.0
+MAX_THINGS = 6
+# Less of a thing than this cannot be asked for: it is to be ignored.
+MIN_FRACTION, MIN_INSIDE, MIN_PIXELS, MIN_SIDE_PX = 0.25, 0.4, 40, 4
+LARGE = ("person", "door")  # seldom fit into the picture
+SMALL_M = 0.4  # what is lower may stand on a table
+TRIES = 30
+SHARES = np.array((14, 14, 10, 14, 11, 9, 11, 11, 6)) / 100  # of the classes, in their order
+CARTON = ((24, 0.45, 0.55), (28, 0.35, 0.75), (32, 0.3, 0.85))  # hue [deg], saturation, value
+
+
+@dataclass(frozen=True)
+class Truth:
+    """One thing in a picture: class, box of what is seen (left, top, right, bottom) [px]."""
+
+    label: int
+    box: tuple[int, int, int, int]
+    fraction: float  # of its pixels that nothing hides
+    ignored: bool  # too little of it is seen
+
+
+@dataclass(frozen=True)
+class Split:
+    """What may be drawn: textures, proportions, and lights."""
+
+    families: tuple[textures.Family, ...]
+    wide: int
+    other_lights: bool
+
+
+SPLITS = {
+    "train": Split(textures.TRAIN, 0, False),
+    "test": Split(textures.TEST, 0, True),
+    "other": Split(textures.TEST, 1, True),
+}
+
+
+class StudioScene:
+    """One picture's scene; `render` after `draw`."""
+
+    def __init__(self, studio: Studio, split: Split, rng: Random) -> None:
+        self._studio, self._split, self._rng = studio, split, rng
+        self._model, self._data = studio.model, studio.data
+        self._placed: list[tuple[Thing, float, float]] = []  # with x, y
+
+    def draw(self) -> None:
+        """Draw all that one picture shows."""
+        rng = self._rng
+        self._camera()
+        self._room()
+        self._lights()
+        kinds = self._studio.things
+        wanted = [t for t in kinds if t.look.label]
+        labels = rng.choice(len(CLASSES), min(1 + rng.poisson(2.2), MAX_THINGS), p=SHARES)
+        tables = [t for t in kinds if is_table(t.look)]
+        table = tables[rng.integers(len(tables))] if rng.random() < 0.3 else None
+        if table and not self._put(table, rng.uniform(0.9, 3.5)):
+            table = None
+        for label in labels:
+            free = [t for t in wanted if t.look.label == CLASSES[label] and not self._is_placed(t)]
+            if free:
+                self._put_wanted(free[rng.integers(len(free))], table)
+        others = [t for t in kinds if not t.look.label and t is not table]
+        for _ in range(int(rng.integers(0, 4))):
+            thing = others[rng.integers(len(others))]
+            if not self._is_placed(thing):
+                self._put(thing, rng.uniform(0.8, 5.0))
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_camlight(self._model, self._data)
+
+    def render(self) -> tuple[NDArray[np.uint8], list[Truth]]:
+        """Return the picture, RGB, and what is in it."""
+        studio = self._studio
+        things = [thing for thing, _, _ in self._placed]
+        studio.show(things)
+        picture, owners = studio.picture().copy(), studio.owners().copy()
+        truths = []
+        for thing in things:
+            number = studio.things.index(thing)
+            seen = owners == number
+            if thing.look.label and seen.any():
+                studio.show([thing], room=False, labelled=True)
+                alone = int((studio.owners() == number).sum())
+                truths.append(_truth(thing, seen, alone, self._is_cut(thing, number, seen)))
+        return expose(self._rng, picture), truths
+
+    def _is_cut(self, thing: Thing, number: int, seen: NDArray[np.bool_]) -> bool:
+        """Return whether most of it is outside the picture; people and doors need not fit."""
+        edges = seen[0].any() or seen[-1].any() or seen[:, 0].any() or seen[:, -1].any()
+        if thing.look.label in LARGE or not edges:
+            return False
+        fovy = self._model.cam_fovy[0]
+        self._model.cam_fovy[0] = math.degrees(2 * math.atan(2 * math.tan(self._fovy / 2)))
+        mujoco.mj_camlight(self._model, self._data)
+        whole = 4 * int((self._studio.owners() == number).sum())
+        self._model.cam_fovy[0] = fovy
+        return int(seen.sum()) < MIN_INSIDE * whole
+
+    def _is_placed(self, thing: Thing) -> bool:
+        return any(thing is placed for placed, _, _ in self._placed)
+
+    def _camera(self) -> None:
+        rng, model = self._rng, self._model
+        self._height = rng.uniform(0.1, 0.6) if rng.random() < 0.75 else rng.uniform(0.6, 1.4)
+        self._fovy = math.radians(rng.uniform(36, 56))
+        pitch = rng.normal(0.03 + 0.12 * self._height, 0.1)  # down
+        roll = rng.normal(0, 0.03)
+        forward = np.array([math.cos(pitch), 0, -math.sin(pitch)])
+        right = np.cross(forward, (0, 0, 1))
+        right /= np.linalg.norm(right)
+        up = np.cross(right, forward)
+        right, up = (
+            right * math.cos(roll) + up * math.sin(roll),
+            up * math.cos(roll) - right * math.sin(roll),
+        )
+        quaternion = np.zeros(4)
+        mujoco.mju_mat2Quat(quaternion, np.stack([right, up, -forward], axis=1).ravel())
+        model.cam_pos[0], model.cam_quat[0] = (0, 0, self._height), quaternion
+        model.cam_fovy[0] = math.degrees(self._fovy)
+
+    def _room(self) -> None:
+        rng, model = self._rng, self._model
+        self._front, left, right = rng.uniform(3.5, 9), rng.uniform(1.2, 6), rng.uniform(1.2, 6)
+        self._sides = (-right, left)
+        high = rng.uniform(1.3, 2.0) if rng.random() < 0.8 else rng.uniform(0.3, 0.9)
+        walls = {
+            "front": ((self._front, 0, high), about((0, 1, 0), -math.pi / 2), (high, 12)),
+            "left": ((0, left, high), about((1, 0, 0), math.pi / 2), (12, high)),
+            "right": ((0, -right, high), about((1, 0, 0), -math.pi / 2), (12, high)),
+        }
+        for name, (at, turn, size) in walls.items():
+            geom = model.geom(name)
+            geom.pos, geom.quat, geom.size[:2] = at, turn, size
+        one = rng.integers(len(self._studio.flat_textures))  # of all walls, mostly
+        for name in ("floor", "front", "left", "right"):
+            material = model.material(name).id
+            other = rng.integers(len(self._studio.flat_textures))
+            number = other if name == "floor" or rng.random() < 0.2 else one
+            plain = rng.random() < 0.35
+            self._paint(material, -1 if plain else self._studio.flat_textures[number])
+            model.mat_texrepeat[material] = rng.uniform(0.3, 2.5)
+            model.mat_reflectance[material] = (
+                rng.uniform(0, 0.25) if name == "floor" and rng.random() < 0.2 else 0
+            )
+
+    def _paint(
+        self, material: int, texture: int, colour: NDArray[np.float32] | None = None
+    ) -> None:
+        rng, model = self._rng, self._model
+        model.mat_texid[material, RGB] = texture
+        if colour is None:
+            colour = textures.colour(rng, 0.35)
+        if texture >= 0:
+            colour = 0.65 + 0.35 * colour
+        model.mat_rgba[material, :3] = colour
+        model.mat_specular[material] = rng.uniform(0, 0.5)
+        model.mat_shininess[material] = rng.uniform(0, 0.6)
+
+    def _lights(self) -> None:
+        rng, model, other = self._rng, self._model, self._split.other_lights
+        warm = rng.uniform(0.15, 0.35) if other else rng.uniform(0, 0.15)
+        tint = (
+            1 - warm * np.array([0, 0.4, 1])
+            if rng.random() < 0.5
+            else 1 - warm * np.array([1, 0.4, 0])
+        )
+        total = rng.uniform(0.55, 1.2)
+        ambient = rng.uniform(0.15, 0.5)
+        model.vis.headlight.ambient[:] = ambient * total * tint
+        model.vis.headlight.diffuse[:] = rng.uniform(0, 0.35) * total if rng.random() < 0.5 else 0
+        model.vis.headlight.specular[:] = 0.1
+        active = int(rng.integers(1, 4))
+        for n in range(3):
+            model.light_active[n] = n < active
+            low, high = (0.35, 0.75) if other else (0.75, 1.5)  # elevation [rad]
+            azimuth, up = rng.uniform(0, 2 * math.pi), rng.uniform(low, high)
+            towards = (
+                math.cos(azimuth) * math.cos(up),
+                math.sin(azimuth) * math.cos(up),
+                math.sin(up),
+            )
+            distance = rng.uniform(2.5, 5)
+            model.light_pos[n] = np.array((1.8, 0, 0.3)) + distance * np.array(towards)
+            model.light_dir[n] = -np.array(towards)
+            model.light_type[n] = (
+                mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+                if rng.random() < 0.6
+                else mujoco.mjtLightType.mjLIGHT_SPOT
+            )
+            model.light_cutoff[n], model.light_exponent[n] = rng.uniform(40, 80), rng.uniform(0, 6)
+            model.light_castshadow[n] = n == 0 and rng.random() < 0.45
+            model.light_diffuse[n] = tint * total * rng.uniform(0.3, 0.9) / math.sqrt(active)
+            model.light_specular[n] = rng.uniform(0.1, 0.5)
+
+    def _put_wanted(self, thing: Thing, table: Thing | None) -> None:
+        """Put a thing, on the table at times, and often something before it."""
+        rng = self._rng
+        if (
+            table
+            and thing.look.height < SMALL_M
+            and rng.random() < 0.6
+            and self._put_on(thing, table)
+        ):
+            return
+        # small things far away are mostly a few pixels: draw the distance by its inverse at times
+        near, far = thing.look.nearest, FAR_M
+        if rng.random() < 0.5:
+            distance = 1 / rng.uniform(1 / far, 1 / near)
+        else:
+            distance = rng.uniform(near, far)
+        if self._put(thing, distance) and rng.random() < 0.85:
+            self._hide(thing)
+
+    def _hide(self, thing: Thing) -> None:
+        """Put something before the last thing that was put, so that it hides a part of it."""
+        rng = self._rng
+        _, x, y = self._placed[-1]
+        distance = math.hypot(x, y)
+        others = [
+            t
+            for t in self._studio.things[-len(OCCLUDERS) - len(FURNITURE) - 2 : -2]
+            if not self._is_placed(t)
+        ]
+        labelled = [
+            t
+            for t in self._studio.things
+            if t.look.label not in ("", "door") and not self._is_placed(t)
+        ]
+        pool = others[: len(OCCLUDERS)] if rng.random() < 0.65 else labelled
+        for _ in range(20):
+            other = pool[rng.integers(len(pool))]
+            gap = thing.look.radius + other.look.radius + rng.uniform(0.02, 0.4)
+            near = distance - gap
+            if near < max(0.35, other.look.nearest * 0.7):
+                continue
+            aside = 0.9 * other.look.radius + thing.look.radius * rng.uniform(-0.6, 0.9)
+            bearing = math.atan2(y, x) + rng.choice([-1, 1]) * aside / near
+            if self._put(other, near, bearing):
+                return
+
+    def _put(self, thing: Thing, distance: float, bearing: float | None = None) -> bool:
+        """Put a thing on the floor where nothing stands; return whether there was room."""
+        rng, look = self._rng, thing.look
+        half = math.atan(math.tan(self._fovy / 2) * WIDTH / HEIGHT)
+        for _ in range(TRIES if bearing is None else 1):
+            angle = rng.uniform(-half, half) * 0.95 if bearing is None else bearing
+            x, y = distance * math.cos(angle), distance * math.sin(angle)
+            low, high = self._sides
+            if x > self._front - 0.2 or not low + 0.1 < y < high - 0.1:
+                continue
+            if all(
+                math.hypot(x - u, y - v) > look.radius + t.look.radius for t, u, v in self._placed
+            ):
+                self._set(thing, x, y, 0.0)
+                return True
+        return False
+
+    def _put_on(self, thing: Thing, table: Thing) -> bool:
+        """Put a small thing on the table where nothing stands yet."""
+        rng, size = self._rng, table.look.parts[0].size
+        _, x, y = next(placed for placed in self._placed if placed[0] is table)
+        if self._height < table.look.height - 0.1 and rng.random() < 0.6:
+            return False  # its top is not seen from here
+        turn = 2 * math.atan2(
+            self._data.mocap_quat[table.mocap, 3], self._data.mocap_quat[table.mocap, 0]
+        )
+        for _ in range(TRIES):
+            u, v = rng.uniform(-1, 1, 2) * (np.array(size[:2]) - thing.look.radius)
+            at_x, at_y = (
+                x + u * math.cos(turn) - v * math.sin(turn),
+                y + u * math.sin(turn) + v * math.cos(turn),
+            )
+            near = [(t, a, b) for t, a, b in self._placed if t is not table]
+            if all(
+                math.hypot(at_x - a, at_y - b) > thing.look.radius + t.look.radius
+                for t, a, b in near
+            ):
+                self._set(thing, at_x, at_y, table.look.height)
+                return True
+        return False
+
+    def _set(self, thing: Thing, x: float, y: float, z: float) -> None:
+        """Put a thing at a place, turned and painted anew."""
+        rng, look = self._rng, thing.look
+        yaw = math.atan2(y, x) + math.pi + rng.uniform(-look.facing, look.facing)
+        turn = np.array(about((0, 0, 1), yaw))
+        if look.lies and rng.random() < look.lies:
+            lying = np.zeros(4)
+            mujoco.mju_mulQuat(lying, turn, np.array(about((0, 1, 0), math.pi / 2)))
+            turn, z = lying, z + look.radius
+        self._data.mocap_pos[thing.mocap], self._data.mocap_quat[thing.mocap] = (x, y, z), turn
+        self._placed.append((thing, x, y))
+        for paint, material in thing.paints.items():
+            self._repaint(paint, material)
+
+    def _repaint(self, paint: str, material: int) -> None:
+        """Draw colour and texture by what a paint stands for."""
+        rng = self._rng
+        chance = {
+            "body": 0.35,
+            "label": 0.6,
+            "shirt": 0.4,
+            "trousers": 0.2,
+            "leaf": 0.3,
+            "carton": 0.15,
+            "wall": 0.4,
+        }
+        textured = rng.random() < chance.get(paint, 0.1)
+        cubes = self._studio.cube_textures
+        colour = textures.colour(rng, 0.6)
+        if paint == "carton" and rng.random() < 0.7:
+            hue, saturation, value = CARTON[rng.integers(len(CARTON))]
+            colour = _hsv(
+                hue + rng.normal(0, 3),
+                saturation + rng.normal(0, 0.06),
+                value + rng.normal(0, 0.06),
+            )
+        elif paint == "tape":
+            colour = _hsv(35, rng.uniform(0, 0.5), rng.uniform(0.45, 0.95))
+        elif paint == "skin":
+            colour, textured = (
+                _hsv(rng.uniform(12, 28), rng.uniform(0.3, 0.6), rng.uniform(0.3, 0.95)),
+                False,
+            )
+        elif paint == "hair":
+            colour, textured = (
+                _hsv(rng.uniform(15, 40), rng.uniform(0, 0.6), rng.uniform(0.05, 0.7)),
+                False,
+            )
+        self._paint(material, cubes[rng.integers(len(cubes))] if textured else -1, colour)
+
+
+def expose(rng: Random, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Make the mean brightness what a camera's automatic exposure makes of it."""
+    gain = np.clip(rng.uniform(70, 135) / max(float(picture.mean()), 1.0), 0.6, 4.0)
+    return np.asarray(np.clip(picture * gain, 0, 255), np.uint8)
+
+
+def _hsv(hue: float, saturation: float, value: float) -> NDArray[np.float32]:
+    hsv = np.array([[[hue % 360, np.clip(saturation, 0, 1), np.clip(value, 0, 1)]]], np.float32)
+    return np.asarray(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0, 0], np.float32)
+
+
+def _truth(thing: Thing, seen: NDArray[np.bool_], alone: int, is_cut: bool) -> Truth:
+    rows, columns = np.flatnonzero(seen.any(1)), np.flatnonzero(seen.any(0))
+    box = (int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)
+    pixels = int(seen.sum())
+    fraction = min(1.0, pixels / max(alone, 1))
+    side = min(box[2] - box[0], box[3] - box[1])
+    ignored = is_cut or fraction < MIN_FRACTION or pixels < MIN_PIXELS or side < MIN_SIDE_PX
+    return Truth(CLASSES.index(thing.look.label), box, fraction, ignored)

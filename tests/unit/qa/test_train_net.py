@@ -1,0 +1,87 @@
+"""The net in JAX and as ONNX is one; needs the extra `train` (and onnxruntime as a judge)."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("jax")
+pytest.importorskip("optax")
+pytest.importorskip("onnx")
+
+import cv2
+
+from gigabrain_zenoh.qa.train import learning, net
+from gigabrain_zenoh.qa.train.export import export
+from gigabrain_zenoh.qa.train.pictures import Labelled
+from gigabrain_zenoh.vision.recognizer import Recognizer
+
+MAX_PARAMETERS, MAX_BYTES = 400_000, 2_000_000
+
+
+def some_net():
+    """A net whose normalisation does something."""
+    params, moments = net.init(0)
+    rng = np.random.default_rng(0)
+    for own in moments.values():
+        own["mean"] = rng.normal(0, 0.1, own["mean"].shape).astype(np.float32)
+        own["variance"] = rng.uniform(0.5, 2, own["variance"].shape).astype(np.float32)
+    return params, moments
+
+
+def test_the_exported_net_answers_as_the_trained_one_and_is_small(tmp_path):
+    runtime = pytest.importorskip("onnxruntime")
+    params, moments = some_net()
+    path = tmp_path / "net.onnx"
+    export(params, moments, path)
+    assert net.parameters(params) <= MAX_PARAMETERS
+    assert path.stat().st_size <= MAX_BYTES
+    picture = np.random.default_rng(1).random((1, 3, 240, 320), np.float32)
+    session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    (theirs,) = session.run(None, {"picture": picture})
+    runner = cv2.dnn.readNetFromONNX(str(path))
+    runner.setInput(picture)
+    assert np.abs(runner.forward() - theirs).max() < 1e-3
+    ours, _ = net.apply(params, moments, picture.transpose(0, 2, 3, 1), False)
+    assert np.abs(np.asarray(ours).transpose(0, 3, 1, 2) - theirs).max() < 1e-3
+
+
+def test_boxes_of_raw_distances_are_those_that_the_runner_decodes(tmp_path):
+    raw = np.random.default_rng(2).normal(0, 1, (1, 60, 80, 4)).astype(np.float32)
+    box = np.asarray(learning.corners(raw))[0, 30, 40]
+    cells = np.full((13, 60, 80), -9.0, np.float32)
+    cells[0, 30, 40], cells[9:, 30, 40] = 3.0, raw[0, 30, 40]
+    from gigabrain_zenoh.vision.recognizer import decode
+
+    assert decode(cells).boxes[0] == pytest.approx(np.clip(box, 0, [320, 240, 320, 240]), abs=1e-3)
+
+
+def test_a_perfect_box_costs_nothing_and_one_apart_more_than_one_that_overlaps():
+    wanted, weight = np.array([[[[0, 0, 10, 10]]]], np.float32), np.ones((1, 1, 1), np.float32)
+    costs = [
+        float(learning.box_loss(wanted + np.float32(shift), wanted, weight)) for shift in (0, 5, 50)
+    ]
+    assert costs[0] == pytest.approx(0, abs=1e-6)
+    assert costs[0] < costs[1] < costs[2]
+
+
+@pytest.mark.slow
+def test_training_goes_on_where_it_was_stopped_and_learns_one_picture(tmp_path, monkeypatch):
+    monkeypatch.setattr(learning, "BATCH", 2)
+    monkeypatch.setattr(learning, "WARM_UP_STEPS", 5)
+    picture = np.full((240, 320, 3), 90, np.uint8)
+    picture[80:160, 100:180] = (250, 30, 30)
+    jpeg = cv2.imencode(".jpg", picture[..., ::-1])[1].tobytes()
+    one = Labelled(
+        jpeg,
+        np.array([[100, 80, 180, 160]], np.float32),
+        np.array([0]),
+        np.ones(1, np.float32),
+        np.zeros(1, bool),
+    )
+    monkeypatch.setattr(learning, "AVERAGED", 0.9)
+    learning.learn([one], 60, tmp_path)
+    state = learning.learn([one], 120, tmp_path)
+    path = tmp_path / "net.onnx"
+    export(state.averaged, state.moments, path)
+    found = Recognizer(path, min_confidence=0.1).find(picture)
+    assert found.names()[0] == "cube"
+    assert np.abs(found.boxes[0] - [100, 80, 180, 160]).max() < 16
