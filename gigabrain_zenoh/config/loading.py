@@ -98,6 +98,8 @@ def got(node: Node) -> str:
     if node.value is None:
         return node.text or "nothing"
     text = node.text if len(node.text) <= _LONGEST else node.text[: _LONGEST - 3] + "..."
+    if isinstance(node.value, bool) and text in ("on", "off"):
+        return f"{text}, which is read as {str(node.value).lower()}; quote it for a text"
     return repr(text) if isinstance(node.value, str) else text
 
 

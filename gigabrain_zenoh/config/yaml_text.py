@@ -13,6 +13,7 @@ import yaml
 
 # libyaml's loader is nine times faster than the Python one; not every platform's wheel has it.
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_BOOLEANS = {"true": True, "on": True, "false": False, "off": False}
 _DEEPEST = 32  # libyaml's composer recurses in C and overruns the stack on deep nesting
 _TOO_DEEP = f"nested too deeply; expected at most {_DEEPEST} levels"
 _LONGEST_NUMBER = 64  # characters
@@ -128,11 +129,11 @@ def _scalar(node: yaml.ScalarNode, line: int) -> str | float | bool | None:
     if kind == "null":
         return None
     if kind == "bool":
-        if text not in ("true", "false"):
+        if text not in _BOOLEANS:
             raise YamlFault(
                 line, f"{text!r} is read as a boolean; write true or false, or quote it"
             )
-        return text == "true"
+        return _BOOLEANS[text]
     # `1e3` has no dot, so YAML 1.1 takes it for a string; here it is a number
     bare = kind == "str" and not node.style and _NUMBER.fullmatch(text) is not None
     if kind in ("int", "float") or bare:
