@@ -1,8 +1,9 @@
-"""The tables of drivers and lidars. Adding one is a folder, and one entry here.
+"""The tables of drivers, lidars and cameras. Adding one is a folder, and one entry here.
 
 Each names both ends of a wire: the driver of a body, or the source of a lidar's scans, and the
-emulator that answers it. Packages offer theirs as entry points in the groups `gigabrain.drivers`,
-`gigabrain.lidars` and `gigabrain.emulators`.
+emulator that answers it; of a camera there is its source only. Packages offer theirs as entry
+points in the groups `gigabrain.drivers`, `gigabrain.lidars`, `gigabrain.cameras` and
+`gigabrain.emulators`.
 """
 
 from typing import NamedTuple
@@ -59,6 +60,14 @@ LIDARS = {
         "gigabrain_drivers.lidars.rplidar.source:Rplidar",
         "gigabrain_drivers.lidars.rplidar.emulator:RplidarDevice",
     ),
+}
+
+
+# by the name in a robot's file: `cameras: {front: {source: NAME}}` of a link
+CAMERAS = {
+    "mujoco": "gigabrain_drivers.cameras.rendered:RenderedCamera",
+    "opencv": "gigabrain_drivers.cameras.opencv:OpenCvCamera",
+    "replay": "gigabrain_drivers.cameras.replay:ReplayedCamera",
 }
 
 

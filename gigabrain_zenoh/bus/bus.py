@@ -89,16 +89,28 @@ class Bus:
         self._kept: dict[str, bytes] = {}
         self._fetching: set[asyncio.Task[None]] = set()
 
-    def publish(self, topic: Topic[M], message: M, *, basis: int = 0, name: str = "") -> M:
-        """Send `message` with its header filled in; returns what was sent."""
+    def publish(
+        self,
+        topic: Topic[M],
+        message: M,
+        *,
+        basis: int = 0,
+        name: str = "",
+        tick: int | None = None,
+        stamp_ns: int | None = None,
+    ) -> M:
+        """Send `message` with its header filled in; returns what was sent.
+
+        `tick` and `stamp_ns` are those of now, unless it was measured earlier.
+        """
         key = topic.at(name)
         self.sent[key] += 1
         stamped = msgspec.structs.replace(
             message,
-            stamp_ns=self.clock.unix_ns(),
+            stamp_ns=self.clock.unix_ns() if stamp_ns is None else stamp_ns,
             seq=self.sent[key],
             boot=self.time.boot,
-            tick=self.time.tick,
+            tick=self.time.tick if tick is None else tick,
             basis=basis,
         )
         payload, encoding = codec.encode(stamped), codec.encoding_of(topic.type)

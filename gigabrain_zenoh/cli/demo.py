@@ -7,6 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from gigabrain_zenoh.cli.cameras import with_cameras
 from gigabrain_zenoh.cli.config import (
     Sets,
     SettingsFiles,
@@ -60,6 +61,8 @@ class RobotOptions:
     "Saved map to find the robot in, instead of making one; see `gigabrain map list`."
     set: Sets = ()
     settings: SettingsFiles = ()
+    cameras: bool = False
+    "Use the robot's cameras; see docs/how-to/cameras.md."
     resume: Resume | None = None
     "Drive on after a stop whose cause has passed. Default: auto; manual with --link real."
 
@@ -79,6 +82,7 @@ class RobotOptions:
             "seed": self.seed,
             "speed": self.speed,
             "lockstep_timeout_s": self.lockstep_timeout,
+            "cameras": self.cameras,
             "resume": self.resume or ("manual" if self.link == "real" else "auto"),
             "router": "tcp/127.0.0.1:0",
         }
@@ -140,7 +144,7 @@ def demo(*, robot: RobotOptions = ROBOT, view: ViewOptions = VIEW) -> int:
     values = robot.values() | (recorded(view.record) if view.record else {})
     checked(values, Deployment)
     merged = merged_values(values, robot.settings, robot.set)
-    deployment, address = merged.deployment, ""
+    deployment, address = with_cameras(merged.deployment, "robot"), ""
     if view.page or (view.page is None and not view.headless):
         checked({"port": view.port}, PageConfig)
         deployment, address = with_page(deployment, view.port, login=view.login)
@@ -165,6 +169,7 @@ def up(
     keys: Path | None = None,
     level: Level = "info",
     keep_stuck: KeepStuck = False,
+    cameras: bool = False,
 ) -> int:
     """Run the processes of a deployment file on this host, until Ctrl-C.
 
@@ -178,6 +183,7 @@ def up(
         map: Saved map to localize in, instead of what the file says of maps.
         keys: Folder of this host's identity, instead of the one in the file.
         level: Lowest level to log.
+        cameras: Use the robot's cameras, as `cameras: on` in the file does.
     """
     from gigabrain_zenoh.host.terminal import LINES, Display, writer
     from gigabrain_zenoh.launch.up import up as run
@@ -185,13 +191,16 @@ def up(
     if map:
         place = checked_map(map)
         set = (*set, "perception.mapping=localize", f"perception.map={place}")
+    if cameras:
+        set = (*set, "cameras=true")
     merged = merged_file(deployment, settings, set, keys)
     path, loaded = deployment_path(deployment), merged.deployment
     try:
         where = host_of(loaded, host)
         if "decision" in loaded.hosts[where]:
             merged.check_behaviour()
-        rows = rows_of(merged, robot="driver" in loaded.hosts[where])
+        loaded = with_cameras(loaded, where)
+        rows = rows_of(merged, loaded, robot="driver" in loaded.hosts[where])
         with Display(writer(sys.stdout), LINES) as display:
 
             def put(line: str) -> None:

@@ -212,6 +212,7 @@ def driver(
     seed: Seed = 0,
     speed: float = 1.0,
     resume: Resume = "manual",
+    cameras: bool = False,
     ports: Path | None = None,
     state_dir: Path | None = None,
     process: ProcessOptions = LOCAL,
@@ -225,6 +226,7 @@ def driver(
         link: How to reach the robot: simulated, emulated or real.
         speed: Simulated over real time. At any speed but 1, time waits for the brain.
         resume: Drive on after a stop whose cause has passed: by itself, or when enabled.
+        cameras: Count the robot's cameras as its own; `gigabrain node run camera` runs them.
         ports: Folder of the emulator's ports, for `--link emulated`.
         state_dir: Folder for the cause of a latch, which survives a restart.
     """
@@ -238,11 +240,14 @@ def driver(
         "seed": seed,
         "speed": speed,
         "resume": resume,
+        "cameras": cameras,
         "emulator": str(ports.absolute()) if ports else "",
         "state_dir": _state_folder(state_dir, process.namespace or Path(name).stem),
     }
     settings = checked(values, DriverConfig)
-    load_link(name, Run(folder=Path(), link=link))  # refuse a wrong name before connecting
+    load_link(
+        name, Run(folder=Path(), link=link, cameras=cameras)
+    )  # refuse a wrong name before connecting
     return process.run("driver", msgspec.to_builtins(settings))
 
 

@@ -87,6 +87,7 @@ class DriverConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     state_dir: str  # folder where it saves the causes that latched it
     emulator: str = ""  # folder of the emulator's ports, if the link is `emulated`
     button: bool = False  # an e-stop button must be present
+    cameras: bool = False  # the body's cameras are used; otherwise it counts as one without
     robot: dict[str, Any] = {}  # fields of the body's file that are other here
 
 
@@ -128,6 +129,17 @@ class EmulatorConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     world: str = "arena"
     seed: Seed = 0
     folder: str  # folder where its ports appear
+    cameras: bool = False  # the emulated world is sent as often as its cameras need
+    robot: dict[str, Any] = {}  # fields of the body's file that are other here
+
+
+class CameraConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the camera process."""
+
+    body: str
+    link: LinkName = "sim"
+    seed: Seed = 0  # of the cameras' errors in the simulation
+    errors: bool = True  # rendered pictures have a sensor's noise, holes and mounting
     robot: dict[str, Any] = {}  # fields of the body's file that are other here
 
 

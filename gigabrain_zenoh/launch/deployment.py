@@ -67,6 +67,7 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     insecure: bool = False  # allow a router that other machines can reach, without keys
     # the processes of each host, by its name
     hosts: dict[str, tuple[str, ...]] = msgspec.field(default_factory=lambda: {"robot": ROBOT})
+    cameras: bool = False  # on: the cameras of the body's file are used, by the process `camera`
     button: ButtonConfig | None = None  # an e-stop button; without its word nothing moves
     robot: dict[str, Any] = {}  # fields of the body's file that are other here, never less safe
     perception: PerceptionConfig = PerceptionConfig()

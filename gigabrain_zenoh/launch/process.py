@@ -70,6 +70,7 @@ class ProcessType:
     stop_last: bool = False  # the others need it in order to end well
     stops: bool = False  # carries commands and stops: gets a higher priority where permitted
     repeats: bool = False  # can be replayed, so it publishes which input it used
+    optional: bool = False  # the robot goes on without it, also where its settings are wrong
     looks_on: bool = False  # not needed by the robot: naps, and runs at low priority
     # identities with which a host may run it; `process` is one of its own, in a subfolder of the
     # host's that has the name of the process

@@ -20,6 +20,7 @@ from gigabrain_zenoh.bus.zenoh.config import router_config
 from gigabrain_zenoh.config.renames import renamed_settings
 from gigabrain_zenoh.config.settings import (
     ButtonConfig,
+    CameraConfig,
     DecisionConfig,
     DriverConfig,
     EmulatorConfig,
@@ -73,6 +74,7 @@ def _driver(deployment: "Deployment", place: ProcessPlace) -> DriverConfig:
         state_dir=str(place.state_dir),
         emulator=str(place.ports) if deployment.link == "emulated" else "",
         button=deployment.button is not None,
+        cameras=deployment.cameras,
         robot=deployment.robot,
     )
 
@@ -83,6 +85,16 @@ def _emulator(deployment: "Deployment", place: ProcessPlace) -> EmulatorConfig:
         world=deployment.world,
         seed=deployment.seed,
         folder=str(place.ports),
+        cameras=deployment.cameras,
+        robot=split(deployment.robot)[1],
+    )
+
+
+def _camera(deployment: "Deployment", _: ProcessPlace) -> CameraConfig:
+    return CameraConfig(
+        body=deployment.body,
+        link=deployment.link,
+        seed=deployment.seed,
         robot=split(deployment.robot)[1],
     )
 
@@ -113,6 +125,12 @@ def _needs_button(deployment: "Deployment", here: set[str]) -> bool:
     """Return whether an e-stop button runs beside the driver: unless `hosts` places it."""
     placed = any("button" in names for names in deployment.hosts.values())
     return deployment.button is not None and "driver" in here and not placed
+
+
+def _needs_camera(deployment: "Deployment", here: set[str]) -> bool:
+    """Return whether the cameras' process runs beside the driver: unless `hosts` places it."""
+    placed = any("camera" in names for names in deployment.hosts.values())
+    return deployment.cameras and "driver" in here and not placed
 
 
 def _maps(deployment: "Deployment") -> bool:
@@ -153,6 +171,14 @@ PROCESSES: Mapping[str, ProcessType] = {
         default=True,
         after=("router", "emulator"),
         stops=True,
+        roles=("robot",),
+    ),
+    "camera": ProcessType(
+        "gigabrain_drivers.cameras.process:run",
+        CameraConfig,
+        derive=_camera,
+        joins=_needs_camera,
+        optional=True,
         roles=("robot",),
     ),
     "perception": ProcessType(

@@ -63,7 +63,7 @@ def process_specs(
                 beats=True,
                 shows_stack=True,
                 stop_last=row.stop_last,
-                optional=row.own,
+                optional=row.own or row.optional,
                 ready_timeout_s=soon_s if after else LATER_S,
             )
         )

@@ -12,6 +12,7 @@ import msgspec
 from msgspec import Struct
 
 from gigabrain_drivers import DRIVERS, shipped_hosts
+from gigabrain_drivers.cameras.base import camera_options
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import LINKS, LinkOptions, RobotFile, Run
 from gigabrain_drivers.lidars.base import check_turns, source_class
@@ -159,6 +160,8 @@ def load_layers(
     # read once more, now that it is known what this driver's part looks like: errors name the line
     options = getattr(layers.convert(_exact_type(path, layers, run.link)), section)
     _check_safe(path, layers, robot)
+    if not run.cameras:
+        robot = msgspec.structs.replace(robot, cameras=())
     if options.lidar:
         robot = msgspec.structs.replace(robot, lidar=options.lidar)
     if borrowed:
@@ -224,6 +227,7 @@ def _driver_of(path: Path, layers: Layers, section: LinkName, link: dict[str, An
 
 def with_ports(options: LinkOptions) -> LinkOptions:
     """The options of a real link with the emulator's ports in place of the real ones."""
+    options = msgspec.structs.replace(options, cameras={})  # rendered from the emulator's world
     if hasattr(options, "port"):
         options = msgspec.structs.replace(options, port=f"{EMULATOR}/base")
     if options.scan:
@@ -249,7 +253,9 @@ def link_options(driver: type[Driver], robot: RobotFile, link: dict[str, Any]) -
     scan = link.get("scan")
     name = scan.get("driver") if isinstance(scan, dict) else None
     # where the lidar is not named, the driver's own options refuse it, with the line
-    fields = [("scan", source_class(name).Options)] if isinstance(name, str) else []
+    fields: list[Any] = [("scan", source_class(name).Options)] if isinstance(name, str) else []
+    if "cameras" in link:
+        fields.append(("cameras", camera_options(robot, link["cameras"])))
 
     def fit(options: LinkOptions) -> None:
         if own := getattr(driver.Options, "__post_init__", None):

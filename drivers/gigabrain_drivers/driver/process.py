@@ -26,7 +26,17 @@ from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import Body, RobotState, SafeState
 from gigabrain_schemas.brain import CmdVel, JointCommand
 from gigabrain_schemas.safety import SafetyState
-from gigabrain_schemas.topics import BODY, JOINT_CMD, SAFETY, SCAN, STATE, Topic, command_topic
+from gigabrain_schemas.topics import (
+    BODY,
+    JOINT_CMD,
+    SAFETY,
+    SCAN,
+    SIM_POSES,
+    SIM_SCENE,
+    STATE,
+    Topic,
+    command_topic,
+)
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.params import shown
 from gigabrain_zenoh.config.settings import DriverConfig
@@ -44,6 +54,7 @@ R = TypeVar("R", bound=Struct)
 Bounds = tuple[float, float]
 PATH = r" - at `[^`]*`$"  # that msgspec adds to an error
 BODY_EVERY_TICKS = 50  # once a second
+OF_THE_STATE = (SIM_SCENE, SIM_POSES)  # they are of the tick whose state comes next
 STALE_NS = 250_000_000  # the echo's 150 ms and the watchdog's 100: older must never move the body
 
 
@@ -176,9 +187,9 @@ class DriverProcess:
         await self._apply_command()
 
     def _emit(self, topic: Topic[Any], message: Message) -> None:
-        """Publish a sensor's message at once, or with the next tick in lock-step."""
+        """Publish a sensor's message at once, or with the next tick: all of them in lock-step."""
         message = clipped(message)
-        if self._lockstep or not self._gate.tick:
+        if self._lockstep or not self._gate.tick or topic in OF_THE_STATE:
             self._sensors.append((topic, message))
         else:
             self._send(topic, message)
@@ -302,6 +313,7 @@ async def run(config: DriverConfig, bus: Bus, ready: Callable[[], None]) -> None
         speed=config.speed,
         seconds=config.seconds,
         emulator=config.emulator or str(ports_folder(config.body)),
+        cameras=config.cameras,
         changes=split(config.robot)[1],
     )
     robot, driver = make_driver(config.body, where)

@@ -60,6 +60,7 @@ class LinkOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     driver: str
     scan: ScanOptions | None = None  # a lidar that the driver carries, see lidars.base.open_lidar
     lidar: Lidar | None = None  # overrides the lidar of the body's file
+    cameras: Any = {}  # the source of each camera, by its name; see cameras.base.CameraOptions
 
     def battery_volts(self) -> tuple[float, float] | None:
         """Return the voltages that the driver takes for empty and full, where it has any."""
@@ -76,4 +77,5 @@ class Run(Struct, frozen=True, kw_only=True):
     speed: float = 1.0  # of real time; other than 1 means lock-step
     seconds: float | None = None  # of simulated time, then it holds still
     emulator: str = ""  # the folder of the emulator's ports, where the link is `emulated`
+    cameras: bool = False  # whether its cameras are used; otherwise the robot has none
     changes: dict[str, Any] = {}  # fields of the robot's file that are other in this run

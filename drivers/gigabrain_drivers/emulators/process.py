@@ -39,7 +39,10 @@ async def run(config: EmulatorConfig, bus: Bus, ready: Callable[[], None]) -> No
 
 def show_world(emulator: Emulator, name: str, bus: Bus) -> LiveWorld:
     """Publish the emulated world for viewers, from the physics thread on."""
-    world, loop = LiveWorld(emulator.body.simulation, name), asyncio.get_running_loop()
+    world, loop = (
+        LiveWorld(emulator.body.simulation, name, emulator.body.robot.cameras),
+        asyncio.get_running_loop(),
+    )
 
     def publish(news: News) -> None:
         for topic, message in news:
@@ -101,6 +104,7 @@ def make_emulator(config: EmulatorConfig) -> Emulator:
             world=config.world,
             seed=config.seed,
             emulator=config.folder,
+            cameras=config.cameras,
             changes=config.robot,
         ),
     )

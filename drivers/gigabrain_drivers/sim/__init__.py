@@ -4,11 +4,20 @@ Imports `driver` and `kinematics`; `emulators` and pictures use it. Time goes on
 that it never drifts; two of them are a tick of the robot's clock.
 """
 
+import math
 import time
+
+from gigabrain_schemas.base import TICK_S
 
 STEP_NS = 10_000_000  # one advance of the physics
 STEP_S = STEP_NS / 1e9
 LATE_S = 0.25  # further behind than this, time is dropped instead of raced after
+
+
+def exposes(rate_hz: float, tick: int) -> bool:
+    """Return whether a camera of this rate takes a picture at the end of a tick."""
+    per_tick = rate_hz * TICK_S
+    return math.floor(tick * per_tick + 1e-9) > math.floor((tick - 1) * per_tick + 1e-9)
 
 
 class Pace:

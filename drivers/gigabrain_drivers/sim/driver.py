@@ -82,7 +82,7 @@ class MujocoDriver(Driver):
         self.lockstep = run.speed != 1.0
         world = load_world(run.world, run.seed)
         self._simulation = Simulation(sim_body(robot, options, run), world, run.seed)
-        self._world = LiveWorld(self._simulation, run.world)
+        self._world = LiveWorld(self._simulation, run.world, robot.cameras)
         period_ns = 1e9 / robot.lidar.rate_hz if robot.lidar else math.inf
         self._scan_ticks = period_ns / TICK_NS
         self._next_scan = self._scan_ticks

@@ -3,12 +3,14 @@
 import asyncio
 import contextlib
 from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
-from gigabrain_drivers.sim import STEP_NS
+from gigabrain_drivers.sim import STEP_NS, exposes
 from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.scene_message import SceneWriter
-from gigabrain_schemas.base import Message, Pose
+from gigabrain_schemas.base import TICK_NS, Message, Pose
+from gigabrain_schemas.body import Camera
 from gigabrain_schemas.sim import SimReply, SimRequest
 from gigabrain_schemas.topics import SIM_POSES, SIM_SCENE, Topic
 from gigabrain_zenoh.errors import Refused
@@ -25,8 +27,9 @@ class LiveWorld:
     `step` belongs into the physics thread, `change` onto the loop; `scene` into whichever begins.
     """
 
-    def __init__(self, simulation: Simulation, world: str) -> None:
-        self._simulation = simulation
+    def __init__(self, simulation: Simulation, world: str, cameras: Sequence[Camera] = ()) -> None:
+        """Describe a world to viewers, and to the cameras that are rendered from it."""
+        self._simulation, self._cameras = simulation, cameras
         self._writer = SceneWriter(simulation.model, simulation.data, world)
         self._waiting: deque[tuple[SimRequest, asyncio.Future[SimReply]]] = deque()
         self._steps, self._shown = 0, -1  # the newest version that viewers know
@@ -47,9 +50,14 @@ class LiveWorld:
         self._steps += 1
         if self._simulation.things.version != self._shown:
             return self.scene()
-        if self._steps % POSES_STEPS == 0:
+        if self._steps % POSES_STEPS == 0 or self._exposes():
             return [(SIM_POSES, self._writer.poses(self._shown))]
         return []
+
+    def _exposes(self) -> bool:
+        """Return whether a camera takes a picture after this step, with which a tick ends."""
+        tick, rest = divmod(self._steps * STEP_NS, TICK_NS)
+        return rest == 0 and any(exposes(camera.rate_hz, tick) for camera in self._cameras)
 
     async def change(self, request: SimRequest) -> SimReply:
         """Carry out a request between two steps. Raises Refused if time stands still."""

@@ -1,8 +1,6 @@
 """Pictures of a robot in its room, rendered off screen."""
 
-import importlib
 import math
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,11 +13,12 @@ from gigabrain_drivers.driver.catalog import make_driver
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.sim.body import SimModel, sim_body
 from gigabrain_drivers.sim.driver import MujocoDriver
+from gigabrain_drivers.sim.graphics import open_graphics
 from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.png import png
 from gigabrain_drivers.sim.world import Pose, World, clearance
 from gigabrain_drivers.sim.worlds import load_world
-from gigabrain_zenoh.errors import ConfigError, Unsupported
+from gigabrain_zenoh.errors import Unsupported
 
 DISTANCE_M, HEIGHT_M = 1.0, 0.50  # of the camera, from the robot and above the floor
 AIM_HEIGHT_M = 0.22  # above the robot, so that the room is in the picture
@@ -78,18 +77,8 @@ def _light(model: mujoco.MjModel, robot: Pose) -> None:
 @contextmanager
 def _graphics(width: int, height: int) -> Iterator[None]:
     """An off-screen OpenGL context. Raises ConfigError naming the packages that are missing."""
+    context = open_graphics(width, height)
     try:
-        backend = importlib.import_module(
-            "mujoco.cgl" if sys.platform == "darwin" else "mujoco.egl"
-        )
-        context = backend.GLContext(width, height)
-    except (ImportError, AttributeError, RuntimeError) as error:
-        raise ConfigError(
-            f"cannot draw without OpenGL ({error}): pip install 'gigabrain-zenoh[view]' and, on "
-            "Debian, apt-get install libegl1 libgl1-mesa-dri"
-        ) from error
-    try:
-        context.make_current()
         yield
     finally:
         context.free()

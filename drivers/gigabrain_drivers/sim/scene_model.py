@@ -108,9 +108,13 @@ class SceneModel:
             )  # fmt: skip
             drawn.ngeom += 1
 
+    def pose_of(self, body: str) -> Pose:
+        """Return where a body is, or the origin."""
+        return self._poses.get(body, STILL)
+
     def robot_place(self) -> tuple[float, float]:
         """Return where the robot is, or the origin."""
-        pose = self._poses.get(BASE, STILL)
+        pose = self.pose_of(BASE)
         return float(pose[0]), float(pose[1])
 
     def aim(self, camera: mujoco.MjvCamera) -> None:

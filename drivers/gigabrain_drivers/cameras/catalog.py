@@ -1,0 +1,51 @@
+"""Which cameras a robot has on a link, each with its source, by its file."""
+
+import importlib.util
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from gigabrain_drivers.cameras.base import CameraOptions, options_of
+from gigabrain_drivers.driver.catalog import load_link, robot_path
+from gigabrain_drivers.driver.robot import Run
+from gigabrain_schemas.body import Camera
+from gigabrain_zenoh.config.loading import line_in
+from gigabrain_zenoh.config.settings import LinkName
+from gigabrain_zenoh.errors import ConfigError
+
+RENDERED = "mujoco"
+INSTALL = "cameras need OpenCV; install it with: pip install 'gigabrain-zenoh[eyes]'"
+
+
+class LinkedCamera(NamedTuple):
+    """A camera of a robot, and what gives its pictures."""
+
+    camera: Camera
+    options: CameraOptions
+    folder: Path  # of the robot's file
+
+
+def cameras_of(body: str, link: LinkName, changes: Mapping[str, Any]) -> list[LinkedCamera]:
+    """Return the cameras of a robot (a name or a file) on a link.
+
+    Where its file names no source, those of a simulated world are rendered. Raises ConfigError.
+    """
+    if not importlib.util.find_spec("cv2"):
+        raise ConfigError(INSTALL)
+    run = Run(folder=Path(), link=link, cameras=True, changes=dict(changes))
+    robot, _, options, folder = load_link(body, run)
+    path = robot_path(body)
+    if not robot.cameras:
+        raise ConfigError(f"{path}: {robot.robot_type} has no cameras; add a part `cameras:`")
+    simulated = link != "real" and (robot.sim or {}).get("driver") == "mujoco"
+    found = []
+    for camera in robot.cameras:
+        given = options_of(options.cameras, camera.name)
+        if given is None and not simulated:
+            line = line_in(path, (link,)) or 1
+            raise ConfigError(
+                f"{path}:{line}: camera {camera.name!r} has no source on the link {link!r}; add "
+                f"`cameras: {{{camera.name}: {{source: opencv, device: /dev/video0}}}}` to it"
+            )
+        found.append(LinkedCamera(camera, given or CameraOptions(source=RENDERED), folder))
+    return found

@@ -1,0 +1,104 @@
+"""Anything that OpenCV opens: USB cameras (v4l2), network streams (RTSP, HTTP), and video files."""
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_drivers.cameras.base import CameraLost, CameraOptions, CameraSource, Frame, Picture
+
+TIMEOUT_MS = 3000  # of opening a stream, and of reading from it
+ASPECT = 0.01  # by which the shape of a scaled picture may differ
+MAX_PIXELS = 16_000_000  # of a picture that is scaled
+
+
+class OpenCvOptions(CameraOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What OpenCV opens."""
+
+    device: str  # /dev/video0, its number, rtsp://..., http://..., or a file beside the robot's
+    repeat: bool = False  # whether a file begins again at its end
+    repeats: bool = False  # a still scene may give the same picture twice, as in strong compression
+
+
+class OpenCvCamera(CameraSource):
+    """A camera without depth, by cv2.VideoCapture. Pictures of another size are scaled."""
+
+    Options = OpenCvOptions
+    options: OpenCvOptions
+
+    _capture: cv2.VideoCapture | None = None
+    _file = False
+    _due_s = 0.0  # of a file's next picture
+
+    def open(self) -> None:
+        """Open the device. Raises CameraLost."""
+        if self.camera.depth:
+            raise CameraLost("OpenCV gives no depth; write `depth: false` for this camera")
+        target, backend = self._target()
+        timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, TIMEOUT_MS]
+        timeouts += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, TIMEOUT_MS]
+        network = isinstance(target, str) and "://" in target
+        capture = cv2.VideoCapture(target, backend, timeouts if network else [])
+        self._capture, self._due_s = capture, time.monotonic()
+        if not capture.isOpened():
+            raise CameraLost(f"{self.options.device} cannot be opened")
+        if not self._file and not network:
+            capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # an old picture is worse than none
+            capture.set(cv2.CAP_PROP_FRAME_WIDTH, self.camera.width)
+            capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self.camera.height)
+            capture.set(cv2.CAP_PROP_FPS, self.camera.rate_hz)
+
+    def read(self) -> Frame:
+        """Return the next picture. Raises CameraLost."""
+        capture = self._capture
+        if capture is None:
+            raise CameraLost(f"{self.options.device} is not open")
+        if self._file:
+            self._due_s += 1 / self.camera.rate_hz
+            time.sleep(max(0.0, self._due_s - time.monotonic()))
+        came, picture = capture.read()
+        if not came and self._file and self.options.repeat:
+            capture.set(cv2.CAP_PROP_POS_FRAMES, 0)
+            came, picture = capture.read()
+        if not came or picture is None:
+            end = "has ended" if self._file else "gives no picture"
+            raise CameraLost(f"{self.options.device} {end}")
+        return Frame(fitted(np.asarray(picture), self.camera.width, self.camera.height))
+
+    def close(self) -> None:
+        """Free the device."""
+        capture, self._capture = self._capture, None
+        if capture:
+            capture.release()
+
+    def _target(self) -> tuple[int | str, int]:
+        device = self.options.device
+        if device.isdecimal():
+            return int(device), cv2.CAP_ANY
+        if "://" in device:
+            return device, cv2.CAP_ANY
+        path = Path(self.site.folder) / Path(device).expanduser()
+        self._file = path.is_file()
+        if not path.exists():
+            raise CameraLost(f"{device} is not there")
+        return str(path), cv2.CAP_ANY
+
+
+def fitted(picture: NDArray[Any], width: int, height: int) -> Picture:
+    """Return a picture in the size of the body's file, in colour. Raises CameraLost."""
+    tall, wide = picture.shape[:2]
+    if picture.dtype != np.uint8 or tall * wide > MAX_PIXELS:
+        raise CameraLost(f"gives pictures of {wide} x {tall} pixels of {picture.dtype}")
+    if picture.ndim == 2:
+        picture = np.asarray(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR), np.uint8)
+    if (wide, tall) == (width, height):
+        return np.asarray(picture, np.uint8)
+    if not math.isclose(wide / tall, width / height, rel_tol=ASPECT):
+        raise CameraLost(
+            f"gives pictures of {wide} x {tall} pixels; the body's file says {width} x {height}"
+        )
+    return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,0 +1,264 @@
+"""The camera process: the pictures of all cameras of a robot, from their sources onto the bus."""
+
+import asyncio
+import contextlib
+import functools
+import threading
+from collections.abc import Callable, Mapping
+
+from gigabrain_drivers.cameras.base import (
+    CameraLost,
+    CameraSite,
+    CameraSource,
+    Frame,
+    source_class,
+)
+from gigabrain_drivers.cameras.catalog import RENDERED, LinkedCamera, cameras_of
+from gigabrain_drivers.cameras.faults import FAULTS, FaultyCamera
+from gigabrain_drivers.cameras.output import LOOK_NS, CameraOutput
+from gigabrain_drivers.sim import exposes
+from gigabrain_schemas.base import TICK_S
+from gigabrain_schemas.body import Camera
+from gigabrain_schemas.sim import SimPoses, SimScene
+from gigabrain_schemas.topics import SIM_POSES, SIM_SCENE, STATE
+from gigabrain_zenoh.bus.bridge import Bridge
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.config.settings import CameraConfig
+from gigabrain_zenoh.runtime.heartbeat import Progress
+
+AGAIN_S = 0.5  # until a source that was lost is opened again
+EARLY = 0.75  # of a period: without ticks, a camera is due this soon
+END_S = 0.5  # that a thread may take to end; one that hangs in a device is left
+
+
+class CameraProcess:
+    """All cameras of one robot. Used as `async with`; its threads run inside."""
+
+    def __init__(self, config: CameraConfig, bus: Bus) -> None:
+        """Read the robot's file. Raises ConfigError."""
+        self._config, self._bus = config, bus
+        self._cameras = cameras_of(config.body, config.link, config.robot)
+        self._halt = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._faults = {one.camera.name: FaultyCamera() for one in self._cameras}
+        self.outputs = {one.camera.name: self._output(one) for one in self._cameras}
+        self._rendered: RenderThread | None = None
+        if config.link != "real":
+            self._serve_faults()
+
+    async def __aenter__(self) -> "CameraProcess":
+        self._bridge = Bridge()
+        bus, drawn = self._bus, []
+        bus.latest(STATE)  # moves this process's clock, by which a silent camera is known
+        for one in self._cameras:
+            if one.options.source == RENDERED:
+                drawn.append(one)
+            else:
+                self._start(functools.partial(self._read, one))
+        if drawn:
+            self._rendered = RenderThread(self._config, drawn, self)
+            self._start(self._rendered.run)
+            bus.latest(SIM_SCENE, self._rendered.show)
+            bus.latest(SIM_POSES, self._rendered.expose)
+            bus.progress = Progress(self._rendered.came, self._exposures)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self._halt.set()
+        if self._rendered:
+            self._rendered.wake()
+        for thread in self._threads:
+            await asyncio.to_thread(thread.join, END_S)
+        self._bridge.close()
+
+    async def watch(self) -> None:
+        """Look after the cameras' health until cancelled. Raises what ended a thread."""
+        async for _ in self._bus.clock.every(LOOK_NS):
+            if self.failed.done():
+                await self.failed
+            for output in self.outputs.values():
+                output.look()
+            causes = [output.cause for output in self.outputs.values()]
+            self._bus.problems = tuple(cause for cause in causes if cause)
+
+    def put(self, name: str, frame: Frame) -> None:
+        """Take an exposure, from any thread."""
+        spoilt = self._faults[name].spoil(frame)
+        if spoilt:
+            self._bridge.post(self.outputs[name].put, self.outputs[name].pack(spoilt))
+
+    @property
+    def halted(self) -> bool:
+        """Return whether the threads are to end."""
+        return self._halt.is_set()
+
+    def now_ns(self) -> int:
+        """Return this process's time [ns]."""
+        return self._bus.clock.now_ns()
+
+    def count(self, name: str) -> None:
+        """Count something in the process's health, from any thread."""
+        self._bridge.post(lambda _: self._bus.counters.update((name,)), None)
+
+    def restart(self) -> None:
+        """Judge all cameras from now on: the robot's time has begun again."""
+        for output in self.outputs.values():
+            output.restart()
+
+    def _output(self, one: LinkedCamera) -> CameraOutput:
+        """Return the output of a camera, which in a simulation goes by the robot's time."""
+        bus, drawn = self._bus, one.options.source == RENDERED
+        repeats = not drawn and source_class(one.options.source).repeats
+
+        def now_s() -> float:
+            return bus.time.tick * TICK_S if drawn else bus.clock.now_ns() / 1e9
+
+        return CameraOutput(one.camera, one.options, bus, now_s, repeats=repeats)
+
+    def _exposures(self) -> int:
+        return sum(output.exposures for output in self.outputs.values())
+
+    def _serve_faults(self) -> None:
+        for name, faulty in self._faults.items():
+            expected = f"one of: {', '.join(FAULTS)}"
+            self._bus.params.add(
+                f"{name}_fault", expected, functools.partial(getattr, faulty, "fault"), faulty.put
+            )
+
+    def _start(self, work: Callable[[], None]) -> None:
+        def run() -> None:
+            try:
+                work()
+            except Exception as error:  # noqa: BLE001 - handed on whole, to end this process
+                self._bridge.post(self._fail, error)
+
+        thread = threading.Thread(target=run, name="camera", daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    def _fail(self, error: Exception) -> None:
+        if not self.failed.done():
+            self.failed.set_exception(error)
+
+    def _read(self, one: LinkedCamera) -> None:
+        """Read a camera until halted; open it again after each loss."""
+        name = one.camera.name
+        site = CameraSite(str(one.folder), self._config.seed)
+        source = source_class(one.options.source)(one.options, one.camera, site)
+        while not self.halted:
+            try:
+                self._take_all(name, source)
+            except CameraLost as error:
+                self._bridge.post(self.outputs[name].lose, f"no picture: {error}")
+            finally:
+                source.close()
+            self._halt.wait(AGAIN_S)
+
+    def _take_all(self, name: str, source: CameraSource) -> None:
+        source.open()
+        while not self.halted:
+            self.put(name, source.read())
+
+
+class RenderThread:
+    """Draws the cameras of a simulated robot, always the newest poses that came.
+
+    `show` and `expose` are called on the loop's thread, `run` is the thread itself.
+    """
+
+    def __init__(
+        self, config: CameraConfig, cameras: list[LinkedCamera], process: CameraProcess
+    ) -> None:
+        self._config, self._process = config, process
+        self._cameras = {one.camera.name: one.camera for one in cameras}
+        self._changed = threading.Condition()
+        self._scene: SimScene | None = None
+        self._due: dict[str, SimPoses] = {}  # by the name of a camera
+        self._drawn: set[str] = set()  # cameras that have taken a picture in this boot
+        self._taken_ns: dict[str, int] = {}  # when each was last due, by this process's clock
+        self._boot, self._count = -1, 0
+
+    def show(self, scene: SimScene) -> None:
+        """Draw this scene from now on."""
+        with self._changed:
+            self._scene = scene
+            self._changed.notify()
+
+    def expose(self, poses: SimPoses) -> None:
+        """Have those cameras take a picture that are due in this tick."""
+        if poses.boot != self._boot:
+            self._boot = poses.boot
+            self._drawn.clear()
+            self._process.restart()
+        with self._changed:
+            for name, camera in self._cameras.items():
+                if name in self._drawn and not self._is_due(camera, poses.tick):
+                    continue
+                self._taken_ns[name] = self._process.now_ns()
+                self._count += 1
+                if name in self._due:
+                    self._process.count("skipped_exposures")
+                self._due[name] = poses
+            self._changed.notify()
+
+    def _is_due(self, camera: Camera, tick: int) -> bool:
+        """Return whether a camera takes a picture now; an emulated world has no ticks."""
+        if tick:
+            return exposes(camera.rate_hz, tick)
+        since_ns = self._process.now_ns() - self._taken_ns.get(camera.name, 0)
+        return since_ns >= EARLY * 1e9 / camera.rate_hz
+
+    def wake(self) -> None:
+        """Have the thread look whether it is to end."""
+        with self._changed:
+            self._changed.notify()
+
+    def came(self) -> tuple[object, ...]:
+        """Return what changes with each input, for the heartbeat."""
+        return (self._count,) if self._drawn else ()
+
+    def run(self) -> None:
+        """Draw until the process halts. Raises ConfigError where nothing can be drawn."""
+        from gigabrain_drivers.cameras.rendered import Renderer, View  # mujoco: 100 MB
+
+        config, shown = self._config, None
+        views = {
+            name: View(camera, config.seed, errors=config.errors)
+            for name, camera in self._cameras.items()
+        }
+        with contextlib.closing(Renderer(views)) as renderer:
+            while not self._process.halted:
+                scene, due = self._next()
+                if scene is not None and scene is not shown:
+                    renderer.show(scene)
+                    shown = scene
+                for poses, names in _together(due):
+                    frames = renderer.expose(poses, names)
+                    self._drawn.update(frames)
+                    for name, frame in frames.items():
+                        exposed = Frame(frame.picture, frame.depth, poses.tick, poses.stamp_ns)
+                        self._process.put(name, exposed)
+
+    def _next(self) -> tuple[SimScene | None, Mapping[str, SimPoses]]:
+        """Wait for something to draw."""
+        with self._changed:
+            while not self._due and not self._process.halted:
+                self._changed.wait()
+            due, self._due = self._due, {}
+            return self._scene, due
+
+
+def _together(due: Mapping[str, SimPoses]) -> list[tuple[SimPoses, list[str]]]:
+    """Return the cameras that see the same poses, so that these are set once."""
+    groups: dict[int, tuple[SimPoses, list[str]]] = {}
+    for name, poses in due.items():
+        groups.setdefault(id(poses), (poses, []))[1].append(name)
+    return list(groups.values())
+
+
+async def run(config: CameraConfig, bus: Bus, ready: Callable[[], None]) -> None:
+    """Publish the cameras' pictures until the process ends. Raises ConfigError."""
+    async with CameraProcess(config, bus) as process:
+        ready()
+        await process.watch()

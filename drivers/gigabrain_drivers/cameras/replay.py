@@ -1,0 +1,138 @@
+"""A camera whose pictures come from a recording (`gigabrain record`), at their own pace."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from gigabrain_drivers.cameras.base import CameraLost, CameraOptions, CameraSource, Frame, Picture
+from gigabrain_drivers.cameras.opencv import fitted
+from gigabrain_schemas.sensors import Image
+from gigabrain_schemas.topics import DEPTH, IMAGE
+from gigabrain_schemas.vision import DepthImage
+from gigabrain_zenoh.codec import Codec
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.recording.bag_reader import samples
+
+LONGEST_WAIT_S = 1.0  # between two pictures of a recording
+
+
+class ReplayOptions(CameraOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where the recording is."""
+
+    file: str  # beside the robot's file
+    camera: str = ""  # of the recording; empty: the one of this name
+    repeat: bool = True  # whether it begins again at its end
+
+
+class Recorded(NamedTuple):
+    """Messages of one exposure."""
+
+    stamp_ns: int
+    picture: Image | None
+    depth: DepthImage | None
+
+
+class ReplayedCamera(CameraSource):
+    """Pictures and depth of a recording. Needs the extra `record`."""
+
+    Options = ReplayOptions
+    options: ReplayOptions
+
+    _exposures: Iterator[Recorded] | None = None
+    _last: tuple[int, float] | None = None  # stamp of the newest exposure, and when it was given
+
+    def open(self) -> None:
+        """Begin at the start of the recording. Raises CameraLost."""
+        path = Path(self.site.folder) / Path(self.options.file).expanduser()
+        self._exposures = recorded(path, self.options.camera or self.camera.name)
+        self._last = None
+
+    def read(self) -> Frame:
+        """Return the next exposure when its time has come. Raises CameraLost."""
+        if self._exposures is None:
+            raise CameraLost("the recording is not open")
+        try:
+            one = next(self._exposures, None)
+        except ConfigError as error:
+            raise CameraLost(str(error)) from None
+        if one is None and self.options.repeat and self._last:
+            self.open()
+            return self.read()
+        if one is None:
+            raise CameraLost(f"{self.options.file} {'has ended' if self._last else 'has none'}")
+        self._wait(one.stamp_ns)
+        return self._frame(one)
+
+    def close(self) -> None:
+        """Let go of the recording."""
+        self._exposures = None
+
+    def _wait(self, stamp_ns: int) -> None:
+        """Wait as long as the recorded camera did."""
+        now_s = time.monotonic()
+        if self._last:
+            before_ns, given_s = self._last
+            pause_s = min(max((stamp_ns - before_ns) / 1e9, 0.0), LONGEST_WAIT_S)
+            time.sleep(max(0.0, given_s + pause_s - now_s))
+            now_s = max(now_s, given_s + pause_s)
+        self._last = stamp_ns, now_s
+
+    def _frame(self, one: Recorded) -> Frame:
+        camera = self.camera
+        picture = None if one.picture is None else pixels_of(one.picture)
+        try:
+            depth = one.depth.array() if one.depth and camera.depth else None
+        except ValueError as error:
+            raise CameraLost(str(error)) from None
+        if picture is not None:
+            picture = fitted(picture, camera.width, camera.height)
+        return Frame(picture, depth)
+
+
+def pixels_of(image: Image) -> Picture:
+    """Return the pixels of a picture, (height, width, 3) or (height, width). Raises CameraLost."""
+    if image.encoding == "jpeg":
+        decoded: Any = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR)
+        if decoded is None:
+            raise CameraLost("the recording has a broken JPEG")
+        return np.asarray(decoded, np.uint8)
+    pixels = image.array()
+    if image.encoding == "rgb8":
+        pixels = pixels[..., ::-1]
+    return np.ascontiguousarray(pixels, np.uint8)
+
+
+def recorded(path: Path, name: str) -> Iterator[Recorded]:
+    """Iterate over the exposures of a camera in a recording. Raises ConfigError.
+
+    A picture and a depth picture of the same tick are one exposure.
+    """
+    keys: dict[str, Codec[Any]] = {
+        topic.at(name): Codec(topic.type, topic.max_bytes) for topic in (IMAGE, DEPTH)
+    }
+    waiting: dict[type, Any] = {}
+    basis = -1
+    for sample in samples(path):
+        if sample.key not in keys:
+            continue
+        try:
+            message = keys[sample.key].decode(sample.payload)
+        except ValueError:  # damaged
+            continue
+        if message.basis != basis and waiting:
+            yield _together(waiting)
+            waiting = {}
+        basis = message.basis
+        waiting[type(message)] = message
+    if waiting:
+        yield _together(waiting)
+
+
+def _together(messages: dict[type, Any]) -> Recorded:
+    picture, depth = messages.get(Image), messages.get(DepthImage)
+    stamp_ns = max(one.stamp_ns for one in messages.values())
+    return Recorded(stamp_ns, picture, depth)

@@ -1,0 +1,54 @@
+"""OpenGL without a window: EGL, else OSMesa. `python -m` this, to check for it."""
+
+import importlib
+import os
+import sys
+from typing import Any
+
+from gigabrain_zenoh.errors import ConfigError
+
+BACKENDS = ("cgl",) if sys.platform == "darwin" else ("egl", "osmesa")
+MISSING = (
+    "on Debian: apt-get install libegl1 libgl1-mesa-dri (or libosmesa6); "
+    "and pip install 'gigabrain-zenoh[eyes]'"
+)
+
+
+def open_graphics(width: int, height: int) -> Any:
+    """Return an OpenGL context of this size [px], current in this thread; it has `free`.
+
+    MUJOCO_GL may choose one of `egl` and `osmesa`. Raises ConfigError naming the packages that are
+    missing.
+    """
+    chosen = os.environ.get("MUJOCO_GL", "").lower()
+    problems = []
+    for name in (chosen,) if chosen in BACKENDS else BACKENDS:
+        try:
+            context = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
+            context.make_current()
+            return context
+        except Exception as error:  # noqa: BLE001 - PyOpenGL raises anything without its library
+            problems.append(f"{name}: {' '.join(str(error).split())[:80]}")
+            _forget()
+    raise ConfigError(f"cannot draw without OpenGL ({'; '.join(problems)}); {MISSING}")
+
+
+def _forget() -> None:
+    """Let PyOpenGL choose another platform, which it does once, on import."""
+    os.environ.pop("PYOPENGL_PLATFORM", None)
+    for module in list(sys.modules):
+        if module.split(".")[0] == "OpenGL" or module in ("mujoco.egl", "mujoco.osmesa"):
+            del sys.modules[module]
+
+
+def main() -> None:
+    """Exit with the code 2 and one line if nothing can be drawn."""
+    try:
+        open_graphics(64, 64).free()
+    except ConfigError as error:
+        print(error)
+        sys.exit(ConfigError.exit_code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,48 @@
+"""Cameras of a robot that is about to start: whether it has them, and what they need."""
+
+import subprocess
+import sys
+
+from msgspec import structs
+
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.launch.deployment import Deployment
+
+CHECK_S = 30.0
+CHECK = (sys.executable, "-P", "-m", "gigabrain_drivers.sim.graphics")
+
+
+def with_cameras(deployment: Deployment, host: str) -> Deployment:
+    """Return the deployment, without cameras where nothing can be drawn; one line says why.
+
+    Raises ConfigError for cameras that the robot does not have, or that need more packages.
+    """
+    here = deployment.hosts.get(host, ())
+    placed = any("camera" in names for names in deployment.hosts.values())
+    runs = "camera" in here or ("driver" in here and not placed)
+    if not deployment.cameras or not runs:
+        return deployment
+    from gigabrain_drivers.cameras.catalog import RENDERED, cameras_of
+    from gigabrain_zenoh.geometry.body_settings import split
+
+    changes = split(deployment.robot)[1]
+    cameras = cameras_of(deployment.body, deployment.link, changes)
+    if all(one.options.source != RENDERED for one in cameras):
+        return deployment
+    problem = _graphics_problem()
+    if not problem:
+        return deployment
+    print(f"gigabrain: no cameras: {problem}", file=sys.stderr)
+    return structs.replace(deployment, cameras=False)
+
+
+def _graphics_problem() -> str:
+    """Return why nothing can be drawn here, in one line; another process tries it."""
+    try:
+        tried = subprocess.run(CHECK, capture_output=True, text=True, timeout=CHECK_S, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise ConfigError(f"cannot check for OpenGL: {error}") from None
+    if tried.returncode == 0:
+        return ""
+    lines = (tried.stdout.strip() or tried.stderr.strip() or "OpenGL crashed").splitlines()
+    return lines[-1]
