@@ -19,10 +19,11 @@ from gigabrain_drivers.sim.graphics import open_graphics
 from gigabrain_drivers.sim.scene_model import BASE, SceneModel
 from gigabrain_schemas.body import Camera
 from gigabrain_schemas.sim import SimPoses, SimScene
-from gigabrain_zenoh.errors import Unsupported
+from gigabrain_zenoh.errors import ConfigError, Unsupported
 
 NEAR_M, FAR_M = 0.01, 60.0  # of what is drawn
 COSTLY = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)
+STEEPEST = 4.0  # of a ray, sideways for each metre ahead
 PIXEL_NOISE = 2.0  # standard deviation, of 255
 NOISE_MARGIN = 256  # [px], by which a table of noise is larger than a picture
 
@@ -79,8 +80,16 @@ class Lens:
         u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2).astype(np.float64)
         matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-        rays = cv2.undistortPoints(pixels, matrix, np.array(camera.distortion or (0.0,) * 5))
+        given = np.array(camera.distortion)
+        coefficients = np.zeros(5 if len(given) <= 5 else 8)
+        coefficients[: len(given)] = given
+        rays = cv2.undistortPoints(pixels, matrix, coefficients)
         x, y = rays[:, 0, 0], rays[:, 0, 1]
+        if not (np.abs(rays) < STEEPEST).all():
+            raise ConfigError(
+                f"camera {camera.name!r}: its distortion folds the picture; "
+                "expected the k1, k2, p1, p2, k3 of its calibration"
+            )
         self.focal = max(fx, fy)
         left, top = -np.floor(self.focal * x.min()), -np.floor(self.focal * y.min())
         self.centre = float(left), float(top)

@@ -2,9 +2,9 @@
 
 import asyncio
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
-from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.brain import CmdVel, WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_zenoh.gate.causes import BRAIN_SILENT
 from gigabrain_zenoh.gate.gate import BRAIN
@@ -26,6 +26,9 @@ class Lockstep:
     that is old by the robot's clock would stop it, where only the machine is slow. So decisions do
     not depend on how fast a machine is.
 
+    A tick in which cameras take pictures waits for these, or for word that they are withheld, and
+    for the world that has their contours, once perception has shown that it makes some.
+
     A verdict that misses a part of the brain does not count: that part answered before safety
     listened, and whether safety gets its next answer in time would be left to chance.
     """
@@ -36,11 +39,18 @@ class Lockstep:
         self._tick = self._basis = self._newest = 0
         self._echo = self._echo_basis = self._judged = 0
         self._seen = self._wanted = 0  # the tick that safety has seen, and the one it must have
+        self._exposed: dict[str, int] = {}  # tick of each camera's newest exposure
+        self._pictures: dict[str, int] = {}  # the one of its newest picture
+        self._contours: dict[str, int] = {}  # the one of the newest contours
         self._wake = asyncio.Event()
         self.timeouts = 0  # ticks that went on without the brain
 
-    def begin(self, tick: int, basis: int) -> None:
-        """A tick has been sent out; `basis` is the tick of the newest scan, or 0."""
+    def begin(self, tick: int, basis: int, exposed: Iterable[str] = ()) -> None:
+        """A tick has been sent out; `basis` is the tick of the newest scan, or 0.
+
+        `exposed` are the cameras that take a picture in it.
+        """
+        self._exposed.update(dict.fromkeys(exposed, tick))
         self._tick, self._basis, self._newest = tick - tick % self._period, basis, tick
         self._wanted = tick - REPEAT_TICKS + 1  # it need not say the same in every tick
         self._wake.clear()
@@ -66,10 +76,37 @@ class Lockstep:
         self._seen = max(self._seen, verdict.tick)
         self._wake.set()
 
+    def picture(self, camera: str, basis: int) -> None:
+        """A picture has come, or word that it is withheld."""
+        if basis <= self._newest:
+            self._pictures[camera] = max(self._pictures.get(camera, 0), basis)
+            self._wake.set()
+
+    def forget_pictures(self) -> None:
+        """Wait for no picture that has not come yet."""
+        self._exposed.clear()
+
+    def world(self, world: WorldModel) -> None:
+        """Perception has seen something."""
+        for camera in world.cameras:
+            if camera.ok and 0 < camera.exposure <= self._newest:
+                self._contours[camera.name] = camera.exposure
+            elif not camera.ok:  # no contours are to come
+                self._contours.pop(camera.name, None)
+        self._wake.set()
+
+    @property
+    def _seen_by_cameras(self) -> bool:
+        return all(
+            self._pictures.get(name, 0) >= tick and self._contours.get(name, tick) >= tick
+            for name, tick in self._exposed.items()
+        )
+
     @property
     def complete(self) -> bool:
         """True once the tick has been answered."""
         rested = min(self._echo_basis, self._judged) >= self._basis
+        rested = rested and self._seen_by_cameras
         return rested and self._echo >= self._tick and self._seen >= self._wanted
 
     async def wait(self, timeout_s: float) -> bool:

@@ -21,6 +21,7 @@ from gigabrain_drivers.driver.lockstep import REPEAT_S, Lockstep, RoundTrip
 from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.driver.world_requests import serve_world
 from gigabrain_drivers.links.frames import describe_command
+from gigabrain_drivers.sim import exposes
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import Body, RobotState, SafeState
@@ -28,12 +29,16 @@ from gigabrain_schemas.brain import CmdVel, JointCommand
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import (
     BODY,
+    CAMERA,
+    DEPTH,
+    IMAGE,
     JOINT_CMD,
     SAFETY,
     SCAN,
     SIM_POSES,
     SIM_SCENE,
     STATE,
+    WORLD,
     Topic,
     command_topic,
 )
@@ -55,6 +60,7 @@ Bounds = tuple[float, float]
 PATH = r" - at `[^`]*`$"  # that msgspec adds to an error
 BODY_EVERY_TICKS = 50  # once a second
 OF_THE_STATE = (SIM_SCENE, SIM_POSES)  # they are of the tick whose state comes next
+CAMERAS_S = 30.0  # that the first tick of lock-step waits for pictures
 STALE_NS = 250_000_000  # the echo's 150 ms and the watchdog's 100: older must never move the body
 
 
@@ -80,6 +86,7 @@ class DriverProcess:
         wait_s = config.lockstep_timeout_s
         self._lockstep = Lockstep(robot.control.period_ticks, wait_s) if driver.lockstep else None
         self._sensors: list[tuple[Topic[Any], Message]] = []  # that wait for the next tick
+        self._poses: Message | None = None  # of the simulated world, the newest
         self._round_trip = RoundTrip()
         self._line = asyncio.Lock()  # one call at a time goes out to the body
         self._sent = ZERO  # the newest command to the body
@@ -102,6 +109,8 @@ class DriverProcess:
         bus.subscribe(JOINT_CMD, self._on_joint_command)
         bus.latest(SAFETY, self._on_safety)
         self._gatekeeper.serve(self._driver.stop)
+        if self._lockstep and self._robot.cameras:
+            self._await_cameras(self._lockstep)
         if self._config.link != "emulated":  # the emulator has the world then
             serve_world(bus, self._driver.change_world)
         self._serve_settings()
@@ -110,6 +119,17 @@ class DriverProcess:
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._run_ticks())
             tasks.create_task(self._apply_commands())
+
+    def _await_cameras(self, lockstep: Lockstep) -> None:
+        """Have ticks wait for pictures, and for the contours in them."""
+
+        def take(key: str, message: Message) -> None:
+            if message.boot == self._gate.boot:
+                lockstep.picture(key.rpartition("/")[2], message.basis)
+
+        for topic in (DEPTH, IMAGE, CAMERA):
+            self._bus.subscribe(topic, take)
+        self._bus.latest(WORLD, lockstep.world)
 
     def _serve_settings(self) -> None:
         """Offer the settings of the body that may change while it runs."""
@@ -188,6 +208,7 @@ class DriverProcess:
 
     def _emit(self, topic: Topic[Any], message: Message) -> None:
         """Publish a sensor's message at once, or with the next tick: all of them in lock-step."""
+        self._poses = message if topic is SIM_POSES else self._poses
         message = clipped(message)
         if self._lockstep or not self._gate.tick or topic in OF_THE_STATE:
             self._sensors.append((topic, message))
@@ -221,19 +242,30 @@ class DriverProcess:
             self._begin(lockstep, state)
             await lockstep.answered()
             return
-        scan, answered = await self._newest_scan(), False
+        scan, answered, cameras_s = await self._newest_scan(), False, CAMERAS_S
         while not answered:
             if scan:
                 self._sensors.append((SCAN, scan))
+            if self._poses and self._robot.cameras:  # not kept for those that come late
+                self._sensors.append((SIM_POSES, self._poses))
             self._begin(lockstep, state)
             answered = await lockstep.wait(REPEAT_S)
+            cameras_s -= REPEAT_S
+            if cameras_s < 0:
+                lockstep.forget_pictures()
 
     def _begin(self, lockstep: Lockstep, state: RobotState) -> None:
         """Announce the tick; on a network in memory the answers come before this returns."""
         tick = self._gate.tick
         with_scan = any(topic is SCAN for topic, _ in self._sensors)
-        lockstep.begin(tick, tick if with_scan else self._round_trip.scan_tick)
+        basis = tick if with_scan else self._round_trip.scan_tick
+        lockstep.begin(tick, basis, self._exposed(tick))
         self._publish_tick(state)
+
+    def _exposed(self, tick: int) -> list[str]:
+        """Return the cameras that take a picture in a tick; in the first one, all."""
+        cameras = self._robot.cameras
+        return [one.name for one in cameras if tick == 1 or exposes(one.rate_hz, tick)]
 
     async def _newest_scan(self) -> Message | None:
         return await self._driver.get_sensor_data("scan") if self._robot.lidar else None

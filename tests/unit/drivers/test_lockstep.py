@@ -1,7 +1,7 @@
 import asyncio
 
 from gigabrain_drivers.driver.lockstep import Lockstep
-from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.brain import CameraStatus, CmdVel, WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_zenoh.safety.catalogue import cause
 
@@ -89,3 +89,69 @@ async def test_a_tick_that_nobody_answers_goes_on_and_is_counted() -> None:
     steps.begin(1, 0)
     await steps.answered()
     assert steps.timeouts == 1
+
+
+def answered(steps: Lockstep, tick: int) -> None:
+    steps.command(command(tick, tick))
+    steps.verdict(SafetyState(verdict="ok", tick=tick, basis=tick))
+
+
+def saw(exposure: int, *, ok: bool = True) -> WorldModel:
+    status = CameraStatus(name="front", ok=ok, exposure=exposure)
+    return WorldModel(scan_ok=True, obstacle_ahead=False, cameras=(status,))
+
+
+def test_a_tick_with_a_picture_waits_for_the_picture() -> None:
+    steps = Lockstep()
+    steps.begin(10, 10, ["front", "rear"])
+    answered(steps, 10)
+    for camera, tick in (("front", 10), ("rear", 5), ("rear", 11)):
+        steps.picture(camera, tick)
+        assert not steps.complete
+    steps.picture("rear", 10)
+    assert steps.complete
+
+
+def test_a_tick_waits_for_contours_once_perception_has_made_some() -> None:
+    steps = Lockstep()
+    steps.begin(5, 5, ["front"])
+    answered(steps, 5)
+    steps.picture("front", 5)
+    assert steps.complete
+    steps.world(saw(5))
+    steps.begin(10, 10, ["front"])
+    answered(steps, 10)
+    steps.picture("front", 10)
+    assert not steps.complete
+    steps.world(saw(10))
+    assert steps.complete
+
+
+def test_a_blind_camera_makes_no_contours_to_wait_for() -> None:
+    steps = Lockstep()
+    steps.begin(5, 5, ["front"])
+    steps.world(saw(5))
+    steps.begin(10, 10, ["front"])
+    answered(steps, 10)
+    steps.picture("front", 10)  # word that it is withheld
+    steps.world(saw(5, ok=False))
+    assert steps.complete
+
+
+def test_a_tick_without_a_picture_still_waits_for_one_that_is_late() -> None:
+    steps = Lockstep()
+    steps.begin(5, 5, ["front"])
+    steps.begin(6, 5)
+    answered(steps, 6)
+    assert not steps.complete
+    steps.picture("front", 5)
+    assert steps.complete
+
+
+def test_pictures_that_never_come_can_be_given_up() -> None:
+    steps = Lockstep()
+    steps.begin(1, 1, ["front"])
+    answered(steps, 1)
+    assert not steps.complete
+    steps.forget_pictures()
+    assert steps.complete
