@@ -22,7 +22,8 @@ DRIFT_PER_M, DRIFT_PER_RAD = 0.02, 0.02  # of odometry: by way, and by turn for 
 MAX_DRIFT_M = 0.15  # since it was seen, more than planners keep clear of
 KEPT_REACH_M = 5.0  # farther from the robot, nobody needs it
 GONE_STRIKES = 3.0  # pictures that see through it; new ones need one
-BESIDE_STRIKES = 0.25  # a picture that sees something there, but not quite in this cell
+BESIDE_STRIKES = 0.05  # a picture that sees something there, but not quite in this cell
+STEADY_POINTS = 3.0  # pixels of a cell that counts in its first picture
 SURE_SEEN = 4.0  # pictures, after which a cell is sure
 SHARES = (0.2, 0.45, 0.7)  # of its height, where a cell is looked at
 THROUGH_M = 0.02  # beyond noise
@@ -94,6 +95,7 @@ class CellMemory:
         cells = self.cells[chosen]
         through, beside = self._seen_through(picture, cells)
         self.cells["strikes"][chosen] += np.where(through, 1.0, BESIDE_STRIKES * beside)
+        self.cells["seen"][chosen] -= through & (cells["seen"] > 1)
 
     def _seen_through(self, picture: Picture, cells: Cells) -> tuple[Mask, Mask]:
         """Return which cells a picture shows to be empty, and where it shows something."""
@@ -165,6 +167,13 @@ class CellMemory:
         cells["seen"], cells["stamp"] = 1.0, self._now
         cells["driven"], cells["turned"] = self._driven, self._turned
         return cells
+
+    def steady(self) -> Mask:
+        """Return which cells most pictures show; pixels at edges show some only at times."""
+        cells = self.cells
+        doubts = np.where(cells["seen"] > 2, 2.0, 1.0)
+        many = (cells["seen"] > 1) | (cells["points"] >= STEADY_POINTS)
+        return np.asarray(many & (cells["strikes"] < doubts))
 
     def to_odometry(self, places: NDArray[np.floating]) -> Floats:
         """Transform (n, 2) from the body's frame to the odometry's."""

@@ -15,12 +15,13 @@ REACH_M = 3.5  # farther, nothing is taken for an obstacle or a hole
 LOW_M, HIGH_M = 0.012, 0.02  # heights of the points of an obstacle, and of its highest ones
 SIGMAS = 4.0  # a height that noise does not explain
 HOLE_M = 0.025  # below the floor
-LIKE_M, LIKE_SHARE = 0.012, 0.01  # a pixel at the same depth as its neighbour, beside the noise
-SUPPORT = 2  # of eight neighbours at the same depth: fewer, and it is a mix of two things
+LIKE_M, LIKE_SHARE, LIKE_SIGMAS = 0.008, 0.005, 3.5  # a pixel as deep as its neighbour
+SUPPORT = 3  # of eight neighbours at the same depth, as at the corner of a thing
 MISSING_REACH_M = 1.2  # where the floor always returns something
 MISSING_PX, MISSING_SHARE = 9, 0.75  # side of a window, and its share of pixels without depth
 ROW_M = 0.25  # longest stretch of floor in one row of pixels, in which a hole's edge is known
 BLIND_SHARE = 0.02  # of pixels with depth: with fewer the picture shows nothing at all
+FIT_REACH_M = 4.0  # depth of the points of the fit
 FIT_STEP = 3  # rows and columns from one point of the fit to the next
 SUB_ROWS = (-0.375, -0.125, 0.125, 0.375)
 
@@ -51,8 +52,10 @@ class DepthCamera:
         low = np.any(least < room, axis=1)  # NaN is not
         self._first = int(np.argmax(low)) if low.any() else camera.height - 2
         # row of the picture, above which nothing is as low as the body
-        self._grid = np.zeros((camera.height, camera.width), np.bool_)
-        self._grid[FIT_STEP // 2 :: FIT_STEP, FIT_STEP // 2 :: FIT_STEP] = True
+        self._grid = np.s_[FIT_STEP // 2 :: FIT_STEP, FIT_STEP // 2 :: FIT_STEP]
+        fitting = model.rays[:, *self._grid].astype(np.float64)
+        down = fitting[2] < 0.0  # no floor is seen upwards
+        self._fitting, self._fit_rays = down, fitting[:, down]
         self._usable = np.isfinite(model.rays[0])
 
     def view(self, millimetres: NDArray[np.uint16]) -> DepthView | None:
@@ -68,9 +71,9 @@ class DepthCamera:
 
     def _fitted(self, depth: Singles) -> FloorPlane:
         origin = self.model.origin
-        at = self._grid & (depth > 0)
-        along = depth[at].astype(np.float64)
-        rays = self.model.rays[:, at].astype(np.float64)
+        along = depth[self._grid][self._fitting].astype(np.float64)
+        at = np.flatnonzero((along > 0) & (along < FIT_REACH_M))
+        along, rays = along[at], self._fit_rays[:, at]
         points = (rays * along).T + origin
         low = np.abs(points[:, 2]) < 0.15  # far beyond what mounting and tilt can do
         sigma = SIGMA_AT_1M * np.square(along[low]) * np.abs(rays[2, low])
@@ -85,12 +88,12 @@ class DepthCamera:
         rise = rays[2] - slope_x * rays[0] - slope_y * rays[1]
         start = z0 - offset - slope_x * x0 - slope_y * y0
         raw = depth[first:]
-        smooth, support = smoothed(raw)
+        smooth, whole = smoothed(raw)
         known = raw > 0
         height = smooth * rise + start
         allowed = self._allowed(smooth, rise, floor)
         near = known & (smooth < REACH_M)
-        reach = near & (support >= SUPPORT)
+        reach = near & whole
         stands = reach & (height > LOW_M + allowed) & (height < self._body_height)
         on_floor = known & (np.abs(height) < LOW_M + allowed)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -109,8 +112,8 @@ class DepthCamera:
 
     def _allowed(self, depth: Singles, rise: Singles, floor: FloorPlane) -> Singles:
         """Return the height that noise and the floor's uncertainty explain [m], per pixel."""
-        spread = floor.sigma(np.array((0.5, 1.0, 2.0, 3.0)), np.zeros(4))
-        plane = np.interp(depth, (0.5, 1.0, 2.0, 3.0), spread).astype(np.float32)
+        near, far = floor.sigma(np.array((0.0, REACH_M)), np.zeros(2)).tolist()
+        plane = np.float32(near) + np.float32((far - near) / REACH_M) * depth
         noise = np.float32(SIGMA_AT_1M / 2) * depth * depth * np.abs(rise)  # smoothed
         return np.asarray(np.float32(SIGMAS) * np.maximum(noise - 0.001, 0) + plane, np.float32)
 
@@ -158,23 +161,33 @@ class DepthCamera:
         return self._places(rays[:, absent], expected[absent], expected[absent])[:, :2]
 
 
-def smoothed(depth: Singles) -> tuple[Singles, NDArray[np.uint8]]:
-    """Return the mean of each pixel and its neighbours at the same depth, and their number."""
+def smoothed(depth: Singles) -> tuple[Singles, Mask]:
+    """Return the mean of each pixel and its neighbours at the same depth, and whether it is whole.
+
+    A pixel at an edge that sees two things measures neither. It is whole if it is as deep as the
+    neighbours on two opposite sides, or as enough of them.
+    """
     threshold = LIKE_M + np.float32(LIKE_SHARE) * depth
-    threshold += np.float32(SIGMAS * 1.5 * SIGMA_AT_1M) * depth * depth
+    threshold += np.float32(LIKE_SIGMAS * SIGMA_AT_1M) * depth * depth
     threshold[depth <= 0] = -1.0
     total = depth.copy()
     count = np.zeros(depth.shape, np.uint8)
+    whole = np.zeros(depth.shape, np.bool_)
     for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
         one, other = _shifted(down, right)
         a, b = depth[one], depth[other]
         step = b - a
-        like = (np.abs(step) < threshold[one]) & (threshold[other] > 0)
-        count[one] += like
-        count[other] += like
-        total[one] += np.where(like, b, 0)
-        total[other] += np.where(like, a, 0)
-    return total / (count + np.float32(1)), count
+        like = np.abs(step, out=step) < threshold[one]
+        like &= b > 0
+        sides = np.zeros(depth.shape, np.uint8)
+        sides[one] += like
+        sides[other] += like
+        count += sides
+        whole |= sides == 2
+        total[one] += b * like
+        total[other] += a * like
+    whole |= count >= SUPPORT
+    return total / (count + np.float32(1)), whole
 
 
 def _shifted(down: int, right: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:

@@ -111,7 +111,7 @@ class ObstacleContours:
         found: list[tuple[float, Contour]] = []
         taken: set[int] = set()
         for kinds in GROUPS:
-            at = np.flatnonzero(np.isin(memory.cells["kind"], kinds))
+            at = np.flatnonzero(np.isin(memory.cells["kind"], kinds) & memory.steady())
             if len(at):
                 found += self._of_group(at, now, taken)
         found.sort(key=lambda one: one[0])

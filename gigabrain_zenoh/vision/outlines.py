@@ -8,6 +8,7 @@ from gigabrain_schemas.arrays import Floats
 LINK_M = 0.05  # cells of this size that touch belong together
 DIRECTIONS = 16  # of an outline's corners; those of boxes are always among them
 SPLIT_ROUNDS = 6
+SAME_M = 1e-6  # corners so near to each other are the same
 HOLLOW_M = 0.07  # most that an outline is off its cells, along a part of an edge
 EDGE_M, EDGE_PARTS = 0.15, 5  # shorter edges are not looked at; parts of the others
 Labels = NDArray[np.intp]
@@ -70,19 +71,16 @@ def _hollow(middle: Floats, outline: Floats, first: Labels) -> NDArray[np.bool_]
     group = np.repeat(np.arange(len(first)), np.diff(first, append=len(middle)))
     edge = np.roll(outline, -1, axis=1) - outline
     length = np.hypot(edge[..., 0], edge[..., 1])
-    which, side = np.nonzero(length > EDGE_M)
+    long = length > EDGE_M
+    box, side = np.nonzero(long[group])
+    of = group[box]
+    direction = edge[of, side] / length[of, side][:, None]
+    off = middle[box] - outline[of, side]
+    along = (off * direction).sum(axis=1) / length[of, side]
+    inward = direction[:, 0] * off[:, 1] - direction[:, 1] * off[:, 0]
+    part = np.clip((along * EDGE_PARTS).astype(np.intp), 0, EDGE_PARTS - 1)
     nearest = np.full((len(first), DIRECTIONS, EDGE_PARTS), np.inf)
-    for number in np.unique(side):
-        long = np.zeros(len(first), np.bool_)
-        long[which[side == number]] = True
-        at = np.flatnonzero(long[group])
-        of = group[at]
-        direction = edge[of, number] / length[of, number][:, None]
-        off = middle[at] - outline[of, number]
-        along = (off * direction).sum(axis=1) / length[of, number]
-        inward = direction[:, 0] * off[:, 1] - direction[:, 1] * off[:, 0]
-        part = np.clip((along * EDGE_PARTS).astype(np.intp), 0, EDGE_PARTS - 1)
-        np.minimum.at(nearest, (of, number, part), inward)
+    np.minimum.at(nearest, (of, side, part), inward)
     return np.asarray(np.any(np.isfinite(nearest) & (nearest > HOLLOW_M), axis=(1, 2)))
 
 
@@ -114,26 +112,18 @@ def support_polygons(low: Floats, high: Floats, first: Labels) -> Floats:
     `first` is where each group begins. The corners are the outermost ones in as many directions,
     counter-clockwise; some of them are the same.
     """
-    outline = np.empty((len(first), DIRECTIONS, 2))
     size = np.diff(first, append=len(low))
-    for number in range(DIRECTIONS):
-        axis = AXES[:, number]
-        corner = np.where(axis >= 0.0, high, low)
-        reach = corner @ axis
-        outermost = np.maximum.reduceat(reach, first)
-        at = np.flatnonzero(reach == np.repeat(outermost, size))
-        group = np.searchsorted(first, at, side="right") - 1
-        _, chosen = np.unique(group, return_index=True)
-        outline[:, number] = corner[at[chosen]]
-    return outline
+    x = np.where(AXES[0][:, None] >= 0.0, high[:, 0], low[:, 0])  # (DIRECTIONS, n)
+    y = np.where(AXES[1][:, None] >= 0.0, high[:, 1], low[:, 1])
+    reach = AXES[0][:, None] * x + AXES[1][:, None] * y
+    outermost = np.repeat(np.maximum.reduceat(reach, first, axis=1), size, axis=1)
+    number = np.where(reach == outermost, np.arange(len(low)), len(low))
+    at = np.minimum.reduceat(number, first, axis=1)
+    corners = np.stack((np.take_along_axis(x, at, axis=1), np.take_along_axis(y, at, axis=1)))
+    return np.asarray(corners.transpose(2, 1, 0))
 
 
 def distinct(outline: Floats) -> list[tuple[float, float]]:
-    """Return the corners of an outline (n, 2) without those that repeat or lie on an edge."""
-    corners = [outline[0]]
-    for corner in outline[1:]:
-        if np.abs(corner - corners[-1]).max() > 1e-6:
-            corners.append(corner)
-    if len(corners) > 1 and np.abs(corners[0] - corners[-1]).max() <= 1e-6:
-        corners.pop()
-    return [(float(x), float(y)) for x, y in corners]
+    """Return the corners of an outline (n, 2) without those that repeat."""
+    moves = np.abs(outline - np.roll(outline, 1, axis=0)).max(axis=1) > SAME_M
+    return [(x, y) for x, y in outline[moves].tolist()]

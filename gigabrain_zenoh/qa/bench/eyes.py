@@ -1,0 +1,406 @@
+"""Contours against MuJoCo's truth: errors, recall, false ones, ghosts, and what they cost."""
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from statistics import mean
+from typing import NamedTuple
+
+import numpy as np
+from msgspec import Struct
+
+from gigabrain_drivers.cameras.depth_noise import NO_ERRORS, SENSOR, DepthErrors, DepthSensor
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.body import BodyDescription, Camera
+from gigabrain_schemas.brain import Contour
+from gigabrain_schemas.vision import DepthImage, pack_depth
+from gigabrain_zenoh.geometry.pose import ORIGIN, compose
+from gigabrain_zenoh.host.bounded import percentile
+from gigabrain_zenoh.qa.bench.eyes_worlds import (
+    LIGHTS,
+    TEXTURES,
+    EyesWorld,
+    Part,
+    Renderer,
+    distances,
+    draw_world,
+)
+from gigabrain_zenoh.vision.camera_model import CameraModel
+from gigabrain_zenoh.vision.obstacle_contours import ObstacleContours
+
+PICTURES, PERIOD_S = 10, 0.1  # of a cluttered world, while the robot drives in an arc
+SPEED, TURN = 0.2, 0.2  # [m/s], [rad/s]
+ERROR_REACH_M, RECALL_REACH_M = 3.0, 2.0
+STEP_M, EDGE_STEP_M = 0.02, 0.004  # between points of outlines
+BEARING_STEP = math.radians(0.5)
+LEAST_M = 0.028  # of what is seen of a thing, for recall: 3 cm less what a pixel may hide
+FOUND_M, FOUND_SHARE = 0.05, 0.5  # distance to a contour, and share of a thing's points within it
+FALSE_M = 0.10  # a contour that is nowhere nearer to a thing is none
+GHOST_M = 0.03  # a contour so near to where the thing stood is its ghost
+GHOST_KINDS = ("gone", "walks off", "gone unseen")
+SEEN_S, GHOST_WAIT_S = 1.0, 3.0
+
+
+class EyesFigures(Struct, frozen=True, kw_only=True):
+    """What was measured with one kind of sensor."""
+
+    sensor: str
+    camera: str
+    worlds: int
+    error_p50_m: float  # from the first thing along each line of sight to the nearest outline
+    error_p95_m: float
+    beyond_p95_m: float  # of outlines beyond the truth
+    missed_p95_m: float  # of what is seen beyond outlines
+    pit_p50_m: float
+    pit_p95_m: float
+    pits: int  # in view
+    pits_found: float  # share
+    things: int  # within reach of recall
+    recall: float
+    recall_first: float  # in the first picture
+    false_in_clutter: int
+    false_per_min: float  # on empty floors
+    colour_per_min: float  # ... by the floor's colour alone
+    empty_pictures: int
+    ghosts: int  # things that went away
+    ghost_p50_s: float
+    ghost_max_s: float
+    cpu_p50_ms: float
+    cpu_p99_ms: float
+
+
+class EyesResult(Struct, frozen=True, kw_only=True):
+    """All figures, and the seed that they begin at."""
+
+    seed: int
+    figures: tuple[EyesFigures, ...]
+
+
+@dataclass
+class Eyes:
+    """A body's contours, and its camera with errors, before a renderer."""
+
+    body: BodyDescription
+    errors: DepthErrors
+    seed: int
+    cpu_ms: list[float] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.camera: Camera = self.body.cameras[0]
+        self.sensor = DepthSensor(self.camera, self.seed, self.errors)
+        self.contours = ObstacleContours(self.body)
+
+    def see(
+        self, renderer: Renderer, pose: Pose, now: float, thing: tuple[float, float] = (0.0, 0.0)
+    ) -> tuple[Contour, ...]:
+        """Return the contours after one more picture."""
+        renderer.move(pose, self.sensor.mounted, thing)
+        pixels = self.sensor.measure(renderer.depth())
+        height, width = pixels.shape
+        image = DepthImage(
+            frame_id=self.camera.name, height=height, width=width, planes=pack_depth(pixels)
+        )
+        begin = time.thread_time()
+        self.contours.add_depth(self.camera.name, image, pose, now)
+        found = self.contours.contours(pose, now)
+        self.cpu_ms.append((time.thread_time() - begin) * 1e3)
+        return found
+
+
+@dataclass
+class ClutterScores:
+    """What cluttered worlds add up to."""
+
+    front: list[float] = field(default_factory=list)
+    beyond: list[float] = field(default_factory=list)
+    missed: list[float] = field(default_factory=list)
+    pit: list[float] = field(default_factory=list)
+    pits: list[bool] = field(default_factory=list)
+    found: list[bool] = field(default_factory=list)
+    found_first: list[bool] = field(default_factory=list)
+    wrong: int = 0
+
+
+def measure_eyes(
+    bodies: Sequence[BodyDescription],
+    worlds: int,
+    seconds: float,
+    ghosts: int,
+    seed: int,
+    show: Callable[[str], None],
+) -> EyesResult:
+    """Measure the first camera of each body, with a sensor's errors and without.
+
+    `seconds` are spent on each of 15 empty floors. Raises ConfigError where nothing can be drawn.
+    """
+    figures = []
+    for body in bodies:
+        for name, errors in (("sensor", SENSOR), ("no errors", NO_ERRORS)):
+            show(f"{body.robot_type}, {name}: {worlds} worlds")
+            cpu: list[float] = []
+            scores = ClutterScores()
+            for number in range(seed, seed + worlds):
+                _clutter(Eyes(body, errors, number, cpu), draw_world(number), scores)
+            show(f"{body.robot_type}, {name}: empty floors")
+            empty = _empty_floors(body, errors, seconds, seed)
+            show(f"{body.robot_type}, {name}: {ghosts} ghosts")
+            times = [
+                _ghost(Eyes(body, errors, number), number) for number in range(seed, seed + ghosts)
+            ]
+            figures.append(_summed(body, name, scores, empty, times, cpu, worlds))
+    return EyesResult(seed=seed, figures=tuple(figures))
+
+
+def _summed(
+    body: BodyDescription,
+    sensor: str,
+    scores: ClutterScores,
+    empty: "EmptyFloors",
+    ghosts: list[float],
+    cpu: list[float],
+    worlds: int,
+) -> EyesFigures:
+    return EyesFigures(
+        sensor=sensor,
+        camera=body.cameras[0].name,
+        worlds=worlds,
+        error_p50_m=_at(scores.front, 0.5),
+        error_p95_m=_at(scores.front, 0.95),
+        beyond_p95_m=_at(scores.beyond, 0.95),
+        missed_p95_m=_at(scores.missed, 0.95),
+        pit_p50_m=_at(scores.pit, 0.5),
+        pit_p95_m=_at(scores.pit, 0.95),
+        pits=len(scores.pits),
+        pits_found=mean(scores.pits) if scores.pits else 1.0,
+        things=len(scores.found),
+        recall=mean(scores.found) if scores.found else 1.0,
+        recall_first=mean(scores.found_first) if scores.found_first else 1.0,
+        false_in_clutter=scores.wrong,
+        false_per_min=empty.by_depth / (empty.pictures * PERIOD_S / 60),
+        colour_per_min=empty.by_colour / (empty.pictures * PERIOD_S / 60),
+        empty_pictures=empty.pictures,
+        ghosts=len(ghosts),
+        ghost_p50_s=_at(ghosts, 0.5),
+        ghost_max_s=max(ghosts, default=0.0),
+        cpu_p50_ms=_at(cpu, 0.5),
+        cpu_p99_ms=_at(cpu, 0.99),
+    )
+
+
+def _at(values: Sequence[float], share: float) -> float:
+    return round(percentile(sorted(values), share) or 0.0, 4)
+
+
+def _driven(picture: int, turn: float = TURN) -> Pose:
+    """Return the pose of the robot after some pictures, on an arc from the origin."""
+    yaw = turn * picture * PERIOD_S
+    if not turn:
+        return Pose(x=SPEED * picture * PERIOD_S, y=0.0, yaw=0.0)
+    return Pose(x=SPEED / turn * math.sin(yaw), y=SPEED / turn * (1 - math.cos(yaw)), yaw=yaw)
+
+
+def _clutter(eyes: Eyes, world: EyesWorld, scores: ClutterScores) -> None:
+    """Drive before a cluttered world, and judge the contours after the last picture."""
+    turn = TURN if eyes.seed % 2 else -TURN
+    with Renderer(world, eyes.camera) as renderer:
+        for number in range(PICTURES):
+            pose = _driven(number, turn)
+            contours = eyes.see(renderer, pose, number * PERIOD_S)
+            if number == 0:
+                scores.found_first += _found(_Truth(eyes, renderer, world, pose), contours)
+        truth = _Truth(eyes, renderer, world, pose)
+    scores.found += _found(truth, contours)
+    _judge_outlines(truth, contours, scores)
+
+
+class _Truth:
+    """What a camera really sees, without errors, in the world's frame."""
+
+    def __init__(self, eyes: Eyes, renderer: Renderer, world: EyesWorld, pose: Pose) -> None:
+        self.world, self.pose, self.height = world, pose, eyes.body.body_height
+        model = CameraModel(eyes.sensor.mounted)
+        depth, part = renderer.depth(), renderer.things()
+        seen = (part >= 0) & (depth < eyes.camera.depth_max) & (depth > eyes.camera.depth_min)
+        points = (model.rays[:, seen] * depth[seen]).T.astype(np.float64) + model.origin
+        low = (points[:, 2] > 0.0) & (points[:, 2] < self.height)
+        self.away = np.hypot(points[low, 0], points[low, 1])
+        self.points: Floats = np.column_stack((_to_world(pose, points[low, :2]), points[low, 2]))
+        owners = np.array([one.thing for one in world.parts], np.intp)
+        self.thing = owners[part[seen][low]] if len(owners) else np.empty(0, np.intp)
+
+
+def _to_world(pose: Pose, points: Floats) -> Floats:
+    cos, sin = math.cos(pose.yaw), math.sin(pose.yaw)
+    return np.asarray(points @ np.array([[cos, sin], [-sin, cos]]) + (pose.x, pose.y))
+
+
+def _outlines(pose: Pose, contours: Sequence[Contour], *, holes: bool) -> list[Floats]:
+    return [
+        _to_world(pose, np.array(one.polygon)) for one in contours if (one.bottom < 0.0) == holes
+    ]
+
+
+def _found(truth: _Truth, contours: Sequence[Contour]) -> list[bool]:
+    """Return whether each thing in view, near and large enough, is covered by contours."""
+    outlines = _outlines(truth.pose, contours, holes=False)
+    found = []
+    for number in np.unique(truth.thing).tolist():
+        mine = truth.points[truth.thing == number]
+        near = truth.away[truth.thing == number]
+        if near.max() > RECALL_REACH_M or np.ptp(mine[:, 2]) < LEAST_M or _width(mine) < LEAST_M:
+            continue
+        covered = distances(outlines, mine[:, :2]) < FOUND_M
+        found.append(bool(covered.mean() >= FOUND_SHARE))
+    return found
+
+
+def _width(points: Floats) -> float:
+    """Return how wide points (n, 3) are from above [m], along their longer axis."""
+    centred = points[:, :2] - points[:, :2].mean(axis=0)
+    _, axes = np.linalg.eigh(centred.T @ centred)
+    return float(np.ptp(centred @ axes[:, 1]))
+
+
+def _judge_outlines(truth: _Truth, contours: Sequence[Contour], scores: ClutterScores) -> None:
+    """Add the distances from outlines to the truth, and from the truth to outlines."""
+    solids, pit = truth.world.solids(truth.height), truth.world.pit
+    here = np.array((truth.pose.x, truth.pose.y))
+    outlines = _outlines(truth.pose, contours, holes=False)
+    for outline in outlines:
+        samples = _along(outline)
+        samples = samples[np.hypot(*(samples - here).T) < ERROR_REACH_M]
+        off = distances(solids, samples)
+        scores.wrong += bool(len(off) and off.min() > FALSE_M)
+        scores.beyond += off[np.isfinite(off)].tolist()
+    reach = truth.points[truth.away < ERROR_REACH_M]
+    cells = np.unique(np.round(reach[:, :2] / STEP_M), axis=0) * STEP_M
+    scores.missed += np.minimum(distances(outlines, cells), 1.0).tolist()
+    scores.front += np.minimum(_to_edges(outlines, _foremost(truth)), 1.0).tolist()
+    holes = _outlines(truth.pose, contours, holes=True)
+    off_pit = [distances([pit.outline] if pit else [], _along(one)) for one in holes]
+    scores.wrong += sum(bool(off.min() > 3 * FALSE_M) for off in off_pit)
+    if pit and _in_view(truth.pose, pit.x - pit.half_x, pit.y):
+        edge = np.linspace(-1, 1, 21)[:, None] * (0.0, pit.half_y) + (pit.x - pit.half_x, pit.y)
+        edge = edge[[_in_view(truth.pose, x, y) for x, y in edge]]
+        gaps = distances(holes, edge)
+        scores.pits.append(bool(gaps.min() < 2 * FALSE_M))
+        scores.pit += np.minimum(gaps, 1.0).tolist()
+        scores.pit += np.concatenate([*off_pit, np.empty(0)]).tolist()
+
+
+def _foremost(truth: _Truth) -> Floats:
+    """Return the nearest point along each line of sight (n, 2), in steps of BEARING_STEP."""
+    reach = truth.away < ERROR_REACH_M
+    points, away = truth.points[reach, :2], truth.away[reach]
+    bearing = np.arctan2(points[:, 1] - truth.pose.y, points[:, 0] - truth.pose.x)
+    step = np.round(bearing / BEARING_STEP).astype(np.intp)
+    order = np.lexsort((away, step))
+    return points[order[np.flatnonzero(np.diff(step[order], prepend=-9999))]]
+
+
+def _to_edges(outlines: Sequence[Floats], points: Floats) -> Floats:
+    """Return the distance of each point (n, 2) to the nearest edge [m], inside as well."""
+    if not outlines or not len(points):
+        return np.full(len(points), np.inf)
+    samples = np.concatenate([_along(one, EDGE_STEP_M) for one in outlines])
+    off = points[:, None] - samples
+    return np.asarray(np.hypot(off[..., 0], off[..., 1]).min(axis=1))
+
+
+def _in_view(pose: Pose, x: float, y: float) -> bool:
+    angle = math.atan2(y - pose.y, x - pose.x) - pose.yaw
+    return abs(math.remainder(angle, math.tau)) < 0.4
+
+
+def _along(outline: Floats, step: float = STEP_M) -> Floats:
+    """Return points along an outline (n, 2), at most `step` [m] apart."""
+    parts = []
+    for begin, end in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        count = int(math.dist(begin, end) / step) + 1
+        parts.append(begin + (end - begin) * (np.arange(count) / count)[:, None])
+    return np.concatenate(parts)
+
+
+class EmptyFloors(NamedTuple):
+    """Contours that there are on empty floors, and the pictures taken there."""
+
+    by_depth: int
+    by_colour: int
+    pictures: int
+
+
+def _empty_floors(
+    body: BodyDescription, errors: DepthErrors, seconds: float, seed: int
+) -> EmptyFloors:
+    """Drive on empty floors, and count the contours by depth, and by colour alone."""
+    depth = colour = 0
+    count = max(1, round(seconds / PERIOD_S))
+    for number, (texture, light) in enumerate((t, one) for t in TEXTURES for one in LIGHTS):
+        eyes = Eyes(body, errors, seed + number)
+        by_colour = ObstacleContours(body)
+        found: set[int] = set()
+        coloured: set[int] = set()
+        with Renderer(EyesWorld(texture=texture, light=light), eyes.camera) as renderer:
+            for picture in range(count):
+                pose = _driven(picture, 0.3 if picture % 100 < 50 else -0.3)
+                now = picture * PERIOD_S
+                found |= {one.track for one in eyes.see(renderer, pose, now)}
+                by_colour.add_colour(eyes.camera.name, renderer.colour(), pose, now)
+                coloured |= {one.track for one in by_colour.contours(pose, now)}
+        depth, colour = depth + len(found), colour + len(coloured)
+    return EmptyFloors(depth, colour, count * len(TEXTURES) * len(LIGHTS))
+
+
+def _ghost(eyes: Eyes, seed: int) -> float:
+    """Return how long a contour stays where a thing no longer is, once that is seen [s]."""
+    random = np.random.default_rng(np.random.SeedSequence((seed, 19)))
+    kind = GHOST_KINDS[seed % len(GHOST_KINDS)]
+    away, angle = random.uniform(0.7, 2.5), random.uniform(-0.3, 0.3)
+    x, y = away * math.cos(angle), away * math.sin(angle)
+    half, tall = random.uniform(0.03, 0.15), random.choice((0.05, 0.15, 0.4, 1.7))
+    bottom = random.choice((0.0, 0.0, 0.1))
+    thing = Part(0, x, y, half, half, max(tall, bottom + 0.03), bottom, random.uniform(0, 3))
+    looks_away = compose(ORIGIN, Pose(x=0.0, y=0.0, yaw=2.5))
+    behind = Part(1, random.uniform(3.0, 5.0), 0.0, 0.05, 8.0, 2.5)
+    with Renderer(EyesWorld((thing,), backdrop=behind), eyes.camera) as renderer:
+        for now, pose, at, counts in _ghost_story(kind, looks_away):
+            found = eyes.see(renderer, pose, now, at)
+            if counts is not None and not _haunted(pose, found, thing.outline, at):
+                return counts
+    return GHOST_WAIT_S
+
+
+def _ghost_story(
+    kind: str, aside: Pose
+) -> Iterator[tuple[float, Pose, tuple[float, float], float | None]]:
+    """Yield time, pose, how far the thing has moved, and since when it is seen to be gone."""
+    far = (100.0, 0.0)
+    pictures = round(SEEN_S / PERIOD_S)
+    for number in range(pictures):
+        yield number * PERIOD_S, ORIGIN, (0.0, 0.0), None
+    begin = pictures
+    if kind == "gone unseen":
+        for number in range(begin, begin + 5):
+            yield number * PERIOD_S, aside, far, None
+        begin += 5
+    walks = [0.1 * step for step in range(1, 6)] if kind == "walks off" else []  # 1 m/s
+    for number, step in enumerate(walks):
+        yield (begin + number) * PERIOD_S, ORIGIN, (0.0, step), None
+    begin += len(walks)
+    for number in range(round(GHOST_WAIT_S / PERIOD_S)):
+        at = (0.0, 0.5) if walks else far
+        yield (begin + number) * PERIOD_S, ORIGIN, at, number * PERIOD_S
+
+
+def _haunted(
+    pose: Pose, contours: Sequence[Contour], stood: Floats, moved: tuple[float, float]
+) -> bool:
+    """Return whether a contour is where the thing stood, or on its way to where it is now."""
+    now = stood + moved
+    for outline in _outlines(pose, contours, holes=False):
+        samples = _along(outline)
+        if distances([stood], samples).min() < GHOST_M and distances([now], samples).max() > 0.1:
+            return True
+    return False
