@@ -155,10 +155,12 @@ class Cameras(Struct, frozen=True, kw_only=True):
         if (image.width, image.height) != wanted:
             code = "camera_wrong"
             text = f"has {image.width} x {image.height} pixels, its file {wanted[0]} x {wanted[1]}"
-        elif same and _moved(since, pose):
-            code, text = "camera_frozen", "repeats one picture while the body moves"
         else:
-            marks, code, text = _look(body, camera, image, (pose, _up(state)), marks)
+            looked = _look(body, camera, image, (pose, _up(state)), marks)
+            if same and not looked[1] and _moved(since, pose):  # two dark pictures may be the same
+                code, text = "camera_frozen", "repeats one picture while the body moves"
+            else:
+                marks, code, text = looked
         seen = CameraState(
             basis=image.basis, code=code, text=text, plane=image.planes[0], since=since
         )

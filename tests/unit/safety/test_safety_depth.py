@@ -269,6 +269,11 @@ def test_a_camera_that_repeats_a_picture_is_found_out_as_the_body_moves() -> Non
     assert drive.go(10) == []
 
 
+def test_a_dark_camera_that_moves_is_not_called_frozen() -> None:
+    drive = Drive(Scene())
+    assert drive.go(50, Velocity(linear_x=-0.2), _constant(0)) == ["camera_blind"]
+
+
 def test_a_still_camera_without_noise_may_repeat_itself_while_the_body_rests() -> None:
     drive = Drive(Scene(), eye=Eye(errors=NO_ERRORS))
     assert drive.go(100) == []
