@@ -85,7 +85,9 @@ class Lens:
         coefficients[: len(given)] = given
         rays = cv2.undistortPoints(pixels, matrix, coefficients)
         x, y = rays[:, 0, 0], rays[:, 0, 1]
-        if not (np.abs(rays) < STEEPEST).all():
+        ahead = np.column_stack([x, y, np.ones_like(x)])
+        back, _ = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), matrix, coefficients)
+        if not ((np.abs(rays) < STEEPEST) & (np.abs(back - pixels) < 1.0)).all():
             raise ConfigError(
                 f"camera {camera.name!r}: its distortion folds the picture; "
                 "expected the k1, k2, p1, p2, k3 of its calibration"

@@ -127,7 +127,8 @@ class DriverProcess:
             if message.boot == self._gate.boot:
                 lockstep.picture(key.rpartition("/")[2], message.basis)
 
-        for topic in (DEPTH, IMAGE, CAMERA):
+        topics: tuple[Topic[Any], ...] = (DEPTH, IMAGE, CAMERA)
+        for topic in topics:
             self._bus.subscribe(topic, take)
         self._bus.latest(WORLD, lockstep.world)
 
