@@ -1,6 +1,6 @@
 """Commands of the training program: `python -m gigabrain_zenoh.qa.train COMMAND`.
 
-all: render, learn, export, score: what made the shipped net.
+all: render, learn, export, score: what made the shipped net. `sheet` shows hits and misses.
 """
 
 import logging
@@ -18,15 +18,21 @@ TRAIN_PICTURES, TEST_PICTURES, STEPS = 12_000, 1_200, 8_000
 FOLDER = Path("things")
 
 
+@cyclopts.Parameter(name="*")
 @dataclass(frozen=True)
 class Plan:
     """How much is rendered and learned, and where it is kept."""
 
     folder: Path = FOLDER
+    "Where the sets and the checkpoint are; what is there is not made again."
     pictures: int = TRAIN_PICTURES
+    "Pictures to train on."
     tests: int = TEST_PICTURES
+    "Pictures of each test set."
     steps: int = STEPS
+    "Steps of training, of 16 pictures each."
     processes: int = 2
+    "Processes that render."
 
 
 @app.command
@@ -63,6 +69,31 @@ def score(plan: Plan = Plan(), *, weights: Path = WEIGHTS) -> None:
         columns[split] = scores.table(guesses, truths)
         print(scores.describe(split, labelled))
     print(scores.text(columns))
+
+
+@app.command
+def sheet(
+    path: Path,
+    plan: Plan = Plan(),
+    *,
+    weights: Path = WEIGHTS,
+    count: int = 12,
+    worst: bool = False,
+) -> None:
+    """Write a JPEG of test pictures with what was found; `worst` takes those with most mistakes."""
+    import cv2
+
+    from gigabrain_zenoh.qa.train import pictures, scores
+    from gigabrain_zenoh.qa.train import sheet as sheets
+
+    labelled = list(pictures.read(sorted(plan.folder.glob("test-*.npz"))))
+    pairs = list(zip(labelled, scores.run(labelled, weights)[0], strict=True))
+    if worst:
+        pairs.sort(key=lambda pair: -sheets.mistakes(*pair))
+    else:
+        pairs = pairs[:: max(1, len(pairs) // count)]  # of many studios
+    made = sheets.sheet(*zip(*pairs[:count], strict=True))
+    cv2.imwrite(str(path), made[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
 
 
 @app.command(name="all")

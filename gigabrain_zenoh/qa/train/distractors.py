@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from gigabrain_zenoh.qa.train.looks import ALONG_X, Geom, Look, Random, about, rod
+from gigabrain_zenoh.qa.train.looks import ALONG_Y, Geom, Look, Random, about, rod
 
 
 def hull(points: list[tuple[float, float, float]], paint: str = "body") -> Geom:
@@ -24,10 +24,13 @@ def frustum(
 
 
 def board(rng: Random) -> Look:
-    """A thin board on edge or leaning."""
-    w, h, thin = rng.uniform(0.1, 0.5), rng.uniform(0.08, 0.7), rng.uniform(0.005, 0.02)
-    tilt = about((0.0, 1.0, 0.0), rng.uniform(-0.4, 0.4))
-    return Look("", (Geom("box", (thin, w, h), (0, 0, h * 0.95), tilt),), 0.15, 2 * h)
+    """A thin board on edge with three to five slanted sides: no rectangle, as a box would show."""
+    w, h, thin = rng.uniform(0.1, 0.4), rng.uniform(0.1, 0.7), rng.uniform(0.005, 0.02)
+    tops = [(rng.uniform(-0.7, 0.7), 1.0)]
+    tops += [(side * rng.uniform(0.6, 1.2), rng.uniform(0.3, 0.8)) for side in (-1, 1)]
+    outline = [(-rng.uniform(0.3, 0.9), 0.0), (rng.uniform(0.3, 0.9), 0.0), *tops]
+    corners = [(x, w * u, h * v) for u, v in outline for x in (-thin, thin)]
+    return Look("", (hull(corners),), 0.12, h, hides=0.6 * w)
 
 
 def pole(rng: Random) -> Look:
@@ -36,7 +39,7 @@ def pole(rng: Random) -> Look:
     parts = [Geom("cylinder", (r, h), (0, 0, h), shine=0.6)]
     if rng.random() < 0.6:
         parts += [Geom("cylinder", (r * 5, 0.01), (0, 0, 0.01), paint="foot")]
-    return Look("", tuple(parts), 0.08, 2 * h)
+    return Look("", tuple(parts), 0.08, 2 * h, hides=r)
 
 
 def cone(rng: Random) -> Look:
@@ -64,9 +67,10 @@ def egg(rng: Random) -> Look:
 
 
 def sausage(rng: Random) -> Look:
-    """A capsule on the floor."""
+    """A capsule on the floor, seen from its side: from its end it would be a ball."""
     r, half = rng.uniform(0.03, 0.08), rng.uniform(0.1, 0.3)
-    return Look("", (Geom("capsule", (r, half), (0, 0, r), ALONG_X),), half + r, 2 * r)
+    parts = (Geom("capsule", (r, half), (0, 0, r), ALONG_Y),)
+    return Look("", parts, half + r, 2 * r, facing=0.7)
 
 
 def bottle(rng: Random) -> Look:

@@ -24,7 +24,7 @@ BATCH = 16
 PEAK_RATE, WEIGHT_DECAY, WARM_UP_STEPS = 2.5e-3, 2e-2, 200
 BOX_WEIGHT = 4.0
 AVERAGED = 0.998  # of the weights that are exported, a step
-SAVE_EVERY_STEPS = 250
+SAVE_EVERY_STEPS = 100
 UNIT_PX = 16.0  # distance of a side at raw 0
 log = logging.getLogger(__name__)
 
@@ -121,7 +121,8 @@ def learn(pictures: Sequence[Labelled], steps: int, folder: Path, seed: int = 0)
     """Train for some steps; goes on from the folder's checkpoint where there is one."""
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint = folder / "checkpoint.pickle"
-    rate = optax.warmup_cosine_decay_schedule(0.0, PEAK_RATE, WARM_UP_STEPS, steps, PEAK_RATE / 100)
+    warm_up = min(WARM_UP_STEPS, steps // 8)
+    rate = optax.warmup_cosine_decay_schedule(0.0, PEAK_RATE, warm_up, steps, PEAK_RATE / 100)
     optimiser = optax.chain(
         optax.clip_by_global_norm(10.0), optax.adamw(rate, weight_decay=WEIGHT_DECAY)
     )

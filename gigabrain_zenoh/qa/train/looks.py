@@ -43,6 +43,7 @@ class Look:
     parts: tuple[Geom, ...]
     radius: float  # of the ground it takes [m]
     height: float  # [m]
+    hides: float = 0.0  # half the width that it hides [m]; 0 for its radius
     lies: float = 0.0  # chance to lie on its side
     facing: float = math.pi  # greatest yaw away from the camera [rad]
     nearest: float = 0.5  # [m] from the camera
@@ -55,7 +56,6 @@ def about(axis: Vector, angle: float) -> Quaternion:
 
 
 ALONG_Y = about((1.0, 0.0, 0.0), math.pi / 2)
-ALONG_X = about((0.0, 1.0, 0.0), math.pi / 2)
 
 
 def ranged(rng: Random, low: float, high: float, wide: int, spread: float = 1.35) -> float:
@@ -164,7 +164,7 @@ def person(rng: Random, wide: int) -> Look:
     for side in (-1, 1):
         foot = (math.sin(step * side) * hip, side * 0.055 * tall, 0.05 * tall)
         parts += [*_leg(tall, fat, foot), *_arm(rng, tall, fat, foot[0], side)]
-    return Look("person", tuple(parts), 0.3, tall, nearest=0.9)
+    return Look("person", tuple(parts), 0.3, tall, hides=0.15, nearest=0.9)
 
 
 def _leg(tall: float, fat: float, foot: Vector) -> list[Geom]:

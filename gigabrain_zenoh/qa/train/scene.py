@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.qa.train import textures
-from gigabrain_zenoh.qa.train.distractors import FURNITURE, OCCLUDERS, is_table
+from gigabrain_zenoh.qa.train.distractors import OCCLUDERS, is_table
 from gigabrain_zenoh.qa.train.looks import Random, about
 from gigabrain_zenoh.qa.train.studio import HEIGHT, RGB, WIDTH, Studio, Thing
 from gigabrain_zenoh.vision.labels import CLASSES
@@ -21,6 +21,7 @@ MIN_FRACTION, MIN_INSIDE, MIN_PIXELS, MIN_SIDE_PX = 0.25, 0.4, 40, 4
 LARGE = ("person", "door")  # seldom fit into the picture
 SMALL_M = 0.4  # what is lower may stand on a table
 TRIES = 30
+OCCLUDED = 0.95  # share of things before which something is tried to be put
 SHARES = np.array((14, 14, 10, 14, 11, 9, 11, 11, 6)) / 100  # of the classes, in their order
 CARTON = ((24, 0.45, 0.55), (28, 0.35, 0.75), (32, 0.3, 0.85))  # hue [deg], saturation, value
 
@@ -224,35 +225,32 @@ class StudioScene:
             distance = 1 / rng.uniform(1 / far, 1 / near)
         else:
             distance = rng.uniform(near, far)
-        if self._put(thing, distance) and rng.random() < 0.85:
+        if self._put(thing, distance) and rng.random() < OCCLUDED:
             self._hide(thing)
 
     def _hide(self, thing: Thing) -> None:
-        """Put something before the last thing that was put, so that it hides a part of it."""
+        """Put something before a thing that was just put, so that it hides a part of it."""
         rng = self._rng
         _, x, y = self._placed[-1]
-        distance = math.hypot(x, y)
-        others = [
-            t
-            for t in self._studio.things[-len(OCCLUDERS) - len(FURNITURE) - 2 : -2]
-            if not self._is_placed(t)
-        ]
-        labelled = [
-            t
-            for t in self._studio.things
-            if t.look.label not in ("", "door") and not self._is_placed(t)
-        ]
-        pool = others[: len(OCCLUDERS)] if rng.random() < 0.65 else labelled
+        distance, side = math.hypot(x, y), rng.choice([-1, 1])
+        pool = self._occluders() if rng.random() < 0.85 else self._hiding_things()
         for _ in range(20):
             other = pool[rng.integers(len(pool))]
             gap = thing.look.radius + other.look.radius + rng.uniform(0.02, 0.4)
             near = distance - gap
-            if near < max(0.35, other.look.nearest * 0.7):
+            if self._is_placed(other) or near < max(0.35, other.look.nearest * 0.6):
                 continue
-            aside = 0.9 * other.look.radius + thing.look.radius * rng.uniform(-0.6, 0.9)
-            bearing = math.atan2(y, x) + rng.choice([-1, 1]) * aside / near
-            if self._put(other, near, bearing):
+            half = (other.look.hides or other.look.radius) * distance / near
+            aside = half + (thing.look.hides or thing.look.radius) * rng.uniform(-0.5, 0.8)
+            if self._put(other, near, math.atan2(y, x) + side * aside / distance):
                 return
+
+    def _occluders(self) -> list[Thing]:
+        first = next(n for n, thing in enumerate(self._studio.things) if not thing.look.label)
+        return self._studio.things[first : first + len(OCCLUDERS)]
+
+    def _hiding_things(self) -> list[Thing]:
+        return [t for t in self._studio.things if t.look.label not in ("", "door")]
 
     def _put(self, thing: Thing, distance: float, bearing: float | None = None) -> bool:
         """Put a thing on the floor where nothing stands; return whether there was room."""

@@ -67,7 +67,7 @@ class Studio:
             if thing.look.label:
                 self.owner[thing.labelled] = n
         self._options = mujoco.MjvOption()
-        self._options.geomgroup[:] = 0
+        self._options.geomgroup[:] = self._options.sitegroup[:] = 0
         self._options.geomgroup[SHOWN] = 1
         self._renderer = mujoco.Renderer(self.model, HEIGHT, WIDTH)
 

@@ -1,0 +1,64 @@
+"""A sheet of pictures: what is there in white, what was found in green, what is wrong in red."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_zenoh.qa.train.pictures import Labelled
+from gigabrain_zenoh.qa.train.scores import OVERLAP, overlaps
+from gigabrain_zenoh.vision.labels import CLASSES
+from gigabrain_zenoh.vision.recognizer import Found
+
+WHITE, GREEN, RED, GREY = (255, 255, 255), (60, 230, 60), (255, 60, 60), (120, 120, 120)
+COLUMNS = 4
+MIN_CONFIDENCE = 0.3
+
+
+def mistakes(one: Labelled, found: Found) -> int:
+    """Return how many things were missed and how many findings are wrong."""
+    right = _right(one, found)
+    counted = int((~one.ignored).sum())
+    return max(counted - int(right.sum()), 0) + int((~right).sum())
+
+
+def sheet(pictures: Sequence[Labelled], found: Sequence[Found]) -> NDArray[np.uint8]:
+    """Return all pictures in rows, RGB, with boxes drawn in."""
+    tiles = [_tile(one, guess) for one, guess in zip(pictures, found, strict=True)]
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % COLUMNS)
+    rows = [np.concatenate(tiles[k : k + COLUMNS], 1) for k in range(0, len(tiles), COLUMNS)]
+    return np.concatenate(rows)
+
+
+def _sure(found: Found) -> NDArray[np.bool_]:
+    return np.asarray(found.confidences >= MIN_CONFIDENCE)
+
+
+def _right(one: Labelled, found: Found) -> NDArray[np.bool_]:
+    """Return which of the sure findings overlap a thing of their class."""
+    sure = _sure(found)
+    shares = overlaps(found.boxes[sure], one.boxes, one.ignored)
+    same = found.labels[sure][:, None] == one.labels[None]
+    return np.asarray(((shares >= OVERLAP) & same).any(axis=1))
+
+
+def _tile(one: Labelled, found: Found) -> NDArray[np.uint8]:
+    picture, sure = one.picture().copy(), _sure(found)
+    for box, ignored in zip(one.boxes, one.ignored, strict=True):
+        _rectangle(picture, box, GREY if ignored else WHITE, "")
+    for box, label, right in zip(
+        found.boxes[sure], found.labels[sure], _right(one, found), strict=True
+    ):
+        _rectangle(picture, box, GREEN if right else RED, CLASSES[label])
+    return picture
+
+
+def _rectangle(
+    picture: NDArray[np.uint8], box: NDArray[np.float32], colour: tuple[int, int, int], text: str
+) -> None:
+    x0, y0, x1, y1 = (int(v) for v in box)
+    cv2.rectangle(picture, (x0, y0), (x1 - 1, y1 - 1), colour, 1)
+    if text:
+        at = (min(x0, picture.shape[1] - 50), max(y0 - 2, 9))
+        cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.35, colour, 1, cv2.LINE_AA)
