@@ -5,10 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
-import numpy as np
-
-from gigabrain_drivers.cameras.base import CameraLost, CameraOptions, CameraSource, Frame, Picture
+from gigabrain_drivers.cameras.base import CameraLost, CameraOptions, CameraSource, Frame
 from gigabrain_drivers.cameras.opencv import fitted
 from gigabrain_schemas.sensors import Image
 from gigabrain_schemas.topics import DEPTH, IMAGE
@@ -16,6 +13,7 @@ from gigabrain_schemas.vision import DepthImage
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.recording.bag_reader import samples
+from gigabrain_zenoh.vision.pictures import decoded
 
 LONGEST_WAIT_S = 1.0  # between two pictures of a recording
 
@@ -83,27 +81,14 @@ class ReplayedCamera(CameraSource):
 
     def _frame(self, one: Recorded) -> Frame:
         camera = self.camera
-        picture = None if one.picture is None else pixels_of(one.picture)
         try:
+            picture = None if one.picture is None else decoded(one.picture)
             depth = one.depth.array() if one.depth and camera.depth else None
         except ValueError as error:
             raise CameraLost(str(error)) from None
         if picture is not None:
             picture = fitted(picture, camera.width, camera.height)
         return Frame(picture, depth)
-
-
-def pixels_of(image: Image) -> Picture:
-    """Return the pixels of a picture, (height, width, 3) or (height, width). Raises CameraLost."""
-    if image.encoding == "jpeg":
-        decoded: Any = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR)
-        if decoded is None:
-            raise CameraLost("the recording has a broken JPEG")
-        return np.asarray(decoded, np.uint8)
-    pixels = image.array()
-    if image.encoding == "rgb8":
-        pixels = pixels[..., ::-1]
-    return np.ascontiguousarray(pixels, np.uint8)
 
 
 def recorded(path: Path, name: str) -> Iterator[Recorded]:

@@ -1,0 +1,201 @@
+"""Pictures of files, and of recordings, come as those of a camera do."""
+
+import time
+from contextlib import closing
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gigabrain_drivers.cameras.base import CameraLost, CameraSite, CameraSource
+from gigabrain_drivers.cameras.opencv import OpenCvCamera, OpenCvOptions, fitted
+from gigabrain_drivers.cameras.replay import ReplayedCamera, ReplayOptions
+from gigabrain_schemas.body import Camera
+from gigabrain_schemas.sensors import Image
+from gigabrain_schemas.topics import DEPTH, IMAGE, Topic
+from gigabrain_schemas.vision import DepthImage, pack_depth
+from gigabrain_zenoh import codec
+from gigabrain_zenoh.bus.headers import header_of
+from gigabrain_zenoh.recording.bag_writer import BagWriter, ReceivedMessage
+
+PLAIN = Camera(name="front", width=64, height=48)
+RGBD = Camera(name="front", width=64, height=48, depth=True)
+GREYS = (40, 120, 200)
+
+
+@pytest.fixture
+def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The pauses [s] that were asked for; none is made."""
+    pauses: list[float] = []
+    monkeypatch.setattr(time, "sleep", pauses.append)
+    return pauses
+
+
+def film(path: Path, width: int = 64, height: int = 48) -> None:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (width, height))
+    for grey in GREYS:
+        writer.write(np.full((height, width, 3), grey, np.uint8))
+    writer.release()
+
+
+def camera(tmp_path: Path, device: str, camera: Camera = PLAIN, **more: object) -> OpenCvCamera:
+    options = OpenCvOptions(source="opencv", device=device, **more)  # type: ignore[arg-type]
+    return OpenCvCamera(options, camera, CameraSite(str(tmp_path)))
+
+
+def means(source: CameraSource, count: int) -> list[int]:
+    pictures = [source.read().picture for _ in range(count)]
+    assert all(one is not None and one.shape == (48, 64, 3) for one in pictures)
+    return [round(float(one.mean()) / 40) * 40 for one in pictures if one is not None]
+
+
+def test_a_film_is_shown_at_the_camera_s_rate_and_ends(tmp_path: Path, slept: list[float]) -> None:
+    film(tmp_path / "film.avi")
+    source = camera(tmp_path, "film.avi")
+    source.open()
+    assert means(source, 3) == [*GREYS]
+    assert slept[-1] == pytest.approx(0.3, abs=0.1)  # from its start
+    with pytest.raises(CameraLost, match=r"film.avi has ended"):
+        source.read()
+    source.close()
+    source.close()
+
+
+def test_a_film_may_begin_again(tmp_path: Path, slept: list[float]) -> None:
+    film(tmp_path / "film.avi")
+    source = camera(tmp_path, "film.avi", repeat=True)
+    source.open()
+    assert means(source, 6) == [*GREYS, *GREYS]
+    source.close()
+
+
+def test_a_larger_picture_of_the_same_shape_is_scaled_and_another_refused(
+    tmp_path: Path, slept: list[float]
+) -> None:
+    film(tmp_path / "large.avi", 640, 480)
+    source = camera(tmp_path, "large.avi")
+    source.open()
+    assert means(source, 3) == [*GREYS]
+    source.close()
+    film(tmp_path / "wide.avi", 640, 360)
+    source = camera(tmp_path, "wide.avi")
+    source.open()
+    with pytest.raises(CameraLost, match=r"gives pictures of 640 x 360 pixels; .* says 64 x 48"):
+        source.read()
+    source.close()
+
+
+@pytest.mark.parametrize(
+    ("device", "error"),
+    [
+        ("/dev/video97", "/dev/video97 is not there"),
+        ("no.mp4", "no.mp4 is not there"),
+        ("garbage.avi", "garbage.avi cannot be opened"),
+        ("http://127.0.0.1:9/x.mjpg", "cannot be opened"),
+    ],
+)
+def test_what_cannot_be_opened_is_named(tmp_path: Path, device: str, error: str) -> None:
+    (tmp_path / "garbage.avi").write_bytes(bytes(range(256)) * 20)
+    source = camera(tmp_path, device)
+    with pytest.raises(CameraLost, match=error):
+        source.open()
+    source.close()
+    with pytest.raises(CameraLost, match="is not open"):
+        source.read()
+
+
+def test_opencv_gives_no_depth(tmp_path: Path) -> None:
+    with pytest.raises(CameraLost, match="write `depth: false`"):
+        camera(tmp_path, "0", RGBD).open()
+
+
+def test_grey_pictures_get_three_channels_and_enormous_ones_are_refused() -> None:
+    assert fitted(np.full((48, 64), 9, np.uint8), 64, 48).shape == (48, 64, 3)
+    for wrong in (np.zeros((5000, 5000, 3), np.uint8), np.zeros((48, 64), np.uint16)):
+        with pytest.raises(CameraLost, match="gives pictures of"):
+            fitted(wrong, 64, 48)
+
+
+def jpeg(grey: int) -> bytes:
+    picture = np.full((48, 64, 3), grey, np.uint8)
+    return bytes(cv2.imencode(".jpg", picture)[1].tobytes())
+
+
+def recording(path: Path, *, broken: bool = False) -> None:
+    """Three exposures at 10 Hz of the camera `front`, and one of another."""
+    file = BagWriter(path, viewers=False, notes={})
+    with closing(file):
+        for number, grey in enumerate(GREYS):
+            header = {"basis": 5 * number + 5, "stamp_ns": 10**18 + number * 10**8}
+            about = {"frame_id": "front", "height": 48, "width": 64}
+            data = b"no jpeg" if broken else jpeg(grey)
+            depth = np.full((48, 64), grey, np.uint16)
+            messages: list[tuple[Topic, str, object]] = [
+                (IMAGE, "front", Image(**about, **header, encoding="jpeg", data=data)),
+                (IMAGE, "rear", Image(**about, **header, encoding="jpeg", data=jpeg(0))),
+                (DEPTH, "front", DepthImage(**about, **header, planes=pack_depth(depth))),
+            ]
+            for topic, name, message in messages:
+                payload = codec.encode(message)  # type: ignore[type-var]
+                encoding = codec.encoding_of(topic.type)
+                file.add(
+                    ReceivedMessage(
+                        header["stamp_ns"], topic.at(name), encoding, payload, header_of(payload)
+                    )
+                )
+        file.finish()
+
+
+def replayed(tmp_path: Path, **more: object) -> ReplayedCamera:
+    options = ReplayOptions(source="replay", file="drive.mcap", **more)  # type: ignore[arg-type]
+    return ReplayedCamera(options, RGBD, CameraSite(str(tmp_path)))
+
+
+def test_a_recording_gives_picture_and_depth_of_one_exposure_together(
+    tmp_path: Path, slept: list[float]
+) -> None:
+    recording(tmp_path / "drive.mcap")
+    source = replayed(tmp_path)
+    source.open()
+    frames = [source.read() for _ in range(6)]  # it begins again
+    depths = [int(one.depth.max()) for one in frames if one.depth is not None]
+    assert depths == [*GREYS, *GREYS]
+    greys = [float(one.picture.mean()) for one in frames if one.picture is not None]
+    assert greys == pytest.approx([*GREYS, *GREYS], abs=3)
+    assert all(0 <= pause <= 0.3 for pause in slept)
+    source.close()
+
+
+def test_a_recording_may_end(tmp_path: Path, slept: list[float]) -> None:
+    recording(tmp_path / "drive.mcap")
+    source = replayed(tmp_path, repeat=False)
+    source.open()
+    for _ in GREYS:
+        source.read()
+    with pytest.raises(CameraLost, match=r"drive\.mcap has ended"):
+        source.read()
+
+
+@pytest.mark.parametrize(
+    ("content", "error"),
+    [
+        (None, "cannot read"),
+        (b"no recording at all", "not a recording"),
+        ("other camera", "drive.mcap has none"),
+        ("broken", "not a JPEG"),
+    ],
+)
+def test_a_recording_that_cannot_be_shown_is_a_lost_camera(
+    tmp_path: Path, slept: list[float], content: str | bytes | None, error: str
+) -> None:
+    path = tmp_path / "drive.mcap"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content:
+        recording(path, broken=content == "broken")
+    source = replayed(tmp_path, camera="top" if content == "other camera" else "front")
+    source.open()
+    with pytest.raises(CameraLost, match=error):
+        source.read()
+    source.close()
