@@ -4,7 +4,6 @@ all: render, learn, export, score: what made the shipped net. `sheet` shows hits
 """
 
 import logging
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +11,6 @@ import cyclopts
 
 from gigabrain_zenoh.vision.recognizer import WEIGHTS
 
-os.environ.setdefault("MUJOCO_GL", "egl")
 app = cyclopts.App(name="python -m gigabrain_zenoh.qa.train", help="Train the shipped recogniser.")
 TRAIN_PICTURES, TEST_PICTURES, STEPS = 12_000, 1_200, 8_000
 FOLDER = Path("things")

@@ -90,7 +90,7 @@ class StudioScene:
         studio = self._studio
         things = [thing for thing, _, _ in self._placed]
         studio.show(things)
-        picture, owners = studio.picture().copy(), studio.owners().copy()
+        picture, owners = studio.picture(), studio.owners()
         truths = []
         for thing in things:
             number = studio.things.index(thing)

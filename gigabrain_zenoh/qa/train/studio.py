@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from gigabrain_zenoh.qa.train import textures
 from gigabrain_zenoh.qa.train.distractors import draw_all
+from gigabrain_zenoh.qa.train.drawing import Drawing
 from gigabrain_zenoh.qa.train.looks import MAKERS, Geom, Look, Random
 
 WIDTH, HEIGHT = 320, 240
@@ -62,18 +63,20 @@ class Studio:
         self.flat_textures = list(range(CUBE_TEXTURES, CUBE_TEXTURES + FLAT_TEXTURES))
         self.things = [self._thing(n, look) for n, look in enumerate(looks)]
         self.things += [self._shipped(len(looks) + n) for n in range(len(bodies))]
-        self.owner = np.full(self.model.ngeom + 1, -1)  # thing of each labelled geom; -1 for none
+        self.owner = np.full(
+            self.model.ngeom + 1, -1
+        )  # thing of each labelled geom; -1, the last, for none
         for n, thing in enumerate(self.things):
             if thing.look.label:
                 self.owner[thing.labelled] = n
         self._options = mujoco.MjvOption()
         self._options.geomgroup[:] = self._options.sitegroup[:] = 0
         self._options.geomgroup[SHOWN] = 1
-        self._renderer = mujoco.Renderer(self.model, HEIGHT, WIDTH)
+        self._drawing = Drawing(self.model, 0, WIDTH, HEIGHT)
 
     def close(self) -> None:
-        """Free the renderer."""
-        self._renderer.close()
+        """Free what OpenGL holds."""
+        self._drawing.close()
 
     def _fill(self, texture: int, rng: Random, families: tuple[textures.Family, ...]) -> None:
         model = self.model
@@ -110,17 +113,12 @@ class Studio:
             self.model.geom_group[thing.labelled if labelled else thing.geoms] = SHOWN
 
     def picture(self) -> NDArray[np.uint8]:
-        """Render what is shown, RGB."""
-        self._renderer.update_scene(self.data, 0, self._options)
-        return np.asarray(self._renderer.render(), np.uint8)
+        """Render what is shown (h, w, 3), RGB."""
+        return self._drawing.colours(self.data, self._options)
 
-    def owners(self) -> NDArray[np.intp]:
-        """Return the number of the thing seen in each pixel; -1 for none."""
-        self._renderer.enable_segmentation_rendering()
-        self._renderer.update_scene(self.data, 0, self._options)
-        geoms = self._renderer.render()[..., 0]
-        self._renderer.disable_segmentation_rendering()
-        return np.asarray(self.owner[geoms])  # -1 is the last one: none
+    def owners(self) -> NDArray[np.int64]:
+        """Return the number of the thing seen in each pixel (h, w); -1 for none."""
+        return np.asarray(self.owner[self._drawing.geoms(self.data, self._options)])
 
 
 def _compile(looks: list[Look], bodies: Iterable[str]) -> mujoco.MjModel:
