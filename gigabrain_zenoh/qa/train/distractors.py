@@ -51,12 +51,12 @@ def cone(rng: Random) -> Look:
 
 
 def wedge(rng: Random) -> Look:
-    """A ramp or a prism."""
+    """A prism, seen from its triangular end: from its side it would be a box."""
     x, y, z = rng.uniform(0.08, 0.3), rng.uniform(0.08, 0.3), rng.uniform(0.06, 0.3)
-    ridge = rng.uniform(-x, x)
+    ridge = rng.uniform(-y, y)
     points = [(sx * x, sy * y, 0.0) for sx in (-1, 1) for sy in (-1, 1)]
-    points += [(ridge, -y, z), (ridge, y, z)]
-    return Look("", (hull(points),), math.hypot(x, y), z)
+    points += [(-x, ridge, z), (x, ridge, z)]
+    return Look("", (hull(points),), math.hypot(x, y), z, hides=y, facing=0.6)
 
 
 def egg(rng: Random) -> Look:

@@ -196,7 +196,7 @@ def figure(rng: Random, wide: int) -> Look:
         Geom("sphere", (0.14,), (0, 0, tall + 0.1), paint="skin"),
         Geom("ellipsoid", (0.16, 0.15, 0.1), (-0.02, 0, tall + 0.18), paint="hair"),
     )
-    return Look("person", parts, r, tall + 0.28, nearest=1.8)
+    return Look("person", parts, r, tall + 0.28, nearest=2.4)
 
 
 def robot(rng: Random, wide: int) -> Look:

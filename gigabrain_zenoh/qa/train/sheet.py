@@ -1,4 +1,4 @@
-"""A sheet of pictures: what is there in white, what was found in green, what is wrong in red."""
+"""A sheet of pictures: found in green, wrong in red, what is there in white (named if missed)."""
 
 from collections.abc import Sequence
 
@@ -18,9 +18,8 @@ MIN_CONFIDENCE = 0.3
 
 def mistakes(one: Labelled, found: Found) -> int:
     """Return how many things were missed and how many findings are wrong."""
-    right = _right(one, found)
-    counted = int((~one.ignored).sum())
-    return max(counted - int(right.sum()), 0) + int((~right).sum())
+    right, there = _hits(one, found)
+    return int((~right).sum() + (~there & ~one.ignored).sum())
 
 
 def sheet(pictures: Sequence[Labelled], found: Sequence[Found]) -> NDArray[np.uint8]:
@@ -35,22 +34,22 @@ def _sure(found: Found) -> NDArray[np.bool_]:
     return np.asarray(found.confidences >= MIN_CONFIDENCE)
 
 
-def _right(one: Labelled, found: Found) -> NDArray[np.bool_]:
-    """Return which of the sure findings overlap a thing of their class."""
+def _hits(one: Labelled, found: Found) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which of the sure findings are right, and which things were found."""
     sure = _sure(found)
     shares = overlaps(found.boxes[sure], one.boxes, one.ignored)
-    same = found.labels[sure][:, None] == one.labels[None]
-    return np.asarray(((shares >= OVERLAP) & same).any(axis=1))
+    hits = (shares >= OVERLAP) & (found.labels[sure][:, None] == one.labels[None])
+    return hits.any(axis=1), hits.any(axis=0)
 
 
 def _tile(one: Labelled, found: Found) -> NDArray[np.uint8]:
     picture, sure = one.picture().copy(), _sure(found)
-    for box, ignored in zip(one.boxes, one.ignored, strict=True):
-        _rectangle(picture, box, GREY if ignored else WHITE, "")
-    for box, label, right in zip(
-        found.boxes[sure], found.labels[sure], _right(one, found), strict=True
-    ):
-        _rectangle(picture, box, GREEN if right else RED, CLASSES[label])
+    right, there = _hits(one, found)
+    for box, label, ignored, hit in zip(one.boxes, one.labels, one.ignored, there, strict=True):
+        missed = "" if hit or ignored else CLASSES[label]
+        _rectangle(picture, box, GREY if ignored else WHITE, missed)
+    for box, label, hit in zip(found.boxes[sure], found.labels[sure], right, strict=True):
+        _rectangle(picture, box, GREEN if hit else RED, CLASSES[label])
     return picture
 
 
