@@ -262,3 +262,21 @@ async def test_a_robot_without_cameras_is_refused() -> None:
 def test_a_distortion_that_folds_the_picture_is_refused() -> None:
     with pytest.raises(ConfigError, match="distortion folds the picture"):
         View(replace(FRONT, distortion=(-90.0, 0.0, 0.0, 0.0, 0.0)), 0, errors=False)
+
+
+async def test_a_scene_that_cannot_be_drawn_is_said_and_a_good_one_is_drawn_again(
+    driver: MujocoDriver,
+) -> None:
+    async with running(driver) as (world, bus):
+        await world.drive(3, 10)
+        broken = replace(world.scene, kinds=b"\xff" * len(world.scene.kinds))
+        world.bus.publish(SIM_SCENE, broken)
+        world.tick(15)
+        await until(lambda: "cannot be shown" in infos(world)[-1], "what is wrong")
+        world.bus.publish(SIM_SCENE, world.scene)
+        await world.drive(16, 30)
+        assert world.heard["image"][-1].tick == 30
+
+
+def infos(world: Simulated) -> list[str]:
+    return [one.problem for one in world.heard["camera"]]  # type: ignore[attr-defined]

@@ -4,7 +4,10 @@ import asyncio
 import contextlib
 import functools
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING
+
+from msgspec.structs import replace
 
 from gigabrain_drivers.cameras.base import (
     CameraLost,
@@ -24,7 +27,11 @@ from gigabrain_schemas.topics import SIM_POSES, SIM_SCENE, STATE
 from gigabrain_zenoh.bus.bridge import Bridge
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import CameraConfig
+from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.runtime.heartbeat import Progress
+
+if TYPE_CHECKING:
+    from gigabrain_drivers.cameras.rendered import Renderer
 
 AGAIN_S = 0.5  # until a source that was lost is opened again
 EARLY = 0.75  # of a period: without ticks, a camera is due this soon
@@ -88,6 +95,11 @@ class CameraProcess:
         if spoilt:
             self._bridge.post(self.outputs[name].put, self.outputs[name].pack(spoilt))
 
+    def lose(self, names: Iterable[str], problem: str) -> None:
+        """Note why some cameras give no pictures, from any thread."""
+        for name in names:
+            self._bridge.post(self.outputs[name].lose, problem)
+
     @property
     def halted(self) -> bool:
         """Return whether the threads are to end."""
@@ -96,6 +108,11 @@ class CameraProcess:
     def now_ns(self) -> int:
         """Return this process's time [ns]."""
         return self._bus.clock.now_ns()
+
+    @property
+    def tick(self) -> int:
+        """Return the robot's newest tick."""
+        return self._bus.time.tick
 
     def count(self, name: str) -> None:
         """Count something in the process's health, from any thread."""
@@ -150,7 +167,7 @@ class CameraProcess:
             try:
                 self._take_all(name, source)
             except CameraLost as error:
-                self._bridge.post(self.outputs[name].lose, f"no picture: {error}")
+                self.lose((name,), f"no picture: {error}")
             finally:
                 source.close()
             self._halt.wait(AGAIN_S)
@@ -191,9 +208,12 @@ class RenderThread:
             self._boot = poses.boot
             self._drawn.clear()
             self._process.restart()
+        has_tick = poses.tick > 0
         with self._changed:
+            if not has_tick:  # of an emulated world, which has none: it is of the newest one
+                poses = replace(poses, tick=self._process.tick)
             for name, camera in self._cameras.items():
-                if name in self._drawn and not self._is_due(camera, poses.tick):
+                if name in self._drawn and not self._is_due(camera, poses.tick if has_tick else 0):
                     continue
                 self._taken_ns[name] = self._process.now_ns()
                 self._count += 1
@@ -231,14 +251,21 @@ class RenderThread:
             while not self._process.halted:
                 scene, due = self._next()
                 if scene is not None and scene is not shown:
-                    renderer.show(scene)
                     shown = scene
+                    self._show(renderer, scene)
                 for poses, names in _together(due):
                     frames = renderer.expose(poses, names)
                     self._drawn.update(frames)
                     for name, frame in frames.items():
                         exposed = Frame(frame.picture, frame.depth, poses.tick, poses.stamp_ns)
                         self._process.put(name, exposed)
+
+    def _show(self, renderer: "Renderer", scene: SimScene) -> None:
+        """Draw a scene from now on; one that cannot be drawn gives no pictures."""
+        try:
+            renderer.show(scene)
+        except ConfigError as error:
+            self._process.lose(self._cameras, f"no picture: {error}")
 
     def _next(self) -> tuple[SimScene | None, Mapping[str, SimPoses]]:
         """Wait for something to draw."""

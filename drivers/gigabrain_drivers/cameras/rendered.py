@@ -132,8 +132,10 @@ class Renderer:
         self._rest_height: float | None = None  # [m], of the base's origin above the floor
 
     def show(self, scene: SimScene) -> None:
-        """Draw this scene from now on. Raises ConfigError for one that cannot be drawn."""
-        if self._scene and self._scene.update(scene):
+        """Draw this scene from now on, or none: raises ConfigError if it cannot be drawn."""
+        before, self._scene = self._scene, None
+        if before and before.update(scene):
+            self._scene = before
             return
         self._free()
         made = SceneModel(scene)
