@@ -269,10 +269,12 @@ async def test_a_scene_that_cannot_be_drawn_is_said_and_a_good_one_is_drawn_agai
 ) -> None:
     async with running(driver) as (world, bus):
         await world.drive(3, 10)
+        assert bus.progress()
         broken = replace(world.scene, kinds=b"\xff" * len(world.scene.kinds))
         world.bus.publish(SIM_SCENE, broken)
         world.tick(15)
         await until(lambda: "cannot be shown" in infos(world)[-1], "what is wrong")
+        assert bus.progress()  # it is no process that hangs
         world.bus.publish(SIM_SCENE, world.scene)
         await world.drive(16, 30)
         assert world.heard["image"][-1].tick == 30

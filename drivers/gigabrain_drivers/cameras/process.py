@@ -68,7 +68,7 @@ class CameraProcess:
             self._start(self._rendered.run)
             bus.latest(SIM_SCENE, self._rendered.show)
             bus.latest(SIM_POSES, self._rendered.expose)
-            bus.progress = Progress(self._rendered.came, self._exposures)
+            bus.progress = Progress(self._rendered.came, self._rendered.done)
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -133,9 +133,6 @@ class CameraProcess:
 
         return CameraOutput(one.camera, one.options, bus, now_s, repeats=repeats)
 
-    def _exposures(self) -> int:
-        return sum(output.exposures for output in self.outputs.values())
-
     def _serve_faults(self) -> None:
         for name, faulty in self._faults.items():
             expected = f"one of: {', '.join(FAULTS)}"
@@ -194,7 +191,7 @@ class RenderThread:
         self._due: dict[str, SimPoses] = {}  # by the name of a camera
         self._drawn: set[str] = set()  # cameras that have taken a picture in this boot
         self._taken_ns: dict[str, int] = {}  # when each was last due, by this process's clock
-        self._boot, self._count = -1, 0
+        self._boot, self._count, self._rounds = -1, 0, 0
 
     def show(self, scene: SimScene) -> None:
         """Draw this scene from now on."""
@@ -238,6 +235,10 @@ class RenderThread:
         """Return what changes with each input, for the heartbeat."""
         return (self._count,) if self._drawn else ()
 
+    def done(self) -> int:
+        """Return what changes with each piece of work, for the heartbeat."""
+        return self._rounds
+
     def run(self) -> None:
         """Draw until the process halts. Raises ConfigError where nothing can be drawn."""
         from gigabrain_drivers.cameras.rendered import Renderer, View  # mujoco: 100 MB
@@ -259,6 +260,7 @@ class RenderThread:
                     for name, frame in frames.items():
                         exposed = Frame(frame.picture, frame.depth, poses.tick, poses.stamp_ns)
                         self._process.put(name, exposed)
+                self._rounds += 1
 
     def _show(self, renderer: "Renderer", scene: SimScene) -> None:
         """Draw a scene from now on; one that cannot be drawn gives no pictures."""
