@@ -187,6 +187,11 @@ class CellMemory:
         dx, dy = places[:, 0] - x, places[:, 1] - y
         return np.column_stack((cos * dx + sin * dy, cos * dy - sin * dx))
 
+    @property
+    def place(self) -> Floats:
+        """Where the robot is (2,), in the odometry frame [m]."""
+        return np.array(self._placed()[:2])
+
     def _placed(self) -> tuple[float, float, float, float]:
         pose = self._pose or Pose(x=0.0, y=0.0, yaw=0.0)
         return pose.x, pose.y, math.cos(pose.yaw), math.sin(pose.yaw)

@@ -134,7 +134,7 @@ class ObstacleContours:
             return []
         cells = self._memory.cells[at]
         labels = connected((cells["low"] + cells["high"]) / 2)
-        labels = split(cells["low"], cells["high"], labels)
+        labels = split(cells["low"], cells["high"], labels, self._memory.place)
         order = np.argsort(labels, kind="stable")
         at, cells, labels = at[order], cells[order], labels[order]
         first = np.flatnonzero(np.diff(labels, prepend=-1))

@@ -50,8 +50,11 @@ def _joined(count: int, begin: Labels, end: Labels) -> Labels:
         labels = joined
 
 
-def split(low: Floats, high: Floats, labels: Labels) -> Labels:
-    """Return finer groups of the boxes from `low` to `high` (n, 2), so that none is hollow."""
+def split(low: Floats, high: Floats, labels: Labels, viewer: Floats) -> Labels:
+    """Return finer groups of the boxes from `low` to `high` (n, 2), so that none is hollow.
+
+    What lies behind the boxes, as seen from `viewer` (2,), is unknown: it may be in an outline.
+    """
     middle = (low + high) / 2
     labels = labels.copy()
     open_ = np.arange(len(labels))  # boxes of groups that may be hollow
@@ -59,19 +62,21 @@ def split(low: Floats, high: Floats, labels: Labels) -> Labels:
         order = open_[np.argsort(labels[open_], kind="stable")]
         first = np.flatnonzero(np.diff(labels[order], prepend=-1))
         outline = support_polygons(low[order], high[order], first)
-        hollow = _hollow(middle[order], outline, first)
+        hollow = _hollow(middle[order], outline, first, viewer)
         if not hollow.any():
             break
         open_ = _halve(middle, labels, order, first, hollow)
     return labels
 
 
-def _hollow(middle: Floats, outline: Floats, first: Labels) -> NDArray[np.bool_]:
-    """Return which groups have an outline with an edge that is far from all their boxes."""
+def _hollow(middle: Floats, outline: Floats, first: Labels, viewer: Floats) -> NDArray[np.bool_]:
+    """Return which groups have an edge towards `viewer` that is far from all their boxes."""
     group = np.repeat(np.arange(len(first)), np.diff(first, append=len(middle)))
     edge = np.roll(outline, -1, axis=1) - outline
     length = np.hypot(edge[..., 0], edge[..., 1])
-    long = length > EDGE_M
+    to_viewer = viewer - (outline + edge / 2)
+    facing = edge[..., 1] * to_viewer[..., 0] - edge[..., 0] * to_viewer[..., 1] > 0.0
+    long = (length > EDGE_M) & facing
     box, side = np.nonzero(long[group])
     of = group[box]
     direction = edge[of, side] / length[of, side][:, None]

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
 from gigabrain_drivers.cameras.depth_noise import NO_ERRORS, SENSOR, DepthErrors, DepthSensor
 from gigabrain_schemas.arrays import Floats
@@ -37,6 +38,7 @@ STEP_M, EDGE_STEP_M = 0.02, 0.004  # between points of outlines
 BEARING_STEP = math.radians(0.5)
 LEAST_M = 0.028  # of what is seen of a thing, for recall: 3 cm less what a pixel may hide
 FOUND_M, FOUND_SHARE = 0.05, 0.5  # distance to a contour, and share of a thing's points within it
+PIT_SEEN_M = 0.03  # below the floor
 FALSE_M = 0.10  # a contour that is nowhere nearer to a thing is none
 GHOST_M = 0.03  # a contour so near to where the thing stood is its ghost
 GHOST_KINDS = ("gone", "walks off", "gone unseen")
@@ -221,14 +223,24 @@ class _Truth:
     def __init__(self, eyes: Eyes, renderer: Renderer, world: EyesWorld, pose: Pose) -> None:
         self.world, self.pose, self.height = world, pose, eyes.body.body_height
         model = CameraModel(eyes.sensor.mounted)
-        depth, part = renderer.depth(), renderer.things()
+        depth, part = renderer.depth(), renderer.parts()
         seen = (part >= 0) & (depth < eyes.camera.depth_max) & (depth > eyes.camera.depth_min)
         points = (model.rays[:, seen] * depth[seen]).T.astype(np.float64) + model.origin
+        self.pit = self._pit_seen(model, depth, part)
         low = (points[:, 2] > 0.0) & (points[:, 2] < self.height)
         self.away = np.hypot(points[low, 0], points[low, 1])
         self.points: Floats = np.column_stack((_to_world(pose, points[low, :2]), points[low, 2]))
         owners = np.array([one.thing for one in world.parts], np.intp)
         self.thing = owners[part[seen][low]] if len(owners) else np.empty(0, np.intp)
+
+    def _pit_seen(
+        self, model: CameraModel, depth: NDArray[np.float32], part: NDArray[np.int32]
+    ) -> Floats:
+        """Return where lines of sight that end below the floor go through it (n, 2)."""
+        down = (part < 0) & (model.rays[2] * depth + model.origin[2] < -PIT_SEEN_M)
+        rays = model.rays[:, down].astype(np.float64)
+        through = (rays[:2] * (-model.origin[2] / rays[2])).T + model.origin[:2]
+        return _to_world(self.pose, through)
 
 
 def _to_world(pose: Pose, points: Floats) -> Floats:
@@ -281,9 +293,11 @@ def _judge_outlines(truth: _Truth, contours: Sequence[Contour], scores: ClutterS
     holes = _outlines(truth.pose, contours, holes=True)
     off_pit = [distances([pit.outline] if pit else [], _along(one)) for one in holes]
     scores.wrong += sum(bool(off.min() > 3 * FALSE_M) for off in off_pit)
-    if pit and _in_view(truth.pose, pit.x - pit.half_x, pit.y):
+    if pit and len(truth.pit):
         edge = np.linspace(-1, 1, 21)[:, None] * (0.0, pit.half_y) + (pit.x - pit.half_x, pit.y)
-        edge = edge[[_in_view(truth.pose, x, y) for x, y in edge]]
+        edge = edge[[np.hypot(*(truth.pit - one).T).min() < FALSE_M for one in edge]]
+        if not len(edge):
+            return
         gaps = distances(holes, edge)
         scores.pits.append(bool(gaps.min() < 2 * FALSE_M))
         scores.pit += np.minimum(gaps, 1.0).tolist()
@@ -307,11 +321,6 @@ def _to_edges(outlines: Sequence[Floats], points: Floats) -> Floats:
     samples = np.concatenate([_along(one, EDGE_STEP_M) for one in outlines])
     off = points[:, None] - samples
     return np.asarray(np.hypot(off[..., 0], off[..., 1]).min(axis=1))
-
-
-def _in_view(pose: Pose, x: float, y: float) -> bool:
-    angle = math.atan2(y - pose.y, x - pose.x) - pose.yaw
-    return abs(math.remainder(angle, math.tau)) < 0.4
 
 
 def _along(outline: Floats, step: float = STEP_M) -> Floats:

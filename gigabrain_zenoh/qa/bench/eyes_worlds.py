@@ -11,14 +11,14 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from gigabrain_drivers.driver.catalog import load_robot
+from gigabrain_drivers.sim.graphics import open_graphics
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import BodyDescription, Camera
-from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.polygon import distance
 from gigabrain_zenoh.vision.camera_model import rotation
 
-FAR_M = 1000.0
+NEAR_M, FAR_M = 0.02, 50.0  # of what is drawn
 CIRCLE = 24  # corners of the polygon that stands for a circle
 CLEAR_M = 0.5  # round the place where the robot drives
 FLOOR_M = 20.0
@@ -174,21 +174,22 @@ class Renderer:
         """Make it. Raises ConfigError where nothing can be drawn."""
         self._camera = camera
         self.model = _spec(world, camera).compile()
+        drawn = self.model.vis.global_
+        drawn.offwidth, drawn.offheight = camera.width, camera.height
         self.data = mujoco.MjData(self.model)
         self._floors = self.model.ngeom - len(world.parts)
-        try:
-            self._renderer = mujoco.Renderer(self.model, camera.height, camera.width)
-        except (AttributeError, RuntimeError, mujoco.FatalError) as error:
-            raise ConfigError(
-                f"cannot render ({error}): set MUJOCO_GL=egl and, on Debian, apt-get install "
-                "libegl1 libgl1-mesa-dri"
-            ) from error
+        self._graphics = open_graphics(camera.width, camera.height)
+        self._scene = mujoco.MjvScene(self.model, maxgeom=self.model.ngeom + 10)
+        self._context = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR.value
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
 
     def __enter__(self) -> "Renderer":
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._renderer.close()
+        self._context.free()
+        self._graphics.free()
 
     def move(self, pose: Pose, mounted: Camera, thing: tuple[float, float] = (0.0, 0.0)) -> None:
         """Put the robot, whose camera really is `mounted`, at a pose, and move all things."""
@@ -199,31 +200,52 @@ class Renderer:
         mujoco.mju_mat2Quat(self.data.mocap_quat[0], matrix.reshape(-1))
         self.data.mocap_pos[1, :2] = thing
         mujoco.mj_forward(self.model, self.data)
-        self._renderer.update_scene(self.data, camera="eye")
+        eye = mujoco.MjvCamera()
+        eye.type, eye.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(
+            self.model, self.data, mujoco.MjvOption(), None, eye, everything, self._scene
+        )
 
     def depth(self) -> NDArray[np.float32]:
         """Return the depth of each pixel [m]."""
-        self._renderer.enable_depth_rendering()
-        depth: NDArray[np.float32] = self._renderer.render().copy()
-        self._renderer.disable_depth_rendering()
-        return depth
+        return self._draw(shadows=False)[1]
 
     def colour(self) -> NDArray[np.uint8]:
         """Return a picture (height, width, 3)."""
-        pixels: NDArray[np.uint8] = self._renderer.render().copy()
-        return pixels
+        return self._draw(shadows=True)[0]
 
-    def things(self) -> NDArray[np.int32]:
+    def parts(self) -> NDArray[np.int32]:
         """Return the number of the part that each pixel shows, -1 for none."""
-        self._renderer.enable_segmentation_rendering()
-        geoms = self._renderer.render()[..., 0].astype(np.int32)
-        self._renderer.disable_segmentation_rendering()
-        return np.where(geoms >= self._floors, geoms - self._floors, -1)
+        for flag in (mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR):
+            self._scene.flags[flag] = 1
+        colours = self._draw(shadows=False)[0].astype(np.int32)
+        for flag in (mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR):
+            self._scene.flags[flag] = 0
+        drawn = colours[..., 0] + colours[..., 1] * 256 + colours[..., 2] * 65536 - 1
+        geoms = np.full(self._scene.ngeom + 1, -1, np.int32)  # the last one: nothing is drawn
+        for one in self._scene.geoms[: self._scene.ngeom]:
+            if one.segid >= 0 and one.objtype == mujoco.mjtObj.mjOBJ_GEOM:
+                geoms[one.segid] = one.objid
+        return np.asarray(np.maximum(geoms[drawn] - self._floors, -1), np.int32)
+
+    def _draw(self, *, shadows: bool) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Return colours (height, width, 3) and depth (height, width) [m]."""
+        width, height = self._camera.width, self._camera.height
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+        colours, raw = np.empty((height, width, 3), np.uint8), np.empty((height, width), np.float32)
+        whole = mujoco.MjrRect(0, 0, width, height)
+        mujoco.mjr_render(whole, self._scene, self._context)
+        mujoco.mjr_readPixels(colours, raw, whole, self._context)
+        # OpenGL counts rows from below; the depth buffer holds 1 at the near plane, 0 at the far
+        depth = NEAR_M * FAR_M / (NEAR_M + (FAR_M - NEAR_M) * raw[::-1])
+        return np.ascontiguousarray(colours[::-1]), depth.astype(np.float32)
 
 
 def _spec(world: EyesWorld, camera: Camera) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
-    spec.stat.extent, spec.visual.map.znear, spec.visual.map.zfar = 5.0, 0.004, 4.0
+    spec.stat.extent, spec.visual.map.znear, spec.visual.map.zfar = 1.0, NEAR_M, FAR_M
+    spec.visual.quality.offsamples = 0
     direction, sun, rest = LIGHTS[world.light]
     spec.visual.headlight.ambient = spec.visual.headlight.diffuse = (rest / 2,) * 3
     spec.worldbody.add_light(
