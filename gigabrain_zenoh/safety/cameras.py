@@ -46,6 +46,7 @@ PENDING_PERIODS = 2.5  # after which a doubtful point that was not seen again is
 DRIFT_M = 0.02  # inside the footprint: what stands there can be no thing
 JUMP_M = 0.5  # between two pictures: the odometry has restarted
 MAX_POINTS = 1500
+LEAST_KNOWN = 0.8  # share of the pixels whose rays follow from the intrinsics
 CHECK_TICKS = 5  # without pictures, between two looks at what is remembered
 
 
@@ -222,6 +223,8 @@ def _look(
         return marks, "camera_wrong", f"sends what is no picture: {error}"[:300]
     pose, up = place
     view = view_of(body, camera, up)
+    if view.known < LEAST_KNOWN:
+        return marks, "camera_wrong", "has a distortion in its file that no lens has"
     dark = blind(camera, view, picture)
     wanted = view._replace(sure=np.zeros_like(view.sure)) if dark else view
     found = sight(body, camera, wanted, picture)

@@ -21,7 +21,8 @@ from gigabrain_zenoh.geometry.sweep import edges, radius
 MOUNT_M, MOUNT_RAD = 0.005, math.radians(0.5)  # to which the mounting of a camera is known
 NOISE_PER_M2, SIGMAS = 0.0015, 3.0  # [1/m], the deviation of a depth z is this times z^2
 MEMORY_M = 0.3  # beyond the stopping distance, what is seen is remembered
-UNDISTORT_STEPS = 20
+UNDISTORT_STEPS, UNDISTORTED = 20, 1e-3  # and how far off a ray may be then, 1 m ahead
+WIDEST = 20.0  # [m] aside of what is 1 m ahead: no lens sees that
 NEVER = 65535  # [mm], a depth that no pixel has
 SURE_NEAR_M, SURE_SHARE = 0.05, 0.8  # beyond depth_min, of depth_max: the floor must be seen there
 ALIKE_M, ALIKE_SHARE = 0.015, 0.02  # by which depths on one surface differ from pixel to pixel
@@ -48,6 +49,7 @@ class View(NamedTuple):
     floor: NDArray[np.float32]  # (h, w) [m], depth at which the ray meets the floor
     sure: Mask  # the floor is so near that it must be seen, or what stands on it
     upright: bool  # columns of the picture are vertical
+    known: float  # share of the pixels whose ray is known
 
 
 class Sighting(NamedTuple):
@@ -77,7 +79,7 @@ def view_of(body: BodyDescription, camera: Camera, up: Up = (0.0, 0.0)) -> View:
     if it fills three pixels. A body that is tilted stands on a slope, or on a sill: nothing is an
     obstacle that would be the floor of one of the two.
     """
-    mount, rays = np.array((camera.x, camera.y, camera.z)), _rays(camera)
+    mount, (rays, known) = np.array((camera.x, camera.y, camera.z)), _rays(camera)
     level = _floor(camera, body, mount, rays, np.array((0.0, 0.0, 1.0)))
     if up != (0.0, 0.0):
         z = math.sqrt(max(0.0, 1.0 - up[0] ** 2 - up[1] ** 2))
@@ -93,25 +95,29 @@ def view_of(body: BodyDescription, camera: Camera, up: Up = (0.0, 0.0)) -> View:
     within = np.minimum(np.minimum(above, top), _reach(mount, rays, reach_of(body)))
     crossing = mount[:2] + np.minimum(floor, 1e6)[..., None] * rays[..., :2]
     away = np.hypot(crossing[..., 0], crossing[..., 1])
-    near = (away <= reach_of(body)) & (outside(edges(body.footprint), crossing) > 0)
+    near = known & (away <= reach_of(body)) & (outside(edges(body.footprint), crossing) > 0)
     sure = near & (floor >= camera.depth_min + SURE_NEAR_M)
     sure &= floor <= SURE_SHARE * camera.depth_max
     return View(
         mount=mount,
         rays=rays.astype(np.float32),
         flat=flat.astype(np.float32),
-        above=_millimetres(above),
+        above=np.where(known, _millimetres(above), np.uint16(NEVER)),
         own=_millimetres(_inside(body, mount, rays)),
-        within=_millimetres(np.minimum(within, camera.depth_max)),
+        within=np.where(known, _millimetres(np.minimum(within, camera.depth_max)), np.uint16(0)),
         below=np.where(near, _millimetres(below), np.uint16(NEVER)),
         floor=floor.astype(np.float32),
         sure=sure,
         upright=abs(math.cos(camera.roll)) >= abs(math.sin(camera.roll)),
+        known=float(known.mean()),
     )
 
 
-def _rays(camera: Camera) -> Floats:
-    """Return the direction of every second pixel in the body's frame, (h, w, 3), 1 m of depth."""
+def _rays(camera: Camera) -> tuple[Floats, Mask]:
+    """Return the direction of every second pixel in the body's frame, (h, w, 3), 1 m of depth.
+
+    And the pixels (h, w) for which that is known: no light reaches the others through the lens.
+    """
     fx, fy, cx, cy = camera.pinhole
     right, down = np.meshgrid(
         (np.arange(0, camera.width, 2) - cx) / fx, (np.arange(0, camera.height, 2) - cy) / fy
@@ -119,8 +125,11 @@ def _rays(camera: Camera) -> Floats:
     seen_x, seen_y = right, down
     for _ in range(UNDISTORT_STEPS if camera.distortion else 0):
         x, y = _distorted(camera, right, down)
-        right, down = right + (seen_x - x), down + (seen_y - y)
-    return np.stack([np.ones_like(right), -right, -down], axis=-1) @ turn_of(camera).T
+        right = (right + (seen_x - x)).clip(-WIDEST, WIDEST)
+        down = (down + (seen_y - y)).clip(-WIDEST, WIDEST)
+    x, y = _distorted(camera, right, down)
+    rays = np.stack([np.ones_like(right), -right, -down], axis=-1) @ turn_of(camera).T
+    return rays, np.hypot(x - seen_x, y - seen_y) < UNDISTORTED
 
 
 def _distorted(camera: Camera, x: Floats, y: Floats) -> tuple[Floats, Floats]:

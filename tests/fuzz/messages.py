@@ -2,22 +2,34 @@
 
 import itertools
 import math
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
 import msgspec
+import numpy as np
+from msgspec.structs import replace
 
-from gigabrain_schemas.base import Message
-from gigabrain_schemas.brain import OccupancyGrid
+from gigabrain_schemas.base import Message, Pose
+from gigabrain_schemas.body import Camera
+from gigabrain_schemas.brain import OccupancyGrid, WorldModel
 from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_schemas.topics import messages
+from gigabrain_schemas.vision import DepthImage
 from gigabrain_zenoh.codec import MAX_ERROR_CHARS
+from gigabrain_zenoh.decision.contours import ContourFilter
+from gigabrain_zenoh.geometry.pose import PoseHistory
+from gigabrain_zenoh.navigation.contours import ContourMemory, placed
 from gigabrain_zenoh.qa.faults.hostile import codec_of, hostile_payloads, leaves
+from gigabrain_zenoh.safety.cameras import MAX_POINTS, Cameras, Picture
+from gigabrain_zenoh.testing.samples import WAFFLE, state
 from tests.fuzz.harness import split
 
 CODECS = {message.__name__: codec_of(message) for message in messages()}
 NAMES = sorted(CODECS)
+HERE = Pose(x=0.0, y=0.0, yaw=0.0)
+MOST_PIXELS = 400  # of a side
 
 
 def check(data: bytes) -> None:
@@ -58,6 +70,37 @@ def used(message: Message) -> None:
         assert message.array().shape == (message.height, message.width)
     elif isinstance(message, Image) and message.encoding != "jpeg":
         assert message.array().shape[:2] == (message.height, message.width)
+    elif isinstance(message, DepthImage):
+        looked_at(message)
+    elif isinstance(message, WorldModel):
+        planned_by(message)
+
+
+def looked_at(picture: DepthImage) -> None:
+    """It is unpacked or refused, and safety bears it from a camera of its size."""
+    for unpack, shrunk in ((picture.array, 1), (picture.quarter, 2)):
+        try:
+            shape = unpack().shape
+        except ValueError as error:
+            told(str(error))
+        else:
+            assert shape == (picture.height // shrunk, picture.width // shrunk)
+    if max(picture.width, picture.height) > MOST_PIXELS:
+        return  # such a camera takes as long as it takes
+    camera = Camera(name="front", depth=True, width=picture.width, height=picture.height, z=0.1)
+    pictures = {"front": Picture(image=replace(picture, basis=1))}
+    seen = Cameras().then(replace(WAFFLE, cameras=(camera,)), pictures, state(1), PoseHistory())
+    assert seen.pictures == 1
+    assert len(seen.obstacles(HERE)) <= MAX_POINTS
+
+
+def planned_by(world: WorldModel) -> None:
+    """What its contours mean can be told and planned by."""
+    merged = ContourFilter(Counter()).merged(world, WAFFLE)
+    assert len(merged.contours) <= len(world.contours)
+    memory = ContourMemory()
+    memory.update(1, HERE, WAFFLE, placed(merged.contours, HERE))
+    assert np.isfinite(memory.points).all()
 
 
 def seeds() -> Iterator[bytes]:

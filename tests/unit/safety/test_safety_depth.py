@@ -333,6 +333,32 @@ def test_random_pictures_are_borne() -> None:
     assert drive.verdict.verdict in ("ok", "slow")
 
 
+def test_cameras_of_all_kinds_and_places_are_borne() -> None:
+    """On the floor, over the body, looking up, back and down, with lenses that bend all."""
+    random = np.random.default_rng(3)
+    for number in range(60):
+        camera = replace(
+            CAMERA,
+            width=64,
+            height=48,
+            field_of_view=random.uniform(0.1, 3.0),
+            distortion=tuple(random.uniform(-100.0, 100.0, number % 9).tolist()),
+            depth_min=random.choice((0.0, 0.25, 5.0)),
+            depth_max=random.choice((5.1, 1000.0)),
+            x=random.uniform(-10, 10),
+            z=random.choice((-10.0, 0.0, 0.1, 10.0)),
+            roll=random.uniform(-4, 4),
+            pitch=random.choice((0.0, 1.57, -1.57, random.uniform(-4, 4))),
+            yaw=random.uniform(-4, 4),
+        )
+        body = replace(SEEING, cameras=(camera,))
+        pixels = random.integers(0, random.choice((1000, 65536)), (48, 64))
+        drive = Drive.__new__(Drive)
+        drive.__dict__.update(Drive(Scene(), body=replace(SEEING, cameras=())).__dict__, body=body)
+        drive.go(20, AHEAD, lambda seen, pixels=pixels: image(pixels, seen.tick))  # type: ignore[misc]
+        assert drive.memory.field.cameras.pictures >= 4
+
+
 def test_a_camera_turned_upright_sees_the_same() -> None:
     camera = replace(CAMERA, roll=math.pi / 2, width=240, height=320, intrinsics=None)
     body = replace(SEEING, cameras=(camera,))
