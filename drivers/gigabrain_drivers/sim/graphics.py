@@ -1,6 +1,7 @@
 """OpenGL without a window: EGL, else OSMesa. `python -m` this, to check for it."""
 
 import importlib
+import logging
 import os
 import sys
 from typing import Any
@@ -20,6 +21,7 @@ def open_graphics(width: int, height: int) -> Any:
     MUJOCO_GL may choose one of `egl` and `osmesa`. Raises ConfigError naming the packages that are
     missing.
     """
+    logging.getLogger("OpenGL.acceleratesupport").setLevel(logging.WARNING)
     chosen = os.environ.get("MUJOCO_GL", "").lower()
     problems = []
     for name in (chosen,) if chosen in BACKENDS else BACKENDS:
