@@ -9,8 +9,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from gigabrain_zenoh.qa.train import net
-from gigabrain_zenoh.qa.train.studio import HEIGHT, WIDTH
-from gigabrain_zenoh.qa.train.targets import STRIDE_PX
+from gigabrain_zenoh.vision.recognizer import HEIGHT_PX, STRIDE_PX, WIDTH_PX
 
 OPSET, IR_VERSION = 13, 8
 
@@ -81,13 +80,13 @@ def model(params: net.Params, moments: net.Params) -> onnx.ModelProto:
     """Return the net for one picture (1, 3, 240, 320), 0 to 1, with a fixed shape."""
     ops = OnnxOps(net.fold(params, moments))
     last = net.network(ops, "picture")
-    shape = [1, net.OUTPUTS, HEIGHT // STRIDE_PX, WIDTH // STRIDE_PX]
+    shape = [1, net.OUTPUTS, HEIGHT_PX // STRIDE_PX, WIDTH_PX // STRIDE_PX]
     ops.nodes[-1].output[0] = "cells"
     assert last == f"t{len(ops.nodes) - 1}", "the last node answers"
     graph = helper.make_graph(
         ops.nodes,
         "things",
-        [helper.make_tensor_value_info("picture", TensorProto.FLOAT, [1, 3, HEIGHT, WIDTH])],
+        [helper.make_tensor_value_info("picture", TensorProto.FLOAT, [1, 3, HEIGHT_PX, WIDTH_PX])],
         [helper.make_tensor_value_info("cells", TensorProto.FLOAT, shape)],
         ops.numbers,
     )

@@ -16,16 +16,21 @@ import optax
 
 from gigabrain_zenoh.qa.train import net
 from gigabrain_zenoh.qa.train.pictures import Labelled
-from gigabrain_zenoh.qa.train.studio import HEIGHT, WIDTH
-from gigabrain_zenoh.qa.train.targets import STRIDE_PX, augment, targets
+from gigabrain_zenoh.qa.train.targets import augment, targets
 from gigabrain_zenoh.vision.labels import CLASSES
+from gigabrain_zenoh.vision.recognizer import (
+    HEIGHT_PX,
+    RAW_LIMITS,
+    STRIDE_PX,
+    UNIT_PX,
+    WIDTH_PX,
+)
 
 BATCH = 16
 PEAK_RATE, WEIGHT_DECAY, WARM_UP_STEPS = 2.5e-3, 2e-2, 200
 BOX_WEIGHT = 4.0
 AVERAGED = 0.998  # of the weights that are exported, a step
 SAVE_EVERY_STEPS = 100
-UNIT_PX = 16.0  # distance of a side at raw 0
 log = logging.getLogger(__name__)
 
 
@@ -52,7 +57,7 @@ def heat_loss(logits: Any, heat: Any, mask: Any) -> Any:
 
 def corners(raw: Any) -> Any:
     """Return boxes (n, h, w, 4) [px] from raw distances to left, top, right, bottom."""
-    d = UNIT_PX * jnp.exp(jnp.clip(raw, -4.0, 3.5))
+    d = UNIT_PX * jnp.exp(jnp.clip(raw, *RAW_LIMITS))
     x = (jnp.arange(raw.shape[2]) + 0.5) * STRIDE_PX
     y = (jnp.arange(raw.shape[1]) + 0.5)[:, None] * STRIDE_PX
     return jnp.stack([x - d[..., 0], y - d[..., 1], x + d[..., 2], y + d[..., 3]], -1)
@@ -102,7 +107,7 @@ def batches(pictures: Sequence[Labelled], steps: range, seed: int) -> Iterator[B
     def make(number: int) -> Batch:
         rng = np.random.default_rng([seed, number])
         made = [augment(rng, pictures[k]) for k in rng.integers(len(pictures), size=BATCH)]
-        parts = [targets(one, HEIGHT, WIDTH) for _, one in made]
+        parts = [targets(one, HEIGHT_PX, WIDTH_PX) for _, one in made]
         return (
             np.stack([p for p, _ in made]),
             *(np.stack(part) for part in zip(*parts, strict=True)),

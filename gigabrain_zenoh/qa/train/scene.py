@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from gigabrain_zenoh.qa.train import textures
 from gigabrain_zenoh.qa.train.distractors import OCCLUDERS, is_table
 from gigabrain_zenoh.qa.train.looks import Random, about
-from gigabrain_zenoh.qa.train.studio import HEIGHT, RGB, WIDTH, Studio, Thing
+from gigabrain_zenoh.qa.train.studio import RGB, Studio, Thing
 from gigabrain_zenoh.vision.labels import CLASSES
+from gigabrain_zenoh.vision.recognizer import HEIGHT_PX, WIDTH_PX
 
 FAR_M = 4.0
 MAX_THINGS = 6
@@ -255,7 +256,7 @@ class StudioScene:
     def _put(self, thing: Thing, distance: float, bearing: float | None = None) -> bool:
         """Put a thing on the floor where nothing stands; return whether there was room."""
         rng, look = self._rng, thing.look
-        half = math.atan(math.tan(self._fovy / 2) * WIDTH / HEIGHT)
+        half = math.atan(math.tan(self._fovy / 2) * WIDTH_PX / HEIGHT_PX)
         for _ in range(TRIES if bearing is None else 1):
             angle = rng.uniform(-half, half) * 0.95 if bearing is None else bearing
             x, y = distance * math.cos(angle), distance * math.sin(angle)

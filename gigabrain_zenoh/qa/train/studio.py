@@ -15,8 +15,8 @@ from gigabrain_zenoh.qa.train import textures
 from gigabrain_zenoh.qa.train.distractors import draw_all
 from gigabrain_zenoh.qa.train.drawing import Drawing
 from gigabrain_zenoh.qa.train.looks import MAKERS, Geom, Look, Random
+from gigabrain_zenoh.vision.recognizer import HEIGHT_PX, WIDTH_PX
 
-WIDTH, HEIGHT = 320, 240
 VARIANTS = 2  # looks of each class in one studio
 CUBE_TEXTURES, FLAT_TEXTURES = 14, 8
 CUBE_PX, FLAT_PX = 48, 192
@@ -72,7 +72,7 @@ class Studio:
         self._options = mujoco.MjvOption()
         self._options.geomgroup[:] = self._options.sitegroup[:] = 0
         self._options.geomgroup[SHOWN] = 1
-        self._drawing = Drawing(self.model, 0, WIDTH, HEIGHT)
+        self._drawing = Drawing(self.model, 0, WIDTH_PX, HEIGHT_PX)
 
     def close(self) -> None:
         """Free what OpenGL holds."""
@@ -123,7 +123,7 @@ class Studio:
 
 def _compile(looks: list[Look], bodies: Iterable[str]) -> mujoco.MjModel:
     spec = mujoco.MjSpec()
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = WIDTH, HEIGHT
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = WIDTH_PX, HEIGHT_PX
     spec.visual.quality.shadowsize = 1024
     spec.visual.map.znear, spec.visual.map.zfar = 0.01, 30.0
     spec.stat.extent, spec.stat.center = 1.0, (2.0, 0, 0.5)

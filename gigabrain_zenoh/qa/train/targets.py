@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from gigabrain_zenoh.qa.train.looks import Random
 from gigabrain_zenoh.qa.train.pictures import Labelled, degrade
 from gigabrain_zenoh.vision.labels import CLASSES
+from gigabrain_zenoh.vision.recognizer import STRIDE_PX
 
-STRIDE_PX = 4
 CORE = 0.54  # share of a box in which cells answer for it
 ZOOM = (0.85, 1.45)
 MIN_LEFT = 0.45  # share of a box that must be left by cutting, or it is to be ignored
