@@ -26,6 +26,8 @@ class CameraOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     source: str  # one of gigabrain_drivers.CAMERAS, or of a package's
     encoding: Literal["jpeg", "bgr8"] = "jpeg"  # of its pictures on the bus
     quality: Annotated[int, Meta(ge=1, le=100)] = 80  # of a JPEG
+    repeat: bool = False  # whether a film or a recording begins again at its end
+    repeats: bool = False  # a still scene may give the same picture twice, as in strong compression
 
 
 class CameraLost(GigabrainError):
@@ -57,7 +59,6 @@ class CameraSource(abc.ABC):
     """
 
     Options: ClassVar[type[CameraOptions]] = CameraOptions  # its part of a robot's file
-    repeats = False  # whether a still scene gives the same bits twice, so that repeats are no fault
 
     def __init__(self, options: Any, camera: Camera, site: CameraSite) -> None:
         self.options, self.camera, self.site = options, camera, site

@@ -20,8 +20,6 @@ class OpenCvOptions(CameraOptions, frozen=True, kw_only=True, forbid_unknown_fie
     """What OpenCV opens."""
 
     device: str  # /dev/video0, its number, rtsp://..., http://..., or a file beside the robot's
-    repeat: bool = False  # whether a file begins again at its end
-    repeats: bool = False  # a still scene may give the same picture twice, as in strong compression
 
 
 class OpenCvCamera(CameraSource):

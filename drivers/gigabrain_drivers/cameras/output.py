@@ -103,7 +103,8 @@ class CameraOutput:
             bus.publish(IMAGE, packed.picture, **header)
 
     def lose(self, problem: str) -> None:
-        """Note why there are no pictures."""
+        """Note why there are no pictures; those of another start are judged by themselves."""
+        self.restart()
         self._lost = problem
         self._look()
 

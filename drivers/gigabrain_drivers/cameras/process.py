@@ -126,7 +126,7 @@ class CameraProcess:
     def _output(self, one: LinkedCamera) -> CameraOutput:
         """Return the output of a camera, which in a simulation goes by the robot's time."""
         bus, drawn = self._bus, one.options.source == RENDERED
-        repeats = not drawn and source_class(one.options.source).repeats
+        repeats = one.options.repeats or one.options.repeat
 
         def now_s() -> float:
             return bus.time.tick * TICK_S if drawn else bus.clock.now_ns() / 1e9

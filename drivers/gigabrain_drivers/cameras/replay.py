@@ -23,7 +23,6 @@ class ReplayOptions(CameraOptions, frozen=True, kw_only=True, forbid_unknown_fie
 
     file: str  # beside the robot's file
     camera: str = ""  # of the recording; empty: the one of this name
-    repeat: bool = True  # whether it begins again at its end
 
 
 class Recorded(NamedTuple):

@@ -156,7 +156,7 @@ def test_a_recording_gives_picture_and_depth_of_one_exposure_together(
     tmp_path: Path, slept: list[float]
 ) -> None:
     recording(tmp_path / "drive.mcap")
-    source = replayed(tmp_path)
+    source = replayed(tmp_path, repeat=True)
     source.open()
     frames = [source.read() for _ in range(6)]  # it begins again
     depths = [int(one.depth.max()) for one in frames if one.depth is not None]
@@ -169,7 +169,7 @@ def test_a_recording_gives_picture_and_depth_of_one_exposure_together(
 
 def test_a_recording_may_end(tmp_path: Path, slept: list[float]) -> None:
     recording(tmp_path / "drive.mcap")
-    source = replayed(tmp_path, repeat=False)
+    source = replayed(tmp_path)
     source.open()
     for _ in GREYS:
         source.read()

@@ -1,0 +1,155 @@
+"""Cameras that are read: a source that hangs, is lost, or sends the wrong thing harms nobody."""
+
+import asyncio
+import functools
+import threading
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gigabrain_drivers.cameras import process as camera_process
+from gigabrain_drivers.cameras.base import CameraLost, CameraSource, Frame
+from gigabrain_drivers.cameras.opencv import OpenCvCamera
+from gigabrain_schemas.topics import CAMERA, IMAGE, STATE
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.config.settings import CameraConfig
+from gigabrain_zenoh.testing import samples
+from gigabrain_zenoh.testing.waiting import until
+from tests.places import ROOT
+
+BODIES = ROOT / "drivers" / "gigabrain_drivers" / "bodies"
+MODEL = BODIES / "turtlebot3_waffle" / "model.xml"
+SOURCE = "cameras: {front: {source: opencv, device: x}}"
+ROBOT = (
+    (BODIES / "turtlebot3_waffle" / "robot.yaml")
+    .read_text()
+    .replace(
+        "sim: {", f"sim: {{model: {MODEL}, cameras: {{front: {{source: opencv, device: x}}}}, "
+    )
+    .replace("depth: true", "depth: false")
+)
+SIZE = (240, 320, 3)
+
+
+class Scripted(CameraSource):
+    """A camera whose next exposures the test chooses."""
+
+    opened = 0
+    hangs = threading.Event()
+    lost, size = "", SIZE
+    random = np.random.default_rng(1)
+
+    def open(self) -> None:
+        type(self).opened += 1
+        if self.lost:
+            raise CameraLost(self.lost)
+
+    def read(self) -> Frame:
+        threading.Event().wait(0.02)
+        while self.hangs.is_set():
+            threading.Event().wait(0.01)
+        if self.lost:
+            raise CameraLost(self.lost)
+        blocks = self.random.integers(30, 220, (15, 20, 3), np.uint8)
+        picture = np.kron(blocks, np.ones((16, 16, 1), np.uint8))
+        return Frame(picture[: self.size[0], : self.size[1]])
+
+    def close(self) -> None: ...
+
+
+@pytest.fixture(autouse=True)
+def scripted(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    Scripted.opened, Scripted.lost, Scripted.size = 0, "", SIZE
+    Scripted.hangs.clear()
+    monkeypatch.setattr(Scripted, "Options", OpenCvCamera.Options)
+    monkeypatch.setattr(camera_process, "source_class", lambda _: Scripted)
+    yield
+    Scripted.hangs.clear()
+
+
+@asynccontextmanager
+async def running(tmp_path: Path) -> AsyncIterator[tuple[Bus, dict[str, list[Any]]]]:
+    (tmp_path / "robot.yaml").write_text(ROBOT)
+    network = LocalNetwork()
+    bus, robot = (Bus(network.transport(), Clock(), name) for name in ("camera", "driver"))
+    heard: dict[str, list[Any]] = {"image": [], "camera": []}
+    robot.subscribe(IMAGE, lambda _, message: heard["image"].append(message))
+    robot.subscribe(CAMERA, lambda _, message: heard["camera"].append(message))
+    robot.time.boot, robot.time.tick = samples.BOOT, 40
+    config = CameraConfig(body=str(tmp_path / "robot.yaml"))
+    task = asyncio.ensure_future(functools.partial(camera_process.run, config)(bus, lambda: None))
+    try:
+        await asyncio.sleep(0)
+        robot.publish(STATE, samples.state(40))
+        await until(lambda: heard["image"] or task.done(), "a picture")
+        yield bus, heard
+        assert not task.done()
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        await bus.close()
+        await robot.close()
+
+
+def problem(heard: dict[str, list[Any]]) -> str:
+    return heard["camera"][-1].problem if heard["camera"] else ""
+
+
+async def test_a_picture_has_the_newest_tick_and_a_new_stamp(tmp_path: Path) -> None:
+    async with running(tmp_path) as (bus, heard):
+        await until(lambda: heard["image"][-1].tick == 40, "the robot's tick")
+        newest = heard["image"][-1]
+        assert (newest.basis, newest.boot, newest.encoding) == (40, samples.BOOT, "jpeg")
+        assert 0 <= bus.clock.unix_ns() - newest.stamp_ns < 10**9
+
+
+async def test_a_source_that_hangs_is_named_and_the_process_goes_on(tmp_path: Path) -> None:
+    async with running(tmp_path) as (bus, heard):
+        Scripted.hangs.set()
+        await until(lambda: problem(heard) == "no picture", "the silence")
+        assert bus.progress()
+        Scripted.hangs.clear()
+        await until(lambda: problem(heard) == "", "the end of it")
+
+
+async def test_a_source_that_is_lost_is_opened_again(tmp_path: Path) -> None:
+    async with running(tmp_path) as (_, heard):
+        Scripted.lost = "the cable is out"
+        await until(lambda: problem(heard) == "no picture: the cable is out", "the loss")
+        await until(lambda: Scripted.opened >= 3, "more tries")
+        Scripted.lost = ""
+        before = len(heard["image"])
+        await until(lambda: len(heard["image"]) > before + 3, "pictures")
+        assert problem(heard) == ""
+
+
+async def test_a_picture_of_another_size_is_withheld_and_said(tmp_path: Path) -> None:
+    async with running(tmp_path) as (_, heard):
+        Scripted.size = (200, 320, 3)
+        await until(lambda: "320 x 200" in problem(heard), "the size")
+        assert problem(heard) == "pictures of 320 x 200 pixels; the body's file says 320 x 240"
+        before = len(heard["image"])
+        await asyncio.sleep(0.2)
+        assert len(heard["image"]) == before
+        Scripted.size = SIZE
+        await until(lambda: problem(heard) == "", "the end of it")
+
+
+async def test_a_source_that_breaks_ends_the_process_with_its_own_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(_: Scripted) -> Frame:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(Scripted, "read", broken)
+    (tmp_path / "robot.yaml").write_text(ROBOT)
+    bus = Bus(LocalNetwork().transport(), Clock(), "camera")
+    with pytest.raises(ZeroDivisionError):
+        await camera_process.run(CameraConfig(body=str(tmp_path / "robot.yaml")), bus, lambda: None)
+    await bus.close()
