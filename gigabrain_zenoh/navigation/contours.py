@@ -11,7 +11,7 @@ from gigabrain_schemas.base import TICK_NS, Pose
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import Contour
 from gigabrain_zenoh.geometry.se2 import from_pose, transform
-from gigabrain_zenoh.navigation.zones import fill
+from gigabrain_zenoh.navigation.zones import EDGE_STEP, spread
 
 CELL_M = 0.05  # of remembered points
 NEAR_M = 1.5  # of the body, within which perception itself remembers what is there
@@ -23,6 +23,61 @@ MAX_POINTS = 20_000
 def placed(contours: Sequence[Contour], pose: Pose) -> tuple[Floats, ...]:
     """Return the polygons (n, 2) [m] of `contours`, seen from a body at `pose`."""
     return tuple(transform(from_pose(pose), np.array(one.polygon)) for one in contours)
+
+
+def covered(polygons: Sequence[Floats], side: int) -> NDArray[np.bool_]:
+    """Return the cells (side, side) in any of the `polygons` (n, 2), in cells, or that they touch.
+
+    All are filled at once, each whichever way round it goes: 128 of them in 3 ms.
+    """
+    if not polygons:
+        return np.zeros((side, side), np.bool_)
+    corners = np.concatenate(polygons)
+    counts = np.array([len(one) for one in polygons])
+    first = np.cumsum(counts) - counts
+    following = np.arange(1, len(corners) + 1)
+    following[first + counts - 1] = first
+    ends = corners[following]
+    doubled = corners[:, 0] * ends[:, 1] - ends[:, 0] * corners[:, 1]
+    sign = np.where(np.add.reduceat(doubled, first) < 0, -1, 1).astype(np.int16)
+    mask = _inside(corners, ends, np.repeat(sign, counts), side)
+    begin, along = _within(corners, ends, side)
+    edge, step = spread(np.ceil(np.abs(along).max(axis=1) / EDGE_STEP).astype(np.intp) + 1)
+    share = step * EDGE_STEP / np.maximum(np.abs(along).max(axis=1), EDGE_STEP)[edge]
+    points = begin[edge] + np.minimum(share, 1.0)[:, None] * along[edge]
+    columns, rows = points[((points >= 0) & (points < side)).all(axis=1)].astype(np.intp).T
+    mask[rows, columns] = True
+    return mask
+
+
+def _inside(corners: Floats, ends: Floats, sign: NDArray[np.int16], side: int) -> NDArray[np.bool_]:
+    """Return the cells (side, side) whose middle is in a polygon, by its winding number."""
+    crossings = np.zeros((side, side + 1), np.int16)  # before a cell's middle
+    both = np.ceil(np.stack((corners[:, 1], ends[:, 1])) - 0.5).clip(0, side).astype(np.intp)
+    least, most = both.min(axis=0), both.max(axis=0)
+    edge, rows = spread(most - least)
+    rows += least[edge]
+    (x, y), (to_x, to_y) = corners[edge].T, ends[edge].T
+    at = x + (rows + 0.5 - y) / np.where(to_y == y, 1.0, to_y - y) * (to_x - x)
+    columns = np.ceil(at - 0.5).clip(0, side).astype(np.intp)
+    np.add.at(crossings, (rows, columns), np.where(to_y < y, sign[edge], -sign[edge]))
+    inside: NDArray[np.bool_] = np.cumsum(crossings[:, :-1], axis=1, dtype=np.int16) != 0
+    return inside
+
+
+def _within(corners: Floats, ends: Floats, side: int) -> tuple[Floats, Floats]:
+    """Return where edges enter the square of `side`, and how they go on in it, (n, 2) each.
+
+    Liang and Barsky, A new concept and method for line clipping, ACM TOG 1984.
+    """
+    along = ends - corners
+    with np.errstate(divide="ignore", invalid="ignore"):
+        low, high = -corners / along, (side - corners) / along
+    still = along == 0.0
+    enter = np.where(still, 0.0, np.minimum(low, high)).max(axis=1).clip(0.0, 1.0)
+    leave = np.where(still, 1.0, np.maximum(low, high)).min(axis=1).clip(0.0, 1.0)
+    length = np.maximum(leave - enter, 0.0)
+    return corners + enter[:, None] * along, length[:, None] * along
 
 
 class ContourMemory:
@@ -76,10 +131,7 @@ def _cells_of(contours: Sequence[Floats], here: Pose) -> NDArray[np.int64]:
     """Return the cells (n, 2), columns first, that polygons cover within FAR_M of `here`."""
     side = round(2 * FAR_M / CELL_M)
     corner = np.floor((np.array((here.x, here.y)) - FAR_M) / CELL_M).astype(np.float64)
-    covered = np.zeros((side, side), np.uint8)
-    for polygon in contours:
-        fill(covered, polygon / CELL_M - corner, 1)
-    rows, columns = np.nonzero(covered)
+    rows, columns = np.nonzero(covered([one / CELL_M - corner for one in contours], side))
     return np.column_stack((columns, rows)).astype(np.int64) + corner.astype(np.int64)
 
 

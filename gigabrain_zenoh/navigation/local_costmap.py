@@ -17,6 +17,7 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_NS
 from gigabrain_zenoh.kernels.images import connected_parts
 from gigabrain_zenoh.kernels.jit import kernel
+from gigabrain_zenoh.navigation.contours import covered
 from gigabrain_zenoh.navigation.footprint import FAR, DistanceGrid
 from gigabrain_zenoh.navigation.zones import fill
 
@@ -284,12 +285,14 @@ class LocalCostmap:
         moving: Floats,
         keepouts: Sequence[Floats] = (),
         body: Floats | None = None,
+        contours: Sequence[Floats] = (),
     ) -> DistanceGrid:
         """Return distances to the nearest obstacle, seen or among the `known` points (n, 2) [m].
 
         Recent hits on one of the discs `moving` do not count: it will be elsewhere soon. Polygons
-        `keepouts` (m, 2) [m] are obstacles; those that a point of the `body` (k, 2) [m] is in only
-        where it would be farther inside. So it can leave, and sees the obstacles in there.
+        `keepouts` and `contours` (m, 2) [m] are obstacles; those that a point of the `body` (k, 2)
+        [m] is in only where it would be farther inside. So it can leave, and sees the obstacles in
+        there.
         """
         free = (self._held.level == 0).view(np.uint8)
         if len(moving):
@@ -302,15 +305,20 @@ class LocalCostmap:
             cells = np.floor((known - (self.x, self.y)) / CELL_M).astype(np.int64)
             cells = cells[((cells >= 0) & (cells < self.cells)).all(axis=1)]
             free[cells[:, 1], cells[:, 0]] = 0
-        if len(keepouts):
-            free[self._keep_out(keepouts, body)] = 0
+        if len(keepouts) or len(contours):
+            free[self._keep_out(keepouts, contours, body)] = 0
         return DistanceGrid(self._chamfer.distance(free), CELL_M, self.x, self.y)
 
-    def _keep_out(self, keepouts: Sequence[Floats], body: Floats | None) -> NDArray[np.bool_]:
-        """Return the cells (side, side) that zones keep the body out of."""
+    def _keep_out(
+        self, keepouts: Sequence[Floats], contours: Sequence[Floats], body: Floats | None
+    ) -> NDArray[np.bool_]:
+        """Return the cells (side, side) that zones and contours keep the body out of."""
         zones = np.zeros((self.cells, self.cells), np.uint8)
         for corners in keepouts:
             fill(zones, (corners - (self.x, self.y)) / CELL_M, 1)
+        if len(contours):
+            seen = [(corners - (self.x, self.y)) / CELL_M for corners in contours]
+            zones[covered(seen, self.cells)] = 1
         if body is None:
             return zones > 0
         at = np.floor((body - (self.x, self.y)) / CELL_M).astype(np.int64).clip(0, self.cells - 1)

@@ -299,8 +299,8 @@ class LocalPlanner:
     def _scene(self, moment: PlanRequest, discs: Floats) -> Scene:
         goal = moment.goal
         body = transform(from_pose(moment.pose), self._rim)
-        closed = (*moment.keepouts, *dynamic_obstacles.standing(moment.contours, discs))
-        grid = self._window.grid(moment.tick, moment.known, discs, closed, body)
+        seen = dynamic_obstacles.standing(moment.contours, discs)
+        grid = self._window.grid(moment.tick, moment.known, discs, moment.keepouts, body, seen)
         ways = self._traffic.ways((goal.x, goal.y)) if self._traffic else None
         to, aside = (goal.x, goal.y), self._half_width
         field = self._costs.field(grid, aside, to, moment.path, ways, moment.avoid)

@@ -11,7 +11,8 @@ from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import Camera
 from gigabrain_schemas.brain import Contour
 from gigabrain_schemas.tasks import Goal
-from gigabrain_zenoh.navigation.contours import KEPT_TICKS, ContourMemory, placed
+from gigabrain_zenoh.geometry import polygon
+from gigabrain_zenoh.navigation.contours import KEPT_TICKS, ContourMemory, covered, placed
 from gigabrain_zenoh.navigation.dynamic_obstacles import standing
 from gigabrain_zenoh.navigation.local_planner import LocalPlan, PlanRequest
 from tests.unit.navigation.drives import WAFFLE, Drive, wall
@@ -100,6 +101,28 @@ def test_polygons_are_placed_where_the_body_is() -> None:
     one = Contour(polygon=((1.0, 0.0), (2.0, 0.0), (2.0, 1.0)), bottom=0.0, top=0.1)
     (found,) = placed((one,), Pose(x=1.0, y=2.0, yaw=math.pi / 2))
     assert found == pytest.approx(np.array(((1.0, 3.0), (1.0, 4.0), (0.0, 4.0))))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_polygons_cover_the_cells_that_each_of_them_covers(seed: int) -> None:
+    random, polygons = np.random.default_rng(seed), []
+    for _ in range(int(random.integers(1, 8))):
+        angles = np.sort(random.uniform(0, math.tau, int(random.integers(3, 9))))
+        radii = random.uniform(0.2, 15.0, len(angles))
+        corners = np.column_stack((np.cos(angles), np.sin(angles))) * radii[:, None]
+        corners += random.uniform(-10, 50, 2)
+        polygons.append(corners[:: random.choice((-1, 1))])
+    middles = np.stack(np.meshgrid(np.arange(40) + 0.5, np.arange(40) + 0.5), axis=-1)
+    away = np.min([polygon.distance(one, middles.reshape(-1, 2)) for one in polygons], axis=0)
+    found = covered(polygons, 40).ravel()
+    assert found[away == 0.0].all()  # its middle is inside
+    assert away[found].max(initial=0.0) <= 0.71  # else an edge crosses it
+    near = away <= 0.2
+    assert np.count_nonzero(found[near]) >= 0.95 * np.count_nonzero(near)
+
+
+def test_no_polygons_cover_nothing() -> None:
+    assert not covered([], 10).any()
 
 
 class TestContourMemory:
