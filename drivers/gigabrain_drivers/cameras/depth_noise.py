@@ -39,11 +39,15 @@ class DepthSensor:
 
     def __init__(self, camera: Camera, seed: int, errors: DepthErrors = SENSOR) -> None:
         self._camera, self._errors = camera, errors
-        key = (Stream.CAMERA, zlib.crc32(camera.name.encode()))
-        mounting, pixels = np.random.SeedSequence(seed, spawn_key=key).spawn(2)
-        self.mounted = _displaced(camera, errors, np.random.default_rng(mounting))
+        self._key = (seed, Stream.CAMERA, zlib.crc32(camera.name.encode()))
+        self.mounted = _displaced(camera, errors, np.random.default_rng(self._key))
         # where it really sits: render from there; everybody else knows only its file
-        self._random = np.random.default_rng(np.random.SFC64(pixels))
+        self.random = self.begin(0)
+
+    def begin(self, exposure: int) -> np.random.Generator:
+        """Draw the errors of one exposure from now on, by its number; return what draws them."""
+        self.random = np.random.Generator(np.random.SFC64([*self._key, 1 + exposure]))
+        return self.random
 
     def measure(self, depth: NDArray[np.floating]) -> NDArray[np.uint16]:
         """Return what the camera measures [mm], (height, width); 0 is unknown.
@@ -53,9 +57,9 @@ class DepthSensor:
         """
         errors, camera = self._errors, self._camera
         true = np.fmax(np.fmin(depth, FAR_M), NEAR_M).astype(np.float32, order="C")  # NaN: far
-        measured = _mixed(true, self._random, errors.mixed) if errors.mixed else true
+        measured = _mixed(true, self.random, errors.mixed) if errors.mixed else true
         if errors.sigma_at_1m:
-            noise = self._random.standard_normal(true.shape, np.float32)
+            noise = self.random.standard_normal(true.shape, np.float32)
             measured = measured + np.float32(errors.sigma_at_1m) * measured * measured * noise
         known = (measured >= camera.depth_min) & (measured <= min(camera.depth_max, 65.535))
         if errors.holes:
@@ -64,10 +68,10 @@ class DepthSensor:
 
     def _holes(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
         share = self._errors.holes / 2
-        alone = self._random.random(shape, np.float32) < share
+        alone = self.random.random(shape, np.float32) < share
         height, width = (-(-side // PATCH_PX) + 1 for side in shape)
-        down, right = self._random.integers(0, PATCH_PX, 2).tolist()
-        patches = self._random.random((height, width), np.float32) < share
+        down, right = self.random.integers(0, PATCH_PX, 2).tolist()
+        patches = self.random.random((height, width), np.float32) < share
         large = patches.repeat(PATCH_PX, axis=0).repeat(PATCH_PX, axis=1)
         return alone | large[down : down + shape[0], right : right + shape[1]]
 

@@ -189,7 +189,7 @@ class RenderThread:
         self._changed = threading.Condition()
         self._scene: SimScene | None = None
         self._due: dict[str, SimPoses] = {}  # by the name of a camera
-        self._drawn: set[str] = set()  # cameras that have taken a picture in this boot
+        self._drawn: dict[str, int] = {}  # tick of each camera's newest picture in this boot
         self._taken_ns: dict[str, int] = {}  # when each was last due, by this process's clock
         self._boot, self._count, self._rounds = -1, 0, 0
 
@@ -221,8 +221,8 @@ class RenderThread:
 
     def _is_due(self, camera: Camera, tick: int) -> bool:
         """Return whether a camera takes a picture now; an emulated world has no ticks."""
-        if tick:
-            return exposes(camera.rate_hz, tick)
+        if tick:  # the first tick of lock-step is sent until it is answered
+            return exposes(camera.rate_hz, tick) and tick != self._drawn.get(camera.name)
         since_ns = self._process.now_ns() - self._taken_ns.get(camera.name, 0)
         return since_ns >= EARLY * 1e9 / camera.rate_hz
 
@@ -256,7 +256,7 @@ class RenderThread:
                     self._show(renderer, scene)
                 for poses, names in _together(due):
                     frames = renderer.expose(poses, names)
-                    self._drawn.update(frames)
+                    self._drawn.update(dict.fromkeys(frames, poses.tick))
                     for name, frame in frames.items():
                         exposed = Frame(frame.picture, frame.depth, poses.tick, poses.stamp_ns)
                         self._process.put(name, exposed)

@@ -51,16 +51,19 @@ class View:
     def __init__(self, camera: Camera, seed: int, *, errors: bool) -> None:
         self.camera = camera
         self.sensor = DepthSensor(camera, seed, SENSOR if errors else NO_ERRORS)
-        self._random = np.random.default_rng(seed)
+        random = np.random.default_rng(seed)
         shape = (camera.height + NOISE_MARGIN, camera.width + NOISE_MARGIN, 3)
         sigma = PIXEL_NOISE if errors else 0.0
-        self._noise = (sigma * self._random.standard_normal(shape, np.float32)).astype(np.int16)
+        self._noise = (sigma * random.standard_normal(shape, np.float32)).astype(np.int16)
         self.lens = Lens(camera)
 
-    def exposure(self, colours: Picture, depth: NDArray[np.float32]) -> Frame:
-        """Return what the camera measures of ideal colours (height, width, 3) and depth [m]."""
+    def exposure(self, colours: Picture, depth: NDArray[np.float32], number: int) -> Frame:
+        """Return what the camera measures of ideal colours (height, width, 3) and depth [m].
+
+        The same `number` of an exposure has the same errors.
+        """
         camera = self.camera
-        down, right = self._random.integers(0, NOISE_MARGIN, 2).tolist()
+        down, right = self.sensor.begin(number).integers(0, NOISE_MARGIN, 2).tolist()
         noise = self._noise[down : down + camera.height, right : right + camera.width]
         noisy = cv2.add(cv2.cvtColor(colours, cv2.COLOR_RGB2BGR), noise, dtype=cv2.CV_8U)
         measured = self.sensor.measure(depth) if camera.depth else None
@@ -167,7 +170,8 @@ class Renderer:
         for name in names:
             view = self._views[name]
             self._aim(drawn, view, base)
-            frames[name] = view.exposure(*view.lens.bend(*self._draw(view.lens)))
+            colours, depth = view.lens.bend(*self._draw(view.lens))
+            frames[name] = view.exposure(colours, depth, poses.tick)
         return frames
 
     def close(self) -> None:

@@ -102,6 +102,18 @@ def test_a_seed_gives_the_same_bits_and_another_one_or_another_camera_others() -
     assert drawn("front", 3)[1] != drawn("rear", 3)[1]
 
 
+def test_an_exposure_has_the_same_errors_whenever_it_is_measured() -> None:
+    sensor = DepthSensor(CAMERA, 3)
+
+    def measured(number: int) -> bytes:
+        sensor.begin(number)
+        return sensor.measure(flat(1.0)).tobytes()
+
+    first = measured(7)
+    assert measured(8) != first
+    assert measured(7) == first
+
+
 def test_without_errors_the_truth_is_measured_and_the_mounting_is_the_file_s() -> None:
     sensor = DepthSensor(CAMERA, 7, NO_ERRORS)
     assert sensor.mounted == CAMERA
