@@ -226,7 +226,8 @@ class RoutePlanner:
             around = self._zones, self._bare, request.body, request.here
             why = explained(found, *around, goal)
             closed = self._rezoned and why is not found
-            if first or closed or self._progress.stuck(request.tick, GIVE_UP_TICKS):
+            final = first and not len(self._contours.points)  # what cameras see may go away
+            if final or closed or self._progress.stuck(request.tick, GIVE_UP_TICKS):
                 return self._route(state="failed", reason=why.reason)
             if self._last_path:  # noise closes narrow ways in the map; the scan shows them
                 return self._go(goal, self._last_path)
