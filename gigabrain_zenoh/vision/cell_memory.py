@@ -18,6 +18,7 @@ from gigabrain_zenoh.vision.depth_picture import SIGMA_AT_1M, Mask
 CELL_M = 0.025
 OBSTACLE, HOLE, MISSING, COLOUR = range(4)  # kinds of cells
 KEPT_S = 120.0  # unseen: the world changes; what stood behind the robot two minutes ago may be gone
+GLIMPSED_S = 1.0  # unseen, if only one picture showed it
 DRIFT_PER_M, DRIFT_PER_RAD = 0.02, 0.02  # of odometry: by way, and by turn for each metre away
 MAX_DRIFT_M = 0.15  # since it was seen, more than planners keep clear of
 KEPT_REACH_M = 5.0  # farther from the robot, nobody needs it
@@ -85,6 +86,7 @@ class CellMemory:
         drift = DRIFT_PER_M * (self._driven - cells["driven"])
         drift += DRIFT_PER_RAD * (self._turned - cells["turned"]) * away
         kept = (now - cells["stamp"] <= KEPT_S) & (drift <= MAX_DRIFT_M) & (away <= KEPT_REACH_M)
+        kept &= (cells["seen"] > 1) | (now - cells["stamp"] <= GLIMPSED_S)
         self.cells = cells[kept]
 
     def look(self, picture: Picture, kinds: tuple[int, ...]) -> None:
