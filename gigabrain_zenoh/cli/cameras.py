@@ -15,7 +15,8 @@ CHECK = (sys.executable, "-P", "-m", "gigabrain_drivers.sim.graphics")
 def with_cameras(deployment: Deployment, host: str) -> Deployment:
     """Return the deployment, without cameras where nothing can be drawn; one line says why.
 
-    Raises ConfigError for cameras that the robot does not have, or that need more packages.
+    Raises ConfigError for cameras that the robot does not have, that need more packages, or that
+    cannot follow the simulation's speed.
     """
     here = deployment.hosts.get(host, ())
     placed = any("camera" in names for names in deployment.hosts.values())
@@ -27,7 +28,13 @@ def with_cameras(deployment: Deployment, host: str) -> Deployment:
 
     changes = split(deployment.robot)[1]
     cameras = cameras_of(deployment.body, deployment.link, changes)
-    if all(one.options.source != RENDERED for one in cameras):
+    read = [one for one in cameras if one.options.source != RENDERED]
+    if read and deployment.speed != 1.0:
+        raise ConfigError(
+            f"camera {read[0].camera.name!r} runs in real time, as its source is "
+            f"{read[0].options.source!r}; leave out --speed"
+        )
+    if len(read) == len(cameras):
         return deployment
     problem = _graphics_problem()
     if not problem:

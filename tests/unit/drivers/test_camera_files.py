@@ -9,6 +9,7 @@ from gigabrain_drivers.driver.catalog import load_link, load_robot, robot_files
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.sim import exposes
 from gigabrain_schemas.body import Camera
+from gigabrain_zenoh.cli.cameras import with_cameras
 from gigabrain_zenoh.config import loading
 from gigabrain_zenoh.config.settings import DriverConfig, LinkName
 from gigabrain_zenoh.errors import ConfigError
@@ -163,3 +164,20 @@ def test_a_camera_takes_pictures_at_its_rate() -> None:
     assert ticks(50.0) == ticks(120.0) == list(range(1, 101))
     assert len(ticks(30.0)) == 60
     assert len(ticks(0.5)) == 1
+
+
+def test_a_camera_that_is_read_cannot_follow_another_speed(tmp_path: Path) -> None:
+    part = "  cameras: {rear: {source: opencv, device: film.mp4}}\n"
+    path = file(tmp_path, "  driver: mujoco\n", f"  driver: mujoco\n{part}")
+    with pytest.raises(ConfigError, match="camera 'rear' runs in real time"):
+        with_cameras(Deployment(body=path, cameras=True, speed=3.0), "robot")
+
+
+def test_a_host_without_the_camera_s_process_checks_nothing() -> None:
+    hosts = {"robot": ("router", "driver"), "eye": ("camera",)}
+    deployment = Deployment(body="turtlebot3_burger", cameras=True, hosts=hosts)
+    assert with_cameras(deployment, "robot") is deployment
+    with pytest.raises(ConfigError, match="has no cameras"):
+        with_cameras(deployment, "eye")
+    off = Deployment(body="turtlebot3_burger")
+    assert with_cameras(off, "robot") is off
