@@ -102,5 +102,5 @@ def test_an_option_of_the_simulator_that_does_not_exist_is_refused_with_its_line
     )
     mine = tmp_path / "robot.yaml"
     mine.write_text(text)
-    with pytest.raises(ConfigError, match=r"robot\.yaml:19: .*'mdel'; did you mean 'model'"):
+    with pytest.raises(ConfigError, match=r"robot\.yaml:22: .*'mdel'; did you mean 'model'"):
         catalog.make_driver(str(mine), Run(folder=Path()))

@@ -75,7 +75,7 @@ def test_an_lds01_is_only_believed_at_its_own_five_turns_a_second(
     run = Run(folder=Path(), link="real")
     if refused:
         with pytest.raises(
-            ConfigError, match=r"robot.yaml:23: real.scan: .* lds01 makes 5 turns a second"
+            ConfigError, match=r"robot.yaml:24: real.scan: .* lds01 makes 5 turns a second"
         ):
             make_driver(str(mine), run)
     else:

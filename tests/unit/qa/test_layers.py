@@ -24,6 +24,7 @@ ONLY_IN = {
     "mujoco": (
         "drivers/gigabrain_drivers/sim/",
         "drivers/gigabrain_drivers/cameras/rendered.py",
+        "gigabrain_zenoh/qa/bench/eyes_worlds.py",
         "gigabrain_zenoh/qa/bench/jackal.py",
         "gigabrain_zenoh/qa/train/",
     ),
