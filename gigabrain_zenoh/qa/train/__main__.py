@@ -28,7 +28,7 @@ class Plan:
     tests: int = TEST_PICTURES
     "Pictures of each test set."
     steps: int = STEPS
-    "Steps of training, of 16 pictures each."
+    "Steps of training, of 16 pictures each (first 24 small ones)."
     processes: int = 2
     "Processes that render."
 

@@ -26,7 +26,18 @@ from gigabrain_zenoh.vision.recognizer import (
     WIDTH_PX,
 )
 
-BATCH = 16
+
+class Stage(NamedTuple):
+    """A part of training: it ends after this share of steps."""
+
+    end: float
+    width: int  # of pictures [px], a multiple of 16
+    height: int  # a multiple of 16
+    batch: int
+
+
+# Small pictures cost a third: first learn what things look like.
+STAGES = (Stage(0.4, 192, 144, 24), Stage(1.0, WIDTH_PX, HEIGHT_PX, 16))
 PEAK_RATE, WEIGHT_DECAY, WARM_UP_STEPS = 2.5e-3, 2e-2, 200
 BOX_WEIGHT = 4.0
 AVERAGED = 0.998  # of the weights that are exported, a step
@@ -48,10 +59,10 @@ Batch = tuple[Any, ...]
 
 def heat_loss(logits: Any, heat: Any, mask: Any) -> Any:
     """Penalty-reduced focal loss of CenterNet, for one thing in the mean."""
-    p = jnp.clip(jax.nn.sigmoid(logits), 1e-4, 1 - 1e-4)
-    peak = heat > 0.999
-    right = jnp.where(peak, (1 - p) ** 2 * -jnp.log(p), 0.0)
-    wrong = jnp.where(peak, 0.0, (1 - heat) ** 4 * p**2 * -jnp.log(1 - p))
+    p, peak = jax.nn.sigmoid(logits), heat > 0.999
+    surprise = jax.nn.softplus(-logits)  # -log p; with the logit it is -log(1 - p)
+    right = jnp.where(peak, (1 - p) ** 2 * surprise, 0.0)
+    wrong = jnp.where(peak, 0.0, (1 - heat) ** 4 * p**2 * (surprise + logits))
     return ((right + wrong) * mask).sum() / jnp.maximum(peak.sum(), 1)
 
 
@@ -90,35 +101,44 @@ def loss(params: net.Params, moments: net.Params, batch: Batch) -> tuple[Any, tu
 
 
 @partial(jax.jit, static_argnums=0, donate_argnums=1)
-def step(optimiser: Any, state: State, batch: Batch) -> tuple[State, Any]:
-    """Do one step; return the new state and (heat loss, box loss)."""
+def step(optimiser: Any, state: State, batch: Batch, number: Any) -> tuple[State, Any]:
+    """Do the step of this number; return the new state and (heat loss, box loss)."""
     grads, (moments, first, second) = jax.grad(loss, has_aux=True)(
         state.params, state.moments, batch
     )
     updates, inner = optimiser.update(grads, state.optimiser, state.params)
     params = optax.apply_updates(state.params, updates)
-    averaged = jax.tree.map(lambda a, p: AVERAGED * a + (1 - AVERAGED) * p, state.averaged, params)
+    kept = jnp.minimum(
+        AVERAGED, (1 + number) / (10 + number)
+    )  # the first weights soon count little
+    averaged = jax.tree.map(lambda a, p: kept * a + (1 - kept) * p, state.averaged, params)
     return State(params, moments, averaged, inner), jnp.stack([first, second])
 
 
-def batches(pictures: Sequence[Labelled], steps: range, seed: int) -> Iterator[Batch]:
-    """Yield batches for steps; made by a thread beside training, one ahead."""
+def stage(number: int, steps: int) -> Stage:
+    """Return the stage of a step."""
+    return next(one for one in STAGES if number < one.end * steps)
+
+
+def batches(
+    pictures: Sequence[Labelled], first: int, steps: int, seed: int, ahead: int = 2
+) -> Iterator[Batch]:
+    """Yield the batches of steps from `first` on; a thread makes them beside training."""
 
     def make(number: int) -> Batch:
-        rng = np.random.default_rng([seed, number])
-        made = [augment(rng, pictures[k]) for k in rng.integers(len(pictures), size=BATCH)]
-        parts = [targets(one, HEIGHT_PX, WIDTH_PX) for _, one in made]
-        return (
-            np.stack([p for p, _ in made]),
-            *(np.stack(part) for part in zip(*parts, strict=True)),
-        )
+        rng, now = np.random.default_rng([seed, number]), stage(number, steps)
+        chosen = rng.integers(len(pictures), size=now.batch)
+        made = [augment(rng, pictures[k], now.width, now.height) for k in chosen]
+        parts = [targets(one, now.height, now.width) for _, one in made]
+        stacked = (np.stack(part) for part in zip(*parts, strict=True))
+        return (np.stack([picture for picture, _ in made]), *stacked)
 
     with ThreadPoolExecutor(1) as pool:
-        ahead = [pool.submit(make, number) for number in steps[:2]]
-        for number in steps:
-            done = ahead.pop(0).result()
-            if number + 2 in steps:
-                ahead.append(pool.submit(make, number + 2))
+        jobs = {k: pool.submit(make, k) for k in range(first, min(first + ahead, steps))}
+        for number in range(first, steps):
+            done = jobs.pop(number).result()
+            if number + ahead < steps:
+                jobs[number + ahead] = pool.submit(make, number + ahead)
             yield done
 
 
@@ -138,10 +158,8 @@ def learn(pictures: Sequence[Labelled], steps: int, folder: Path, seed: int = 0)
         state = jax.tree.unflatten(jax.tree.structure(state), leaves)
     state = State(*jax.tree.map(jnp.array, tuple(state)))
     begun, sums = time.monotonic(), np.zeros(2)
-    for number, batch in zip(
-        range(first, steps), batches(pictures, range(first, steps), seed), strict=True
-    ):
-        state, parts = step(optimiser, state, batch)
+    for number, batch in enumerate(batches(pictures, first, steps, seed), first):
+        state, parts = step(optimiser, state, batch, jnp.float32(number))
         sums += np.asarray(parts)
         if (number + 1) % 50 == 0:
             pace = (time.monotonic() - begun) / (number + 1 - first)

@@ -17,10 +17,16 @@ Floats = NDArray[np.float32]
 Target = tuple[Floats, Floats, Floats, Floats]
 
 
-def augment(rng: Random, one: Labelled) -> tuple[NDArray[np.uint8], Labelled]:
-    """Decode, mirror, zoom, shift, and degrade a picture; its boxes follow."""
+def augment(
+    rng: Random, one: Labelled, width: int, height: int
+) -> tuple[NDArray[np.uint8], Labelled]:
+    """Decode, scale, mirror, zoom, shift, and degrade a picture; its boxes follow."""
     picture, boxes = one.picture(), one.boxes.copy()
-    height, width = picture.shape[:2]
+    if picture.shape[:2] != (height, width):
+        boxes *= np.tile([width, height], 2) / np.tile(picture.shape[1::-1], 2)
+        picture = np.asarray(
+            cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8
+        )
     if rng.random() < 0.5:
         picture = np.ascontiguousarray(picture[:, ::-1])
         boxes[:, [0, 2]] = width - boxes[:, [2, 0]]

@@ -65,7 +65,8 @@ def test_a_perfect_box_costs_nothing_and_one_apart_more_than_one_that_overlaps()
 
 @pytest.mark.slow
 def test_training_goes_on_where_it_was_stopped_and_learns_one_picture(tmp_path, monkeypatch):
-    monkeypatch.setattr(learning, "BATCH", 2)
+    stages = (learning.Stage(0.5, 192, 144, 2), learning.Stage(1.0, 320, 240, 2))
+    monkeypatch.setattr(learning, "STAGES", stages)
     monkeypatch.setattr(learning, "WARM_UP_STEPS", 5)
     picture = np.full((240, 320, 3), 90, np.uint8)
     picture[80:160, 100:180] = (250, 30, 30)
@@ -77,7 +78,6 @@ def test_training_goes_on_where_it_was_stopped_and_learns_one_picture(tmp_path, 
         np.ones(1, np.float32),
         np.zeros(1, bool),
     )
-    monkeypatch.setattr(learning, "AVERAGED", 0.9)
     learning.learn([one], 60, tmp_path)
     state = learning.learn([one], 120, tmp_path)
     path = tmp_path / "net.onnx"

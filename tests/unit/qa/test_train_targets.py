@@ -56,7 +56,7 @@ def test_an_ignored_thing_is_masked_in_its_class_only():
 def test_boxes_follow_what_is_in_the_changed_picture():
     one = labelled(("cube", (100, 60, 180, 160)))
     for seed in range(30):
-        picture, changed = augment(np.random.default_rng(seed), one)
+        picture, changed = augment(np.random.default_rng(seed), one, 320, 240)
         if changed.ignored[0]:
             continue
         x0, y0, x1, y1 = changed.boxes[0].astype(int)
@@ -67,7 +67,16 @@ def test_boxes_follow_what_is_in_the_changed_picture():
 
 def test_a_thing_that_is_nearly_cut_away_is_to_be_ignored():
     one = labelled(("cube", (0, 60, 60, 160)))
-    changes = [augment(np.random.default_rng(seed), one)[1] for seed in range(60)]
+    changes = [augment(np.random.default_rng(seed), one, 320, 240)[1] for seed in range(60)]
     small = [c for c in changes if c.boxes[0, 2] - c.boxes[0, 0] < 20]
     assert small
     assert all(c.ignored[0] for c in small)
+
+
+def test_a_smaller_picture_has_smaller_boxes():
+    one = labelled(("cube", (100, 60, 180, 160)))
+    whole = [augment(np.random.default_rng(s), one, 320, 240)[1].boxes[0] for s in range(20)]
+    half = [augment(np.random.default_rng(s), one, 160, 120)[1].boxes[0] for s in range(20)]
+    sizes = [np.mean([box[2] - box[0] for box in boxes]) for boxes in (whole, half)]
+    assert sizes[0] / sizes[1] == pytest.approx(2, abs=0.1)
+    assert augment(np.random.default_rng(1), one, 160, 120)[0].shape == (120, 160, 3)
