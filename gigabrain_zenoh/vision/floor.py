@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
 
-OFFSET_M, SLOPE = 0.004, 0.006  # standard deviations before the first picture: 4 mm, 0.35 degrees
-MAX_OFFSET_M, MAX_SLOPE = 0.015, 0.028  # 1.5 cm and 1.6 degrees: mounting and tilt together
-WALK_OFFSET_M, WALK_SLOPE = 0.0007, 0.0015  # standard deviations of the change per picture
+OFFSET_M, SLOPE = 0.004, 0.009  # standard deviations before the first picture: 4 mm, 0.5 degrees
+MAX_OFFSET_M, MAX_SLOPE = 0.015, 0.035  # 1.5 cm and 2 degrees: mounting and tilt together
+WALK_OFFSET_M, WALK_SLOPE = 0.001, 0.006  # standard deviations of the change per picture
 ROUGH_M = 0.003  # standard deviation of a real floor from its plane
 REACHES_M = (0.6, 1.0, 1.6, 2.4, 3.2, 3.2)  # outwards from what is sure to what is not
 GATE = 3.0  # standard deviations from the plane, beyond which a point is not floor

@@ -60,6 +60,8 @@ class ObstacleContours:
         problem = self._refused(name, image.width, image.height)
         if problem:
             return problem
+        if not self._cameras[name].depth:
+            return f"the camera {name!r} measures no depth"
         try:
             pixels = image.array()
         except ValueError as error:

@@ -7,6 +7,7 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from msgspec.structs import replace
 
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import Camera
@@ -95,6 +96,11 @@ def test_wrong_sizes_and_names_are_refused() -> None:
     for pixels in (np.zeros((24, 32, 3)), np.zeros((240, 320)), np.zeros((240, 320, 4))):
         assert eyes.add_colour("front", pixels.astype(np.uint8), START, 0.3)
     assert near(eyes.contours(START, 0.3), 0.9, 0.0)
+
+
+def test_depth_of_a_camera_without_depth_is_refused() -> None:
+    eyes = ObstacleContours(body(replace(LOW, depth=False)))
+    assert "no depth" in eyes.add_depth("front", image(np.ones((240, 320), np.uint16)), START, 0.0)
 
 
 def test_clutter_is_no_more_than_128_contours() -> None:

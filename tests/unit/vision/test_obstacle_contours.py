@@ -154,6 +154,16 @@ def test_mounting_errors_make_no_obstacles(camera: Camera) -> None:
             assert eyes.contours(START, number / 10) == ()
 
 
+def test_a_body_that_nods_from_picture_to_picture_makes_no_obstacles() -> None:
+    sensor = DepthSensor(LOW, 0)
+    eyes = ObstacleContours(body(LOW))
+    for number in range(12):
+        tilt = math.radians(1.0) * (-1 if number % 6 < 3 else 1)
+        mounted = replace(sensor.mounted, pitch=sensor.mounted.pitch + tilt)
+        eyes.add_depth("front", image(sensor.measure(depth_of(mounted))), START, number / 10)
+        assert eyes.contours(START, number / 10) == ()
+
+
 def test_the_body_itself_is_no_obstacle() -> None:
     camera = replace(HIGH, x=-0.2)
     own = Box(0.0, 0.0, 0.05, 0.1, 0.15)
