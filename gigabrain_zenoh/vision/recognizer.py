@@ -50,6 +50,10 @@ class Recognizer:
     """
 
     def __init__(self, weights: Path = WEIGHTS, *, min_confidence: float = MIN_CONFIDENCE) -> None:
+        if not weights.is_file():
+            raise ConfigError(
+                f"{weights}: no such file; `python -m gigabrain_zenoh.qa.train all` makes it"
+            )
         try:
             self._net = cv2.dnn.readNetFromONNX(str(weights))
         except cv2.error as error:

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.vision.labels import CLASSES
-from gigabrain_zenoh.vision.recognizer import decode, fit, suppress
+from gigabrain_zenoh.vision.recognizer import Recognizer, decode, fit, suppress
 
 BALL, CAN = CLASSES.index("ball"), CLASSES.index("can")
 
@@ -66,3 +67,13 @@ def test_a_picture_of_another_shape_is_scaled_into_the_middle():
     assert fitted.shape == (240, 320, 3)
     assert (scale, left, top) == (0.5, 40, 0)
     assert (fitted[0, 39], fitted[0, 40]) == (pytest.approx([114] * 3), pytest.approx([0] * 3))
+
+
+def test_weights_that_are_none_are_refused_in_one_line(tmp_path):
+    bad = tmp_path / "bad.onnx"
+    bad.write_bytes(b"no net")
+    with pytest.raises(ConfigError, match=r"bad\.onnx") as refused:
+        Recognizer(bad)
+    assert "\n" not in str(refused.value)
+    with pytest.raises(ConfigError, match=r"missing\.onnx"):
+        Recognizer(tmp_path / "missing.onnx")
