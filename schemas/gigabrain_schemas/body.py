@@ -124,7 +124,7 @@ PixelOffset = Annotated[float, Meta(ge=-1e5, le=1e5)]  # [px]
 FocalLength = Annotated[float, Meta(ge=1.0, le=1e5)]  # [px]
 FieldOfView = Annotated[float, Meta(ge=0.1, le=3.0)]  # [rad]
 Coefficient = Annotated[float, Meta(ge=-100.0, le=100.0)]  # of distortion
-CameraName = Annotated[str, Meta(pattern=r"^[A-Za-z]\w*$(?!\n)", max_length=32)]
+CameraName = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]*$(?!\n)", max_length=32)]
 MOST_CAMERAS = 8
 
 

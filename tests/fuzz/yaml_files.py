@@ -41,7 +41,7 @@ def check(data: bytes) -> None:
 
 def told(complaint: str) -> None:
     """One line, and where it is not about a driver's name, which line of the file it is."""
-    assert complaint.startswith(("x.yaml:", "no driver", "no lidar"))
+    assert complaint.startswith(("x.yaml:", "no driver", "no lidar", "no camera source"))
     assert "\n" not in complaint
     assert len(complaint) < LONGEST_LINE
 

@@ -97,7 +97,12 @@ def camera_options(robot: BodyDescription, part: Any) -> Any:
         kind = source_class(source).Options if isinstance(source, str) else CameraOptions
         fields.append((camera.name, kind | None, None))
     return msgspec.defstruct(
-        "LinkCameras", fields, frozen=True, kw_only=True, forbid_unknown_fields=True
+        "LinkCameras",
+        fields,
+        frozen=True,
+        kw_only=True,
+        forbid_unknown_fields=True,
+        omit_defaults=True,
     )
 
 

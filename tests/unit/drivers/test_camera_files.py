@@ -123,6 +123,7 @@ def test_a_wrong_source_is_named_with_its_line(tmp_path: Path, part: str, wanted
         ("rate_hz: 15", "rate_hz: 1e9", "robot.yaml:10: cameras[0].rate_hz: expected a number"),
         ("depth: true", "depth: 2", "robot.yaml:10: cameras[0].depth: expected true or false"),
         ("name: rear", "name: ../rear", "robot.yaml:11: cameras[1].name: expected"),
+        ("name: rear", "name: rear²", "robot.yaml:11: cameras[1].name: expected"),
     ],
 )
 def test_a_wrong_camera_is_named_with_its_line(
