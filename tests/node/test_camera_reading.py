@@ -141,6 +141,17 @@ async def test_a_picture_of_another_size_is_withheld_and_said(tmp_path: Path) ->
         await until(lambda: problem(heard) == "", "the end of it")
 
 
+async def test_a_picture_that_nobody_would_take_is_withheld_and_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with running(tmp_path) as (_, heard):
+        monkeypatch.setattr("gigabrain_drivers.cameras.output.HEADER_BYTES", 2**20)
+        await until(lambda: "at most 1.0 MB are sent" in problem(heard), "the size")
+        before = len(heard["image"])
+        await asyncio.sleep(0.2)
+        assert len(heard["image"]) == before
+
+
 async def test_a_source_that_breaks_ends_the_process_with_its_own_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -27,6 +27,7 @@ REMEDIES = {
     camera_health.UNDEREXPOSED: "switch a light on, or set the camera's exposure",
     camera_health.OVEREXPOSED: "turn it away from the light, or set the camera's exposure",
 }
+HEADER_BYTES = 1024  # of a message, beside its pixels
 RECONNECT = "check its cable, or connect it again"
 
 
@@ -81,7 +82,7 @@ class CameraOutput:
             picture = Image(**about, encoding="jpeg", data=data)
         elif frame.picture is not None:
             picture = Image(**about, encoding="bgr8", data=frame.picture.tobytes())
-        return Packed(frame, picture, depth)
+        return Packed(frame, picture, depth, _too_large(picture, depth))
 
     def put(self, packed: Packed) -> None:
         """Judge an exposure, and publish it if it can be believed."""
@@ -92,7 +93,7 @@ class CameraOutput:
         stamp_ns = frame.stamp_ns or bus.clock.unix_ns()
         usable = self._health.take(self._now_s(), frame.picture, frame.depth)
         self._look()
-        if not usable or self._problem:
+        if not usable or self._problem or packed.problem:
             bus.counters[f"{name}_withheld"] += 1
             bus.publish(CAMERA, self._info(), basis=tick, name=name)
             return
@@ -147,3 +148,15 @@ class CameraOutput:
     def _info(self) -> CameraInfo:
         source = self._options.source[:32]
         return CameraInfo(camera=self.camera, source=source, problem=self._problem[:500])
+
+
+def _too_large(picture: Image | None, depth: DepthImage | None) -> str:
+    """Return what is wrong with messages that nobody would take; empty for nothing."""
+    sizes = (
+        ("a picture", len(picture.data) if picture else 0, IMAGE.max_bytes),
+        ("a depth picture", sum(map(len, depth.planes)) if depth else 0, DEPTH.max_bytes),
+    )
+    for what, size, limit in sizes:
+        if size > limit - HEADER_BYTES:
+            return f"{what} of {size / 1e6:.1f} MB; at most {limit / 1e6:.1f} MB are sent"
+    return ""
