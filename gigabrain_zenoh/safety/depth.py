@@ -245,20 +245,19 @@ def sight(body: BodyDescription, camera: Camera, view: View, picture: Pixels) ->
     stands = ((picture - np.uint16(1)) < view.within) & (picture > view.own)
     found: list[tuple[Floats, bool, bool]] = []
     if stands.any():
-        beside = _alike(stands, picture)
-        metres = picture * np.float32(0.001)
-        for mask, sure in ((beside >= SURELY_BESIDE, True), (beside >= BESIDE, False)):
-            points = _nearest(view, mask & stands, metres)
-            found.append((points[outside(hull, points[:, :2]) > 0], False, sure))
+        beside, metres = _alike(stands, picture), picture * np.float32(0.001)
+        sure, doubtful = beside >= SURELY_BESIDE, stands & (beside >= BESIDE)
+        for points, known in _nearest(view, stands & sure, doubtful, metres):
+            found.append((points[outside(hull, points[:, :2]) > 0], False, known))
     hole = (picture > view.below) & ~dark
     holes = _beside(hole) if hole.any() else hole.view(np.uint8)
     gap = _squares(hole | (dark & view.sure))
-    for mask, sure in (
-        (hole & (holes >= SURE_HOLE_BESIDE), True),
-        ((hole & (holes >= HOLE_BESIDE)) | gap, False),
-    ):
-        if mask.any():
-            found.append((_nearest(view, mask, view.floor), True, sure))
+    doubtful = (hole & (holes >= HOLE_BESIDE)) | gap
+    if doubtful.any():
+        for points, known in _nearest(
+            view, hole & (holes >= SURE_HOLE_BESIDE), doubtful, view.floor
+        ):
+            found.append((points, True, known))
     if not found:
         return Sighting(np.empty((0, 3)), np.empty(0, bool), np.empty(0, bool))
     counts = [len(points) for points, _, _ in found]
@@ -269,18 +268,29 @@ def sight(body: BodyDescription, camera: Camera, view: View, picture: Pixels) ->
     )
 
 
-def _nearest(view: View, mask: Mask, metres: NDArray[np.float32]) -> Floats:
-    """Return the nearest point (n, 3) [m] of `mask` in each column, at depths `metres` (h, w)."""
-    away = np.where(mask, metres * view.flat, np.float32(np.inf))
+def _nearest(
+    view: View, sure: Mask, doubtful: Mask, metres: NDArray[np.float32]
+) -> tuple[tuple[Floats, bool], tuple[Floats, bool]]:
+    """Return the nearest points (n, 3) [m] in each column, at depths `metres` (h, w).
+
+    First those that are `sure`, then those `doubtful` ones that are nearer still.
+    """
+    way, rays = metres * view.flat, view.rays
     if not view.upright:
-        away, metres, rays = away.T, metres.T, view.rays.transpose(1, 0, 2)
-    else:
-        rays = view.rays
-    row, column = away.argmin(axis=0), np.arange(away.shape[1])
-    seen = np.isfinite(away[row, column])
-    row, column = row[seen], column[seen]
-    points: Floats = view.mount + metres[row, column, None].astype(np.float64) * rays[row, column]
-    return points
+        way, metres, rays = way.T, metres.T, rays.transpose(1, 0, 2)
+        sure, doubtful = sure.T, doubtful.T
+    column, found = np.arange(way.shape[1]), []
+    least = np.full(way.shape[1], np.inf, np.float32)
+    for mask, known in ((sure, True), (doubtful, False)):
+        away = np.where(mask, way, np.float32(np.inf))
+        row = away.argmin(axis=0)
+        nearest = away[row, column]
+        nearer = np.flatnonzero(nearest < least)
+        least = np.minimum(least, nearest)
+        row = row[nearer]
+        points = metres[row, nearer, None].astype(np.float64) * rays[row, nearer]
+        found.append((view.mount + points, known))
+    return found[0], found[1]
 
 
 def _beside(mask: Mask) -> NDArray[np.uint8]:
