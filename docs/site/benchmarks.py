@@ -25,11 +25,12 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from gigabrain_zenoh.cli import bench, bench_navigation
+from gigabrain_zenoh.cli import bench, bench_eyes, bench_navigation
 from gigabrain_zenoh.qa.bench.barn import BarnResult
 from gigabrain_zenoh.qa.bench.bodies import BodiesResult
 from gigabrain_zenoh.qa.bench.chain import ChainResult, chain_page
 from gigabrain_zenoh.qa.bench.estop import EstopResult, estop_page
+from gigabrain_zenoh.qa.bench.eyes import EyesResult
 from gigabrain_zenoh.qa.bench.goals import GoalsResult
 from gigabrain_zenoh.qa.bench.plan import PlanResult
 from gigabrain_zenoh.qa.bench.slam_logs import SlamResult
@@ -43,6 +44,7 @@ DRAWN: dict[str, tuple[type[Struct], Callable[[Any], Any]]] = {  # by the words 
     "bodies": (BodiesResult, bench._bodies_table),
     "chain": (ChainResult, chain_page),
     "estop": (EstopResult, estop_page),
+    "eyes": (EyesResult, bench_eyes._eyes_table),
     "goals": (GoalsResult, bench_navigation._goals_table),
     "plan": (PlanResult, bench._plan_table),
     "slam": (SlamResult, bench_navigation._logs_table),
