@@ -172,6 +172,15 @@ def test_an_empty_floor_has_no_obstacles(seed: int) -> None:
             assert drive.marks == 0
 
 
+@pytest.mark.parametrize(("away", "tolerance"), [(0.5, 0.0096), (1.0, 0.0142), (2.0, 0.0233)])
+def test_the_tolerance_of_heights_grows_with_the_way(away: float, tolerance: float) -> None:
+    view, column = view_of(replace(SEEING, max_linear_speed=2.0), CAMERA), 80
+    depths = view.above[:, column] / 1000.0
+    row = int(np.abs(depths - away).argmin())
+    height = CAMERA.z + float(view.rays[row, column, 2]) * depths[row]
+    assert height == pytest.approx(tolerance, rel=0.1)
+
+
 def test_one_pixel_is_noise_and_a_group_is_a_thing() -> None:
     floor = Scene().depth(CAMERA, ORIGIN) * 1000
     one, group = floor.copy(), floor.copy()
