@@ -261,18 +261,22 @@ def _found(truth: _Truth, contours: Sequence[Contour]) -> list[bool]:
     for number in np.unique(truth.thing).tolist():
         mine = truth.points[truth.thing == number]
         near = truth.away[truth.thing == number]
-        if near.max() > RECALL_REACH_M or np.ptp(mine[:, 2]) < LEAST_M or _width(mine) < LEAST_M:
+        if (
+            near.max() > RECALL_REACH_M
+            or np.ptp(mine[:, 2]) < LEAST_M
+            or _width(mine, truth.pose) < LEAST_M
+        ):
             continue
         covered = distances(outlines, mine[:, :2]) < FOUND_M
         found.append(bool(covered.mean() >= FOUND_SHARE))
     return found
 
 
-def _width(points: Floats) -> float:
-    """Return how wide points (n, 3) are from above [m], along their longer axis."""
-    centred = points[:, :2] - points[:, :2].mean(axis=0)
-    _, axes = np.linalg.eigh(centred.T @ centred)
-    return float(np.ptp(centred @ axes[:, 1]))
+def _width(points: Floats, pose: Pose) -> float:
+    """Return how wide points (n, 3) are across the line of sight [m]."""
+    x, y = points[:, 0] - pose.x, points[:, 1] - pose.y
+    bearing = math.atan2(y.mean(), x.mean())
+    return float(np.ptp(y * math.cos(bearing) - x * math.sin(bearing)))
 
 
 def _judge_outlines(truth: _Truth, contours: Sequence[Contour], scores: ClutterScores) -> None:

@@ -48,6 +48,12 @@ def test_things_stand_apart_from_each_other_and_from_the_robot() -> None:
             assert distances([one.outline], np.zeros((1, 2)))[0] > 0.2
 
 
+def test_width_is_that_across_the_line_of_sight() -> None:
+    along = np.column_stack((np.linspace(1, 2, 9), np.linspace(1, 2, 9), np.zeros(9)))
+    assert bench._width(along, STILL) == pytest.approx(0.0, abs=1e-9)
+    assert bench._width(along, Pose(x=3.0, y=0.0, yaw=1.0)) == pytest.approx(math.sqrt(2))
+
+
 def test_outlines_are_counter_clockwise_and_of_the_right_size() -> None:
     box = Part(0, 1.0, 2.0, 0.3, 0.1, 0.5, yaw=0.7)
     assert area(box.outline) == pytest.approx(0.12)
