@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from gigabrain_schemas.base import TICK_NS, Pose
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import DetectedObject, Objects, WorldModel
-from gigabrain_schemas.topics import OBJECTS
+from gigabrain_schemas.topics import PERCEIVED
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.freshness import Latest
 from gigabrain_zenoh.geometry.pose import PoseHistory, to_frame
@@ -27,11 +27,11 @@ class DetectedObjects:
         self._bus = bus
         self._newest: dict[str, Latest[Objects]] = {}
         self._history = PoseHistory()
-        bus.subscribe(OBJECTS, self._add)
+        bus.subscribe(PERCEIVED, self._add)
 
     def _add(self, key: str, objects: Objects) -> None:
-        name = key.removeprefix(f"{OBJECTS.key}/")
-        latest = self._newest.get(name) or Latest(OBJECTS, self._bus.clock, self._bus.time)
+        name = key.removeprefix(f"{PERCEIVED.key}/")
+        latest = self._newest.get(name) or Latest(PERCEIVED, self._bus.clock, self._bus.time)
         latest.store(objects)
         put_newest(self._newest, name, latest, MAX_PERCEPTORS)
 

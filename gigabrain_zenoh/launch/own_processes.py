@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from msgspec import Struct
 
-from gigabrain_schemas.topics import OBJECTS
+from gigabrain_schemas.topics import PERCEIVED
 from gigabrain_zenoh.config import loading
 from gigabrain_zenoh.config.settings import OwnPerceptor, OwnProcess, ProcessConfig
 from gigabrain_zenoh.errors import ConfigError
@@ -57,7 +57,7 @@ def own_type(deployment: "Deployment", name: str) -> ProcessType | None:
     if entry := deployment.processes.get(name):
         return ProcessType(entry.module, writes=entry.writes)
     if name in deployment.perceptors:
-        return ProcessType("", writes=(OBJECTS.at(name),))
+        return ProcessType("", writes=(PERCEIVED.at(name),))
     return None
 
 

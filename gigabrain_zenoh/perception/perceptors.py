@@ -1,7 +1,7 @@
 """Perceptors: perception steps that packages offer, each run by a process of its own.
 
 A perceptor looks for things in each scan, and what it finds is published on
-`robot/objects/<name>`. Behaviours get these objects, and the planner keeps clear of those that
+`robot/perceived/<name>`. Behaviours get these objects, and the planner keeps clear of those that
 are to be avoided. One that raises or hangs costs only itself. Packages offer theirs as entry points
 of the group `gigabrain.perceptors`.
 """
@@ -16,7 +16,7 @@ from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import DetectedObject, Objects, WorldModel
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_schemas.topics import BODY, OBJECTS, SCAN, STATE, WORLD
+from gigabrain_schemas.topics import BODY, PERCEIVED, SCAN, STATE, WORLD
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.errors import unknown
 from gigabrain_zenoh.geometry.pose import PoseHistory
@@ -103,7 +103,7 @@ async def run(perceptor: Perceptor, bus: Bus, ready: Callable[[], None]) -> None
         found = loop.step(body.current.description) if body.current else None
         if found:
             objects, basis = found
-            bus.publish(OBJECTS, objects, basis=basis, name=bus.process)
+            bus.publish(PERCEIVED, objects, basis=basis, name=bus.process)
 
     def on_world(world: WorldModel) -> None:
         loop.add_world(world)

@@ -145,9 +145,9 @@ class Camera(Record, frozen=True, kw_only=True):
     x: Offset = 0.0  # [m], mounting in the body's frame, z from the floor
     y: Offset = 0.0  # [m]
     z: Offset = 0.0  # [m]
-    roll: Angle = 0.0  # [rad]
-    pitch: Angle = 0.0  # [rad], positive looks down
-    yaw: Angle = 0.0  # [rad]
+    roll: MountingAngle = 0.0  # [rad]
+    pitch: MountingAngle = 0.0  # [rad], positive looks down
+    yaw: MountingAngle = 0.0  # [rad]
 
     def __post_init__(self) -> None:
         if self.depth_max <= self.depth_min:

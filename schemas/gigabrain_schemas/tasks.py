@@ -15,6 +15,7 @@ from gigabrain_schemas.base import (
     Record,
     Text,
 )
+from gigabrain_schemas.objects import TagId
 
 How = Literal["replace", "queue", "preempt"]
 # in place of all that there is to do; after it; or before it, which goes on afterwards
@@ -32,18 +33,21 @@ class Goal(Record, frozen=True, kw_only=True):
 
 
 class GoalRequest(Message, frozen=True, kw_only=True):
-    """Go there: to coordinates, or to a named place of the map."""
+    """Go there: to coordinates, a named place of the map, before an object or a tag."""
 
     x: Coordinate | None = None  # [m], in the map
     y: Coordinate | None = None  # [m]
     yaw: Angle | None = None  # [rad]; None for any, or for that of the place
     place: Name = ""  # instead of x and y; see robot/zones
+    object: Name = ""  # the class of one, such as can; see robot/objects
+    tag: TagId | None = None
     how: How = "replace"
     source: Name = "anonymous"
 
     def __post_init__(self) -> None:
-        if (self.x is None) != (self.y is None) or (self.x is None) != bool(self.place):
-            raise ValueError("expected x and y, or a place")
+        ways = self.x is not None, bool(self.place), bool(self.object), self.tag is not None
+        if (self.x is None) != (self.y is None) or sum(ways) != 1:
+            raise ValueError("expected x and y, a place, an object or a tag")
 
 
 class GoalReply(Message, frozen=True, kw_only=True):

@@ -10,6 +10,7 @@ from gigabrain_schemas import (
     body,
     brain,
     logs,
+    objects,
     requests,
     safety,
     sensors,
@@ -107,9 +108,15 @@ WORLD = Topic(
     "robot/world", brain.WorldModel, 10, missed=2.5, max_bytes=64 * KB,
     publishers=BRAIN, drawing="obstacles", plotted=True,
 )  # fmt: skip
-OBJECTS = Topic(
-    "robot/objects", brain.Objects, 10, missed=5.0, max_bytes=64 * KB, many=True,
+PERCEIVED = Topic(
+    "robot/perceived", brain.Objects, 10, missed=5.0, max_bytes=64 * KB, many=True,
     publishers=BRAIN,
+)  # fmt: skip
+DETECTIONS = Topic(
+    "robot/detections", objects.Detections, 10, depth=8, max_bytes=64 * KB, publishers=BRAIN,
+)  # fmt: skip
+OBJECT_MAP = Topic(
+    "robot/objects", objects.ObjectMap, 1, keep=True, max_bytes=128 * KB, publishers=BRAIN,
 )  # fmt: skip
 POSE = Topic("robot/pose", brain.PoseInMap, 10, publishers=BRAIN, drawing="pose")
 MAP = Topic(
@@ -218,6 +225,10 @@ MAP_LIST = Service(
 )  # fmt: skip
 ZONES_CHANGE = Service(
     "robot/zones_change", zones.ZonesRequest, zones.ZonesReply, callers=OPERATOR, servers=BRAIN,
+)  # fmt: skip
+OBJECTS_CHANGE = Service(
+    "robot/objects_change", objects.ObjectsRequest, objects.ObjectsReply,
+    callers=OPERATOR, servers=BRAIN,
 )  # fmt: skip
 AUDIT_LOG = Service(
     "robot/audit_log", logs.AuditRequest, logs.AuditPage, priority="background",

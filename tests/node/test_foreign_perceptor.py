@@ -14,7 +14,7 @@ from msgspec import Struct
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.brain import DetectedObject, Intent, Objects, WorldModel
 from gigabrain_schemas.tasks import GoalRequest
-from gigabrain_schemas.topics import BODY, GOAL, OBJECTS, SCAN, STATE, WORLD
+from gigabrain_schemas.topics import BODY, GOAL, PERCEIVED, SCAN, STATE, WORLD
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import behaviours
@@ -37,7 +37,7 @@ HALL = """
 #..................#
 ####################
 """
-KEY = OBJECTS.at("people")
+KEY = PERCEIVED.at("people")
 SOURCE = '''"""Somebody's perceptors."""
 
 from msgspec import Struct
@@ -124,7 +124,7 @@ async def test_it_gets_scan_world_and_pose_of_one_tick_in_whatever_order(order: 
                     bench.send(WORLD, world(tick))
                 await bench.clock.advance(0)
         sent = [msgspec.msgpack.decode(data, type=Objects)
-                for key, data in bench.network.sent if key == "robot/objects/node"]  # fmt: skip
+                for key, data in bench.network.sent if key == "robot/perceived/node"]  # fmt: skip
     assert [(one.scan.basis, one.world.basis) for one in perceptor.given] == [(6, 6), (11, 11)]
     assert [(one.basis, one.objects[0].x) for one in sent] == [(6, 8.0), (11, 13.0)]
 

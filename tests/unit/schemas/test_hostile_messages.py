@@ -27,12 +27,13 @@ NULLABLE = {
     "TaskStatus.distance_remaining", "TaskStatus.eta", "TaskStatus.goal.yaw",
     "TaskStatus.done.0.position_error", "TaskStatus.done.0.heading_error",
     "Description.report.distance_m", "Description.report.contacts",
+    "Detections.tags.0.yaw_in_map",
 }  # fmt: skip
 WILL_DO_EMPTY = {
     "EstopRequest", "DescribeRequest", "AuditRequest", "AuditPage", "ParamRequest", "SimRequest",
-    "TaskStatus", "Zones", "MapListRequest", "MapListReply",
+    "TaskStatus", "Zones", "MapListRequest", "MapListReply", "ObjectMap",
 }  # fmt: skip
-NEEDS_ONE = {"GoalRequest", "ZonesRequest"}  # of several fields
+NEEDS_ONE = {"GoalRequest", "ZonesRequest", "ObjectsRequest"}  # of several fields
 REPORT = ("Description.report.distance_m", "Description.report.contacts")  # texts as well
 
 # maps whose keys are free, such as rates by key

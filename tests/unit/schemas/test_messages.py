@@ -26,6 +26,10 @@ REQUIRED: dict[str, set[str]] = {
     "Body": {"description", "link"},
     "WorldModel": {"scan_ok", "obstacle_ahead"},
     "Objects": {"objects"},
+    "Detections": {"camera", "width", "height"},
+    "ObjectMap": set(),
+    "ObjectsRequest": set(),
+    "ObjectsReply": {"ok", "text"},
     "PoseInMap": {"x", "y", "yaw", "covariance"},
     "OccupancyGrid": {"resolution", "width", "height", "origin_x", "origin_y", "cells"},
     "Intent": {"behaviour", "reason"},
@@ -75,7 +79,7 @@ REQUIRED: dict[str, set[str]] = {
 
 NEEDED = {  # one of several is needed, and the example has no other
     ("JointCommand", "position"), ("GoalRequest", "x"), ("GoalRequest", "y"),
-    ("ZonesRequest", "zone"),
+    ("ZonesRequest", "zone"), ("ObjectsRequest", "ids"),
 }  # fmt: skip
 
 by_name = pytest.mark.parametrize("name", sorted(EXAMPLES))
@@ -91,7 +95,9 @@ def test_the_table_holds_the_keys_and_rates_of_the_design() -> None:
         "robot/depth/*": ("DepthImage", 10),
         "robot/camera/*": ("CameraInfo", 1),
         "robot/world": ("WorldModel", 10),
-        "robot/objects/*": ("Objects", 10),
+        "robot/perceived/*": ("Objects", 10),
+        "robot/detections": ("Detections", 10),
+        "robot/objects": ("ObjectMap", 1),
         "robot/pose": ("PoseInMap", 10),
         "robot/map": ("OccupancyGrid", 1),
         "robot/zones": ("Zones", 0.5),
@@ -113,8 +119,8 @@ def test_the_table_holds_the_keys_and_rates_of_the_design() -> None:
     assert [service.at("*") for service in SERVICES] == [
         "robot/estop", "robot/release", "robot/enable", "robot/goal", "robot/mission",
         "robot/task_change", "robot/map_save", "robot/sim_change", "robot/map_load",
-        "robot/map_list", "robot/zones_change", "robot/audit_log", "robot/param/*",
-        "robot/describe/*",
+        "robot/map_list", "robot/zones_change", "robot/objects_change", "robot/audit_log",
+        "robot/param/*", "robot/describe/*",
     ]  # fmt: skip
 
 
@@ -128,7 +134,9 @@ def test_a_value_stops_counting_after_so_many_missed_periods() -> None:
         "robot/depth": 250_000_000,
         "robot/camera": 5_000_000_000,
         "robot/world": 250_000_000,
-        "robot/objects": 500_000_000,
+        "robot/perceived": 500_000_000,
+        "robot/detections": 500_000_000,
+        "robot/objects": 5_000_000_000,
         "robot/pose": 500_000_000,
         "robot/map": 5_000_000_000,
         "robot/zones": 10_000_000_000,
@@ -171,7 +179,7 @@ def test_every_message_has_an_example_in_which_every_field_is_used() -> None:
     of_other_kinds = {  # zones have the fields of their kind; a request has one subject
         "Zones.zones.0.max_speed", "Zones.zones.0.lane_width", "Zones.zones.1.lane_width",
         "Zones.zones.2.max_speed", "ZonesRequest.zone.max_speed", "ZonesRequest.zone.lane_width",
-        "ZonesRequest.place", "Zones.places.1.yaw",
+        "ZonesRequest.place", "Zones.places.1.yaw", "GoalRequest.tag",
     }  # fmt: skip
     elsewhere = {"WorldModel.sectors.3", "Description.report.min_clearance_m"}
     assert unused == elsewhere | not_ended | of_other_kinds
@@ -190,7 +198,7 @@ def test_every_message_is_frozen_and_documented_and_carries_the_header(
 def test_the_golden_folder_holds_the_examples_byte_for_byte() -> None:
     stored = {path.name: path.read_bytes() for path in examples.FOLDER.iterdir()}
     assert stored == examples.files()
-    assert len(stored) == 102
+    assert len(stored) == 110
 
 
 @by_name

@@ -1,0 +1,115 @@
+"""What was recognised: things and tags in one picture, and a memory of what stands where."""
+
+from typing import Annotated
+
+from msgspec import Meta
+
+from gigabrain_schemas.base import (
+    Angle,
+    Coordinate,
+    Count,
+    Distance,
+    Fraction,
+    Message,
+    Name,
+    Record,
+    Text,
+)
+from gigabrain_schemas.body import CameraName, PixelOffset, Side
+from gigabrain_schemas.sensors import Quaternion
+
+Point = tuple[Coordinate, Coordinate, Coordinate]  # [m] x, y, z; z from the floor
+Box = tuple[PixelOffset, PixelOffset, PixelOffset, PixelOffset]  # [px] left, top, right, bottom
+Pixel = tuple[PixelOffset, PixelOffset]
+TagId = Annotated[int, Meta(ge=0, le=1_000_000)]
+Label = Annotated[str, Meta(min_length=1, max_length=64)]
+Extent = tuple[Distance, Distance]  # [m] width and height
+
+
+class Detection(Record, frozen=True, kw_only=True):
+    """A thing in a picture."""
+
+    label: Label  # its class
+    confidence: Fraction
+    box: Box
+    position: Point | None = None  # [m], its middle in the body's frame at the exposure; by depth
+    in_map: Point | None = None  # [m], the same in the map; None where the robot is not localized
+    size: Extent | None = None  # by depth
+
+
+class TagDetection(Record, frozen=True, kw_only=True):
+    """An AprilTag in a picture. Its x axis comes out of its face, its z axis points to its top."""
+
+    id: TagId
+    corners: tuple[Pixel, Pixel, Pixel, Pixel]  # from its lower left, counter-clockwise as seen
+    size: Distance  # [m], of its black square
+    position: Point  # [m], in the body's frame at the exposure
+    orientation: Quaternion  # x, y, z, w, in the body's frame
+    in_map: Point | None = None  # [m]
+    yaw_in_map: Angle | None = None  # [rad], of its x axis
+
+
+class Detections(Message, frozen=True, kw_only=True):
+    """Everything that was recognised in one picture. Its basis is that of the exposure."""
+
+    camera: CameraName
+    width: Side  # [px], of the picture
+    height: Side  # [px]
+    things: Annotated[tuple[Detection, ...], Meta(max_length=128)] = ()
+    tags: Annotated[tuple[TagDetection, ...], Meta(max_length=64)] = ()
+    took_ms: Annotated[float, Meta(ge=0.0, le=1e6)] = 0.0
+
+
+class MapObject(Record, frozen=True, kw_only=True):
+    """A thing that stands in the map."""
+
+    id: Count
+    label: Label
+    x: Coordinate  # [m], its middle
+    y: Coordinate  # [m]
+    z: Coordinate  # [m], from the floor
+    size: Extent
+    confidence: Fraction
+    seen: Count = 1  # pictures
+    last_seen_ns: Count = 0  # Unix time, for people
+
+
+class MapTag(Record, frozen=True, kw_only=True):
+    """An AprilTag that hangs in the map."""
+
+    id: TagId
+    x: Coordinate  # [m]
+    y: Coordinate  # [m]
+    z: Coordinate  # [m], from the floor
+    yaw: Angle  # [rad], where its face looks
+    size: Distance  # [m], of its black square
+    seen: Count = 1  # pictures
+    last_seen_ns: Count = 0  # Unix time, for people
+
+
+class ObjectMap(Message, frozen=True, kw_only=True):
+    """A memory of what stands where in the map. The last value is kept for late joiners."""
+
+    objects: Annotated[tuple[MapObject, ...], Meta(max_length=256)] = ()
+    tags: Annotated[tuple[MapTag, ...], Meta(max_length=256)] = ()
+    map: Name = ""  # the saved map that it is kept with; empty for a growing one
+
+
+class ObjectsRequest(Message, frozen=True, kw_only=True):
+    """Forget objects or tags."""
+
+    ids: Annotated[tuple[Count, ...], Meta(max_length=256)] = ()
+    tags: Annotated[tuple[TagId, ...], Meta(max_length=256)] = ()
+    everything: bool = False
+    source: Name = "anonymous"
+
+    def __post_init__(self) -> None:
+        if bool(self.ids or self.tags) == self.everything:
+            raise ValueError("expected ids and tags, or everything")
+
+
+class ObjectsReply(Message, frozen=True, kw_only=True):
+    """The result of a change."""
+
+    ok: bool
+    text: Text  # a sentence for people
