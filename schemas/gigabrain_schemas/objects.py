@@ -93,6 +93,7 @@ class ObjectMap(Message, frozen=True, kw_only=True):
     objects: Annotated[tuple[MapObject, ...], Meta(max_length=256)] = ()
     tags: Annotated[tuple[MapTag, ...], Meta(max_length=256)] = ()
     map: Name = ""  # the saved map that it is kept with; empty for a growing one
+    recognizing: bool = False  # detections have come within the last seconds
 
 
 class ObjectsRequest(Message, frozen=True, kw_only=True):

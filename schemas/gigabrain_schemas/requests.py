@@ -4,7 +4,17 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, field
 
-from gigabrain_schemas.base import Count, Finite, Key, Message, Name, Record, Text
+from gigabrain_schemas.base import (
+    Angle,
+    Coordinate,
+    Count,
+    Finite,
+    Key,
+    Message,
+    Name,
+    Record,
+    Text,
+)
 from gigabrain_schemas.body import GateStatus
 
 Keys = Annotated[tuple[Key, ...], Meta(max_length=256)]
@@ -54,6 +64,22 @@ class MapRequest(Message, frozen=True, kw_only=True):
 
 class MapReply(Message, frozen=True, kw_only=True):
     """The result of saving a map, with its place."""
+
+    ok: bool
+    text: Text  # a sentence for people
+
+
+class PoseRequest(Message, frozen=True, kw_only=True):
+    """Look for the robot at a pose in its map, as RViz's 2D Pose Estimate does."""
+
+    x: Coordinate  # [m]
+    y: Coordinate  # [m]
+    yaw: Angle | None = None  # [rad]; None for any
+    source: Name = "anonymous"
+
+
+class PoseReply(Message, frozen=True, kw_only=True):
+    """Whether the robot is looked for there."""
 
     ok: bool
     text: Text  # a sentence for people

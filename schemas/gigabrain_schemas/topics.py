@@ -226,6 +226,9 @@ MAP_LIST = Service(
 ZONES_CHANGE = Service(
     "robot/zones_change", zones.ZonesRequest, zones.ZonesReply, callers=OPERATOR, servers=BRAIN,
 )  # fmt: skip
+POSE_SET = Service(
+    "robot/pose_set", requests.PoseRequest, requests.PoseReply, callers=OPERATOR, servers=BRAIN,
+)  # fmt: skip
 OBJECTS_CHANGE = Service(
     "robot/objects_change", objects.ObjectsRequest, objects.ObjectsReply,
     callers=OPERATOR, servers=BRAIN,

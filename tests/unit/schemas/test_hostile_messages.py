@@ -23,7 +23,7 @@ NULLABLE = {
     "SafetyState.caps.forward", "SafetyState.caps.backward", "SafetyState.caps.left",
     "SafetyState.caps.right", "SafetyState.caps.rotation",
     "SafetyState.caps.turn_left", "SafetyState.caps.turn_right",
-    "GoalRequest.yaw", "Zones.places.0.yaw",
+    "GoalRequest.yaw", "PoseRequest.yaw", "Zones.places.0.yaw",
     "TaskStatus.distance_remaining", "TaskStatus.eta", "TaskStatus.goal.yaw",
     "TaskStatus.done.0.position_error", "TaskStatus.done.0.heading_error",
     "Description.report.distance_m", "Description.report.contacts",

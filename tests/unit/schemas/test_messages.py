@@ -28,6 +28,8 @@ REQUIRED: dict[str, set[str]] = {
     "Objects": {"objects"},
     "Detections": {"camera", "width", "height"},
     "ObjectMap": set(),
+    "PoseRequest": {"x", "y"},
+    "PoseReply": {"ok", "text"},
     "ObjectsRequest": set(),
     "ObjectsReply": {"ok", "text"},
     "PoseInMap": {"x", "y", "yaw", "covariance"},
@@ -119,8 +121,8 @@ def test_the_table_holds_the_keys_and_rates_of_the_design() -> None:
     assert [service.at("*") for service in SERVICES] == [
         "robot/estop", "robot/release", "robot/enable", "robot/goal", "robot/mission",
         "robot/task_change", "robot/map_save", "robot/sim_change", "robot/map_load",
-        "robot/map_list", "robot/zones_change", "robot/objects_change", "robot/audit_log",
-        "robot/param/*", "robot/describe/*",
+        "robot/map_list", "robot/zones_change", "robot/pose_set", "robot/objects_change",
+        "robot/audit_log", "robot/param/*", "robot/describe/*",
     ]  # fmt: skip
 
 
@@ -198,7 +200,7 @@ def test_every_message_is_frozen_and_documented_and_carries_the_header(
 def test_the_golden_folder_holds_the_examples_byte_for_byte() -> None:
     stored = {path.name: path.read_bytes() for path in examples.FOLDER.iterdir()}
     assert stored == examples.files()
-    assert len(stored) == 110
+    assert len(stored) == 114
 
 
 @by_name
