@@ -4,6 +4,8 @@ A busy process skips messages, and work in other threads is done in time or not.
 know both.
 """
 
+import asyncio
+import contextlib
 from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -12,6 +14,7 @@ import msgspec
 
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.logs import (
+    FINISHED,
     MAX_ENTRIES,
     WAITED,
     AcceptedRequest,
@@ -43,8 +46,25 @@ class InputLogger:
         """Return whether background work is done within that time; the node may use its result."""
         return done(job, patience_s)
 
+    def when_done(self, job: Job, then: Callable[[Job], None]) -> None:
+        """Call `then(job)` on the event loop once background work is done."""
+        loop = asyncio.get_running_loop()
+
+        def finish() -> None:
+            self._note_finished()
+            then(job)
+
+        def wake(_job: Job) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop is closed
+                loop.call_soon_threadsafe(finish)
+
+        job.add_done_callback(wake)
+
     def flush(self) -> None:
         """Publish all entries that are not published yet."""
+
+    def _note_finished(self) -> None:
+        """Record that background work counts from now on."""
 
 
 class PublishedInputLogger(InputLogger):
@@ -77,6 +97,9 @@ class PublishedInputLogger(InputLogger):
             self._taken, self._keys = [], {}
             self._publish(InputLog(began_ns=self._began_ns, keys=keys, taken=tuple(taken)))
 
+    def _note_finished(self) -> None:
+        self._add(FINISHED, 1)
+
     def _add(self, key: str, seq: int) -> None:
         now_ns = self._unix_ns()
         after_ns = now_ns - self._began_ns
@@ -95,11 +118,23 @@ class ReplayedInputLogger(InputLogger):
 
     def __init__(self) -> None:
         self.outcomes: deque[bool] = deque()  # of what is waited for at the present message
+        self._unfinished: deque[tuple[Job, Callable[[Job], None]]] = deque()
 
     def in_time(self, job: Job, patience_s: float) -> bool:
         """Return the recorded outcome; wait for work without one."""
         there = self.outcomes.popleft() if self.outcomes else True
         return there and done(job, None)
+
+    def when_done(self, job: Job, then: Callable[[Job], None]) -> None:
+        """Keep it until `finish`."""
+        self._unfinished.append((job, then))
+
+    def finish(self) -> None:
+        """Wait for the oldest work that is not finished, which counts from now on."""
+        if self._unfinished:
+            job, then = self._unfinished.popleft()
+            done(job, None)
+            then(job)
 
 
 def log_accepted(bus: "Bus", key: str, request: Message, basis: int) -> None:

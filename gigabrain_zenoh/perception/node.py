@@ -8,23 +8,26 @@ from functools import cache, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats, hits_bytes
-from gigabrain_schemas.base import Pose
-from gigabrain_schemas.body import Body, BodyDescription, RobotState
+from gigabrain_schemas.base import TICK_S, Pose
+from gigabrain_schemas.body import Body, BodyDescription, Camera, RobotState
 from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import BODY, SCAN, STATE, WORLD
-from gigabrain_zenoh.bus.bus import Bus, Latest
+from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.geometry.pose import PlacedScans
 from gigabrain_zenoh.geometry.scan import EDGE, blind_ahead, hits, scan_problem
+from gigabrain_zenoh.geometry.stopping import scan_limit_ns
 from gigabrain_zenoh.kernels.precompile import Kernels
 from gigabrain_zenoh.perception.obstacle_tracker import ObstacleTracker
 from gigabrain_zenoh.runtime.heartbeat import Progress
 
 if TYPE_CHECKING:
+    from gigabrain_zenoh.perception.camera_contours import CameraContours
     from gigabrain_zenoh.perception.mapper import Mapper
 
 MAP_KERNELS = "gigabrain_zenoh.mapping.slam_map:warm_up"  # calls each kernel once, to compile it
@@ -90,25 +93,82 @@ def _unknown(problem: str) -> WorldModel:
     return WorldModel(scan_ok=False, scan_problem=problem, obstacle_ahead=True)
 
 
+class WorldPublisher:
+    """Publishes a world for each scan, and the newest one again when cameras have seen more."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self.cameras: CameraContours | None = None  # imported and made only where there are some
+        self.on_state: Callable[[RobotState], object] = id  # called while there are cameras
+        self._of: tuple[Camera, ...] = ()
+        self._newest: tuple[WorldModel, Pose | None] | None = None
+        self.body = bus.latest(BODY, self._on_body)
+
+    def close(self) -> None:
+        """End the thread that looks at pictures."""
+        if self.cameras:
+            self.cameras.close()
+            self.cameras = None
+
+    def publish(self, world: WorldModel, pose: Pose | None, basis: int) -> None:
+        """Publish the world of a scan, taken where the body was at `pose` in the odometry."""
+        world = replace(world, tick=self._bus.time.tick, basis=basis)
+        self._newest = self._publish(world, pose), pose
+
+    def _publish(self, world: WorldModel, pose: Pose | None) -> WorldModel:
+        if self.cameras:
+            contours = self.cameras.contours(pose, world.basis)
+            statuses = self.cameras.statuses(self._bus.time.tick)
+            world = replace(world, contours=contours, cameras=statuses)
+        return self._bus.publish(WORLD, world, basis=world.basis, tick=world.tick)
+
+    def _on_new(self) -> None:
+        """Publish the newest world again, unless its scan is old."""
+        time, body = self._bus.time, self.body.current
+        if self._newest and body:
+            world, pose = self._newest
+            age_s = (time.tick - world.basis) * TICK_S
+            limit_s = scan_limit_ns(body.description) / 1e9
+            if world.boot == time.boot and age_s <= limit_s:
+                self._publish(world, pose)
+
+    def _on_body(self, body: Body) -> None:
+        description = body.description
+        if description.cameras == self._of:
+            return
+        self.close()
+        self._of, self._newest = description.cameras, None
+        if self._of:
+            from gigabrain_zenoh.perception.camera_contours import CameraContours
+
+            self.cameras = CameraContours(self._bus, description, self._on_new, self._on_state)
+
+    def _on_state(self, state: RobotState) -> None:
+        self.on_state(state)
+
+
 async def run(config: PerceptionConfig, bus: Bus, ready: Callable[[], None]) -> None:
     """Publish a world model as soon as each scan arrives, until the process ends."""
-    body = bus.latest(BODY)
+    worlds = WorldPublisher(bus)
+    body = worlds.body
     needs = (SCAN.key,) if config.mapping == "off" else (SCAN.key, STATE.key)
 
     def received() -> tuple[object, ...]:
         return tuple(map(bus.arrived.get, needs)) if body.current else ()
 
     bus.progress = Progress(received, lambda: bus.sent[WORLD.key])
+    with closing(worlds):
+        if config.mapping == "off":
+            _follow(config, bus, worlds)
+            ready()
+            await bus.failed
+            return
+        await _run_with_maps(config, bus, worlds, ready)
 
-    def on_scan(scan: LaserScan) -> None:
-        if body.current:
-            bus.publish(WORLD, step(config, body.current.description, scan), basis=scan.basis)
 
-    if config.mapping == "off":
-        bus.latest(SCAN, on_scan)
-        ready()
-        await bus.failed
-        return
+async def _run_with_maps(
+    config: PerceptionConfig, bus: Bus, worlds: WorldPublisher, ready: Callable[[], None]
+) -> None:
     maps = config.mapping == "slam"
     kernels = Kernels(MAP_KERNELS if maps else LOCALIZE_KERNELS, bus.input_log.in_time)
     # a saved map is checked before anything drives by it
@@ -120,21 +180,34 @@ async def run(config: PerceptionConfig, bus: Bus, ready: Callable[[], None]) -> 
         def mapper() -> "Mapper":
             from gigabrain_zenoh.perception.mapper import Mapper  # imports numba: for maps only
 
-            made = stack.enter_context(closing(Mapper(config, bus, body)))
+            made = stack.enter_context(closing(Mapper(config, bus, worlds.body)))
             stack.push_async_callback(made.finish_writing)
             return made
 
         if not kernels.beside:
             mapper()
-        _follow(config, bus, body, kernels, mapper)
+        _follow_odometry(config, bus, worlds, kernels, mapper)
         ready()
         await asyncio.gather(bus.failed, kernels.finish())
 
 
-def _follow(
+def _follow(config: PerceptionConfig, bus: Bus, worlds: WorldPublisher) -> None:
+    """Publish world models without odometry, unless cameras need it."""
+
+    def on_scan(scan: LaserScan, pose: Pose | None) -> None:
+        body = worlds.body.current
+        if body:
+            worlds.publish(step(config, body.description, scan), pose, scan.basis)
+
+    placed = PlacedScans(on_scan, lambda scan: on_scan(scan, None))
+    worlds.on_state = placed.state
+    bus.latest(SCAN, lambda scan: placed.scan(scan) if worlds.cameras else on_scan(scan, None))
+
+
+def _follow_odometry(
     config: PerceptionConfig,
     bus: Bus,
-    body: Latest[Body],
+    worlds: WorldPublisher,
     kernels: Kernels,
     make_mapper: "Callable[[], Mapper]",
 ) -> None:
@@ -146,11 +219,11 @@ def _follow(
     mapper: Mapper | None = None
 
     def on_scan(scan: LaserScan, pose: Pose | None) -> None:
-        if body.current:
-            description = body.current.description
-            world = step(config, description, scan)
-            world = tracker.add_obstacles(world, description.lidar, scan, pose)
-            bus.publish(WORLD, world, basis=scan.basis)
+        body = worlds.body.current
+        if body:
+            world = step(config, body.description, scan)
+            world = tracker.add_obstacles(world, body.description.lidar, scan, pose)
+            worlds.publish(world, pose, scan.basis)
             if mapper:
                 mapper.process_scan(scan, world.scan_problem)
 

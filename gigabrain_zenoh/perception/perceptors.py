@@ -77,6 +77,7 @@ class PerceptorLoop:
         scan = self._scan
         found = scan and (scan.boot, scan.basis) == (world.boot, world.basis)
         self._waiting = (scan, world) if scan and found else None
+        self._scan = None  # cameras make more worlds of one scan
 
     def add_state(self, state: RobotState) -> None:
         """Add the odometry."""

@@ -16,7 +16,7 @@ import msgspec
 from msgspec import Struct
 
 from gigabrain_schemas.base import Message
-from gigabrain_schemas.logs import WAITED, AcceptedRequest, InputLog
+from gigabrain_schemas.logs import FINISHED, WAITED, AcceptedRequest, InputLog
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import (
     CMD_VEL,
@@ -162,7 +162,11 @@ def logged_inputs(recorded: Sequence[Sample], process: str) -> RecordedInputs | 
     events: list[Event] = []
     lost = 0
     for at_ns, name, seq in _entries(logs):
-        payload = bytes((seq > 0,)) if name == WAITED else _nearest(by_number[name, seq], at_ns)
+        payload = (
+            bytes((seq > 0,))
+            if name in (WAITED, FINISHED)
+            else _nearest(by_number[name, seq], at_ns)
+        )
         if payload is None:
             lost += 1
         else:

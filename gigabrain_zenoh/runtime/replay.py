@@ -5,7 +5,7 @@ import contextlib
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 
-from gigabrain_schemas.logs import WAITED
+from gigabrain_schemas.logs import FINISHED, WAITED
 from gigabrain_schemas.topics import MAP_SAVE, SERVICES
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.input_log import ReplayedInputLogger
@@ -36,13 +36,15 @@ async def replay(
 
     The node's parameters are served under the name `process`. An event on a service's key is a
     request; it is answered before time continues, except when it saves a map. An event on WAITED
-    holds the outcome of a wait for a worker thread, at the event before it. Raises the node's own
+    holds the outcome of a wait for a worker thread, at the event before it; at one on FINISHED work
+    in a thread is finished, or at once where there is none. Raises the node's own
     error, and ValueError for events that are not in order of time.
     """
     clock, network = FakeClock(), LocalNetwork()
     bus = Bus(network.transport(), clock, process)
     serve_params(bus)
     bus.input_log = past = ReplayedInputLogger()
+    finishes_logged = any(key == FINISHED for _, key, _ in recording)
     ready, asked = asyncio.Event(), list[asyncio.Future[None]]()
     running = asyncio.ensure_future(node(bus, ready.set))
     try:
@@ -55,8 +57,12 @@ async def replay(
             if key in ASKED or key.rpartition("/")[0] in ASKED:
                 asked.append(asyncio.ensure_future(_ask(network, key, payload)))
                 await asyncio.wait(asked[-1:], timeout=0.0 if key in GOES_ON else PATIENCE_S)
+            elif key == FINISHED:
+                past.finish()
             else:
                 network.deliver(key, payload)
+                if not finishes_logged:
+                    past.finish()
         await clock.advance(0)
     finally:
         for each in (running, *asked):

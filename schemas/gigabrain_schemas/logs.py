@@ -62,7 +62,8 @@ class InputLog(Message, frozen=True, kw_only=True):
     """All inputs that a process has used since its last InputLog, in its own order.
 
     A busy process skips messages, and those on different keys arrive in any order; only the process
-    knows what its output rests on. The key WAITED stands for background work.
+    knows what its output rests on. The key WAITED stands for background work that is due,
+    FINISHED for such work that counts as soon as it is finished.
     """
 
     began_ns: Count  # Unix time of the first entry, by the process's own clock
@@ -75,6 +76,7 @@ class InputLog(Message, frozen=True, kw_only=True):
 
 
 WAITED = "~waited"
+FINISHED = "~finished"
 
 
 class AcceptedRequest(Message, frozen=True, kw_only=True):
