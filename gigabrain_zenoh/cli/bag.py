@@ -29,6 +29,7 @@ def record(
     seconds: float | None = None,
     split_size: float | None = None,
     split_time: float | None = None,
+    pictures: float | None = None,
     raw_only: bool = False,
     keep_free: float = 200.0,
 ) -> int:
@@ -43,6 +44,7 @@ def record(
         seconds: End after this time [s].
         split_size: Start a new file after this size [MB].
         split_time: Start a new file after this time [s].
+        pictures: Pictures and depth of each camera [Hz]; 0: none. Default: all.
         raw_only: Leave out the drawings for Foxglove, Lichtblick and Rerun: half the size.
         keep_free: Stop writing while less than this is free on the disk [MB].
     """
@@ -53,6 +55,7 @@ def record(
     values = {
         "file": str(output or file_name()),
         "topics": topics or (),
+        "pictures": pictures,
         "viewers": not raw_only,
         "split_mb": split_size,
         "split_s": split_time,

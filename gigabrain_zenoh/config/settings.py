@@ -149,6 +149,8 @@ class RecorderConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     folder: str = ""  # folder of the recordings; empty: the user's state folder
     file: str = ""  # name of a single file, instead of `folder`
     topics: tuple[str, ...] = ()  # names or key expressions; empty: all
+    pictures: Annotated[float, Meta(ge=0, le=120)] | None = None
+    # [Hz], pictures and depth of each camera; 0: none; without it all
     viewers: bool = True  # also record the messages that Foxglove, Lichtblick and Rerun draw
     split_mb: Annotated[float, Meta(gt=0)] | None = None  # start a new file after this size [MB]
     split_s: Annotated[float, Meta(gt=0)] | None = None  # or after this time [s]

@@ -26,7 +26,7 @@ from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Metadata, 
 from mcap.writer import MCAP0_MAGIC
 from msgspec import Struct
 
-from gigabrain_schemas.topics import current_key
+from gigabrain_schemas.topics import DEPTH, IMAGE, current_key
 from gigabrain_zenoh.bus.headers import Header, SequenceGaps, header_of
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import open_regular
@@ -294,6 +294,8 @@ class _StrictStream(ReadDataStream):
         return data
 
 
+PICTURE_KEYS = (f"{IMAGE.key}/", f"{DEPTH.key}/")
+PICTURES_NOTE = "pictures"  # of a recording that leaves pictures out: their rate
 TABLE_HEAD = (
     f"{'key':<28} {'message':<14} {'messages':>8} {'hz':>7} {'kB':>9} {'missing':>8} "
     f"{'restarts':>9} {'longest gap':>11}"
@@ -351,7 +353,8 @@ def read_info(path: Path) -> BagInfo:
     bag, gaps, keys = Bag(path), SequenceGaps(), dict[str, _KeyCounts]()
     first_ns = last_ns = 0
     for sample in bag:
-        gaps.count(sample.key, sample.header)
+        if not (sample.key.startswith(PICTURE_KEYS) and _leaves_out_pictures(bag)):
+            gaps.count(sample.key, sample.header)
         key = keys.setdefault(sample.key, _KeyCounts())
         if key.messages:
             key.longest_ns = max(key.longest_ns, sample.log_ns - key.last_ns)
@@ -371,6 +374,10 @@ def read_info(path: Path) -> BagInfo:
         keys=infos,
         notes={name: dict(values) for name, values in bag.notes.items()},
     )
+
+
+def _leaves_out_pictures(bag: Bag) -> bool:
+    return PICTURES_NOTE in bag.notes.get("gigabrain", {})
 
 
 def faults(info: BagInfo) -> list[str]:

@@ -15,7 +15,7 @@ from mcap.well_known import MessageEncoding
 from mcap.writer import IndexType, Writer
 from msgspec import Struct
 
-from gigabrain_schemas.topics import CMD_VEL, INTENT, STATE, TASK, TOPICS, Topic
+from gigabrain_schemas.topics import CMD_VEL, DEPTH, INTENT, STATE, TASK, TOPICS, Topic
 from gigabrain_zenoh.bus.headers import Header, is_json
 from gigabrain_zenoh.bus.listening import topic_of
 from gigabrain_zenoh.codec import Codec
@@ -23,7 +23,8 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import open_regular
 from gigabrain_zenoh.host.posix import fcntl
 from gigabrain_zenoh.recording.bag_reader import MAGIC, RAW, Bag, BagDamage, check_magic
-from gigabrain_zenoh.recording.drawing import Drawer, Drawn, json_schema
+from gigabrain_zenoh.recording.drawing import Drawer
+from gigabrain_zenoh.recording.drawn import Drawn, json_schema
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +34,7 @@ MIN_DRAWN_INTERVAL_NS = {
     STATE.key: 30_000_000,
     CMD_VEL.key: 30_000_000,
     TASK.key: 450_000_000,  # holds the whole path to the goal
+    DEPTH.key: 450_000_000,  # of each camera; viewers take it uncompressed
 }
 _fdatasync = getattr(os, "fdatasync", os.fsync)  # macOS has no fdatasync
 
@@ -182,7 +184,7 @@ class BagWriter:
         self.first_ns = self.first_ns or log_ns
         stamp_ns = header.stamp_ns or log_ns
         self._writer.add_message(channel.id, log_ns, payload, stamp_ns, header.seq & 0xFFFF_FFFF)
-        if channel.drawn and self._is_worth_drawing(message):
+        if channel.drawn and self._is_worth_drawing(channel.drawn, message):
             self._draw(channel.drawn, message)
         self._store()
 
@@ -243,13 +245,13 @@ class BagWriter:
             channel = self._view_channel(drawn)
             self._writer.add_message(channel, received.log_ns, drawn.data, stamp_ns)
 
-    def _is_worth_drawing(self, message: ReceivedMessage) -> bool:
+    def _is_worth_drawing(self, topic: Topic[Any], message: ReceivedMessage) -> bool:
         """Return whether it shows more than the one before; decided before it is decoded."""
         key, header = message.key, message.header
         if key == INTENT.key:  # repeated with every tick
             before, self._last_intent = self._last_intent, (header.boot, header.basis)
             return before != self._last_intent
-        interval_ns = MIN_DRAWN_INTERVAL_NS.get(key)
+        interval_ns = MIN_DRAWN_INTERVAL_NS.get(topic.key)
         if interval_ns is not None:
             if message.log_ns - self._last_drawn_ns.get(key, 0) < interval_ns:
                 return False

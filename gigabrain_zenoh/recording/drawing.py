@@ -7,25 +7,45 @@ lidar's own frame.
 import functools
 import math
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import msgspec
 import numpy as np
-from foxglove import Schema
 from foxglove import messages as fox
 
 from gigabrain_schemas.base import Message, Pose
 from gigabrain_schemas.body import Body, RobotState
-from gigabrain_schemas.brain import Intent, Obstacle, OccupancyGrid, PoseInMap, WorldModel
+from gigabrain_schemas.brain import (
+    Intent,
+    Objects,
+    Obstacle,
+    OccupancyGrid,
+    PoseInMap,
+    WorldModel,
+)
 from gigabrain_schemas.safety import LogRecord
-from gigabrain_schemas.sensors import Image, LaserScan
+from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.tasks import TaskStatus
 from gigabrain_schemas.topics import Drawing, Topic
 from gigabrain_schemas.zones import Place, Zone, Zones
 from gigabrain_zenoh.geometry.pose import to_frame
+from gigabrain_zenoh.recording import camera_drawing
+from gigabrain_zenoh.recording.drawn import (
+    BASE,
+    BLUE,
+    LIDAR,
+    MAP,
+    ODOM,
+    Drawn,
+    KnownEntities,
+    as_drawn,
+    json_schema,
+    label,
+    pose_of,
+    quaternion,
+    stamp,
+)
 
-MAP, ODOM, BASE = "map", "odom", "base_link"
-LIDAR = "base_scan"  # as LaserScan has it
 GREY = [round(254 - 2.54 * cell) for cell in range(101)]  # by probability of being occupied [%]
 CELL_COLOURS = np.array(  # red, green, blue and alpha as one number; unknown is transparent
     [
@@ -50,8 +70,7 @@ ZONE_COLOURS = {
     "speed": fox.Color(r=0.96, g=0.62, b=0.04, a=0.8),
     "one_way": fox.Color(r=0.04, g=0.37, b=0.49, a=0.3),
 }
-PLACE_COLOUR = fox.Color(r=0.04, g=0.37, b=0.49, a=1.0)
-PLACE_LENGTH_M, LABEL_SIZE_M = 0.4, 0.25
+PLACE_LENGTH_M = 0.4
 OBSTACLE_HEIGHT_M = 0.3
 LINE_WIDTH_M = 0.08
 ARROW_TIME_S = 1.0  # an arrow reaches to where an obstacle will be then
@@ -60,28 +79,11 @@ MIN_WALL_RADIUS_M = 0.3  # larger obstacles at rest are drawn as the points seen
 MAX_POINT_GAP_M = 0.25  # between two neighbouring points on one obstacle
 OBSTACLE_LIFETIME = fox.Duration(sec=1)
 
-MAX_SCHEMA_DEPTH = 12  # a Struct may contain itself
-SCALARS = {str: "string", bool: "boolean", int: "integer", float: "number"}
-BOUNDS = ("type", "minimum", "exclusiveMinimum")
-
-
-class Drawn(NamedTuple):
-    """One encoded message for viewers."""
-
-    topic: str
-    encoding: str  # protobuf or json
-    schema: Callable[[], Schema]
-    data: bytes
-
-
-def _drawn(topic: str, message: Any) -> Drawn:
-    return Drawn(f"/viz/{topic}", "protobuf", type(message).get_schema, message.encode())
-
 
 def _numbers(topic: Topic[Any], message: Message) -> Drawn:
     """Return the numbers of a message for plots, without what is drawn otherwise."""
     if isinstance(message, WorldModel):
-        message = msgspec.structs.replace(message, hits=b"", obstacles=())
+        message = msgspec.structs.replace(message, hits=b"", obstacles=(), contours=())
     elif isinstance(message, Intent):
         message = msgspec.structs.replace(message, trajectory=())
     schema = functools.partial(json_schema, topic.type)
@@ -94,7 +96,7 @@ class Drawer:
 
     def __init__(self) -> None:
         self._odometry = Pose(x=0.0, y=0.0, yaw=0.0)
-        self._zones_drawn: set[str] = set()  # ids
+        self._zones_drawn = KnownEntities()
         self._last_intent = (0, -1)  # boot and basis of the last path drawn
         self._converters: dict[Drawing, Callable[[Any, str], Iterable[Drawn]]] = {
             "scan": self._scan,
@@ -104,10 +106,15 @@ class Drawer:
             "path": self._path,
             "obstacles": self._obstacles,
             "task": self._task,
-            "image": self._image,
             "log": self._log,
             "odometry": self._state,
             "lidar_frame": self._body,
+            "image": camera_drawing.picture,
+            "depth": camera_drawing.depth,
+            "camera": camera_drawing.calibration,
+            "detections": camera_drawing.recognised,
+            "objects": camera_drawing.ObjectMapDrawing().draw,
+            "perceived": self._perceived,
         }
 
     def draws(self, topic: Topic[Any]) -> bool:
@@ -138,7 +145,7 @@ class Drawer:
             end_angle=last,
             ranges=cast(list[float], ranges.astype(np.float64)),
         )
-        yield _drawn("scan", drawn)
+        yield as_drawn("scan", drawn)
 
     def _map(self, grid: OccupancyGrid, _: str) -> Iterable[Drawn]:
         cells = np.frombuffer(grid.cells, np.uint8)
@@ -155,28 +162,18 @@ class Drawer:
             fields=[fox.PackedElementField(name=n, offset=i, type=byte) for i, n in names],
             data=CELL_COLOURS[cells].tobytes(),
         )
-        yield _drawn("map", drawn)
+        yield as_drawn("map", drawn)
 
     def _zones(self, zones: Zones, _: str) -> Iterable[Drawn]:
         """Draw the edges of zones, the direction of lanes, and the places, each with its name."""
-        entities = [_zone_entity(zones, one) for one in zones.zones]
-        entities += [_place_entity(zones, one) for one in zones.places]
-        names = {one.name for one in zones.zones} | {one.name for one in zones.places}
-        gone = [
-            fox.SceneEntityDeletion(
-                timestamp=stamp(zones),
-                type=fox.SceneEntityDeletionType.MatchingId,
-                id=name,
-            )
-            for name in sorted(self._zones_drawn - names)
-        ]
-        self._zones_drawn = names
-        yield _drawn("zones", fox.SceneUpdate(entities=entities, deletions=gone))
+        entities = {one.name: _zone_entity(zones, one) for one in zones.zones}
+        entities |= {one.name: _place_entity(zones, one) for one in zones.places}
+        yield as_drawn("zones", self._zones_drawn.update(zones, entities))
 
     def _pose(self, pose: PoseInMap, _: str) -> Iterable[Drawn]:
         here = pose_of(pose.x, pose.y, pose.yaw)
         in_map = fox.PoseInFrame(timestamp=stamp(pose), frame_id=MAP, pose=here)
-        yield _drawn("pose", in_map)
+        yield as_drawn("pose", in_map)
         odom = self._odometry
         yaw = pose.yaw - odom.yaw
         x = pose.x - odom.x * math.cos(yaw) + odom.y * math.sin(yaw)
@@ -187,11 +184,17 @@ class Drawer:
         shown = intent.trajectory[::PATH_STEP]
         poses = [pose_of(point.x, point.y, point.yaw) for point in shown]
         path = fox.PosesInFrame(timestamp=stamp(intent), frame_id=BASE, poses=poses)
-        yield _drawn("path", path)
+        yield as_drawn("path", path)
 
     def _obstacles(self, world: WorldModel, _: str) -> Iterable[Drawn]:
         entities = obstacle_entities(world, self._odometry)
-        yield _drawn("obstacles", fox.SceneUpdate(entities=entities))
+        yield as_drawn("obstacles", fox.SceneUpdate(entities=entities))
+        yield from camera_drawing.contours(world)
+
+    def _perceived(self, found: Objects, name: str) -> Iterable[Drawn]:
+        """Draw what a perceptor has found, with its labels."""
+        entities = [_cylinder(found, one, one.label) for one in found.objects]
+        yield as_drawn(f"perceived/{name}", fox.SceneUpdate(entities=entities))
 
     def _task(self, status: TaskStatus, _: str) -> Iterable[Drawn]:
         """Draw the path to the goal, with the goal at its end."""
@@ -200,26 +203,7 @@ class Drawer:
             goal = status.goal
             poses.append(pose_of(goal.x, goal.y, goal.yaw or 0.0))
         path = fox.PosesInFrame(timestamp=stamp(status), frame_id=MAP, poses=poses)
-        yield _drawn("way", path)
-
-    def _image(self, image: Image, name: str) -> Iterable[Drawn]:
-        when = stamp(image)
-        if image.encoding == "jpeg":
-            jpeg = fox.CompressedImage(
-                timestamp=when, frame_id=image.frame_id, data=image.data, format="jpeg"
-            )
-            yield _drawn(f"image/{name}", jpeg)
-            return
-        raw = fox.RawImage(
-            timestamp=when,
-            frame_id=image.frame_id,
-            width=image.width,
-            height=image.height,
-            encoding={"depth16": "16UC1", "depth32f": "32FC1"}.get(image.encoding, image.encoding),
-            step=len(image.data) // max(image.height, 1),
-            data=image.data,
-        )
-        yield _drawn(f"image/{name}", raw)
+        yield as_drawn("way", path)
 
     def _log(self, record: LogRecord, _: str) -> Iterable[Drawn]:
         drawn = fox.Log(
@@ -228,7 +212,7 @@ class Drawer:
             message=record.text,
             name=record.process,
         )
-        yield _drawn("log", drawn)
+        yield as_drawn("log", drawn)
 
     def _state(self, state: RobotState, _: str) -> Iterable[Drawn]:
         self._odometry = state.pose
@@ -249,22 +233,7 @@ class Drawer:
             translation=fox.Vector3(x=pose.x, y=pose.y),
             rotation=quaternion(pose.yaw),
         )
-        return _drawn("tf", drawn)
-
-
-def stamp(message: Message) -> fox.Timestamp:
-    """Return the time of validity of `message`."""
-    return fox.Timestamp(message.stamp_ns // 1_000_000_000, message.stamp_ns % 1_000_000_000)
-
-
-def quaternion(yaw: float) -> fox.Quaternion:
-    """Return a heading [rad] as a quaternion."""
-    return fox.Quaternion(z=math.sin(yaw / 2), w=math.cos(yaw / 2))
-
-
-def pose_of(x: float, y: float, yaw: float) -> fox.Pose:
-    """Return a planar pose [m, m, rad]."""
-    return fox.Pose(position=fox.Vector3(x=x, y=y), orientation=quaternion(yaw))
+        return as_drawn("tf", drawn)
 
 
 def obstacle_entities(world: WorldModel, odometry: Pose) -> list[fox.SceneEntity]:
@@ -316,10 +285,10 @@ def _zone_entity(zones: Zones, zone: Zone) -> fox.SceneEntity:
         (x, y), (to_x, to_y) = zone.points[-2:]
         arrows = [_arrow(x, y, math.atan2(to_y - y, to_x - x), math.hypot(to_x - x, to_y - y))]
     x, y = zone.points[0]
-    label = zone.name if zone.max_speed is None else f"{zone.name}: {zone.max_speed:g} m/s"
+    text = zone.name if zone.max_speed is None else f"{zone.name}: {zone.max_speed:g} m/s"
     return fox.SceneEntity(
         timestamp=stamp(zones), frame_id=MAP, id=zone.name, lines=[line], arrows=arrows,
-        texts=[_label(x, y, label)],
+        texts=[label(x, y, text)],
     )  # fmt: skip
 
 
@@ -329,26 +298,19 @@ def _place_entity(zones: Zones, place: Place) -> fox.SceneEntity:
     return fox.SceneEntity(
         timestamp=stamp(zones), frame_id=MAP, id=place.name,
         arrows=[_arrow(place.x, place.y, place.yaw or 0.0, length)],
-        texts=[_label(place.x, place.y, place.name)],
+        texts=[label(place.x, place.y, place.name)],
     )  # fmt: skip
 
 
 def _arrow(x: float, y: float, yaw: float, length: float) -> fox.ArrowPrimitive:
     return fox.ArrowPrimitive(
         pose=pose_of(x, y, yaw), shaft_length=length, shaft_diameter=0.04,
-        head_length=0.1, head_diameter=0.1, color=PLACE_COLOUR,
+        head_length=0.1, head_diameter=0.1, color=BLUE,
     )  # fmt: skip
 
 
-def _label(x: float, y: float, text: str) -> fox.TextPrimitive:
-    return fox.TextPrimitive(
-        pose=pose_of(x, y, 0.0), billboard=True, font_size=LABEL_SIZE_M, color=PLACE_COLOUR,
-        text=text,
-    )  # fmt: skip
-
-
-def _cylinder(world: WorldModel, one: Obstacle) -> fox.SceneEntity:
-    """Draw a cylinder, and an arrow to where it will be."""
+def _cylinder(at: Message, one: Obstacle, text: str = "") -> fox.SceneEntity:
+    """Draw a cylinder, an arrow to where it will be, and a text."""
     here = pose_of(one.x, one.y, 0.0)
     wide = 2 * max(one.radius, 0.01)
     body = fox.CylinderPrimitive(
@@ -362,59 +324,7 @@ def _cylinder(world: WorldModel, one: Obstacle) -> fox.SceneEntity:
         head_length=0.08, head_diameter=0.08, color=AMBER,
     )  # fmt: skip
     return fox.SceneEntity(
-        timestamp=stamp(world), frame_id=ODOM, id=str(one.id), lifetime=OBSTACLE_LIFETIME,
+        timestamp=stamp(at), frame_id=ODOM, id=str(one.id), lifetime=OBSTACLE_LIFETIME,
         cylinders=[body], arrows=[arrow] if speed > MIN_ARROW_SPEED else [],
+        texts=[label(one.x, one.y, text, OBSTACLE_HEIGHT_M)] if text else [],
     )  # fmt: skip
-
-
-def json_schema(kind: type[Message]) -> Schema:
-    """Return the schema of a message type in the form that viewers accept."""
-    return Schema(name=f"gigabrain.{kind.__name__}", encoding="jsonschema", data=flat_schema(kind))
-
-
-def flat_schema(message: type[msgspec.Struct]) -> bytes:
-    """Return the JSON Schema of `message` in the flat form that Foxglove and Lichtblick accept.
-
-    They refuse `$ref`, `$defs`, `anyOf`, an `enum` without `type`, and arrays of arrays. One such
-    property makes them ignore the whole channel, so it is left out of the schema.
-    """
-    whole = msgspec.json.schema(message)
-    parts = whole.pop("$defs", {})
-    flat = _flat(whole, parts, 0, item=False) or {"type": "object"}
-    return msgspec.json.encode({"title": message.__name__, **flat})
-
-
-def _flat(
-    part: dict[str, Any], parts: dict[str, Any], depth: int, *, item: bool
-) -> dict[str, Any] | None:
-    """Return one property; None if it has to be left out."""
-    if depth > MAX_SCHEMA_DEPTH:
-        return None
-    if "$ref" in part:
-        return _flat(parts[part["$ref"].rsplit("/", 1)[-1]], parts, depth + 1, item=item)
-    if "anyOf" in part:  # `X | None` becomes X
-        kinds = [kind for kind in part["anyOf"] if kind.get("type") != "null"]
-        return _flat(kinds[0], parts, depth + 1, item=item) if len(kinds) == 1 else None
-    kind = part.get("type")
-    if "enum" in part:
-        return {"type": kind or SCALARS[type(part["enum"][0])]}
-    if kind in SCALARS.values():
-        kept = BOUNDS if item else (*BOUNDS, "contentEncoding")
-        return {name: part[name] for name in kept if name in part}
-    if kind == "array" and not item:
-        return _array(part, parts, depth)
-    if kind == "object":
-        return _object(part, parts, depth)
-    return None
-
-
-def _array(part: dict[str, Any], parts: dict[str, Any], depth: int) -> dict[str, Any] | None:
-    items = part.get("items") or (part.get("prefixItems") or [None])[0]
-    inner = _flat(items, parts, depth + 1, item=True) if isinstance(items, dict) else None
-    return inner and {"type": "array", "items": inner}
-
-
-def _object(part: dict[str, Any], parts: dict[str, Any], depth: int) -> dict[str, Any]:
-    properties = part.get("properties", {}).items()
-    flat = {name: _flat(value, parts, depth + 1, item=False) for name, value in properties}
-    return {"type": "object", "properties": {name: value for name, value in flat.items() if value}}

@@ -152,7 +152,7 @@ async def record(config: RecorderConfig, where: Where, seconds: float | None) ->
             await _show_status(recorder, stop, seconds)
     end = recorder.status()
     print(status_line(end))
-    for key in sorted(recorder.intake.seen):
+    for key in sorted(recorder.intake.seen | recorder.intake.left_out):
         print(_key_line(recorder, key))
     return 1 if end.dropped else 0
 
@@ -202,10 +202,11 @@ def _rates(before: Status, now: Status) -> str:
 
 def _key_line(recorder: Recorder, key: str) -> str:
     intake = recorder.intake
-    line = f"  {key:<28} {intake.seen[key]:>7}"
+    line = f"  {key:<28} {intake.seen[key]:>7} {intake.bytes[key] / 1e6:>8.2f} MB"
     for name, counts in (
         ("missing", intake.gaps.missing),
         ("dropped", intake.dropped),
+        ("left out", intake.left_out),
         ("restarts", intake.gaps.restarts),
     ):
         if counts[key]:

@@ -7,15 +7,19 @@ from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 from msgspec import Struct
 
-from gigabrain_zenoh.bus.headers import SequenceGaps, header_of
+from gigabrain_schemas.base import TICK_S
+from gigabrain_zenoh.bus.headers import Header, SequenceGaps, header_of
 from gigabrain_zenoh.bus.listening import topic_of
 from gigabrain_zenoh.bus.zenoh.workarounds import LONGEST_S
 from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.bounded import put_newest
 from gigabrain_zenoh.logs import Fault
+from gigabrain_zenoh.recording.bag_reader import PICTURE_KEYS, PICTURES_NOTE
 from gigabrain_zenoh.recording.bag_writer import BagWriter, ReceivedMessage
 
 log = logging.getLogger(__name__)
@@ -28,6 +32,45 @@ OTHER_KEYS = "others"  # counts messages beyond those
 MAX_BATCH_NS = round(LONGEST_S * 1e9)  # within it a message's own stamp is its time of reception
 
 
+class _Exposure(NamedTuple):
+    """The newest chosen exposure of a camera."""
+
+    boot: int
+    at: float  # [ticks]
+    due: float  # [ticks], when the next one is chosen
+    topics: tuple[str, ...]  # of which it has been recorded
+
+
+class PictureThinning:
+    """Chooses exposures of each camera at a rate of the robot's time; depth comes with its picture.
+
+    A rate of 0 chooses none.
+    """
+
+    def __init__(self, hz: float) -> None:
+        self._period = 1.0 / hz / TICK_S if hz else 0.0  # [ticks]
+        self._chosen: dict[str, _Exposure] = {}  # by camera
+
+    def is_left_out(self, key: str, header: Header, now_ns: int) -> bool:
+        """Return whether the exposure of a picture or of depth is left out."""
+        if not self._period:
+            return True
+        topic, _, camera = key.rpartition("/")
+        at = header.basis or (header.stamp_ns or now_ns) / 1e9 / TICK_S
+        before = self._chosen.get(camera)
+        if before is None or before.boot != header.boot or at < before.at:
+            chosen = _Exposure(header.boot, at, at + self._period, (topic,))
+        elif at == before.at and topic not in before.topics:
+            chosen = before._replace(topics=(*before.topics, topic))
+        elif at >= before.due:
+            due = max(before.due, at - self._period) + self._period
+            chosen = _Exposure(header.boot, at, due, (topic,))
+        else:
+            return True
+        put_newest(self._chosen, camera, chosen, MAX_CHANNELS)
+        return False
+
+
 class Intake:
     """Bounded queue from any thread to the writer. It never makes the bus wait.
 
@@ -36,10 +79,14 @@ class Intake:
     """
 
     def __init__(
-        self, max_bytes: int, unix_ns: Callable[[], int], hurry: Callable[[], object] = int
+        self,
+        max_bytes: int,
+        unix_ns: Callable[[], int],
+        hurry: Callable[[], object] = int,
+        pictures: PictureThinning | None = None,
     ) -> None:
         self._max_bytes, self._unix_ns, self._hurry = max_bytes, unix_ns, hurry
-        self._lock = threading.Lock()
+        self._lock, self._pictures = threading.Lock(), pictures
         self._waiting: list[tuple[int, str, str, bytes]] = []
         self._parsed: list[ReceivedMessage] = []  # the oldest, with their headers
         self._held_bytes = 0  # waiting, or being written
@@ -48,6 +95,8 @@ class Intake:
         self.gaps = SequenceGaps()
         self.seen: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
+        self.left_out: Counter[str] = Counter()  # pictures beyond the wanted rate
+        self.bytes: Counter[str] = Counter()  # received, without those left out
 
     def receive(self, key: str, encoding: str, payload: bytes) -> None:
         """Queue one message, or drop it. May be called from any thread."""
@@ -57,7 +106,10 @@ class Intake:
                 self.seen[OTHER_KEYS] += 1
                 self.dropped[OTHER_KEYS] += 1
                 return
+            if self._pictures and self._is_left_out(self._pictures, key, payload, now_ns):
+                return
             self.seen[key] += 1
+            self.bytes[key] += size
             if self._held_bytes + size > self._max_bytes:
                 self._parse()  # earlier messages are counted before this one
                 self.gaps.count(key, header_of(payload))
@@ -67,6 +119,19 @@ class Intake:
             self._waiting.append((now_ns, key, encoding, payload))
         if before < self._max_bytes // 4 <= before + size:
             self._hurry()
+
+    def _is_left_out(
+        self, pictures: PictureThinning, key: str, payload: bytes, now_ns: int
+    ) -> bool:
+        if not key.startswith(PICTURE_KEYS):
+            return False
+        header = header_of(payload)
+        if not pictures.is_left_out(key, header, now_ns):
+            return False
+        self._parse()  # earlier messages are counted before this one
+        self.gaps.count(key, header)
+        self.left_out[key] += 1
+        return True
 
     def _is_known(self, key: str, encoding: str) -> bool:
         """Return whether a key is recorded in an encoding; the first MAX_CHANNELS are."""
@@ -142,6 +207,7 @@ class Recorder:
             round(config.queue_mb * MB),
             lambda: start_unix_ns + time.monotonic_ns() - start_ns,
             self._wake.set,
+            None if config.pictures is None else PictureThinning(config.pictures),
         )
         self._start_s = time.monotonic()
         self._files = self._closed_bytes = self._written = 0
@@ -187,7 +253,10 @@ class Recorder:
         )
 
     def _default_open(self, path: Path) -> BagWriter:
-        return BagWriter(path, viewers=self._config.viewers, notes=self._config.notes)
+        notes, pictures = dict(self._config.notes), self._config.pictures
+        if pictures is not None:
+            notes[PICTURES_NOTE] = f"{pictures:g} Hz"
+        return BagWriter(path, viewers=self._config.viewers, notes=notes)
 
     def _next_file(self) -> BagWriter:
         """Create the next file of the row. Raises ConfigError."""

@@ -24,6 +24,17 @@ def jpeg_size(data: bytes) -> tuple[int, int]:
     raise ValueError("not a JPEG, or one without a size")
 
 
+def check_jpeg(image: Image) -> None:
+    """Raise ValueError for a JPEG that is too large, or of another size than its message says."""
+    width, height = jpeg_size(image.data)
+    if (width, height) != (image.width, image.height):
+        raise ValueError(
+            f"a JPEG of {width} x {height} pixels; its message says {image.width} x {image.height}"
+        )
+    if width * height > MAX_PIXELS:
+        raise ValueError(f"a JPEG of {width} x {height} pixels; at most {MAX_PIXELS} are read")
+
+
 def decoded(image: Image) -> NDArray[np.uint8]:
     """Return blue, green, red of a picture, (height, width, 3), or (height, width) for mono8.
 
@@ -40,13 +51,7 @@ def decoded(image: Image) -> NDArray[np.uint8]:
 def _decompressed(image: Image) -> NDArray[np.uint8]:
     import cv2
 
-    width, height = jpeg_size(image.data)
-    if (width, height) != (image.width, image.height):
-        raise ValueError(
-            f"a JPEG of {width} x {height} pixels; its message says {image.width} x {image.height}"
-        )
-    if width * height > MAX_PIXELS:
-        raise ValueError(f"a JPEG of {width} x {height} pixels; at most {MAX_PIXELS} are read")
+    check_jpeg(image)
     pixels: Any = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR)
     if pixels is None:
         raise ValueError("a broken JPEG")

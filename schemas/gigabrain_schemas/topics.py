@@ -31,7 +31,7 @@ Role = Literal["robot", "brain", "operator", "viewer", "router", "process"]  # o
 # How viewers show a topic; `recording/drawing.py` has a function for each.
 Drawing = Literal[
     "scan", "map", "zones", "pose", "path", "obstacles", "task", "image", "log", "odometry",
-    "lidar_frame",
+    "lidar_frame", "depth", "camera", "detections", "objects", "perceived",
 ]  # fmt: skip
 
 
@@ -102,21 +102,26 @@ IMAGE = Topic(
 )  # fmt: skip
 DEPTH = Topic(
     "robot/depth", vision.DepthImage, 10, missed=2.5, max_bytes=1024 * KB, many=True, depth=2,
+    drawing="depth",
 )  # fmt: skip
-CAMERA = Topic("robot/camera", vision.CameraInfo, 1, keep=True, max_bytes=4 * KB, many=True)
+CAMERA = Topic(
+    "robot/camera", vision.CameraInfo, 1, keep=True, max_bytes=4 * KB, many=True, drawing="camera",
+)  # fmt: skip
 WORLD = Topic(
     "robot/world", brain.WorldModel, 10, missed=2.5, max_bytes=64 * KB,
     publishers=BRAIN, drawing="obstacles", plotted=True,
 )  # fmt: skip
 PERCEIVED = Topic(
     "robot/perceived", brain.Objects, 10, missed=5.0, max_bytes=64 * KB, many=True,
-    publishers=BRAIN,
+    publishers=BRAIN, drawing="perceived",
 )  # fmt: skip
 DETECTIONS = Topic(
     "robot/detections", objects.Detections, 10, depth=8, max_bytes=64 * KB, publishers=BRAIN,
+    drawing="detections",
 )  # fmt: skip
 OBJECT_MAP = Topic(
     "robot/objects", objects.ObjectMap, 1, keep=True, max_bytes=128 * KB, publishers=BRAIN,
+    drawing="objects",
 )  # fmt: skip
 POSE = Topic("robot/pose", brain.PoseInMap, 10, publishers=BRAIN, drawing="pose")
 MAP = Topic(

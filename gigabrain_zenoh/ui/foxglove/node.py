@@ -38,7 +38,8 @@ from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.config.settings import FoxgloveConfig
 from gigabrain_zenoh.diagnostics.discovery import chain_flows, discover, flows
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.recording.drawing import Drawer, Drawn
+from gigabrain_zenoh.recording.drawing import Drawer
+from gigabrain_zenoh.recording.drawn import Drawn
 from gigabrain_zenoh.ui.foxglove.access import HOST, Front, hidden_host, topic_to_steer
 from gigabrain_zenoh.ui.foxglove.requests import REFRESH_NS, FoxgloveRequests
 from gigabrain_zenoh.ui.steering import RateLimiter, TeleopArbiter, ViewerScene

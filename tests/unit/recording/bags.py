@@ -1,6 +1,7 @@
 """Recordings for tests, made without a robot."""
 
 import itertools
+import struct
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -47,6 +48,11 @@ def scan(seq: int) -> bytes:
         angle_min=0.0, angle_increment=0.01745, range_min=0.1, range_max=3.5, ranges=ranges,
     )  # fmt: skip
     return msgspec.msgpack.encode(message)
+
+
+def jpeg_head(width: int, height: int) -> bytes:
+    """Return the beginning of a JPEG of that size; there are no pixels in it."""
+    return b"\xff\xd8\xff\xc0\x00\x11\x08" + struct.pack(">HH", height, width) + bytes(10)
 
 
 def arrival(at_ns: int, key: str, payload: bytes) -> ReceivedMessage:

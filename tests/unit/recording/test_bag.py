@@ -22,7 +22,7 @@ from gigabrain_zenoh.cli.app import make_app
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.recording.bag_reader import HEAD, MAGIC, ZSTD_NAME, Bag, faults, read_info
 from gigabrain_zenoh.recording.bag_writer import BagWriter, is_unfinished, recover, recover_all
-from gigabrain_zenoh.recording.drawing import flat_schema
+from gigabrain_zenoh.recording.drawn import flat_schema
 from tests.unit.recording import bags
 
 

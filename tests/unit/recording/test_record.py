@@ -3,8 +3,10 @@
 import asyncio
 import os
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 from msgspec.structs import replace
 
@@ -89,7 +91,7 @@ def test_every_kind_of_message_is_drawn_for_viewers(tmp_path: Path) -> None:
     for n, topic in enumerate(TOPICS):
         payload = codec.encode(EXAMPLES[topic.type.__name__])
         file.add(bags.arrival(n, topic.at("front"), payload))
-    jpeg = Image(frame_id="camera", encoding="jpeg", height=1, width=1, data=b"\xff\xd8")
+    jpeg = Image(frame_id="camera", encoding="jpeg", height=2, width=4, data=bags.jpeg_head(4, 2))
     file.add(bags.arrival(99, "robot/image/rear", codec.encode(jpeg)))
     file.finish()
     file.close()
@@ -106,6 +108,12 @@ def test_every_kind_of_message_is_drawn_for_viewers(tmp_path: Path) -> None:
         "/viz/path": "foxglove.PosesInFrame",
         "/viz/image/front": "foxglove.RawImage",
         "/viz/image/rear": "foxglove.CompressedImage",
+        "/viz/depth/front": "foxglove.RawImage",
+        "/viz/calibration/front": "foxglove.CameraCalibration",
+        "/viz/annotations/front": "foxglove.ImageAnnotations",
+        "/viz/contours": "foxglove.SceneUpdate",
+        "/viz/objects": "foxglove.SceneUpdate",
+        "/viz/perceived/front": "foxglove.SceneUpdate",
         "/viz/obstacles": "foxglove.SceneUpdate",
         "/viz/way": "foxglove.PosesInFrame",
         "/viz/log": "foxglove.Log",
@@ -187,3 +195,57 @@ def test_the_writer_is_woken_when_a_quarter_of_the_queue_is_full() -> None:
     for expected in (1, 1, 2):
         intake.receive("robot/scan", "", bytes(400))
         assert len(told) == expected
+
+
+def exposures(count: int, *, boot: int = 7, basis_step: int = 5) -> Iterator[tuple[str, bytes]]:
+    """Yield depth and picture of a camera at 10 Hz, as it publishes them."""
+    for seq in range(1, count + 1):
+        header = {"seq": seq, "boot": boot, "basis": basis_step * seq, "tick": 5 * seq}
+        header["stamp_ns"] = bags.BEGIN_NS + 100_000_000 * seq
+        yield "robot/depth/front", msgspec.msgpack.encode(header | {"planes": b"d" * 100})
+        yield "robot/image/front", msgspec.msgpack.encode(header | {"data": b"i" * 50})
+
+
+def bases(path: Path, key: str) -> list[int]:
+    return [sample.header.basis for sample in Bag(path) if sample.key == key]
+
+
+@pytest.mark.parametrize(
+    ("hz", "kept_bases"), [(2.0, [5, 30, 55, 80]), (3.0, [5, 25, 40, 55, 75, 90]), (0.0, [])]
+)
+def test_pictures_are_thinned_to_the_wanted_rate_and_depth_stays_with_its_picture(
+    tmp_path: Path, hz: float, kept_bases: list[int]
+) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path, replace(QUICK, pictures=hz)) as recorder:
+        for key, payload in exposures(20):
+            recorder.intake.receive(key, "", payload)
+        recorder.intake.receive("robot/state", "", bags.state(1))
+    assert bases(path, "robot/image/front") == kept_bases
+    assert bases(path, "robot/depth/front") == kept_bases
+    assert recorder.intake.left_out["robot/image/front"] == 20 - len(kept_bases)
+    assert recorder.intake.bytes["robot/depth/front"] >= 100 * len(kept_bases)
+    assert recorder.status().missing == recorder.status().dropped == 0
+    found = read_info(path)
+    assert [key.missing for key in found.keys] == [0] * len(found.keys)
+    assert found.notes["gigabrain"] == {"pictures": f"{hz:g} Hz"}
+
+
+def test_without_a_rate_all_pictures_are_recorded(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path, QUICK) as recorder:
+        for key, payload in exposures(20):
+            recorder.intake.receive(key, "", payload)
+    assert len(bases(path, "robot/image/front")) == 20
+
+
+def test_a_camera_whose_clock_stands_still_or_begins_again_is_thinned_too(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path, replace(QUICK, pictures=2.0)) as recorder:
+        for boot in (7, 8):
+            for key, payload in exposures(20, boot=boot):
+                recorder.intake.receive(key, "", payload)
+        for _ in range(50):
+            for key, payload in exposures(1, boot=9, basis_step=400):
+                recorder.intake.receive(key, "", payload)
+    assert bases(path, "robot/image/front") == [*[5, 30, 55, 80] * 2, 400]
