@@ -25,7 +25,7 @@ PATIENCE_S = 30.0  # longest wait for an answer: it may need a worker thread, or
 def record(network: LocalNetwork, clock: Clock) -> list[Event]:
     """Return a list to which every later message on the topics of `network` is appended."""
     events: list[Event] = []
-    network.listen("robot/*", lambda key, data: events.append((clock.now_ns(), key, data)))
+    network.listen("robot/**", lambda key, data: events.append((clock.now_ns(), key, data)))
     return events
 
 

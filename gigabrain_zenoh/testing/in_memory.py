@@ -55,6 +55,12 @@ class PatientJournal(InputLogger):
         """Wait for `job`, whatever patience the node has; with none it only looks."""
         return done(job, PATIENCE_S if patience_s else 0.0)
 
+    def when_done(self, job: Job, then: Callable[[Job], None]) -> None:
+        """Wait for `job`, and call `then(job)`."""
+        done(job, PATIENCE_S)
+        self._note_finished()
+        then(job)
+
 
 class Net:
     """The buses of two processes on one network and one clock."""

@@ -1,6 +1,7 @@
 """What a process has looked at is said in its own order, and a replay goes by just that."""
 
 import asyncio
+import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 
@@ -8,7 +9,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.examples import example
-from gigabrain_schemas.logs import WAITED, AcceptedRequest, InputLog
+from gigabrain_schemas.logs import FINISHED, WAITED, AcceptedRequest, InputLog
 from gigabrain_schemas.topics import BODY, GOAL, INPUT_LOG, REQUEST_LOG, SCAN, STATE
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.bus.bus import Bus
@@ -98,6 +99,31 @@ def test_whether_work_beside_was_in_time_is_said_as_well() -> None:
     assert said.input_log.in_time(finished(), 0.0)
     said.input_log.flush()
     assert [(key, seq) for key, seq, _ in said.entries()] == [(WAITED, 0), (WAITED, 1)]
+
+
+async def test_work_that_counts_when_it_is_done_is_said_before_it_counts() -> None:
+    said, counted = Said(), asyncio.Event()
+    work: Job = Future()
+    said.input_log.when_done(work, lambda job: (job.result(), counted.set()))
+    said.input_log.note("robot/state", 7)
+    threading.Thread(target=work.set_result, args=(None,)).start()
+    await counted.wait()
+    said.input_log.note("robot/state", 8)
+    said.input_log.flush()
+    entries = [(key, seq) for key, seq, _ in said.entries()]
+    assert entries == [("robot/state", 7), (FINISHED, 1), ("robot/state", 8)]
+
+
+def test_a_replay_counts_the_oldest_work_where_it_is_told_and_waits_for_it() -> None:
+    past, counted = ReplayedInputLogger(), list[int]()
+    for number in (1, 2):
+        past.when_done(finished(), lambda _, number=number: counted.append(number))
+    assert counted == []
+    past.finish()
+    assert counted == [1]
+    past.finish()
+    past.finish()  # of work that nobody has begun
+    assert counted == [1, 2]
 
 
 def test_a_replay_takes_work_as_done_where_it_was_done_then() -> None:

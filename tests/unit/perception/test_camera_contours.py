@@ -1,0 +1,243 @@
+"""Contours of cameras in the world that perception publishes: where, of when, and whether."""
+
+import functools
+from collections.abc import Callable
+
+import msgspec
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.brain import CameraStatus, Contour, WorldModel
+from gigabrain_schemas.logs import FINISHED
+from gigabrain_schemas.topics import BODY, CAMERA, DEPTH, IMAGE, SCAN, STATE, WORLD
+from gigabrain_schemas.vision import CameraInfo, DepthImage
+from gigabrain_zenoh import codec
+from gigabrain_zenoh.clock import FakeClock
+from gigabrain_zenoh.config.settings import PerceptionConfig
+from gigabrain_zenoh.perception import node as perception
+from gigabrain_zenoh.perception.camera_contours import SKIPPED
+from gigabrain_zenoh.runtime.replay import Event, record, replay
+from gigabrain_zenoh.testing.in_memory import NodeBench, PatientJournal
+from gigabrain_zenoh.testing.samples import BOOT, WAFFLE, body, open_space, scan, state
+from tests.unit.vision.scenes import LOW, Box, depth_of, image, millimetres, near
+
+CAMERA_BODY = replace(WAFFLE, cameras=(LOW,), body_height=0.2)
+BOX = Box(x=1.0, y=0.0, half_x=0.05, half_y=0.1, top=0.1)
+MAPPING = pytest.mark.parametrize("mapping", ["off", "slam"])
+
+
+class Bench(NodeBench):
+    """Perception, and a body with one depth camera that drives along x."""
+
+    def __init__(self, mapping: str = "off", boot: int = BOOT) -> None:
+        config = PerceptionConfig(mapping=mapping)  # type: ignore[arg-type]
+        super().__init__(functools.partial(perception.run, config))
+        self.boot = boot
+        self.pose = Pose(x=0.0, y=0.0, yaw=0.0)
+
+    async def begin(self, tick: int = 1) -> None:
+        await self.ready()
+        self.send(BODY, body(CAMERA_BODY, boot=self.boot))
+        self.drive(tick)
+
+    def drive(self, tick: int, x: float | None = None) -> None:
+        """Be at x [m] at a tick."""
+        self.pose = self.pose if x is None else replace(self.pose, x=x)
+        self.send(STATE, state(tick, pose=(self.pose.x, 0.0, 0.0), boot=self.boot))
+
+    async def look(self, tick: int, picture: DepthImage | None = None, name: str = "front") -> None:
+        """Take a picture of BOX from where it is, and wait until it is done with."""
+        seen = millimetres(LOW, depth_of(LOW, (BOX,), pose=self.pose))
+        picture = replace(picture or image(seen), boot=self.boot, tick=tick, basis=tick)
+        self.network.deliver(DEPTH.at(name), codec.encode(picture))
+        await self.settled()
+
+    async def settled(self) -> None:
+        await self.clock.advance(0)
+
+    async def world(self, tick: int) -> WorldModel:
+        """Return the world of a scan at a tick."""
+        self.sent(WORLD)
+        self.send(SCAN, scan(open_space(), tick, boot=self.boot))
+        await self.settled()
+        return self.sent(WORLD)[-1]
+
+
+def status(world: WorldModel) -> CameraStatus:
+    (one,) = world.cameras
+    return one
+
+
+def front_of(world: WorldModel) -> float:
+    """Return where the nearest contour begins [m]."""
+    return min(x for x, _ in world.contours[0].polygon)
+
+
+@MAPPING
+async def test_what_a_camera_sees_is_in_the_next_world_where_it_is_then(mapping: str) -> None:
+    async with Bench(mapping) as bench:
+        await bench.begin()
+        await bench.look(1)
+        bench.drive(6, x=0.3)
+        world = await bench.world(6)
+        assert status(world) == CameraStatus(name="front", ok=True, exposure=1)
+        assert near(world.contours, 0.65, 0.0)
+        assert front_of(world) == pytest.approx(0.65, abs=0.02)
+        assert world.contours[0].age == pytest.approx(0.1)
+
+
+@MAPPING
+async def test_a_picture_brings_the_newest_world_again_with_its_contours(mapping: str) -> None:
+    async with Bench(mapping) as bench:
+        await bench.begin()
+        before = await bench.world(1)
+        assert not before.contours
+        bench.drive(3, x=0.1)
+        await bench.look(3)
+        (again,) = bench.sent(WORLD)
+        assert (again.basis, again.tick) == (before.basis, before.tick)
+        assert status(again).exposure == 3
+        assert front_of(again) == pytest.approx(0.95, abs=0.02)  # where the body was at the scan
+        bench.drive(1 + 30)
+        await bench.look(1 + 30)
+        assert bench.sent(WORLD) == []  # that scan is old by now
+
+
+async def test_a_picture_that_comes_before_the_state_of_its_tick_waits_for_it() -> None:
+    async with Bench() as bench:
+        await bench.begin()
+        await bench.look(2)
+        assert not (await bench.world(1)).contours
+        bench.drive(2)
+        await bench.settled()
+        assert status(bench.sent(WORLD)[-1]).exposure == 2
+
+
+def no_picture(status: CameraStatus) -> bool:
+    return "no picture" in status.problem
+
+
+async def test_a_camera_that_is_silent_withheld_or_wrong_is_not_ok_and_says_why() -> None:
+    async with Bench() as bench:
+        await bench.begin()
+        first = status(await bench.world(1))
+        assert not first.ok
+        assert no_picture(first)
+        assert first.exposure == 0
+        await bench.look(1)
+        bench.drive(20)
+        assert status(await bench.world(20)).ok
+        bench.drive(23)
+        silent = status(await bench.world(23))
+        assert not silent.ok
+        assert no_picture(silent)
+        info = CameraInfo(camera=LOW, problem="covered", boot=BOOT, tick=23)
+        bench.network.deliver(CAMERA.at("front"), codec.encode(info))
+        await bench.look(23)
+        assert status(await bench.world(23)).problem == "covered"
+        bench.network.deliver(CAMERA.at("front"), codec.encode(replace(info, problem="")))
+        bench.drive(28)
+        small = DepthImage(frame_id="front", height=16, width=16, planes=(b"", b"", b"", b""))
+        await bench.look(28, small)
+        wrong = status(await bench.world(28))
+        assert not wrong.ok
+        assert "320 x 240" in wrong.problem
+        assert near((await bench.world(28)).contours, 0.95, 0.0)  # what was seen stays
+        bench.drive(33)
+        await bench.look(33)
+        assert status(await bench.world(33)).ok
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda picture: replace(picture, planes=(b"\x78", b"", b"", b"")),
+        lambda picture: replace(picture, planes=(b"bomb" * 1000, *picture.planes[1:])),
+        lambda picture: replace(picture, height=2048, width=4096),
+    ],
+)
+async def test_broken_pictures_are_refused_and_perception_goes_on(
+    spoil: Callable[[DepthImage], DepthImage],
+) -> None:
+    picture = image(millimetres(LOW, depth_of(LOW, (BOX,))))
+    async with Bench() as bench:
+        await bench.begin()
+        await bench.look(1, spoil(picture))
+        assert not status(await bench.world(1)).ok
+        bench.drive(6)
+        await bench.look(6)
+        assert status(await bench.world(6)).ok
+
+
+async def test_a_flood_costs_no_more_than_the_rate_of_the_camera() -> None:
+    async with Bench() as bench:
+        await bench.begin()
+        for tick in range(1, 101):
+            bench.drive(tick)
+            await bench.look(tick)
+        assert bench.bus.counters[SKIPPED] >= 60
+        await bench.look(100, name="stranger")
+        await bench.look(1)  # an old one
+        assert status(await bench.world(100)).exposure > 95
+
+
+async def test_a_restarted_driver_begins_with_nothing_seen() -> None:
+    async with Bench() as bench:
+        await bench.begin()
+        await bench.look(1)
+        bench.boot = BOOT + 1
+        for tick in (1, 2, 3):
+            bench.send(BODY, body(CAMERA_BODY, boot=bench.boot))
+            bench.drive(tick)
+        world = await bench.world(3)
+        assert (world.contours, status(world).exposure) == ((), 0)
+        await bench.look(3)
+        assert (await bench.world(3)).contours
+
+
+async def test_a_body_without_cameras_costs_nothing() -> None:
+    async with Bench() as bench:
+        await bench.ready()
+        bench.send(BODY, body())
+        listened = {DEPTH.at("*"), IMAGE.at("*"), CAMERA.at("*"), STATE.key}
+        assert not listened & set(bench.bus.listens)
+        bench.send(BODY, body(CAMERA_BODY))
+        assert listened - set(bench.bus.listens) == {IMAGE.at("*")}
+        bench.send(BODY, body())
+        assert not listened & set(bench.bus.listens)
+        assert (await bench.world(1)).cameras == ()
+
+
+class Noting(PatientJournal):
+    """Puts what threads have done between the other events."""
+
+    def __init__(self, events: list[Event], clock: FakeClock) -> None:
+        self._events, self._clock = events, clock
+
+    def _note_finished(self) -> None:
+        self._events.append((self._clock.now_ns(), FINISHED, b"\1"))
+
+
+async def test_a_replay_gives_the_same_worlds() -> None:
+    """What a thread has done counts from where the log says, and not when it is done again."""
+    async with Bench("slam") as bench:
+        events = record(bench.network, bench.clock)
+        bench.bus.input_log = Noting(events, bench.clock)
+        await bench.begin()
+        for tick in range(6, 60, 5):
+            bench.drive(tick, x=tick / 100)
+            await bench.world(tick)
+            await bench.look(tick)
+            bench.drive(tick + 1)
+    worlds = [data for _, key, data in events if key == WORLD.key]
+    assert sum(bool(contours_of(data)) for data in worlds) > 15
+    inputs = {BODY.key, STATE.key, SCAN.key, DEPTH.at("front"), FINISHED}
+    heard = [event for event in events if event[1] in inputs]
+    config = PerceptionConfig(mapping="slam")
+    now = await replay(functools.partial(perception.run, config), heard, "perception")
+    assert [data for key, data in now if key == WORLD.key] == worlds
+
+
+def contours_of(data: bytes) -> tuple[Contour, ...]:
+    return msgspec.msgpack.decode(data, type=WorldModel).contours
