@@ -137,7 +137,7 @@ class DepthCamera:
         if not len(rows):
             return np.empty((0, 3), np.float32)
         above, under = np.maximum(rows - 1, 0), np.minimum(rows + 1, len(rise) - 1)
-        step = (rise[under, columns] - rise[above, columns]) / np.float32(2)
+        step = np.nan_to_num(rise[under, columns] - rise[above, columns]) / np.float32(2)
         parts = [
             np.minimum(rise[rows, columns] + np.float32(part) * step, np.float32(-1e-3))
             for part in SUB_ROWS

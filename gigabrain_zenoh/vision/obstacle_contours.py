@@ -1,6 +1,9 @@
 """Obstacle contours: what the cameras of a body saw, in its frame, remembered where it drives."""
 
+import math
+
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
@@ -25,6 +28,7 @@ from gigabrain_zenoh.vision.depth_picture import HIGH_M, DepthCamera
 from gigabrain_zenoh.vision.floor_colour import ColourCamera
 from gigabrain_zenoh.vision.outlines import Labels, connected, distinct, split, support_polygons
 
+ENOUGH_PIXELS = 320 * 240  # of larger pictures every second row and column is taken, or fewer
 MAX_CONTOURS = 128  # the nearest
 BOTTOMLESS_M = -1.0  # of a hole that returns nothing
 ROOM_ABOVE_M = 0.01  # what hangs no higher than this above the body bars the way too
@@ -46,6 +50,7 @@ class ObstacleContours:
         self._footprint: Floats = np.array(description.footprint)
         self._height = description.body_height + ROOM_ABOVE_M
         self._cameras: dict[str, Camera] = {one.name: one for one in description.cameras}
+        self._steps = {one.name: step_of(one) for one in description.cameras}
         self._depth: dict[str, DepthCamera] = {}
         self._colour: dict[str, ColourCamera] = {}
         self._memory = CellMemory()
@@ -66,10 +71,12 @@ class ObstacleContours:
             pixels = image.array()
         except ValueError as error:
             return str(error)
+        step = self._steps[name]
         if name not in self._depth:
-            self._depth[name] = DepthCamera(CameraModel(self._cameras[name]), self._height)
+            model = CameraModel(reduced(self._cameras[name], step))
+            self._depth[name] = DepthCamera(model, self._height)
         camera = self._depth[name]
-        view = camera.view(pixels)
+        view = camera.view(pixels[::step, ::step])
         self._memory.move(pose, now)
         if view is None:
             return "it shows nothing"
@@ -94,10 +101,11 @@ class ObstacleContours:
         problem = self._refused(name, pixels.shape[1], pixels.shape[0])
         if problem:
             return problem
+        step = self._steps[name]
         if name not in self._colour:
-            self._colour[name] = ColourCamera(CameraModel(self._cameras[name]))
+            self._colour[name] = ColourCamera(CameraModel(reduced(self._cameras[name], step)))
         camera = self._colour[name]
-        view = camera.view(pixels)
+        view = camera.view(pixels[::step, ::step])
         self._memory.move(pose, now)
         if view is None:
             return "no floor is in view"
@@ -165,6 +173,22 @@ class ObstacleContours:
             track = self._tracks
         taken.add(track)
         return track
+
+
+def step_of(camera: Camera) -> int:
+    """Return how many rows and columns of its pictures to go on by, from one pixel to the next."""
+    return max(1, int(math.sqrt(camera.width * camera.height / ENOUGH_PIXELS) + 0.35))
+
+
+def reduced(camera: Camera, step: int) -> Camera:
+    """Return a camera that sees only each `step`th row and column of the pixels."""
+    fx, fy, cx, cy = camera.pinhole
+    return replace(
+        camera,
+        width=-(-camera.width // step),
+        height=-(-camera.height // step),
+        intrinsics=(fx / step, fy / step, cx / step, cy / step),
+    )
 
 
 def _believed(cells: Cells, labels: Labels) -> NDArray[np.bool_]:

@@ -4,7 +4,7 @@ import math
 
 import msgspec
 import numpy as np
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from msgspec.structs import replace
@@ -18,6 +18,7 @@ from tests.unit.vision.scenes import LOW, START, Box, body, feed, image, near
 
 SMALL = Camera(name="front", depth=True, width=32, height=24, z=0.1)
 QUICK = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+UNSEEING = replace(SMALL, z=-0.5, field_of_view=1.0, distortion=(1.0,))  # pixels without a ray
 angles = st.floats(-math.pi, math.pi)
 poses = st.builds(Pose, x=st.floats(-1e3, 1e3), y=st.floats(-1e3, 1e3), yaw=angles)
 cameras = st.builds(
@@ -62,6 +63,7 @@ def test_any_picture_makes_valid_contours(seen: list[tuple[np.ndarray, Pose]]) -
 
 @QUICK
 @given(cameras, pictures, poses)
+@example(UNSEEING, np.ones((24, 32), np.uint16), START)
 def test_any_camera_makes_valid_contours(camera: Camera, pixels: np.ndarray, pose: Pose) -> None:
     eyes = ObstacleContours(body(camera))
     for number in range(3):
