@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from importlib.resources import files
+from pathlib import Path
 
 import pytest
 
@@ -62,3 +63,33 @@ def test_the_person_counts_as_a_contact_and_never_comes_nearer_by_himself() -> N
     standing.command(0.2, 0.0)
     run(standing, 4)
     assert standing.truth.contacts == 1
+
+
+def with_pit(folder: Path, depth: float) -> World:
+    """A floor that ends half a metre ahead, and goes on lower."""
+    path = folder / "pit.xml"
+    path.write_text(
+        "<mujoco><worldbody>"
+        '<geom name="floor0" type="box" size="2.5 2.5 .5" pos="-2 0 -.5"/>'
+        f'<geom name="floor1" type="box" size="2.5 2.5 .5" pos="3 0 {-0.5 - depth}"/>'
+        "</worldbody></mujoco>"
+    )
+    return replace(room(), model=path)
+
+
+@pytest.mark.parametrize("depth", [0.05, 0.3])
+def test_a_fall_down_a_step_is_counted_once_and_is_no_contact(tmp_path: Path, depth: float) -> None:
+    simulation = Simulation(waffle(), with_pit(tmp_path, depth), 0)
+    simulation.command(0.2, 0.0)
+    run(simulation, 1.5)
+    assert simulation.truth.falls == 0
+    run(simulation, 4)
+    assert (simulation.truth.falls, simulation.truth.contacts) == (1, 0)
+
+
+def test_driving_and_braking_hard_is_no_fall() -> None:
+    simulation = Simulation(waffle(), room(), 0)
+    for speed in (0.26, -0.26, 0.26, 0.0):
+        simulation.command(speed, 1.8)
+        run(simulation, 1)
+    assert simulation.truth.falls == 0

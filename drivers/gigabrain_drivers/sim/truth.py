@@ -17,6 +17,7 @@ MEASURED = [  # types whose sizes along x and y are known
     mujoco.mjtGeom.mjGEOM_BOX.value, mujoco.mjtGeom.mjGEOM_CYLINDER.value,
     mujoco.mjtGeom.mjGEOM_CAPSULE.value, mujoco.mjtGeom.mjGEOM_SPHERE.value,
 ]  # fmt: skip
+FALL_TILT = math.cos(math.radians(12))  # cosine of a tilt beyond which the body has fallen
 MAX_CLEARANCE_M = 10.0  # larger clearances count as this
 
 
@@ -26,7 +27,9 @@ class Truth:
     contacts: how often the robot touched something else than the floor; sliding along one thing
     is one contact, touching it again half a second later another. touching: right now.
     min_clearance_m: the least distance from the robot's outline to anything, sampled at 10 Hz,
-    0 in contact. distance_m: the length of the path of the base's origin.
+    0 in contact. falls: how often the robot tipped over, or a part of it sank below the level of
+    the floor on which it began; sampled at 10 Hz. distance_m: the length of the path of the base's
+    origin.
     """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -42,7 +45,9 @@ class Truth:
         ]
         self._last_touch: dict[int, int] = {}
         self._steps = 0
+        self._parts = np.flatnonzero(self._is_robot)
         self.contacts, self.touching = 0, False
+        self.falls, self._fallen = 0, False
         self.min_clearance_m, self.distance_m = MAX_CLEARANCE_M, 0.0
         mujoco.mj_forward(model, data)
         self.find_obstacles()
@@ -97,6 +102,7 @@ class Truth:
         self._touch()
         if self._steps % CLEARANCE_STEPS == 0:
             self._clear()
+            self._fall()
 
     def _touch(self) -> None:
         """Count contacts between the robot and obstacles that begin in this step."""
@@ -112,6 +118,13 @@ class Truth:
             if self._steps - self._last_touch.get(thing, -NEW_CONTACT_STEPS) >= NEW_CONTACT_STEPS:
                 self.contacts += 1
             self._last_touch[thing] = self._steps
+
+    def _fall(self) -> None:
+        """Count falls that begin."""
+        tipped = self._data.xmat[self._base, 8] < FALL_TILT
+        fallen = bool(tipped or self._data.geom_xpos[self._parts, 2].min() < 0.0)
+        self.falls += fallen and not self._fallen
+        self._fallen = fallen
 
     def _clear(self) -> None:
         """Measure what may be nearer than the nearest so far, exactly."""
