@@ -29,6 +29,7 @@ from gigabrain_zenoh.cli import bench, bench_eyes, bench_navigation
 from gigabrain_zenoh.qa.bench.barn import BarnResult
 from gigabrain_zenoh.qa.bench.bodies import BodiesResult
 from gigabrain_zenoh.qa.bench.chain import ChainResult, chain_page
+from gigabrain_zenoh.qa.bench.clutter import ClutterResult
 from gigabrain_zenoh.qa.bench.estop import EstopResult, estop_page
 from gigabrain_zenoh.qa.bench.eyes import EyesResult
 from gigabrain_zenoh.qa.bench.goals import GoalsResult
@@ -43,6 +44,7 @@ DRAWN: dict[str, tuple[type[Struct], Callable[[Any], Any]]] = {  # by the words 
     "barn": (BarnResult, lambda result: bench_navigation._barn_table(result, "worlds", "plant")),
     "bodies": (BodiesResult, bench._bodies_table),
     "chain": (ChainResult, chain_page),
+    "clutter": (ClutterResult, bench_eyes._clutter_table),
     "estop": (EstopResult, estop_page),
     "eyes": (EyesResult, bench_eyes._eyes_table),
     "goals": (GoalsResult, bench_navigation._goals_table),

@@ -1,14 +1,18 @@
-"""`gigabrain bench eyes`: contours of cameras against the truth of the simulator."""
+"""`gigabrain bench eyes` and `clutter`: contours of cameras, and driving by them."""
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.table import Table
 
 from gigabrain_zenoh.cli.bench import finish, side_by_side
-from gigabrain_zenoh.cli.options import JsonFile, check_positive, print_progress
+from gigabrain_zenoh.cli.options import Body, JsonFile, check_names, check_positive, print_progress
 from gigabrain_zenoh.host import files
+from gigabrain_zenoh.host.signals import run_async
 
 if TYPE_CHECKING:
+    from gigabrain_zenoh.qa.bench.clutter import ClutterResult, ClutterRun
     from gigabrain_zenoh.qa.bench.eyes import EyesResult
 
 
@@ -75,3 +79,84 @@ def _eyes_table(result: "EyesResult") -> Table:
 
 def _cm(*metres: float) -> str:
     return ", ".join(f"{100 * one:.1f}" for one in metres)
+
+
+def clutter(
+    *,
+    seeds: str = "0-9",
+    speed: float = 3.0,
+    seconds: float = 120.0,
+    lidar_only: bool = False,
+    body: Body = "turtlebot3_waffle",
+    json: JsonFile = None,
+    logs: Path | None = None,
+) -> int:
+    """Drive a whole robot to ten goals in each of many cluttered worlds.
+
+    Example: gigabrain bench clutter --seeds 0-99 --json clutter.json
+    Example: gigabrain bench clutter --seeds 0-99 --json clutter.json --lidar-only
+
+    Each world is drawn at random: tables, low boxes, shelves and bars that hang, door sills, steps
+    down, and few things that a lidar sees. Contacts and falls are those of the physics; after a
+    fall a world is over. It needs EGL or OSMesa: set MUJOCO_GL=egl.
+
+    A file that exists is continued: worlds that it holds are not driven again. Exit code 1 if a
+    robot with cameras touched something, fell, or missed over two goals of a world.
+
+    Args:
+        seeds: Seeds of the worlds, such as 0-99 or 3,5,20-22.
+        speed: Simulated over real time.
+        seconds: Time in each world, from the first goal [s of its own time].
+        lidar_only: Leave the cameras off.
+        logs: Keep the worlds and the logs of all processes in this folder.
+    """
+    from gigabrain_zenoh.qa.bench.clutter import ClutterCourse, earlier, measure_clutter, seeds_of
+
+    check_positive(speed=speed, seconds=seconds)
+    check_names([body])
+    files.check_result_path(json)
+    wanted = seeds_of(seeds)
+    course = ClutterCourse(
+        body=body, cameras=not lidar_only, speed=speed, seconds=seconds, logs=logs
+    )
+    before = earlier(json, course)
+
+    def keep(result: "ClutterResult") -> None:
+        files.write_result(result, json)
+
+    result = run_async(measure_clutter(wanted, course, before, keep, print_progress))
+    finish(_clutter_table(result), result, json)
+    return 0 if all(one.ok for one in result.of(cameras=True)) else 1
+
+
+def _clutter_table(result: "ClutterResult") -> Table:
+    columns = {"with cameras": result.of(cameras=True), "lidar alone": result.of(cameras=False)}
+    shown = {name: _clutter_cells(runs) for name, runs in columns.items() if runs}
+    figures = next(iter(shown.values()), {})
+    return side_by_side(
+        "Ten goals in cluttered worlds",
+        f"{result.body}, x{result.speed:g} real time, at most {result.seconds:g} s in each world.",
+        list(shown),
+        {figure: [cells[figure] for cells in shown.values()] for figure in figures},
+    )
+
+
+def _clutter_cells(runs: "Sequence[ClutterRun]") -> dict[str, str]:
+    goals, unharmed = sum(one.reached for one in runs), sum(one.unharmed for one in runs)
+    return {
+        "worlds": str(len(runs)),
+        "contacts": str(sum(one.contacts for one in runs)),
+        "falls": str(sum(one.falls for one in runs)),
+        "worlds without both": str(unharmed),
+        "goals reached": f"{goals} of {10 * len(runs)}",
+        "worlds with 8 goals or more": str(sum(one.reached >= 8 for one in runs)),
+        "without contact and fall, and with 8 goals": str(sum(one.ok for one in runs)),
+        "least goals in a world": str(min(one.reached for one in runs)),
+        "least clearance [m]": f"{min(one.min_clearance_m for one in runs):.3f}",
+        "distance in a world, mean [m]": f"{_mean(runs, 'distance_m'):.1f}",
+        "time in a world, mean [s]": f"{_mean(runs, 'seconds'):.0f}",
+    }
+
+
+def _mean(runs: "Sequence[ClutterRun]", field: str) -> float:
+    return float(sum(getattr(one, field) for one in runs) / len(runs))

@@ -128,6 +128,11 @@ class Tasks:
         """Resume a paused task; return the reply in words. Raises Refused."""
         return await self._change(TaskRequest(do="resume", task=task, source=self._bus.process))
 
+    @property
+    def newest(self) -> TaskStatus | None:
+        """The newest status that came, if any has since the first request."""
+        return self._newest
+
     async def status(self) -> TaskStatus:
         """Return the current, the waiting and the most recent ended tasks. Raises BodyLost."""
         self._listen()
