@@ -16,7 +16,7 @@ SIDE_BY_SIDE := -n 2 --dist loadfile
 MAKEFLAGS += --no-print-directory
 
 .PHONY: setup demo lint style rooms types site unit node system check test qa qa-tests extremes dockerfile signals \
-  ci-extra slow first-starts bench faults soak mutation fuzz golden recordings pictures clean
+  ci-extra slow first-starts train-tests bench faults soak mutation fuzz golden recordings pictures clean
 
 setup: $(WARM)
 
@@ -135,7 +135,7 @@ fuzz: setup
 
 # what CI runs behind `make test`: slow tests, first starts in empty environments, and what the pages
 # say to run
-ci-extra: setup slow first-starts
+ci-extra: setup slow first-starts train-tests
 	$(BIN)/python -m tests.qa.documentation
 
 # tests of some 12 s and more
@@ -146,6 +146,17 @@ slow: setup
 first-starts: setup
 	$(BIN)/python -m tests.qa.first_start --way wheel --tool pip
 	$(BIN)/python -m tests.qa.first_start --way make sdist tool --tool uv --python $(PYTHON)
+
+# tests of training, in an environment of its own: JAX, and an independent judge
+TRAIN := .qa/train
+$(TRAIN)/.installed: pyproject.toml | $(INSTALLED)
+	@$(PYTHON) -m venv $(TRAIN)
+	@PATH="$$PATH:$(BIN)" uv pip install --quiet --python $(TRAIN)/bin/python -e '.[train]' pytest hotcoco onnxruntime
+	@touch $@
+
+train-tests: $(TRAIN)/.installed
+	JAX_PLATFORMS=cpu $(TRAIN)/bin/python -m pytest --noconftest -W ignore -o addopts=--import-mode=importlib -q \
+	  tests/unit/qa/test_train_judge.py tests/unit/qa/test_train_net.py
 
 bench: setup
 	$(BIN)/gigabrain bench chain
