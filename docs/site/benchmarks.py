@@ -28,6 +28,7 @@ from rich.text import Text
 from gigabrain_zenoh.cli import bench, bench_eyes, bench_navigation
 from gigabrain_zenoh.qa.bench.barn import BarnResult
 from gigabrain_zenoh.qa.bench.bodies import BodiesResult
+from gigabrain_zenoh.qa.bench.camera_cost import CameraCost, cameras_table
 from gigabrain_zenoh.qa.bench.chain import ChainResult, chain_page
 from gigabrain_zenoh.qa.bench.clutter import ClutterResult
 from gigabrain_zenoh.qa.bench.estop import EstopResult, estop_page
@@ -43,6 +44,7 @@ BLOCK = re.compile(r"^<!-- table: (\w+) -->\n.*?^<!-- end -->\n", re.MULTILINE |
 DRAWN: dict[str, tuple[type[Struct], Callable[[Any], Any]]] = {  # by the words behind `bench`
     "barn": (BarnResult, lambda result: bench_navigation._barn_table(result, "worlds", "plant")),
     "bodies": (BodiesResult, bench._bodies_table),
+    "cameras": (CameraCost, cameras_table),
     "chain": (ChainResult, chain_page),
     "clutter": (ClutterResult, bench_eyes._clutter_table),
     "estop": (EstopResult, estop_page),

@@ -101,6 +101,7 @@ COMMANDS = {
     "bench slam": ("bench_navigation:slam", "Measure map errors on laser logs or in simulation."),
     "bench goals": ("bench_navigation:goals", "Explore, then drive to random goals."),
     "bench eyes": ("bench_eyes:eyes", "Measure obstacle contours of cameras."),
+    "bench cameras": ("bench_eyes:cameras", "Measure what cameras cost a whole robot."),
     "bench clutter": ("bench_eyes:clutter", "Drive to goals among what a lidar cannot see."),
     "bench barn": ("bench_navigation:barn", "Run the BARN and DynaBARN benchmarks."),
     "precompile": ("map:precompile", "Compile mapping and navigation for a quick first start."),

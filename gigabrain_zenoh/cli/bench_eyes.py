@@ -1,4 +1,4 @@
-"""`gigabrain bench eyes` and `clutter`: contours of cameras, and driving by them."""
+"""`gigabrain bench eyes`, `cameras` and `clutter`: contours, their cost, and driving by them."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from gigabrain_zenoh.cli.bench import finish, side_by_side
-from gigabrain_zenoh.cli.options import Body, JsonFile, check_names, check_positive, print_progress
+from gigabrain_zenoh.cli.options import (
+    Body,
+    JsonFile,
+    World,
+    check_names,
+    check_positive,
+    print_progress,
+)
 from gigabrain_zenoh.host import files
 from gigabrain_zenoh.host.signals import run_async
 
@@ -79,6 +86,32 @@ def _eyes_table(result: "EyesResult") -> Table:
 
 def _cm(*metres: float) -> str:
     return ", ".join(f"{100 * one:.1f}" for one in metres)
+
+
+def cameras(
+    *,
+    seconds: float = 20.0,
+    body: Body = "turtlebot3_waffle",
+    world: World = "arena",
+    json: JsonFile = None,
+) -> int:
+    """Measure what cameras cost a whole robot, and how soon the world has their contours.
+
+    Example: gigabrain bench cameras --seconds 20
+
+    The same robot drives without its cameras, then with them. It needs EGL or OSMesa.
+
+    Args:
+        seconds: Duration of each [s].
+    """
+    from gigabrain_zenoh.qa.bench.camera_cost import cameras_table, measure_cameras
+
+    files.check_result_path(json)
+    check_positive(seconds=seconds)
+    check_names([body], [world])
+    result = run_async(measure_cameras(body, world, seconds, print_progress))
+    finish(cameras_table(result), result, json)
+    return 0
 
 
 def clutter(

@@ -176,9 +176,9 @@ async def measured_robot(
                 yield group, bus
 
 
-async def driver_report(bus: Bus) -> dict[str, float | int | str | None]:
-    """Return the driver's report; empty while it does not answer."""
-    answers = await bus.ask(DESCRIBE, DescribeRequest(), timeout_s=ASK_S, name="driver")
+async def report_of(bus: Bus, process: str = "driver") -> dict[str, float | int | str | None]:
+    """Return the report of a process; empty while it does not answer."""
+    answers = await bus.ask(DESCRIBE, DescribeRequest(), timeout_s=ASK_S, name=process)
     return dict(answers[0].report) if answers else {}
 
 

@@ -84,6 +84,7 @@ CALLS = {
     "render": "render {file}.png",
     "bench chain": "bench chain --seconds 3 --rounds 1",
     "bench stack": "bench stack --seconds 3",
+    "bench cameras": "bench cameras --seconds 3",
     "faults": "faults --only e-stop-pressed",
     "bench estop": "bench estop",
     "bench bodies": "bench bodies --seconds 3",

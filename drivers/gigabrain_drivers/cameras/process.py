@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import functools
 import threading
+import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING
 
@@ -69,6 +70,7 @@ class CameraProcess:
             bus.latest(SIM_SCENE, self._rendered.show)
             bus.latest(SIM_POSES, self._rendered.expose)
             bus.progress = Progress(self._rendered.came, self._rendered.done)
+            bus.report = self._rendered.report
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -192,6 +194,7 @@ class RenderThread:
         self._drawn: dict[str, int] = {}  # tick of each camera's newest picture in this boot
         self._taken_ns: dict[str, int] = {}  # when each was last due, by this process's clock
         self._boot, self._count, self._rounds = -1, 0, 0
+        self._cpu_s = 0.0  # that drawing has taken
 
     def show(self, scene: SimScene) -> None:
         """Draw this scene from now on."""
@@ -239,6 +242,10 @@ class RenderThread:
         """Return what changes with each piece of work, for the heartbeat."""
         return self._rounds
 
+    def report(self) -> dict[str, float | int | str | None]:
+        """Return the CPU time of drawing, for the process's description."""
+        return {"render_cpu_s": round(self._cpu_s, 3)}
+
     def run(self) -> None:
         """Draw until the process halts. Raises ConfigError where nothing can be drawn."""
         from gigabrain_drivers.cameras.rendered import Renderer, View  # mujoco: 100 MB
@@ -255,7 +262,9 @@ class RenderThread:
                     shown = scene
                     self._show(renderer, scene)
                 for poses, names in _together(due):
+                    began_s = time.thread_time()
                     frames = renderer.expose(poses, names)
+                    self._cpu_s += time.thread_time() - began_s
                     self._drawn.update(dict.fromkeys(frames, poses.tick))
                     for name, frame in frames.items():
                         exposed = Frame(frame.picture, frame.depth, poses.tick, poses.stamp_ns)

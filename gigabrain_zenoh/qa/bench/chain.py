@@ -38,8 +38,8 @@ from gigabrain_zenoh.qa.robot_under_test import (
     LOOPBACK,
     ProcessGroup,
     client,
-    driver_report,
     measured_robot,
+    report_of,
 )
 from gigabrain_zenoh.runtime.managed_process import ProcessSpec
 
@@ -156,7 +156,7 @@ async def brain(rate_hz: float, folder: Path) -> AsyncIterator[tuple[ProcessGrou
     """
     deployment = Deployment(body=str(_mock_body(rate_hz, folder)), resume="auto", router=LOOPBACK)
     async with measured_robot(deployment, folder) as (group, bus):
-        while not (await driver_report(bus)).get("scan_to_cmd_n"):
+        while not (await report_of(bus)).get("scan_to_cmd_n"):
             await group.poll()
         yield group, bus
 
@@ -189,7 +189,7 @@ async def listen_to_chain(
 
 
 async def _chain_latencies(bus: Bus) -> Latencies:
-    report = await driver_report(bus)
+    report = await report_of(bus)
     names = Latencies.__struct_fields__
     return msgspec.convert({name: report.get(f"scan_to_cmd_{name}") for name in names}, Latencies)
 

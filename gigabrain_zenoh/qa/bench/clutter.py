@@ -32,8 +32,8 @@ from gigabrain_zenoh.qa.judging import Failed
 from gigabrain_zenoh.qa.robot_under_test import (
     LOOPBACK,
     ProcessGroup,
-    driver_report,
     measured_robot,
+    report_of,
 )
 
 START_S = 600.0  # a robot's processes and its first map, on a busy machine
@@ -290,7 +290,7 @@ class CourseDriver:
             if asyncio.get_running_loop().time() > end_s:
                 raise Failed("the driver does not answer")
             await self._group.poll()
-            report = await driver_report(self._bus)
+            report = await report_of(self._bus)
             truth = {k: float(v) for k, v in report.items() if isinstance(v, int | float)}
         self._truth = truth
         for what in ("contact", "fall"):

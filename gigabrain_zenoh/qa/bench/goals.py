@@ -34,8 +34,8 @@ from gigabrain_zenoh.qa.bench.slam_world import GrowthSampler, MapGrowth
 from gigabrain_zenoh.qa.robot_under_test import (
     LOOPBACK,
     ProcessGroup,
-    driver_report,
     measured_robot,
+    report_of,
     rss_mb,
 )
 
@@ -314,7 +314,7 @@ class GoalSender:
         truth: dict[str, float] = {}
         while not truth:
             await self._group.poll()
-            report = await driver_report(self._bus)
+            report = await report_of(self._bus)
             truth = {k: float(v) for k, v in report.items() if isinstance(v, int | float)}
         return truth
 

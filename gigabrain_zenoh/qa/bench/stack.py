@@ -23,8 +23,8 @@ from gigabrain_zenoh.qa.robot_under_test import (
     LOOPBACK,
     START_S,
     ProcessGroup,
-    driver_report,
     measured_robot,
+    report_of,
 )
 
 if TYPE_CHECKING:
@@ -106,10 +106,10 @@ async def measure_stack(
         names = list(group.supervisor.statuses)
         healths: defaultdict[str, list[Health]] = defaultdict(list)
         close = bus.subscribe(HEALTH, lambda _key, health: healths[health.process].append(health))
-        before, began_ns = await driver_report(bus), bus.clock.now_ns()
+        before, began_ns = await report_of(bus), bus.clock.now_ns()
         await group.run_for(max(seconds, 2 * PERIOD_S))
         close()
-        after, ended_ns = await driver_report(bus), bus.clock.now_ns()
+        after, ended_ns = await report_of(bus), bus.clock.now_ns()
         await group.until(lambda: len(healths) >= len(names), "health of all processes")
     first_goal = await measure_first_goal(body, world, show) if goal else None
     return StackResult(
