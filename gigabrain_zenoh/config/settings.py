@@ -143,6 +143,41 @@ class CameraConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     robot: dict[str, Any] = {}  # fields of the body's file that are other here
 
 
+class RecognizerConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings in the `recognizer` part of a deployment file: the net that recognises things."""
+
+    onnx: str = ""  # file of a net of one's own; empty: the shipped one
+    labels: str = ""  # file with one class a line, in the order of the net's outputs
+    layout: Literal["things", "yolo", "detr"] = "things"  # of the net's outputs
+    min_confidence: Annotated[float, Meta(ge=0.01, le=0.99)] = 0.3
+    rate_hz: Annotated[float, Meta(ge=0.1, le=60)] = 5.0  # pictures of each camera, at most
+
+    def __post_init__(self) -> None:
+        if self.layout != "things" and not self.onnx:
+            raise ValueError(f"layout: {self.layout} is for a net of one's own; name it in `onnx`")
+        if self.onnx and not self.labels and self.layout != "things":
+            raise ValueError("labels: missing; expected a file with one class a line")
+
+
+TagSize = Annotated[float, Meta(ge=0.005, le=10.0)]  # [m], of its black square
+TagNumber = Annotated[str, Meta(pattern=r"^\d{1,6}$")]
+
+
+class TagConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings in the `tags` part of a deployment file: the AprilTags that are looked for."""
+
+    family: Literal["36h11", "36h10", "25h9", "16h5"] = "36h11"
+    size: TagSize = 0.16  # [m]
+    sizes: dict[TagNumber, TagSize] = {}  # [m], of those that have another, by number
+
+
+class RecognitionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the recognition process."""
+
+    recognizer: RecognizerConfig = RecognizerConfig()
+    tags: TagConfig = TagConfig()
+
+
 class RecorderConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings in the `recorder` part of a deployment file."""
 

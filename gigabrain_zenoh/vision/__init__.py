@@ -1,5 +1,6 @@
 """Vision: what can be told from pictures and depth of cameras. A pure library.
 
-It may import `geometry` and `kernels`. It may be imported by `perception`, and by processes of
-cameras. It knows no bus, no clock and no process; cv2 is imported where it is needed only.
+It may import `config`, `geometry`, `host` and `kernels`. It may be imported by `perception`,
+`recognition`, and by processes of cameras. It knows no bus, no clock and no process; cv2 is
+imported where it is needed only.
 """

@@ -28,19 +28,20 @@ class Found:
     """Things found in one picture, the surest first.
 
     boxes: float32 (n, 4), left, top, right, bottom [px of the picture]; labels: int64 (n,),
-    indices into CLASSES; confidences: float32 (n,), 0 to 1.
+    indices into `classes`; confidences: float32 (n,), 0 to 1.
     """
 
     boxes: Floats
     labels: NDArray[np.int64]
     confidences: Floats
+    classes: Sequence[str] = CLASSES
 
     def __len__(self) -> int:
         return len(self.labels)
 
     def names(self) -> tuple[str, ...]:
         """Return the class of each."""
-        return tuple(CLASSES[label] for label in self.labels)
+        return tuple(self.classes[label] for label in self.labels)
 
 
 class Recognizer:
@@ -49,17 +50,19 @@ class Recognizer:
     One picture costs some 10 ms of a core at 320 x 240; it is for one thread.
     """
 
-    def __init__(self, weights: Path = WEIGHTS, *, min_confidence: float = MIN_CONFIDENCE) -> None:
+    def __init__(
+        self,
+        weights: Path = WEIGHTS,
+        *,
+        min_confidence: float = MIN_CONFIDENCE,
+        classes: Sequence[str] = CLASSES,
+    ) -> None:
         if not weights.is_file():
             raise ConfigError(
                 f"{weights}: no such file; `python -m gigabrain_zenoh.qa.train all` makes it"
             )
-        try:
-            self._net = cv2.dnn.readNetFromONNX(str(weights))
-        except cv2.error as error:
-            why = str(error).split("error:")[-1].strip().splitlines()[0][:120]
-            raise ConfigError(f"{weights}: no net that cv2.dnn can run: {why}") from error
-        self._min_confidence = min_confidence
+        self._net = read_net(weights)
+        self._min_confidence, self._classes = min_confidence, classes
 
     def find(self, picture: Picture) -> Found:
         """Find things in a picture (h, w, 3), RGB, of any size."""
@@ -73,25 +76,49 @@ class Recognizer:
         fitted, scale, left, top = fit(picture)
         self._net.setInput(cv2.dnn.blobFromImage(fitted, 1 / 255.0))
         found = decode(np.asarray(self._net.forward())[0], self._min_confidence)
-        height, width = picture.shape[:2]
-        moved = (found.boxes - np.array([left, top, left, top], np.float32)) / scale
-        boxes = np.clip(moved, 0, [width, height, width, height]).astype(np.float32)
-        return Found(boxes, found.labels, found.confidences)
+        boxes = unfit(found.boxes, picture, scale, left, top)
+        return Found(boxes, found.labels, found.confidences, self._classes)
 
 
-def fit(picture: Picture) -> tuple[Picture, float, int, int]:
-    """Scale a picture to the net's size, grey around it; return it, scale, left and top [px]."""
+def read_net(path: Path) -> cv2.dnn.Net:
+    """Return the net of an ONNX file. Raises ConfigError where cv2.dnn cannot run it."""
+    try:
+        return cv2.dnn.readNetFromONNX(str(path))
+    except cv2.error as error:
+        raise ConfigError(f"{path}: no net that cv2.dnn can run: {reason(error)}") from error
+
+
+def reason(error: cv2.error) -> str:
+    """Return what OpenCV says, in one line."""
+    return str(error).split("error:")[-1].strip().splitlines()[0][:120]
+
+
+def fit(
+    picture: Picture, size: tuple[int, int] = (WIDTH_PX, HEIGHT_PX)
+) -> tuple[Picture, float, int, int]:
+    """Scale a picture to a net's size (width, height), grey around it.
+
+    Returns it, with scale, left and top [px].
+    """
     height, width = picture.shape[:2]
-    if (height, width) == (HEIGHT_PX, WIDTH_PX):
+    if (width, height) == size:
         return picture, 1.0, 0, 0
-    scale = min(WIDTH_PX / width, HEIGHT_PX / height)
-    size = max(1, round(width * scale)), max(1, round(height * scale))
+    scale = min(size[0] / width, size[1] / height)
+    inner = max(1, round(width * scale)), max(1, round(height * scale))
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    small = cv2.resize(picture, size, interpolation=how)
-    left, top = (WIDTH_PX - size[0]) // 2, (HEIGHT_PX - size[1]) // 2
-    canvas = np.full((HEIGHT_PX, WIDTH_PX, 3), GREY, np.uint8)
-    canvas[top : top + size[1], left : left + size[0]] = small
+    small = cv2.resize(picture, inner, interpolation=how)
+    left, top = (size[0] - inner[0]) // 2, (size[1] - inner[1]) // 2
+    canvas = np.full((size[1], size[0], 3), GREY, np.uint8)
+    canvas[top : top + inner[1], left : left + inner[0]] = small
     return canvas, scale, left, top
+
+
+def unfit(boxes: Floats, picture: Picture, scale: float, left: int, top: int) -> Floats:
+    """Return boxes of a fitted picture as boxes of the picture itself."""
+    height, width = picture.shape[:2]
+    moved = (boxes - np.array([left, top, left, top], np.float32)) / scale
+    clipped: Floats = np.clip(moved, 0, [width, height, width, height]).astype(np.float32)
+    return clipped
 
 
 def decode(raw: Floats, min_confidence: float = MIN_CONFIDENCE) -> Found:
