@@ -1,5 +1,6 @@
 """Cameras of a robot that is about to start: whether it has them, and what they need."""
 
+import importlib.util
 import subprocess
 import sys
 
@@ -7,6 +8,7 @@ from msgspec import structs
 
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.launch.deployment import Deployment
+from gigabrain_zenoh.recognition.node import INSTALL
 
 CHECK_S = 30.0
 CHECK = (sys.executable, "-P", "-m", "gigabrain_drivers.sim.graphics")
@@ -41,6 +43,20 @@ def with_cameras(deployment: Deployment, host: str) -> Deployment:
         return deployment
     print(f"gigabrain: no cameras: {problem}", file=sys.stderr)
     return structs.replace(deployment, cameras=False)
+
+
+def check_recognizer(deployment: Deployment, host: str) -> None:
+    """Raise ConfigError for a net of one's own that `host` is to run, and cannot."""
+    here, wanted = deployment.hosts.get(host, ()), deployment.recognizer
+    placed = any("recognition" in names for names in deployment.hosts.values())
+    runs = "recognition" in here or ("perception" in here and not placed)
+    if not (deployment.cameras and deployment.recognition and wanted.onnx and runs):
+        return
+    if not importlib.util.find_spec("cv2"):
+        raise ConfigError(INSTALL)
+    from gigabrain_zenoh.vision.nets import load_net
+
+    load_net(wanted)
 
 
 def _graphics_problem() -> str:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from gigabrain_zenoh.cli.cameras import with_cameras
+from gigabrain_zenoh.cli.cameras import check_recognizer, with_cameras
 from gigabrain_zenoh.cli.config import (
     Sets,
     SettingsFiles,
@@ -145,6 +145,7 @@ def demo(*, robot: RobotOptions = ROBOT, view: ViewOptions = VIEW) -> int:
     checked(values, Deployment)
     merged = merged_values(values, robot.settings, robot.set)
     deployment, address = with_cameras(merged.deployment, "robot"), ""
+    check_recognizer(deployment, "robot")
     if view.page or (view.page is None and not view.headless):
         checked({"port": view.port}, PageConfig)
         deployment, address = with_page(deployment, view.port, login=view.login)
@@ -200,6 +201,7 @@ def up(
         if "decision" in loaded.hosts[where]:
             merged.check_behaviour()
         loaded = with_cameras(loaded, where)
+        check_recognizer(loaded, where)
         rows = rows_of(merged, loaded, robot="driver" in loaded.hosts[where])
         with Display(writer(sys.stdout), LINES) as display:
 

@@ -23,10 +23,12 @@ from gigabrain_zenoh.config.settings import (
     OwnProcess,
     PageConfig,
     PerceptionConfig,
+    RecognizerConfig,
     RecorderConfig,
     Resume,
     Seed,
     Speed,
+    TagConfig,
 )
 from gigabrain_zenoh.config.yaml_text import Node
 from gigabrain_zenoh.errors import ConfigError, unknown
@@ -47,6 +49,7 @@ from gigabrain_zenoh.security.identity_files import (
 )
 
 MOST_HOSTS = 64
+NET_FILES = ("onnx", "labels")  # in the part `recognizer`
 ROBOT = tuple(name for name, one in PROCESSES.items() if one.default)
 
 
@@ -68,6 +71,9 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     # the processes of each host, by its name
     hosts: dict[str, tuple[str, ...]] = msgspec.field(default_factory=lambda: {"robot": ROBOT})
     cameras: bool = False  # on: the cameras of the body's file are used, by the process `camera`
+    recognition: bool = True  # off: what cameras see is not recognised
+    recognizer: RecognizerConfig = RecognizerConfig()
+    tags: TagConfig = TagConfig()
     button: ButtonConfig | None = None  # an e-stop button; without its word nothing moves
     robot: dict[str, Any] = {}  # fields of the body's file that are other here, never less safe
     perception: PerceptionConfig = PerceptionConfig()
@@ -199,11 +205,19 @@ def load_deployment(path: Path, keys: str = "") -> Deployment:
 
 
 def with_keys(loaded: Deployment, path: Path, keys: str = "") -> Deployment:
-    """Return the deployment of a file with its keys beside it, unless `keys` replaces them."""
+    """Return the deployment of a file with its files beside it, unless `keys` replaces these."""
     if loaded.keys and not keys:
         keys = str(path.absolute().parent / Path(loaded.keys).expanduser())
-    world = config.beside(loaded.world, path.absolute().parent)
-    return msgspec.structs.replace(loaded, keys=keys, world=world)
+    folder = path.absolute().parent
+    net = loaded.recognizer
+    files = {name: getattr(net, name) for name in NET_FILES}
+    there = {name: str(folder / Path(file).expanduser()) for name, file in files.items() if file}
+    return structs.replace(
+        loaded,
+        keys=keys,
+        world=config.beside(loaded.world, folder),
+        recognizer=structs.replace(net, **there),
+    )
 
 
 def own_names(root: Node) -> list[str]:

@@ -13,11 +13,17 @@ from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.config import loading
 from gigabrain_zenoh.config.layers import Layers, Row, assignment, full_key, keys_of
 from gigabrain_zenoh.config.settings import LinkName
-from gigabrain_zenoh.config.yaml_text import Node
+from gigabrain_zenoh.config.yaml_text import Entry, Node
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError, UnknownName
 from gigabrain_zenoh.host.files import read_bounded, replace_file
-from gigabrain_zenoh.launch.deployment import Deployment, deployment_type, own_names, with_keys
+from gigabrain_zenoh.launch.deployment import (
+    NET_FILES,
+    Deployment,
+    deployment_type,
+    own_names,
+    with_keys,
+)
 
 ROWS_FILE, MAX_ROWS_BYTES = "config.json", 1_000_000
 SETTINGS = "decision.settings"
@@ -69,7 +75,7 @@ def merge(
     for text in sets:
         one = assignment(text)
         key = full_key(one.key, _keys(layers, robot_type), SETTINGS)
-        value = with_world(one._replace(key=key).nested(), Path())
+        value = with_files(one._replace(key=key).nested(), Path())
         layers.add(value, lambda _, text=text: f"--set {text}")  # type: ignore[misc]
     deployment = layers.convert(_type_of(layers))
     if path:
@@ -96,17 +102,45 @@ def _add_file(layers: Layers, path: Path) -> None:
     root = loading.document(loading.read(path), str(path))
     if root.entries is None:
         raise ConfigError(f"{path}:{root.line}: expected a mapping of settings")
-    layers.add(with_world(root, path.absolute().parent), lambda line: f"{path}:{line}")
+    layers.add(with_files(root, path.absolute().parent), lambda line: f"{path}:{line}")
 
 
-def with_world(root: Node, folder: Path) -> Node:
+def with_files(root: Node, folder: Path) -> Node:
+    """Return settings in which the files that they name are taken from `folder`."""
+    return _with_world(_with_paths(root, "recognizer", folder), folder)
+
+
+def _with_world(root: Node, folder: Path) -> Node:
     """Return settings in which the file of a world, if they name one, is taken from `folder`."""
-    entries = tuple(
-        replace(one, node=replace(one.node, value=loading.beside(one.node.value, folder)))
-        if one.key == "world" and isinstance(one.node.value, str)
-        else one
-        for one in root.entries or ()
-    )
+
+    def placed(one: Entry) -> Entry:
+        if one.key != "world" or not isinstance(one.node.value, str):
+            return one
+        return replace(one, node=replace(one.node, value=loading.beside(one.node.value, folder)))
+
+    return _replaced(root, placed)
+
+
+def _with_paths(root: Node, part: str, folder: Path) -> Node:
+    """Return settings in which each file that a part names is taken from `folder`."""
+
+    def path(one: Entry) -> Entry:
+        name = one.node.value
+        if one.key not in NET_FILES or not isinstance(name, str) or not name:
+            return one
+        there = str(folder.absolute() / Path(name).expanduser())
+        return replace(one, node=replace(one.node, value=there))
+
+    def placed(one: Entry) -> Entry:
+        if one.key != part or one.node.entries is None:
+            return one
+        return replace(one, node=_replaced(one.node, path))
+
+    return _replaced(root, placed)
+
+
+def _replaced(root: Node, change: Callable[[Entry], Entry]) -> Node:
+    entries = tuple(change(one) for one in root.entries or ())
     return replace(root, entries=entries, value={one.key: one.node.value for one in entries})
 
 

@@ -28,6 +28,7 @@ from gigabrain_zenoh.config.settings import (
     PageConfig,
     PerceptionConfig,
     ProcessConfig,
+    RecognitionConfig,
     RecorderConfig,
     RelayConfig,
     RouterConfig,
@@ -99,6 +100,10 @@ def _camera(deployment: "Deployment", _: ProcessPlace) -> CameraConfig:
     )
 
 
+def _recognition(deployment: "Deployment", _: ProcessPlace) -> RecognitionConfig:
+    return RecognitionConfig(recognizer=deployment.recognizer, tags=deployment.tags)
+
+
 def _recorder(deployment: "Deployment", _: ProcessPlace) -> RecorderConfig:
     """Return the recorder's settings, with notes on the other processes that a replay needs."""
     about = {"perception": deployment.perception, "decision": deployment.decision}
@@ -131,6 +136,13 @@ def _needs_camera(deployment: "Deployment", here: set[str]) -> bool:
     """Return whether the cameras' process runs beside the driver: unless `hosts` places it."""
     placed = any("camera" in names for names in deployment.hosts.values())
     return deployment.cameras and "driver" in here and not placed
+
+
+def _needs_recognition(deployment: "Deployment", here: set[str]) -> bool:
+    """Return whether pictures are recognised beside perception: unless `hosts` places it."""
+    placed = any("recognition" in names for names in deployment.hosts.values())
+    wanted = deployment.cameras and deployment.recognition
+    return wanted and "perception" in here and not placed
 
 
 def _maps(deployment: "Deployment") -> bool:
@@ -187,6 +199,14 @@ PROCESSES: Mapping[str, ProcessType] = {
         default=True,
         compiles=_maps,
         repeats=True,
+        roles=("robot", "brain"),
+    ),
+    "recognition": ProcessType(
+        "gigabrain_zenoh.recognition.node:run",
+        RecognitionConfig,
+        derive=_recognition,
+        joins=_needs_recognition,
+        optional=True,
         roles=("robot", "brain"),
     ),
     "decision": ProcessType(

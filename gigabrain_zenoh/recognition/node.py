@@ -1,0 +1,216 @@
+"""Recognition node: publishes what is recognised in the pictures of each camera.
+
+A worker thread looks at one picture at a time, always the newest of a camera whose turn it is, so
+that no number of pictures costs more than the rate of the settings.
+"""
+
+import asyncio
+import logging
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING
+
+from msgspec.structs import replace
+
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.body import Body, Camera, RobotState
+from gigabrain_schemas.brain import PoseInMap
+from gigabrain_schemas.objects import Detections, Point
+from gigabrain_schemas.sensors import Image
+from gigabrain_schemas.topics import BODY, DEPTH, DETECTIONS, IMAGE, POSE, STATE
+from gigabrain_schemas.vision import DepthImage
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.config.settings import RecognitionConfig
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.geometry.pose import PoseHistory, compose, relative, to_parent, wrap_angle
+from gigabrain_zenoh.host.this_process import step_aside
+from gigabrain_zenoh.host.threads import Job
+from gigabrain_zenoh.logs import Fault
+from gigabrain_zenoh.runtime.heartbeat import Progress
+
+if TYPE_CHECKING:
+    from gigabrain_zenoh.recognition.observer import Observer
+
+log = logging.getLogger(__name__)
+EARLY = 0.25  # of a period: a picture that comes so much earlier is not left out
+DEPTH_WAIT_NS = 60_000_000  # that a picture waits for its depth
+KEPT_DEPTHS = 4  # of a camera, for the picture of the same exposure
+INSTALL = "recognition needs OpenCV; install it with: pip install 'gigabrain-zenoh[eyes]'"
+
+
+@dataclass
+class _Eye:
+    """A camera, its newest picture that waits, and the depth of its last exposures."""
+
+    camera: Camera
+    due_ns: int = 0  # when its next picture is looked at
+    picture: Image | None = None
+    came_ns: int = 0  # when that picture came
+    depths: dict[int, DepthImage] = field(default_factory=dict)  # by basis
+
+    def keep(self, depth: DepthImage) -> None:
+        """Keep the depth of an exposure."""
+        self.depths[depth.basis] = depth
+        while len(self.depths) > KEPT_DEPTHS:
+            del self.depths[next(iter(self.depths))]
+
+    def depth_of(self, picture: Image) -> DepthImage | None:
+        """Return the depth of the same exposure."""
+        depth = self.depths.get(picture.basis)
+        return depth if depth and depth.boot == picture.boot else None
+
+
+class Recognition:
+    """Follows the cameras of a body, on the loop; `observer` runs in a thread beside it."""
+
+    def __init__(self, config: RecognitionConfig, bus: Bus, observer: "Observer") -> None:
+        self._bus, self._observer = bus, observer
+        self._period_ns = round(1e9 / config.recognizer.rate_hz)
+        self._pool = ThreadPoolExecutor(1, "recognition", initializer=step_aside)
+        self._eyes: dict[str, _Eye] = {}
+        self._history, self._fault = PoseHistory(), Fault(log)
+        self._busy, self._taken, self._done = False, 0, 0
+        self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._pose = bus.latest(POSE)
+        bus.latest(BODY, self._on_body)
+        bus.latest(STATE, self._on_state)
+        bus.subscribe(DEPTH, self._on_depth)
+        bus.subscribe(IMAGE, self._on_image)
+        bus.progress = Progress(lambda: (self._taken,) if self._eyes else (), lambda: self._done)
+
+    def close(self) -> None:
+        """Let the thread end after its work; one that hangs is left."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def _on_body(self, body: Body) -> None:
+        cameras = {one.name: one for one in body.description.cameras}
+        if cameras != {name: eye.camera for name, eye in self._eyes.items()}:
+            self._eyes = {name: _Eye(camera) for name, camera in cameras.items()}
+
+    def _on_state(self, state: RobotState) -> None:
+        self._history = self._history.then(state)
+        self._start()
+
+    def _on_depth(self, key: str, depth: DepthImage) -> None:
+        if eye := self._eyes.get(key.removeprefix(f"{DEPTH.key}/")):
+            eye.keep(depth)
+            self._start()
+
+    def _on_image(self, key: str, picture: Image) -> None:
+        eye = self._eyes.get(key.removeprefix(f"{IMAGE.key}/"))
+        now_ns = self._bus.clock.now_ns()
+        if eye is None or now_ns < eye.due_ns - EARLY * self._period_ns:
+            return
+        if picture.boot != self._bus.time.boot:
+            return
+        eye.picture, eye.came_ns = picture, now_ns
+        self._taken += 1
+        self._start()
+
+    def _start(self) -> None:
+        """Look at the picture that is most due, unless one is looked at."""
+        if self._busy:
+            return
+        now_ns = self._bus.clock.now_ns()
+        for eye in sorted(self._eyes.values(), key=lambda one: one.due_ns):
+            picture = eye.picture
+            if picture is None:
+                continue
+            depth = eye.depth_of(picture)
+            if eye.camera.depth and depth is None and now_ns - eye.came_ns < DEPTH_WAIT_NS:
+                continue
+            eye.picture = None
+            eye.due_ns = max(eye.due_ns, now_ns - self._period_ns) + self._period_ns
+            self._busy = True
+            job = self._pool.submit(self._observer.observe, eye.camera, picture, depth)
+            self._bus.input_log.when_done(job, partial(self._finish, picture))
+            return
+
+    def _finish(self, picture: Image, job: Job) -> None:
+        self._busy, self._done = False, self._done + 1
+        try:
+            found: Detections = job.result()
+        except ValueError as error:
+            self._bus.counters["broken_pictures"] += 1
+            self._fault.begin(f"camera {picture.frame_id}: skipped a picture: {error}")
+        except Exception as error:  # noqa: BLE001 - handed on whole, to end this process
+            if not self.failed.done():
+                self.failed.set_exception(error)
+        else:
+            self._fault.end(f"camera {picture.frame_id}: its pictures are whole again")
+            self._publish(found, picture)
+        self._start()
+
+    def _publish(self, found: Detections, picture: Image) -> None:
+        bus = self._bus
+        if picture.boot != bus.time.boot:
+            return
+        place = self._place(picture.boot, picture.basis)
+        if place:
+            found = in_map(found, place)
+        bus.latency_ms["recognition"] = found.took_ms
+        bus.publish(DETECTIONS, found, basis=picture.basis, stamp_ns=picture.stamp_ns)
+
+    def _place(self, boot: int, tick: int) -> Pose | None:
+        """Return the body's pose in the map at `tick`; None where it is not localized."""
+        known: PoseInMap | None = self._pose.fresh()
+        if known is None or not known.localized:
+            return None
+        then, here = self._history.at(boot, known.basis), self._history.at(boot, tick)
+        if then is None or here is None:
+            return None
+        return compose(Pose(x=known.x, y=known.y, yaw=known.yaw), relative(then, here))
+
+
+def in_map(found: Detections, place: Pose) -> Detections:
+    """Return detections with their places in the map, for a body at `place` in it."""
+    from gigabrain_zenoh.vision.tags import yaw_of
+
+    def at(position: Point) -> Point:
+        x, y = to_parent(place, position[0], position[1])
+        return x, y, position[2]
+
+    return replace(
+        found,
+        things=tuple(
+            replace(one, in_map=at(one.position)) if one.position else one for one in found.things
+        ),
+        tags=tuple(
+            replace(
+                one,
+                in_map=at(one.position),
+                yaw_in_map=wrap_angle(place.yaw + yaw_of(one.orientation)),
+            )
+            for one in found.tags
+        ),
+    )
+
+
+def make_observer(config: RecognitionConfig) -> "Observer":
+    """Return the observer of the settings. Raises ConfigError."""
+    try:
+        import cv2
+    except ImportError:
+        raise ConfigError(INSTALL) from None
+    from gigabrain_zenoh.recognition.observer import Observer
+    from gigabrain_zenoh.vision.nets import load_net
+    from gigabrain_zenoh.vision.tags import TagFinder
+
+    cv2.setNumThreads(1)
+    net, tags = load_net(config.recognizer), config.tags
+    if net is None:
+        log.warning("no weights of a net are installed: only tags are recognised")
+    sizes = {int(number): size for number, size in tags.sizes.items()}
+    return Observer(net, TagFinder(tags.family, tags.size, sizes))
+
+
+async def run(config: RecognitionConfig, bus: Bus, ready: Callable[[], None]) -> None:
+    """Publish what is recognised until the process ends. Raises ConfigError."""
+    recognition = Recognition(config, bus, await asyncio.to_thread(make_observer, config))
+    try:
+        ready()
+        await asyncio.gather(bus.failed, recognition.failed)
+    finally:
+        recognition.close()

@@ -1,0 +1,97 @@
+"""Turns one picture, with its depth, into detections. It knows no bus and no clock."""
+
+import time
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_schemas.body import Camera
+from gigabrain_schemas.objects import Box, Detection, Detections
+from gigabrain_schemas.sensors import Image
+from gigabrain_schemas.vision import DepthImage
+from gigabrain_zenoh.vision.camera_model import CameraModel
+from gigabrain_zenoh.vision.nets import Net
+from gigabrain_zenoh.vision.pictures import decoded
+from gigabrain_zenoh.vision.recognizer import Found
+from gigabrain_zenoh.vision.tags import TagFinder
+from gigabrain_zenoh.vision.thing_places import thing_place
+
+MAX_THINGS = 128
+MIN_BOX_PX = 1.0
+
+
+class Observer:
+    """Looks at the pictures of all cameras of a body, in one thread. Without a net, for tags only.
+
+    Figures at 320 x 240 on one core: net 12 ms, tags 4 ms, JPEG and depth 2 ms.
+    """
+
+    def __init__(self, net: Net | None, tags: TagFinder) -> None:
+        self._net, self._tags = net, tags
+        self._models: dict[Camera, CameraModel] = {}
+
+    def observe(self, camera: Camera, image: Image, depth: DepthImage | None) -> Detections:
+        """Return what is in a picture. Raises ValueError where it is broken, or of another size."""
+        began = time.perf_counter()
+        picture = decoded(image)
+        if picture.shape[:2] != (camera.height, camera.width):
+            height, width = picture.shape[:2]
+            raise ValueError(
+                f"a picture of {width} x {height} pixels; the body's file says "
+                f"{camera.width} x {camera.height}"
+            )
+        model, far = self._model(camera), _depth_of(depth, camera)
+        mono = picture.ndim == 2
+        grey = picture if mono else _converted(picture, cv2.COLOR_BGR2GRAY)
+        to_rgb = cv2.COLOR_GRAY2RGB if mono else cv2.COLOR_BGR2RGB
+        found = self._net.find(_converted(picture, to_rgb)) if self._net else None
+        return Detections(
+            camera=camera.name,
+            width=camera.width,
+            height=camera.height,
+            things=_things(found, model, far) if found else (),
+            tags=self._tags.find(grey, model, far),
+            took_ms=1e3 * (time.perf_counter() - began),
+        )
+
+    def _model(self, camera: Camera) -> CameraModel:
+        if camera not in self._models:
+            self._models[camera] = CameraModel(camera)
+        return self._models[camera]
+
+
+def _converted(picture: NDArray[np.uint8], how: int) -> NDArray[np.uint8]:
+    return np.asarray(cv2.cvtColor(picture, how), np.uint8)
+
+
+def _depth_of(depth: DepthImage | None, camera: Camera) -> NDArray[np.uint16] | None:
+    """Return the depth of a picture's pixels [mm]; None where it is of another size or broken."""
+    if depth is None or (depth.height, depth.width) != (camera.height, camera.width):
+        return None
+    pixels = depth.array()
+    usable = (pixels >= camera.depth_min * 1e3) & (pixels <= camera.depth_max * 1e3)
+    return np.where(usable, pixels, np.uint16(0))
+
+
+def _things(
+    found: Found, model: CameraModel, depth: NDArray[np.uint16] | None
+) -> tuple[Detection, ...]:
+    """Return what a net found, the surest first, placed by depth."""
+    things = []
+    for label, sure, corners in zip(
+        found.names(), found.confidences.tolist(), found.boxes.tolist(), strict=True
+    ):
+        left, top, right, bottom = corners
+        box: Box = (left, top, right, bottom)
+        if right - left < MIN_BOX_PX or bottom - top < MIN_BOX_PX:
+            continue
+        place = None if depth is None else thing_place(label, box, model, depth)
+        things.append(Detection(
+            label=label,
+            confidence=min(max(sure, 0.0), 1.0),
+            box=box,
+            position=place.position if place else None,
+            size=place.size if place else None,
+        ))  # fmt: skip
+    return tuple(things[:MAX_THINGS])

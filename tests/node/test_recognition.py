@@ -1,0 +1,317 @@
+"""Recognition on the bus: what it publishes of pictures, and what it bears."""
+
+import asyncio
+import logging
+import math
+import threading
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_schemas.body import Camera
+from gigabrain_schemas.brain import PoseInMap
+from gigabrain_schemas.objects import Detections
+from gigabrain_schemas.sensors import Image
+from gigabrain_schemas.topics import BODY, DEPTH, DETECTIONS, IMAGE, POSE, STATE
+from gigabrain_schemas.vision import DepthImage, pack_depth
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork
+from gigabrain_zenoh.clock import FakeClock
+from gigabrain_zenoh.config.settings import RecognitionConfig
+from gigabrain_zenoh.recognition.node import Recognition, make_observer
+from gigabrain_zenoh.recognition.observer import Observer
+from gigabrain_zenoh.testing import samples
+from gigabrain_zenoh.testing.waiting import settle, until
+from gigabrain_zenoh.vision.camera_model import CameraModel
+from gigabrain_zenoh.vision.recognizer import Found
+from gigabrain_zenoh.vision.tags import TagFinder
+from tests.unit.vision.tag_scenes import CAMERA, draw, facing
+
+TAG, DEPTH_PICTURE = draw(
+    facing(7, 0.16, (1.0, 0.2, 0.1), 0.3, 0.0, 0.0), CameraModel(CAMERA), np.random.default_rng(0)
+)
+REAR = Camera(name="rear", width=320, height=240, x=-0.2, z=0.1, yaw=math.pi)
+STAMP_NS = 1_795_580_000_000_000_000
+
+
+class SeesABall:
+    """A net that sees the same ball in each picture, or hangs."""
+
+    def __init__(self) -> None:
+        self.seen, self.go_on = 0, threading.Event()
+        self.go_on.set()
+
+    def find(self, picture: np.ndarray) -> Found:
+        self.seen += 1
+        assert self.go_on.wait(30)
+        box = np.array([[120, 60, 160, 100]], np.float32)
+        return Found(box, np.array([1]), np.array([0.9], np.float32))
+
+
+class Robot:
+    """What the driver, the cameras and perception publish, and what recognition says."""
+
+    def __init__(self, bus: Bus, clock: FakeClock, recognition: Recognition, net: SeesABall):
+        self.bus, self.clock, self.recognition, self.net = bus, clock, recognition, net
+        self.heard: list[Detections] = []
+        bus.subscribe(DETECTIONS, lambda _, message: self.heard.append(message))
+        self.own = recognition._bus
+
+    def be(self, tick: int, pose: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+        self.bus.time.boot, self.bus.time.tick = samples.BOOT, tick
+        self.bus.publish(STATE, samples.state(tick, pose=pose))
+
+    def show(self, basis: int, picture: Any = TAG, name: str = "front", depth: bool = True) -> None:
+        header: dict[str, Any] = {"basis": basis, "stamp_ns": STAMP_NS, "name": name}
+        about: dict[str, Any] = {"frame_id": name, "width": 320, "height": 240}
+        if depth:
+            planes = pack_depth(DEPTH_PICTURE)
+            self.bus.publish(DEPTH, DepthImage(**about, planes=planes), **header)
+        data = picture if isinstance(picture, bytes) else cv2.imencode(".png", picture)[1]
+        if not isinstance(picture, bytes):
+            data = cv2.imencode(".jpg", picture, (cv2.IMWRITE_JPEG_QUALITY, 90))[1].tobytes()
+        self.bus.publish(IMAGE, Image(**about, encoding="jpeg", data=data), **header)
+
+    async def finds(self, count: int) -> Detections:
+        await until(lambda: len(self.heard) >= count, f"{count} detections")
+        return self.heard[-1]
+
+    async def pass_s(self, seconds: float) -> None:
+        await self.clock.advance(round(seconds * 1e9))
+
+
+@asynccontextmanager
+async def running(*cameras: Camera) -> AsyncIterator[Robot]:
+    network, clock, net = LocalNetwork(), FakeClock(), SeesABall()
+    bus, own = (Bus(network.transport(), clock, name) for name in ("driver", "recognition"))
+    recognition = Recognition(RecognitionConfig(), own, Observer(net, TagFinder()))
+    robot = Robot(bus, clock, recognition, net)
+    try:
+        robot.be(40)
+        description = replace(samples.WAFFLE, cameras=cameras or (CAMERA,))
+        bus.publish(BODY, samples.body(description))
+        await settle()
+        yield robot
+    finally:
+        net.go_on.set()
+        recognition.close()
+        await bus.close()
+        await own.close()
+
+
+async def test_what_is_seen_is_published_with_basis_and_stamp_of_the_exposure():
+    async with running() as robot:
+        robot.show(basis=38)
+        found = await robot.finds(1)
+        assert (found.camera, found.width, found.height) == ("front", 320, 240)
+        assert (found.basis, found.stamp_ns, found.boot) == (38, STAMP_NS, samples.BOOT)
+        (ball,), (tag,) = found.things, found.tags
+        assert (ball.label, ball.confidence) == ("ball", pytest.approx(0.9))
+        assert ball.box == (120, 60, 160, 100)
+        assert ball.in_map is None
+        assert tag.id == 7
+        assert tag.position == pytest.approx((1.0, 0.2, 0.1), abs=0.01)
+        assert found.took_ms > 0
+
+
+async def test_places_in_the_map_are_by_the_pose_moved_to_the_exposure():
+    async with running() as robot:
+        robot.be(41, (1.0, 0.0, 0.0))
+        robot.be(46, (1.5, 0.0, 0.0))
+        pose = PoseInMap(x=5.5, y=2.0, yaw=math.pi / 2, covariance=(0.01,) * 9)
+        robot.bus.publish(POSE, pose, basis=46)
+        robot.show(basis=41)
+        found = await robot.finds(1)
+        (tag,) = found.tags
+        # at the exposure it was 0.5 m behind where it was localized: at (5.5, 1.5), facing +y
+        assert tag.in_map == pytest.approx((5.5 - 0.2, 1.5 + 1.0, 0.1), abs=0.01)
+        assert tag.yaw_in_map == pytest.approx(-math.pi / 2 + 0.3, abs=0.03)
+        (ball,) = found.things
+        assert ball.position
+        assert ball.in_map == pytest.approx(
+            (5.5 - ball.position[1], 1.5 + ball.position[0], ball.position[2])
+        )
+
+
+async def test_a_robot_that_is_not_localized_gives_no_places_in_the_map():
+    async with running() as robot:
+        pose = PoseInMap(x=0.0, y=0.0, yaw=0.0, covariance=(0.01,) * 9, localized=False)
+        robot.bus.publish(POSE, pose, basis=40)
+        robot.show(basis=40)
+        found = await robot.finds(1)
+        assert found.tags[0].in_map is None
+
+
+async def test_broken_pictures_are_counted_and_the_next_one_is_looked_at(caplog):
+    async with running() as robot:
+        whole = cv2.imencode(".jpg", TAG)[1].tobytes()
+        small = cv2.imencode(".jpg", TAG[:64, :64])[1].tobytes()
+        for number, bad in enumerate((b"\xff\xd8\xff", whole[:200], small, b"x" * 900), 1):
+            robot.show(40, bad)
+            await until(
+                lambda: robot.own.counters["broken_pictures"] == number,  # noqa: B023
+                "a broken picture",
+            )
+            await robot.pass_s(1)
+        assert robot.heard == []
+        faults = [one for one in caplog.records if one.levelno >= logging.WARNING]
+        assert len(faults) == 1
+        robot.show(40)
+        assert (await robot.finds(1)).tags
+
+
+async def test_a_picture_of_another_size_than_the_bodys_file_says_is_refused():
+    async with running(replace(CAMERA, width=640, height=480)) as robot:
+        robot.show(40)
+        await until(lambda: robot.own.counters["broken_pictures"] == 1, "a refusal")
+
+
+async def test_a_flood_of_pictures_costs_no_more_than_the_rate():
+    async with running() as robot:
+        for tick in range(40, 240):  # 4 s at 50 Hz
+            robot.be(tick)
+            robot.show(tick)
+            await settle()
+            await until(lambda: not robot.recognition._busy, "an idle worker")
+            await robot.pass_s(0.02)
+        assert 19 <= robot.net.seen <= 21
+
+
+async def test_the_newest_picture_is_looked_at_when_the_worker_is_free():
+    async with running() as robot:
+        robot.net.go_on.clear()
+        robot.show(basis=40)
+        await until(lambda: robot.net.seen == 1, "work")
+        for basis in (41, 42, 43):
+            await robot.pass_s(1)
+            robot.show(basis)
+        await settle()
+        robot.net.go_on.set()
+        await robot.finds(2)
+        assert [one.basis for one in robot.heard] == [40, 43]
+
+
+async def test_cameras_take_turns():
+    async with running(CAMERA, REAR) as robot:
+        for _ in range(4):
+            robot.show(40)
+            robot.show(40, name="rear", depth=False)
+            await until(lambda: not robot.recognition._busy, "an idle worker")
+            await settle()
+            await until(lambda: not robot.recognition._busy, "an idle worker")
+            await robot.pass_s(0.2)
+        await until(lambda: len(robot.heard) == 8, "eight pictures")
+        assert [one.camera for one in robot.heard].count("rear") == 4
+        assert all(thing.position is None for one in robot.heard if one.camera == "rear"
+                   for thing in one.things)  # fmt: skip
+
+
+async def test_a_picture_waits_for_its_depth_but_not_for_long():
+    async with running() as robot:
+        robot.show(40, depth=False)
+        await settle()
+        assert robot.net.seen == 0
+        await robot.pass_s(0.1)
+        robot.be(41)
+        found = await robot.finds(1)
+        assert found.things[0].position is None
+
+
+async def test_depth_of_another_exposure_or_broken_depth_is_not_used():
+    async with running() as robot:
+        robot.show(38)
+        await robot.finds(1)
+        await robot.pass_s(1)
+        robot.show(39, depth=False)
+        await robot.pass_s(0.1)
+        robot.be(41)
+        found = await robot.finds(2)
+        assert found.basis == 39
+        assert found.things[0].position is None
+        await robot.pass_s(1)
+        about: dict[str, Any] = {"frame_id": "front", "width": 320, "height": 240}
+        broken = DepthImage(**about, planes=(b"no", b"zlib", b"at", b"all"))
+        robot.bus.publish(DEPTH, broken, basis=40, name="front")
+        robot.show(40, depth=False)
+        await until(lambda: robot.own.counters["broken_pictures"] == 1, "a refusal")
+
+
+async def test_a_net_that_hangs_is_no_progress_and_one_without_pictures_is():
+    async with running() as robot:
+        progress = robot.own.progress
+        progress()
+        assert progress()
+        robot.net.go_on.clear()
+        robot.show(40)
+        await until(lambda: robot.net.seen == 1, "work")
+        progress()
+        await robot.pass_s(1)
+        robot.show(41)
+        await settle()
+        assert not progress()
+        robot.net.go_on.set()
+        await robot.finds(2)
+        assert progress()
+
+
+async def test_pictures_of_an_earlier_start_of_the_driver_are_left_out():
+    async with running() as robot:
+        about: dict[str, Any] = {"frame_id": "front", "width": 320, "height": 240}
+        data = cv2.imencode(".jpg", TAG)[1].tobytes()
+        robot.bus.time.boot = 3
+        robot.bus.publish(IMAGE, Image(**about, encoding="jpeg", data=data), name="front")
+        await settle()
+        robot.be(41)
+        await settle()
+        assert robot.net.seen == 0
+
+
+async def test_an_error_of_the_net_ends_the_process():
+    async with running() as robot:
+        robot.net.find = lambda _: 1 / 0  # type: ignore[method-assign,return-value,assignment]
+        robot.show(40)
+        with pytest.raises(ZeroDivisionError):
+            await asyncio.wait_for(robot.recognition.failed, 30)
+
+
+def test_without_weights_only_tags_are_recognised_and_one_line_says_so(caplog, monkeypatch):
+    from gigabrain_zenoh.vision import nets
+
+    monkeypatch.setattr(nets, "WEIGHTS", nets.WEIGHTS.with_name("none.onnx"))
+    observer = make_observer(RecognitionConfig())
+    assert len(caplog.records) == 1
+    data = cv2.imencode(".jpg", TAG)[1].tobytes()
+    picture = Image(frame_id="front", width=320, height=240, encoding="jpeg", data=data)
+    found = observer.observe(CAMERA, picture, None)
+    assert found.things == ()
+    assert [tag.id for tag in found.tags] == [7]
+
+
+@pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "mono8"])
+def test_raw_pictures_are_looked_at_too(encoding):
+    pixels = TAG if encoding == "mono8" else cv2.cvtColor(TAG, cv2.COLOR_GRAY2BGR)
+    picture = Image(
+        frame_id="front", width=320, height=240, encoding=encoding, data=pixels.tobytes()
+    )
+    found = Observer(SeesABall(), TagFinder()).observe(CAMERA, picture, None)
+    assert [tag.id for tag in found.tags] == [7]
+    assert [thing.label for thing in found.things] == ["ball"]
+
+
+def test_the_net_gets_red_green_blue():
+    got = []
+
+    class Net(SeesABall):
+        def find(self, picture: np.ndarray) -> Found:
+            got.append(picture[120, 160].tolist())
+            return super().find(picture)
+
+    red = np.full((240, 320, 3), (10, 20, 250), np.uint8)  # blue, green, red
+    picture = Image(frame_id="front", width=320, height=240, encoding="bgr8", data=red.tobytes())
+    Observer(Net(), TagFinder()).observe(CAMERA, picture, None)
+    assert got == [[250, 20, 10]]
