@@ -5,8 +5,7 @@ from collections import Counter
 from typing import Any, TypeVar
 
 from gigabrain_schemas.base import Message, Velocity
-from gigabrain_schemas.sensors import Image
-from gigabrain_schemas.topics import IMAGE, LOG, MAP, STATE, Topic
+from gigabrain_schemas.topics import LOG, MAP, STATE, Topic
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.freshness import Latest
 from gigabrain_zenoh.bus.listening import Sampled
@@ -23,17 +22,13 @@ SETTLE_S = 0.1  # start of a new stream that is ignored: commands the network ha
 
 
 class ViewerScene(RobotView):
-    """Messages for viewers: also map, log and images. Busy topics are decoded when read."""
-
-    max_cameras = 8  # whose images are shown
+    """Messages for viewers: also map and log. Busy topics are decoded when read."""
 
     def __init__(self, bus: Bus) -> None:
         self.sampled: dict[Topic[Any], Sampled[Any]] = {}
         super().__init__(bus)
-        self.images: dict[str, Sampled[Image]] = {}  # by camera
         bus.latest(MAP, functools.partial(self.on_rare, MAP))
         bus.subscribe(LOG, lambda _key, record: self.on_rare(LOG, record))
-        bus.tap(IMAGE.at("*"), self._receive_image)
 
     def newest_of(self, topic: Topic[M]) -> Latest[M]:
         """Subscribe to a busy topic; decode only the messages that are read."""
@@ -50,12 +45,6 @@ class ViewerScene(RobotView):
         """Publish the operator's wanted velocity with the newest tick."""
         self.sampled[STATE].poll()
         steer(self.bus, wanted)
-
-    def _receive_image(self, key: str, encoding: str, payload: bytes) -> None:
-        camera = key.rpartition("/")[2]
-        if camera in self.images or len(self.images) < self.max_cameras:
-            sampled = self.images.setdefault(camera, Sampled(self.bus, IMAGE))
-            sampled.receive(key, encoding, payload)
 
 
 class RateLimiter:

@@ -13,9 +13,12 @@ from msgspec.structs import replace
 from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.arrays import ranges_bytes
 from gigabrain_schemas.base import Pose
-from gigabrain_schemas.body import Body, RobotState
+from gigabrain_schemas.body import Body, Camera, RobotState
 from gigabrain_schemas.brain import (
+    Contour,
+    DetectedObject,
     Intent,
+    Objects,
     Obstacle,
     OccupancyGrid,
     PoseInMap,
@@ -24,15 +27,19 @@ from gigabrain_schemas.brain import (
     WorldModel,
 )
 from gigabrain_schemas.examples import EXAMPLES
+from gigabrain_schemas.objects import MapObject, MapTag, ObjectMap
 from gigabrain_schemas.requests import EstopRequest, GateReply
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.tasks import GoalReply, GoalRequest, TaskReply, TaskRequest, TaskStatus
 from gigabrain_schemas.topics import (
     BODY,
+    CAMERA,
     ESTOP,
     GOAL,
     INTENT,
     MAP,
+    OBJECT_MAP,
+    PERCEIVED,
     POSE,
     SCAN,
     STATE,
@@ -41,6 +48,7 @@ from gigabrain_schemas.topics import (
     TELEOP,
     WORLD,
 )
+from gigabrain_schemas.vision import CameraInfo
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import Clock
@@ -61,6 +69,23 @@ def wall_ahead() -> LaserScan:
     )  # fmt: skip
 
 
+# ahead of the robot, at (0.5, 0) in its map: a low box, a table top, and a step down
+CONTOURS = (
+    Contour(polygon=((0.7, 0.5), (0.9, 0.5), (0.9, 0.7), (0.7, 0.7)), bottom=0.0, top=0.05),
+    Contour(polygon=((0.7, 0.9), (0.9, 0.9), (0.9, 1.1), (0.7, 1.1)), bottom=0.5, top=0.75),
+    Contour(polygon=((0.7, 1.3), (0.9, 1.3), (0.9, 1.5), (0.7, 1.5)), bottom=-0.2, top=0.0),
+)
+THINGS = ObjectMap(
+    objects=(
+        MapObject(id=3, label="can", x=0.0, y=-1.0, z=0.06, size=(0.07, 0.12), confidence=0.9),
+        MapObject(id=4, label="can", x=-1.0, y=1.0, z=0.06, size=(0.07, 0.12), confidence=0.6),
+        MapObject(id=5, label="ball", x=-1.0, y=-1.0, z=0.1, size=(0.2, 0.2), confidence=0.8),
+    ),
+    tags=(MapTag(id=7, x=-1.4, y=0.5, z=0.2, yaw=0.0, size=0.1),),
+)
+REAR = CameraInfo(camera=Camera(name="rear"), problem="covered")
+
+
 class Fake:
     """A robot with all topics, which stands at (0.5, 0) in its map and at (1, 1) by odometry."""
 
@@ -73,6 +98,7 @@ class Fake:
         tokens.write_text(f'{{"operator": "{OPERATOR}", "viewer": "{VIEWER}"}}')
         values = {"port": free_port(), "tokens": str(tokens), "login": True} | config
         self.config = msgspec.convert(values, PageConfig)
+        self._said = 0
         self.goals: list[GoalRequest] = []
         self.changes: list[TaskRequest] = []
         self.steered: list[Twist] = []
@@ -111,8 +137,14 @@ class Fake:
         self.robot.publish(POSE, PoseInMap(x=0.5, y=0.0, yaw=0.0, covariance=(0.0,) * 9))
         thing = Obstacle(id=1, x=1.0, y=1.8, radius=0.3)  # so at (0.5, 0.8) in the map
         wall = Obstacle(id=2, x=2.2, y=1.0, radius=0.45)
-        world = WorldModel(scan_ok=True, obstacle_ahead=False, obstacles=(thing, wall))
-        self.robot.publish(WORLD, world)
+        world = WorldModel(
+            scan_ok=True, obstacle_ahead=False, obstacles=(thing, wall), contours=CONTOURS
+        )
+        self._said += 1
+        self.robot.publish(WORLD, world, basis=self._said)
+        self.robot.publish(CAMERA, REAR, name="rear")
+        person = DetectedObject(id=9, x=2.3, y=2.5, radius=0.2, label="person")  # (1.8, 1.5)
+        self.robot.publish(PERCEIVED, Objects(objects=(person,)), name="people")
         self.robot.publish(SCAN, wall_ahead())
         way = tuple(TrajectoryPoint(t=i / 10, x=i / 10, y=0.0, yaw=0.0) for i in range(11))
         intent = Intent(trajectory=way, behaviour="navigate", reason="on its way to the kitchen")
@@ -134,6 +166,7 @@ class Fake:
         )  # fmt: skip
         task = EXAMPLES["TaskStatus"]
         assert isinstance(task, TaskStatus)
+        self.robot.publish(OBJECT_MAP, THINGS)
         self.robot.publish(TASK, replace(task, path=((0.5, 0.0), (0.5, -1.5), (1.5, -1.5))))
 
 

@@ -26,13 +26,18 @@ class Bridge:
 
     def __init__(self, folder: Path) -> None:
         self.config = FoxgloveConfig(port=free_port(), secret=str(folder / "secret"))
-        network = LocalNetwork()
+        network = self._network = LocalNetwork()
         self.robot = Bus(network.transport(), Clock(), "driver")
         self.bus = Bus(network.transport(), Clock(), "foxglove")
         self.steered: list[Twist] = []
         self.robot.subscribe(TELEOP, lambda _key, twist: self.steered.append(twist))
         body = load_robot("turtlebot3_waffle").description()
         self.robot.publish(BODY, Body(description=body, link="sim"))
+
+    @property
+    def patterns(self) -> list[str]:
+        """What is subscribed on the bus."""
+        return [key for key, _ in self._network._listeners]
 
     @property
     def turns(self) -> list[float]:

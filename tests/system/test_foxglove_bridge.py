@@ -18,16 +18,22 @@ from gigabrain_schemas.base import Message, Pose, Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import Obstacle, OccupancyGrid, PoseInMap, WorldModel
 from gigabrain_schemas.examples import EXAMPLES, example
+from gigabrain_schemas.objects import Detections
 from gigabrain_schemas.requests import GateReply
 from gigabrain_schemas.safety import Health
-from gigabrain_schemas.sensors import Image, LaserScan
+from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import (
+    CAMERA,
+    DEPTH,
+    DETECTIONS,
     ENABLE,
     ESTOP,
     HEALTH,
     IMAGE,
     LOG,
     MAP,
+    OBJECT_MAP,
+    PERCEIVED,
     POSE,
     RELEASE,
     SCAN,
@@ -74,17 +80,24 @@ async def test_a_scan_arrives_in_foxgloves_schema_beam_by_beam(bridge: Bridge) -
 
 
 async def test_every_kind_of_message_has_a_channel_to_be_drawn_from(bridge: Bridge) -> None:
-    said = (STATE, SCAN, WORLD, POSE, MAP, TASK, LOG)
+    said = (STATE, SCAN, WORLD, POSE, MAP, TASK, LOG, OBJECT_MAP)
     for topic in said:
         message = EXAMPLES[topic.type.__name__]
         assert isinstance(message, topic.type)
         bridge.robot.publish(topic, message)
-    picture = Image(frame_id="cam", encoding="mono8", height=1, width=2, data=b"\x00\xff")
-    bridge.robot.publish(IMAGE, picture, name="front")
+    assert "robot/image/*" not in bridge.patterns
     async with bridge.viewer() as viewer:
-        for topic in ("scan", "map", "pose", "tf", "obstacles", "way", "image/front", "log",
-                      "state_numbers", "world_numbers"):  # fmt: skip
+        for topic in ("scan", "map", "pose", "tf", "obstacles", "way", "contours", "log",
+                      "state_numbers", "world_numbers", "objects"):  # fmt: skip
             assert await viewer.channel(f"/viz/{topic}")
+        await until(lambda: "robot/image/*" in bridge.patterns, "pictures are received")
+        for camera in (IMAGE, DEPTH, CAMERA, PERCEIVED):
+            bridge.robot.publish(camera, example(camera.type), name="front")
+        bridge.robot.publish(DETECTIONS, example(Detections))
+        for topic in ("image/front", "depth/front", "calibration/front", "annotations/front",
+                      "perceived/front"):  # fmt: skip
+            assert await viewer.channel(f"/viz/{topic}")
+    await until(lambda: "robot/image/*" not in bridge.patterns, "nobody looks")
     assert viewer.server["capabilities"] == [
         "clientPublish", "connectionGraph", "parameters", "parametersSubscribe", "services",
     ]  # fmt: skip

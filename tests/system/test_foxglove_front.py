@@ -113,7 +113,7 @@ async def test_of_200_viewers_that_do_not_read_16_are_admitted_and_cut_off(
     assert starts[:16] == [bytes(12)] * 16
     assert made.there <= 16
     async with asyncio.timeout(20):
-        while stands._viewers or made.there:  # noqa: ASYNC110 - until they are cut off
+        while stands.viewers or made.there:  # noqa: ASYNC110 - until they are cut off
             await asyncio.sleep(0.01)
     data, writer = await first(port)  # a newcomer has a place
     assert data == bytes(20)

@@ -7,8 +7,6 @@ import pytest
 import pytest_asyncio
 from playwright.async_api import Page
 
-from gigabrain_schemas.sensors import Image
-from gigabrain_schemas.topics import IMAGE
 from gigabrain_zenoh.testing.waiting import until
 from tests.system.fake_page import Fake, serving
 from tests.system.page import Browser, browser, needs_browser
@@ -124,25 +122,6 @@ async def test_a_click_sends_a_goal_in_the_map_and_a_drag_its_heading(
     await page.click("#cancel")
     await page.wait_for_selector('#reply:has-text("goal-7 is cancelled")')
     assert [(change.do, change.source) for change in fake.changes] == [("cancel", "page")]
-
-
-async def test_pictures_of_cameras_are_drawn(chromium: Browser, fake: Fake) -> None:
-    page = await chromium.open()
-    grey = Image(frame_id="cam", encoding="mono8", height=1, width=2, data=b"\x00\xff")
-    rgb = Image(frame_id="cam", encoding="rgb8", height=1, width=1, data=b"\x0a\x14\x1e")
-    for camera, picture in (("front", grey), ("rear", rgb)):
-        fake.robot.publish(IMAGE, picture, name=camera)
-        figure = f'#pictures [data-camera="{camera}"]'
-        await page.wait_for_selector(f"{figure} canvas[width='{picture.width}']")
-        pixels = await page.evaluate(
-            """(figure) => { const canvas = document.querySelector(`${figure} canvas`)
-            return [...canvas.getContext('2d')
-              .getImageData(0, 0, canvas.width, canvas.height).data] }""",
-            figure,
-        )
-        expected = [0, 0, 0, 255, 255, 255, 255, 255] if camera == "front" else [10, 20, 30, 255]
-        assert pixels == expected
-        assert await page.inner_text(f"{figure} figcaption") == camera
 
 
 async def test_a_gamepad_drives_while_a_shoulder_button_is_held(

@@ -55,7 +55,7 @@ class Front:
         self._origins = {origin.lower() for origin in (*VIEWERS, *origins)}
         self._server_address = server_address
         self._arriving: list[asyncio.StreamWriter] = []
-        self._viewers = 0
+        self.viewers = 0
         self._server: asyncio.Server | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._logged: set[str] = set()  # reasons for refusals that were logged
@@ -110,7 +110,7 @@ class Front:
             if writer in self._arriving:
                 self._arriving.remove(writer)
         reason = self.refusal(head)
-        if not reason and self._viewers >= MAX_VIEWERS:
+        if not reason and self.viewers >= MAX_VIEWERS:
             reason = f"503 {MAX_VIEWERS} viewers are connected already"
         if not reason:
             return head
@@ -142,7 +142,7 @@ class Front:
         self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
     ) -> None:
         """Forward bytes until either side closes, or the viewer reads nothing for too long."""
-        self._viewers += 1
+        self.viewers += 1
         try:
             to_reader, to_writer = await asyncio.open_connection(*self._server_address)
             to_writer.write(head)
@@ -158,7 +158,7 @@ class Front:
                     task.cancel()
                 await asyncio.gather(*copying, return_exceptions=True)
         finally:
-            self._viewers -= 1
+            self.viewers -= 1
             asyncio.get_running_loop().call_later(TRIM_DELAY_S, this_process.trim_heap)
 
 

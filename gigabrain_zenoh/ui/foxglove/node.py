@@ -28,9 +28,14 @@ from msgspec import Struct
 
 from gigabrain_schemas.base import Finite, Message, Velocity
 from gigabrain_schemas.topics import (
+    CAMERA,
+    DEPTH,
+    DETECTIONS,
     HEALTH,
     IMAGE,
     LOG,
+    OBJECT_MAP,
+    PERCEIVED,
     Topic,
 )
 from gigabrain_zenoh.bus.bus import Bus
@@ -38,8 +43,10 @@ from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.config.settings import FoxgloveConfig
 from gigabrain_zenoh.diagnostics.discovery import chain_flows, discover, flows
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.bounded import put_newest
 from gigabrain_zenoh.recording.drawing import Drawer
 from gigabrain_zenoh.recording.drawn import Drawn
+from gigabrain_zenoh.ui.camera_feed import CameraFeed
 from gigabrain_zenoh.ui.foxglove.access import HOST, Front, hidden_host, topic_to_steer
 from gigabrain_zenoh.ui.foxglove.requests import REFRESH_NS, FoxgloveRequests
 from gigabrain_zenoh.ui.steering import RateLimiter, TeleopArbiter, ViewerScene
@@ -52,6 +59,12 @@ MAX_WAITING_MESSAGES = 64  # for a slow viewer; the oldest are dropped
 NAME = "gigabrain"
 MAX_MESSAGE_BYTES = 1024
 MAX_CHANNELS = 64  # of all viewers
+FED = (IMAGE, DEPTH, PERCEIVED, DETECTIONS)
+
+
+def _key(topic: Topic[Any], name: str) -> str:
+    """Return the key of what is drawn; detections have one for each camera too."""
+    return f"{topic.key}/{name}" if name else topic.key
 
 
 class FoxgloveView(ViewerScene):
@@ -59,33 +72,43 @@ class FoxgloveView(ViewerScene):
 
     def __init__(self, bus: Bus, context: Context) -> None:
         self._context, self._drawer = context, Drawer()
-        self._kept: dict[Topic[Any], Message] = {}
+        self._kept: dict[str, tuple[Topic[Any], Message, str]] = {}  # by key
         self._channels: dict[str, Channel] = {}
         self._channel_names: dict[str, set[str]] = {}  # by the key that they are drawn from
         super().__init__(bus)
+        self._feed = CameraFeed(bus, *FED)
+        bus.subscribe(CAMERA, lambda key, info: self._keep(CAMERA, info, key.rpartition("/")[2]))
+        bus.latest(OBJECT_MAP, lambda stored: self._keep(OBJECT_MAP, stored))
 
-    def draw_new(self) -> None:
-        """Draw everything received since the last call."""
+    def draw_new(self, viewers: int) -> None:
+        """Draw everything received since the last call; pictures are received for viewers only."""
         for topic, sampled in self.sampled.items():
             if self._has_viewers(topic.key) and (message := sampled.poll()):
                 self._draw(topic, message)
-        for camera, sampled in list(self.images.items()):
-            if self._has_viewers(IMAGE.at(camera)) and (image := sampled.poll()):
-                self._draw(IMAGE, image, camera)
+        self._feed.watch(viewers > 0)
+        for topic in FED:
+            for name in self._feed.names(topic):
+                if self._has_viewers(_key(topic, name)) and (new := self._feed.poll(topic, name)):
+                    self._draw(topic, new, name)
+        for found in self._feed.new_detections():
+            self._draw(DETECTIONS, found, found.camera)
 
     def draw_kept(self, channel: str) -> None:
         """Draw rare messages again for a new subscriber of a channel."""
-        for topic, message in self._kept.items():
-            if channel in self._channel_names.get(topic.key, ()):
-                self._draw(topic, message)
+        for key, kept in self._kept.items():
+            if channel in self._channel_names.get(key, ()):
+                self._draw(*kept)
 
     def on_rare(self, topic: Topic[Any], message: Message) -> None:
         """Draw a rare message at once, and keep it for later subscribers."""
-        if topic is HEALTH:
-            return
-        if topic is not LOG:
-            self._kept[topic] = message
-        self._draw(topic, message)
+        if topic is LOG:
+            self._draw(topic, message)
+        elif topic is not HEALTH:
+            self._keep(topic, message)
+
+    def _keep(self, topic: Topic[Any], message: Message, name: str = "") -> None:
+        put_newest(self._kept, _key(topic, name), (topic, message, name), MAX_CHANNELS)
+        self._draw(topic, message, name)
 
     def _has_viewers(self, key: str) -> bool:
         """Return whether a viewer subscribes, or cannot yet because nothing has been drawn."""
@@ -93,7 +116,7 @@ class FoxgloveView(ViewerScene):
         return not names or any(self._channels[name].base.has_sinks() for name in names)
 
     def _draw(self, topic: Topic[Any], message: Message, name: str = "") -> None:
-        key = topic.at(name)
+        key = _key(topic, name)
         if not self._has_viewers(key):
             return
         for drawn in self._drawer.draw(topic, message, name):
@@ -293,7 +316,7 @@ async def run(config: FoxgloveConfig, bus: Bus, ready: Callable[[], None]) -> No
         await asyncio.to_thread(server.stop)
         raise
     tasks = [
-        asyncio.ensure_future(_draw(bus, view)),
+        asyncio.ensure_future(_draw(bus, view, front)),
         asyncio.ensure_future(_publish_graph(bus, steering, server)),
         asyncio.ensure_future(_publish_parameters(bus, steering, server)),
     ]
@@ -312,9 +335,9 @@ async def run(config: FoxgloveConfig, bus: Bus, ready: Callable[[], None]) -> No
             end.result()
 
 
-async def _draw(bus: Bus, view: FoxgloveView) -> None:
+async def _draw(bus: Bus, view: FoxgloveView, front: Front) -> None:
     async for _ in bus.clock.every(FRAME_INTERVAL_NS):
-        view.draw_new()
+        view.draw_new(front.viewers)
         bus.counters["frames"] += 1
 
 

@@ -25,7 +25,8 @@ from gigabrain_zenoh.ui.steering import ViewerScene
 
 ABOUT, STATE, SCAN, MAP, HEALTH, LOG, REPLY, IMAGE, TASK = range(1, 10)  # to the browser
 SCENE, POSES, ZONES = 10, 11, 12
-LOGIN, DRIVE, ASK = range(1, 4)  # from the browser
+CAMERA, FOUND, CONTOURS, PERCEIVED, OBJECTS = range(13, 18)
+LOGIN, DRIVE, ASK, WATCH, SHOWN = range(1, 6)  # from the browser
 MAX_KEPT_LINES = 30  # of the log, for viewers that connect later
 
 T = TypeVar("T")
@@ -161,8 +162,6 @@ def decoded(content: bytes, kind: type[T]) -> T:
 class PageView(ViewerScene):
     """Newest messages of a robot as frames. `send` passes a frame and its slot to all viewers."""
 
-    max_cameras = 4
-
     def __init__(
         self,
         bus: Bus,
@@ -170,13 +169,14 @@ class PageView(ViewerScene):
         on_body: Callable[[], None] = lambda: None,
     ) -> None:
         self._send, self._on_body = send, on_body
-        self._kept: dict[str, bytes] = {}  # map, task and scene, by slot
+        self._kept: dict[str, bytes] = {}  # map, task, objects and scene, by slot
         self._lines: list[bytes] = []
         self._described: BodyDescription | None = None
         self._numbers = itertools.count()
         self._zones = Zones()
         super().__init__(bus)
         bus.latest(topics.ZONES, self._on_zones)
+        bus.latest(topics.OBJECT_MAP, lambda one: self._keep("objects", as_json(OBJECTS, one)))
         self.newest_of(topics.SIM_POSES)
         bus.latest(topics.SIM_SCENE, lambda scene: self._keep("scene", as_json(SCENE, scene)))
 
@@ -191,23 +191,20 @@ class PageView(ViewerScene):
             frame="map" if in_map else "odom",
             intent=self.intent.fresh(),
             safety=self.safety.fresh(),
-            world=world and replace(world, hits=b""),  # the page draws the scan itself
+            world=world and replace(world, hits=b"", contours=()),  # drawn by frames of their own
             driving=driving,
             viewers=viewers,
         )
         return as_json(STATE, content)
 
     def new_frames(self) -> Iterator[tuple[str, bytes]]:
-        """Yield scan, poses and images received since the last call, with their slots."""
+        """Yield scan and poses received since the last call, with their slots."""
         pose, _ = self._newest_pose(self.state.fresh())
         scan: LaserScan | None = self.sampled[topics.SCAN].poll()
         if scan and pose and self.body:
             yield "scan", scan_frame(scan, self.body.description, pose)
         if poses := self.sampled[topics.SIM_POSES].poll():
             yield "poses", poses_frame(poses)
-        for camera, sampled in list(self.images.items()):
-            if image := sampled.poll():
-                yield f"image/{camera}", image_frame(camera, image)
 
     def kept_frames(self) -> Iterator[tuple[str, bytes]]:
         """Yield the frames for a new viewer: map, task, health and log."""

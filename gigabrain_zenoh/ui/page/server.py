@@ -174,5 +174,4 @@ async def _send_frames(bus: Bus, sessions: Sessions) -> None:
     numbers = itertools.count()
     async for _ in bus.clock.every(FRAME_INTERVAL_NS):
         bus.counters["frames"] = next(numbers)
-        if sessions.viewers:
-            sessions.send_news()
+        sessions.send_news()

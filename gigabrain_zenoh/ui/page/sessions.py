@@ -29,6 +29,13 @@ from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.plugins import package_version
 from gigabrain_zenoh.ui.page import frames
 from gigabrain_zenoh.ui.page.access import Access, Role
+from gigabrain_zenoh.ui.page.cameras import (
+    CameraFrames,
+    PicturePace,
+    Shown,
+    SurroundingsFrames,
+    Watch,
+)
 from gigabrain_zenoh.ui.page.frames import PageReply, PageRequest, PageView, Setting
 from gigabrain_zenoh.ui.steering import RateLimiter, TeleopArbiter
 
@@ -52,6 +59,7 @@ class Viewer:
 
     def __init__(self, number: int, role: Role) -> None:
         self.number, self.role = number, role
+        self.pace = PicturePace()
         self.gives_way = asyncio.Event()
         self._slots: dict[str, bytes] = {}
         self._filled = asyncio.Event()
@@ -178,6 +186,9 @@ class Sessions:
         self._loop = asyncio.get_running_loop()
         self._rates = RateLimiter()
         self.viewers: list[Viewer] = []
+        self._clock = bus.clock
+        self._cameras = CameraFrames(bus, self.send)
+        self._surroundings = SurroundingsFrames(bus)
         self._view = PageView(bus, self.send, self._introduce_all)
         self._handler = RequestHandler(bus, self._view.health.keys)
         self._arbiter = TeleopArbiter(self._view)
@@ -188,10 +199,19 @@ class Sessions:
             viewer.queue(slot, frame)
 
     def send_news(self) -> None:
-        """Send the present state, scan and images to all viewers."""
+        """Send the present state, scan and pictures to the viewers; receive nothing for none."""
+        self._surroundings.watch(bool(self.viewers))
+        by_pace = {viewer.pace: viewer for viewer in self.viewers}
+        now_ns = self._clock.now_ns()
+        for pace, slot, frame in self._cameras.new_frames(tuple(by_pace), now_ns):
+            by_pace[pace].queue(slot, frame)
+        if not self.viewers:
+            return
         driving = self._arbiter.driving(self._loop.time())
         self.send("state", self._view.state_frame(driving, len(self.viewers)))
         for slot, frame in self._view.new_frames():
+            self.send(slot, frame)
+        for slot, frame in self._surroundings.new_frames(self._view.world.fresh()):
             self.send(slot, frame)
 
     def close(self) -> None:
@@ -282,7 +302,7 @@ class Sessions:
             link=body.link if body else "",
         )
         viewer.queue("about", frames.as_json(frames.ABOUT, about))
-        for slot, frame in self._view.kept_frames():
+        for slot, frame in (*self._view.kept_frames(), *self._cameras.kept_frames()):
             viewer.queue(slot, frame)
 
     def _introduce_all(self) -> None:
@@ -309,9 +329,13 @@ class Sessions:
         if self._rates.is_exceeded(viewer.number, now_s):
             raise ValueError("too many frames")
         kind, content = frame[:1], frame[1:]
-        if viewer.role != "operator":
+        if kind == bytes((frames.WATCH,)):
+            viewer.pace.set_watch(frames.decoded(content, Watch))
+        elif kind == bytes((frames.SHOWN,)):
+            viewer.pace.shown(frames.decoded(content, Shown).camera)
+        elif viewer.role != "operator":
             raise ValueError("viewers may not drive")
-        if kind == bytes((frames.DRIVE,)):
+        elif kind == bytes((frames.DRIVE,)):
             if not self._arbiter.drive(viewer.number, frames.drive_of(content), now_s):
                 self._reply(viewer, PageReply(id=0, what="drive", ok=False, text=OTHER_STEERS))
         elif kind == bytes((frames.ASK,)):

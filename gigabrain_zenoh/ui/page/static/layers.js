@@ -61,7 +61,7 @@ function paintRobot(pen, view) {
 }
 
 /** Return a function that transforms a point into the frame of a pose. */
-const toFrameOf = ({ x, y, yaw }) => {
+export const toFrameOf = ({ x, y, yaw }) => {
   const c = Math.cos(yaw), s = Math.sin(yaw)
   return ([px, py]) => [c * (px - x) + s * (py - y), c * (py - y) - s * (px - x)]
 }
@@ -97,7 +97,7 @@ function paintPoints(pen, view, points) {
   pen.globalAlpha = 1
 }
 
-function paintDisc(pen, view, x, y, radius, velocity) {
+export function paintDisc(pen, view, x, y, radius, velocity) {
   pen.beginPath()
   pen.arc(x, y, Math.max(radius, 3 * view.pixel), 0, TAU)
   pen.globalAlpha = 0.35

@@ -1,6 +1,7 @@
 // The WebSocket. A frame is a byte for its kind, then its content. Nothing is queued while it is down.
 const ABOUT = 1, STATE = 2, SCAN = 3, MAP = 4, HEALTH = 5, LOG = 6, REPLY = 7, IMAGE = 8, TASK = 9, SCENE = 10, POSES = 11, ZONES = 12
-const LOGIN = 1, DRIVE = 2, ASK = 3
+const CAMERA = 13, FOUND = 14, CONTOURS = 15, PERCEIVED = 16, OBJECTS = 17
+const LOGIN = 1, DRIVE = 2, ASK = 3, WATCH = 4, SHOWN = 5
 const SILENT_AFTER_MS = 1000, RETRY_MS = [300, 600, 1200, 2500], FULL_RETRY_MS = 5000
 const WRONG_TOKEN = 4401, FULL = 4429 // codes of a closed WebSocket
 
@@ -13,7 +14,7 @@ export class Link {
   #pending = new Map() // by the id of a request: what resolves it
   #receivedMs = 0
 
-  /** `on` has about, robot, scan, map, task, health, log, image, scene, poses, zones, reply, connection(status) and login(). */
+  /** `on` has about, robot, scan, map, task, health, log, image, camera, found, contours, perceived, objects, scene, poses, zones, reply, connection(status) and login(). */
   constructor(on, token) {
     this.on = on
     this.token = token
@@ -39,6 +40,16 @@ export class Link {
     frame.setUint8(0, DRIVE);
     [x, y, z].forEach((value, i) => frame.setFloat32(4 + 4 * i, value, true))
     this.#socket.send(frame.buffer)
+  }
+
+  /** Say which pictures are wanted. */
+  watch(wanted) { this.#tell(WATCH, wanted) }
+
+  /** Say that a camera's picture has been shown, so that the next one may come. */
+  shown(camera) { this.#tell(SHOWN, { camera }) }
+
+  #tell(kind, content) {
+    if (this.#socket.readyState === WebSocket.OPEN) this.#socket.send(this.#frame(kind, content))
   }
 
   /** Resolve to the robot's reply, or to the reason why there is none; never reject. */
@@ -77,6 +88,11 @@ export class Link {
     else if (kind === LOG) this.on.log(json())
     else if (kind === REPLY) this.#resolve(json())
     else if (kind === IMAGE) this.on.image(data)
+    else if (kind === FOUND) this.on.found(json())
+    else if (kind === CONTOURS) this.on.contours(json())
+    else if (kind === PERCEIVED) this.on.perceived(json())
+    else if (kind === OBJECTS) this.on.objects(json())
+    else if (kind === CAMERA) this.on.camera(json())
     else if (kind === ABOUT) this.on.about(json())
   }
 

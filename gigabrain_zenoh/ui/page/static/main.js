@@ -1,12 +1,15 @@
 // Connects the parts of the page: shows the frames that the link receives, and sends the operator's requests.
+import { Cameras } from './cameras.js'
 import { Drive } from './drive.js'
 import { Link } from './link.js'
 import { MapView } from './map.js'
-import { $, setText, showFigures, showGate, showHealth, showImage, showLogLine, showSafety, showTables, showTask } from './panels.js'
+import { Objects } from './objects.js'
+import { $, publishedCameras, setText, showFigures, showGate, showHealth, showLogLine, showSafety, showTables, showTask } from './panels.js'
 import { Settings } from './settings.js'
 import { WorldView } from './world_view.js'
 import { Zones } from './zones.js'
 
+const NARROW_PX = 860 // below, the page is that of a phone; see style.css
 const STOP_TIMEOUT_MS = 2500 // the server gives up after two seconds
 const BY_HAND = 'press the hardware e-stop or cut the power'
 const stored = (key) => { try { return sessionStorage.getItem(key) ?? '' } catch { return '' } }
@@ -27,12 +30,18 @@ const zones = new Zones(map, {
   request: (what, more, timeoutMs) => link.request(what, more, timeoutMs),
   say: (text, ok) => show($('zone-note'), text, `note${ok ? '' : ' bad'}`),
 })
+const objects = new Objects(map, { go: requestGoal, allowed: () => !viewOnly() })
+const cameras = new Cameras({ watch: (wanted) => link.watch(wanted), shown: (camera) => link.shown(camera) })
 const link = new Link({
   about(info) {
+    const first = !about.body
     about = info
     map.body = info.body
     setText($('robot'), info.body ? `${info.body.robot_type} · ${info.link}` : 'gigabrain')
     document.title = `${info.body?.robot_type ?? 'gigabrain'}${viewOnly() ? ' (view only)' : ''}`
+    cameras.know((info.body?.cameras ?? []).map(({ name }) => name))
+    if (first && info.body?.cameras.length && innerWidth > NARROW_PX) cameras.open(true)
+    else cameras.resume()
     $('estop').disabled = viewOnly()
     $('edit-zones').hidden = viewOnly()
     $('estop').querySelector('small').textContent = viewOnly() ? 'view only: this token cannot stop the robot' : 'space bar'
@@ -41,6 +50,7 @@ const link = new Link({
     robot = now
     if (now.state?.gate.mode === 'latched') drive.releaseAll() // a held key must not move the robot right after the release
     map.setRobot(now)
+    cameras.setStatus(now.world?.cameras ?? [])
     showGate(now.state, viewOnly())
     showFigures(now.state, now)
     showSafety(now.safety, about.body)
@@ -52,9 +62,17 @@ const link = new Link({
     map.setTask(status)
     showTask(status, viewOnly())
   },
-  health: showHealth,
+  health(health) {
+    showHealth(health)
+    cameras.know(publishedCameras())
+  },
   log: showLogLine,
-  image: showImage,
+  image: (data) => cameras.image(data),
+  camera: (news) => cameras.setProblem(news),
+  found: (found) => cameras.found(found),
+  contours: (contours) => objects.setContours(contours),
+  perceived: (found) => objects.setPerceived(found),
+  objects: (stored) => objects.set(stored),
   scene(scene) {
     world.setScene(scene)
     $('show-world').hidden = false
@@ -123,11 +141,14 @@ function showReply(reply) {
   show($('reply'), reply.text, `note${reply.ok ? '' : ' bad'}`)
 }
 
-async function sendGoal(goal) {
+function sendGoal({ x, y, yaw }) { return requestGoal({ x, y, yaw }, { x, y, yaw }) }
+
+/** Send a goal; `place` is where it is drawn until the robot has answered. */
+async function requestGoal(goal, place) {
   if (viewOnly()) return
-  map.goal = goal
+  map.goal = place
   show($('goal'), 'sending the goal …', 'note')
-  const reply = await link.request('goal', { goal: { x: goal.x, y: goal.y, yaw: goal.yaw } })
+  const reply = await link.request('goal', { goal })
   if (!reply.ok) map.goal = map.task?.goal ?? null
   show($('goal'), reply.text, `note${reply.ok ? '' : ' bad'}`)
   map.draw()
@@ -190,12 +211,13 @@ function selectTab(tab) {
 function showSettings() {
   if (!$('settings').hidden && link.live && !viewOnly()) settings.refresh()
 }
-tabs.forEach((tab, i) => {
+tabs.forEach((tab) => {
   tab.addEventListener('click', () => selectTab(tab))
   tab.addEventListener('keydown', (event) => {
     const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key]
     if (!step) return
-    const next = tabs[(i + step + tabs.length) % tabs.length]
+    const shown = tabs.filter((each) => !each.hidden), at = shown.indexOf(tab)
+    const next = shown[(at + step + shown.length) % shown.length]
     next.focus()
     selectTab(next)
   })

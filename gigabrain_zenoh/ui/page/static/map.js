@@ -6,7 +6,7 @@ const MIN_HEADING_DRAG_M = 0.1 // a shorter drag sets no heading
 const MIN_STEP_M = 0.03 // between two points of the driven path
 const MAX_TRAIL = 4000, TRAIL_CUT = 1000 // points of the driven path
 const TAU = 2 * Math.PI
-const COLOURS = ['floor', 'grid', 'scan', 'plan', 'zone', 'trail', 'trace', 'robot', 'obstacle', 'ink']
+const COLOURS = ['floor', 'grid', 'scan', 'plan', 'zone', 'trail', 'trace', 'robot', 'obstacle', 'ink', 'low', 'overhang', 'hole', 'thing']
 
 export class MapView {
   #scale = 90 // pixels per metre
@@ -19,7 +19,9 @@ export class MapView {
     this.canvas = canvas
     this.onGoal = onGoal
     this.layers = [] // functions that draw more, in metres
+    this.robotLayers = [] // likewise, in the robot's frame
     this.tool = null // takes a click instead of the goal
+    this.pick = null // takes a click on something that is drawn; returns whether there is anything
     this.follow = true
     this.dragMoves = false // a drag moves the map and sets no goal
     this.clear()
@@ -135,7 +137,7 @@ export class MapView {
       pen.save()
       pen.translate(pose.x, pose.y)
       pen.rotate(pose.yaw)
-      for (const paint of ON_ROBOT) paint(pen, this)
+      for (const paint of [...this.robotLayers, ...ON_ROBOT]) paint(pen, this)
       pen.restore()
     }
     this.#paintPath(pen)
@@ -198,6 +200,22 @@ export class MapView {
     pen.stroke()
   }
 
+  /** Write a text, upright on the screen; `yaw` is that of the frame which is drawn in. */
+  label(pen, text, x, y, yaw = 0) {
+    pen.save()
+    pen.translate(x, y)
+    pen.rotate(-yaw)
+    pen.scale(this.pixel, -this.pixel)
+    pen.font = '12px system-ui, sans-serif'
+    pen.textAlign = 'center'
+    pen.lineWidth = 3
+    pen.strokeStyle = this.colour.floor
+    pen.strokeText(text, 0, 4)
+    pen.fillStyle = this.colour.ink
+    pen.fillText(text, 0, 4)
+    pen.restore()
+  }
+
   /** Return the place in the map under the pointer. */
   #placeOf(event) {
     const box = this.canvas.getBoundingClientRect()
@@ -249,7 +267,7 @@ export class MapView {
     this.#pointers.delete(event.pointerId)
     const goal = this.#drag?.goal
     this.#drag = null
-    if (goal && completed) (this.tool ?? this.onGoal)(goal)
+    if (goal && completed && (this.tool || goal.yaw !== null || !this.pick?.(goal))) (this.tool ?? this.onGoal)(goal)
     this.draw()
   }
 

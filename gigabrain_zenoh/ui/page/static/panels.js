@@ -1,6 +1,7 @@
-// Panels beside the map: gate, safety, processes, topics, log, images. Messages are shown as text, never as HTML.
+// Panels beside the map: gate, safety, processes, topics, log. Messages are shown as text, never as HTML.
 export const $ = (id) => document.getElementById(id)
 const MODES = { enabled: 'driving allowed', idle: 'idle', stopping: 'stopping', latched: 'latched' }
+const IMAGE = 'robot/image/'
 const MAX_LOG_LINES = 200, SILENT_AFTER_MS = 3000
 const AXES = [
   ['forward', 'max_linear_speed', 'm/s'], ['backward', 'max_linear_speed', 'm/s'],
@@ -12,7 +13,7 @@ export function setText(element, text) {
   if (element.textContent !== text) element.textContent = text
 }
 
-function makeElement(tag, text = '', kind = '') {
+export function makeElement(tag, text = '', kind = '') {
   const element = document.createElement(tag)
   element.textContent = text
   if (kind) element.className = kind
@@ -120,6 +121,12 @@ function problemsOfProcesses() {
   return [...healthByProcess.values()].flatMap(([health]) => health.problems ?? [])
 }
 
+/** Return the cameras that processes say they publish pictures of. */
+export function publishedCameras() {
+  const keys = [...healthByProcess.values()].flatMap(([health]) => Object.keys(health.sent_hz))
+  return keys.filter((key) => key.startsWith(IMAGE)).map((key) => key.slice(IMAGE.length))
+}
+
 export function showTables() {
   const now = performance.now()
   const all = [...healthByProcess].sort().map(([, entry]) => entry)
@@ -158,7 +165,7 @@ function topicRows(all) {
   ))
 }
 
-function fillTable(panel, rows) {
+export function fillTable(panel, rows) {
   panel.querySelector('tbody').replaceChildren(...rows.map(({ cells, numbers, silent }) => {
     const row = makeElement('tr', '', silent ? 'silent' : '')
     row.append(...cells.map((text, i) => makeElement('td', text, numbers.includes(i) ? 'n' : '')))
@@ -178,40 +185,4 @@ export function showLogLine(line) {
   item.append(makeElement('time', new Date(line.stamp_ns / 1e6).toLocaleTimeString([], { hour12: false })), makeElement('span', line.process, 'p'), makeElement('span', line.text))
   list.prepend(item)
   while (list.children.length > MAX_LOG_LINES) list.lastElementChild.remove()
-}
-
-export function showImage(data) {
-  const head = new DataView(data, 4, 88), text = new TextDecoder()
-  const [width, height] = [head.getUint32(0, true), head.getUint32(4, true)]
-  const textAt = (at, length) => text.decode(new Uint8Array(data, 4 + at, length)).replace(/\0+$/, '')
-  const camera = textAt(8, 64), encoding = textAt(72, 16), pixels = new Uint8Array(data, 92)
-  const canvas = canvasOf(camera), pen = canvas.getContext('2d')
-  if (encoding === 'jpeg') {
-    createImageBitmap(new Blob([pixels], { type: 'image/jpeg' })).then((picture) => {
-      canvas.width = picture.width
-      canvas.height = picture.height
-      pen.drawImage(picture, 0, 0)
-    }, () => {})
-    return
-  }
-  const step = { rgb8: 3, bgr8: 3, mono8: 1 }[encoding]
-  if (!step) return
-  const image = new ImageData(width, height), order = { rgb8: [0, 1, 2], bgr8: [2, 1, 0], mono8: [0, 0, 0] }[encoding]
-  for (let i = 0; i < width * height; i++) {
-    order.forEach((from, to) => { image.data[4 * i + to] = pixels[step * i + from] })
-    image.data[4 * i + 3] = 255
-  }
-  canvas.width = width
-  canvas.height = height
-  pen.putImageData(image, 0, 0)
-}
-
-function canvasOf(camera) {
-  const known = [...$('pictures').children].find((figure) => figure.dataset.camera === camera)
-  if (known) return known.querySelector('canvas')
-  const figure = makeElement('figure')
-  figure.dataset.camera = camera
-  figure.append(makeElement('canvas'), makeElement('figcaption', camera))
-  $('pictures').append(figure)
-  return figure.querySelector('canvas')
 }

@@ -178,7 +178,7 @@ export class Zones {
     }
     const count = zone.points.length, sum = zone.points.reduce((a, p) => [a[0] + p[0], a[1] + p[1]], [0, 0])
     const text = zone.max_speed ? `${zone.name} ${zone.max_speed} m/s` : zone.name
-    this.#label(pen, text, sum[0] / count, sum[1] / count)
+    this.map.label(pen, text, sum[0] / count, sum[1] / count)
   }
 
   #paintArrows(pen, points, colour) {
@@ -208,20 +208,6 @@ export class Zones {
       pen.lineTo(x + 3 * size * Math.cos(yaw), y + 3 * size * Math.sin(yaw))
     }
     map.stroke(pen, map.colour.plan, 2)
-    this.#label(pen, name, x, y + 2.5 * size)
-  }
-
-  #label(pen, text, x, y) {
-    pen.save()
-    pen.translate(x, y)
-    pen.scale(this.map.pixel, -this.map.pixel)
-    pen.font = '12px system-ui, sans-serif'
-    pen.textAlign = 'center'
-    pen.lineWidth = 3
-    pen.strokeStyle = this.map.colour.floor
-    pen.strokeText(text, 0, 4)
-    pen.fillStyle = this.map.colour.ink
-    pen.fillText(text, 0, 4)
-    pen.restore()
+    this.map.label(pen, name, x, y + 2.5 * size)
   }
 }

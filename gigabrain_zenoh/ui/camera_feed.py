@@ -1,0 +1,66 @@
+"""Pictures, detections and findings for viewers, received only while somebody looks."""
+
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from gigabrain_schemas.base import Message
+from gigabrain_schemas.body import MOST_CAMERAS
+from gigabrain_schemas.objects import Detections
+from gigabrain_schemas.topics import DETECTIONS, Topic
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.listening import Sampled
+from gigabrain_zenoh.host.bounded import put_newest
+
+
+class CameraFeed:
+    """Newest message of each camera or perceptor; decoded when it is read.
+
+    Of topics with a key for each camera, the first MOST_CAMERAS keys are kept.
+    """
+
+    def __init__(self, bus: Bus, *topics: Topic[Any]) -> None:
+        self._bus, self._topics = bus, topics
+        self._sampled: dict[Topic[Any], dict[str, Sampled[Any]]] = {}
+        self._detections: dict[str, Detections] = {}  # new ones, by camera
+        self._closes: list[Callable[[], None]] = []
+
+    def watch(self, on: bool) -> None:
+        """Begin or end to receive."""
+        if on == bool(self._closes):
+            return
+        for close in self._closes:
+            close()
+        self._closes = []
+        self._detections.clear()
+        self._sampled = {topic: {} for topic in self._topics if topic.many}
+        if on:
+            self._closes = [
+                self._bus.tap(topic.at("*"), functools.partial(self._receive, topic))
+                for topic in self._sampled
+            ]
+            if DETECTIONS in self._topics:
+                self._closes.append(self._bus.subscribe(DETECTIONS, self._add_detections))
+
+    def names(self, topic: Topic[Any]) -> list[str]:
+        """Return the names below a topic that have been received."""
+        return list(self._sampled.get(topic, ()))
+
+    def poll(self, topic: Topic[Any], name: str) -> Message | None:
+        """Return the newest message of a name since the last call; None if there is none."""
+        sampled = self._sampled.get(topic, {}).get(name)
+        return sampled.poll() if sampled else None
+
+    def new_detections(self) -> Iterator[Detections]:
+        """Yield the newest detections of each camera since the last call."""
+        found, self._detections = self._detections, {}
+        yield from found.values()
+
+    def _receive(self, topic: Topic[Any], key: str, encoding: str, payload: bytes) -> None:
+        """Keep an encoded payload. In any thread."""
+        held, name = self._sampled.get(topic), key.removeprefix(f"{topic.key}/")
+        if held is not None and (name in held or len(held) < MOST_CAMERAS):
+            held.setdefault(name, Sampled(self._bus, topic)).receive(key, encoding, payload)
+
+    def _add_detections(self, _key: str, found: Detections) -> None:
+        put_newest(self._detections, found.camera, found, MOST_CAMERAS)

@@ -1,0 +1,218 @@
+"""Cameras for browsers: each gets the newest picture when it has shown the last one.
+
+A slow browser so gets fewer pictures, and none of them waits in the network. Nothing is received
+from the bus while no browser has the panel open.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Annotated, Any
+
+from msgspec import Meta, Struct
+
+from gigabrain_schemas.base import Name
+from gigabrain_schemas.brain import Contour, Objects, WorldModel
+from gigabrain_schemas.objects import Detections
+from gigabrain_schemas.sensors import Image
+from gigabrain_schemas.topics import CAMERA, DETECTIONS, IMAGE, PERCEIVED
+from gigabrain_schemas.vision import CameraInfo
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.host.bounded import put_newest
+from gigabrain_zenoh.ui.camera_feed import CameraFeed
+from gigabrain_zenoh.ui.page import frames
+
+PICTURE_INTERVAL_NS = 190_000_000  # at least, between two pictures of a camera: every second frame
+SHOWN_TIMEOUT_NS = 3_000_000_000  # after which a picture counts as lost on its way
+MAX_NAMES = 16  # of cameras and perceptors
+
+
+class Watch(Struct, frozen=True, forbid_unknown_fields=True):
+    """Frame of a browser: which pictures it shows."""
+
+    open: bool = False  # its panel of cameras
+    folded: Annotated[tuple[Name, ...], Meta(max_length=MAX_NAMES)] = ()  # cameras without pictures
+
+
+class Shown(Struct, frozen=True, forbid_unknown_fields=True):
+    """Frame of a browser: it has shown a picture of a camera, and may get the next one."""
+
+    camera: Name
+
+
+class PicturePace:
+    """Pictures of one browser: which it wants, and which it has not shown yet."""
+
+    def __init__(self) -> None:
+        self.watch = Watch()
+        self._waiting: set[str] = set()  # cameras whose last picture it has not shown yet
+        self._sent: dict[str, tuple[int, int]] = {}  # number and time of the last one, by camera
+
+    def set_watch(self, watch: Watch) -> None:
+        """Begin again with what is wanted now."""
+        self.watch = watch
+        self._waiting.clear()
+        self._sent.clear()
+
+    def shown(self, camera: str) -> None:
+        """Note that the browser has shown a picture."""
+        self._waiting.discard(camera)
+
+    def wants(self, camera: str) -> bool:
+        """Return whether the browser shows a camera."""
+        return self.watch.open and camera not in self.watch.folded
+
+    def is_ready(self, camera: str, now_ns: int) -> bool:
+        """Return whether a new picture of a camera may be sent."""
+        since_ns = now_ns - self._sent.get(camera, (0, -PICTURE_INTERVAL_NS))[1]
+        waiting = camera in self._waiting and since_ns < SHOWN_TIMEOUT_NS
+        return self.wants(camera) and not waiting and since_ns >= PICTURE_INTERVAL_NS
+
+    def take(self, camera: str, number: int, now_ns: int) -> bool:
+        """Note that a picture is sent; return False if it was sent before."""
+        if self._sent.get(camera, (0, 0))[0] == number:
+            return False
+        put_newest(self._sent, camera, (number, now_ns), MAX_NAMES)
+        self._waiting.add(camera)
+        return True
+
+
+class CameraFrames:
+    """Frames of cameras: pictures and detections for those who watch, problems for all.
+
+    `send` passes a frame and its slot to all viewers.
+    """
+
+    def __init__(self, bus: Bus, send: Callable[[str, bytes], None]) -> None:
+        self._send = send
+        self._feed = CameraFeed(bus, IMAGE, DETECTIONS)
+        self._newest: dict[str, tuple[int, bytes]] = {}  # number and frame, by camera
+        self._problems: dict[str, tuple[str, str]] = {}  # of the camera, and of its picture
+        self._kept: dict[str, bytes] = {}
+        bus.subscribe(CAMERA, self._on_info)
+
+    def kept_frames(self) -> Iterator[tuple[str, bytes]]:
+        """Yield what is known of cameras, for a new viewer."""
+        yield from self._kept.items()
+
+    def new_frames(
+        self, paces: Sequence[PicturePace], now_ns: int
+    ) -> Iterator[tuple[PicturePace, str, bytes]]:
+        """Yield the frames that are due, with the pace of the browser they are for."""
+        watching = [pace for pace in paces if pace.watch.open]
+        self._feed.watch(bool(watching))
+        if not watching:
+            self._newest.clear()
+            return
+        for camera in self._feed.names(IMAGE):
+            ready = [pace for pace in watching if pace.is_ready(camera, now_ns)]
+            number, frame = self._picture(camera) if ready else (0, b"")
+            for pace in ready:
+                if number and pace.take(camera, number, now_ns):
+                    yield pace, f"image/{camera}", frame
+        for found in self._feed.new_detections():
+            frame = frames.as_json(frames.FOUND, _without_poses(found))
+            for pace in watching:
+                if pace.wants(found.camera):
+                    yield pace, f"found/{found.camera}", frame
+
+    def _picture(self, camera: str) -> tuple[int, bytes]:
+        """Return the newest picture and its number; the number is 0 without one."""
+        number, frame = self._newest.get(camera, (0, b""))
+        image = self._feed.poll(IMAGE, camera)
+        if not isinstance(image, Image):
+            return number, frame
+        problem = _problem_of(image)
+        self._note(camera, self._problems.get(camera, ("", ""))[0], problem)
+        if problem:
+            return 0, b""
+        newest = number + 1, frames.image_frame(camera, image)
+        put_newest(self._newest, camera, newest, MAX_NAMES)
+        return newest
+
+    def _on_info(self, key: str, info: CameraInfo) -> None:
+        camera = key.removeprefix(f"{CAMERA.key}/")
+        self._note(camera, info.problem, self._problems.get(camera, ("", ""))[1])
+
+    def _note(self, camera: str, problem: str, picture: str) -> None:
+        """Send the problem of a camera when it changes."""
+        if self._problems.get(camera) != (problem, picture):
+            put_newest(self._problems, camera, (problem, picture), MAX_NAMES)
+            content = {"camera": camera, "problem": problem or picture}
+            frame = frames.as_json(frames.CAMERA, content)
+            put_newest(self._kept, f"camera/{camera}", frame, MAX_NAMES)
+            self._send(f"camera/{camera}", frame)
+
+
+def _problem_of(image: Image) -> str:
+    """Return why a browser should not be given a picture; an empty text if it may be."""
+    if image.encoding != "jpeg":
+        return ""
+    from gigabrain_zenoh.vision.pictures import check_jpeg  # numpy, for pictures only
+
+    try:
+        check_jpeg(image)
+    except ValueError as error:
+        return str(error)
+    return ""
+
+
+def _without_poses(found: Detections) -> dict[str, Any]:
+    """Return what is drawn over a picture, rounded."""
+    return {
+        "camera": found.camera,
+        "width": found.width,
+        "height": found.height,
+        "things": [
+            {
+                "label": one.label,
+                "confidence": round(one.confidence, 2),
+                "box": [round(at, 1) for at in one.box],
+                "position": one.position and [round(at, 3) for at in one.position],
+            }
+            for one in found.things
+        ],
+        "tags": [
+            {
+                "id": one.id,
+                "corners": [[round(at, 1) for at in corner] for corner in one.corners],
+                "position": [round(at, 3) for at in one.position],
+            }
+            for one in found.tags
+        ],
+    }
+
+
+class SurroundingsFrames:
+    """Contours of cameras and findings of perceptors, for the map."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._feed = CameraFeed(bus, PERCEIVED)
+        self._drawn_basis, self._drawn = -1, False
+
+    def watch(self, on: bool) -> None:
+        """Begin or end to receive findings."""
+        self._feed.watch(on)
+
+    def new_frames(self, world: WorldModel | None) -> Iterator[tuple[str, bytes]]:
+        """Yield contours and findings received since the last call, with their slots."""
+        basis = world.basis if world else -1
+        shown: tuple[Contour, ...] = world.contours if world else ()
+        if basis != self._drawn_basis and (shown or self._drawn):
+            self._drawn = bool(shown)
+            yield "contours", frames.as_json(frames.CONTOURS, [_rounded(one) for one in shown])
+        self._drawn_basis = basis
+        for name in self._feed.names(PERCEIVED):
+            found = self._feed.poll(PERCEIVED, name)
+            if isinstance(found, Objects):
+                content = {"name": name, "objects": found.objects}
+                yield f"perceived/{name}", frames.as_json(frames.PERCEIVED, content)
+
+
+def _rounded(one: Contour) -> dict[str, Any]:
+    """Return a contour to the millimetre: at ten a second, digits count."""
+    return {
+        "polygon": [[round(x, 3), round(y, 3)] for x, y in one.polygon],
+        "bottom": round(one.bottom, 3),
+        "top": round(one.top, 3),
+        "age": round(one.age, 1),
+        "confidence": round(one.confidence, 2),
+    }

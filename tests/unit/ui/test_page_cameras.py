@@ -1,0 +1,233 @@
+"""Pictures at the operator page: for browsers that look, at their pace, and never a queue."""
+
+import struct
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from gigabrain_schemas.brain import Contour, DetectedObject, Objects, WorldModel
+from gigabrain_schemas.examples import example
+from gigabrain_schemas.objects import Detection, Detections, ObjectMap
+from gigabrain_schemas.sensors import Image
+from gigabrain_schemas.topics import (
+    CAMERA,
+    DETECTIONS,
+    IMAGE,
+    OBJECT_MAP,
+    PERCEIVED,
+    STATE,
+    WORLD,
+)
+from gigabrain_schemas.vision import CameraInfo
+from gigabrain_zenoh.testing.waiting import settle
+from gigabrain_zenoh.ui.page import frames
+from gigabrain_zenoh.ui.page.cameras import Shown, Watch
+from tests.unit.recording.bags import jpeg_head
+from tests.unit.ui.test_page_places import Page, Socket
+
+FRAME_NS = 100_000_000
+
+
+@pytest.fixture
+async def page(tmp_path: Path) -> AsyncIterator[Page]:
+    made = Page(tmp_path)
+    yield made
+    await made.close()
+
+
+def say(socket: Socket, kind: int, content: msgspec.Struct) -> None:
+    socket.said.put_nowait(frames.as_json(kind, content))
+
+
+async def looks(page: Page, *folded: str) -> Socket:
+    """Connect a viewer that has the panel open."""
+    socket = await page.comes(page.tokens.viewer)
+    say(socket, frames.WATCH, Watch(open=True, folded=folded))
+    await settle()
+    page.sessions.send_news()
+    await settle()
+    return socket
+
+
+def picture(width: int = 320, height: int = 240, data: bytes = b"") -> Image:
+    data = data or jpeg_head(320, 240)
+    return Image(frame_id="front", encoding="jpeg", width=width, height=height, data=data)
+
+
+async def tick(page: Page) -> None:
+    """Let a tenth of a second pass, and send what is due."""
+    await page.net.clock.advance(FRAME_NS)
+    page.sessions.send_news()
+    for _ in range(3):
+        await settle()
+
+
+def pictures(socket: Socket) -> list[str]:
+    """Return the cameras of the pictures that a browser has got, in order."""
+    images = (frame for frame in socket.got if frame[0] == frames.IMAGE)
+    return [struct.unpack_from("64s", frame, 12)[0].rstrip(b"\0").decode() for frame in images]
+
+
+def patterns(page: Page) -> list[str]:
+    """Return what is subscribed on the bus."""
+    return sorted(key for key, _ in page.net.network._listeners)
+
+
+def content(socket: Socket, kind: int) -> list[dict[str, object]]:
+    return [msgspec.json.decode(frame[1:]) for frame in socket.got if frame[0] == kind]
+
+
+async def test_nothing_is_subscribed_while_nobody_looks(page: Page) -> None:
+    quiet = patterns(page)
+    viewer = await looks(page)
+    watching = set(patterns(page)) - set(quiet)
+    assert {"robot/image/*", "robot/detections", "robot/perceived/*"} <= watching
+    say(viewer, frames.WATCH, Watch())
+    await settle()
+    page.sessions.send_news()
+    assert not {"robot/image/*", "robot/detections"} & set(patterns(page))
+    page.sessions.viewers.clear()
+    page.sessions.send_news()
+    assert patterns(page) == quiet
+
+
+async def test_a_browser_gets_the_next_picture_when_it_has_shown_the_last(page: Page) -> None:
+    slow = await looks(page)
+    for _ in range(20):
+        page.net.two.publish(IMAGE, picture(), name="front")
+        await tick(page)
+    assert pictures(slow) == ["front"]  # 2 s without a word
+    say(slow, frames.SHOWN, Shown(camera="front"))
+    await settle()
+    for _ in range(5):
+        page.net.two.publish(IMAGE, picture(), name="front")
+        await tick(page)
+    assert pictures(slow) == ["front", "front"]
+
+
+async def test_a_quick_browser_gets_five_pictures_a_second_of_a_flood(page: Page) -> None:
+    quick = await looks(page)
+    for _ in range(20):
+        for _ in range(10):
+            page.net.two.publish(IMAGE, picture(), name="front")
+        await tick(page)
+        say(quick, frames.SHOWN, Shown(camera="front"))
+        await settle()
+    assert len(pictures(quick)) == 10
+
+
+async def test_the_same_picture_is_not_sent_twice(page: Page) -> None:
+    viewer = await looks(page)
+    page.net.two.publish(IMAGE, picture(), name="front")
+    for _ in range(10):
+        await tick(page)
+        say(viewer, frames.SHOWN, Shown(camera="front"))
+        await settle()
+    assert pictures(viewer) == ["front"]
+
+
+async def test_a_second_viewer_gets_the_newest_picture_too(page: Page) -> None:
+    first, second = await looks(page), await looks(page)
+    page.net.two.publish(IMAGE, picture(), name="front")
+    await tick(page)
+    assert pictures(first) == pictures(second) == ["front"]
+
+
+async def test_folded_cameras_and_more_than_eight_are_not_sent(page: Page) -> None:
+    viewer = await looks(page, "cam3")
+    for number in range(20):
+        page.net.two.publish(IMAGE, picture(), name=f"cam{number}")
+    await tick(page)
+    assert pictures(viewer) == [f"cam{number}" for number in range(8) if number != 3]
+
+
+@pytest.mark.parametrize(
+    ("data", "problem"),
+    [
+        (jpeg_head(65500, 65500), "a JPEG of 65500 x 65500 pixels; its message says 320 x 240"),
+        (b"\xff\xd8\xff", "not a JPEG, or one without a size"),
+    ],
+    ids=["bomb", "cut off"],
+)
+async def test_a_picture_that_is_not_what_it_claims_stays_away_from_browsers(
+    page: Page, data: bytes, problem: str
+) -> None:
+    viewer = await looks(page)
+    page.net.two.publish(IMAGE, picture(data=data), name="front")
+    await tick(page)
+    assert pictures(viewer) == []
+    assert content(viewer, frames.CAMERA) == [{"camera": "front", "problem": problem}]
+    page.net.two.publish(IMAGE, picture(), name="front")
+    await tick(page)
+    assert pictures(viewer) == ["front"]
+    assert content(viewer, frames.CAMERA)[-1] == {"camera": "front", "problem": ""}
+
+
+async def test_a_picture_that_does_not_decode_is_passed_over(page: Page) -> None:
+    viewer = await looks(page)
+    page.net.network.deliver("robot/image/front", b"garbage")
+    await tick(page)
+    assert pictures(viewer) == []
+
+
+async def test_the_problem_of_a_camera_is_sent_once_and_kept_for_others(page: Page) -> None:
+    viewer = await page.comes(page.tokens.viewer)
+    info = example(CameraInfo)
+    for _ in range(3):
+        page.net.two.publish(CAMERA, msgspec.structs.replace(info, problem="covered"), name="front")
+        await settle()
+    later = await page.comes(page.tokens.viewer)
+    expected = [{"camera": "front", "problem": "covered"}]
+    assert content(viewer, frames.CAMERA) == content(later, frames.CAMERA) == expected
+
+
+async def test_detections_are_sent_to_those_who_see_the_picture(page: Page) -> None:
+    open_, folded = await looks(page), await looks(page, "front")
+    can = Detection(label="can", confidence=0.93456, box=(1.23456, 2, 3, 4), in_map=(1.0, 2.0, 3.0))
+    found = Detections(camera="front", width=320, height=240, things=(can,))
+    page.net.two.publish(DETECTIONS, found)
+    await tick(page)
+    (sent,) = content(open_, frames.FOUND)
+    assert sent["things"] == [
+        {"label": "can", "confidence": 0.93, "box": [1.2, 2.0, 3.0, 4.0], "position": None}
+    ]
+    assert content(folded, frames.FOUND) == []
+
+
+async def test_contours_are_sent_once_each_and_taken_back(page: Page) -> None:
+    viewer = await page.comes(page.tokens.viewer)
+    page.net.two.publish(STATE, example(STATE.type))
+    box = Contour(polygon=((1.00004, 0.0), (2.0, 0.0), (2.0, 1.0)), bottom=0.0, top=0.05)
+    for basis, shown in ((1, (box,)), (1, (box,)), (2, ()), (3, ())):
+        world = WorldModel(scan_ok=True, obstacle_ahead=False, contours=shown)
+        page.net.two.publish(WORLD, world, basis=basis)
+        await tick(page)
+    first, last = content(viewer, frames.CONTOURS)
+    assert first[0]["polygon"] == [[1.0, 0.0], [2.0, 0.0], [2.0, 1.0]]  # type: ignore[index]
+    assert last == []
+    assert all(b'"polygon"' not in frame for frame in viewer.got if frame[0] == frames.STATE)
+
+
+async def test_findings_and_the_map_of_objects_are_sent(page: Page) -> None:
+    viewer = await page.comes(page.tokens.viewer)
+    page.sessions.send_news()
+    person = DetectedObject(id=1, x=2.0, y=1.0, radius=0.3, label="person")
+    page.net.two.publish(PERCEIVED, Objects(objects=(person,)), name="people")
+    page.net.two.publish(OBJECT_MAP, example(ObjectMap))
+    await tick(page)
+    (found,) = content(viewer, frames.PERCEIVED)
+    assert (found["name"], len(found["objects"])) == ("people", 1)  # type: ignore[arg-type]
+    assert len(content(viewer, frames.OBJECTS)) == 1
+    later = await page.comes(page.tokens.viewer)
+    assert len(content(later, frames.OBJECTS)) == 1
+
+
+async def test_a_frame_that_the_page_never_sends_ends_the_connection(page: Page) -> None:
+    for kind, bad in ((frames.WATCH, b'{"open": 1}'), (frames.SHOWN, b"{}"), (frames.WATCH, b"x")):
+        socket = await page.comes(page.tokens.viewer)
+        socket.said.put_nowait(bytes((kind,)) + bad)
+        for _ in range(5):
+            await settle()
+        assert socket.code == 1008
