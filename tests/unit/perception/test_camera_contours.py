@@ -3,13 +3,17 @@
 import functools
 from collections.abc import Callable
 
+import cv2
 import msgspec
+import numpy as np
 import pytest
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.brain import CameraStatus, Contour, WorldModel
 from gigabrain_schemas.logs import FINISHED
+from gigabrain_schemas.sensors import Image
 from gigabrain_schemas.topics import BODY, CAMERA, DEPTH, IMAGE, SCAN, STATE, WORLD
 from gigabrain_schemas.vision import CameraInfo, DepthImage
 from gigabrain_zenoh import codec
@@ -20,7 +24,8 @@ from gigabrain_zenoh.perception.camera_contours import SKIPPED
 from gigabrain_zenoh.runtime.replay import Event, record, replay
 from gigabrain_zenoh.testing.in_memory import NodeBench, PatientJournal
 from gigabrain_zenoh.testing.samples import BOOT, WAFFLE, body, open_space, scan, state
-from tests.unit.vision.scenes import LOW, Box, depth_of, image, millimetres, near
+from tests.unit.vision.scenes import HIGH, LOW, Box, depth_of, image, millimetres, near
+from tests.unit.vision.test_floor_colour import picture
 
 CAMERA_BODY = replace(WAFFLE, cameras=(LOW,), body_height=0.2)
 BOX = Box(x=1.0, y=0.0, half_x=0.05, half_y=0.1, top=0.1)
@@ -194,6 +199,34 @@ async def test_a_restarted_driver_begins_with_nothing_seen() -> None:
         assert (world.contours, status(world).exposure) == ((), 0)
         await bench.look(3)
         assert (await bench.world(3)).contours
+
+
+@pytest.mark.parametrize("encoding", ["bgr8", "jpeg"])
+async def test_a_camera_without_depth_gives_contours_by_colour_that_are_marked(
+    encoding: str,
+) -> None:
+    plain = replace(HIGH, depth=False)
+    async with Bench() as bench:
+        await bench.ready()
+        bench.send(BODY, body(replace(CAMERA_BODY, cameras=(plain,))))
+        for tick in (1, 6, 11, 16):
+            bench.drive(tick)
+            pixels = picture(Box(1.5, 0.0, 0.1, 0.2, 0.3), seed=tick)
+            data = pixels.tobytes() if encoding == "bgr8" else jpeg(pixels)
+            sent = Image(
+                frame_id="front", encoding=encoding, width=320, height=240, data=data,  # type: ignore[arg-type]
+                boot=BOOT, tick=tick, basis=tick,
+            )  # fmt: skip
+            bench.network.deliver(IMAGE.at("front"), codec.encode(sent))
+            await bench.settled()
+        world = await bench.world(16)
+    assert status(world).ok
+    assert near(world.contours, 1.4, 0.0)
+    assert {one.source for one in world.contours} == {"floor_colour"}
+
+
+def jpeg(pixels: NDArray[np.uint8]) -> bytes:
+    return bytes(cv2.imencode(".jpg", pixels)[1].tobytes())
 
 
 async def test_a_body_without_cameras_costs_nothing() -> None:
