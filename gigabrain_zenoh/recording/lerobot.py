@@ -1,7 +1,7 @@
 """Converts a recording into a LeRobot dataset: format version 3.0, as lerobot 0.4 reads it.
 
 A frame is a tenth of a second of the robot's time. An episode lasts while the gate is enabled
-without a gap. Images are left out.
+without a gap. Pictures and depth become videos.
 """
 
 import json
@@ -14,11 +14,14 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.body import Body, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.sensors import LaserScan
+from gigabrain_schemas.topics import BODY
+from gigabrain_schemas.topics import STATE as STATE_TOPIC
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.recording.bag_reader import Bag, samples
+from gigabrain_zenoh.recording.lerobot_video import VIDEO_PATH, VideoFeature, write_videos
 from gigabrain_zenoh.recording.message_tables import message_of
 
 try:
@@ -32,6 +35,7 @@ VERSION, TASK = "v3.0", "drive"
 STATE, SCAN, ACTION = "observation.state", "observation.environment_state", "action"
 STATE_NAMES = ("x", "y", "yaw", "linear_x", "linear_y", "angular_z")
 ACTION_NAMES = ("linear_x", "linear_y", "angular_z")
+LATERAL = "linear_y"
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 FILE = "chunk-000/file-000.parquet"
 Floats = NDArray[np.float32]
@@ -86,12 +90,17 @@ def episodes(path: Path) -> list[list[LeRobotFrame]]:
     return rows
 
 
-def columns(row: list[LeRobotFrame], episode: int, first: int) -> dict[str, NDArray[Any]]:
-    """Return an episode's columns; `first` is the number of its first frame in the dataset."""
+def columns(
+    row: list[LeRobotFrame], episode: int, first: int, *, lateral: bool = True
+) -> dict[str, NDArray[Any]]:
+    """Return an episode's columns; `first` is the number of its first frame in the dataset.
+
+    Without `lateral` the speed to the side is left out.
+    """
     count = np.arange(len(row), dtype=np.int64)
     found: dict[str, NDArray[Any]] = {
-        STATE: np.stack([frame.state for frame in row]),
-        ACTION: np.stack([frame.action for frame in row]),
+        STATE: np.stack([frame.state for frame in row])[:, _kept(STATE_NAMES, lateral)],
+        ACTION: np.stack([frame.action for frame in row])[:, _kept(ACTION_NAMES, lateral)],
         "timestamp": (count / FRAME_HZ).astype(np.float32),
         "frame_index": count,
         "episode_index": np.full(len(row), episode, np.int64),
@@ -103,11 +112,19 @@ def columns(row: list[LeRobotFrame], episode: int, first: int) -> dict[str, NDAr
     return found
 
 
-def features(beams: int) -> dict[str, dict[str, Any]]:
+def _kept(names: Sequence[str], lateral: bool) -> list[int]:
+    """Return which values of a vector the dataset has."""
+    return [number for number, name in enumerate(names) if lateral or name != LATERAL]
+
+
+def features(beams: int, *, lateral: bool = True) -> dict[str, dict[str, Any]]:
     """Return the format's description of the columns."""
+    state, action = (
+        [names[number] for number in _kept(names, lateral)] for names in (STATE_NAMES, ACTION_NAMES)
+    )
     found: dict[str, dict[str, Any]] = {
-        STATE: {"dtype": "float32", "shape": [6], "names": list(STATE_NAMES)},
-        ACTION: {"dtype": "float32", "shape": [3], "names": list(ACTION_NAMES)},
+        STATE: {"dtype": "float32", "shape": [len(state)], "names": state},
+        ACTION: {"dtype": "float32", "shape": [len(action)], "names": action},
         "timestamp": {"dtype": "float32", "shape": [1], "names": None},
         **{name: {"dtype": "int64", "shape": [1], "names": None} for name in COUNTERS},
     }
@@ -135,36 +152,53 @@ def statistics(data: Mapping[str, NDArray[Any]]) -> dict[str, dict[str, list[flo
 def convert(path: Path, folder: Path) -> str:
     """Write the dataset into a new folder; return a summary in words. Raises ConfigError."""
     rows, tables, first = episodes(path), [], 0
+    robot_type, lateral = _body(path)
     for episode, row in enumerate(rows):
-        tables.append(columns(row, episode, first))
+        tables.append(columns(row, episode, first, lateral=lateral))
         first += len(row)
     whole = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
-    state = next((m for m in map(message_of, Bag(path)) if isinstance(m, RobotState)), None)
-    info = {
-        "codebase_version": VERSION,
-        "robot_type": state.robot_type if state else None,
-        "total_episodes": len(rows),
-        "total_frames": first,
-        "total_tasks": 1,
-        "chunks_size": 1000,
-        "data_files_size_in_mb": 100,
-        "video_files_size_in_mb": 200,
-        "fps": FRAME_HZ,
-        "splits": {"train": f"0:{len(rows)}"},
-        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-        "video_path": None,
-        "features": features(len(rows[0][0].scan)),
-    }
+    ticks = [(frame.boot, frame.tick) for row in rows for frame in row]
     try:
         folder.mkdir(parents=True)
+        videos = write_videos(path, ticks, folder, FRAME_HZ)
         _write_columns(whole, folder / "data" / FILE)
-        _write_episodes([len(row) for row in rows], TASK, folder / "meta/episodes" / FILE)
+        _write_episodes([len(row) for row in rows], videos, folder / "meta/episodes" / FILE)
         _write_task(TASK, folder / "meta/tasks.parquet")
+        info = {
+            "codebase_version": VERSION,
+            "robot_type": robot_type,
+            "total_episodes": len(rows),
+            "total_frames": first,
+            "total_tasks": 1,
+            "chunks_size": 1000,
+            "data_files_size_in_mb": 100,
+            "video_files_size_in_mb": 200,
+            "fps": FRAME_HZ,
+            "splits": {"train": f"0:{len(rows)}"},
+            "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+            "video_path": VIDEO_PATH if videos else None,
+            "features": features(len(rows[0][0].scan), lateral=lateral)
+            | {video.key: video.feature for video in videos},
+        }
+        stats = statistics(whole) | {video.key: video.statistics for video in videos}
         (folder / "meta/info.json").write_text(json.dumps(info, indent=4))
-        (folder / "meta/stats.json").write_text(json.dumps(statistics(whole), indent=4))
+        (folder / "meta/stats.json").write_text(json.dumps(stats, indent=4))
     except OSError as error:
         raise ConfigError(f"cannot write {folder}: {error.strerror}") from None
-    return f"{folder}: {len(rows)} episodes, {first} frames"
+    found = [f"{folder}: {len(rows)} episodes, {first} frames"]
+    return "\n  ".join(found + [video.summary for video in videos])
+
+
+def _body(path: Path) -> tuple[str | None, bool]:
+    """Return the type of the recorded body, and whether it can move to the side, if known."""
+    robot_type = None
+    for sample in Bag(path):
+        message = message_of(sample) if sample.key in (BODY.key, STATE_TOPIC.key) else None
+        if isinstance(message, Body):
+            return message.description.robot_type, message.description.max_lateral_speed > 0
+        if isinstance(message, RobotState):
+            robot_type = message.robot_type
+    return robot_type, True
 
 
 def _write_columns(columns: Mapping[str, NDArray[Any]], path: Path) -> None:
@@ -178,12 +212,12 @@ def _write_columns(columns: Mapping[str, NDArray[Any]], path: Path) -> None:
     _write_table(pa.table(arrays), path)
 
 
-def _write_episodes(lengths: Sequence[int], task: str, path: Path) -> None:
-    """Write the range of rows of each episode in the data file. Raises OSError."""
+def _write_episodes(lengths: Sequence[int], videos: Sequence[VideoFeature], path: Path) -> None:
+    """Write the rows of each episode in the data file, and its time in videos. Raises OSError."""
     ends, zeros = list(accumulate(lengths)), [0] * len(lengths)
-    table = {
+    table: dict[str, list[Any]] = {
         "episode_index": list(range(len(lengths))),
-        "tasks": [[task]] * len(lengths),
+        "tasks": [[TASK]] * len(lengths),
         "length": list(lengths),
         "data/chunk_index": zeros,
         "data/file_index": zeros,
@@ -192,6 +226,13 @@ def _write_episodes(lengths: Sequence[int], task: str, path: Path) -> None:
         "meta/episodes/chunk_index": zeros,
         "meta/episodes/file_index": zeros,
     }
+    for key in (video.key for video in videos):
+        table |= {
+            f"videos/{key}/chunk_index": zeros,
+            f"videos/{key}/file_index": zeros,
+            f"videos/{key}/from_timestamp": [start / FRAME_HZ for start in [0, *ends[:-1]]],
+            f"videos/{key}/to_timestamp": [end / FRAME_HZ for end in ends],
+        }
     _write_table(pa.table(table), path)
 
 
