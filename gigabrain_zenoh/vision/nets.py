@@ -109,7 +109,7 @@ class YoloNet:
         self._net = read_net(path)
         made = _tried(self._net, path, self._size or (320, 320), f"export it so: {GOOD_YOLO}")
         self._final = made.ndim == 3 and made.shape[2] == 6 and made.shape[1] != 4 + len(classes)
-        if made.ndim != 3 or len(made) != 1 or made.shape[1] < 5:
+        if made.ndim != 3 or len(made) != 1 or (made.shape[1] < 5 and not self._final):
             raise ConfigError(
                 f"{path}: gives {_sizes(made.shape)}; layout `yolo` expects "
                 f"1 x {4 + len(classes)} x n"

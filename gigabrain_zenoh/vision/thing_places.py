@@ -15,7 +15,7 @@ from gigabrain_zenoh.vision.camera_model import CameraModel
 # the middle's distance behind the median of what is seen of the inner part, of the width
 BEHIND = {
     "ball": 0.43,
-    "box": 0.42,
+    "box": 0.38,
     "can": 0.47,
     "charger": 0.3,
     "cube": 0.42,
@@ -24,6 +24,7 @@ BEHIND = {
     "person": 0.4,
     "robot": 0.42,
 }
+ROUND = {"ball"}
 USUAL, MOST_M = 0.35, 0.35  # of other things, and of all
 INNER = (0.2, 0.15, 0.8, 0.75)  # left, top, right, bottom of the part that is looked at
 MIN_PIXELS, MIN_SHARE = 8, 0.15  # with depth, of that part
@@ -64,7 +65,8 @@ def thing_place(
     if not np.isfinite((x, y, z)).all():
         return None
     whole = top >= EDGE_PX and bottom <= height - EDGE_PX
-    return ThingPlace((x, y, z), (wide * middle, high * middle) if whole else None)
+    tall = high * (middle if label in ROUND else front)  # the upper edge of others is in front
+    return ThingPlace((x, y, z), (wide * middle, tall) if whole else None)
 
 
 def _inside(box: Box, depth: NDArray[np.uint16]) -> NDArray[np.float64]:

@@ -116,7 +116,7 @@ PERCEIVED = Topic(
     publishers=BRAIN, drawing="perceived",
 )  # fmt: skip
 DETECTIONS = Topic(
-    "robot/detections", objects.Detections, 10, depth=8, max_bytes=64 * KB, publishers=BRAIN,
+    "robot/detections", objects.Detections, 5, depth=8, max_bytes=64 * KB, publishers=BRAIN,
     drawing="detections",
 )  # fmt: skip
 OBJECT_MAP = Topic(
