@@ -23,6 +23,7 @@ from gigabrain_zenoh.mapping.likelihood_field import (
     is_self_similar,
 )
 from gigabrain_zenoh.mapping.occupancy_grid import CELL, LogOddsGrid
+from gigabrain_zenoh.mapping.pose_hint import PoseHint, explained
 
 LOST_SCORE, LOST_SCANS = 0.45, 5  # so bad a fit for so long: the robot is somewhere else
 SURE_SCORE, SURE_SCANS = 0.65, 3  # so good a fit for so long, and the only one: it is here
@@ -42,6 +43,7 @@ SEARCH_INTERVAL_SCANS = 10  # from one search of the whole map to the next
 SPREAD = np.diag((0.1, 0.1, 0.05)) ** 2  # the covariance of a place that a search has found
 NOWHERE = np.diag((1e3, 1e3, math.pi)) ** 2  # the covariance of what is not known
 
+ALIKE_SCORE = 0.1  # places of one hint that fit so much alike: the hint does not tell them apart
 SEARCH_DEADLINE_SCANS = 8  # after which what a search has found is taken
 
 JUDGED_RADIUS_M = 5.0  # round the robot, beams that end farther off are not judged
@@ -131,6 +133,24 @@ class Localizer:
             for k, (pose, one) in enumerate(zip(poses, candidates, strict=True))
         ]
         self.why = _in_words(len(poses))
+
+    def suggest(self, candidates: list[Candidate]) -> None:
+        """Follow what a hint has found at the last scan, beside the other places.
+
+        If it is a single place, it counts as odometry's does. A robot that is localized stays.
+        """
+        if self._localized or not candidates:
+            return
+        alike = [one for one in candidates if one.score >= candidates[0].score - ALIKE_SCORE]
+        sole = len(alike) == 1
+        for one in alike:
+            near = [k for k, h in enumerate(self._places) if not apart(h.pose, (one.pose,))]
+            good = int(one.score >= SURE_SCORE)
+            there = Hypothesis(one.pose, SPREAD, one.score, good=good)
+            if near:
+                there = self._places.pop(near[0])
+            self._places.insert(0, replace(there, continues=sole))
+        self.why = _in_words(len(self._places))
 
     def step(self, view: View, motion: Floats, noise: Floats) -> Place:
         """Process one scan after a `motion` (3,) of covariance `noise` (3, 3), in its own frame."""
@@ -272,14 +292,23 @@ class BackgroundLocalizer:
         self._moved = IDENTITY  # since the scan that a search uses
         self.last = last  # where it was before it was lost, by odometry: it may still be there
         self._lost = 0  # how often
+        self._hint: PoseHint | None = None  # of the next scan
+
+    def suggest(self, hint: PoseHint) -> None:
+        """Look for the robot near `hint`, a pose of the next scan, unless it is localized."""
+        self._hint = hint
 
     def step(self, view: View, motion: Floats, noise: Floats) -> Place:
         """Process one scan, and start a search of the whole map when it is needed."""
         self._moved = compose(self._moved, motion)
         self.last = None if self.last is None else compose(self.last, motion)
         place = self._localizer.step(view, motion, noise)
+        hint, self._hint = self._hint, None
         if place.localized:
             self.last = place.pose
+        elif hint:
+            self._localizer.suggest(explained(self._localizer.map, view.beams, hint))
+            place = self._localizer.place
         if self._localizer.wants_search and self._background.idle:
             self._search(view)
         return place

@@ -25,6 +25,7 @@ from gigabrain_zenoh.mapping.occupancy_grid import (
     LogOddsGrid,
 )
 from gigabrain_zenoh.mapping.pose_graph import DriftRates
+from gigabrain_zenoh.mapping.pose_hint import PoseHint
 from gigabrain_zenoh.mapping.slam import Correction, Estimate, Slam
 from gigabrain_zenoh.mapping.static_map import warm_up as warm_up_localizing
 
@@ -182,6 +183,11 @@ class SlamMap:
         field = field_of(self._grid.percent(), CELL, origin)
         self._finder = BackgroundLocalizer(field, why, self._background, self._here())
         self._last = Place(self._last.pose, NOWHERE, False, why)
+
+    def suggest(self, hint: PoseHint) -> None:
+        """See RobotMap."""
+        if self._finder:
+            self._finder.suggest(hint)
 
     def _here(self) -> Floats | None:
         """Return the robot's pose as far as odometry knows it."""

@@ -17,6 +17,7 @@ from gigabrain_zenoh.mapping.likelihood_field import contradiction, field_of
 from gigabrain_zenoh.mapping.localizer import BackgroundLocalizer, Place
 from gigabrain_zenoh.mapping.occupancy_grid import CELL, LogOddsGrid
 from gigabrain_zenoh.mapping.occupancy_grid import warm_up as warm_up_grid
+from gigabrain_zenoh.mapping.pose_hint import PoseHint
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.mapping.slam_map import MapSnapshot  # and gtsam: only who makes maps pays
@@ -33,6 +34,9 @@ class RobotMap(Protocol):
 
     def lose(self, why: str) -> None:
         """Search the whole map for the robot."""
+
+    def suggest(self, hint: PoseHint) -> None:
+        """Look for the robot near `hint`, a pose of the next scan, unless it is localized."""
 
     def grid(self) -> OccupancyGrid:
         """Return the map as a message."""
@@ -91,6 +95,10 @@ class StaticMap(RobotMap):
     def lose(self, why: str) -> None:
         """See RobotMap."""
         self._finder.lose(why)
+
+    def suggest(self, hint: PoseHint) -> None:
+        """See RobotMap."""
+        self._finder.suggest(hint)
 
     def grid(self) -> OccupancyGrid:
         """See RobotMap."""

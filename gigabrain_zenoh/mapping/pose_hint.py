@@ -1,0 +1,113 @@
+"""Poses near a hint that explain a scan: a tag or a person says roughly where the robot is.
+
+The hint's ellipsoid is sampled, the likeliest samples are fitted to the scan, and the hint holds
+the fit near itself. So a hint never moves the robot to where the scan does not fit.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.geometry.se2 import inverse_of
+from gigabrain_zenoh.mapping.global_localization import FEWEST_POINTS, Candidate, apart
+from gigabrain_zenoh.mapping.keyframes import Beams, Points
+from gigabrain_zenoh.mapping.likelihood_field import LikelihoodField, fit
+
+SIGMAS = 2.0  # of the hint's ellipsoid that are sampled
+STEP_M = 0.12  # between samples
+REACH_M = 1.5  # turns count as the way of a wall at this distance
+MOST_SAMPLES, AT_ONCE = 20_000, 1000
+POINTS = 90  # of a scan, evenly chosen
+SIGMA_M = 0.15  # how near a hit of a sample should be to a wall
+UNKNOWN = 0.75  # likelihood of a hit that the map cannot judge, as in the global search
+TRIED, MOST_FOUND = 12, 4
+LEAST_SCORE, LEAST_SHOWN = 0.5, 0.2
+WEAK = np.diag((1.0, 1.0, 1.0))  # information that holds a fit at its sample
+OFF_COST = 0.02  # of the score, for one standard deviation off the hint
+
+
+class PoseHint(NamedTuple):
+    """A rough pose of the robot in its map."""
+
+    pose: Floats  # (3,)
+    covariance: Floats  # (3, 3), in the map's axes
+
+
+def explained(field: LikelihoodField, beams: Beams, hint: PoseHint) -> list[Candidate]:
+    """Return the poses within the hint that explain a scan, the best first."""
+    if len(beams.hits) < FEWEST_POINTS:
+        return []
+    samples = _samples(hint)
+    likely = _likelihoods(field, beams.hits, samples)
+    tried: list[Floats] = []
+    for k in np.argsort(-likely, kind="stable")[: 20 * TRIED]:
+        if len(tried) < TRIED and apart(samples[k], tried):
+            tried.append(samples[k])
+    fits = [fit(field, beams, pose, WEAK) for pose in tried]
+    good = [
+        (Candidate(one.pose, one.score), _squared_deviation(hint, one.pose))
+        for one in fits
+        if one.score >= LEAST_SCORE and one.shown >= LEAST_SHOWN
+    ]
+    good = [one for one in good if one[1] <= (SIGMAS + 1.0) ** 2]
+    found: list[Candidate] = []
+    for one, _ in sorted(good, key=lambda pair: OFF_COST * pair[1] - pair[0].score):
+        if len(found) < MOST_FOUND and apart(one.pose, (other.pose for other in found)):
+            found.append(one)
+    return found
+
+
+def _samples(hint: PoseHint) -> Floats:
+    """Return poses (n, 3) in a lattice along the axes of the hint's ellipsoid."""
+    scale = np.array((1.0, 1.0, REACH_M))
+    values, axes = np.linalg.eigh(hint.covariance * np.outer(scale, scale))
+    reaches = SIGMAS * np.sqrt(np.maximum(values, 1e-12))
+    reaches = np.minimum(reaches, math.pi * REACH_M)
+    step = STEP_M
+    while np.prod(2 * np.ceil(reaches / step) + 1) > MOST_SAMPLES:
+        step *= 1.2
+    counts = np.ceil(reaches / step).astype(int)
+    lines = [np.linspace(-far, far, 2 * n + 1) for far, n in zip(reaches, counts, strict=True)]
+    lattice = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
+    inside = (np.square(lattice / np.maximum(reaches, 1e-9)).sum(axis=1) <= 1.01) | (
+        np.abs(lattice).max(axis=1) < 1e-9
+    )
+    return np.asarray(hint.pose + (lattice[inside] @ axes.T) / scale, np.float64)
+
+
+def _likelihoods(field: LikelihoodField, hits: Points, samples: Floats) -> Floats:
+    """Return how near the hits of a scan are to walls at each sample, 0 to 1."""
+    chosen = hits[np.linspace(0, len(hits) - 1, min(POINTS, len(hits))).astype(np.intp)]
+    image = np.exp(-0.5 * (field.distance / SIGMA_M) ** 2)
+    image[~field.shown] = UNKNOWN
+    found = [
+        _mean(image, field, chosen, samples[k : k + AT_ONCE])
+        for k in range(0, len(samples), AT_ONCE)
+    ]
+    return np.concatenate(found)
+
+
+def _mean(
+    image: NDArray[np.floating], field: LikelihoodField, hits: Points, samples: Floats
+) -> Floats:
+    cos, sin = np.cos(samples[:, 2])[:, None], np.sin(samples[:, 2])[:, None]
+    x = samples[:, :1] + cos * hits[:, 0] - sin * hits[:, 1]
+    y = samples[:, 1:2] + sin * hits[:, 0] + cos * hits[:, 1]
+    columns = np.floor((x - field.origin[0]) / field.cell).astype(np.intp)
+    rows = np.floor((y - field.origin[1]) / field.cell).astype(np.intp)
+    height, width = image.shape
+    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    values = image[np.where(inside, rows, 0), np.where(inside, columns, 0)]
+    return np.asarray(np.where(inside, values, UNKNOWN).mean(axis=1), np.float64)
+
+
+def _squared_deviation(hint: PoseHint, pose: Floats) -> float:
+    """Return how many standard deviations a fit is off the hint, squared."""
+    off = pose - hint.pose
+    off[2] = math.remainder(off[2], math.tau)
+    slack = np.diag((STEP_M, STEP_M, STEP_M / REACH_M)) ** 2
+    spread = inverse_of(hint.covariance + slack)
+    return float(off @ spread @ off)
