@@ -37,6 +37,7 @@ OCCUPIED_PERCENT, FREE_PERCENT = 65, 40  # from here on, and up to here
 LEAST_FREE_M2, LEAST_WALL_M = 1.0, 1.0  # less than that is no map
 GRAPH = ".graph.npz"
 ZONES = ".zones.yaml"  # see zone_file
+OBJECTS = ".objects.json"  # see object_file
 STAMP = "grid"  # in the graph's file: which grid it belongs to
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -102,9 +103,15 @@ def load_graph(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def save(
-    path: Path, found: SavedMap, graph: Arrays, *, replace: bool = False, zones: bytes = b""
+    path: Path,
+    found: SavedMap,
+    graph: Arrays,
+    *,
+    replace: bool = False,
+    zones: bytes = b"",
+    objects: bytes = b"",
 ) -> None:
-    """Write `path`, a YAML file's, and its image, graph and zones. All of it, or nothing.
+    """Write `path`, a YAML file's, and its image, graph, zones and objects. All of it, or nothing.
 
     Raises Refused for an unusable map, or if a map is there and `replace` is False.
     """
@@ -116,7 +123,8 @@ def save(
         _finish(path)
         if path.exists() and not replace:
             raise Refused(f"not saved: there is a map {path} already; --replace overwrites it")
-        beside = {path.with_suffix(ZONES).name: zones} if zones else {}
+        ends = ((ZONES, zones), (OBJECTS, objects))
+        beside = {path.with_suffix(end).name: data for end, data in ends if data}
         _commit(path, {**_files(path, found, graph), **beside})
     except ValueError as error:
         raise Refused(f"not saved: {error}") from None

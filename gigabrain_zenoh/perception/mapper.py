@@ -7,14 +7,15 @@ import asyncio
 import logging
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from msgspec.structs import replace
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_NS
-from gigabrain_schemas.body import Body, Lidar, RobotState
-from gigabrain_schemas.brain import OccupancyGrid, PoseInMap
+from gigabrain_schemas.body import Body, BodyDescription, Lidar, RobotState
+from gigabrain_schemas.brain import OccupancyGrid, PoseInMap, WorldModel
 from gigabrain_schemas.requests import MapReply, MapRequest
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import MAP, MAP_LIST, MAP_LOAD, MAP_SAVE, POSE
@@ -27,7 +28,7 @@ from gigabrain_zenoh.geometry.scan import beams, hits
 from gigabrain_zenoh.host.bounded import NewestValues
 from gigabrain_zenoh.host.threads import InTime, done
 from gigabrain_zenoh.kernels.precompile import ensure_compiled
-from gigabrain_zenoh.mapping import map_file, zone_file
+from gigabrain_zenoh.mapping import map_file, object_file, zone_file
 from gigabrain_zenoh.mapping.autosave import Autosave, refuse
 from gigabrain_zenoh.mapping.keyframes import Scan, View
 from gigabrain_zenoh.mapping.localizer import Place
@@ -36,7 +37,12 @@ from gigabrain_zenoh.mapping.odometry import OdometryFusion, OdometrySample, way
 from gigabrain_zenoh.mapping.static_map import RobotMap, StaticMap
 from gigabrain_zenoh.mapping.zone_file import ZoneFile
 from gigabrain_zenoh.perception.node import LOCALIZE_KERNELS, MAP_KERNELS
+from gigabrain_zenoh.perception.pose_hints import PoseHints
+from gigabrain_zenoh.perception.surroundings import Surroundings
 from gigabrain_zenoh.perception.zone_keeper import ZoneKeeper
+
+if TYPE_CHECKING:
+    from gigabrain_zenoh.perception.object_keeper import ObjectKeeper  # for cameras only
 
 log = logging.getLogger(__name__)
 
@@ -107,15 +113,17 @@ class Mapper:
         self._zones = ZoneKeeper(bus, config.state_dir, lambda: self._tick)
         found = zone_file.load(map_file.path_of(config.map)) if config.map else ZoneFile()
         self._zones.use_map(config.map, config.mapping, found, loaded=False)
+        self._objects: ObjectKeeper | None = None  # of a body with cameras
+        self._hints = PoseHints(bus, lambda: self._last, lambda why: self._chart.lose(why))
         bus.serve(MAP_SAVE, self._save)
         bus.serve(MAP_LOAD, self._load)
         bus.serve(MAP_LIST, self._list)
         bus.report = self._report
 
-    def process_scan(self, scan: LaserScan, problem: str) -> None:
-        """Process a scan, or skip it if `problem` is not empty or its odometry is missing."""
-        if problem:
-            self._skip(problem)
+    def process_scan(self, scan: LaserScan, world: WorldModel) -> None:
+        """Process a scan and its world, or skip a bad one, and one whose odometry is missing."""
+        if world.scan_problem:
+            self._skip(world.scan_problem)
             return
         moment = self._fusion.at(scan.basis) if scan.boot == self._boot else None
         if moment is None and self._last is None and not self._early:
@@ -124,7 +132,7 @@ class Mapper:
         elif moment is None or (self._last and moment.tick <= self._last.tick):
             self._skip("no odometry for its tick")
         else:
-            self._process(scan, moment)
+            self._process(scan, world, moment)
 
     def skip_future_scan(self, scan: LaserScan, tick: int) -> None:
         """Skip a scan whose state had not arrived by `tick`, when the next scan came."""
@@ -137,14 +145,16 @@ class Mapper:
             self._autosave.close()
 
     async def finish_writing(self) -> None:
-        """Return once the zones are written."""
+        """Return once zones and objects are written."""
         await self._zones.finish_writing()
+        if self._objects:
+            await self._objects.finish_writing()
 
     def add_state(self, state: RobotState) -> None:
         """Add a robot state; must be called before `process_scan` for scans of the same tick."""
         body = self._bodies.current
         if body:
-            self._reset_odometry(state.boot)
+            self._reset_odometry(state.boot, body.description)
             self._fusion.add(state, body.description)
 
     def _autosave_of(self, config: PerceptionConfig) -> Autosave | None:
@@ -155,7 +165,7 @@ class Mapper:
     def _tick(self) -> int:
         return self._last.tick if self._last else 0
 
-    def _reset_odometry(self, boot: int) -> None:
+    def _reset_odometry(self, boot: int, body: BodyDescription) -> None:
         """Reset the odometry when the driver has restarted; the map is kept.
 
         If this process has restarted and the driver has not, resume the last autosaved map.
@@ -166,12 +176,28 @@ class Mapper:
             self._chart.lose("the driver has restarted")
         self._boot, self._fusion, self._last, self._published = boot, OdometryFusion(), None, None
         self._before, self._early = None, False
-        if not self._mapped and self._bus.input_log.live:
-            self._resume(boot)
+        self._hints.clear()
+        resumed = not self._mapped and self._bus.input_log.live and self._resume(boot)
         self._zones.set_boot(boot)
+        self._watch(boot, body, resumed=resumed)
 
-    def _resume(self, boot: int) -> None:
-        """Resume the map and the zones of an earlier process of this run of the driver."""
+    def _watch(self, boot: int, body: BodyDescription, *, resumed: bool) -> None:
+        """Remember what the cameras of a body see, if it has some."""
+        if self._objects is None and body.cameras:
+            from gigabrain_zenoh.perception.object_keeper import ObjectKeeper  # as above
+
+            self._objects = ObjectKeeper(self._bus, self._config.state_dir, lambda: self._fusion)
+            self._objects.use_map(self._config.map, self._config.mapping)
+            if resumed:
+                self._objects.restore(boot)
+        if self._objects:
+            self._objects.restart(boot)
+
+    def _resume(self, boot: int) -> bool:
+        """Resume the map and the zones of an earlier process of this run of the driver.
+
+        Return whether there is one to go on with.
+        """
         kept = self._zones.restore(boot)
         if kept and kept.maps_loaded:  # another map than that of the settings
             self._use(replace(self._config, map=kept.map, mapping=kept.mapping), loaded=False)
@@ -180,6 +206,7 @@ class Mapper:
         found = self._config.mapping == "localize" and kept and kept.map == self._zones.map
         if kept and (self._mapped or found):
             self._zones.resume(kept)
+        return self._mapped or bool(found)
 
     def _resume_map(self, autosave: Autosave, boot: int) -> None:
         """Resume the newest intact map that was saved during this run of the driver, if any."""
@@ -200,15 +227,23 @@ class Mapper:
             log.info("resumed the map of tick %d", head.tick, extra={"data": data})
             return
 
-    def _process(self, scan: LaserScan, moment: OdometrySample) -> None:
+    def _process(self, scan: LaserScan, world: WorldModel, moment: OdometrySample) -> None:
         body = self._bodies.current
         if body is None or body.description.lidar is None:
             return
         began = time.perf_counter()
         view = view_of(body.description.lidar, scan, self._config.ignore_below)
         before = self._last
-        place = self._chart.step(view, *self._motion(moment))
+        motion = self._motion(moment)
+        self._suggest(moment)
+        place = self._chart.step(view, *motion)
         self._mapped = True
+        if self._objects:
+            points = view.scan.points.astype(np.float64)
+            seen = Surroundings(body.description, world, points, self._chart.keyframes()[1])
+            self._objects.at_scan(seen, place, moment)
+            if self._published:
+                self._objects.publish(scan.basis)
         if self._autosave and before:
             self._autosave_map(self._autosave, before)
         self._bus.publish(POSE, message_of(place), basis=scan.basis)
@@ -230,6 +265,15 @@ class Mapper:
         if last.jumps != moment.jumps:
             self._chart.lose("the odometry has jumped")
         return moment.fused if blank else step, noise
+
+    def _suggest(self, moment: OdometrySample) -> None:
+        """Tell the map where the robot is by a tag in the newest picture, or by a person."""
+        seen = self._objects and self._objects.hint()
+        if seen:
+            self._hints.add(*seen)
+        hint = self._hints.at(moment)
+        if hint:
+            self._chart.suggest(hint)
 
     def _autosave_map(self, autosave: Autosave, before: OdometrySample) -> None:
         """Save the map as it was at the scan `before`, when a save is due.
@@ -268,6 +312,7 @@ class Mapper:
         if self._autosave and self._autosave.problem:
             problems = (*problems, self._autosave.problem)
         problems = (*problems, *self._zones.problems())
+        problems = (*problems, *(self._objects.problems() if self._objects else ()))
         for problem in problems:
             if problem.code not in {one.code for one in known}:
                 log.warning("%s", problem.text, extra={"data": {"event": problem.code}})
@@ -303,6 +348,8 @@ class Mapper:
             log.warning("map for %s: %s", request.source, error, extra={"data": {"event": "map"}})
             return MapReply(ok=False, text=str(error)[:500])
         self._zones.saved_as(request.name)
+        if self._objects:
+            self._objects.saved_as(request.name)
         log.info("map by %s: %s", request.source, text, extra={"data": {"event": "map"}})
         return MapReply(ok=True, text=text[:500])
 
@@ -314,7 +361,10 @@ class Mapper:
         saved, graph = await asyncio.to_thread(self._chart.still().to_save)
         if self._bus.input_log.live:
             zones = zone_file.encoded(self._zones.present)
-            await asyncio.to_thread(map_file.save, path, saved, graph, replace=replace, zones=zones)
+            objects = object_file.encoded(self._objects.present) if self._objects else b""
+            await asyncio.to_thread(
+                map_file.save, path, saved, graph, replace=replace, zones=zones, objects=objects
+            )
         return f"saved {path}: {map_file.in_words(saved)}"
 
     async def _list(self, _request: MapListRequest) -> MapListReply:
@@ -355,6 +405,9 @@ class Mapper:
         self._config, self._chart, self._blank = config, chart, False
         self._autosave, self._published = self._autosave_of(config), None
         self._zones.use_map(config.map, config.mapping, zones, loaded=loaded)
+        self._hints.clear()
+        if self._objects:
+            self._objects.use_map(config.map, config.mapping)
 
     def _report(self) -> dict[str, float | int | str | None]:
         times = {f"map_ms_p{p}": self._took_ms.percentile(p / 100) for p in (50, 99)}

@@ -110,10 +110,12 @@ class WorldPublisher:
             self.cameras.close()
             self.cameras = None
 
-    def publish(self, world: WorldModel, pose: Pose | None, basis: int) -> None:
+    def publish(self, world: WorldModel, pose: Pose | None, basis: int) -> WorldModel:
         """Publish the world of a scan, taken where the body was at `pose` in the odometry."""
         world = replace(world, tick=self._bus.time.tick, basis=basis)
-        self._newest = self._publish(world, pose), pose
+        world = self._publish(world, pose)
+        self._newest = world, pose
+        return world
 
     def _publish(self, world: WorldModel, pose: Pose | None) -> WorldModel:
         if self.cameras:
@@ -223,9 +225,9 @@ def _follow_odometry(
         if body:
             world = step(config, body.description, scan)
             world = tracker.add_obstacles(world, body.description.lidar, scan, pose)
-            worlds.publish(world, pose, scan.basis)
+            world = worlds.publish(world, pose, scan.basis)
             if mapper:
-                mapper.process_scan(scan, world.scan_problem)
+                mapper.process_scan(scan, world)
 
     def on_state(state: RobotState) -> None:
         nonlocal mapper

@@ -1,0 +1,406 @@
+"""Keeper of the memory of things and tags: takes detections, publishes, saves and forgets.
+
+Only a body with cameras has one. Pictures are placed at the next scan, by the odometry of their
+exposure, so that the work a scan takes is bounded.
+"""
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import TICK_NS, TICK_S, Cause, Count, Finite, Name
+from gigabrain_schemas.objects import (
+    Detections,
+    MapObject,
+    MapTag,
+    ObjectMap,
+    ObjectsReply,
+    ObjectsRequest,
+)
+from gigabrain_schemas.topics import DETECTIONS, OBJECT_MAP, OBJECTS_CHANGE
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.input_log import log_accepted
+from gigabrain_zenoh.codec import DECODE_ERRORS
+from gigabrain_zenoh.config.settings import MappingMode
+from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.geometry.se2 import between, compose
+from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file
+from gigabrain_zenoh.host.threads import BackgroundWriter
+from gigabrain_zenoh.logs import Fault
+from gigabrain_zenoh.mapping import map_file, object_file
+from gigabrain_zenoh.mapping.localizer import Place
+from gigabrain_zenoh.mapping.object_file import ObjectFile
+from gigabrain_zenoh.mapping.odometry import OdometryFusion, OdometrySample
+from gigabrain_zenoh.mapping.pose_hint import PoseHint
+from gigabrain_zenoh.perception.object_memory import Anchor, Glance, ObjectMemory
+from gigabrain_zenoh.perception.surroundings import Surroundings
+from gigabrain_zenoh.perception.tag_memory import TagMemory
+
+log = logging.getLogger(__name__)
+
+WAITING = 4  # pictures that wait for the next scan; of a flood the newest count
+FUTURE_TICKS = 50  # that a picture may be ahead of the odometry
+CHANGED_TICKS = round(0.6e9 / TICK_NS)  # shortest interval between changed object maps,
+AGAIN_TICKS = round(2e9 / TICK_NS)  # and longest one between unchanged ones
+DOUBT_TICKS = round(2e9 / TICK_NS)  # between copies, to go back to when the robot is lost
+SAVED_TICKS = round(5e9 / TICK_NS)  # shortest interval between writes
+RECOGNIZING_TICKS = round(3e9 / TICK_NS)  # since the last detections
+STEADY_RAD_S, RATE_TICKS = 0.8, 5  # turning faster blurs pictures; ticks to measure it over
+SHIFT_M = 0.01  # of an object, less is not published at once
+STATE_FILE, MAX_STATE_BYTES = "objects.json", 400_000
+
+
+class KeptAnchor(Struct, frozen=True):
+    """The keyframe that an object moves with, and its pose then."""
+
+    keyframe: Count
+    x: Finite
+    y: Finite
+    yaw: Finite
+
+
+class KeptObject(Struct, frozen=True):
+    """An object, and its anchor in a growing map."""
+
+    object: MapObject
+    anchor: KeptAnchor | None = None
+
+
+class KeptTag(Struct, frozen=True):
+    """A tag, and its anchor in a growing map."""
+
+    tag: MapTag
+    anchor: KeptAnchor | None = None
+
+
+class ObjectState(Struct, frozen=True, kw_only=True):
+    """What the next perception process needs."""
+
+    boot: Count  # start of the driver for which it counts
+    map: Name = ""
+    objects: tuple[KeptObject, ...] = ()
+    tags: tuple[KeptTag, ...] = ()
+
+
+Write = tuple[ObjectState, Path | None, ObjectFile]  # and where the latter is written, if at all
+Copy = tuple[list[tuple[MapObject, Anchor | None]], list[tuple[MapTag, Anchor | None]]]
+
+
+class ObjectKeeper:
+    """Publisher of `robot/objects`, and server of `robot/objects_change`."""
+
+    def __init__(self, bus: Bus, state_dir: str, fusion: Callable[[], OdometryFusion]) -> None:
+        self._bus, self._fusion = bus, fusion
+        self._state_path = Path(state_dir) / STATE_FILE if state_dir else None
+        self.memory, self.tags = ObjectMemory(), TagMemory()
+        self._waiting: deque[Detections] = deque(maxlen=WAITING)
+        self._boot = self._tick = 0
+        self._seen_tick: int | None = None  # of the last detections
+        self._now = ObjectMap()  # as published
+        self._sent_tick: int | None = None
+        self._taken: dict[str, int] = {}  # tick of the newest picture, by camera
+        self._copies: deque[Copy] = deque(maxlen=2)  # the older one is 2 to 4 s old
+        self._copied_tick = 0
+        self._map = ""  # in use
+        self._file: Path | None = None  # where its objects are written
+        self._saved = ObjectMap()  # as written last
+        self._saved_tick = 0
+        self._fault, self.problem = Fault(log), ""
+        self._writer: BackgroundWriter[Write] = BackgroundWriter(self._write, 1)
+        bus.subscribe(DETECTIONS, self._receive)
+        bus.serve(OBJECTS_CHANGE, self._change)
+
+    def use_map(self, name: str, mapping: MappingMode) -> None:
+        """Use the objects of a map from now on. A file that cannot be read is left as it is."""
+        self.memory.clear()
+        self.tags.clear()
+        self._copies.clear()
+        path = map_file.path_of(name) if name else None
+        self._map = name if len(name) <= 64 and "/" not in name else Path(name).stem[:64]
+        # a growing map is not the one in the file any more
+        self._file = path if mapping == "localize" else None
+        self._fault.end("the objects of another map are used")
+        self.problem, self._sent_tick = "", None
+        try:
+            found = object_file.load(path) if path else ObjectFile()
+        except ConfigError as error:
+            self._file = None
+            self._fail(f"the map's objects are not used: {error}")
+            return
+        self.memory.restore([(one, None) for one in found.objects])
+        self.tags.restore([(one, None) for one in found.tags])
+
+    def saved_as(self, name: str) -> None:
+        """Name the map that was saved with these objects."""
+        self._map, self._sent_tick = name, None
+
+    def restore(self, boot: int) -> None:
+        """Go on with what an earlier process kept in this start of the driver, in the same map."""
+        if self._state_path is None or not self._bus.input_log.live:
+            return
+        try:
+            data = read_bounded(self._state_path, MAX_STATE_BYTES)
+            found = msgspec.json.decode(data, type=ObjectState)
+        except FileNotFoundError:
+            return
+        except (OSError, ConfigError, *DECODE_ERRORS) as error:
+            log.warning("%s: %s", self._state_path, error, extra={"data": {"event": "objects"}})
+            return
+        if found.boot == boot and found.map == self._map:
+            self.memory.restore([(one.object, _anchor(one.anchor)) for one in found.objects])
+            self.tags.restore([(one.tag, _anchor(one.anchor)) for one in found.tags])
+
+    def restart(self, boot: int) -> None:
+        """Begin with another start of the driver: ticks and odometry begin again."""
+        self._boot, self._tick = boot, 0
+        self._waiting.clear()
+        self._seen_tick = self._sent_tick = None
+        self._saved_tick = self._copied_tick = 0
+        self._taken.clear()
+        if self._copies:
+            self._doubt()
+        self.memory.restart()
+        self.tags.restart()
+
+    def hint(self) -> tuple[PoseHint, OdometrySample] | None:
+        """Return where the robot was by the tags in a picture that waits, and its odometry then."""
+        for picture in reversed(self._waiting):
+            sample = self._fusion().at(picture.basis)
+            found = self.tags.hint(picture.tags) if sample else None
+            if sample and found:
+                return found, sample
+        return None
+
+    def at_scan(self, seen: Surroundings, place: Place, moment: OdometrySample) -> None:
+        """Take the pictures that wait; the robot was at `place` at the scan of `moment`."""
+        self._tick = moment.tick
+        if not place.localized:
+            self._doubt()
+        self._follow(seen.keyframes)
+        for picture in self._ready():
+            self._take(picture, seen, place, moment)
+        self._follow(seen.keyframes)
+        if place.localized and not 0 <= moment.tick - self._copied_tick < DOUBT_TICKS:
+            self._copied_tick = moment.tick
+            self._copies.append((self.memory.anchored(), self.tags.anchored()))
+
+    def publish(self, tick: int) -> None:
+        """Publish the objects if they are due at this tick, and keep them."""
+        since = AGAIN_TICKS if self._sent_tick is None else tick - self._sent_tick
+        if 0 <= since < CHANGED_TICKS:
+            return
+        seen = self._seen_tick
+        now = ObjectMap(
+            objects=self.memory.objects()[: object_file.MOST],
+            tags=self.tags.tags()[: object_file.MOST],
+            map=self._map,
+            recognizing=seen is not None and 0 <= tick - seen <= RECOGNIZING_TICKS,
+        )
+        if 0 <= since < AGAIN_TICKS and _alike(now, self._now):
+            return
+        self._now = self._bus.publish(OBJECT_MAP, now, basis=tick)
+        self._sent_tick = tick
+        self._keep(tick)
+
+    @property
+    def present(self) -> ObjectFile:
+        """What stays, in the map as it is now."""
+        return ObjectFile(
+            objects=tuple(one for one, _ in self.memory.anchored())[: object_file.MOST],
+            tags=self.tags.tags()[: object_file.MOST],
+        )
+
+    def problems(self) -> tuple[Cause, ...]:
+        """Return why objects are not kept, if they are not."""
+        if not self.problem:
+            return ()
+        remedy = "remove the damaged file, or make room on the disk, and load the map again"
+        return (Cause(code="objects_unsaved", text=self.problem[:500], remedy=remedy),)
+
+    async def finish_writing(self) -> None:
+        """Return once all is written."""
+        if self._tick:
+            self._keep(self._tick + SAVED_TICKS)
+        await self._writer.close()
+
+    def _receive(self, _key: str, picture: Detections) -> None:
+        if self._boot and picture.boot == self._boot:
+            if len(self._waiting) == WAITING:
+                self._bus.counters["detections_left_out"] += 1
+            self._waiting.append(picture)
+
+    def _ready(self) -> list[Detections]:
+        """Take the pictures whose odometry is known; drop those that can never be placed."""
+        newest = self._fusion().newest
+        ready, later = [], []
+        for one in self._waiting:
+            if newest and one.basis <= newest.tick:
+                ready.append(one)
+            elif newest and one.basis <= newest.tick + FUTURE_TICKS:
+                later.append(one)
+            else:
+                self._bus.counters["detections_left_out"] += 1
+        self._waiting.clear()
+        self._waiting.extend(later)
+        return ready
+
+    def _take(
+        self, picture: Detections, seen: Surroundings, place: Place, moment: OdometrySample
+    ) -> None:
+        camera, sample = seen.camera(picture.camera), self._fusion().at(picture.basis)
+        again = picture.basis <= self._taken.get(picture.camera, -1)
+        if camera is None or sample is None or again or sample.jumps != moment.jumps:
+            self._bus.counters["detections_left_out"] += 1
+            return
+        self._taken[camera.name] = self._seen_tick = picture.basis
+        if not place.localized:
+            return
+        motion = between(moment.fused, sample.fused)
+        glance = Glance(
+            detections=picture,
+            camera=camera,
+            pose=compose(place.pose, motion),
+            spread=place.covariance,
+            hits=_moved(seen.hiding(camera.z), motion),
+            time_s=picture.basis * TICK_S,
+            unix_ns=picture.stamp_ns,
+            steady=self._steady(sample),
+        )
+        self.memory.look(glance)
+        self.tags.look(glance)
+
+    def _doubt(self) -> None:
+        """Go back to what was known some seconds ago: since then the robot may have been lost."""
+        self.tags.doubt()
+        if self._copies:
+            objects, tags = self._copies[0]
+            self.memory.restore(objects)
+            self.tags.restore(tags)
+            self._copies.clear()
+
+    def _steady(self, sample: OdometrySample) -> bool:
+        """Return whether the body turned slowly enough for sharp pictures."""
+        before = self._fusion().at(sample.tick - RATE_TICKS)
+        if before is None:
+            return True
+        turn = abs(float(between(before.fused, sample.fused)[2]))
+        return turn <= STEADY_RAD_S * RATE_TICKS * TICK_S
+
+    def _follow(self, keyframes: Floats) -> None:
+        self.memory.follow(keyframes)
+        self.tags.follow(keyframes)
+
+    async def _change(self, request: ObjectsRequest) -> ObjectsReply:
+        try:
+            text = self._forget(request)
+        except Refused as error:
+            return ObjectsReply(ok=False, text=str(error)[:500])
+        log_accepted(self._bus, OBJECTS_CHANGE.key, request, self._tick)
+        self._sent_tick = None
+        if self._tick:
+            self.publish(self._tick)
+        log.info("%s, by %s", text, request.source, extra={"data": {"event": "objects"}})
+        return ObjectsReply(ok=True, text=text[:500])
+
+    def _forget(self, request: ObjectsRequest) -> str:
+        """Forget what is asked for; return it as text. Raises Refused if it is not known."""
+        known = self.present
+        if request.everything:
+            self.memory.clear()
+            self.tags.clear()
+            return f"forgot {len(known.objects)} objects and {len(known.tags)} tags"
+        ids = {one.id for one in self.memory.objects()}
+        tags = {one.id for one in known.tags}
+        missing = [f"object {one}" for one in request.ids if one not in ids]
+        missing += [f"tag {one}" for one in request.tags if one not in tags]
+        if missing:
+            raise Refused(f"no {', no '.join(missing)}; `gigabrain objects` lists what is known")
+        self.memory.forget(request.ids)
+        self.tags.forget(request.tags)
+        names = [f"object {one}" for one in request.ids] + [f"tag {one}" for one in request.tags]
+        return f"forgot {', '.join(names)}"
+
+    def _keep(self, tick: int) -> None:
+        """Write what the next process needs, and the map's file in a saved map."""
+        if not self._bus.input_log.live or 0 <= tick - self._saved_tick < SAVED_TICKS:
+            return
+        found = self.present
+        now = ObjectMap(objects=found.objects, tags=found.tags, map=self._map)
+        if _alike(now, self._saved) or (self._state_path is None and self._file is None):
+            return
+        self._saved, self._saved_tick = now, tick
+        state = ObjectState(
+            boot=self._boot,
+            map=self._map,
+            objects=tuple(KeptObject(one, _kept(at)) for one, at in self.memory.anchored()),
+            tags=tuple(KeptTag(one, _kept(at)) for one, at in self.tags.anchored()),
+        )
+        written = self._writer.put((state, self._file, found))
+        written.add_done_callback(self._on_written)
+
+    def _write(self, newest: Sequence[Write]) -> str:
+        (state, beside, found), path = newest[-1], self._state_path
+        try:
+            if path:
+                make_folder(path.parent)
+                replace_file(path, msgspec.json.encode(state))
+            if beside:
+                object_file.save(beside, found)
+        except OSError as error:
+            return f"objects are not saved: {error.filename or path}: {error.strerror}"
+        except Refused as error:
+            return f"objects are {error}"
+        return ""
+
+    def _on_written(self, done: "asyncio.Future[str]") -> None:
+        if problem := done.result():
+            self._fail(problem)
+        elif self.problem.startswith("objects are"):
+            self.problem = ""
+            self._fault.end("objects are saved again")
+
+    def _fail(self, problem: str) -> None:
+        self.problem = problem
+        self._fault.begin(problem)
+
+
+def _moved(hits: Floats, motion: Floats) -> Floats:
+    """Return points (n, 2) of one body frame in that of the body after `motion`."""
+    cos, sin = np.cos(motion[2]), np.sin(motion[2])
+    off = hits - motion[:2]
+    return np.column_stack((off @ (cos, sin), off @ (-sin, cos)))
+
+
+def _alike(one: ObjectMap, other: ObjectMap) -> bool:
+    """Return whether two maps differ by no more than small shifts."""
+    if one.map != other.map or one.recognizing != other.recognizing:
+        return False
+    if [(it.id, it.label) for it in one.objects] != [(it.id, it.label) for it in other.objects]:
+        return False
+    if [it.id for it in one.tags] != [it.id for it in other.tags]:
+        return False
+    return bool((np.abs(_places(one) - _places(other)) < SHIFT_M).all())
+
+
+def _places(found: ObjectMap) -> Floats:
+    """Return where everything is, (n, 2) [m]."""
+    objects = [(one.x, one.y) for one in found.objects]
+    return np.array(objects + [(one.x, one.y) for one in found.tags]).reshape(-1, 2)
+
+
+def _anchor(kept: KeptAnchor | None) -> Anchor | None:
+    return Anchor(kept.keyframe, np.array((kept.x, kept.y, kept.yaw))) if kept else None
+
+
+def _kept(anchor: Anchor | None) -> KeptAnchor | None:
+    if anchor is None:
+        return None
+    x, y, yaw = anchor.pose.tolist()
+    return KeptAnchor(anchor.keyframe, x, y, yaw)

@@ -1,0 +1,342 @@
+"""Memory of things: what was recognised in pictures, tracked into what stands where in the map.
+
+A sighting is noisy by its distance and by the robot's own pose. Existence is log-odds: sightings
+raise it, and pictures lower it in which a thing should be seen and is not. What is behind the
+robot, far off, or hidden stays. What moves by itself is forgotten after seconds.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.body import Camera
+from gigabrain_schemas.objects import Box, Detections, MapObject
+from gigabrain_zenoh.geometry.se2 import compose, inverse, transform
+from gigabrain_zenoh.perception.camera_view import CameraView
+
+MOVERS = frozenset(("person", "robot", "dog", "cat", "bird"))
+MOVERS_STAY_S = 3.0
+FARTHEST_M, HIGHEST_M = 8.0, 3.0  # what claims to stand beyond is not believed
+NOISE_M, NOISE_PER_M = 0.03, 0.01  # standard deviation of a position, and of that per metre off
+LEAST_GAIN = 0.06  # of a sighting: what was moved a little is followed
+GATE_M, GATE_SIGMAS, MOVER_GATE_M = 0.25, 3.0, 1.0  # how far off the same thing may be seen
+GATE_HEIGHT_M = 0.4
+OTHER_GATE_M = 0.15  # the same for another class: a thing is taken for a can, then for a cylinder
+SEEN_ODDS, CONFIDENT_ODDS, MISSED_ODDS, MOST_ODDS = 0.4, 0.8, 0.6, 4.0
+BEGIN_ODDS = -0.8
+SURE_SEEN, SURE_ODDS = 3, 1.0  # pictures and log-odds, from which on a thing counts
+GLIMPSE_S = 1.0  # after which one that does not count is forgotten
+NEAR_M = 2.5  # within which a thing that should be seen is seen
+BEFORE_M = 0.15  # what is so much nearer may hide a thing
+TOGETHER_M = 0.08  # nearer things of one class are one
+MAX_TRACKS, MAX_LABELS = 256, 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class Glance:
+    """One picture, with all that is needed to place what it shows."""
+
+    detections: Detections
+    camera: Camera
+    pose: Floats  # (3,) of the body in the map at the exposure
+    spread: Floats  # (3, 3), covariance of the pose, in the map's axes
+    hits: Floats  # (n, 2) [m] of a scan of about then, in the body's frame: they hide things
+    time_s: float  # of the robot
+    unix_ns: int
+    steady: bool = True  # the body turned slowly: what should be seen is seen
+
+
+class Sighting(NamedTuple):
+    """A thing in a picture, placed in the map."""
+
+    label: str
+    confidence: float
+    position: Floats  # (3,) [m]
+    variance: float  # [m2], of x and y each
+    size: tuple[float, float] | None
+    box: Box
+    distance: float  # [m], from the camera
+
+
+@dataclass
+class Anchor:
+    """The keyframe that a thing moves with."""
+
+    keyframe: int
+    pose: Floats  # (3,), of the keyframe when the thing was placed last
+
+
+@dataclass
+class ObjectTrack:
+    """A thing that is followed from picture to picture."""
+
+    id: int
+    position: Floats  # (3,) [m] in the map
+    variance: float  # [m2]
+    size: tuple[float, float]  # [m]
+    odds: float  # log-odds of its existence
+    seen: int
+    last_s: float  # by the robot's time
+    last_ns: int
+    votes: dict[str, float] = field(default_factory=dict)  # confidence by class
+    anchor: Anchor | None = None
+
+    @property
+    def label(self) -> str:
+        """Its likeliest class."""
+        return max(self.votes, key=self.votes.__getitem__)
+
+    @property
+    def moves(self) -> bool:
+        """Whether it moves by itself."""
+        return self.label in MOVERS
+
+    @property
+    def sure(self) -> bool:
+        """Whether it counts."""
+        return self.seen >= SURE_SEEN and self.odds >= SURE_ODDS
+
+    def message(self) -> MapObject:
+        """Return it as it is published and saved."""
+        x, y, z = (round(value, 3) for value in self.position.tolist())
+        width, height = self.size
+        return MapObject(
+            id=self.id, label=self.label, x=x, y=y, z=z,
+            size=(round(width, 3), round(height, 3)),
+            confidence=round(1 / (1 + math.exp(-self.odds)), 3),
+            seen=self.seen, last_seen_ns=self.last_ns,
+        )  # fmt: skip
+
+
+class ObjectMemory:
+    """All things that are followed."""
+
+    def __init__(self) -> None:
+        self._tracks: list[ObjectTrack] = []
+        self._next_id = 1
+
+    def look(self, glance: Glance) -> None:
+        """Take what one picture shows."""
+        self._expire(glance.time_s)
+        sightings = _placed(glance)
+        pairs = _matched(sightings, self._tracks)
+        for sighting, track in pairs:
+            _update(track, sighting, glance)
+        matched = {id(track) for _, track in pairs}
+        self._miss([one for one in self._tracks if id(one) not in matched], sightings, glance)
+        taken = {id(sighting) for sighting, _ in pairs}
+        for sighting in sightings:
+            if id(sighting) not in taken:
+                self._begin(sighting, glance)
+        self._join()
+
+    def objects(self) -> tuple[MapObject, ...]:
+        """Return the things that count, the oldest first."""
+        return tuple(one.message() for one in self._tracks if one.sure)
+
+    def anchored(self) -> list[tuple[MapObject, Anchor | None]]:
+        """Return the things that count and stay, each with its anchor."""
+        return [(one.message(), one.anchor) for one in self._tracks if one.sure and not one.moves]
+
+    def restore(self, found: Sequence[tuple[MapObject, Anchor | None]]) -> None:
+        """Follow these things instead of all others."""
+        self._tracks = [_restored(one, anchor) for one, anchor in found[:MAX_TRACKS]]
+        self._next_id = max((one.id for one in self._tracks), default=0) % 2**62 + 1
+
+    def restart(self) -> None:
+        """Forget what moves, and what does not count yet: the robot's time begins again."""
+        self._tracks = [one for one in self._tracks if one.sure and not one.moves]
+        for one in self._tracks:
+            one.last_s = -math.inf
+
+    def forget(self, ids: Sequence[int]) -> list[int]:
+        """Forget things by their ids; return those that were there."""
+        wanted = set(ids)
+        there = [one.id for one in self._tracks if one.id in wanted]
+        self._tracks = [one for one in self._tracks if one.id not in wanted]
+        return there
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._tracks = []
+
+    def follow(self, poses: Floats) -> None:
+        """Move things with the keyframes (n, 3) that they are fixed to."""
+        for one in self._tracks:
+            one.position, one.anchor = carried(one.position, one.anchor, poses)
+
+    def _expire(self, now_s: float) -> None:
+        self._tracks = [
+            one
+            for one in self._tracks
+            if now_s - one.last_s <= (MOVERS_STAY_S if one.sure else GLIMPSE_S)
+            or (one.sure and not one.moves)
+        ]
+
+    def _begin(self, sighting: Sighting, glance: Glance) -> None:
+        if len(self._tracks) >= MAX_TRACKS:
+            weakest = min(range(len(self._tracks)), key=lambda k: self._tracks[k].odds)
+            if self._tracks[weakest].sure:
+                return
+            del self._tracks[weakest]
+        self._tracks.append(
+            ObjectTrack(
+                id=self._next_id,
+                position=sighting.position,
+                variance=sighting.variance,
+                size=sighting.size or (0.1, 0.1),
+                odds=BEGIN_ODDS + CONFIDENT_ODDS * sighting.confidence,
+                seen=1,
+                last_s=glance.time_s,
+                last_ns=glance.unix_ns,
+                votes={sighting.label: max(sighting.confidence, 1e-3)},
+            )
+        )
+        self._next_id += 1
+
+    def _miss(self, unseen: list[ObjectTrack], sightings: list[Sighting], glance: Glance) -> None:
+        """Lower the odds of things that this picture should show and does not."""
+        still = [one for one in unseen if one.sure and not one.moves]
+        if not still or not glance.steady:
+            return
+        view = CameraView(glance.camera)
+        here = inverse(glance.pose)
+        gone = set()
+        for one in still:
+            x, y = transform(here, one.position[None, :2])[0].tolist()
+            spot = view.spot(np.array((x, y, float(one.position[2]))), max(one.size), NEAR_M)
+            if spot is None or view.hidden(glance.hits, (x, y), max(one.size) / 2 + BEFORE_M):
+                continue
+            if any(_before(other, spot.pixel, spot.depth) for other in sightings):
+                continue
+            one.odds -= MISSED_ODDS
+            if one.odds < 0.0:
+                gone.add(id(one))
+        self._tracks = [one for one in self._tracks if id(one) not in gone]
+
+    def _join(self) -> None:
+        """Join things of one class that have come to lie on each other; the older one stays."""
+        if len(self._tracks) < 2:
+            return
+        places = np.array([one.position for one in self._tracks])
+        near = np.hypot(*(places[:, None, :2] - places[None, :, :2]).transpose(2, 0, 1))
+        first, second = np.nonzero(np.triu(near < TOGETHER_M, k=1))
+        gone = set()
+        for i, j in zip(first.tolist(), second.tolist(), strict=True):
+            one, other = self._tracks[i], self._tracks[j]
+            if one.label == other.label and abs(one.position[2] - other.position[2]) < TOGETHER_M:
+                gone.add(id(other))
+        self._tracks = [one for one in self._tracks if id(one) not in gone]
+
+
+def _placed(glance: Glance) -> list[Sighting]:
+    """Return what can be placed in the map; what is too far off to be true is left out."""
+    found = []
+    pose_variance = float(glance.spread[0, 0] + glance.spread[1, 1]) / 2
+    for one in glance.detections.things:
+        if one.position is None:
+            continue
+        x, y, z = one.position
+        distance = math.hypot(x - glance.camera.x, y - glance.camera.y)
+        if distance > FARTHEST_M or not -1.0 <= z <= HIGHEST_M:
+            continue
+        own = (NOISE_M + NOISE_PER_M * distance) ** 2
+        variance = own + pose_variance + float(glance.spread[2, 2]) * distance**2
+        at_x, at_y = transform(glance.pose, np.array(((x, y),)))[0].tolist()
+        place = np.array((at_x, at_y, z))
+        size = None if one.size is None else (min(one.size[0], 5.0), min(one.size[1], 5.0))
+        found.append(Sighting(one.label, one.confidence, place, variance, size, one.box, distance))
+    return found
+
+
+def _matched(
+    sightings: list[Sighting], tracks: list[ObjectTrack]
+) -> list[tuple[Sighting, ObjectTrack]]:
+    """Return pairs of what is the same thing, the nearest first; none is in two pairs."""
+    if not sightings or not tracks:
+        return []
+    seen = np.array([one.position for one in sightings])
+    known = np.array([one.position for one in tracks])
+    off = np.hypot(*(seen[:, None, :2] - known[None, :, :2]).transpose(2, 0, 1))
+    variance = np.add.outer([one.variance for one in sightings], [one.variance for one in tracks])
+    gates = np.maximum(GATE_M, GATE_SIGMAS * np.sqrt(variance)).clip(max=MOVER_GATE_M)
+    gates[:, [one.moves for one in tracks]] = MOVER_GATE_M
+    labels = np.array([one.label for one in tracks])
+    same = np.array([one.label for one in sightings])[:, None] == labels[None, :]
+    gates = np.where(same, gates, OTHER_GATE_M)
+    level = np.abs(seen[:, None, 2] - known[None, :, 2]) < GATE_HEIGHT_M
+    cost = np.where(same, off, off + GATE_M)
+    rows, columns = np.nonzero((off < gates) & level)
+    pairs, taken_rows, taken_columns = [], set(), set()
+    for k in np.argsort(cost[rows, columns], kind="stable").tolist():
+        row, column = int(rows[k]), int(columns[k])
+        if row not in taken_rows and column not in taken_columns:
+            taken_rows.add(row)
+            taken_columns.add(column)
+            pairs.append((sightings[row], tracks[column]))
+    return pairs
+
+
+def _update(track: ObjectTrack, sighting: Sighting, glance: Glance) -> None:
+    gain = max(track.variance / (track.variance + sighting.variance), LEAST_GAIN)
+    gain = 0.6 if track.moves else gain
+    track.position = track.position + gain * (sighting.position - track.position)
+    track.variance = gain * sighting.variance
+    if sighting.size:
+        old, new = track.size, sighting.size
+        track.size = old[0] + gain * (new[0] - old[0]), old[1] + gain * (new[1] - old[1])
+    track.odds = min(track.odds + SEEN_ODDS + CONFIDENT_ODDS * sighting.confidence, MOST_ODDS)
+    track.seen, track.last_s, track.last_ns = track.seen + 1, glance.time_s, glance.unix_ns
+    track.anchor = None  # it is fixed anew, to what is mapped round it now
+    votes = track.votes
+    votes[sighting.label] = votes.get(sighting.label, 0.0) + sighting.confidence
+    if len(votes) > MAX_LABELS:
+        del votes[min(votes, key=votes.__getitem__)]
+
+
+def _before(other: Sighting, pixel: tuple[float, float], depth: float) -> bool:
+    """Return whether a thing of this picture lies before that pixel."""
+    left, top, right, bottom = other.box
+    inside = left <= pixel[0] <= right and top <= pixel[1] <= bottom
+    return inside and other.distance < depth - BEFORE_M / 2
+
+
+def _restored(one: MapObject, anchor: Anchor | None) -> ObjectTrack:
+    sure = min(max(one.confidence, 0.73), 0.982)
+    return ObjectTrack(
+        id=one.id,
+        position=np.array((one.x, one.y, one.z)),
+        variance=NOISE_M**2,
+        size=one.size,
+        odds=math.log(sure / (1 - sure)) + 0.01,
+        seen=max(one.seen, SURE_SEEN),
+        last_s=-math.inf,
+        last_ns=one.last_seen_ns,
+        votes={one.label: 1.0},
+        anchor=anchor,
+    )
+
+
+def carried(position: Floats, anchor: Anchor | None, poses: Floats) -> tuple[Floats, Anchor | None]:
+    """Return a position (3 or 4: x, y, z and maybe yaw) where its keyframe has moved to.
+
+    Without an anchor it stays, and is fixed to the nearest keyframe.
+    """
+    if not len(poses):
+        return position, anchor
+    if anchor is None or anchor.keyframe >= len(poses):
+        nearest = int(np.hypot(*(poses[:, :2] - position[:2]).T).argmin())
+        return position, Anchor(nearest, poses[nearest].copy())
+    now = poses[anchor.keyframe]
+    if np.array_equal(now, anchor.pose):
+        return position, anchor
+    moved = compose(now, inverse(anchor.pose))
+    there = position.copy()
+    there[:2] = transform(moved, position[None, :2])[0]
+    if len(position) > 3:
+        there[3] = math.remainder(float(position[3] + moved[2]), math.tau)
+    return there, Anchor(anchor.keyframe, now.copy())

@@ -1,0 +1,70 @@
+"""Hints where the robot is: from a person, who asks on `robot/pose_set`, and from tags."""
+
+import logging
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from gigabrain_schemas.base import TICK_NS
+from gigabrain_schemas.requests import PoseReply, PoseRequest
+from gigabrain_schemas.topics import POSE_SET
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.input_log import log_accepted
+from gigabrain_zenoh.geometry.se2 import between, compose
+from gigabrain_zenoh.mapping.odometry import OdometrySample
+from gigabrain_zenoh.mapping.pose_hint import PoseHint
+
+log = logging.getLogger(__name__)
+
+COUNTS_TICKS = round(2e9 / TICK_NS)  # for how long a hint counts while the robot is not found
+PERSON_M, PERSON_RAD = 0.3, 0.25  # deviation of what a person says
+SAID = "a person has said where it is"
+
+
+class PoseHints:
+    """The newest hint, carried on by odometry."""
+
+    def __init__(
+        self, bus: Bus, moment: Callable[[], OdometrySample | None], lose: Callable[[str], None]
+    ) -> None:
+        self._bus, self._moment, self._lose = bus, moment, lose
+        self._hint: PoseHint | None = None
+        self._sample: OdometrySample | None = None  # at which the hint counts
+        self._by_person = False
+        bus.serve(POSE_SET, self._set)
+
+    def clear(self) -> None:
+        """Forget the hint: odometry begins again."""
+        self._hint = None
+
+    def add(self, hint: PoseHint, sample: OdometrySample) -> None:
+        """Take a tag's hint for the place of `sample`, unless a person has just said another."""
+        if not (self._by_person and self.at(sample)):
+            self._hint, self._sample, self._by_person = hint, sample, False
+
+    def at(self, moment: OdometrySample) -> PoseHint | None:
+        """Return the hint as of `moment`; None if there is none, or it is too old."""
+        hint, sample = self._hint, self._sample
+        if hint is None or sample is None:
+            return None
+        if moment.tick - sample.tick > COUNTS_TICKS or moment.jumps != sample.jumps:
+            self._hint = None
+            return None
+        pose = compose(hint.pose, between(sample.fused, moment.fused))
+        return PoseHint(pose, hint.covariance)
+
+    async def _set(self, request: PoseRequest) -> PoseReply:
+        moment = self._moment()
+        if moment is None:
+            return PoseReply(ok=False, text="no map and no scan yet; try again in a moment")
+        log_accepted(self._bus, POSE_SET.key, request, moment.tick)
+        yaw = 0.0 if request.yaw is None else math.remainder(request.yaw, math.tau)
+        turn = math.pi / 2 if request.yaw is None else PERSON_RAD
+        spread = np.diag((PERSON_M, PERSON_M, turn)) ** 2
+        self._lose(SAID)
+        self._hint = PoseHint(np.array((request.x, request.y, yaw)), spread)
+        self._sample, self._by_person = moment, True
+        text = f"looking for the robot round ({request.x:.2f}, {request.y:.2f})"
+        log.info("%s, by %s", text, request.source, extra={"data": {"event": "pose"}})
+        return PoseReply(ok=True, text=text)
