@@ -23,7 +23,7 @@ from gigabrain_zenoh.mapping.likelihood_field import (
     is_self_similar,
 )
 from gigabrain_zenoh.mapping.occupancy_grid import CELL, LogOddsGrid
-from gigabrain_zenoh.mapping.pose_hint import PoseHint, explained
+from gigabrain_zenoh.mapping.pose_hint import PoseHint, better, explained, far_from
 
 LOST_SCORE, LOST_SCANS = 0.45, 5  # so bad a fit for so long: the robot is somewhere else
 SURE_SCORE, SURE_SCANS = 0.65, 3  # so good a fit for so long, and the only one: it is here
@@ -44,6 +44,8 @@ SPREAD = np.diag((0.1, 0.1, 0.05)) ** 2  # the covariance of a place that a sear
 NOWHERE = np.diag((1e3, 1e3, math.pi)) ** 2  # the covariance of what is not known
 
 ALIKE_SCORE = 0.1  # places of one hint that fit so much alike: the hint does not tell them apart
+ASKED_SCANS = 3  # between two looks of a localized robot at where a hint says that it is
+ELSEWHERE = "a tag says that it is elsewhere, and so does the scan"
 SEARCH_DEADLINE_SCANS = 8  # after which what a search has found is taken
 
 JUDGED_RADIUS_M = 5.0  # round the robot, beams that end farther off are not judged
@@ -293,9 +295,12 @@ class BackgroundLocalizer:
         self.last = last  # where it was before it was lost, by odometry: it may still be there
         self._lost = 0  # how often
         self._hint: PoseHint | None = None  # of the next scan
+        self._unasked = (
+            ASKED_SCANS  # scans since a localized robot has looked where a hint says it is
+        )
 
     def suggest(self, hint: PoseHint) -> None:
-        """Look for the robot near `hint`, a pose of the next scan, unless it is localized."""
+        """See RobotMap."""
         self._hint = hint
 
     def step(self, view: View, motion: Floats, noise: Floats) -> Place:
@@ -304,6 +309,9 @@ class BackgroundLocalizer:
         self.last = None if self.last is None else compose(self.last, motion)
         place = self._localizer.step(view, motion, noise)
         hint, self._hint = self._hint, None
+        if place.localized and hint and self._is_elsewhere(view, hint, place.pose):
+            self.lose(ELSEWHERE)
+            place = self._localizer.place
         if place.localized:
             self.last = place.pose
         elif hint:
@@ -312,6 +320,14 @@ class BackgroundLocalizer:
         if self._localizer.wants_search and self._background.idle:
             self._search(view)
         return place
+
+    def _is_elsewhere(self, view: View, hint: PoseHint, pose: Floats) -> bool:
+        """Return whether the scan fits where a hint says, and better than where the robot is."""
+        self._unasked += 1
+        if self._unasked < ASKED_SCANS or not far_from(hint, pose):
+            return False
+        self._unasked = 0
+        return bool(better(self._localizer.map, view.beams, hint, pose))
 
     def lose(self, why: str) -> None:
         """Search the whole map for the robot; discard the result of a running search."""

@@ -47,8 +47,8 @@ def load(map_path: Path) -> ObjectFile:
         return ObjectFile()
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
-    except (ConfigError, *DECODE_ERRORS) as error:
-        raise ConfigError(f"{path}: {error}") from None
+    except DECODE_ERRORS as error:
+        raise ConfigError(f"{path}: {str(error)[:200]}") from None
 
 
 def save(map_path: Path, found: ObjectFile) -> None:
@@ -58,7 +58,7 @@ def save(map_path: Path, found: ObjectFile) -> None:
         make_folder(path.parent)
         replace_file(path, encoded(found))
     except OSError as error:
-        raise Refused(f"not saved: {error.filename or path}: {error.strerror}") from None
+        raise Refused(f"{error.filename or path}: {error.strerror}") from None
 
 
 def encoded(found: ObjectFile) -> bytes:

@@ -26,6 +26,8 @@ UNKNOWN = 0.75  # likelihood of a hit that the map cannot judge, as in the globa
 TRIED, MOST_FOUND = 12, 4
 LEAST_SCORE, LEAST_SHOWN = 0.5, 0.2
 WEAK = np.diag((1.0, 1.0, 1.0))  # information that holds a fit at its sample
+FAR_SIGMAS = 4.0  # off the hint: the robot is not where it thinks to be, or the tag was moved
+SURE_SCORE, BETTER = 0.65, 0.15  # of a place that a localized robot leaves its own for
 OFF_COST = 0.02  # of the score, for one standard deviation off the hint
 
 
@@ -58,6 +60,22 @@ def explained(field: LikelihoodField, beams: Beams, hint: PoseHint) -> list[Cand
         if len(found) < MOST_FOUND and apart(one.pose, (other.pose for other in found)):
             found.append(one)
     return found
+
+
+def far_from(hint: PoseHint, pose: Floats) -> bool:
+    """Return whether the hint says that the robot is somewhere else."""
+    return _squared_deviation(hint, pose) > FAR_SIGMAS**2
+
+
+def better(field: LikelihoodField, beams: Beams, hint: PoseHint, pose: Floats) -> list[Candidate]:
+    """Return the poses within the hint that explain a scan, if they do so better than `pose`.
+
+    So a tag that was moved throws no robot off, whose scan fits where it thinks to be.
+    """
+    found = explained(field, beams, hint)
+    if not found or found[0].score < SURE_SCORE:
+        return []
+    return found if found[0].score > fit(field, beams, pose, WEAK).score + BETTER else []
 
 
 def _samples(hint: PoseHint) -> Floats:
@@ -108,6 +126,6 @@ def _squared_deviation(hint: PoseHint, pose: Floats) -> float:
     """Return how many standard deviations a fit is off the hint, squared."""
     off = pose - hint.pose
     off[2] = math.remainder(off[2], math.tau)
-    slack = np.diag((STEP_M, STEP_M, STEP_M / REACH_M)) ** 2
+    slack = np.diag((STEP_M, STEP_M, STEP_M / REACH_M)) ** 2  # of the map and the lattice
     spread = inverse_of(hint.covariance + slack)
     return float(off @ spread @ off)

@@ -15,7 +15,13 @@ from gigabrain_zenoh.geometry.se2 import IDENTITY, between, compose, wrap
 from gigabrain_zenoh.host.threads import PATIENCE_S, InTime, ScheduledWorker, Take, done
 from gigabrain_zenoh.mapping.keyframes import Scan, View, shaped
 from gigabrain_zenoh.mapping.likelihood_field import field_of
-from gigabrain_zenoh.mapping.localizer import NOWHERE, BackgroundLocalizer, KidnapDetector, Place
+from gigabrain_zenoh.mapping.localizer import (
+    ELSEWHERE,
+    NOWHERE,
+    BackgroundLocalizer,
+    KidnapDetector,
+    Place,
+)
 from gigabrain_zenoh.mapping.map_file import Arrays
 from gigabrain_zenoh.mapping.occupancy_grid import (
     CELL,
@@ -25,7 +31,7 @@ from gigabrain_zenoh.mapping.occupancy_grid import (
     LogOddsGrid,
 )
 from gigabrain_zenoh.mapping.pose_graph import DriftRates
-from gigabrain_zenoh.mapping.pose_hint import PoseHint
+from gigabrain_zenoh.mapping.pose_hint import PoseHint, better, far_from
 from gigabrain_zenoh.mapping.slam import Correction, Estimate, Slam
 from gigabrain_zenoh.mapping.static_map import warm_up as warm_up_localizing
 
@@ -34,6 +40,7 @@ DRAWN_AT_ONCE = 8  # sweeps, of those that wait after the map was redrawn
 LOOP_SCANS, KEYFRAME_SCANS, SWEEPS_A_SCAN = 5, 2, 200  # how long the work beside may take
 SHIFT_M, SHIFT_RAD = 0.02, 0.004  # keyframes that moved less need not be redrawn
 RATES = DriftRates(away=0.008, turn=0.002)  # of scans every few centimetres, guided by odometry
+LOOKED_SCANS = 5  # between two looks at where a hint says that the robot is
 FITS = ("matched", "recovered")  # scans that were found otherwise are not drawn
 
 LOOKING = "looking for the robot in the map"
@@ -101,6 +108,8 @@ class SlamMap:
         self._resumed = False  # no scan has come since it was thawed
         self._last = Place(IDENTITY, NOWHERE, False, "no scan yet")
         self._loops = self._renewals = 0
+        self._hint: PoseHint | None = None  # of the next scan
+        self._unasked = LOOKED_SCANS  # scans since it has looked where a hint says it is
         self._wanted = False  # a copy, as soon as nothing is under way beside
         self._still: MapSnapshot | None = None
 
@@ -154,7 +163,12 @@ class SlamMap:
         if self._wanted and self._background.idle:
             self._wanted, self._still = False, self._copied()
         self._draw_waiting()
+        hint, self._hint = self._hint, None
+        if hint and not self._finder:
+            self._look_elsewhere(view, hint, compose(self._moved, motion))
         if self._finder:
+            if hint:
+                self._finder.suggest(hint)
             self._last = self._find(self._finder, view, motion, noise)
             return self._last
         self._moved = compose(self._moved, motion)
@@ -186,8 +200,7 @@ class SlamMap:
 
     def suggest(self, hint: PoseHint) -> None:
         """See RobotMap."""
-        if self._finder:
-            self._finder.suggest(hint)
+        self._hint = hint
 
     def _here(self) -> Floats | None:
         """Return the robot's pose as far as odometry knows it."""
@@ -271,6 +284,19 @@ class SlamMap:
             self._finder, self._doubt = None, KidnapDetector()
             self._moved, self._doubted = IDENTITY, False
         return place
+
+    def _look_elsewhere(self, view: View, hint: PoseHint, moved: Floats) -> None:
+        """Lose the robot if the scan fits where a hint says, and better than where it is."""
+        self._unasked += 1
+        if not self._slam.keyframes or self._unasked < LOOKED_SCANS:
+            return
+        here = compose(self._slam.pose, moved)
+        if not far_from(hint, here):
+            return
+        self._unasked = 0
+        field = field_of(self._grid.percent(), CELL, (self._grid.origin_x, self._grid.origin_y))
+        if better(field, view.beams, hint, here):
+            self.lose(ELSEWHERE)
 
     def _doubtful(self, view: View) -> bool:
         """Leave out a scan that does not belong here; after some of them, the robot is lost."""

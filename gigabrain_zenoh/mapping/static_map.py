@@ -36,7 +36,10 @@ class RobotMap(Protocol):
         """Search the whole map for the robot."""
 
     def suggest(self, hint: PoseHint) -> None:
-        """Look for the robot near `hint`, a pose of the next scan, unless it is localized."""
+        """Look for the robot near `hint`, a pose of the next scan.
+
+        A localized robot stays, unless its scan fits better there.
+        """
 
     def grid(self) -> OccupancyGrid:
         """Return the map as a message."""

@@ -238,6 +238,8 @@ class Mapper:
         self._suggest(moment)
         place = self._chart.step(view, *motion)
         self._mapped = True
+        if place.localized:
+            self._hints.found()
         if self._objects:
             points = view.scan.points.astype(np.float64)
             seen = Surroundings(body.description, world, points, self._chart.keyframes()[1])

@@ -33,7 +33,6 @@ from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.geometry.se2 import between, compose
 from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file
 from gigabrain_zenoh.host.threads import BackgroundWriter
-from gigabrain_zenoh.logs import Fault
 from gigabrain_zenoh.mapping import map_file, object_file
 from gigabrain_zenoh.mapping.localizer import Place
 from gigabrain_zenoh.mapping.object_file import ObjectFile
@@ -54,6 +53,7 @@ SAVED_TICKS = round(5e9 / TICK_NS)  # shortest interval between writes
 RECOGNIZING_TICKS = round(3e9 / TICK_NS)  # since the last detections
 STEADY_RAD_S, RATE_TICKS = 0.8, 5  # turning faster blurs pictures; ticks to measure it over
 SHIFT_M = 0.01  # of an object, less is not published at once
+UNSAVED = "objects are not saved"
 STATE_FILE, MAX_STATE_BYTES = "objects.json", 400_000
 
 
@@ -112,7 +112,7 @@ class ObjectKeeper:
         self._file: Path | None = None  # where its objects are written
         self._saved = ObjectMap()  # as written last
         self._saved_tick = 0
-        self._fault, self.problem = Fault(log), ""
+        self.problem = ""
         self._writer: BackgroundWriter[Write] = BackgroundWriter(self._write, 1)
         bus.subscribe(DETECTIONS, self._receive)
         bus.serve(OBJECTS_CHANGE, self._change)
@@ -126,13 +126,12 @@ class ObjectKeeper:
         self._map = name if len(name) <= 64 and "/" not in name else Path(name).stem[:64]
         # a growing map is not the one in the file any more
         self._file = path if mapping == "localize" else None
-        self._fault.end("the objects of another map are used")
         self.problem, self._sent_tick = "", None
         try:
             found = object_file.load(path) if path else ObjectFile()
         except ConfigError as error:
             self._file = None
-            self._fail(f"the map's objects are not used: {error}")
+            self.problem = f"the map's objects are not used: {error}"
             return
         self.memory.restore([(one, None) for one in found.objects])
         self.tags.restore([(one, None) for one in found.tags])
@@ -354,21 +353,16 @@ class ObjectKeeper:
             if beside:
                 object_file.save(beside, found)
         except OSError as error:
-            return f"objects are not saved: {error.filename or path}: {error.strerror}"
+            return f"{UNSAVED}: {error.filename or path}: {error.strerror}"
         except Refused as error:
-            return f"objects are {error}"
+            return f"{UNSAVED}: {error}"
         return ""
 
     def _on_written(self, done: "asyncio.Future[str]") -> None:
         if problem := done.result():
-            self._fail(problem)
-        elif self.problem.startswith("objects are"):
+            self.problem = problem
+        elif self.problem.startswith(UNSAVED):
             self.problem = ""
-            self._fault.end("objects are saved again")
-
-    def _fail(self, problem: str) -> None:
-        self.problem = problem
-        self._fault.begin(problem)
 
 
 def _moved(hits: Floats, motion: Floats) -> Floats:

@@ -43,6 +43,14 @@ class PoseHints:
         if not (self._by_person and self.at(sample)):
             self._hint, self._sample, self._by_person = hint, sample, False
 
+    def found(self) -> None:
+        """Forget what a person has said: the robot is localized. A tag's hint is kept.
+
+        It tells at once where a robot is that was carried off.
+        """
+        if self._by_person:
+            self._hint, self._by_person = None, False
+
     def at(self, moment: OdometrySample) -> PoseHint | None:
         """Return the hint as of `moment`; None if there is none, or it is too old."""
         hint, sample = self._hint, self._sample

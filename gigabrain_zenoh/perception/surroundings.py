@@ -21,8 +21,11 @@ class Surroundings:
     keyframes: Floats  # (n, 3), their poses in the map
 
     def camera(self, name: str) -> Camera | None:
-        """Return a camera that can be believed; None for others."""
-        blind = any(one.name == name and not one.ok for one in self.world.cameras)
+        """Return a camera that can be believed; None for others.
+
+        One whose pictures have never come here is judged by what is recognised in them alone.
+        """
+        blind = any(one.name == name and one.exposure and not one.ok for one in self.world.cameras)
         found = (one for one in self.body.cameras if one.name == name)
         return None if blind else next(found, None)
 
