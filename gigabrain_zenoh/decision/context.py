@@ -159,6 +159,12 @@ class ContextSource:
         """Why the robot's pose in the map is unknown now; None if it is known."""
         return self._map_from_odom(self._bus.time.boot, self._bus.time.tick)[1]
 
+    def here(self, boot: int, tick: int) -> Pose | None:
+        """Return the robot's pose in the map at `tick`, as far as it is known."""
+        map_from_odom, _ = self._map_from_odom(boot, tick)
+        pose = self._history.at(boot, tick)
+        return compose(map_from_odom, pose) if map_from_odom and pose else None
+
     def oriented(self, state: RobotState) -> bool:
         """Return whether there are a map and a pose in it."""
         lost = self._map_from_odom(state.boot, state.tick)[1]

@@ -1,246 +1,47 @@
-"""Serves goals, missions and changes of tasks, and steps what they want.
+"""Steps what the tasks want: the queue of goals and missions, and the navigator.
 
-Goals are accepted from the start, while the planning kernels still compile.
+The robot can drive before the planning kernels are compiled.
 """
 
 import asyncio
-import logging
-from collections.abc import Awaitable, Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from gigabrain_schemas.base import TICK_S, Message
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import Intent, WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import (
     Goal,
-    GoalReply,
-    GoalRequest,
-    MissionReply,
-    MissionRequest,
-    TaskReply,
-    TaskRequest,
-    TaskStatus,
 )
-from gigabrain_schemas.topics import GOAL, MISSION, STATE, TASK, TASK_CHANGE, Service, Topic
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.bus.freshness import PreviousTick
-from gigabrain_zenoh.bus.input_log import log_accepted
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision.behaviours import (
     Behaviour,
-    DriveCommand,
-    Idle,
     Inputs,
     NavigationConfig,
     StepOutcome,
     StepResult,
     WaitReason,
     battery_nearly_empty,
-    describe_end,
 )
 from gigabrain_zenoh.decision.behaviours.avoid import Avoid, AvoidConfig
 from gigabrain_zenoh.decision.context import ContextSource
 from gigabrain_zenoh.decision.detected_objects import ObjectsByPerceptor
 from gigabrain_zenoh.decision.drive_kernels import DriveKernels
 from gigabrain_zenoh.decision.node import InputSource
+from gigabrain_zenoh.decision.task_server import TaskServer
 from gigabrain_zenoh.decision.tasks import mission as missions
-from gigabrain_zenoh.decision.tasks.mission import Mission
-from gigabrain_zenoh.decision.tasks.scripts import Scripts
-from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile, TaskQueue
 from gigabrain_zenoh.decision.zones import ZoneSource
-from gigabrain_zenoh.errors import GigabrainError, Refused
-from gigabrain_zenoh.host.threads import BackgroundWriter
-from gigabrain_zenoh.logs import Fault
+from gigabrain_zenoh.errors import Refused
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.decision.navigator import Navigator
 
-log = logging.getLogger(__name__)
-
 COMPILING = "mapping and planning compile meanwhile, once per installation"
 FIRST_MAP_TICKS = 3000  # how long after the kernels a first map may come
-STATUS_TICKS = 10  # robot/task is published at 5 Hz
-STARTING_STATUS_NS = 200_000_000  # the same while the kernels compile
+STARTING_STATUS_NS = 200_000_000  # of the status, while the kernels compile
 POSE_TIMEOUT_NS, POLL_NS = 700_000_000, 50_000_000  # wait for a first pose in the map
-
-
-# returns how the robot would reach a goal, for people; without a goal, checks only that its pose in
-# the map is known. Raises Refused
-CheckGoal = Callable[[Goal | None], Awaitable[str]]
-
-
-class TaskServer:
-    """Serves tasks on the bus: keeps the queue, publishes its status and writes it to disk."""
-
-    def __init__(
-        self, bus: Bus, check: CheckGoal, zones: ZoneSource, *, folder: str = "", scripts: str = ""
-    ) -> None:
-        self._bus, self._check, self._zones = bus, check, zones
-        self._scripts, self._topics, file = Scripts(scripts), TopicCache(bus), TaskFile(folder)
-        saved, problem = file.read()
-        if problem:
-            log.warning("%s", problem, extra={"data": {"event": "tasks"}})
-        self._queue = TaskQueue(self._topics.read, self._scripts.start, saved)
-        self._writer: BackgroundWriter[Saved] = BackgroundWriter(file.write, 1)
-        self._written, self._write_fault = saved, Fault(log)
-        self._boot = self._tick = self._status_tick = self._basis = 0
-        self._logged: set[str] = set()  # tasks whose end was logged
-        self._maps_loaded: int | None = None  # see Zones
-        self._waits = ""  # what all tasks wait for, before the first step
-        bus.serve(GOAL, self._on_goal)
-        bus.serve(MISSION, self._on_mission)
-        bus.serve(TASK_CHANGE, self._on_change)
-
-    def publish_starting(self) -> None:
-        """Publish the status while nothing can drive by a map yet."""
-        self._waits = f"waiting: {WaitReason.STARTING}"
-        self._publish()
-
-    def wait(self, state: RobotState) -> None:
-        """Publish that status at its rate; called with every step that does not advance tasks."""
-        self._tick = state.tick
-        if not 0 <= state.tick - self._status_tick < STATUS_TICKS:
-            self.publish_starting()
-
-    def unused(self, boot: int) -> bool:
-        """Return whether there is no task, nor was there one in this start of the driver."""
-        return self._queue.is_unused(boot)
-
-    def step(
-        self, state: RobotState, outcome: StepOutcome | None, basis: int = 0
-    ) -> tuple[DriveCommand | None, Idle]:
-        """Advance the queue, with the world of tick `basis`.
-
-        Return the next command, and why the robot stands if there is none.
-        """
-        self._waits = ""
-        same_boot = state.boot == self._boot
-        seconds = max(0, state.tick - self._tick) * TICK_S if same_boot else 0.0
-        self._boot, self._tick, self._basis = state.boot, state.tick, basis
-        if not same_boot:
-            self._queue.restart(state.boot)
-            self._status_tick = 0
-        self._drop_if_moved()
-        self._topics.observe(state)
-        wanted = self._queue.step(seconds, outcome)
-        if not 0 <= state.tick - self._status_tick < STATUS_TICKS or self._just_ended():
-            self._publish()
-        return wanted
-
-    def _drop_if_moved(self) -> None:
-        """Cancel all tasks if another map was loaded: their coordinates mean other places."""
-        loaded = self._zones.maps_loaded(self._boot, self._tick)
-        if loaded is None or loaded == self._maps_loaded:
-            return
-        before, self._maps_loaded = self._maps_loaded, loaded
-        if before is not None and self._queue.status.current:
-            text = self._queue.cancel("all", "loading another map")
-            log.warning("%s: another map was loaded", text, extra={"data": {"event": "task"}})
-
-    def begin(self, mission: Mission, label: str, boot: int) -> None:
-        """Start a mission, unless there were tasks in this start of the driver."""
-        if self.unused(boot):
-            self._queue.add_mission(mission, label, "queue", "itself")
-
-    async def close(self) -> None:
-        """Return once all is written."""
-        await self._writer.close()
-
-    def _just_ended(self) -> bool:
-        done = self._queue.status.done
-        return bool(done) and done[0].id not in self._logged
-
-    def _publish(self) -> None:
-        """Publish the status, and write the queue where it has changed."""
-        self._status_tick = self._tick
-        status = self._bus.publish(TASK, self._status())
-        for task in reversed(status.done):
-            if task.id not in self._logged:
-                data = {"event": "task", "task": task.id, "state": task.state}
-                log.info("%s", describe_end(task), extra={"data": data})
-        self._logged = {task.id for task in status.done}
-        saved = self._queue.saved
-        if saved != self._written:
-            self._written = saved
-            written = self._writer.put(saved)
-            written.add_done_callback(lambda done: self._on_written(done.result()))
-
-    def _status(self) -> TaskStatus:
-        status = self._queue.status
-        if not self._waits or status.current is None or status.current.state != "active":
-            return status
-        return replace(status, current=replace(status.current, reason=self._waits))
-
-    def _on_written(self, problem: str) -> None:
-        if problem:
-            self._write_fault.begin(problem)
-        else:
-            self._write_fault.end("tasks are saved again")
-
-    async def _on_goal(self, request: GoalRequest) -> GoalReply:
-        try:
-            goal = self._goal_of(request)
-            path = await self._check(goal)
-            name = self._queue.add_goal(goal, request.how, request.source, request.place)
-        except GigabrainError as error:
-            _log_refusal("goal", request.source, error)
-            return GoalReply(ok=False, text=str(error)[:500])
-        self._accept(name, GOAL, request)
-        return GoalReply(ok=True, text=f"{name}: {path}"[:500], goal=name)
-
-    def _goal_of(self, request: GoalRequest) -> Goal:
-        """Return the goal that is asked for. Raises Refused for a place that is not there."""
-        if request.x is None or request.y is None:
-            return self._zones.goal(request.place, request.yaw)
-        return Goal(x=request.x, y=request.y, yaw=request.yaw)
-
-    async def _on_mission(self, request: MissionRequest) -> MissionReply:
-        label = request.label or "mission"
-        try:
-            # a long one takes a tenth of a second to parse, which no scan should wait for
-            places = self._zones.newest.places
-            mission = await asyncio.to_thread(missions.loads, request.mission, label, places)
-            for script in mission.scripts:
-                self._scripts.path(script)
-            if mission.drives:
-                await self._check(None)
-            name = self._queue.add_mission(mission, label, request.how, request.source)
-        except GigabrainError as error:
-            _log_refusal("mission", request.source, error)
-            return MissionReply(ok=False, text=str(error)[:500])
-        self._accept(name, MISSION, request)
-        return MissionReply(ok=True, text=f"{name}: {label}"[:500], task=name)
-
-    async def _on_change(self, request: TaskRequest) -> TaskReply:
-        try:
-            if request.do == "cancel":
-                text = self._queue.cancel(request.task, request.source)
-            elif request.do == "pause":
-                text = self._queue.pause(request.task, request.source)
-            else:
-                text = self._queue.resume(request.task)
-        except GigabrainError as error:
-            return TaskReply(ok=False, text=str(error)[:500], task=request.task)
-        log.info("%s, by %s", text, request.source, extra={"data": {"event": "task"}})
-        self._record(TASK_CHANGE, request)
-        return TaskReply(ok=True, text=text[:500], task=request.task)
-
-    def _accept(
-        self, name: str, service: Service[Any, Any], request: GoalRequest | MissionRequest
-    ) -> None:
-        data = {"event": "task", "task": name, "source": request.source}
-        log.info("accepted %s from %s", name, request.source, extra={"data": data})
-        self._record(service, request)
-
-    def _record(
-        self, service: Service[Any, Any], request: GoalRequest | MissionRequest | TaskRequest
-    ) -> None:
-        """Publish when a request takes effect, so that a recording can be replayed."""
-        log_accepted(self._bus, service.key, request, self._basis)
-        self._publish()
 
 
 class GoalServer(InputSource):
@@ -253,10 +54,11 @@ class GoalServer(InputSource):
     def __init__(self, settings: NavigationConfig, bus: Bus, config: DecisionConfig) -> None:
         self._bus, self._config, self._name = bus, settings, config.behaviour
         self._zones = ZoneSource(bus)
-        self._tasks = TaskServer(
-            bus, self.check, self._zones, folder=config.state_dir, scripts=settings.scripts
-        )
         self._source = ContextSource(bus, self._zones)
+        self._tasks = TaskServer(
+            bus, self.check, self._zones, self._source,
+            folder=config.state_dir, scripts=settings.scripts,
+        )  # fmt: skip
         self._kernels = DriveKernels(bus.input_log.in_time)
         self._compile_first = config.compile_first or not bus.input_log.live
         self._avoid = Avoid(_roaming(settings))  # drives without a map
@@ -410,35 +212,3 @@ def _roaming(config: NavigationConfig) -> AvoidConfig:
     return (
         slow if limit is None else replace(slow, max_linear_speed=min(slow.max_linear_speed, limit))
     )
-
-
-class TopicCache:
-    """The newest message of each topic that conditions read, as of before the present tick."""
-
-    def __init__(self, bus: Bus) -> None:
-        self._bus = bus
-        self._received: dict[str, PreviousTick[Any]] = {}
-        self._state: RobotState | None = None
-
-    def observe(self, state: RobotState) -> None:
-        """Record the present state."""
-        self._state = state
-
-    def read(self, topic: Topic[Any]) -> Message | None:
-        """Return the newest message while it is fresh; the first call subscribes."""
-        state = self._state
-        if state is None or topic.key == STATE.key:
-            return state
-        if topic.key not in self._received:
-            earlier: PreviousTick[Any] = PreviousTick()
-            self._received[topic.key] = earlier
-            self._bus.subscribe(topic, lambda _key, message: earlier.receive(message))
-        found: Message | None = self._received[topic.key].at(
-            state.boot, state.tick, topic.stale_after_ns
-        )
-        return found
-
-
-def _log_refusal(what: str, source: str, error: GigabrainError) -> None:
-    data = {"event": "task refused", "source": source}
-    log.warning("refused a %s from %s: %s", what, source, error, extra={"data": data})

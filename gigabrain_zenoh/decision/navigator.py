@@ -1,6 +1,6 @@
 """The navigator: owns map, route and local planner, and carries out one drive command per scan.
 
-The import takes long; until it is done, `goal_server` already serves goals.
+The import takes long; until it is done, `task_server` already serves goals.
 """
 
 import asyncio

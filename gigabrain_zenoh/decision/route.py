@@ -5,16 +5,17 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from msgspec import structs
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.tasks import Goal
-from gigabrain_zenoh.decision.behaviours import DriveCommand
+from gigabrain_zenoh.decision.behaviours import DriveCommand, Target
+from gigabrain_zenoh.decision.enlarging import enlarged
 from gigabrain_zenoh.decision.give_way import GiveWay
 from gigabrain_zenoh.decision.progress import AT_GOAL_M, ProgressMonitor
+from gigabrain_zenoh.decision.seeking import LookAround, place_before, random_place
 from gigabrain_zenoh.navigation.contours import ContourMemory
 from gigabrain_zenoh.navigation.costmap import (
     Costmap,
@@ -36,12 +37,11 @@ BLOCKED_MEMORY_TICKS = 500  # 10 s, for which a plan avoids what blocked the las
 FRONTIER_HYSTERESIS_M = 1.5  # switch frontiers only for a gain of this much
 SAME_FRONTIER_M = 0.6  # a frontier moves as the map grows
 FRONTIER_CONFIRM_TICKS = 125  # 2.5 s: the map is published once a second
-MAX_VISIT_COST, MIN_VISIT_M = 2.0, 1.5  # cost of a place worth visiting, and length of the way [m]
 ARRIVED_M = LocalSettings().position_tolerance
 NEAR_GOAL_M = 0.25  # good enough for a goal that was free when it was requested: maps shift
 OCCUPIED_TICKS = 500  # 10 s without progress towards an occupied goal
-GOAL_MARGIN_M = 2.0  # of unknown space around a goal outside the map
-MAX_ENLARGED_CELLS = 4_000_000
+
+LOOKING = "looking around"  # what a robot does that searches
 
 Point = tuple[float, float]
 
@@ -111,6 +111,7 @@ class RoutePlanner:
         self._blocking: Floats = np.empty((0, 2))  # hits that blocked a route
         self._blocking_tick = 0
         self._contours = ContourMemory()
+        self._looks = LookAround()
         self._version = 0
         self._reset(0, 0)
 
@@ -120,6 +121,7 @@ class RoutePlanner:
         command = request.command
         if restarted:
             self._contours.forget()
+            self._looks = LookAround()
         if restarted or command.number != self._number:
             self._reset(command.number, request.tick)
         self._contours.update(request.tick, request.here, request.body, request.contours)
@@ -128,9 +130,16 @@ class RoutePlanner:
             request = replace(request, grid=self._enlarged(request.grid, command.goal))
             return self._to_goal(command.goal, request, self._update_costmap(request))
         costs = self._update_costmap(request)
+        if command.target:
+            return self._to_target(command.target, request, costs)
+        if command.kind == "look":
+            return self._look(request, costs)
         if command.kind == "visit":
             return self._to_goal(
-                self._goal or _random_place(request, costs, self._planner), request, costs
+                self._goal
+                or random_place(costs, request.here, command.number, self._planner.search),
+                request,
+                costs,
             )
         return self._explore(request, costs)
 
@@ -303,6 +312,47 @@ class RoutePlanner:
             self._visited.append((goal.x, goal.y))
         return self._route(reason="no path to unexplored space")
 
+    def _to_target(self, target: Target, request: RouteRequest, costs: Costmap) -> Route:
+        """Return a route before a thing or a tag."""
+        around = costs, request.body, request.here
+        goal = self._goal or place_before(*around, target, self._planner.search)
+        if goal is None:
+            reason = f"no free and reachable place before {target.name}"
+            return self._route(state="failed", reason=reason)
+        route = self._to_goal(goal, request, costs)
+        before = f"before {target.name}"
+        return replace(route, reason=f"{before}, {route.reason}" if route.reason else before)
+
+    def _look(self, request: RouteRequest, costs: Costmap) -> Route:
+        """Return a route to where unseen places can be looked at, or to unexplored space."""
+        if request.command.seek != self._looks.seek:
+            self._looks = LookAround(request.command.seek, request.tick)
+        looks, around = self._looks, (costs, request.body, request.here)
+        there = looks.goal is not None and self._goal == looks.goal
+        looks.look(*around, request.tick)
+        arrived = request.feedback is not None and request.feedback.arrived
+        stuck = self._progress.stuck(request.tick, LEAVE_FRONTIER_TICKS)
+        if there and looks.goal and (arrived or stuck):
+            looks.give_up()
+        if there and looks.goal is None:
+            self._drop_frontier(request.tick)
+        while goal := looks.next_goal(*around, self._planner.search):
+            if self._goal not in (None, goal):
+                self._drop_frontier(request.tick)
+            found = self._find(goal, request, costs)
+            if isinstance(found, Path):
+                self._progress.measure(float(found.remaining[0]), request.tick)
+                return self._go(goal, found, activity=LOOKING)
+            looks.give_up()
+        route = self._explore(request, costs)
+        if route.state == "running" or looks.settled(request.tick):
+            ended = route.state == "done"
+            reason = "everything reachable was looked at" if ended else route.reason
+            return replace(
+                route, reason=reason, activity=LOOKING if route.points is not None else ""
+            )
+        return self._route(reason="looking at the last places")
+
     def _explored(self, request: RouteRequest, costs: Costmap) -> Route:
         """End the exploration, once the map has been updated without a new frontier."""
         cell = costs.cell(request.here.x, request.here.y)
@@ -363,52 +413,6 @@ def explained(
     if isinstance(path, Unreachable):
         return found
     return replace(found, fault=f"{NO_WAY} {zones.in_the_way(path.points)}")
-
-
-def _random_place(request: RouteRequest, costs: Costmap, planner: PathPlanner) -> Goal:
-    """Return a random reachable place away from obstacles; the robot's own if there is none."""
-    start, here = costs.cell(request.here.x, request.here.y), request.here
-    if start is not None:
-        way = planner.search.field(costs.cost, start, "from") * costs.resolution
-        free = (costs.cost < MAX_VISIT_COST) & (way > MIN_VISIT_M) & np.isfinite(way)
-        rows, columns = np.nonzero(free)
-        if len(rows):
-            one = int(np.random.default_rng(request.command.number).integers(len(rows)))
-            x, y = costs.points(rows[one : one + 1], columns[one : one + 1])[0].tolist()
-            return Goal(x=x, y=y)
-    return Goal(x=here.x, y=here.y)
-
-
-def enlarged(grid: OccupancyGrid, goal: Goal) -> OccupancyGrid:
-    """Return `grid` with unknown space around it, so that it contains `goal`.
-
-    Return the same grid if it contains the goal, or if the map would become too large.
-    """
-    columns = _cells_to_add(goal.x, grid.origin_x, grid.width, grid.resolution)
-    rows = _cells_to_add(goal.y, grid.origin_y, grid.height, grid.resolution)
-    width, height = grid.width + sum(columns), grid.height + sum(rows)
-    if (width, height) == (grid.width, grid.height) or width * height > MAX_ENLARGED_CELLS:
-        return grid
-    wide = np.full((height, width), -1, np.int8)
-    wide[rows[0] : height - rows[1], columns[0] : width - columns[1]] = grid.array()
-    return structs.replace(
-        grid,
-        width=width,
-        height=height,
-        origin_x=grid.origin_x - columns[0] * grid.resolution,
-        origin_y=grid.origin_y - rows[0] * grid.resolution,
-        cells=wide.tobytes(),
-    )
-
-
-def _cells_to_add(value: float, origin: float, count: int, resolution: float) -> tuple[int, int]:
-    """Return how many cells to add before the first and after the last."""
-    end = origin + count * resolution
-    if origin <= value < end:
-        return 0, 0
-    before = math.ceil((origin - value + GOAL_MARGIN_M) / resolution)
-    after = math.ceil((value - end + GOAL_MARGIN_M) / resolution)
-    return max(0, before), max(0, after)
 
 
 def _offset(found: Unreachable) -> str:

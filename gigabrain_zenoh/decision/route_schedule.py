@@ -18,7 +18,8 @@ CELLS_PER_SCAN = 250_000  # every this many cells add one scan until a plan is d
 MIN_DUE_SCANS = 2
 HUNG_SCANS = 200  # a plan that is overdue for this many scans will never finish
 PATIENCE_S = 0.05  # how long a scan waits for a due plan; control waits no longer
-REPLAN_TICKS = 25  # a route is checked at least twice a second
+REPLAN_TICKS = 25  # a route is checked at least twice a second,
+LOOK_TICKS = 10  # and more often where what cameras see decides
 
 
 class RouteSchedule:
@@ -122,4 +123,5 @@ class RouteSchedule:
         if self._feedback and self._feedback.arrived and self._feedback.version == route.version:
             return True
         changed = grid is not known or zones is not rules
-        return changed or not 0 <= tick - before < REPLAN_TICKS
+        limit = LOOK_TICKS if command.kind == "look" else REPLAN_TICKS
+        return changed or not 0 <= tick - before < limit

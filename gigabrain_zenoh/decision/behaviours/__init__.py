@@ -32,7 +32,18 @@ SHIPPED = {  # name in a deployment file -> "module:class"
 NAVIGATION_PACKAGES = ("numba", "py_trees")
 
 SpeedLimit = Annotated[float, Meta(gt=0, le=10)]  # [m/s] or [rad/s]
-DriveKind = Literal["goto", "explore", "visit"]  # `visit`: a random reachable place
+# `visit`: a random reachable place; `approach`: before a target; `look`: at what was not seen yet
+DriveKind = Literal["goto", "explore", "visit", "approach", "look"]
+
+
+class Target(Struct, frozen=True, kw_only=True):
+    """A thing or a tag to drive before."""
+
+    name: str  # for people, such as `can 3`
+    x: float  # [m] in the map
+    y: float  # [m]
+    radius: float  # [m]
+    yaw: float | None = None  # [rad], where the face of a tag looks
 
 
 class DriveCommand(Struct, frozen=True):
@@ -41,6 +52,8 @@ class DriveCommand(Struct, frozen=True):
     number: int  # a new number is a new command, even for the same goal
     kind: DriveKind
     goal: Goal | None = None  # of `goto`
+    target: Target | None = None  # of `approach`
+    seek: int = 0  # of `look`: which search it belongs to; a new one has seen nothing
 
 
 class StepOutcome(Struct, frozen=True, kw_only=True):

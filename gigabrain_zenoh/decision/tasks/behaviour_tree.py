@@ -3,7 +3,8 @@
 All nodes use the robot's time.
 """
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -20,8 +21,10 @@ from gigabrain_zenoh.decision.behaviours import (
     StepOutcome,
     describe_goal,
 )
+from gigabrain_zenoh.decision.known_objects import Seek, Sought, Wanted, named
 from gigabrain_zenoh.decision.tasks.conditions import Condition, Read, parse
 from gigabrain_zenoh.decision.tasks.mission import (
+    AtTag,
     BatteryBelow,
     Mission,
     Patrol,
@@ -37,6 +40,14 @@ Progress = dict[str, Index]  # of each running node, by its number in depth-firs
 
 
 StartScript = Callable[[Script], Run]
+MOVED_M = 0.15  # that a target may be off where the robot drives to
+
+NOBODY_LOOKS = "waiting: nothing is recognised in pictures; run the process `recognition`"
+
+
+def seek_nothing(_wanted: Wanted, _without: Collection[int], _preferred: int | None) -> Sought:
+    """Return that nothing is known."""
+    return Sought()
 
 
 @dataclass
@@ -46,6 +57,7 @@ class MissionContext:
     read: Read
     start: StartScript
     numbers: Iterator[int]  # of drive commands, each only once
+    seek: Seek = seek_nothing
     now_s: float = 0.0
     held_s: float = 0.0  # of that, while the body did not follow a command
     outcome: StepOutcome | None = None  # of the command of the last tick
@@ -105,6 +117,62 @@ class _DriveNode(_Leaf):
             return Status.SUCCESS if done else self.failed(self._prefix + outcome.reason)
         self.context.command = self._command
         return Status.RUNNING
+
+
+class _SeekNode(_Leaf):
+    """Drives before the nearest wanted thing or tag, and looks for one while none is known."""
+
+    def __init__(self, wanted: Wanted, context: MissionContext) -> None:
+        super().__init__(f"looking for {named(wanted)}", context)
+        self._wanted = wanted
+        self._command = DriveCommand(0, "look")
+        self._id: int | None = None  # of the target
+        self._seek = 0
+        self._missed: dict[int, str] = {}  # ids that it cannot get to, and why
+
+    def initialise(self) -> None:
+        self._seek = next(self.context.numbers)
+        self._command, self._id = DriveCommand(self._seek, "look", seek=self._seek), None
+        self._missed = {}
+
+    def update(self) -> Status:
+        outcome = self.context.outcome
+        if outcome and outcome.number == self._command.number and outcome.state != "running":
+            if self._command.kind == "look":
+                return self.failed(self._why(outcome.reason))
+            if outcome.state == "done":
+                return Status.SUCCESS
+            if self._id is not None:
+                self._missed[self._id] = outcome.reason
+        found = self.context.seek(self._wanted, self._missed, self._id)
+        self._choose(found)
+        target = self._command.target
+        self.context.doing = f"going before {target.name}" if target else self.name
+        if target is None and not found.recognizing:
+            self.context.doing = NOBODY_LOOKS
+        else:
+            self.context.command = self._command
+        return Status.RUNNING
+
+    def _choose(self, found: Sought) -> None:
+        """Give another command if there is another target, or if it is somewhere else."""
+        target, before = found.target, self._command.target
+        if target is None:
+            if before or self._command.kind != "look":
+                number = next(self.context.numbers)
+                self._command, self._id = DriveCommand(number, "look", seek=self._seek), None
+            return
+        off = math.hypot(target.x - before.x, target.y - before.y) if before else math.inf
+        if found.id != self._id or off > MOVED_M:
+            number = next(self.context.numbers)
+            self._command = DriveCommand(number, "approach", target=target)
+            self._id = found.id
+
+    def _why(self, reason: str) -> str:
+        text = f"{named(self._wanted)} was not found: {reason}"
+        if self._missed:
+            text = "; ".join((*dict.fromkeys(self._missed.values()), text))
+        return text
 
 
 class _WaitNode(_Leaf):
@@ -271,6 +339,8 @@ class TreeBuilder:
         context = self._context
         if step.goto is not None:
             return self._go_to(step.goto)
+        if step.find is not None:
+            return _SeekNode(step.find if isinstance(step.find, str) else step.find.tag, context)
         if step.explore or step.visit:
             return _DriveNode("explore" if step.explore else "visit", context)
         if step.wait is not None:
@@ -314,6 +384,8 @@ class TreeBuilder:
         return _repeated(Sequence("round", memory=True, children=children), patrol.loops)
 
     def _go_to(self, place: Place) -> Behaviour:
+        if isinstance(place, AtTag):
+            return _SeekNode(place.tag, self._context)
         name = place if isinstance(place, str) else ""
         return _DriveNode("goto", self._context, self._mission.goal(place), name)
 

@@ -12,6 +12,7 @@ from msgspec import Meta, Struct
 from msgspec.structs import replace
 
 from gigabrain_schemas.base import Finite, Name, Percentage
+from gigabrain_schemas.objects import Label, TagId
 from gigabrain_schemas.tasks import Goal
 from gigabrain_schemas.zones import Place as MapPlace
 from gigabrain_zenoh.config import loading, yaml_text
@@ -25,19 +26,28 @@ MAX_DEPTH = 50  # of nested steps, likewise; carrying them out is recursive
 TOO_DEEP = f"more than {MAX_DEPTH} nested steps once every tree is written out"
 
 Point = Annotated[tuple[Finite, ...], Meta(min_length=2, max_length=3)]  # [m], [m], [rad]
-Place = Name | Point
+
+
+class Part(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A part of a mission file."""
+
+
+class AtTag(Part, frozen=True, kw_only=True):
+    """Before a tag, such as one at a charger."""
+
+    tag: TagId
+
+
+Place = Name | Point | AtTag
+Wanted = Label | AtTag
 Places = Annotated[tuple[Place, ...], Meta(min_length=1, max_length=1000)]
 Steps = Annotated[tuple["Step", ...], Meta(min_length=1)]
 Seconds = Annotated[float, Meta(gt=0, le=1e7)]
 Pause = Annotated[float, Meta(ge=0, le=1e7)]
 Times = Annotated[int, Meta(ge=1, le=MAX_LOOPS)]
 Comparison = Annotated[str, Meta(max_length=200)]  # see conditions.py
-DRIVING = ("goto", "patrol", "explore", "visit", "battery_below")
+DRIVING = ("goto", "patrol", "find", "explore", "visit", "battery_below")
 Keys = tuple[str | int, ...]  # from the top of the file
-
-
-class Part(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A part of a mission file."""
 
 
 class Patrol(Part, frozen=True, kw_only=True):
@@ -113,6 +123,7 @@ class Step(Part, frozen=True, kw_only=True):
 
     goto: Place | None = None
     patrol: Patrol | None = None
+    find: Wanted | None = None  # a thing by its class: look for one, and drive before it
     explore: Explore | None = None
     visit: Visit | None = None
     wait: Seconds | None = None
@@ -151,7 +162,7 @@ class Mission(Part, frozen=True, kw_only=True):
     trees: dict[Name, Steps] = {}  # names of steps that are used several times
     do: Steps  # in order
 
-    def goal(self, place: Place) -> Goal:
+    def goal(self, place: Name | Point) -> Goal:
         """Return the goal of a place, given by name or coordinates."""
         x, y, *yaw = self.places[place] if isinstance(place, str) else place
         return Goal(x=x, y=y, yaw=yaw[0] if yaw else None)
@@ -165,6 +176,14 @@ class Mission(Part, frozen=True, kw_only=True):
     def drives(self) -> bool:
         """Whether any step drives."""
         return any(step.kind in DRIVING for _, step in _steps(self))
+
+    @property
+    def looks(self) -> bool:
+        """Whether any step needs a camera that recognises things or tags."""
+        return any(
+            step.find is not None or any(isinstance(place, AtTag) for _, place in _places(step))
+            for _, step in _steps(self)
+        )
 
 
 class PatrolFile(Part, frozen=True, kw_only=True):
@@ -185,6 +204,11 @@ def goal_mission(goal: Goal) -> Mission:
     """Return the mission that drives to one goal."""
     point = (goal.x, goal.y) if goal.yaw is None else (goal.x, goal.y, goal.yaw)
     return Mission(do=(Step(goto=point),))
+
+
+def find_mission(wanted: str | int) -> Mission:
+    """Return the mission that drives before a thing of a class, or before a tag."""
+    return Mission(do=(Step(find=AtTag(tag=wanted) if isinstance(wanted, int) else wanted),))
 
 
 def patrol_mission(patrol: PatrolFile, loops: int | None) -> str:

@@ -12,6 +12,7 @@ from py_trees.common import Status
 from gigabrain_schemas.tasks import Goal, How, Task, TaskState, TaskStatus
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.decision.behaviours import DriveCommand, Idle, StepOutcome, describe_goal
+from gigabrain_zenoh.decision.known_objects import Seek, Wanted, named
 from gigabrain_zenoh.decision.tasks.behaviour_tree import (
     MissionContext,
     Progress,
@@ -19,9 +20,10 @@ from gigabrain_zenoh.decision.tasks.behaviour_tree import (
     TreeBuilder,
     progress_of,
     restore,
+    seek_nothing,
 )
 from gigabrain_zenoh.decision.tasks.conditions import Read
-from gigabrain_zenoh.decision.tasks.mission import Mission, goal_mission, loads
+from gigabrain_zenoh.decision.tasks.mission import Mission, find_mission, goal_mission, loads
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file
 
@@ -97,8 +99,11 @@ class Saved(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="
 class TaskQueue:
     """Carries out one task after the other."""
 
-    def __init__(self, read: Read, start: StartScript, saved: Saved) -> None:
+    def __init__(
+        self, read: Read, start: StartScript, saved: Saved, seek: Seek = seek_nothing
+    ) -> None:
         self._read, self._start, self._numbers = read, start, itertools.count(1)
+        self._seek = seek
         self._count, self._boot = saved.count, saved.boot
         self._jobs: list[Job] = []
         self._done: list[Task] = []
@@ -123,6 +128,10 @@ class TaskQueue:
         """Add a goal, maybe with a `place` name; return its name. Raises Refused if it is full."""
         label = f"{place} {describe_goal(goal)}".strip()[:64]
         return self._add("goal", goal_mission(goal), label, how, source)
+
+    def add_find(self, wanted: Wanted, how: How, source: str) -> str:
+        """Add a goal before a thing or a tag; return its name. Raises Refused if it is full."""
+        return self._add("goal", find_mission(wanted), f"find {named(wanted)}"[:64], how, source)
 
     def add_mission(self, mission: Mission, label: str, how: How, source: str) -> str:
         """Add a mission, and return its name. Raises Refused if the queue is full."""
@@ -225,7 +234,7 @@ class TaskQueue:
         return name
 
     def _context(self) -> MissionContext:
-        return MissionContext(self._read, self._start, self._numbers)
+        return MissionContext(self._read, self._start, self._numbers, self._seek)
 
     def _job(self, name: str) -> Job:
         if not self._jobs:

@@ -21,7 +21,8 @@ from gigabrain_schemas.tasks import (
 )
 from gigabrain_schemas.topics import GOAL, MISSION, STATE, TASK, TASK_CHANGE, Topic
 from gigabrain_zenoh.decision.behaviours import DriveCommand, StepOutcome
-from gigabrain_zenoh.decision.goal_server import TaskServer
+from gigabrain_zenoh.decision.context import ContextSource
+from gigabrain_zenoh.decision.task_server import TaskServer
 from gigabrain_zenoh.decision.tasks import mission as missions
 from gigabrain_zenoh.decision.tasks.mission import Script
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskQueue
@@ -114,9 +115,11 @@ class Site:
     def __init__(self, folder: Path, *, scripts: str = "") -> None:
         self.net = Net()
         self.wall, self.lost = "", ""
+        zones = ZoneSource(self.net.one)
         self.service = TaskServer(
-            self.net.one, self._check, ZoneSource(self.net.one), folder=str(folder), scripts=scripts
-        )
+            self.net.one, self._check, zones, ContextSource(self.net.one, zones),
+            folder=str(folder), scripts=scripts,
+        )  # fmt: skip
         self.told: list[TaskStatus] = []
         self.net.two.subscribe(TASK, lambda _key, status: self.told.append(status))
         self.tick, self.command, self.outcome = 0, None, None

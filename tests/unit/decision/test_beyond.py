@@ -5,7 +5,7 @@ import pytest
 
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.tasks import Goal
-from gigabrain_zenoh.decision.route import enlarged
+from gigabrain_zenoh.decision.enlarging import enlarged
 
 
 def small() -> OccupancyGrid:

@@ -11,7 +11,7 @@ from gigabrain_schemas.logs import AcceptedRequest
 from gigabrain_schemas.tasks import Goal, GoalReply, GoalRequest
 from gigabrain_schemas.topics import REQUEST_LOG
 from gigabrain_schemas.zones import Place
-from gigabrain_zenoh.decision import goal_server
+from gigabrain_zenoh.decision import task_server
 from gigabrain_zenoh.decision.behaviours import StepOutcome
 from gigabrain_zenoh.decision.tasks import mission
 from gigabrain_zenoh.decision.tasks.mission import Mission
@@ -55,7 +55,7 @@ async def test_the_loop_goes_on_while_a_mission_is_read(
         return mission.loads(text, source, places)
 
     monkeypatch.setattr(
-        goal_server, "missions", SimpleNamespace(**{**vars(mission), "loads": loads})
+        task_server, "missions", SimpleNamespace(**{**vars(mission), "loads": loads})
     )
     await site.step()
     assert (await site.carry_out("do: [{wait: 5}]")).ok

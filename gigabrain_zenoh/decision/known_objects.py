@@ -1,0 +1,91 @@
+"""Things and tags in the map, as received from perception, and the nearest of those wanted."""
+
+import math
+from collections import deque
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.body import BodyDescription
+from gigabrain_schemas.objects import MapObject, MapTag, ObjectMap
+from gigabrain_schemas.topics import OBJECT_MAP
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.decision.behaviours import Target
+
+TAG_RADIUS_M = 0.02
+LEAST_RADIUS_M, MOST_RADIUS_M = 0.02, 1.0
+NO_OBJECTS = ObjectMap()
+Wanted = str | int  # a class, or the number of a tag
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sought:
+    """What is known of a wanted thing now."""
+
+    target: Target | None = None
+    id: int = 0  # of the target
+    recognizing: bool = True  # so a thing that is looked at is found
+
+
+Seek = Callable[[Wanted, Collection[int], int | None], Sought]  # without some ids; one preferred
+
+
+class ObjectSource:
+    """The newest map of objects, as it was before a tick: so a replay seeks the same."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._received: deque[ObjectMap] = deque(maxlen=2)
+        self._watches = False
+
+    def observe(self, body: BodyDescription | None) -> None:
+        """Subscribe once the body is known to have cameras."""
+        if body and body.cameras and not self._watches:
+            self._watches = True
+            self._bus.latest(OBJECT_MAP, self._received.append)
+
+    @property
+    def newest(self) -> ObjectMap:
+        """The objects that were received last."""
+        return self._received[-1] if self._received else NO_OBJECTS
+
+    def at(self, boot: int, tick: int) -> ObjectMap:
+        """Return the newest objects from before `tick`, or from an earlier run of the driver."""
+        earlier = (one for one in reversed(self._received) if one.boot != boot or one.tick < tick)
+        return next(earlier, NO_OBJECTS)
+
+
+def sought(
+    known: ObjectMap,
+    here: Pose | None,
+    wanted: Wanted,
+    without: Collection[int],
+    preferred: int | None,
+) -> Sought:
+    """Return the nearest of the wanted things, or the `preferred` one while it is there."""
+    there: list[MapObject | MapTag]
+    if isinstance(wanted, int):
+        there = [one for one in known.tags if one.id == wanted and one.id not in without]
+    else:
+        there = [one for one in known.objects if one.label == wanted and one.id not in without]
+    if not there:
+        return Sought(recognizing=known.recognizing)
+    x, y = (here.x, here.y) if here else (there[0].x, there[0].y)
+    best = min(
+        there, key=lambda one: (one.id != preferred, math.hypot(one.x - x, one.y - y), one.id)
+    )
+    return Sought(target=_target(best), id=best.id, recognizing=known.recognizing)
+
+
+def _target(one: MapObject | MapTag) -> Target:
+    if isinstance(one, MapTag):
+        return Target(name=f"tag {one.id}", x=one.x, y=one.y, radius=TAG_RADIUS_M, yaw=one.yaw)
+    radius = min(max(one.size[0] / 2, LEAST_RADIUS_M), MOST_RADIUS_M)
+    return Target(name=f"{one.label} {one.id}", x=one.x, y=one.y, radius=radius)
+
+
+def named(wanted: Wanted) -> str:
+    """Return what is wanted, for people."""
+    if isinstance(wanted, int):
+        return f"tag {wanted}"
+    return f"{'an' if wanted[:1].lower() in 'aeiou' else 'a'} {wanted}"

@@ -1,0 +1,236 @@
+"""Places to drive to: before a thing or a tag, to look from at what was not seen, or any place."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.body import BodyDescription, Camera
+from gigabrain_schemas.tasks import Goal
+from gigabrain_zenoh.decision.behaviours import Target
+from gigabrain_zenoh.navigation.costmap import LETHAL, Costmap
+from gigabrain_zenoh.navigation.grid_search import GridSearch
+
+GAP_M = 0.25  # between the body's front and a thing that it stands before,
+FARTHER_M = (0.0, 0.1, 0.2, 0.35, 0.5, 0.8)  # or so much more, where the thing stands in a corner
+ROUND_RAD = np.radians(np.arange(0, 360, 15))  # directions from which a thing is looked at,
+BEFORE_RAD = np.radians((0, -10, 10, -20, 20, -35, 35))  # and those off a tag's face
+FARTHER_COST, TURNED_COST, NARROW_COST = 2.0, 1.0, 0.05  # [m] of way, for a metre, rad and cost
+OWN_M = 0.25  # round a thing, what is occupied is the thing itself or what it stands at
+OCCUPIED_PERCENT = 65
+
+CELL_M = 0.2  # of what has been looked at
+LOOK_M, LEAST_LOOK_M = 2.5, 0.3  # within which a thing is recognised
+RIM_RAD = math.radians(4)  # at the picture's edge, where a thing may be cut off
+SAMPLE_M = 0.05  # along a line of sight
+STAND_M = (0.6, 1.8)  # from what is looked at, where there is a choice
+NEIGHBOURS, AROUND_M = 4, 0.45  # unseen cells so near together are worth a look
+NEARBY_M = 1.2  # unseen cells so near to the chosen one are looked at with it
+SURE_TICKS = 75  # 1.5 s, until all counts as seen: what was seen last is still being recognised
+VIEWPOINTS = 24  # that are tried at once
+
+MAX_VISIT_COST, MIN_VISIT_M = 2.0, 1.5  # cost of a place worth visiting, and length of the way [m]
+
+Cells = NDArray[np.int64]  # (n, 2), in steps of CELL_M from the map's frame
+
+
+def place_before(
+    costs: Costmap, body: BodyDescription, here: Pose, target: Target, search: GridSearch
+) -> Goal | None:
+    """Return the best free place from which the body faces a target; None without one."""
+    start = costs.cell(here.x, here.y)
+    if start is None:
+        return None
+    way = search.field(costs.cost, start, "from", costs.against) * costs.resolution
+    front = max(x for x, _ in body.footprint)
+    best: tuple[float, Goal] | None = None
+    angles = ROUND_RAD if target.yaw is None else target.yaw + BEFORE_RAD
+    for farther in FARTHER_M:
+        away = front + target.radius + GAP_M + farther
+        for angle in angles.tolist():
+            x, y = target.x + away * math.cos(angle), target.y + away * math.sin(angle)
+            cell = costs.cell(x, y)
+            if cell is None or costs.cost[cell] >= LETHAL or not math.isfinite(way[cell]):
+                continue
+            if costs.zone_problem(x, y) or not _sees(costs, (x, y), target):
+                continue
+            off = 0.0 if target.yaw is None else abs(math.remainder(angle - target.yaw, math.tau))
+            worse = FARTHER_COST * farther + TURNED_COST * off
+            worse += float(way[cell]) + NARROW_COST * float(costs.cost[cell])
+            if best is None or worse < best[0]:
+                yaw = math.remainder(angle + math.pi, math.tau)
+                best = worse, Goal(x=x, y=y, yaw=yaw)
+    return best[1] if best else None
+
+
+def random_place(costs: Costmap, here: Pose, seed: int, search: GridSearch) -> Goal:
+    """Return a random reachable place away from obstacles; the robot's own if there is none."""
+    start = costs.cell(here.x, here.y)
+    if start is not None:
+        way = search.field(costs.cost, start, "from") * costs.resolution
+        free = (costs.cost < MAX_VISIT_COST) & (way > MIN_VISIT_M) & np.isfinite(way)
+        rows, columns = np.nonzero(free)
+        if len(rows):
+            one = int(np.random.default_rng(seed).integers(len(rows)))
+            x, y = costs.points(rows[one : one + 1], columns[one : one + 1])[0].tolist()
+            return Goal(x=x, y=y)
+    return Goal(x=here.x, y=here.y)
+
+
+def _sees(costs: Costmap, place: tuple[float, float], target: Target) -> bool:
+    """Return whether nothing in the map is between a place and a target."""
+    ends = np.array(((target.x, target.y),))
+    return bool(in_sight(costs, np.array(place), ends, short=target.radius + OWN_M)[0])
+
+
+def in_sight(costs: Costmap, eye: Floats, points: Floats, short: float) -> NDArray[np.bool_]:
+    """Return to which points (n, 2) the way from `eye` (2,) is clear, `short` [m] of them."""
+    off = points - eye
+    far = np.hypot(*off.T)
+    steps = np.arange(SAMPLE_M, float(far.max(initial=0.0)), SAMPLE_M)
+    if not len(steps):
+        return np.ones(len(points), np.bool_)
+    lines = eye + steps[None, :, None] * (off / np.maximum(far, 1e-6)[:, None])[:, None, :]
+    columns = np.floor((lines[..., 0] - costs.origin_x) / costs.resolution).astype(np.intp)
+    rows = np.floor((lines[..., 1] - costs.origin_y) / costs.resolution).astype(np.intp)
+    height, width = costs.cells.shape
+    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    walls = costs.cells[np.where(inside, rows, 0), np.where(inside, columns, 0)]
+    blocked = inside & (walls >= OCCUPIED_PERCENT) & (steps[None, :] < (far - short)[:, None])
+    return np.asarray(~blocked.any(axis=1))
+
+
+class LookAround:
+    """Where cameras have looked in one search, and where to look next. Not thread-safe."""
+
+    def __init__(self, seek: int = 0, tick: int = 0) -> None:
+        self.seek = seek  # the search that it belongs to
+        self._seen: set[tuple[int, int]] = set()
+        self._aim: tuple[int, int] | None = None  # the cell that it goes to look at
+        self.goal: Goal | None = None  # from where
+        self._changed_tick = tick  # when something was seen last
+
+    def look(self, costs: Costmap, body: BodyDescription, here: Pose, tick: int) -> None:
+        """Record what the body's cameras see from `here`."""
+        before = len(self._seen)
+        for camera in body.cameras:
+            self._seen.update(map(tuple, _in_view(costs, camera, here).tolist()))
+        if len(self._seen) != before:
+            self._changed_tick = tick
+        if self._aim in self._seen:
+            self.drop()
+
+    def give_up(self) -> None:
+        """Count the present aim, and what is beside it, as seen: it cannot be looked at better."""
+        if self._aim:
+            i, j = self._aim
+            reach = range(-1, 2)
+            self._seen.update((i + di, j + dj) for di in reach for dj in reach)
+        self.drop()
+
+    def drop(self) -> None:
+        """Choose another aim next."""
+        self._aim = self.goal = None
+
+    def settled(self, tick: int) -> bool:
+        """Return whether nothing new was seen for a while."""
+        return tick - self._changed_tick >= SURE_TICKS
+
+    def next_goal(
+        self, costs: Costmap, body: BodyDescription, here: Pose, search: GridSearch
+    ) -> Goal | None:
+        """Return where to look from next; None if everything reachable has been looked at."""
+        if self.goal:
+            return self.goal
+        start = costs.cell(here.x, here.y)
+        if start is None:
+            return None
+        way = search.field(costs.cost, start, "from", costs.against) * costs.resolution
+        unseen, far = self._unseen(costs, way)
+        if not len(unseen):
+            return None
+        spots = (unseen + 0.5) * CELL_M
+        bearing = np.arctan2(spots[:, 1] - here.y, spots[:, 0] - here.x)
+        turn = np.abs(np.remainder(bearing - here.yaw + np.pi, 2 * np.pi) - np.pi)
+        best = int(np.argmin(far + 0.3 * turn))
+        self._aim = tuple(unseen[best].tolist())
+        around = np.hypot(*(spots - spots[best]).T) < NEARBY_M
+        self.goal = _viewpoint(costs, body, here, spots[best], spots[around].mean(axis=0), way)
+        return self.goal
+
+    def _unseen(self, costs: Costmap, way: Floats) -> tuple[Cells, Floats]:
+        """Return the reachable cells (n, 2) that are worth a look, and the ways there [m]."""
+        rows, columns = np.nonzero(np.isfinite(way) & (costs.cost < LETHAL) & (costs.cells >= 0))
+        points = costs.points(rows, columns)
+        cells, first = np.unique(
+            np.floor(points / CELL_M).astype(np.int64), axis=0, return_index=True
+        )
+        new = np.array([tuple(one) not in self._seen for one in cells.tolist()], np.bool_)
+        cells, far = cells[new], way[rows[first[new]], columns[first[new]]]
+        if not len(cells):
+            return cells, far
+        worth = _crowded(cells)
+        return cells[worth], far[worth]
+
+
+def _crowded(cells: Cells) -> NDArray[np.bool_]:
+    """Return which cells (n, 2) have enough others of them around."""
+    low = cells.min(axis=0)
+    grid = np.zeros(cells.max(axis=0) - low + 5, np.int64)
+    i, j = (cells - low + 2).T
+    grid[i, j] = 1
+    reach = round(AROUND_M / CELL_M)
+    steps = range(-reach, reach + 1)
+    counts = sum(grid[i + di, j + dj] for di in steps for dj in steps)
+    return np.asarray(counts > NEIGHBOURS)
+
+
+def _in_view(costs: Costmap, camera: Camera, here: Pose) -> Cells:
+    """Return the cells (n, 2) that a camera sees well from a body at `here`."""
+    cos, sin = math.cos(here.yaw), math.sin(here.yaw)
+    eye = np.array(
+        (here.x + cos * camera.x - sin * camera.y, here.y + sin * camera.x + cos * camera.y)
+    )
+    reach = math.ceil(LOOK_M / CELL_M)
+    middle = np.floor(eye / CELL_M).astype(np.int64)
+    steps = np.arange(-reach, reach + 1)
+    cells = (np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) + middle).astype(np.int64)
+    off = (cells + 0.5) * CELL_M - eye
+    far = np.hypot(*off.T)
+    fx, _, _, _ = camera.pinhole
+    half = math.atan2(camera.width / 2, fx) - RIM_RAD
+    axis = here.yaw + camera.yaw
+    turn = np.abs(np.remainder(np.arctan2(off[:, 1], off[:, 0]) - axis + np.pi, 2 * np.pi) - np.pi)
+    cells = cells[(far <= LOOK_M) & (far >= LEAST_LOOK_M) & (turn <= half)]
+    found: Cells = cells[in_sight(costs, eye, (cells + 0.5) * CELL_M, CELL_M)]
+    return found
+
+
+def _viewpoint(
+    costs: Costmap, body: BodyDescription, here: Pose, aim: Floats, middle: Floats, way: Floats
+) -> Goal:
+    """Return the place nearest by its way that sees `aim` (2,), facing `middle` (2,)."""
+    yaw = math.atan2(*(middle - (here.x, here.y))[::-1].tolist())
+    off = math.hypot(*(aim - (here.x, here.y)).tolist())
+    eye = np.array((here.x, here.y))
+    turns = body.turning_radius == 0.0
+    if turns and STAND_M[0] <= off <= LOOK_M and in_sight(costs, eye, aim[None], CELL_M)[0]:
+        yaw = math.atan2(*(aim - eye)[::-1].tolist())
+        return Goal(x=here.x, y=here.y, yaw=yaw)
+    angles = np.linspace(0.0, math.tau, VIEWPOINTS, endpoint=False)
+    ring = np.column_stack((np.cos(angles), np.sin(angles)))
+    best, least = aim, math.inf
+    for far in (*np.linspace(*STAND_M, 4).tolist(), 0.0):
+        for place in aim + far * ring if far else aim[None]:
+            cell = costs.cell(*place.tolist())
+            if cell is None or costs.cost[cell] >= LETHAL or way[cell] >= least:
+                continue
+            if far and not in_sight(costs, place, aim[None], CELL_M)[0]:
+                continue
+            best, least = place, float(way[cell])
+    x, y = best.tolist()
+    to = middle - best
+    facing = math.atan2(float(to[1]), float(to[0])) if np.hypot(*to) > CELL_M else None
+    return Goal(x=x, y=y, yaw=facing if turns else None)
