@@ -17,7 +17,9 @@ from gigabrain_schemas.topics import DEPTH, IMAGE, Topic
 from gigabrain_schemas.vision import DepthImage, pack_depth
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.bus.headers import header_of
+from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.recording.bag_writer import BagWriter, ReceivedMessage
+from gigabrain_zenoh.recording.recorder import Recorder
 
 PLAIN = Camera(name="front", width=64, height=48)
 RGBD = Camera(name="front", width=64, height=48, depth=True)
@@ -165,6 +167,36 @@ def test_a_recording_gives_picture_and_depth_of_one_exposure_together(
     assert greys == pytest.approx([*GREYS, *GREYS], abs=3)
     assert all(0 <= pause <= 0.3 for pause in slept)
     source.close()
+
+
+def test_a_thinned_recording_gives_whole_exposures_at_their_rate(
+    tmp_path: Path, slept: list[float]
+) -> None:
+    """Recorded at 10 Hz from 20: every second exposure, depth with its picture."""
+    config = RecorderConfig(pictures=10.0, keep_free_mb=0, flush_s=0.05)
+    shades = range(10, 90, 10)
+    with Recorder(tmp_path / "drive.mcap", config) as recorder:
+        for number, shade in enumerate(shades):
+            at = 1 + 2.5 * number  # [ticks] of 20 ms
+            header = {"boot": 7, "basis": round(at), "stamp_ns": 10**18 + round(at * 2e7)}
+            about = header | {"frame_id": "front", "width": 64, "height": 48}
+            data = np.full((48, 64, 3), shade, np.uint8).tobytes()
+            planes = pack_depth(np.full((48, 64), 100 * shade, np.uint16))
+            for topic, message in (
+                (DEPTH, DepthImage(**about, planes=planes)),  # type: ignore[arg-type]
+                (IMAGE, Image(**about, encoding="bgr8", data=data)),  # type: ignore[arg-type]
+            ):
+                recorder.intake.receive(topic.at("front"), "", codec.encode(message))
+    source = replayed(tmp_path)
+    source.open()
+    frames = [source.read() for _ in range(len(shades) // 2)]
+    with pytest.raises(CameraLost, match=r"has ended"):
+        source.read()
+    assert [int(one.picture.max()) for one in frames if one.picture is not None] == [10, 30, 50, 70]
+    assert [int(one.depth.max()) for one in frames if one.depth is not None] == [
+        1000, 3000, 5000, 7000,
+    ]  # fmt: skip
+    assert slept == pytest.approx([0.1, 0.2, 0.3], abs=0.05)  # from the first
 
 
 def test_a_recording_may_end(tmp_path: Path, slept: list[float]) -> None:

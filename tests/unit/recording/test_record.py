@@ -249,3 +249,39 @@ def test_a_camera_whose_clock_stands_still_or_begins_again_is_thinned_too(tmp_pa
             for key, payload in exposures(1, boot=9, basis_step=400):
                 recorder.intake.receive(key, "", payload)
     assert bases(path, "robot/image/front") == [*[5, 30, 55, 80] * 2, 400]
+
+
+def test_a_flood_of_eight_cameras_costs_pictures_and_no_memory(tmp_path: Path) -> None:
+    """A second of 8 cameras at 100 Hz, 30 kB a picture, while the disk takes nothing."""
+    path = tmp_path / "a.mcap"
+    recorder = Recorder(path, replace(QUICK, pictures=2.0, queue_mb=1.0))
+    body = bytes(30_000)
+    for seq in range(1, 101):
+        for camera in range(8):
+            header = {"seq": seq, "boot": 7, "basis": seq, "stamp_ns": bags.BEGIN_NS}
+            payload = msgspec.msgpack.encode(header | {"data": body})
+            recorder.intake.receive(f"robot/image/cam{camera}", "", payload)
+        recorder.intake.receive("robot/state", "", bags.state(seq))
+    with recorder:
+        pass
+    assert kept(path)["robot/state"] == 100
+    assert len(bases(path, "robot/image/cam3")) == 4  # of 100 ticks, which are 2 s
+    assert recorder.status().dropped == 0
+    assert recorder.intake.left_out["robot/image/cam3"] == 96
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"garbage",
+        b"{",
+        msgspec.msgpack.encode({"basis": -5, "boot": -1, "stamp_ns": 2**70 % 7}),
+    ],
+)
+def test_pictures_that_are_no_messages_are_thinned_too(tmp_path: Path, payload: bytes) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path, replace(QUICK, pictures=2.0)) as recorder:
+        for _ in range(200):
+            recorder.intake.receive("robot/image/front", "", payload)
+    assert len(list(Bag(path))) < 5
