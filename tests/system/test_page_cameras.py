@@ -121,7 +121,11 @@ async def test_boxes_are_drawn_over_the_picture_and_can_be_switched_off(
     assert drawn_pixels > 50
     name = await page.get_attribute('[data-camera="front"] .frame', "aria-label")
     assert name == "Picture of camera front: can"
-    await page.uncheck("#show-boxes")
+    await page.click("#show-boxes")
+    assert await overlay() == 0
+    fake.presses.clear()
+    await page.keyboard.press("Space")  # stops, whatever has the focus
+    await until(lambda: fake.presses == ["page"], "an e-stop")
     assert await overlay() == 0
 
 

@@ -16,8 +16,9 @@ export class Cameras {
   constructor({ watch, shown }) {
     Object.assign(this, { watch, shown })
     $('show-cameras').addEventListener('click', () => this.open(!this.#open))
-    $('show-boxes').addEventListener('change', () => {
-      this.#boxes = $('show-boxes').checked
+    $('show-boxes').addEventListener('click', () => {
+      this.#boxes = !this.#boxes
+      $('show-boxes').setAttribute('aria-pressed', this.#boxes)
       for (const view of this.#views.values()) this.#drawFound(view)
     })
     document.addEventListener('visibilitychange', () => this.resume())
