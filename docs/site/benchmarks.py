@@ -34,6 +34,7 @@ from gigabrain_zenoh.qa.bench.clutter import ClutterResult
 from gigabrain_zenoh.qa.bench.estop import EstopResult, estop_page
 from gigabrain_zenoh.qa.bench.eyes import EyesResult
 from gigabrain_zenoh.qa.bench.goals import GoalsResult
+from gigabrain_zenoh.qa.bench.objects import ObjectsResult
 from gigabrain_zenoh.qa.bench.plan import PlanResult
 from gigabrain_zenoh.qa.bench.slam_logs import SlamResult
 from gigabrain_zenoh.qa.bench.stack import StackResult, stack_page
@@ -50,6 +51,7 @@ DRAWN: dict[str, tuple[type[Struct], Callable[[Any], Any]]] = {  # by the words 
     "estop": (EstopResult, estop_page),
     "eyes": (EyesResult, bench_eyes._eyes_table),
     "goals": (GoalsResult, bench_navigation._goals_table),
+    "objects": (ObjectsResult, bench_eyes._objects_table),
     "plan": (PlanResult, bench._plan_table),
     "slam": (SlamResult, bench_navigation._logs_table),
     "stack": (StackResult, stack_page),

@@ -1,4 +1,4 @@
-"""`gigabrain bench eyes`, `cameras` and `clutter`: contours, their cost, and driving by them."""
+"""`gigabrain bench eyes`, `cameras`, `clutter`, `objects`: what cameras give and cost."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,11 +16,14 @@ from gigabrain_zenoh.cli.options import (
     print_progress,
 )
 from gigabrain_zenoh.host import files
+from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.host.signals import run_async
+from gigabrain_zenoh.qa.judging import table_of
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.qa.bench.clutter import ClutterResult, ClutterRun
     from gigabrain_zenoh.qa.bench.eyes import EyesResult
+    from gigabrain_zenoh.qa.bench.objects import ObjectsResult
 
 
 def eyes(
@@ -160,6 +163,61 @@ def clutter(
     result = run_async(measure_clutter(wanted, course, before, keep, print_progress))
     finish(_clutter_table(result), result, json)
     return 0 if all(one.ok for one in result.of(cameras=True)) else 1
+
+
+def objects(
+    *,
+    seeds: str = "0-9",
+    speed: float = 3.0,
+    seconds: float = 120.0,
+    body: Body = "turtlebot3_waffle",
+    json: JsonFile = None,
+) -> int:
+    """Measure what a robot with cameras remembers of things in a room, against the truth.
+
+    Example: gigabrain bench objects --seeds 0-9
+
+    Seven things of five classes stand in each room: cubes, balls, cylinders, cans, boxes. The robot
+    drives to eight places, and what it remembers is compared with the physics. It needs EGL or
+    OSMesa: set MUJOCO_GL=egl.
+
+    Args:
+        seeds: Seeds of the worlds, such as 0-9 or 3,5,20-22.
+        speed: Simulated over real time.
+        seconds: Time in each world, from the first place on [s of its own time].
+    """
+    from gigabrain_zenoh.qa.bench.clutter import seeds_of
+    from gigabrain_zenoh.qa.bench.objects import measure_objects
+
+    check_positive(speed=speed, seconds=seconds)
+    check_names([body])
+    files.check_result_path(json)
+    result = run_async(measure_objects(seeds_of(seeds), body, speed, seconds, print_progress))
+    finish(_objects_table(result), result, json)
+    return 0
+
+
+def _objects_table(result: "ObjectsResult") -> Table:
+    table = table_of(
+        "class", "there", "remembered", "not there", title="Things that are remembered"
+    )
+    runs = result.runs
+    for label in sorted({one for run in runs for one in run.things}):
+        found = [
+            yes
+            for run in runs
+            for name, yes in zip(run.things, run.found, strict=True)
+            if name == label
+        ]
+        false = sum(run.false.count(label) for run in runs)
+        table.add_row(label, str(len(found)), str(sum(found)), str(false))
+    errors = sorted(error for run in runs for error in run.errors_m)
+    p50, p95 = (_cm(percentile(errors, share) or 0.0) for share in (0.5, 0.95))
+    table.caption = (
+        f"{len(runs)} rooms, {result.body}, x{result.speed:g} real time. "
+        f"Position off p50 {p50} cm, p95 {p95} cm."
+    )
+    return table
 
 
 def _clutter_table(result: "ClutterResult") -> Table:

@@ -85,6 +85,7 @@ CALLS = {
     "bench chain": "bench chain --seconds 3 --rounds 1",
     "bench stack": "bench stack --seconds 3",
     "bench cameras": "bench cameras --seconds 3",
+    "bench objects": "bench objects --seeds 0",
     "faults": "faults --only e-stop-pressed",
     "bench estop": "bench estop",
     "bench bodies": "bench bodies --seconds 3",

@@ -18,7 +18,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.client.tasks import Tasks
 from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
-from gigabrain_zenoh.geometry.pose import compose, inverse
+from gigabrain_zenoh.geometry.pose import ORIGIN, compose, inverse
 from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.navigation.global_planner import warm_up
 from gigabrain_zenoh.qa.bench.cluttered_worlds import (
@@ -247,6 +247,7 @@ class CourseDriver:
         self._states = bus.latest(STATE)
         self._began_s = 0.0
         self._truth: dict[str, float] = {}
+        self.world_from_map = ORIGIN  # of the map, in the world
         self.reached = 0
         self.incidents: list[Incident] = []
         self.missed: list[MissedGoal] = []
@@ -262,7 +263,8 @@ class CourseDriver:
         await self.look()
         here = self._poses.current
         assert here
-        world_from_map = compose(self._true_pose(), inverse(Pose(x=here.x, y=here.y, yaw=here.yaw)))
+        in_map = Pose(x=here.x, y=here.y, yaw=here.yaw)
+        world_from_map = self.world_from_map = compose(self._true_pose(), inverse(in_map))
         self._began_s += self.seconds
         over = ""
         for number, (x, y) in enumerate(self._world.goals, 1):
