@@ -6,6 +6,7 @@ HEVC without loss, as lerobot 0.6 reads it; unknown depth becomes the least one,
 """
 
 import math
+import re
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
@@ -17,6 +18,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from gigabrain_schemas.base import Message
+from gigabrain_schemas.body import MOST_CAMERAS
 from gigabrain_schemas.sensors import Image
 from gigabrain_schemas.topics import DEPTH, IMAGE, STATE
 from gigabrain_schemas.vision import DepthImage
@@ -32,6 +34,7 @@ DEPTH_OPTIONS = {"g": "2", "x265-params": "lossless=1:log-level=error"}
 DEPTH_MAX_CODE = 4095
 DEPTH_MIN_M, DEPTH_MAX_M, DEPTH_SHIFT_M = 0.01, 10.0, 3.5  # of lerobot's own scale
 RAW_FORMATS = {"rgb8": "rgb24", "bgr8": "bgr24", "mono8": "gray"}
+CAMERA_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,31}")  # others are no cameras of ours
 JPEG_END, JPEG_TAIL_BYTES = b"\xff\xd9", 64
 SAMPLE_STEP = 4  # of the pixels that statistics are made of, in rows and columns
 SAMPLE_EVERY = 10  # pictures
@@ -71,6 +74,8 @@ def write_videos(
     for key, message, boot, tick in _exposures(path):
         if not find_spec("av"):
             raise ConfigError("videos need PyAV: pip install 'gigabrain-zenoh[lerobot]'")
+        if key not in tracks and len(tracks) >= 2 * MOST_CAMERAS:
+            continue
         if key not in tracks:
             tracks[key] = _Track(key, places, folder / _file_of(key), hz)
         tracks[key].take(message, boot, tick)
@@ -89,7 +94,7 @@ def _exposures(path: Path) -> Iterator[tuple[str, Message, int, int]]:
         if sample.key == STATE.key:
             boot, tick = sample.header.boot, sample.header.tick
         topic, _, camera = sample.key.rpartition("/")
-        if topic not in (IMAGE.key, DEPTH.key):
+        if topic not in (IMAGE.key, DEPTH.key) or not CAMERA_NAME.fullmatch(camera):
             continue
         message = message_of(sample)
         if message is not None:

@@ -21,10 +21,59 @@ NAVIGATES = {
     "speed": 2.0,  # in lock-step, so that a busy machine does not make it stop
 }
 SIZES = {"light": (1280, 800), "phone": (390, 844), "dark": (1280, 800)}
+SEEN_S = 20.0  # in which the cameras see the room around the robot
+ROOM = """
+description: a room with a table, low boxes, cans and a person
+size: [6, 5]
+start: [-1.8, 0, 0]
+boxes:
+  - {at: [0.9, 1.2], size: [1.2, 0.7, 0.03], bottom: 0.42, material: wood}
+  - {at: [0.4, 0.95], size: [0.05, 0.05, 0.42], material: dark_wood}
+  - {at: [1.4, 0.95], size: [0.05, 0.05, 0.42], material: dark_wood}
+  - {at: [0.4, 1.45], size: [0.05, 0.05, 0.42], material: dark_wood}
+  - {at: [1.4, 1.45], size: [0.05, 0.05, 0.42], material: dark_wood}
+  - {at: [-0.4, -0.7], size: [0.3, 0.2, 0.08], yaw: 0.4, material: carton}
+  - {at: [1.9, -0.6], size: [0.4, 0.3, 0.3], yaw: 0.2, material: carton}
+cylinders:
+  - {at: [-0.5, 0.35], radius: 0.035, height: 0.12, material: steel}
+  - {at: [0.3, -0.2], radius: 0.035, height: 0.12, material: blue}
+people:
+  - {path: [[0.8, -1.6], [1.6, -1.6]], speed: 0.1}
+"""
 
 
 async def take_screenshots(folder: Path) -> None:
-    """Explore the house and take all screenshots; the dark one shows the topics."""
+    """Take all screenshots."""
+    await take_map_screenshots(folder)
+    await take_camera_screenshot(folder)
+
+
+async def take_camera_screenshot(folder: Path) -> None:
+    """Explore a room with cameras, and show what they see."""
+    with tempfile.TemporaryDirectory() as place:
+        home = Home(Path(place) / "home")
+        world = home.folder / "room.yaml"
+        world.write_text(ROOM)
+        try:
+            robot = Robot(home, world=str(world), cameras=True, **NAVIGATES)
+            await robot.served()
+            async with async_playwright() as playwright:
+                chromium = await playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+                page = await chromium.new_page()
+                await page.goto(f"{robot.origin}/#{OPERATOR}")
+                await prepare(page, "light")
+                await page.wait_for_selector("#show-contours", timeout=READY_S * 1000)
+                await page.wait_for_timeout(SEEN_S * 1000)
+                await page.click('[data-camera="front"] .frame')  # larger
+                await page.wait_for_timeout(1000)
+                await page.screenshot(path=folder / "page_cameras.png")
+                await chromium.close()
+        finally:
+            home.close()
+
+
+async def take_map_screenshots(folder: Path) -> None:
+    """Explore the house; the dark screenshot shows the topics."""
     with tempfile.TemporaryDirectory() as place:
         home = Home(Path(place) / "home")
         try:

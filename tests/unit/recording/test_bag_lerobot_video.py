@@ -181,6 +181,19 @@ def test_a_camera_of_broken_pictures_only_is_left_out(tmp_path: Path) -> None:
     assert not [key for key in info_of(folder)["features"] if "images" in key]
 
 
+def test_keys_that_name_no_camera_make_no_files(tmp_path: Path) -> None:
+    path, folder = tmp_path / "a.mcap", tmp_path / "dataset"
+    names = ["..", "a b", "a\0b", "x" * 40, *(f"cam{number}" for number in range(20))]
+    sent = [
+        (tick * TICK_NS, f"robot/image/{name}", image(tick)) for tick in (5, 10) for name in names
+    ]
+    write(path, driving(20), iter(sent))
+    convert(path, folder)
+    made = [each.name for each in (folder / "videos").iterdir()]
+    assert len(made) == 16
+    assert set(made) <= {f"observation.images.cam{number}" for number in range(20)}
+
+
 def test_depth_comes_back_as_lerobot_reads_it(tmp_path: Path) -> None:
     path, folder = tmp_path / "a.mcap", tmp_path / "dataset"
     write(path, driving(50), pictures(range(5, 51, 5), "robot/depth/front"))

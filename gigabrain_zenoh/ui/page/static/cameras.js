@@ -2,6 +2,7 @@
 import { $, makeElement, setText } from './panels.js'
 
 const SILENT_AFTER_MS = 1500, FOUND_FOR_MS = 1000
+const MAX_CAMERAS = 16 // as the server takes
 const ARIA_EVERY_MS = 2000 // between two descriptions for screen readers
 const LINE_PX = 2, TEXT_PX = 12 // on the screen
 const CHANNELS = { rgb8: [0, 1, 2], bgr8: [2, 1, 0], mono8: [0, 0, 0] }
@@ -49,8 +50,10 @@ export class Cameras {
 
   setProblem({ camera, problem }) {
     this.know([camera])
-    this.#viewOf(camera).reported = problem
-    this.#showProblem(this.#viewOf(camera))
+    const view = this.#viewOf(camera)
+    if (!view) return
+    view.reported = problem
+    this.#showProblem(view)
   }
 
   /** Take what perception thinks of the cameras. */
@@ -58,7 +61,7 @@ export class Cameras {
     for (const { name, ok, problem } of cameras) {
       this.know([name])
       const view = this.#viewOf(name), blind = ok ? '' : problem || 'cannot be believed'
-      if (view.blind === blind) continue
+      if (!view || view.blind === blind) continue
       view.blind = blind
       this.#showProblem(view)
     }
@@ -71,6 +74,7 @@ export class Cameras {
     const textAt = (at, length) => text.decode(new Uint8Array(data, 4 + at, length)).replace(/\0+$/, '')
     const camera = textAt(8, 64), encoding = textAt(72, 16), pixels = new Uint8Array(data, 92)
     const view = this.#viewOf(camera)
+    if (!view) return
     try {
       const picture = encoding === 'jpeg' ? await createImageBitmap(new Blob([pixels], { type: 'image/jpeg' })) : fromPixels(pixels, width, height, encoding)
       drawPicture(view.picture, picture)
@@ -86,12 +90,14 @@ export class Cameras {
 
   found(found) {
     const view = this.#viewOf(found.camera)
+    if (!view) return
     Object.assign(view, { found, foundMs: performance.now() })
     this.#drawFound(view)
   }
 
+  /** Return the panel of a camera, new or not; undefined if there are too many. */
   #viewOf(camera) {
-    if (!this.#views.has(camera)) this.#views.set(camera, this.#makeView(camera))
+    if (!this.#views.has(camera) && this.#views.size < MAX_CAMERAS) this.#views.set(camera, this.#makeView(camera))
     return this.#views.get(camera)
   }
 
