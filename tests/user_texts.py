@@ -328,6 +328,7 @@ def _chains() -> dict[str, why.ChainFacts]:
         id="goal-1", kind="goal", label="1 2", source="ann", state="paused", reason="by ann"
     )
     rest = replace(good.intent, twist=still, reason="no path")
+    lost_reason = f"waiting: {behaviours.WaitReason.NOT_LOCALIZED}"
     zone, lidar = catalogue.cause("zone_ahead"), catalogue.cause("scan_lost")
     blocked = SafetyState(verdict="ok", caps=SpeedCaps(forward=0.0), causes=(zone,))
     stop = SafetyState(verdict="stop", causes=(lidar,))
@@ -345,6 +346,7 @@ def _chains() -> dict[str, why.ChainFacts]:
         "starting": replace(good, intent=None, tasks=tasks, fastest=still),
         "no intent": replace(good, intent=None),
         "stands": replace(good, intent=rest, fastest=still),
+        "lost": replace(good, intent=replace(rest, reason=lost_reason), fastest=still),
         "no goal": replace(good, intent=rest, tasks=tasks, fastest=still),
         "paused": replace(good, intent=rest, tasks=replace(tasks, current=task), fastest=still),
         "no command": replace(good, command=None),

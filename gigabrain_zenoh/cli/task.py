@@ -33,20 +33,24 @@ TaskNameOrAll = Annotated[
 
 
 def goto(
-    place: Annotated[str, Parameter(allow_leading_hyphen=True)],
+    place: Annotated[str, Parameter(allow_leading_hyphen=True)] = "",
     y: Annotated[float | None, Parameter(allow_leading_hyphen=True)] = None,
     yaw: Annotated[float | None, Parameter(allow_leading_hyphen=True)] = None,
     /,
     *,
+    object: str = "",
+    tag: int | None = None,
     mode: Mode = "replace",
     wait: Wait = True,
     at: RobotAddress = LOCAL,
 ) -> None:
-    """Send the robot to a place in its map, and wait until it arrives.
+    """Send the robot to a place, a thing or a tag, and wait for it.
 
     Example: gigabrain goto 3.0 1.5 1.57
 
     Example: gigabrain goto kitchen
+
+    Example: gigabrain goto --object can
 
     Exit code 0 on arrival.
 
@@ -54,7 +58,16 @@ def goto(
         place: Place in the map: x [m], or the name of a place; see `gigabrain place list`.
         y: Place in the map [m], if x is given.
         yaw: Heading on arrival [rad]. Default: any, or that of the named place.
+        object: Class of a thing: before the nearest one. If none is known, it looks for one.
+        tag: Number of an AprilTag: before its face.
     """
+    if object or tag is not None:
+        if place or (object and tag is not None):
+            raise ConfigError("goto: expected a place, --object or --tag; got more than one")
+        _send(at, lambda tasks: tasks.go_to_object(object, tag=tag, how=mode), wait)
+        return
+    if not place:
+        raise ConfigError("goto: expected a place, --object CLASS or --tag NUMBER")
     if y is None:
         if _is_number(place):
             raise ConfigError(f"goto: Y is missing: expected two numbers, or a name; got {place!r}")

@@ -11,6 +11,7 @@ from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.body import BodyDescription, GateStatus, Joint, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.logs import AuditRecord
+from gigabrain_schemas.objects import ObjectMap
 from gigabrain_schemas.requests import GateReply
 from gigabrain_schemas.tasks import Task
 from gigabrain_schemas.topics import (
@@ -23,6 +24,7 @@ from gigabrain_schemas.topics import (
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.listening import listen, topic_named
 from gigabrain_zenoh.client.motion import OdometryMotion, Reached
+from gigabrain_zenoh.client.objects import known_objects
 from gigabrain_zenoh.client.requests import (
     ANSWER_S,
     audit_log,
@@ -121,13 +123,27 @@ class Robot:
         """
         return await self._carry_out(0.0, angle, speed)
 
-    async def goto(self, x: float | str, y: float | None = None, yaw: float | None = None) -> Task:
+    async def goto(
+        self,
+        x: float | str | None = None,
+        y: float | None = None,
+        yaw: float | None = None,
+        *,
+        object: str = "",
+        tag: int | None = None,
+    ) -> Task:
         """Send the robot to a pose [m, m, rad] or a named place; return the task once it has ended.
 
-        Cancelling this call cancels the goal. `tasks` has missions, the queue and progress. Raises
-        Refused, and BodyLost if no process serves goals.
+        Instead of these, `object` is the class of a thing to drive before, and `tag` the number of
+        a tag; the robot looks for one that it does not know. Cancelling this call cancels the goal.
+        `tasks` has missions, the queue and progress. Raises Refused, and BodyLost if no process
+        serves goals.
         """
-        if isinstance(x, str):
+        if sum((x is not None, bool(object), tag is not None)) != 1:
+            raise ConfigError("goto: expected x and y, the name of a place, an object or a tag")
+        if x is None:
+            name = await self.tasks.go_to_object(object, tag=tag)
+        elif isinstance(x, str):
             name = await self.tasks.go_to_place(x, yaw)
         elif y is None:
             raise ConfigError("goto: expected x and y, or the name of a place")
@@ -138,6 +154,10 @@ class Robot:
         except asyncio.CancelledError:
             await self.tasks.cancel(name)
             raise
+
+    async def objects(self) -> ObjectMap:
+        """Return the things and tags that the cameras have recognised. Raises BodyLost."""
+        return await known_objects(self._bus)
 
     async def set_base_velocity(
         self, linear_x: float, linear_y: float = 0.0, angular_z: float = 0.0

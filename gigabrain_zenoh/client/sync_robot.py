@@ -9,6 +9,7 @@ from typing import Any, TypeVar, overload
 from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.body import BodyDescription, Joint, RobotState
 from gigabrain_schemas.logs import AuditRecord
+from gigabrain_schemas.objects import ObjectMap
 from gigabrain_schemas.requests import GateReply
 from gigabrain_schemas.tasks import How, Task, TaskStatus
 from gigabrain_schemas.topics import Topic
@@ -75,6 +76,10 @@ class SyncTasks:
         """Start a mission, given as a file or as its text; return the task's name."""
         return self._run(self._tasks.carry_out(mission, how=how, label=label))
 
+    def go_to_object(self, label: str = "", *, tag: int | None = None, how: How = "replace") -> str:
+        """Send the robot before a thing of a class, or before a tag; return the task's name."""
+        return self._run(self._tasks.go_to_object(label, tag=tag, how=how))
+
     def explore(self, *, how: How = "replace") -> str:
         """Start exploring until nothing unknown is reachable; return the task's name."""
         return self._run(self._tasks.explore(how=how))
@@ -115,9 +120,21 @@ class SyncRobot:
         """Turn on the spot by `angle` [rad], counter-clockwise if it is positive."""
         return self._run(self._robot.turn(angle, speed=speed))
 
-    def goto(self, x: float | str, y: float | None = None, yaw: float | None = None) -> Task:
-        """Send the robot to a pose [m, m, rad] or a place's name, and wait until it arrives."""
-        return self._run(self._robot.goto(x, y, yaw))
+    def goto(
+        self,
+        x: float | str | None = None,
+        y: float | None = None,
+        yaw: float | None = None,
+        *,
+        object: str = "",
+        tag: int | None = None,
+    ) -> Task:
+        """Send the robot to a pose [m, m, rad], a place's name, an object or a tag, and wait."""
+        return self._run(self._robot.goto(x, y, yaw, object=object, tag=tag))
+
+    def objects(self) -> ObjectMap:
+        """Return the things and tags that the cameras have recognised."""
+        return self._run(self._robot.objects())
 
     def drive(self, linear_x: float = 0.0, angular_z: float = 0.0, *, seconds: float) -> None:
         """Drive [m/s, rad/s] for `seconds` of the robot's time, then stop."""

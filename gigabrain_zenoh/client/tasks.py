@@ -21,6 +21,7 @@ from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 from gigabrain_zenoh.security.identity_files import may_not_ask
 
 MAX_NAME_CHARS = 64
+MAX_TAG = 1_000_000
 LARGEST = 1e9  # limit of coordinates on the bus
 PLAN_S = 5.0  # how long path planning in a large map may take
 SILENT_S = 5.0  # after this long without a task status, the robot counts as lost
@@ -75,6 +76,20 @@ class Tasks:
         if not name or len(name) > MAX_NAME_CHARS:
             raise ConfigError(f"a place has a name of 1 to {MAX_NAME_CHARS} characters")
         request = GoalRequest(place=name, yaw=yaw, how=how, source=self._bus.process)
+        return await self._go(request)
+
+    async def go_to_object(
+        self, label: str = "", *, tag: int | None = None, how: How = "replace"
+    ) -> str:
+        """Send the robot before the nearest thing of a class, or before a tag; it looks for one.
+
+        Return the task's name. Raises ConfigError for a name or number that cannot be, and Refused.
+        """
+        if tag is not None and not 0 <= tag <= MAX_TAG:
+            raise ConfigError(f"a tag has a number from 0 to {MAX_TAG}, got {tag}")
+        if tag is None and not 1 <= len(label) <= MAX_NAME_CHARS:
+            raise ConfigError(f"a thing has a class of 1 to {MAX_NAME_CHARS} characters")
+        request = GoalRequest(object=label, tag=tag, how=how, source=self._bus.process)
         return await self._go(request)
 
     async def _go(self, request: GoalRequest) -> str:

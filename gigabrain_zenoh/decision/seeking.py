@@ -17,19 +17,20 @@ GAP_M = 0.25  # between the body's front and a thing that it stands before,
 FARTHER_M = (0.0, 0.1, 0.2, 0.35, 0.5, 0.8)  # or so much more, where the thing stands in a corner
 ROUND_RAD = np.radians(np.arange(0, 360, 15))  # directions from which a thing is looked at,
 BEFORE_RAD = np.radians((0, -10, 10, -20, 20, -35, 35))  # and those off a tag's face
-FARTHER_COST, TURNED_COST, NARROW_COST = 2.0, 1.0, 0.05  # [m] of way, for a metre, rad and cost
+FARTHER_COST, TURNED_COST, NARROW_COST = 4.0, 1.0, 0.05  # [m] of way, for a metre, rad and cost
 OWN_M = 0.25  # round a thing, what is occupied is the thing itself or what it stands at
 OCCUPIED_PERCENT = 65
 
 CELL_M = 0.2  # of what has been looked at
-LOOK_M, LEAST_LOOK_M = 2.5, 0.3  # within which a thing is recognised
+LOOK_M = 2.5  # within which a thing is recognised
+OWN_GROUND_M = 0.5  # round the body: it would stand in a thing there
 RIM_RAD = math.radians(4)  # at the picture's edge, where a thing may be cut off
 SAMPLE_M = 0.05  # along a line of sight
-STAND_M = (0.6, 1.8)  # from what is looked at, where there is a choice
+STAND_M = (0.5, 1.8)  # from what is looked at, where there is a choice
 NEIGHBOURS, AROUND_M = 4, 0.45  # unseen cells so near together are worth a look
-NEARBY_M = 1.2  # unseen cells so near to the chosen one are looked at with it
 SURE_TICKS = 75  # 1.5 s, until all counts as seen: what was seen last is still being recognised
-VIEWPOINTS = 24  # that are tried at once
+VIEWPOINTS = 16  # round what is to be looked at, that are tried
+LOOK_PRICE_M = 1.0  # of way, that one look costs
 
 MAX_VISIT_COST, MIN_VISIT_M = 2.0, 1.5  # cost of a place worth visiting, and length of the way [m]
 
@@ -151,13 +152,12 @@ class LookAround:
         unseen, far = self._unseen(costs, way)
         if not len(unseen):
             return None
-        spots = (unseen + 0.5) * CELL_M
+        spots = ((unseen + 0.5) * CELL_M).astype(np.float64)
         bearing = np.arctan2(spots[:, 1] - here.y, spots[:, 0] - here.x)
         turn = np.abs(np.remainder(bearing - here.yaw + np.pi, 2 * np.pi) - np.pi)
         best = int(np.argmin(far + 0.3 * turn))
         self._aim = tuple(unseen[best].tolist())
-        around = np.hypot(*(spots - spots[best]).T) < NEARBY_M
-        self.goal = _viewpoint(costs, body, here, spots[best], spots[around].mean(axis=0), way)
+        self.goal = _viewpoint(costs, body, here, spots[best], spots, way)
         return self.goal
 
     def _unseen(self, costs: Costmap, way: Floats) -> tuple[Cells, Floats]:
@@ -203,34 +203,46 @@ def _in_view(costs: Costmap, camera: Camera, here: Pose) -> Cells:
     half = math.atan2(camera.width / 2, fx) - RIM_RAD
     axis = here.yaw + camera.yaw
     turn = np.abs(np.remainder(np.arctan2(off[:, 1], off[:, 0]) - axis + np.pi, 2 * np.pi) - np.pi)
-    cells = cells[(far <= LOOK_M) & (far >= LEAST_LOOK_M) & (turn <= half)]
+    cells = cells[(far <= LOOK_M) & ((turn <= half) | (far < OWN_GROUND_M))]
     found: Cells = cells[in_sight(costs, eye, (cells + 0.5) * CELL_M, CELL_M)]
     return found
 
 
 def _viewpoint(
-    costs: Costmap, body: BodyDescription, here: Pose, aim: Floats, middle: Floats, way: Floats
+    costs: Costmap, body: BodyDescription, here: Pose, aim: Floats, spots: Floats, way: Floats
 ) -> Goal:
-    """Return the place nearest by its way that sees `aim` (2,), facing `middle` (2,)."""
-    yaw = math.atan2(*(middle - (here.x, here.y))[::-1].tolist())
-    off = math.hypot(*(aim - (here.x, here.y)).tolist())
+    """Return the place that sees `aim` (2,), and many of the `spots` (n, 2) for its way."""
     eye = np.array((here.x, here.y))
+    off = math.hypot(*(aim - eye).tolist())
     turns = body.turning_radius == 0.0
     if turns and STAND_M[0] <= off <= LOOK_M and in_sight(costs, eye, aim[None], CELL_M)[0]:
-        yaw = math.atan2(*(aim - eye)[::-1].tolist())
-        return Goal(x=here.x, y=here.y, yaw=yaw)
+        return Goal(x=here.x, y=here.y, yaw=_facing(body, eye, aim, spots)[0])
     angles = np.linspace(0.0, math.tau, VIEWPOINTS, endpoint=False)
     ring = np.column_stack((np.cos(angles), np.sin(angles)))
+    places = [aim, *(aim + far * one for far in np.linspace(*STAND_M, 4) for one in ring)]
     best, least = aim, math.inf
-    for far in (*np.linspace(*STAND_M, 4).tolist(), 0.0):
-        for place in aim + far * ring if far else aim[None]:
-            cell = costs.cell(*place.tolist())
-            if cell is None or costs.cost[cell] >= LETHAL or way[cell] >= least:
-                continue
-            if far and not in_sight(costs, place, aim[None], CELL_M)[0]:
-                continue
-            best, least = place, float(way[cell])
+    for k, place in enumerate(places):
+        cell = costs.cell(*place.tolist())
+        if cell is None or costs.cost[cell] >= LETHAL or not math.isfinite(way[cell]):
+            continue
+        if k and not in_sight(costs, place, aim[None], CELL_M)[0]:
+            continue
+        price = (float(way[cell]) + LOOK_PRICE_M) / (_facing(body, place, aim, spots)[1] + 1)
+        if price < least:
+            best, least = place, price
     x, y = best.tolist()
-    to = middle - best
-    facing = math.atan2(float(to[1]), float(to[0])) if np.hypot(*to) > CELL_M else None
-    return Goal(x=x, y=y, yaw=facing if turns else None)
+    return Goal(x=x, y=y, yaw=_facing(body, best, aim, spots)[0] if turns else None)
+
+
+def _facing(body: BodyDescription, eye: Floats, aim: Floats, spots: Floats) -> tuple[float, int]:
+    """Return the heading from which a camera shows `aim` and most of the `spots`, and how many."""
+    camera = body.cameras[0]
+    half = math.atan2(camera.width / 2, camera.pinhole[0]) - RIM_RAD
+    off = spots - eye
+    bearings = np.arctan2(off[:, 1], off[:, 0])[np.hypot(*off.T) <= LOOK_M]
+    ahead = math.atan2(*(aim - eye)[::-1].tolist())
+    options = ahead + half * np.array((0.0, 0.4, -0.4, 0.8, -0.8))
+    turns = np.abs(np.remainder(bearings[None, :] - options[:, None] + np.pi, 2 * np.pi) - np.pi)
+    counts = (turns <= half).sum(axis=1)
+    best = int(np.argmax(counts))
+    return math.remainder(float(options[best]) - camera.yaw, math.tau), int(counts[best])

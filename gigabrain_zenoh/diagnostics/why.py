@@ -26,6 +26,7 @@ from gigabrain_schemas.topics import (
     command_topic,
 )
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.decision.behaviours import WaitReason
 from gigabrain_zenoh.diagnostics.discovery import discover
 from gigabrain_zenoh.diagnostics.robot_view import RobotView
 from gigabrain_zenoh.diagnostics.topic_stats import HOPS, ChainMonitor, monitor_chain
@@ -45,6 +46,11 @@ START_ROUTER = (
     "start the robot with `gigabrain up` or `gigabrain demo`, or name its router with --connect"
 )
 READ_SAFETY_LOG = "read its log with `gigabrain log --process safety`"
+GOES_ON = "remove the cause; decision then goes on by itself"
+FIND_IT = (
+    "drive it a turn with `gigabrain teleop`, show its camera a tag that it knows, "
+    "or tell it where it is with `gigabrain pose X Y`"
+)
 CHECK_LIDAR = "check the lidar's power and cable"
 
 
@@ -204,7 +210,7 @@ def _intent(facts: ChainFacts) -> LinkStatus:
             ok=False,
             waits=True,
             text=f"decision wants to stand: {intent.reason}",
-            remedy="remove the cause; decision then goes on by itself",
+            remedy=FIND_IT if WaitReason.NOT_LOCALIZED in intent.reason else GOES_ON,
         )
     return _ok("intent", f"{intent.reason}{_after(facts, INTENT.key, 'the world')}")
 

@@ -1,0 +1,80 @@
+"""Requests about things, tags and the robot's pose, as the page and the command line make them."""
+
+import asyncio
+from typing import Any
+
+import msgspec
+
+from gigabrain_schemas.brain import PoseInMap
+from gigabrain_schemas.objects import ObjectMap, ObjectsRequest
+from gigabrain_schemas.requests import PoseRequest
+from gigabrain_schemas.topics import OBJECT_MAP, OBJECTS_CHANGE, POSE, POSE_SET
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.client.zones import ANSWER_S, NO_MAPPING
+from gigabrain_zenoh.codec import Codec
+from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
+
+FOUND_S = 4.0  # within which a robot is found where somebody says that it is
+UNDERWAY_S = 0.1  # for which poses of before the request may still arrive
+NO_OBJECTS = (
+    "no process remembers things; the robot needs a camera (--cameras), and perception a map "
+    "(mapping: slam or localize)"
+)
+
+
+async def known_objects(bus: Bus) -> ObjectMap:
+    """Return the things and tags that the robot knows. Raises BodyLost."""
+    kept = await bus.kept(OBJECT_MAP)
+    if not kept:
+        raise BodyLost(NO_OBJECTS)
+    found: ObjectMap = Codec(OBJECT_MAP.type, OBJECT_MAP.max_bytes).decode(kept[0])
+    return found
+
+
+async def forget_objects(bus: Bus, **fields: Any) -> str:
+    """Forget `ids`, `tags` or `everything`; return the reply as text. Raises as below."""
+    request = _request(ObjectsRequest, {"source": bus.process[:64], **fields})
+    replies = await bus.ask(OBJECTS_CHANGE, request, timeout_s=ANSWER_S)
+    if not replies:
+        raise BodyLost(NO_OBJECTS)
+    if not replies[0].ok:
+        raise Refused(replies[0].text)
+    return replies[0].text
+
+
+async def set_pose(bus: Bus, x: float, y: float, yaw: float | None = None) -> PoseInMap:
+    """Tell the robot where it is [m, m, rad]; return its pose once its scan has confirmed it.
+
+    Raises ConfigError for numbers that are not valid, BodyLost, and Refused if the scan does not
+    fit there.
+    """
+    request = _request(PoseRequest, {"x": x, "y": y, "yaw": yaw, "source": bus.process[:64]})
+    replies = await bus.ask(POSE_SET, request, timeout_s=ANSWER_S)
+    if not replies:
+        raise BodyLost(NO_MAPPING)
+    if not replies[0].ok:
+        raise Refused(replies[0].text)
+    await asyncio.sleep(UNDERWAY_S)
+    found: asyncio.Future[PoseInMap] = asyncio.get_running_loop().create_future()
+
+    def on_pose(_key: str, pose: PoseInMap) -> None:
+        if pose.localized and not found.done():
+            found.set_result(pose)
+
+    close = bus.subscribe(POSE, on_pose)
+    try:
+        return await asyncio.wait_for(found, FOUND_S)
+    except TimeoutError:
+        raise Refused(
+            f"not found: the scan does not tell its place round ({x:.2f}, {y:.2f}); "
+            "the whole map is searched; check the place, or drive the robot a little"
+        ) from None
+    finally:
+        close()
+
+
+def _request(kind: Any, fields: dict[str, Any]) -> Any:
+    try:
+        return msgspec.convert(fields, kind)
+    except (ValueError, OverflowError) as error:  # msgspec.ValidationError is one
+        raise ConfigError(f"not a valid request: {error}") from None

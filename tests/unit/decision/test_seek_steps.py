@@ -1,0 +1,160 @@
+"""The step that finds a thing or a tag: what it wants, and what becomes of it."""
+
+from collections.abc import Collection
+
+import pytest
+
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.objects import MapObject, MapTag, ObjectMap
+from gigabrain_zenoh.decision.known_objects import Sought, Wanted, named, sought
+from gigabrain_zenoh.decision.tasks.mission import loads
+from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskQueue
+from gigabrain_zenoh.errors import ConfigError
+from tests.unit.decision.sites import Robot
+
+
+def can(number: int, x: float, y: float = 0.0, label: str = "can") -> MapObject:
+    return MapObject(id=number, label=label, x=x, y=y, z=0.06, size=(0.07, 0.12), confidence=0.9)
+
+
+class Seeker(Robot):
+    """An executive that knows some things; it stands at the origin."""
+
+    def __init__(self, saved: Saved | None = None) -> None:
+        super().__init__()
+        self.known = ObjectMap(recognizing=True)
+        self.tasks = TaskQueue(self._read, self._start, saved or Saved(), self._seek)
+
+    def knows(self, *objects: MapObject, tags: tuple[MapTag, ...] = ()) -> None:
+        self.known = ObjectMap(objects=objects, tags=tags, recognizing=True)
+
+    def wanted(self) -> tuple[str, str] | None:
+        """What is commanded, and the name of its target."""
+        self.step()
+        if self.command is None:
+            return None
+        return self.command.kind, self.command.target.name if self.command.target else ""
+
+    def _seek(self, wanted: Wanted, without: Collection[int], preferred: int | None) -> Sought:
+        return sought(self.known, Pose(x=0.0, y=0.0, yaw=0.0), wanted, without, preferred)
+
+
+def test_it_looks_for_a_thing_and_drives_before_the_nearest_once_it_is_known() -> None:
+    robot = Seeker()
+    robot.tasks.add_find("can", "replace", "ann")
+    assert robot.wanted() == ("look", "")
+    assert robot.status.doing == "looking for a can"
+    robot.knows(can(4, 5.0), can(9, 2.0), can(1, 0.1, label="ball"))
+    assert robot.wanted() == ("approach", "can 9")
+    assert robot.status.doing == "going before can 9"
+    robot.knows(can(4, 0.5), can(9, 2.04))  # it keeps to the one that it has chosen
+    number = robot.command.number if robot.command else 0
+    assert robot.wanted() == ("approach", "can 9")
+    assert robot.command
+    assert robot.command.number == number
+    robot.knows(can(9, 2.4))  # it was pushed
+    assert robot.wanted() == ("approach", "can 9")
+    assert robot.command.number > number
+    robot.reached()
+    assert robot.last == ("succeeded", "it is there")
+    assert (robot.status.done[0].kind, robot.status.done[0].label) == ("goal", "find a can")
+
+
+def test_a_thing_that_is_carried_away_under_way_is_looked_for_again() -> None:
+    robot = Seeker()
+    robot.tasks.add_find("can", "replace", "ann")
+    robot.knows(can(1, 2.0))
+    assert robot.wanted() == ("approach", "can 1")
+    robot.knows()
+    assert robot.wanted() == ("look", "")
+    seek = robot.command.seek if robot.command else 0
+    robot.knows(can(2, 3.0))
+    assert robot.wanted() == ("approach", "can 2")
+    robot.knows()
+    assert robot.wanted() == ("look", "")
+    assert robot.command
+    assert robot.command.seek == seek  # what has been looked at counts on
+
+
+def test_when_all_was_looked_at_it_fails_in_words() -> None:
+    robot = Seeker()
+    robot.carry_out("do: [{find: umbrella}]")
+    assert robot.wanted() == ("look", "")
+    robot.failed("everything reachable was looked at")
+    assert robot.last == (
+        "failed",
+        "an umbrella was not found: everything reachable was looked at",
+    )
+
+
+def test_of_two_things_the_one_that_can_be_reached_will_do() -> None:
+    robot = Seeker()
+    robot.carry_out("do: [{find: can}]")
+    robot.knows(can(1, 1.0), can(2, 2.0))
+    assert robot.wanted() == ("approach", "can 1")
+    robot.failed("no free and reachable place before can 1")
+    assert robot.wanted() == ("approach", "can 2")
+    robot.failed("no free and reachable place before can 2")
+    assert robot.wanted() == ("look", "")
+    robot.failed("everything reachable was looked at")
+    assert robot.last[1] == (
+        "no free and reachable place before can 1; no free and reachable place before can 2; "
+        "a can was not found: everything reachable was looked at"
+    )
+
+
+def test_while_nothing_is_recognised_it_waits_and_says_so() -> None:
+    robot = Seeker()
+    robot.tasks.add_find("can", "replace", "ann")
+    robot.known = ObjectMap()
+    assert robot.wanted() is None
+    assert "recognition" in robot.status.doing
+    robot.known = ObjectMap(objects=(can(1, 1.0),))  # what is known is driven to all the same
+    assert robot.wanted() == ("approach", "can 1")
+
+
+def test_missions_name_tags_as_places_also_at_a_charger() -> None:
+    robot = Seeker()
+    robot.carry_out(
+        "do: [{battery_below: {percentage: 20, goto: {tag: 7}, do: [{goto: {tag: 3}}]}}]"
+    )
+    tags = tuple(MapTag(id=n, x=float(n), y=0.0, z=0.4, yaw=3.0, size=0.16) for n in (3, 7))
+    robot.knows(tags=tags)
+    assert robot.wanted() == ("approach", "tag 3")
+    assert robot.command
+    assert robot.command.target
+    assert robot.command.target.yaw == 3.0
+    robot.charge = 10.0
+    assert robot.wanted() == ("approach", "tag 7")
+
+
+def test_a_find_goes_on_after_a_restart_of_decision() -> None:
+    robot = Seeker()
+    robot.carry_out("do: [{goto: a}, {find: can}]")
+    robot.step()
+    robot.reached()
+    again = Seeker(robot.tasks.saved)
+    assert again.wanted() == ("look", "")
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("do: [{find: ''}]", "length >= 1"),
+        ("do: [{find: {tag: -1}}]", ">= 0"),
+        ("do: [{find: [1, 2]}]", "got a list of 2"),
+        ("do: [{goto: {tag: seven}}]", "got 'seven'"),
+        ("do: [{goto: {tag: 7, more: 1}}]", "unknown field"),
+    ],
+)
+def test_what_cannot_be_found_is_refused(text: str, why: str) -> None:
+    with pytest.raises(ConfigError, match="m:1: ") as refused:
+        loads(text, "m")
+    assert why in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_things_are_named_for_people() -> None:
+    assert [named(one) for one in ("can", "umbrella", "Apple", 7)] == [
+        "a can", "an umbrella", "an Apple", "tag 7",
+    ]  # fmt: skip

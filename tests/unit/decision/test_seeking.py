@@ -1,0 +1,159 @@
+"""Places before things and tags, and the order in which unseen places are looked at."""
+
+import math
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.body import Camera
+from gigabrain_zenoh.decision.behaviours import DriveCommand, Target
+from gigabrain_zenoh.decision.route import RouteFeedback, RoutePlanner, RouteRequest
+from gigabrain_zenoh.decision.seeking import LookAround, place_before
+from gigabrain_zenoh.navigation.costmap import Costmap, costmap, inflation
+from gigabrain_zenoh.navigation.grid_search import GridSearch
+from gigabrain_zenoh.testing.samples import WAFFLE
+from tests.unit.navigation.grids import empty, grid_of
+
+SEEING = replace(
+    WAFFLE, cameras=(Camera(name="front", width=320, height=240, field_of_view=1.047, depth=True),)
+)
+ROOM = empty(6.0, 4.0)
+HERE = Pose(x=1.0, y=1.0, yaw=0.0)
+FRONT_M = 0.075
+
+
+def costs_of(cells: np.ndarray) -> Costmap:
+    return costmap(grid_of(cells), inflation(WAFFLE))
+
+
+def can(x: float, y: float) -> Target:
+    return Target(name="can 1", x=x, y=y, radius=0.035)
+
+
+def off(place: object, target: Target) -> tuple[float, float]:
+    """How far it stands from a target [m], and how far it looks past it [rad]."""
+    x, y, yaw = place.x, place.y, place.yaw  # type: ignore[attr-defined]
+    turn = math.atan2(target.y - y, target.x - x) - yaw
+    return math.hypot(target.x - x, target.y - y), abs(math.remainder(turn, math.tau))
+
+
+def test_it_stands_before_a_thing_on_the_near_side_and_faces_it() -> None:
+    target = can(4.0, 1.0)
+    place = place_before(costs_of(ROOM), WAFFLE, HERE, target, GridSearch())
+    assert place
+    distance, turn = off(place, target)
+    assert distance == pytest.approx(FRONT_M + 0.035 + 0.25, abs=0.01)
+    assert turn < 0.01
+    assert place.x < 4.0
+
+
+def test_before_a_thing_in_a_corner_it_stands_where_it_fits() -> None:
+    target = can(5.8, 3.8)
+    costs = costs_of(ROOM)
+    place = place_before(costs, WAFFLE, HERE, target, GridSearch())
+    assert place
+    assert costs.cost[costs.cell(place.x, place.y)] < 100  # type: ignore[index]
+    assert off(place, target)[0] < 1.2
+
+
+def test_it_does_not_stand_behind_the_wall_from_a_thing() -> None:
+    cells = ROOM.copy()
+    cells[:30, 30] = 100  # a wall at x = 3 m, open above y = 3 m
+    target = can(3.5, 1.0)
+    place = place_before(costs_of(cells), WAFFLE, HERE, target, GridSearch())
+    assert place
+    assert place.x > 3.2
+
+
+def test_before_a_tag_it_stands_on_the_side_of_its_face() -> None:
+    target = Target(name="tag 7", x=5.9, y=2.0, radius=0.02, yaw=math.pi)
+    place = place_before(costs_of(ROOM), WAFFLE, HERE, target, GridSearch())
+    assert place
+    assert (place.x, place.y) == pytest.approx((5.9 - 0.345, 2.0), abs=0.15)
+    turned_away = replace(target, yaw=0.0)  # its face is towards the wall
+    assert place_before(costs_of(ROOM), WAFFLE, HERE, turned_away, GridSearch()) is None
+
+
+def test_where_no_place_is_free_there_is_none() -> None:
+    cells = ROOM.copy()
+    cells[:, 30] = 100  # a wall right across
+    assert place_before(costs_of(cells), WAFFLE, HERE, can(4.5, 1.0), GridSearch()) is None
+    assert place_before(costs_of(ROOM), WAFFLE, HERE, can(1e5, -1e5), GridSearch()) is None
+
+
+def test_a_thing_shown_by_the_map_does_not_hide_itself() -> None:
+    cells = ROOM.copy()
+    cells[9:11, 39:41] = 100  # a box, round (4, 1)
+    target = Target(name="box 1", x=4.0, y=1.0, radius=0.15)
+    place = place_before(costs_of(cells), WAFFLE, HERE, target, GridSearch())
+    assert place
+    assert off(place, target)[0] >= FRONT_M + 0.15 + 0.25 - 0.01
+
+
+def search(cells: np.ndarray, *, most: int = 400) -> tuple[list[Pose], str]:
+    """Poses that a search of everything goes through, as if it drove at once, and its end."""
+    planner, here, poses = RoutePlanner(), HERE, []
+    tick, feedback = 0, None
+    for _ in range(most):
+        tick += 25
+        route = planner.plan(
+            RouteRequest(
+                tick=tick,
+                command=DriveCommand(5, "look", seek=5),
+                here=here,
+                grid=grid_of(cells),
+                body=SEEING,
+                feedback=feedback,
+                seen=np.empty((0, 2)),
+            )
+        )
+        if route.state != "running":
+            return poses, route.reason
+        feedback = None
+        if route.goal:
+            yaw = here.yaw if route.goal.yaw is None else route.goal.yaw
+            here = Pose(x=route.goal.x, y=route.goal.y, yaw=yaw)
+            poses.append(here)
+            feedback = RouteFeedback(version=route.version, arrived=True)
+    raise AssertionError("it looks for ever")
+
+
+def seen_by(poses: list[Pose], cells: np.ndarray) -> float:
+    """The share of the free cells that a camera has seen from one of these poses."""
+    looks, costs = LookAround(), costs_of(cells)
+    for pose in poses:
+        looks.look(costs, SEEING, pose, 1)
+    rows, columns = np.nonzero(cells == 0)
+    points = np.floor(costs.points(rows, columns) / 0.2).astype(int)
+    return float(np.mean([tuple(one) in looks._seen for one in points.tolist()]))
+
+
+def test_it_looks_at_a_whole_room_and_then_says_that_nothing_is_there() -> None:
+    poses, reason = search(ROOM)
+    assert reason == "everything reachable was looked at"
+    assert seen_by(poses, ROOM) > 0.9
+    assert len(poses) < 40
+
+
+def test_it_looks_into_each_room_of_a_flat() -> None:
+    cells = empty(8.0, 6.0)
+    cells[:25, 40] = 100
+    cells[35:, 40] = 100  # a wall with a door
+    poses, reason = search(cells)
+    assert reason == "everything reachable was looked at"
+    assert seen_by(poses, cells) > 0.9
+
+
+def test_a_room_behind_a_wall_is_not_looked_for_for_ever() -> None:
+    cells = empty(8.0, 4.0)
+    cells[:, 40] = 100
+    poses, reason = search(cells)
+    assert reason == "everything reachable was looked at"
+    assert max(pose.x for pose in poses) < 4.0
+
+
+def test_it_turns_on_the_spot_before_it_drives() -> None:
+    poses, _ = search(ROOM)
+    assert (poses[0].x, poses[0].y) == (1.0, 1.0)
