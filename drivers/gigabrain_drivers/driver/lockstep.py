@@ -1,8 +1,9 @@
 """Lock-step of a simulation with the brain, and the round trip from scan to command."""
 
 import asyncio
+import logging
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 from gigabrain_schemas.brain import CmdVel, WorldModel
 from gigabrain_schemas.safety import SafetyState
@@ -10,7 +11,9 @@ from gigabrain_zenoh.gate.causes import BRAIN_SILENT
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.geometry.stopping import REPEAT_TICKS
 from gigabrain_zenoh.host.bounded import NewestValues
+from gigabrain_zenoh.logs import Fault
 
+log = logging.getLogger(__name__)
 TIMEOUT_S = 0.15  # of wall time per tick
 REPEAT_S = 0.1  # how often the first tick is announced until the brain is there
 
@@ -44,6 +47,7 @@ class Lockstep:
         self._contours: dict[str, int] = {}  # the one of the newest contours
         self._wake = asyncio.Event()
         self.timeouts = 0  # ticks that went on without the brain
+        self._fault = Fault(log)  # never ended: only the first of them is logged
 
     def begin(self, tick: int, basis: int, exposed: Iterable[str] = ()) -> None:
         """A tick has been sent out; `basis` is the tick of the newest scan, or 0.
@@ -96,18 +100,21 @@ class Lockstep:
         self._wake.set()
 
     @property
-    def _seen_by_cameras(self) -> bool:
-        return all(
-            self._pictures.get(name, 0) >= tick and self._contours.get(name, tick) >= tick
-            for name, tick in self._exposed.items()
-        )
-
-    @property
     def complete(self) -> bool:
         """True once the tick has been answered."""
-        rested = min(self._echo_basis, self._judged) >= self._basis
-        rested = rested and self._seen_by_cameras
-        return rested and self._echo >= self._tick and self._seen >= self._wanted
+        return next(self._missing(), None) is None
+
+    def _missing(self) -> Iterator[str]:
+        """Yield what has not come yet, in words."""
+        if self._echo < self._tick or self._echo_basis < self._basis:
+            yield "a command"
+        if self._judged < self._basis or self._seen < self._wanted:
+            yield "a verdict of safety"
+        for name, tick in self._exposed.items():
+            if self._pictures.get(name, 0) < tick:
+                yield f"a picture of the camera {name}"
+            elif self._contours.get(name, tick) < tick:
+                yield f"the contours of the camera {name}"
 
     async def wait(self, timeout_s: float) -> bool:
         """Wait for the answer; return whether it came in time."""
@@ -124,6 +131,10 @@ class Lockstep:
         """Wait as long as a tick waits, and count where that was in vain."""
         if not await self.wait(self._timeout_s):
             self.timeouts += 1
+            missing = ", ".join(self._missing())
+            self._fault.begin(
+                f"tick {self._newest} went on after {self._timeout_s:g} s without {missing}"
+            )
 
 
 class RoundTrip:

@@ -37,7 +37,7 @@ from gigabrain_zenoh.qa.robot_under_test import (
 )
 
 START_S = 600.0  # a robot's processes and its first map, on a busy machine
-WAIT_S = 20.0  # that a tick may wait for the brain: a slow host decides the same
+WAIT_S = 3.0  # that a tick may wait for the brain: less than a stuck process may take
 MAX_SILENCE_S = 120.0  # of the tasks, and of the driver
 REACHED_M = 0.3  # from a goal at rest, by the physics
 LEAST_REACHED = 8  # goals of a world

@@ -1,5 +1,7 @@
 import asyncio
 
+import pytest
+
 from gigabrain_drivers.driver.lockstep import Lockstep
 from gigabrain_schemas.brain import CameraStatus, CmdVel, WorldModel
 from gigabrain_schemas.safety import SafetyState
@@ -155,3 +157,19 @@ def test_pictures_that_never_come_can_be_given_up() -> None:
     assert not steps.complete
     steps.forget_pictures()
     assert steps.complete
+
+
+async def test_the_first_tick_that_goes_on_alone_says_what_was_missing(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    steps = Lockstep(timeout_s=0.001)
+    for tick in (10, 15):
+        steps.begin(tick, tick, ("front", "rear"))
+        steps.verdict(SafetyState(verdict="ok", tick=tick, basis=tick))
+        steps.picture("rear", tick)
+        await steps.answered()
+    (record,) = caplog.records
+    for part in ("tick 10", "a command", "front"):
+        assert part in record.getMessage()
+    for part in ("safety", "rear"):
+        assert part not in record.getMessage()
