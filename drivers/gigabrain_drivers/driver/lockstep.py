@@ -3,7 +3,7 @@
 import asyncio
 import logging
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from gigabrain_schemas.brain import CmdVel, WorldModel
 from gigabrain_schemas.safety import SafetyState
@@ -15,6 +15,7 @@ from gigabrain_zenoh.logs import Fault
 
 log = logging.getLogger(__name__)
 TIMEOUT_S = 0.15  # of wall time per tick
+ANNOUNCE_S = 0.2  # of waiting, then a tick is announced again: states are stale after 0.25 s
 REPEAT_S = 0.1  # how often the first tick is announced until the brain is there
 
 MAX_TIMES = 20_000  # newest times that the figures are drawn from
@@ -127,14 +128,23 @@ class Lockstep:
             return False
         return True
 
-    async def answered(self) -> None:
-        """Wait as long as a tick waits, and count where that was in vain."""
-        if not await self.wait(self._timeout_s):
+    async def answered(self, again: Callable[[], object]) -> None:
+        """Wait as long as a tick waits, and count where that was in vain.
+
+        Meanwhile `again` announces the tick again, so that its state does not grow stale.
+        """
+        left_s = self._timeout_s
+        while not await self.wait(min(left_s, ANNOUNCE_S)):
+            left_s -= ANNOUNCE_S
+            if left_s > 0:
+                again()
+                continue
             self.timeouts += 1
             missing = ", ".join(self._missing())
             self._fault.begin(
                 f"tick {self._newest} went on after {self._timeout_s:g} s without {missing}"
             )
+            return
 
 
 class RoundTrip:

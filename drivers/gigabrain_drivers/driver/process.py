@@ -241,7 +241,7 @@ class DriverProcess:
         """
         if self._gate.tick > 1:
             self._begin(lockstep, state)
-            await lockstep.answered()
+            await lockstep.answered(lambda: self._publish_tick(state))
             return
         scan, answered, cameras_s = await self._newest_scan(), False, CAMERAS_S
         while not answered:

@@ -89,7 +89,7 @@ async def test_the_answer_wakes_the_one_who_waits() -> None:
 async def test_a_tick_that_nobody_answers_goes_on_and_is_counted() -> None:
     steps = Lockstep()
     steps.begin(1, 0)
-    await steps.answered()
+    await steps.answered(lambda: None)
     assert steps.timeouts == 1
 
 
@@ -167,9 +167,31 @@ async def test_the_first_tick_that_goes_on_alone_says_what_was_missing(
         steps.begin(tick, tick, ("front", "rear"))
         steps.verdict(SafetyState(verdict="ok", tick=tick, basis=tick))
         steps.picture("rear", tick)
-        await steps.answered()
+        await steps.answered(lambda: None)
     (record,) = caplog.records
     for part in ("tick 10", "a command", "front"):
         assert part in record.getMessage()
     for part in ("safety", "rear"):
         assert part not in record.getMessage()
+
+
+async def test_a_tick_that_waits_long_is_announced_again_until_it_is_answered() -> None:
+    steps = Lockstep(timeout_s=60.0)
+    steps.begin(10, 10)
+    announced = 0
+
+    def again() -> None:
+        nonlocal announced
+        announced += 1
+        if announced == 2:
+            answered(steps, 10)
+
+    await steps.answered(again)
+    assert (announced, steps.timeouts) == (2, 0)
+
+
+async def test_a_tick_with_the_usual_patience_is_announced_once() -> None:
+    steps = Lockstep()
+    steps.begin(10, 10)
+    await steps.answered(lambda: pytest.fail("announced again"))
+    assert steps.timeouts == 1
