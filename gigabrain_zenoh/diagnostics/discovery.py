@@ -25,6 +25,7 @@ COMMAND_OF_SERVICE = {  # services that people take for topics, and the commands
     "mission": "mission FILE", "task_change": "task", "map_save": "map save",
     "param": "param", "audit_log": "audit", "describe": "node info", "sim_change": "world",
     "map_list": "map list", "map_load": "map load NAME", "zones_change": "zone",
+    "pose_set": "pose X Y", "objects_change": "objects --forget ID",
 }  # fmt: skip
 INSTALL_MATPLOTLIB = "for pictures install: pip install 'gigabrain-zenoh[record]'"
 INK, PLAIN = "#1e293b", {"facecolor": "white", "edgecolor": "none", "pad": 1}

@@ -1,0 +1,143 @@
+"""A whole robot drives before things and tags that its camera would recognise.
+
+The test plays the recognition process, with the truth of the simulator.
+"""
+
+import asyncio
+import contextlib
+import json
+import math
+from collections.abc import AsyncIterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.objects import Detection, Detections, TagDetection
+from gigabrain_schemas.sim import SimRequest, Thing
+from gigabrain_schemas.topics import DETECTIONS, SIM_CHANGE
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.geometry.pose import ORIGIN, relative, to_frame
+from gigabrain_zenoh.qa.probe import Probe, probing
+from gigabrain_zenoh.runtime.connect import connect
+from gigabrain_zenoh.testing.processes import Home, robot_of
+from gigabrain_zenoh.testing.waiting import until
+from tests.system.test_cameras import can_draw
+
+COMPILING_S = 600.0  # at the very first start
+SIGHT_M, HALF_VIEW = 2.5, 0.45
+CORNERS = ((100.0, 100.0), (120.0, 100.0), (120.0, 80.0), (100.0, 80.0))
+TAG = Pose(x=0.9, y=3.15, yaw=-math.pi / 2)  # in the world, on its wall
+
+
+@dataclass
+class Recogniser:
+    """Publishes what the camera sees of some things, as the truth is."""
+
+    bus: Bus
+    robot: Probe
+    cans: list[Thing] = field(default_factory=list)
+    tags: dict[int, Pose] = field(default_factory=dict)
+    place: Pose = ORIGIN  # of the robot, in the world
+
+    async def run(self) -> None:
+        while True:
+            tick = self.robot.state.tick
+            replies = await self.bus.ask(SIM_CHANGE, SimRequest())
+            if replies and replies[0].robot:
+                self.place = replies[0].robot
+                self.bus.publish(DETECTIONS, self._picture(), basis=tick)
+            await asyncio.sleep(0.1)
+
+    def _picture(self) -> Detections:
+        things = [self._can(one) for one in self.cans if self.sees(one.x, one.y)]
+        tags = [self._tag(n, at) for n, at in self.tags.items() if self.sees(at.x, at.y)]
+        return Detections(
+            camera="front", width=320, height=240, things=tuple(things), tags=tuple(tags)
+        )
+
+    def _can(self, one: Thing) -> Detection:
+        x, y = to_frame(self.place, one.x, one.y)
+        return Detection(
+            label="can", confidence=0.9, box=(150, 110, 170, 140), position=(x, y, 0.06),
+            size=(0.1, 0.12),
+        )  # fmt: skip
+
+    def _tag(self, number: int, at: Pose) -> TagDetection:
+        seen = relative(self.place, at)
+        return TagDetection(
+            id=number, corners=CORNERS, size=0.16, position=(seen.x, seen.y, 0.4),
+            orientation=(0.0, 0.0, math.sin(seen.yaw / 2), math.cos(seen.yaw / 2)),
+        )  # fmt: skip
+
+    def off(self, x: float, y: float) -> tuple[float, float]:
+        """How far the robot is from a place [m], and how far it looks past it [rad]."""
+        ahead, left = to_frame(self.place, x, y)
+        return math.hypot(ahead, left), abs(math.atan2(left, ahead))
+
+    def sees(self, x: float, y: float) -> bool:
+        far, turn = self.off(x, y)
+        return far < SIGHT_M and turn < HALF_VIEW
+
+
+@contextlib.asynccontextmanager
+async def seeing(home: Home) -> AsyncIterator[Recogniser]:
+    """A robot with a camera in the arena, and somebody who recognises for it."""
+    file = home.deployment(
+        body="turtlebot3_waffle", world="arena", resume="auto", cameras=True, recognition=False,
+        perception={"mapping": "slam"}, decision={"behaviour": "navigate"},
+    )  # fmt: skip
+    up = home.start("up", str(file))
+    endpoint = await robot_of(home, up)
+    async with connect(endpoint, "looker", timeout_s=None) as bus, probing(endpoint) as robot:
+        await until(lambda: robot.state.gate.mode == "enabled", "driving", COMPILING_S)
+        recogniser = Recogniser(bus, robot)
+        running = asyncio.ensure_future(recogniser.run())
+        try:
+            yield recogniser
+        finally:
+            running.cancel()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not can_draw(), reason="there is no OpenGL here")
+async def test_it_goes_before_cans_and_tags_finds_them_and_lists_them(
+    home: Home, tmp_path: Path
+) -> None:
+    async with seeing(home) as seen:
+        await until(lambda: seen.place != ORIGIN, "a place")
+        nothing = await home.run("objects")
+        assert nothing.out.startswith("no things and no tags")
+        can = Thing(name="can", kind="cylinder", x=-1.2, y=1.0, size=(0.1, 0.1, 0.3))
+        added = await seen.bus.ask(SIM_CHANGE, SimRequest(do="add", thing=can))
+        assert added[0].ok, added[0].text
+        seen.cans, seen.tags = [can], {7: TAG}
+
+        there = home.start("goto", "--object", "can")
+        assert await there.ended(300.0) == 0, there.err
+        far, turn = seen.off(can.x, can.y)
+        assert 0.3 < far < 0.8
+        assert turn < 0.3
+        listed = await home.run("objects", "--json")
+        found = json.loads(listed.out)
+        assert [one["label"] for one in found["objects"]] == ["can"]
+
+        before = home.start("goto", "--tag", "7")
+        assert await before.ended(300.0) == 0, before.err
+        far, turn = seen.off(TAG.x, TAG.y)
+        assert far < 0.9
+        assert turn < 0.3
+        refused = await home.run("goto", "can")
+        assert refused.err == (
+            "gigabrain: no place is called 'can'; an object is: gigabrain goto --object can\n"
+        )
+        number = found["objects"][0]["id"]
+        forgot = await home.run("objects", "--forget", str(number))
+        assert forgot.out == f"forgot object {number}\n"
+
+        mission = tmp_path / "find.yaml"
+        mission.write_text("do: [{find: umbrella}]")
+        nowhere = home.start("mission", str(mission))
+        assert await nowhere.ended(600.0) == 1
+        assert "an umbrella was not found: everything reachable was looked at" in nowhere.err
