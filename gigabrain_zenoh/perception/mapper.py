@@ -28,7 +28,7 @@ from gigabrain_zenoh.geometry.scan import beams, hits
 from gigabrain_zenoh.host.bounded import NewestValues
 from gigabrain_zenoh.host.threads import InTime, done
 from gigabrain_zenoh.kernels.precompile import ensure_compiled
-from gigabrain_zenoh.mapping import map_file, object_file, zone_file
+from gigabrain_zenoh.mapping import map_file, zone_file
 from gigabrain_zenoh.mapping.autosave import Autosave, refuse
 from gigabrain_zenoh.mapping.keyframes import Scan, View
 from gigabrain_zenoh.mapping.localizer import Place
@@ -38,7 +38,6 @@ from gigabrain_zenoh.mapping.static_map import RobotMap, StaticMap
 from gigabrain_zenoh.mapping.zone_file import ZoneFile
 from gigabrain_zenoh.perception.node import LOCALIZE_KERNELS, MAP_KERNELS
 from gigabrain_zenoh.perception.pose_hints import PoseHints
-from gigabrain_zenoh.perception.surroundings import Surroundings
 from gigabrain_zenoh.perception.zone_keeper import ZoneKeeper
 
 if TYPE_CHECKING:
@@ -241,8 +240,8 @@ class Mapper:
         if place.localized:
             self._hints.found()
         if self._objects:
-            points = view.scan.points.astype(np.float64)
-            seen = Surroundings(body.description, world, points, self._chart.keyframes()[1])
+            keyframes = self._chart.keyframes()[1]
+            seen = self._objects.surroundings(body.description, world, view, keyframes)
             self._objects.at_scan(seen, place, moment)
             if self._published:
                 self._objects.publish(scan.basis)
@@ -363,7 +362,7 @@ class Mapper:
         saved, graph = await asyncio.to_thread(self._chart.still().to_save)
         if self._bus.input_log.live:
             zones = zone_file.encoded(self._zones.present)
-            objects = object_file.encoded(self._objects.present) if self._objects else b""
+            objects = self._objects.encoded() if self._objects else b""
             await asyncio.to_thread(
                 map_file.save, path, saved, graph, replace=replace, zones=zones, objects=objects
             )

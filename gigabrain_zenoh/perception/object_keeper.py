@@ -16,6 +16,8 @@ from msgspec import Struct
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_NS, TICK_S, Cause, Count, Finite, Name
+from gigabrain_schemas.body import BodyDescription
+from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.objects import (
     Detections,
     MapObject,
@@ -34,6 +36,7 @@ from gigabrain_zenoh.geometry.se2 import between, compose
 from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file
 from gigabrain_zenoh.host.threads import BackgroundWriter
 from gigabrain_zenoh.mapping import map_file, object_file
+from gigabrain_zenoh.mapping.keyframes import View
 from gigabrain_zenoh.mapping.localizer import Place
 from gigabrain_zenoh.mapping.object_file import ObjectFile
 from gigabrain_zenoh.mapping.odometry import OdometryFusion, OdometrySample
@@ -177,6 +180,12 @@ class ObjectKeeper:
                 return found, sample
         return None
 
+    def surroundings(
+        self, body: BodyDescription, world: WorldModel, view: View, keyframes: Floats
+    ) -> Surroundings:
+        """Return what `at_scan` needs to know of a scan."""
+        return Surroundings(body, world, view.scan.points.astype(np.float64), keyframes)
+
     def at_scan(self, seen: Surroundings, place: Place, moment: OdometrySample) -> None:
         """Take the pictures that wait; the robot was at `place` at the scan of `moment`."""
         self._tick = moment.tick
@@ -207,6 +216,10 @@ class ObjectKeeper:
         self._now = self._bus.publish(OBJECT_MAP, now, basis=tick)
         self._sent_tick = tick
         self._keep(tick)
+
+    def encoded(self) -> bytes:
+        """Return the content of the file beside a map."""
+        return object_file.encoded(self.present)
 
     @property
     def present(self) -> ObjectFile:
