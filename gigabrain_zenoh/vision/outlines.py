@@ -10,6 +10,7 @@ DIRECTIONS = 16  # of an outline's corners; those of boxes are always among them
 SPLIT_ROUNDS = 6
 SAME_M = 1e-6  # corners so near to each other are the same
 HOLLOW_M = 0.07  # most that an outline is off its cells, along a part of an edge
+AROUND_M = 0.4  # a viewer so near to an outline, or in it, sees all of its edges
 EDGE_M, EDGE_PARTS = 0.15, 8  # shorter edges are not looked at; parts of the others
 Labels = NDArray[np.intp]
 _angles = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
@@ -53,7 +54,8 @@ def _joined(count: int, begin: Labels, end: Labels) -> Labels:
 def split(low: Floats, high: Floats, labels: Labels, viewer: Floats) -> Labels:
     """Return finer groups of the boxes from `low` to `high` (n, 2), so that none is hollow.
 
-    What lies behind the boxes, as seen from `viewer` (2,), is unknown: it may be in an outline.
+    What lies behind the boxes, as seen from `viewer` (2,), is unknown: it may be in an outline,
+    unless that is so near that the viewer may be there itself.
     """
     middle = (low + high) / 2
     labels = labels.copy()
@@ -70,12 +72,17 @@ def split(low: Floats, high: Floats, labels: Labels, viewer: Floats) -> Labels:
 
 
 def _hollow(middle: Floats, outline: Floats, first: Labels, viewer: Floats) -> NDArray[np.bool_]:
-    """Return which groups have an edge towards `viewer` that is far from all their boxes."""
+    """Return which groups have an edge towards `viewer` that is far from all their boxes.
+
+    A viewer in an outline, as in the corner of two walls, may be where that edge cuts the corner.
+    """
     group = np.repeat(np.arange(len(first)), np.diff(first, append=len(middle)))
     edge = np.roll(outline, -1, axis=1) - outline
     length = np.hypot(edge[..., 0], edge[..., 1])
     to_viewer = viewer - (outline + edge / 2)
-    facing = edge[..., 1] * to_viewer[..., 0] - edge[..., 0] * to_viewer[..., 1] > 0.0
+    before = edge[..., 1] * to_viewer[..., 0] - edge[..., 0] * to_viewer[..., 1]
+    beyond = np.where(length > 0.0, before / np.maximum(length, SAME_M), -np.inf).max(axis=1)
+    facing = (before > 0.0) | (beyond < AROUND_M)[:, None]
     long = (length > EDGE_M) & facing
     box, side = np.nonzero(long[group])
     of = group[box]
