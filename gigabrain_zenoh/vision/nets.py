@@ -35,6 +35,7 @@ STRIDE_PX, LARGEST_PX = 32, 640  # of nets with dynamic axes
 MAX_LABEL_BYTES, MAX_LABEL = 1_000_000, 64
 GOOD_YOLO = "`yolo export model=my.pt format=onnx imgsz=320 dynamic=False`"
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's pixels, RGB
+BOXES = ("dets", "boxes", "pred_boxes")  # names of that output
 ORT = "needs ONNX Runtime; install it with: pip install onnxruntime"
 
 
@@ -139,8 +140,8 @@ class YoloNet:
         if self._final:
             final = raw[raw[:, 4] >= self._least]
             return final[:, :4], final[:, 5].astype(np.int64), np.minimum(final[:, 4], 1)
-        labels = np.asarray(raw[4:].argmax(axis=0), np.int64)
-        sure = raw[4:].max(axis=0)
+        scores = np.where(_named_ones(self._classes)[:, None], raw[4:], 0)
+        labels, sure = np.asarray(scores.argmax(axis=0), np.int64), scores.max(axis=0)
         chosen = np.flatnonzero(sure >= self._least)
         return _corners(raw[:4, chosen].T), labels[chosen], np.minimum(sure[chosen], 1)
 
@@ -157,10 +158,11 @@ class DetrNet:
         self._size = _input_size(path)
         self._session = _session(path)
         self._input: str = self._session.get_inputs()[0].name
+        self._outputs = [one.name for one in self._session.get_outputs()]
         logits, _ = self._run(np.zeros((*(self._size or (320, 320)), 3), np.uint8))
         self._classes = _named(classes, logits.shape[1], path)
-        names = {one.name for one in self._session.get_outputs()}
-        self._softmax = logits.shape[1] == len(classes) + 1 and "dets" not in names
+        none = logits.shape[1] == len(classes) + 1
+        self._softmax = none and "dets" not in self._outputs  # RF-DETR has none, but a sigmoid
         if len(classes) == len(COCO_IDS):
             self._softmax = logits.shape[1] == COCO_IDS[-1] + 2
 
@@ -173,9 +175,9 @@ class DetrNet:
                 scores = (scores / scores.sum(axis=1, keepdims=True))[:, :-1]
             else:
                 scores = 1 / (1 + np.exp(-logits))
+        scores = np.where(_named_ones(self._classes)[: scores.shape[1]], scores, 0)
         labels, sure = scores.argmax(axis=1), scores.max(axis=1)
-        wanted = (sure >= self._least) & np.isfinite(boxes).all(axis=1)
-        index = np.flatnonzero(wanted & _known(labels, self._classes))
+        index = np.flatnonzero((sure >= self._least) & np.isfinite(boxes).all(axis=1))
         index = index[np.argsort(-sure[index], kind="stable")][:MAX_CANDIDATES]
         height, width = picture.shape[:2]
         sides = np.array((width, height, width, height))
@@ -188,9 +190,12 @@ class DetrNet:
         scaled = cv2.resize(picture, (width, height)).astype(np.float32) / 255
         normal = (scaled - np.array(MEAN, np.float32)) / np.array(DEVIATION, np.float32)
         made = self._answers(np.ascontiguousarray(normal.transpose(2, 0, 1)[None]))
-        heads = [one[0] for one in made if one.ndim == 3 and len(one) == 1]
-        boxes = [one for one in heads if one.shape[1] == 4]
-        logits = [one for one in heads if one.shape[1] != 4]
+        heads = [one for one in made if one.ndim == 3 and len(one) == 1]
+        boxes = [one[0] for one in heads if one.shape[2] == 4]
+        logits = [one[0] for one in heads if one.shape[2] != 4]
+        if len(boxes) == len(heads) == 2:  # three classes, and none
+            first = self._outputs[0] in BOXES
+            boxes, logits = (boxes[:1], boxes[1:]) if first else (boxes[1:], boxes[:1])
         if len(boxes) != 1 or len(logits) != 1 or len(boxes[0]) != len(logits[0]):
             gives = ", ".join(_sizes(one.shape) for one in made)
             raise ConfigError(
@@ -233,9 +238,14 @@ def _named(classes: Sequence[str], outputs: int, path: Path) -> tuple[str, ...]:
 
 def _known(labels: NDArray[np.int64], classes: Sequence[str]) -> NDArray[np.bool_]:
     """Return which labels have a name."""
-    named = np.array([bool(name) for name in classes])
-    inside = (labels >= 0) & (labels < len(named))
-    return np.asarray(inside & named[np.clip(labels, 0, len(named) - 1)], np.bool_)
+    inside = (labels >= 0) & (labels < len(classes))
+    named = _named_ones(classes)[np.clip(labels, 0, len(classes) - 1)]
+    return np.asarray(inside & named, np.bool_)
+
+
+def _named_ones(classes: Sequence[str]) -> NDArray[np.bool_]:
+    """Return which classes have a name."""
+    return np.array([bool(name) for name in classes])
 
 
 def _corners(boxes: Floats) -> Floats:

@@ -220,7 +220,19 @@ def test_detr_heads_of_other_shapes_are_refused(tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match="5 classes, but its labels have 2"):
         detr(tmp_path, monkeypatch, ("cat", "dog"), [(0, 1, 2, 3, 4)])
     with pytest.raises(ConfigError, match="layout `detr` expects logits"):
-        detr(tmp_path, monkeypatch, ("cat", "dog", "cow", "hen"), [(0, 1, 2, 3)])
+        detr(tmp_path, monkeypatch, ("cat", "dog"), [[(0, 1, 2)]])
+
+
+@pytest.mark.parametrize("outputs", [("logits", "pred_boxes"), ("labels", "dets")])
+def test_of_four_logits_and_four_sides_the_name_tells_which_are_boxes(
+    tmp_path, monkeypatch, outputs
+):
+    names = ("cat", "dog", "cow")
+    net, _ = detr(tmp_path, monkeypatch, names, [(-9, -9, 3, -9), (-9, 1, -9, 2)], outputs)
+    found = net.find(BLACK)
+    assert found.names()[0] == "cow"
+    assert found.boxes[0] == pytest.approx([120, 60, 200, 180])
+    assert len(found) == (2 if "dets" in outputs else 1)  # with a sigmoid each class is by itself
 
 
 def test_without_onnx_runtime_one_line_says_what_to_install(tmp_path, monkeypatch):

@@ -1,0 +1,85 @@
+"""Nets as people export them: from their own packages, in an environment of its own.
+
+The first test installs some 1.5 GB, so they are left to `make qa`; they are skipped, with the
+reason, where the packages or a torch without CUDA cannot be had.
+"""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.places import ROOT
+
+pytestmark = pytest.mark.qa
+RUNTIME = ("numpy", "onnx", "onnxruntime", "opencv-python-headless", "msgspec", "pyyaml", "pillow")
+PACKAGES = {  # with what they import; big ones without what they need, which would be CUDA's
+    "ultralytics": "ultralytics ultralytics-thop torchvision requests psutil polars matplotlib "
+    "scipy",
+    "transformers": "transformers torchvision scipy",
+    "rfdetr": "rfdetr torchvision supervision transformers pydantic pyDeprecate<0.10 tqdm requests "
+    "defusedxml scipy",
+}
+BIG = ("ultralytics", "ultralytics-thop", "torchvision", "rfdetr", "supervision")
+
+
+def pip(python: Path, *words: str) -> str:
+    """Run pip; skip the test with its last error where something cannot be had."""
+    made = subprocess.run(
+        (python, "-m", "pip", *words), capture_output=True, text=True, check=False
+    )
+    if made.returncode:
+        lines = [one for one in made.stderr.splitlines() if one.startswith("ERROR")]
+        pytest.skip(f"pip {' '.join(words[:6])}: {lines[-1] if lines else made.stderr[-200:]}")
+    return made.stdout
+
+
+@pytest.fixture(scope="module")
+def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the interpreter of an environment with a torch that needs no CUDA."""
+    folder = tmp_path_factory.mktemp("environment")
+    subprocess.run((sys.executable, "-m", "venv", folder), check=True)
+    there = folder / "bin" / "python"
+    versions = pip(there, "index", "versions", "torch")
+    plain = re.search(r"[\d.]+\+cpu", versions)
+    if not plain:
+        pytest.skip("the package index has no torch without CUDA")
+    pip(there, "install", f"torch=={plain[0]}", *RUNTIME)
+    return there
+
+
+@pytest.mark.parametrize(
+    ("net", "package"),
+    [
+        ("yolov8n", "ultralytics"),
+        ("yolo11n", "ultralytics"),
+        ("yolo11n-dynamic", "ultralytics"),
+        ("detr", "transformers"),
+        ("rf_detr", "rfdetr"),
+    ],
+)
+def test_an_exported_net_finds_the_boxes_of_its_own_package(
+    net: str, package: str, python: Path, tmp_path: Path
+) -> None:
+    wanted = PACKAGES[package].split()
+    pip(python, "install", "--no-deps", *(one for one in wanted if one in BIG))
+    pip(python, "install", *(one for one in wanted if one not in BIG))
+    path = os.pathsep.join(str(ROOT / one) for one in (".", "schemas", "drivers"))
+    offline = {"YOLO_OFFLINE": "1", "YOLO_CONFIG_DIR": str(tmp_path), "YOLO_AUTOINSTALL": "false",
+               "HF_HUB_OFFLINE": "1"}  # fmt: skip
+    script = Path(__file__).with_name("exported_nets.py")
+    made = subprocess.run(
+        (python, script, net, tmp_path), capture_output=True, text=True, check=False,
+        env=os.environ | offline | {"PYTHONPATH": path},
+    )  # fmt: skip
+    assert made.returncode == 0, made.stderr[-2000:]
+    compared = json.loads(made.stdout.splitlines()[-1])
+    assert compared["found"] >= 10
+    assert compared["judged"] >= compared["found"] * 0.7
+    assert compared["missed"] == 0
+    assert compared["off_px"] < 0.1
+    assert compared["off_score"] < 1e-4
