@@ -187,7 +187,7 @@ class DetrNet:
     def _run(self, picture: Picture) -> tuple[Floats, Floats]:
         """Return logits (n, classes) and boxes (n, 4)."""
         height, width = self._size or _rounded(picture)
-        scaled = cv2.resize(picture, (width, height)).astype(np.float32) / 255
+        scaled = cv2.resize(picture.astype(np.float32), (width, height)) / 255
         normal = (scaled - np.array(MEAN, np.float32)) / np.array(DEVIATION, np.float32)
         made = self._answers(np.ascontiguousarray(normal.transpose(2, 0, 1)[None]))
         heads = [one for one in made if one.ndim == 3 and len(one) == 1]

@@ -13,7 +13,16 @@ from gigabrain_drivers.sim.body import SimBody, SimModel
 from gigabrain_drivers.sim.mjcf_world import has_floor, load_model, model_error
 from gigabrain_drivers.sim.model_measures import align, mismatches
 from gigabrain_drivers.sim.model_parts import PartFinder
-from gigabrain_drivers.sim.world import Box, ClosedPath, Light, Pose, Shape, WalkingPath, World
+from gigabrain_drivers.sim.world import (
+    Ball,
+    Box,
+    ClosedPath,
+    Light,
+    Pose,
+    Shape,
+    WalkingPath,
+    World,
+)
 from gigabrain_drivers.sim.world_file import FLOOR, MATERIALS
 from gigabrain_zenoh.errors import ConfigError
 
@@ -220,6 +229,9 @@ def _add_shape(spec: mujoco.MjSpec, shape: Shape) -> None:
         geom.type = mujoco.mjtGeom.mjGEOM_BOX
         geom.size = (shape.half_x, shape.half_y, half)
         geom.quat = yaw_quaternion(Pose(shape.x, shape.y, shape.yaw))
+    elif isinstance(shape, Ball):
+        geom.type = mujoco.mjtGeom.mjGEOM_SPHERE
+        geom.size = (shape.radius, 0, 0)
     else:
         geom.type = mujoco.mjtGeom.mjGEOM_CYLINDER
         geom.size = (shape.radius, half, 0)

@@ -64,7 +64,27 @@ class Cylinder:
         return max(math.hypot(x - self.x, y - self.y) - self.radius, 0.0)
 
 
-Shape = Box | Cylinder
+@dataclass(frozen=True, slots=True)
+class Ball:
+    """A ball. Off the floor it is decoration only."""
+
+    x: float
+    y: float
+    radius: float
+    material: str = "wall"
+    bottom: float = 0.0
+
+    @property
+    def height(self) -> float:
+        """Return its diameter [m]."""
+        return 2 * self.radius
+
+    def distance(self, x: float, y: float) -> float:
+        """Return the distance of a point from the outline [m]; 0 inside."""
+        return max(math.hypot(x - self.x, y - self.y) - self.radius, 0.0)
+
+
+Shape = Box | Cylinder | Ball
 
 
 def clearance(shapes: Iterable[Shape], x: float, y: float) -> float:

@@ -4,15 +4,17 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from msgspec import Meta, Struct, field
 
 from gigabrain_drivers.sim.map_world import map_world
+from gigabrain_drivers.sim.tag_plates import tag_plate
 from gigabrain_drivers.sim.world import (
     WALKING_SPEED,
     WALL_HALF,
     WALL_HEIGHT,
+    Ball,
     Box,
     ClosedPath,
     Colour,
@@ -28,6 +30,7 @@ from gigabrain_zenoh.config.loading import nearest
 from gigabrain_zenoh.errors import ConfigError
 
 MOST_M = 400.0  # from the origin to anything in a world
+MAX_THINGS, MAX_TAGS = 200, 50
 MAX_SHAPES, MAX_PEOPLE, MAX_LIGHTS, MAX_CORNERS = 4000, 16, 8, 100
 MIN_PATH_M = 0.5
 LEAF_HALF = 0.02  # [m], of a closed door
@@ -51,6 +54,7 @@ MATERIALS: dict[str, Colour] = {
     "white": (0.95, 0.95, 0.95),
     "black": (0.06, 0.06, 0.07),
     "steel": (0.66, 0.69, 0.72),
+    "metal": (0.80, 0.81, 0.83),
     "blue": (0.20, 0.36, 0.60),
     "teal": (0.13, 0.52, 0.53),
     "green": (0.38, 0.56, 0.36),
@@ -189,6 +193,53 @@ class CylinderPart(_Part, frozen=True, kw_only=True):
         return Cylinder(*self.at, self.radius, self.height, self.material, self.bottom)
 
 
+class BallPart(_Part, frozen=True, kw_only=True):
+    """A ball. Off the floor it is decoration only."""
+
+    at: Point
+    radius: Annotated[float, Meta(ge=0.005, le=10.0)] = 0.1  # [m]
+    bottom: Height = 0.0  # [m], above the floor
+    material: Material = "orange"
+
+    def shape(self) -> Ball:
+        """Return the ball."""
+        return Ball(*self.at, self.radius, self.material, self.bottom)
+
+
+class CanPart(_Part, frozen=True, kw_only=True):
+    """A drinks can: a coloured label between two rims of metal."""
+
+    at: Point
+    radius: Annotated[float, Meta(ge=0.01, le=1.0)] = 0.035  # [m]
+    height: Annotated[float, Meta(ge=0.02, le=2.0)] = 0.12  # [m]
+    material: Material = "orange"  # of its label
+
+    def shapes(self) -> Iterator[Cylinder]:
+        """Yield its cylinders; the one that stands on the floor is its core."""
+        rim = min(0.3 * self.radius, 0.2 * self.height)
+        yield Cylinder(*self.at, 0.8 * self.radius, self.height, "metal")
+        label = self.height - 2 * rim
+        yield Cylinder(*self.at, self.radius, label, self.material, rim)
+        shoulder = self.height - 2 * rim / 3
+        yield Cylinder(*self.at, 0.9 * self.radius, shoulder, "metal", rim / 3)
+
+
+class TagPart(_Part, frozen=True, kw_only=True):
+    """An AprilTag on a white plate that hangs upright. It is decoration only."""
+
+    id: Annotated[int, Meta(ge=0, le=10_000)]
+    at: Point  # the middle of its face
+    yaw: Angle = 0.0  # where its face looks [rad]
+    z: Annotated[float, Meta(ge=0.02, le=20.0)] = 0.3  # its middle, above the floor [m]
+    size: Annotated[float, Meta(ge=0.01, le=10.0)] = 0.16  # of its black square [m]
+    family: Literal["36h11", "36h10", "25h9", "16h5"] = "36h11"
+
+    def shapes(self) -> list[Box]:
+        """Return the boxes of plate and tag. Raises ConfigError for a tag that is none."""
+        face = Pose(self.at[0], self.at[1], self.yaw)
+        return tag_plate(self.id, self.family, face, self.z, self.size)
+
+
 class PersonPart(_Part, frozen=True, kw_only=True):
     """A person who walks round a closed path; of two points, there and back."""
 
@@ -239,6 +290,9 @@ class WorldFile(_Part, frozen=True, kw_only=True):
     walls: Annotated[tuple[WallPart, ...], Meta(max_length=MAX_SHAPES)] = ()
     boxes: Annotated[tuple[BoxPart, ...], Meta(max_length=MAX_SHAPES)] = ()
     cylinders: Annotated[tuple[CylinderPart, ...], Meta(max_length=MAX_SHAPES)] = ()
+    balls: Annotated[tuple[BallPart, ...], Meta(max_length=MAX_THINGS)] = ()
+    cans: Annotated[tuple[CanPart, ...], Meta(max_length=MAX_THINGS)] = ()
+    tags: Annotated[tuple[TagPart, ...], Meta(max_length=MAX_TAGS)] = ()
     people: Annotated[tuple[PersonPart, ...], Meta(max_length=MAX_PEOPLE)] = ()
     lights: Annotated[tuple[LightPart, ...], Meta(max_length=MAX_LIGHTS)] = ()
     map: str = ""  # YAML file of a ROS map whose occupied cells become walls
@@ -251,7 +305,7 @@ class WorldFile(_Part, frozen=True, kw_only=True):
             if name in (*MATERIALS, FLOOR):
                 raise ValueError(f"materials: {name!r} is there already; choose another name")
         known = (*MATERIALS, *self.materials)
-        for part in ("walls", "boxes", "cylinders"):
+        for part in ("walls", "boxes", "cylinders", "balls", "cans"):
             for number, one in enumerate(getattr(self, part)):
                 if one.material not in known:
                     hint = nearest(one.material, known) or f"; known: {', '.join(known)}"
@@ -278,6 +332,14 @@ def build_world(file: WorldFile, path: Path) -> World:
     shapes: list[Shape] = [box for wall in file.walls for box in wall.shapes(file.wall_height)]
     shapes += [part.shape() for part in file.boxes]
     shapes += [part.shape() for part in file.cylinders]
+    shapes += [part.shape() for part in file.balls]
+    shapes += [shape for part in file.cans for shape in part.shapes()]
+    for number, tag in enumerate(file.tags):
+        try:
+            shapes += tag.shapes()
+        except ConfigError as error:
+            line = config.line_in(path, ("tags", str(number))) or 1
+            raise ConfigError(f"{path}:{line}: tags[{number}]: {error}") from None
     size = file.size or (2.0, 2.0)  # grown by the map or the model
     world = World(
         name=path.stem,

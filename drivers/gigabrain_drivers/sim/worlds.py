@@ -1,4 +1,4 @@
-"""Worlds by name or file: an arena, a house and a warehouse, random layouts, and people's own.
+"""Worlds by name or file: shipped ones, random layouts, and people's own.
 
 In those that are shipped, free passages are at least 1.1 m wide (doors 1.0 m) and everything else
 is flush, so a robot that only looks a metre ahead and turns right can roam without end.
@@ -103,7 +103,7 @@ def _by_wall(random: np.random.Generator) -> Placed:
     return Box(sign * off, along, depth, width, height, material), radius
 
 
-NAMED_WORLDS = ("arena", "house", "warehouse")  # files in `shipped_worlds`
+NAMED_WORLDS = ("arena", "house", "playroom", "warehouse")  # files in `shipped_worlds`
 
 
 def world_names() -> dict[str, str]:
