@@ -82,24 +82,34 @@ class Plane(NamedTuple):
 
     point: Floats  # [m]
     normal: Floats  # towards the camera
+    tilt_error: float  # [rad], of the normal
 
 
 def place(corners: Floats, size: float, model: CameraModel, depth: Depth | None) -> Placed | None:
     """Return the pose of a tag by its corners [px], (4, 2), from the lower left; None if open."""
     poses = _poses(corners, size, model)
+    if not poses:
+        return None
     plane = _plane(corners, model, depth) if depth is not None else None
-    if plane is not None and poses:
+    if plane is not None and plane.tilt_error <= MAX_TILT_ERROR:
         by_depth = _on_plane(corners, model, plane, size)
         if by_depth is not None:
             return by_depth
-    if not poses:
-        return None
     (best, error), *others = poses
     for other, other_error in others:
         turned = math.acos(np.clip(best.axes[:, 0] @ other.axes[:, 0], -1.0, 1.0))
         if turned > TURNED_RAD and other_error < SURE * error:
             return None
-    return best
+    return best if plane is None else _at_depth(best, model, plane)
+
+
+def _at_depth(placed: Placed, model: CameraModel, plane: Plane) -> Placed:
+    """Return a pose moved along its ray to where depth has it; as it is where that is far off."""
+    ray, out = placed.position - model.origin, placed.axes[:, 0]
+    farther = float(plane.point @ out / (ray @ out))
+    if not SAME_SIZE[0] < farther < SAME_SIZE[1]:
+        return placed
+    return Placed(model.origin + farther * ray, placed.axes)
 
 
 def _poses(corners: Floats, size: float, model: CameraModel) -> list[tuple[Placed, float]]:
@@ -136,7 +146,7 @@ def _to_body(vector: Floats, model: CameraModel) -> Floats:
 
 
 def _plane(corners: Floats, model: CameraModel, depth: Depth) -> Plane | None:
-    """Return the plane of a tag by the depth inside it; None where that does not tell."""
+    """Return the plane of a tag by the depth inside it; None where too little is known."""
     middle = corners.mean(axis=0)
     inner = middle + INNER * (corners - middle)
     mask = np.zeros(depth.shape, np.uint8)
@@ -154,11 +164,9 @@ def _plane(corners: Floats, model: CameraModel, depth: Depth) -> Plane | None:
         if near.all():
             break
         points = points[near]
-    tilt_error = spread[2] / max(spread[1], 1e-9) / math.sqrt(len(points))
-    if tilt_error * 2 > MAX_TILT_ERROR:
-        return None
+    tilt_error = 2 * spread[2] / max(spread[1], 1e-9) / math.sqrt(len(points))
     normal = axes[2] if axes[2] @ point < 0 else -axes[2]
-    return Plane(point, normal)
+    return Plane(point, normal, float(tilt_error))
 
 
 def _on_plane(corners: Floats, model: CameraModel, plane: Plane, size: float) -> Placed | None:

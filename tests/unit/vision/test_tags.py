@@ -104,6 +104,18 @@ def test_a_tag_of_less_than_12_pixels_is_left_out():
         assert len(TagFinder(size=0.1).find(picture, MODEL, depth)) == count
 
 
+def test_the_distance_of_a_far_tag_is_by_depth_though_its_tilt_is_not():
+    rng = np.random.default_rng(2)
+    for turned in (0.05, 0.15, -0.1):
+        plate = facing(5, 0.2, (3.5, 0.2, 0.3), turned, 0.0, 0.0)
+        picture, depth = draw(plate, MODEL, rng, noise=2.0)
+        for found in TagFinder(size=0.2).find(picture, MODEL, depth):
+            assert found.position[0] == pytest.approx(3.5, abs=0.01)
+            break
+        else:
+            pytest.fail("it was left out")
+
+
 def test_depth_of_something_else_is_not_believed():
     plate = facing(5, 0.16, (0.8, 0.1, 0.1), 0.6, 0.0, 0.0)
     picture, depth = draw(plate, MODEL, np.random.default_rng(0))
