@@ -35,6 +35,7 @@ DEPTH_MAX_CODE = 4095
 DEPTH_MIN_M, DEPTH_MAX_M, DEPTH_SHIFT_M = 0.01, 10.0, 3.5  # of lerobot's own scale
 RAW_FORMATS = {"rgb8": "rgb24", "bgr8": "bgr24", "mono8": "gray"}
 CAMERA_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,31}")  # others are no cameras of ours
+LIMITED_RANGE, BT601 = 1, 5  # of FFmpeg's AVColorRange and AVColorSpace
 JPEG_END, JPEG_TAIL_BYTES = b"\xff\xd9", 64
 SAMPLE_STEP = 4  # of the pixels that statistics are made of, in rows and columns
 SAMPLE_EVERY = 10  # pictures
@@ -200,7 +201,8 @@ def _frame_of(message: Message) -> Frame:
     else:
         raise ValueError(f"{message.encoding} is no picture in colours")
     even = frame.width - frame.width % 2, frame.height - frame.height % 2
-    return frame.reformat(*even, format="yuv420p")
+    # JPEG uses all 256 levels; without a word players take video for limited (ITU-R BT.601)
+    return frame.reformat(*even, format="yuv420p", dst_color_range=LIMITED_RANGE)
 
 
 def _from_jpeg(image: Image) -> Frame:
@@ -235,6 +237,9 @@ class _Video:
         self._stream = self._container.add_stream(codec, rate=hz, options=options)
         self._stream.width, self._stream.height = first.width, first.height
         self._stream.pix_fmt = first.format.name
+        if not self._is_depth:
+            context = self._stream.codec_context
+            context.color_range, context.colorspace = LIMITED_RANGE, BT601
         self._codec = codec
         self._samples: list[NDArray[Any]] = []  # minimum, maximum, mean, mean square; (4, channels)
         self._sampled = 0
