@@ -254,6 +254,7 @@ class Navigator:
             headings=None if headings is None else headings + np.array((to_odom.yaw, 0.0)),
             obstacles=context.world.obstacles,
             contours=placed(context.world.contours, context.pose),
+            cameras=tuple(one.name for one in context.world.cameras if one.ok),
             response=context.actuation,
             sent=context.sent,
             delayed=context.delayed_s,

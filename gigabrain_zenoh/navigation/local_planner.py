@@ -20,6 +20,7 @@ from gigabrain_zenoh.navigation.cost import SECOND, cost_to_go_at
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
 from gigabrain_zenoh.navigation.footprint import Placement, clearance, outline_of
 from gigabrain_zenoh.navigation.local_costmap import LocalCostmap, Pose2D
+from gigabrain_zenoh.navigation.looked_ground import LookedGround
 from gigabrain_zenoh.navigation.motion_model import (
     InitialState,
     MotionModel,
@@ -100,6 +101,7 @@ class PlanRequest:
     known: Floats = field(default_factory=no_points)  # (m, 2) [m], obstacles of the map near by
     obstacles: tuple[Obstacle, ...] = ()
     contours: tuple[Floats, ...] = ()  # polygons (k, 2) [m] of what cameras see now
+    cameras: tuple[str, ...] = ()  # names of those that are believed
     keepouts: tuple[Floats, ...] = ()  # polygons (k, 2) [m] that the body must not enter
     avoid: tuple[Floats, ...] = ()  # polygons (k, 2) [m] that no way should lead through
     max_speed: float | None = None  # [m/s], of a speed zone; the other limits hold as well
@@ -236,6 +238,7 @@ class LocalPlanner:
         """Discard the costmap and the last plan, as the odometry has restarted."""
         self._window = LocalCostmap(self._settings.window, self._settings.memory)
         self._costs = CostToGo(self._window.cells)
+        self._ground = LookedGround(self._body, self._window.cells)
         self._sampler.forget()
         if self._traffic:
             self._traffic.reset()
@@ -301,12 +304,14 @@ class LocalPlanner:
         body = transform(from_pose(moment.pose), self._rim)
         seen = dynamic_obstacles.standing(moment.contours, discs)
         grid = self._window.grid(moment.tick, moment.known, discs, moment.keepouts, body, seen)
+        place = Pose2D(moment.pose.x, moment.pose.y, moment.pose.yaw)
+        looked = self._ground.limited(grid, place, moment.cameras, moment.contours)
         ways = self._traffic.ways((goal.x, goal.y)) if self._traffic else None
         to, aside = (goal.x, goal.y), self._half_width
         field = self._costs.field(grid, aside, to, moment.path, ways, moment.avoid)
         yaw = math.nan if goal.yaw is None else goal.yaw
         near, turned = self._settings.position_tolerance, self._settings.yaw_tolerance
-        return Scene(grid, field, discs, goal.x, goal.y, yaw, near, turned, self._track(moment))
+        return Scene(looked, field, discs, goal.x, goal.y, yaw, near, turned, self._track(moment))
 
     def _track(self, moment: PlanRequest) -> Floats:
         """Return what a car follows; other bodies go by the cost to go alone."""

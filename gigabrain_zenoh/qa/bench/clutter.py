@@ -39,6 +39,7 @@ from gigabrain_zenoh.qa.robot_under_test import (
 START_S = 600.0  # a robot's processes and its first map, on a busy machine
 WAIT_S = 3.0  # that a tick may wait for the brain: less than a stuck process may take
 MAX_SILENCE_S = 120.0  # of the tasks, and of the driver
+SETTLED_S = 3.0  # after the first goal was sent
 REACHED_M = 0.3  # from a goal at rest, by the physics
 LEAST_REACHED = 8  # goals of a world
 POLLS_PER_LOOK = 5  # at the truth
@@ -306,11 +307,20 @@ class CourseDriver:
     async def _go(self, x: float, y: float) -> str:
         """Drive to a goal in the map; return why it was not reached, empty if it was."""
         try:
-            task = await self._while_running(self._tasks.go_to(x, y))
+            task = await self._accepted(x, y)
             ended = await self._while_running(self._tasks.result(task))
         except (Refused, BodyLost) as refusal:
             return f"refused: {refusal}"
         return "" if ended.state == "succeeded" else f"{ended.state}: {ended.reason}"
+
+    async def _accepted(self, x: float, y: float) -> str:
+        """Return the name of the task; a robot that has just started may not know its pose yet."""
+        while True:
+            try:
+                return await self._while_running(self._tasks.go_to(x, y))
+            except Refused:
+                if self.seconds > SETTLED_S:
+                    raise
 
     async def _while_running(self, work: Awaitable[T]) -> T:
         """Wait for `work`. Raises _Over, and GigabrainError when a process dies."""

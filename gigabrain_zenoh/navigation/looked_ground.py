@@ -1,0 +1,178 @@
+"""Ground that cameras have looked at: what stands low on other ground nobody knows.
+
+A camera sees a wedge ahead. Beside the body, and nearer than it sees the floor, a sill or a step
+down may be that has never been in view. So ground that a body may sweep soon, and that was neither
+in view nor stood on, costs like an obstacle MARGIN_M away: the body turns more in place, and looks.
+It is not closed: a body that may turn nowhere would stand for ever.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.body import BodyDescription, Camera
+from gigabrain_zenoh.geometry.sweep import radius
+from gigabrain_zenoh.navigation.footprint import FAR, DistanceGrid
+from gigabrain_zenoh.navigation.local_costmap import (
+    CELL_M,
+    Chamfer,
+    Pose2D,
+    Singles,
+    fill_disc,
+)
+from gigabrain_zenoh.navigation.zones import fill
+
+SURE_M = 1.5  # from a camera: so far it shows what is 3 cm high
+EDGE_RAD = math.radians(1.5)  # at the sides of a picture that is not trusted
+SOON_M = 0.25  # beyond the circle of a turning body, which it may sweep before it has looked
+PLACED_M = 0.1  # beyond that circle, clear where a person puts the body down
+MARGIN_M = 0.06  # as far as an obstacle whose cost unknown ground has
+BIN_RAD = math.radians(3.0)  # of the bearings round a camera
+SHADE_STEP_M = 0.015  # between points of an outline that hides what is behind it
+BEHIND_M = 0.05  # of what is behind an outline's nearest point that is seen nevertheless
+Mask = NDArray[np.bool_]
+
+
+class LookedGround:
+    """Cells of a window that were in view of the cameras of `body`, or that it has stood on.
+
+    The window has the cells of a LocalCostmap. It is empty, and hides nothing, until a camera has
+    been believed once.
+    """
+
+    def __init__(self, body: BodyDescription, side: int) -> None:
+        self._body, self._side = body, side
+        self._turning = radius(body.footprint)
+        self._looked = np.zeros((side, side), np.uint8)
+        self._row = self._column = 0  # of cell (0, 0)
+        self._chamfer = Chamfer(side, CELL_M, FAR)
+        self._began = False
+
+    def limited(
+        self, grid: DistanceGrid, place: Pose2D, cameras: Sequence[str], outlines: Sequence[Floats]
+    ) -> DistanceGrid:
+        """Return `grid` with obstacles beyond the ground near `place` that no camera has looked at.
+
+        See `look`; the cells of `grid` are those of the window.
+        """
+        self.look(place, cameras, outlines, grid.x, grid.y)
+        unseen = self._unseen(place)
+        if unseen is None:
+            return grid
+        return grid._replace(distance=np.minimum(grid.distance, unseen))
+
+    def look(
+        self, place: Pose2D, cameras: Sequence[str], outlines: Sequence[Floats], x: float, y: float
+    ) -> None:
+        """Take in what the believed `cameras` see from `place`, in the window at (x, y) [m].
+
+        The polygons `outlines` (n, 2) [m] hide what is behind them.
+        """
+        seeing = [one for one in self._body.cameras if one.name in cameras and one.depth]
+        if not seeing and not self._began:
+            return
+        self._follow(round(y / CELL_M), round(x / CELL_M))
+        if not self._began:
+            self._began = True
+            reach = math.ceil((self._turning + PLACED_M) / CELL_M)
+            fill_disc(self._looked, *self._cell(place.x, place.y), reach)
+        cos, sin = math.cos(place.yaw), math.sin(place.yaw)
+        turn = np.array([[cos, sin], [-sin, cos]])
+        stood = np.array(self._body.footprint) @ turn + (place.x, place.y)
+        fill(self._looked, (stood - self._corner) / CELL_M, 1)
+        for camera in seeing:
+            eye = np.array((camera.x, camera.y)) @ turn + (place.x, place.y)
+            self._see(camera, eye, place.yaw + camera.yaw, outlines)
+
+    def _unseen(self, place: Pose2D) -> Singles | None:
+        """Return distances (side, side) to unseen ground near `place`; None where all was seen."""
+        if not self._began:
+            return None
+        near = np.zeros((self._side, self._side), np.uint8)
+        reach = math.ceil((self._turning + SOON_M) / CELL_M)
+        fill_disc(near, *self._cell(place.x, place.y), reach)
+        unseen = (near > 0) & (self._looked == 0)
+        if not unseen.any():
+            return None
+        return self._chamfer.distance((~unseen).view(np.uint8)) + np.float32(MARGIN_M)
+
+    @property
+    def _corner(self) -> Floats:
+        return np.array((self._column, self._row)) * CELL_M
+
+    def _cell(self, x: float, y: float) -> tuple[int, int]:
+        return math.floor(y / CELL_M) - self._row, math.floor(x / CELL_M) - self._column
+
+    def _follow(self, row: int, column: int) -> None:
+        """Move the window; what leaves it is forgotten."""
+        down, right = row - self._row, column - self._column
+        if down or right:
+            old, self._looked = self._looked, np.zeros_like(self._looked)
+            (to_y, from_y), (to_x, from_x) = _overlap(down, self._side), _overlap(right, self._side)
+            self._looked[to_y, to_x] = old[from_y, from_x]
+            self._row, self._column = row, column
+
+    def _see(self, camera: Camera, eye: Floats, yaw: float, outlines: Sequence[Floats]) -> None:
+        """Mark the floor in view of a camera at `eye` (2,)."""
+        near, far, half = floor_in_view(camera)
+        if near >= far:
+            return
+        reach = math.ceil(far / math.cos(half) / CELL_M) + 1
+        row, column = self._cell(float(eye[0]), float(eye[1]))
+        rows = slice(max(row - reach, 0), max(row + reach + 1, 0))
+        columns = slice(max(column - reach, 0), max(column + reach + 1, 0))
+        part = self._looked[rows, columns]
+        y, x = np.indices(part.shape)
+        right = self._corner[0] + (x + columns.start + 0.5) * CELL_M - eye[0]
+        up = self._corner[1] + (y + rows.start + 0.5) * CELL_M - eye[1]
+        bearing, away = _polar(right, up, yaw)
+        ahead = away * np.cos(bearing)
+        seen = (np.abs(bearing) < half) & (ahead >= near) & (ahead <= far)
+        free = _shades(eye, yaw, outlines)
+        seen &= away <= free[_bin(bearing, len(free))] + BEHIND_M
+        part[seen] = 1
+
+
+def floor_in_view(camera: Camera) -> tuple[float, float, float]:
+    """Return how near and how far ahead a camera surely sees the floor [m], and half its angle."""
+    fx, fy, _, cy = camera.pinhole
+    lowest = camera.pitch + math.atan2(camera.height - cy, fy)
+    highest = camera.pitch - math.atan2(cy, fy)
+    near = camera.z / math.tan(lowest) if 0.0 < lowest < math.pi / 2 else math.inf
+    far = camera.z / math.tan(highest) if highest > 0.0 else math.inf
+    half = math.atan2(camera.width / 2, fx) - EDGE_RAD
+    return max(near, camera.depth_min), min(far, camera.depth_max, SURE_M), half
+
+
+def _overlap(shift: int, side: int) -> tuple[slice, slice]:
+    """Return where the cells of a window stay that moves by `shift`: to, and from."""
+    count = max(side - abs(shift), 0)
+    to, from_ = max(-shift, 0), max(shift, 0)
+    return slice(to, to + count), slice(from_, from_ + count)
+
+
+def _polar(x: Floats, y: Floats, yaw: float) -> tuple[Floats, Floats]:
+    bearing = np.remainder(np.arctan2(y, x) - yaw + math.pi, math.tau) - math.pi
+    return bearing, np.hypot(x, y)
+
+
+def _bin(bearing: Floats, count: int) -> NDArray[np.intp]:
+    return np.minimum(((bearing + math.pi) / BIN_RAD).astype(np.intp), count - 1)
+
+
+def _shades(eye: Floats, yaw: float, outlines: Sequence[Floats]) -> Floats:
+    """Return the distance of the nearest outline in each bin of bearings (n,) [m]."""
+    free = np.full(round(math.tau / BIN_RAD), np.inf)
+    if outlines:
+        begin = np.concatenate(outlines)
+        along = np.concatenate([np.roll(one, -1, axis=0) - one for one in outlines])
+        steps = np.ceil(np.hypot(along[:, 0], along[:, 1]) / SHADE_STEP_M).astype(np.intp) + 1
+        edge = np.repeat(np.arange(len(steps)), steps)
+        step = np.arange(len(edge)) - np.repeat(np.cumsum(steps) - steps, steps)
+        points = begin[edge] + (step / steps[edge])[:, None] * along[edge] - eye
+        bearing, away = _polar(points[:, 0], points[:, 1], yaw)
+        np.minimum.at(free, _bin(bearing, len(free)), away)
+    return free

@@ -1,0 +1,144 @@
+"""Ground that no camera has looked at costs like an obstacle near by, until it has been in view."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.body import Camera
+from gigabrain_schemas.tasks import Goal
+from gigabrain_zenoh.geometry.sweep import depth, edges
+from gigabrain_zenoh.navigation.footprint import FAR, DistanceGrid
+from gigabrain_zenoh.navigation.local_costmap import CELL_M, Pose2D
+from gigabrain_zenoh.navigation.local_planner import PlanRequest
+from gigabrain_zenoh.navigation.looked_ground import MARGIN_M, LookedGround, floor_in_view
+from tests.unit.navigation.drives import WAFFLE, Drive
+
+FRONT = Camera(
+    name="front", width=320, height=240, rate_hz=10, field_of_view=1.047, depth=True, x=0.064,
+    z=0.094,
+)  # fmt: skip
+BODY = replace(WAFFLE, cameras=(FRONT,), body_height=0.17)
+SIDE = 200
+HERE = Pose2D(0.0, 0.0, 0.0)
+CORNER_M = -SIDE / 2 * CELL_M
+
+
+def open_ground(x: float = CORNER_M, y: float = CORNER_M) -> DistanceGrid:
+    return DistanceGrid(np.full((SIDE, SIDE), FAR, np.float32), CELL_M, x, y)
+
+
+def at(grid: DistanceGrid, x: float, y: float) -> float:
+    return float(grid.distance[int((y - grid.y) / CELL_M), int((x - grid.x) / CELL_M)])
+
+
+def looked(
+    ground: LookedGround, place: Pose2D = HERE, outlines: tuple[Floats, ...] = ()
+) -> DistanceGrid:
+    return ground.limited(open_ground(), place, ("front",), outlines)
+
+
+def test_without_a_believed_camera_nothing_costs_more() -> None:
+    ground = LookedGround(BODY, SIDE)
+    for names in ((), ("rear",)):
+        assert ground.limited(open_ground(), HERE, names, ()).distance.min() == FAR
+    assert (
+        LookedGround(WAFFLE, SIDE).limited(open_ground(), HERE, ("front",), ()).distance.min()
+        == FAR
+    )
+
+
+def test_the_body_may_turn_where_it_was_put_down() -> None:
+    grid = looked(LookedGround(BODY, SIDE))
+    for bearing in np.linspace(-math.pi, math.pi, 24):
+        assert at(grid, 0.25 * math.cos(bearing), 0.25 * math.sin(bearing)) >= 0.1
+
+
+def test_ground_beside_and_behind_is_costly_until_it_has_been_in_view() -> None:
+    ground = LookedGround(BODY, SIDE)
+    grid = looked(ground)
+    assert at(grid, 0.45, 0.0) > 0.1
+    assert at(grid, 0.0, 0.45) == at(grid, -0.45, 0.0) == pytest.approx(MARGIN_M)
+    grid = looked(ground, Pose2D(0.0, 0.0, math.pi / 2))
+    assert at(grid, 0.0, 0.45) > 0.1
+    assert at(grid, -0.45, 0.0) == pytest.approx(MARGIN_M)
+    assert at(looked(ground), 0.0, 0.45) > 0.1  # it is remembered
+
+
+def test_what_is_far_from_the_body_is_open_still() -> None:
+    grid = looked(LookedGround(BODY, SIDE))
+    assert at(grid, 0.0, 1.0) > 0.3
+    assert at(grid, -1.0, 0.0) > 0.3
+
+
+def test_what_stands_hides_what_is_behind_it() -> None:
+    box = np.array([(0.36, -0.1), (0.42, -0.1), (0.42, 0.1), (0.36, 0.1)])
+    ground = LookedGround(BODY, SIDE)
+    assert at(looked(ground, HERE, (box,)), 0.48, 0.0) == pytest.approx(MARGIN_M, abs=CELL_M)
+    assert at(looked(ground), 0.48, 0.0) > 0.1
+
+
+def test_where_the_body_stood_is_known() -> None:
+    ground = LookedGround(BODY, SIDE)
+    for x in np.arange(0.0, 1.01, 0.1):
+        grid = looked(ground, Pose2D(x, 0.0, 0.0))
+    assert at(grid, 0.5, 0.0) > 0.1
+    assert at(grid, 0.6, 0.12) > 0.1
+
+
+def test_the_window_moves_without_forgetting() -> None:
+    ground = LookedGround(BODY, SIDE)
+    looked(ground)
+    moved = open_ground(CORNER_M + 8 * CELL_M, CORNER_M - 4 * CELL_M)
+    grid = ground.limited(moved, HERE, (), ())
+    assert at(grid, 0.45, 0.0) > 0.1
+    assert at(grid, 0.0, 0.45) == pytest.approx(MARGIN_M)
+    far = ground.limited(open_ground(50.0, 50.0), Pose2D(52.0, 52.0, 0.0), (), ())
+    assert at(far, 52.4, 52.0) == pytest.approx(MARGIN_M)
+
+
+def test_a_camera_sees_the_floor_from_where_its_lowest_row_meets_it() -> None:
+    near, far, half = floor_in_view(FRONT)
+    assert (near, far) == (0.25, 1.5)
+    assert half == pytest.approx(math.radians(30.0 - 1.5), abs=0.01)
+    near, far, _ = floor_in_view(replace(FRONT, z=0.5))
+    assert near == pytest.approx(0.5 / math.tan(math.radians(23.4)), rel=0.01)
+    near, far, _ = floor_in_view(replace(FRONT, z=0.5, pitch=math.radians(40.0)))
+    assert near == pytest.approx(0.5 / math.tan(math.radians(63.4)), rel=0.01)
+    assert far == pytest.approx(1.5, abs=0.1)
+    assert floor_in_view(replace(FRONT, pitch=-1.0))[0] == math.inf
+
+
+def deepest_in_unknown(names: tuple[str, ...], goal: Goal) -> float:
+    """Drive to a goal, and return how far it swept ground that was never in view [m].
+
+    Negative where it kept away.
+    """
+
+    class SeeingDrive(Drive):
+        def moment(self) -> PlanRequest:
+            return dataclasses.replace(super().moment(), cameras=names)
+
+    drive, axis = SeeingDrive(BODY, goal, np.empty((0, 2))), np.arange(-1.5, 1.5, 0.03)
+    cells = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
+    known, deepest, counted = np.hypot(*cells.T) < 0.353, -1.0, 0
+    while not drive.go(0.1).arrived:
+        assert drive.tick < 2000
+        for pose in drive.poses[counted:]:
+            cosine, sine = math.cos(pose.yaw), math.sin(pose.yaw)
+            here = (cells - (pose.x, pose.y)) @ np.array(((cosine, -sine), (sine, cosine)))
+            inside, ahead = -depth(edges(BODY.footprint), here), here[:, 0] - FRONT.x
+            deepest = max(deepest, float(inside[~known].max()))
+            in_view = (ahead >= 0.25) & (np.abs(here[:, 1]) <= math.tan(0.52) * ahead)
+            known |= (in_view & (ahead < 1.5)) | (inside >= 0)
+        counted = len(drive.poses)
+    return deepest
+
+
+def test_it_keeps_away_from_ground_that_was_never_in_view() -> None:
+    goal = Goal(x=1.2, y=0.9)
+    assert deepest_in_unknown((), goal) > 0.0
+    assert deepest_in_unknown(("front",), goal) < 0.0
