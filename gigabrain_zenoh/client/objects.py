@@ -1,6 +1,7 @@
 """Requests about things, tags and the robot's pose, as the page and the command line make them."""
 
 import asyncio
+import math
 from typing import Any
 
 import msgspec
@@ -15,6 +16,7 @@ from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 
 FOUND_S = 4.0  # within which a robot is found where somebody says that it is
+THERE_M = 1.2  # from where somebody says that it is
 UNDERWAY_S = 0.1  # for which poses of before the request may still arrive
 NO_OBJECTS = (
     "no process remembers things; the robot needs a camera (--cameras), and perception a map "
@@ -63,7 +65,7 @@ async def set_pose(bus: Bus, x: float, y: float, yaw: float | None = None) -> Po
 
     close = bus.subscribe(POSE, on_pose)
     try:
-        return await asyncio.wait_for(found, FOUND_S)
+        pose = await asyncio.wait_for(found, FOUND_S)
     except TimeoutError:
         raise Refused(
             f"not found: the scan does not tell its place round ({x:.2f}, {y:.2f}); "
@@ -71,6 +73,12 @@ async def set_pose(bus: Bus, x: float, y: float, yaw: float | None = None) -> Po
         ) from None
     finally:
         close()
+    if math.hypot(pose.x - x, pose.y - y) > THERE_M:
+        raise Refused(
+            f"the scan does not fit round ({x:.2f}, {y:.2f}); the robot is localized at "
+            f"({pose.x:.2f}, {pose.y:.2f})"
+        )
+    return pose
 
 
 def _request(kind: Any, fields: dict[str, Any]) -> Any:

@@ -243,9 +243,9 @@ class ObjectKeeper:
         await self._writer.close()
 
     def _receive(self, _key: str, picture: Detections) -> None:
-        if self._boot and picture.boot == self._boot:
-            if len(self._waiting) == WAITING:
-                self._bus.counters["detections_left_out"] += 1
+        if picture.boot != self._boot or len(self._waiting) == WAITING:
+            self._bus.counters["detections_left_out"] += 1
+        if picture.boot == self._boot:
             self._waiting.append(picture)
 
     def _ready(self) -> list[Detections]:

@@ -66,6 +66,8 @@ CALLS = {
     "place list": "place list",
     "place remove": "place remove nowhere",
     "zone add": "zone add {name} keepout 3 3 4 3 4 4",
+    "objects": "objects",
+    "pose": "pose 0 0",
     "world add": "world add box 1.5 1.5",
     "world list": "world list",
     "world remove": "world remove box0",
@@ -106,5 +108,6 @@ OWN_CODES = {
     # without a map, a simulation, or what is named
     **dict.fromkeys(("map load", "view", "world add", "world list", "world remove"), (1, 2)),
     **dict.fromkeys(("place add", "place list", "place remove", "zone add", "param save"), (1, 2)),
+    **dict.fromkeys(("objects", "pose"), (1,)),  # without cameras or a map, or not there
     **dict.fromkeys(("estop", "release", "enable", "topic pub", "doctor", "driver test"), (1, 3)),
 }
