@@ -6,6 +6,7 @@ import sys
 
 from msgspec import structs
 
+from gigabrain_zenoh.config.settings import RecognizerConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.recognition.node import INSTALL
@@ -50,7 +51,8 @@ def check_recognizer(deployment: Deployment, host: str) -> None:
     here, wanted = deployment.hosts.get(host, ()), deployment.recognizer
     placed = any("recognition" in names for names in deployment.hosts.values())
     runs = "recognition" in here or ("perception" in here and not placed)
-    if not (deployment.cameras and deployment.recognition and wanted.onnx and runs):
+    used = deployment.cameras and deployment.recognition and runs
+    if not used or wanted == RecognizerConfig():
         return
     if not importlib.util.find_spec("cv2"):
         raise ConfigError(INSTALL)

@@ -152,12 +152,6 @@ class RecognizerConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     min_confidence: Annotated[float, Meta(ge=0.01, le=0.99)] = 0.3
     rate_hz: Annotated[float, Meta(ge=0.1, le=60)] = 5.0  # pictures of each camera, at most
 
-    def __post_init__(self) -> None:
-        if self.layout != "things" and not self.onnx:
-            raise ValueError(f"layout: {self.layout} is for a net of one's own; name it in `onnx`")
-        if self.onnx and not self.labels and self.layout != "things":
-            raise ValueError("labels: missing; expected a file with one class a line")
-
 
 TagSize = Annotated[float, Meta(ge=0.005, le=10.0)]  # [m], of its black square
 TagNumber = Annotated[str, Meta(pattern=r"^\d{1,6}$")]

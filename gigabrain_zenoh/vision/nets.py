@@ -49,6 +49,12 @@ class Net(Protocol):
 
 def load_net(config: RecognizerConfig) -> Net | None:
     """Return the net of the settings; None where no weights are shipped. Raises ConfigError."""
+    own = config.layout != "things"
+    if own and not config.onnx:
+        text = f"recognizer: layout `{config.layout}` is for a net of one's own"
+        raise ConfigError(f"{text}; name its file in `onnx`")
+    if own and not config.labels:
+        raise ConfigError("recognizer: labels: missing; expected a file with one class a line")
     if not config.onnx and not WEIGHTS.is_file():
         return None
     path = Path(config.onnx) if config.onnx else WEIGHTS
@@ -89,7 +95,8 @@ def _check_things(path: Path, classes: Sequence[str]) -> None:
             f"{WIDTH_PX}: is it `layout: yolo`, or `detr`?"
         )
     net = read_net(path)
-    made = _tried(net, path, (HEIGHT_PX, WIDTH_PX), "layout `things`")
+    blob = np.zeros((1, 3, HEIGHT_PX, WIDTH_PX), np.float32)
+    made = _run(net, blob, path, "expected a net as training exports it")
     if made.ndim != 4 or made.shape[1] != len(classes) + 4:
         raise ConfigError(
             f"{path}: gives {_sizes(made.shape)}; expected 1 x {len(classes) + 4} x …, for "
@@ -108,7 +115,8 @@ class YoloNet:
         self._classes, self._least = classes, config.min_confidence
         self._size = _input_size(path)
         self._net = read_net(path)
-        made = _tried(self._net, path, self._size or (320, 320), f"export it so: {GOOD_YOLO}")
+        self._path = path
+        made = self._answers(np.zeros((*(self._size or (320, 320)), 3), np.uint8))
         self._final = made.ndim == 3 and made.shape[2] == 6 and made.shape[1] != 4 + len(classes)
         if made.ndim != 3 or len(made) != 1 or (made.shape[1] < 5 and not self._final):
             raise ConfigError(
@@ -124,8 +132,7 @@ class YoloNet:
         """Find things in a picture (h, w, 3), RGB, of any size."""
         height, width = self._size or _rounded(picture)
         fitted, scale, left, top = fit(picture, (width, height))
-        self._net.setInput(cv2.dnn.blobFromImage(fitted, 1 / 255.0))
-        raw = np.asarray(self._net.forward(), np.float32)[0]
+        raw = np.asarray(self._answers(fitted), np.float32)[0]
         boxes, labels, sure = self._unpacked(raw)
         wanted = np.flatnonzero(_known(labels, self._classes) & np.isfinite(boxes).all(axis=1))
         best = wanted[np.argsort(-sure[wanted], kind="stable")[:MAX_CANDIDATES]]
@@ -134,6 +141,10 @@ class YoloNet:
             kept = suppress(boxes, labels, sure)
             boxes, labels, sure = boxes[kept], labels[kept], sure[kept]
         return Found(unfit(boxes, picture, scale, left, top), labels, sure, self._classes)
+
+    def _answers(self, fitted: Picture) -> NDArray[Any]:
+        blob = cv2.dnn.blobFromImage(fitted, 1 / 255.0)
+        return _run(self._net, blob, self._path, f"export it so: {GOOD_YOLO}")
 
     def _unpacked(self, raw: Floats) -> tuple[Floats, NDArray[np.int64], Floats]:
         """Return corners, labels and confidences of what is sure enough."""
@@ -271,10 +282,10 @@ def _rounded(picture: Picture) -> tuple[int, int]:
     return tall, wide
 
 
-def _tried(net: cv2.dnn.Net, path: Path, size: tuple[int, int], advice: str) -> NDArray[Any]:
-    """Return what a net gives for a black picture. Raises ConfigError where it cannot run."""
+def _run(net: cv2.dnn.Net, blob: Any, path: Path, advice: str) -> NDArray[Any]:
+    """Return what a net gives for a picture. Raises ConfigError where it cannot run."""
     try:
-        net.setInput(np.zeros((1, 3, *size), np.float32))
+        net.setInput(blob)
         return np.asarray(net.forward())
     except cv2.error as error:
         raise ConfigError(f"{path}: cv2.dnn cannot run it: {reason(error)}; {advice}") from None

@@ -69,7 +69,7 @@ def test_a_deployment_file_names_net_and_tags_beside_itself(tmp_path):
 
 def test_a_net_on_the_command_line_is_taken_from_where_one_is(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    sets = ("recognizer.onnx=my.onnx", "recognizer.labels=my.txt", "recognizer.layout=detr")
+    sets = ("recognizer.layout=detr", "recognizer.labels=my.txt", "recognizer.onnx=my.onnx")
     made = merged_values({"body": "turtlebot3_waffle"}, (), sets).deployment
     assert made.recognizer == RecognizerConfig(
         onnx=str(tmp_path / "my.onnx"), labels=str(tmp_path / "my.txt"), layout="detr"
@@ -79,8 +79,6 @@ def test_a_net_on_the_command_line_is_taken_from_where_one_is(tmp_path, monkeypa
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        ("recognizer: {layout: yolo}", "robot.yaml:1: .*onnx"),
-        ("recognizer: {onnx: a.onnx, layout: yolo}", "robot.yaml:1: .*labels"),
         ("recognizer: {onnx: a.onnx, layout: yolov8}", "robot.yaml:1: .*'detr', 'things', 'yolo'"),
         ("recognizer: {rate_hz: 0}", "robot.yaml:1: "),
         ("tags: {family: 36h12}", "robot.yaml:1: .*36h11"),

@@ -1,5 +1,6 @@
 """Nets of one's own: the layouts that people export, and what is refused."""
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -135,6 +136,30 @@ def test_a_file_that_is_no_net_is_refused_in_one_line(tmp_path, layout):
         with pytest.raises(ConfigError, match=r"my\.onnx") as refused:
             load(tmp_path, layout, "cat", "dog")
         assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [({"layout": "yolo"}, "`onnx`"), ({"layout": "detr", "onnx": "a.onnx"}, "labels: missing")],
+)
+def test_a_layout_needs_a_net_and_labels(settings, expected):
+    with pytest.raises(ConfigError, match=expected):
+        load_net(RecognizerConfig(**settings))
+
+
+def test_any_bytes_are_a_net_or_are_refused(tmp_path):
+    rng = np.random.default_rng(1)
+    path = tmp_path / "my.onnx"
+    whole = write_net(path, SIZE, yolo()).read_bytes()
+    read = 0
+    for _ in range(600):
+        data = bytearray(whole)
+        for at in rng.integers(0, len(data), rng.integers(1, 6)):
+            data[at] = rng.integers(256)
+        path.write_bytes(data[: rng.integers(1, len(data) + 1)] if rng.random() < 0.3 else data)
+        with contextlib.suppress(ConfigError):
+            read += bool(input_of(path).name)
+    assert 100 < read < 600
 
 
 def test_a_missing_net_or_list_of_labels_is_named(tmp_path):
