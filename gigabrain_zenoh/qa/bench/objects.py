@@ -28,6 +28,7 @@ THINGS, GOALS = 7, 8
 GAP_M, GOAL_GAP_M, START_GAP_M = 0.7, 0.45, 0.8  # between things; from a goal, and from the start
 SAME_M = 0.3  # from the truth, within which a remembered thing is taken for it
 COLOURS = ((0.75, 0.2, 0.15), (0.15, 0.35, 0.7), (0.9, 0.7, 0.2), (0.2, 0.55, 0.3), (0.8, 0.8, 0.8))
+CARTON = (0.68, 0.5, 0.33)
 GEOMS = ("box", "cylinder", "sphere", "capsule", "ellipsoid")
 Progress = Callable[[str], None]
 
@@ -185,6 +186,7 @@ def write(course: ClutteredWorld, placed: Sequence[Placed], folder: Path) -> Pat
 
 def _mjcf(number: int, one: Placed, random: np.random.Generator) -> str:
     paints = {part.paint: COLOURS[random.integers(len(COLOURS))] for part in one.look.parts}
+    paints["carton"] = CARTON
     quat = f"{math.cos(one.yaw / 2):.6f} 0 0 {math.sin(one.yaw / 2):.6f}"
     geoms = "".join(_geoms(number, one.look.parts, paints))
     return (

@@ -99,7 +99,7 @@ def box(rng: Random, wide: int) -> Look:
         x, y = rng.uniform(0.06, 0.18, 2)
         z = max(x, y) * ranged(rng, 1.6, 2.4, wide)
     parts = [Geom("box", (x, y, z), (0, 0, z), paint="carton")]
-    if rng.random() < 0.75:
+    if rng.random() < 0.9:
         w, e = 0.025, 0.0015
         parts += [Geom("box", (x + e, w, z + e), (0, 0, z), paint="tape", shine=0.6)]
         face = 1 if rng.random() < 0.5 else -1

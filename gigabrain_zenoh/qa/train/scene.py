@@ -22,6 +22,7 @@ MIN_FRACTION, MIN_INSIDE, MIN_PIXELS, MIN_SIDE_PX = 0.25, 0.4, 40, 4
 LARGE = ("person", "door")  # seldom fit into the picture
 SMALL_M = 0.4  # what is lower may stand on a table
 TRIES = 30
+DRAWN_PX = 10.0  # across: what is smaller stands nearer, so that it is as large in the picture
 OCCLUDED = 0.95  # share of things before which something is tried to be put
 SHARES = np.array((14, 14, 10, 14, 11, 9, 11, 11, 6)) / 100  # of the classes, in their order
 CARTON = ((24, 0.45, 0.55), (28, 0.35, 0.75), (32, 0.3, 0.85))  # hue [deg], saturation, value
@@ -155,19 +156,16 @@ class StudioScene:
             other = rng.integers(len(self._studio.flat_textures))
             number = other if name == "floor" or rng.random() < 0.2 else one
             plain = rng.random() < 0.35
-            self._paint(material, -1 if plain else self._studio.flat_textures[number])
+            colour = textures.colour(rng, 0.2, 0.35)
+            self._paint(material, -1 if plain else self._studio.flat_textures[number], colour)
             model.mat_texrepeat[material] = rng.uniform(0.3, 2.5)
             model.mat_reflectance[material] = (
                 rng.uniform(0, 0.25) if name == "floor" and rng.random() < 0.2 else 0
             )
 
-    def _paint(
-        self, material: int, texture: int, colour: NDArray[np.float32] | None = None
-    ) -> None:
+    def _paint(self, material: int, texture: int, colour: NDArray[np.float32]) -> None:
         rng, model = self._rng, self._model
         model.mat_texid[material, RGB] = texture
-        if colour is None:
-            colour = textures.colour(rng, 0.35)
         if texture >= 0:
             colour = 0.65 + 0.35 * colour
         model.mat_rgba[material, :3] = colour
@@ -221,13 +219,19 @@ class StudioScene:
         ):
             return
         # small things far away are mostly a few pixels: draw the distance by its inverse at times
-        near, far = thing.look.nearest, FAR_M
+        near, far = thing.look.nearest, self._farthest(thing)
         if rng.random() < 0.5:
             distance = 1 / rng.uniform(1 / far, 1 / near)
         else:
             distance = rng.uniform(near, far)
         if self._put(thing, distance) and rng.random() < OCCLUDED:
             self._hide(thing)
+
+    def _farthest(self, thing: Thing) -> float:
+        """Return how far away a thing may stand to be large enough in the picture [m]."""
+        focal = HEIGHT_PX / 2 / math.tan(self._fovy / 2)
+        side = min(2 * thing.look.radius, thing.look.height)
+        return max(thing.look.nearest + 0.1, min(FAR_M, focal * side / DRAWN_PX))
 
     def _hide(self, thing: Thing) -> None:
         """Put something before a thing that was just put, so that it hides a part of it."""
@@ -242,7 +246,7 @@ class StudioScene:
             if self._is_placed(other) or near < max(0.35, other.look.nearest * 0.6):
                 continue
             half = (other.look.hides or other.look.radius) * distance / near
-            aside = half + (thing.look.hides or thing.look.radius) * rng.uniform(-0.5, 0.8)
+            aside = half + (thing.look.hides or thing.look.radius) * rng.uniform(-0.2, 0.85)
             if self._put(other, near, math.atan2(y, x) + side * aside / distance):
                 return
 
@@ -274,6 +278,8 @@ class StudioScene:
         """Put a small thing on the table where nothing stands yet."""
         rng, size = self._rng, table.look.parts[0].size
         _, x, y = next(placed for placed in self._placed if placed[0] is table)
+        if math.hypot(x, y) > self._farthest(thing):
+            return False
         if self._height < table.look.height - 0.1 and rng.random() < 0.6:
             return False  # its top is not seen from here
         turn = 2 * math.atan2(
@@ -312,18 +318,17 @@ class StudioScene:
         """Draw colour and texture by what a paint stands for."""
         rng = self._rng
         chance = {
-            "body": 0.35,
+            "body": 0.2,
             "label": 0.6,
             "shirt": 0.4,
             "trousers": 0.2,
             "leaf": 0.3,
-            "carton": 0.15,
             "wall": 0.4,
         }
         textured = rng.random() < chance.get(paint, 0.1)
         cubes = self._studio.cube_textures
-        colour = textures.colour(rng, 0.6)
-        if paint == "carton" and rng.random() < 0.7:
+        colour = textures.colour(rng, 0.75, 0.25)
+        if paint == "carton":
             hue, saturation, value = CARTON[rng.integers(len(CARTON))]
             colour = _hsv(
                 hue + rng.normal(0, 3),

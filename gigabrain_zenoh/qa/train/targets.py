@@ -10,7 +10,7 @@ from gigabrain_zenoh.vision.labels import CLASSES
 from gigabrain_zenoh.vision.recognizer import STRIDE_PX
 
 CORE = 0.54  # share of a box in which cells answer for it
-ZOOM = (0.85, 1.45)
+ZOOM = (0.9, 1.4)
 MIN_LEFT = 0.45  # share of a box that must be left by cutting, or it is to be ignored
 
 Floats = NDArray[np.float32]
@@ -42,8 +42,6 @@ def augment(
         boxes = np.clip(moved, 0, [width, height, width, height]).astype(np.float32)
         ignored |= _area(boxes) < MIN_LEFT * _area(moved)
         ignored |= np.minimum(boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]) < 3
-    if rng.random() < 0.2:
-        picture = np.ascontiguousarray(picture[..., rng.permutation(3)])
     return degrade(rng, picture), Labelled(b"", boxes, one.labels, one.fractions, ignored)
 
 

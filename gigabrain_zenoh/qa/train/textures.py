@@ -121,10 +121,10 @@ TRAIN: tuple[Family, ...] = (plain, plain, speckles, checks, stripes, tiles, pla
 TEST: tuple[Family, ...] = (plain, marble, plaid, hexagons, waves)
 
 
-def colour(rng: Random, vivid: float = 0.5) -> NDArray[np.float32]:
+def colour(rng: Random, vivid: float = 0.5, darkest: float = 0.15) -> NDArray[np.float32]:
     """Draw a colour, RGB from 0 to 1: with chance `vivid` any hue, else close to grey."""
     saturation = rng.uniform(0.35, 1.0) if rng.random() < vivid else rng.uniform(0.0, 0.2)
-    hsv = np.array([[[rng.uniform(0, 360), saturation, rng.uniform(0.15, 1.0)]]], np.float32)
+    hsv = np.array([[[rng.uniform(0, 360), saturation, rng.uniform(darkest, 1.0)]]], np.float32)
     return np.asarray(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0, 0], np.float32)
 
 
