@@ -21,9 +21,8 @@ NAVIGATES = {
     "speed": 2.0,  # in lock-step, so that a busy machine does not make it stop
 }
 SIZES = {"light": (1280, 800), "phone": (390, 844), "dark": (1280, 800)}
-SEEN_S = 20.0  # in which the cameras see the room around the robot
 ROOM = """
-description: a room with a table, low boxes, cans and a person
+description: a room with a table, low boxes, cans, a ball, a person and a tag
 size: [6, 5]
 start: [-1.8, 0, 0]
 boxes:
@@ -34,9 +33,13 @@ boxes:
   - {at: [1.4, 1.45], size: [0.05, 0.05, 0.42], material: dark_wood}
   - {at: [-0.4, -0.7], size: [0.3, 0.2, 0.08], yaw: 0.4, material: carton}
   - {at: [1.9, -0.6], size: [0.4, 0.3, 0.3], yaw: 0.2, material: carton}
-cylinders:
-  - {at: [-0.5, 0.35], radius: 0.035, height: 0.12, material: steel}
-  - {at: [0.3, -0.2], radius: 0.035, height: 0.12, material: blue}
+cans:
+  - {at: [-0.5, 0.35]}
+  - {at: [0.3, -0.2]}
+balls:
+  - {at: [0.2, 0.4], radius: 0.1}
+tags:
+  - {id: 7, at: [2.45, 0.6], yaw: 3.14159, z: 0.25, size: 0.2}
 people:
   - {path: [[0.8, -1.6], [1.6, -1.6]], speed: 0.1}
 """
@@ -49,7 +52,7 @@ async def take_screenshots(folder: Path) -> None:
 
 
 async def take_camera_screenshot(folder: Path) -> None:
-    """Explore a room with cameras, and show what they see."""
+    """Explore a room with cameras until a thing is known, and show what they see."""
     with tempfile.TemporaryDirectory() as place:
         home = Home(Path(place) / "home")
         world = home.folder / "room.yaml"
@@ -62,10 +65,10 @@ async def take_camera_screenshot(folder: Path) -> None:
                 page = await chromium.new_page()
                 await page.goto(f"{robot.origin}/#{OPERATOR}")
                 await prepare(page, "light")
-                await page.wait_for_selector("#show-contours", timeout=READY_S * 1000)
-                await page.wait_for_timeout(SEEN_S * 1000)
-                await page.click('[data-camera="front"] .frame')  # larger
-                await page.wait_for_timeout(1000)
+                for seen in ("#show-contours", "#tab-objects"):
+                    await page.wait_for_selector(seen, timeout=READY_S * 1000)
+                await page.click("#tab-objects")
+                await page.wait_for_timeout(1200)  # the table is filled once a second
                 await page.screenshot(path=folder / "page_cameras.png")
                 await chromium.close()
         finally:
