@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 EARLY = 0.25  # of a period: a picture that comes so much earlier is not left out
 DEPTH_WAIT_NS = 60_000_000  # that a picture waits for its depth
+SURE_TIMES = 5  # pictures in a row that show a tag in another size
 KEPT_DEPTHS = 4  # of a camera, for the picture of the same exposure
 INSTALL = "recognition needs OpenCV; install it with: pip install 'gigabrain-zenoh[eyes]'"
 
@@ -72,6 +73,7 @@ class Recognition:
         self._eyes: dict[str, _Eye] = {}
         self._history, self._fault = PoseHistory(), Fault(log)
         self._busy, self._taken, self._done = False, 0, 0
+        self._misread: dict[int, int] = {}  # how often in a row a tag had another size, by number
         self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._pose = bus.latest(POSE)
         bus.latest(BODY, self._on_body)
@@ -141,7 +143,23 @@ class Recognition:
         else:
             self._fault.end(f"camera {picture.frame_id}: its pictures are whole again")
             self._publish(found, picture)
+            self._warn_of_sizes(found)
         self._start()
+
+    def _warn_of_sizes(self, found: Detections) -> None:
+        """Log a tag that several pictures show in another size than the settings say, once."""
+        measured = self._observer.other_sizes
+        for tag in found.tags:
+            if tag.id not in measured:
+                self._misread.pop(tag.id, None)
+                continue
+            times = self._misread[tag.id] = self._misread.get(tag.id, 0) + 1
+            if times == SURE_TIMES:
+                log.warning(
+                    "tag %d measures %.2f m by depth, but its size is set to %.2f m; "
+                    "set `tags: size`, or its own in `sizes`",
+                    tag.id, measured[tag.id], tag.size,
+                )  # fmt: skip
 
     def _publish(self, found: Detections, picture: Image) -> None:
         bus = self._bus

@@ -55,6 +55,11 @@ class Observer:
             took_ms=1e3 * (time.perf_counter() - began),
         )
 
+    @property
+    def other_sizes(self) -> dict[int, float]:
+        """Return the sizes of tags that depth measures otherwise than the settings say [m]."""
+        return dict(self._tags.other_sizes)
+
     def _model(self, camera: Camera) -> CameraModel:
         if camera not in self._models:
             self._models[camera] = CameraModel(camera)

@@ -32,6 +32,7 @@ INNER = 0.85  # share of a tag's sides within which depth is taken: its edges mi
 MIN_POINTS = 20  # with depth
 MAX_TILT_ERROR = 0.06  # [rad], of a plane by depth that is believed
 SAME_SIZE = (0.8, 1.25)  # measured by depth, of what the settings say
+EDGE_ON = -0.05  # cosine of the angle between a ray and a face that is too slanting
 MAX_TAGS = 64
 Grey = NDArray[np.uint8]
 Depth = NDArray[np.uint16]
@@ -44,6 +45,7 @@ class TagFinder:
         self, family: str = "36h11", size: float = 0.16, sizes: Mapping[int, float] | None = None
     ) -> None:
         self._size, self._sizes = size, dict(sizes or {})
+        self.other_sizes: dict[int, float] = {}  # [m], measured by depth: not what they should be
         found = cv2.aruco.DetectorParameters()
         found.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         found.minMarkerPerimeterRate = 0.03  # of the longer side of a picture
@@ -64,10 +66,20 @@ class TagFinder:
                 continue
             corners = refined(grey, corners)
             size = self._sizes.get(tag, self._size)
-            placed = place(corners, size, model, depth)
+            plane = None if depth is None else _plane(corners, model, depth)
+            if plane and plane.tilt_error <= MAX_TILT_ERROR:
+                self._compare(tag, size, _measured(corners, model, plane))
+            placed = place(corners, size, model, plane)
             if placed:
                 found[tag] = _detection(tag, corners, size, placed)
         return tuple(found.values())[:MAX_TAGS]
+
+    def _compare(self, tag: int, size: float, measured: float) -> None:
+        """Note a tag whose size by depth is another one."""
+        if SAME_SIZE[0] < measured / size < SAME_SIZE[1]:
+            self.other_sizes.pop(tag, None)
+        elif math.isfinite(measured) and len(self.other_sizes) < MAX_TAGS:
+            self.other_sizes[tag] = measured
 
 
 class Placed(NamedTuple):
@@ -85,12 +97,14 @@ class Plane(NamedTuple):
     tilt_error: float  # [rad], of the normal
 
 
-def place(corners: Floats, size: float, model: CameraModel, depth: Depth | None) -> Placed | None:
-    """Return the pose of a tag by its corners [px], (4, 2), from the lower left; None if open."""
+def place(corners: Floats, size: float, model: CameraModel, plane: Plane | None) -> Placed | None:
+    """Return the pose of a tag by its corners [px], (4, 2), from the lower left; None if open.
+
+    `plane` is where depth has it.
+    """
     poses = _poses(corners, size, model)
     if not poses:
         return None
-    plane = _plane(corners, model, depth) if depth is not None else None
     if plane is not None and plane.tilt_error <= MAX_TILT_ERROR:
         by_depth = _on_plane(corners, model, plane, size)
         if by_depth is not None:
@@ -171,21 +185,29 @@ def _plane(corners: Floats, model: CameraModel, depth: Depth) -> Plane | None:
 
 def _on_plane(corners: Floats, model: CameraModel, plane: Plane, size: float) -> Placed | None:
     """Return the pose of a tag whose corners are on a plane; None if they are not its size."""
-    straight = cv2.undistortPoints(corners.reshape(-1, 1, 2), *_lens(model)).reshape(4, 2)
-    rays = np.stack([_to_body(np.array((x, y, 1.0)), model) for x, y in straight])
-    slant = rays @ plane.normal
-    if (slant > -0.05).any():  # seen from its edge, or from behind
+    if not SAME_SIZE[0] < _measured(corners, model, plane) / size < SAME_SIZE[1]:
         return None
-    placed = rays * (plane.point @ plane.normal / slant)[:, None]
-    lower_left, lower_right, upper_right, upper_left = placed
+    lower_left, lower_right, upper_right, upper_left = placed = _cast(corners, model, plane)
     up = (upper_left - lower_left) + (upper_right - lower_right)
     up -= (up @ plane.normal) * plane.normal
-    measured = float(np.linalg.norm(placed - np.roll(placed, 1, axis=0), axis=1).mean())
-    if not SAME_SIZE[0] < measured / size < SAME_SIZE[1]:
-        return None
     up /= np.linalg.norm(up)
     axes = np.stack((plane.normal, np.cross(up, plane.normal), up), axis=1)
     return Placed(model.origin + placed.mean(axis=0), axes)
+
+
+def _measured(corners: Floats, model: CameraModel, plane: Plane) -> float:
+    """Return the mean side of a tag on a plane [m]; not a number where it is seen edge-on."""
+    placed = _cast(corners, model, plane)
+    return float(np.linalg.norm(placed - np.roll(placed, 1, axis=0), axis=1).mean())
+
+
+def _cast(corners: Floats, model: CameraModel, plane: Plane) -> Floats:
+    """Return where rays through pixels (n, 2) meet a plane, from the camera, in the body's axes."""
+    straight = cv2.undistortPoints(corners.reshape(-1, 1, 2), *_lens(model)).reshape(4, 2)
+    rays = np.stack([_to_body(np.array((x, y, 1.0)), model) for x, y in straight])
+    slant = rays @ plane.normal
+    slant[slant > EDGE_ON] = np.nan  # seen from its edge, or from behind
+    return np.asarray(rays * (plane.point @ plane.normal / slant)[:, None], np.float64)
 
 
 def _shortest_side(corners: Floats) -> float:

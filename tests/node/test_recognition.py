@@ -211,6 +211,18 @@ async def test_cameras_take_turns():
                    for thing in one.things)  # fmt: skip
 
 
+async def test_a_tag_of_another_size_than_is_set_is_named_once(caplog):
+    async with running() as robot:
+        robot.recognition._observer = Observer(robot.net, TagFinder(size=0.1))
+        for count in range(1, 9):
+            robot.show(40)
+            await robot.finds(count)
+            await robot.pass_s(1)
+        warnings = [one for one in caplog.records if one.levelno >= logging.WARNING]
+        assert len(warnings) == 1
+        assert "tag 7 measures 0.16 m" in warnings[0].message
+
+
 async def test_a_picture_waits_for_its_depth_but_not_for_long():
     async with running() as robot:
         robot.show(40, depth=False)
