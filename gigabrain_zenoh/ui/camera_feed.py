@@ -1,16 +1,24 @@
 """Pictures, detections and findings for viewers, received only while somebody looks."""
 
 import functools
+from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import Any
 
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import MOST_CAMERAS
 from gigabrain_schemas.objects import Detections
-from gigabrain_schemas.topics import DETECTIONS, Topic
+from gigabrain_schemas.sensors import Image
+from gigabrain_schemas.topics import DETECTIONS, IMAGE, Topic
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.headers import header_of
 from gigabrain_zenoh.bus.listening import Sampled
+from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.host.bounded import put_newest
+
+RECENT = 8  # pictures of a camera; what is recognised in one comes up to 0.5 s later
+_decode_image = Codec(IMAGE.type, IMAGE.max_bytes).decode
 
 
 class CameraFeed:
@@ -23,6 +31,7 @@ class CameraFeed:
         self._bus, self._topics = bus, topics
         self._sampled: dict[Topic[Any], dict[str, Sampled[Any]]] = {}
         self._detections: dict[str, Detections] = {}  # new ones, by camera
+        self._recent: dict[str, deque[bytes]] = {}  # the newest pictures, by camera
         self._closes: list[Callable[[], None]] = []
 
     def watch(self, on: bool) -> None:
@@ -33,6 +42,7 @@ class CameraFeed:
             close()
         self._closes = []
         self._detections.clear()
+        self._recent.clear()
         self._sampled = {topic: {} for topic in self._topics if topic.many}
         if on:
             self._closes = [
@@ -51,6 +61,14 @@ class CameraFeed:
         sampled = self._sampled.get(topic, {}).get(name)
         return sampled.poll() if sampled else None
 
+    def picture_at(self, camera: str, basis: int) -> Image | None:
+        """Return the picture that was exposed at a tick, if it is one of the newest."""
+        for payload in reversed(tuple(self._recent.get(camera, ()))):
+            if header_of(payload).basis == basis:
+                with suppress(ValueError):
+                    return _decode_image(payload)
+        return None
+
     def new_detections(self) -> Iterator[Detections]:
         """Yield the newest detections of each camera since the last call."""
         found, self._detections = self._detections, {}
@@ -61,6 +79,8 @@ class CameraFeed:
         held, name = self._sampled.get(topic), key.removeprefix(f"{topic.key}/")
         if held is not None and (name in held or len(held) < MOST_CAMERAS):
             held.setdefault(name, Sampled(self._bus, topic)).receive(key, encoding, payload)
+            if topic is IMAGE and DETECTIONS in self._topics:
+                self._recent.setdefault(name, deque(maxlen=RECENT)).append(payload)
 
     def _add_detections(self, _key: str, found: Detections) -> None:
         put_newest(self._detections, found.camera, found, MOST_CAMERAS)

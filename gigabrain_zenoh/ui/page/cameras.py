@@ -22,6 +22,8 @@ from gigabrain_zenoh.ui.page import frames
 
 PICTURE_INTERVAL_NS = 190_000_000  # at least, between two pictures of a camera: every second frame
 SHOWN_TIMEOUT_NS = 3_000_000_000  # after which a picture counts as lost on its way
+RECOGNISED_TICKS = 25  # from one picture to the next in which things are recognised
+MAX_TICKS = 50  # by which a picture may be older than the last; beyond, time has begun again
 MAX_NAMES = 16  # of cameras and perceptors
 
 
@@ -85,6 +87,10 @@ class CameraFrames:
         self._send = send
         self._feed = CameraFeed(bus, IMAGE, DETECTIONS)
         self._newest: dict[str, tuple[int, bytes]] = {}  # number and frame, by camera
+        self._polled: dict[str, Image] = {}  # the newest picture, by camera
+        self._shown: dict[str, int] = {}  # exposure of the last picture sent, by camera
+        self._recognised: dict[str, tuple[int, int]] = {}  # last two exposures, by camera
+        self._found: dict[str, bytes] = {}  # frame of what was recognised in the last, by camera
         self._problems: dict[str, tuple[str, str]] = {}  # of the camera, and of its picture
         self._kept: dict[str, bytes] = {}
         bus.subscribe(CAMERA, self._on_info)
@@ -100,25 +106,44 @@ class CameraFrames:
         watching = [pace for pace in paces if pace.watch.open]
         self._feed.watch(bool(watching))
         if not watching:
-            self._newest.clear()
+            for held in (self._newest, self._found, self._recognised, self._polled, self._shown):
+                held.clear()
             return
+        new = [self._add(found) for found in self._feed.new_detections()]
         for camera in self._feed.names(IMAGE):
             ready = [pace for pace in watching if pace.is_ready(camera, now_ns)]
             number, frame = self._picture(camera) if ready else (0, b"")
             for pace in ready:
                 if number and pace.take(camera, number, now_ns):
                     yield pace, f"image/{camera}", frame
-        for found in self._feed.new_detections():
-            frame = frames.as_json(frames.FOUND, _without_poses(found))
-            for pace in watching:
-                if pace.wants(found.camera):
-                    yield pace, f"found/{found.camera}", frame
+                    if self._is_paired(camera):
+                        yield pace, f"found/{camera}", self._found[camera]
+        for camera in new:
+            if not self._is_paired(camera):
+                for pace in watching:
+                    if pace.wants(camera):
+                        yield pace, f"found/{camera}", self._found[camera]
+
+    def _add(self, found: Detections) -> str:
+        """Keep what was recognised; return its camera."""
+        camera, (_, last) = found.camera, self._recognised.get(found.camera, (0, 0))
+        put_newest(self._recognised, camera, (last, found.basis), MAX_NAMES)
+        frame = frames.as_json(frames.FOUND, _without_poses(found))
+        put_newest(self._found, camera, frame, MAX_NAMES)
+        return camera
+
+    def _is_paired(self, camera: str) -> bool:
+        """Return whether things are recognised often enough to show only those pictures."""
+        before, last = self._recognised.get(camera, (0, 0))
+        newest = self._polled.get(camera)
+        often = 0 < last - before <= RECOGNISED_TICKS
+        return often and newest is not None and newest.basis - last <= RECOGNISED_TICKS
 
     def _picture(self, camera: str) -> tuple[int, bytes]:
         """Return the newest picture and its number; the number is 0 without one."""
         number, frame = self._newest.get(camera, (0, b""))
-        image = self._feed.poll(IMAGE, camera)
-        if not isinstance(image, Image):
+        image = self._image(camera)
+        if image is None:
             return number, frame
         problem = _problem_of(image)
         self._note(camera, self._problems.get(camera, ("", ""))[0], problem)
@@ -127,6 +152,26 @@ class CameraFrames:
         newest = number + 1, frames.image_frame(camera, image)
         put_newest(self._newest, camera, newest, MAX_NAMES)
         return newest
+
+    def _image(self, camera: str) -> Image | None:
+        """Return the next picture to show; None if there is none.
+
+        While things are recognised, it is the one that they were recognised in: boxes of a picture
+        drawn over a later one are beside the things when the robot turns.
+        """
+        image = self._feed.poll(IMAGE, camera)
+        newest = image if isinstance(image, Image) else self._polled.get(camera)
+        if newest is None:
+            return None
+        put_newest(self._polled, camera, newest, MAX_NAMES)
+        if self._is_paired(camera):
+            last = self._recognised[camera][1]
+            behind = self._shown.get(camera, -MAX_TICKS) - last
+            image = None if 0 <= behind < MAX_TICKS else self._feed.picture_at(camera, last)
+        if not isinstance(image, Image):
+            return None
+        put_newest(self._shown, camera, image.basis, MAX_NAMES)
+        return image
 
     def _on_info(self, key: str, info: CameraInfo) -> None:
         camera = key.removeprefix(f"{CAMERA.key}/")

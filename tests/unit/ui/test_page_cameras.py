@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import AsyncIterator
+from itertools import pairwise
 from pathlib import Path
 
 import msgspec
@@ -194,6 +195,34 @@ async def test_detections_are_sent_to_those_who_see_the_picture(page: Page) -> N
         {"label": "can", "confidence": 0.93, "box": [1.2, 2.0, 3.0, 4.0], "position": None}
     ]
     assert content(folded, frames.FOUND) == []
+
+
+async def test_while_things_are_recognised_their_own_picture_is_shown(page: Page) -> None:
+    """At 10 Hz; every second picture is recognised, and what is in it comes 0.1 s later."""
+    viewer = await looks(page)
+    shown: list[tuple[int, int]] = []
+    for number in range(1, 41):
+        data = jpeg_head(320, 240) + bytes((number,))
+        page.net.two.publish(IMAGE, picture(data=data), name="front", basis=5 * number)
+        if number <= 20 and number % 2 == 0 and number > 2:  # then recognition ends
+            can = Detection(label=f"can {number - 1}", confidence=0.9, box=(1.0, 2.0, 3.0, 4.0))
+            found = Detections(camera="front", width=320, height=240, things=(can,))
+            page.net.two.publish(DETECTIONS, found, basis=5 * (number - 1))
+        await tick(page)
+        say(viewer, frames.SHOWN, Shown(camera="front"))
+        await settle()
+        images = [frame[-1] for frame in viewer.got if frame[0] == frames.IMAGE]
+        if not shown or len(images) > shown[-1][1]:
+            shown.append((images[-1], len(images)))
+    numbers = [number for number, _ in shown]
+    assert numbers == sorted(set(numbers))  # never back in time
+    assert [n for n in numbers if 5 < n < 20] == [7, 9, 11, 13, 15, 17, 19]  # those recognised
+    assert len([n for n in numbers if n > 26]) >= 6  # without recognition all of them again
+    kinds = [(frame[0], frame) for frame in viewer.got if frame[0] in (frames.IMAGE, frames.FOUND)]
+    for (kind, frame), (after, boxes) in pairwise(kinds):
+        if kind == frames.IMAGE and 7 <= frame[-1] <= 19:  # boxes come with their picture
+            assert after == frames.FOUND
+            assert f'"can {frame[-1]}"'.encode() in boxes
 
 
 async def test_contours_are_sent_once_each_and_taken_back(page: Page) -> None:
