@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_schemas.body import Camera
-from gigabrain_schemas.objects import Box, Detection, Detections
+from gigabrain_schemas.objects import Box, Detection, Detections, TagDetection
 from gigabrain_schemas.sensors import Image
 from gigabrain_schemas.vision import DepthImage
 from gigabrain_zenoh.vision.camera_model import CameraModel
@@ -19,6 +19,8 @@ from gigabrain_zenoh.vision.thing_places import thing_place
 
 MAX_THINGS = 128
 MIN_BOX_PX = 1.0
+SAME_BOX = 0.6  # of two boxes of one thing: their intersection over their union
+MARGIN = 1 / 8  # of a tag's side
 
 
 class Observer:
@@ -46,12 +48,14 @@ class Observer:
         grey = picture if mono else _converted(picture, cv2.COLOR_BGR2GRAY)
         to_rgb = cv2.COLOR_GRAY2RGB if mono else cv2.COLOR_BGR2RGB
         found = self._net.find(_converted(picture, to_rgb)) if self._net else None
+        tags = self._tags.find(grey, model, far)
+        taken = [_plate(tag) for tag in tags]
         return Detections(
             camera=camera.name,
             width=camera.width,
             height=camera.height,
-            things=_things(found, model, far) if found else (),
-            tags=self._tags.find(grey, model, far),
+            things=_things(found, model, far, taken) if found else (),
+            tags=tags,
             took_ms=1e3 * (time.perf_counter() - began),
         )
 
@@ -79,11 +83,33 @@ def _depth_of(depth: DepthImage | None, camera: Camera) -> NDArray[np.uint16] | 
     return np.where(usable, pixels, np.uint16(0))
 
 
+def _plate(tag: TagDetection) -> Box:
+    """Return the box round a tag and its margin, one cell wide [px]."""
+    columns, rows = zip(*tag.corners, strict=True)
+    margin = max(max(columns) - min(columns), max(rows) - min(rows)) * MARGIN
+    return (
+        min(columns) - margin, min(rows) - margin, max(columns) + margin, max(rows) + margin,
+    )  # fmt: skip
+
+
+def overlap(one: Box, other: Box) -> float:
+    """Return the intersection of two boxes over their union."""
+    wide = min(one[2], other[2]) - max(one[0], other[0])
+    high = min(one[3], other[3]) - max(one[1], other[1])
+    if wide <= 0 or high <= 0:
+        return 0.0
+    areas = sum((box[2] - box[0]) * (box[3] - box[1]) for box in (one, other))
+    return wide * high / (areas - wide * high)
+
+
 def _things(
-    found: Found, model: CameraModel, depth: NDArray[np.uint16] | None
+    found: Found, model: CameraModel, depth: NDArray[np.uint16] | None, taken: list[Box]
 ) -> tuple[Detection, ...]:
-    """Return what a net found, the surest first, placed by depth."""
-    things = []
+    """Return what a net found, the surest first, placed by depth.
+
+    A thing has one class, the surest; boxes of `taken` are of tags, which are no things.
+    """
+    things, taken = [], list(taken)
     for label, sure, corners in zip(
         found.names(), found.confidences.tolist(), found.boxes.tolist(), strict=True
     ):
@@ -91,6 +117,9 @@ def _things(
         box: Box = (left, top, right, bottom)
         if right - left < MIN_BOX_PX or bottom - top < MIN_BOX_PX:
             continue
+        if any(overlap(box, other) > SAME_BOX for other in taken):
+            continue
+        taken.append(box)
         place = None if depth is None else thing_place(label, box, model, depth)
         things.append(Detection(
             label=label,

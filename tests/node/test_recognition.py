@@ -315,6 +315,38 @@ def test_raw_pictures_are_looked_at_too(encoding):
     assert [thing.label for thing in found.things] == ["ball"]
 
 
+class Sees(SeesABall):
+    """A net that sees what it is told, the surest first."""
+
+    def __init__(self, *boxes: tuple[float, float, float, float]) -> None:
+        super().__init__()
+        self.boxes = np.array(boxes, np.float32)
+
+    def find(self, picture: np.ndarray) -> Found:
+        count = len(self.boxes)
+        return Found(self.boxes, np.arange(count), np.linspace(0.9, 0.5, count, dtype=np.float32))
+
+
+def looked_at(net: SeesABall) -> Detections:
+    data = cv2.imencode(".jpg", TAG)[1].tobytes()
+    picture = Image(frame_id="front", width=320, height=240, encoding="jpeg", data=data)
+    return Observer(net, TagFinder()).observe(CAMERA, picture, None)
+
+
+def test_a_thing_has_one_class_the_surest():
+    found = looked_at(Sees((20, 20, 60, 60), (22, 20, 61, 62), (40, 20, 80, 60)))
+    assert [thing.label for thing in found.things] == ["cube", "cylinder"]
+
+
+def test_a_tag_is_no_thing_but_what_stands_before_it_is():
+    (tag,) = looked_at(Sees()).tags
+    columns, rows = zip(*tag.corners, strict=True)
+    plate = (min(columns) - 4, min(rows) - 4, max(columns) + 4, max(rows) + 4)
+    before = (min(columns), min(rows) + 20, min(columns) + 15, max(rows) + 30)
+    found = looked_at(Sees(plate, before))
+    assert [thing.label for thing in found.things] == ["ball"]
+
+
 def test_the_net_gets_red_green_blue():
     got = []
 
