@@ -72,7 +72,7 @@ class Recognition:
         self._pool = ThreadPoolExecutor(1, "recognition", initializer=step_aside)
         self._eyes: dict[str, _Eye] = {}
         self._history, self._fault = PoseHistory(), Fault(log)
-        self._busy, self._taken, self._done = False, 0, 0
+        self._busy, self._closed, self._taken, self._done = False, False, 0, 0
         self._misread: dict[int, int] = {}  # how often in a row a tag had another size, by number
         self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._pose = bus.latest(POSE)
@@ -84,6 +84,7 @@ class Recognition:
 
     def close(self) -> None:
         """Let the thread end after its work; one that hangs is left."""
+        self._closed = True
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def _on_body(self, body: Body) -> None:
@@ -113,7 +114,7 @@ class Recognition:
 
     def _start(self) -> None:
         """Look at the picture that is most due, unless one is looked at."""
-        if self._busy:
+        if self._busy or self._closed:
             return
         now_ns = self._bus.clock.now_ns()
         for eye in sorted(self._eyes.values(), key=lambda one: one.due_ns):
@@ -132,6 +133,8 @@ class Recognition:
 
     def _finish(self, picture: Image, job: Job) -> None:
         self._busy, self._done = False, self._done + 1
+        if self._closed:
+            return
         try:
             found: Detections = job.result()
         except ValueError as error:

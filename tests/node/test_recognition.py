@@ -283,6 +283,23 @@ async def test_pictures_of_an_earlier_start_of_the_driver_are_left_out():
         assert robot.net.seen == 0
 
 
+async def test_work_that_ends_after_the_process_closed_starts_no_more(caplog):
+    async with running() as robot:
+        robot.net.go_on.clear()
+        robot.show(40)
+        await until(lambda: robot.net.seen == 1, "work")
+        await robot.pass_s(1)
+        robot.show(41)
+        await settle()
+        robot.recognition.close()
+        robot.net.go_on.set()
+        await until(lambda: not robot.recognition._busy, "its end")
+        await settle()
+    assert robot.heard == []
+    assert robot.net.seen == 1
+    assert caplog.records == []
+
+
 async def test_an_error_of_the_net_ends_the_process():
     async with running() as robot:
         robot.net.find = lambda _: 1 / 0  # type: ignore[method-assign,return-value,assignment]
