@@ -57,7 +57,7 @@ RECOGNIZING_TICKS = round(3e9 / TICK_NS)  # since the last detections
 STEADY_RAD_S, RATE_TICKS = 0.8, 5  # turning faster blurs pictures; ticks to measure it over
 SHIFT_M = 0.01  # of an object, less is not published at once
 UNSAVED = "objects are not saved"
-STATE_FILE, MAX_STATE_BYTES = "objects.json", 400_000
+STATE_FILE, MAX_STATE_BYTES = "objects.json", 1_000_000
 
 
 class KeptAnchor(Struct, frozen=True):

@@ -34,6 +34,7 @@ NEAR_M = 2.5  # within which a thing that should be seen is seen
 BEFORE_M = 0.15  # what is so much nearer may hide a thing
 TOGETHER_M = 0.08  # nearer things of one class are one
 MAX_TRACKS, MAX_LABELS = 256, 8
+MAX_LABEL_BYTES = 96  # so that all things fit into a message
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,7 +239,8 @@ def _placed(glance: Glance) -> list[Sighting]:
     found = []
     pose_variance = float(glance.spread[0, 0] + glance.spread[1, 1]) / 2
     for one in glance.detections.things:
-        if one.position is None:
+        plain = one.label.isprintable() and len(one.label.encode()) <= MAX_LABEL_BYTES
+        if one.position is None or not plain:
             continue
         x, y, z = one.position
         distance = math.hypot(x - glance.camera.x, y - glance.camera.y)

@@ -7,8 +7,12 @@ import pytest
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.body import Camera
-from gigabrain_schemas.objects import Detection, Detections
+from gigabrain_schemas.objects import Detection, Detections, MapObject, MapTag, ObjectMap
+from gigabrain_schemas.topics import OBJECT_MAP
+from gigabrain_zenoh import codec
 from gigabrain_zenoh.geometry.se2 import inverse, transform
+from gigabrain_zenoh.mapping import object_file
+from gigabrain_zenoh.mapping.object_file import ObjectFile
 from gigabrain_zenoh.perception.object_memory import Anchor, Glance, ObjectMemory, carried
 
 FRONT = Camera(
@@ -228,3 +232,36 @@ def test_a_detection_without_a_place_is_no_object() -> None:
         unplaced = Detections(camera="front", width=320, height=240, things=(blind,))
         eye.memory.look(Glance(**{**glance.__dict__, "detections": unplaced}))
     assert eye.labels == []
+
+
+def test_as_many_things_and_tags_as_are_kept_fit_into_a_message_and_a_file() -> None:
+    things = tuple(
+        MapObject(
+            id=2**63 - 1 - k,
+            label='"' * 64 if k % 2 else "\u00e4" * 48,
+            x=-1e5 + 0.001,
+            y=1e5 - 0.001,
+            z=0.123,
+            size=(1.234, 5.678),
+            confidence=0.982,
+            seen=2**62,
+            last_seen_ns=2**62,
+        )
+        for k in range(256)
+    )
+    tags = tuple(
+        MapTag(
+            id=10**6 - k,
+            x=-1e5 + 0.001,
+            y=1e5 - 0.001,
+            z=0.123,
+            yaw=3.1415,
+            size=0.1234,
+            seen=2**62,
+            last_seen_ns=2**62,
+        )
+        for k in range(256)
+    )
+    message = ObjectMap(objects=things, tags=tags, map="m" * 64, recognizing=True)
+    assert len(codec.encode(message)) < OBJECT_MAP.max_bytes
+    assert len(object_file.encoded(ObjectFile(objects=things, tags=tags))) < object_file.MAX_BYTES
