@@ -109,6 +109,7 @@ class CameraContours:
         """Stop listening, and end the thread after its work."""
         for end in self._ends:
             end()
+        self._eyes.clear()  # no work is begun any more
         self._pool.shutdown()
 
     def contours(self, pose: Pose | None, tick: int) -> tuple[Contour, ...]:

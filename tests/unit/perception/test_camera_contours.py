@@ -19,6 +19,7 @@ from gigabrain_schemas.vision import CameraInfo, DepthImage
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.clock import FakeClock
 from gigabrain_zenoh.config.settings import PerceptionConfig
+from gigabrain_zenoh.host.threads import Job
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.perception.camera_contours import SKIPPED
 from gigabrain_zenoh.runtime.replay import Event, record, replay
@@ -227,6 +228,24 @@ async def test_a_camera_without_depth_gives_contours_by_colour_that_are_marked(
 
 def jpeg(pixels: NDArray[np.uint8]) -> bytes:
     return bytes(cv2.imencode(".jpg", pixels)[1].tobytes())
+
+
+async def test_a_picture_that_waits_at_the_end_is_left() -> None:
+    """The work in progress ends behind the node; nothing is begun then."""
+    unfinished: list[tuple[Job, Callable[[Job], None]]] = []
+
+    class Late(PatientJournal):
+        def when_done(self, job: Job, then: Callable[[Job], None]) -> None:
+            unfinished.append((job, then))
+
+    async with Bench() as bench:
+        bench.bus.input_log = Late()
+        await bench.begin()
+        for tick in (1, 6):
+            bench.drive(tick)
+            await bench.look(tick)
+    ((job, then),) = unfinished
+    then(job)
 
 
 async def test_a_body_without_cameras_costs_nothing() -> None:
