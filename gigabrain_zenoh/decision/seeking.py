@@ -22,7 +22,7 @@ OWN_M = 0.25  # round a thing, what is occupied is the thing itself or what it s
 OCCUPIED_PERCENT = 65
 
 CELL_M = 0.2  # of what has been looked at
-LOOK_M = 2.5  # within which a thing is recognised
+LOOK_M = 2.2  # a thing is recognised within 2.5 m, and may stand 0.3 m behind, at a wall
 OWN_GROUND_M = 0.5  # round the body: it would stand in a thing there
 RIM_RAD = math.radians(4)  # at the picture's edge, where a thing may be cut off
 SAMPLE_M = 0.05  # along a line of sight
