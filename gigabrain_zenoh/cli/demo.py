@@ -192,8 +192,7 @@ def up(
     if map:
         place = checked_map(map)
         set = (*set, "perception.mapping=localize", f"perception.map={place}")
-    if cameras:
-        set = (*set, "cameras=true")
+    set = (*set, "cameras=true") if cameras else set
     merged = merged_file(deployment, settings, set, keys)
     path, loaded = deployment_path(deployment), merged.deployment
     try:
@@ -208,9 +207,8 @@ def up(
             def put(line: str) -> None:
                 display.put(f"{line}\n")
 
-            file = str(path.absolute())
-            running = run(loaded, where, put, level, keep_stuck=keep_stuck, file=file, rows=rows)
-            return run_async(running)
+            file, stuck = str(path.absolute()), keep_stuck
+            return run_async(run(loaded, where, put, level, keep_stuck=stuck, file=file, rows=rows))
     except ConfigError as error:
         raise located(path, error) from None
 

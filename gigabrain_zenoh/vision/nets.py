@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from gigabrain_zenoh.config.settings import RecognizerConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import read_bounded
-from gigabrain_zenoh.vision.coco import COCO_IDS
-from gigabrain_zenoh.vision.labels import CLASSES
+from gigabrain_zenoh.vision.labels import CLASSES, COCO_IDS
 from gigabrain_zenoh.vision.onnx_file import input_of
 from gigabrain_zenoh.vision.recognizer import (
     HEIGHT_PX,

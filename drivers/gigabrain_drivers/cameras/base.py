@@ -46,7 +46,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class CameraSite:
-    """Where a source runs."""
+    """The folder and the seed that a source works with."""
 
     folder: str  # of the robot's file, to which paths in it are relative
     seed: int = 0

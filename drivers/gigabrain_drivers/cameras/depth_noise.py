@@ -21,7 +21,7 @@ PATCH_PX = 4  # side of a hole that is more than one pixel
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DepthErrors:
-    """How far the depth of a camera is from the truth."""
+    """Errors of a depth camera: noise, holes, edges and mounting."""
 
     sigma_at_1m: float = 0.0015  # [m], standard deviation; grows with the square of the depth
     holes: float = 0.02  # share of pixels without depth: half of them alone, half in patches

@@ -27,7 +27,7 @@ class FaultyCamera:
         self.fault = name
 
     def spoil(self, frame: Frame) -> Frame | None:
-        """Return what comes of an exposure; None where nothing comes."""
+        """Return the exposure with the fault applied; None for an unplugged camera."""
         self._count += 1
         fault, last = self.fault, self._last
         if fault == "unplugged":

@@ -17,7 +17,7 @@ MAX_PIXELS = 16_000_000  # of a picture that is scaled
 
 
 class OpenCvOptions(CameraOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What OpenCV opens."""
+    """Fields of a camera that OpenCV opens."""
 
     device: str  # /dev/video0, its number, rtsp://..., http://..., or a file beside the robot's
 

@@ -151,7 +151,7 @@ class CameraOutput:
 
 
 def _too_large(picture: Image | None, depth: DepthImage | None) -> str:
-    """Return what is wrong with messages that nobody would take; empty for nothing."""
+    """Return why messages exceed the limits of their topics; empty if they do not."""
     sizes = (
         ("a picture", len(picture.data) if picture else 0, IMAGE.max_bytes),
         ("a depth picture", sum(map(len, depth.planes)) if depth else 0, DEPTH.max_bytes),

@@ -126,7 +126,7 @@ class CameraProcess:
             output.restart()
 
     def _output(self, one: LinkedCamera) -> CameraOutput:
-        """Return the output of a camera, which in a simulation goes by the robot's time."""
+        """Return the output of a camera; a rendered one is judged by the robot's time."""
         bus, drawn = self._bus, one.options.source == RENDERED
         repeats = one.options.repeats or one.options.repeat
 

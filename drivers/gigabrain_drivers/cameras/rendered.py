@@ -46,7 +46,7 @@ class RenderedCamera(CameraSource):
 
 
 class View:
-    """How one rendered camera sees: where it really sits, and its errors."""
+    """One rendered camera: its lens, its true mounting and its errors."""
 
     def __init__(self, camera: Camera, seed: int, *, errors: bool) -> None:
         self.camera = camera

@@ -10,7 +10,7 @@ import pytest
 from gigabrain_zenoh.config.settings import RecognizerConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.vision import nets
-from gigabrain_zenoh.vision.coco import COCO_IDS
+from gigabrain_zenoh.vision.labels import COCO_IDS
 from gigabrain_zenoh.vision.nets import Net, load_net, read_labels
 from gigabrain_zenoh.vision.onnx_file import input_of
 from tests.unit.vision.onnx_bytes import write_net
