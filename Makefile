@@ -12,7 +12,8 @@ DEMO := $(VENV)/.demo
 INSTALLED := $(VENV)/.installed
 WARM := $(VENV)/.done
 PYTEST := $(BIN)/pytest
-SIDE_BY_SIDE := -n 2 --dist loadfile
+# a worker that crashes ends the run: the one in its place has been seen to wait for ever
+SIDE_BY_SIDE := -n 2 --dist loadfile --max-worker-restart 0
 MAKEFLAGS += --no-print-directory
 
 .PHONY: setup demo lint style rooms types site unit node system check test qa qa-tests extremes dockerfile signals \

@@ -19,6 +19,7 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.vision.camera_model import CameraModel
 from gigabrain_zenoh.vision.tags import TagFinder, cells, yaw_of
 from gigabrain_zenoh.vision.thing_places import thing_place
+from tests.unit.vision.tag_scenes import judge
 
 FRONT = load_robot("turtlebot3_waffle").cameras[0]
 MODEL = CameraModel(FRONT)
@@ -69,10 +70,7 @@ def test_tags_of_a_world_file_are_seen_where_they_hang_and_by_pupil_apriltags_to
         assert math.remainder(yaw_of(found[tag].orientation) - yaw, math.tau) == pytest.approx(
             0, abs=0.03
         )
-    judge = pytest.importorskip("pupil_apriltags", reason="no wheel here").Detector(
-        "tag36h11", quad_decimate=1.0
-    )
-    judged = {one.tag_id: one.corners - 0.5 for one in judge.detect(grey)}
+    judged = {one.tag_id: one.corners - 0.5 for one in judge().detect(grey)}
     assert set(judged) == set(found)
     for tag, corners in judged.items():
         assert np.abs(corners - np.array(found[tag].corners)).max() < 0.6

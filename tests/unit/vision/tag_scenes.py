@@ -1,9 +1,10 @@
 """Pictures of AprilTags at known poses: warped from the plane of the tag, with depth."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from gigabrain_schemas.body import Camera
@@ -22,6 +23,15 @@ class Plate(NamedTuple):
     size: float  # [m], of its black square
     position: NDArray[np.float64]  # [m], of its middle, in the body's frame
     axes: NDArray[np.float64]  # (3, 3): out of its face, to its left, to its top, as columns
+
+
+def judge() -> Any:
+    """Return the detector of pupil-apriltags, which works out corners by other code than ours."""
+    module = pytest.importorskip("pupil_apriltags", reason="no wheel here")
+    detector = module.Detector("tag36h11", quad_decimate=1.0)
+    # it would free the families before the detector, which still writes to them
+    detector.tag_families.clear()
+    return detector
 
 
 def facing(

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from gigabrain_zenoh.vision.camera_model import CameraModel, rotation
 from gigabrain_zenoh.vision.tags import TagFinder, cells, quaternion, yaw_of
-from tests.unit.vision.tag_scenes import CAMERA, Plate, draw, facing, project
+from tests.unit.vision.tag_scenes import CAMERA, Plate, draw, facing, judge, project
 
 MODEL = CameraModel(CAMERA)
 BENT = CameraModel(replace(CAMERA, distortion=(-0.25, 0.08, 0.001, -0.001)))
@@ -147,9 +147,7 @@ def test_a_quaternion_turns_as_its_matrix():
 
 
 def test_pupil_apriltags_finds_the_same_corners_and_poses():
-    judge = pytest.importorskip("pupil_apriltags", reason="no wheel here").Detector(
-        "tag36h11", quad_decimate=1.0
-    )
+    detector = judge()
     rng, finder = np.random.default_rng(6), TagFinder()
     fx, fy, cx, cy = MODEL.camera.pinhole
     compared = 0
@@ -159,7 +157,7 @@ def test_pupil_apriltags_finds_the_same_corners_and_poses():
         (found,) = finder.find(picture, MODEL, depth)
         (other,) = (
             one
-            for one in judge.detect(picture, True, (fx, fy, cx + 0.5, cy + 0.5), 0.16)
+            for one in detector.detect(picture, True, (fx, fy, cx + 0.5, cy + 0.5), 0.16)
             if one.tag_id == found.id
         )
         corners = other.corners - 0.5  # its pixels begin at their edge, ours in their middle
