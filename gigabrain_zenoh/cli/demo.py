@@ -190,8 +190,7 @@ def up(
     from gigabrain_zenoh.launch.up import up as run
 
     if map:
-        place = checked_map(map)
-        set = (*set, "perception.mapping=localize", f"perception.map={place}")
+        set = (*set, "perception.mapping=localize", f"perception.map={checked_map(map)}")
     set = (*set, "cameras=true") if cameras else set
     merged = merged_file(deployment, settings, set, keys)
     path, loaded = deployment_path(deployment), merged.deployment
