@@ -51,6 +51,8 @@ class SuiteOptions:
     "Simulated world; see `gigabrain worlds`."
     behaviour: str = "avoid"
     "Behaviour. `navigate` makes a map (tried with tests 1 to 9, 18, 19, 43 and 45)."
+    cameras: Annotated[bool, Parameter(negative=())] = False
+    "Use the cameras of simulated robots in all tests, not in those of cameras alone."
     long: Annotated[bool, Parameter(negative=())] = False
     "Run the long forms, as before a release: soak, load, all orders of deaths."
 
@@ -71,7 +73,7 @@ class SuiteOptions:
         """Return the options in the form that the suite takes."""
         from gigabrain_zenoh.qa.faults.rig import Options
 
-        return Options(self.body, self.world, self.behaviour, self.long)
+        return Options(self.body, self.world, self.behaviour, self.cameras, self.long)
 
 
 DEFAULT = SuiteOptions()

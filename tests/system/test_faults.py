@@ -8,8 +8,15 @@ from gigabrain_zenoh.qa.faults.rig import Options
 from gigabrain_zenoh.qa.faults.suite import FAULTS, run_suite
 from gigabrain_zenoh.qa.judging import FaultResult, FaultRow
 
-# a process, the gate, a link, the router, and the e-stop
-QUICK = ("decision-killed", "gate-killed", "serial-unplugged", "router-killed", "e-stop-pressed")
+# a process, the gate, a link, the router, the e-stop, and a camera
+QUICK = (
+    "decision-killed",
+    "gate-killed",
+    "serial-unplugged",
+    "router-killed",
+    "e-stop-pressed",
+    "camera-killed-or-frozen",
+)
 ROWS = [
     pytest.param(fault, id=fault.name, marks=() if fault.name in QUICK else pytest.mark.qa)
     for fault in FAULTS

@@ -80,6 +80,7 @@ class Options:
     body: str = ""  # instead of each stage's own
     world: str = "arena"
     behaviour: str = "avoid"
+    cameras: bool = False
     long: bool = False  # the forms for a release, instead of those for every change
     wall: bool = True  # judge wall-clock limits too, which need an otherwise idle machine
 
@@ -186,6 +187,7 @@ def deployment_of(options: Options, stage: Stage, resume: Resume = "manual") -> 
         world=options.world,
         resume="auto" if stage == "auto" else resume,
         router=LOOPBACK,
+        cameras=options.cameras and stage in ("sim", "auto"),
         perception=PerceptionConfig(mapping="slam" if needs_map(options.behaviour) else "off"),
         decision=DecisionConfig(
             behaviour=options.behaviour,
