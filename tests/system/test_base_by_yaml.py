@@ -76,8 +76,8 @@ async def test_a_board_with_whole_revolutions_and_ticks_passes_the_kit(tmp_path:
     for results in checked:
         assert len(results) == 16
         assert [result for result in results if result.verdict == "FAILED"] == []
-        skipped = [result for result in results if result.verdict == "skipped"]
-        assert all("too busy to tell" in result.measured for result in skipped)
+        skipped = [result.measured for result in results if result.verdict == "skipped"]
+        assert [why for why in skipped if "too busy to judge" not in why] == []
 
 
 @pytest.mark.parametrize(
