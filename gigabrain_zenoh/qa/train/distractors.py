@@ -25,7 +25,7 @@ def frustum(
 
 def board(rng: Random) -> Look:
     """A thin board on edge with three to five slanted sides: no rectangle, as a box would show."""
-    w, h, thin = rng.uniform(0.1, 0.4), rng.uniform(0.1, 0.7), rng.uniform(0.005, 0.02)
+    w, h, thin = rng.uniform(0.06, 0.2), rng.uniform(0.1, 0.5), rng.uniform(0.005, 0.02)
     tops = [(rng.uniform(-0.7, 0.7), 1.0)]
     tops += [(side * rng.uniform(0.6, 1.2), rng.uniform(0.3, 0.8)) for side in (-1, 1)]
     outline = [(-rng.uniform(0.3, 0.9), 0.0), (rng.uniform(0.3, 0.9), 0.0), *tops]
@@ -151,7 +151,7 @@ def picture(rng: Random) -> Look:
 
 
 OCCLUDERS = (board, board, pole, cone, wedge, bottle, bucket, egg, sausage, chair)
-FURNITURE = (table, table, chair, shelf, picture, picture, picture)
+FURNITURE = (table, table, chair, shelf, picture)
 
 
 def draw_all(rng: Random) -> list[Look]:

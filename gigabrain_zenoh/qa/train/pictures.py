@@ -40,16 +40,16 @@ class Labelled:
 
 def degrade(rng: Random, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Add what a camera adds: exposure, colour cast, blur, and noise."""
-    levels = np.linspace(0, 1, 256)[:, None] ** rng.uniform(0.7, 1.4)
-    levels = 255 * levels * rng.uniform(0.75, 1.3) * rng.uniform(0.9, 1.1, 3)
+    levels = np.linspace(0, 1, 256)[:, None] ** rng.uniform(0.8, 1.25)
+    levels = 255 * levels * rng.uniform(0.85, 1.2) * rng.uniform(0.94, 1.06, 3)
     out = cv2.LUT(picture, np.clip(levels, 0, 255).astype(np.uint8)[:, None])
     if rng.random() < 0.5:
-        out = cv2.GaussianBlur(out, (0, 0), rng.uniform(0.3, 0.9))
-    if rng.random() < 0.15:
+        out = cv2.GaussianBlur(out, (0, 0), rng.uniform(0.3, 0.7))
+    if rng.random() < 0.1:
         out = cv2.blur(out, (int(rng.integers(3, 6)), 1))  # the robot turns
     noise = np.empty(out.shape, np.int16)
     cv2.setRNGSeed(int(rng.integers(2**31)))
-    cv2.randn(noise, np.zeros(3), np.full(3, rng.uniform(0.0, 9.0)))
+    cv2.randn(noise, np.zeros(3), np.full(3, rng.uniform(0.0, 6.0)))
     return np.asarray(cv2.add(out, noise, dtype=cv2.CV_8U), np.uint8)
 
 

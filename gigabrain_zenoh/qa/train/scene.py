@@ -18,14 +18,25 @@ from gigabrain_zenoh.vision.recognizer import HEIGHT_PX, WIDTH_PX
 FAR_M = 4.0
 MAX_THINGS = 6
 # Less of a thing than this cannot be asked for: it is to be ignored.
-MIN_FRACTION, MIN_INSIDE, MIN_PIXELS, MIN_SIDE_PX = 0.25, 0.4, 40, 4
+MIN_FRACTION, MIN_INSIDE, MIN_PIXELS, MIN_SIDE_PX = 0.4, 0.5, 60, 6
 LARGE = ("person", "door")  # seldom fit into the picture
 SMALL_M = 0.4  # what is lower may stand on a table
 TRIES = 30
-DRAWN_PX = 10.0  # across: what is smaller stands nearer, so that it is as large in the picture
+DRAWN_PX = 14.0  # across: what is smaller stands nearer, so that it is as large in the picture
 OCCLUDED = 0.95  # share of things before which something is tried to be put
 SHARES = np.array((14, 14, 10, 14, 11, 9, 11, 11, 6)) / 100  # of the classes, in their order
-CARTON = ((24, 0.45, 0.55), (28, 0.35, 0.75), (32, 0.3, 0.85))  # hue [deg], saturation, value
+TEXTURED = {"label": 0.6, "print": 0.6, "shirt": 0.4, "leaf": 0.3, "wall": 0.4, "carton": 0.0}
+VIVID = {  # chance of a bright colour, by class; else it is close to grey
+    "": 0.2, "cube": 0.9, "ball": 0.8, "cylinder": 0.4, "can": 0.8, "box": 0.2, "person": 0.4,
+    "robot": 0.5, "charger": 0.2, "door": 0.2,
+}  # fmt: skip
+# hue [deg] and its spread, least and greatest saturation and value
+HUES = {
+    "carton": ((29.0, 4.0), (0.25, 0.5), (0.5, 0.9)),
+    "tape": ((35.0, 4.0), (0.0, 0.5), (0.45, 0.95)),
+    "skin": ((20.0, 4.0), (0.3, 0.6), (0.3, 0.95)),
+    "hair": ((27.0, 6.0), (0.0, 0.6), (0.05, 0.7)),
+}
 
 
 @dataclass(frozen=True)
@@ -156,12 +167,11 @@ class StudioScene:
             other = rng.integers(len(self._studio.flat_textures))
             number = other if name == "floor" or rng.random() < 0.2 else one
             plain = rng.random() < 0.35
-            colour = textures.colour(rng, 0.2, 0.35)
+            colour = textures.colour(rng, 0.1, 0.4)
             self._paint(material, -1 if plain else self._studio.flat_textures[number], colour)
             model.mat_texrepeat[material] = rng.uniform(0.3, 2.5)
-            model.mat_reflectance[material] = (
-                rng.uniform(0, 0.25) if name == "floor" and rng.random() < 0.2 else 0
-            )
+            shines = name == "floor" and rng.random() < 0.1
+            model.mat_reflectance[material] = rng.uniform(0, 0.15) if shines else 0
 
     def _paint(self, material: int, texture: int, colour: NDArray[np.float32]) -> None:
         rng, model = self._rng, self._model
@@ -174,7 +184,7 @@ class StudioScene:
 
     def _lights(self) -> None:
         rng, model, other = self._rng, self._model, self._split.other_lights
-        warm = rng.uniform(0.15, 0.35) if other else rng.uniform(0, 0.15)
+        warm = rng.uniform(0.1, 0.25) if other else rng.uniform(0, 0.1)
         tint = (
             1 - warm * np.array([0, 0.4, 1])
             if rng.random() < 0.5
@@ -246,7 +256,7 @@ class StudioScene:
             if self._is_placed(other) or near < max(0.35, other.look.nearest * 0.6):
                 continue
             half = (other.look.hides or other.look.radius) * distance / near
-            aside = half + (thing.look.hides or thing.look.radius) * rng.uniform(-0.2, 0.85)
+            aside = half + (thing.look.hides or thing.look.radius) * rng.uniform(0.1, 0.95)
             if self._put(other, near, math.atan2(y, x) + side * aside / distance):
                 return
 
@@ -312,47 +322,29 @@ class StudioScene:
         self._data.mocap_pos[thing.mocap], self._data.mocap_quat[thing.mocap] = (x, y, z), turn
         self._placed.append((thing, x, y))
         for paint, material in thing.paints.items():
-            self._repaint(paint, material)
+            self._repaint(look.label, paint, material)
 
-    def _repaint(self, paint: str, material: int) -> None:
-        """Draw colour and texture by what a paint stands for."""
+    def _repaint(self, label: str, paint: str, material: int) -> None:
+        """Draw colour and texture by what a paint stands for, on a thing of this class."""
         rng = self._rng
-        chance = {
-            "body": 0.2,
-            "label": 0.6,
-            "shirt": 0.4,
-            "trousers": 0.2,
-            "leaf": 0.3,
-            "wall": 0.4,
-        }
-        textured = rng.random() < chance.get(paint, 0.1)
-        cubes = self._studio.cube_textures
-        colour = textures.colour(rng, 0.75, 0.25)
-        if paint == "carton":
-            hue, saturation, value = CARTON[rng.integers(len(CARTON))]
+        textured = rng.random() < TEXTURED.get(paint, 0.1)
+        if paint in HUES:
+            (hue, spread), saturation, value = HUES[paint]
             colour = _hsv(
-                hue + rng.normal(0, 3),
-                saturation + rng.normal(0, 0.06),
-                value + rng.normal(0, 0.06),
+                hue + rng.normal(0, spread), rng.uniform(*saturation), rng.uniform(*value)
             )
-        elif paint == "tape":
-            colour = _hsv(35, rng.uniform(0, 0.5), rng.uniform(0.45, 0.95))
-        elif paint == "skin":
-            colour, textured = (
-                _hsv(rng.uniform(12, 28), rng.uniform(0.3, 0.6), rng.uniform(0.3, 0.95)),
-                False,
-            )
-        elif paint == "hair":
-            colour, textured = (
-                _hsv(rng.uniform(15, 40), rng.uniform(0, 0.6), rng.uniform(0.05, 0.7)),
-                False,
-            )
+            textured = False
+        elif paint in ("label", "print", "shirt", "band"):
+            colour = textures.colour(rng, 0.8, 0.3)
+        else:
+            colour = textures.colour(rng, VIVID[label], 0.3)
+        cubes = self._studio.cube_textures
         self._paint(material, cubes[rng.integers(len(cubes))] if textured else -1, colour)
 
 
 def expose(rng: Random, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Make the mean brightness what a camera's automatic exposure makes of it."""
-    gain = np.clip(rng.uniform(70, 135) / max(float(picture.mean()), 1.0), 0.6, 4.0)
+    gain = np.clip(rng.uniform(90, 140) / max(float(picture.mean()), 1.0), 0.6, 4.0)
     return np.asarray(np.clip(picture * gain, 0, 255), np.uint8)
 
 

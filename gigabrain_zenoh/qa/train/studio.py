@@ -20,7 +20,7 @@ from gigabrain_zenoh.vision.recognizer import HEIGHT_PX, WIDTH_PX
 VARIANTS = 2  # looks of each class in one studio
 CUBE_TEXTURES, FLAT_TEXTURES = 14, 8
 CUBE_PX, FLAT_PX = 48, 192
-CONTRAST_OF_ROOMS, CONTRAST_OF_THINGS = (0.1, 0.6), (0.3, 0.9)  # of textures
+OF_ROOMS, OF_THINGS = ((0.1, 0.4), 0.15), ((0.2, 0.6), 0.5)  # textures: contrast, bright colours
 SHOWN, HIDDEN = 0, 5  # groups of geoms
 SMOOTH_EDGES = 0.3  # share of studios with multisampling, which makes a picture cost thrice as much
 TRAINED_BODIES = ("turtlebot3_burger", "turtlebot3_waffle", "skid_rover", "ackermann_car")
@@ -83,8 +83,8 @@ class Studio:
         model = self.model
         start, n = model.tex_adr[texture], model.tex_width[texture]
         faces = model.tex_height[texture] // n
-        low, high = CONTRAST_OF_ROOMS if faces == 1 else CONTRAST_OF_THINGS
-        one = textures.draw(rng, families, n, rng.uniform(low, high))
+        (low, high), vivid = OF_ROOMS if faces == 1 else OF_THINGS
+        one = textures.draw(rng, families, n, rng.uniform(low, high), vivid)
         data = np.concatenate([np.rot90(one, k % 4) for k in range(faces)])
         model.tex_data[start : start + data.size] = data.ravel()
 

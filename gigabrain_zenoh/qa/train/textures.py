@@ -123,15 +123,17 @@ TEST: tuple[Family, ...] = (plain, marble, plaid, hexagons, waves)
 
 def colour(rng: Random, vivid: float = 0.5, darkest: float = 0.15) -> NDArray[np.float32]:
     """Draw a colour, RGB from 0 to 1: with chance `vivid` any hue, else close to grey."""
-    saturation = rng.uniform(0.35, 1.0) if rng.random() < vivid else rng.uniform(0.0, 0.2)
+    saturation = rng.uniform(0.45, 1.0) if rng.random() < vivid else rng.uniform(0.0, 0.2)
     hsv = np.array([[[rng.uniform(0, 360), saturation, rng.uniform(darkest, 1.0)]]], np.float32)
     return np.asarray(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0, 0], np.float32)
 
 
-def draw(rng: Random, families: tuple[Family, ...], n: int, contrast: float = 1.0) -> Picture:
+def draw(
+    rng: Random, families: tuple[Family, ...], n: int, contrast: float = 1.0, vivid: float = 0.3
+) -> Picture:
     """Draw an n by n texture of one of the families in two colours."""
     share = families[rng.integers(len(families))](rng, n)[..., None] * contrast
-    first, second = colour(rng, 0.3), colour(rng, 0.3)
+    first, second = colour(rng, vivid, 0.3), colour(rng, vivid, 0.3)
     picture = first * (1 - share) + second * share
     picture += rng.normal(0, 0.02, (n, n, 1))
     return np.asarray(np.clip(255 * picture, 0, 255), np.uint8)
