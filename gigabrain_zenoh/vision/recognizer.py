@@ -12,7 +12,7 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.vision.labels import CLASSES
 
 WEIGHTS = Path(__file__).parent / "weights" / "things.onnx"
-WIDTH_PX, HEIGHT_PX, STRIDE_PX = 320, 240, 4
+WIDTH_PX, HEIGHT_PX, STRIDE_PX = 320, 240, 8
 UNIT_PX = 16.0  # distance to a side at raw 0
 RAW_LIMITS = (-4.0, 3.5)  # of raw distances
 MAX_CANDIDATES = 200  # before overlapping ones are dropped

@@ -12,7 +12,7 @@ import cyclopts
 from gigabrain_zenoh.vision.recognizer import WEIGHTS
 
 app = cyclopts.App(name="python -m gigabrain_zenoh.qa.train", help="Train the shipped recogniser.")
-TRAIN_PICTURES, TEST_PICTURES, STEPS = 12_000, 1_200, 9_500
+TRAIN_PICTURES, TEST_PICTURES, STEPS = 9_000, 1_040, 9_000
 FOLDER = Path("things")
 
 

@@ -36,8 +36,12 @@ class Stage(NamedTuple):
     batch: int
 
 
-# Small pictures cost a third: first learn what things look like.
-STAGES = (Stage(0.4, 192, 144, 24), Stage(1.0, WIDTH_PX, HEIGHT_PX, 16))
+# Small pictures cost less: first learn what things look like.
+STAGES = (
+    Stage(0.4, 192, 144, 24),
+    Stage(0.75, 256, 192, 16),
+    Stage(1.0, WIDTH_PX, HEIGHT_PX, 16),
+)
 PEAK_RATE, WEIGHT_DECAY, WARM_UP_STEPS = 2.5e-3, 2e-2, 200
 BOX_WEIGHT = 4.0
 AVERAGED = 0.998  # of the weights that are exported, a step

@@ -1,8 +1,8 @@
 """The net: a small centre-based detector, described once for training and for export.
 
-A picture of 240 x 320 gives 60 x 80 cells of 4 px. Each has a logit for each class, which is
+A picture of 240 x 320 gives 30 x 40 cells of 8 px. Each has a logit for each class, which is
 highest at the middle of a thing, and the distances to the four sides of its box. The way to
-stride 16 sees 230 px around a cell. Training: TTFNet (Liu et al. 2020, arXiv 1909.00700).
+stride 16 sees 300 px around a cell. Training: TTFNet (Liu et al. 2020, arXiv 1909.00700).
 """
 
 from collections.abc import Mapping
@@ -49,18 +49,16 @@ class Ops(Protocol[T]):
 
 
 def network(ops: Ops[T], picture: T) -> T:
-    """Build the net for a picture (n, 240, 320, 3), 0 to 1; returns (n, 60, 80, OUTPUTS)."""
+    """Build the net for a picture (n, 240, 320, 3), 0 to 1; returns (n, 30, 40, OUTPUTS)."""
     x = ops.relu(ops.conv(picture, "stem", 16, stride=2))
-    fine = _block(ops, ops.relu(ops.conv(x, "down4", 32, stride=2)), "fine", 32)
-    middle = _block(ops, ops.relu(ops.conv(fine, "down8", 64, stride=2)), "middle", 64)
+    x = ops.relu(ops.conv(x, "down4", 32, stride=2))
+    middle = _block(ops, ops.relu(ops.conv(x, "down8", 64, stride=2)), "middle", 64)
     deep = _block(ops, ops.relu(ops.conv(middle, "down16", 72, stride=2)), "deep", 72)
     deep = _block(ops, deep, "wide", 72, dilation=2)
-    top = ops.double(ops.conv(deep, "deep_in", 48, size=1))
-    middle = ops.relu(ops.add(top, ops.conv(middle, "middle_in", 48, size=1)))
-    middle = ops.relu(ops.conv(middle, "merge8", 32))
-    fine = ops.relu(ops.add(ops.double(middle), ops.conv(fine, "fine_in", 32, size=1)))
-    fine = ops.relu(ops.conv(fine, "merge4", 32))
-    return ops.conv(fine, "out", OUTPUTS, size=1, normed=False)
+    top = ops.double(ops.conv(deep, "deep_in", 64, size=1))
+    middle = ops.relu(ops.add(top, ops.conv(middle, "middle_in", 64, size=1)))
+    middle = ops.relu(ops.conv(middle, "merge8", 64))
+    return ops.conv(middle, "out", OUTPUTS, size=1, normed=False)
 
 
 def _block(ops: Ops[T], x: T, name: str, channels: int, dilation: int = 1) -> T:

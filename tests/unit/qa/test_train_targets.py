@@ -24,7 +24,7 @@ def labelled(*things, ignored=()):
 def answer(one):
     """What a perfect net would answer: logits by the heat, distances to the box's sides."""
     heat, _, boxes, weights = targets(one, 240, 320)
-    rows, columns = np.indices(weights.shape) * 4 + 2
+    rows, columns = np.indices(weights.shape) * 8 + 4
     middle = np.stack([columns, rows], -1)
     sides = np.concatenate([middle - boxes[..., :2], boxes[..., 2:] - middle], -1)
     logits = np.where(heat > 0.999, 4.0, -9.0)
@@ -49,8 +49,8 @@ def test_an_ignored_thing_is_masked_in_its_class_only():
     heat, mask, _, weights = targets(labelled(("can", (40, 40, 80, 80)), ignored=(0,)), 240, 320)
     assert not heat.any()
     assert not weights.any()
-    assert mask[15, 15, CLASSES.index("can")] == 0
-    assert mask[15, 15, CLASSES.index("ball")] == 1
+    assert mask[7, 7, CLASSES.index("can")] == 0
+    assert mask[7, 7, CLASSES.index("ball")] == 1
 
 
 def test_boxes_follow_what_is_in_the_changed_picture():

@@ -12,7 +12,7 @@ BALL, CAN = CLASSES.index("ball"), CLASSES.index("can")
 
 def raw(*things: tuple[int, int, int, float, tuple[float, float, float, float]]) -> np.ndarray:
     """An answer with some cells: class, row, column, logit, distances to the sides [px]."""
-    cells = np.full((13, 60, 80), -9.0, np.float32)
+    cells = np.full((13, 30, 40), -9.0, np.float32)
     for label, row, column, logit, distances in things:
         cells[label, row, column] = logit
         cells[9:, row, column] = np.log(np.array(distances) / 16)
@@ -23,14 +23,14 @@ def test_a_cell_tells_class_confidence_and_the_box_around_its_middle():
     found = decode(raw((BALL, 10, 20, 2.0, (8, 16, 24, 32))))
     assert found.names() == ("ball",)
     assert found.confidences == pytest.approx([0.8808], abs=1e-4)
-    assert found.boxes == pytest.approx(np.array([[74, 26, 106, 74]]), abs=1e-3)
+    assert found.boxes == pytest.approx(np.array([[156, 68, 188, 116]]), abs=1e-3)
 
 
 def test_of_overlapping_boxes_of_one_class_the_surest_is_kept():
-    sides = (10.0, 10.0, 10.0, 10.0)
+    sides = (20.0, 20.0, 20.0, 20.0)
     found = decode(raw((BALL, 10, 20, 1.0, sides), (BALL, 10, 21, 2.0, sides)))
     assert found.names() == ("ball",)
-    assert found.boxes[0, 0] == pytest.approx(76)
+    assert found.boxes[0, 0] == pytest.approx(152)
 
 
 def test_overlapping_boxes_of_two_classes_are_both_kept_surest_first():
@@ -51,13 +51,13 @@ def test_what_is_unsure_is_left_out():
 
 
 def test_boxes_end_at_the_edges():
-    found = decode(raw((BALL, 0, 0, 3.0, (90, 90, 500, 500))))
+    found = decode(raw((BALL, 0, 0, 3.0, (90, 90, 510, 510))))
     assert found.boxes.tolist() == [[0, 0, 320, 240]]
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_net_that_answers_nonsense_gives_boxes_inside_the_picture_or_none(value):
-    found = decode(np.full((13, 60, 80), value, np.float32))
+    found = decode(np.full((13, 30, 40), value, np.float32))
     assert np.isfinite(found.boxes).all()
     assert (found.boxes >= 0).all()
 
