@@ -9,6 +9,8 @@ GigabrainError
 ├── Unsupported       the body has no such primitive
 ├── BodyLost          the body no longer answers
 ├── ClockLost         a process's robot time does not match any state
+├── BadPayload        a ROS 2 message that cannot be decoded, or JSON that is none of its type
+├── NoAnswer          no ROS 2 node answered a service in time
 └── NotConfirmed      no body has confirmed an e-stop (exit code 3)
 """
 
@@ -63,6 +65,14 @@ class BodyLost(GigabrainError):
 
 class ClockLost(GigabrainError):
     """The robot's time in this process is wrong. It ends; its supervisor starts it again."""
+
+
+class BadPayload(GigabrainError):
+    """A ROS 2 message that cannot be decoded, or values that do not fit its type."""
+
+
+class NoAnswer(GigabrainError):
+    """No ROS 2 node serves the service, or none answered in time."""
 
 
 class NotConfirmed(GigabrainError):

@@ -189,6 +189,34 @@ class RecorderConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     notes: dict[str, str] = {}  # stored in the file, for replay
 
 
+RosName = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}$")]
+RosNamespace = Annotated[
+    str, Meta(pattern=r"^/([A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*)?$")
+]
+
+
+class Ros2Link(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How a process joins ROS 2 as a node."""
+
+    transport: Literal["rmw_zenoh", "dds"] = "rmw_zenoh"
+    domain: Annotated[int, Meta(ge=0, le=232)] = 0  # ROS_DOMAIN_ID of the others
+    namespace: RosNamespace = "/"  # of the node, and of topics without a leading slash
+    node: RosName = "gigabrain"  # name of the node
+    router: str = ""  # Zenoh endpoint of a ROS router; empty: the deployment's own router
+    distro: Literal["humble", "iron", "jazzy", "kilted", "rolling"] = "jazzy"  # of the others
+    localhost: bool = False  # DDS talks to nodes of this host only
+    types: tuple[str, ...] = ()  # .msg, .srv and .action files of one's own, or folders of them
+
+
+class Ros2Config(Ros2Link, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings in the `ros2` part of a deployment file: the gateway to ROS 2."""
+
+    take: bool = False  # take the body from another commander with the first command
+    cmd_vel_timeout: Annotated[float, Meta(gt=0, le=0.2)] = 0.2  # [s], a command counts at most
+    leave_out: tuple[str, ...] = ()  # ROS topics and services that are not offered
+    free_fleet: bool = False  # also offer what Open-RMF's free_fleet adapter uses
+
+
 OwnName = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
 ModuleName = Annotated[str, Meta(pattern=r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*(:[A-Za-z_]\w*)?$")]
 

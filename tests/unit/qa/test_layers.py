@@ -19,8 +19,11 @@ ONLY_IN = {
         "gigabrain_zenoh/bus/zenoh/session.py",
         "gigabrain_zenoh/bus/zenoh/transport.py",
         "gigabrain_zenoh/qa/bench/relay.py",
+        "gigabrain_zenoh/ros2/rmw_zenoh.py",
         "gigabrain_zenoh/testing/processes.py",
     ),
+    "rosbags": ("gigabrain_zenoh/ros2/",),
+    "cyclonedds": ("gigabrain_zenoh/ros2/",),
     "mujoco": (
         "drivers/gigabrain_drivers/sim/",
         "drivers/gigabrain_drivers/cameras/rendered.py",

@@ -1,0 +1,77 @@
+"""RIHS01, the hash by which ROS 2 names the definition of a type (REP-2016).
+
+rosbags hashes types with `char` wrongly: `rosidl` turns `char` into `uint8` first.
+"""
+
+import json
+from collections.abc import Callable
+from hashlib import sha256
+from typing import Any
+
+from rosbags.interfaces import Nodetype
+
+from gigabrain_zenoh.ros2.type_files import Description, Fields
+
+# numbers of type_description_interfaces/msg/FieldType
+NUMBERS = {
+    "int8": 2,
+    "uint8": 3,
+    "int16": 4,
+    "uint16": 5,
+    "int32": 6,
+    "uint32": 7,
+    "int64": 8,
+    "uint64": 9,
+    "float32": 10,
+    "float64": 11,
+    "char": 3,
+    "bool": 15,
+    "byte": 16,
+    "string": 17,
+}
+NESTED, BOUNDED_STRING = 1, 21
+ARRAY, BOUNDED_SEQUENCE, SEQUENCE = 48, 96, 144  # added to the number of the element's type
+
+
+def rihs01(name: str, fields_of: Callable[[str], Fields]) -> str:
+    """Return the hash of a message, service or action. Raises what `fields_of` raises."""
+    described: dict[str, Any] = {}
+    waiting = [name]
+    while waiting:
+        each = waiting.pop()
+        if each in described:
+            continue
+        fields = [_field(field, kind) for field, kind in fields_of(each)]
+        described[each] = {"type_name": each, "fields": fields}
+        nested = (field["type"]["nested_type_name"] for field in fields)
+        waiting.extend(one for one in nested if one)
+    whole = {
+        "type_description": described[name],
+        "referenced_type_descriptions": [described[k] for k in sorted(described) if k != name],
+    }
+    return f"RIHS01_{sha256(json.dumps(whole).encode()).hexdigest()}"
+
+
+def _field(name: str, description: Description) -> dict[str, Any]:
+    kind, inner, added, capacity = description[0], description, 0, 0
+    if kind == Nodetype.ARRAY:
+        inner, capacity = description[1]
+        added = ARRAY
+    elif kind == Nodetype.SEQUENCE:
+        inner, capacity = description[1]
+        added = BOUNDED_SEQUENCE if capacity else SEQUENCE
+    number, longest, nested = NESTED, 0, ""
+    if inner[0] == Nodetype.NAME:
+        nested = inner[1]
+    else:
+        primitive, longest = inner[1]
+        number = BOUNDED_STRING if longest else NUMBERS[primitive]
+    return {
+        "name": name,
+        "type": {
+            "type_id": added + number,
+            "capacity": capacity,
+            "string_capacity": longest,
+            "nested_type_name": nested,
+        },
+    }

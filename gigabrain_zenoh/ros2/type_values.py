@@ -1,0 +1,210 @@
+"""Values of ROS messages: defaults, what JSON holds for them, and what Python makes of that."""
+
+import base64
+import binascii
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+from rosbags.typesys.base import normalize_fieldname
+from rosbags.typesys.store import Typestore
+
+from gigabrain_zenoh.errors import BadPayload, ConfigError
+from gigabrain_zenoh.ros2.type_files import DUMMY, Description
+
+BYTES = ("uint8", "char", "byte")
+DTYPES = {"bool": np.dtype(np.bool_), "char": np.dtype(np.uint8), "byte": np.dtype(np.int8)}
+Make = Callable[[], Any]
+Plan = dict[str, tuple[Description, Make]]  # by the name of the attribute, in the wire's order
+
+
+def dtype(primitive: str) -> np.dtype[Any]:
+    """Return the type of the elements of an array."""
+    return DTYPES.get(primitive) or np.dtype(primitive)
+
+
+class Values:
+    """Makes and reads the messages of a store of types."""
+
+    def __init__(self, store: Typestore, defaults: Mapping[str, Mapping[str, Any]]) -> None:
+        self._store, self._defaults = store, defaults
+        self._plans: dict[str, Plan] = {}
+
+    def make(self, name: str, fields: Mapping[str, Any]) -> Any:
+        """Make a message of `fields`, and of defaults."""
+        plan = self._plan(name)
+        values = [
+            self._fitting(kind, fields[field]) if field in fields else default()
+            for field, (kind, default) in plan.items()
+        ]
+        if not fields.keys() <= plan.keys():
+            wrong = ", ".join(sorted(fields.keys() - plan.keys()))
+            raise ConfigError(f"{name} has no field {wrong}; it has: {', '.join(plan)}")
+        return self._store.types[name](*values)
+
+    def from_dict(self, name: str, data: Any, path: str = "") -> Any:
+        """Make a message of JSON's values. Raises BadPayload."""
+        plan = self._plan(name)
+        if not isinstance(data, Mapping):
+            raise BadPayload(f"{path or name}: expected an object, got {_short(data)}")
+        if wrong := data.keys() - plan.keys():
+            each = ", ".join(sorted(map(str, wrong)))
+            raise BadPayload(f"{path or name}: no field {each}; known: {', '.join(plan)}")
+        values = [
+            self._checked(kind, data[field], f"{path}.{field}" if path else field)
+            if field in data
+            else default()
+            for field, (kind, default) in plan.items()
+        ]
+        return self._store.types[name](*values)
+
+    def to_dict(self, message: Any) -> dict[str, Any]:
+        """Return the message's fields in JSON's values."""
+        return {
+            field: self._plain(kind, getattr(message, field))
+            for field, (kind, _) in self._plan(message.__msgtype__).items()
+            if field != DUMMY
+        }
+
+    def _plan(self, name: str) -> Plan:
+        plan = self._plans.get(name)
+        if plan is None:
+            given = self._defaults.get(name, {})
+            plan = self._plans[name] = {}
+            for field, kind in self._store.fielddefs[name][1]:
+                key = normalize_fieldname(field)
+                plan[key] = (kind, self._default(kind, given.get(key)))
+        return plan
+
+    def _default(self, kind: Description, given: Any) -> Make:
+        if given is not None:
+            return lambda: self._fitting(kind, given)
+        if kind[0] == Nodetype.NAME:
+            return lambda: self.make(kind[1], {})
+        if kind[0] == Nodetype.BASE:
+            primitive = kind[1][0]
+            zero: Any = {"string": "", "bool": False}.get(primitive, 0)
+            zero = 0.0 if primitive.startswith("float") else zero
+            return lambda: zero
+        inner, size = kind[1]
+        count = size if kind[0] == Nodetype.ARRAY else 0
+        if inner[0] == Nodetype.BASE and inner[1][0] != "string":
+            element = dtype(inner[1][0])
+            return lambda: np.zeros(count, element)
+        one = self._default(inner, None)
+        return lambda: [one() for _ in range(count)]
+
+    def _fitting(self, kind: Description, value: Any) -> Any:
+        """Return the value as rosbags encodes it: mappings and lists are turned, others taken."""
+        if kind[0] == Nodetype.BASE:
+            return value
+        if kind[0] == Nodetype.NAME:
+            return self.make(kind[1], value) if isinstance(value, Mapping) else value
+        inner = kind[1][0]
+        if inner[0] == Nodetype.NAME:
+            return [self._fitting(inner, each) for each in value]
+        if inner[1][0] == "string":
+            return list(value)
+        if isinstance(value, bytes | bytearray | memoryview):
+            return np.frombuffer(value, dtype(inner[1][0]))
+        return np.ascontiguousarray(value, dtype(inner[1][0])).reshape(-1)
+
+    def _checked(self, kind: Description, value: Any, path: str) -> Any:
+        if kind[0] == Nodetype.NAME:
+            return self.from_dict(kind[1], value, path)
+        if kind[0] == Nodetype.BASE:
+            return _scalar(kind[1][0], kind[1][1], value, path)
+        inner, size = kind[1]
+        numbers = inner[0] == Nodetype.BASE and inner[1][0] != "string"
+        if numbers and inner[1][0] in BYTES and isinstance(value, str):
+            value = _bytes(value, path)
+            array: Any = np.frombuffer(value, dtype(inner[1][0]))
+        elif not isinstance(value, list | tuple):
+            raise BadPayload(f"{path}: expected a list, got {_short(value)}")
+        else:
+            array = [
+                self._checked(inner, each, f"{path}[{index}]") for index, each in enumerate(value)
+            ]
+        if kind[0] == Nodetype.ARRAY and len(array) != size:
+            raise BadPayload(f"{path}: expected {size} elements, got {len(array)}")
+        if kind[0] == Nodetype.SEQUENCE and size and len(array) > size:
+            raise BadPayload(f"{path}: expected at most {size} elements, got {len(array)}")
+        return np.asarray(array, dtype(inner[1][0])) if numbers else array
+
+    def _plain(self, kind: Description, value: Any) -> Any:
+        if kind[0] == Nodetype.NAME:
+            return self.to_dict(value)
+        if kind[0] == Nodetype.BASE:
+            return _text(value) if isinstance(value, float) else value
+        inner = kind[1][0]
+        if inner[0] == Nodetype.NAME:
+            return [self.to_dict(each) for each in value]
+        if inner[1][0] == "string":
+            return list(value)
+        if kind[0] == Nodetype.SEQUENCE and inner[1][0] in BYTES:
+            return base64.b64encode(value.tobytes()).decode()
+        elements = value.tolist()
+        return [_text(each) for each in elements] if value.dtype.kind == "f" else elements
+
+
+def _text(number: float) -> float | str:
+    """Return a number that JSON knows, or the name that others have for it."""
+    if math.isfinite(number):
+        return number
+    if math.isnan(number):
+        return "NaN"
+    return "Infinity" if number > 0 else "-Infinity"
+
+
+NAMES = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
+
+
+def _scalar(primitive: str, longest: int, value: Any, path: str) -> Any:
+    """Return a number, truth value or text of the type. Raises BadPayload."""
+    if primitive == "string":
+        if isinstance(value, str) and "\0" not in value:
+            if longest and len(value.encode(errors="replace")) > longest:
+                raise BadPayload(f"{path}: expected at most {longest} bytes")
+            return value.encode(errors="replace").decode()
+        raise BadPayload(f"{path}: expected a text, got {_short(value)}")
+    if primitive == "bool":
+        if isinstance(value, bool):
+            return value
+        raise BadPayload(f"{path}: expected true or false, got {_short(value)}")
+    if primitive.startswith("float"):
+        return _float(primitive, value, path)
+    limits = np.iinfo(dtype(primitive))
+    if isinstance(value, int) and not isinstance(value, bool) and limits.min <= value <= limits.max:
+        return value
+    raise BadPayload(
+        f"{path}: expected a whole number from {limits.min} to {limits.max}, got {_short(value)}"
+    )
+
+
+def _float(primitive: str, value: Any, path: str) -> float:
+    if isinstance(value, str) and value in NAMES:
+        return NAMES[value]
+    largest = float(np.finfo(dtype(primitive)).max)
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        if isinstance(value, float) and not math.isfinite(value):
+            return value
+        if -largest <= value <= largest:
+            return float(value)
+    raise BadPayload(
+        f"{path}: expected a number up to {largest:.3g}, or NaN, Infinity or -Infinity as text, "
+        f"got {_short(value)}"
+    )
+
+
+def _bytes(text: str, path: str) -> bytes:
+    try:
+        return base64.b64decode(text, validate=True)
+    except (binascii.Error, ValueError):
+        raise BadPayload(f"{path}: expected a list of numbers, or base64") from None
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 40 else f"{text[:40]}…"

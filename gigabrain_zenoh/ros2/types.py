@@ -1,0 +1,116 @@
+"""Types of ROS 2 messages: their CDR, their hashes, and values made from Python's own.
+
+Messages are instances of the dataclasses that rosbags generates; arrays of numbers are numpy
+arrays. Definitions are those of Jazzy that rosbags brings, those in `definitions/`, and the user's.
+"""
+
+import struct
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.base import TypesysError, normalize_fieldname
+
+from gigabrain_zenoh.errors import BadPayload, ConfigError, unknown
+from gigabrain_zenoh.ros2.type_files import SHIPPED, Fields, Found, read_files
+from gigabrain_zenoh.ros2.type_hash import rihs01
+from gigabrain_zenoh.ros2.type_values import Values
+
+DEFAULTS: dict[str, dict[str, Any]] = {  # of types in rosbags' store, which keeps none
+    "geometry_msgs/msg/Quaternion": {"w": 1.0},
+    "sensor_msgs/msg/NavSatStatus": {"status": -2},
+}
+MAX_PAYLOAD = 64 << 20  # bytes of one message
+LARGE = 1 << 16  # bytes
+
+
+class Types:
+    """All message, service and action types that this process knows."""
+
+    def __init__(self, more: Iterable[Path] = ()) -> None:
+        """Load the definitions; `more` are files or folders of the user's. Raises ConfigError."""
+        self._store: Any = get_typestore(Stores.ROS2_JAZZY)
+        self._interfaces: dict[str, Fields] = {}  # services and actions
+        self._hashes: dict[str, str] = {}
+        self._defaults = dict(DEFAULTS)
+        for found in (read_files([SHIPPED]), read_files(more)):
+            self._add(found)
+        self._values = Values(self._store, self._defaults)
+
+    def known(self, name: str) -> str:
+        """Return the name of a message type. Raises ConfigError if it is unknown."""
+        if name not in self._store.fielddefs:
+            raise unknown("ROS message type", name, self._store.fielddefs)
+        return name
+
+    def is_interface(self, name: str) -> bool:
+        """Return whether `name` is a known service or action."""
+        return name in self._interfaces
+
+    def encode(self, name: str, message: object) -> bytes:
+        """Return the message as CDR, little-endian, with its header of 4 bytes."""
+        return bytes(self._store.serialize_cdr(message, self.known(name), little_endian=True))
+
+    def decode(self, name: str, payload: bytes) -> Any:
+        """Return the message in a payload; ignores a tail and the content of padding.
+
+        Arrays of numbers are views of the payload. Raises BadPayload, and nothing else.
+        """
+        if not 4 <= len(payload) <= MAX_PAYLOAD or payload[0] or payload[1] > 1:
+            raise BadPayload(f"{name}: no CDR: {len(payload)} bytes, {payload[:4].hex()}…")
+        definition = self._store.get_msgdef(self.known(name))
+        read = definition.deserialize_cdr_le if payload[1] else definition.deserialize_cdr_be
+        try:
+            return read(_body(payload), 0, definition.cls, self._store)[0]
+        except (SerdeError, struct.error, ValueError) as error:
+            raise BadPayload(f"{name}: {error}") from None
+
+    def make(self, name: str, **fields: Any) -> Any:
+        """Make a message; fields that are left out get their defaults, in nested ones as well.
+
+        Values are taken as they are, but for lists of numbers, and mappings in place of messages.
+        Raises ConfigError for an unknown type or field.
+        """
+        return self._values.make(self.known(name), fields)
+
+    def from_dict(self, name: str, data: Mapping[str, Any]) -> Any:
+        """Make a message from JSON's values, checked. Raises BadPayload with the field."""
+        return self._values.from_dict(self.known(name), data)
+
+    def to_dict(self, message: object) -> dict[str, Any]:
+        """Return the message in JSON's values: bytes as base64, and NaN and Infinity as texts."""
+        return self._values.to_dict(message)
+
+    def hash(self, name: str) -> str:
+        """Return `RIHS01_…` of a message, service or action. Raises ConfigError if unknown."""
+        if name not in self._hashes:
+            self._hashes[name] = rihs01(name, self._fields)
+        return self._hashes[name]
+
+    def _fields(self, name: str) -> Fields:
+        fields = self._interfaces.get(name)
+        return self._store.fielddefs[self.known(name)][1] if fields is None else fields
+
+    def _add(self, found: Found) -> None:
+        messages = found.messages
+        try:
+            self._store.register(
+                {name: (each.constants, each.fields) for name, each in messages.items()}
+            )
+        except TypesysError as error:
+            raise ConfigError(f"types: {error}; rename the type") from None
+        self._interfaces |= found.interfaces
+        for name, each in messages.items():
+            if each.defaults:
+                self._defaults[name] = {
+                    normalize_fieldname(field): value for field, value in each.defaults.items()
+                }
+        for name in messages:
+            self.hash(name)  # raises for a field of an unknown type
+
+
+def _body(payload: bytes) -> bytes | memoryview:
+    """Return what follows the header, without a copy where a copy would cost more."""
+    return payload[4:] if len(payload) < LARGE else memoryview(payload)[4:]
