@@ -25,6 +25,7 @@ class Endpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     names: dict[str, tuple[str, ...]] = {}  # of processes, by role: what a router lets publish
     grants: dict[str, tuple[str, ...]] = {}  # keys that processes of one's own write, by name
     nap_s: float = 0.0  # [s], how long tapped messages may gather before delivery
+    stamps: bool = False  # samples carry Zenoh's time, by which late readers of ROS order them
 
 
 class RouterConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -3,3 +3,10 @@
 It may import bus, config and host; zenoh, rosbags and cyclonedds are imported here only.
 The gateway, drivers of ROS 2 robots, commands and qa may import it. It knows no robot.
 """
+
+from importlib.util import find_spec
+
+from gigabrain_zenoh.errors import ConfigError
+
+if not all(find_spec(name) for name in ("rosbags", "xxhash")):
+    raise ConfigError("ROS 2 needs more packages: pip install 'gigabrain-zenoh[ros2]'")

@@ -133,6 +133,8 @@ def session_settings(endpoint: Endpoint) -> dict[str, Any]:
         config |= bounds(endpoint.grants)
     if endpoint.namespace:
         config["namespace"] = endpoint.namespace
+    if endpoint.stamps:
+        config["timestamping/enabled"] = True
     return config
 
 

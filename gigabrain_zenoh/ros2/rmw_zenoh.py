@@ -1,0 +1,455 @@
+"""Transport to ROS nodes that use `rmw_zenoh`, over a router.
+
+A client session, as ROS nodes are peers and a router forwards nothing between peers. Tokens and
+declarations are made again on each new session, so nodes find each other after the router's
+restart.
+"""
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable
+from itertools import count
+from types import TracebackType
+from typing import Any
+
+import zenoh
+import zenoh.ext
+from msgspec import structs
+from zenoh.handlers import Callback
+
+from gigabrain_zenoh.bus.bridge import Bridge, Mailbox, QueryQueue
+from gigabrain_zenoh.bus.zenoh.session import OpenSession, ReconnectingSession, open_session
+from gigabrain_zenoh.config.settings import Endpoint, Ros2Link
+from gigabrain_zenoh.errors import ConfigError, GigabrainError, NoAnswer
+from gigabrain_zenoh.ros2.qos import DEFAULT, SERVICES, Qos
+from gigabrain_zenoh.ros2.rmw_names import (
+    NO_HASH,
+    SPACE,
+    Attachment,
+    NodeName,
+    gid_of,
+    parse_attachment,
+    parse_token,
+    topic_key,
+)
+from gigabrain_zenoh.ros2.transport import (
+    Answer,
+    Close,
+    EndpointKind,
+    GraphEndpoint,
+    OnReaders,
+    OnReceived,
+    Received,
+    absolute,
+)
+from gigabrain_zenoh.ros2.types import Types
+
+log = logging.getLogger(__name__)
+HEARTBEAT_S = 0.5  # of publishers whose late readers notice what they missed
+RETRY_S = 0.1  # until a service is asked again that no node serves yet
+REMOTE = zenoh.Locality.REMOTE
+
+
+class _Bundle:
+    """Declarations that are withdrawn together, the last first."""
+
+    def __init__(self, *declared: Any) -> None:
+        self._declared = declared
+
+    def undeclare(self) -> None:
+        for each in reversed(self._declared):
+            with contextlib.suppress(zenoh.ZError):  # its session is closed
+                each.undeclare()
+
+
+class _Entity:
+    """What an endpoint of ours is called: its key, and its token in a session."""
+
+    def __init__(
+        self, home: "RmwZenohTransport", kind: EndpointKind, topic: str, type: str, qos: Qos
+    ) -> None:
+        self.kind, self.type, self.qos = kind, type, qos
+        self.topic = absolute(topic, home.link.namespace)
+        self.hash = NO_HASH if home.link.distro == "humble" else home.types.hash(type)
+        self.key = topic_key(home.link.domain, self.topic, type, self.hash)
+        self.gid = b""
+        self._home, self._id = home, next(home.ids)
+        self._sequence = count(1)
+
+    def declare_token(self, line: OpenSession) -> Any:
+        """Announce the endpoint on a session, after which its id is known."""
+        node = self._home.name_in(line.session)
+        token = node.endpoint_token(self._id, self.kind, self.topic, self.type, self.hash, self.qos)
+        self.gid = gid_of(token)
+        return line.session.liveliness().declare_token(token)
+
+    def attachment(self) -> bytes:
+        """Return the attachment of the next message or request."""
+        return Attachment(next(self._sequence), time.time_ns(), self.gid).to_bytes()
+
+
+class RmwZenohPublisher:
+    """A publisher, on one session after another."""
+
+    def __init__(
+        self, home: "RmwZenohTransport", entity: _Entity, on_readers: OnReaders | None
+    ) -> None:
+        self.readers = 0
+        self.entity = entity
+        self._home, self._on_readers = home, on_readers
+        self._put: Callable[..., None] | None = None
+        self._matched = False
+        self._close = home.lines.declare(self._declare)
+
+    def publish(self, payload: bytes) -> None:
+        """Send to all readers. Without a session there are none, and only a late reader misses it.
+
+        A congested link drops the message.
+        """
+        if self._put:
+            self._put(payload, attachment=self.entity.attachment())
+
+    def close(self) -> None:
+        """Withdraw the publisher."""
+        self._home.publishers.discard(self)
+        self._put = None
+        self._close()
+
+    def lost(self) -> None:
+        """Forget the readers, as the session is lost."""
+        self._put, self._matched = None, False
+        self.count()
+
+    def count(self) -> None:
+        """Count the readers: those with a token, and one at least if Zenoh knows of any.
+
+        Zenoh also counts a subscriber of our own, though no message goes there.
+        """
+        least = 0 if self._home.hears(self.entity.key) else 1
+        readers = max(least, self._home.readers_of(self.entity)) if self._matched else 0
+        if readers != self.readers:
+            self.readers = readers
+            if self._on_readers:
+                self._on_readers(readers)
+
+    def _declare(self, line: OpenSession) -> _Bundle:
+        """Declare; of an advanced publisher a plain one beside it tells the readers."""
+        entity, session = self.entity, line.session
+        plain = session.declare_publisher(
+            entity.key,
+            congestion_control=zenoh.CongestionControl.DROP,
+            allowed_destination=REMOTE,
+        )
+        made: list[Any] = [plain]
+        if entity.qos.transient_local:
+            made.append(_advanced_publisher(session, entity))
+        made.append(plain.declare_matching_listener(line.guard(self._told)))
+        made.append(entity.declare_token(line))
+        self._put = made[1 if entity.qos.transient_local else 0].put
+        self._match(bool(plain.matching_status))
+        return _Bundle(*made)
+
+    def _told(self, status: zenoh.MatchingStatus) -> None:
+        self._home.bridge.post(self._match, status.matching)
+
+    def _match(self, matched: bool) -> None:
+        self._matched = matched
+        self.count()
+
+
+def _advanced_publisher(session: zenoh.Session, entity: _Entity) -> Any:
+    """Declare a publisher that keeps its last messages for late readers."""
+    return zenoh.ext.declare_advanced_publisher(
+        session,
+        entity.key,
+        congestion_control=zenoh.CongestionControl.DROP,
+        allowed_destination=REMOTE,
+        cache=zenoh.ext.CacheConfig(entity.qos.depth),
+        publisher_detection=True,
+        sample_miss_detection=zenoh.ext.MissDetectionConfig(
+            heartbeat=None, sporadic_heartbeat=HEARTBEAT_S
+        )
+        if entity.qos.reliable
+        else None,
+    )
+
+
+class RmwZenohTransport:
+    """One ROS node on a Zenoh session."""
+
+    lines: ReconnectingSession
+    bridge: Bridge
+
+    def __init__(self, link: Ros2Link, types: Types, endpoint: Endpoint | None = None) -> None:
+        """Prepare; `endpoint` is the deployment's own, used if `link` names no router."""
+        self.link, self.types = link, types
+        self.counts: Counter[str] = Counter()
+        self.ids = count(1)  # of endpoints; 0 is the node's
+        self.publishers: set[RmwZenohPublisher] = set()
+        self.subscribers: set[_Entity] = set()
+        self._endpoint = _endpoint(link, endpoint)
+        self._graph: dict[str, GraphEndpoint | str] = {}  # by token
+        self._clients: dict[tuple[str, str], _Entity] = {}
+
+    async def __aenter__(self) -> "RmwZenohTransport":
+        session = await open_session(self._endpoint)
+        self.bridge = Bridge()
+        self._questions: QueryQueue[zenoh.Query] = QueryQueue(self.bridge, _drop)
+        self.lines = ReconnectingSession(session, self._endpoint, self.bridge, self._lost)
+        self.lines.declare(self._declare_node)
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.bridge.close()
+        self._questions.close()
+        await self.lines.close()
+
+    def publisher(
+        self, topic: str, type: str, qos: Qos = DEFAULT, on_readers: OnReaders | None = None
+    ) -> RmwZenohPublisher:
+        """Declare a publisher."""
+        entity = _Entity(self, "publisher", topic, type, qos)
+        made = RmwZenohPublisher(self, entity, on_readers)
+        self.publishers.add(made)
+        return made
+
+    def subscribe(self, topic: str, type: str, qos: Qos, handle: OnReceived) -> Close:
+        """Call `handle` for each message; a busy loop keeps the newest `qos.depth` messages."""
+        entity = _Entity(self, "subscriber", topic, type, qos)
+
+        def deliver(sample: zenoh.Sample) -> None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                known = self._attachment(sample.attachment, entity.topic)
+                source_ns, gid = (known.source_ns, known.gid) if known else (None, b"")
+                handle(Received(sample.payload.to_bytes(), source_ns, gid))
+
+        mailbox = Mailbox(self.bridge, deliver, qos.depth)
+
+        def declare(line: OpenSession) -> _Bundle:
+            subscriber = _subscriber(line.session, entity, line.guard(mailbox.put))
+            return _Bundle(subscriber, entity.declare_token(line))
+
+        self.subscribers.add(entity)
+        undeclare = self.lines.declare(declare)
+
+        def close() -> None:
+            self.subscribers.discard(entity)
+            undeclare()
+
+        return close
+
+    def serve(self, service: str, type: str, handle: Answer) -> Close:
+        """Answer requests of a service, each in a task of its own."""
+        entity = _Entity(self, "server", service, type, SERVICES)
+
+        async def run(query: zenoh.Query) -> None:
+            with query:  # released at the end, else the client waits for its timeout
+                known = self._attachment(query.attachment, entity.topic)
+                request = query.payload.to_bytes() if query.payload else b""
+                try:
+                    response = await handle(request)
+                except GigabrainError as error:
+                    log.warning("%s: no answer: %s", entity.topic, error)
+                    return
+                attachment = known.answered().to_bytes() if known else None
+                with contextlib.suppress(zenoh.ZError):  # the client's session is lost
+                    query.reply(entity.key, response, attachment=attachment)
+
+        put, ends = self._questions.serve(run, urgent=False)
+
+        def declare(line: OpenSession) -> _Bundle:
+            queryable = line.session.declare_queryable(
+                entity.key, line.guard(put), complete=True, allowed_origin=REMOTE
+            )
+            return _Bundle(queryable, entity.declare_token(line))
+
+        undeclare = self.lines.declare(declare)
+
+        def close() -> None:
+            undeclare()
+            ends()
+
+        return close
+
+    async def call(self, service: str, type: str, request: bytes, timeout_s: float) -> bytes:
+        """Return the response of the service's server, waiting for it to appear.
+
+        Raises NoAnswer. A server that a token names is asked once only.
+        """
+        client = self._client(service, type)
+        end_s = time.monotonic() + timeout_s
+        while (left_s := end_s - time.monotonic()) > 0:
+            line = await self.lines.within(left_s)
+            left_s = end_s - time.monotonic()
+            if line is None or left_s <= 0:
+                break
+            served = self._has_server(client)
+            if (response := await self._ask(line, client, request, left_s)) is not None:
+                return response
+            if served:
+                break
+            await asyncio.sleep(min(RETRY_S, max(0.0, end_s - time.monotonic())))
+        raise NoAnswer(f"no answer of {client.topic} within {timeout_s:g} s")
+
+    def endpoints(self) -> tuple[GraphEndpoint, ...]:
+        """Return the endpoints of all nodes in the domain."""
+        return tuple(each for each in self._graph.values() if isinstance(each, GraphEndpoint))
+
+    def nodes(self) -> tuple[str, ...]:
+        """Return the names of all nodes in the domain."""
+        return tuple(each for each in self._graph.values() if isinstance(each, str))
+
+    def name_in(self, session: zenoh.Session) -> NodeName:
+        """Return the name of our node in a session."""
+        link = self.link
+        return NodeName(link.domain, str(session.zid()), link.namespace, link.node)
+
+    def hears(self, key: str) -> bool:
+        """Return whether a subscriber of ours is on the key."""
+        return any(each.key == key for each in self.subscribers)
+
+    def readers_of(self, entity: _Entity) -> int:
+        """Count the subscribers of others on the key of a publisher."""
+        hash = "" if entity.hash == NO_HASH else entity.hash
+        return sum(
+            each.kind == "subscriber"
+            and not each.ours
+            and (each.topic, each.type, each.hash) == (entity.topic, entity.type, hash)
+            for each in self.endpoints()
+        )
+
+    def _declare_node(self, line: OpenSession) -> _Bundle:
+        name = self.name_in(line.session)
+        liveliness = line.session.liveliness()
+
+        def told(sample: zenoh.Sample) -> None:
+            there = sample.kind == zenoh.SampleKind.PUT
+            self.bridge.post(self._token, (str(sample.key_expr), there, name.zid))
+
+        watch = liveliness.declare_subscriber(
+            f"{SPACE}/{name.domain}/**", line.guard(told), history=True
+        )
+        return _Bundle(watch, liveliness.declare_token(name.token))
+
+    def _token(self, change: tuple[str, bool, str]) -> None:
+        key, there, zid = change
+        if not there:
+            self._graph.pop(key, None)
+        else:
+            try:
+                self._graph[key] = parse_token(key, zid)
+            except ValueError as error:
+                self.counts["malformed token"] += 1
+                log.debug("%s", error)
+                return
+        if "/MS/" in key:
+            for publisher in tuple(self.publishers):
+                publisher.count()
+
+    def _lost(self) -> None:
+        self._graph.clear()
+        for publisher in tuple(self.publishers):
+            publisher.lost()
+
+    def _attachment(self, data: zenoh.ZBytes | None, topic: str) -> Attachment | None:
+        """Return what came with a message; without it, only sender and time are unknown."""
+        reason, text = "missing attachment", "ROS nodes would drop this message"
+        if data is not None:
+            try:
+                return parse_attachment(data.to_bytes())
+            except ValueError as error:
+                reason, text = "malformed attachment", str(error)
+        if not self.counts[reason]:
+            log.warning("%s: %s: %s", topic, reason, text)
+        self.counts[reason] += 1
+        return None
+
+    def _client(self, service: str, type: str) -> _Entity:
+        """Return the client of a service; a new one is announced."""
+        key = (absolute(service, self.link.namespace), type)
+        if key not in self._clients:
+            entity = _Entity(self, "client", service, type, SERVICES)
+            self.lines.declare(lambda line: _Bundle(entity.declare_token(line)))
+            self._clients[key] = entity
+        return self._clients[key]
+
+    def _has_server(self, client: _Entity) -> bool:
+        return any(
+            each.kind == "server" and each.topic == client.topic and not each.ours
+            for each in self.endpoints()
+        )
+
+    async def _ask(
+        self, line: OpenSession, client: _Entity, request: bytes, timeout_s: float
+    ) -> bytes | None:
+        """Query the servers, and return the first response; None if there is none."""
+        answered: asyncio.Future[bytes | None] = asyncio.get_running_loop().create_future()
+
+        def settle(response: bytes | None) -> None:
+            if not answered.done():
+                answered.set_result(response)
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                self.bridge.post(settle, reply.ok.payload.to_bytes())
+
+        handler = Callback(on_reply, drop=lambda: self.bridge.post(settle, None), indirect=False)
+        try:
+            line.session.get(
+                client.key,
+                handler,
+                payload=request,
+                attachment=client.attachment(),
+                timeout=timeout_s,
+                target=zenoh.QueryTarget.ALL_COMPLETE,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                congestion_control=zenoh.CongestionControl.DROP,  # never block the loop
+                allowed_destination=REMOTE,
+            )
+        except zenoh.ZError as error:  # the session has just been closed
+            log.debug("no query was sent on %s: %s", client.key, error)
+            return None
+        with contextlib.suppress(TimeoutError):  # the session was lost, and the handler with it
+            return await asyncio.wait_for(answered, timeout_s + RETRY_S)
+        return None
+
+
+def _endpoint(link: Ros2Link, own: Endpoint | None) -> Endpoint:
+    """Return the way to the router. ROS's keys are outside of any robot's namespace."""
+    if link.router:
+        keys = own.keys if own else ""
+        return Endpoint(connect=(link.router,), keys=keys, stamps=True)
+    if own is None or not own.connect:
+        raise ConfigError("ros2: no router; name one as router: tcp/127.0.0.1:7447")
+    return structs.replace(own, namespace="", listen=(), nap_s=0.0, stamps=True)
+
+
+def _subscriber(
+    session: zenoh.Session, entity: _Entity, put: Callable[[zenoh.Sample], None]
+) -> Any:
+    """Declare a subscriber; of transient local data one that asks for what it missed."""
+    if not entity.qos.transient_local:
+        return session.declare_subscriber(entity.key, put, allowed_origin=REMOTE)
+    return zenoh.ext.declare_advanced_subscriber(
+        session,
+        entity.key,
+        put,
+        allowed_origin=REMOTE,
+        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=entity.qos.depth),
+        recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
+        if entity.qos.reliable
+        else None,
+    )
+
+
+def _drop(query: zenoh.Query) -> None:
+    """Release a query without an answer, because too many are waiting."""
+    query.drop()
