@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_NS
 from gigabrain_schemas.requests import PoseReply, PoseRequest
 from gigabrain_schemas.topics import POSE_SET
@@ -19,6 +20,7 @@ log = logging.getLogger(__name__)
 
 COUNTS_TICKS = round(2e9 / TICK_NS)  # for how long a hint counts while the robot is not found
 PERSON_M, PERSON_RAD = 0.3, 0.25  # deviation of what a person says
+LEAST_VARIANCE = 1e-6  # [m2], [rad2]
 SAID = "a person has said where it is"
 
 
@@ -68,11 +70,27 @@ class PoseHints:
             return PoseReply(ok=False, text="no map and no scan yet; try again in a moment")
         log_accepted(self._bus, POSE_SET.key, request, moment.tick)
         yaw = 0.0 if request.yaw is None else math.remainder(request.yaw, math.tau)
-        turn = math.pi / 2 if request.yaw is None else PERSON_RAD
-        spread = np.diag((PERSON_M, PERSON_M, turn)) ** 2
+        spread = _spread(request)
+        if spread is None:
+            return PoseReply(ok=False, text="the covariance is none: it has negative eigenvalues")
         self._lose(SAID)
         self._hint = PoseHint(np.array((request.x, request.y, yaw)), spread)
         self._sample, self._by_person = moment, True
         text = f"looking for the robot round ({request.x:.2f}, {request.y:.2f})"
         log.info("%s, by %s", text, request.source, extra={"data": {"event": "pose"}})
         return PoseReply(ok=True, text=text)
+
+
+def _spread(request: PoseRequest) -> Floats | None:
+    """Return the covariance (3, 3) of a request; None if it has an impossible one."""
+    turn = math.pi / 2 if request.yaw is None else PERSON_RAD
+    if not request.covariance:
+        return np.diag((PERSON_M, PERSON_M, turn)) ** 2
+    given = np.array(request.covariance).reshape(3, 3)
+    spread = (given + given.T) / 2
+    if np.linalg.eigvalsh(spread).min() < -LEAST_VARIANCE:
+        return None
+    if request.yaw is None:
+        spread[2], spread[:, 2] = 0.0, 0.0
+        spread[2, 2] = turn**2
+    return np.asarray(spread + LEAST_VARIANCE * np.eye(3), np.float64)

@@ -236,6 +236,7 @@ class BodyDescription(Record, frozen=True, kw_only=True):
     max_angular_acceleration: AccelerationLimit = 3.0  # [rad/s2]
     wheel_separation: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
     # [m], left to right; of omni wheels, to the next one
+    wheel_radius: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.0  # [m]; 0: not known, or no wheels
     max_rim_speed: SpeedLimit | None = None
     # [m/s], of a wheel of a differential base; None: it has its largest speeds both at once
     min_turning_radius: Annotated[float, Meta(ge=0.0, le=100.0)] = 0.0

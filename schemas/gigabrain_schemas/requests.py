@@ -75,7 +75,13 @@ class PoseRequest(Message, frozen=True, kw_only=True):
     x: Coordinate  # [m]
     y: Coordinate  # [m]
     yaw: Angle | None = None  # [rad]; None for any
+    covariance: Annotated[tuple[Finite, ...], Meta(max_length=9)] = ()
+    # of x, y, yaw, 9 values by row; empty: that of what a person says
     source: Name = "anonymous"
+
+    def __post_init__(self) -> None:
+        if len(self.covariance) not in (0, 9):
+            raise ValueError(f"covariance needs 9 values or none, got {len(self.covariance)}")
 
 
 class PoseReply(Message, frozen=True, kw_only=True):

@@ -11,7 +11,6 @@ from gigabrain_schemas.body import BodyDescription, Lidar
 from gigabrain_zenoh.config.settings import LinkName
 
 Length = Annotated[float, Meta(ge=0.0, le=10.0)]  # [m], of a part of a body
-WheelRadius = Annotated[float, Meta(ge=0.0, le=2.0)]  # [m]
 
 LINKS: tuple[LinkName, ...] = ("sim", "emulated", "real")
 
@@ -30,7 +29,6 @@ class RobotFile(BodyDescription, frozen=True, kw_only=True, forbid_unknown_field
 
     summary: str  # one line, for `gigabrain robots`
     wheel_base: Length = 0.0  # [m], front to rear, of mecanum and Ackermann bases
-    wheel_radius: WheelRadius = 0.0  # [m]
     effective_track: Length = 0.0
     # [m], of a skid-steered base: the separation of rolling wheels that would turn it as much
     joints: tuple[JointLimits, ...] = ()
