@@ -67,7 +67,7 @@ class Types:
         except (SerdeError, struct.error, ValueError) as error:
             raise BadPayload(f"{name}: {error}") from None
 
-    def make(self, name: str, **fields: Any) -> Any:
+    def make(self, name: str, /, **fields: Any) -> Any:
         """Make a message; fields that are left out get their defaults, in nested ones as well.
 
         Values are taken as they are, but for lists of numbers, and mappings in place of messages.
