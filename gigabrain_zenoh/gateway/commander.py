@@ -1,0 +1,266 @@
+"""What a velocity from ROS does: a pure state machine in front of the gate.
+
+The first command that moves asks for the body. Each command goes to the gate at once, and again
+with each state of the robot for at most one period of its sender. Then the gate gets nothing, then
+zero, and 0.5 s after the last command the body is given back. A body that was lost, by a stop or
+to another commander, is asked for only after the sender has sent zero or has paused.
+"""
+
+import math
+import statistics
+from typing import Any, NamedTuple
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from gigabrain_schemas.base import Velocity
+from gigabrain_schemas.body import GateStatus, RobotState
+from gigabrain_zenoh.gateway.lateness import Lateness
+from gigabrain_zenoh.geometry.limits import ZERO, Limits, clamp
+
+MS = 1_000_000
+TIMEOUT_NS = 200 * MS  # longest period of a sender
+BRAKE_NS = 60 * MS  # silence after the period before zero is sent; the gate bears 100 ms
+RELEASE_NS = 500 * MS  # after the last command
+AHEAD_NS = 100 * MS  # by which the clock of a stamp may be ahead of ours
+ASK_NS = 500 * MS  # from one request for the body to the next
+INTERVALS = 9  # of a sender, for their median
+MAX_SENDERS = 8
+FRAMES = ("", "base_link", "base_footprint")  # in which a body can be commanded
+PAUSE = "send zero, or pause for 0.5 s, before it may drive again"
+
+
+class Config(Struct, frozen=True, kw_only=True):
+    """Settings of the commander."""
+
+    name: str  # of this commander, at the gate
+    take: bool = False
+    timeout_ns: int = TIMEOUT_NS
+
+
+class Wanted(NamedTuple):
+    """A velocity as ROS sent it."""
+
+    linear: tuple[float, float, float]  # [m/s]
+    angular: tuple[float, float, float]  # [rad/s]
+    sender: bytes = b""
+    frame: str = ""
+    stamp_ns: int = 0  # of a TwistStamped, in ROS time; 0 for none
+    sent_ns: int | None = None  # Unix time of its publication, by the sender's clock
+
+
+class Now(NamedTuple):
+    """The present time."""
+
+    ns: int  # by a clock that only goes forward
+    ros_ns: int  # ROS time: Unix time, or that of the simulation
+    unix_ns: int  # of this host
+
+
+class Sender(Struct, frozen=True):
+    """One publisher of commands."""
+
+    id: bytes
+    last_ns: int
+    intervals: tuple[int, ...] = ()  # [ns], newest last
+    lateness: Lateness = Lateness()
+
+
+class Memory(Struct, frozen=True, kw_only=True):
+    """What the commander remembers."""
+
+    gate: GateStatus | None = None  # newest of a fresh state
+    boot: int = 0
+    granted: tuple[int, int] = (0, 0)  # boot, and the gate's count of enables, of the last grant
+    holds: bool = False  # the body, since the last grant
+    asking: bool = False
+    asked_ns: int = -ASK_NS
+    blocked: str = ""  # why the sender has to pause first
+    velocity: Velocity = ZERO
+    last_ns: int = -RELEASE_NS  # when the newest command was sent, as far as it is known
+    period_ns: int = TIMEOUT_NS  # of its sender
+    senders: tuple[Sender, ...] = ()  # the newest last
+    refusal: str = ""  # why commands are refused now; empty if they are not
+
+
+class Ask(NamedTuple):
+    """Ask the gate for the body."""
+
+    take: bool
+
+
+class Send(NamedTuple):
+    """Send a velocity to the gate."""
+
+    velocity: Velocity
+
+
+class Refuse(NamedTuple):
+    """Count a command that was refused."""
+
+    code: str
+
+
+Action = Ask | Send | Refuse
+Step = tuple[Memory, tuple[Action, ...]]
+
+
+def arrive(config: Config, limits: Limits, memory: Memory, wanted: Wanted, now: Now) -> Step:
+    """Process a command of ROS."""
+    code, text = _fault(config, wanted, now)
+    if code == "not_finite":  # its sender is out of order: brake
+        memory = replace(memory, velocity=ZERO, refusal=text)
+        return memory, (Refuse(code), *((Send(ZERO),) if memory.holds else ()))
+    if code:
+        return replace(memory, refusal=text), (Refuse(code),)
+    sender, paused = _next(memory, wanted, now)
+    late_ns = now.ros_ns - wanted.stamp_ns if wanted.stamp_ns else sender.lateness.now_ns
+    memory = replace(memory, senders=_kept(memory.senders, sender))
+    if late_ns > config.timeout_ns:
+        text = f"a command came {late_ns / 1e6:.0f} ms late: the network had held it back"
+        return replace(memory, refusal=text), (Refuse("late"),)
+    velocity = clamp(Velocity(linear_x=wanted.linear[0], linear_y=wanted.linear[1],
+                              angular_z=wanted.angular[2]), limits)  # fmt: skip
+    memory = replace(
+        memory,
+        velocity=velocity,
+        last_ns=now.ns - max(0, late_ns),
+        period_ns=_period_ns(config, sender),
+        blocked="" if paused or velocity == ZERO else memory.blocked,
+    )
+    sideways = bool(wanted.linear[1]) and not limits.lateral_speed
+    memory, actions = _obey(config, memory, now)
+    return memory, (*actions, *((Refuse("sideways"),) if sideways else ()))
+
+
+def observe(config: Config, memory: Memory, state: RobotState, now: Now) -> Step:
+    """Process a state of the robot: repeat the command, brake, or give the body back."""
+    memory = replace(memory, gate=state.gate, boot=state.boot)
+    if state.gate.mode == "latched" and not _is_old(memory):
+        memory = replace(memory, blocked=f"the robot was latched; {PAUSE}")
+    since_ns = now.ns - memory.last_ns
+    if since_ns >= RELEASE_NS:
+        return replace(memory, holds=False, velocity=ZERO, refusal=""), ()
+    if not memory.holds:
+        return memory, ()
+    if not _mine(config, memory):
+        return _lost(config, memory), ()
+    if since_ns <= memory.period_ns:
+        return memory, (Send(memory.velocity),)
+    return memory, ((Send(ZERO),) if since_ns > memory.period_ns + BRAKE_NS else ())
+
+
+def answer(config: Config, memory: Memory, gate: GateStatus | None, text: str, now: Now) -> Step:
+    """Process the gate's answer: `gate` if it has granted the body, else the reason."""
+    memory = replace(memory, asking=False)
+    if gate is None:
+        return replace(memory, refusal=text), ()
+    live = now.ns - memory.last_ns < RELEASE_NS
+    memory = replace(memory, granted=(memory.boot, gate.enables), holds=live, refusal="")
+    fresh = now.ns - memory.last_ns <= memory.period_ns
+    return memory, ((Send(memory.velocity if fresh else ZERO),) if live else ())
+
+
+def forget(memory: Memory, why: str) -> Memory:
+    """Stop commanding at once, as for an e-stop; the sender has to pause first."""
+    return replace(memory, holds=False, velocity=ZERO, blocked=f"{why}; {PAUSE}")
+
+
+def _obey(config: Config, memory: Memory, now: Now) -> Step:
+    """Send the newest command, or ask for the body with which to."""
+    gate = memory.gate
+    if gate is None:
+        text = "no state from the robot; check that its driver runs"
+        return replace(memory, refusal=text), (Refuse("no_robot"),)
+    if memory.holds:
+        return replace(memory, refusal=""), (Send(memory.velocity),)
+    if memory.velocity == ZERO:
+        return memory, ()
+    if _mine(config, memory) and not memory.blocked:  # given back, and not taken since
+        return replace(memory, holds=True, refusal=""), (Send(memory.velocity),)
+    if text := _obstacle(config, memory, gate):
+        return replace(memory, refusal=text), (Refuse("commander"),)
+    if memory.asking or now.ns - memory.asked_ns < ASK_NS:
+        return memory, ()
+    return replace(memory, asking=True, asked_ns=now.ns), (Ask(config.take),)
+
+
+def _obstacle(config: Config, memory: Memory, gate: GateStatus) -> str:
+    """Return why the gate need not be asked for the body now; empty if it may be."""
+    if memory.blocked:
+        return memory.blocked
+    if gate.commander not in ("", config.name) and not config.take:
+        return f"{gate.commander} drives; end that first, or set `ros2: {{take: true}}`"
+    if gate.mode == "latched":
+        causes = "; ".join(cause.text for cause in gate.causes)
+        return f"latched: {causes}; call the service release first"
+    return ""
+
+
+def _lost(config: Config, memory: Memory) -> Memory:
+    """Note that a stop or another commander has ended the lease."""
+    gate = memory.gate
+    assert gate
+    other = gate.commander if gate.commander != config.name else ""
+    why = f"{other} has taken the body" if other else f"the gate has stopped: {gate.mode}"
+    return replace(memory, holds=False, velocity=ZERO, blocked=f"{why}; {PAUSE}",
+                   refusal=f"{why}; {PAUSE}")  # fmt: skip
+
+
+def _mine(config: Config, memory: Memory) -> bool:
+    gate = memory.gate
+    mine = gate is not None and gate.mode == "enabled" and gate.commander == config.name
+    return mine or _is_old(memory)
+
+
+def _is_old(memory: Memory) -> bool:
+    """Return whether the newest state is from before the last grant."""
+    boot, enables = memory.granted
+    return memory.gate is not None and memory.boot == boot and memory.gate.enables < enables
+
+
+def _fault(config: Config, wanted: Wanted, now: Now) -> tuple[str, str]:
+    """Return code and text of what is wrong with a command; empty if nothing is."""
+    if not all(math.isfinite(value) for value in (*wanted.linear, *wanted.angular)):
+        return "not_finite", "a command holds NaN or infinity; repair the program that sends it"
+    if wanted.frame.rpartition("/")[2] not in FRAMES:
+        return "frame", f"a command is in frame {wanted.frame!r}; expected base_link"
+    if wanted.stamp_ns:
+        age_ns = now.ros_ns - wanted.stamp_ns
+        if age_ns > config.timeout_ns:
+            return "stale", f"a command's stamp is {age_ns / 1e9:.2f} s old; compare the clocks"
+        if age_ns < -AHEAD_NS:
+            text = f"a command's stamp is {-age_ns / 1e9:.2f} s ahead; compare the clocks"
+            return "future", text
+    return "", ""
+
+
+def _next(memory: Memory, wanted: Wanted, now: Now) -> tuple[Sender, bool]:
+    """Return the sender with this command, and whether all senders had paused before it."""
+    paused = now.ns - memory.last_ns >= RELEASE_NS
+    known = next((one for one in memory.senders if one.id == wanted.sender), None)
+    lateness = (known.lateness if known else Lateness()).then(wanted.sent_ns, now.unix_ns, now.ns)
+    if known is None or now.ns - known.last_ns >= RELEASE_NS:
+        return Sender(wanted.sender, now.ns, (), lateness), paused
+    intervals = (*known.intervals, now.ns - known.last_ns)[-INTERVALS:]
+    return Sender(wanted.sender, now.ns, intervals, lateness), paused
+
+
+def _kept(senders: tuple[Sender, ...], newest: Sender) -> tuple[Sender, ...]:
+    others = tuple(one for one in senders if one.id != newest.id)
+    return (*others, newest)[-MAX_SENDERS:]
+
+
+def _period_ns(config: Config, sender: Sender) -> int:
+    """Return how long a command counts: the median interval; the longest while there is none."""
+    if not sender.intervals:
+        return config.timeout_ns
+    return min(config.timeout_ns, round(statistics.median(sender.intervals)))
+
+
+def wanted_of(twist: Any, sender: bytes = b"", sent_ns: int | None = None) -> Wanted:
+    """Return a geometry_msgs/Twist as a command."""
+    linear, angular = twist.linear, twist.angular
+    return Wanted(
+        (linear.x, linear.y, linear.z), (angular.x, angular.y, angular.z), sender, "", 0, sent_ns
+    )

@@ -1,0 +1,93 @@
+"""The map, the path, and poses that ROS sends."""
+
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.brain import OccupancyGrid
+from gigabrain_schemas.tasks import TaskStatus
+from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.gateway.conversions.frames import (
+    MAP,
+    ODOM,
+    Make,
+    header,
+    pose,
+    pose_stamped,
+    time,
+    yaw_of,
+)
+from gigabrain_zenoh.geometry.pose import compose
+
+FARTHEST = 1e5  # [m], of coordinates
+PLANAR = (0, 1, 5)  # of x, y, z, roll, pitch, yaw
+
+
+def occupancy_grid(make: Make, grid: OccupancyGrid) -> Any:
+    """Return nav_msgs/OccupancyGrid: 0 free to 100 occupied, -1 unknown, as ours."""
+    return make(
+        "nav_msgs/msg/OccupancyGrid",
+        header=header(make, grid.stamp_ns, MAP),
+        info=make(
+            "nav_msgs/msg/MapMetaData",
+            map_load_time=time(make, grid.stamp_ns),
+            resolution=grid.resolution,
+            width=grid.width,
+            height=grid.height,
+            origin=pose(make, Pose(x=grid.origin_x, y=grid.origin_y, yaw=0.0)),
+        ),
+        data=grid.array().ravel(),
+    )
+
+
+def plan(make: Make, status: TaskStatus) -> Any:
+    """Return nav_msgs/Path of the way to the goal, headed along it; without one it is empty."""
+    points = status.path
+    yaws = [math.atan2(b[1] - a[1], b[0] - a[0]) for a, b in itertools.pairwise(points)]
+    yaws.append(yaws[-1] if yaws else 0.0)
+    if status.goal and status.goal.yaw is not None:
+        yaws[-1] = status.goal.yaw
+    poses = [
+        pose_stamped(make, status.stamp_ns, MAP, Pose(x=x, y=y, yaw=yaw))
+        for (x, y), yaw in zip(points, yaws, strict=False)
+    ]
+    return make("nav_msgs/msg/Path", header=header(make, status.stamp_ns, MAP), poses=poses)
+
+
+def planar(ros_pose: Any) -> Pose:
+    """Return a geometry_msgs/Pose on the floor. Raises Refused for one that is none."""
+    x, y = float(ros_pose.position.x), float(ros_pose.position.y)
+    yaw = yaw_of(ros_pose.orientation)
+    if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST):
+        raise Refused(f"the position ({x:g}, {y:g}) is none in a map; expected metres")
+    if yaw is None:
+        raise Refused("the orientation is no quaternion of length 1; expected w: 1.0 for straight")
+    return Pose(x=x, y=y, yaw=yaw)
+
+
+def in_map(frame: str, at: Pose, odom_in_map: Pose | None) -> Pose:
+    """Return a pose of ROS in the map; frames are `map` and `odom`. Raises Refused for others."""
+    if frame == MAP:
+        return at
+    if frame != ODOM:
+        raise Refused(f"frame {frame!r} is not known as one of goals; expected {MAP} or {ODOM}")
+    if odom_in_map is None:
+        raise Refused(f"a goal in {ODOM} needs the robot's place in the map, which is not known")
+    return compose(odom_in_map, at)
+
+
+def planar_covariance(values: Any) -> tuple[float, ...]:
+    """Return the covariance of x, y and yaw, 9 values by row, of a ROS covariance of 36.
+
+    Empty where nothing is known: all zero. Raises Refused for one that is no covariance.
+    """
+    full = np.asarray(values, np.float64).reshape(6, 6)
+    part = full[np.ix_(PLANAR, PLANAR)]
+    if not np.isfinite(part).all() or np.linalg.eigvalsh((part + part.T) / 2).min() < -1e-9:
+        raise Refused("the covariance is none: expected finite values, symmetric, none negative")
+    if not part.any():
+        return ()
+    return tuple(float(value) for value in ((part + part.T) / 2).ravel())

@@ -1,0 +1,245 @@
+"""What the gateway publishes: a table, and publishers that work only while ROS reads them."""
+
+import functools
+import logging
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from gigabrain_schemas.body import Body, Camera, RobotState
+from gigabrain_schemas.tasks import TaskStatus
+from gigabrain_schemas.topics import BODY, DEPTH, IMAGE, IMU, MAP, SCAN, STATE, TASK, Topic
+from gigabrain_zenoh.bus.transport import Close
+from gigabrain_zenoh.gateway.conversions import body as of_body
+from gigabrain_zenoh.gateway.conversions import maps, sensors
+from gigabrain_zenoh.gateway.conversions.description import robot_description
+from gigabrain_zenoh.gateway.conversions.frames import (
+    MAP as MAP_FRAME,
+)
+from gigabrain_zenoh.gateway.conversions.frames import (
+    ODOM,
+    Make,
+    on_floor,
+    tf_static,
+    transforms,
+)
+from gigabrain_zenoh.gateway.scene import Scene
+from gigabrain_zenoh.logs import Fault
+from gigabrain_zenoh.ros2.qos import DEFAULT, LATCHED, SENSOR_DATA, Qos
+from gigabrain_zenoh.ros2.transport import RosPublisher, RosTransport
+from gigabrain_zenoh.ros2.types import Types
+
+log = logging.getLogger(__name__)
+SECOND_NS = 1_000_000_000
+TF = Qos(depth=100)  # as tf2's broadcaster
+CLOCK = Qos(reliable=False, depth=1)  # as ROS's own subscription
+Convert = Callable[[Make, Any, Scene], Any | None]  # None: nothing to publish
+
+
+@dataclass(frozen=True)
+class Row:
+    """A ROS topic, and what it is made of."""
+
+    topic: str  # below the namespace
+    type: str
+    qos: Qos
+    sources: tuple[tuple[Topic[Any], Convert], ...]
+    name: str = "*"  # of the camera
+    every_ns: int = 0  # shortest time between two
+    content: Callable[[Any], object] | None = None  # published again only if this has changed
+    simulated: bool = False  # of a simulation only
+
+
+def _tf(make: Make, state: RobotState, scene: Scene) -> Any:
+    """Return the moving frames, with the map's as of now: it is known, and as good as then."""
+    frames = of_body.moving_frames(scene.body, state)
+    if odom := scene.odom_in_map:
+        frames.insert(0, on_floor(MAP_FRAME, ODOM, odom))
+    return transforms(make, state.stamp_ns, frames)
+
+
+class _ImuSource:
+    """Prefers a body's own IMU stream to the readings in its states."""
+
+    def __init__(self) -> None:
+        self._last_tick = (0, 0)
+
+    def of_topic(self, make: Make, reading: Any, _: Scene) -> Any:
+        self._last_tick = reading.boot, reading.tick
+        return of_body.imu(make, reading)
+
+    def of_state(self, make: Make, state: RobotState, _: Scene) -> Any | None:
+        boot, tick = self._last_tick
+        streams = boot == state.boot and state.tick - tick < IMU_TICKS
+        return None if streams else of_body.imu_of_state(make, state)
+
+
+IMU_TICKS = 50  # after which a stream has ended
+
+
+def table() -> tuple[Row, ...]:
+    """Return the rows of every robot; those of its cameras are `camera_rows`."""
+    imu = _ImuSource()
+    return (
+        Row("scan", "sensor_msgs/msg/LaserScan", SENSOR_DATA, (
+            (SCAN, lambda make, scan, scene: sensors.laser_scan(make, scan, scene.body)),)),
+        Row("odom", "nav_msgs/msg/Odometry", DEFAULT, ((STATE, _plain(of_body.odometry)),)),
+        Row("tf", "tf2_msgs/msg/TFMessage", TF, ((STATE, _tf),)),
+        Row("tf_static", "tf2_msgs/msg/TFMessage", LATCHED, ((BODY, _plain(tf_static)),),
+            content=_description),
+        Row("map", "nav_msgs/msg/OccupancyGrid", LATCHED, ((MAP, _plain(maps.occupancy_grid)),)),
+        Row("imu", "sensor_msgs/msg/Imu", SENSOR_DATA, (
+            (IMU, imu.of_topic), (STATE, imu.of_state))),
+        Row("joint_states", "sensor_msgs/msg/JointState", DEFAULT, (
+            (STATE, _plain(of_body.joint_states)),)),
+        Row("battery_state", "sensor_msgs/msg/BatteryState", DEFAULT, (
+            (STATE, _plain(of_body.battery_state)),), every_ns=SECOND_NS),
+        Row("plan", "nav_msgs/msg/Path", DEFAULT, ((TASK, _plain(_Plans()),),)),
+        Row("robot_description", "std_msgs/msg/String", LATCHED, (
+            (BODY, _plain(robot_description)),), content=_description),
+        Row("clock", "rosgraph_msgs/msg/Clock", CLOCK, ((STATE, _plain(of_body.clock)),),
+            simulated=True),
+    )  # fmt: skip
+
+
+def _description(body: Body) -> object:
+    return body.description
+
+
+def _plain(convert: Callable[[Make, Any], Any | None]) -> Convert:
+    return lambda make, message, _: convert(make, message)
+
+
+class _Plans:
+    """Publishes a path while there is one, and once the empty one behind it."""
+
+    def __init__(self) -> None:
+        self._empty = False
+
+    def __call__(self, make: Make, status: TaskStatus) -> Any | None:
+        was_empty, self._empty = self._empty, not status.path
+        return None if was_empty and self._empty else maps.plan(make, status)
+
+
+def camera_rows(cameras: tuple[Camera, ...]) -> Iterator[Row]:
+    """Yield the rows of the cameras: the first below `camera`, others below `camera/NAME`."""
+    for number, camera in enumerate(cameras):
+        at = f"camera/{camera.name}" if number else "camera"
+
+        def picture(make: Make, image: Any, _: Scene, camera: Camera = camera) -> Any | None:
+            return sensors.compressed_image(make, image, camera.name)
+
+        def info(make: Make, message: Any, _: Scene, camera: Camera = camera) -> Any:
+            return sensors.camera_info(make, message.stamp_ns, camera)
+
+        def depth(make: Make, image: Any, _: Scene, camera: Camera = camera) -> Any:
+            return sensors.depth_image(make, image, camera.name)
+
+        about, image = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/CompressedImage"
+        yield Row(f"{at}/image/compressed", image, SENSOR_DATA, ((IMAGE, picture),), camera.name)
+        yield Row(f"{at}/camera_info", about, SENSOR_DATA, ((IMAGE, info),), camera.name)
+        if camera.depth:
+            raw, at = "sensor_msgs/msg/Image", f"{at}/depth"
+            yield Row(f"{at}/image_raw", raw, SENSOR_DATA, ((DEPTH, depth),), camera.name)
+            # depth_image_proc looks for it there
+            yield Row(f"{at}/camera_info", about, SENSOR_DATA, ((DEPTH, info),), camera.name)
+
+
+@dataclass
+class _Published:
+    """One row at work."""
+
+    row: Row
+    publisher: RosPublisher | None = None
+    readers: int = 0
+    closes: list[Close] = field(default_factory=list)
+    sent_ns: int = -SECOND_NS
+    content: object = None  # of the last, where the row compares it
+
+
+class Publishing:
+    """Publishers of all rows; one without readers neither receives nor encodes anything."""
+
+    def __init__(
+        self, scene: Scene, ros: RosTransport, types: Types, leave_out: tuple[str, ...] = ()
+    ) -> None:
+        self._scene, self._ros, self._types = scene, ros, types
+        self._leave_out = {name.strip("/") for name in leave_out}
+        self._cameras: tuple[Camera, ...] = ()
+        self._of_cameras: list[_Published] = []
+        self._fault, self._closed = Fault(log), False
+        self._simulated: _Published | None = None
+        self._rows = [self._open(row) for row in table() if not row.simulated]
+        scene.on_body.append(self._follow_body)
+        if scene.body:
+            self._follow_body(scene.body)
+
+    @property
+    def topics(self) -> list[str]:
+        """The topics that are offered now, below the namespace."""
+        every = [*self._rows, *self._of_cameras]
+        return [one.row.topic for one in every if one.publisher]
+
+    def close(self) -> None:
+        """Withdraw all publishers."""
+        self._closed = True
+        for one in (*self._rows, *self._of_cameras):
+            self._end(one)
+
+    def _follow_body(self, body: Body) -> None:
+        """Offer the topics of its cameras, and of a simulation its clock."""
+        if self._closed:
+            return
+        if body.link == "sim" and self._simulated is None:
+            (row,) = (row for row in table() if row.simulated)
+            self._simulated = self._open(row)
+            self._rows.append(self._simulated)
+        if body.description.cameras == self._cameras:
+            return
+        self._cameras = body.description.cameras
+        for one in self._of_cameras:
+            self._end(one)
+        self._of_cameras = [self._open(row) for row in camera_rows(self._cameras)]
+
+    def _open(self, row: Row) -> _Published:
+        one = _Published(row)
+        if row.topic not in self._leave_out:
+            count = functools.partial(self._count, one)
+            one.publisher = self._ros.publisher(row.topic, row.type, row.qos, count)
+        return one
+
+    def _end(self, one: _Published) -> None:
+        self._count(one, 0)
+        if one.publisher:
+            one.publisher.close()
+
+    def _count(self, one: _Published, readers: int) -> None:
+        """Begin with the first reader, end with the last."""
+        before, one.readers = one.readers, readers
+        if readers and not one.closes and not self._closed:
+            one.content, one.sent_ns = None, -SECOND_NS
+            for topic, convert in one.row.sources:
+                take = functools.partial(self._take, one, convert)
+                one.closes.append(self._scene.feeds.add(topic, take, one.row.name))
+        elif before and not readers:
+            for close in one.closes:
+                close()
+            one.closes = []
+
+    def _take(self, one: _Published, convert: Convert, message: Any) -> None:
+        now_ns = self._scene.bus.clock.now_ns()
+        content = one.row.content(message) if one.row.content else None
+        same = content is not None and content == one.content
+        if one.publisher is None or same or now_ns - one.sent_ns < one.row.every_ns:
+            return
+        try:
+            made = convert(self._types.make, message, self._scene)
+        except ValueError as error:
+            self._scene.bus.counters["not_converted"] += 1
+            self._fault.begin(f"{one.row.topic}: left out a message: {error}")
+            return
+        if made is None:
+            return
+        one.content, one.sent_ns = content, now_ns
+        one.publisher.publish(self._types.encode(one.row.type, made))
+        self._scene.bus.counters["published"] += 1
