@@ -1,0 +1,343 @@
+"""Services over DDS, as Fast DDS and Cyclone DDS under ROS 2 call and answer them.
+
+A service is two topics: requests `rq/<name>Request` and replies `rr/<name>Reply`. rmw_fastrtps
+names the request that a reply belongs to in the inline QoS of the sample, rmw_cyclonedds in 16
+bytes before the payload. Cyclone DDS's library cannot write that inline QoS, so services have a
+participant of their own.
+"""
+
+import asyncio
+import itertools
+import logging
+import secrets
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Self
+
+from gigabrain_zenoh.errors import BusError, ConfigError, GigabrainError, NoAnswer
+from gigabrain_zenoh.ros2.rtps_discovery import (
+    MAX_DOMAIN,
+    READER_KIND,
+    WRITER_KIND,
+    EndpointData,
+    ParticipantData,
+    service_topics,
+    service_types,
+)
+from gigabrain_zenoh.ros2.rtps_participant import LEASE_S, Participant
+from gigabrain_zenoh.ros2.rtps_reader import ReliableReader
+from gigabrain_zenoh.ros2.rtps_sockets import Sockets
+from gigabrain_zenoh.ros2.rtps_wire import VENDOR_CYCLONE, VENDOR_UNKNOWN, Data, Sample
+from gigabrain_zenoh.ros2.rtps_writer import ReliableWriter
+from gigabrain_zenoh.ros2.transport import Answer
+
+log = logging.getLogger(__name__)
+
+MAX_RUNNING = 64  # requests of one service that are handled at once; more are dropped
+ENCAPSULATION_BYTES, CYCLONE_HEADER_BYTES = 4, 16
+REFRESH_S = 2.0
+READY_S = 1.0  # a server that answers no greeting is asked all the same
+POLL_S = 0.01
+
+
+class ServiceType(NamedTuple):
+    """A type of services, with ROS's hashes of both messages, empty where they are not known."""
+
+    name: str  # "std_srvs/srv/SetBool"
+    request_hash: str = ""  # "RIHS01_..."
+    reply_hash: str = ""
+
+
+class RequestReply:
+    """A participant for services. `open` it, and `close` it at the end."""
+
+    def __init__(self, sockets: Sockets, enclave: str) -> None:
+        """Create a participant that is not connected; see `open`."""
+        self._sockets, self._enclave = sockets, enclave
+        self._prefix = VENDOR_UNKNOWN + secrets.token_bytes(10)
+        self.participant = Participant(
+            self._data([]), self._sockets.send, self._sockets.announce, time.time_ns
+        )
+        self._servers: dict[str, Server] = {}
+        self._clients: dict[tuple[str, ServiceType], _Client] = {}
+        self._ticking: asyncio.Task[None] | None = None
+
+    @classmethod
+    async def open(
+        cls,
+        domain: int,
+        *,
+        localhost: bool = False,
+        peers: Sequence[str] = (),
+        enclave: str = "/",
+    ) -> Self:
+        """Open a participant of a DDS domain. Raises BusError, ConfigError.
+
+        With `localhost` it meets participants of this host only, without multicast. `peers` are
+        IPv4 addresses of hosts that multicast does not reach.
+        """
+        if not 0 <= domain <= MAX_DOMAIN:
+            raise ConfigError(f"domain: expected 0 to {MAX_DOMAIN}, got {domain}")
+        made = cls(Sockets(domain, localhost=localhost, peers=peers), enclave)
+        try:
+            await made._sockets.open(made._receive)
+        except BaseException:
+            made._sockets.close()
+            raise
+        made._refresh()
+        made._ticking = asyncio.create_task(made._tick())
+        return made
+
+    async def close(self) -> None:
+        """Say goodbye to all, and close the sockets; may be called again."""
+        if self._ticking:
+            self._ticking.cancel()
+            await asyncio.wait([self._ticking])
+            self._ticking = None
+            self.participant.leave()
+        for server in list(self._servers.values()):
+            server.cancel()
+        self._servers.clear()
+        for client in self._clients.values():
+            client.fail("the participant was closed")
+        self._clients.clear()
+        self._sockets.close()
+
+    def serve(self, service: str, type_: ServiceType, handle: Answer) -> "Server":
+        """Answer the requests to an absolute service name. Raises BusError for a second server."""
+        if service in self._servers:
+            raise BusError(f"{service}: this process has a server of that name already")
+        server = Server(self, service, type_, handle)
+        self._servers[service] = server
+        return server
+
+    async def call(
+        self, service: str, type_: ServiceType, request: bytes, timeout_s: float
+    ) -> bytes:
+        """Return the first reply of a server. Raises NoAnswer if none comes in time."""
+        if own := self._servers.get(service):
+            return await own.ask(request, timeout_s)
+        key = service, type_
+        if key not in self._clients:
+            self._clients[key] = _Client(self, service, type_)
+        return await self._clients[key].call(request, timeout_s)
+
+    def gids(self) -> tuple[list[bytes], list[bytes]]:
+        """Return the GUIDs of all readers and writers, for `ros_discovery_info`."""
+        readers = [data.guid for _, data in self.participant.readers.values()]
+        return readers, [data.guid for _, data in self.participant.writers.values()]
+
+    def add_pair(
+        self,
+        out: tuple[str, str, str],
+        into: tuple[str, str, str],
+        deliver: Callable[[bytes, Data], None],
+    ) -> tuple[ReliableWriter, ReliableReader, bytes]:
+        """Add a writer and a reader, each by (topic, type, hash); also return the reader's GUID."""
+        participant, now = self.participant, time.monotonic()
+        writer = ReliableWriter(participant.next_entity(WRITER_KIND), participant.send)
+        reader = ReliableReader(participant.next_entity(READER_KIND), participant.send, deliver)
+        guid = self._prefix + reader.entity
+        participant.add_reader(reader, EndpointData(guid, *into[:2], type_hash=into[2]), now)
+        data = EndpointData(self._prefix + writer.entity, *out[:2], type_hash=out[2])
+        participant.add_writer(writer, data, now)
+        return writer, reader, guid
+
+    def forget(self, server: "Server") -> None:
+        """Withdraw a server."""
+        if self._servers.get(server.service) is server:
+            del self._servers[server.service]
+            for entity in server.entities:
+                self.participant.remove(entity, time.monotonic())
+
+    def is_cyclone(self, guid: bytes) -> bool:
+        """Return whether the owner of an endpoint is Cyclone DDS."""
+        remote = self.participant.remotes.get(guid[:12])
+        return remote is not None and remote.data.vendor == VENDOR_CYCLONE
+
+    def _data(self, hosts: Sequence[str]) -> ParticipantData:
+        return ParticipantData(
+            prefix=self._prefix,
+            builtin=tuple((host, self._sockets.builtin_port) for host in hosts),
+            user=tuple((host, self._sockets.user_port) for host in hosts),
+            lease_s=LEASE_S,
+            enclave=self._enclave,
+        )
+
+    def _refresh(self) -> None:
+        hosts, own = self._sockets.refresh()
+        self.participant.move(self._data(hosts), own)
+
+    def _receive(self, datagram: bytes, source: str) -> None:
+        self.participant.receive(datagram, source, time.monotonic())
+
+    async def _tick(self) -> None:
+        refreshed = time.monotonic()
+        while True:
+            now = time.monotonic()
+            if now - refreshed >= REFRESH_S:
+                refreshed = now
+                self._refresh()
+            await asyncio.sleep(self.participant.tick(now))
+
+
+class Server:
+    """A service that this process answers."""
+
+    def __init__(self, bus: RequestReply, service: str, type_: ServiceType, handle: Answer) -> None:
+        """Announce the service."""
+        self.service, self.handle, self._bus = service, handle, bus
+        self.dropped = 0  # requests that came while too many were handled
+        self._running: set[asyncio.Task[None]] = set()
+        requests, replies = service_topics(service)
+        request, reply = service_types(type_.name)
+        self._writer, self._reader, _ = bus.add_pair(
+            (replies, reply, type_.reply_hash),
+            (requests, request, type_.request_hash),
+            self._on_request,
+        )
+        self.entities = self._reader.entity, self._writer.entity
+
+    @property
+    def clients(self) -> int:
+        """Number of matched clients."""
+        return len(self._reader.writers)
+
+    async def ask(self, request: bytes, timeout_s: float) -> bytes:
+        """Return the reply to a request of this process. Raises NoAnswer."""
+        try:
+            async with asyncio.timeout(timeout_s):
+                return await self.handle(request)
+        except TimeoutError:
+            raise NoAnswer(f"{self.service}: no reply within {timeout_s:g} s") from None
+
+    def close(self) -> None:
+        """Withdraw the service. Requests that are being handled get no reply."""
+        self.cancel()
+        self._bus.forget(self)
+
+    def cancel(self) -> None:
+        """Stop handling requests."""
+        for task in self._running:
+            task.cancel()
+
+    def _on_request(self, writer: bytes, data: Data) -> None:
+        if len(self._running) >= MAX_RUNNING:
+            self.dropped += 1
+            if self.dropped == 1:
+                log.warning("%s: dropped a request: %d are running", self.service, MAX_RUNNING)
+            return
+        task = asyncio.create_task(self._answer(writer, data))
+        self._running.add(task)
+        task.add_done_callback(self._finish)
+
+    async def _answer(self, writer: bytes, data: Data) -> None:
+        request, header = data.payload, b""
+        if self._bus.is_cyclone(writer):
+            request, header = _take_header(request)
+        reply = await self.handle(request)
+        related = data.related.guid if data.related else bytes(16)
+        asker = related if related[:12] == writer[:12] else writer  # the client's reader, if named
+        target = asker if related == asker else writer[:12]
+        if header:
+            target, reply = writer[:12], _put_header(reply, header)
+        now = time.monotonic()
+        self._writer.write(reply, now, related=Sample(asker, data.seq), target=target)
+
+    def _finish(self, task: asyncio.Task[None]) -> None:
+        self._running.discard(task)
+        error = None if task.cancelled() else task.exception()
+        if isinstance(error, GigabrainError):
+            log.warning("%s: a request got no reply: %s", self.service, error)
+        elif error:
+            log.error("%s: a request got no reply", self.service, exc_info=error)
+
+
+class _Client:
+    """Calls one service."""
+
+    def __init__(self, bus: RequestReply, service: str, type_: ServiceType) -> None:
+        self._service, self._bus = service, bus
+        self._waiting: dict[int, asyncio.Future[bytes]] = {}
+        self._cyclone_numbers = itertools.count(1)
+        requests, replies = service_topics(service)
+        request, reply = service_types(type_.name)
+        self._writer, self._reader, self._guid = bus.add_pair(
+            (requests, request, type_.request_hash),
+            (replies, reply, type_.reply_hash),
+            self._on_reply,
+        )
+        self._names = self._guid, self._guid[:12] + self._writer.entity  # in replies
+
+    async def call(self, request: bytes, timeout_s: float) -> bytes:
+        """Send a request; return the first reply. Raises NoAnswer."""
+        future: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
+        numbers: list[int] = []
+        try:
+            async with asyncio.timeout(timeout_s):
+                numbers = self._send(request, await self._servers(timeout_s))
+                self._waiting.update(dict.fromkeys(numbers, future))
+                return await future
+        except TimeoutError:
+            why = "no reply" if numbers else "no server"
+            raise NoAnswer(
+                f"{self._service}: {why} within {timeout_s:g} s; is its node running?"
+            ) from None
+        finally:
+            for number in numbers:
+                self._waiting.pop(number, None)
+
+    def fail(self, why: str) -> None:
+        """End all calls."""
+        for future in self._waiting.values():
+            if not future.done():
+                future.set_exception(NoAnswer(f"{self._service}: {why}"))
+
+    async def _servers(self, timeout_s: float) -> list[bytes]:
+        """Return the GUIDs of the servers' readers, once they can reply."""
+        started = time.monotonic()
+        while True:
+            repliers = {guid[:12]: one for guid, one in self._reader.writers.items()}
+            askers = self._writer.readers
+            found = {guid: one for guid, one in askers.items() if guid[:12] in repliers}
+            ready = [g for g, one in found.items() if one.heard and repliers[g[:12]].heard]
+            late = time.monotonic() - started > min(READY_S, timeout_s / 2)
+            if ready or (found and late):
+                return ready or list(found)
+            await asyncio.sleep(POLL_S)
+
+    def _send(self, request: bytes, servers: list[bytes]) -> list[int]:
+        now, related = time.monotonic(), Sample(self._guid, -1 << 32)
+        numbers = []
+        for guid in servers:
+            payload = request
+            if self._bus.is_cyclone(guid):
+                number = next(self._cyclone_numbers)
+                header = self._guid[4:12] + number.to_bytes(8, "little")
+                payload = _put_header(request, header)
+                numbers.append(-number)
+            seq = self._writer.write(payload, now, related=related, target=guid)
+            numbers.append(seq)
+        return numbers
+
+    def _on_reply(self, writer: bytes, data: Data) -> None:
+        number, reply = 0, data.payload
+        if self._bus.is_cyclone(writer):
+            reply, header = _take_header(reply)
+            if header[:8] == self._guid[4:12]:
+                number = -int.from_bytes(header[8:], "little")
+        elif data.related and data.related.guid in self._names:
+            number = data.related.seq
+        future = self._waiting.get(number)
+        if future and not future.done():
+            future.set_result(reply)
+
+
+def _take_header(payload: bytes) -> tuple[bytes, bytes]:
+    """Return (payload, header) of what Cyclone DDS's rmw layer wrote."""
+    end = ENCAPSULATION_BYTES + CYCLONE_HEADER_BYTES
+    return payload[:ENCAPSULATION_BYTES] + payload[end:], payload[ENCAPSULATION_BYTES:end]
+
+
+def _put_header(payload: bytes, header: bytes) -> bytes:
+    return payload[:ENCAPSULATION_BYTES] + header + payload[ENCAPSULATION_BYTES:]

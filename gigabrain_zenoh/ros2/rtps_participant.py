@@ -1,0 +1,334 @@
+"""A participant of DDS that has services only, as a state machine without sockets or clocks.
+
+It announces itself, finds the other participants (SPDP) and their endpoints (SEDP), and matches
+those with its own. Source: OMG DDSI-RTPS 2.3, chapter 8.5. A participant is believed only from an
+address that it announces, so that it cannot make this one send to others.
+"""
+
+import logging
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass, field
+
+from gigabrain_zenoh.ros2.rtps_discovery import (
+    HAS_PUBLICATIONS_READER,
+    HAS_PUBLICATIONS_WRITER,
+    HAS_SUBSCRIPTIONS_READER,
+    HAS_SUBSCRIPTIONS_WRITER,
+    PUBLICATIONS_READER,
+    PUBLICATIONS_WRITER,
+    SPDP_READER,
+    SPDP_WRITER,
+    SUBSCRIPTIONS_READER,
+    SUBSCRIPTIONS_WRITER,
+    Address,
+    EndpointData,
+    ParticipantData,
+    choose_address,
+    decode_endpoint,
+    decode_participant,
+)
+from gigabrain_zenoh.ros2.rtps_reader import ReliableReader
+from gigabrain_zenoh.ros2.rtps_wire import (
+    DISPOSED,
+    UNKNOWN_ENTITY,
+    AckNack,
+    BadMessage,
+    Data,
+    DataFragments,
+    Gap,
+    Heartbeat,
+    HeartbeatFragments,
+    NackFragments,
+    Submessage,
+    decode_message,
+    encode_message,
+)
+from gigabrain_zenoh.ros2.rtps_writer import ReliableWriter
+
+log = logging.getLogger(__name__)
+
+LEASE_S, ANNOUNCE_S = 10.0, 2.0
+FIRST_ANNOUNCEMENTS, FIRST_ANNOUNCE_S = 5, 0.1
+MIN_LEASE_S, MAX_LEASE_S = 1.0, 300.0  # of others
+MAX_REMOTES, MAX_ENDPOINTS = 256, 4096  # endpoints of one participant
+SERVICE_TOPICS = ("rq/", "rr/")  # of all others no endpoint is kept
+MIN_TICK_S, MAX_TICK_S = 0.01, 0.1
+
+
+@dataclass(slots=True, eq=False)
+class Remote:
+    """Another participant."""
+
+    data: ParticipantData
+    builtin: Address
+    user: Address
+    heard_s: float
+    endpoints: dict[bytes, EndpointData] = field(default_factory=dict)
+
+
+class Participant:
+    """The participant; `send` takes a datagram, `announce` one for all participants."""
+
+    def __init__(
+        self,
+        data: ParticipantData,
+        send: Callable[[bytes, Address], None],
+        announce: Callable[[bytes], None],
+        unix_ns: Callable[[], int],
+    ) -> None:
+        """Create a participant that listens at the addresses of `data`."""
+        self.data, self.own = data, frozenset[str]()
+        self.remotes: dict[bytes, Remote] = {}
+        self.writers: dict[bytes, tuple[ReliableWriter, EndpointData]] = {}
+        self.readers: dict[bytes, tuple[ReliableReader, EndpointData]] = {}
+        self._out, self._announce, self._unix_ns = send, announce, unix_ns
+        self._announced, self._next_s, self._now, self._entities = 0, 0.0, 0.0, 0
+        self._sequence = 1
+        self._builtin_writers = {
+            one: ReliableWriter(one, self.send, transient_local=True)
+            for one in (PUBLICATIONS_WRITER, SUBSCRIPTIONS_WRITER)
+        }
+        self._builtin_readers = {
+            one: ReliableReader(one, self.send, self._on_endpoint)
+            for one in (PUBLICATIONS_READER, SUBSCRIPTIONS_READER)
+        }
+
+    def move(self, data: ParticipantData, own: Collection[str]) -> None:
+        """Take the addresses of this host; announce them if they are others than before."""
+        if data != self.data:
+            self.data, self._sequence, self._next_s = data, self._sequence + 1, 0.0
+        self.own = frozenset(own)
+
+    def next_entity(self, kind: int) -> bytes:
+        """Return the entity id of a new endpoint; `kind` is WRITER_KIND or READER_KIND."""
+        self._entities += 1
+        return self._entities.to_bytes(3, "big") + bytes((kind,))
+
+    def send(self, to: bytes, address: Address, submessages: Iterable[Submessage]) -> None:
+        """Send submessages to a participant."""
+        self._out(encode_message(self.data.prefix, to, submessages, self._unix_ns()), address)
+
+    def add_writer(self, writer: ReliableWriter, data: EndpointData, now: float) -> None:
+        """Announce a writer."""
+        self.writers[writer.entity] = writer, data
+        self._announce_endpoint(PUBLICATIONS_WRITER, data, now)
+        self._match_all(data, now)
+
+    def add_reader(self, reader: ReliableReader, data: EndpointData, now: float) -> None:
+        """Announce a reader."""
+        self.readers[reader.entity] = reader, data
+        self._announce_endpoint(SUBSCRIPTIONS_WRITER, data, now)
+        self._match_all(data, now)
+
+    def remove(self, entity: bytes, now: float) -> None:
+        """Announce that an endpoint is gone."""
+        _, data = self.writers.pop(entity, None) or self.readers.pop(entity)
+        builtin = PUBLICATIONS_WRITER if data.is_writer else SUBSCRIPTIONS_WRITER
+        self._builtin_writers[builtin].write(data.encode_key(), now, status=DISPOSED, key=data.guid)
+
+    def receive(self, datagram: bytes, source: str, now: float) -> None:
+        """Take a datagram. Nothing that it may hold raises an error."""
+        self._now = now
+        try:
+            message = decode_message(datagram, self.data.prefix)
+        except BadMessage:
+            return
+        if message.prefix == self.data.prefix:
+            return
+        for one in message.submessages:
+            if isinstance(one, Data) and one.writer == SPDP_WRITER:
+                self._on_participant(message.prefix, message.vendor, one, source)
+                continue
+            remote = self.remotes.get(message.prefix)
+            if remote is None or not self._believed(remote.data, source):
+                return
+            remote.heard_s = now
+            self._dispatch(message.prefix, one)
+
+    def tick(self, now: float) -> float:
+        """Do what is due; return the seconds until the next tick."""
+        self._now = now
+        for prefix, remote in list(self.remotes.items()):
+            lease = min(max(remote.data.lease_s, MIN_LEASE_S), MAX_LEASE_S)
+            if now - remote.heard_s > lease:
+                self._forget(prefix)
+        if now >= self._next_s:
+            self._announced += 1
+            early = self._announced <= FIRST_ANNOUNCEMENTS
+            self._next_s = now + (FIRST_ANNOUNCE_S if early else ANNOUNCE_S)
+            self._announce(self._announcement(b""))
+        writers = [*self._builtin_writers.values(), *(one for one, _ in self.writers.values())]
+        readers = [*self._builtin_readers.values(), *(one for one, _ in self.readers.values())]
+        due = [*(one.tick(now) for one in writers), *(one.tick(now) for one in readers)]
+        return min(max(MIN_TICK_S, min(self._next_s, *due) - now), MAX_TICK_S)
+
+    def leave(self) -> None:
+        """Tell all others that this participant is gone."""
+        key = self.data.prefix + bytes((0, 0, 1, 0xC1))
+        gone = Data(
+            SPDP_READER,
+            SPDP_WRITER,
+            self._sequence + 1,
+            self.data.encode_key(),
+            status=DISPOSED,
+            key=key,
+        )
+        self._announce(encode_message(self.data.prefix, b"", [gone], self._unix_ns()))
+        for prefix, remote in self.remotes.items():
+            self.send(prefix, remote.builtin, [gone])
+        self.remotes.clear()
+
+    def _announcement(self, to: bytes) -> bytes:
+        data = Data(SPDP_READER, SPDP_WRITER, self._sequence, self.data.encode())
+        return encode_message(self.data.prefix, to, [data], self._unix_ns())
+
+    def _announce_endpoint(self, builtin: bytes, data: EndpointData, now: float) -> None:
+        self._builtin_writers[builtin].write(data.encode(), now, key=data.guid)
+
+    def _believed(self, data: ParticipantData, source: str) -> bool:
+        return choose_address((*data.builtin, *data.user), source, self.own) is not None
+
+    def _on_participant(self, prefix: bytes, vendor: bytes, one: Data, source: str) -> None:
+        remote = self.remotes.get(prefix)
+        if one.status:
+            if remote and self._believed(remote.data, source):
+                self._forget(prefix)
+            return
+        try:
+            data = decode_participant(one.payload, vendor)
+        except BadMessage:
+            return
+        builtin = choose_address(data.builtin, source, self.own)
+        user = choose_address(data.user, source, self.own)
+        if data.prefix != prefix or builtin is None or user is None:
+            return
+        if remote and remote.data == data:
+            remote.heard_s = self._now
+        elif remote:
+            remote.data, remote.heard_s = data, self._now
+            if remote.builtin not in data.builtin or remote.user not in data.user:
+                remote.builtin, remote.user = builtin, user
+                self._match_builtin(prefix, remote)
+                for endpoint in remote.endpoints.values():
+                    self._match(endpoint, remote)
+        elif len(self.remotes) < MAX_REMOTES:
+            self.remotes[prefix] = remote = Remote(data, builtin, user, self._now)
+            self._out(self._announcement(prefix), builtin)
+            self._match_builtin(prefix, remote)
+
+    def _match_builtin(self, prefix: bytes, remote: Remote) -> None:
+        has, where, now = remote.data.endpoints, remote.builtin, self._now
+        if has & HAS_PUBLICATIONS_READER:
+            writer = self._builtin_writers[PUBLICATIONS_WRITER]
+            writer.match(prefix + PUBLICATIONS_READER, where, now)
+        if has & HAS_SUBSCRIPTIONS_READER:
+            writer = self._builtin_writers[SUBSCRIPTIONS_WRITER]
+            writer.match(prefix + SUBSCRIPTIONS_READER, where, now)
+        if has & HAS_PUBLICATIONS_WRITER:
+            reader = self._builtin_readers[PUBLICATIONS_READER]
+            reader.match(prefix + PUBLICATIONS_WRITER, where, now)
+        if has & HAS_SUBSCRIPTIONS_WRITER:
+            reader = self._builtin_readers[SUBSCRIPTIONS_READER]
+            reader.match(prefix + SUBSCRIPTIONS_WRITER, where, now)
+
+    def _dispatch(self, prefix: bytes, one: Submessage) -> None:
+        if isinstance(one, AckNack | NackFragments):
+            writer = self._builtin_writers.get(one.writer)
+            if writer is None and (found := self.writers.get(one.writer)):
+                writer = found[0]
+            if writer is None:
+                return
+            if isinstance(one, AckNack):
+                writer.on_acknack(prefix + one.reader, one, self._now)
+            else:
+                writer.on_nack_fragments(prefix + one.reader, one, self._now)
+            return
+        guid = prefix + one.writer
+        for reader in self._readers_for(one.reader, guid):
+            _take(reader, guid, one, self._now)
+
+    def _readers_for(self, entity: bytes, writer: bytes) -> list[ReliableReader]:
+        if entity == UNKNOWN_ENTITY:
+            every = [*self._builtin_readers.values(), *(one for one, _ in self.readers.values())]
+            return [one for one in every if writer in one.writers]
+        if found := self._builtin_readers.get(entity):
+            return [found]
+        return [self.readers[entity][0]] if entity in self.readers else []
+
+    def _on_endpoint(self, writer: bytes, one: Data) -> None:
+        remote = self.remotes.get(writer[:12])
+        if remote is None:
+            return
+        try:
+            guid = one.key or decode_endpoint(one.payload).guid
+            endpoint = None if one.status else decode_endpoint(one.payload)
+        except BadMessage:
+            return
+        if guid[:12] != writer[:12]:
+            return
+        known = remote.endpoints.get(guid)
+        if endpoint is None or (known and known != endpoint):
+            self._unmatch(guid)
+            remote.endpoints.pop(guid, None)
+        if endpoint is None or endpoint.guid != guid or len(remote.endpoints) >= MAX_ENDPOINTS:
+            return
+        if endpoint.topic.startswith(SERVICE_TOPICS):
+            remote.endpoints[guid] = endpoint
+            self._match(endpoint, remote)
+
+    def _match_all(self, data: EndpointData, now: float) -> None:
+        self._now = now
+        for remote in self.remotes.values():
+            for endpoint in remote.endpoints.values():
+                if data.matches(endpoint):
+                    self._match(endpoint, remote)
+
+    def _match(self, endpoint: EndpointData, remote: Remote) -> None:
+        allowed = (*remote.data.user, *remote.data.builtin)
+        hosts = {host for host, _ in allowed}
+        listed = [one for one in endpoint.locators if one[0] in hosts]
+        where = choose_address(listed, remote.user[0], self.own) or remote.user
+        if endpoint.is_writer:
+            for reader, data in self.readers.values():
+                if data.matches(endpoint):
+                    reader.match(endpoint.guid, where, self._now)
+        else:
+            for writer, data in self.writers.values():
+                if data.matches(endpoint):
+                    writer.match(endpoint.guid, where, self._now)
+
+    def _unmatch(self, guid: bytes) -> None:
+        for writer, _ in self.writers.values():
+            writer.unmatch(guid)
+        for reader, _ in self.readers.values():
+            reader.unmatch(guid)
+
+    def _forget(self, prefix: bytes) -> None:
+        remote = self.remotes.pop(prefix)
+        for guid in remote.endpoints:
+            self._unmatch(guid)
+        for entity, writer in self._builtin_writers.items():
+            writer.unmatch(prefix + _COUNTERPARTS[entity])
+        for entity, reader in self._builtin_readers.items():
+            reader.unmatch(prefix + _COUNTERPARTS[entity])
+
+
+_COUNTERPARTS = {
+    PUBLICATIONS_WRITER: PUBLICATIONS_READER,
+    PUBLICATIONS_READER: PUBLICATIONS_WRITER,
+    SUBSCRIPTIONS_WRITER: SUBSCRIPTIONS_READER,
+    SUBSCRIPTIONS_READER: SUBSCRIPTIONS_WRITER,
+}
+
+
+def _take(reader: ReliableReader, guid: bytes, one: Submessage, now: float) -> None:
+    if isinstance(one, Data):
+        reader.on_data(guid, one, now)
+    elif isinstance(one, DataFragments):
+        reader.on_fragments(guid, one, now)
+    elif isinstance(one, Heartbeat):
+        reader.on_heartbeat(guid, one, now)
+    elif isinstance(one, HeartbeatFragments):
+        reader.on_heartbeat_fragments(guid, one, now)
+    elif isinstance(one, Gap):
+        reader.on_gap(guid, one, now)

@@ -1,0 +1,233 @@
+"""Reliable reader of RTPS, as a state machine without sockets or clocks.
+
+Source: OMG DDSI-RTPS 2.3, chapter 8.4. Times are in seconds of any one clock. All memory is
+bounded, whatever a peer sends; the answer to a datagram is at most one datagram.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from gigabrain_zenoh.ros2.rtps_discovery import Address
+from gigabrain_zenoh.ros2.rtps_wire import (
+    WINDOW,
+    AckNack,
+    Data,
+    DataFragments,
+    Gap,
+    Heartbeat,
+    HeartbeatFragments,
+    NackFragments,
+)
+from gigabrain_zenoh.ros2.rtps_writer import Send
+
+MAX_SAMPLE_BYTES, MAX_FRAGMENTS = 1 << 20, 4096
+MAX_EARLY, MAX_EARLY_BYTES = WINDOW, 4 << 20  # samples of one writer that came out of order
+MAX_ASSEMBLIES, ASSEMBLY_S = 8, 5.0  # fragmented samples of a reader that are not complete
+GREET_S, SLOWEST_GREETING_S = 0.5, 8.0  # requests for a first heartbeat: the wait doubles
+MAX_STRANGERS = 256  # writers that have sent heartbeats before they were announced
+ASK_S = 0.005  # a reader asks one writer for missing samples at most so often
+
+
+@dataclass(slots=True, eq=False)
+class _Assembly:
+    """A sample of which not all fragments are here."""
+
+    data: DataFragments
+    at_s: float
+    parts: dict[int, bytes] = field(default_factory=dict)
+
+    @property
+    def total(self) -> int:
+        return -(-self.data.sample_bytes // self.data.fragment_bytes)
+
+    def missing(self) -> tuple[int, ...]:
+        first = next(n for n in range(1, self.total + 1) if n not in self.parts)
+        window = range(first, min(first + WINDOW, self.total + 1))
+        return tuple(number for number in window if number not in self.parts)
+
+
+@dataclass(slots=True, eq=False)
+class _Writer:
+    """A remote writer, as its reader knows it."""
+
+    guid: bytes
+    address: Address
+    next: int = 1  # the sample to deliver next
+    early: dict[int, Data | None] = field(default_factory=dict)  # None: it does not concern us
+    early_bytes: int = 0
+    assemblies: dict[int, _Assembly] = field(default_factory=dict)
+    heard: bool = False
+    wait_s: float = GREET_S
+    due_s: float = 0.0
+    asked_s: float = -1.0
+
+
+class ReliableReader:
+    """A reader that hands on each sample of its matched writers once, in order."""
+
+    def __init__(self, entity: bytes, send: Send, deliver: Callable[[bytes, Data], None]) -> None:
+        """Create a reader with an entity id; `deliver` gets a writer's GUID and its sample."""
+        self.entity = entity
+        self.writers: dict[bytes, _Writer] = {}
+        self._send, self._deliver, self._serial = send, deliver, 0
+        self._strangers: dict[bytes, None] = {}
+
+    def match(self, guid: bytes, address: Address, now: float) -> None:
+        """Add a remote writer, or change its address."""
+        if known := self.writers.get(guid):
+            known.address = address
+            return
+        heard = guid in self._strangers
+        self._strangers.pop(guid, None)
+        self.writers[guid] = writer = _Writer(guid, address, heard=heard)
+        self._greet(writer, now)
+
+    def unmatch(self, guid: bytes) -> None:
+        """Remove a remote writer."""
+        self.writers.pop(guid, None)
+        self._strangers.pop(guid, None)
+
+    def on_data(self, guid: bytes, data: Data, now: float) -> None:
+        """Take a sample."""
+        writer = self.writers.get(guid)
+        if writer is None or data.seq < writer.next or data.seq in writer.early:
+            return
+        writer.assemblies.pop(data.seq, None)
+        if data.seq == writer.next:
+            writer.next += 1
+            self._deliver(guid, data)
+            self._drain(writer)
+            return
+        size = writer.early_bytes + len(data.payload)
+        if data.seq < writer.next + MAX_EARLY and size <= MAX_EARLY_BYTES:
+            writer.early[data.seq], writer.early_bytes = data, size
+        if now - writer.asked_s >= ASK_S:
+            self._ask(writer, data.seq, now)
+
+    def on_fragments(self, guid: bytes, part: DataFragments, now: float) -> None:
+        """Take fragments of a sample, and the sample when all are here."""
+        writer = self.writers.get(guid)
+        if writer is None or part.sample_bytes > MAX_SAMPLE_BYTES:
+            return
+        if part.sample_bytes > MAX_FRAGMENTS * part.fragment_bytes:
+            return
+        if not writer.next <= part.seq < writer.next + MAX_EARLY or part.seq in writer.early:
+            return
+        assembly = writer.assemblies.get(part.seq)
+        if assembly is None or _shape(assembly.data) != _shape(part):
+            if assembly is None and self._assemblies() >= MAX_ASSEMBLIES:
+                return
+            assembly = writer.assemblies[part.seq] = _Assembly(part, now)
+        assembly.at_s = now
+        for number in range(part.first, min(part.first + part.number, assembly.total + 1)):
+            start = (number - part.first) * part.fragment_bytes
+            size = min(part.fragment_bytes, part.sample_bytes - (number - 1) * part.fragment_bytes)
+            piece = part.payload[start : start + size]
+            if len(piece) == size:
+                assembly.parts.setdefault(number, piece)
+        if len(assembly.parts) == assembly.total:
+            whole = b"".join(assembly.parts[n] for n in range(1, assembly.total + 1))
+            related = assembly.data.related or part.related
+            self.on_data(guid, Data(part.reader, part.writer, part.seq, whole, related), now)
+
+    def on_heartbeat(self, guid: bytes, beat: Heartbeat, now: float) -> None:
+        """Ask for what is missing of what the writer has."""
+        writer = self.writers.get(guid)
+        if writer is None:
+            if len(self._strangers) < MAX_STRANGERS:
+                self._strangers[guid] = None
+            return
+        writer.heard = True
+        self._skip(writer, beat.first)  # what the writer no longer has will never come
+        if not beat.final or writer.next <= beat.last:
+            self._ask(writer, beat.last, now)
+
+    def on_heartbeat_fragments(self, guid: bytes, beat: HeartbeatFragments, now: float) -> None:
+        """Ask for the missing fragments of a sample."""
+        writer = self.writers.get(guid)
+        assembly = writer.assemblies.get(beat.seq) if writer else None
+        missing = [n for n in assembly.missing() if n <= beat.last] if assembly else []
+        if writer and missing:
+            self._nack_fragments(writer, beat.seq, tuple(missing))
+
+    def on_gap(self, guid: bytes, gap: Gap, now: float) -> None:
+        """Stop waiting for samples that do not concern this reader."""
+        writer = self.writers.get(guid)
+        if writer is None:
+            return
+        writer.heard = True
+        if gap.start <= writer.next:
+            self._skip(writer, gap.base)
+        window = range(max(gap.start, writer.next), min(gap.base, writer.next + MAX_EARLY))
+        for seq in (*window, *gap.others):
+            if writer.next <= seq < writer.next + MAX_EARLY:
+                writer.early.setdefault(seq, None)
+        self._drain(writer)
+
+    def tick(self, now: float) -> float:
+        """Greet writers that have not answered; return when the next greeting is due."""
+        due = math.inf
+        for writer in self.writers.values():
+            for seq in [s for s, one in writer.assemblies.items() if now - one.at_s > ASSEMBLY_S]:
+                del writer.assemblies[seq]
+            if not writer.heard:
+                if now >= writer.due_s:
+                    self._greet(writer, now)
+                due = min(due, writer.due_s)
+        return due
+
+    def _assemblies(self) -> int:
+        return sum(len(writer.assemblies) for writer in self.writers.values())
+
+    def _greet(self, writer: _Writer, now: float) -> None:
+        writer.due_s = now + writer.wait_s
+        writer.wait_s = min(2 * writer.wait_s, SLOWEST_GREETING_S)
+        self._acknack(writer, (), final=False)
+
+    def _skip(self, writer: _Writer, first: int) -> None:
+        """Deliver what is here of the samples below `first`, and go on with `first`."""
+        if first <= writer.next:
+            return
+        for seq in sorted(seq for seq in writer.early if seq < first):
+            self._take_early(writer, seq)
+        for seq in [seq for seq in writer.assemblies if seq < first]:
+            del writer.assemblies[seq]
+        writer.next = max(writer.next, first)
+        self._drain(writer)
+
+    def _drain(self, writer: _Writer) -> None:
+        while writer.next in writer.early:
+            self._take_early(writer, writer.next)
+
+    def _take_early(self, writer: _Writer, seq: int) -> None:
+        data = writer.early.pop(seq)
+        writer.next = seq + 1
+        writer.assemblies.pop(seq, None)
+        if data is not None:
+            writer.early_bytes -= len(data.payload)
+            self._deliver(writer.guid, data)
+
+    def _ask(self, writer: _Writer, last: int, now: float) -> None:
+        """Acknowledge, and ask for samples up to `last`."""
+        writer.asked_s = now
+        window = range(writer.next, min(last + 1, writer.next + WINDOW))
+        lacking = [seq for seq in window if seq not in writer.early]
+        partial = [seq for seq in lacking if seq in writer.assemblies]
+        self._acknack(writer, tuple(seq for seq in lacking if seq not in partial), final=True)
+        for seq in partial[:1]:
+            self._nack_fragments(writer, seq, writer.assemblies[seq].missing())
+
+    def _acknack(self, writer: _Writer, missing: tuple[int, ...], *, final: bool) -> None:
+        self._serial += 1
+        ack = AckNack(self.entity, writer.guid[12:], writer.next, missing, self._serial, final)
+        self._send(writer.guid[:12], writer.address, [ack])
+
+    def _nack_fragments(self, writer: _Writer, seq: int, missing: tuple[int, ...]) -> None:
+        self._serial += 1
+        nack = NackFragments(self.entity, writer.guid[12:], seq, missing, self._serial)
+        self._send(writer.guid[:12], writer.address, [nack])
+
+
+def _shape(part: DataFragments) -> tuple[int, int]:
+    return part.fragment_bytes, part.sample_bytes

@@ -1,0 +1,150 @@
+"""UDP sockets of a participant of DDS: its two ports, and the group of announcements."""
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import Callable, Sequence
+
+import psutil
+
+from gigabrain_zenoh.errors import BusError
+from gigabrain_zenoh.ros2.rtps_discovery import (
+    MAX_PARTICIPANTS,
+    MULTICAST_GROUP,
+    Address,
+    multicast_port,
+    participant_ports,
+)
+
+LOOPBACK = "127.0.0.1"
+LOCAL_PEERS = 32  # participants of this host that are looked for without multicast, as ROS does
+RECEIVE_BYTES = 1 << 20  # of a socket's buffer
+PEER_EVERY = 8  # announcements to this host's ports, where multicast reaches most of them
+ANY = ""
+
+
+class _Receiver(asyncio.DatagramProtocol):
+    def __init__(self, receive: Callable[[bytes, str], None]) -> None:
+        self._receive = receive
+
+    def datagram_received(self, data: bytes, addr: Address) -> None:
+        self._receive(data, addr[0])
+
+    def error_received(self, exc: Exception) -> None:
+        """Ignore that a peer's port is closed; its lease ends by itself."""
+
+
+class Sockets:
+    """The sockets. Datagrams that cannot be sent are dropped, as those that get lost."""
+
+    def __init__(self, domain: int, *, localhost: bool, peers: Sequence[str]) -> None:
+        """Prepare sockets; `peers` are hosts to announce to by unicast."""
+        self.builtin_port = self.user_port = 0
+        self._domain, self._localhost, self._peers = domain, localhost, peers
+        self._transports: list[asyncio.DatagramTransport] = []
+        self._out: socket.socket | None = None
+        self._group: socket.socket | None = None
+        self._joined: set[str] = set()
+        self._announcements = 0
+
+    async def open(self, receive: Callable[[bytes, str], None]) -> None:
+        """Bind the ports of the first free participant. Raises BusError if there is none."""
+        builtin, user = self._free_pair()
+        self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._out.setblocking(False)
+        self._out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
+        self._out.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, RECEIVE_BYTES)
+        self._group = self._group_socket()
+        for one in (builtin, user, self._group):
+            one.setblocking(False)
+            with contextlib.suppress(OSError):
+                one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BYTES)
+            transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(
+                lambda: _Receiver(receive), sock=one
+            )
+            self._transports.append(transport)
+
+    def close(self) -> None:
+        """Close all sockets; may be called again."""
+        for transport in self._transports:
+            transport.close()
+        if self._out:
+            self._out.close()
+        self._transports, self._out, self._group = [], None, None
+
+    def refresh(self) -> tuple[list[str], list[str]]:
+        """Return this host's IPv4 addresses, to announce and all; join the group on new ones."""
+        own = addresses()
+        outer = [one for one in own if not one.startswith("127.")]
+        for one in own:
+            if self._group and one not in self._joined and not self._localhost:
+                member = socket.inet_aton(MULTICAST_GROUP) + socket.inet_aton(one)
+                with contextlib.suppress(OSError):  # such as a link without multicast
+                    self._group.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
+        self._joined = set(own)
+        return ([LOOPBACK] if self._localhost or not outer else outer), own
+
+    def send(self, datagram: bytes, address: Address) -> None:
+        """Send a datagram, if the network takes it."""
+        if self._out:
+            with contextlib.suppress(OSError):
+                self._out.sendto(datagram, address)
+
+    def announce(self, datagram: bytes) -> None:
+        """Send a datagram to all participants of the domain that can be reached."""
+        if not self._localhost and self._out:
+            for one in sorted(self._joined):
+                with contextlib.suppress(OSError):
+                    self._out.setsockopt(
+                        socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(one)
+                    )
+                    self._out.sendto(datagram, (MULTICAST_GROUP, multicast_port(self._domain)))
+        local = self._localhost or self._announcements < 3 or self._announcements % PEER_EVERY == 0
+        for host in (*self._peers, *([LOOPBACK] if local else [])):
+            for index in range(LOCAL_PEERS):
+                port, _ = participant_ports(self._domain, index)
+                if (host, port) != (LOOPBACK, self.builtin_port):
+                    self.send(datagram, (host, port))
+        self._announcements += 1
+
+    def _free_pair(self) -> tuple[socket.socket, socket.socket]:
+        host = LOOPBACK if self._localhost else ANY
+        for index in range(MAX_PARTICIPANTS):
+            ports = participant_ports(self._domain, index)
+            pair = socket.socket(type=socket.SOCK_DGRAM), socket.socket(type=socket.SOCK_DGRAM)
+            try:
+                for one, port in zip(pair, ports, strict=True):
+                    one.bind((host, port))
+            except OSError:
+                for one in pair:
+                    one.close()
+                continue
+            self.builtin_port, self.user_port = ports
+            return pair
+        first, last = participant_ports(self._domain, 0)[0], ports[1]
+        raise BusError(
+            f"no free UDP ports of DDS domain {self._domain} ({first} to {last}); "
+            "end other ROS 2 programs, or choose another domain"
+        )
+
+    def _group_socket(self) -> socket.socket:
+        group = socket.socket(type=socket.SOCK_DGRAM)
+        group.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if hasattr(socket, "SO_REUSEPORT"):
+            with contextlib.suppress(OSError):
+                group.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        group.bind((ANY, multicast_port(self._domain)))
+        return group
+
+
+def addresses() -> list[str]:
+    """Return the IPv4 addresses of this host's interfaces that are up."""
+    up = {name for name, stats in psutil.net_if_stats().items() if stats.isup}
+    found = {
+        one.address
+        for name, some in psutil.net_if_addrs().items()
+        if name in up
+        for one in some
+        if one.family == socket.AF_INET
+    }
+    return sorted(found)
