@@ -17,7 +17,7 @@ SIDE_BY_SIDE := -n 2 --dist loadfile --max-worker-restart 0
 MAKEFLAGS += --no-print-directory
 
 .PHONY: setup demo lint style rooms types site unit node system check test qa qa-tests extremes dockerfile signals \
-  ci-extra slow first-starts train-tests bench faults soak mutation fuzz golden recordings pictures clean
+  ci-extra slow first-starts train-tests ros2-environment bench faults soak mutation fuzz golden recordings pictures clean
 
 setup: $(WARM)
 
@@ -158,6 +158,10 @@ $(TRAIN)/.installed: pyproject.toml | $(INSTALLED)
 train-tests: $(TRAIN)/.installed
 	JAX_PLATFORMS=cpu $(TRAIN)/bin/python -m pytest --noconftest -W ignore -o addopts=--import-mode=importlib -q \
 	  tests/unit/qa/test_train_judge.py tests/unit/qa/test_train_net.py
+
+# real ROS 2, for the tests that compare with it; they build it themselves where it is missing
+ros2-environment: $(INSTALLED)
+	$(BIN)/python -m tests.ros2.environment $(ARGS)
 
 bench: setup
 	$(BIN)/gigabrain bench chain
