@@ -1,0 +1,104 @@
+"""What the rclpy programs have in common: commands in on stdin, events out on stdout, as JSON.
+
+A command is a line `{"do": name, "id": number, ...}`; the answer is an event with the same name and
+id. A program ends when its stdin does, and by the exception of a command that cannot be obeyed.
+Times are of the monotonic clock, which all processes of a machine share.
+"""
+
+import json
+import os
+import queue
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+Command = Callable[..., Mapping[str, Any] | None]
+_printing = threading.Lock()
+
+
+def say(event: str, **fields: Any) -> None:
+    """Print an event, with the time at which it is printed unless `at_ns` is given."""
+    line = json.dumps({"event": event, "at_ns": time.monotonic_ns()} | fields)
+    with _printing:
+        print(line, flush=True)
+
+
+class Console:
+    """One node, its commands, and the executor that runs both in one thread."""
+
+    def __init__(self, settings: Mapping[str, Any]) -> None:
+        rclpy.init()
+        self.node = Node(settings["node"], namespace=settings.get("namespace", "/"))
+        self.commands: dict[str, Command] = {}
+        self._lines: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._came = self.node.create_guard_condition(self._obey)
+        self._ended = False
+
+    def run(self) -> None:
+        """Obey commands until stdin ends."""
+        executor = SingleThreadedExecutor()
+        executor.add_node(self.node)
+        threading.Thread(target=self._read, daemon=True).start()
+        say("ready", pid=os.getpid())
+        try:
+            while not self._ended:
+                executor.spin_once()
+        except (KeyboardInterrupt, ExternalShutdownException):
+            pass
+        executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown()
+
+    def _read(self) -> None:
+        for line in sys.stdin:
+            self._lines.put(line)
+            self._came.trigger()
+        self._ended = True
+        self._came.trigger()
+
+    def _obey(self) -> None:
+        while not self._lines.empty():
+            command = json.loads(self._lines.get())
+            do, number = command.pop("do"), command.pop("id")
+            answer = self.commands[do](**command) or {}
+            say(do, id=number, **answer)
+
+
+def start() -> Console:
+    """Return a console with the settings that the command line gives as JSON."""
+    return Console(json.loads(sys.argv[1]))
+
+
+def profile(reliable: bool = True, transient_local: bool = False, depth: int = 10) -> QoSProfile:
+    """Return a quality of service."""
+    durability = DurabilityPolicy.TRANSIENT_LOCAL if transient_local else DurabilityPolicy.VOLATILE
+    reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+    return QoSProfile(depth=depth, reliability=reliability, durability=durability)
+
+
+def endpoints(node: Node, topic: str) -> dict[str, list[dict[str, Any]]]:
+    """Return what ROS knows of the publishers and subscribers of a topic."""
+
+    def one(info: Any) -> dict[str, Any]:
+        return {
+            "node": info.node_name,
+            "namespace": info.node_namespace,
+            "type": info.topic_type,
+            "hash": str(info.topic_type_hash),
+            "gid": bytes(info.endpoint_gid).hex(),
+            "reliable": info.qos_profile.reliability == ReliabilityPolicy.RELIABLE,
+            "transient_local": info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+            "depth": info.qos_profile.depth,
+        }
+
+    return {
+        "publishers": [one(info) for info in node.get_publishers_info_by_topic(topic)],
+        "subscribers": [one(info) for info in node.get_subscriptions_info_by_topic(topic)],
+    }

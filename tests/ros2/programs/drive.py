@@ -1,0 +1,74 @@
+"""Publishes commands at a rate, and single messages of any type.
+
+Commands: `drive` and `rest` (Twist or TwistStamped), `publish`, `endpoints`. Each command that is
+sent at a rate is an event `sent`, so that its last one is known where the program was killed.
+"""
+
+from typing import Any
+
+from rclpy.publisher import Publisher
+
+from tests.ros2.programs.console import endpoints, profile, say, start
+from tests.ros2.programs.messages import find, make
+
+TWIST = "geometry_msgs/msg/Twist"
+
+
+def main() -> None:
+    """Run until stdin ends."""
+    console = start()
+    node = console.node
+    publishers: dict[str, Publisher] = {}
+    timers: dict[str, Any] = {}
+
+    def publisher(topic: str, type: str, qos: dict[str, Any]) -> Publisher:
+        if topic not in publishers:
+            publishers[topic] = node.create_publisher(find(type), topic, profile(**qos))
+        return publishers[topic]
+
+    def publish(topic: str, type: str, value: dict[str, Any], **qos: Any) -> None:
+        publisher(topic, type, qos).publish(make(find(type), value))
+
+    def drive(
+        linear: float,
+        angular: float = 0.0,
+        hz: float = 20.0,
+        topic: str = "/cmd_vel",
+        type: str = TWIST,
+        frame: str = "base_link",
+        late_s: float = 0.0,
+    ) -> None:
+        twist = {"linear": {"x": linear}, "angular": {"z": angular}}
+        stamped = type != TWIST
+        message = make(find(type), {"twist": twist} if stamped else twist)
+        to = publisher(topic, type, {})
+
+        def send() -> None:
+            if stamped:
+                now_ns = node.get_clock().now().nanoseconds - int(late_s * 1e9)
+                message.header.frame_id = frame
+                message.header.stamp.sec, message.header.stamp.nanosec = divmod(now_ns, 10**9)
+            say("sent", topic=topic)
+            to.publish(message)
+
+        rest(topic)
+        timers[topic] = node.create_timer(1 / hz, send)
+        send()
+
+    def rest(topic: str = "/cmd_vel") -> None:
+        if topic in timers:
+            node.destroy_timer(timers.pop(topic))
+
+    console.commands |= {
+        "advertise": lambda topic, type, **qos: publisher(topic, type, qos) and None,
+        "publish": publish,
+        "drive": drive,
+        "rest": rest,
+        "readers": lambda topic: {"readers": publishers[topic].get_subscription_count()},
+        "endpoints": lambda topic: endpoints(node, topic),
+    }
+    console.run()
+
+
+if __name__ == "__main__":
+    main()
