@@ -28,6 +28,7 @@ from tests.places import ROOT
 
 FOLDER = Path(os.environ.get("GIGABRAIN_ROS2", ROOT / ".qa/ros2"))  # several checkouts share one
 DEFINITIONS = ROOT / "gigabrain_zenoh/ros2/definitions"
+WITH_ROS = "packages_of_ros"  # in the environment: names that need no generating
 KINDS = ("msg", "srv", "action")
 PLATFORM = ("linux", "x86_64")  # of the wheels
 ROS = ("ros-jazzy-rclpy[fastrtps]==7.1.6", "ros-jazzy-common-interfaces==5.3.6")
@@ -127,8 +128,10 @@ def build(folder: Path = FOLDER, definitions: tuple[Path, ...] = (DEFINITIONS,))
     folder = folder.absolute()
     with locked(folder):
         python = install(folder)
+        with_ros = (folder / WITH_ROS).read_text().split()
         for package in packages(definitions):
-            package.generate(folder)
+            if package.name not in with_ros:
+                package.generate(folder)
     return python
 
 
@@ -156,6 +159,8 @@ def install(folder: Path) -> Path:
     installer = [uv, "pip", "install", "--python"] if uv else []
     by = [*installer, str(python)] if uv else [str(python), "-m", "pip", "install"]
     step("installing the packages", [*by, "--quiet", *wanted])
+    with_ros = [path.parent.name for path in folder.glob("share/*/package.xml")]
+    (folder / WITH_ROS).write_text("\n".join(with_ros))
     built(folder, "packages", inputs)
     return python
 
@@ -169,8 +174,9 @@ class MessagePackage:
         files = [f for kind in KINDS for f in sorted((folder / kind).glob(f"*.{kind}"))]
         self.texts = {f"{f.parent.name}/{f.name}": f.read_text() for f in files}
         found = {name for text in self.texts.values() for name in REFERENCE.findall(text)}
-        if any(name.startswith("action/") for name in self.texts):
-            found.add("action_msgs")
+        kinds = {name.partition("/")[0] for name in self.texts}
+        found |= {"service_msgs"} if "srv" in kinds else set()
+        found |= {"action_msgs"} if "action" in kinds else set()
         self.needs = sorted(found - {self.name})
 
     def generate(self, folder: Path) -> None:
@@ -232,7 +238,7 @@ class MessagePackage:
 
 def packages(definitions: tuple[Path, ...]) -> list[MessagePackage]:
     """Return the packages in folders of definitions, each after those that it needs."""
-    found: dict[str, MessagePackage] = {}
+    found: dict[str, MessagePackage] = {}  # the last one of a name wins
     for folder in definitions:
         if not folder.is_dir():
             raise NotBuilt(f"{folder} is no folder of definitions")
