@@ -58,14 +58,7 @@ class Types:
 
         Arrays of numbers are views of the payload. Raises BadPayload, and nothing else.
         """
-        if not 4 <= len(payload) <= MAX_PAYLOAD or payload[0] or payload[1] > 1:
-            raise BadPayload(f"{name}: no CDR: {len(payload)} bytes, {payload[:4].hex()}…")
-        definition = self._store.get_msgdef(self.known(name))
-        read = definition.deserialize_cdr_le if payload[1] else definition.deserialize_cdr_be
-        try:
-            return read(_body(payload), 0, definition.cls, self._store)[0]
-        except (SerdeError, struct.error, ValueError) as error:
-            raise BadPayload(f"{name}: {error}") from None
+        return decoded(self._store, self.known(name), payload)
 
     def make(self, name: str, /, **fields: Any) -> Any:
         """Make a message; fields that are left out get their defaults, in nested ones as well.
@@ -89,9 +82,14 @@ class Types:
             self._hashes[name] = rihs01(name, self._fields)
         return self._hashes[name]
 
+    def fields(self, name: str) -> Fields:
+        """Return the fields of a message type, as rosbags describes them. Raises ConfigError."""
+        fields: Fields = self._store.fielddefs[self.known(name)][1]
+        return fields
+
     def _fields(self, name: str) -> Fields:
         fields = self._interfaces.get(name)
-        return self._store.fielddefs[self.known(name)][1] if fields is None else fields
+        return self.fields(name) if fields is None else fields
 
     def _add(self, found: Found) -> None:
         messages = found.messages
@@ -109,6 +107,18 @@ class Types:
                 }
         for name in messages:
             self.hash(name)  # raises for a field of an unknown type
+
+
+def decoded(store: Any, name: str, payload: bytes) -> Any:
+    """Return the message in a payload, of a type in a store of rosbags. Raises BadPayload."""
+    if not 4 <= len(payload) <= MAX_PAYLOAD or payload[0] or payload[1] > 1:
+        raise BadPayload(f"{name}: no CDR: {len(payload)} bytes, {payload[:4].hex()}…")
+    definition = store.get_msgdef(name)
+    read = definition.deserialize_cdr_le if payload[1] else definition.deserialize_cdr_be
+    try:
+        return read(_body(payload), 0, definition.cls, store)[0]
+    except (SerdeError, struct.error, ValueError) as error:
+        raise BadPayload(f"{name}: {error}") from None
 
 
 def _body(payload: bytes) -> bytes | memoryview:

@@ -1,0 +1,380 @@
+"""Transport to ROS nodes over DDS: topics by cyclonedds, services by a participant of their own.
+
+cyclonedds calls from its own thread, which only posts to the loop; the loop then takes what the
+reader holds, at most its depth.
+"""
+
+import asyncio
+import functools
+import logging
+from collections import Counter
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any
+
+from cyclonedds._clayer import ddspy_take, ddspy_write
+from cyclonedds.builtin import (
+    BuiltinDataReader,
+    BuiltinTopicDcpsParticipant,
+    BuiltinTopicDcpsPublication,
+    BuiltinTopicDcpsSubscription,
+)
+from cyclonedds.core import DDSException, Entity, InstanceState, Listener, SampleState, ViewState
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy
+from cyclonedds.qos import Qos as DdsQos
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+from gigabrain_zenoh.bus.bridge import Bridge
+from gigabrain_zenoh.config.settings import Ros2Link
+from gigabrain_zenoh.errors import BadPayload, BusError
+from gigabrain_zenoh.ros2.dds_graph import INFO_TOPIC, INFO_TYPE, DdsGraph, DiscoveryInfo
+from gigabrain_zenoh.ros2.dds_types import IdlTypes
+from gigabrain_zenoh.ros2.qos import DEFAULT, MAX_DEPTH, Qos
+from gigabrain_zenoh.ros2.rtps import RequestReply, ServiceType
+from gigabrain_zenoh.ros2.transport import (
+    Answer,
+    Close,
+    GraphEndpoint,
+    OnReaders,
+    OnReceived,
+    Received,
+    absolute,
+)
+from gigabrain_zenoh.ros2.types import Types
+
+log = logging.getLogger(__name__)
+ALL = SampleState.Any | ViewState.Any | InstanceState.Any
+BLOCKING_MS = 1  # that a write waits for a slow reader, as it holds up the loop
+INFO_QOS = Qos(transient_local=True, depth=1)
+LOCALHOST = """<CycloneDDS><Domain Id="any">
+<General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
+<AllowMulticast>false</AllowMulticast></General>
+<Discovery><ParticipantIndex>auto</ParticipantIndex>
+<MaxAutoParticipantIndex>100</MaxAutoParticipantIndex>
+<Peers><Peer Address="127.0.0.1"/></Peers></Discovery>
+</Domain></CycloneDDS>"""
+
+
+class _Heard(Listener):
+    """Posts to the loop that a reader has something, or that a writer's readers changed."""
+
+    def __init__(self, post: Callable[[], None]) -> None:
+        self._post = post
+        Listener.__init__(self)
+
+    def on_data_available(self, reader: object) -> None:
+        """Post; in a thread of cyclonedds."""
+        self._post()
+
+    def on_publication_matched(self, writer: object, status: object) -> None:
+        """Post; in a thread of cyclonedds."""
+        self._post()
+
+
+class DdsPublisher:
+    """A publisher: a writer of cyclonedds."""
+
+    def __init__(self, home: "DdsTransport", writer: Any, on_readers: OnReaders | None) -> None:
+        self.readers = 0
+        self._home, self._writer, self._on_readers = home, writer, on_readers
+        self.gid: bytes = writer.guid.bytes
+
+    def publish(self, payload: bytes) -> None:
+        """Send to all readers; a slow reliable reader can hold it up for a millisecond."""
+        if self._writer and ddspy_write(self._writer._ref, payload) < 0:
+            self._home.counts["not sent"] += 1
+
+    def close(self) -> None:
+        """Withdraw the publisher."""
+        if self._writer:
+            writer, self._writer = self._writer, None
+            self._home.remove(self, writer)
+
+    def count(self, _: object = None) -> None:
+        """Count the readers."""
+        if not self._writer:
+            return
+        readers = int(self._writer.get_publication_matched_status().current_count)
+        if readers != self.readers:
+            self.readers = readers
+            if self._on_readers:
+                self._on_readers(readers)
+
+
+class DdsSubscriber:
+    """A reader of cyclonedds."""
+
+    def __init__(self, home: "DdsTransport", reader: Any, depth: int, handle: OnReceived) -> None:
+        self._home, self._reader, self._depth, self._handle = home, reader, depth, handle
+        self._gids: dict[int, bytes] = {}  # by the handle of a publisher
+        self.gid: bytes = reader.guid.bytes
+
+    def take(self, _: object = None) -> None:
+        """Hand over what the reader holds."""
+        taken = ddspy_take(self._reader._ref, ALL, self._depth) if self._reader else ()
+        if isinstance(taken, int):
+            self._home.counts["not taken"] += 1
+            return
+        for payload, info in taken:
+            if info.valid_data and self._reader:
+                gid = self._gid(info.publication_handle)
+                self._handle(Received(payload, info.source_timestamp, gid))
+
+    def close(self) -> None:
+        """Withdraw the subscriber."""
+        if self._reader:
+            reader, self._reader = self._reader, None
+            self._home.remove(self, reader)
+
+    def _gid(self, handle: int) -> bytes:
+        if handle not in self._gids:
+            if len(self._gids) >= MAX_DEPTH:  # of publishers that came and went
+                self._gids.clear()
+            found = self._reader.get_matched_publication_data(handle)
+            self._gids[handle] = found.key.bytes if found else b""
+        return self._gids[handle]
+
+
+class DdsTransport:
+    """One ROS node, as a participant of a DDS domain."""
+
+    def __init__(self, link: Ros2Link, types: Types) -> None:
+        """Prepare; `link` names domain and node."""
+        self.link, self.types = link, types
+        self.counts: Counter[str] = Counter()
+        self._info = DiscoveryInfo(link.distro)
+        self._idl, self._info_idl = IdlTypes(types.fields), IdlTypes(self._info.fields_of)
+        self._topics: dict[tuple[str, str], Any] = {}
+        self._mine: list[DdsPublisher | DdsSubscriber] = []
+        self._telling = self._closed = False
+        self._kept: list[Entity] = []  # cyclonedds deletes what is not referenced
+
+    async def __aenter__(self) -> "DdsTransport":
+        self._loop = asyncio.get_running_loop()
+        self._bridge = Bridge()
+        self._services = await RequestReply.open(self.link.domain, localhost=self.link.localhost)
+        try:
+            self._open()
+        except DDSException as error:
+            await self._services.close()
+            self._bridge.close()
+            raise BusError(f"DDS domain {self.link.domain} cannot be joined: {error}") from None
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._bridge.close()
+        self._closed = True
+        await self._services.close()
+        await asyncio.to_thread(_delete, self._participant)  # and all that it has
+
+    def publisher(
+        self, topic: str, type: str, qos: Qos = DEFAULT, on_readers: OnReaders | None = None
+    ) -> DdsPublisher:
+        """Declare a publisher. `on_readers` is called from the loop's next turn on."""
+        told: list[DdsPublisher] = []
+        writer = DataWriter(
+            self._participant,
+            self._topic(topic, type),
+            dds_qos(qos, self.types.hash(type)),
+            _Heard(lambda: self._bridge.post(_count, told)),
+        )
+        told.append(DdsPublisher(self, writer, on_readers))
+        self._bridge.post(_count, told)  # it may have been matched before it was known
+        self._add(told[0])
+        return told[0]
+
+    def subscribe(self, topic: str, type: str, qos: Qos, handle: OnReceived) -> Close:
+        """Call `handle` for each message; a busy loop keeps the newest `qos.depth` messages."""
+        told: list[DdsSubscriber] = []
+        post = _Once(self._bridge, functools.partial(_take, told))
+        reader = DataReader(
+            self._participant,
+            self._topic(topic, type),
+            dds_qos(qos, self.types.hash(type)),
+            _Heard(post),
+        )
+        told.append(DdsSubscriber(self, reader, qos.depth, handle))
+        post()
+        self._add(told[0])
+        return told[0].close
+
+    def serve(self, service: str, type: str, handle: Answer) -> Close:
+        """Answer requests of a service, each in a task of its own."""
+        name = absolute(service, self.link.namespace)
+        server = self._services.serve(name, self._service_type(type), handle)
+        self._tell_soon()
+
+        def close() -> None:
+            server.close()
+            self._tell_soon()
+
+        return close
+
+    async def call(self, service: str, type: str, request: bytes, timeout_s: float) -> bytes:
+        """Return the response of the service's server, waiting for it to appear."""
+        name = absolute(service, self.link.namespace)
+        self._tell_soon()
+        return await self._services.call(name, self._service_type(type), request, timeout_s)
+
+    def endpoints(self) -> tuple[GraphEndpoint, ...]:
+        """Return the endpoints of all nodes in the domain."""
+        return self._graph.endpoints()
+
+    def nodes(self) -> tuple[str, ...]:
+        """Return the names of all nodes in the domain."""
+        return self._graph.nodes()
+
+    def remove(self, one: DdsPublisher | DdsSubscriber, entity: Entity) -> None:
+        """Delete an endpoint, in another thread: a writer waits for its readers a while."""
+        self._mine.remove(one)
+        self._loop.run_in_executor(None, _delete, entity)
+        self._tell_soon()
+
+    def _open(self) -> None:
+        if self.link.localhost:
+            self._kept += _localhost(self.link.domain)
+        qos = DdsQos(Policy.Userdata(b"enclave=/;"))
+        self._participant = DomainParticipant(self.link.domain, qos)
+        guid = self._participant.guid.bytes
+        self._graph = DdsGraph(
+            self._info, frozenset({guid[:12], self._services.participant.data.prefix})
+        )
+        self._watch(BuiltinTopicDcpsParticipant, self._graph.participant)
+        self._watch(BuiltinTopicDcpsPublication, lambda s: self._graph.endpoint(s, True))
+        self._watch(BuiltinTopicDcpsSubscription, lambda s: self._graph.endpoint(s, False))
+        topic = Topic(self._participant, INFO_TOPIC, self._info_idl.struct(INFO_TYPE))
+        hash = self.types.hash(INFO_TYPE)
+        self._teller = DataWriter(self._participant, topic, dds_qos(INFO_QOS, hash, own=True))
+        told: list[DdsSubscriber] = []
+        post = _Once(self._bridge, functools.partial(_take, told))
+        qos = dds_qos(INFO_QOS, hash, keep_all=True, own=True)
+        reader = DataReader(self._participant, topic, qos, _Heard(post))
+        told.append(DdsSubscriber(self, reader, MAX_DEPTH, self._told))
+        post()
+        self._kept += [topic, reader]
+        self._tell()
+
+    def _watch(self, topic: Any, take: Callable[[Any], None]) -> None:
+        """Call `take` for each change that DDS knows of participants or endpoints."""
+        readers: list[BuiltinDataReader] = []
+
+        def read() -> None:
+            try:
+                taken = readers[0].take(MAX_DEPTH) if readers else ()
+            except Exception as error:  # noqa: BLE001 - it has no class of its own for bad names
+                self.counts["malformed endpoint"] += 1
+                log.debug("an endpoint cannot be read: %s", error)
+                return
+            for sample in taken:
+                take(sample)
+            if len(taken) == MAX_DEPTH:
+                post()
+
+        post = _Once(self._bridge, read)
+        readers.append(BuiltinDataReader(self._participant, topic, listener=_Heard(post)))
+        self._kept.append(readers[0])
+        post()
+
+    def _told(self, received: Received) -> None:
+        try:
+            self._graph.told(received.payload)
+        except BadPayload as error:
+            self.counts["malformed discovery"] += 1
+            log.debug("%s", error)
+
+    def _topic(self, topic: str, type: str) -> Any:
+        name = f"rt{absolute(topic, self.link.namespace)}"
+        if (name, type) not in self._topics:
+            self._topics[name, type] = Topic(self._participant, name, self._idl.struct(type))
+        return self._topics[name, type]
+
+    def _service_type(self, type: str) -> ServiceType:
+        halves = self.types.hash(f"{type}_Request"), self.types.hash(f"{type}_Response")
+        return ServiceType(type, *halves)
+
+    def _add(self, one: DdsPublisher | DdsSubscriber) -> None:
+        self._mine.append(one)
+        self._tell_soon()
+
+    def _tell_soon(self) -> None:
+        """Tell the others our endpoints once this turn of the loop is over."""
+        if not self._telling:
+            self._telling = True
+            self._loop.call_soon(self._tell)
+
+    def _tell(self) -> None:
+        self._telling = False
+        if self._closed:
+            return
+        readers, writers = self._services.gids()
+        readers += [each.gid for each in self._mine if isinstance(each, DdsSubscriber)]
+        writers += [each.gid for each in self._mine if isinstance(each, DdsPublisher)]
+        payload = self._info.encode(
+            self._participant.guid.bytes, self.link.namespace, self.link.node, readers, writers
+        )
+        ddspy_write(self._teller._ref, payload)
+
+
+class _Once:
+    """Posts a call to the loop, unless one waits there already. From any thread."""
+
+    def __init__(self, bridge: Bridge, function: Callable[[], None]) -> None:
+        self._bridge, self._function = bridge, function
+        self._posted = False
+
+    def __call__(self) -> None:
+        if not self._posted:
+            self._posted = True
+            self._bridge.post(_Once._run, self)
+
+    def _run(self) -> None:
+        self._posted = False  # before reading, so that what arrives from now on posts again
+        self._function()
+
+
+def _count(told: list[DdsPublisher]) -> None:
+    for each in told:
+        each.count()
+
+
+def _take(told: list[DdsSubscriber]) -> None:
+    for each in told:
+        each.take()
+
+
+def dds_qos(qos: Qos, hash: str, *, keep_all: bool = False, own: bool = False) -> DdsQos:
+    """Return cyclonedds's policies; with `own` an endpoint also meets those of its participant."""
+    return DdsQos(
+        Policy.Reliability.Reliable(duration(milliseconds=BLOCKING_MS))
+        if qos.reliable
+        else Policy.Reliability.BestEffort,
+        Policy.Durability.TransientLocal if qos.transient_local else Policy.Durability.Volatile,
+        Policy.History.KeepAll if keep_all else Policy.History.KeepLast(qos.depth),
+        Policy.DurabilityService(0, Policy.History.KeepLast(qos.depth), -1, -1, -1),
+        Policy.DataRepresentation(use_cdrv0_representation=True),
+        Policy.IgnoreLocal.Nothing if own else Policy.IgnoreLocal.Participant,
+        Policy.Userdata(f"typehash={hash};".encode()),
+    )
+
+
+def _delete(entity: Any) -> None:
+    """Delete an entity and all below it, which references from elsewhere may not prevent."""
+    entity._delete(entity._ref)
+
+
+def _localhost(domain: int) -> list[Entity]:
+    """Keep a domain of this process to this host; the first who joins it decides."""
+    try:
+        return [Domain(domain, LOCALHOST)]
+    except DDSException as error:
+        log.debug("DDS domain %d is open already: %s", domain, error)
+        return []

@@ -1,0 +1,40 @@
+"""Opens the transport that a configuration names; its libraries are imported then, not before."""
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from importlib.util import find_spec
+from pathlib import Path
+
+from gigabrain_zenoh.config.settings import Endpoint, Ros2Link
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.ros2.transport import RosTransport
+from gigabrain_zenoh.ros2.types import Types
+
+
+def load_types(link: Ros2Link) -> Types:
+    """Load all types, those of the user's files as well. Raises ConfigError."""
+    return Types(Path(each).expanduser() for each in link.types)
+
+
+@asynccontextmanager
+async def open_transport(
+    link: Ros2Link, types: Types, endpoint: Endpoint | None = None
+) -> AsyncIterator[RosTransport]:
+    """Open a node, and close it at the end of the context.
+
+    `endpoint` is the deployment's own, for `rmw_zenoh` without a router of its own. Raises
+    ConfigError where a library or a router is missing, BusError where the domain cannot be joined.
+    """
+    made: RosTransport
+    if link.transport == "dds":
+        if not find_spec("cyclonedds"):
+            raise ConfigError("transport: dds needs more: pip install 'gigabrain-zenoh[dds]'")
+        from gigabrain_zenoh.ros2.dds import DdsTransport
+
+        async with DdsTransport(link, types) as made:
+            yield made
+    else:
+        from gigabrain_zenoh.ros2.rmw_zenoh import RmwZenohTransport
+
+        async with RmwZenohTransport(link, types, endpoint) as made:
+            yield made
