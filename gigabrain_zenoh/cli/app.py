@@ -41,6 +41,7 @@ COMMANDS = {
     "page": ("views:page", "Serve the operator page: the robot in a browser."),
     "view": ("views:view", "Open a live window of the simulation, or save a picture of it."),
     "foxglove": ("views:foxglove", "Show the robot live in Foxglove or Lichtblick."),
+    "ros2": ("ros2:ros2", "Run the gateway to ROS 2: the robot becomes a node there."),
     "why": ("diagnose:why", "Say why the robot does not move."),
     "doctor": ("diagnose:doctor", "Check this machine and the robot, and say what to fix."),
     "top": ("node:top", "Watch processes and topics live."),

@@ -27,6 +27,7 @@ ASK_NS = 500 * MS  # from one request for the body to the next
 INTERVALS = 9  # of a sender, for their median
 MAX_SENDERS = 8
 FRAMES = ("", "base_link", "base_footprint")  # in which a body can be commanded
+NO_ROBOT = "no state from the robot; check that its driver runs"
 PAUSE = "send zero, or pause for 0.5 s, before it may drive again"
 
 
@@ -77,7 +78,8 @@ class Memory(Struct, frozen=True, kw_only=True):
     asked_ns: int = -ASK_NS
     blocked: str = ""  # why the sender has to pause first
     velocity: Velocity = ZERO
-    last_ns: int = -RELEASE_NS  # when the newest command was sent, as far as it is known
+    heard_ns: int = -RELEASE_NS  # when any command came, also one that was refused
+    last_ns: int = -RELEASE_NS  # when the newest good one was sent, as far as it is known
     period_ns: int = TIMEOUT_NS  # of its sender
     senders: tuple[Sender, ...] = ()  # the newest last
     refusal: str = ""  # why commands are refused now; empty if they are not
@@ -107,13 +109,15 @@ Step = tuple[Memory, tuple[Action, ...]]
 
 def arrive(config: Config, limits: Limits, memory: Memory, wanted: Wanted, now: Now) -> Step:
     """Process a command of ROS."""
+    paused = now.ns - memory.heard_ns >= RELEASE_NS
+    memory = replace(memory, heard_ns=now.ns)
     code, text = _fault(config, wanted, now)
     if code == "not_finite":  # its sender is out of order: brake
         memory = replace(memory, velocity=ZERO, refusal=text)
         return memory, (Refuse(code), *((Send(ZERO),) if memory.holds else ()))
     if code:
         return replace(memory, refusal=text), (Refuse(code),)
-    sender, paused = _next(memory, wanted, now)
+    sender = _next(memory, wanted, now)
     late_ns = now.ros_ns - wanted.stamp_ns if wanted.stamp_ns else sender.lateness.now_ns
     memory = replace(memory, senders=_kept(memory.senders, sender))
     if late_ns > config.timeout_ns:
@@ -139,8 +143,10 @@ def observe(config: Config, memory: Memory, state: RobotState, now: Now) -> Step
     if state.gate.mode == "latched" and not _is_old(memory):
         memory = replace(memory, blocked=f"the robot was latched; {PAUSE}")
     since_ns = now.ns - memory.last_ns
+    if now.ns - memory.heard_ns >= RELEASE_NS:
+        memory = replace(memory, refusal="")
     if since_ns >= RELEASE_NS:
-        return replace(memory, holds=False, velocity=ZERO, refusal=""), ()
+        return replace(memory, holds=False, velocity=ZERO), ()
     if not memory.holds:
         return memory, ()
     if not _mine(config, memory):
@@ -166,12 +172,21 @@ def forget(memory: Memory, why: str) -> Memory:
     return replace(memory, holds=False, velocity=ZERO, blocked=f"{why}; {PAUSE}")
 
 
+def silent(memory: Memory, now: Now) -> Step:
+    """Process a command of ROS while the robot is silent: a lease is over."""
+    blocked = f"the robot was silent; {PAUSE}" if memory.holds else memory.blocked
+    memory = replace(
+        memory, gate=None, holds=False, velocity=ZERO, heard_ns=now.ns,
+        blocked=blocked, refusal=NO_ROBOT,
+    )  # fmt: skip
+    return memory, (Refuse("no_robot"),)
+
+
 def _obey(config: Config, memory: Memory, now: Now) -> Step:
     """Send the newest command, or ask for the body with which to."""
     gate = memory.gate
     if gate is None:
-        text = "no state from the robot; check that its driver runs"
-        return replace(memory, refusal=text), (Refuse("no_robot"),)
+        return silent(memory, now)
     if memory.holds:
         return replace(memory, refusal=""), (Send(memory.velocity),)
     if memory.velocity == ZERO:
@@ -235,15 +250,14 @@ def _fault(config: Config, wanted: Wanted, now: Now) -> tuple[str, str]:
     return "", ""
 
 
-def _next(memory: Memory, wanted: Wanted, now: Now) -> tuple[Sender, bool]:
-    """Return the sender with this command, and whether all senders had paused before it."""
-    paused = now.ns - memory.last_ns >= RELEASE_NS
+def _next(memory: Memory, wanted: Wanted, now: Now) -> Sender:
+    """Return the sender with this command."""
     known = next((one for one in memory.senders if one.id == wanted.sender), None)
     lateness = (known.lateness if known else Lateness()).then(wanted.sent_ns, now.unix_ns, now.ns)
     if known is None or now.ns - known.last_ns >= RELEASE_NS:
-        return Sender(wanted.sender, now.ns, (), lateness), paused
+        return Sender(wanted.sender, now.ns, (), lateness)
     intervals = (*known.intervals, now.ns - known.last_ns)[-INTERVALS:]
-    return Sender(wanted.sender, now.ns, intervals, lateness), paused
+    return Sender(wanted.sender, now.ns, intervals, lateness)
 
 
 def _kept(senders: tuple[Sender, ...], newest: Sender) -> tuple[Sender, ...]:

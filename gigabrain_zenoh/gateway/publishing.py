@@ -10,6 +10,7 @@ from gigabrain_schemas.body import Body, Camera, RobotState
 from gigabrain_schemas.tasks import TaskStatus
 from gigabrain_schemas.topics import BODY, DEPTH, IMAGE, IMU, MAP, SCAN, STATE, TASK, Topic
 from gigabrain_zenoh.bus.transport import Close
+from gigabrain_zenoh.config.settings import Ros2Config
 from gigabrain_zenoh.gateway.conversions import body as of_body
 from gigabrain_zenoh.gateway.conversions import maps, sensors
 from gigabrain_zenoh.gateway.conversions.description import robot_description
@@ -23,7 +24,7 @@ from gigabrain_zenoh.gateway.conversions.frames import (
     tf_static,
     transforms,
 )
-from gigabrain_zenoh.gateway.scene import Scene
+from gigabrain_zenoh.gateway.scene import Scene, left_out
 from gigabrain_zenoh.logs import Fault
 from gigabrain_zenoh.ros2.qos import DEFAULT, LATCHED, SENSOR_DATA, Qos
 from gigabrain_zenoh.ros2.transport import RosPublisher, RosTransport
@@ -160,11 +161,8 @@ class _Published:
 class Publishing:
     """Publishers of all rows; one without readers neither receives nor encodes anything."""
 
-    def __init__(
-        self, scene: Scene, ros: RosTransport, types: Types, leave_out: tuple[str, ...] = ()
-    ) -> None:
-        self._scene, self._ros, self._types = scene, ros, types
-        self._leave_out = {name.strip("/") for name in leave_out}
+    def __init__(self, scene: Scene, ros: RosTransport, types: Types, config: Ros2Config) -> None:
+        self._scene, self._ros, self._types, self._config = scene, ros, types, config
         self._cameras: tuple[Camera, ...] = ()
         self._of_cameras: list[_Published] = []
         self._fault, self._closed = Fault(log), False
@@ -203,7 +201,7 @@ class Publishing:
 
     def _open(self, row: Row) -> _Published:
         one = _Published(row)
-        if row.topic not in self._leave_out:
+        if not left_out(self._config, row.topic):
             count = functools.partial(self._count, one)
             one.publisher = self._ros.publisher(row.topic, row.type, row.qos, count)
         return one

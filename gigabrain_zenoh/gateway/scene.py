@@ -9,10 +9,16 @@ from gigabrain_schemas.brain import PoseInMap
 from gigabrain_schemas.topics import BODY, POSE, STATE, Topic
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import Close
+from gigabrain_zenoh.config.settings import Ros2Config
 from gigabrain_zenoh.geometry.pose import PoseHistory, compose, inverse
 
 M = TypeVar("M", bound=Message)
 Handle = Callable[[Any], None]
+
+
+def left_out(config: Ros2Config, name: str) -> bool:
+    """Return whether the settings leave out a ROS topic, service or action."""
+    return name in {one.strip("/") for one in config.leave_out}
 
 
 class Feeds:

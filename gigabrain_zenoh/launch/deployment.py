@@ -26,6 +26,7 @@ from gigabrain_zenoh.config.settings import (
     RecognizerConfig,
     RecorderConfig,
     Resume,
+    Ros2Config,
     Seed,
     Speed,
     TagConfig,
@@ -81,6 +82,7 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     recorder: RecorderConfig = RecorderConfig()
     page: PageConfig = PageConfig()
     foxglove: FoxgloveConfig = FoxgloveConfig()
+    ros2: Ros2Config | None = None  # the gateway to ROS 2, beside the driver unless `hosts` has it
     # of one's own; where there is one host, it runs those that `hosts` does not name
     processes: dict[OwnName, OwnProcess] = {}
     perceptors: dict[OwnName, OwnPerceptor] = {}
@@ -209,7 +211,10 @@ def with_keys(loaded: Deployment, path: Path, keys: str = "") -> Deployment:
     if loaded.keys and not keys:
         keys = str(path.absolute().parent / Path(loaded.keys).expanduser())
     folder = path.absolute().parent
-    net = loaded.recognizer
+    net, ros2 = loaded.recognizer, loaded.ros2
+    if ros2:
+        own = tuple(str(folder / Path(file).expanduser()) for file in ros2.types)
+        ros2 = structs.replace(ros2, types=own)
     files = {name: getattr(net, name) for name in NET_FILES}
     there = {name: str(folder / Path(file).expanduser()) for name, file in files.items() if file}
     return structs.replace(
@@ -217,6 +222,7 @@ def with_keys(loaded: Deployment, path: Path, keys: str = "") -> Deployment:
         keys=keys,
         world=config.beside(loaded.world, folder),
         recognizer=structs.replace(net, **there),
+        ros2=ros2,
     )
 
 

@@ -72,6 +72,7 @@ class ProcessType:
     repeats: bool = False  # can be replayed, so it publishes which input it used
     optional: bool = False  # the robot goes on without it, also where its settings are wrong
     looks_on: bool = False  # not needed by the robot: naps, and runs at low priority
+    prompt: bool = False  # carries requests for others: runs at normal priority, though `own`
     # identities with which a host may run it; `process` is one of its own, in a subfolder of the
     # host's that has the name of the process
     roles: tuple[Role, ...] = ("process",)
@@ -125,7 +126,7 @@ def run(config: ProcessConfig, load: Load, make_bus: MakeBus = Bus) -> int:
         process_type, node = load(config)
         if process_type.stops:
             go_first()  # like the other branches, before any thread starts: threads inherit it
-        elif process_type.looks_on or process_type.own:
+        elif process_type.looks_on or (process_type.own and not process_type.prompt):
             step_aside()
         else:
             start_first()

@@ -14,7 +14,18 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from msgspec import structs
 
-from gigabrain_schemas.topics import Role
+from gigabrain_schemas.topics import (
+    CMD_VEL,
+    ENABLE,
+    ESTOP,
+    GOAL,
+    MAP_SAVE,
+    MISSION,
+    POSE_SET,
+    RELEASE,
+    TASK_CHANGE,
+    Role,
+)
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.zenoh.config import router_config
 from gigabrain_zenoh.config.renames import renamed_settings
@@ -31,6 +42,7 @@ from gigabrain_zenoh.config.settings import (
     RecognitionConfig,
     RecorderConfig,
     RelayConfig,
+    Ros2Config,
     RouterConfig,
 )
 from gigabrain_zenoh.errors import ConfigError
@@ -49,6 +61,16 @@ if TYPE_CHECKING:
 GROUP = "gigabrain.processes"
 OPERATED: tuple[Role, ...] = ("robot", "operator")
 MEET = {"perception", "decision"}  # each runs once per robot, so there is one relay at most
+ROS_WRITES = tuple(
+    one.key
+    for one in (
+        CMD_VEL, ESTOP, RELEASE, ENABLE, GOAL, MISSION, TASK_CHANGE, POSE_SET, MAP_SAVE,
+    )
+)  # fmt: skip
+ROUTER_FOR_ROS = (
+    "ros2: nodes of ROS have no identity at a router with keys; name another one as "
+    "`router:`, or use `transport: dds`"
+)
 AT_THE_ROBOT = {"router", "driver"}  # no relay between them: a body without its router must stop
 
 
@@ -112,6 +134,22 @@ def _recorder(deployment: "Deployment", _: ProcessPlace) -> RecorderConfig:
     plain["speed"] = f"{deployment.speed:g}"
     notes |= plain | deployment.recorder.notes
     return structs.replace(deployment.recorder, notes=notes)
+
+
+def _ros2(deployment: "Deployment", place: ProcessPlace) -> Ros2Config:
+    """Return the gateway's settings; its ROS router is the robot's own unless they name one."""
+    config = deployment.ros2 or Ros2Config()
+    if config.transport != "rmw_zenoh" or config.router:
+        return config
+    if place.endpoint.keys:
+        raise ConfigError(ROUTER_FOR_ROS)
+    return structs.replace(config, router=place.endpoint.connect[-1])
+
+
+def _needs_ros2(deployment: "Deployment", here: set[str]) -> bool:
+    """Return whether the gateway to ROS runs beside the driver: unless `hosts` places it."""
+    placed = any("ros2" in names for names in deployment.hosts.values())
+    return deployment.ros2 is not None and "driver" in here and not placed
 
 
 def _needs_relay(_: "Deployment", here: set[str]) -> bool:
@@ -239,6 +277,15 @@ PROCESSES: Mapping[str, ProcessType] = {
     ),
     "foxglove": ProcessType(
         "gigabrain_zenoh.ui.foxglove.node:run", FoxgloveConfig, looks_on=True, roles=OPERATED
+    ),
+    "ros2": ProcessType(
+        "gigabrain_zenoh.gateway.node:run",
+        Ros2Config,
+        derive=_ros2,
+        joins=_needs_ros2,
+        optional=True,
+        prompt=True,
+        writes=ROS_WRITES,
     ),
     "recorder": ProcessType(
         "gigabrain_zenoh.recording.node:run",

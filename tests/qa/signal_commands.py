@@ -37,6 +37,7 @@ CALLS = {
     "teleop": "teleop --take",
     "page": "page --port {port}",
     "foxglove": "foxglove --port {port}",
+    "ros2": "ros2",
     "audit": "audit --follow",
     "topic list": "topic list",
     "topic echo": "topic echo state",

@@ -19,6 +19,7 @@ from gigabrain_zenoh.gateway.commander import (
     arrive,
     forget,
     observe,
+    silent,
 )
 from gigabrain_zenoh.geometry.limits import limits_of
 from gigabrain_zenoh.testing import samples
@@ -110,6 +111,33 @@ def test_while_another_commander_drives_commands_are_refused_and_say_who():
 def test_without_a_state_of_the_robot_commands_are_refused():
     machine = Machine()
     assert machine.command() == [Refuse("no_robot")]
+
+
+def test_a_robot_that_was_silent_is_driven_again_only_after_a_pause():
+    machine = Machine()
+    machine.drives()
+    for _ in range(20):
+        machine.ms += 50
+        machine.memory, actions = silent(machine.memory, machine.now)
+        assert actions == (Refuse("no_robot"),)
+    machine.ms += 50
+    machine.state(replace(IDLE, enables=9))
+    assert machine.command() == [Refuse("commander")]
+    assert "the robot was silent" in machine.memory.refusal
+    machine.command(0.0)
+    assert machine.command() == [Ask(False)]
+
+
+def test_a_refusal_is_named_as_long_as_commands_come():
+    machine = Machine()
+    machine.state()
+    for _ in range(20):
+        machine.ms += 50
+        assert machine.command(age_ms=3000) == [Refuse("stale")]
+        machine.state()
+        assert "3.00 s old" in machine.memory.refusal
+    machine.sends(520)
+    assert machine.memory.refusal == ""
 
 
 def test_a_refusal_of_the_gate_is_kept_and_asked_again_after_half_a_second():

@@ -1,0 +1,229 @@
+"""Commands of ROS on the bus: /cmd_vel by the commander, and the poses that RViz publishes."""
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable, Coroutine, Iterable
+from typing import Any
+
+from msgspec.structs import asdict
+
+from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.requests import PoseRequest
+from gigabrain_schemas.tasks import GoalRequest
+from gigabrain_schemas.topics import GOAL, POSE_SET, command_topic
+from gigabrain_zenoh.client.requests import ANSWER_S, enable
+from gigabrain_zenoh.client.tasks import PLAN_S
+from gigabrain_zenoh.config.settings import Ros2Config
+from gigabrain_zenoh.errors import BadPayload, GigabrainError, Refused
+from gigabrain_zenoh.gateway import commander
+from gigabrain_zenoh.gateway.commander import Action, Ask, Memory, Now, Refuse, Send, wanted_of
+from gigabrain_zenoh.gateway.conversions.diagnostics import Level, Status
+from gigabrain_zenoh.gateway.conversions.frames import MAP, stamp_ns
+from gigabrain_zenoh.gateway.conversions.maps import in_map, planar, planar_covariance
+from gigabrain_zenoh.gateway.scene import Scene, left_out
+from gigabrain_zenoh.geometry.limits import limits_of
+from gigabrain_zenoh.logs import Fault
+from gigabrain_zenoh.ros2.qos import DEFAULT, Qos
+from gigabrain_zenoh.ros2.transport import Received, RosTransport
+from gigabrain_zenoh.ros2.types import Types
+
+log = logging.getLogger(__name__)
+COMMANDS = Qos(reliable=False, depth=1)  # matches every publisher; only the newest counts
+TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+POSE, GUESS = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
+
+
+class Background:
+    """Tasks that answer ROS; one that fails unexpectedly ends the process."""
+
+    def __init__(self) -> None:
+        self._tasks: set[asyncio.Task[None]] = set()
+        self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+
+    def start(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Start a task."""
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._done)
+        return task
+
+    def close(self) -> None:
+        """Cancel all tasks."""
+        for task in self._tasks:
+            task.cancel()
+
+    def _done(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) and not self.failed.done():
+            self.failed.set_exception(error)
+
+
+class RosCommander:
+    """Listens to /cmd_vel, and is one commander of the robot's gate."""
+
+    def __init__(
+        self, scene: Scene, ros: RosTransport, types: Types, config: Ros2Config, work: Background
+    ) -> None:
+        self._scene, self._types, self._work = scene, types, work
+        self._bus, self._bad = scene.bus, Fault(log)
+        self._config = commander.Config(
+            name=scene.bus.process,
+            take=config.take,
+            timeout_ns=round(config.cmd_vel_timeout * 1e9),
+        )
+        self._memory, self._refused = Memory(), Fault(log)
+        scene.on_state.append(self._observe)
+        if not left_out(config, "cmd_vel"):
+            ros.subscribe("cmd_vel", TWIST, COMMANDS, self._on_twist)
+            ros.subscribe("cmd_vel", STAMPED, COMMANDS, self._on_stamped)
+
+    @property
+    def holds(self) -> bool:
+        """Whether it has the body."""
+        return self._memory.holds
+
+    def forget(self, why: str) -> None:
+        """Stop commanding at once, until its sender has paused."""
+        self._memory = commander.forget(self._memory, why)
+
+    def status(self) -> Status:
+        """Return a line of diagnostics: who may drive, and why a command is refused."""
+        counters = self._bus.counters
+        values = {key: n for key, n in counters.items() if key.startswith("cmd_vel_")}
+        if self._memory.refusal:
+            return Status("cmd_vel", Level.WARN, f"refused: {self._memory.refusal}", values)
+        return Status("cmd_vel", Level.OK, "drives" if self.holds else "no commands", values)
+
+    def _on_twist(self, received: Received) -> None:
+        twist = self._decoded(TWIST, received)
+        if twist is not None:
+            self._arrive(wanted_of(twist, received.gid, received.source_ns))
+
+    def _on_stamped(self, received: Received) -> None:
+        message = self._decoded(STAMPED, received)
+        if message is None:
+            return
+        wanted = wanted_of(message.twist, received.gid, received.source_ns)
+        at = stamp_ns(message.header.stamp)
+        self._arrive(wanted._replace(stamp_ns=at, frame=message.header.frame_id))
+
+    def _decoded(self, name: str, received: Received) -> Any | None:
+        try:
+            message = self._types.decode(name, received.payload)
+        except BadPayload as error:
+            self._bus.counters["cmd_vel_broken"] += 1
+            self._bad.begin(f"dropped a message on cmd_vel: {error}")
+            return None
+        self._bad.end("cmd_vel can be decoded again")
+        return message
+
+    def _arrive(self, wanted: commander.Wanted) -> None:
+        about = self._scene.description
+        if about is None or self._scene.fresh_state is None:
+            self._memory, actions = commander.silent(self._memory, self._now())
+            self._act(actions)
+            return
+        limits, now = limits_of(about), self._now()
+        self._memory, actions = commander.arrive(self._config, limits, self._memory, wanted, now)
+        self._act(actions)
+
+    def _observe(self, state: RobotState) -> None:
+        self._memory, actions = commander.observe(self._config, self._memory, state, self._now())
+        self._act(actions)
+
+    def _now(self) -> Now:
+        clock = self._bus.clock
+        return Now(clock.now_ns(), self._scene.ros_ns(), clock.unix_ns())
+
+    def _act(self, actions: Iterable[Action]) -> None:
+        for action in actions:
+            match action:
+                case Send(velocity):
+                    about = self._scene.description
+                    assert about
+                    command = CmdVel(**asdict(velocity), source=self._config.name)
+                    self._bus.publish(command_topic(about), command)
+                case Ask(take):
+                    self._work.start(self._ask(take=take))
+                case Refuse(code):
+                    self._bus.counters[f"cmd_vel_{code}"] += 1
+        if self._memory.refusal:
+            self._refused.begin(f"refused /cmd_vel: {self._memory.refusal}")
+        else:
+            self._refused.end("/cmd_vel is obeyed, or silent")
+
+    async def _ask(self, *, take: bool) -> None:
+        gate, text = None, ""
+        try:
+            gate = (await enable(self._bus, self._config.name, take=take)).gate
+        except GigabrainError as error:
+            text = str(error)
+        now = self._now()
+        self._memory, actions = commander.answer(self._config, self._memory, gate, text, now)
+        self._act(actions)
+
+
+class PoseRequests:
+    """Passes on the poses that RViz publishes: where the robot is, and where it shall go."""
+
+    def __init__(
+        self, scene: Scene, ros: RosTransport, types: Types, config: Ros2Config, work: Background
+    ) -> None:
+        self._scene, self._types, self._work = scene, types, work
+        self.problems: dict[str, str] = {}  # the last refusal, by topic; gone once one is accepted
+        for topic, name, ask in (
+            ("initialpose", GUESS, self._initial_pose),
+            ("goal_pose", POSE, self._goal),
+        ):
+            if not left_out(config, topic):
+                ros.subscribe(topic, name, DEFAULT, self._handler(topic, name, ask))
+
+    def status(self) -> list[Status]:
+        """Return lines of diagnostics for what was refused last."""
+        return [Status(topic, Level.WARN, f"refused: {text}")
+                for topic, text in self.problems.items()]  # fmt: skip
+
+    def _handler(
+        self, topic: str, name: str, ask: Callable[[Any], Awaitable[str]]
+    ) -> Callable[[Received], None]:
+        async def answer(payload: bytes) -> None:
+            try:
+                text = await ask(self._types.decode(name, payload))
+            except GigabrainError as error:
+                self.problems[topic] = str(error)
+                self._scene.bus.counters[f"{topic}_refused"] += 1
+                log.warning("refused /%s: %s", topic, error)
+            else:
+                self.problems.pop(topic, None)
+                log.info("/%s: %s", topic, text)
+
+        def handle(received: Received) -> None:
+            self._work.start(answer(received.payload))
+
+        return handle
+
+    async def _initial_pose(self, message: Any) -> str:
+        frame, guess = message.header.frame_id, message.pose
+        if frame != MAP:
+            raise Refused(f"frame {frame!r} is not that of a first pose; expected {MAP}")
+        at, covariance = planar(guess.pose), planar_covariance(guess.covariance)
+        bus = self._scene.bus
+        request = PoseRequest(x=at.x, y=at.y, yaw=at.yaw, covariance=covariance, source=bus.process)
+        replies = await bus.ask(POSE_SET, request, timeout_s=ANSWER_S)
+        if not replies:
+            raise Refused("no process localizes; run perception with mapping: slam or localize")
+        if not replies[0].ok:
+            raise Refused(replies[0].text)
+        return replies[0].text
+
+    async def _goal(self, message: Any) -> str:
+        at = in_map(message.header.frame_id, planar(message.pose), self._scene.odom_in_map)
+        bus = self._scene.bus
+        request = GoalRequest(x=at.x, y=at.y, yaw=at.yaw, source=bus.process)
+        replies = await bus.ask(GOAL, request, timeout_s=PLAN_S)
+        if not replies:
+            raise Refused("no process serves goals; run decision with behaviour: navigate")
+        if not replies[0].ok:
+            raise Refused(replies[0].text)
+        return replies[0].text

@@ -1,0 +1,85 @@
+"""All that one robot offers to ROS, on an open transport."""
+
+import asyncio
+import logging
+from collections.abc import Callable
+
+from gigabrain_schemas.base import Cause
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.config.settings import Ros2Config
+from gigabrain_zenoh.gateway.conversions.diagnostics import Level, Status
+from gigabrain_zenoh.gateway.diagnosing import Diagnosing
+from gigabrain_zenoh.gateway.driving import Background, PoseRequests, RosCommander
+from gigabrain_zenoh.gateway.parameters import Parameters
+from gigabrain_zenoh.gateway.publishing import Publishing
+from gigabrain_zenoh.gateway.scene import Scene
+from gigabrain_zenoh.gateway.services import Services
+from gigabrain_zenoh.ros2.transport import RosTransport
+from gigabrain_zenoh.ros2.types import Types
+
+log = logging.getLogger(__name__)
+PERIOD_NS = 1_000_000_000
+REMEDY = "see /diagnostics in ROS, or `gigabrain log --process ros2`"
+
+
+class Gateway:
+    """The parts of the gateway, and what runs beside the messages."""
+
+    def __init__(self, config: Ros2Config, bus: Bus, ros: RosTransport, types: Types) -> None:
+        self._bus, self._ros = bus, ros
+        self.scene, self.work = Scene(bus), Background()
+        scene, work = self.scene, self.work
+        self.publishing = Publishing(scene, ros, types, config)
+        self.commander = RosCommander(scene, ros, types, config, work)
+        self.poses = PoseRequests(scene, ros, types, config, work)
+        self.services = Services(scene, ros, types, config, self.commander)
+        self.parameters = Parameters(ros, types, config, lambda: scene.simulated)
+        self.diagnosing = Diagnosing(scene, ros, types, self._statuses)
+
+    def close(self) -> None:
+        """End what runs for ROS; a body that it drives is stopped by the gate."""
+        self.publishing.close()
+        self.work.close()
+
+    async def run(self) -> None:
+        """Publish diagnostics, and report to the robot's own tools, until cancelled."""
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self.diagnosing.run())
+            tasks.create_task(self._report())
+            tasks.create_task(self._failure())
+
+    async def _failure(self) -> None:
+        await self.work.failed
+
+    async def _report(self) -> None:
+        """Put into health what ROS wants and does not get, once a second."""
+        async for _ in self._bus.clock.every(PERIOD_NS):
+            self._bus.problems = tuple(
+                Cause(code=f"ros2_{one.name}", text=f"/{one.name}: {one.text}"[:500], remedy=REMEDY)
+                for one in self._statuses()
+                if one.level is not Level.OK
+            )
+            for reason, count in self._ros.counts.items():
+                self._bus.counters[f"ros_{reason}"] = count
+
+    def _statuses(self) -> list[Status]:
+        return [self.commander.status(), *self.poses.status()]
+
+
+async def serve(
+    config: Ros2Config, bus: Bus, ros: RosTransport, types: Types, ready: Callable[[], None]
+) -> None:
+    """Serve ROS until the process ends."""
+    gateway = Gateway(config, bus, ros, types)
+    running = asyncio.ensure_future(gateway.run())
+    try:
+        log.info("node %s on %s, domain %d", config.node, config.transport, config.domain)
+        ready()
+        await asyncio.wait((running, bus.failed), return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        gateway.close()
+        running.cancel()
+        await asyncio.wait((running,))
+    for end in (running, bus.failed):
+        if end.done() and not end.cancelled():
+            end.result()

@@ -1,0 +1,232 @@
+"""Nav2's actions on our tasks: navigate_to_pose is a goal, navigate_through_poses a mission."""
+
+import asyncio
+import contextlib
+import itertools
+import logging
+import math
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import msgspec
+
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.brain import OccupancyGrid
+from gigabrain_schemas.tasks import Task, TaskStatus
+from gigabrain_schemas.topics import MAP
+from gigabrain_zenoh.client.tasks import Tasks
+from gigabrain_zenoh.codec import Codec
+from gigabrain_zenoh.errors import GigabrainError, Refused
+from gigabrain_zenoh.gateway import result_codes
+from gigabrain_zenoh.gateway.conversions.frames import MAP as MAP_FRAME
+from gigabrain_zenoh.gateway.conversions.frames import Make, pose_stamped
+from gigabrain_zenoh.gateway.conversions.maps import in_map, planar
+from gigabrain_zenoh.gateway.result_codes import Codes
+from gigabrain_zenoh.gateway.scene import Scene
+
+log = logging.getLogger(__name__)
+SECOND_NS = 1_000_000_000
+NEAR_M = 0.5  # by which the task's goal may be off the pose that it stands for
+MAX_POSES = 200
+NO_TREES = "this navigator has no behavior trees; leave behavior_tree empty"
+_decode_map = Codec(MAP.type, MAP.max_bytes).decode
+
+
+class EndState(IntEnum):
+    """How a goal ends, by action_msgs/GoalStatus."""
+
+    SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
+
+
+class Outcome(NamedTuple):
+    """How a goal has ended."""
+
+    state: EndState
+    code: int = result_codes.NONE
+    text: str = ""
+
+
+class Progress(NamedTuple):
+    """What feedback tells."""
+
+    here: Pose | None
+    passed_ns: int
+    left_s: float
+    left_m: float
+    poses_left: int
+
+
+OnProgress = Callable[[Progress], None]
+
+
+class Navigator:
+    """Carries out one goal at a time. A new one preempts the one before."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene, self._tasks = scene, Tasks(scene.bus)
+        self._task = ""  # name of the task that the robot is at for ROS
+
+    async def carry_out(
+        self, codes: Codes, poses: Sequence[Pose], on_progress: OnProgress
+    ) -> Outcome:
+        """Drive to one pose, or through several in the map. Cancelling this cancels the task.
+
+        A goal that comes while another one is carried out replaces its task.
+        """
+        before, self._task = self._task, ""
+        sending = asyncio.ensure_future(self._send(poses))
+        try:
+            name = self._task = await asyncio.shield(sending)
+        except GigabrainError as error:
+            await self._cancel(before)
+            return await self._refused(codes, poses, error)
+        except asyncio.CancelledError:
+            with contextlib.suppress(GigabrainError):  # refused: then there is nothing to cancel
+                await self._cancel(await sending)
+            await self._cancel(before)
+            raise
+        follow = _Follower(self._scene, name, poses, on_progress)
+        try:
+            task = await self._tasks.result(name, follow.update)
+        except GigabrainError as error:
+            return Outcome(EndState.ABORTED, codes.navigator + result_codes.UNKNOWN, str(error))
+        except asyncio.CancelledError:
+            if self._task == name:  # no other goal takes its place
+                await self._cancel(name)
+            raise
+        finally:
+            self._task = "" if self._task == name else self._task
+        return self._ended(codes, task, had_path=follow.had_path)
+
+    async def _send(self, poses: Sequence[Pose]) -> str:
+        if len(poses) == 1:
+            return await self._tasks.go_to(poses[0].x, poses[0].y, poses[0].yaw)
+        steps = [{"goto": [at.x, at.y, at.yaw]} for at in poses]
+        text = msgspec.json.encode({"do": steps}).decode()
+        return await self._tasks.carry_out(text, label="navigate_through_poses")
+
+    async def _cancel(self, name: str) -> None:
+        if name:
+            with contextlib.suppress(GigabrainError):  # it has just ended
+                await self._tasks.cancel(name)
+
+    async def _refused(self, codes: Codes, poses: Sequence[Pose], error: GigabrainError) -> Outcome:
+        """Return the outcome of a goal that was not accepted, with a code by the map."""
+        if not isinstance(error, Refused):
+            return Outcome(EndState.ABORTED, codes.navigator + result_codes.UNKNOWN, str(error))
+        about, grid = self._scene.description, await self._map()
+        radius = result_codes.inner_radius(about.footprint) if about else 0.0
+        code = result_codes.of_refusal(codes, self._scene.here, poses, grid, radius)
+        return Outcome(EndState.ABORTED, code, str(error))
+
+    def _ended(self, codes: Codes, task: Task, *, had_path: bool) -> Outcome:
+        if task.state == "succeeded":
+            return Outcome(EndState.SUCCEEDED)
+        if task.state == "cancelled":  # by another client: a cancel of ROS ends the wait before
+            return Outcome(EndState.ABORTED, codes.navigator + result_codes.UNKNOWN, task.reason)
+        return Outcome(
+            EndState.ABORTED, result_codes.of_failure(codes, had_path=had_path), task.reason
+        )
+
+    async def _map(self) -> OccupancyGrid | None:
+        for payload in await self._scene.bus.kept(MAP):
+            with contextlib.suppress(ValueError):
+                return _decode_map(payload)
+        return None
+
+
+class _Follower:
+    """Turns the status of a task into feedback."""
+
+    def __init__(
+        self, scene: Scene, task: str, poses: Sequence[Pose], on_progress: OnProgress
+    ) -> None:
+        self._scene, self._task, self._poses = scene, task, poses
+        self._on_progress = on_progress
+        self._began_ns, self._reached = scene.ros_ns(), 0
+        self.had_path = False
+
+    def update(self, status: TaskStatus) -> None:
+        """Take a status, if it is of this task."""
+        if status.current is None or status.current.id != self._task:
+            return
+        self.had_path = self.had_path or len(status.path) > 1
+        if status.goal:
+            self._pass(Pose(x=status.goal.x, y=status.goal.y, yaw=0.0))
+        rest = self._poses[self._reached :]
+        further = math.fsum(_apart(a, b) for a, b in itertools.pairwise(rest))
+        here = self._scene.here
+        left_m = status.distance_remaining
+        if left_m is None:
+            left_m = _apart(here, rest[0]) if here else 0.0
+        left_s = status.eta if status.eta is not None else self._time_for(left_m)
+        self._on_progress(
+            Progress(
+                here,
+                max(0, self._scene.ros_ns() - self._began_ns),
+                left_s + self._time_for(further),
+                left_m + further,
+                len(rest),
+            )
+        )
+
+    def _pass(self, goal: Pose) -> None:
+        """Move on to the pose that the task drives to now."""
+        for number in range(self._reached, len(self._poses)):
+            if _apart(goal, self._poses[number]) <= NEAR_M:
+                self._reached = number
+                return
+
+    def _time_for(self, way: float) -> float:
+        about = self._scene.description
+        return way / about.max_linear_speed if about else 0.0
+
+
+def _apart(one: Pose, other: Pose) -> float:
+    return math.hypot(one.x - other.x, one.y - other.y)
+
+
+class Requested(NamedTuple):
+    """A goal as ROS sent it: poses in the map, or why it cannot be carried out."""
+
+    poses: tuple[Pose, ...]
+    fault: Outcome | None = None
+
+
+def requested(codes: Codes, poses: Sequence[Any], tree: str, odom_in_map: Pose | None) -> Requested:
+    """Return the goal of PoseStamped messages."""
+    if tree:
+        code = codes.navigator + result_codes.NO_BEHAVIOR_TREE
+        return Requested((), Outcome(EndState.ABORTED, code, NO_TREES))
+    if not 0 < len(poses) <= MAX_POSES:
+        text = f"{len(poses)} poses; expected 1 to {MAX_POSES}"
+        code = codes.navigator + result_codes.UNKNOWN
+        return Requested((), Outcome(EndState.ABORTED, code, text))
+    try:
+        found = tuple(in_map(p.header.frame_id, planar(p.pose), odom_in_map) for p in poses)
+    except Refused as error:
+        code = codes.navigator + result_codes.NO_TRANSFORM
+        return Requested((), Outcome(EndState.ABORTED, code, str(error)))
+    return Requested(found)
+
+
+def feedback(make: Make, action: str, at_ns: int, progress: Progress) -> Any:
+    """Return the feedback of an action; our navigator has no recoveries that it counts."""
+    here = progress.here or Pose(x=0.0, y=0.0, yaw=0.0)
+    fields: dict[str, Any] = {
+        "current_pose": pose_stamped(make, at_ns, MAP_FRAME if progress.here else "", here),
+        "navigation_time": _duration(make, progress.passed_ns),
+        "estimated_time_remaining": _duration(make, round(progress.left_s * SECOND_NS)),
+        "number_of_recoveries": 0,
+        "distance_remaining": progress.left_m,
+    }
+    if action.endswith("NavigateThroughPoses"):
+        fields["number_of_poses_remaining"] = progress.poses_left
+    return make(f"{action}_Feedback", **fields)
+
+
+def _duration(make: Make, length_ns: int) -> Any:
+    sec, nanosec = divmod(max(0, length_ns), SECOND_NS)
+    sec = min(sec, 2**31 - 1)
+    return make("builtin_interfaces/msg/Duration", sec=sec, nanosec=nanosec)

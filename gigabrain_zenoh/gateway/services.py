@@ -1,0 +1,94 @@
+"""Services for ROS: e-stop, release, enable, saving the map, and the node's parameters.
+
+`map_save` is a Trigger: it is in every ROS installation, and its reply has words, where Nav2's
+SaveMap answers true or false.
+"""
+
+import datetime
+import logging
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from gigabrain_schemas.requests import MapRequest
+from gigabrain_schemas.topics import MAP_SAVE
+from gigabrain_zenoh.client.requests import enable, press_estop, release
+from gigabrain_zenoh.config.settings import Ros2Config
+from gigabrain_zenoh.errors import BodyLost, GigabrainError, Refused
+from gigabrain_zenoh.gate.state import BRAIN
+from gigabrain_zenoh.gateway.driving import RosCommander
+from gigabrain_zenoh.gateway.scene import Scene, left_out
+from gigabrain_zenoh.ros2.transport import RosTransport
+from gigabrain_zenoh.ros2.types import Types
+
+log = logging.getLogger(__name__)
+TRIGGER, SET_BOOL = "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"
+SAVE_S = 10.0  # timeout: a large map takes a second on a slow disk
+NOT_HERE = "an e-stop is not taken back here; look at the robot, then call the service release"
+
+
+class Services:
+    """Answers ROS's requests with the gateway's own rights."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        ros: RosTransport,
+        types: Types,
+        config: Ros2Config,
+        commander: RosCommander,
+    ) -> None:
+        self._scene, self._types, self._commander = scene, types, commander
+        acts: dict[str, tuple[str, Callable[[Any], Awaitable[str]]]] = {
+            "estop": (SET_BOOL, self._estop),
+            "release": (TRIGGER, self._release),
+            "enable": (TRIGGER, self._enable),
+            "map_save": (TRIGGER, self._map_save),
+        }
+        for name, (kind, act) in acts.items():
+            if not left_out(config, name):
+                ros.serve(name, kind, self._answerer(name, kind, act))
+
+    def _answerer(
+        self, name: str, kind: str, act: Callable[[Any], Awaitable[str]]
+    ) -> Callable[[bytes], Awaitable[bytes]]:
+        async def answer(payload: bytes) -> bytes:
+            ok = True
+            try:
+                text = await act(self._types.decode(f"{kind}_Request", payload))
+            except GigabrainError as error:
+                ok, text = False, str(error)
+            log.info("service %s: %s", name, text, extra={"data": {"event": name, "ok": ok}})
+            made = self._types.make(f"{kind}_Response", success=ok, message=text)
+            return self._types.encode(f"{kind}_Response", made)
+
+        return answer
+
+    async def _estop(self, request: Any) -> str:
+        if not request.data:
+            raise Refused(NOT_HERE)
+        self._commander.forget("an e-stop was pressed")
+        return (await press_estop(self._scene.bus, "a service call of ROS")).text
+
+    async def _release(self, _: Any) -> str:
+        state = self._scene.fresh_state
+        if state is None:
+            raise BodyLost("no state from the robot; check that its driver runs")
+        return (await release(self._scene.bus, state.gate.estop_generation)).text
+
+    async def _enable(self, _: Any) -> str:
+        """Let the robot's brain drive; the body is taken from this gateway's own commander only."""
+        state, bus = self._scene.fresh_state, self._scene.bus
+        ours = state is not None and state.gate.commander == bus.process
+        self._commander.forget("the robot's brain was enabled")
+        return (await enable(bus, BRAIN, take=ours)).text
+
+    async def _map_save(self, _: Any) -> str:
+        bus = self._scene.bus
+        when = datetime.datetime.fromtimestamp(bus.clock.unix_ns() // 10**9, datetime.UTC)
+        request = MapRequest(name=f"ros2-{when:%Y%m%d-%H%M%S}", source=bus.process)
+        replies = await bus.ask(MAP_SAVE, request, timeout_s=SAVE_S)
+        if not replies:
+            raise Refused("no process makes a map; run perception with mapping: slam")
+        if not replies[0].ok:
+            raise Refused(replies[0].text)
+        return replies[0].text
