@@ -144,7 +144,8 @@ def observe(config: Config, memory: Memory, state: RobotState, now: Now) -> Step
         memory = replace(memory, blocked=f"the robot was latched; {PAUSE}")
     since_ns = now.ns - memory.last_ns
     if now.ns - memory.heard_ns >= RELEASE_NS:
-        memory = replace(memory, refusal="")
+        blocked = memory.blocked if state.gate.mode == "latched" else ""
+        memory = replace(memory, refusal="", blocked=blocked)
     if since_ns >= RELEASE_NS:
         return replace(memory, holds=False, velocity=ZERO), ()
     if not memory.holds:

@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.base import Pose, Velocity
-from gigabrain_schemas.body import Battery, Body, Camera, Joint, Lidar
+from gigabrain_schemas.body import Battery, Body, Camera, Joint
 from gigabrain_schemas.sensors import Imu, ImuData
 from gigabrain_zenoh.gateway.conversions import body, description, frames
 from gigabrain_zenoh.ros2.types import Types
@@ -197,7 +197,6 @@ def test_a_body_without_a_lidar_has_no_frame_of_one():
     bare = Body(description=replace(samples.WAFFLE, lidar=None), link="sim")
     children = [one.child for one in frames.static_frames(bare)]
     assert children == ["base_link", "imu_link"]
-    assert Lidar(beams=1, rate_hz=1, range_min=0.1, range_max=1).x == 0.0
 
 
 @pytest.mark.parametrize("yaw", [0.0, 1.0, -3.0, math.pi])

@@ -1,0 +1,511 @@
+"""Each topic of the gateway, read by a node of ROS in memory: type, QoS, rate, content."""
+
+import math
+from contextlib import asynccontextmanager
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_schemas.base import Cause
+from gigabrain_schemas.body import Camera, Joint
+from gigabrain_schemas.brain import OccupancyGrid, PoseInMap
+from gigabrain_schemas.requests import PoseReply
+from gigabrain_schemas.safety import Health, SafetyState
+from gigabrain_schemas.sensors import Image, Imu, ImuData
+from gigabrain_schemas.tasks import Goal, GoalReply, TaskStatus
+from gigabrain_schemas.topics import (
+    BODY,
+    DEPTH,
+    GOAL,
+    HEALTH,
+    IMAGE,
+    IMU,
+    MAP,
+    POSE,
+    POSE_SET,
+    SAFETY,
+    SCAN,
+    STATE,
+    TASK,
+)
+from gigabrain_schemas.vision import DepthImage, pack_depth
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork
+from gigabrain_zenoh.clock import FakeClock
+from gigabrain_zenoh.config.settings import Ros2Config
+from gigabrain_zenoh.ros2.qos import DEFAULT, LATCHED, SENSOR_DATA, Qos
+from gigabrain_zenoh.testing import samples
+from tests.node.ros2_robot import TICK_NS, RosNode, gateway_on
+
+CAMERAS = (
+    Camera(name="front", width=16, height=16, depth=True, x=0.1, z=0.2),
+    Camera(name="rear", width=16, height=16),
+)
+BURGER = replace(samples.WAFFLE, wheel_separation=0.16, wheel_radius=0.033, cameras=CAMERAS)
+GRID = OccupancyGrid(
+    resolution=0.1, width=2, height=1, origin_x=0.0, origin_y=0.0, cells=b"\x64\xff"
+)
+JPEG = Image(frame_id="front", encoding="jpeg", height=16, width=16, data=b"\xff\xd8jpeg")
+DEPTH_PICTURE = DepthImage(
+    frame_id="front", height=16, width=16, planes=pack_depth(np.full((16, 16), 750, np.uint16))
+)
+READING = Imu(
+    orientation=(0.0, 0.0, 0.0, 1.0),
+    angular_velocity=(0.0, 0.0, 0.1),
+    linear_acceleration=(1.0, 0.0, 9.8),
+)
+ABOUT = "sensor_msgs/msg/CameraInfo"
+PICTURE, RAW = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"
+TF, DIAGNOSTICS = "tf2_msgs/msg/TFMessage", "diagnostic_msgs/msg/DiagnosticArray"
+TABLE = {
+    "/scan": ("sensor_msgs/msg/LaserScan", SENSOR_DATA),
+    "/odom": ("nav_msgs/msg/Odometry", DEFAULT),
+    "/tf": (TF, Qos(depth=100)),
+    "/tf_static": (TF, LATCHED),
+    "/map": ("nav_msgs/msg/OccupancyGrid", LATCHED),
+    "/imu": ("sensor_msgs/msg/Imu", SENSOR_DATA),
+    "/joint_states": ("sensor_msgs/msg/JointState", DEFAULT),
+    "/battery_state": ("sensor_msgs/msg/BatteryState", DEFAULT),
+    "/plan": ("nav_msgs/msg/Path", DEFAULT),
+    "/diagnostics": (DIAGNOSTICS, DEFAULT),
+    "/robot_description": ("std_msgs/msg/String", LATCHED),
+    "/camera/image/compressed": (PICTURE, SENSOR_DATA),
+    "/camera/camera_info": (ABOUT, SENSOR_DATA),
+    "/camera/depth/image_raw": (RAW, SENSOR_DATA),
+    "/camera/depth/camera_info": (ABOUT, SENSOR_DATA),
+    "/camera/rear/image/compressed": (PICTURE, SENSOR_DATA),
+    "/camera/rear/camera_info": (ABOUT, SENSOR_DATA),
+    "/clock": ("rosgraph_msgs/msg/Clock", Qos(reliable=False, depth=1)),
+}
+
+
+class Driver:
+    """What a robot's processes publish, by hand."""
+
+    def __init__(self, bus, gateway_bus, node, clock):
+        self.bus, self.gateway_bus, self.node, self.clock, self.tick = (
+            bus,
+            gateway_bus,
+            node,
+            clock,
+            0,
+        )
+        bus.time.boot = samples.BOOT
+
+    async def say(self, topic, message, **about):
+        self.bus.time.tick = self.tick
+        self.bus.publish(topic, message, **about)
+        await self.clock.advance(0)
+
+    async def body(self, about=BURGER, *, real=False):
+        await self.say(BODY, samples.body(about, real=real))
+
+    async def states(self, count=1, **about):
+        for _ in range(count):
+            self.tick += 1
+            changed = {name: about[name] for name in ("imu", "joints") if name in about}
+            plain = {name: value for name, value in about.items() if name not in changed}
+            await self.say(STATE, replace(samples.state(self.tick, **plain), **changed))
+            await self.clock.advance(TICK_NS)
+
+    def read(self, topic, qos=None):
+        """Subscribe as ROS tools do, unless with another QoS."""
+        kind, offered = TABLE[topic]
+        return self.node.read(topic, kind, qos or offered)
+
+    def got(self, topic):
+        return self.node.received[topic]
+
+
+@asynccontextmanager
+async def driver(config=None):
+    network, clock = LocalNetwork(), FakeClock()
+    async with gateway_on(network, clock, config) as (gateway_bus, ros):
+        bus = Bus(network.transport(), clock, "driver")
+        yield Driver(bus, gateway_bus, RosNode(ros, clock), clock)
+        await bus.close()
+
+
+async def test_the_topics_have_the_types_and_qos_that_ros_tools_expect():
+    async with driver() as robot:
+        await robot.body()
+        assert robot.node.topics() == TABLE
+
+
+async def test_a_namespace_is_before_each_topic_and_what_is_left_out_is_not_there():
+    config = Ros2Config(namespace="/robot1", leave_out=("scan", "/camera/depth/image_raw"))
+    async with driver(config) as robot:
+        await robot.body()
+        left = set(TABLE) - {"/scan", "/camera/depth/image_raw"}
+        assert set(robot.node.topics()) == {f"/robot1{topic}" for topic in left}
+
+
+async def everything(robot):
+    """Publish all that the gateway could pass on."""
+    await robot.body()
+    await robot.states(3)
+    for topic, message, name in (
+        (IMU, READING, ""), (SCAN, samples.scan(samples.open_space()), ""), (MAP, GRID, ""),
+        (TASK, TaskStatus(path=((0.0, 0.0), (1.0, 0.0))), ""),
+        (IMAGE, JPEG, "front"), (IMAGE, replace(JPEG, frame_id="rear"), "rear"),
+        (DEPTH, DEPTH_PICTURE, "front"), (SAFETY, SafetyState(verdict="ok"), ""),
+    ):  # fmt: skip
+        await robot.say(topic, message, name=name)
+    await robot.clock.advance(1_100_000_000)
+
+
+async def test_what_ros_does_not_read_is_neither_received_nor_encoded():
+    async with driver() as robot:
+        await everything(robot)
+        assert robot.gateway_bus.counters["published"] == 0
+        unread = {"scan", "map", "imu", "task", "image/front", "depth/front", "health/*", "safety"}
+        listens = set(robot.gateway_bus.listens)
+        assert listens.isdisjoint({f"robot/{key}" for key in unread})
+
+
+@pytest.mark.parametrize("topic", TABLE)
+async def test_each_topic_comes_with_its_first_reader_and_ends_with_the_last(topic):
+    async with driver() as robot:
+        await robot.body()
+        before = sorted(robot.gateway_bus.listens)
+        close = robot.read(topic)
+        other = robot.read(topic)
+        await everything(robot)
+        count = len(robot.got(topic))
+        assert count >= 2  # one for each reader
+        assert robot.gateway_bus.counters["published"] == count / 2
+        close()
+        assert len(robot.gateway_bus.listens) >= len(before)
+        other()
+        assert sorted(robot.gateway_bus.listens) == before
+        await everything(robot)
+        assert len(robot.got(topic)) == count
+
+
+@pytest.mark.parametrize("topic", ["/map", "/tf_static", "/robot_description"])
+async def test_late_readers_get_what_is_kept(topic):
+    async with driver() as robot:
+        await everything(robot)
+        robot.read(topic)
+        await robot.clock.advance(0)
+        assert len(robot.got(topic)) == 1
+        robot.read(topic)
+        await robot.clock.advance(0)
+        assert len(robot.got(topic)) == 2
+
+
+async def test_what_the_driver_repeats_unchanged_is_published_once():
+    async with driver() as robot:
+        robot.read("/robot_description")
+        for _ in range(5):
+            await robot.body()
+        assert len(robot.got("/robot_description")) == 1
+        await robot.body(replace(BURGER, body_height=0.4))
+        assert len(robot.got("/robot_description")) == 2
+
+
+async def test_odometry_and_transforms_come_with_each_state():
+    async with driver() as robot:
+        await robot.body()
+        for topic in ("/odom", "/tf", "/joint_states", "/clock"):
+            robot.read(topic)
+        joints = (Joint(name="wheel_left_joint", position=0.5),)
+        await robot.states(50, pose=(1.0, 2.0, 0.0), v=0.2, joints=joints)
+        for topic in ("/odom", "/tf", "/joint_states", "/clock"):
+            assert len(robot.got(topic)) == 50
+        odom, tf = robot.got("/odom")[-1], robot.got("/tf")[-1]
+        assert odom.pose.pose.position.y == 2.0
+        assert odom.header.stamp == tf.transforms[0].header.stamp == robot.got("/clock")[-1].clock
+        found = [(one.header.frame_id, one.child_frame_id) for one in tf.transforms]
+        assert found == [("odom", "base_footprint"), ("base_link", "wheel_left_link")]
+        assert (odom.header.stamp.sec, odom.header.stamp.nanosec) == (1_000_000_000, 980_000_000)
+
+
+async def test_tf_has_the_map_once_the_robot_is_localized_and_while_it_is():
+    async with driver() as robot:
+        robot.read("/tf")
+        await robot.states(2, pose=(1.0, 0.0, 0.0))
+        there = PoseInMap(x=5.0, y=5.0, yaw=math.pi / 2, covariance=(0.0,) * 9)
+        await robot.say(POSE, there, basis=2)
+        await robot.states(1, pose=(2.0, 0.0, 0.0))
+        in_map, in_odom = robot.got("/tf")[-1].transforms
+        assert (in_map.header.frame_id, in_map.child_frame_id) == ("map", "odom")
+        assert (in_odom.header.frame_id, in_odom.child_frame_id) == ("odom", "base_footprint")
+        at = in_map.transform
+        assert (at.translation.x, at.translation.y) == pytest.approx((5.0, 4.0))
+        assert (at.rotation.z, at.rotation.w) == pytest.approx((0.70710678, 0.70710678))
+        await robot.say(POSE, replace(there, localized=False), basis=3)
+        await robot.states(1)
+        assert len(robot.got("/tf")[-1].transforms) == 1
+
+
+async def test_a_place_in_the_map_that_is_old_is_no_transform():
+    async with driver() as robot:
+        robot.read("/tf")
+        await robot.states(2)
+        await robot.say(POSE, PoseInMap(x=0.0, y=0.0, yaw=0.0, covariance=(0.0,) * 9), basis=2)
+        await robot.states(1)
+        assert len(robot.got("/tf")[-1].transforms) == 2
+        await robot.states(60)
+        assert len(robot.got("/tf")[-1].transforms) == 1
+
+
+async def test_an_imu_stream_goes_before_the_readings_in_states():
+    async with driver() as robot:
+        robot.read("/imu")
+        data = ImuData(
+            orientation=READING.orientation,
+            angular_velocity=READING.angular_velocity,
+            linear_acceleration=(0.0, 0.0, 9.8),
+        )
+        await robot.states(3, imu=data)
+        assert len(robot.got("/imu")) == 3
+        for _ in range(10):
+            await robot.say(IMU, READING)
+            await robot.states(1, imu=data)
+        assert [one.linear_acceleration.x for one in robot.got("/imu")[3:]] == [1.0] * 10
+
+
+async def test_a_battery_comes_once_a_second():
+    async with driver() as robot:
+        robot.read("/battery_state")
+        await robot.states(150, battery=40.0)
+        assert len(robot.got("/battery_state")) == 3
+        assert robot.got("/battery_state")[-1].percentage == pytest.approx(0.4)
+
+
+async def test_pictures_have_the_stamp_of_their_camera_info():
+    async with driver() as robot:
+        await robot.body()
+        for topic in ("/camera/image/compressed", "/camera/camera_info", "/camera/depth/image_raw",
+                      "/camera/depth/camera_info", "/camera/rear/camera_info"):  # fmt: skip
+            robot.read(topic)
+        await robot.say(IMAGE, JPEG, name="front", stamp_ns=5_000_000_007)
+        await robot.say(DEPTH, DEPTH_PICTURE, name="front", stamp_ns=6_000_000_008)
+        (picture,), (about,) = (
+            robot.got("/camera/image/compressed"),
+            robot.got("/camera/camera_info"),
+        )
+        assert (picture.header.stamp.sec, picture.header.stamp.nanosec) == (5, 7)
+        assert picture.header == about.header
+        assert picture.data.tobytes() == JPEG.data
+        (depth,) = robot.got("/camera/depth/image_raw")
+        assert depth.header == robot.got("/camera/depth/camera_info")[0].header
+        assert depth.header.stamp.sec == 6
+        assert depth.data[:2].tolist() == [238, 2]  # 750 mm
+        assert robot.got("/camera/rear/camera_info") == []
+
+
+async def test_depth_that_cannot_be_unpacked_is_left_out_and_counted():
+    async with driver() as robot:
+        await robot.body()
+        robot.read("/camera/depth/image_raw")
+        broken = replace(DEPTH_PICTURE, planes=(b"broken",) * 4)
+        await robot.say(DEPTH, broken, name="front")
+        assert robot.got("/camera/depth/image_raw") == []
+        assert robot.gateway_bus.counters["not_converted"] == 1
+        await robot.say(DEPTH, DEPTH_PICTURE, name="front")
+        assert len(robot.got("/camera/depth/image_raw")) == 1
+
+
+async def test_topics_of_cameras_follow_the_body():
+    async with driver() as robot:
+        await robot.body(replace(BURGER, cameras=()), real=True)
+        plain = {topic for topic in TABLE if "camera" not in topic} - {"/clock"}
+        assert set(robot.node.topics()) == plain
+        await robot.body(replace(BURGER, cameras=CAMERAS[1:]), real=True)
+        assert set(robot.node.topics()) - plain == {
+            "/camera/image/compressed", "/camera/camera_info",
+        }  # fmt: skip
+        await robot.body(replace(BURGER, cameras=()), real=True)
+        assert set(robot.node.topics()) == plain
+
+
+async def test_a_path_ends_with_an_empty_one():
+    async with driver() as robot:
+        robot.read("/plan")
+        moving = TaskStatus(path=((0.0, 0.0), (1.0, 0.0)), goal=Goal(x=1.0, y=0.0))
+        for status in (TaskStatus(), moving, moving, TaskStatus(), TaskStatus()):
+            await robot.say(TASK, status)
+        assert [len(one.poses) for one in robot.got("/plan")] == [0, 2, 2, 0]
+
+
+HEALTHY = Health(process="perception", pid=7, host="robot", uptime_s=5, cpu=0.2, rss_bytes=10**8,
+                 received_hz={}, sent_hz={}, rejected={}, latency_ms={}, counters={})  # fmt: skip
+
+
+async def diagnosed(robot):
+    """Return the newest diagnostics by name: level and text."""
+    await robot.states(60)
+    statuses = robot.got("/diagnostics")[-1].status
+    assert {one.hardware_id for one in statuses} == {"waffle"}
+    return {one.name: (one.level, one.message) for one in statuses}
+
+
+async def test_diagnostics_have_levels_of_gate_safety_battery_and_processes():
+    async with driver() as robot:
+        await robot.body()
+        robot.read("/diagnostics")
+        problem = Cause(code="x", text="no map", remedy="save one")
+        await robot.say(HEALTH, HEALTHY, name="perception")
+        await robot.say(HEALTH, replace(HEALTHY, process="decision", problems=(problem,)),
+                        name="decision")  # fmt: skip
+        await robot.states(1)
+        await robot.say(SAFETY, SafetyState(verdict="slow", causes=(problem,)))
+        found = await diagnosed(robot)
+        assert found["gigabrain: gate"] == (0, "enabled control")
+        assert found["gigabrain: safety"][0] == 3  # stale: the verdict is older than a second
+        assert found["gigabrain: battery"] == (0, "100 %, 12.0 V")
+        assert found["gigabrain: perception"] == (0, "runs")
+        assert found["gigabrain: decision"] == (1, "no map (save one)")
+        assert found["gigabrain: cmd_vel"] == (0, "no commands")
+        await robot.states(200)
+        assert (await diagnosed(robot))["gigabrain: perception"][0] == 3
+
+
+async def test_diagnostics_of_a_silent_robot_are_stale():
+    async with driver() as robot:
+        await robot.body()
+        robot.read("/diagnostics")
+        await robot.clock.advance(2_000_000_000)
+        statuses = {one.name: one for one in robot.got("/diagnostics")[-1].status}
+        assert statuses["gigabrain: gate"].level == 3
+        assert "driver" in statuses["gigabrain: gate"].message
+
+
+async def asked(robot, service, reply, topic, kind, **fields):
+    """Publish a pose as RViz does; return the requests that a server of ours gets."""
+    requests = []
+
+    async def answer(request):
+        requests.append(request)
+        return reply
+
+    robot.bus.serve(service, answer)
+    await robot.states(2, pose=(1.0, 0.0, 0.0))
+    robot.node.publish(topic, kind, **fields)
+    await robot.clock.advance(TICK_NS)
+    return requests
+
+
+GUESS = "geometry_msgs/msg/PoseWithCovarianceStamped"
+THERE = {"position": {"x": 2.0, "y": 3.0}, "orientation": {"z": 1.0, "w": 0.0}}
+COVARIANCE = np.diag((0.25, 0.25, 0, 0, 0, 0.07)).ravel()
+
+
+async def test_initialpose_says_where_the_robot_is_and_how_sure_that_is():
+    async with driver() as robot:
+        guess = {"pose": THERE, "covariance": COVARIANCE}
+        (request,) = await asked(
+            robot, POSE_SET, PoseReply(ok=True, text="looking"), "/initialpose", GUESS,
+            header={"frame_id": "map"}, pose=guess,
+        )  # fmt: skip
+        assert (request.x, request.y, request.source) == (2.0, 3.0, "ros2")
+        assert abs(request.yaw) == pytest.approx(math.pi)
+        assert request.covariance == (0.25, 0, 0, 0, 0.25, 0, 0, 0, 0.07)
+
+
+POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
+
+
+async def test_goal_pose_is_a_goal_in_map_or_odom():
+    async with driver() as robot:
+        accepted = GoalReply(ok=True, text="on the way", goal="goal-1")
+        (request,) = await asked(
+            robot,
+            GOAL,
+            accepted,
+            "/goal_pose",
+            POSE_STAMPED,
+            header={"frame_id": "map"},
+            pose=THERE,
+        )
+        assert (request.x, request.y, request.how, request.source) == (2.0, 3.0, "replace", "ros2")
+        await robot.say(POSE, PoseInMap(x=1.0, y=9.0, yaw=0.0, covariance=(0.0,) * 9), basis=2)
+        await robot.states(1, pose=(1.0, 0.0, 0.0))
+        requests = []
+
+        async def answer(request):
+            requests.append(request)
+            return accepted
+
+        robot.bus.serve(GOAL, answer)
+        robot.node.publish("/goal_pose", POSE_STAMPED, header={"frame_id": "odom"}, pose=THERE)
+        await robot.clock.advance(TICK_NS)
+        assert (requests[0].x, requests[0].y) == pytest.approx((2.0, 12.0))
+
+
+@pytest.mark.parametrize(
+    ("frame", "pose", "words"),
+    [
+        ("base_link", THERE, "frame 'base_link'"),
+        ("odom", THERE, "not known"),
+        ("map", {"position": {"x": math.nan}}, "position"),
+    ],
+)
+async def test_a_goal_pose_that_cannot_be_is_refused_and_said_on_diagnostics(frame, pose, words):
+    async with driver() as robot:
+        await robot.body()
+        robot.read("/diagnostics")
+        reply = GoalReply(ok=True, text="on the way", goal="goal-1")
+        header = {"frame_id": frame}
+        assert not await asked(
+            robot, GOAL, reply, "/goal_pose", POSE_STAMPED, header=header, pose=pose
+        )
+        level, text = (await diagnosed(robot))["gigabrain: goal_pose"]
+        assert (level, words in text) == (1, True)
+        assert robot.gateway_bus.problems[0].code == "ros2_goal_pose"
+
+
+async def test_an_initialpose_in_another_frame_is_refused():
+    async with driver() as robot:
+        requests = await asked(
+            robot, POSE_SET, PoseReply(ok=True, text=""), "/initialpose", GUESS,
+            header={"frame_id": "odom"}, pose={"pose": THERE},
+        )  # fmt: skip
+        assert requests == []
+        assert robot.gateway_bus.counters["initialpose_refused"] == 1
+
+
+RCL = "rcl_interfaces/srv"
+
+
+async def test_the_settings_are_parameters_that_cannot_be_set():
+    async with driver(Ros2Config(cmd_vel_timeout=0.15, leave_out=("imu",))) as robot:
+        await robot.body()
+        call = robot.node.call
+        names = (await call("/gigabrain/list_parameters", f"{RCL}/ListParameters")).result.names
+        assert {"use_sim_time", "transport", "domain", "cmd_vel_timeout", "take"} <= set(names)
+        asked = ["use_sim_time", "domain", "cmd_vel_timeout", "transport", "leave_out", "nothing"]
+        found = await call("/gigabrain/get_parameters", f"{RCL}/GetParameters", names=asked)
+        assert [one.type for one in found.values] == [1, 2, 3, 4, 9, 0]
+        time, domain, timeout, transport, left, _ = found.values
+        assert (time.bool_value, domain.integer_value) == (True, 0)
+        assert (timeout.double_value, transport.string_value) == (0.15, "rmw_zenoh")
+        assert left.string_array_value == ["imu"]
+        types = await call(
+            "/gigabrain/get_parameter_types", f"{RCL}/GetParameterTypes", names=asked
+        )
+        assert list(types.types) == [1, 2, 3, 4, 9, 0]
+        about = await call(
+            "/gigabrain/describe_parameters", f"{RCL}/DescribeParameters", names=["take"]
+        )
+        assert (about.descriptors[0].type, about.descriptors[0].read_only) == (1, True)
+        wanted = [{"name": "take", "value": {"type": 1, "bool_value": True}}]
+        done = await call("/gigabrain/set_parameters", f"{RCL}/SetParameters", parameters=wanted)
+        assert (done.results[0].successful, "read-only" in done.results[0].reason) == (False, True)
+        done = await call("/gigabrain/set_parameters_atomically", f"{RCL}/SetParametersAtomically",
+                          parameters=wanted)  # fmt: skip
+        assert not done.result.successful
+
+
+async def test_a_place_is_composed_of_the_poses_of_its_tick():
+    async with driver() as robot:
+        robot.read("/tf")
+        await robot.states(1, pose=(0.0, 0.0, 0.0))
+        await robot.states(1, pose=(1.0, 0.0, 0.0))
+        here = PoseInMap(x=0.0, y=0.0, yaw=0.0, covariance=(0.0,) * 9)
+        await robot.say(POSE, here, basis=3)  # before the state of its tick
+        await robot.states(1, pose=(3.0, 0.0, 0.0))
+        assert robot.got("/tf")[-1].transforms[0].transform.translation.x == pytest.approx(-3.0)
