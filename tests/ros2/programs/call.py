@@ -5,8 +5,9 @@ from typing import Any
 
 from rclpy.client import Client
 
-from tests.ros2.programs.console import say, start
+from tests.ros2.programs.console import start
 from tests.ros2.programs.messages import find, make, to_json
+from tests.ros2.programs.say import say
 
 
 def main() -> None:

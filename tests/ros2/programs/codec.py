@@ -10,8 +10,8 @@ from typing import Any
 
 from rclpy.serialization import deserialize_message, serialize_message
 
-from tests.ros2.programs.console import say
 from tests.ros2.programs.messages import find, make, to_json
+from tests.ros2.programs.say import say
 
 
 def hashes() -> dict[str, Any]:

@@ -10,7 +10,6 @@ import os
 import queue
 import sys
 import threading
-import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -19,15 +18,9 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+from tests.ros2.programs.say import say
+
 Command = Callable[..., Mapping[str, Any] | None]
-_printing = threading.Lock()
-
-
-def say(event: str, **fields: Any) -> None:
-    """Print an event, with the time at which it is printed unless `at_ns` is given."""
-    line = json.dumps({"event": event, "at_ns": time.monotonic_ns()} | fields)
-    with _printing:
-        print(line, flush=True)
 
 
 class Console:

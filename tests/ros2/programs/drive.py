@@ -8,8 +8,9 @@ from typing import Any
 
 from rclpy.publisher import Publisher
 
-from tests.ros2.programs.console import endpoints, profile, say, start
+from tests.ros2.programs.console import endpoints, profile, start
 from tests.ros2.programs.messages import find, make
+from tests.ros2.programs.say import say
 
 TWIST = "geometry_msgs/msg/Twist"
 

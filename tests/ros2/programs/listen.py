@@ -9,8 +9,9 @@ from typing import Any
 
 from rclpy.clock import Clock
 
-from tests.ros2.programs.console import endpoints, profile, say, start
+from tests.ros2.programs.console import endpoints, profile, start
 from tests.ros2.programs.messages import find, to_json
+from tests.ros2.programs.say import say
 
 KEPT = 1000  # times of arrival that are kept for each topic
 

@@ -9,8 +9,9 @@ from typing import Any
 
 from rclpy.action import ActionClient
 
-from tests.ros2.programs.console import say, start
+from tests.ros2.programs.console import start
 from tests.ros2.programs.messages import find, make, to_json
+from tests.ros2.programs.say import say
 
 STATUS = ("unknown", "accepted", "executing", "canceling", "succeeded", "canceled", "aborted")
 

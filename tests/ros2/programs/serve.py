@@ -9,8 +9,9 @@ from typing import Any
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.task import Future
 
-from tests.ros2.programs.console import Console, say, start
+from tests.ros2.programs.console import Console, start
 from tests.ros2.programs.messages import find, make, to_json
+from tests.ros2.programs.say import say
 
 
 class Action:
