@@ -86,6 +86,7 @@ class RequestReply:
             raise
         made._refresh()
         made._ticking = asyncio.create_task(made._tick())
+        made._ticking.add_done_callback(_report)
         return made
 
     async def close(self) -> None:
@@ -202,6 +203,11 @@ class Server:
     def clients(self) -> int:
         """Number of matched clients."""
         return len(self._reader.writers)
+
+    @property
+    def pending(self) -> int:
+        """Number of replies that a client has not acknowledged."""
+        return self._writer.pending
 
     async def ask(self, request: bytes, timeout_s: float) -> bytes:
         """Return the reply to a request of this process. Raises NoAnswer."""
@@ -331,6 +337,11 @@ class _Client:
         future = self._waiting.get(number)
         if future and not future.done():
             future.set_result(reply)
+
+
+def _report(ticking: asyncio.Task[None]) -> None:
+    if not ticking.cancelled() and (error := ticking.exception()):
+        log.error("services over DDS have stopped", exc_info=error)
 
 
 def _take_header(payload: bytes) -> tuple[bytes, bytes]:

@@ -5,7 +5,6 @@ those with its own. Source: OMG DDSI-RTPS 2.3, chapter 8.5. A participant is bel
 address that it announces, so that it cannot make this one send to others.
 """
 
-import logging
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
 
@@ -14,6 +13,8 @@ from gigabrain_zenoh.ros2.rtps_discovery import (
     HAS_PUBLICATIONS_WRITER,
     HAS_SUBSCRIPTIONS_READER,
     HAS_SUBSCRIPTIONS_WRITER,
+    MAX_PARTICIPANTS,
+    PARTICIPANT,
     PUBLICATIONS_READER,
     PUBLICATIONS_WRITER,
     SPDP_READER,
@@ -45,12 +46,10 @@ from gigabrain_zenoh.ros2.rtps_wire import (
 )
 from gigabrain_zenoh.ros2.rtps_writer import ReliableWriter
 
-log = logging.getLogger(__name__)
-
 LEASE_S, ANNOUNCE_S = 10.0, 2.0
 FIRST_ANNOUNCEMENTS, FIRST_ANNOUNCE_S = 5, 0.1
 MIN_LEASE_S, MAX_LEASE_S = 1.0, 300.0  # of others
-MAX_REMOTES, MAX_ENDPOINTS = 256, 4096  # endpoints of one participant
+MAX_REMOTES, MAX_ENDPOINTS, MAX_ALL_ENDPOINTS = 512, 2048, 20_000  # endpoints of one, and of all
 SERVICE_TOPICS = ("rq/", "rr/")  # of all others no endpoint is kept
 MIN_TICK_S, MAX_TICK_S = 0.01, 0.1
 
@@ -60,6 +59,7 @@ class Remote:
     """Another participant."""
 
     data: ParticipantData
+    payload: bytes  # of its newest announcement
     builtin: Address
     user: Address
     heard_s: float
@@ -83,7 +83,7 @@ class Participant:
         self.readers: dict[bytes, tuple[ReliableReader, EndpointData]] = {}
         self._out, self._announce, self._unix_ns = send, announce, unix_ns
         self._announced, self._next_s, self._now, self._entities = 0, 0.0, 0.0, 0
-        self._sequence = 1
+        self._sequence, self._endpoints = 1, 0  # endpoints of all remote participants
         self._builtin_writers = {
             one: ReliableWriter(one, self.send, transient_local=True)
             for one in (PUBLICATIONS_WRITER, SUBSCRIPTIONS_WRITER)
@@ -164,7 +164,7 @@ class Participant:
 
     def leave(self) -> None:
         """Tell all others that this participant is gone."""
-        key = self.data.prefix + bytes((0, 0, 1, 0xC1))
+        key = self.data.prefix + PARTICIPANT
         gone = Data(
             SPDP_READER,
             SPDP_WRITER,
@@ -194,6 +194,9 @@ class Participant:
             if remote and self._believed(remote.data, source):
                 self._forget(prefix)
             return
+        if remote and remote.payload == one.payload and self._believed(remote.data, source):
+            remote.heard_s = self._now
+            return
         try:
             data = decode_participant(one.payload, vendor)
         except BadMessage:
@@ -202,19 +205,23 @@ class Participant:
         user = choose_address(data.user, source, self.own)
         if data.prefix != prefix or builtin is None or user is None:
             return
-        if remote and remote.data == data:
-            remote.heard_s = self._now
-        elif remote:
-            remote.data, remote.heard_s = data, self._now
+        if remote:
+            remote.data, remote.payload, remote.heard_s = data, one.payload, self._now
             if remote.builtin not in data.builtin or remote.user not in data.user:
                 remote.builtin, remote.user = builtin, user
                 self._match_builtin(prefix, remote)
                 for endpoint in remote.endpoints.values():
                     self._match(endpoint, remote)
-        elif len(self.remotes) < MAX_REMOTES:
-            self.remotes[prefix] = remote = Remote(data, builtin, user, self._now)
+        elif len(self.remotes) < MAX_REMOTES and self._of_host(builtin[0]) < MAX_PARTICIPANTS:
+            self.remotes[prefix] = remote = Remote(data, one.payload, builtin, user, self._now)
             self._out(self._announcement(prefix), builtin)
             self._match_builtin(prefix, remote)
+
+    def _of_host(self, host: str) -> int:
+        return sum(remote.builtin[0] == host for remote in self.remotes.values())
+
+    def _has_room(self, remote: Remote) -> bool:
+        return len(remote.endpoints) < MAX_ENDPOINTS and self._endpoints < MAX_ALL_ENDPOINTS
 
     def _match_builtin(self, prefix: bytes, remote: Remote) -> None:
         has, where, now = remote.data.endpoints, remote.builtin, self._now
@@ -267,13 +274,15 @@ class Participant:
         if guid[:12] != writer[:12]:
             return
         known = remote.endpoints.get(guid)
-        if endpoint is None or (known and known != endpoint):
+        if known and known != endpoint:
+            del remote.endpoints[guid]
+            self._endpoints -= 1
             self._unmatch(guid)
-            remote.endpoints.pop(guid, None)
-        if endpoint is None or endpoint.guid != guid or len(remote.endpoints) >= MAX_ENDPOINTS:
+        if endpoint is None or endpoint == known or endpoint.guid != guid:
             return
-        if endpoint.topic.startswith(SERVICE_TOPICS):
+        if endpoint.topic.startswith(SERVICE_TOPICS) and self._has_room(remote):
             remote.endpoints[guid] = endpoint
+            self._endpoints += 1
             self._match(endpoint, remote)
 
     def _match_all(self, data: EndpointData, now: float) -> None:
@@ -305,6 +314,7 @@ class Participant:
 
     def _forget(self, prefix: bytes) -> None:
         remote = self.remotes.pop(prefix)
+        self._endpoints -= len(remote.endpoints)
         for guid in remote.endpoints:
             self._unmatch(guid)
         for entity, writer in self._builtin_writers.items():

@@ -22,7 +22,8 @@ from gigabrain_zenoh.ros2.rtps_wire import (
 from gigabrain_zenoh.ros2.rtps_writer import Send
 
 MAX_SAMPLE_BYTES, MAX_FRAGMENTS = 1 << 20, 4096
-MAX_EARLY, MAX_EARLY_BYTES = WINDOW, 4 << 20  # samples of one writer that came out of order
+MAX_EARLY = WINDOW  # samples of one writer that came out of order
+MAX_ALL_EARLY, MAX_EARLY_BYTES = 4096, 4 << 20  # of all writers of a reader
 MAX_ASSEMBLIES, ASSEMBLY_S = 8, 5.0  # fragmented samples of a reader that are not complete
 GREET_S, SLOWEST_GREETING_S = 0.5, 8.0  # requests for a first heartbeat: the wait doubles
 MAX_STRANGERS = 256  # writers that have sent heartbeats before they were announced
@@ -55,7 +56,6 @@ class _Writer:
     address: Address
     next: int = 1  # the sample to deliver next
     early: dict[int, Data | None] = field(default_factory=dict)  # None: it does not concern us
-    early_bytes: int = 0
     assemblies: dict[int, _Assembly] = field(default_factory=dict)
     heard: bool = False
     wait_s: float = GREET_S
@@ -72,6 +72,7 @@ class ReliableReader:
         self.writers: dict[bytes, _Writer] = {}
         self._send, self._deliver, self._serial = send, deliver, 0
         self._strangers: dict[bytes, None] = {}
+        self._early = self._early_bytes = 0
 
     def match(self, guid: bytes, address: Address, now: float) -> None:
         """Add a remote writer, or change its address."""
@@ -85,7 +86,9 @@ class ReliableReader:
 
     def unmatch(self, guid: bytes) -> None:
         """Remove a remote writer."""
-        self.writers.pop(guid, None)
+        if writer := self.writers.pop(guid, None):
+            for seq in list(writer.early):
+                self._pop_early(writer, seq)
         self._strangers.pop(guid, None)
 
     def on_data(self, guid: bytes, data: Data, now: float) -> None:
@@ -99,9 +102,9 @@ class ReliableReader:
             self._deliver(guid, data)
             self._drain(writer)
             return
-        size = writer.early_bytes + len(data.payload)
-        if data.seq < writer.next + MAX_EARLY and size <= MAX_EARLY_BYTES:
-            writer.early[data.seq], writer.early_bytes = data, size
+        if data.seq < writer.next + MAX_EARLY and self._has_room(len(data.payload)):
+            writer.early[data.seq] = data
+            self._early, self._early_bytes = self._early + 1, self._early_bytes + len(data.payload)
         if now - writer.asked_s >= ASK_S:
             self._ask(writer, data.seq, now)
 
@@ -161,16 +164,19 @@ class ReliableReader:
             self._skip(writer, gap.base)
         window = range(max(gap.start, writer.next), min(gap.base, writer.next + MAX_EARLY))
         for seq in (*window, *gap.others):
-            if writer.next <= seq < writer.next + MAX_EARLY:
-                writer.early.setdefault(seq, None)
+            new = writer.next <= seq < writer.next + MAX_EARLY and seq not in writer.early
+            if new and self._has_room(0):
+                writer.early[seq] = None
+                self._early += 1
         self._drain(writer)
 
     def tick(self, now: float) -> float:
         """Greet writers that have not answered; return when the next greeting is due."""
         due = math.inf
         for writer in self.writers.values():
-            for seq in [s for s, one in writer.assemblies.items() if now - one.at_s > ASSEMBLY_S]:
-                del writer.assemblies[seq]
+            if writer.assemblies:
+                kept = ((s, a) for s, a in writer.assemblies.items() if now - a.at_s <= ASSEMBLY_S)
+                writer.assemblies = dict(kept)
             if not writer.heard:
                 if now >= writer.due_s:
                     self._greet(writer, now)
@@ -201,12 +207,20 @@ class ReliableReader:
             self._take_early(writer, writer.next)
 
     def _take_early(self, writer: _Writer, seq: int) -> None:
-        data = writer.early.pop(seq)
+        data = self._pop_early(writer, seq)
         writer.next = seq + 1
         writer.assemblies.pop(seq, None)
         if data is not None:
-            writer.early_bytes -= len(data.payload)
             self._deliver(writer.guid, data)
+
+    def _pop_early(self, writer: _Writer, seq: int) -> Data | None:
+        data = writer.early.pop(seq)
+        self._early -= 1
+        self._early_bytes -= len(data.payload) if data else 0
+        return data
+
+    def _has_room(self, size: int) -> bool:
+        return self._early < MAX_ALL_EARLY and self._early_bytes + size <= MAX_EARLY_BYTES
 
     def _ask(self, writer: _Writer, last: int, now: float) -> None:
         """Acknowledge, and ask for samples up to `last`."""

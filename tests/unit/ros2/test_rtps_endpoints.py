@@ -5,6 +5,7 @@ import random
 import pytest
 
 from gigabrain_zenoh.ros2.rtps_reader import (
+    MAX_ALL_EARLY,
     MAX_ASSEMBLIES,
     MAX_EARLY,
     MAX_SAMPLE_BYTES,
@@ -255,6 +256,25 @@ def test_samples_out_of_order_are_kept_up_to_a_bound():
     (writer,) = reader.writers.values()
     assert len(writer.early) < MAX_EARLY
     assert network.got[CLIENT] == []
+
+
+def test_many_writers_share_the_room_for_samples_out_of_order():
+    network = Network()
+    reader = network.join(CLIENT)
+    for number in range(100):
+        guid = number.to_bytes(12, "big") + WRITER
+        reader.match(guid, AT, 0.0)
+        for seq in range(2, 100):
+            reader.on_data(guid, Data(READER, WRITER, seq, bytes(1000)), 0.0)
+    kept = sum(len(writer.early) for writer in reader.writers.values())
+    assert kept == MAX_ALL_EARLY
+
+    for guid in list(reader.writers):
+        if guid != SERVER + WRITER:
+            reader.unmatch(guid)
+    reader.on_data(SERVER + WRITER, Data(READER, WRITER, 2, b"second"), 0.0)
+    reader.on_data(SERVER + WRITER, Data(READER, WRITER, 1, b"first"), 0.0)
+    assert network.got[CLIENT] == [b"first", b"second"]
 
 
 def test_a_gap_of_any_size_costs_nothing():

@@ -16,7 +16,7 @@ from gigabrain_zenoh.ros2.rtps_discovery import (
     EndpointData,
     ParticipantData,
 )
-from gigabrain_zenoh.ros2.rtps_participant import MAX_REMOTES, Participant
+from gigabrain_zenoh.ros2.rtps_participant import MAX_ENDPOINTS, MAX_REMOTES, Participant
 from gigabrain_zenoh.ros2.rtps_reader import ReliableReader
 from gigabrain_zenoh.ros2.rtps_wire import (
     UNKNOWN_ENTITY,
@@ -212,7 +212,7 @@ def test_sixty_participants_with_four_services_find_each_other():
         for service in range(4):
             add_reader(ether, one, f"rq/n{number}/s{service}Request")
     writers = [add_writer(ether, everyone[0], f"rq/n{number}/s0Request") for number in range(1, 60)]
-    ether.run(3.0)
+    ether.run(1.5)
 
     assert all(len(one.remotes) == 59 for one in everyone)
     assert all(len(writer.readers) == 1 for writer in writers)
@@ -259,9 +259,22 @@ def test_the_number_of_remote_participants_is_bounded():
     one = ether.join(1)
     for number in range(2 * MAX_REMOTES):
         prefix = b"\0\0" + number.to_bytes(10, "big")
-        one.receive(announcement(b"x" + prefix[1:], "10.0.0.66"), "10.0.0.66", ether.now)
+        host = f"10.0.7.{number % 200}"
+        one.receive(announcement(b"x" + prefix[1:], host), host, ether.now)
 
     assert len(one.remotes) == MAX_REMOTES
+
+
+def test_one_host_cannot_take_the_place_of_all_others():
+    ether = Ether()
+    one, two = ether.join(1), ether.join(2)
+    for number in range(2 * MAX_REMOTES):
+        prefix = b"x" + number.to_bytes(11, "big")
+        one.receive(announcement(prefix, "10.0.0.66"), "10.0.0.66", ether.now)
+    ether.run(1.0)
+
+    assert two.data.prefix in one.remotes
+    assert len(one.remotes) == 121  # as many as have ports on a host
 
 
 def test_an_endpoint_of_another_participant_is_not_believed():
@@ -338,7 +351,7 @@ def test_mutated_datagrams_raise_nothing_and_are_not_amplified(seed):
     assert {to for _, to, _ in ether.way} <= {"10.0.0.66"}
     assert sent < 2 * received
     (remote,) = one.remotes.values()
-    assert len(remote.endpoints) < 4096
+    assert len(remote.endpoints) <= MAX_ENDPOINTS
 
     two = ether.join(2)  # and it still works
     _, got = add_reader(ether, two, "rr/aReply")
