@@ -45,6 +45,10 @@ class Types:
             raise unknown("ROS message type", name, self._store.fielddefs)
         return name
 
+    def messages(self) -> tuple[str, ...]:
+        """Return the names of all message types."""
+        return tuple(sorted(self._store.fielddefs))
+
     def is_interface(self, name: str) -> bool:
         """Return whether `name` is a known service or action."""
         return name in self._interfaces

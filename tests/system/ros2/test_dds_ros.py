@@ -1,0 +1,159 @@
+"""Nodes over DDS against real ROS 2: rclpy over Fast DDS."""
+
+import asyncio
+from collections.abc import AsyncIterator
+
+import pytest
+
+from gigabrain_zenoh.config.settings import Ros2Link
+from gigabrain_zenoh.ros2.dds import DdsTransport
+from gigabrain_zenoh.ros2.qos import LATCHED, SENSOR_DATA, Qos
+from gigabrain_zenoh.ros2.transport import Received
+from gigabrain_zenoh.ros2.types import Types
+from gigabrain_zenoh.testing.waiting import until
+from tests.ros2.judge import Judge
+
+TWIST = "geometry_msgs/msg/Twist"
+SCAN = "sensor_msgs/msg/LaserScan"
+GRID = "nav_msgs/msg/OccupancyGrid"
+TRIGGER = "std_srvs/srv/Trigger"
+
+
+@pytest.fixture(scope="module")
+def types() -> Types:
+    return Types()
+
+
+@pytest.fixture
+async def node(judge: Judge, types: Types) -> AsyncIterator[DdsTransport]:
+    link = Ros2Link(
+        transport="dds", domain=judge.domain, localhost=True, namespace="/robot1", node="brain"
+    )
+    async with DdsTransport(link, types) as made:
+        yield made
+
+
+async def test_rclpy_reads_what_we_publish(judge: Judge, node: DdsTransport, types: Types) -> None:
+    publisher = node.publisher("scan", SCAN, SENSOR_DATA)
+    ears = judge.start("listen", node="ears")
+    await ears.query("subscribe", topic="/robot1/scan", type=SCAN, qos={"reliable": False})
+    await until(lambda: publisher.readers == 1, "the reader")
+    scan = types.make(SCAN, header={"frame_id": "base_scan"}, ranges=[1.0, float("inf"), 0.25])
+    payload = types.encode(SCAN, scan)
+    while not (report := await ears.query("report", topic="/robot1/scan"))["count"]:
+        publisher.publish(payload)
+    assert report["values"][0]["ranges"] == [1.0, float("inf"), 0.25]
+    assert report["values"][0]["header"]["frame_id"] == "base_scan"
+    assert abs(report["now_ns"] - report["sent_ns"][-1]) < 60e9
+    await asyncio.to_thread(ears.close)
+    await until(lambda: publisher.readers == 0, "its end")
+
+
+async def test_we_read_what_rclpy_publishes(judge: Judge, node: DdsTransport, types: Types) -> None:
+    got: list[Received] = []
+    node.subscribe("/cmd_vel", TWIST, Qos(), got.append)
+    hands = judge.start("drive", node="hands")
+    await hands.query("drive", linear=0.25, angular=-0.5, hz=20)
+    await until(lambda: len(got) > 5, "commands")
+    twist = types.decode(TWIST, got[-1].payload)
+    assert (twist.linear.x, twist.angular.z) == (0.25, -0.5)
+    assert got[-1].source_ns is not None
+    found = await hands.query("endpoints", topic="/cmd_vel")
+    assert {each["gid"] for each in found["publishers"]} == {got[-1].gid.hex()}
+
+
+async def test_latched_messages_reach_late_rclpy_and_late_us(
+    judge: Judge, node: DdsTransport, types: Types
+) -> None:
+    grid = types.encode(GRID, types.make(GRID, data=[-1, 0, 100], info={"width": 3, "height": 1}))
+    node.publisher("/map", GRID, LATCHED).publish(grid)
+    ears = judge.start("listen", node="ears")
+    latched = {"transient_local": True, "depth": 1}
+    await ears.query("subscribe", topic="/map", type=GRID, qos=latched, stream=True)
+    message = await ears.hear("message", topic="/map")
+    assert message["value"]["data"] == [-1, 0, 100]
+    hands = judge.start("drive", node="hands")
+    value = {"data": [5], "info": {"width": 1, "height": 1}}
+    await hands.query("publish", topic="/their_map", type=GRID, value=value, **latched)
+    got: list[Received] = []
+    node.subscribe("/their_map", GRID, LATCHED, got.append)
+    await until(lambda: got, "their map")
+    assert types.decode(GRID, got[0].payload).data.tolist() == [5]
+
+
+async def test_rclpy_finds_our_node_and_its_endpoints(
+    judge: Judge, node: DdsTransport, types: Types
+) -> None:
+    node.publisher("scan", SCAN, SENSOR_DATA)
+    node.subscribe("cmd_vel", TWIST, Qos(), lambda _: None)
+
+    async def answer(request: bytes) -> bytes:
+        return request
+
+    close = node.serve("estop", TRIGGER, answer)
+    viewer = judge.start("graph", node="viewer")
+    while "/robot1/brain" not in (found := await viewer.query("graph"))["nodes"]:
+        pass
+    while "/robot1/estop" not in (found := await viewer.query("graph"))["services"]:
+        pass
+    assert found["services"]["/robot1/estop"] == [TRIGGER]
+    assert found["topics"]["/robot1/scan"] == [SCAN]
+    (scan,) = (await viewer.query("endpoints", topic="/robot1/scan"))["publishers"]
+    assert (scan["node"], scan["namespace"], scan["type"]) == ("brain", "/robot1", SCAN)
+    assert (scan["reliable"], scan["transient_local"]) == (False, False)
+    assert scan["hash"] == types.hash(SCAN)
+    (command,) = (await viewer.query("endpoints", topic="/robot1/cmd_vel"))["subscribers"]
+    assert (command["node"], command["reliable"]) == ("brain", True)
+    close()
+    while "/robot1/estop" in (await viewer.query("graph"))["services"]:
+        pass
+
+
+async def test_we_find_rclpys_nodes_and_endpoints(judge: Judge, node: DdsTransport) -> None:
+    serve = judge.start("serve", node="server", namespace="/other")
+    await serve.query("service", service="/release", type=TRIGGER)
+    drive = judge.start("drive", node="hands")
+    await drive.query("drive", linear=0.1, hz=10)
+    await until(lambda: {"/other/server", "/hands"} <= set(node.nodes()), "their nodes")
+
+    def found() -> set[tuple[str, str, str, str]]:
+        return {(each.node, each.kind, each.topic, each.type) for each in node.endpoints()}
+
+    wanted = {
+        ("/hands", "publisher", "/cmd_vel", TWIST),
+        ("/other/server", "server", "/release", TRIGGER),
+    }
+    await until(lambda: wanted <= found(), "their endpoints")
+    hashes = {each.hash for each in node.endpoints() if each.topic == "/cmd_vel"}
+    assert hashes == {node.types.hash(TWIST)}
+
+
+@pytest.mark.slow  # Fast DDS's lease is 20 s
+async def test_a_killed_rclpy_is_forgotten_after_its_lease(
+    judge: Judge, node: DdsTransport
+) -> None:
+    publisher = node.publisher("scan", SCAN, SENSOR_DATA)
+    ears = judge.start("listen", node="ears")
+    await ears.query("subscribe", topic="/robot1/scan", type=SCAN, qos={"reliable": False})
+    await until(lambda: publisher.readers == 1 and "/ears" in node.nodes(), "the reader")
+    ears.kill()
+    await until(lambda: publisher.readers == 0 and "/ears" not in node.nodes(), "its end")
+
+
+async def test_services_go_both_ways(judge: Judge, node: DdsTransport, types: Types) -> None:
+    async def answer(request: bytes) -> bytes:
+        response = types.make(f"{TRIGGER}_Response", success=True, message="stopped")
+        return types.encode(f"{TRIGGER}_Response", response)
+
+    node.serve("estop", TRIGGER, answer)
+    caller = judge.start("call", node="caller")
+    service = {"service": "/robot1/estop", "type": TRIGGER}
+    while not (await caller.query("available", **service))["available"]:
+        pass
+    await caller.query("call", **service)
+    assert (await caller.hear("response"))["value"] == {"success": True, "message": "stopped"}
+    serve = judge.start("serve", node="server")
+    await serve.query("service", service="/release", type=TRIGGER, success=True, message="free")
+    request = types.encode(f"{TRIGGER}_Request", types.make(f"{TRIGGER}_Request"))
+    response = await node.call("/release", TRIGGER, request, 60)
+    assert types.decode(f"{TRIGGER}_Response", response).message == "free"

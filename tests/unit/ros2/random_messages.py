@@ -1,0 +1,54 @@
+"""Messages of any type with random values, as JSON's values with bytes as lists."""
+
+import random
+import struct
+from typing import Any
+
+from rosbags.interfaces import Nodetype
+
+from gigabrain_zenoh.ros2.type_files import DUMMY
+from gigabrain_zenoh.ros2.types import Types
+
+RANGES = {
+    "int8": (-(2**7), 2**7 - 1),
+    "uint8": (0, 2**8 - 1),
+    "char": (0, 2**8 - 1),
+    "int16": (-(2**15), 2**15 - 1),
+    "uint16": (0, 2**16 - 1),
+    "int32": (-(2**31), 2**31 - 1),
+    "uint32": (0, 2**32 - 1),
+    "int64": (-(2**63), 2**63 - 1),
+    "uint64": (0, 2**64 - 1),
+    "byte": (0, 127),  # read with a sign here, and without one by ROS
+}
+TEXTS = ("", "map", "ä€ 😀", "x" * 17)
+
+
+def random_fields(types: Types, name: str, source: random.Random) -> dict[str, Any]:
+    """Return random values of all fields."""
+    return {
+        field: _value(types, kind, source) for field, kind in types.fields(name) if field != DUMMY
+    }
+
+
+def _value(types: Types, kind: Any, source: random.Random) -> Any:
+    if kind[0] == Nodetype.NAME:
+        return random_fields(types, kind[1], source)
+    if kind[0] == Nodetype.BASE:
+        return _scalar(*kind[1], source)
+    inner, size = kind[1]
+    count = size if kind[0] == Nodetype.ARRAY else source.randint(0, min(size or 3, 3))
+    return [_value(types, inner, source) for _ in range(count)]
+
+
+def _scalar(primitive: str, longest: int, source: random.Random) -> Any:
+    if primitive == "string":
+        text = source.choice(TEXTS)
+        return text[:longest] if longest and text.isascii() else "" if longest else text
+    if primitive == "bool":
+        return source.random() < 0.5
+    if primitive == "float64":
+        return source.uniform(-1e9, 1e9)
+    if primitive == "float32":
+        return struct.unpack("<f", struct.pack("<f", source.uniform(-1e6, 1e6)))[0]
+    return source.randint(*RANGES[primitive])
