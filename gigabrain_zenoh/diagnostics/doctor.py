@@ -47,11 +47,11 @@ SYSTEMS = ("router", "driver", "perception", "decision", "control", "safety")
 LIBRARIES: Mapping[str, tuple[int, ...]] = {  # with the lowest version
     "eclipse-zenoh": (1, 10), "msgspec": (0, 19), "numpy": (1, 26), "pyserial": (), "pyyaml": (),
     "cyclopts": (5, 0), "rich": (), "mujoco-core": (), "cryptography": (), "mcap": (),
-    "textual": (), "uvloop": (),
+    "textual": (), "uvloop": (), "rosbags": (0, 11), "xxhash": (3,), "cyclonedds": (11,),
 }  # fmt: skip
 EXTRAS = {  # optional libraries, and the extra of the package that installs each
     "mujoco-core": "sim", "cryptography": "keys", "mcap": "record", "textual": "view",
-    "uvloop": "fast",
+    "uvloop": "fast", "rosbags": "ros2", "xxhash": "ros2", "cyclonedds": "dds",
 }  # fmt: skip
 SENDERS: dict[Topic[Any], str] = {
     STATE: "driver", SCAN: "driver", BODY: "driver", WORLD: "perception", INTENT: "decision",

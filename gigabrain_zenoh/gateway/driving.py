@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine, Iterable
 from typing import Any
 
@@ -187,19 +188,31 @@ class PoseRequests:
     def _handler(
         self, topic: str, name: str, ask: Callable[[Any], Awaitable[str]]
     ) -> Callable[[Received], None]:
-        async def answer(payload: bytes) -> None:
-            try:
-                text = await ask(self._types.decode(name, payload))
-            except GigabrainError as error:
-                self.problems[topic] = str(error)
-                self._scene.bus.counters[f"{topic}_refused"] += 1
-                log.warning("refused /%s: %s", topic, error)
-            else:
-                self.problems.pop(topic, None)
-                log.info("/%s: %s", topic, text)
+        """Return a handler that asks for one pose at a time; the newest one waits for it."""
+        waiting: deque[bytes] = deque(maxlen=1)
+        busy, fault = False, Fault(log)
+
+        async def work() -> None:
+            nonlocal busy
+            while waiting:
+                try:
+                    text = await ask(self._types.decode(name, waiting.pop()))
+                except GigabrainError as error:
+                    self.problems[topic] = str(error)
+                    self._scene.bus.counters[f"{topic}_refused"] += 1
+                    fault.begin(f"refused /{topic}: {error}")
+                else:
+                    self.problems.pop(topic, None)
+                    fault.end(f"/{topic} is accepted again")
+                    log.info("/%s: %s", topic, text)
+            busy = False
 
         def handle(received: Received) -> None:
-            self._work.start(answer(received.payload))
+            nonlocal busy
+            waiting.append(received.payload)
+            if not busy:
+                busy = True
+                self._work.start(work())
 
         return handle
 

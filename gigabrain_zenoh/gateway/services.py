@@ -22,6 +22,7 @@ from gigabrain_zenoh.ros2.types import Types
 
 log = logging.getLogger(__name__)
 TRIGGER, SET_BOOL = "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"
+LOG_NS = 1_000_000_000
 SAVE_S = 10.0  # timeout: a large map takes a second on a slow disk
 NOT_HERE = "an e-stop is not taken back here; look at the robot, then call the service release"
 
@@ -38,6 +39,7 @@ class Services:
         commander: RosCommander,
     ) -> None:
         self._scene, self._types, self._commander = scene, types, commander
+        self._logged = ("", "", 0)  # the last call that was logged, and when
         acts: dict[str, tuple[str, Callable[[Any], Awaitable[str]]]] = {
             "estop": (SET_BOOL, self._estop),
             "release": (TRIGGER, self._release),
@@ -57,11 +59,19 @@ class Services:
                 text = await act(self._types.decode(f"{kind}_Request", payload))
             except GigabrainError as error:
                 ok, text = False, str(error)
-            log.info("service %s: %s", name, text, extra={"data": {"event": name, "ok": ok}})
+            self._log(name, text, ok=ok)
             made = self._types.make(f"{kind}_Response", success=ok, message=text)
             return self._types.encode(f"{kind}_Response", made)
 
         return answer
+
+    def _log(self, name: str, text: str, *, ok: bool) -> None:
+        """Log a call, unless it repeats the last one within a second."""
+        now_ns = self._scene.bus.clock.now_ns()
+        if self._logged[:2] == (name, text) and now_ns - self._logged[2] < LOG_NS:
+            return
+        self._logged = name, text, now_ns
+        log.info("service %s: %s", name, text, extra={"data": {"event": name, "ok": ok}})
 
     async def _estop(self, request: Any) -> str:
         if not request.data:

@@ -1,5 +1,6 @@
 """Each topic of the gateway, read by a node of ROS in memory: type, QoS, rate, content."""
 
+import asyncio
 import math
 from contextlib import asynccontextmanager
 
@@ -456,6 +457,25 @@ async def test_a_goal_pose_that_cannot_be_is_refused_and_said_on_diagnostics(fra
         level, text = (await diagnosed(robot))["gigabrain: goal_pose"]
         assert (level, words in text) == (1, True)
         assert robot.gateway_bus.problems[0].code == "ros2_goal_pose"
+
+
+async def test_of_many_goals_at_once_the_first_and_the_newest_are_asked_for():
+    async with driver() as robot:
+        requests, go_on = [], asyncio.Event()
+
+        async def answer(request):
+            requests.append(request.x)
+            await go_on.wait()
+            return GoalReply(ok=True, text="on the way", goal="goal-1")
+
+        robot.bus.serve(GOAL, answer)
+        for number in range(100):
+            pose = {"position": {"x": float(number)}}
+            robot.node.publish("/goal_pose", POSE_STAMPED, header={"frame_id": "map"}, pose=pose)
+            await robot.clock.advance(0)
+        go_on.set()
+        await robot.clock.advance(TICK_NS)
+        assert requests == [0.0, 99.0]
 
 
 async def test_an_initialpose_in_another_frame_is_refused():

@@ -1,0 +1,276 @@
+"""Nav2's goals on our tasks: what the robot is asked, feedback, preemption, cancel, codes."""
+
+import asyncio
+import math
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.brain import OccupancyGrid, PoseInMap
+from gigabrain_schemas.tasks import Goal, GoalReply, MissionReply, Task, TaskReply, TaskStatus
+from gigabrain_schemas.topics import BODY, GOAL, MAP, MISSION, POSE, STATE, TASK, TASK_CHANGE
+from gigabrain_zenoh.decision.tasks.mission import loads
+from gigabrain_zenoh.gateway.navigation import (
+    EndState,
+    Navigator,
+    Outcome,
+    feedback,
+    requested,
+)
+from gigabrain_zenoh.gateway.result_codes import THROUGH_POSES, TO_POSE, inner_radius
+from gigabrain_zenoh.gateway.scene import Scene
+from gigabrain_zenoh.ros2.types import Types
+from gigabrain_zenoh.testing import samples
+from gigabrain_zenoh.testing.in_memory import Net
+
+MAKE = Types().make
+THERE = Pose(x=2.0, y=1.0, yaw=0.5)
+STOPS = (Pose(x=1.0, y=0.0, yaw=0.0), Pose(x=1.0, y=2.0, yaw=0.0), Pose(x=3.0, y=2.0, yaw=0.0))
+FREE = OccupancyGrid(resolution=0.1, width=50, height=50, origin_x=-1.0, origin_y=-1.0,
+                     cells=bytes(2500))  # fmt: skip
+
+
+class Brain:
+    """Decision as a client sees it, by hand, and the navigator that asks it."""
+
+    def __init__(self):
+        self.net = Net()
+        self.bus = self.net.one
+        self.bus.time.boot = samples.BOOT
+        self.navigator = Navigator(Scene(self.net.bus("ros2")))
+        self.asked, self.done, self.tick, self.count = [], [], 0, 0
+        self.refusal, self.progress = "", []
+        self.bus.serve(GOAL, self._goal)
+        self.bus.serve(MISSION, self._mission)
+        self.bus.serve(TASK_CHANGE, self._change)
+
+    async def _goal(self, request):
+        self.asked.append((request.x, request.y, request.yaw, request.how))
+        if self.refusal:
+            return GoalReply(ok=False, text=self.refusal)
+        self.count += 1
+        return GoalReply(ok=True, text="on the way", goal=f"goal-{self.count}")
+
+    async def _mission(self, request):
+        self.asked.append(loads(request.mission, "mission"))
+        self.count += 1
+        return MissionReply(ok=True, text="", task=f"mission-{self.count}")
+
+    async def _change(self, request):
+        self.asked.append((request.do, request.task))
+        return TaskReply(ok=True, text="")
+
+    async def located(self, x=0.0, y=0.0, grid=FREE):
+        self.bus.publish(BODY, samples.body())
+        self.tick += 1
+        self.bus.time.tick = self.tick
+        self.bus.publish(STATE, samples.state(self.tick))
+        self.bus.publish(POSE, PoseInMap(x=x, y=y, yaw=0.0, covariance=(0.0,) * 9),
+                         basis=self.tick)  # fmt: skip
+        if grid:
+            self.bus.publish(MAP, grid)
+        await self.settle()
+
+    async def settle(self):
+        await self.net.clock.advance(0)
+
+    def begin(self, poses=(THERE,), codes=TO_POSE):
+        return asyncio.ensure_future(self.navigator.carry_out(codes, poses, self.progress.append))
+
+    async def say(self, state, name="goal-1", reason="", **about):
+        """Publish the status of a task that is active, or has ended."""
+        task = Task(id=name, kind="goal", label="", source="ros2", state=state, reason=reason)
+        if state in ("succeeded", "failed", "cancelled"):
+            self.done.insert(0, task)
+            status = TaskStatus(done=tuple(self.done), **about)
+        else:
+            status = TaskStatus(current=task, done=tuple(self.done), **about)
+        self.bus.publish(TASK, status)
+        await self.settle()
+
+
+async def test_a_goal_is_a_task_and_its_end_is_the_result():
+    brain = Brain()
+    await brain.located()
+    goal = brain.begin()
+    await brain.settle()
+    assert brain.asked == [(2.0, 1.0, 0.5, "replace")]
+    await brain.say("active", path=((0.0, 0.0), (2.0, 1.0)), distance_remaining=2.5, eta=11.0)
+    await brain.say("succeeded")
+    assert await goal == Outcome(EndState.SUCCEEDED, 0, "")
+
+
+async def test_feedback_tells_place_time_and_way_left():
+    brain = Brain()
+    await brain.located(x=0.5, y=0.25)
+    goal = brain.begin()
+    await brain.settle()
+    brain.net.clock.stall(1_500_000_000)
+    await brain.located(x=0.75, y=0.25)
+    await brain.say("active", path=((0.0, 0.0), (2.0, 1.0)), distance_remaining=2.5, eta=11.25)
+    await brain.say("active", name="goal-9", distance_remaining=99.0)
+    (progress,) = brain.progress
+    made = feedback(MAKE, "nav2_msgs/action/NavigateToPose", 7_000_000_001, progress)
+    assert (made.current_pose.header.frame_id, made.current_pose.header.stamp.sec) == ("map", 7)
+    assert (made.current_pose.pose.position.x, made.current_pose.pose.position.y) == (0.75, 0.25)
+    assert made.navigation_time.sec == 1
+    assert (made.estimated_time_remaining.sec, made.estimated_time_remaining.nanosec) == (
+        11, 250_000_000,
+    )  # fmt: skip
+    assert (made.distance_remaining, made.number_of_recoveries) == (2.5, 0)
+    await brain.say("succeeded")
+    await goal
+
+
+async def test_several_poses_are_a_mission_and_feedback_counts_those_left():
+    brain = Brain()
+    await brain.located()
+    goal = brain.begin(STOPS, THROUGH_POSES)
+    await brain.settle()
+    (mission,) = brain.asked
+    assert [step.goto for step in mission.do] == [(1.0, 0.0, 0.0), (1.0, 2.0, 0.0), (3.0, 2.0, 0.0)]
+    for at in STOPS:
+        await brain.say("active", "mission-1", goal=Goal(x=at.x, y=at.y + 0.1),
+                        distance_remaining=0.5, eta=2.0)  # fmt: skip
+    assert [one.poses_left for one in brain.progress] == [3, 2, 1]
+    assert [one.left_m for one in brain.progress] == pytest.approx([4.5, 2.5, 0.5])
+    assert [one.left_s for one in brain.progress] == pytest.approx([2 + 4 / 0.26, 2 + 2 / 0.26, 2])
+    action = "nav2_msgs/action/NavigateThroughPoses"
+    assert feedback(MAKE, action, 0, brain.progress[1]).number_of_poses_remaining == 2
+    await brain.say("succeeded", "mission-1")
+    assert (await goal).state is EndState.SUCCEEDED
+
+
+async def test_a_cancel_cancels_the_task():
+    brain = Brain()
+    await brain.located()
+    goal = brain.begin()
+    await brain.settle()
+    goal.cancel()
+    await brain.settle()
+    assert goal.cancelled()
+    assert brain.asked[1:] == [("cancel", "goal-1")]
+
+
+async def test_a_cancel_before_the_answer_cancels_the_task_that_was_accepted():
+    brain = Brain()
+    await brain.located()
+    goal = brain.begin()
+    await asyncio.sleep(0)
+    goal.cancel()
+    await brain.settle()
+    assert goal.cancelled()
+    assert brain.asked == [(2.0, 1.0, 0.5, "replace"), ("cancel", "goal-1")]
+
+
+async def test_a_new_goal_replaces_the_task_without_a_cancel_between():
+    brain = Brain()
+    await brain.located()
+    old = brain.begin()
+    await brain.settle()
+    new = brain.begin((replace(THERE, x=1.5),))
+    old.cancel()
+    await brain.settle()
+    assert brain.asked == [(2.0, 1.0, 0.5, "replace"), (1.5, 1.0, 0.5, "replace")]
+    await brain.say("succeeded", "goal-2")
+    assert (await new).state is EndState.SUCCEEDED
+
+
+async def test_a_new_goal_that_is_refused_ends_the_task_before_as_well():
+    brain = Brain()
+    await brain.located()
+    old = brain.begin()
+    await brain.settle()
+    brain.refusal = "no way leads there"
+    new = brain.begin()
+    old.cancel()
+    assert (await new).state is EndState.ABORTED
+    assert brain.asked[2:] == [("cancel", "goal-1")]
+
+
+async def test_a_task_that_another_client_ends_is_aborted_with_its_reason():
+    brain = Brain()
+    await brain.located()
+    goal = brain.begin()
+    await brain.settle()
+    await brain.say("cancelled", reason="cancelled by ann")
+    assert await goal == Outcome(EndState.ABORTED, 9000, "cancelled by ann")
+
+
+@pytest.mark.parametrize(("path", "code"), [(((0.0, 0.0), (2.0, 1.0)), 105), ((), 208)])
+async def test_a_task_that_fails_has_the_code_of_the_controller_or_the_planner(path, code):
+    brain = Brain()
+    await brain.located()
+    goal = brain.begin()
+    await brain.settle()
+    await brain.say("active", path=path)
+    await brain.say("failed", reason="gave up")
+    assert await goal == Outcome(EndState.ABORTED, code, "gave up")
+
+
+def with_wall(column, row=None):
+    """Return a map with an occupied column of cells, or one cell."""
+    cells = np.zeros((50, 50), np.int8)
+    cells[slice(None) if row is None else row, column] = 100
+    return replace(FREE, cells=cells.tobytes())
+
+
+@pytest.mark.parametrize(
+    ("codes", "here", "goal", "grid", "code"),
+    [
+        (TO_POSE, (0.0, 0.0), (2.0, 1.0), with_wall(20), 208),
+        (THROUGH_POSES, (0.0, 0.0), (2.0, 1.0), with_wall(20), 308),
+        (TO_POSE, (0.0, 0.0), (9.0, 1.0), FREE, 204),
+        (TO_POSE, (-3.0, 0.0), (2.0, 1.0), FREE, 203),
+        (TO_POSE, (0.05, 0.05), (2.0, 1.0), with_wall(10, 10), 205),
+        (TO_POSE, (0.0, 0.0), (2.05, 1.05), with_wall(30, 20), 206),
+        (TO_POSE, (0.0, 0.0), (2.05, 1.11), with_wall(30, 20), 208),
+        (TO_POSE, (0.0, 0.0), (2.0, 1.0), None, 202),
+        (TO_POSE, None, (2.0, 1.0), FREE, 202),
+    ],
+)
+async def test_a_refused_goal_has_the_code_of_the_planner(codes, here, goal, grid, code):
+    brain = Brain()
+    if here:
+        await brain.located(*here, grid)
+    elif grid:
+        brain.bus.publish(MAP, grid)
+    brain.refusal = "no way leads to the goal"
+    found = await brain.begin((Pose(x=goal[0], y=goal[1], yaw=0.0),), codes)
+    assert found == Outcome(EndState.ABORTED, code, "no way leads to the goal")
+
+
+def test_the_largest_circle_in_a_footprint_touches_its_nearest_side():
+    assert inner_radius(samples.WAFFLE.footprint) == pytest.approx(0.075)
+    assert inner_radius(((1.0, 1.0), (2.0, 1.0), (2.0, 2.0))) == pytest.approx(math.sqrt(2))
+
+
+def ros_goal(frame="map", x=2.0, w=1.0):
+    return MAKE("geometry_msgs/msg/PoseStamped", header={"frame_id": frame},
+                pose={"position": {"x": x, "y": 1.0}, "orientation": {"w": w}})  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("poses", "tree", "code"),
+    [
+        ([ros_goal("base_link")], "", 9002),
+        ([ros_goal("odom")], "", 9002),
+        ([ros_goal(x=math.nan)], "", 9002),
+        ([ros_goal(w=0.0)], "", 9002),
+        ([ros_goal()], "my_tree.xml", 9001),
+        ([], "", 9000),
+        ([ros_goal()] * 201, "", 9000),
+    ],
+)
+def test_goals_that_cannot_be_have_a_code_and_a_text(poses, tree, code):
+    fault = requested(TO_POSE, poses, tree, None).fault
+    assert (fault.state, fault.code) == (EndState.ABORTED, code)
+    assert fault.text
+
+
+def test_goals_in_odom_are_turned_into_the_map():
+    odom = Pose(x=10.0, y=0.0, yaw=math.pi / 2)
+    (found,) = requested(TO_POSE, [ros_goal("odom")], "", odom).poses
+    assert (found.x, found.y, found.yaw) == pytest.approx((9.0, 2.0, math.pi / 2))
