@@ -1,11 +1,13 @@
 """Nodes over DDS against real ROS 2: rclpy over Fast DDS."""
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
+from typing import Any
 
 import pytest
 
 from gigabrain_zenoh.config.settings import Ros2Link
+from gigabrain_zenoh.ros2.actions import ActionServer, Goal, GoalState, Outcome
 from gigabrain_zenoh.ros2.dds import DdsTransport
 from gigabrain_zenoh.ros2.qos import LATCHED, SENSOR_DATA, Qos
 from gigabrain_zenoh.ros2.transport import Received
@@ -17,6 +19,7 @@ TWIST = "geometry_msgs/msg/Twist"
 SCAN = "sensor_msgs/msg/LaserScan"
 GRID = "nav_msgs/msg/OccupancyGrid"
 TRIGGER = "std_srvs/srv/Trigger"
+NAVIGATE = "nav2_msgs/action/NavigateToPose"
 
 
 @pytest.fixture(scope="module")
@@ -138,6 +141,59 @@ async def test_a_killed_rclpy_is_forgotten_after_its_lease(
     await until(lambda: publisher.readers == 1 and "/ears" in node.nodes(), "the reader")
     ears.kill()
     await until(lambda: publisher.readers == 0 and "/ears" not in node.nodes(), "its end")
+
+
+class Walk:
+    """Walks until it is cancelled or preempted, or has sent all its feedback."""
+
+    def __init__(self) -> None:
+        self.goals: list[Any] = []
+
+    def accept(self, message: Any) -> bool:
+        return bool(message.behavior_tree != "none")
+
+    def cancel(self, goal: Goal) -> bool:
+        return True
+
+    async def run(self, goal: Goal, feedback: Callable[[Any], None]) -> Outcome:
+        self.goals.append(goal.message)
+        steps = 5 if goal.message.behavior_tree == "short" else 10_000
+        for step in range(steps):
+            if goal.cancel_requested:
+                return Outcome(GoalState.CANCELED)
+            if goal.preempted:
+                return Outcome(GoalState.ABORTED)
+            feedback({"distance_remaining": float(steps - step)})
+            await asyncio.sleep(0.02)
+        return Outcome(GoalState.SUCCEEDED, {"error_code": 0, "error_msg": "there"})
+
+
+async def test_rclpys_goals_are_followed_preempted_and_cancelled(
+    judge: Judge, node: DdsTransport, types: Types
+) -> None:
+    walk = Walk()
+    server = ActionServer(node, types, "/navigate_to_pose", NAVIGATE, walk, preempts=True)
+    client = judge.start("navigate", node="client")
+    action = {"action": "/navigate_to_pose", "type": NAVIGATE}
+    while not (await client.query("available", **action))["available"]:
+        pass
+    pose = {"header": {"frame_id": "map"}, "pose": {"position": {"x": 1.5}}}
+    for name in ("first", "second"):
+        await client.query("send", **action, name=name, goal={"pose": pose})
+        await client.hear("accepted", name=name)
+        heard = await client.hear("feedback", name=name)
+        assert heard["value"]["distance_remaining"] > 0
+    assert (await client.hear("result", name="first"))["status"] == "aborted"
+    await client.query("cancel", name="second")
+    assert (await client.hear("cancelled", name="second"))["goals"] == 1
+    assert (await client.hear("result", name="second"))["status"] == "canceled"
+    await client.query("send", **action, name="third", goal={"behavior_tree": "short"})
+    third = await client.hear("result", name="third")
+    assert (third["status"], third["value"]["error_msg"]) == ("succeeded", "there")
+    await client.query("send", **action, name="fourth", goal={"behavior_tree": "none"})
+    await client.hear("rejected", name="fourth")
+    assert walk.goals[0].pose.pose.position.x == 1.5
+    await server.close()
 
 
 async def test_services_go_both_ways(judge: Judge, node: DdsTransport, types: Types) -> None:
