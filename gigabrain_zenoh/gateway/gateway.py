@@ -10,6 +10,7 @@ from gigabrain_zenoh.config.settings import Ros2Config
 from gigabrain_zenoh.gateway.conversions.diagnostics import Level, Status
 from gigabrain_zenoh.gateway.diagnosing import Diagnosing
 from gigabrain_zenoh.gateway.driving import Background, PoseRequests, RosCommander
+from gigabrain_zenoh.gateway.nav2 import Nav2Actions
 from gigabrain_zenoh.gateway.parameters import Parameters
 from gigabrain_zenoh.gateway.publishing import Publishing
 from gigabrain_zenoh.gateway.scene import Scene
@@ -33,11 +34,13 @@ class Gateway:
         self.commander = RosCommander(scene, ros, types, config, work)
         self.poses = PoseRequests(scene, ros, types, config, work)
         self.services = Services(scene, ros, types, config, self.commander)
+        self.actions = Nav2Actions(scene, ros, types, config)
         self.parameters = Parameters(ros, types, config, lambda: scene.simulated)
         self.diagnosing = Diagnosing(scene, ros, types, self._statuses)
 
-    def close(self) -> None:
+    async def close(self) -> None:
         """End what runs for ROS; a body that it drives is stopped by the gate."""
+        await self.actions.close()
         self.publishing.close()
         self.work.close()
 
@@ -77,7 +80,7 @@ async def serve(
         ready()
         await asyncio.wait((running, bus.failed), return_when=asyncio.FIRST_COMPLETED)
     finally:
-        gateway.close()
+        await gateway.close()
         running.cancel()
         await asyncio.wait((running,))
     for end in (running, bus.failed):

@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+from contextlib import asynccontextmanager
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from gigabrain_zenoh.gateway.scene import Scene
 from gigabrain_zenoh.ros2.types import Types
 from gigabrain_zenoh.testing import samples
 from gigabrain_zenoh.testing.in_memory import Net
+from tests.node.ros2_robot import RosNode, gateway_on
 
 MAKE = Types().make
 THERE = Pose(x=2.0, y=1.0, yaw=0.5)
@@ -274,3 +276,123 @@ def test_goals_in_odom_are_turned_into_the_map():
     odom = Pose(x=10.0, y=0.0, yaw=math.pi / 2)
     (found,) = requested(TO_POSE, [ros_goal("odom")], "", odom).poses
     assert (found.x, found.y, found.yaw) == pytest.approx((9.0, 2.0, math.pi / 2))
+
+
+ACTION = "nav2_msgs/action/NavigateToPose"
+THROUGH = "nav2_msgs/action/NavigateThroughPoses"
+
+
+class Client:
+    """A client of the gateway's actions, on ROS in memory."""
+
+    def __init__(self, brain, node):
+        self.brain, self.node = brain, node
+        self.results = {}
+
+    async def send(self, number, poses=None, name="/navigate_to_pose", **fields):
+        """Send a goal, and wait for its result beside; returns whether it was accepted."""
+        kind = THROUGH if name.endswith("poses") else ACTION
+        key = "poses" if kind == THROUGH else "pose"
+        goal = {key: poses if poses is not None else ros_goal(), **fields}
+        id = {"uuid": np.full(16, number, np.uint8)}
+        reply = await self.node.call(
+            f"{name}/_action/send_goal", f"{kind}_SendGoal", goal_id=id, goal=goal
+        )
+        if reply.accepted:
+            asking = self.node.call(f"{name}/_action/get_result", f"{kind}_GetResult", goal_id=id)
+            self.results[number] = asyncio.ensure_future(asking)
+        await self.brain.settle()
+        return reply.accepted
+
+    async def result(self, number):
+        got = await self.results[number]
+        return got.status, got.result.error_code
+
+    async def cancel(self, number):
+        info = {"goal_id": {"uuid": np.full(16, number, np.uint8)}}
+        reply = await self.node.call(
+            "/navigate_to_pose/_action/cancel_goal", "action_msgs/srv/CancelGoal", goal_info=info
+        )
+        await self.brain.settle()
+        return reply.return_code, len(reply.goals_canceling)
+
+
+@asynccontextmanager
+async def client():
+    brain = Brain()
+    async with gateway_on(brain.net.network, brain.net.clock) as (_, ros):
+        await brain.located()
+        yield Client(brain, RosNode(ros, brain.net.clock))
+
+
+async def test_a_client_of_ros_sends_a_goal_follows_it_and_gets_the_result():
+    async with client() as ros:
+        topic = "/navigate_to_pose/_action/feedback"
+        ros.node.read(topic, f"{ACTION}_FeedbackMessage")
+        assert await ros.send(1)
+        assert ros.brain.asked == [(2.0, 1.0, 0.0, "replace")]
+        await ros.brain.say("active", path=((0.0, 0.0), (2.0, 1.0)), distance_remaining=2.25)
+        (message,) = ros.node.received[topic]
+        assert message.goal_id.uuid.tolist() == [1] * 16
+        assert message.feedback.distance_remaining == 2.25
+        await ros.brain.say("succeeded")
+        assert await ros.result(1) == (4, 0)
+
+
+async def test_a_client_of_ros_cancels_a_goal():
+    async with client() as ros:
+        await ros.send(1)
+        assert await ros.cancel(1) == (0, 1)
+        assert ros.brain.asked[1:] == [("cancel", "goal-1")]
+        assert await ros.result(1) == (5, 0)
+        assert await ros.cancel(1) == (3, 0)
+
+
+async def test_a_new_goal_preempts_the_one_before_which_is_aborted_as_by_nav2():
+    async with client() as ros:
+        await ros.send(1)
+        await ros.send(2, ros_goal(x=1.5))
+        assert await ros.result(1) == (6, 0)
+        assert ros.brain.asked == [(2.0, 1.0, 0.0, "replace"), (1.5, 1.0, 0.0, "replace")]
+        await ros.brain.say("succeeded", "goal-2")
+        assert await ros.result(2) == (4, 0)
+
+
+async def test_a_goal_that_is_not_understood_is_aborted_and_does_not_end_the_present_one():
+    async with client() as ros:
+        await ros.send(1)
+        await ros.send(2, ros_goal("camera"))
+        assert await ros.result(2) == (6, 9002)
+        await ros.brain.say("succeeded")
+        assert await ros.result(1) == (4, 0)
+
+
+async def test_a_goal_without_a_way_is_aborted_with_the_planners_code():
+    async with client() as ros:
+        ros.brain.refusal = "no way leads to the goal"
+        await ros.send(1, ros_goal(x=99.0))
+        assert await ros.result(1) == (6, 204)
+
+
+async def test_several_poses_are_driven_and_reject_single_ones_meanwhile():
+    async with client() as ros:
+        name = "/navigate_through_poses"
+        topic = f"{name}/_action/feedback"
+        ros.node.read(topic, f"{THROUGH}_FeedbackMessage")
+        assert await ros.send(1, [ros_goal(x=1.0), ros_goal(x=2.0)], name)
+        assert not await ros.send(2)
+        await ros.brain.say("active", "mission-1", goal=Goal(x=2.0, y=1.0), distance_remaining=0.5)
+        assert ros.node.received[topic][0].feedback.number_of_poses_remaining == 1
+        await ros.brain.say("succeeded", "mission-1")
+        assert await ros.result(1) == (4, 0)
+        assert await ros.send(3)
+
+
+async def test_a_gateway_that_ends_cancels_the_task_of_ros():
+    brain = Brain()
+    async with gateway_on(brain.net.network, brain.net.clock) as (_, network):
+        await brain.located()
+        ros = Client(brain, RosNode(network, brain.net.clock))
+        await ros.send(1)
+    assert brain.asked[1:] == [("cancel", "goal-1")]
+    assert await ros.result(1) == (6, 0)

@@ -1,0 +1,129 @@
+"""Nav2's two navigators as actions of ROS, which share one robot.
+
+As in Nav2, a new goal of the same action preempts the one before, which ends as aborted. A goal of
+the other action is rejected meanwhile, and one that cannot be understood does not end the present.
+"""
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+from gigabrain_zenoh.config.settings import Ros2Config
+from gigabrain_zenoh.gateway.navigation import (
+    EndState,
+    Navigator,
+    Progress,
+    feedback,
+    requested,
+)
+from gigabrain_zenoh.gateway.navigation import Outcome as Ended
+from gigabrain_zenoh.gateway.result_codes import THROUGH_POSES, TO_POSE, Codes
+from gigabrain_zenoh.gateway.scene import Scene, left_out
+from gigabrain_zenoh.ros2.actions import ActionServer, Goal, GoalState, Outcome
+from gigabrain_zenoh.ros2.transport import RosTransport
+from gigabrain_zenoh.ros2.types import Types
+
+Work = asyncio.Future[Ended]
+TO_POSE_TYPE = "nav2_msgs/action/NavigateToPose"
+THROUGH_POSES_TYPE = "nav2_msgs/action/NavigateThroughPoses"
+
+
+class NavigateHandler:
+    """Carries out the goals of one of the actions."""
+
+    def __init__(
+        self, scene: Scene, types: Types, navigator: Navigator, type: str, codes: Codes
+    ) -> None:
+        self._scene, self._types, self._navigator = scene, types, navigator
+        self._type, self._codes = type, codes
+        self._works: dict[bytes, Work] = {}  # by goal
+        self.others: list[NavigateHandler] = []
+
+    @property
+    def busy(self) -> bool:
+        """Whether a goal is carried out."""
+        return bool(self._works)
+
+    def accept(self, message: Any) -> bool:
+        """Accept any goal while no other action has the robot; `run` says what is wrong with it."""
+        return not any(other.busy for other in self.others)
+
+    def cancel(self, goal: Goal) -> bool:
+        """Cancel a goal, whose task then ends."""
+        work = self._works.get(goal.id)
+        if work:
+            work.cancel()
+        return True
+
+    async def run(self, goal: Goal, feed: Callable[[Any], None]) -> Outcome:
+        """Carry out a goal until its end."""
+        message = goal.message
+        poses = message.poses if self._type == THROUGH_POSES_TYPE else [message.pose]
+        asked = requested(self._codes, poses, message.behavior_tree, self._scene.odom_in_map)
+        if asked.fault:
+            return _outcome(asked.fault)
+        if goal.cancel_requested:
+            return Outcome(GoalState.CANCELED)
+
+        def tell(progress: Progress) -> None:
+            made = self._types.make
+            feed(feedback(made, self._type, self._scene.ros_ns(), progress))
+
+        before = list(self._works.values())
+        carrying = self._navigator.carry_out(self._codes, asked.poses, tell)
+        work = self._works[goal.id] = asyncio.ensure_future(carrying)
+        for one in before:  # after the new one is begun, whose task takes the place of its own
+            one.cancel()
+        try:
+            return _outcome(await work)
+        except asyncio.CancelledError:
+            if not work.cancelled() or self._closing():
+                work.cancel()
+                raise
+            return Outcome(GoalState.CANCELED if goal.cancel_requested else GoalState.ABORTED)
+        finally:
+            del self._works[goal.id]
+
+    @staticmethod
+    def _closing() -> bool:
+        """Return whether the task that runs this is itself cancelled."""
+        task = asyncio.current_task()
+        return task is not None and task.cancelling() > 0
+
+
+def _outcome(ended: Ended) -> Outcome:
+    state = {
+        EndState.SUCCEEDED: GoalState.SUCCEEDED,
+        EndState.CANCELED: GoalState.CANCELED,
+        EndState.ABORTED: GoalState.ABORTED,
+    }[ended.state]
+    return Outcome(state, {"error_code": ended.code, "error_msg": ended.text})
+
+
+class Nav2Actions:
+    """The two actions on a transport."""
+
+    def __init__(self, scene: Scene, ros: RosTransport, types: Types, config: Ros2Config) -> None:
+        navigator = Navigator(scene)
+        rows = (
+            ("navigate_to_pose", TO_POSE_TYPE, TO_POSE),
+            ("navigate_through_poses", THROUGH_POSES_TYPE, THROUGH_POSES),
+        )
+        handlers = {
+            name: (kind, NavigateHandler(scene, types, navigator, kind, codes))
+            for name, kind, codes in rows
+            if not left_out(config, name)
+        }
+        for _, handler in handlers.values():
+            handler.others = [one for _, one in handlers.values() if one is not handler]
+        self._servers = [
+            ActionServer(
+                ros, types, name, kind, handler, preempts=True, now_ns=scene.bus.clock.unix_ns
+            )
+            for name, (kind, handler) in handlers.items()
+        ]
+
+    async def close(self) -> None:
+        """Withdraw the actions; goals end as aborted, and their tasks are cancelled."""
+        for server in self._servers:
+            await server.close()
