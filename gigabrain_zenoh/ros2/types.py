@@ -4,6 +4,7 @@ Messages are instances of the dataclasses that rosbags generates; arrays of numb
 arrays. Definitions are those of Jazzy that rosbags brings, those in `definitions/`, and the user's.
 """
 
+import difflib
 import struct
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -13,7 +14,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.base import TypesysError, normalize_fieldname
 
-from gigabrain_zenoh.errors import BadPayload, ConfigError, unknown
+from gigabrain_zenoh.errors import BadPayload, ConfigError, UnknownName
 from gigabrain_zenoh.ros2.type_files import SHIPPED, Fields, Found, read_files
 from gigabrain_zenoh.ros2.type_hash import rihs01
 from gigabrain_zenoh.ros2.type_values import Values
@@ -42,7 +43,9 @@ class Types:
     def known(self, name: str) -> str:
         """Return the name of a message type. Raises ConfigError if it is unknown."""
         if name not in self._store.fielddefs:
-            raise unknown("ROS message type", name, self._store.fielddefs)
+            close = difflib.get_close_matches(name, self._store.fielddefs, n=1)
+            hint = f"did you mean {close[0]!r}?" if close else "add its definition by `types:`"
+            raise UnknownName(f"no ROS message type {name!r}; {hint}", value=name)
         return name
 
     def messages(self) -> tuple[str, ...]:
@@ -110,7 +113,10 @@ class Types:
                     normalize_fieldname(field): value for field, value in each.defaults.items()
                 }
         for name in messages:
-            self.hash(name)  # raises for a field of an unknown type
+            try:
+                self.hash(name)
+            except ConfigError as error:
+                raise ConfigError(f"types: a field of {name}: {error}") from None
 
 
 def decoded(store: Any, name: str, payload: bytes) -> Any:
