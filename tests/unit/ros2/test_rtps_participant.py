@@ -171,6 +171,22 @@ def test_a_participant_that_dies_is_forgotten_after_its_lease():
     assert not writer.readers
 
 
+def test_a_participant_that_is_started_again_is_found_within_a_second():
+    ether = Ether()
+    one, two = ether.join(1), ether.join(2)
+    writer = add_writer(ether, one)
+    add_reader(ether, two)
+    ether.run(30.0)
+    ether.kill(two)
+    again = ether.join(3)
+    _, got = add_reader(ether, again)
+    ether.run(1.0)
+
+    writer.write(b"here", ether.now)
+    ether.run(0.1)
+    assert got == [b"here"]
+
+
 def test_a_participant_that_was_away_for_longer_than_its_lease_is_found_again():
     ether = Ether()
     one, two = ether.join(1), ether.join(2)

@@ -1,0 +1,265 @@
+"""Services of ours, called by rclpy over Fast DDS, and services of rclpy, called by us."""
+
+import asyncio
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gigabrain_zenoh.errors import NoAnswer, Refused
+from gigabrain_zenoh.ros2.rtps import RequestReply, ServiceType
+from gigabrain_zenoh.ros2.types import Types
+from gigabrain_zenoh.testing.waiting import PATIENCE_S, until
+from tests.places import ROOT
+from tests.ros2.judge import Judge, Program, free_domain
+
+SET_BOOL, TRIGGER = "std_srvs/srv/SetBool", "std_srvs/srv/Trigger"
+GET_MAP, SET_MAP = "nav_msgs/srv/GetMap", "nav_msgs/srv/SetMap"
+ESTOP = {"service": "/estop", "type": SET_BOOL}
+
+
+class Bus:
+    """A participant of ours, with values in place of payloads."""
+
+    def __init__(self, bus: RequestReply, types: Types) -> None:
+        self.bus, self.types = bus, types
+        self.requests: list[Any] = []
+
+    def kind(self, name: str) -> ServiceType:
+        halves = (self.types.hash(f"{name}_{half}") for half in ("Request", "Response"))
+        return ServiceType(name, *halves)
+
+    def serve(self, service: str, type: str, wait_s: float = 0.0, **fields: Any):
+        reply = self.types.make(f"{type}_Response", **fields)
+        payload = self.types.encode(f"{type}_Response", reply)
+
+        async def answer(request: bytes) -> bytes:
+            self.requests.append(self.types.decode(f"{type}_Request", request))
+            await asyncio.sleep(wait_s)
+            return payload
+
+        return self.bus.serve(service, self.kind(type), answer)
+
+    async def call(self, service: str, type: str, timeout_s: float = 30.0, **fields: Any) -> Any:
+        request = self.types.make(f"{type}_Request", **fields)
+        payload = self.types.encode(f"{type}_Request", request)
+        reply = await self.bus.call(service, self.kind(type), payload, timeout_s)
+        return self.types.decode(f"{type}_Response", reply)
+
+
+@pytest.fixture(scope="module")
+def types() -> Types:
+    return Types()
+
+
+@pytest.fixture
+async def bus(judge: Judge, types: Types) -> AsyncIterator[Bus]:
+    opened = await RequestReply.open(judge.domain, localhost=True)
+    yield Bus(opened, types)
+    await opened.close()
+
+
+async def available(program: Program, service: str, type: str) -> None:
+    await asyncio.to_thread(
+        program.poll, "available", lambda answer: answer["available"], service=service, type=type
+    )
+
+
+async def calls(program: Program, count: int, service: str, type: str, **request: Any):
+    """Call one after the other; return the responses."""
+    responses = []
+    for number in range(count):
+        name = f"{service}-{len(program.seen('response'))}-{number}"
+        await asyncio.to_thread(
+            program.send, "call", service=service, type=type, name=name, **request
+        )
+        responses.append(await program.hear("response", name=name))
+    return responses
+
+
+@contextmanager
+def server(domain: int, service: str, name: str) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a server of ours in a process of its own."""
+    script = Path(__file__).with_name("rtps_server.py")
+    command = [sys.executable, str(script), str(domain), service, name]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE)
+    try:
+        assert process.stdout
+        assert process.stdout.readline() == b"up\n"
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+async def test_rclpy_gets_the_reply_of_our_server(judge: Judge, bus: Bus) -> None:
+    bus.serve("/estop", SET_BOOL, success=True, message="stopped")
+    call = judge.start("call")
+    await available(call, **ESTOP)
+
+    (response,) = await calls(call, 1, **ESTOP, data=True)
+
+    assert response["value"] == {"success": True, "message": "stopped"}
+    assert [request.data for request in bus.requests] == [True]
+
+
+async def test_a_client_that_was_there_first_finds_our_server(judge: Judge, bus: Bus) -> None:
+    call = judge.start("call")
+    assert not (await call.query("available", **ESTOP))["available"]
+    bus.serve("/estop", SET_BOOL, success=True)
+    await available(call, **ESTOP)
+
+    assert (await calls(call, 1, **ESTOP, data=True))[0]["value"]["success"]
+
+
+@pytest.mark.slow
+async def test_a_thousand_requests_get_a_thousand_replies(judge: Judge, bus: Bus) -> None:
+    bus.serve("/estop", SET_BOOL, success=True, message="stopped")
+    bus.serve("/release", TRIGGER, success=False, message="it is still moving")
+    call = judge.start("call")
+    await available(call, **ESTOP)
+    await available(call, "/release", TRIGGER)
+
+    stopped = await calls(call, 500, **ESTOP, data=True)
+    released = await calls(call, 500, "/release", TRIGGER)
+
+    assert all(one["value"] == {"success": True, "message": "stopped"} for one in stopped)
+    refused = {"success": False, "message": "it is still moving"}
+    assert all(one["value"] == refused for one in released)
+    took_ms = sorted(1e3 * one["took_s"] for one in (*stopped, *released))
+    print(f"median {statistics.median(took_ms):.2f} ms, p99 {took_ms[989]:.2f} ms")
+
+
+async def test_many_requests_at_once_are_all_answered(judge: Judge, bus: Bus) -> None:
+    bus.serve("/estop", SET_BOOL, wait_s=0.05, success=True)
+    programs = [await asyncio.to_thread(judge.start, "call", f"call{n}") for n in range(3)]
+    for program in programs:
+        await available(program, **ESTOP)
+        for number in range(8):  # the history of an rclpy client holds 10
+            program.send("call", **ESTOP, name=str(number), data=True)
+
+    for program in programs:
+        for number in range(8):
+            assert (await program.hear("response", name=str(number)))["value"]["success"]
+
+
+async def test_replies_and_requests_longer_than_a_datagram_arrive(judge: Judge, bus: Bus) -> None:
+    cells = [(3 * n) % 101 for n in range(300_000)]
+    grid = bus.types.make("nav_msgs/msg/OccupancyGrid", data=cells)
+    bus.serve("/map", GET_MAP, map=grid)
+    bus.serve("/set_map", SET_MAP, success=True)
+    call = judge.start("call")
+    await available(call, "/map", GET_MAP)
+    await available(call, "/set_map", SET_MAP)
+
+    (fetched,) = await calls(call, 1, "/map", GET_MAP)
+    (stored,) = await calls(call, 1, "/set_map", SET_MAP, map={"data": cells[:200_000]})
+
+    assert fetched["value"]["map"]["data"] == cells
+    assert stored["value"]["success"]
+    assert bus.requests[-1].map.data.tolist() == cells[:200_000]
+
+
+async def test_a_server_is_found_again_after_its_process_was_killed(judge: Judge) -> None:
+    call = judge.start("call")
+    with server(judge.domain, "/estop", "first"):
+        await available(call, **ESTOP)
+        (response,) = await calls(call, 1, **ESTOP, data=True)
+        assert response["value"]["message"] == "first"
+    with server(judge.domain, "/estop", "second"):
+        began = time.monotonic()
+        while call.seen("response")[-1]["value"]["message"] != "second":
+            assert time.monotonic() < began + PATIENCE_S
+            call.send("call", **ESTOP, name="again", data=True)
+            await asyncio.sleep(0.05)
+        print(f"found again in {time.monotonic() - began:.2f} s")
+
+
+async def test_two_servers_in_two_processes_answer_their_services(judge: Judge) -> None:
+    call = judge.start("call")
+    with server(judge.domain, "/left/estop", "left"), server(judge.domain, "/right/estop", "right"):
+        for name in ("left", "right"):
+            await available(call, f"/{name}/estop", SET_BOOL)
+            (response,) = await calls(call, 1, f"/{name}/estop", SET_BOOL, data=True)
+            assert response["value"]["message"] == name
+
+
+@pytest.mark.slow  # ROS gives its participants a lease of 20 s
+async def test_a_client_killed_while_it_waits_leaves_nothing_behind(judge: Judge, bus: Bus) -> None:
+    served = bus.serve("/estop", SET_BOOL, wait_s=1.0, success=True)
+    call = judge.start("call")
+    await available(call, **ESTOP)
+    for number in range(5):
+        call.send("call", **ESTOP, name=str(number), data=True)
+    await until(lambda: len(bus.requests) == 5, "five requests")
+    call.kill()
+
+    await until(lambda: not bus.bus.participant.remotes, "the lease has ended")
+    await until(lambda: not served.pending, "replies are dropped")
+    assert served.clients == 0
+
+    later = judge.start("call", "later")
+    await available(later, **ESTOP)
+    assert (await calls(later, 1, **ESTOP, data=True))[0]["value"]["success"]
+
+
+async def test_we_get_the_reply_of_an_rclpy_server(judge: Judge, bus: Bus) -> None:
+    serve = judge.start("serve")
+    serve.ask("service", **ESTOP, success=True, message="stopped")
+
+    for number in range(20):
+        reply = await bus.call("/estop", SET_BOOL, data=bool(number % 2))
+        assert (reply.success, reply.message) == (True, "stopped")
+
+    values = [one["value"]["data"] for one in serve.seen("request")]
+    assert values == [False, True] * 10
+
+
+async def test_we_wait_for_a_server_that_comes_later(judge: Judge, bus: Bus) -> None:
+    called = asyncio.create_task(bus.call("/estop", SET_BOOL, data=True))
+    serve = await asyncio.to_thread(judge.start, "serve")
+    await serve.query("service", **ESTOP, success=True, message="late")
+
+    assert (await called).message == "late"
+
+
+async def test_without_a_server_a_call_ends_in_time(judge: Judge, bus: Bus) -> None:
+    with pytest.raises(NoAnswer, match=r"/estop: no server within 0\.2 s"):
+        await bus.call("/estop", SET_BOOL, timeout_s=0.2, data=True)
+
+
+async def test_a_request_that_is_refused_gets_no_reply(judge: Judge, bus: Bus) -> None:
+    async def refuse(request: bytes) -> bytes:
+        raise Refused("not now")
+
+    other = await RequestReply.open(judge.domain, localhost=True)
+    other.serve("/estop", bus.kind(SET_BOOL), refuse)
+    with pytest.raises(NoAnswer, match="/estop: no reply within 1 s"):
+        await bus.call("/estop", SET_BOOL, timeout_s=1, data=True)
+    await other.close()
+
+
+async def test_ros_lists_our_services_with_their_hashes(judge: Judge, bus: Bus) -> None:
+    bus.serve("/estop", SET_BOOL, success=True)
+    graph = judge.start("graph")
+    found = await asyncio.to_thread(
+        graph.poll, "graph", lambda found: "/estop" in found["services"]
+    )
+
+    assert found["services"]["/estop"] == [SET_BOOL]
+
+
+async def test_ours_meet_by_multicast_too(types: Types) -> None:
+    with free_domain() as domain:
+        one, two = await RequestReply.open(domain), await RequestReply.open(domain)
+        Bus(one, types).serve("/estop", SET_BOOL, success=True)
+        assert (await Bus(two, types).call("/estop", SET_BOOL, data=True)).success
+        await one.close()
+        await two.close()
