@@ -83,6 +83,11 @@ class Types:
         """Return the message in JSON's values: bytes as base64, and NaN and Infinity as texts."""
         return self._values.to_dict(message)
 
+    def definition(self, name: str) -> str:
+        """Return a message's definition with all that it holds, as bags and viewers want it."""
+        text: str = self._store.generate_msgdef(self.known(name), ros_version=2)[0]
+        return text
+
     def hash(self, name: str) -> str:
         """Return `RIHS01_…` of a message, service or action. Raises ConfigError if unknown."""
         if name not in self._hashes:

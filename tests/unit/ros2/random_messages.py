@@ -2,6 +2,7 @@
 
 import random
 import struct
+from collections.abc import Sequence
 from typing import Any
 
 from rosbags.interfaces import Nodetype
@@ -24,26 +25,30 @@ RANGES = {
 TEXTS = ("", "map", "ä€ 😀", "x" * 17)
 
 
-def random_fields(types: Types, name: str, source: random.Random) -> dict[str, Any]:
+def random_fields(
+    types: Types, name: str, source: random.Random, texts: Sequence[str] = TEXTS
+) -> dict[str, Any]:
     """Return random values of all fields."""
     return {
-        field: _value(types, kind, source) for field, kind in types.fields(name) if field != DUMMY
+        field: _value(types, kind, source, texts)
+        for field, kind in types.fields(name)
+        if field != DUMMY
     }
 
 
-def _value(types: Types, kind: Any, source: random.Random) -> Any:
+def _value(types: Types, kind: Any, source: random.Random, texts: Sequence[str]) -> Any:
     if kind[0] == Nodetype.NAME:
-        return random_fields(types, kind[1], source)
+        return random_fields(types, kind[1], source, texts)
     if kind[0] == Nodetype.BASE:
-        return _scalar(*kind[1], source)
+        return _scalar(*kind[1], source, texts)
     inner, size = kind[1]
     count = size if kind[0] == Nodetype.ARRAY else source.randint(0, min(size or 3, 3))
-    return [_value(types, inner, source) for _ in range(count)]
+    return [_value(types, inner, source, texts) for _ in range(count)]
 
 
-def _scalar(primitive: str, longest: int, source: random.Random) -> Any:
+def _scalar(primitive: str, longest: int, source: random.Random, texts: Sequence[str]) -> Any:
     if primitive == "string":
-        text = source.choice(TEXTS)
+        text = source.choice(texts)
         return text[:longest] if longest and text.isascii() else "" if longest else text
     if primitive == "bool":
         return source.random() < 0.5

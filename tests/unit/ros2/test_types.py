@@ -278,6 +278,9 @@ SIZE = 8000  # bytes
 
 def test_a_payload_allocates_no_more_than_its_length_allows(types: Types) -> None:
     worst: dict[str, float] = {}
+    for name in types.messages():  # what is made for each type stays
+        with contextlib.suppress(BadPayload):
+            types.decode(name, b"\0\1\0\0")
     tracemalloc.start()
     try:
         for name in types.messages():
