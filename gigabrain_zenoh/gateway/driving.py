@@ -31,8 +31,26 @@ from gigabrain_zenoh.ros2.types import Types
 
 log = logging.getLogger(__name__)
 COMMANDS = Qos(reliable=False, depth=1)  # matches every publisher; only the newest counts
+QUIET_NS = 1_000_000_000
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 POSE, GUESS = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
+
+
+class QuietFault:
+    """A fault that ends only after a second without it, as good and bad senders may alternate."""
+
+    def __init__(self) -> None:
+        self._fault, self._last_ns = Fault(log), 0
+
+    def begin(self, text: str, now_ns: int) -> None:
+        """Log the fault, unless it goes on."""
+        self._last_ns = now_ns
+        self._fault.begin(text)
+
+    def end(self, text: str, now_ns: int) -> None:
+        """Log the end of the fault, if it has not come for a second."""
+        if self._fault.active and now_ns - self._last_ns >= QUIET_NS:
+            self._fault.end(text)
 
 
 class Background:
@@ -67,13 +85,13 @@ class RosCommander:
         self, scene: Scene, ros: RosTransport, types: Types, config: Ros2Config, work: Background
     ) -> None:
         self._scene, self._types, self._work = scene, types, work
-        self._bus, self._bad = scene.bus, Fault(log)
+        self._bus, self._bad = scene.bus, QuietFault()
         self._config = commander.Config(
             name=scene.bus.process,
             take=config.take,
             timeout_ns=round(config.cmd_vel_timeout * 1e9),
         )
-        self._memory, self._refused = Memory(), Fault(log)
+        self._memory, self._refused = Memory(), QuietFault()
         scene.on_state.append(self._observe)
         if not left_out(config, "cmd_vel"):
             ros.subscribe("cmd_vel", TWIST, COMMANDS, self._on_twist)
@@ -114,9 +132,9 @@ class RosCommander:
             message = self._types.decode(name, received.payload)
         except BadPayload as error:
             self._bus.counters["cmd_vel_broken"] += 1
-            self._bad.begin(f"dropped a message on cmd_vel: {error}")
+            self._bad.begin(f"dropped a message on /cmd_vel: {error}", self._bus.clock.now_ns())
             return None
-        self._bad.end("cmd_vel can be decoded again")
+        self._bad.end("/cmd_vel can be decoded again", self._bus.clock.now_ns())
         return message
 
     def _arrive(self, wanted: commander.Wanted) -> None:
@@ -149,10 +167,11 @@ class RosCommander:
                     self._work.start(self._ask(take=take))
                 case Refuse(code):
                     self._bus.counters[f"cmd_vel_{code}"] += 1
+        now_ns = self._bus.clock.now_ns()
         if self._memory.refusal:
-            self._refused.begin(f"refused /cmd_vel: {self._memory.refusal}")
+            self._refused.begin(f"refused /cmd_vel: {self._memory.refusal}", now_ns)
         else:
-            self._refused.end("/cmd_vel is obeyed, or silent")
+            self._refused.end("/cmd_vel is obeyed, or silent", now_ns)
 
     async def _ask(self, *, take: bool) -> None:
         gate, text = None, ""
@@ -190,7 +209,7 @@ class PoseRequests:
     ) -> Callable[[Received], None]:
         """Return a handler that asks for one pose at a time; the newest one waits for it."""
         waiting: deque[bytes] = deque(maxlen=1)
-        busy, fault = False, Fault(log)
+        busy, fault, clock = False, QuietFault(), self._scene.bus.clock
 
         async def work() -> None:
             nonlocal busy
@@ -200,10 +219,10 @@ class PoseRequests:
                 except GigabrainError as error:
                     self.problems[topic] = str(error)
                     self._scene.bus.counters[f"{topic}_refused"] += 1
-                    fault.begin(f"refused /{topic}: {error}")
+                    fault.begin(f"refused /{topic}: {error}", clock.now_ns())
                 else:
                     self.problems.pop(topic, None)
-                    fault.end(f"/{topic} is accepted again")
+                    fault.end(f"/{topic} is accepted again", clock.now_ns())
                     log.info("/%s: %s", topic, text)
             busy = False
 

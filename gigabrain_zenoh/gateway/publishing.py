@@ -127,7 +127,7 @@ def camera_rows(cameras: tuple[Camera, ...]) -> Iterator[Row]:
     for number, camera in enumerate(cameras):
         at = f"camera/{camera.name}" if number else "camera"
 
-        def picture(make: Make, image: Any, _: Scene, camera: Camera = camera) -> Any | None:
+        def picture(make: Make, image: Any, _: Scene, camera: Camera = camera) -> Any:
             return sensors.compressed_image(make, image, camera.name)
 
         def info(make: Make, message: Any, _: Scene, camera: Camera = camera) -> Any:
@@ -155,6 +155,7 @@ class _Published:
     readers: int = 0
     closes: list[Close] = field(default_factory=list)
     sent_ns: int = -SECOND_NS
+    fault: Fault = field(default_factory=lambda: Fault(log))
     content: object = None  # of the last, where the row compares it
 
 
@@ -165,7 +166,7 @@ class Publishing:
         self._scene, self._ros, self._types, self._config = scene, ros, types, config
         self._cameras: tuple[Camera, ...] = ()
         self._of_cameras: list[_Published] = []
-        self._fault, self._closed = Fault(log), False
+        self._closed = False
         self._simulated: _Published | None = None
         self._rows = [self._open(row) for row in table() if not row.simulated]
         scene.on_body.append(self._follow_body)
@@ -234,8 +235,9 @@ class Publishing:
             made = convert(self._types.make, message, self._scene)
         except ValueError as error:
             self._scene.bus.counters["not_converted"] += 1
-            self._fault.begin(f"{one.row.topic}: left out a message: {error}")
+            one.fault.begin(f"/{one.row.topic}: left out a message: {error}")
             return
+        one.fault.end(f"/{one.row.topic}: messages can be converted again")
         if made is None:
             return
         one.content, one.sent_ns = content, now_ns

@@ -39,10 +39,13 @@ def laser_scan(make: Make, scan: LaserScan, body: Body | None = None) -> Any:
     )
 
 
-def compressed_image(make: Make, picture: Image, camera: str) -> Any | None:
-    """Return sensor_msgs/CompressedImage of a JPEG; None for a picture that is not compressed."""
+def compressed_image(make: Make, picture: Image, camera: str) -> Any:
+    """Return sensor_msgs/CompressedImage of a JPEG. Raises ValueError for other pictures."""
     if picture.encoding != "jpeg":
-        return None
+        raise ValueError(
+            f"pictures of {camera} are {picture.encoding}, not JPEG; "
+            "set `encoding: jpeg` for it in the body's file"
+        )
     return make(
         "sensor_msgs/msg/CompressedImage",
         header=header(make, picture.stamp_ns, optical_frame(camera)),

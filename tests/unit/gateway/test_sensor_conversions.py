@@ -62,7 +62,8 @@ def test_a_jpeg_goes_unchanged_and_a_raw_picture_not_at_all():
     assert (got.header.frame_id, got.format) == ("front_optical_frame", "jpeg")
     assert got.data.tobytes() == b"\xff\xd8\x01"
     raw = Image(frame_id="front", encoding="mono8", height=1, width=2, data=b"ab")
-    assert sensors.compressed_image(MAKE, raw, "front") is None
+    with pytest.raises(ValueError, match="mono8, not JPEG"):
+        sensors.compressed_image(MAKE, raw, "front")
 
 
 def test_depth_is_16_bit_millimetres_by_row():

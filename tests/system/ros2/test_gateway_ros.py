@@ -1,0 +1,225 @@
+"""A whole robot with the gateway in processes, and real ROS 2 over DDS that reads and drives it."""
+
+import asyncio
+import contextlib
+import os
+import signal
+from collections.abc import AsyncIterator
+from typing import Any
+
+import pytest
+
+from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.topics import STATE
+from gigabrain_zenoh.client.requests import release
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.errors import BodyLost, Refused
+from gigabrain_zenoh.runtime.connect import connect
+from gigabrain_zenoh.testing.processes import Home, free_port
+from gigabrain_zenoh.testing.waiting import until
+from tests.ros2.judge import Judge, Program
+
+TRIGGER, SET_BOOL = "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"
+DEFAULT: dict[str, Any] = {}
+SENSOR = {"reliable": False, "depth": 5}
+LATCHED = {"transient_local": True, "depth": 1}
+READ = {
+    "/scan": ("sensor_msgs/msg/LaserScan", SENSOR),
+    "/odom": ("nav_msgs/msg/Odometry", DEFAULT),
+    "/tf": ("tf2_msgs/msg/TFMessage", {"depth": 100}),
+    "/tf_static": ("tf2_msgs/msg/TFMessage", LATCHED),
+    "/joint_states": ("sensor_msgs/msg/JointState", DEFAULT),
+    "/battery_state": ("sensor_msgs/msg/BatteryState", DEFAULT),
+    "/robot_description": ("std_msgs/msg/String", LATCHED),
+    "/diagnostics": ("diagnostic_msgs/msg/DiagnosticArray", DEFAULT),
+    "/clock": ("rosgraph_msgs/msg/Clock", {"reliable": False, "depth": 1}),
+}
+
+
+class Robot:
+    """A running robot as its own bus shows it."""
+
+    def __init__(self, home: Home, bus: Any) -> None:
+        self.home, self.bus = home, bus
+        self.states: list[RobotState] = []
+        bus.subscribe(STATE, lambda _, state: self.states.append(state))
+
+    @property
+    def now(self) -> RobotState:
+        """The newest state."""
+        return self.states[-1]
+
+    async def becomes(self, mode: str) -> None:
+        """Wait for a mode of the gate."""
+        await until(lambda: self.states and self.now.gate.mode == mode, mode)
+
+
+@contextlib.asynccontextmanager
+async def running(home: Home, judge: Judge, **parts: Any) -> AsyncIterator[Robot]:
+    """Yield a robot whose gateway joins the judge's domain."""
+    router = f"tcp/127.0.0.1:{free_port()}"
+    ros2 = {"transport": "dds", "domain": judge.domain, "localhost": True}
+    file = home.deployment(
+        body="turtlebot3_burger", world="arena", router=router, ros2=ros2, **parts
+    )
+    home.start("up", str(file))
+    session = connect(Endpoint(connect=(router,)), "test", timeout_s=None)
+    async with asyncio.timeout(400), session as bus:
+        made = Robot(home, bus)
+        await until(lambda: home.processes("ros2"), "the gateway runs")
+        await until(lambda: made.states, "states")
+        yield made
+
+
+@pytest.fixture
+async def robot(home: Home, judge: Judge) -> AsyncIterator[Robot]:
+    async with running(home, judge) as made:
+        await made.becomes("latched")
+        yield made
+
+
+async def released(robot: Robot) -> None:
+    """Release the robot, once it has rested as long as that takes."""
+    while robot.now.gate.mode == "latched":
+        with contextlib.suppress(Refused, BodyLost):
+            await release(robot.bus, robot.now.gate.estop_generation)
+        count = len(robot.states)
+        await until(lambda: len(robot.states) > count + 10, "states")  # noqa: B023
+
+
+async def driving(robot: Robot, driver: Program) -> None:
+    """Let a program drive; on a busy machine the gate may stop it, and it has to pause."""
+    while True:
+        await driver.query("drive", linear=0.15, hz=20.0)
+        with contextlib.suppress(TimeoutError):
+            await until(lambda: robot.now.velocity.linear_x > 0.12, "it drives", 10.0)
+            return
+        await driver.query("rest")
+        await asyncio.sleep(1.0)
+
+
+async def test_rclpy_reads_topics_with_values_frames_and_qos(robot: Robot, judge: Judge) -> None:
+    listener = judge.start("listen")
+    for topic, (kind, qos) in READ.items():
+        await listener.query("subscribe", topic=topic, type=kind, qos=qos)
+    values: dict[str, Any] = {}
+    for topic in READ:
+        report = await asyncio.to_thread(
+            listener.poll, "report", lambda one: one["count"] > 0, topic=topic
+        )
+        values[topic] = report["values"][-1]
+    scan = values["/scan"]
+    assert (scan["header"]["frame_id"], len(scan["ranges"])) == ("base_scan", 360)
+    assert scan["range_max"] == pytest.approx(3.5)
+    odom = values["/odom"]
+    assert (odom["header"]["frame_id"], odom["child_frame_id"]) == ("odom", "base_footprint")
+    moving = {one["child_frame_id"] for one in values["/tf"]["transforms"]}
+    assert moving == {"base_footprint", "wheel_left_link", "wheel_right_link"}
+    static = {one["child_frame_id"] for one in values["/tf_static"]["transforms"]}
+    assert static == {"base_link", "imu_link", "base_scan"}
+    assert values["/joint_states"]["name"] == ["wheel_left_joint", "wheel_right_joint"]
+    assert 0.0 < values["/battery_state"]["percentage"] <= 1.0
+    assert values["/robot_description"]["data"].startswith("<?xml")
+    names = {one["name"] for one in values["/diagnostics"]["status"]}
+    assert {"gigabrain: gate", "gigabrain: safety", "gigabrain: cmd_vel"} <= names
+    stamp, now = odom["header"]["stamp"], values["/clock"]["clock"]
+    assert abs(stamp["sec"] - now["sec"]) <= 2
+
+
+async def test_rclpy_drives_by_cmd_vel_and_killed_the_body_stops(
+    robot: Robot, judge: Judge
+) -> None:
+    await released(robot)
+    driver = judge.start("drive")
+    await driving(robot, driver)
+    assert robot.now.gate.commander == "ros2"
+    driver.kill()
+    await until(lambda: abs(robot.now.velocity.linear_x) < 0.01, "it stands")
+    await robot.becomes("idle")
+    assert robot.now.gate.commander == ""
+
+
+async def test_rclpy_stops_by_service_and_releases_by_another(robot: Robot, judge: Judge) -> None:
+    await released(robot)
+    driver, caller = judge.start("drive"), judge.start("call", node="caller")
+    await driving(robot, driver)
+    await caller.query("call", service="/estop", type=SET_BOOL, data=True)
+    response = await caller.hear("response", service="/estop")
+    assert response["value"]["success"]
+    await until(lambda: robot.now.gate.mode == "latched", "it is latched")
+    await until(lambda: robot.now.velocity.linear_x < 0.01, "it stands")
+    await caller.query("call", service="/estop", type=SET_BOOL, data=False, name="undo")
+    refused = await caller.hear("response", name="undo")
+    assert not refused["value"]["success"]
+    await driver.query("rest")
+    await asyncio.sleep(1.0)
+    await caller.query("call", service="/release", type=TRIGGER)
+    response = await caller.hear("response", service="/release")
+    assert response["value"]["success"], response
+    await robot.becomes("idle")
+
+
+async def test_a_killed_gateway_costs_the_robot_nothing_and_ros_finds_it_again(
+    robot: Robot, judge: Judge
+) -> None:
+    listener = judge.start("listen")
+    kind, qos = READ["/odom"]
+    await listener.query("subscribe", topic="/odom", type=kind, qos=qos)
+    await asyncio.to_thread(listener.poll, "report", lambda one: one["count"] > 5, topic="/odom")
+    (before,) = robot.home.processes("ros2")
+    others = set(robot.home.processes()) - {before}
+    os.kill(before, signal.SIGKILL)
+    await until(lambda: robot.home.processes("ros2") not in ([], [before]), "it is restarted")
+    count = (await listener.query("report", topic="/odom"))["count"]
+    await asyncio.to_thread(
+        listener.poll, "report", lambda one: one["count"] > count + 20, topic="/odom"
+    )
+    assert others <= set(robot.home.processes())
+
+
+NAVIGATE = "nav2_msgs/action/NavigateToPose"
+
+
+def goal_at(x: float, y: float, frame: str = "map") -> dict[str, Any]:
+    return {
+        "pose": {
+            "header": {"frame_id": frame},
+            "pose": {"position": {"x": x, "y": y}, "orientation": {"w": 1.0}},
+        }
+    }
+
+
+async def test_rclpy_sends_goals_cancels_and_preempts_them(home: Home, judge: Judge) -> None:
+    brain = {"perception": {"mapping": "slam"}, "decision": {"behaviour": "navigate"}}
+    async with running(home, judge, resume="auto", **brain) as robot:
+        client = judge.start("navigate")
+        action = "/navigate_to_pose"
+        await asyncio.to_thread(
+            client.poll, "available", lambda one: one["available"], action=action, type=NAVIGATE
+        )
+        await robot.becomes("enabled")
+
+        async def send(name: str, goal: dict[str, Any]) -> None:
+            await client.query("send", action=action, type=NAVIGATE, name=name, goal=goal)
+            await client.hear("accepted", name=name)
+
+        async def result(name: str) -> tuple[str, int]:
+            found = await client.hear("result", 120.0, name=name)
+            return found["status"], found["value"]["error_code"]
+
+        while True:  # until there is a map
+            await send(name := f"early-{len(client.seen('accepted'))}", goal_at(50.0, 50.0))
+            if (found := await result(name)) != ("aborted", 202):
+                break
+        assert found == ("aborted", 204)
+        await send("frame", goal_at(0.0, 0.0, "somewhere"))
+        assert await result("frame") == ("aborted", 9002)
+        await send("far", goal_at(0.6, 0.0))
+        feedback = await client.hear("feedback", name="far")
+        assert feedback["value"]["current_pose"]["header"]["frame_id"] == "map"
+        await send("back", goal_at(-0.4, 0.0))
+        assert await result("far") == ("aborted", 0)
+        await client.query("cancel", name="back")
+        assert await result("back") == ("canceled", 0)
+        await send("home", goal_at(0.2, 0.0))
+        assert await result("home") == ("succeeded", 0)
