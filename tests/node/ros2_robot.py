@@ -49,11 +49,11 @@ class RosNode:
         return TYPES.decode(f"{type}_Response", reply)
 
     def topics(self):
-        """Return the topics of others by name: their type and QoS."""
+        """Return the topics of others by name, without those of actions: their type and QoS."""
         return {
             one.topic: (one.type, one.qos)
             for one in self.transport.endpoints()
-            if not one.ours and one.kind == "publisher"
+            if not one.ours and one.kind == "publisher" and "/_action/" not in one.topic
         }
 
 

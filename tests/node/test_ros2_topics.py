@@ -134,6 +134,28 @@ async def test_the_topics_have_the_types_and_qos_that_ros_tools_expect():
         assert robot.node.topics() == TABLE
 
 
+SERVED = {
+    "/estop": "std_srvs/srv/SetBool",
+    "/release": "std_srvs/srv/Trigger",
+    "/enable": "std_srvs/srv/Trigger",
+    "/map_save": "std_srvs/srv/Trigger",
+}
+
+
+async def test_services_actions_and_parameters_have_the_names_that_ros_tools_expect():
+    async with driver() as robot:
+        servers = {
+            one.topic: one.type
+            for one in robot.node.transport.endpoints()
+            if not one.ours and one.kind == "server"
+        }
+        assert SERVED.items() <= servers.items()
+        actions = {"navigate_to_pose", "navigate_through_poses"}
+        goals = {f"/{name}/_action/send_goal" for name in actions}
+        parameters = {"/gigabrain/get_parameters", "/gigabrain/list_parameters"}
+        assert goals | parameters <= set(servers)
+
+
 async def test_a_namespace_is_before_each_topic_and_what_is_left_out_is_not_there():
     config = Ros2Config(namespace="/robot1", leave_out=("scan", "/camera/depth/image_raw"))
     async with driver(config) as robot:
