@@ -54,8 +54,9 @@ class Sockets:
         self._out.setblocking(False)
         self._out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
         self._out.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, RECEIVE_BYTES)
-        self._group = self._group_socket()
-        for one in (builtin, user, self._group):
+        # bound to its port, it would get what others of this host have joined for
+        self._group = None if self._localhost else self._group_socket()
+        for one in (builtin, user, *([self._group] if self._group else [])):
             one.setblocking(False)
             with contextlib.suppress(OSError):
                 one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BYTES)
@@ -77,7 +78,7 @@ class Sockets:
         own = addresses()
         outer = [one for one in own if not one.startswith("127.")]
         for one in own:
-            if self._group and one not in self._joined and not self._localhost:
+            if self._group and one not in self._joined:
                 member = socket.inet_aton(MULTICAST_GROUP) + socket.inet_aton(one)
                 with contextlib.suppress(OSError):  # such as a link without multicast
                     self._group.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)

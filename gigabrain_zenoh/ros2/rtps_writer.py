@@ -4,6 +4,7 @@ Source: OMG DDSI-RTPS 2.3, chapter 8.4. Times are in seconds of any one clock. A
 bounded, whatever a peer sends; a reader gets no more than the samples that it asked for.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -30,6 +31,7 @@ MAX_HISTORY, MAX_HISTORY_BYTES = 512, 8 << 20  # of a writer
 HISTORY_S = 5.0  # a sample waits so long for a reader that is not there yet
 FIRST_HEARTBEAT_S, SLOWEST_HEARTBEAT_S = 0.05, 2.0
 RESEND_S = 0.01  # one sample is not sent again to one reader within this time
+MAX_RESEND_BYTES = 1 << 18  # in answer to one datagram; a reader that lacks more asks again
 
 
 @dataclass(slots=True, eq=False)
@@ -129,13 +131,14 @@ class ReliableWriter:
         if not self._transient_local:
             self._forget_acked(reader)
         asked = [seq for seq in ack.missing if 0 < seq <= self._last]
-        wanted, absent = [], []
+        wanted, absent, size = [], [], 0
         for seq in asked:
             one = self._history.get(seq)
             if one is None or not self._concerns(one, reader):
                 absent.append(seq)
-            elif now - reader.sent_s.get(seq, -1.0) >= RESEND_S:
+            elif now - reader.sent_s.get(seq, -1.0) >= RESEND_S and size < MAX_RESEND_BYTES:
                 wanted.append(one)
+                size += len(one.data.payload)
         if absent:
             self._to(reader, [self._gap(reader, absent[0], absent)])
         if wanted:
@@ -152,9 +155,11 @@ class ReliableWriter:
         if now - reader.sent_s.get(nack.seq, -1.0) < RESEND_S:
             return
         reader.sent_s[nack.seq] = now
-        for part in _fragments(one.data, reader.guid[12:]):
-            if part.first in nack.missing:
-                self._to(reader, [part])
+        parts = _fragments(one.data, reader.guid[12:])
+        wanted = (part for part in parts if part.first in nack.missing)
+        for part in itertools.islice(wanted, MAX_RESEND_BYTES // FRAGMENT_BYTES):
+            self._to(reader, [part])
+        self._to(reader, [self._heartbeat(reader)])
 
     def tick(self, now: float) -> float:
         """Send heartbeats that are due; return when the next one is due."""

@@ -130,6 +130,68 @@ def test_a_reply_goes_to_its_reader_alone_and_others_do_not_wait_for_it():
     assert network.writer.pending == 0
 
 
+def test_a_reply_needs_no_second_message_after_replies_to_others():
+    network = Network()
+    network.join(CLIENT)
+    network.join(OTHER)
+    network.run(0.1)
+    for target, payload in ((CLIENT, b"a"), (OTHER, b"b"), (CLIENT, b"c")):
+        network.writer.write(payload, network.now, target=target + READER)
+
+    for source, to, one in [one for one in network.way if one[1] != SERVER]:
+        network.deliver(source, to, one)
+
+    assert network.got == {CLIENT: [b"a", b"c"], OTHER: [b"b"]}
+
+
+def test_samples_that_a_writer_no_longer_has_are_not_waited_for():
+    network = Network()
+    reader = network.join(CLIENT)
+
+    reader.on_data(SERVER + WRITER, Data(READER, WRITER, 7, b"seven"), 0.0)
+    reader.on_heartbeat(SERVER + WRITER, Heartbeat(READER, WRITER, 7, 7, 1), 0.0)
+
+    assert network.got[CLIENT] == [b"seven"]
+
+
+def test_samples_that_do_not_concern_a_reader_are_not_waited_for():
+    network = Network()
+    reader = network.join(CLIENT)
+
+    reader.on_gap(SERVER + WRITER, Gap(READER, WRITER, 2, 4, (5,)), 0.0)
+    for seq in (6, 4, 1):
+        reader.on_data(SERVER + WRITER, Data(READER, WRITER, seq, b"%d" % seq), 0.0)
+
+    assert network.got[CLIENT] == [b"1", b"4", b"6"]
+
+
+def test_a_reader_that_asks_for_what_is_not_for_it_is_told_so():
+    network = Network()
+    network.join(CLIENT)
+    network.join(OTHER)
+    for target in (OTHER, CLIENT, OTHER, OTHER):
+        network.writer.write(b"reply", network.now, target=target + READER)
+    network.way.clear()
+
+    ask = AckNack(READER, WRITER, 1, (1, 3, 4), 1)
+    network.writer.on_acknack(CLIENT + READER, ask, 1.0)
+
+    assert network.way == [(SERVER, CLIENT, Gap(READER, WRITER, 1, 2, (3, 4)))]
+
+
+@pytest.mark.parametrize(("base", "final"), [(0, False), (1, False), (2, True)])
+def test_a_reader_that_greets_hears_what_there_is_and_answers_only_if_it_lacks_some(base, final):
+    network = Network(transient_local=True)
+    network.join(CLIENT)
+    network.writer.write(b"endpoint", network.now)
+    network.way.clear()
+
+    network.writer.on_acknack(CLIENT + READER, AckNack(READER, WRITER, base, (), 1, False), 1.0)
+
+    ((_, _, beat),) = network.way
+    assert (beat.first, beat.last, beat.final) == (1, 1, final)
+
+
 def test_a_reply_waits_for_a_reader_that_is_not_announced_yet():
     network = Network()
 
@@ -313,6 +375,21 @@ def test_asking_again_and_again_brings_a_sample_once_in_ten_milliseconds():
 
     network.writer.on_acknack(CLIENT + READER, AckNack(READER, WRITER, 1, (1,), 200), 1.02)
     assert network.sent == 1
+
+
+def test_the_answer_to_one_request_for_samples_is_bounded():
+    network = Network()
+    network.join(CLIENT)
+    network.readers.clear()
+    for _ in range(200):
+        network.writer.write(bytes(30_000), 1.0)
+    network.way.clear()
+
+    ask = AckNack(READER, WRITER, 1, tuple(range(1, 201)), 1)
+    network.writer.on_acknack(CLIENT + READER, ask, 2.0)
+
+    sizes = [len(one.payload) for _, _, one in network.way if isinstance(one, Data)]
+    assert sum(sizes) == 9 * 30_000
 
 
 def test_strangers_get_no_answer():

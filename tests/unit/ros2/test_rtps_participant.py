@@ -171,6 +171,35 @@ def test_a_participant_that_dies_is_forgotten_after_its_lease():
     assert not writer.readers
 
 
+def test_nothing_is_sent_to_a_participant_that_is_gone():
+    ether = Ether()
+    one, two = ether.join(1), ether.join(2)
+    add_writer(ether, one)
+    add_reader(ether, two)
+    ether.run(1.0)
+    ether.kill(two)
+    ether.run(0.05)
+    add_writer(ether, one, "rq/bRequest")  # is never acknowledged
+    ether.run(12.0)
+    ether.way.clear()
+    for _ in range(200):
+        ether.now += 0.05
+        one.tick(ether.now)
+
+    assert not [to for _, to, _ in ether.way if to == "10.0.0.2"]
+
+
+def test_a_participant_is_answered_at_once_when_it_is_found():
+    ether = Ether()
+    one, two = ether.join(1), ether.join(2)
+    add_reader(ether, two)
+    writer = add_writer(ether, one)
+    two._announce = lambda datagram: None
+    ether.run(0.5)
+
+    assert len(writer.readers) == 1
+
+
 def test_a_participant_that_is_started_again_is_found_within_a_second():
     ether = Ether()
     one, two = ether.join(1), ether.join(2)
