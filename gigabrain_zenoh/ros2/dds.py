@@ -5,6 +5,7 @@ reader holds, at most its depth.
 """
 
 import asyncio
+import atexit
 import functools
 import logging
 from collections import Counter
@@ -174,6 +175,7 @@ class DdsTransport:
         self._bridge.close()
         self._closed = True
         await self._services.close()
+        _open.discard(self._participant)
         await asyncio.to_thread(_delete, self._participant)  # and all that it has
 
     def publisher(
@@ -244,6 +246,8 @@ class DdsTransport:
             self._kept += _localhost(self.link.domain)
         qos = DdsQos(Policy.Userdata(b"enclave=/;"))
         self._participant = DomainParticipant(self.link.domain, qos)
+        _close_at_exit()
+        _open.add(self._participant)
         guid = self._participant.guid.bytes
         self._graph = DdsGraph(
             self._info, frozenset({guid[:12], self._services.participant.data.prefix})
@@ -369,6 +373,20 @@ def dds_qos(qos: Qos, hash: str, *, keep_all: bool = False, own: bool = False) -
 def _delete(entity: Any) -> None:
     """Delete an entity and all below it, which references from elsewhere may not prevent."""
     entity._delete(entity._ref)
+
+
+_open: set[Any] = set()  # participants of this process
+
+
+@functools.cache
+def _close_at_exit() -> None:
+    """Delete at the end what is open: a callback during the interpreter's end would never end."""
+    atexit.register(_delete_all)
+
+
+def _delete_all() -> None:
+    for each in tuple(_open):
+        _delete(each)
 
 
 def _localhost(domain: int) -> list[Entity]:

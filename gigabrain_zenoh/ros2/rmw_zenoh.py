@@ -190,15 +190,15 @@ class RmwZenohTransport:
         self.ids = count(1)  # of endpoints; 0 is the node's
         self.publishers: set[RmwZenohPublisher] = set()
         self.subscribers: set[_Entity] = set()
-        self._endpoint = _endpoint(link, endpoint)
+        self.endpoint = _endpoint(link, endpoint)
         self._graph: dict[str, GraphEndpoint | str] = {}  # by token
         self._clients: dict[tuple[str, str], _Entity] = {}
 
     async def __aenter__(self) -> "RmwZenohTransport":
-        session = await open_session(self._endpoint)
+        session = await open_session(self.endpoint)
         self.bridge = Bridge()
         self._questions: QueryQueue[zenoh.Query] = QueryQueue(self.bridge, _drop)
-        self.lines = ReconnectingSession(session, self._endpoint, self.bridge, self._lost)
+        self.lines = ReconnectingSession(session, self.endpoint, self.bridge, self._lost)
         self.lines.declare(self._declare_node)
         return self
 

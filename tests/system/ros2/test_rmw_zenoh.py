@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 import pytest
@@ -10,6 +10,7 @@ import zenoh
 
 from gigabrain_zenoh.config.settings import Ros2Link
 from gigabrain_zenoh.errors import ConfigError, NoAnswer, Refused
+from gigabrain_zenoh.ros2.actions import ActionServer, Goal, GoalState, Outcome
 from gigabrain_zenoh.ros2.qos import LATCHED, SENSOR_DATA, Qos
 from gigabrain_zenoh.ros2.rmw_names import NodeName, parse_attachment
 from gigabrain_zenoh.ros2.rmw_zenoh import RmwZenohTransport
@@ -20,6 +21,7 @@ from gigabrain_zenoh.testing.waiting import until
 
 STRING = "std_msgs/msg/String"
 TRIGGER = "std_srvs/srv/Trigger"
+NAVIGATE = "nav2_msgs/action/NavigateToPose"
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 KEY = f"0/chatter/std_msgs::msg::dds_::String_/{HASH}"
 
@@ -282,6 +284,39 @@ async def test_humble_meets_humble_only(nodes: Nodes) -> None:
     publisher = humble.publisher("/chatter", STRING)
     await until(lambda: publisher.readers == 1, "the reader of the same age")
     await repeat(lambda: publisher.publish(nodes.string("hi")), lambda: got)
+
+
+class Instant:
+    """An action that succeeds at once."""
+
+    def accept(self, message: Any) -> bool:
+        return True
+
+    def cancel(self, goal: Goal) -> bool:
+        return False
+
+    async def run(self, goal: Goal, feedback: Callable[[Any], None]) -> Outcome:
+        return Outcome(GoalState.SUCCEEDED, {"error_msg": goal.message.behavior_tree})
+
+
+async def test_an_action_is_served(nodes: Nodes) -> None:
+    types = nodes.types
+    node, client = await nodes.node("robot"), await nodes.node("client")
+    server = ActionServer(node, types, "/navigate_to_pose", NAVIGATE, Instant())
+
+    async def ask(service: str, kind: str, **fields: Any) -> Any:
+        request = types.encode(f"{kind}_Request", types.make(f"{kind}_Request", **fields))
+        name = f"/navigate_to_pose/_action/{service}"
+        return types.decode(f"{kind}_Response", await client.call(name, kind, request, 60))
+
+    id = {"uuid": bytes(range(16))}
+    sent = await ask(
+        "send_goal", f"{NAVIGATE}_SendGoal", goal_id=id, goal={"behavior_tree": "here"}
+    )
+    assert sent.accepted
+    got = await ask("get_result", f"{NAVIGATE}_GetResult", goal_id=id)
+    assert (got.status, got.result.error_msg) == (GoalState.SUCCEEDED, "here")
+    await server.close()
 
 
 async def test_all_is_found_again_after_the_routers_restart(types: Types) -> None:
