@@ -223,12 +223,13 @@ class Device(abc.ABC):
     Options: ClassVar[type[Struct]]  # those of the driver or scan source that it answers
     baud: ClassVar[int | None] = None  # of its line; None: as fast as the host
     period_s: ClassVar[float] = 0.01  # between two steps
-    watchdog_ns: ClassVar[int] = 150_000_000  # from the last command until its motors stop
-    promised_in: ClassVar[str] = "the rule for firmware"  # where its makers say so
+    watchdog_ns = 150_000_000  # from the last command until its motors stop
+    promised_in = "the rule for firmware"  # where its makers say so
 
     def __init__(self, body: EmulatedBody, options: Any, wire: Wire) -> None:
         self.body, self.options, self.wire = body, options, wire
         self.sag_volts = 0.0  # brown-out: by how much the supply has fallen [V]
+        self.halted = False  # frozen or unplugged: for devices with a processor beside the board
 
     @classmethod
     def port(cls, options: Any) -> Port:

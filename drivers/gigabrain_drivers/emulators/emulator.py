@@ -17,7 +17,7 @@ from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.robot import LinkOptions, Run
 from gigabrain_drivers.emulators.base import Broken, Device, EmulatedBody, Port, Wire
 from gigabrain_drivers.emulators.faults import NO_FAULTS, Faults, FaultyWire, faults_in
-from gigabrain_drivers.emulators.ports import TcpPort
+from gigabrain_drivers.emulators.ports import Pty, TcpPort
 from gigabrain_drivers.sim.body import MujocoOptions, SimBattery, sim_body
 from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.worlds import load_world
@@ -112,6 +112,7 @@ class Station:
         """Have these faults and no others from now on."""
         before, self.faults, self._wire.faults = self.faults, faults, faults
         self.device.sag_volts = faults.brown_out
+        self.device.halted = faults.frozen or faults.unplugged
         if faults.unplugged:
             self._port.unplug()
         else:
@@ -214,7 +215,7 @@ def device_class(driver: str) -> type[Device]:
 
 
 def wire_kind(name: str) -> Literal["serial", "tcp", ""]:
-    """Return the kind of line to an emulated robot's base; empty where it cannot be emulated.
+    """Return the kind of line to an emulated robot's base; empty where there is none of bytes.
 
     Raises ConfigError, and UnknownName.
     """
@@ -223,7 +224,9 @@ def wire_kind(name: str) -> Literal["serial", "tcp", ""]:
     run = Run(folder=Path(), link="emulated")
     _, _, options, _ = catalog.load_link(name, run)
     port = device_class(options.driver).port(options)
-    return "tcp" if isinstance(port, TcpPort) else "serial"
+    if isinstance(port, TcpPort):
+        return "tcp"
+    return "serial" if isinstance(port, Pty) else ""
 
 
 def _parts(options: LinkOptions) -> dict[str, Any]:

@@ -8,14 +8,14 @@ import math
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.base import Device
 from gigabrain_drivers.emulators.emulator import BASE, Emulator
-from gigabrain_drivers.links.link import Link
+from gigabrain_drivers.links.link import Trace
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.clock import Clock
@@ -137,7 +137,7 @@ class CheckedRobot:
     @property
     def promise(self) -> str:
         """Time after which the firmware stops the motors without a command, with its source."""
-        device = type(self._emulator.stations[BASE].device) if self._emulator else Device
+        device = self._emulator.stations[BASE].device if self._emulator else Device
         return f"{device.watchdog_ns / 1e6:.0f} ms ({device.promised_in})"
 
     @property
@@ -161,11 +161,17 @@ class CheckedRobot:
         return still and not any(self._emulator.body.commanded)
 
 
-def link_of(driver: Driver) -> Link:
+class TracedLine(Protocol):
+    """A line that shows what goes over it."""
+
+    trace: Trace | None
+
+
+def link_of(driver: Driver) -> TracedLine:
     """Return the line that a driver keeps in `link`. Raises Skipped."""
-    link = getattr(driver, "link", None)
-    if not isinstance(link, Link):
-        raise Skipped("the driver keeps no Link in `link`: no bytes to look at")
+    link: TracedLine | None = getattr(driver, "link", None)
+    if link is None or not hasattr(link, "trace"):
+        raise Skipped("the driver keeps no line with a `trace` in `link`: no bytes to look at")
     return link
 
 

@@ -1,0 +1,296 @@
+"""Compares a ROS 2 robot with its file: which topic is missing, and what to do. Pure.
+
+`explain` needs the graph alone, for the log of a driver; `findings` the messages too.
+"""
+
+import difflib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+from gigabrain_drivers.bodies.ros2 import options as ros2
+from gigabrain_drivers.bodies.ros2.conversion import stamp_ns
+from gigabrain_drivers.bodies.ros2.frames import FrameTree
+from gigabrain_drivers.bodies.ros2.options import Ros2Options
+from gigabrain_schemas.body import Lidar
+from gigabrain_zenoh.ros2.qos import Qos, mismatch
+from gigabrain_zenoh.ros2.transport import GraphEndpoint, absolute
+
+CLOCK_S = 1.0  # by which stamps may differ from this machine's clock
+RATE_SHARE = 0.8  # of the rate in the robot's file
+PLACE_M, PLACE_RAD = 0.02, 0.05  # by which a mounting in the file may differ from /tf_static
+SIM_TIME_S = 1e8  # seconds since 1970 below which a stamp counts from a simulation's start
+MAX_NAMED = 4
+
+Verdict = Literal["ok", "warning", "error"]
+
+
+class Finding(NamedTuple):
+    """One line of the check."""
+
+    what: str  # the topic, or the frames
+    verdict: Verdict
+    text: str  # what was found
+    do: str = ""  # what to do about it
+
+
+class Row(NamedTuple):
+    """A topic that the robot's file names."""
+
+    part: str
+    topic: str  # with its namespace
+    type: str
+    qos: Qos
+    hz: float  # that the file expects; 0: any
+
+
+@dataclass
+class Heard:
+    """What came on a topic while it was watched."""
+
+    count: int = 0
+    seconds: float = 0.0  # from the first message to the last
+    offset_s: float | None = None  # of the newest stamp, behind this machine's clock
+    stamp_s: float = 0.0  # the newest stamp
+    frame: str = ""
+    child_frame: str = ""
+    unreadable: str = ""  # why a message could not be decoded or used
+
+    @property
+    def hz(self) -> float:
+        """Rate of the messages."""
+        return (self.count - 1) / self.seconds if self.seconds else 0.0
+
+    def take(self, message: Any, unix_ns: int, elapsed_s: float) -> None:
+        """Note a message that came so long after the first."""
+        self.count += 1
+        self.seconds = elapsed_s
+        header = getattr(message, "header", None)
+        if header:
+            self.stamp_s = stamp_ns(header.stamp) / 1e9
+            self.offset_s = unix_ns / 1e9 - self.stamp_s
+            self.frame = header.frame_id
+        self.child_frame = getattr(message, "child_frame_id", "")
+
+
+@dataclass
+class Watched:
+    """All that a watch of the robot has brought."""
+
+    endpoints: tuple[GraphEndpoint, ...] = ()
+    heard: dict[str, Heard] = field(default_factory=dict)  # by part
+    frames: FrameTree = field(default_factory=FrameTree)
+
+
+def rows(options: Ros2Options, lidar: Lidar | None = None) -> list[Row]:
+    """Return the topics that the robot publishes by its file."""
+    topics = options.topics
+    found = []
+    for part, type, hz in (
+        ("odometry", ros2.ODOMETRY, topics.odometry.hz),
+        ("scan", ros2.SCAN, lidar.rate_hz if lidar else 0.0),
+        ("imu", ros2.IMU, 0.0),
+        ("battery", ros2.BATTERY, 0.0),
+        ("joints", ros2.JOINTS, 0.0),
+    ):
+        if topic := getattr(topics, part):
+            name = absolute(topic.name, options.namespace)
+            found.append(Row(part, name, type, Qos(topic.qos == "reliable"), hz))
+    if options.mounting == "tf_static":
+        latched = Qos(transient_local=True)
+        found.append(Row("mounting", ros2.TF_STATIC_TOPIC, ros2.TF, latched, 0.0))
+    return found
+
+
+def explain(options: Ros2Options, endpoints: Sequence[GraphEndpoint]) -> str:
+    """Return what is wrong in the graph and what to do, in one line; empty if nothing is."""
+    wrong = [f for f in graph_findings(options, endpoints) if f.verdict == "error"]
+    return "; ".join(f"{each.what}: {each.text}; {each.do}" for each in wrong[:2])
+
+
+def graph_findings(
+    options: Ros2Options, endpoints: Sequence[GraphEndpoint], lidar: Lidar | None = None
+) -> list[Finding]:
+    """Return what the graph says of each topic."""
+    others = [each for each in endpoints if not each.ours]
+    if not others:
+        return [Finding("graph", "error", "no other node is found", _reach(options))]
+    return [
+        *(_published(row, others) for row in rows(options, lidar)),
+        *_commanded(options, others),
+    ]
+
+
+def _reach(options: Ros2Options) -> str:
+    """Return what to check where nothing is found at all."""
+    if options.transport == "rmw_zenoh":
+        return (
+            f"is the router {options.router or options.port} up, do the robot's nodes run with "
+            f"RMW_IMPLEMENTATION=rmw_zenoh_cpp and ROS_DOMAIN_ID={options.domain}?"
+        )
+    local = ", or does it talk to its own machine only (ROS_LOCALHOST_ONLY)"
+    return (
+        f"is the robot's ROS_DOMAIN_ID {options.domain}, is it on this network with multicast"
+        f"{local}?"
+    )
+
+
+def _published(row: Row, others: Sequence[GraphEndpoint]) -> Finding:
+    there = [each for each in others if each.topic == row.topic and each.kind == "publisher"]
+    if not there:
+        return Finding(row.topic, "error", "it has no publisher", _elsewhere(row, others))
+    right = [each for each in there if each.type == row.type]
+    if not right:
+        return Finding(
+            row.topic,
+            "error",
+            f"it is of type {there[0].type}; expected {row.type}",
+            f"name the right topic in topics.{row.part}.name, or have {there[0].node} publish "
+            "that type",
+        )
+    wrong = mismatch(right[0].qos, row.qos)
+    if wrong:
+        return Finding(
+            row.topic,
+            "error",
+            f"no message can come: {wrong}",
+            f"write topics: {{{row.part}: {{qos: best_effort}}}}"
+            if row.part != "mounting"
+            else "have its publisher use transient local, as robot_state_publisher does",
+        )
+    if len(right) > 1:
+        names = ", ".join(sorted({each.node for each in right}))
+        return Finding(row.topic, "warning", f"{len(right)} publishers: {names}", "end all but one")
+    return Finding(row.topic, "ok", f"{row.type} of {right[0].node or 'a node'}, {right[0].qos}")
+
+
+def _elsewhere(row: Row, others: Sequence[GraphEndpoint]) -> str:
+    """Return where topics of the type, or of a like name, are."""
+    publishers = [each for each in others if each.kind == "publisher"]
+    same = sorted({each.topic for each in publishers if each.type == row.type})
+    if same:
+        named = ", ".join(same[:MAX_NAMED])
+        return f"topics of that type: {named}; write it as topics.{row.part}.name, or set namespace"
+    if row.part == "mounting":
+        return "start robot_state_publisher on the robot, or write mounting: file"
+    close = difflib.get_close_matches(row.topic, sorted({each.topic for each in publishers}), 1)
+    like = f"{close[0]} is there; " if close else ""
+    return f"{like}start the node that publishes it, or leave topics.{row.part} out"
+
+
+def _commanded(options: Ros2Options, others: Sequence[GraphEndpoint]) -> list[Finding]:
+    command = options.topics.command
+    topic = absolute(command.name, options.namespace)
+    there = [each for each in others if each.topic == topic]
+    takers = [each for each in there if each.kind == "subscriber"]
+    right = [each for each in takers if each.type == command.type]
+    offered = Qos(command.qos == "reliable")
+    if not takers:
+        kinds = (ros2.TWIST, ros2.TWIST_STAMPED)
+        like = sorted({e.topic for e in others if e.kind == "subscriber" and e.type in kinds})
+        text = f"topics that take one: {', '.join(like[:MAX_NAMED])}; " if like else ""
+        do = f"{text}start the robot's base node, or write topics.command.name"
+        found = [Finding(topic, "error", "no node takes commands", do)]
+    elif not right:
+        do = f"write topics: {{command: {{type: {takers[0].type}}}}}"
+        text = f"{takers[0].node} takes {takers[0].type}; expected {command.type}"
+        found = [Finding(topic, "error", text, do)]
+    elif wrong := mismatch(offered, right[0].qos):
+        do = "write topics: {command: {qos: reliable}}"
+        found = [Finding(topic, "error", f"no command can arrive: {wrong}", do)]
+    else:
+        found = [Finding(topic, "ok", f"{command.type} to {right[0].node or 'a node'}")]
+    rivals = sorted({each.node for each in there if each.kind == "publisher"})
+    rivals = [node for node in rivals if not _guards(node, options)]
+    if rivals:
+        do = "end it: the robot obeys whoever spoke last, and our gate knows nothing of it"
+        found.append(Finding(topic, "warning", f"commanded by {', '.join(rivals)} as well", do))
+    return found
+
+
+def _guards(node: str, options: Ros2Options) -> bool:
+    """Return whether a node is a driver of ours or its guard."""
+    return node.rpartition("/")[2] in (options.node, f"{options.node}_guard")
+
+
+def findings(options: Ros2Options, lidar: Lidar | None, watched: Watched) -> list[Finding]:
+    """Return all that is known after a watch: the graph, then messages, stamps and frames."""
+    found = graph_findings(options, watched.endpoints, lidar)
+    bad = {each.what for each in found if each.verdict == "error"}
+    if any(each.what == "graph" for each in found):
+        return found
+    for row in rows(options, lidar):
+        if row.topic not in bad and row.part != "mounting":
+            found += _messages(row, watched.heard.get(row.part) or Heard())
+    if options.mounting == "tf_static" or len(watched.frames):
+        found += _connected(options, lidar, watched)
+    return found
+
+
+def _messages(row: Row, heard: Heard) -> list[Finding]:
+    if heard.unreadable:
+        do = "is it the same definition on the robot? Other distributions changed some"
+        return [Finding(row.topic, "error", heard.unreadable, do)]
+    if not heard.count:
+        do = "is its node alive, and the network between open for UDP both ways?"
+        return [Finding(row.topic, "error", "its publisher is there, but no message came", do)]
+    found = []
+    if row.hz and heard.hz < RATE_SHARE * row.hz:
+        where = "topics.odometry.hz" if row.part == "odometry" else "rate_hz of `lidar:`"
+        do = f"write what it does as {where}, or have the robot send as often"
+        text = f"{heard.hz:.1f} messages a second; expected {row.hz:g}"
+        found.append(Finding(row.topic, "warning", text, do))
+    if wrong := _clock(row, heard):
+        found.append(wrong)
+    if not found:
+        found.append(Finding(row.topic, "ok", f"{heard.hz:.1f} Hz, stamps of this clock"))
+    return found
+
+
+def _clock(row: Row, heard: Heard) -> Finding | None:
+    if heard.offset_s is None or abs(heard.offset_s) <= CLOCK_S:
+        return None
+    if heard.stamp_s == 0.0:
+        return Finding(row.topic, "error", "its stamps are 0", "have its node fill in the header")
+    if heard.stamp_s < SIM_TIME_S:
+        do = "set use_sim_time false on the robot; a simulation belongs on link sim or emulated"
+        text = f"its stamps are of a simulation: {heard.stamp_s:.1f} s"
+        return Finding(row.topic, "error", text, do)
+    way = "behind" if heard.offset_s > 0 else "ahead of"
+    text = f"its stamps are {abs(heard.offset_s):.1f} s {way} this machine's clock"
+    do = "synchronise both machines by chrony or NTP; TwistStamped commands look old otherwise"
+    return Finding(row.topic, "warning", text, do)
+
+
+def _connected(options: Ros2Options, lidar: Lidar | None, watched: Watched) -> list[Finding]:
+    """Return which frames of messages do not lead to the base."""
+    level: Verdict = "error" if options.mounting == "tf_static" else "warning"
+    base, found = options.base_frame, list[Finding]()
+    frame_of: dict[str, Callable[[Heard], str]] = {
+        "odometry": lambda heard: heard.child_frame,
+        "scan": lambda heard: heard.frame,
+        "imu": lambda heard: heard.frame,
+    }
+    for part, frame in frame_of.items():
+        heard = watched.heard.get(part)
+        if not heard or not heard.count:
+            continue
+        name = frame(heard)
+        place = watched.frames.find(name, base)
+        if place is None:
+            known = ", ".join(watched.frames.names[:12]) or "none"
+            text = f"{name!r} is not connected with {base!r}; frames of /tf_static: {known}"
+            do = "write the robot's own base as base_frame, or publish the missing joint"
+            found.append(Finding(f"{part} frame", level, text, do))
+            continue
+        x, y, yaw = place.planar
+        text = f"{name} at x {x:.3f} m, y {y:.3f} m, yaw {yaw:.3f} rad of {base}"
+        if part == "scan" and lidar and options.mounting == "file":
+            off = max(abs(x - lidar.x), abs(y - lidar.y)), abs(yaw - lidar.yaw)
+            if off[0] > PLACE_M or off[1] > PLACE_RAD:
+                do = "correct x, y and yaw of `lidar:`, or write mounting: tf_static"
+                expected = f"the file says x {lidar.x:g}, y {lidar.y:g}, yaw {lidar.yaw:g}"
+                found.append(Finding("scan frame", "warning", f"{text}; {expected}", do))
+                continue
+        found.append(Finding(f"{part} frame", "ok", text))
+    return found

@@ -1,0 +1,175 @@
+"""A process that stops a ROS 2 robot when its driver has died or hangs.
+
+A robot without a watchdog of its own drives on for ever when its commands end. So the driver starts
+this process, with a node of its own, and tells it of each command: moving, or at rest. When moving
+commands stop coming, or the driver is gone, it sends zero. It cannot help where the network between
+this machine and the robot is cut.
+"""
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import sys
+from typing import Any
+
+import msgspec
+
+from gigabrain_drivers.bodies.ros2.link import RosLink
+from gigabrain_drivers.bodies.ros2.options import Ros2Options
+from gigabrain_schemas.base import Velocity
+from gigabrain_zenoh.clock import Clock
+
+MOVING, AT_REST, QUIT = b"m", b"0", b"q"
+SILENCE_NS = 150_000_000  # after the last word of a moving robot, until zero is sent,
+ZEROS_NS = 1_000_000_000  # for so long, as a single message may get lost
+PERIOD_NS = 20_000_000
+WORD_NS = 500_000_000  # between two words to the driver
+LOST_NS = 3_000_000_000  # without a word of the guard, after which the driver counts it as lost
+RESTART_NS = 500_000_000
+
+
+class GuardState:
+    """Decides when zero is sent. Pure."""
+
+    def __init__(self) -> None:
+        self.gone = False  # whether the driver is
+        self._moving_ns: int | None = None  # when it last said that the robot moves
+        self._stop_ns: int | None = None  # since when zeros are sent
+
+    def take(self, words: bytes, now_ns: int) -> None:
+        """Take what the driver has said; nothing means that it has ended."""
+        if not words:
+            self.gone = True
+            return
+        if QUIT in words:
+            self.gone, self._moving_ns, self._stop_ns = True, None, None
+            return
+        self._moving_ns = now_ns if words[-1:] == MOVING else None
+        self._stop_ns = None
+
+    def stops(self, now_ns: int) -> bool:
+        """Return whether zero is to be sent now."""
+        since = self._moving_ns
+        begins = since is not None and (self.gone or now_ns - since >= SILENCE_NS)
+        if begins and self._stop_ns is None:
+            self._stop_ns = now_ns
+        return self._stop_ns is not None and now_ns - self._stop_ns <= ZEROS_NS
+
+    def ended(self, now_ns: int) -> bool:
+        """Return whether there is nothing left to do."""
+        return self.gone and not self.stops(now_ns)
+
+
+class Guard:
+    """The driver's end: starts the process, and again if it ends."""
+
+    def __init__(self, options: Ros2Options, clock: Clock) -> None:
+        self._options, self._clock = options, clock
+        self._process: asyncio.subprocess.Process | None = None
+        self._heard_ns: int | None = None
+        self._readers = 0
+        self._keeper: asyncio.Task[None] | None = None
+
+    @property
+    def problem(self) -> str:
+        """Why it could not stop the robot; empty while it could."""
+        if self._heard_ns is None:
+            return "the guard, which stops the robot if this driver dies, is starting"
+        if self._clock.now_ns() - self._heard_ns > LOST_NS:
+            return "the guard, which stops the robot if this driver dies, does not answer"
+        if not self._readers:
+            return "the guard, which stops the robot if this driver dies, does not reach it yet"
+        return ""
+
+    def open(self) -> None:
+        """Start it in the background."""
+        if self._keeper is None:
+            self._keeper = asyncio.create_task(self._keep(), name="guard")
+
+    def tell(self, *, moving: bool) -> None:
+        """Tell it of a command that was sent."""
+        self._write(MOVING if moving else AT_REST)
+
+    async def close(self) -> None:
+        """End it; nothing is left to guard."""
+        keeper, self._keeper = self._keeper, None
+        if keeper:
+            self._write(QUIT)
+            keeper.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await keeper
+
+    def _write(self, word: bytes) -> None:
+        process = self._process
+        if process and process.stdin and process.returncode is None:
+            with contextlib.suppress(ConnectionError, RuntimeError):
+                process.stdin.write(word)
+
+    async def _keep(self) -> None:
+        while True:
+            try:
+                await self._run()
+            finally:
+                self._process, self._heard_ns = None, None
+            await self._clock.sleep_ns(RESTART_NS)
+
+    async def _run(self) -> None:
+        settings = msgspec.to_builtins(self._options)
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-P", "-m", __name__, json.dumps(settings)),
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            env=environment,
+            start_new_session=True,  # what ends the driver's group must not end it
+        )
+        self._process = process
+        assert process.stdout
+        assert process.stdin
+        try:
+            while line := await process.stdout.readline():
+                self._heard_ns, self._readers = self._clock.now_ns(), int(line)
+        finally:
+            process.stdin.close()  # it ends by that
+
+
+async def guard(options: Ros2Options) -> None:
+    """Guard the robot until the driver ends, and a moment longer."""
+    clock, state = Clock(), GuardState()
+    link = RosLink(msgspec.structs.replace(options, node=f"{options.node}_guard"[:64]), clock)
+    link.open()
+    loop = asyncio.get_running_loop()
+    os.set_blocking(sys.stdin.fileno(), False)
+
+    def read() -> None:
+        with contextlib.suppress(BlockingIOError):
+            words = os.read(sys.stdin.fileno(), 4096)
+            state.take(words, clock.now_ns())
+            if not words:
+                loop.remove_reader(sys.stdin.fileno())
+
+    loop.add_reader(sys.stdin.fileno(), read)
+    told_ns = -WORD_NS
+    async for now_ns in clock.every(PERIOD_NS):
+        if state.stops(now_ns):
+            link.send(Velocity())
+        if state.ended(now_ns):
+            break
+        if link.transport and now_ns - told_ns >= WORD_NS and not state.gone:
+            told_ns = now_ns
+            with contextlib.suppress(BrokenPipeError):
+                print(link.readers, flush=True)
+    await link.close()
+
+
+def main(words: list[str]) -> None:
+    """Run the guard of the link whose options are given as JSON."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the driver, whose end ends it
+    options: Any = msgspec.convert(json.loads(words[0]), Ros2Options)
+    asyncio.run(guard(options))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,180 @@
+"""The node of a driver: joins ROS 2, listens to the robot's topics, and commands it.
+
+It goes on joining until it is closed. Everything runs on the event loop.
+"""
+
+import asyncio
+import contextlib
+import functools
+import logging
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager
+from typing import Any
+
+from gigabrain_drivers.bodies.ros2.conversion import Unusable, command_message
+from gigabrain_drivers.bodies.ros2.options import Ros2Options
+from gigabrain_drivers.links import link as links
+from gigabrain_drivers.links.link import Trace
+from gigabrain_schemas.base import Velocity
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.errors import BadPayload, GigabrainError
+from gigabrain_zenoh.logs import Fault
+from gigabrain_zenoh.ros2.opening import load_types, open_transport
+from gigabrain_zenoh.ros2.qos import Qos
+from gigabrain_zenoh.ros2.transport import Received, RosPublisher, RosTransport
+from gigabrain_zenoh.ros2.types import Types
+
+log = logging.getLogger(__name__)
+
+RETRY_NS = 500_000_000  # between two attempts to join
+DEPTH = 5  # messages that wait where the loop is busy; the newest count
+STATIC_DEPTH = 100  # publishers of /tf_static keep one message each
+
+Opener = Callable[[], AbstractAsyncContextManager[RosTransport]]
+Take = Callable[[Any], None]  # of a message; may raise Unusable
+
+
+@functools.cache
+def all_types() -> Types:
+    """Return ROS's own types, loaded once: it takes a moment."""
+    from gigabrain_zenoh.config.settings import Ros2Link
+
+    return load_types(Ros2Link())
+
+
+class RosLink:
+    """A node on a transport, opened again whenever opening it fails."""
+
+    def __init__(self, options: Ros2Options, clock: Clock, opener: Opener | None = None) -> None:
+        """`opener` instead of the transport that the options name."""
+        self._options, self._clock = options, clock
+        self._opener = opener or self._open_transport
+        self.trace: Trace | None = None  # ("tx" or "rx", payload)
+        self.on_open: Callable[[], None] = _nothing
+        self.problem = "not opened"
+        self.errors = 0  # messages that could not be used
+        self.transport: RosTransport | None = None
+        self._topics: list[tuple[str, str, Qos, Take]] = []
+        self._faults: dict[str, Fault] = {}
+        self._command: RosPublisher | None = None
+        self._keeper: asyncio.Task[None] | None = None
+        self._types: Types | None = None
+
+    def __str__(self) -> str:
+        options = self._options
+        if options.transport == "dds":
+            return f"ROS 2 by DDS, domain {options.domain}"
+        return f"ROS 2 by rmw_zenoh, {options.router or options.port}, domain {options.domain}"
+
+    @property
+    def readers(self) -> int:
+        """Number of nodes that take our commands."""
+        return self._command.readers if self._command else 0
+
+    def listen(
+        self, topic: str, type: str, take: Take, *, reliable: bool, kept: bool = False
+    ) -> None:
+        """Have `take` called with each message; before `open`. `kept`: old ones as well."""
+        qos = Qos(reliable, kept, STATIC_DEPTH if kept else DEPTH)
+        self._topics.append((topic, type, qos, take))
+
+    def open(self) -> None:
+        """Join in the background. Return at once."""
+        if self._keeper is None:
+            self.problem = "joining ROS 2"
+            self._keeper = asyncio.create_task(self._keep_open(), name=f"link {self}")
+
+    async def close(self) -> None:
+        """Leave ROS 2. May be called any number of times."""
+        keeper, self._keeper = self._keeper, None
+        if keeper:
+            keeper.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await keeper
+        self.problem = "closed"
+
+    def send(self, to: Velocity) -> bool:
+        """Publish a command now; return whether a node takes it. Never blocks or raises."""
+        if self._command is None or self._types is None:
+            return False
+        topic = self._options.topics.command
+        message = command_message(self._types, to, topic, self._clock.unix_ns())
+        payload = self._types.encode(topic.type, message)
+        self._command.publish(payload)
+        self._show("tx", topic.name, topic.type, payload)
+        return self._command.readers > 0
+
+    @contextlib.asynccontextmanager
+    async def _open_transport(self) -> Any:
+        link = self._options.link()
+        async with open_transport(link, await asyncio.to_thread(all_types)) as transport:
+            yield transport
+
+    async def _keep_open(self) -> None:
+        fault = Fault(log)
+        while True:
+            try:
+                self._types = await asyncio.to_thread(all_types)
+                async with self._opener() as transport:
+                    fault.end(f"{self}: joined")
+                    self._attach(transport)
+                    try:
+                        await asyncio.Event().wait()
+                    finally:
+                        self.transport = self._command = None
+            except GigabrainError as error:
+                self.problem = str(error)
+                fault.begin(f"{self}: {error}")
+                await self._clock.sleep_ns(RETRY_NS)
+
+    def _attach(self, transport: RosTransport) -> None:
+        self.transport, self.problem = transport, ""
+        command = self._options.topics.command
+        self._command = transport.publisher(
+            command.name, command.type, Qos(command.qos == "reliable", depth=1)
+        )
+        for topic, type, qos, take in self._topics:
+            transport.subscribe(topic, type, qos, functools.partial(self._take, topic, type, take))
+        self.on_open()
+
+    def _take(self, topic: str, type: str, take: Take, received: Received) -> None:
+        self._show("rx", topic, type, received.payload)
+        fault = self._faults.setdefault(topic, Fault(log))
+        assert self._types
+        try:
+            take(self._types.decode(type, received.payload))
+        except (BadPayload, Unusable) as error:
+            self.errors += 1
+            fault.begin(f"{topic}: a message was dropped: {error}")
+        else:
+            fault.end(f"{topic}: its messages are good again")
+
+    def _show(self, way: str, topic: str, type: str, payload: bytes) -> None:
+        if self.trace:
+            self.trace(way, payload)
+        if links.log.isEnabledFor(logging.DEBUG):
+            links.log.debug("%s %s", self, f"{way} {topic} {self._text(type, payload)}")
+
+    def _text(self, type: str, payload: bytes) -> str:
+        """Describe a message in one line."""
+        assert self._types
+        try:
+            return _short(self._types.to_dict(self._types.decode(type, payload)))
+        except BadPayload as error:
+            return f"{payload[:16].hex()}… {error}"
+
+
+MAX_SHOWN = 6  # elements of a list
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{name}: {_short(each)}" for name, each in value.items()) + "}"
+    if isinstance(value, list):
+        more = ", …" if len(value) > MAX_SHOWN else ""
+        return "[" + ", ".join(_short(each) for each in value[:MAX_SHOWN]) + more + "]"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _nothing() -> None:
+    pass

@@ -1,0 +1,138 @@
+"""Judges a robot's odometry: whether it comes, is possible, and goes on. Pure.
+
+A jump of the pose is taken out, so that our odometry goes on where it was: the map stays right. The
+link counts as lost for a moment all the same, as the robot may have been restarted.
+"""
+
+import math
+from typing import NamedTuple
+
+from msgspec import structs
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_zenoh.geometry import se2
+
+LOST_PERIODS = 2.5  # without odometry, and the link is lost,
+MIN_TIMEOUT_NS = 100_000_000  # but not before
+SETTLE_NS = 300_000_000  # of good odometry, after a fault in it
+PUSHED_FACTOR = 1.5  # times as fast as it can drive a body may be pushed, and
+MAX_FACTOR = 3.0  # times its greatest turn rate, beyond which a reported one is no measurement
+JUMP_M, JUMP_RAD = 0.1, 0.3  # more between two messages; what moves further has jumped
+BACK_NS = 20_000_000  # by which a stamp may be older than the last: two threads of a publisher
+
+
+class OdometrySample(NamedTuple):
+    """One odometry message in our terms."""
+
+    stamp_ns: int  # by the robot's clock
+    pose: Floats  # (3,), in the robot's odometry frame
+    velocity: Velocity
+
+
+class OdometryWatch:
+    """Keeps the newest odometry, and says what is wrong with it."""
+
+    def __init__(self, topic: str, hz: float, max_speed: float, max_turn: float) -> None:
+        """`max_speed` [m/s] and `max_turn` [rad/s] are the body's greatest."""
+        self.timeout_ns = max(round(LOST_PERIODS / hz * 1e9), MIN_TIMEOUT_NS)
+        self.errors = 0  # messages that were refused
+        self.velocity = Velocity()
+        self._topic, self._speed, self._turn = topic, max_speed, max_turn
+        self._pose: Floats = se2.IDENTITY  # ours, which never jumps
+        self._last: OdometrySample | None = None
+        self._came_ns: int | None = None  # when the last good one did
+        self._fault, self._fault_ns = "", 0  # the newest, and when it was seen last
+
+    @property
+    def pose(self) -> Pose:
+        """The pose, from where odometry began."""
+        x, y, yaw = map(float, self._pose)
+        return Pose(x=x, y=y, yaw=yaw)
+
+    def age_ns(self, now_ns: int) -> int | None:
+        """Return the age of the newest good message; None before the first."""
+        return None if self._came_ns is None else now_ns - self._came_ns
+
+    def refuse(self, reason: str, now_ns: int) -> None:
+        """Note a message that cannot be used."""
+        self.errors += 1
+        self._fault, self._fault_ns = f"{self._topic}: {reason}", now_ns
+
+    def restart(self) -> None:
+        """Forget when the last message came: the transport is a new one."""
+        self._came_ns = None
+
+    def add(self, sample: OdometrySample, now_ns: int) -> None:
+        """Take a message."""
+        values = (*sample.pose, *_speeds(sample.velocity))
+        if not all(map(math.isfinite, values)):
+            self.refuse(
+                "its pose or velocity is NaN or infinite: restart the node that sends it", now_ns
+            )
+            return
+        last = self._last
+        if last is None:
+            self._pose = se2.wrapped(sample.pose)
+        elif sample.stamp_ns == last.stamp_ns:
+            self.refuse("its stamps stand still: the same message again", now_ns)
+            return
+        elif sample.stamp_ns < last.stamp_ns - BACK_NS:
+            back = (last.stamp_ns - sample.stamp_ns) / 1e9
+            self.refuse(
+                f"its stamps went back by {back:.3g} s: restarted, or two publishers?", now_ns
+            )
+            self._last = sample  # from here on it counts again
+            return
+        else:
+            self._go_on(last, sample, now_ns)
+            velocity = self._possible(last, sample)
+            self._last, self._came_ns, self.velocity = sample, now_ns, velocity
+            return
+        self._last, self._came_ns, self.velocity = sample, now_ns, sample.velocity
+
+    def problem(self, now_ns: int) -> str:
+        """Return why the odometry cannot be relied on; empty if it can."""
+        age_ns = self.age_ns(now_ns)
+        if self._fault and now_ns - self._fault_ns < SETTLE_NS:
+            return self._fault
+        self._fault = ""
+        if age_ns is None:
+            return f"{self._topic}: no message yet"
+        if age_ns > self.timeout_ns:
+            return f"{self._topic}: no message for {age_ns / 1e6:.0f} ms"
+        return ""
+
+    def _possible(self, last: OdometrySample, sample: OdometrySample) -> Velocity:
+        """Return the velocity, with a turn that cannot be taken from the pose instead.
+
+        A TurtleBot3 reports -125 rad/s when its heading passes half a turn.
+        """
+        velocity = sample.velocity
+        if abs(velocity.angular_z) <= MAX_FACTOR * self._turn:
+            return velocity
+        passed_s = max(sample.stamp_ns - last.stamp_ns, 1) / 1e9
+        turned = float(se2.between(last.pose, sample.pose)[2])
+        return structs.replace(velocity, angular_z=turned / passed_s)
+
+    def _go_on(self, last: OdometrySample, sample: OdometrySample, now_ns: int) -> None:
+        moved = se2.between(last.pose, sample.pose)
+        passed_s = max(sample.stamp_ns - last.stamp_ns, 0) / 1e9
+        if self._came_ns is not None:  # a stamp may leap ahead; the time of arrival does not
+            passed_s = min(passed_s, max((now_ns - self._came_ns) / 1e9, 0.0) + 0.5)
+        far, turned = math.hypot(moved[0], moved[1]), abs(float(moved[2]))
+        if (
+            far > PUSHED_FACTOR * self._speed * passed_s + JUMP_M
+            or turned > PUSHED_FACTOR * self._turn * passed_s + JUMP_RAD
+        ):
+            self.refuse(
+                f"it jumped by {far:.2f} m and {math.degrees(turned):.0f} degrees in "
+                f"{passed_s * 1e3:.0f} ms: was the robot restarted, or its odometry reset?",
+                now_ns,
+            )
+            return
+        self._pose = se2.compose(self._pose, moved)
+
+
+def _speeds(velocity: Velocity) -> tuple[float, float, float]:
+    return velocity.linear_x, velocity.linear_y, velocity.angular_z

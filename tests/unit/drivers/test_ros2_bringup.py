@@ -1,0 +1,201 @@
+"""The bringup check names what is wrong with a ROS 2 robot, and what to do."""
+
+from typing import Any
+
+import msgspec
+import pytest
+
+from gigabrain_drivers.bodies.ros2.bringup import (
+    Finding,
+    Heard,
+    Watched,
+    explain,
+    findings,
+    graph_findings,
+)
+from gigabrain_drivers.bodies.ros2.frames import FrameTree
+from gigabrain_drivers.bodies.ros2.options import Ros2Options
+from gigabrain_schemas.body import Lidar
+from gigabrain_zenoh.ros2.qos import LATCHED, SENSOR_DATA, Qos
+from gigabrain_zenoh.ros2.transport import EndpointKind, GraphEndpoint
+from gigabrain_zenoh.ros2.types import Types
+
+STAMPED, TWIST = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist"
+ODOMETRY, SCAN, TF = "nav_msgs/msg/Odometry", "sensor_msgs/msg/LaserScan", "tf2_msgs/msg/TFMessage"
+LIDAR = Lidar(beams=360, rate_hz=10, range_min=0.1, range_max=8.0, x=-0.032)
+NOW_S = 1_700_000_000.0
+
+
+def options(**changes: Any) -> Ros2Options:
+    topics = {
+        "command": {"type": STAMPED},
+        "odometry": {"name": "odom"},
+        "scan": {"name": "scan"},
+    } | changes.pop("topics", {})
+    given = {"driver": "ros2", "transport": "dds", "domain": 7, "watchdog": 0.5} | changes
+    return msgspec.convert(given | {"topics": topics}, Ros2Options)
+
+
+def end(
+    topic: str, type: str, kind: EndpointKind = "publisher", qos: Qos | None = None, **of: Any
+) -> GraphEndpoint:
+    node = of.get("node", "/base")
+    return GraphEndpoint(node, kind, topic, type, "", qos or Qos(), of.get("ours", False))
+
+
+GOOD = (
+    end("/odom", ODOMETRY),
+    end("/scan", SCAN, qos=SENSOR_DATA, node="/lidar"),
+    end("/cmd_vel", STAMPED, "subscriber"),
+)
+
+
+def only(found: list[Finding], what: str) -> Finding:
+    (one,) = [each for each in found if each.what == what]
+    return one
+
+
+def test_a_whole_robot_has_nothing_wrong() -> None:
+    found = graph_findings(options(), GOOD, LIDAR)
+    assert {each.verdict for each in found} == {"ok"}
+    assert [each.what for each in found] == ["/odom", "/scan", "/cmd_vel"]
+    assert explain(options(), GOOD) == ""
+
+
+def test_an_empty_graph_asks_for_domain_and_network() -> None:
+    ours = end("/cmd_vel", STAMPED, ours=True)
+    (found,) = graph_findings(options(), [ours])
+    assert (found.what, found.verdict) == ("graph", "error")
+    assert "ROS_DOMAIN_ID 7" in found.do
+    zenoh = options(transport="rmw_zenoh", router="tcp/robot:7447")
+    (found,) = graph_findings(zenoh, [])
+    assert "tcp/robot:7447" in found.do
+    assert "rmw_zenoh_cpp" in found.do
+
+
+def test_a_missing_topic_is_named_with_others_of_its_type() -> None:
+    there = [end("/robot1/odom", ODOMETRY), *GOOD[1:]]
+    found = only(graph_findings(options(), there), "/odom")
+    assert (found.verdict, found.text) == ("error", "it has no publisher")
+    assert "/robot1/odom; write it as topics.odometry.name, or set namespace" in found.do
+    assert graph_findings(options(namespace="/robot1"), there)[0].verdict == "ok"
+
+
+def test_a_wrong_type_is_named() -> None:
+    there = [end("/odom", "geometry_msgs/msg/PoseStamped"), *GOOD[1:]]
+    found = only(graph_findings(options(), there), "/odom")
+    assert found.text == f"it is of type geometry_msgs/msg/PoseStamped; expected {ODOMETRY}"
+    there = [*GOOD[:2], end("/cmd_vel", TWIST, "subscriber")]
+    found = only(graph_findings(options(), there), "/cmd_vel")
+    assert found.verdict == "error"
+    assert found.do == f"write topics: {{command: {{type: {TWIST}}}}}"
+
+
+def test_quality_of_service_that_cannot_match_is_named() -> None:
+    wanted = options(topics={"scan": {"qos": "reliable"}})
+    found = only(graph_findings(wanted, GOOD), "/scan")
+    assert found.verdict == "error"
+    assert found.do == "write topics: {scan: {qos: best_effort}}"
+    wanted = options(topics={"command": {"type": STAMPED, "qos": "best_effort"}})
+    found = only(graph_findings(wanted, GOOD), "/cmd_vel")
+    assert found.do == "write topics: {command: {qos: reliable}}"
+    volatile = [*GOOD, end("/tf_static", TF)]
+    found = only(graph_findings(options(mounting="tf_static"), volatile), "/tf_static")
+    assert "volatile" in found.text
+
+
+def test_nobody_who_takes_commands_is_an_error_with_those_who_might() -> None:
+    there = [*GOOD[:2], end("/base/cmd", TWIST, "subscriber")]
+    found = only(graph_findings(options(), there), "/cmd_vel")
+    assert (found.verdict, found.text) == ("error", "no node takes commands")
+    assert "/base/cmd" in found.do
+    assert "/cmd_vel: no node takes commands" in explain(options(), there)
+
+
+def test_another_commander_is_a_warning_but_our_driver_and_guard_are_not() -> None:
+    mine = [end("/cmd_vel", STAMPED, node=f"/gigabrain_driver{n}") for n in ("", "_guard")]
+    assert len(graph_findings(options(), [*GOOD, *mine])) == 3
+    there = [*GOOD, *mine, end("/cmd_vel", STAMPED, node="/teleop")]
+    *_, found = graph_findings(options(), there)
+    assert (found.verdict, found.text) == ("warning", "commanded by /teleop as well")
+
+
+def test_two_publishers_of_one_topic_are_a_warning() -> None:
+    found = only(graph_findings(options(), [*GOOD, end("/odom", ODOMETRY, node="/ekf")]), "/odom")
+    assert (found.verdict, found.text) == ("warning", "2 publishers: /base, /ekf")
+
+
+def watched(heard: dict[str, Heard], frames: FrameTree | None = None) -> Watched:
+    return Watched(GOOD, heard, frames or FrameTree())
+
+
+def heard(hz: float = 20.0, offset_s: float = 0.01, **fields: Any) -> Heard:
+    stamp_s = fields.pop("stamp_s", NOW_S - offset_s)
+    return Heard(101, 100 / hz, offset_s, stamp_s, **fields)
+
+
+SOUND = {"odometry": heard(), "scan": heard(10.0)}
+
+
+def test_messages_with_right_rates_and_stamps_are_fine() -> None:
+    found = findings(options(), LIDAR, watched(SOUND))
+    assert {each.verdict for each in found} == {"ok"}
+    assert [each.what for each in found] == ["/odom", "/scan", "/cmd_vel", "/odom", "/scan"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "verdict", "text"),
+    [
+        (Heard(), "error", "no message came"),
+        (Heard(unreadable="bad"), "error", "bad"),
+        (heard(10.0), "warning", "10.0 messages a second; expected 20"),
+        (heard(offset_s=3.0), "warning", "3.0 s behind this machine's clock"),
+        (heard(offset_s=-3.0), "warning", "3.0 s ahead of this machine's clock"),
+        (heard(offset_s=NOW_S - 12.5, stamp_s=12.5), "error", "of a simulation: 12.5 s"),
+        (heard(offset_s=NOW_S, stamp_s=0.0), "error", "its stamps are 0"),
+    ],
+)
+def test_messages_with_something_wrong(wrong: Heard, verdict: str, text: str) -> None:
+    found = findings(options(), LIDAR, watched(SOUND | {"odometry": wrong}))
+    bad = [each for each in found if each.what == "/odom" and each.verdict != "ok"]
+    assert len(bad) == 1
+    assert bad[0].verdict == verdict
+    assert text in bad[0].text
+    assert bad[0].do
+
+
+def tree(types: Types, x: float) -> FrameTree:
+    made = FrameTree()
+    for parent, child, at in (("base_footprint", "base_link", 0.0), ("base_link", "base_scan", x)):
+        made.add(
+            [
+                types.make(
+                    "geometry_msgs/msg/TransformStamped",
+                    header={"frame_id": parent},
+                    child_frame_id=child,
+                    transform={"translation": {"x": at}},
+                )
+            ]
+        )
+    return made
+
+
+@pytest.mark.parametrize(
+    ("mounting", "x", "frame", "verdict", "text"),
+    [
+        ("file", -0.032, "base_scan", "ok", "x -0.032 m"),
+        ("file", 0.1, "base_scan", "warning", "the file says x -0.032"),
+        ("tf_static", 0.1, "base_scan", "ok", "x 0.100 m"),
+        ("file", 0.1, "laser", "warning", "'laser' is not connected with 'base_footprint'"),
+        ("tf_static", 0.1, "laser", "error", "frames of /tf_static: base_footprint, base_link"),
+    ],
+)
+def test_frames_must_lead_to_the_base(
+    mounting: str, x: float, frame: str, verdict: str, text: str
+) -> None:
+    heards = {"odometry": heard(child_frame="base_footprint"), "scan": heard(10.0, frame=frame)}
+    graph = (*GOOD, end("/tf_static", TF, qos=LATCHED))
+    seen = Watched(graph, heards, tree(Types(), x))
+    found = only(findings(options(mounting=mounting), LIDAR, seen), "scan frame")
+    assert found.verdict == verdict
+    assert text in found.text

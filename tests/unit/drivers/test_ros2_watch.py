@@ -1,0 +1,166 @@
+"""Odometry of a ROS 2 robot: what is wrong with it is named, and its pose never jumps."""
+
+import math
+
+import numpy as np
+import pytest
+
+from gigabrain_drivers.bodies.ros2.guard import GuardState
+from gigabrain_drivers.bodies.ros2.watch import SETTLE_NS, OdometrySample, OdometryWatch
+from gigabrain_schemas.base import Velocity
+
+MS = 1_000_000
+PERIOD_NS = 50 * MS
+
+
+class Robot:
+    """Drives at 0.2 m/s and reports at 20 Hz."""
+
+    def __init__(self) -> None:
+        self.watch = OdometryWatch("odom", 20.0, 0.2, 2.6)
+        self.now_ns, self.x, self.yaw = 0, 0.0, 0.0
+        self.stamp_ns = 1_700_000_000_000 * MS
+
+    def report(self, times: int = 1, **velocity: float) -> None:
+        for _ in range(times):
+            self.now_ns += PERIOD_NS
+            self.stamp_ns += PERIOD_NS
+            self.x += 0.01
+            moves = Velocity(**({"linear_x": 0.2} | velocity))
+            pose = np.array((self.x, 0.0, self.yaw))
+            self.watch.add(OdometrySample(self.stamp_ns, pose, moves), self.now_ns)
+
+    @property
+    def problem(self) -> str:
+        return self.watch.problem(self.now_ns)
+
+
+@pytest.fixture
+def robot() -> Robot:
+    made = Robot()
+    made.report(4)
+    return made
+
+
+def test_good_odometry_has_no_problem(robot: Robot) -> None:
+    assert robot.problem == ""
+    assert robot.watch.pose.x == pytest.approx(0.04)
+    assert robot.watch.velocity.linear_x == 0.2
+
+
+def test_nothing_yet_is_a_problem() -> None:
+    assert Robot().problem == "odom: no message yet"
+
+
+def test_silence_is_lost_after_two_and_a_half_periods(robot: Robot) -> None:
+    robot.now_ns += 125 * MS
+    assert robot.problem == ""
+    robot.now_ns += MS
+    assert robot.problem == "odom: no message for 126 ms"
+    robot.report()
+    assert robot.problem == ""
+
+
+@pytest.mark.parametrize("field", ["linear_x", "angular_z"])
+def test_nan_is_named_at_once_and_settles(robot: Robot, field: str) -> None:
+    robot.report(**{field: math.nan})
+    assert "NaN" in robot.problem
+    assert robot.watch.velocity.linear_x == 0.2
+    robot.report(5)
+    assert "NaN" in robot.problem
+    robot.report(2)
+    assert robot.problem == ""
+    assert robot.watch.errors == 1
+
+
+def test_stamps_that_go_back_are_named(robot: Robot) -> None:
+    robot.stamp_ns -= 5_000 * MS
+    robot.report()
+    assert "stamps went back by 4.95 s" in robot.problem
+    robot.report(7)
+    assert robot.problem == ""
+
+
+def test_a_little_disorder_of_stamps_is_borne(robot: Robot) -> None:
+    robot.stamp_ns -= 60 * MS
+    robot.report()
+    assert robot.problem == ""
+
+
+def test_a_message_that_is_repeated_for_ever_is_no_odometry(robot: Robot) -> None:
+    for _ in range(5):
+        robot.stamp_ns -= PERIOD_NS
+        robot.report()
+    assert "stand still" in robot.problem
+
+
+def test_a_restarted_robot_is_lost_for_a_moment_and_the_pose_goes_on(robot: Robot) -> None:
+    robot.report(100)
+    before = robot.watch.pose.x
+    assert before == pytest.approx(1.04)
+    robot.x = 0.0
+    robot.report()
+    assert "jumped by 1.03 m" in robot.problem
+    assert robot.watch.pose.x == before
+    robot.report(SETTLE_NS // PERIOD_NS)
+    assert robot.problem == ""
+    assert robot.watch.pose.x == pytest.approx(before + 0.06)
+
+
+def test_a_body_that_is_pushed_or_late_has_not_jumped(robot: Robot) -> None:
+    robot.x += 0.08
+    robot.report()
+    assert robot.problem == ""
+    robot.now_ns += 950 * MS
+    robot.stamp_ns += 950 * MS
+    robot.x += 0.3
+    robot.report()
+    assert robot.problem == ""
+
+
+def test_a_turn_rate_that_cannot_be_is_taken_from_the_pose(robot: Robot) -> None:
+    robot.yaw = math.pi - 0.01
+    robot.report(20)
+    robot.yaw = -math.pi + 0.04  # 0.05 rad further
+    robot.report(angular_z=-124.7)
+    assert robot.watch.velocity.angular_z == pytest.approx(1.0)
+    assert robot.watch.velocity.linear_x == 0.2
+
+
+def test_a_new_transport_starts_again(robot: Robot) -> None:
+    robot.watch.restart()
+    assert robot.problem == "odom: no message yet"
+    robot.report()
+    assert robot.problem == ""
+
+
+def test_the_guard_sends_zero_when_a_moving_driver_falls_silent() -> None:
+    state = GuardState()
+    state.take(b"0m", 0)
+    assert not state.stops(149 * MS)
+    assert state.stops(150 * MS)
+    assert state.stops(1150 * MS)
+    assert not state.stops(1151 * MS)
+    state.take(b"m", 2000 * MS)
+    assert not state.stops(2100 * MS)
+    assert state.stops(2200 * MS)
+    state.take(b"m0", 2210 * MS)
+    assert not state.stops(9000 * MS)
+
+
+def test_the_guard_stops_at_once_when_the_driver_is_gone_and_then_ends() -> None:
+    state = GuardState()
+    state.take(b"m", 0)
+    state.take(b"", MS)
+    assert state.stops(MS)
+    assert not state.ended(1000 * MS)
+    assert state.ended(1002 * MS)
+
+
+@pytest.mark.parametrize("words", [b"0", b"mq"])
+def test_the_guard_leaves_a_robot_that_was_let_go_alone(words: bytes) -> None:
+    state = GuardState()
+    state.take(words, 0)
+    state.take(b"", MS)
+    assert not state.stops(MS)
+    assert state.ended(MS)
