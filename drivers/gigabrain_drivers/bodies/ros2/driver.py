@@ -90,7 +90,8 @@ class Ros2Driver(Driver):
         self._wanted = ZERO
         self._wanted_ns = self._sent_ns = self._well_ns = self._clock.now_ns()
         self._commanded_ns = self._clock.now_ns()
-        self._repeat_ns = round(1e9 / topics.command.hz)
+        # a little early, as the check for it has a period of its own
+        self._repeat_ns = round(1e9 / topics.command.hz) - GUARD_PERIOD_NS // 2
         self._connected, self._found, self._reconnects = False, False, 0
         self._fault, self._named = Fault(log), ""
         self._task: asyncio.Task[None] | None = None

@@ -26,7 +26,7 @@ from gigabrain_zenoh.ros2.types import Types
 
 log = logging.getLogger(__name__)
 
-RETRY_NS = 500_000_000  # between two attempts to join
+RETRY_NS = 200_000_000  # between two attempts to join
 DEPTH = 5  # messages that wait where the loop is busy; the newest count
 STATIC_DEPTH = 100  # publishers of /tf_static keep one message each
 
