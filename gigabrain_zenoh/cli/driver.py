@@ -125,6 +125,38 @@ def trace(
     return int(not received)
 
 
+def bringup(
+    name: Body, *, link: Literal["emulated", "real"] = "real", seconds: float = 5.0
+) -> int:
+    """Compare a ROS 2 robot with its file: topics, types, QoS, rates, stamps and frames.
+
+    Example: gigabrain driver bringup turtlebot3_ros2 --link emulated
+
+    It only listens, and sends the robot nothing. Each line that is not ok
+    says what to do. Exit code 1 if one is an error.
+
+    Args:
+        link: The robot itself, or its emulator.
+        seconds: Time to listen [s].
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from gigabrain_zenoh.qa.conformance import ros2_bringup
+
+    check_positive(seconds=seconds)
+    with tempfile.TemporaryDirectory(prefix="gigabrain-") as folder:
+        found = run_async(ros2_bringup.check(name, link, Path(folder), seconds))
+    table = Table(title=f"{name}, link {link}")
+    for title in ("topic", "verdict", "found", "to do"):
+        table.add_column(title)
+    for one in found:
+        colour = {"ok": "green", "warning": "yellow", "error": "red"}[one.verdict]
+        table.add_row(one.what, f"[{colour}]{one.verdict}[/{colour}]", one.text, one.do)
+    Console().print(table)
+    return int(any(one.verdict == "error" for one in found))
+
+
 def _print_trace(
     name: str, link: LinkName, part: str, seconds: float, speeds: dict[str, float]
 ) -> bool:

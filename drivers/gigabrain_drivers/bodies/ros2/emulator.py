@@ -57,6 +57,7 @@ class RosPort:
         self.path, self._options = path, options
         self.on_bytes: Callable[[bytes], None] = lambda data: None
         self._publishers: dict[str, RosPublisher] = {}
+        self._address: Address | None = None
         self._plugged = False
         self._running: asyncio.Task[None] | None = None
         self._endings: set[asyncio.Task[None]] = set()
@@ -112,10 +113,9 @@ class RosPort:
             localhost=options.transport == "dds",
         )
         async with contextlib.AsyncExitStack() as stack:
-            if options.transport == "dds":
-                address = Address(domain=free_domain())
-            else:
-                address = Address(router=await _router(stack))
+            address = self._address = self._address or _free_address(options)
+            if address.router:
+                await _open_router(stack, address.router)
             changes = msgspec.structs.asdict(address)
             link = msgspec.structs.replace(link, **changes)
             transport = await stack.enter_async_context(open_transport(link, types))
@@ -143,15 +143,18 @@ class RosPort:
             self.on_bytes(frame(topic, payload))
 
 
-async def _router(stack: contextlib.AsyncExitStack) -> str:
-    """Open a router on a free port; return its endpoint."""
+def _free_address(options: Ros2Options) -> Address:
+    """Return where nobody else is; it stays the same when the nodes start again."""
+    if options.transport == "dds":
+        return Address(domain=free_domain())
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        return Address(router=f"tcp/127.0.0.1:{probe.getsockname()[1]}")
+
+
+async def _open_router(stack: contextlib.AsyncExitStack, endpoint: str) -> None:
     session = await open_session(Endpoint(listen=(endpoint,)))
-    loop = asyncio.get_running_loop()
-    stack.push_async_callback(loop.run_in_executor, None, session.close)
-    return endpoint
+    stack.push_async_callback(asyncio.to_thread, session.close)
 
 
 def free_domain() -> int:
