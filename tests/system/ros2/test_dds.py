@@ -205,6 +205,19 @@ async def test_a_service_answers_and_is_in_the_graph(nodes: Nodes) -> None:
     )
 
 
+async def test_what_is_no_message_of_the_type_is_not_sent(nodes: Nodes) -> None:
+    talker, listener = await nodes.node("talker"), await nodes.node("listener")
+    got: list[Received] = []
+    listener.subscribe("/chatter", STRING, Qos(), got.append)
+    publisher = talker.publisher("/chatter", STRING)
+    await until(lambda: publisher.readers == 1, "the reader")
+    publisher.publish(b"\0\1\0\0" + b"\xff" * 8)
+    assert talker.counts["not sent"] == 1
+    publisher.publish(nodes.string("hi") + b"tail")
+    await until(lambda: got, "the good one")
+    assert [nodes.text(each.payload) for each in got] == ["hi"]
+
+
 async def test_an_unknown_type_and_an_impossible_name_are_refused(nodes: Nodes) -> None:
     node = await nodes.node()
     with pytest.raises(ConfigError, match="Strin"):
