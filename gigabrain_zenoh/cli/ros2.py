@@ -6,11 +6,10 @@ from typing import Literal
 
 import msgspec
 from cyclopts import Parameter
-from msgspec import structs
 
 from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, checked
 from gigabrain_zenoh.config.settings import ProcessConfig, Ros2Config
-from gigabrain_zenoh.launch.processes import run_process
+from gigabrain_zenoh.launch.processes import run_process, with_ros_router
 from gigabrain_zenoh.runtime.running import find_endpoint
 
 
@@ -62,9 +61,7 @@ def ros2(*, options: RosOptions = LOCAL_ROS, at: RobotAddress = LOCAL) -> int:
     If the gateway ends, nothing else of the robot notices. In a deployment
     file, a part `ros2:` starts it with the robot.
     """
-    config = options.config()
     endpoint = find_endpoint(at.connect, at.namespace, at.folder)
-    if config.transport == "rmw_zenoh" and not config.router:
-        config = structs.replace(config, router=endpoint.connect[-1])
+    config = with_ros_router(options.config(), endpoint)
     settings = msgspec.to_builtins(config)
     return run_process(ProcessConfig(name="ros2", endpoint=endpoint, settings=settings))

@@ -35,6 +35,7 @@ from gigabrain_zenoh.config.settings import (
     DecisionConfig,
     DriverConfig,
     EmulatorConfig,
+    Endpoint,
     FoxgloveConfig,
     PageConfig,
     PerceptionConfig,
@@ -137,13 +138,19 @@ def _recorder(deployment: "Deployment", _: ProcessPlace) -> RecorderConfig:
 
 
 def _ros2(deployment: "Deployment", place: ProcessPlace) -> Ros2Config:
-    """Return the gateway's settings; its ROS router is the robot's own unless they name one."""
-    config = deployment.ros2 or Ros2Config()
+    return with_ros_router(deployment.ros2 or Ros2Config(), place.endpoint)
+
+
+def with_ros_router(config: Ros2Config, endpoint: Endpoint) -> Ros2Config:
+    """Return the gateway's settings with the robot's own router, unless they name another one.
+
+    Raises ConfigError where that router has keys.
+    """
     if config.transport != "rmw_zenoh" or config.router:
         return config
-    if place.endpoint.keys:
+    if endpoint.keys:
         raise ConfigError(ROUTER_FOR_ROS)
-    return structs.replace(config, router=place.endpoint.connect[-1])
+    return structs.replace(config, router=endpoint.connect[-1])
 
 
 def _needs_ros2(deployment: "Deployment", here: set[str]) -> bool:
