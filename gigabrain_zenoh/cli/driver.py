@@ -125,9 +125,7 @@ def trace(
     return int(not received)
 
 
-def bringup(
-    name: Body, *, link: Literal["emulated", "real"] = "real", seconds: float = 5.0
-) -> int:
+def bringup(name: Body, *, link: Literal["emulated", "real"] = "real", seconds: float = 5.0) -> int:
     """Compare a ROS 2 robot with its file: topics, types, QoS, rates, stamps and frames.
 
     Example: gigabrain driver bringup turtlebot3_ros2 --link emulated

@@ -16,7 +16,6 @@ from types import TracebackType
 from typing import Any
 
 import zenoh
-import zenoh.ext
 from msgspec import structs
 from zenoh.handlers import Callback
 
@@ -25,6 +24,7 @@ from gigabrain_zenoh.bus.zenoh.session import OpenSession, ReconnectingSession, 
 from gigabrain_zenoh.config.settings import Endpoint, Ros2Link
 from gigabrain_zenoh.errors import ConfigError, GigabrainError, NoAnswer
 from gigabrain_zenoh.ros2.qos import DEFAULT, SERVICES, Qos
+from gigabrain_zenoh.ros2.rmw_declared import REMOTE, Bundle, advanced_publisher, subscriber
 from gigabrain_zenoh.ros2.rmw_names import (
     NO_HASH,
     SPACE,
@@ -48,21 +48,7 @@ from gigabrain_zenoh.ros2.transport import (
 from gigabrain_zenoh.ros2.types import Types
 
 log = logging.getLogger(__name__)
-HEARTBEAT_S = 0.5  # of publishers whose late readers notice what they missed
 RETRY_S = 0.1  # until a service is asked again that no node serves yet
-REMOTE = zenoh.Locality.REMOTE
-
-
-class _Bundle:
-    """Declarations that are withdrawn together, the last first."""
-
-    def __init__(self, *declared: Any) -> None:
-        self._declared = declared
-
-    def undeclare(self) -> None:
-        for each in reversed(self._declared):
-            with contextlib.suppress(zenoh.ZError):  # its session is closed
-                each.undeclare()
 
 
 class _Entity:
@@ -135,7 +121,7 @@ class RmwZenohPublisher:
             if self._on_readers:
                 self._on_readers(readers)
 
-    def _declare(self, line: OpenSession) -> _Bundle:
+    def _declare(self, line: OpenSession) -> Bundle:
         """Declare; of an advanced publisher a plain one beside it tells the readers."""
         entity, session = self.entity, line.session
         plain = session.declare_publisher(
@@ -145,12 +131,12 @@ class RmwZenohPublisher:
         )
         made: list[Any] = [plain]
         if entity.qos.transient_local:
-            made.append(_advanced_publisher(session, entity))
+            made.append(advanced_publisher(session, entity.key, entity.qos))
         made.append(plain.declare_matching_listener(line.guard(self._told)))
         made.append(entity.declare_token(line))
         self._put = made[1 if entity.qos.transient_local else 0].put
         self._match(bool(plain.matching_status))
-        return _Bundle(*made)
+        return Bundle(*made)
 
     def _told(self, status: zenoh.MatchingStatus) -> None:
         self._home.bridge.post(self._match, status.matching)
@@ -158,23 +144,6 @@ class RmwZenohPublisher:
     def _match(self, matched: bool) -> None:
         self._matched = matched
         self.count()
-
-
-def _advanced_publisher(session: zenoh.Session, entity: _Entity) -> Any:
-    """Declare a publisher that keeps its last messages for late readers."""
-    return zenoh.ext.declare_advanced_publisher(
-        session,
-        entity.key,
-        congestion_control=zenoh.CongestionControl.DROP,
-        allowed_destination=REMOTE,
-        cache=zenoh.ext.CacheConfig(entity.qos.depth),
-        publisher_detection=True,
-        sample_miss_detection=zenoh.ext.MissDetectionConfig(
-            heartbeat=None, sporadic_heartbeat=HEARTBEAT_S
-        )
-        if entity.qos.reliable
-        else None,
-    )
 
 
 class RmwZenohTransport:
@@ -233,9 +202,9 @@ class RmwZenohTransport:
 
         mailbox = Mailbox(self.bridge, deliver, qos.depth)
 
-        def declare(line: OpenSession) -> _Bundle:
-            subscriber = _subscriber(line.session, entity, line.guard(mailbox.put))
-            return _Bundle(subscriber, entity.declare_token(line))
+        def declare(line: OpenSession) -> Bundle:
+            made = subscriber(line.session, entity.key, qos, line.guard(mailbox.put))
+            return Bundle(made, entity.declare_token(line))
 
         self.subscribers.add(entity)
         undeclare = self.lines.declare(declare)
@@ -265,11 +234,11 @@ class RmwZenohTransport:
 
         put, ends = self._questions.serve(run, urgent=False)
 
-        def declare(line: OpenSession) -> _Bundle:
+        def declare(line: OpenSession) -> Bundle:
             queryable = line.session.declare_queryable(
                 entity.key, line.guard(put), complete=True, allowed_origin=REMOTE
             )
-            return _Bundle(queryable, entity.declare_token(line))
+            return Bundle(queryable, entity.declare_token(line))
 
         undeclare = self.lines.declare(declare)
 
@@ -326,7 +295,7 @@ class RmwZenohTransport:
             for each in self.endpoints()
         )
 
-    def _declare_node(self, line: OpenSession) -> _Bundle:
+    def _declare_node(self, line: OpenSession) -> Bundle:
         name = self.name_in(line.session)
         liveliness = line.session.liveliness()
 
@@ -337,7 +306,7 @@ class RmwZenohTransport:
         watch = liveliness.declare_subscriber(
             f"{SPACE}/{name.domain}/**", line.guard(told), history=True
         )
-        return _Bundle(watch, liveliness.declare_token(name.token))
+        return Bundle(watch, liveliness.declare_token(name.token))
 
     def _token(self, change: tuple[str, bool, str]) -> None:
         key, there, zid = change
@@ -377,7 +346,7 @@ class RmwZenohTransport:
         key = (absolute(service, self.link.namespace), type)
         if key not in self._clients:
             entity = _Entity(self, "client", service, type, SERVICES)
-            self.lines.declare(lambda line: _Bundle(entity.declare_token(line)))
+            self.lines.declare(lambda line: Bundle(entity.declare_token(line)))
             self._clients[key] = entity
         return self._clients[key]
 
@@ -430,24 +399,6 @@ def _endpoint(link: Ros2Link, own: Endpoint | None) -> Endpoint:
     if own is None or not own.connect:
         raise ConfigError("ros2: no router; name one as router: tcp/127.0.0.1:7447")
     return structs.replace(own, namespace="", listen=(), nap_s=0.0, stamps=True)
-
-
-def _subscriber(
-    session: zenoh.Session, entity: _Entity, put: Callable[[zenoh.Sample], None]
-) -> Any:
-    """Declare a subscriber; of transient local data one that asks for what it missed."""
-    if not entity.qos.transient_local:
-        return session.declare_subscriber(entity.key, put, allowed_origin=REMOTE)
-    return zenoh.ext.declare_advanced_subscriber(
-        session,
-        entity.key,
-        put,
-        allowed_origin=REMOTE,
-        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=entity.qos.depth),
-        recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
-        if entity.qos.reliable
-        else None,
-    )
 
 
 def _drop(query: zenoh.Query) -> None:

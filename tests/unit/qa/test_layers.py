@@ -19,6 +19,7 @@ ONLY_IN = {
         "gigabrain_zenoh/bus/zenoh/session.py",
         "gigabrain_zenoh/bus/zenoh/transport.py",
         "gigabrain_zenoh/qa/bench/relay.py",
+        "gigabrain_zenoh/ros2/rmw_declared.py",
         "gigabrain_zenoh/ros2/rmw_zenoh.py",
         "gigabrain_zenoh/testing/processes.py",
     ),

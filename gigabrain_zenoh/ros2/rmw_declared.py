@@ -1,0 +1,61 @@
+"""Zenoh declarations as `rmw_zenoh` makes them: publishers and subscribers with a history."""
+
+import contextlib
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+import zenoh.ext
+
+from gigabrain_zenoh.ros2.qos import Qos
+
+HEARTBEAT_S = 0.5  # of publishers whose late readers notice what they missed
+REMOTE = zenoh.Locality.REMOTE
+
+
+class Bundle:
+    """Declarations that are withdrawn together, the last first."""
+
+    def __init__(self, *declared: Any) -> None:
+        self._declared = declared
+
+    def undeclare(self) -> None:
+        """Withdraw all of them."""
+        for each in reversed(self._declared):
+            with contextlib.suppress(zenoh.ZError):  # its session is closed
+                each.undeclare()
+
+
+def advanced_publisher(session: zenoh.Session, key: str, qos: Qos) -> Any:
+    """Declare a publisher that keeps its last messages for late readers."""
+    return zenoh.ext.declare_advanced_publisher(
+        session,
+        key,
+        congestion_control=zenoh.CongestionControl.DROP,
+        allowed_destination=REMOTE,
+        cache=zenoh.ext.CacheConfig(qos.depth),
+        publisher_detection=True,
+        sample_miss_detection=zenoh.ext.MissDetectionConfig(
+            heartbeat=None, sporadic_heartbeat=HEARTBEAT_S
+        )
+        if qos.reliable
+        else None,
+    )
+
+
+def subscriber(
+    session: zenoh.Session, key: str, qos: Qos, put: Callable[[zenoh.Sample], None]
+) -> Any:
+    """Declare a subscriber; of transient local data one that asks for what it missed."""
+    if not qos.transient_local:
+        return session.declare_subscriber(key, put, allowed_origin=REMOTE)
+    return zenoh.ext.declare_advanced_subscriber(
+        session,
+        key,
+        put,
+        allowed_origin=REMOTE,
+        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=qos.depth),
+        recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
+        if qos.reliable
+        else None,
+    )
