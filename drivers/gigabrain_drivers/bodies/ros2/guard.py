@@ -28,6 +28,7 @@ PERIOD_NS = 20_000_000
 WORD_NS = 500_000_000  # between two words to the driver
 LOST_NS = 3_000_000_000  # without a word of the guard, after which the driver counts it as lost
 RESTART_NS = 500_000_000
+CLOSE_S = 1.0
 
 
 class GuardState:
@@ -161,7 +162,10 @@ async def guard(options: Ros2Options) -> None:
             told_ns = now_ns
             with contextlib.suppress(BrokenPipeError):
                 print(link.readers, flush=True)
-    await link.close()
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(CLOSE_S):
+            await link.close()
+    os._exit(0)  # threads of DDS can hang at the end of a process; nothing is left to do
 
 
 def main(words: list[str]) -> None:

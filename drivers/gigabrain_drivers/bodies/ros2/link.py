@@ -27,6 +27,7 @@ from gigabrain_zenoh.ros2.types import Types
 log = logging.getLogger(__name__)
 
 RETRY_NS = 200_000_000  # between two attempts to join
+CLOSE_S = 1.0  # for leaving
 DEPTH = 5  # messages that wait where the loop is busy; the newest count
 STATIC_DEPTH = 100  # publishers of /tf_static keep one message each
 
@@ -89,8 +90,9 @@ class RosLink:
         keeper, self._keeper = self._keeper, None
         if keeper:
             keeper.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await keeper
+            _, late = await asyncio.wait((keeper,), timeout=CLOSE_S)
+            if late:
+                log.warning("%s: it has not been left within %g s", self, CLOSE_S)
         self.problem = "closed"
 
     def send(self, to: Velocity) -> bool:

@@ -1,0 +1,169 @@
+"""A TurtleBot3 that rclpy plays, worn as a body: its node killed and frozen while it drives."""
+
+import asyncio
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gigabrain_drivers.bodies.ros2.driver import Ros2Driver
+from gigabrain_drivers.driver import catalog
+from gigabrain_drivers.driver.robot import Run
+from gigabrain_schemas.base import Velocity
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.qa.conformance import ros2_bringup
+from gigabrain_zenoh.testing.waiting import until
+from tests.ros2.judge import Judge, Program, frozen
+
+ROOM = [[-2, -2, 4, -2], [4, -2, 4, 2], [4, 2, -2, 2], [-2, 2, -2, -2]]
+MAX_LOST_S, MAX_FOUND_S, MAX_BOARD_S = 0.25, 3.0, 0.5
+SHARED_MACHINE_S = 0.35  # on top of these
+DRIVE = """
+import asyncio, sys
+from pathlib import Path
+from tests.system.ros2.test_ros2_body import Session
+async def main():
+    async with Session(Path(sys.argv[1])) as it:
+        await it.found()
+        it.wanted = 0.15
+        await asyncio.sleep(60)
+asyncio.run(main())
+"""
+
+
+def robot_file(judge: Judge, folder: Path) -> Path:
+    """The shipped TurtleBot3, in the judge's domain."""
+    text = catalog.robot_path("turtlebot3_ros2").read_text()
+    text = text.replace("domain: 30", f"localhost: true\n  domain: {judge.domain}")
+    file = folder / "turtlebot3.yaml"
+    file.write_text(text)
+    return file
+
+
+class Session:
+    """A driver whose process ticks: it reads a state, and commands `wanted`, each 20 ms."""
+
+    def __init__(self, file: Path) -> None:
+        _, driver = catalog.make_driver(str(file), Run(folder=file.parent, link="real"))
+        assert isinstance(driver, Ros2Driver)
+        self.driver, self.wanted = driver, 0.0
+        self.state: Any = None
+        self.sent = Velocity()
+
+    async def __aenter__(self) -> "Session":
+        await self.driver.__aenter__()
+        self._task = asyncio.create_task(self._run())
+        return self
+
+    async def __aexit__(self, *error: Any) -> None:
+        self._task.cancel()
+        await asyncio.gather(self._task, return_exceptions=True)
+        await self.driver.__aexit__(*error)
+
+    async def _run(self) -> None:
+        async for _ in self.driver.ticks(Clock()):
+            self.state = await self.driver.read_state()
+            wanted = self.wanted if self.connected else 0.0
+            self.sent = await self.driver.set_base_velocity(wanted, 0.0, 0.0)
+
+    @property
+    def connected(self) -> bool:
+        return self.state is not None and self.state.link.connected
+
+    async def found(self) -> float:
+        return await self._took(lambda: self.connected, "found")
+
+    async def lost(self) -> float:
+        return await self._took(lambda: not self.connected, "lost")
+
+    async def _took(self, condition: Any, what: str) -> float:
+        loop = asyncio.get_running_loop()
+        begun_s = loop.time()
+        await until(condition, f"{what}: {self.driver.problem}")
+        return loop.time() - begun_s
+
+
+async def truth(robot: Program) -> dict[str, Any]:
+    return dict(await robot.query("truth"))
+
+
+async def moving(robot: Program, it: Session) -> None:
+    it.wanted = 0.15
+    await asyncio.to_thread(robot.poll, "truth", lambda now: now["speed_mps"] > 0.1)
+
+
+async def stands_after(robot: Program) -> float:
+    loop = asyncio.get_running_loop()
+    begun_s = loop.time()
+    await asyncio.to_thread(robot.poll, "truth", lambda now: now["speed_mps"] < 0.005, 10.0)
+    return loop.time() - begun_s
+
+
+async def test_it_is_driven_and_measured(judge: Judge, tmp_path: Path) -> None:
+    robot = judge.start("turtlebot3", walls=ROOM, stamped=True)
+    async with Session(robot_file(judge, tmp_path)) as it:
+        await it.found()
+        await moving(robot, it)
+        await until(lambda: it.state.velocity.linear_x > 0.12, "the measured speed")
+        assert it.sent.linear_x == pytest.approx(0.15)
+        await until(lambda: it.driver.sensors["scan"], "a scan")
+        assert it.state.battery.percentage == pytest.approx(83.3, abs=0.1)
+        assert it.state.joints[0].velocity == pytest.approx(0.15 / 0.033, rel=0.2)
+        it.wanted = 0.0
+        assert await stands_after(robot) < 1.0
+
+
+@pytest.mark.parametrize("fault", ["killed", "frozen"])
+async def test_its_node_fails_while_it_drives(judge: Judge, tmp_path: Path, fault: str) -> None:
+    robot = judge.start("turtlebot3", walls=ROOM, stamped=True)
+    node = (await robot.hear("node"))["pid"]
+    async with Session(robot_file(judge, tmp_path)) as it:
+        await it.found()
+        await moving(robot, it)
+        if fault == "killed":
+            os.kill(node, 9)
+            lost_s, stands_s = await asyncio.gather(it.lost(), stands_after(robot))
+            await robot.query("start_node")
+        else:
+            with frozen(node):
+                lost_s, stands_s = await asyncio.gather(it.lost(), stands_after(robot))
+                it.wanted = 0.0
+                await asyncio.sleep(1.0)  # what it finds in its queue is zero
+        assert it.driver.problem
+        it.wanted = 0.0
+        found_s = await it.found()
+        print(f"{fault}: lost {lost_s:.3f} s, stands {stands_s:.3f} s, found {found_s:.3f} s")
+        assert lost_s <= MAX_LOST_S + SHARED_MACHINE_S
+        assert stands_s <= MAX_BOARD_S + SHARED_MACHINE_S
+        assert (await truth(robot))["speed_mps"] == 0.0
+        assert it.state.link.reconnects == 1
+        await moving(robot, it)
+
+
+async def test_a_killed_driver_is_replaced_by_its_guard(judge: Judge, tmp_path: Path) -> None:
+    robot = judge.start("turtlebot3", walls=ROOM, stamped=True)
+    file = robot_file(judge, tmp_path)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    driver = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-c", DRIVE, str(file)), env=environment
+    )
+    try:
+        await asyncio.to_thread(robot.poll, "truth", lambda now: now["speed_mps"] > 0.14)
+    finally:
+        driver.kill()
+        await driver.wait()
+    assert await stands_after(robot) < 0.15 + 0.1 + SHARED_MACHINE_S
+
+
+async def test_bringup_finds_it_whole_or_names_the_wrong_type(judge: Judge, tmp_path: Path) -> None:
+    judge.start("turtlebot3", walls=ROOM)  # which takes Twist, as on Humble
+    file = robot_file(judge, tmp_path)
+    found = await ros2_bringup.check(str(file), "real", tmp_path, 3.0)
+    wrong = [one for one in found if one.verdict == "error"]
+    assert [one.what for one in wrong] == ["/cmd_vel"]
+    assert wrong[0].do == "write topics: {command: {type: geometry_msgs/msg/Twist}}"
+    frames = [one.text for one in found if one.what == "scan frame"]
+    assert frames
+    assert "x -0.032 m" in frames[0]
