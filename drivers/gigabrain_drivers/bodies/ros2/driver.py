@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import logging
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,7 @@ from gigabrain_zenoh.logs import Fault
 
 log = logging.getLogger(__name__)
 
+NUMBERS = re.compile(r"[\d.]+")
 COMMAND_TIMEOUT_NS = 80_000_000  # without a command; zero is then out by 100 ms
 GUARD_PERIOD_NS = 20_000_000  # between two checks by the driver
 REST_NS = 800_000_000  # for which a closing driver sends zero, at most, until the robot stands
@@ -75,7 +77,8 @@ class Ros2Driver(Driver):
         topics = options.topics
         self.link = RosLink(options, self._clock, opener)
         self.link.on_open = self._opened
-        self._guard = Guard(options, self._clock) if options.needs_guard and not opener else None
+        guarded = options.needs_guard and not opener
+        self._guard = Guard(options, self._clock, lambda: self.link.readers) if guarded else None
         self._watch = OdometryWatch(
             topics.odometry.name,
             topics.odometry.hz,
@@ -235,11 +238,13 @@ class Ros2Driver(Driver):
         if self._connected:
             self._send(ZERO)
         self._connected = False
-        if self._named or now_ns - self._well_ns < LOG_AFTER_NS:
+        kind = NUMBERS.sub("", problem)  # how long it lasts makes no other problem of it
+        if kind == self._named or now_ns - self._well_ns < LOG_AFTER_NS:
             return
-        self._named = problem
+        self._named = kind
         transport = self.link.transport
         more = explain(self.options, transport.endpoints()) if transport else ""
+        self._fault.end(f"{self.link}: now something else is wrong")
         self._fault.begin(f"{self.link}: {problem}{'; ' if more else ''}{more}")
 
     def _take_odometry(self, message: Any) -> None:

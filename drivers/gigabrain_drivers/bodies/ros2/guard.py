@@ -12,6 +12,7 @@ import json
 import os
 import signal
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -29,6 +30,7 @@ WORD_NS = 500_000_000  # between two words to the driver
 LOST_NS = 3_000_000_000  # without a word of the guard, after which the driver counts it as lost
 RESTART_NS = 500_000_000
 CLOSE_S = 1.0
+START_S = 10.0  # for its first word, on a busy machine
 
 
 class GuardState:
@@ -66,8 +68,9 @@ class GuardState:
 class Guard:
     """The driver's end: starts the process, and again if it ends."""
 
-    def __init__(self, options: Ros2Options, clock: Clock) -> None:
-        self._options, self._clock = options, clock
+    def __init__(self, options: Ros2Options, clock: Clock, reached: Callable[[], object]) -> None:
+        """`reached` tells whether the driver itself reaches the robot."""
+        self._options, self._clock, self._reached = options, clock, reached
         self._process: asyncio.subprocess.Process | None = None
         self._heard_ns: int | None = None
         self._readers = 0
@@ -129,11 +132,23 @@ class Guard:
         self._process = process
         assert process.stdout
         assert process.stdin
+        alone_ns = self._clock.now_ns()
         try:
-            while line := await process.stdout.readline():
+            while self._clock.now_ns() - alone_ns < LOST_NS:  # else it has failed to join
+                async with asyncio.timeout(START_S if self._heard_ns is None else LOST_NS / 1e9):
+                    line = await process.stdout.readline()
+                if not line:
+                    return
                 self._heard_ns, self._readers = self._clock.now_ns(), int(line)
+                if self._readers or not self._reached():
+                    alone_ns = self._heard_ns
+        except TimeoutError:
+            return
         finally:
             process.stdin.close()  # it ends by that
+            if self._keeper:  # it is replaced, and may hang
+                with contextlib.suppress(ProcessLookupError):
+                    process.kill()
 
 
 async def guard(options: Ros2Options) -> None:
