@@ -150,7 +150,7 @@ class RecognizerConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     onnx: str = ""  # file of a net of one's own; empty: the shipped one
     labels: str = ""  # file with one class a line, in the order of the net's outputs
     layout: Literal["things", "yolo", "detr"] = "things"  # of the net's outputs
-    min_confidence: Annotated[float, Meta(ge=0.01, le=0.99)] = 0.3
+    min_confidence: Annotated[float, Meta(ge=0.01, le=0.99)] = 0.4
     rate_hz: Annotated[float, Meta(ge=0.1, le=60)] = 5.0  # pictures of each camera, at most
 
 

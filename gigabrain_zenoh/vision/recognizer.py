@@ -16,7 +16,7 @@ WIDTH_PX, HEIGHT_PX, STRIDE_PX = 320, 240, 8
 UNIT_PX = 16.0  # distance to a side at raw 0
 RAW_LIMITS = (-4.0, 3.5)  # of raw distances
 MAX_CANDIDATES = 200  # before overlapping ones are dropped
-MIN_CONFIDENCE, MAX_OVERLAP = 0.3, 0.5
+MIN_CONFIDENCE, MAX_OVERLAP = 0.4, 0.5
 GREY = (114, 114, 114)  # around pictures of another shape
 
 Picture = NDArray[np.uint8]
