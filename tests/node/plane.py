@@ -142,7 +142,8 @@ class Plane:
         self._move()
         bench = self.bench
         if self.tick % 50 == 2:
-            bench.send(BODY, body(self.description, boot=self.boot))
+            own = body(self.description, boot=self.boot)
+            bench.send(BODY, msgspec.structs.replace(own, tick=self.tick))
             if self.maps and not self.maps_sent:
                 bench.send(MAP, as_map(self.known, self.tick, self.boot))
         x, y, yaw = self._odometry()
