@@ -16,7 +16,7 @@ from gigabrain_zenoh.runtime.running import find_endpoint
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class RosOptions:
-    """How the node joins ROS 2."""
+    """Settings with which the node joins ROS 2."""
 
     transport: Literal["rmw_zenoh", "dds"] = "rmw_zenoh"
     "How the other nodes talk: by rmw_zenoh over a router, or by DDS."

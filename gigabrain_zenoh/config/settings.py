@@ -197,7 +197,7 @@ RosNamespace = Annotated[
 
 
 class Ros2Link(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How a process joins ROS 2 as a node."""
+    """Settings with which a process joins ROS 2 as a node."""
 
     transport: Literal["rmw_zenoh", "dds"] = "rmw_zenoh"
     domain: Annotated[int, Meta(ge=0, le=232)] = 0  # ROS_DOMAIN_ID of the others

@@ -1,4 +1,4 @@
-"""What a velocity from ROS does: a pure state machine in front of the gate.
+"""Commander for velocities from ROS: a pure state machine in front of the gate.
 
 The first command that moves asks for the body. Each command goes to the gate at once, and again
 with each state of the robot for at most one period of its sender. Then the gate gets nothing, then
@@ -68,7 +68,7 @@ class Sender(Struct, frozen=True):
 
 
 class Memory(Struct, frozen=True, kw_only=True):
-    """What the commander remembers."""
+    """State of the commander."""
 
     gate: GateStatus | None = None  # newest of a fresh state
     boot: int = 0

@@ -28,7 +28,7 @@ class Diagnosing:
         own: Callable[[], Iterable[Status]],
     ) -> None:
         self._scene, self._types, self._own = scene, types, own
-        self._health: ProcessHealth | None = None  # while somebody reads
+        self._health: ProcessHealth | None = None  # while there are readers
         self._safety: Latest[SafetyState] | None = None
         self._close_safety: Callable[[], None] = lambda: None
         self._publisher = ros.publisher("diagnostics", TYPE, DEFAULT, self._count)

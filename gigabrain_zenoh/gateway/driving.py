@@ -99,7 +99,7 @@ class RosCommander:
 
     @property
     def holds(self) -> bool:
-        """Whether it has the body."""
+        """True while it holds the body."""
         return self._memory.holds
 
     def forget(self, why: str) -> None:

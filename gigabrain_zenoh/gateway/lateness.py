@@ -1,4 +1,4 @@
-"""How late a message is against the fastest ones of its sender, whose clock may be off."""
+"""Delay of a message over the fastest of its sender, whose clock may be off."""
 
 from msgspec import Struct
 from msgspec.structs import replace

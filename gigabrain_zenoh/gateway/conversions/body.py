@@ -1,4 +1,4 @@
-"""What the body measures of itself: odometry, joints, battery, attitude."""
+"""Conversions of the body's own measurements: odometry, joints, battery, attitude."""
 
 import math
 from typing import Any

@@ -46,7 +46,7 @@ class Row(NamedTuple):
 
 @dataclass
 class Heard:
-    """What came on a topic while it was watched."""
+    """Messages of a topic received while it was watched."""
 
     count: int = 0
     seconds: float = 0.0  # from the first message to the last

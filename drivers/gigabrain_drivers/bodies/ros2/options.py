@@ -159,7 +159,7 @@ class Ros2Options(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class Address(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where an emulator is: the content of the file of its port."""
+    """Address of an emulator, as written in the file of its port."""
 
     domain: Annotated[int, Meta(ge=0, le=232)] = 0
     router: str = ""
