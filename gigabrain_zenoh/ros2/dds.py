@@ -1,13 +1,13 @@
 """Transport to ROS nodes over DDS: topics by cyclonedds, services by a participant of their own.
 
-cyclonedds calls from its own thread, which only posts to the loop; the loop then takes what the
-reader holds, at most its depth.
+A thread waits until readers have something, and posts that to the loop; the loop then takes what
+a reader holds, at most its depth.
 """
 
 import asyncio
-import atexit
-import functools
+import contextlib
 import logging
+import threading
 from collections import Counter
 from collections.abc import Callable
 from types import TracebackType
@@ -20,7 +20,16 @@ from cyclonedds.builtin import (
     BuiltinTopicDcpsPublication,
     BuiltinTopicDcpsSubscription,
 )
-from cyclonedds.core import DDSException, Entity, InstanceState, Listener, SampleState, ViewState
+from cyclonedds.core import (
+    DDSException,
+    DDSStatus,
+    Entity,
+    GuardCondition,
+    InstanceState,
+    SampleState,
+    ViewState,
+    WaitSet,
+)
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy
@@ -49,6 +58,7 @@ from gigabrain_zenoh.ros2.types import Types
 
 log = logging.getLogger(__name__)
 ALL = SampleState.Any | ViewState.Any | InstanceState.Any
+FOREVER = duration(infinite=True)
 BLOCKING_MS = 1  # that a write waits for a slow reader, as it holds up the loop
 INFO_QOS = Qos(transient_local=True, depth=1)
 LOCALHOST = """<CycloneDDS><Domain Id="any">
@@ -60,20 +70,44 @@ LOCALHOST = """<CycloneDDS><Domain Id="any">
 </Domain></CycloneDDS>"""
 
 
-class _Heard(Listener):
-    """Posts to the loop that a reader has something, or that a writer's readers changed."""
+class _Waiting:
+    """Waits in a thread of its own for readers with data and writers whose readers changed.
 
-    def __init__(self, post: Callable[[], None]) -> None:
-        self._post = post
-        Listener.__init__(self)
+    cyclonedds could call listeners instead, from its own threads. They would hold its locks while
+    they wait for Python's, and `ddspy_write` holds Python's while it waits for theirs.
+    """
 
-    def on_data_available(self, reader: object) -> None:
-        """Post; in a thread of cyclonedds."""
-        self._post()
+    def __init__(self, participant: DomainParticipant) -> None:
+        self._set = WaitSet(participant)
+        self._told: dict[Entity, tuple[int, Callable[[], None]]] = {}
+        self._ended = GuardCondition(participant)
+        self._set.attach(self._ended)
+        self._thread = threading.Thread(target=self._run, name="dds", daemon=True)
+        self._thread.start()
 
-    def on_publication_matched(self, writer: object, status: object) -> None:
-        """Post; in a thread of cyclonedds."""
-        self._post()
+    def watch(self, entity: Entity, status: int, post: Callable[[], None]) -> None:
+        """Call `post`, in the thread, each time that the status is set. Calls it now as well."""
+        entity.set_status_mask(status)
+        self._told = {**self._told, entity: (status, post)}
+        self._set.attach(entity)
+        post()
+
+    def forget(self, entity: Entity) -> None:
+        """Watch it no more."""
+        self._told = {one: told for one, told in self._told.items() if one is not entity}
+        self._set.detach(entity)
+
+    def close(self) -> None:
+        """End the thread."""
+        self._ended.set(True)
+        self._thread.join()
+
+    def _run(self) -> None:
+        while self._set.wait(FOREVER) and not self._ended.read():
+            for entity, (status, post) in self._told.items():
+                with contextlib.suppress(DDSException):  # it may be deleted meanwhile
+                    if entity.take_status(status):
+                        post()
 
 
 class DdsPublisher:
@@ -95,7 +129,7 @@ class DdsPublisher:
             writer, self._writer = self._writer, None
             self._home.remove(self, writer)
 
-    def count(self, _: object = None) -> None:
+    def count(self) -> None:
         """Count the readers."""
         if not self._writer:
             return
@@ -114,16 +148,17 @@ class DdsSubscriber:
         self._gids: dict[int, bytes] = {}  # by the handle of a publisher
         self.gid: bytes = reader.guid.bytes
 
-    def take(self, _: object = None) -> None:
-        """Hand over what the reader holds."""
+    def take(self) -> bool:
+        """Hand over what the reader holds; return whether there may be more."""
         taken = ddspy_take(self._reader._ref, ALL, self._depth) if self._reader else ()
         if isinstance(taken, int):
             self._home.counts["not taken"] += 1
-            return
+            return False
         for payload, info in taken:
             if info.valid_data and self._reader:
                 gid = self._gid(info.publication_handle)
                 self._handle(Received(payload, info.source_timestamp, gid))
+        return len(taken) == self._depth
 
     def close(self) -> None:
         """Withdraw the subscriber."""
@@ -175,39 +210,34 @@ class DdsTransport:
         self._bridge.close()
         self._closed = True
         await self._services.close()
-        _open.discard(self._participant)
+        await asyncio.to_thread(self._waiting.close)
         await asyncio.to_thread(_delete, self._participant)  # and all that it has
 
     def publisher(
         self, topic: str, type: str, qos: Qos = DEFAULT, on_readers: OnReaders | None = None
     ) -> DdsPublisher:
         """Declare a publisher. `on_readers` is called from the loop's next turn on."""
-        told: list[DdsPublisher] = []
         writer = DataWriter(
-            self._participant,
-            self._topic(topic, type),
-            dds_qos(qos, self.types.hash(type)),
-            _Heard(lambda: self._bridge.post(_count, told)),
+            self._participant, self._topic(topic, type), dds_qos(qos, self.types.hash(type))
         )
-        told.append(DdsPublisher(self, writer, on_readers))
-        self._bridge.post(_count, told)  # it may have been matched before it was known
-        self._add(told[0])
-        return told[0]
+        publisher = DdsPublisher(self, writer, on_readers)
+        self._waiting.watch(
+            writer,
+            DDSStatus.PublicationMatched,
+            lambda: self._bridge.post(DdsPublisher.count, publisher),
+        )
+        self._add(publisher)
+        return publisher
 
     def subscribe(self, topic: str, type: str, qos: Qos, handle: OnReceived) -> Close:
         """Call `handle` for each message; a busy loop keeps the newest `qos.depth` messages."""
-        told: list[DdsSubscriber] = []
-        post = _Once(self._bridge, functools.partial(_take, told))
         reader = DataReader(
-            self._participant,
-            self._topic(topic, type),
-            dds_qos(qos, self.types.hash(type)),
-            _Heard(post),
+            self._participant, self._topic(topic, type), dds_qos(qos, self.types.hash(type))
         )
-        told.append(DdsSubscriber(self, reader, qos.depth, handle))
-        post()
-        self._add(told[0])
-        return told[0].close
+        subscriber = DdsSubscriber(self, reader, qos.depth, handle)
+        self._listen(reader, subscriber.take)
+        self._add(subscriber)
+        return subscriber.close
 
     def serve(self, service: str, type: str, handle: Answer) -> Close:
         """Answer requests of a service, each in a task of its own."""
@@ -238,6 +268,7 @@ class DdsTransport:
     def remove(self, one: DdsPublisher | DdsSubscriber, entity: Entity) -> None:
         """Delete an endpoint, in another thread: a writer waits for its readers a while."""
         self._mine.remove(one)
+        self._waiting.forget(entity)
         self._loop.run_in_executor(None, _delete, entity)
         self._tell_soon()
 
@@ -246,8 +277,7 @@ class DdsTransport:
             self._kept += _localhost(self.link.domain)
         qos = DdsQos(Policy.Userdata(b"enclave=/;"))
         self._participant = DomainParticipant(self.link.domain, qos)
-        _close_at_exit()
-        _open.add(self._participant)
+        self._waiting = _Waiting(self._participant)
         guid = self._participant.guid.bytes
         self._graph = DdsGraph(
             self._info, frozenset({guid[:12], self._services.participant.data.prefix})
@@ -258,35 +288,33 @@ class DdsTransport:
         topic = Topic(self._participant, INFO_TOPIC, self._info_idl.struct(INFO_TYPE))
         hash = self.types.hash(INFO_TYPE)
         self._teller = DataWriter(self._participant, topic, dds_qos(INFO_QOS, hash, own=True))
-        told: list[DdsSubscriber] = []
-        post = _Once(self._bridge, functools.partial(_take, told))
         qos = dds_qos(INFO_QOS, hash, keep_all=True, own=True)
-        reader = DataReader(self._participant, topic, qos, _Heard(post))
-        told.append(DdsSubscriber(self, reader, MAX_DEPTH, self._told))
-        post()
+        reader = DataReader(self._participant, topic, qos)
+        self._listen(reader, DdsSubscriber(self, reader, MAX_DEPTH, self._told).take)
         self._kept += [topic, reader]
         self._tell()
 
     def _watch(self, topic: Any, take: Callable[[Any], None]) -> None:
         """Call `take` for each change that DDS knows of participants or endpoints."""
-        readers: list[BuiltinDataReader] = []
+        reader = BuiltinDataReader(self._participant, topic)
 
-        def read() -> None:
+        def read() -> bool:
             try:
-                taken = readers[0].take(MAX_DEPTH) if readers else ()
+                taken = reader.take(MAX_DEPTH)
             except Exception as error:  # noqa: BLE001 - it has no class of its own for bad names
                 self.counts["malformed endpoint"] += 1
                 log.debug("an endpoint cannot be read: %s", error)
-                return
+                return False
             for sample in taken:
                 take(sample)
-            if len(taken) == MAX_DEPTH:
-                post()
+            return len(taken) == MAX_DEPTH
 
-        post = _Once(self._bridge, read)
-        readers.append(BuiltinDataReader(self._participant, topic, listener=_Heard(post)))
-        self._kept.append(readers[0])
-        post()
+        self._listen(reader, read)
+        self._kept.append(reader)
+
+    def _listen(self, reader: Entity, take: Callable[[], bool]) -> None:
+        """Have the loop call `take` when a reader has data, and again while it returns True."""
+        self._waiting.watch(reader, DDSStatus.DataAvailable, _Once(self._bridge, take))
 
     def _told(self, received: Received) -> None:
         try:
@@ -329,9 +357,12 @@ class DdsTransport:
 
 
 class _Once:
-    """Posts a call to the loop, unless one waits there already. From any thread."""
+    """Posts a call to the loop, unless one waits there already. From any thread.
 
-    def __init__(self, bridge: Bridge, function: Callable[[], None]) -> None:
+    Posts once more where the function returns True.
+    """
+
+    def __init__(self, bridge: Bridge, function: Callable[[], bool]) -> None:
         self._bridge, self._function = bridge, function
         self._posted = False
 
@@ -342,17 +373,8 @@ class _Once:
 
     def _run(self) -> None:
         self._posted = False  # before reading, so that what arrives from now on posts again
-        self._function()
-
-
-def _count(told: list[DdsPublisher]) -> None:
-    for each in told:
-        each.count()
-
-
-def _take(told: list[DdsSubscriber]) -> None:
-    for each in told:
-        each.take()
+        if self._function():
+            self()
 
 
 def dds_qos(qos: Qos, hash: str, *, keep_all: bool = False, own: bool = False) -> DdsQos:
@@ -373,20 +395,6 @@ def dds_qos(qos: Qos, hash: str, *, keep_all: bool = False, own: bool = False) -
 def _delete(entity: Any) -> None:
     """Delete an entity and all below it, which references from elsewhere may not prevent."""
     entity._delete(entity._ref)
-
-
-_open: set[Any] = set()  # participants of this process
-
-
-@functools.cache
-def _close_at_exit() -> None:
-    """Delete at the end what is open: a callback during the interpreter's end would never end."""
-    atexit.register(_delete_all)
-
-
-def _delete_all() -> None:
-    for each in tuple(_open):
-        _delete(each)
 
 
 def _localhost(domain: int) -> list[Entity]:

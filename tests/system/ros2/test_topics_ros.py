@@ -11,7 +11,7 @@ import pytest
 from gigabrain_zenoh.config.settings import Ros2Link
 from gigabrain_zenoh.ros2.dds import DdsTransport
 from gigabrain_zenoh.ros2.qos import DEFAULT, LATCHED, SENSOR_DATA, Qos
-from gigabrain_zenoh.ros2.transport import Received
+from gigabrain_zenoh.ros2.transport import GraphEndpoint, Received
 from gigabrain_zenoh.ros2.types import Types
 from gigabrain_zenoh.testing.waiting import until
 from tests.ros2.judge import Judge
@@ -94,8 +94,13 @@ async def test_we_read_what_ros_publishes(judge: Judge, node: Node) -> None:
     times = [one.source_ns for one in got if one.source_ns]
     assert times == sorted(times)
     assert len(set(times)) == len(got)
-    (endpoint,) = [one for one in ours.endpoints() if one.topic == "/cmd_vel" and not one.ours]
-    assert (endpoint.node, endpoint.kind, endpoint.type) == ("/hands", "publisher", TWIST)
+
+    def theirs() -> list[GraphEndpoint]:
+        return [one for one in ours.endpoints() if one.topic == "/cmd_vel" and not one.ours]
+
+    await until(lambda: [one.node for one in theirs()] == ["/hands"], "the publisher's node")
+    (endpoint,) = theirs()
+    assert (endpoint.kind, endpoint.type) == ("publisher", TWIST)
     assert endpoint.hash == node.types.hash(TWIST)
     assert endpoint.qos.reliable
 
