@@ -20,7 +20,12 @@ from msgspec import structs
 from zenoh.handlers import Callback
 
 from gigabrain_zenoh.bus.bridge import Bridge, Mailbox, QueryQueue
-from gigabrain_zenoh.bus.zenoh.session import OpenSession, ReconnectingSession, open_session
+from gigabrain_zenoh.bus.zenoh.session import (
+    OpenSession,
+    ReconnectingSession,
+    has_subscriber,
+    open_session,
+)
 from gigabrain_zenoh.config.settings import Endpoint, Ros2Link
 from gigabrain_zenoh.errors import ConfigError, GigabrainError, NoAnswer
 from gigabrain_zenoh.ros2.qos import DEFAULT, SERVICES, Qos
@@ -135,7 +140,7 @@ class RmwZenohPublisher:
         made.append(plain.declare_matching_listener(line.guard(self._told)))
         made.append(entity.declare_token(line))
         self._put = made[1 if entity.qos.transient_local else 0].put
-        self._match(bool(plain.matching_status))
+        self._match(has_subscriber(plain))
         return Bundle(*made)
 
     def _told(self, status: zenoh.MatchingStatus) -> None:

@@ -153,6 +153,15 @@ T = TypeVar("T")
 AGAIN_S = 1.0  # pause after a failed attempt to open a session
 
 
+def has_subscriber(publisher: zenoh.Publisher) -> bool:
+    """Return whether anybody subscribes to the publisher's key.
+
+    The status is an object that is always true, where the stubs of zenoh 1.10 say bool.
+    """
+    status: Any = publisher.matching_status
+    return bool(status.matching)
+
+
 class OpenSession:
     """A session, valid until a client's link to its router is lost."""
 

@@ -94,6 +94,15 @@ async def test_the_wire_is_that_of_rmw_zenoh(nodes: Nodes) -> None:
     assert tokens == {node.token, made}
 
 
+async def test_without_a_reader_there_is_none_from_the_start(nodes: Nodes) -> None:
+    told: list[int] = []
+    talker = await nodes.node("talker")
+    publisher = talker.publisher("/chatter", STRING, on_readers=told.append)
+    latched = talker.publisher("/map", STRING, Qos(transient_local=True), told.append)
+    await until(lambda: len(talker.endpoints()) == 2, "our own tokens")
+    assert (publisher.readers, latched.readers, told) == (0, 0, [])
+
+
 async def test_a_reader_is_told_as_it_comes_and_goes(nodes: Nodes) -> None:
     told: list[int] = []
     talker = await nodes.node("talker")
