@@ -1,118 +1,19 @@
-"""Nodes over DDS: participants of ours in this process, on the loopback."""
+"""What DDS alone does, with participants of ours in this process."""
 
-import asyncio
-import contextlib
-import os
 from collections.abc import AsyncIterator
-from typing import Any
 
 import pytest
 
-from gigabrain_zenoh.config.settings import Ros2Link
-from gigabrain_zenoh.errors import ConfigError, NoAnswer
-from gigabrain_zenoh.ros2.dds import DdsTransport
-from gigabrain_zenoh.ros2.qos import LATCHED, SENSOR_DATA, Qos
+from gigabrain_zenoh.ros2.qos import SENSOR_DATA, Qos
 from gigabrain_zenoh.ros2.transport import Received
-from gigabrain_zenoh.ros2.types import Types
-from gigabrain_zenoh.testing.processes import repeat
 from gigabrain_zenoh.testing.waiting import until
-
-STRING = "std_msgs/msg/String"
-TRIGGER = "std_srvs/srv/Trigger"
-
-
-class Nodes:
-    """Makes nodes in a domain of this process's own."""
-
-    def __init__(self, types: Types) -> None:
-        self.types = types
-        self.domain = 100 + os.getpid() % 100
-        self.stack = contextlib.AsyncExitStack()
-
-    def link(self, name: str, **fields: Any) -> Ros2Link:
-        fields = {"domain": self.domain, "localhost": True} | fields
-        return Ros2Link(node=name, transport="dds", **fields)
-
-    async def node(self, name: str = "gigabrain", **fields: Any) -> DdsTransport:
-        made = DdsTransport(self.link(name, **fields), self.types)
-        return await self.stack.enter_async_context(made)
-
-    def string(self, data: str) -> bytes:
-        return self.types.encode(STRING, self.types.make(STRING, data=data))
-
-    def text(self, payload: bytes) -> str:
-        return str(self.types.decode(STRING, payload).data)
-
-
-@pytest.fixture(scope="module")
-def types() -> Types:
-    return Types()
+from tests.ros2.nodes import STRING, Nodes, dds_nodes
 
 
 @pytest.fixture
-async def nodes(types: Types) -> AsyncIterator[Nodes]:
-    made = Nodes(types)
-    async with made.stack:
+async def nodes() -> AsyncIterator[Nodes]:
+    async with dds_nodes() as made:
         yield made
-
-
-async def test_a_message_arrives_with_its_time_and_sender(nodes: Nodes) -> None:
-    talker, listener = await nodes.node("talker"), await nodes.node("listener")
-    got: list[Received] = []
-    listener.subscribe("/chatter", STRING, Qos(), got.append)
-    publisher = talker.publisher("/chatter", STRING)
-    await until(lambda: publisher.readers == 1, "the reader")
-    publisher.publish(nodes.string("hi"))
-    publisher.publish(nodes.string("ho"))
-    await until(lambda: len(got) == 2, "both messages")
-    assert [nodes.text(each.payload) for each in got] == ["hi", "ho"]
-    assert got[0].source_ns is not None
-    assert got[1].source_ns is not None
-    assert 0 < got[0].source_ns <= got[1].source_ns
-    assert got[0].gid == publisher.gid
-
-
-async def test_a_reader_is_told_as_it_comes_and_goes(nodes: Nodes) -> None:
-    told: list[int] = []
-    talker = await nodes.node("talker")
-    publisher = talker.publisher("/chatter", STRING, on_readers=told.append)
-    async with DdsTransport(nodes.link("listener"), nodes.types) as listener:
-        closes = [
-            listener.subscribe("/chatter", STRING, SENSOR_DATA, lambda _: None) for _ in range(2)
-        ]
-        await until(lambda: publisher.readers == 2, "two readers")
-        closes[0]()
-        closes[0]()
-        await until(lambda: publisher.readers == 1, "one reader")
-    await until(lambda: publisher.readers == 0, "no reader")
-    assert told[-1] == 0
-
-
-async def test_a_node_does_not_hear_itself(nodes: Nodes) -> None:
-    node, other = await nodes.node("talker"), await nodes.node("listener")
-    own: list[Received] = []
-    got: list[Received] = []
-    node.subscribe("/chatter", STRING, Qos(), own.append)
-    publisher = node.publisher("/chatter", STRING)
-    other.subscribe("/chatter", STRING, Qos(), got.append)
-    await repeat(lambda: publisher.publish(nodes.string("hi")), lambda: got)
-    assert own == []
-    assert publisher.readers == 1
-
-
-@pytest.mark.parametrize("first", ["publisher", "subscriber"])
-async def test_a_latched_message_reaches_late_joiners_in_either_order(
-    nodes: Nodes, first: str
-) -> None:
-    got: list[Received] = []
-    if first == "subscriber":
-        (await nodes.node("listener")).subscribe("/map", STRING, LATCHED, got.append)
-    publisher = (await nodes.node("talker")).publisher("/map", STRING, LATCHED)
-    publisher.publish(nodes.string("old"))
-    publisher.publish(nodes.string("map"))
-    if first == "publisher":
-        (await nodes.node("listener")).subscribe("/map", STRING, LATCHED, got.append)
-    await until(lambda: got and nodes.text(got[-1].payload) == "map", "the map")
 
 
 async def test_a_reliable_reader_does_not_match_a_best_effort_publisher(nodes: Nodes) -> None:
@@ -123,86 +24,6 @@ async def test_a_reliable_reader_does_not_match_a_best_effort_publisher(nodes: N
     listener.subscribe("/other", STRING, Qos(), lambda _: None)
     await until(lambda: other.readers == 1, "the reader that matches")
     assert sensor.readers == 0
-
-
-async def test_a_busy_loop_keeps_the_newest(nodes: Nodes) -> None:
-    talker, listener = await nodes.node("talker"), await nodes.node("listener")
-    got: list[str] = []
-    listener.subscribe(
-        "/chatter", STRING, Qos(depth=2), lambda r: got.append(nodes.text(r.payload))
-    )
-    publisher = talker.publisher("/chatter", STRING)
-    await until(lambda: publisher.readers == 1, "the reader")
-    for number in range(50):
-        publisher.publish(nodes.string(str(number)))
-    await until(lambda: got and got[-1] == "49", "the newest")
-
-
-async def test_a_message_of_a_megabyte_arrives_whole(nodes: Nodes) -> None:
-    image = "sensor_msgs/msg/Image"
-    types = nodes.types
-    payload = types.encode(image, types.make(image, data=bytes(range(256)) * 4096))
-    got: list[Received] = []
-    (await nodes.node("listener")).subscribe("/image", image, SENSOR_DATA, got.append)
-    publisher = (await nodes.node("talker")).publisher("/image", image, SENSOR_DATA)
-    await repeat(lambda: publisher.publish(payload), lambda: got)
-    assert got[0].payload == payload
-
-
-async def test_the_graph_names_nodes_topics_types_and_qos(nodes: Nodes) -> None:
-    rviz = await nodes.node("rviz")
-    for name in ("robot1", "robot2"):
-        node = await nodes.node("gigabrain", namespace=f"/{name}")
-        node.publisher("scan", STRING, SENSOR_DATA)
-
-    def scans() -> list[Any]:
-        return [each for each in rviz.endpoints() if each.node]
-
-    await until(lambda: len(scans()) == 2, "both scans")
-    assert set(rviz.nodes()) == {"/rviz", "/robot1/gigabrain", "/robot2/gigabrain"}
-    assert {(each.node, each.topic, each.type, each.hash) for each in scans()} == {
-        (f"/{name}/gigabrain", f"/{name}/scan", STRING, nodes.types.hash(STRING))
-        for name in ("robot1", "robot2")
-    }
-    assert {(each.kind, each.qos.reliable, each.ours) for each in scans()} == {
-        ("publisher", False, False)
-    }
-
-
-async def test_a_node_that_leaves_is_forgotten(nodes: Nodes) -> None:
-    rviz = await nodes.node("rviz")
-    async with DdsTransport(nodes.link("talker"), nodes.types) as talker:
-        talker.publisher("/chatter", STRING)
-        await until(lambda: any(each.node == "/talker" for each in rviz.endpoints()), "the talker")
-    await until(lambda: rviz.nodes() == ("/rviz",) and not rviz.endpoints(), "its end")
-
-
-async def test_a_service_answers_and_is_in_the_graph(nodes: Nodes) -> None:
-    server, client = await nodes.node("server"), await nodes.node("client")
-    types = nodes.types
-
-    async def answer(request: bytes) -> bytes:
-        response = types.make(f"{TRIGGER}_Response", success=True, message="stopped")
-        return types.encode(f"{TRIGGER}_Response", response)
-
-    server.serve("estop", TRIGGER, answer)
-    request = types.encode(f"{TRIGGER}_Request", types.make(f"{TRIGGER}_Request"))
-    response = await client.call("/estop", TRIGGER, request, 20)
-    assert types.decode(f"{TRIGGER}_Response", response).message == "stopped"
-    with pytest.raises(NoAnswer):
-        await client.call("/release", TRIGGER, request, 0.3)
-
-    def kinds() -> set[tuple[str, str, str]]:
-        return {
-            (each.kind, each.node, each.type)
-            for each in client.endpoints()
-            if each.topic == "/estop"
-        }
-
-    await until(
-        lambda: kinds() == {("server", "/server", TRIGGER), ("client", "/client", TRIGGER)},
-        "both sides",
-    )
 
 
 async def test_what_is_no_message_of_the_type_is_not_sent(nodes: Nodes) -> None:
@@ -218,23 +39,14 @@ async def test_what_is_no_message_of_the_type_is_not_sent(nodes: Nodes) -> None:
     assert [nodes.text(each.payload) for each in got] == ["hi"]
 
 
-async def test_an_unknown_type_and_an_impossible_name_are_refused(nodes: Nodes) -> None:
-    node = await nodes.node()
-    with pytest.raises(ConfigError, match="Strin"):
-        node.publisher("/chatter", "std_msgs/msg/Strin")
-    with pytest.raises(ConfigError, match="ROS name"):
-        node.subscribe("a b", STRING, Qos(), lambda _: None)
-
-
-async def test_nothing_is_called_after_the_end(nodes: Nodes) -> None:
-    got: list[Received] = []
-    talker = await nodes.node("talker")
-    async with DdsTransport(nodes.link("listener"), nodes.types) as listener:
-        listener.subscribe("/chatter", STRING, Qos(), got.append)
-        publisher = talker.publisher("/chatter", STRING)
-        await repeat(lambda: publisher.publish(nodes.string("hi")), lambda: got)
-    heard = len(got)
-    for _ in range(10):
-        publisher.publish(nodes.string("hi"))
-        await asyncio.sleep(0.01)
-    assert len(got) == heard
+async def test_a_busy_loop_keeps_the_newest(nodes: Nodes) -> None:
+    talker, listener = await nodes.node("talker"), await nodes.node("listener")
+    got: list[str] = []
+    listener.subscribe(
+        "/chatter", STRING, Qos(depth=2), lambda r: got.append(nodes.text(r.payload))
+    )
+    publisher = talker.publisher("/chatter", STRING)
+    await until(lambda: publisher.readers == 1, "the reader")
+    for number in range(50):
+        publisher.publish(nodes.string(str(number)))
+    await until(lambda: got and got[-1] == "49", "the newest")

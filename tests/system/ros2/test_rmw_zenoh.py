@@ -1,7 +1,6 @@
-"""Nodes over `rmw_zenoh`: two sessions of ours, and bare Zenoh sessions in place of others."""
+"""What `rmw_zenoh` alone does: nodes of ours, and bare Zenoh sessions in place of others."""
 
 import asyncio
-import contextlib
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
@@ -11,68 +10,26 @@ import zenoh
 from gigabrain_zenoh.config.settings import Ros2Link
 from gigabrain_zenoh.errors import ConfigError, NoAnswer, Refused
 from gigabrain_zenoh.ros2.actions import ActionServer, Goal, GoalState, Outcome
-from gigabrain_zenoh.ros2.qos import LATCHED, SENSOR_DATA, Qos
+from gigabrain_zenoh.ros2.qos import LATCHED, Qos
 from gigabrain_zenoh.ros2.rmw_names import NodeName, parse_attachment
 from gigabrain_zenoh.ros2.rmw_zenoh import RmwZenohTransport
 from gigabrain_zenoh.ros2.transport import Received
-from gigabrain_zenoh.ros2.types import Types
-from gigabrain_zenoh.testing.processes import ZenohNetwork, repeat, robot
+from gigabrain_zenoh.testing.processes import repeat, robot
 from gigabrain_zenoh.testing.waiting import until
+from tests.ros2.nodes import STRING, TRIGGER, ZenohNodes, types, zenoh_nodes
 
-STRING = "std_msgs/msg/String"
-TRIGGER = "std_srvs/srv/Trigger"
 NAVIGATE = "nav2_msgs/action/NavigateToPose"
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 KEY = f"0/chatter/std_msgs::msg::dds_::String_/{HASH}"
 
 
-class Nodes:
-    """Makes nodes on one router."""
-
-    def __init__(self, net: ZenohNetwork, types: Types) -> None:
-        self.net, self.types = net, types
-        self.stack = contextlib.AsyncExitStack()
-
-    async def node(self, name: str = "gigabrain", **fields: Any) -> RmwZenohTransport:
-        link = Ros2Link(node=name, router=self.net.endpoint, **fields)
-        return await self.stack.enter_async_context(RmwZenohTransport(link, self.types))
-
-    def string(self, data: str) -> bytes:
-        return self.types.encode(STRING, self.types.make(STRING, data=data))
-
-    def text(self, payload: bytes) -> str:
-        return str(self.types.decode(STRING, payload).data)
-
-
-@pytest.fixture(scope="module")
-def types() -> Types:
-    return Types()
-
-
 @pytest.fixture
-async def nodes(types: Types) -> AsyncIterator[Nodes]:
-    async with robot() as net:
-        await net.router()
-        made = Nodes(net, types)
-        async with made.stack:
-            yield made
+async def nodes() -> AsyncIterator[ZenohNodes]:
+    async with zenoh_nodes() as made:
+        yield made
 
 
-async def test_a_message_arrives_with_its_time_and_sender(nodes: Nodes) -> None:
-    talker, listener = await nodes.node("talker"), await nodes.node("listener")
-    got: list[Received] = []
-    listener.subscribe("/chatter", STRING, Qos(), got.append)
-    publisher = talker.publisher("/chatter", STRING)
-    await until(lambda: publisher.readers == 1, "the reader")
-    await repeat(lambda: publisher.publish(nodes.string("hi")), lambda: len(got) > 1)
-    assert {nodes.text(each.payload) for each in got} == {"hi"}
-    assert got[0].source_ns is not None
-    assert got[1].source_ns is not None
-    assert 0 < got[0].source_ns < got[1].source_ns
-    assert (got[0].gid, len(got[0].gid)) == (publisher.entity.gid, 16)
-
-
-async def test_the_wire_is_that_of_rmw_zenoh(nodes: Nodes) -> None:
+async def test_the_wire_is_that_of_rmw_zenoh(nodes: ZenohNodes) -> None:
     samples: list[zenoh.Sample] = []
     session = nodes.net.raw()
     session.declare_subscriber("0/**", samples.append)
@@ -94,7 +51,7 @@ async def test_the_wire_is_that_of_rmw_zenoh(nodes: Nodes) -> None:
     assert tokens == {node.token, made}
 
 
-async def test_without_a_reader_there_is_none_from_the_start(nodes: Nodes) -> None:
+async def test_without_a_reader_there_is_none_from_the_start(nodes: ZenohNodes) -> None:
     told: list[int] = []
     talker = await nodes.node("talker")
     publisher = talker.publisher("/chatter", STRING, on_readers=told.append)
@@ -103,56 +60,9 @@ async def test_without_a_reader_there_is_none_from_the_start(nodes: Nodes) -> No
     assert (publisher.readers, latched.readers, told) == (0, 0, [])
 
 
-async def test_a_reader_is_told_as_it_comes_and_goes(nodes: Nodes) -> None:
-    told: list[int] = []
-    talker = await nodes.node("talker")
-    publisher = talker.publisher("/chatter", STRING, on_readers=told.append)
-    async with RmwZenohTransport(
-        Ros2Link(node="listener", router=nodes.net.endpoint), nodes.types
-    ) as listener:
-        closes = [
-            listener.subscribe("/chatter", STRING, SENSOR_DATA, lambda _: None) for _ in range(2)
-        ]
-        await until(lambda: publisher.readers == 2, "two readers")
-        closes[0]()
-        await until(lambda: publisher.readers == 1, "one reader")
-    await until(lambda: publisher.readers == 0, "no reader")
-    assert told[-1] == 0
-
-
-async def test_a_node_does_not_hear_itself(nodes: Nodes) -> None:
-    node, other = await nodes.node("talker"), await nodes.node("listener")
-    own: list[Received] = []
-    got: list[Received] = []
-    node.subscribe("/chatter", STRING, Qos(), own.append)
-    publisher = node.publisher("/chatter", STRING)
-    await until(lambda: node.endpoints(), "our own tokens")
-    assert publisher.readers == 0
-    other.subscribe("/chatter", STRING, Qos(), got.append)
-    await repeat(lambda: publisher.publish(nodes.string("hi")), lambda: got)
-    assert own == []
-    assert publisher.readers == 1
-
-
-@pytest.mark.parametrize("first", ["publisher", "subscriber"])
-async def test_a_latched_message_reaches_late_joiners_in_either_order(
-    nodes: Nodes, first: str
+async def test_a_volatile_reader_gets_what_a_latched_topic_sends_now(
+    nodes: ZenohNodes,
 ) -> None:
-    got: list[Received] = []
-    if first == "subscriber":
-        listener = await nodes.node("listener")
-        listener.subscribe("/map", STRING, LATCHED, got.append)
-        await until(lambda: listener.endpoints(), "the subscriber's token")
-    talker = await nodes.node("talker")
-    publisher = talker.publisher("/map", STRING, LATCHED)
-    publisher.publish(nodes.string("old"))
-    publisher.publish(nodes.string("map"))
-    if first == "publisher":
-        (await nodes.node("listener")).subscribe("/map", STRING, LATCHED, got.append)
-    await until(lambda: got and nodes.text(got[-1].payload) == "map", "the map")
-
-
-async def test_a_volatile_reader_gets_what_a_latched_topic_sends_from_now_on(nodes: Nodes) -> None:
     publisher = (await nodes.node("talker")).publisher("/map", STRING, LATCHED)
     publisher.publish(nodes.string("old"))
     got: list[Received] = []
@@ -161,7 +71,7 @@ async def test_a_volatile_reader_gets_what_a_latched_topic_sends_from_now_on(nod
     assert {nodes.text(each.payload) for each in got} == {"map"}
 
 
-async def test_a_service_answers_and_correlates(nodes: Nodes) -> None:
+async def test_a_service_answers_and_correlates(nodes: ZenohNodes) -> None:
     server, client = await nodes.node("server"), await nodes.node("client")
 
     async def answer(request: bytes) -> bytes:
@@ -179,7 +89,7 @@ async def test_a_service_answers_and_correlates(nodes: Nodes) -> None:
         await client.call("/estop", TRIGGER, b"no", 1)
 
 
-async def test_a_client_waits_for_its_server(nodes: Nodes) -> None:
+async def test_a_client_waits_for_its_server(nodes: ZenohNodes) -> None:
     client = await nodes.node("client")
     with pytest.raises(NoAnswer, match="/estop"):
         await client.call("estop", TRIGGER, b"a", 0.3)
@@ -193,7 +103,7 @@ async def test_a_client_waits_for_its_server(nodes: Nodes) -> None:
     assert await asking == b"a"
 
 
-async def test_a_reply_carries_the_attachment_of_its_request(nodes: Nodes) -> None:
+async def test_a_reply_carries_the_attachment_of_its_request(nodes: ZenohNodes) -> None:
     async def answer(request: bytes) -> bytes:
         return request
 
@@ -219,7 +129,9 @@ async def test_a_reply_carries_the_attachment_of_its_request(nodes: Nodes) -> No
     assert attachment.source_ns > 0
 
 
-async def test_messages_without_a_good_attachment_are_counted_and_delivered(nodes: Nodes) -> None:
+async def test_messages_without_a_good_attachment_count_and_arrive(
+    nodes: ZenohNodes,
+) -> None:
     listener = await nodes.node("listener")
     got: list[Received] = []
     listener.subscribe("/chatter", STRING, Qos(), got.append)
@@ -232,20 +144,7 @@ async def test_messages_without_a_good_attachment_are_counted_and_delivered(node
     assert (got[-1].payload, got[-1].source_ns, got[-1].gid) == (b"b", None, b"")
 
 
-async def test_the_graph_names_both_robots_of_two_namespaces(nodes: Nodes) -> None:
-    rviz = await nodes.node("rviz")
-    for name in ("robot1", "robot2"):
-        node = await nodes.node("gigabrain", namespace=f"/{name}")
-        node.publisher("scan", STRING, SENSOR_DATA)
-    await until(lambda: len(rviz.endpoints()) == 2, "both scans")
-    assert set(rviz.nodes()) == {"/rviz", "/robot1/gigabrain", "/robot2/gigabrain"}
-    assert {(each.node, each.topic, each.qos) for each in rviz.endpoints()} == {
-        ("/robot1/gigabrain", "/robot1/scan", SENSOR_DATA),
-        ("/robot2/gigabrain", "/robot2/scan", SENSOR_DATA),
-    }
-
-
-async def test_the_tokens_of_sixty_nodes_are_found_and_lost(nodes: Nodes) -> None:
+async def test_the_tokens_of_sixty_nodes_are_found_and_lost(nodes: ZenohNodes) -> None:
     session = nodes.net.raw()
     tokens = []
     for number in range(60):
@@ -262,7 +161,7 @@ async def test_the_tokens_of_sixty_nodes_are_found_and_lost(nodes: Nodes) -> Non
     await until(lambda: node.nodes() == ("/gigabrain",), "their end")
 
 
-async def test_a_malformed_token_is_counted(nodes: Nodes) -> None:
+async def test_a_malformed_token_is_counted(nodes: ZenohNodes) -> None:
     node = await nodes.node()
     token = nodes.net.raw().liveliness().declare_token("@ros2_lv/0/x/y")
     await until(lambda: node.counts["malformed token"] == 1, "the token")
@@ -270,7 +169,7 @@ async def test_a_malformed_token_is_counted(nodes: Nodes) -> None:
     assert node.endpoints() == ()
 
 
-async def test_another_domain_is_another_world(nodes: Nodes) -> None:
+async def test_another_domain_is_another_world(nodes: ZenohNodes) -> None:
     talker, listener = await nodes.node("talker", domain=1), await nodes.node("listener", domain=2)
     other = await nodes.node("other", domain=1)
     got: list[Received] = []
@@ -284,7 +183,7 @@ async def test_another_domain_is_another_world(nodes: Nodes) -> None:
     assert got == []
 
 
-async def test_humble_meets_humble_only(nodes: Nodes) -> None:
+async def test_humble_meets_humble_only(nodes: ZenohNodes) -> None:
     humble = await nodes.node("humble", distro="humble")
     jazzy, old = await nodes.node("jazzy"), await nodes.node("old", distro="humble")
     got: list[Received] = []
@@ -308,7 +207,7 @@ class Instant:
         return Outcome(GoalState.SUCCEEDED, {"error_msg": goal.message.behavior_tree})
 
 
-async def test_an_action_is_served(nodes: Nodes) -> None:
+async def test_an_action_is_served(nodes: ZenohNodes) -> None:
     types = nodes.types
     node, client = await nodes.node("robot"), await nodes.node("client")
     server = ActionServer(node, types, "/navigate_to_pose", NAVIGATE, Instant())
@@ -328,9 +227,9 @@ async def test_an_action_is_served(nodes: Nodes) -> None:
     await server.close()
 
 
-async def test_all_is_found_again_after_the_routers_restart(types: Types) -> None:
+async def test_all_is_found_again_after_the_routers_restart() -> None:
     async with robot() as net:
-        nodes = Nodes(net, types)
+        nodes = ZenohNodes(net)
         async with nodes.stack:
             router = await net.router()
             talker, listener = await nodes.node("talker"), await nodes.node("listener")
@@ -352,6 +251,6 @@ async def test_all_is_found_again_after_the_routers_restart(types: Types) -> Non
             assert nodes.text(got[-1].payload) == "again"
 
 
-async def test_without_a_router_the_error_names_the_option(types: Types) -> None:
+async def test_without_a_router_the_error_names_the_option() -> None:
     with pytest.raises(ConfigError, match="router: tcp"):
-        RmwZenohTransport(Ros2Link(), types)
+        RmwZenohTransport(Ros2Link(), types())

@@ -160,7 +160,7 @@ async def test_a_killed_driver_is_replaced_by_its_guard(judge: Judge, tmp_path: 
 async def test_bringup_finds_it_whole_or_names_the_wrong_type(judge: Judge, tmp_path: Path) -> None:
     judge.start("turtlebot3", walls=ROOM)  # which takes Twist, as on Humble
     file = robot_file(judge, tmp_path)
-    found = await ros2_bringup.check(str(file), "real", tmp_path, 3.0)
+    found = await ros2_bringup.check(str(file), "real", tmp_path, 6.0)
     wrong = [one for one in found if one.verdict == "error"]
     assert [one.what for one in wrong] == ["/cmd_vel"]
     assert wrong[0].do == "write topics: {command: {type: geometry_msgs/msg/Twist}}"
