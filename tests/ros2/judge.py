@@ -143,6 +143,13 @@ class Program:
         """Send a command and return its answer, while the event loop goes on."""
         return await self.hear(do, id=self.send(do, **fields))
 
+    async def available(self, **where: Any) -> None:
+        """Wait until the program finds the server of a service or action, as its users must.
+
+        What is sent before is lost.
+        """
+        await asyncio.to_thread(self.poll, "available", lambda one: one["available"], **where)
+
     def kill(self) -> int:
         """End it at once, as `kill -9` does; returns the monotonic time [ns] of the signal."""
         self._process.kill()

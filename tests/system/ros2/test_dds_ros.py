@@ -175,8 +175,7 @@ async def test_rclpys_goals_are_followed_preempted_and_cancelled(
     server = ActionServer(node, types, "/navigate_to_pose", NAVIGATE, walk, preempts=True)
     client = judge.start("navigate", node="client")
     action = {"action": "/navigate_to_pose", "type": NAVIGATE}
-    while not (await client.query("available", **action))["available"]:
-        pass
+    await client.available(**action)
     pose = {"header": {"frame_id": "map"}, "pose": {"position": {"x": 1.5}}}
     for name in ("first", "second"):
         await client.query("send", **action, name=name, goal={"pose": pose})
@@ -204,8 +203,7 @@ async def test_services_go_both_ways(judge: Judge, node: DdsTransport, types: Ty
     node.serve("estop", TRIGGER, answer)
     caller = judge.start("call", node="caller")
     service = {"service": "/robot1/estop", "type": TRIGGER}
-    while not (await caller.query("available", **service))["available"]:
-        pass
+    await caller.available(**service)
     await caller.query("call", **service)
     assert (await caller.hear("response"))["value"] == {"success": True, "message": "stopped"}
     serve = judge.start("serve", node="server")

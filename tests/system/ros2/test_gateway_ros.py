@@ -143,6 +143,7 @@ async def test_rclpy_stops_by_service_and_releases_by_another(robot: Robot, judg
     await released(robot)
     driver, caller = judge.start("drive"), judge.start("call", node="caller")
     await driving(robot, driver)
+    await caller.available(service="/estop", type=SET_BOOL)
     await caller.query("call", service="/estop", type=SET_BOOL, data=True)
     response = await caller.hear("response", service="/estop")
     assert response["value"]["success"]
@@ -153,6 +154,7 @@ async def test_rclpy_stops_by_service_and_releases_by_another(robot: Robot, judg
     assert not refused["value"]["success"]
     await driver.query("rest")
     await asyncio.sleep(1.0)
+    await caller.available(service="/release", type=TRIGGER)
     await caller.query("call", service="/release", type=TRIGGER)
     response = await caller.hear("response", service="/release")
     assert response["value"]["success"], response
@@ -194,9 +196,7 @@ async def test_rclpy_sends_goals_cancels_and_preempts_them(home: Home, judge: Ju
     async with running(home, judge, resume="auto", **brain) as robot:
         client = judge.start("navigate")
         action = "/navigate_to_pose"
-        await asyncio.to_thread(
-            client.poll, "available", lambda one: one["available"], action=action, type=NAVIGATE
-        )
+        await client.available(action=action, type=NAVIGATE)
         await robot.becomes("enabled")
 
         async def send(name: str, goal: dict[str, Any]) -> None:

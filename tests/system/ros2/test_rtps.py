@@ -65,12 +65,6 @@ async def bus(judge: Judge, types: Types) -> AsyncIterator[Bus]:
     await opened.close()
 
 
-async def available(program: Program, service: str, type: str) -> None:
-    await asyncio.to_thread(
-        program.poll, "available", lambda answer: answer["available"], service=service, type=type
-    )
-
-
 async def calls(program: Program, count: int, service: str, type: str, **request: Any):
     """Call one after the other; return the responses."""
     responses = []
@@ -102,7 +96,7 @@ def server(domain: int, service: str, name: str) -> Iterator[subprocess.Popen[by
 async def test_rclpy_gets_the_reply_of_our_server(judge: Judge, bus: Bus) -> None:
     bus.serve("/estop", SET_BOOL, success=True, message="stopped")
     call = judge.start("call")
-    await available(call, **ESTOP)
+    await call.available(**ESTOP)
 
     (response,) = await calls(call, 1, **ESTOP, data=True)
 
@@ -114,7 +108,7 @@ async def test_a_client_that_was_there_first_finds_our_server(judge: Judge, bus:
     call = judge.start("call")
     assert not (await call.query("available", **ESTOP))["available"]
     bus.serve("/estop", SET_BOOL, success=True)
-    await available(call, **ESTOP)
+    await call.available(**ESTOP)
 
     assert (await calls(call, 1, **ESTOP, data=True))[0]["value"]["success"]
 
@@ -124,8 +118,8 @@ async def test_a_thousand_requests_get_a_thousand_replies(judge: Judge, bus: Bus
     bus.serve("/estop", SET_BOOL, success=True, message="stopped")
     bus.serve("/release", TRIGGER, success=False, message="it is still moving")
     call = judge.start("call")
-    await available(call, **ESTOP)
-    await available(call, "/release", TRIGGER)
+    await call.available(**ESTOP)
+    await call.available(service="/release", type=TRIGGER)
 
     stopped = await calls(call, 500, **ESTOP, data=True)
     released = await calls(call, 500, "/release", TRIGGER)
@@ -141,7 +135,7 @@ async def test_many_requests_at_once_are_all_answered(judge: Judge, bus: Bus) ->
     bus.serve("/estop", SET_BOOL, wait_s=0.05, success=True)
     programs = [await asyncio.to_thread(judge.start, "call", f"call{n}") for n in range(3)]
     for program in programs:
-        await available(program, **ESTOP)
+        await program.available(**ESTOP)
         for number in range(8):  # the history of an rclpy client holds 10
             program.send("call", **ESTOP, name=str(number), data=True)
 
@@ -156,8 +150,8 @@ async def test_replies_and_requests_longer_than_a_datagram_arrive(judge: Judge, 
     bus.serve("/map", GET_MAP, map=grid)
     bus.serve("/set_map", SET_MAP, success=True)
     call = judge.start("call")
-    await available(call, "/map", GET_MAP)
-    await available(call, "/set_map", SET_MAP)
+    await call.available(service="/map", type=GET_MAP)
+    await call.available(service="/set_map", type=SET_MAP)
 
     (fetched,) = await calls(call, 1, "/map", GET_MAP)
     (stored,) = await calls(call, 1, "/set_map", SET_MAP, map={"data": cells[:200_000]})
@@ -170,7 +164,7 @@ async def test_replies_and_requests_longer_than_a_datagram_arrive(judge: Judge, 
 async def test_a_server_is_found_again_after_its_process_was_killed(judge: Judge) -> None:
     call = judge.start("call")
     with server(judge.domain, "/estop", "first"):
-        await available(call, **ESTOP)
+        await call.available(**ESTOP)
         (response,) = await calls(call, 1, **ESTOP, data=True)
         assert response["value"]["message"] == "first"
     with server(judge.domain, "/estop", "second"):
@@ -186,7 +180,7 @@ async def test_two_servers_in_two_processes_answer_their_services(judge: Judge) 
     call = judge.start("call")
     with server(judge.domain, "/left/estop", "left"), server(judge.domain, "/right/estop", "right"):
         for name in ("left", "right"):
-            await available(call, f"/{name}/estop", SET_BOOL)
+            await call.available(service=f"/{name}/estop", type=SET_BOOL)
             (response,) = await calls(call, 1, f"/{name}/estop", SET_BOOL, data=True)
             assert response["value"]["message"] == name
 
@@ -195,7 +189,7 @@ async def test_two_servers_in_two_processes_answer_their_services(judge: Judge) 
 async def test_a_client_killed_while_it_waits_leaves_nothing_behind(judge: Judge, bus: Bus) -> None:
     served = bus.serve("/estop", SET_BOOL, wait_s=1.0, success=True)
     call = judge.start("call")
-    await available(call, **ESTOP)
+    await call.available(**ESTOP)
     for number in range(5):
         call.send("call", **ESTOP, name=str(number), data=True)
     await until(lambda: len(bus.requests) == 5, "five requests")
@@ -206,7 +200,7 @@ async def test_a_client_killed_while_it_waits_leaves_nothing_behind(judge: Judge
     assert served.clients == 0
 
     later = judge.start("call", "later")
-    await available(later, **ESTOP)
+    await later.available(**ESTOP)
     assert (await calls(later, 1, **ESTOP, data=True))[0]["value"]["success"]
 
 
