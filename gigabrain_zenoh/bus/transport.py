@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 from collections import deque
 from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 from gigabrain_schemas.topics import Priority, Topic
@@ -11,6 +12,7 @@ from gigabrain_zenoh.errors import GigabrainError
 
 OnSample = Callable[[str, bytes], bool | None]  # key, payload; returns False for an invalid payload
 OnRaw = Callable[[str, str, bytes], None]  # key, encoding, payload
+OnReaders = Callable[[bool], None]  # whether there are any
 Answer = Callable[[bytes], Awaitable[tuple[bytes, str]]]  # request; reply and its encoding
 Close = Callable[[], None]  # may be called twice
 T = TypeVar("T")
@@ -49,6 +51,10 @@ class Transport(Protocol):
         """Call `on_raw` immediately, from any thread, for every sample on `pattern`."""
         ...
 
+    def watch_readers(self, key: str, on_readers: OnReaders) -> Close:
+        """Call `on_readers` with whether others subscribe to `key`: now, and at each change."""
+        ...
+
     def serve(self, key: str, answer: Answer, *, urgent: bool = False) -> Close:
         """Answer queries on `key`. A GigabrainError from `answer` is sent back as its text.
 
@@ -71,12 +77,20 @@ class Transport(Protocol):
         ...
 
 
+@dataclass
+class _Watcher:
+    key: str
+    on_readers: OnReaders
+    there: bool  # as told last
+
+
 class LocalNetwork:
     """Connects transports inside this process, first in first out. For tests and replay."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[str, bytes]] = []
         self._listeners: list[tuple[str, OnSample]] = []
+        self._watchers: list[_Watcher] = []
         self._servers: list[tuple[str, Answer]] = []
         self._queue: deque[tuple[str, bytes]] = deque()
         self._delivering = False
@@ -102,7 +116,29 @@ class LocalNetwork:
 
     def listen(self, key: str, on_sample: OnSample) -> Close:
         """Register a listener; return a function that removes it."""
-        return _added(self._listeners, (key, on_sample))
+        remove = _added(self._listeners, (key, on_sample))
+        self._tell_watchers()
+
+        def close() -> None:
+            remove()
+            self._tell_watchers()
+
+        return close
+
+    def watch(self, key: str, on_readers: OnReaders) -> Close:
+        """Register a watcher of the listeners on `key`; return a function that removes it."""
+        watcher = _Watcher(key, on_readers, self._has_listener(key))
+        on_readers(watcher.there)
+        return _added(self._watchers, watcher)
+
+    def _tell_watchers(self) -> None:
+        for watcher in tuple(self._watchers):
+            before, watcher.there = watcher.there, self._has_listener(watcher.key)
+            if watcher.there != before:
+                watcher.on_readers(watcher.there)
+
+    def _has_listener(self, key: str) -> bool:
+        return any(_matches(pattern, key) for pattern, _ in self._listeners)
 
     def serve(self, key: str, answer: Answer) -> Close:
         """Register a server on `key`; return a function that removes it."""
@@ -133,6 +169,11 @@ class LocalTransport:
     def tap(self, pattern: str, on_raw: OnRaw) -> Close:
         """Register a listener; `on_raw` receives an empty encoding."""
         return self.subscribe(pattern, lambda key, payload: on_raw(key, "", payload), 1)
+
+    def watch_readers(self, key: str, on_readers: OnReaders) -> Close:
+        """Register a watcher; listeners of this transport count as well."""
+        self._closers.append(self._network.watch(key, on_readers))
+        return self._closers[-1]
 
     def serve(self, key: str, answer: Answer, *, urgent: bool = False) -> Close:
         """Register a server on `key`; `urgent` has no effect, as queries never wait here."""

@@ -1,6 +1,5 @@
 """Zenoh declarations as `rmw_zenoh` makes them: publishers and subscribers with a history."""
 
-import contextlib
 from collections.abc import Callable
 from typing import Any
 
@@ -11,19 +10,6 @@ from gigabrain_zenoh.ros2.qos import Qos
 
 HEARTBEAT_S = 0.5  # of publishers whose late readers notice what they missed
 REMOTE = zenoh.Locality.REMOTE
-
-
-class Bundle:
-    """Declarations that are withdrawn together, the last first."""
-
-    def __init__(self, *declared: Any) -> None:
-        self._declared = declared
-
-    def undeclare(self) -> None:
-        """Withdraw all of them."""
-        for each in reversed(self._declared):
-            with contextlib.suppress(zenoh.ZError):  # its session is closed
-                each.undeclare()
 
 
 def advanced_publisher(session: zenoh.Session, key: str, qos: Qos) -> Any:

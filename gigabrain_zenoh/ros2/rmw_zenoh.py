@@ -21,6 +21,7 @@ from zenoh.handlers import Callback
 
 from gigabrain_zenoh.bus.bridge import Bridge, Mailbox, QueryQueue
 from gigabrain_zenoh.bus.zenoh.session import (
+    Bundle,
     OpenSession,
     ReconnectingSession,
     has_subscriber,
@@ -29,7 +30,7 @@ from gigabrain_zenoh.bus.zenoh.session import (
 from gigabrain_zenoh.config.settings import Endpoint, Ros2Link
 from gigabrain_zenoh.errors import ConfigError, GigabrainError, NoAnswer
 from gigabrain_zenoh.ros2.qos import DEFAULT, SERVICES, Qos
-from gigabrain_zenoh.ros2.rmw_declared import REMOTE, Bundle, advanced_publisher, subscriber
+from gigabrain_zenoh.ros2.rmw_declared import REMOTE, advanced_publisher, subscriber
 from gigabrain_zenoh.ros2.rmw_names import (
     NO_HASH,
     SPACE,

@@ -235,6 +235,22 @@ async def test_nobody_is_more_urgent_than_what_he_says(net: ZenohNetwork) -> Non
     }
 
 
+async def test_a_sender_knows_whether_others_listen(net: ZenohNetwork) -> None:
+    sender, receiver = await net.client(), await net.client()
+    told: list[bool] = []
+    close = sender.watch_readers("tf", told.append)
+    assert told == [False]
+    end = receiver.subscribe("tf", lambda *_: None, 1)
+    await until(lambda: told[-1], "a reader")
+    end()
+    await until(lambda: not told[-1], "none")
+    close()
+    receiver.subscribe("tf", lambda *_: None, 1)
+    ear = SampleCollector(receiver, "tf")
+    await repeat(lambda: sender.publish(TELEOP, "tf", b"x", ""), lambda: ear.samples)
+    assert not told[-1]
+
+
 async def test_late_joiners_get_the_kept_value(net: ZenohNetwork) -> None:
     one = Bus(await net.client(), Clock(), "one")
     one.publish(MAP, example(OccupancyGrid))

@@ -191,6 +191,19 @@ class Declaration:
         self.made: Any = None
 
 
+class Bundle:
+    """Declarations that are withdrawn together, the last first."""
+
+    def __init__(self, *declared: Any) -> None:
+        self._declared = declared
+
+    def undeclare(self) -> None:
+        """Withdraw all of them."""
+        for each in reversed(self._declared):
+            with contextlib.suppress(zenoh.ZError):  # its session is closed
+                each.undeclare()
+
+
 class ReconnectingSession:
     """The current line and all declarations on it. Calls `on_lost` on the event loop."""
 

@@ -10,8 +10,14 @@ from zenoh.handlers import Callback
 
 from gigabrain_schemas.topics import Priority, Topic
 from gigabrain_zenoh.bus.bridge import Bridge, Mailbox, QueryQueue
-from gigabrain_zenoh.bus.transport import Answer, Close, Link, OnLink, OnRaw, OnSample
-from gigabrain_zenoh.bus.zenoh.session import ReconnectingSession, open_session
+from gigabrain_zenoh.bus.transport import Answer, Close, Link, OnLink, OnRaw, OnReaders, OnSample
+from gigabrain_zenoh.bus.zenoh.session import (
+    Bundle,
+    OpenSession,
+    ReconnectingSession,
+    has_subscriber,
+    open_session,
+)
 from gigabrain_zenoh.bus.zenoh.workarounds import ReceiveThrottle, keep_thread_state
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import GigabrainError
@@ -90,6 +96,20 @@ class ZenohTransport:
                 pattern, Callback(line.guard(take), indirect=False)
             )
         )
+
+    def watch_readers(self, key: str, on_readers: OnReaders) -> Close:
+        """Call `on_readers` with whether `key` has subscribers: in each session, at each change."""
+
+        def told(status: zenoh.MatchingStatus) -> None:
+            self._bridge.post(on_readers, status.matching)
+
+        def declare(line: OpenSession) -> Bundle:
+            publisher = line.session.declare_publisher(key)
+            listener = publisher.declare_matching_listener(line.guard(told))
+            on_readers(has_subscriber(publisher))
+            return Bundle(publisher, listener)
+
+        return self._lines.declare(declare)
 
     def serve(self, key: str, answer: Answer, *, urgent: bool = False) -> Close:
         """Answer queries on `key`, each in its own task."""
