@@ -209,6 +209,9 @@ class Ros2Link(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     types: tuple[str, ...] = ()  # .msg, .srv and .action files of one's own, or folders of them
 
 
+FREE_FLEET = ("tf", "battery_state", "navigate_to_pose")  # topics and actions of ROS that it uses
+
+
 class Ros2Config(Ros2Link, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings in the `ros2` part of a deployment file: the gateway to ROS 2."""
 
@@ -216,6 +219,11 @@ class Ros2Config(Ros2Link, frozen=True, kw_only=True, forbid_unknown_fields=True
     cmd_vel_timeout: Annotated[float, Meta(gt=0, le=0.2)] = 0.2  # [s], a command counts at most
     leave_out: tuple[str, ...] = ()  # ROS topics and services that are not offered
     free_fleet: bool = False  # also offer what Open-RMF's free_fleet adapter uses
+
+    def __post_init__(self) -> None:
+        for name in self.leave_out:
+            if self.free_fleet and name.strip("/") in FREE_FLEET:
+                raise ValueError(f"leave_out: free_fleet needs {name}; leave it out of this list")
 
 
 OwnName = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,31}$")]

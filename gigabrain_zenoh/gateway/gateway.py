@@ -7,6 +7,7 @@ from collections.abc import Callable
 from gigabrain_schemas.base import Cause
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import Ros2Config
+from gigabrain_zenoh.gateway import free_fleet
 from gigabrain_zenoh.gateway.conversions.diagnostics import Level, Status
 from gigabrain_zenoh.gateway.diagnosing import Diagnosing
 from gigabrain_zenoh.gateway.driving import Background, PoseRequests, RosCommander
@@ -30,18 +31,22 @@ class Gateway:
         self._bus, self._ros = bus, ros
         self.scene, self.work = Scene(bus), Background()
         scene, work = self.scene, self.work
-        self.publishing = Publishing(scene, ros, types, config)
+        fleet = self._fleet = free_fleet.FreeFleet(bus) if config.free_fleet else None
+        self.publishing = [Publishing(scene, ros, types, config)]
+        if fleet:
+            self.publishing.append(Publishing(scene, fleet, types, config, free_fleet.TOPICS))
         self.commander = RosCommander(scene, ros, types, config, work)
         self.poses = PoseRequests(scene, ros, types, config, work)
         self.services = Services(scene, ros, types, config, self.commander)
-        self.actions = Nav2Actions(scene, ros, types, config)
+        self.actions = Nav2Actions(scene, ros, types, config, fleet)
         self.parameters = Parameters(ros, types, config, lambda: scene.simulated)
         self.diagnosing = Diagnosing(scene, ros, types, self._statuses)
 
     async def close(self) -> None:
         """End what runs for ROS; a body that it drives is stopped by the gate."""
         await self.actions.close()
-        self.publishing.close()
+        for publishing in self.publishing:
+            publishing.close()
         self.work.close()
 
     async def run(self) -> None:
@@ -64,6 +69,8 @@ class Gateway:
             )
             for reason, count in self._ros.counts.items():
                 self._bus.counters[f"ros_{reason}"] = count
+            if self._fleet:
+                self._bus.counters["free_fleet_refused"] = self._fleet.counts["refused"]
 
     def _statuses(self) -> list[Status]:
         return [self.commander.status(), *self.poses.status()]

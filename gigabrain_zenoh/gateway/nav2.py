@@ -20,7 +20,7 @@ from gigabrain_zenoh.gateway.navigation import Outcome as Ended
 from gigabrain_zenoh.gateway.result_codes import THROUGH_POSES, TO_POSE, Codes
 from gigabrain_zenoh.gateway.scene import Scene, left_out
 from gigabrain_zenoh.ros2.actions import ActionServer, Goal, GoalState, Outcome
-from gigabrain_zenoh.ros2.transport import RosTransport
+from gigabrain_zenoh.ros2.transport import RosServer, RosTransport
 from gigabrain_zenoh.ros2.types import Types
 
 Work = asyncio.Future[Ended]
@@ -101,9 +101,16 @@ def _outcome(ended: Ended) -> Outcome:
 
 
 class Nav2Actions:
-    """The two actions on a transport."""
+    """The two actions on a transport; `fleet` has the first of them too."""
 
-    def __init__(self, scene: Scene, ros: RosTransport, types: Types, config: Ros2Config) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        ros: RosTransport,
+        types: Types,
+        config: Ros2Config,
+        fleet: RosServer | None = None,
+    ) -> None:
         navigator = Navigator(scene)
         rows = (
             ("navigate_to_pose", TO_POSE_TYPE, TO_POSE),
@@ -118,7 +125,14 @@ class Nav2Actions:
             handler.others = [one for _, one in handlers.values() if one is not handler]
         self._servers = [
             ActionServer(
-                ros, types, name, kind, handler, preempts=True, now_ns=scene.bus.clock.unix_ns
+                ros,
+                types,
+                name,
+                kind,
+                handler,
+                preempts=True,
+                polled=fleet if kind == TO_POSE_TYPE else None,
+                now_ns=scene.bus.clock.unix_ns,
             )
             for name, (kind, handler) in handlers.items()
         ]

@@ -2,7 +2,7 @@
 
 import functools
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,7 +27,7 @@ from gigabrain_zenoh.gateway.conversions.frames import (
 from gigabrain_zenoh.gateway.scene import Scene, left_out
 from gigabrain_zenoh.logs import Fault
 from gigabrain_zenoh.ros2.qos import DEFAULT, LATCHED, SENSOR_DATA, Qos
-from gigabrain_zenoh.ros2.transport import RosPublisher, RosTransport
+from gigabrain_zenoh.ros2.transport import RosPublisher, RosServer
 from gigabrain_zenoh.ros2.types import Types
 
 log = logging.getLogger(__name__)
@@ -162,8 +162,17 @@ class _Published:
 class Publishing:
     """Publishers of all rows; one without readers neither receives nor encodes anything."""
 
-    def __init__(self, scene: Scene, ros: RosTransport, types: Types, config: Ros2Config) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        ros: RosServer,
+        types: Types,
+        config: Ros2Config,
+        only: Collection[str] | None = None,
+    ) -> None:
+        """Offer all topics that `config` does not leave out, or of these those in `only`."""
         self._scene, self._ros, self._types, self._config = scene, ros, types, config
+        self._only = only
         self._cameras: tuple[Camera, ...] = ()
         self._of_cameras: list[_Published] = []
         self._closed = False
@@ -202,7 +211,8 @@ class Publishing:
 
     def _open(self, row: Row) -> _Published:
         one = _Published(row)
-        if not left_out(self._config, row.topic):
+        wanted = self._only is None or row.topic in self._only
+        if wanted and not left_out(self._config, row.topic):
             count = functools.partial(self._count, one)
             one.publisher = self._ros.publisher(row.topic, row.type, row.qos, count)
         return one

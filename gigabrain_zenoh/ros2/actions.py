@@ -5,6 +5,7 @@ States, and what a cancel request means, are those of `action_msgs`.
 """
 
 import asyncio
+import functools
 import logging
 import time
 from collections.abc import Callable, Mapping
@@ -13,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.ros2.qos import ACTION_STATUS, DEFAULT
-from gigabrain_zenoh.ros2.transport import RosTransport
+from gigabrain_zenoh.ros2.transport import Close, RosServer
 from gigabrain_zenoh.ros2.types import Types
 
 log = logging.getLogger(__name__)
@@ -160,18 +161,21 @@ class ActionServer:
 
     def __init__(
         self,
-        transport: RosTransport,
+        transport: RosServer,
         types: Types,
         name: str,
         type: str,
         handler: ActionHandler,
         *,
         preempts: bool = False,
+        polled: RosServer | None = None,
         now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         """Offer the action `name` of a type such as nav2_msgs/action/NavigateToPose.
 
-        With `preempts`, a new goal sets `preempted` of those that are active.
+        With `preempts`, a new goal sets `preempted` of those that are active. `polled` is a second
+        transport that has the action too, where a request for a result does not wait for the goal's
+        end: it is answered at once with the present state.
         """
         self.goals = Goals()
         self._types, self._type, self._handler = types, type, handler
@@ -179,13 +183,18 @@ class ActionServer:
         self._ends: dict[bytes, asyncio.Event] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         base = f"{name}/_action"
-        self._feedback = transport.publisher(f"{base}/feedback", f"{type}_FeedbackMessage", DEFAULT)
-        self._status = transport.publisher(f"{base}/status", STATUSES, ACTION_STATUS)
-        self._closes = [
-            transport.serve(f"{base}/send_goal", f"{type}_SendGoal", self._send_goal),
-            transport.serve(f"{base}/get_result", f"{type}_GetResult", self._get_result),
-            transport.serve(f"{base}/cancel_goal", CANCEL, self._cancel_goal),
-        ]
+        servers = [transport, polled] if polled else [transport]
+        message = f"{type}_FeedbackMessage"
+        self._feedback = [one.publisher(f"{base}/feedback", message, DEFAULT) for one in servers]
+        self._status = [one.publisher(f"{base}/status", STATUSES, ACTION_STATUS) for one in servers]
+        self._closes: list[Close] = []
+        for one in servers:
+            get_result = functools.partial(self._get_result, waits=one is not polled)
+            self._closes += [
+                one.serve(f"{base}/send_goal", f"{type}_SendGoal", self._send_goal),
+                one.serve(f"{base}/get_result", f"{type}_GetResult", get_result),
+                one.serve(f"{base}/cancel_goal", CANCEL, self._cancel_goal),
+            ]
         self._publish_status()
 
     async def close(self) -> None:
@@ -198,8 +207,8 @@ class ActionServer:
         for goal in self.goals.active():  # whose task had not begun
             self.goals.end(goal, Outcome(GoalState.ABORTED), self._now_ns())
             self._ends.pop(goal.id).set()
-        self._feedback.close()
-        self._status.close()
+        for publisher in (*self._feedback, *self._status):
+            publisher.close()
 
     async def _send_goal(self, request: bytes) -> bytes:
         asked = self._types.decode(f"{self._type}_SendGoal_Request", request)
@@ -236,18 +245,19 @@ class ActionServer:
 
     def _feed(self, goal: Goal, fields: Any) -> None:
         """Publish the feedback of a goal, if a client listens."""
-        if self._feedback.readers and goal.active:
+        read = [one for one in self._feedback if one.readers]
+        if read and goal.active:
             fields = self._message("Feedback", fields)
-            self._feedback.publish(
-                self._encode("FeedbackMessage", goal_id=_uuid(goal.id), feedback=fields)
-            )
+            payload = self._encode("FeedbackMessage", goal_id=_uuid(goal.id), feedback=fields)
+            for publisher in read:
+                publisher.publish(payload)
 
-    async def _get_result(self, request: bytes) -> bytes:
+    async def _get_result(self, request: bytes, *, waits: bool) -> bytes:
         asked = self._types.decode(f"{self._type}_GetResult_Request", request)
         goal = self.goals.get(asked.goal_id.uuid.tobytes())
         if goal is None:
             return self._encode("GetResult_Response", status=int(GoalState.UNKNOWN))
-        if goal.active:
+        if waits and goal.active:
             await self._ends[goal.id].wait()
         result = self._message("Result", goal.result)
         return self._encode("GetResult_Response", status=int(goal.state), result=result)
@@ -275,7 +285,9 @@ class ActionServer:
             {"goal_info": _info(goal), "status": int(goal.state)} for goal in self.goals.all()
         ]
         message = self._types.make(STATUSES, status_list=states)
-        self._status.publish(self._types.encode(STATUSES, message))
+        payload = self._types.encode(STATUSES, message)
+        for publisher in self._status:
+            publisher.publish(payload)
 
     def _message(self, part: str, fields: Any) -> Any:
         """Return a message of one of the action's parts; a message is taken as it is."""

@@ -60,11 +60,11 @@ class RosPublisher(Protocol):
         ...
 
 
-class RosTransport(Protocol):
-    """One ROS node on a transport.
+class RosServer(Protocol):
+    """Offers topics and services.
 
-    Topics and services are absolute (`/scan`) or relative to the node's namespace (`scan`). Types
-    are `std_msgs/msg/String` or `std_srvs/srv/SetBool`.
+    Both are absolute (`/scan`) or relative to the node's namespace (`scan`). Types are
+    `std_msgs/msg/String` or `std_srvs/srv/SetBool`.
     """
 
     counts: Counter[str]  # what was refused or lost, by reason
@@ -75,15 +75,19 @@ class RosTransport(Protocol):
         """Declare a publisher. `on_readers` gets the number of readers at each change."""
         ...
 
-    def subscribe(self, topic: str, type: str, qos: Qos, handle: OnReceived) -> Close:
-        """Call `handle` for each message; a busy loop keeps the newest `qos.depth` messages."""
-        ...
-
     def serve(self, service: str, type: str, handle: Answer) -> Close:
         """Answer requests of a service, each in a task of its own.
 
         A GigabrainError of `handle` is logged, and the client gets no answer: ROS has no other way.
         """
+        ...
+
+
+class RosTransport(RosServer, Protocol):
+    """One ROS node on a transport."""
+
+    def subscribe(self, topic: str, type: str, qos: Qos, handle: OnReceived) -> Close:
+        """Call `handle` for each message; a busy loop keeps the newest `qos.depth` messages."""
         ...
 
     async def call(self, service: str, type: str, request: bytes, timeout_s: float) -> bytes:
