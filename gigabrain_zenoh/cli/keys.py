@@ -57,14 +57,15 @@ def issue(
 
     Roles: robot: all processes of a robot. brain: perception and decision.
     operator: drive, stop and release. viewer: receive only. router: the router
-    of a site, on a host of its own. process: a process of your own: receives
-    all, and sends what it declares.
+    of a site, on a host of its own. dispatcher: Open-RMF's adapter: goals of
+    robots with free_fleet, and nothing else. process: a process of your own:
+    receives all, and sends what it declares.
 
     Args:
         role: Role of the identity.
         name: Name of its folder. Default: role and robot.
         host: Address or name under which others reach the router there; may be given again.
-        robot: Namespace of the robot. Without it, an operator or viewer is for all robots.
+        robot: Namespace of the robot. Without it, an operator, viewer or dispatcher is for all.
         process: Name of the process of your own, for the role process.
         days: Days until it expires.
     """
@@ -89,7 +90,7 @@ def revoke(role: Role, *, robot: str = "", process: str = "", dir: FleetFolder =
     Routers refuse them once they have the new list and are restarted.
 
     Args:
-        role: Role of the identities: brain, operator, viewer or process.
+        role: Role of the identities: brain, operator, viewer, dispatcher or process.
         robot: Namespace of the robot, for identities that name one.
         process: Name of the process, for the role process.
     """
@@ -168,6 +169,8 @@ def _first_use(role: Role, robot: str, folder: Path) -> str:
     if role in ("operator", "viewer"):
         command = "estop" if role == "operator" else "topic list"
         return f"gigabrain {command} --connect tls/ADDRESS:7447{namespace} --keys {keys}"
+    if role == "dispatcher":
+        return f"name the three files of {keys} in the Zenoh configuration of Open-RMF's adapter"
     return f"gigabrain up FILE --host HOST --keys {keys}, where FILE has a line `keys:`"
 
 

@@ -40,6 +40,8 @@ class RosOptions:
     "Longest time in seconds that a /cmd_vel counts."
     leave_out: tuple[str, ...] = ()
     "ROS topic or service not to offer; may be given again."
+    free_fleet: bool = False
+    "Also offer what Open-RMF's adapter free_fleet uses, below the robot's namespace."
 
     def config(self) -> Ros2Config:
         """Return the settings of the process. Raises ConfigError."""

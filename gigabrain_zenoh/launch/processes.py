@@ -55,6 +55,7 @@ from gigabrain_zenoh.launch.process import ProcessPlace, ProcessType, run
 from gigabrain_zenoh.plugins import load_plugin, plugin_names
 from gigabrain_zenoh.runtime.connect import MakeBus
 from gigabrain_zenoh.runtime.replay import Node
+from gigabrain_zenoh.security.acl import FLEET_KEYS
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.launch.deployment import Deployment
@@ -67,7 +68,11 @@ ROS_WRITES = tuple(
     for one in (
         CMD_VEL, ESTOP, RELEASE, ENABLE, GOAL, MISSION, TASK_CHANGE, POSE_SET, MAP_SAVE,
     )
-)  # fmt: skip
+) + FLEET_KEYS  # fmt: skip
+NAME_FOR_FLEET = (
+    "ros2: Open-RMF calls a robot by its namespace, and this one has none; set `namespace:` of the "
+    "deployment, or leave free_fleet off"
+)
 ROUTER_FOR_ROS = (
     "ros2: nodes of ROS have no identity at a router with keys; name another one as "
     "`router:`, or use `transport: dds`"
@@ -144,8 +149,11 @@ def _ros2(deployment: "Deployment", place: ProcessPlace) -> Ros2Config:
 def with_ros_router(config: Ros2Config, endpoint: Endpoint) -> Ros2Config:
     """Return the gateway's settings with the robot's own router, unless they name another one.
 
-    Raises ConfigError where that router has keys.
+    Raises ConfigError where that router has keys, and for a robot without the name that free_fleet
+    needs.
     """
+    if config.free_fleet and not endpoint.namespace:
+        raise ConfigError(NAME_FOR_FLEET)
     if config.transport != "rmw_zenoh" or config.router:
         return config
     if endpoint.keys:

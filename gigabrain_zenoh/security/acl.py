@@ -91,13 +91,16 @@ def role_named(role: str) -> Role:
 
 
 EVERYTHING = "robot/**"  # all keys of one robot
+# beside these, what Open-RMF's free_fleet adapter uses of it: an identity of the role dispatcher
+FLEET_ACTION = "navigate_to_pose/_action/*"
+FLEET_KEYS = ("tf", "battery_state", FLEET_ACTION)
 TO_LISTENERS = ("put", "query", "reply", "declare_queryable")
 FIRST: Mapping[str, int] = {}  # no identity is revoked
 LOCAL = "local"  # clients of the router's Unix socket, which only this user can open
 
 
-FLEET_WIDE: tuple[Role, ...] = ("operator", "viewer")  # where no robot is named
-OF_ONE_ROBOT: tuple[Role, ...] = ("robot", "brain", "operator", "viewer")
+FLEET_WIDE: tuple[Role, ...] = ("operator", "viewer", "dispatcher")  # where no robot is named
+OF_ONE_ROBOT: tuple[Role, ...] = ("robot", "brain", "operator", "viewer", "dispatcher")
 PUBLISHED: tuple[Topic[Any], ...] = (*TOPICS, ESTOP_SAID)
 Rule = dict[str, Any]
 
@@ -109,6 +112,8 @@ OWN_KEY_BYTES = 1024 * 1024
 
 def check_write(key: str) -> None:
     """Raise ValueError for a key that no process of one's own can be granted."""
+    if key in FLEET_KEYS:
+        return
     first, *rest = key.removeprefix("robot/").split("/")
     if not key.startswith("robot/") or not all(OWN_PART.fullmatch(part) for part in rest):
         raise ValueError(
@@ -185,7 +190,10 @@ class Table:
         The robot itself may do everything below its own name.
         """
         if role == "robot":
-            return [EVERYTHING], [EVERYTHING], [EVERYTHING]
+            every = [EVERYTHING, *FLEET_KEYS]
+            return every, every, every
+        if role == "dispatcher":
+            return [], [FLEET_ACTION], []
         kept = self._kept()
         puts = [k for one in self.topics if role in one.publishers for k in self._own(one, role)]
         queries = [*kept, *(one.at("*") for one in self.services if role in one.callers)]
@@ -264,7 +272,7 @@ def _known(robots: Sequence[str], grants: Grants) -> Iterator[tuple[str, tuple[s
 def _rules(role: Role, robot: str, table: Table, process: str) -> Iterator[Rule]:
     """Yield one role's rules for one robot."""
     who = common_name(role, robot, process=process)
-    everything = under(robot, [EVERYTHING])
+    everything = under(robot, FLEET_KEYS if role == "dispatcher" else (EVERYTHING, *FLEET_KEYS))
     puts, queries, replies = table.keys_of_process(process) if process else table.keys(role)
     yield _rule(f"{who} hears", "egress", TO_LISTENERS, everything)
     # subscriptions are no secret: a fleet's operator may subscribe to `**`

@@ -27,7 +27,9 @@ R = TypeVar("R", bound=Message)
 
 KB = 1024
 Priority = Literal["real_time", "interactive_high", "data_high", "data", "background"]
-Role = Literal["robot", "brain", "operator", "viewer", "router", "process"]  # of an identity
+Role = Literal[  # of an identity
+    "robot", "brain", "operator", "viewer", "dispatcher", "router", "process",
+]  # fmt: skip
 # How viewers show a topic; `recording/drawing.py` has a function for each.
 Drawing = Literal[
     "scan", "map", "zones", "pose", "path", "obstacles", "task", "image", "log", "odometry",

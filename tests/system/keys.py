@@ -12,11 +12,15 @@ from gigabrain_zenoh.bus.zenoh.config import session_config
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.launch.processes import names_by_role
+from gigabrain_zenoh.security.acl import FLEET_KEYS
 from gigabrain_zenoh.security.authority import issue, new_fleet
 from gigabrain_zenoh.testing.processes import free_endpoint
 
-WRITES = {"mine": ("robot/intent", "robot/goal", "robot/lamp/**")}  # of a process of one's own
-OF_RED: tuple[Role, ...] = ("robot", "brain", "operator", "viewer")
+WRITES = {  # of processes of one's own
+    "mine": ("robot/intent", "robot/goal", "robot/lamp/**"),
+    "ros2": FLEET_KEYS,
+}
+OF_RED: tuple[Role, ...] = ("robot", "brain", "operator", "viewer", "dispatcher")
 
 
 def make_fleet(folder: Path, name: str) -> Path:
@@ -24,10 +28,11 @@ def make_fleet(folder: Path, name: str) -> Path:
     new_fleet(name, folder)
     for role in OF_RED:
         issue(folder, role, robot="red")
-    issue(folder, "process", robot="red", process="mine")
+    for process in WRITES:
+        issue(folder, "process", robot="red", process=process)
     for robot in ("blue", "green"):  # of green nobody will have heard
         issue(folder, "robot", robot=robot)
-    for role in ("operator", "router"):
+    for role in ("operator", "dispatcher", "router"):
         issue(folder, role)
     return folder
 

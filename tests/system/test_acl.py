@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from gigabrain_schemas.topics import ESTOP_SAID, SERVICES, TOPICS
+from gigabrain_schemas.topics import ESTOP_SAID, SERVICES, TELEOP, TOPICS
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.security.authority import issue
 from gigabrain_zenoh.testing.processes import SampleCollector, repeat
@@ -130,6 +130,54 @@ async def test_a_process_of_ones_own_sees_all_of_its_robot_and_answers_for_itsel
     await asked_until_answered(operator, "red/robot/describe/mine")
     assert await ask(operator, "red/robot/estop") == []
     assert await ask(operator, "red/robot/describe/driver") == []
+
+
+FLEET_READ = ("tf", "battery_state", "navigate_to_pose/_action/feedback")
+FLEET_ASKED = [f"navigate_to_pose/_action/{name}" for name in ("send_goal", "get_result")]
+
+
+@pytest.mark.parametrize("who", ["dispatcher", "dispatcher@red"])
+async def test_open_rmfs_adapter_reads_and_asks_what_free_fleet_offers_and_nothing_else(
+    net: Site, who: str
+) -> None:
+    robot, gateway = [await net.client(one, "red") for one in ("robot@red", "process.ros2@red")]
+    rmf, heard = net.raw(who), set[str]()
+    wanted = {f"red/{key}" for key in FLEET_READ}
+    for key in ("**", *wanted):
+        rmf.declare_subscriber(key, lambda sample: heard.add(str(sample.key_expr)))
+    for key in ASKED:
+        robot.serve(key, answer)
+    for key in FLEET_ASKED:
+        gateway.serve(key, answer)
+
+    def send() -> None:
+        for topic in TOPICS:
+            robot.publish(topic, topic.at("driver"), b"x", "")
+        for key in FLEET_READ:
+            gateway.publish(TELEOP, key, b"x", "")
+
+    await repeat(send, lambda: heard >= wanted)
+    for key in FLEET_ASKED:
+        await asked_until_answered(rmf, f"red/{key}")
+    assert [key for key in ASKED if await ask(rmf, f"red/{key}")] == []
+    assert heard == wanted
+    ears = [SampleCollector(robot, key) for key in ("tf", "robot/teleop")]
+    await repeat(send, lambda: all(ear.samples for ear in ears))
+    for key in ("tf", "robot/teleop"):
+        rmf.put(f"red/{key}", b"forged")
+    await asked_until_answered(rmf, f"red/{FLEET_ASKED[0]}")  # after all it has sent
+    count = len(ears[0].samples)
+    await repeat(send, lambda: len(ears[0].samples) > count + 1)
+    assert not any(b"forged" in ear.payloads for ear in ears)
+
+
+async def test_nobody_but_open_rmf_and_the_robot_ask_for_its_goals(net: Site) -> None:
+    gateway = await net.client("process.ros2@red", "red")
+    for key in FLEET_ASKED:
+        gateway.serve(key, answer)
+    await asked_until_answered(net.raw("dispatcher@red"), f"red/{FLEET_ASKED[-1]}")
+    for who in ("brain@red", "operator@red", "operator", "viewer@red", "process.mine@red"):
+        assert await ask(net.raw(who), f"red/{FLEET_ASKED[-1]}") == [], who
 
 
 async def test_nobody_but_the_robot_answers_for_its_gate(net: Site) -> None:

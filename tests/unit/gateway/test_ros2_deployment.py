@@ -66,13 +66,23 @@ def test_a_router_with_keys_serves_no_nodes_of_ros(tmp_path):
 
 def test_its_own_identity_may_command_and_ask_and_nothing_else():
     puts, queries, served = Table({}, grants=grants()).keys_of_process("ros2")
-    assert puts == ["robot/health/ros2", "robot/log", "robot/cmd_vel", "robot/estop"]
+    fleet = ["tf", "battery_state", "navigate_to_pose/_action/*"]
+    assert puts == ["robot/health/ros2", "robot/log", "robot/cmd_vel", "robot/estop", *fleet]
     asked = {one.removeprefix("robot/") for one in queries}
     assert asked >= {"estop", "release", "enable", "goal", "mission", "task_change", "pose_set",
                      "map_save"}  # fmt: skip
     assert asked.isdisjoint({"map_load", "zones_change", "sim_change", "param/*", "audit_log"})
-    assert served == ["robot/param/ros2", "robot/describe/ros2"]
+    assert served == ["robot/param/ros2", "robot/describe/ros2", *fleet]
     assert process_type("ros2").roles == ("process",)
+
+
+def test_open_rmf_needs_a_name_of_the_robot(tmp_path):
+    fleet = Ros2Config(free_fleet=True)
+    with pytest.raises(ConfigError, match="calls a robot by its namespace, and this one has none"):
+        specs(Deployment(ros2=fleet), tmp_path)
+    _, started = specs(Deployment(ros2=fleet, namespace="red"), tmp_path)["ros2"]
+    assert started["settings"]["free_fleet"]
+    assert started["endpoint"]["namespace"] == "red"
 
 
 def written(tmp_path, text):
@@ -96,6 +106,7 @@ def test_a_file_sets_it_up_with_its_types_beside_itself(tmp_path):
         ("ros2: {domain: 233}", "robot.yaml:1: .*232"),
         ("ros2: {cmd_vel_timeout: 0.3}", "robot.yaml:1: .*0.2"),
         ("hosts: {robot: [router, driver, ros2]}", "ros2 needs settings"),
+        ("ros2: {free_fleet: true, leave_out: [/tf]}", "robot.yaml:1: .*free_fleet needs /tf"),
     ],
 )
 def test_a_wrong_setting_is_refused_with_its_line(tmp_path, text, error):

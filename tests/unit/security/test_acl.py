@@ -28,9 +28,26 @@ def test_a_router_without_keys_has_no_rules_and_with_them_denies_by_default() ->
     rules = access_control(["red"], Table({}), "red")
     assert rules["default_permission"] == "deny"
     assert {policy["subjects"][0] for policy in rules["policies"]} == {
-        "local", "robot@red", "brain@red", "operator@red", "viewer@red", "operator", "viewer",
+        "local", "robot@red", "brain@red", "operator@red", "viewer@red", "dispatcher@red",
+        "operator", "viewer", "dispatcher",
     }  # fmt: skip
     assert known_names(["red"]) == (
         "robot@red", "brain@red", "operator", "operator@red", "viewer", "viewer@red",
+        "dispatcher", "dispatcher@red",
     )  # fmt: skip
-    assert known_names([""]) == ("robot", "brain", "operator", "viewer")
+    assert known_names([""]) == ("robot", "brain", "operator", "viewer", "dispatcher")
+
+
+def test_open_rmfs_adapter_reads_and_asks_what_free_fleet_needs_and_nothing_else() -> None:
+    rules = {rule["id"]: rule for rule in access_control(["red"], Table({}))["rules"]}
+    ours = {name: rule for name, rule in rules.items() if name.startswith("dispatcher@red")}
+    keys = ["red/battery_state", "red/navigate_to_pose/_action/*", "red/tf"]
+    assert ours.keys() == {
+        "dispatcher@red hears", "dispatcher@red is heard", "dispatcher@red listens",
+        "dispatcher@red asks",
+    }  # fmt: skip
+    assert ours["dispatcher@red hears"]["key_exprs"] == keys
+    assert ours["dispatcher@red listens"]["key_exprs"] == keys
+    assert ours["dispatcher@red asks"]["key_exprs"] == ["red/navigate_to_pose/_action/*"]
+    for role in ("brain", "operator", "viewer"):
+        assert not any("_action" in key for key in rules[f"{role}@red asks"]["key_exprs"])

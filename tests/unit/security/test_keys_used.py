@@ -16,7 +16,7 @@ from gigabrain_zenoh.launch.deployment import (
     client_endpoint,
     load_deployment,
 )
-from gigabrain_zenoh.launch.processes import names_by_role
+from gigabrain_zenoh.launch.processes import grants, names_by_role
 from gigabrain_zenoh.launch.specs import process_specs
 
 ROOT = Path(__file__).parents[3]
@@ -109,6 +109,7 @@ def test_the_committed_router_of_a_larger_site_is_what_the_command_prints() -> N
             keys="/etc/gigabrain/keys",
             fleet=("red", "blue"),
             names=names_by_role(),
+            grants=grants(),
         )
     )
     assert committed == made
