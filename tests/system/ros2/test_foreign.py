@@ -2,11 +2,9 @@
 
 import asyncio
 import json
-import os
 import random
 import subprocess
-from collections.abc import AsyncIterator, Callable
-from pathlib import Path
+from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
@@ -20,8 +18,7 @@ from gigabrain_zenoh.ros2.transport import absolute, dds_type
 from gigabrain_zenoh.ros2.types import Types
 from gigabrain_zenoh.testing.processes import repeat, robot
 from gigabrain_zenoh.testing.waiting import until
-from tests.ros2.environment import NotBuilt
-from tests.ros2.foreign import PROGRAMS, javascript, python
+from tests.ros2.foreign import PROGRAMS, built, javascript, python
 from tests.unit.ros2.random_messages import random_fields
 
 STRING, SET_BOOL = "std_msgs/msg/String", "std_srvs/srv/SetBool"
@@ -37,16 +34,6 @@ READ_IN_JAVASCRIPT = (
     "tf2_msgs/msg/TFMessage",
     "trajectory_msgs/msg/JointTrajectory",
 )
-
-
-def built(build: Callable[[], Path]) -> Path:
-    """Return what was built; where it cannot be the test is skipped, but in CI it fails."""
-    try:
-        return build()
-    except NotBuilt as error:
-        if "CI" in os.environ:
-            raise
-        pytest.skip(str(error))
 
 
 @pytest.fixture(scope="module")

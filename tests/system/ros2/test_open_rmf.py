@@ -1,0 +1,186 @@
+"""A robot of Open-RMF: a client with the libraries of its adapter, written from its source."""
+
+import asyncio
+import contextlib
+import json
+import subprocess
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.safety import Health
+from gigabrain_schemas.topics import HEALTH, STATE
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.config.settings import Ros2Config
+from gigabrain_zenoh.gateway.gateway import serve
+from gigabrain_zenoh.ros2.memory import MemoryNetwork
+from gigabrain_zenoh.ros2.types import Types
+from gigabrain_zenoh.runtime.connect import connect
+from gigabrain_zenoh.testing import samples
+from gigabrain_zenoh.testing.processes import Home, endpoint_of, repeat
+from gigabrain_zenoh.testing.waiting import until
+from tests.ros2.foreign import PROGRAMS, built, free_fleet
+from tests.system.keys import site
+
+SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
+ACTIVE = (1, 2, 3)  # accepted, executing, canceling
+CONFIG: dict[str, Any] = {"mode": "client", "scouting": {"multicast": {"enabled": False}}}
+
+
+class Adapter:
+    """The client, in a process of its own."""
+
+    def __init__(self, process: asyncio.subprocess.Process) -> None:
+        self._process = process
+
+    async def call(self, *line: Any) -> Any:
+        """Return what it answers."""
+        assert self._process.stdin
+        assert self._process.stdout
+        self._process.stdin.write(json.dumps(line).encode() + b"\n")
+        return json.loads(await self._process.stdout.readline())
+
+    async def poll(self, name: str, done: Callable[[Any], bool]) -> Any:
+        """Call again and again until the answer is as wanted, and return it."""
+        async with asyncio.timeout(120):
+            while True:
+                if done(found := await self.call(name)):
+                    return found
+                await asyncio.sleep(0.05)
+
+    async def next(self, name: str) -> Any:
+        """Return the first answer that there is."""
+        return await self.poll(name, lambda found: found is not None)
+
+    async def end(self) -> Any:
+        """Return the status with which the present goal ends."""
+        return await self.poll("status", lambda found: found not in ACTIVE)
+
+
+@pytest.fixture(scope="module")
+def interpreter() -> Path:
+    return built(free_fleet)
+
+
+@contextlib.asynccontextmanager
+async def adapter(
+    interpreter: Path, folder: Path, config: dict[str, Any]
+) -> AsyncIterator[Adapter]:
+    """Yield a client that takes the robot for `red`."""
+    file = folder / "open_rmf.json5"
+    file.write_text(json.dumps(CONFIG | config))
+    process = await asyncio.create_subprocess_exec(
+        str(interpreter), str(PROGRAMS / "open_rmf.py"), "red", str(file),
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+    )  # fmt: skip
+    assert process.stdin
+    try:
+        yield Adapter(process)
+    finally:
+        process.stdin.close()
+        try:
+            await asyncio.wait_for(process.wait(), 10)
+        except TimeoutError:
+            process.kill()
+
+
+async def test_open_rmf_sends_follows_and_cancels_goals_and_reads_battery_and_pose(
+    home: Home, interpreter: Path, tmp_path: Path
+) -> None:
+    file = home.deployment(
+        body="turtlebot3_burger",
+        world="arena",
+        namespace="red",
+        resume="auto",
+        ros2={"free_fleet": True},
+        perception={"mapping": "slam"},
+        decision={"behaviour": "navigate"},
+    )
+    home.start("up", str(file))
+    endpoint, states, healths = endpoint_of(file), list[RobotState](), list[Health]()
+    async with (
+        asyncio.timeout(400),
+        connect(endpoint, "test", timeout_s=None) as bus,
+        adapter(interpreter, tmp_path, {"connect": {"endpoints": list(endpoint.connect)}}) as rmf,
+    ):
+        bus.subscribe(STATE, lambda _, state: states.append(state))
+        bus.subscribe(HEALTH, lambda _, health: healths.append(health), name="ros2")
+        begin = await rmf.next("pose")
+        assert 0.0 < await rmf.next("battery") <= 1.0
+        await until(lambda: states and states[-1].gate.mode == "enabled", "it may drive")
+
+        for name in ("send_goal", "get_result", "cancel_goal"):
+            for payload in ("", "00010000ff", "0001000001" + "00" * 70_000):
+                assert await rmf.call("garbage", name, payload) not in ("", "no answer")
+        await until(lambda: healths and healths[-1].counters.get("free_fleet_refused") == 9)
+        assert await rmf.call("stop") == 0  # there was nothing to cancel
+        assert abs(states[-1].velocity.linear_x) < 0.01
+
+        async def sent(x: float, y: float) -> None:
+            """Send a goal, and again if there is no map yet."""
+            while True:
+                assert await rmf.call("navigate", begin[0] + x, begin[1] + y) is True
+                while (status := await rmf.call("status")) in ACTIVE:
+                    if (told := await rmf.call("feedback")) and told[-1]:
+                        return
+                assert status == ABORTED
+
+        await sent(0.6, 0.0)
+        frame, distance, _, _ = await rmf.call("feedback")
+        assert frame == "map"
+        assert 0.0 < distance < 2.0
+        await until(lambda: states[-1].velocity.linear_x > 0.05, "it drives")
+        assert await rmf.call("stop") == 0
+        assert await rmf.end() == CANCELED
+        await until(lambda: abs(states[-1].velocity.linear_x) < 0.01, "it stands")
+        await sent(0.4, 0.0)
+        assert await rmf.end() == SUCCEEDED
+        assert await rmf.call("stop") == 0
+        end = await rmf.call("pose")
+        assert end[:2] == pytest.approx([begin[0] + 0.4, begin[1]], abs=0.3)
+
+
+async def test_with_keys_the_identity_of_a_dispatcher_is_enough(
+    fleet: Path, interpreter: Path, tmp_path: Path
+) -> None:
+    types, config = Types(), Ros2Config(free_fleet=True)
+    async with site(fleet) as net:
+        robot = Bus(await net.client("robot@red", "red"), Clock(), "driver")
+        robot.time.boot = samples.BOOT
+        gateway = Bus(await net.client("process.ros2@red", "red"), Clock(), "ros2")
+        ready = asyncio.Event()
+        ros = MemoryNetwork(types).transport()
+        running = asyncio.ensure_future(serve(config, gateway, ros, types, ready.set))
+        keys = fleet / "dispatcher"
+        tls = {
+            "enable_mtls": True,
+            "root_ca_certificate": str(keys / "ca.crt"),
+            "connect_certificate": str(keys / "identity.crt"),
+            "connect_private_key": str(keys / "identity.key"),
+        }
+        at = net.address.replace("tcp/", "tls/")
+        where = {"connect": {"endpoints": [at]}, "transport": {"link": {"tls": tls}}}
+        async with adapter(interpreter, tmp_path, where) as rmf:
+            await ready.wait()
+            charge: list[float] = []
+
+            def send() -> None:
+                robot.time.tick += 1
+                robot.publish(STATE, samples.state(robot.time.tick, battery=75.0))
+
+            async def read() -> None:
+                charge.append(await rmf.next("battery"))
+
+            reading = asyncio.ensure_future(read())
+            await repeat(send, lambda: charge)
+            await reading
+            assert charge == [0.75]
+            assert await rmf.call("navigate", 1.0, 0.0) is True
+            assert await rmf.end() == ABORTED  # nothing here serves goals
+            assert await rmf.call("stop") == 0
+        running.cancel()
+        await asyncio.wait((running,))
