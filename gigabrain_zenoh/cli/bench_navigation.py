@@ -273,8 +273,10 @@ class GoalsOptions:
     "Continue until the person of the world has stopped for the robot this many times."
     hours: float = 0.0
     "Continue for this time [h of its own time], and report the memory of perception."
+    link: Literal["sim", "emulated"] = "sim"
+    "How to reach the robots."
     speed: float = 5.0
-    "Simulated over real time."
+    "Simulated over real time; emulated robots run at 1."
     seed: int = 0
     "Random seed of the start pose, the sensor noise and the goals."
     headings: bool = False
@@ -290,6 +292,7 @@ def goals(*, options: GoalsOptions = GOALS, json: JsonFile = None, logs: Path | 
     Example: gigabrain bench goals --bodies alpha --worlds house --goals 10 --speed 1
     Example: gigabrain bench goals --bodies turtlebot3_waffle --worlds house --hours 8
     Example: gigabrain bench goals --bodies ackermann_car --worlds house --goals 30 --headings
+    Example: gigabrain bench goals --bodies turtlebot3_ros2 --link emulated --goals 30
 
     Columns: time to map the world, goals reached, contacts, least clearance,
     mean time per goal, largest error of position and heading at rest (against
@@ -311,9 +314,10 @@ def goals(*, options: GoalsOptions = GOALS, json: JsonFile = None, logs: Path | 
         goals=options.goals,
         meetings=options.meetings,
         hours=options.hours,
-        speed=options.speed,
+        speed=options.speed if options.link == "sim" else 1.0,
         seed=options.seed,
         headings=options.headings,
+        link=options.link,
         logs=logs,
     )
     result = run_async(measure_goals(options.bodies, options.worlds, course, print_progress))

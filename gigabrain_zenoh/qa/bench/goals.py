@@ -22,7 +22,7 @@ from gigabrain_schemas.tasks import Goal
 from gigabrain_schemas.topics import BODY, MAP, POSE, STATE
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.client.tasks import Tasks
-from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
+from gigabrain_zenoh.config.settings import DecisionConfig, LinkName, PerceptionConfig
 from gigabrain_zenoh.errors import BodyLost, GigabrainError, Refused
 from gigabrain_zenoh.geometry.pose import compose, inverse, wrap_angle
 from gigabrain_zenoh.launch.deployment import Deployment
@@ -60,6 +60,7 @@ class GoalCourse(Struct, frozen=True, kw_only=True):
     speed: float = 5.0
     seed: int = 0
     headings: bool = False  # all goals have one, and the body's own motions reach them
+    link: LinkName = "sim"
     logs: Path | None = None  # folder of the processes' logs
 
 
@@ -158,6 +159,7 @@ async def measure_goals(
                 world=world,
                 seed=course.seed,
                 speed=course.speed,
+                link=course.link,
                 resume="auto",
                 router=LOOPBACK,
                 perception=PerceptionConfig(mapping="slam"),
@@ -183,7 +185,8 @@ async def _run(deployment: Deployment, course: GoalCourse, show: Progress) -> Go
         show(f"{name}: starting")
         began_s = asyncio.get_running_loop().time()
         async with measured_robot(deployment, folder, START_S) as (group, bus):
-            sender = GoalSender(bus, group, deployment.seed, poses)
+            judge = "driver" if deployment.link == "sim" else "emulator"
+            sender = GoalSender(bus, group, deployment.seed, poses, judge)
             await group.until(lambda: sender.is_localized, "a map, and the robot in it", START_S)
             show(f"{name}: exploring")
             explored = await sender.explore()
@@ -207,7 +210,7 @@ async def _run(deployment: Deployment, course: GoalCourse, show: Progress) -> Go
         met=int(report["person_stood"]),
         distance_m=report["distance_m"],
         seconds=report["sim_seconds"],
-        alone=int(report["lockstep_timeouts"]),
+        alone=int(report.get("lockstep_timeouts", 0)),
         failures=tuple(sender.failures),
         growth=growth,
     )
@@ -238,13 +241,19 @@ def _folder(course: GoalCourse, name: str) -> Iterator[Path]:
 class GoalSender:
     """Sends a robot to random goals; every other one has a heading.
 
-    With `poses` (n, 3) in the world, the goals are some of them, all with their heading.
+    With `poses` (n, 3) in the world, the goals are some of them, all with their heading. The
+    process `judge` reports the truth.
     """
 
     def __init__(
-        self, bus: Bus, group: ProcessGroup, seed: int, poses: Floats | None = None
+        self,
+        bus: Bus,
+        group: ProcessGroup,
+        seed: int,
+        poses: Floats | None = None,
+        judge: str = "driver",
     ) -> None:
-        self._reachable = poses
+        self._reachable, self._judge = poses, judge
         self._bus, self._group, self._tasks = bus, group, Tasks(bus, silent_s=MAX_SILENCE_S)
         self._maps, self._poses, self._bodies = bus.latest(MAP), bus.latest(POSE), bus.latest(BODY)
         self._states = bus.latest(STATE)  # also sets the boot that all other messages must have
@@ -279,7 +288,7 @@ class GoalSender:
     async def send(self) -> None:
         """Send it to a random goal, and wait for the result."""
         # a person who blocks all ways walks on after a while
-        goal = await self._retried(GigabrainError, self._random_goal)
+        goal = await self._retried(GigabrainError, self.random_goal)
         self.sent += 1
         reason = await self._go(goal)
         if not reason:
@@ -314,7 +323,7 @@ class GoalSender:
         truth: dict[str, float] = {}
         while not truth:
             await self._group.poll()
-            report = await report_of(self._bus)
+            report = await report_of(self._bus, self._judge)
             truth = {k: float(v) for k, v in report.items() if isinstance(v, int | float)}
         return truth
 
@@ -359,7 +368,8 @@ class GoalSender:
         assert pose
         return Pose(x=pose.x, y=pose.y, yaw=pose.yaw)
 
-    async def _random_goal(self) -> Goal:
+    async def random_goal(self) -> Goal:
+        """Return a place that it can reach. Raises GigabrainError where there is none."""
         if self._reachable is not None:
             return await self._reachable_goal(self._reachable)
         x, y = await self._random_place()

@@ -1,0 +1,291 @@
+"""Measures a simulated robot with its gateway against real ROS 2: `python -m tests.ros2.measure`.
+
+Times are from events on one machine with one monotonic clock: when rclpy has sent or received, and
+when the robot's state with the effect has arrived here. A busy machine makes all of them longer.
+"""
+
+import asyncio
+import contextlib
+import os
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import psutil
+from cyclopts import App
+from rich.console import Console
+from rich.table import Table
+
+from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_schemas.topics import SCAN, STATE
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.client.requests import release
+from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig, Ros2Config
+from gigabrain_zenoh.errors import BodyLost, Refused
+from gigabrain_zenoh.host.bounded import percentile
+from gigabrain_zenoh.launch.deployment import Deployment
+from gigabrain_zenoh.qa.bench.goals import START_S, GoalSender
+from gigabrain_zenoh.qa.robot_under_test import LOOPBACK, ProcessGroup, measured_robot
+from gigabrain_zenoh.testing.waiting import until
+from tests.ros2.environment import build, say
+from tests.ros2.judge import Judge, Program, judging
+
+SPEED_MPS, COMMAND_HZ, PAUSE_S, TRY_S = 0.15, 20.0, 1.0, 10.0
+SET_BOOL, NAVIGATE = "std_srvs/srv/SetBool", "nav2_msgs/action/NavigateToPose"
+ACTION = {"action": "/navigate_to_pose", "type": NAVIGATE}
+GOAL_S = 300.0
+READ = {
+    "/scan": ("sensor_msgs/msg/LaserScan", {"reliable": False}),
+    "/odom": ("nav_msgs/msg/Odometry", {}),
+    "/tf": ("tf2_msgs/msg/TFMessage", {}),
+}
+
+app = App(result_action="return_value")
+
+
+class Robot:
+    """A running robot, with the times [ns] at which its states and scans have arrived."""
+
+    def __init__(self, group: ProcessGroup, bus: Bus) -> None:
+        self.group, self.bus = group, bus
+        self.states: list[tuple[int, RobotState]] = []
+        self.scans: dict[int, int] = {}  # by the stamp
+        bus.subscribe(STATE, self._take_state)
+        bus.subscribe(SCAN, self._take_scan)
+
+    def _take_state(self, _key: str, state: RobotState) -> None:
+        self.states.append((time.monotonic_ns(), state))
+
+    def _take_scan(self, _key: str, scan: LaserScan) -> None:
+        self.scans[scan.stamp_ns] = time.monotonic_ns()
+
+    @property
+    def now(self) -> RobotState:
+        """The newest state."""
+        return self.states[-1][1]
+
+    def stopped_ns(self, since_ns: int) -> int | None:
+        """Return when the first state with a command of zero arrived after `since_ns`."""
+        later = ((at, one) for at, one in self.states if at > since_ns)
+        return next((at for at, one in later if one.sent.linear_x == 0.0), None)
+
+    def braked_ns(self, since_ns: int) -> int | None:
+        """Return when the first state with a lower command than before arrived after `since_ns`."""
+        later = [(at, one.sent.linear_x) for at, one in self.states if at > since_ns]
+        return next((at for (_, was), (at, now) in pairwise(later) if now < was), None)
+
+    async def released(self) -> None:
+        """Release the robot, once it has rested as long as that takes."""
+        while self.now.gate.mode == "latched":
+            with contextlib.suppress(Refused, BodyLost):
+                await release(self.bus, self.now.gate.estop_generation)
+            await asyncio.sleep(0.1)
+
+    async def driven(self, driver: Program) -> None:
+        """Let ROS drive; on a busy machine the gate may stop it, and it has to pause."""
+        while True:
+            await self.released()
+            await driver.query("drive", linear=SPEED_MPS, angular=0.5, hz=COMMAND_HZ)
+            with contextlib.suppress(TimeoutError):
+                await until(lambda: self.now.velocity.linear_x > 0.1, "it drives", TRY_S)
+                return
+            await driver.query("rest")
+            await asyncio.sleep(PAUSE_S)
+
+
+@contextlib.asynccontextmanager
+async def running(judge: Judge, world: str, **parts: Any) -> AsyncIterator[Robot]:
+    """Run a robot whose gateway is in the judge's domain."""
+    ros2 = Ros2Config(transport="dds", domain=judge.domain, localhost=True)
+    body = "turtlebot3_burger"
+    deployment = Deployment(body=body, world=world, router=LOOPBACK, ros2=ros2, **parts)
+    async with measured_robot(deployment, ready_s=START_S) as (group, bus):
+        robot = Robot(group, bus)
+        await until(lambda: robot.states, "states")
+        yield robot
+
+
+async def added_latency(robot: Robot, judge: Judge, count: int) -> list[float]:
+    """Return by how much later [ms] scans arrive at rclpy than at a process on our bus."""
+    listen = judge.start("listen")
+    kind, qos = READ["/scan"]
+    await listen.query("subscribe", topic="/scan", type=kind, qos=qos, stream=True)
+    await listen.hear("message", nth=count + 5)
+    found = []
+    for event in listen.seen("message", topic="/scan")[5:]:
+        stamp = event["value"]["header"]["stamp"]
+        came_ns = robot.scans.get(stamp["sec"] * 10**9 + stamp["nanosec"])
+        if came_ns is not None:
+            found.append((event["at_ns"] - came_ns) / 1e6)
+    listen.close()
+    return found
+
+
+async def brakings(robot: Robot, judge: Judge, count: int) -> list[float]:
+    """Return the times [ms] from the period after a killed publisher's last command to braking."""
+    found = []
+    for _ in range(count):
+        driver = judge.start("drive")
+        await robot.driven(driver)
+        driver.kill()
+        last_ns = driver.seen("sent")[-1]["at_ns"]
+        await until(lambda ns=last_ns: robot.braked_ns(ns), "braking")
+        found.append(((robot.braked_ns(last_ns) or 0) - last_ns) / 1e6 - 1e3 / COMMAND_HZ)
+        await asyncio.sleep(PAUSE_S)
+    return found
+
+
+async def stops(robot: Robot, judge: Judge, count: int) -> list[float]:
+    """Return the times [ms] from a call of /estop to a command of zero, while it drives."""
+    caller, found = judge.start("call"), []
+    where = {"service": "/estop", "type": SET_BOOL}
+    await caller.available(**where)
+    for number in range(count):
+        driver = judge.start("drive")
+        await robot.driven(driver)
+        await caller.query("call", **where, name=str(number), data=True)
+        sent_ns = (await caller.hear("response", name=str(number)))["sent_ns"]
+        await until(lambda ns=sent_ns: robot.stopped_ns(ns), "stopping")
+        found.append(((robot.stopped_ns(sent_ns) or 0) - sent_ns) / 1e6)
+        driver.close()
+        await asyncio.sleep(PAUSE_S)
+    return found
+
+
+async def load(robot: Robot, judge: Judge, seconds: float) -> tuple[float, dict[str, float]]:
+    """Return the gateway's share of a core [%], and the rates [Hz] at which rclpy reads."""
+    listen = judge.start("listen")
+    for topic, (kind, qos) in READ.items():
+        await listen.query("subscribe", topic=topic, type=kind, qos=qos)
+    await asyncio.to_thread(listen.poll, "report", lambda one: one["count"] > 10, topic="/odom")
+    process = psutil.Process(robot.group.pids["ros2"])
+    times = process.cpu_times()
+    began_s = time.monotonic()
+    await asyncio.sleep(seconds)
+    spent = process.cpu_times()
+    used_s = spent.user + spent.system - times.user - times.system
+    share = 100 * used_s / (time.monotonic() - began_s)
+    rates = {topic: listen.ask("report", topic=topic)["hz"] for topic in READ}
+    listen.close()
+    return share, rates
+
+
+class Goals:
+    """Goals that rclpy sends to a robot that has explored its world."""
+
+    def __init__(self, sender: GoalSender, client: Program) -> None:
+        self._sender, self._client = sender, client
+
+    async def send(self, name: str) -> None:
+        """Send a goal to a random place; return once it is followed."""
+        place = await self._sender.random_goal()
+        position = {"x": place.x, "y": place.y}
+        pose = {"header": {"frame_id": "map"}, "pose": {"position": position}}
+        await self._client.query("send", **ACTION, name=name, goal={"pose": pose})
+        await self._client.hear("feedback", name=name)
+
+    async def ended(self, name: str) -> tuple[str, int]:
+        """Return how a goal ended, and Nav2's error code."""
+        found = await self._client.hear("result", GOAL_S, name=name)
+        return found["status"], found["value"]["error_code"]
+
+    async def followed(self, name: str) -> bool:
+        """Return whether a goal is reached."""
+        await self.send(name)
+        return await self.ended(name) == ("succeeded", 0)
+
+    async def cancelled(self, name: str) -> bool:
+        """Return whether a goal ends when it is cancelled."""
+        await self.send(name)
+        await self._client.query("cancel", name=name)
+        return await self.ended(name) == ("canceled", 0)
+
+    async def preempted(self, name: str) -> bool:
+        """Return whether a goal ends when the next one comes, which is reached."""
+        await self.send(name)
+        await self.send(f"{name}, then")
+        ends = await self.ended(name), await self.ended(f"{name}, then")
+        return ends == (("aborted", 0), ("succeeded", 0))
+
+
+async def goals(judge: Judge, count: int) -> dict[str, tuple[int, int]]:
+    """Return how many goals were followed, cancelled and preempted as wanted, of how many."""
+    brain = {"perception": PerceptionConfig(mapping="slam"), "resume": "auto"}
+    brain["decision"] = DecisionConfig(behaviour="navigate")
+    async with running(judge, "house", **brain) as robot:
+        sender = GoalSender(robot.bus, robot.group, seed=0)
+        await until(lambda: sender.is_localized, "a map", START_S)
+        say("exploring the house")
+        await sender.explore()
+        client = judge.start("navigate")
+        await client.available(**ACTION)
+        tried = Goals(sender, client)
+        ways: dict[str, Callable[[str], Awaitable[bool]]] = {
+            "followed": tried.followed,
+            "cancelled": tried.cancelled,
+            "preempted": tried.preempted,
+        }
+        found = {}
+        for way, run in ways.items():
+            right = 0
+            for number in range(count):
+                right += await run(f"{way} {number}")
+                say(f"{way}: {right} of {number + 1}")
+            found[way] = right, count
+    return found
+
+
+async def times(judge: Judge, count: int, seconds: float) -> Table:
+    """Return the table of times and load."""
+    table = Table("what", "n", "p50", "p99", "longest", title=f"load {os.getloadavg()[0]:.1f}")
+    async with running(judge, "arena") as robot:
+        say("measuring rates and load")
+        share, rates = await load(robot, judge, seconds)
+        rows: dict[str, Any] = {
+            "scan at rclpy, later than on our bus [ms]": added_latency,
+            "publisher killed: from its period to braking [ms]": brakings,
+            "/estop called: to zero [ms]": stops,
+        }
+        for name, measure in rows.items():
+            say(f"measuring: {name}")
+            values = sorted(await measure(robot, judge, count))
+            shown = (statistics.median(values), percentile(values, 0.99), values[-1])
+            table.add_row(name, str(len(values)), *(f"{one:.1f}" for one in shown if one))
+    listed = ", ".join(f"{topic} {hz:.1f} Hz" for topic, hz in rates.items())
+    table.add_row(f"gateway's share of a core [%]; {listed}", "", f"{share:.1f}")
+    return table
+
+
+async def measured(count: int, seconds: float, goal_count: int) -> None:
+    """Measure, and print the tables."""
+    with tempfile.TemporaryDirectory() as folder, judging(build(), Path(folder)) as judge:
+        if count:
+            Console().print(await times(judge, count, seconds))
+        if goal_count:
+            table = Table("navigate_to_pose in the house", "as wanted")
+            for way, (right, of) in (await goals(judge, goal_count)).items():
+                table.add_row(way, f"{right} of {of}")
+            Console().print(table)
+
+
+@app.default
+def main(*, count: int = 20, seconds: float = 10.0, goals: int = 20) -> int:
+    """Measure latency, braking, e-stop and load, then navigation, and print tables.
+
+    Args:
+        count: How often each time is measured.
+        seconds: How long the load is measured.
+        goals: How many goals are followed, cancelled, and preempted, each.
+    """
+    asyncio.run(measured(count, seconds, goals))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(app())
