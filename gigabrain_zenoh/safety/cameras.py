@@ -34,6 +34,7 @@ from gigabrain_zenoh.safety.depth import (
 )
 
 LATE_PERIODS = 2.5  # of a camera without a picture, unless the allowed age of scans is longer
+AGAIN_TICKS = 50  # 1 s without a late picture, after which a camera that was late counts again
 MIN_PERIOD_SHARE = 0.5  # of its period: pictures that come faster are skipped
 FROZEN_M, FROZEN_RAD = 0.02, math.radians(2)  # moved while the picture stays exactly the same
 UP_STEP = 0.01  # of the vertical's x and y: 0.6 deg, to which a tilt counts
@@ -87,6 +88,7 @@ class CameraState(Struct, frozen=True, kw_only=True):
     text: str = ""
     plane: bytes = b""  # of that picture, as it came
     since: Pose | None = None  # where the body was when that plane first came
+    late: int = 0  # tick at which a picture was last overdue; 0 for never
 
 
 class Cameras(Struct, frozen=True, kw_only=True):
@@ -111,6 +113,10 @@ class Cameras(Struct, frozen=True, kw_only=True):
                 now = now._with(body, camera, picture.image, state, history)
         causes, dark = [], set[str]()
         for camera in depth_cameras(body):
+            seen = now.states.get(camera.name)
+            if seen and _overdue(body, camera, seen, pictures.get(camera.name), state):
+                seen = replace(seen, late=state.tick)
+                now = replace(now, states={**now.states, camera.name: seen})
             if found := now._cause(body, camera, pictures.get(camera.name), state):
                 causes.append(found)
                 dark |= directions(camera)
@@ -162,8 +168,8 @@ class Cameras(Struct, frozen=True, kw_only=True):
                 code, text = "camera_frozen", "repeats one picture while the body moves"
             else:
                 marks, code, text = looked
-        seen = CameraState(
-            basis=image.basis, code=code, text=text, plane=image.planes[0], since=since
+        seen = replace(
+            before, basis=image.basis, code=code, text=text, plane=image.planes[0], since=since
         )
         states = {**self.states, camera.name: seen}
         return replace(self, states=states, marks=marks, pose=pose, pictures=self.pictures + 1)
@@ -173,20 +179,35 @@ class Cameras(Struct, frozen=True, kw_only=True):
     ) -> Cause | None:
         """Return why a camera cannot be believed now."""
         seen = self.states.get(camera.name)
-        limit_ns = max(body.thresholds.scan_age * 1e9, LATE_PERIODS * 1e9 / camera.rate_hz)
         if seen is None or picture is None:
             return cause("camera_lost", f"no picture of camera {camera.name} has come yet")
-        age_ns = max(picture.age_ns, (state.tick - seen.basis) * TICK_NS)
-        if age_ns > limit_ns:
-            late = f"no picture of camera {camera.name} for more than {limit_ns / 1e6:.0f} ms"
-            future = picture.image.basis > state.tick
-            return cause("camera_lost", f"{late}; the newest is of the future" if future else late)
+        if late := _overdue(body, camera, seen, picture, state):
+            return cause("camera_lost", late)
+        if seen.late and state.tick - seen.late < AGAIN_TICKS:
+            return cause("camera_lost", f"pictures of camera {camera.name} have just come again")
         return cause(seen.code, f"camera {camera.name} {seen.text}") if seen.code else None
 
 
 def depth_cameras(body: BodyDescription) -> tuple[Camera, ...]:
     """Return the cameras of `body` that measure depth."""
     return tuple(camera for camera in body.cameras if camera.depth)
+
+
+def _overdue(
+    body: BodyDescription,
+    camera: Camera,
+    seen: CameraState,
+    picture: Picture | None,
+    state: RobotState,
+) -> str:
+    """Return that the newest picture is too old; empty if it is not."""
+    limit_ns = max(body.thresholds.scan_age * 1e9, LATE_PERIODS * 1e9 / camera.rate_hz)
+    age_ns = (state.tick - seen.basis) * TICK_NS
+    if max(age_ns, picture.age_ns if picture else 0) <= limit_ns:
+        return ""
+    late = f"no picture of camera {camera.name} for more than {limit_ns / 1e6:.0f} ms"
+    future = picture is not None and picture.image.basis > state.tick
+    return f"{late}; the newest is of the future" if future else late
 
 
 def directions(camera: Camera) -> set[str]:

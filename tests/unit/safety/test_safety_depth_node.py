@@ -101,7 +101,8 @@ async def test_a_camera_that_falls_silent_is_missed_within_half_a_second() -> No
         verdict = await watch.go(14, pictures=False)
         assert codes(verdict) == ["camera_lost"]
         assert verdict.caps == SpeedCaps(forward=0.0)
-        assert codes(await watch.go(6)) == []
+        assert codes(await watch.go(6)) == ["camera_lost"]
+        assert codes(await watch.go(55)) == []
 
 
 async def test_pictures_of_another_start_do_not_count() -> None:
