@@ -181,7 +181,9 @@ def _look(
 ) -> tuple[str, View]:
     """Add a picture; return why it was refused, and what is known then."""
     now = picture.basis * TICK_S
-    if isinstance(picture, DepthImage):
+    if picture.frame_id != name:
+        refused = f"it is a picture of the camera {picture.frame_id!r}"
+    elif isinstance(picture, DepthImage):
         refused = contours.add_depth(name, picture, pose, now)
     else:
         try:

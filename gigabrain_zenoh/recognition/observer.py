@@ -34,8 +34,13 @@ class Observer:
         self._models: dict[Camera, CameraModel] = {}
 
     def observe(self, camera: Camera, image: Image, depth: DepthImage | None) -> Detections:
-        """Return what is in a picture. Raises ValueError where it is broken, or of another size."""
+        """Return what is in a picture.
+
+        Raises ValueError where it is broken, of another size, or of another camera.
+        """
         began = time.perf_counter()
+        if image.frame_id != camera.name:
+            raise ValueError(f"a picture of the camera {image.frame_id!r}")
         picture = decoded(image)
         if picture.shape[:2] != (camera.height, camera.width):
             height, width = picture.shape[:2]

@@ -159,7 +159,9 @@ class Cameras(Struct, frozen=True, kw_only=True):
         if self.pose and math.hypot(pose.x - self.pose.x, pose.y - self.pose.y) > JUMP_M:
             marks = NO_MARKS
         wanted = (camera.width, camera.height)
-        if (image.width, image.height) != wanted:
+        if image.frame_id != camera.name:
+            code, text = "camera_wrong", f"sends pictures of the camera {image.frame_id!r}"
+        elif (image.width, image.height) != wanted:
             code = "camera_wrong"
             text = f"has {image.width} x {image.height} pixels, its file {wanted[0]} x {wanted[1]}"
         else:

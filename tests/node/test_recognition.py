@@ -332,6 +332,12 @@ def test_raw_pictures_are_looked_at_too(encoding):
     assert [thing.label for thing in found.things] == ["ball"]
 
 
+def test_a_picture_of_another_camera_is_not_looked_at():
+    picture = Image(frame_id="rear", width=320, height=240, encoding="mono8", data=TAG.tobytes())
+    with pytest.raises(ValueError, match="rear"):
+        Observer(SeesABall(), TagFinder()).observe(CAMERA, picture, None)
+
+
 class Sees(SeesABall):
     """A net that sees what it is told, the surest first."""
 

@@ -151,8 +151,11 @@ async def test_a_camera_that_is_silent_withheld_or_wrong_is_not_ok_and_says_why(
         assert "320 x 240" in wrong.problem
         assert near((await bench.world(28)).contours, 0.95, 0.0)  # what was seen stays
         bench.drive(33)
-        await bench.look(33)
-        assert status(await bench.world(33)).ok
+        await bench.look(33, replace(small, frame_id="rear"))
+        assert "'rear'" in status(await bench.world(33)).problem
+        bench.drive(38)
+        await bench.look(38)
+        assert status(await bench.world(38)).ok
 
 
 @pytest.mark.parametrize(

@@ -237,6 +237,7 @@ FAULTS: dict[str, tuple[str, Spoil]] = {
     "covered": ("camera_blind", _constant(0)),
     "far beyond its range": ("camera_blind", _constant(65535)),
     "of the wrong size": ("camera_wrong", lambda seen: image(np.ones((120, 160)), seen.tick)),
+    "of another camera": ("camera_wrong", lambda seen: replace(seen, frame_id="rear")),
     "truncated": ("camera_wrong", lambda seen: _first_plane(seen, seen.planes[0][:99])),
     "empty": ("camera_wrong", lambda seen: _first_plane(seen, b"")),
     "no plane": ("camera_wrong", lambda seen: _first_plane(seen, b"x" * 1000)),
