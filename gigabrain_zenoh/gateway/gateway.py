@@ -84,6 +84,8 @@ async def serve(
     running = asyncio.ensure_future(gateway.run())
     try:
         log.info("node %s on %s, domain %d", config.node, config.transport, config.domain)
+        if config.free_fleet:
+            log.info("serves Open-RMF's adapter free_fleet")
         ready()
         await asyncio.wait((running, bus.failed), return_when=asyncio.FIRST_COMPLETED)
     finally:

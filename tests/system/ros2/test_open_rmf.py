@@ -3,6 +3,8 @@
 import asyncio
 import contextlib
 import json
+import os
+import signal
 import subprocess
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
@@ -26,7 +28,8 @@ from gigabrain_zenoh.testing.waiting import until
 from tests.ros2.foreign import PROGRAMS, built, free_fleet
 from tests.system.keys import site
 
-SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
+SILENT = ("no answer", "Timeout")
+UNKNOWN, SUCCEEDED, CANCELED, ABORTED = 0, 4, 5, 6
 ACTIVE = (1, 2, 3)  # accepted, executing, canceling
 CONFIG: dict[str, Any] = {"mode": "client", "scouting": {"multicast": {"enabled": False}}}
 
@@ -142,6 +145,13 @@ async def test_open_rmf_sends_follows_and_cancels_goals_and_reads_battery_and_po
         assert await rmf.call("stop") == 0
         end = await rmf.call("pose")
         assert end[:2] == pytest.approx([begin[0] + 0.4, begin[1]], abs=0.3)
+
+        await sent(0.0, 0.0)
+        (before,) = home.processes("ros2")
+        os.kill(before, signal.SIGKILL)
+        assert await rmf.poll("status", lambda found: found not in (*ACTIVE, *SILENT)) == UNKNOWN
+        await sent(0.4, 0.0)
+        assert await rmf.end() == SUCCEEDED
 
 
 async def test_with_keys_the_identity_of_a_dispatcher_is_enough(
