@@ -223,7 +223,7 @@ class Ros2Config(Ros2Link, frozen=True, kw_only=True, forbid_unknown_fields=True
     def __post_init__(self) -> None:
         for name in self.leave_out:
             if self.free_fleet and name.strip("/") in FREE_FLEET:
-                raise ValueError(f"leave_out: free_fleet needs {name}; leave it out of this list")
+                raise ValueError(f"leave_out: free_fleet needs {name}; remove it from this list")
 
 
 OwnName = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
