@@ -161,6 +161,24 @@ async def test_a_router_that_is_killed_and_comes_back_carries_data_and_queries_a
     assert b"lost" not in ear.payloads
 
 
+async def test_a_sender_knows_of_readers_again_after_the_routers_restart() -> None:
+    endpoint = free_endpoint()
+    told: list[bool] = []
+    with router_process(endpoint) as router:
+        sender, receiver = await client_of(endpoint), await client_of(endpoint)
+        sender.watch_readers("tf", told.append)
+        ear = SampleCollector(receiver, "tf")
+        await until(lambda: told[-1], "a reader")
+        router.kill()
+    told.append(False)
+    with router_process(endpoint):
+        await until(lambda: told[-1], "the reader again")
+        ear.close()
+        await until(lambda: not told[-1], "none")
+        await sender.close()
+        await receiver.close()
+
+
 async def test_a_client_joins_again_with_a_session_of_which_its_router_knows_nothing() -> None:
     endpoint = free_endpoint()
     with router_process(endpoint) as router:
