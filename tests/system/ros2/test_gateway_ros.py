@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
+import yaml
 
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.topics import STATE
@@ -17,6 +18,7 @@ from gigabrain_zenoh.errors import BodyLost, Refused
 from gigabrain_zenoh.runtime.connect import connect
 from gigabrain_zenoh.testing.processes import Home, free_port
 from gigabrain_zenoh.testing.waiting import until
+from tests.places import ROOT
 from tests.ros2.judge import Judge, Program
 
 TRIGGER, SET_BOOL = "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"
@@ -58,10 +60,10 @@ class Robot:
 async def running(home: Home, judge: Judge, **parts: Any) -> AsyncIterator[Robot]:
     """Yield a robot whose gateway joins the judge's domain."""
     router = f"tcp/127.0.0.1:{free_port()}"
-    ros2 = {"transport": "dds", "domain": judge.domain, "localhost": True}
-    file = home.deployment(
-        body="turtlebot3_burger", world="arena", router=router, ros2=ros2, **parts
-    )
+    parts = {"body": "turtlebot3_burger", "world": "arena"} | parts
+    given = {"transport": "dds", "domain": judge.domain, "localhost": True}
+    parts["ros2"] = parts.get("ros2", {}) | given
+    file = home.deployment(router=router, **parts)
     home.start("up", str(file))
     session = connect(Endpoint(connect=(router,)), "test", timeout_s=None)
     async with asyncio.timeout(400), session as bus:
@@ -179,6 +181,28 @@ async def test_a_killed_gateway_costs_the_robot_nothing_and_ros_finds_it_again(
     assert others <= set(robot.home.processes())
 
 
+async def test_a_robot_without_a_brain_leaves_nav2_its_names(home: Home, judge: Judge) -> None:
+    parts = yaml.safe_load((ROOT / "examples/ros2/nav2.yaml").read_text())
+    async with running(home, judge, **parts) as robot:
+        listener, driver = judge.start("listen", node="listener"), judge.start("drive")
+        kind, qos = READ["/tf"]
+        await listener.query("subscribe", topic="/tf", type=kind, qos=qos)
+        await released(robot)
+        await driving(robot, driver)
+        assert robot.now.gate.commander == "ros2"
+        report = await asyncio.to_thread(
+            listener.poll, "report", lambda one: one["count"] > 0, topic="/tf"
+        )
+        parents = {one["header"]["frame_id"] for one in report["values"][-1]["transforms"]}
+        assert parents == {"odom", "base_link"}
+        heard = (await listener.query("endpoints", topic="/cmd_vel"))["subscribers"]
+        assert {one["node"] for one in heard} == {"gigabrain"}
+        for topic in OF_NAV2:
+            found = await listener.query("endpoints", topic=topic)
+            assert (topic, found["publishers"], found["subscribers"]) == (topic, [], [])
+
+
+OF_NAV2 = ("/map", "/plan", "/goal_pose", "/initialpose", "/navigate_to_pose/_action/status")
 NAVIGATE = "nav2_msgs/action/NavigateToPose"
 
 
