@@ -37,29 +37,35 @@ async def driving(home: Home, router: str, **ros2: Any) -> AsyncIterator[Any]:
         yield latest
 
 
+@contextlib.asynccontextmanager
+async def started(
+    command: tuple[str, ...], environment: Mapping[str, str]
+) -> AsyncIterator[asyncio.subprocess.Process]:
+    """Run a program, and end it with the context."""
+    process = await asyncio.create_subprocess_exec(
+        *command, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE
+    )
+    try:
+        yield process
+    finally:
+        if process.returncode is None:
+            process.kill()
+        await process.communicate()
+
+
 async def stops(latest: Any, command: tuple[str, ...], environment: Mapping[str, str]) -> None:
     """Check that a program stops the robot when something is near, and not before."""
-
-    async def start(near: str) -> asyncio.subprocess.Process:
-        return await asyncio.create_subprocess_exec(
-            *command, near, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE
-        )
-
-    watching = await start(NOTHING_IS_NEAR)
-    assert watching.stdout
-    lines = [await watching.stdout.readline() for _ in range(2)]
-    watching.kill()
-    await watching.communicate()
-    assert [line for line in lines if b" beams, the nearest " not in line] == []
+    async with started((*command, NOTHING_IS_NEAR), environment) as watching:
+        assert watching.stdout
+        lines = [await watching.stdout.readline() for _ in range(2)]  # of eleven scans
+        assert [line for line in lines if b" beams, the nearest " not in line] == []
     assert latest.newest.gate.estop_generation == 0
-    pressing = await start(ALL_IS_NEAR)
-    said, _ = await pressing.communicate()
-    assert (pressing.returncode, said.splitlines()[-1]) == (
-        0,
-        b"e-stop: stopped and latched; e-stop number 1",
-    )
+    async with started((*command, ALL_IS_NEAR), environment) as pressing:
+        said, _ = await pressing.communicate()
+    assert said.splitlines()[-1].startswith(b"e-stop: stopped and latched; e-stop number ")
+    assert pressing.returncode == 0
     await until(lambda: latest.newest.gate.mode == "latched", "it is latched")
-    assert latest.newest.gate.estop_generation == 1
+    assert latest.newest.gate.estop_generation >= 1
 
 
 def over_dds(judge: Judge) -> dict[str, Any]:
