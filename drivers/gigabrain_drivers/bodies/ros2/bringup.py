@@ -13,10 +13,10 @@ from gigabrain_drivers.bodies.ros2.conversion import stamp_ns
 from gigabrain_drivers.bodies.ros2.frames import FrameTree
 from gigabrain_drivers.bodies.ros2.options import Ros2Options
 from gigabrain_schemas.body import Lidar
+from gigabrain_zenoh.ros2.graph import CLOCK_S, SYNCHRONISE, clock_text, unreached
 from gigabrain_zenoh.ros2.qos import Qos, mismatch
 from gigabrain_zenoh.ros2.transport import GraphEndpoint, absolute
 
-CLOCK_S = 1.0  # by which stamps may differ from this machine's clock
 RATE_SHARE = 0.8  # of the rate in the robot's file
 PLACE_M, PLACE_RAD = 0.02, 0.05  # by which a mounting in the file may differ from /tf_static
 SIM_TIME_S = 1e8  # seconds since 1970 below which a stamp counts from a simulation's start
@@ -114,25 +114,13 @@ def graph_findings(
     """Return what the graph says of each topic."""
     others = [each for each in endpoints if not each.ours]
     if not others:
-        return [Finding("graph", "error", "no other node is found", _reach(options))]
+        router = str(options.router or options.port)
+        do = unreached(options.transport, options.domain, router)
+        return [Finding("graph", "error", "no other node is found", do)]
     return [
         *(_published(row, others) for row in rows(options, lidar)),
         *_commanded(options, others),
     ]
-
-
-def _reach(options: Ros2Options) -> str:
-    """Return what to check where nothing is found at all."""
-    if options.transport == "rmw_zenoh":
-        return (
-            f"is the router {options.router or options.port} up, do the robot's nodes run with "
-            f"RMW_IMPLEMENTATION=rmw_zenoh_cpp and ROS_DOMAIN_ID={options.domain}?"
-        )
-    local = ", or does it talk to its own machine only (ROS_LOCALHOST_ONLY)"
-    return (
-        f"is the robot's ROS_DOMAIN_ID {options.domain}, is it on this network with multicast"
-        f"{local}?"
-    )
 
 
 def _published(row: Row, others: Sequence[GraphEndpoint]) -> Finding:
@@ -256,10 +244,8 @@ def _clock(row: Row, heard: Heard) -> Finding | None:
         do = "set use_sim_time false on the robot; a simulation belongs on link sim or emulated"
         text = f"its stamps are of a simulation: {heard.stamp_s:.1f} s"
         return Finding(row.topic, "error", text, do)
-    way = "behind" if heard.offset_s > 0 else "ahead of"
-    text = f"its stamps are {abs(heard.offset_s):.1f} s {way} this machine's clock"
-    do = "synchronise both machines by chrony or NTP; TwistStamped commands look old otherwise"
-    return Finding(row.topic, "warning", text, do)
+    do = f"{SYNCHRONISE}; TwistStamped commands look old otherwise"
+    return Finding(row.topic, "warning", f"its stamps are {clock_text(heard.offset_s)}", do)
 
 
 def _connected(options: Ros2Options, lidar: Lidar | None, watched: Watched) -> list[Finding]:
