@@ -36,6 +36,7 @@ from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.diagnostics.discovery import discover
 from gigabrain_zenoh.diagnostics.listener import CLIENT_NAME
 from gigabrain_zenoh.diagnostics.robot_view import ProcessHealth
+from gigabrain_zenoh.diagnostics.ros2_check import Shell, check_ros2, inspect_shell
 from gigabrain_zenoh.errors import BusError, ConfigError
 from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.runtime import running
@@ -111,6 +112,7 @@ class MachineFacts(Struct, frozen=True, kw_only=True):
     ports: tuple[Port, ...]
     multicast: bool  # whether sessions search for others by multicast
     certificate: Certificate | None = None
+    shell: Shell = Shell()
 
 
 class RobotFacts(Struct, frozen=True, kw_only=True):
@@ -131,7 +133,7 @@ def examine(machine: MachineFacts, robot: RobotFacts) -> list[Diagnosis]:
     checks = (
         _python(machine), _libraries(machine), _folders(machine), _serial(machine),
         _multicast(machine), _certificate(machine), _router(robot), _processes(robot),
-        _problems(robot), _rates(robot), _clocks(robot), _load(robot),
+        _problems(robot), _rates(robot), _clocks(robot), _load(robot), _ros2(machine, robot),
     )  # fmt: skip
     return list(itertools.chain.from_iterable(checks))
 
@@ -304,6 +306,12 @@ def _load(robot: RobotFacts) -> Iterator[Diagnosis]:
             yield _hint(process, f"uses {health.cpu:.0%} of a core", cure)
 
 
+def _ros2(machine: MachineFacts, robot: RobotFacts) -> Iterator[Diagnosis]:
+    if gateway := robot.described.get("ros2"):
+        for grade, text, cure in check_ros2(gateway, machine.shell):
+            yield Diagnosis(about="ros2", grade=grade, text=text, cure=cure)
+
+
 def inspect_machine(keys: str = "") -> MachineFacts:
     """Return the state of this computer; `keys` is the folder of an identity."""
     major, minor, micro = platform.python_version_tuple()
@@ -316,6 +324,7 @@ def inspect_machine(keys: str = "") -> MachineFacts:
         ports=tuple(_ports()),
         multicast=bool(config["scouting/multicast/enabled"]),
         certificate=_load_certificate(keys) if keys else None,
+        shell=inspect_shell(),
     )
 
 

@@ -62,6 +62,12 @@ class Lateness(Struct, frozen=True):
     before_ns: int | None = None  # in the window before
     began_ns: int = 0  # of this window
 
+    @property
+    def shortest_ns(self) -> int | None:
+        """The shortest delay, offset included; None without a message with a time."""
+        known = [ns for ns in (self.least_ns, self.before_ns) if ns is not None]
+        return min(known, default=None)
+
     def then(self, sent_ns: int | None, arrived_ns: int, clock_ns: int) -> "Lateness":
         """Return the state after a message, sent and arrived by clocks that may differ.
 
@@ -75,8 +81,8 @@ class Lateness(Struct, frozen=True):
         elif clock_ns - self.began_ns > WINDOW_NS:
             fresh = Lateness(0, None, self.least_ns, clock_ns)
         least_ns = delay_ns if fresh.least_ns is None else min(fresh.least_ns, delay_ns)
-        known = least_ns if fresh.before_ns is None else min(least_ns, fresh.before_ns)
-        return replace(fresh, now_ns=delay_ns - known, least_ns=least_ns)
+        after = replace(fresh, least_ns=least_ns)
+        return replace(after, now_ns=delay_ns - (after.shortest_ns or 0))
 
 
 class Now(NamedTuple):
@@ -210,6 +216,14 @@ def silent(memory: Memory, now: Now) -> Step:
         blocked=blocked, refusal=NO_ROBOT,
     )  # fmt: skip
     return memory, (Refuse("no_robot"),)
+
+
+def offsets_s(memory: Memory, now: Now) -> list[float]:
+    """Return by how many seconds the clock of each present sender is behind ours, at most."""
+    least = (
+        one.lateness.shortest_ns for one in memory.senders if now.ns - one.last_ns < RELEASE_NS
+    )
+    return [ns / 1e9 for ns in least if ns is not None]
 
 
 def _obey(config: Config, memory: Memory, now: Now) -> Step:

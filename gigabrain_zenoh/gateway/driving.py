@@ -102,6 +102,10 @@ class RosCommander:
         """True while it holds the body."""
         return self._memory.holds
 
+    def offsets_s(self) -> list[float]:
+        """Return by how much the clocks of those who command now are behind this host's."""
+        return commander.offsets_s(self._memory, self._now())
+
     def forget(self, why: str) -> None:
         """Stop commanding at once, until its sender has paused."""
         self._memory = commander.forget(self._memory, why)

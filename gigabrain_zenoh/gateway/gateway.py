@@ -11,6 +11,7 @@ from gigabrain_zenoh.gateway import free_fleet
 from gigabrain_zenoh.gateway.conversions.diagnostics import Level, Status
 from gigabrain_zenoh.gateway.diagnosing import Diagnosing
 from gigabrain_zenoh.gateway.driving import Background, PoseRequests, RosCommander
+from gigabrain_zenoh.gateway.graph_watch import GraphWatch
 from gigabrain_zenoh.gateway.nav2 import Nav2Actions
 from gigabrain_zenoh.gateway.parameters import Parameters
 from gigabrain_zenoh.gateway.publishing import Publishing
@@ -40,7 +41,11 @@ class Gateway:
         self.services = Services(scene, ros, types, config, self.commander)
         self.actions = Nav2Actions(scene, ros, types, config, fleet)
         self.parameters = Parameters(ros, types, config, lambda: scene.simulated)
-        self.diagnosing = Diagnosing(scene, ros, types, self._statuses)
+        self.graph = GraphWatch(ros, config, self.commander.offsets_s)
+        bus.report = self.graph.report
+        self.diagnosing = Diagnosing(
+            scene, ros, types, lambda: (*self._statuses(), self.graph.status())
+        )
 
     async def close(self) -> None:
         """End what runs for ROS; a body that it drives is stopped by the gate."""
@@ -62,11 +67,12 @@ class Gateway:
     async def _report(self) -> None:
         """Put into health what ROS wants and does not get, once a second."""
         async for _ in self._bus.clock.every(PERIOD_NS):
-            self._bus.problems = tuple(
+            refused = (
                 Cause(code=f"ros2_{one.name}", text=f"/{one.name}: {one.text}"[:500], remedy=REMEDY)
                 for one in self._statuses()
                 if one.level is not Level.OK
             )
+            self._bus.problems = (*refused, *self.graph.look())
             for reason, count in self._ros.counts.items():
                 self._bus.counters[f"ros_{reason}"] = count
             if self._fleet:

@@ -19,6 +19,7 @@ from gigabrain_zenoh.gateway.commander import (
     arrive,
     forget,
     observe,
+    offsets_s,
     silent,
 )
 from gigabrain_zenoh.geometry.limits import limits_of
@@ -411,3 +412,13 @@ def test_an_estop_from_ros_ends_its_own_commands_first():
     machine.ms += 20
     assert machine.state() == []
     assert machine.command() == [Refuse("commander")]
+
+
+def test_the_clock_of_a_sender_is_known_by_its_fastest_command_while_it_commands():
+    machine = Machine()
+    for late_ms in (-4990, -5000, -4980):
+        machine.command(late_ms=late_ms)
+    machine.command(sender=b"b")
+    assert offsets_s(machine.memory, machine.now) == [-5.0]
+    machine.ms += 500
+    assert offsets_s(machine.memory, machine.now) == []

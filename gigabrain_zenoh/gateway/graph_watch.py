@@ -1,0 +1,72 @@
+"""What keeps ROS and the gateway apart: types, QoS, type hashes and clocks, for health."""
+
+from collections.abc import Callable, Iterable, Mapping
+
+from gigabrain_schemas.base import Cause
+from gigabrain_zenoh.config.settings import Ros2Config
+from gigabrain_zenoh.gateway.conversions.diagnostics import Level, Status
+from gigabrain_zenoh.ros2.graph import (
+    CLOCK_S,
+    SYNCHRONISE,
+    clock_text,
+    nameless,
+    troubles,
+    unreached,
+)
+from gigabrain_zenoh.ros2.transport import RosTransport
+
+MAX_CAUSES = 8
+MAX_TEXT = 500
+EVERY = 5  # calls from one look at the graph to the next
+
+
+class GraphWatch:
+    """Looks at the graph every few seconds, as that of many nodes takes a while."""
+
+    def __init__(
+        self, ros: RosTransport, config: Ros2Config, offsets_s: Callable[[], Iterable[float]]
+    ) -> None:
+        """Watch; `offsets_s` returns how far clocks of the publishers of /cmd_vel are behind."""
+        self._ros, self._config, self._offsets_s = ros, config, offsets_s
+        self._calls = 0
+        self.causes: tuple[Cause, ...] = ()
+
+    def look(self) -> tuple[Cause, ...]:
+        """Return what is wrong; each fifth call looks again."""
+        if self._calls % EVERY == 0:
+            self.causes = tuple(self._find())[:MAX_CAUSES]
+        self._calls += 1
+        return self.causes
+
+    def status(self) -> Status:
+        """Return a line of diagnostics."""
+        if not self.causes:
+            return Status("graph", Level.OK, "all ends match")
+        return Status("graph", Level.WARN, "; ".join(one.text for one in self.causes))
+
+    def report(self) -> Mapping[str, str | int]:
+        """Return how the gateway has joined ROS, for `gigabrain doctor`."""
+        config = self._config
+        others = {one.node for one in self._ros.endpoints() if not one.ours}
+        return {
+            "transport": config.transport,
+            "domain": config.domain,
+            "node": f"{config.namespace.rstrip('/')}/{config.node}",
+            "distro": config.distro,
+            "localhost": int(config.localhost),
+            "other_nodes": len(others),
+            "to_check": "" if others else unreached(config.transport, config.domain, config.router),
+        }
+
+    def _find(self) -> Iterable[Cause]:
+        endpoints = self._ros.endpoints()
+        found = troubles(self._config, endpoints, ours_only=True)
+        if odd := nameless(self._config, endpoints):
+            found.append(odd)
+        for one in found:
+            text = f"{one.topic}: {one.text}"[:MAX_TEXT]
+            yield Cause(code=f"ros2_{one.kind}", text=text, remedy=one.do)
+        for offset_s in self._offsets_s():
+            if abs(offset_s) > CLOCK_S:
+                text = f"/cmd_vel: the clock of a publisher is {clock_text(offset_s)}"
+                yield Cause(code="ros2_clock", text=text, remedy=SYNCHRONISE)
