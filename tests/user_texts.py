@@ -83,6 +83,14 @@ BAD_MISSIONS = {
     "unknown field in a condition": "do:\n- wait_until: battery.percentag < 3",
     "number against word": "do:\n- check: pose.x == here",
 }
+GATEWAY = {  # as the process ros2 reports it
+    "transport": "dds", "domain": 0, "node": "/gigabrain", "distro": "jazzy", "localhost": 1,
+    "other_nodes": 0, "to_check": "is the others' ROS_DOMAIN_ID 0?",
+}  # fmt: skip
+ROS_SHELL = {
+    "ROS_DISTRO": "humble", "ROS_DOMAIN_ID": "7", "RMW_IMPLEMENTATION": "rmw_zenoh_cpp",
+    "ROS_LOCALHOST_ONLY": "1", "ROS_DISCOVERY_SERVER": "10.0.0.2:11811",
+}  # fmt: skip
 OLD_YAML = {
     "avoid": "turn linear_speed angular_speed speed_limit unknown samples begin scripts",
     "navigate": "turn linear_speed angular_speed speed_limit unknown samples begin scripts",
@@ -276,6 +284,7 @@ def _doctor() -> Iterator[str]:
         ports=(doctor.Port(path="/dev/ttyACM0", about="OpenCR", usb="0483:5740", usable=False),),
         multicast=True,
         certificate=doctor.Certificate(folder="keys/red", problem="red.crt expired on 2026-01-01"),
+        shell=doctor.Shell(variables=ROS_SHELL, host="laptop"),
     )
     soon = doctor.Certificate(folder="keys/red", name="robot@red", days_left=12.0)
     health = replace(example(Health), process="driver", sent_hz={}, cpu=0.95)
@@ -285,6 +294,7 @@ def _doctor() -> Iterator[str]:
         described={
             "driver": described,
             "safety": replace(described, process="safety", version="9"),
+            "ros2": replace(described, process="ros2", host="burger", report=GATEWAY),
         },
         health={"driver": replace(health, rejected={"robot/cmd_vel": 3})},
         lead_ms={"waffle": 1800.0, "burger": -1800.0},

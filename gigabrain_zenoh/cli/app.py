@@ -42,6 +42,8 @@ COMMANDS = {
     "view": ("views:view", "Open a live window of the simulation, or save a picture of it."),
     "foxglove": ("views:foxglove", "Show the robot live in Foxglove or Lichtblick."),
     "ros2": ("ros2:ros2", "Run the gateway to ROS 2: the robot becomes a node there."),
+    "ros2 topics": ("ros2:topics", "List topics of ROS, with the robot's keys beside them."),
+    "ros2 pass": ("ros2:pass_", "Pass messages between a key and a ROS topic, without code."),
     "why": ("diagnose:why", "Say why the robot does not move."),
     "doctor": ("diagnose:doctor", "Check this machine and the robot, and say what to fix."),
     "top": ("node:top", "Watch processes and topics live."),
@@ -132,14 +134,19 @@ GROUPS = {
     "bench": "Run benchmarks.",
     "schema": "Export message definitions.",
 }
+# commands that have others below them
+PARENTS = COMMANDS.keys() & {command.rpartition(" ")[0] for command in COMMANDS}
 
 
 def make_app(chosen: "Sequence[str]" = ()) -> "App":
     """Return the app with all commands.
 
     A command whose name is among the words `chosen` shows its own help. The others keep their line
-    of the table, so that their modules are not imported.
+    of the table, so that their modules are not imported. A command of PARENTS takes options of its
+    own only if it is chosen.
     """
+    from importlib import import_module
+
     from cyclopts import App, Parameter
 
     from gigabrain_zenoh.cli.options import default_text, refuse_fractions
@@ -159,7 +166,14 @@ def make_app(chosen: "Sequence[str]" = ()) -> "App":
         group_name, _, name = command.rpartition(" ")
         group = groups.get(group_name, app)
         shown = None if name in chosen else summary
-        group.command(f"{MODULES}.{function}", name=name, help=shown)
+        if command not in PARENTS:
+            group.command(f"{MODULES}.{function}", name=name, help=shown)
+            continue
+        parent = groups[command] = App(name=name, help=shown)
+        if name in chosen:
+            module, _, attribute = function.partition(":")
+            parent.default(getattr(import_module(f"{MODULES}.{module}"), attribute))
+        group.command(parent)
     return app
 
 

@@ -97,9 +97,9 @@ def completion(shell: Literal["bash", "zsh", "fish"]) -> None:
     Args:
         shell: Shell to write the script for.
     """
-    from gigabrain_zenoh.cli.app import make_app
+    from gigabrain_zenoh.cli.app import PARENTS, make_app
 
-    print(make_app().generate_completion(shell=shell))
+    print(make_app(tuple(PARENTS)).generate_completion(shell=shell))
 
 
 def _live_topics(_: object) -> list[str]:
@@ -228,8 +228,8 @@ def usage_error(error: CycloptsError) -> str:
             name = token.keyword or token.value
             names = [each for argument in known for each in argument.names]
             return f"no option {name!r}{nearest(name, names) or see}"
-        case UnusedCliTokensError(unused_tokens=[str(name), *_]):
-            return f"unexpected argument {name!r}{see}"
+        case UnusedCliTokensError(unused_tokens=[str(name), *_], app=app):
+            return f"unexpected argument {name!r}{nearest(name, app or ()) or see}"
         case MissingArgumentError(argument=Argument() as argument):
             given = error.keyword or next((token.keyword for token in argument.tokens), None)
             missing = f"{given}: a value is missing" if given else f"missing {_shown(argument)}"

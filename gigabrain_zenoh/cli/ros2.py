@@ -1,31 +1,44 @@
-"""`gigabrain ros2`: the gateway to ROS 2, by hand."""
+"""`gigabrain ros2`: the gateway to ROS 2 by hand, what ROS sees, and topics without code."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 from cyclopts import Parameter
 
-from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, checked
-from gigabrain_zenoh.config.settings import ProcessConfig, Ros2Config
-from gigabrain_zenoh.launch.processes import run_process, with_ros_router
+from gigabrain_zenoh.cli.options import (
+    LOCAL,
+    JsonLines,
+    RobotAddress,
+    checked,
+    print_line,
+    print_progress,
+    print_table,
+)
+from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig, Ros2Config, Ros2Link
+from gigabrain_zenoh.errors import BusError
+from gigabrain_zenoh.host.signals import run_async
+from gigabrain_zenoh.launch.processes import gateway_config, run_process, with_ros_router
 from gigabrain_zenoh.runtime.running import find_endpoint
+
+if TYPE_CHECKING:
+    from gigabrain_zenoh.gateway.topic_list import TopicRow
 
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
-class RosOptions:
-    """Settings with which the node joins ROS 2."""
+class RosLinkOptions:
+    """Settings with which a node joins ROS 2."""
 
     transport: Literal["rmw_zenoh", "dds"] = "rmw_zenoh"
     "How the other nodes talk: by rmw_zenoh over a router, or by DDS."
     domain: int = 0
     "ROS_DOMAIN_ID of the other nodes."
     ros_namespace: str = "/"
-    "Namespace of the node and of its topics."
+    "Namespace of the gateway's node and of its topics."
     node: str = "gigabrain"
-    "Name of the node."
+    "Name of the gateway's node."
     router: str = ""
     "Zenoh endpoint of a ROS router. Without it, the robot's own router."
     distro: Literal["humble", "iron", "jazzy", "kilted", "rolling"] = "jazzy"
@@ -34,6 +47,19 @@ class RosOptions:
     "Find nodes of this machine only, by DDS."
     types: tuple[Path, ...] = ()
     "File of ROS types, or folder of them; may be given again."
+
+    def given(self) -> dict[str, Any]:
+        """Return the settings as a deployment file has them."""
+        given = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        types = tuple(str(file.expanduser().absolute()) for file in self.types)
+        return given | {"types": types, "namespace": given.pop("ros_namespace")}
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class RosOptions(RosLinkOptions):
+    """Settings of the gateway."""
+
     take: bool = False
     "Take the body from another commander with the first /cmd_vel."
     cmd_vel_timeout: float = 0.2
@@ -43,15 +69,8 @@ class RosOptions:
     free_fleet: bool = False
     "Also offer what Open-RMF's adapter free_fleet uses, below the robot's namespace."
 
-    def config(self) -> Ros2Config:
-        """Return the settings of the process. Raises ConfigError."""
-        given = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        types = tuple(str(file.expanduser().absolute()) for file in self.types)
-        given |= {"types": types, "namespace": given.pop("ros_namespace")}
-        return checked(given, Ros2Config)
 
-
-LOCAL_ROS = RosOptions()
+LOCAL_ROS, LOCAL_LINK = RosOptions(), RosLinkOptions()
 
 
 def ros2(*, options: RosOptions = LOCAL_ROS, at: RobotAddress = LOCAL) -> int:
@@ -63,7 +82,98 @@ def ros2(*, options: RosOptions = LOCAL_ROS, at: RobotAddress = LOCAL) -> int:
     If the gateway ends, nothing else of the robot notices. In a deployment
     file, a part `ros2:` starts it with the robot.
     """
-    endpoint = find_endpoint(at.connect, at.namespace, at.folder)
-    config = with_ros_router(options.config(), endpoint)
+    endpoint = _endpoint(at)
+    config = gateway_config(checked(options.given(), Ros2Config), endpoint)
     settings = msgspec.to_builtins(config)
     return run_process(ProcessConfig(name="ros2", endpoint=endpoint, settings=settings))
+
+
+def topics(
+    *,
+    options: RosLinkOptions = LOCAL_LINK,
+    at: RobotAddress = LOCAL,
+    all_topics: bool = False,
+    json: JsonLines = False,
+) -> None:
+    """List topics, services and actions of ROS, with the robot's keys beside them.
+
+    Example: gigabrain ros2 topics --transport dds
+
+    It joins ROS for a few seconds, until nothing new is found. Give the
+    gateway's own options: transport, domain and namespace. Below the list it
+    says what keeps nodes apart, as types or QoS that do not match.
+
+    Args:
+        all_topics: Also list what every node has, and the parts of actions.
+    """
+    link = checked(options.given(), Ros2Link)
+    endpoint = None if link.transport == "dds" else _endpoint(at)
+    link = with_ros_router(link, endpoint) if endpoint else link
+    listed = run_async(_listed(link, all_topics=all_topics))
+    if json:
+        for row in listed:
+            print_line(msgspec.json.encode(row).decode())
+        return
+    from gigabrain_zenoh.gateway.topic_list import gateway_node, topic_table
+
+    print_table(topic_table(listed))
+    for name, trouble in dict.fromkeys((row.name, text) for row in listed for text in row.troubles):
+        print_line(f"{name}: {trouble}")
+    if not any(row.robot_keys for row in listed):
+        print_progress(f"the gateway's node {gateway_node(link)} is not among them")
+
+
+async def _listed(link: Ros2Link, *, all_topics: bool) -> "list[TopicRow]":
+    """Join ROS for a while. Raises BusError where no other node is there."""
+    from gigabrain_zenoh.gateway.topic_list import rows
+    from gigabrain_zenoh.ros2.graph import discovered, unreached
+    from gigabrain_zenoh.ros2.opening import load_types, open_transport
+
+    own = msgspec.structs.replace(link, node=f"{link.node}_topics", namespace="/")
+    async with open_transport(own, load_types(own)) as ros:
+        found = await discovered(ros.endpoints)
+    if not found:
+        do = unreached(link.transport, link.domain, link.router)
+        raise BusError(f"no node of ROS in domain {link.domain}: {do}")
+    return rows(found, link, all_topics=all_topics)
+
+
+def pass_(
+    source: str,
+    target: str,
+    type: str,
+    /,
+    *,
+    as_: Annotated[Literal["fields", "json", "cdr"], Parameter(name="--as")] = "fields",
+    options: RosLinkOptions = LOCAL_LINK,
+    at: RobotAddress = LOCAL,
+) -> None:
+    """Pass messages from a key to a ROS topic, or from a ROS topic to a key, until Ctrl-C.
+
+    Example: gigabrain ros2 pass robot/world /world std_msgs/String --as json
+
+    A ROS topic starts with /, a key does not. A key may be any topic of the
+    robot, or one of your own below robot/, with JSON or MessagePack. ROS
+    writes to your own keys only: it drives the robot through the gateway.
+    Nothing is encoded while nobody reads.
+
+    Args:
+        source: Key or ROS topic to read.
+        target: ROS topic or key to write.
+        type: ROS type of the topic, such as std_msgs/String.
+        as_: Fields of the same names; JSON in the type's only text; or CDR, unchanged.
+    """
+    from gigabrain_zenoh import logs
+    from gigabrain_zenoh.gateway.passing import pass_on, route
+    from gigabrain_zenoh.ros2.opening import load_types
+
+    link = checked(options.given(), Ros2Link)
+    types = load_types(link)
+    chosen = route(source, target, type, as_, types)
+    link = with_ros_router(link, _endpoint(at))
+    logs.setup("pass", None, json_console=False)
+    run_async(pass_on(chosen, at.where(), link, types))
+
+
+def _endpoint(at: RobotAddress) -> Endpoint:
+    return find_endpoint(at.connect, at.namespace, at.folder)

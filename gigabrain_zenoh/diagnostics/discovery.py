@@ -83,9 +83,8 @@ def unknown_topic(name: str, live_keys: Iterable[str]) -> UnknownName:
     """Return the error for an unknown topic; it suggests the nearest topic, or a command."""
     if command := COMMAND_OF_SERVICE.get(short_name(name)):
         return UnknownName(f"{name} is a service, not a topic; use: gigabrain {command}")
-    return unknown(
-        "topic", name, {*(short_name(t.key) for t in TOPICS), *map(short_name, live_keys)}
-    )
+    known = {*(short_name(topic.key) for topic in TOPICS), *map(short_name, live_keys)}
+    return unknown("topic", short_name(name), known)
 
 
 class Flow(Struct, frozen=True, order=True):

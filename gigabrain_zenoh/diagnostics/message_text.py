@@ -56,7 +56,7 @@ def summary(values: Sequence[float] | NDArray[np.generic]) -> Summary:
     )
 
 
-def _array_of(message: Message) -> tuple[str, NDArray[np.generic]] | None:
+def array_of(message: Message) -> tuple[str, NDArray[np.generic]] | None:
     """Return the name and the content of a message's array field; None where it has none."""
     if isinstance(message, LaserScan):
         return "ranges", message.ranges_m
@@ -92,7 +92,7 @@ def read(key: str, payload: bytes, *, whole: bool) -> Any:
 def tree(message: Message, *, whole: bool) -> dict[str, Any]:
     """Return a message as a tree of plain values."""
     values: dict[str, Any] = msgspec.to_builtins(message, builtin_types=(bytes,))
-    if found := _array_of(message):
+    if found := array_of(message):
         name, array = found
         as_list = whole and not isinstance(message, Image)
         numbers = array.ravel().tolist() if as_list else ()

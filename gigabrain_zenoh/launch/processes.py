@@ -9,7 +9,7 @@ import contextlib
 import os
 import sys
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 from msgspec import structs
@@ -44,6 +44,7 @@ from gigabrain_zenoh.config.settings import (
     RecorderConfig,
     RelayConfig,
     Ros2Config,
+    Ros2Link,
     RouterConfig,
 )
 from gigabrain_zenoh.errors import ConfigError
@@ -143,17 +144,28 @@ def _recorder(deployment: "Deployment", _: ProcessPlace) -> RecorderConfig:
 
 
 def _ros2(deployment: "Deployment", place: ProcessPlace) -> Ros2Config:
-    return with_ros_router(deployment.ros2 or Ros2Config(), place.endpoint)
+    return gateway_config(deployment.ros2 or Ros2Config(), place.endpoint)
 
 
-def with_ros_router(config: Ros2Config, endpoint: Endpoint) -> Ros2Config:
-    """Return the gateway's settings with the robot's own router, unless they name another one.
+def gateway_config(config: Ros2Config, endpoint: Endpoint) -> Ros2Config:
+    """Return the gateway's settings for the robot at an endpoint.
 
-    Raises ConfigError where that router has keys, and for a robot without the name that free_fleet
+    Raises ConfigError as `with_ros_router` does, and for a robot without the name that free_fleet
     needs.
     """
     if config.free_fleet and not endpoint.namespace:
         raise ConfigError(NAME_FOR_FLEET)
+    return with_ros_router(config, endpoint)
+
+
+L = TypeVar("L", bound=Ros2Link)
+
+
+def with_ros_router(config: L, endpoint: Endpoint) -> L:
+    """Return settings for ROS with the robot's own router, unless they name another one.
+
+    Raises ConfigError where that router has keys.
+    """
     if config.transport != "rmw_zenoh" or config.router:
         return config
     if endpoint.keys:

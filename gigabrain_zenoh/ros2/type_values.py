@@ -25,6 +25,11 @@ def dtype(primitive: str) -> np.dtype[Any]:
     return DTYPES.get(primitive) or np.dtype(primitive)
 
 
+def is_text(kind: Description) -> bool:
+    """Return whether a field is a text."""
+    return bool(kind[0] == Nodetype.BASE and kind[1][0] == "string")
+
+
 class Values:
     """Makes and reads the messages of a store of types."""
 
@@ -67,6 +72,21 @@ class Values:
             for field, (kind, _) in self._plan(message.__msgtype__).items()
             if field != DUMMY
         }
+
+    def known_part(self, name: str, data: Mapping[str, Any]) -> dict[str, Any]:
+        """Return those of JSON's values that a type has fields for."""
+        return {
+            field: self._known(kind, data[field])
+            for field, (kind, _) in self._plan(name).items()
+            if field in data
+        }
+
+    def _known(self, kind: Description, value: Any) -> Any:
+        if kind[0] == Nodetype.NAME and isinstance(value, Mapping):
+            return self.known_part(kind[1], value)
+        if kind[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE) and isinstance(value, list | tuple):
+            return [self._known(kind[1][0], each) for each in value]
+        return value
 
     def _plan(self, name: str) -> Plan:
         plan = self._plans.get(name)

@@ -17,7 +17,7 @@ from rosbags.typesys.base import TypesysError, normalize_fieldname
 from gigabrain_zenoh.errors import BadPayload, ConfigError, UnknownName
 from gigabrain_zenoh.ros2.type_files import SHIPPED, Fields, Found, read_files
 from gigabrain_zenoh.ros2.type_hash import rihs01
-from gigabrain_zenoh.ros2.type_values import Values
+from gigabrain_zenoh.ros2.type_values import Values, is_text
 
 DEFAULTS: dict[str, dict[str, Any]] = {  # of types in rosbags' store, which keeps none
     "geometry_msgs/msg/Quaternion": {"w": 1.0},
@@ -82,6 +82,15 @@ class Types:
     def to_dict(self, message: object) -> dict[str, Any]:
         """Return the message in JSON's values: bytes as base64, and NaN and Infinity as texts."""
         return self._values.to_dict(message)
+
+    def known_part(self, name: str, data: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the part of JSON's values that a type has fields for, in nested ones as well."""
+        return self._values.known_part(self.known(name), data)
+
+    def only_text(self, name: str) -> str:
+        """Return the name of a type's field if it has but one, a text; else an empty text."""
+        field, kind = self.fields(name)[0]
+        return field if len(self.fields(name)) == 1 and is_text(kind) else ""
 
     def definition(self, name: str) -> str:
         """Return a message's definition with all that it holds, as bags and viewers want it."""

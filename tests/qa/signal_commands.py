@@ -39,6 +39,8 @@ CALLS = {
     "page": "page --port {port}",
     "foxglove": "foxglove --port {port}",
     "ros2": "ros2",
+    "ros2 topics": "ros2 topics",
+    "ros2 pass": "ros2 pass robot/world /world std_msgs/String --as json",
     "audit": "audit --follow",
     "topic list": "topic list",
     "topic echo": "topic echo state",
@@ -112,6 +114,7 @@ OWN_CODES = {
     # without a map, a simulation, or what is named
     **dict.fromkeys(("map load", "view", "world add", "world list", "world remove"), (1, 2)),
     **dict.fromkeys(("place add", "place list", "place remove", "zone add", "param save"), (1, 2)),
+    "ros2 topics": (1,),  # without another node
     **dict.fromkeys(("objects", "pose"), (1,)),  # without cameras or a map, or not there
     **dict.fromkeys(("estop", "release", "enable", "topic pub", "doctor", "driver test"), (1, 3)),
 }

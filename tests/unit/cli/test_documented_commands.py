@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from cyclopts import CycloptsError, MissingArgumentError
 
-from gigabrain_zenoh.cli.app import make_app
+from gigabrain_zenoh.cli.app import PARENTS, make_app
 from tests.places import ROOT
 
 FENCE = re.compile(r"^```(?:sh)?\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -26,7 +26,7 @@ def documented() -> Iterator[str]:
 
 
 def test_documented_commands_can_be_parsed() -> None:
-    app, wrong = make_app(), []
+    app, wrong = make_app(tuple(PARENTS)), []
     for line in sorted(set(documented())):
         words = shlex.split(line.partition(": gigabrain ")[2], comments=True)
         end = next((i for i, word in enumerate(words) if word in ENDS), len(words))
