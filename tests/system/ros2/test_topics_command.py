@@ -12,7 +12,11 @@ from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.examples import example
 from gigabrain_schemas.topics import WORLD
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.config.settings import Endpoint, Ros2Link
+from gigabrain_zenoh.ros2.qos import DEFAULT
+from gigabrain_zenoh.ros2.rmw_zenoh import RmwZenohTransport
+from gigabrain_zenoh.ros2.transport import Received
+from gigabrain_zenoh.ros2.types import Types
 from gigabrain_zenoh.runtime.connect import connect
 from gigabrain_zenoh.testing.processes import Home, free_endpoint, router_process
 from gigabrain_zenoh.testing.waiting import until
@@ -135,6 +139,27 @@ async def test_messages_of_rclpy_reach_a_key_as_json_latched_ones_too(
     await until(lambda: got[-1][1] == b'{"data":"2"}', "the next one")
     command.close()
     assert command.err.count("\n") == 1
+
+
+async def test_over_rmw_zenoh_both_commands_use_the_robots_router(
+    home: Home, bus: tuple[Bus, str]
+) -> None:
+    ours, router = bus
+    types, got = Types(), list[Received]()
+    async with RmwZenohTransport(Ros2Link(node="reader", router=router), types) as reader:
+        words = ("robot/world", "/world", "std_msgs/String", "--as", "json", "--connect", router)
+        command = home.start("ros2", "pass", *words)
+        reader.subscribe("/world", STRING, DEFAULT, got.append)
+        await until(lambda: "robot/world" in command.err, "it passes")
+        while not got:
+            ours.publish(WORLD, example(WorldModel))
+            await asyncio.sleep(0.05)
+        text = types.decode(STRING, got[0].payload).data
+        assert msgspec.json.decode(text, type=WorldModel).sectors == example(WorldModel).sectors
+        listing = await home.run("ros2", "topics", "--json", "--connect", router)
+        (row,) = map(json.loads, listing.out.splitlines())
+        assert (row["name"], row["type"]) == ("/world", STRING)
+        assert (row["senders"], row["receivers"]) == (["/gigabrain_pass"], ["/reader"])
 
 
 @pytest.mark.parametrize(
