@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import msgspec
@@ -29,17 +30,18 @@ from gigabrain_zenoh.host.signals import run_until, stop_signals
 from gigabrain_zenoh.logs import Fault
 from gigabrain_zenoh.ros2.graph import troubles
 from gigabrain_zenoh.ros2.opening import open_transport
-from gigabrain_zenoh.ros2.qos import Qos
+from gigabrain_zenoh.ros2.qos import LATCHED, Qos
 from gigabrain_zenoh.ros2.transport import GraphEndpoint, Received, RosTransport, absolute
 from gigabrain_zenoh.ros2.types import Types
 from gigabrain_zenoh.runtime.connect import Where, connect
 from gigabrain_zenoh.security.acl import OWN_KEY_BYTES, check_write
+from gigabrain_zenoh.security.identity_files import identity_in
 
 log = logging.getLogger(__name__)
 Form = Literal["fields", "json", "cdr"]
 DEPTH = 10  # messages that wait for a busy reader
 CHECK_NS = 1_000_000_000  # from one look at the ROS graph to the next
-OWN_KEYS = frozenset({one.key for one in TOPICS} | {one.key for one in SERVICES})
+ROBOT_KEYS = frozenset({one.key for one in TOPICS} | {one.key for one in SERVICES})
 
 
 class Route(NamedTuple):
@@ -76,7 +78,7 @@ def route(source: str, target: str, type: str, form: Form, types: Types) -> Rout
 
 def check_own_key(key: str) -> None:
     """Raise Refused for a key of the table, and ConfigError for one that cannot be written."""
-    if key in OWN_KEYS or key.rpartition("/")[0] in OWN_KEYS:
+    if key in ROBOT_KEYS or key.rpartition("/")[0] in ROBOT_KEYS:
         raise robots_own(key)
     try:
         if "*" in key:
@@ -84,6 +86,16 @@ def check_own_key(key: str) -> None:
         check_write(key)
     except ValueError as error:
         raise ConfigError(f"{key}: {error}") from None
+
+
+def check_writer(keys: str, key: str) -> None:
+    """Raise Refused for an identity by which a router takes no key of one's own."""
+    identity = identity_in(Path(keys)) if keys else None
+    if identity and identity.role not in ("robot", "process"):
+        raise Refused(
+            f"{identity.name} may not write {key}; make an identity of a process that `writes` it: "
+            "gigabrain keys issue process --process NAME"
+        )
 
 
 def robots_own(key: str) -> Refused:
@@ -211,7 +223,7 @@ class Passage:
         self._qos = self._listens = Qos(reliable=False, depth=DEPTH)
         self._read = self._looked = False
         if route.to_ros:
-            self._qos = Qos(transient_local=topic is not None and topic.keep, depth=DEPTH)
+            self._qos = LATCHED if topic and topic.keep else Qos(depth=DEPTH)
             self._publisher = ros.publisher(route.topic, route.type, self._qos, self._count)
         else:
             own = Topic(route.key, Message, 10, max_bytes=OWN_KEY_BYTES)
@@ -359,6 +371,7 @@ async def pass_on(route: Route, where: Where, link: Ros2Link, types: Types) -> N
             route = route._replace(key=found.pattern)
             check_fields(types, route, topic)
         else:
+            check_writer(where.keys, route.key)
             bus = await stack.enter_async_context(connect(where, CLIENT_NAME))
         ros = await stack.enter_async_context(open_transport(own, types))
         passage = Passage(route, bus, ros, types, own, topic)

@@ -24,6 +24,7 @@ from tests.ros2.judge import Judge
 from tests.system.ros2.test_gateway_ros import running
 
 STRING, LASER = "std_msgs/msg/String", "sensor_msgs/msg/LaserScan"
+NAVIGATE = "nav2_msgs/action/NavigateToPose"
 BEST_EFFORT = {"reliable": False, "depth": 5}
 
 
@@ -73,7 +74,13 @@ async def test_a_robots_keys_are_listed_and_doctor_finds_what_does_not_match(
     async with running(home, judge) as robot:
         listener = judge.start("listen", node="rviz")
         await listener.query("subscribe", topic="/scan", type=LASER, qos={})
+        caller, client = judge.start("call", node="caller"), judge.start("navigate", node="client")
+        await caller.query("call", service="/release", type="std_srvs/srv/Trigger")
+        await client.query("available", action="/navigate_to_pose", type=NAVIGATE)
         rows = await listed(home, judge)
+        assert [row["name"] for row in rows.values() if row["troubles"]] == ["/scan"]
+        assert rows["/release"]["receivers"] == ["/caller"]
+        assert rows["/navigate_to_pose"]["receivers"] == ["/client"]
         assert rows["/scan"]["robot_keys"] == ["robot/scan"]
         assert (rows["/scan"]["senders"], rows["/scan"]["receivers"]) == (["/gigabrain"], ["/rviz"])
         assert rows["/estop"]["robot_keys"] == ["robot/estop"]
@@ -91,7 +98,7 @@ async def test_a_robots_keys_are_listed_and_doctor_finds_what_does_not_match(
         of_ros = {one["text"]: one for one in found if one["about"] == "ros2"}
         wrong = f"ROS_DOMAIN_ID is {judge.domain + 1} in this shell, and {judge.domain} in the"
         assert {one["grade"] for text, one in of_ros.items() if text.startswith(wrong)} == {"bad"}
-        joined = f"node /gigabrain on dds, domain {judge.domain}, other nodes: 1"
+        joined = f"node /gigabrain on dds, domain {judge.domain}, other nodes: 3"
         assert of_ros[joined]["grade"] == "ok"
 
 

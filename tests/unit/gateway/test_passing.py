@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import AsyncIterator
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -18,10 +19,18 @@ from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import FakeClock
 from gigabrain_zenoh.config.settings import Ros2Link
 from gigabrain_zenoh.errors import BadPayload, ConfigError, Refused
-from gigabrain_zenoh.gateway.passing import Converter, Passage, check_fields, fitting_qos, route
+from gigabrain_zenoh.gateway.passing import (
+    Converter,
+    Passage,
+    check_fields,
+    check_writer,
+    fitting_qos,
+    route,
+)
 from gigabrain_zenoh.ros2.memory import MemoryNetwork
 from gigabrain_zenoh.ros2.qos import DEFAULT, LATCHED, SENSOR_DATA, Qos
 from gigabrain_zenoh.ros2.types import Types
+from gigabrain_zenoh.security.authority import issue, new_fleet
 
 TYPES = Types()
 STRING, LASER = "std_msgs/msg/String", "sensor_msgs/msg/LaserScan"
@@ -59,6 +68,18 @@ def test_a_wrong_route_is_refused_in_one_line(
 def test_ros_writes_to_no_key_of_the_robot(key: str) -> None:
     with pytest.raises(Refused, match="through the gateway"):
         route("/a", key, "std_msgs/String", "json", TYPES)
+
+
+def test_an_identity_that_may_not_write_the_key_is_named(tmp_path: Path) -> None:
+    new_fleet("home", tmp_path / "home")
+    issued = {
+        role: issue(tmp_path / "home", role, robot="red", process=process)
+        for role, process in {"operator": "", "process": "mine", "robot": ""}.items()
+    }
+    with pytest.raises(Refused, match="operator@red may not write robot/notes; make an identity"):
+        check_writer(str(issued["operator"]), "robot/notes")
+    for keys in ("", str(issued["process"]), str(issued["robot"])):
+        check_writer(keys, "robot/notes")
 
 
 def test_a_route_names_both_ends() -> None:
@@ -119,6 +140,16 @@ def test_json_and_messagepack_of_ones_own_key_become_fields_the_rest_is_left_out
 def test_what_does_not_fit_is_refused(form: Any, payload: bytes, words: str) -> None:
     with pytest.raises(BadPayload, match=words):
         converter("robot/mine", "/p", STRING, form).of_payload(payload)
+
+
+def test_types_of_ones_own_pass_as_well(tmp_path: Path) -> None:
+    (tmp_path / "tank_msgs" / "msg").mkdir(parents=True)
+    (tmp_path / "tank_msgs" / "msg" / "Level.msg").write_text("string name\nfloat32[] litres\n")
+    types = Types([tmp_path])
+    there = Converter(types, route("robot/tank", "/tank", "tank_msgs/Level", "fields", types))
+    cdr = there.of_payload(b'{"name": "left", "litres": [1.5, "NaN"]}')
+    back = Converter(types, route("/tank", "robot/tank", "tank_msgs/Level", "fields", types))
+    assert back.to_payload(cdr) == b'{"name":"left","litres":[1.5,"NaN"]}'
 
 
 def string(text: str) -> bytes:
