@@ -83,6 +83,8 @@ def troubles(
         types[one.topic][one.node, one.kind].add(one.type)
     found: dict[Trouble, None] = {}
     for topic, there in by_topic.items():
+        if ours_only and not any(one.ours for one in there):
+            continue  # such as those of each node, which have many pairs
         for giver, taker in _pairs(there):
             if not ours_only or giver.ours != taker.ours:
                 found |= dict.fromkeys(_between(link, giver, taker, types[topic]))
