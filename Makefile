@@ -148,7 +148,7 @@ first-starts: setup
 	$(BIN)/python -m tests.qa.first_start --way wheel --tool pip
 	$(BIN)/python -m tests.qa.first_start --way make sdist tool --tool uv --python $(PYTHON)
 
-# tests of training, in an environment of its own: JAX, and an independent judge
+# tests of training, in an environment of its own: TensorFlow, and an independent judge
 TRAIN := .qa/train
 $(TRAIN)/.installed: pyproject.toml | $(INSTALLED)
 	@$(PYTHON) -m venv $(TRAIN)
@@ -156,7 +156,7 @@ $(TRAIN)/.installed: pyproject.toml | $(INSTALLED)
 	@touch $@
 
 train-tests: $(TRAIN)/.installed
-	JAX_PLATFORMS=cpu $(TRAIN)/bin/python -m pytest --noconftest -W ignore -o addopts=--import-mode=importlib -q \
+	$(TRAIN)/bin/python -m pytest --noconftest -W ignore -o addopts=--import-mode=importlib -q \
 	  tests/unit/qa/test_train_judge.py tests/unit/qa/test_train_net.py
 
 # real ROS 2, for the tests that compare with it; they build it themselves where it is missing

@@ -5,14 +5,12 @@ import pickle
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
+import keras
 import numpy as np
-import optax
+import tensorflow as tf
 
 from gigabrain_zenoh.qa.train import net
 from gigabrain_zenoh.qa.train.pictures import Labelled
@@ -45,17 +43,8 @@ STAGES = (
 PEAK_RATE, WEIGHT_DECAY, WARM_UP_STEPS = 2.5e-3, 2e-2, 200
 BOX_WEIGHT = 4.0
 AVERAGED = 0.998  # of the weights that are exported, a step
-SAVE_EVERY_STEPS = 100
+LOG_EVERY_STEPS, SAVE_EVERY_STEPS = 100, 500
 log = logging.getLogger(__name__)
-
-
-class State(NamedTuple):
-    """All that a step changes."""
-
-    params: net.Params
-    moments: net.Params
-    averaged: net.Params
-    optimiser: Any
 
 
 Batch = tuple[Any, ...]
@@ -63,60 +52,96 @@ Batch = tuple[Any, ...]
 
 def heat_loss(logits: Any, heat: Any, mask: Any) -> Any:
     """Penalty-reduced focal loss of CenterNet, for one thing in the mean."""
-    p, peak = jax.nn.sigmoid(logits), heat > 0.999
-    surprise = jax.nn.softplus(-logits)  # -log p; with the logit it is -log(1 - p)
-    right = jnp.where(peak, (1 - p) ** 2 * surprise, 0.0)
-    wrong = jnp.where(peak, 0.0, (1 - heat) ** 4 * p**2 * (surprise + logits))
-    return ((right + wrong) * mask).sum() / jnp.maximum(peak.sum(), 1)
+    p, peak = tf.sigmoid(logits), heat > 0.999
+    surprise = tf.nn.softplus(-logits)  # -log p; with the logit it is -log(1 - p)
+    right = (1 - p) ** 2 * surprise
+    wrong = (1 - heat) ** 4 * p**2 * (surprise + logits)
+    found = tf.reduce_sum(tf.cast(peak, tf.float32))
+    return tf.reduce_sum(tf.where(peak, right, wrong) * mask) / tf.maximum(found, 1)
 
 
 def corners(raw: Any) -> Any:
     """Return boxes (n, h, w, 4) [px] from raw distances to left, top, right, bottom."""
-    d = UNIT_PX * jnp.exp(jnp.clip(raw, *RAW_LIMITS))
-    x = (jnp.arange(raw.shape[2]) + 0.5) * STRIDE_PX
-    y = (jnp.arange(raw.shape[1]) + 0.5)[:, None] * STRIDE_PX
-    return jnp.stack([x - d[..., 0], y - d[..., 1], x + d[..., 2], y + d[..., 3]], -1)
+    d = UNIT_PX * tf.exp(tf.clip_by_value(raw, *RAW_LIMITS))
+    x = (np.arange(raw.shape[2], dtype=np.float32) + 0.5) * STRIDE_PX
+    y = (np.arange(raw.shape[1], dtype=np.float32)[:, None] + 0.5) * STRIDE_PX
+    return tf.stack([x - d[..., 0], y - d[..., 1], x + d[..., 2], y + d[..., 3]], -1)
 
 
 def box_loss(found: Any, wanted: Any, weights: Any) -> Any:
     """Generalised IoU loss, weighted."""
-    low, high = (
-        jnp.maximum(found[..., :2], wanted[..., :2]),
-        jnp.minimum(found[..., 2:], wanted[..., 2:]),
-    )
-    both = jnp.prod(jnp.maximum(high - low, 0), -1)
-    area = [jnp.prod(jnp.maximum(b[..., 2:] - b[..., :2], 0), -1) for b in (found, wanted)]
-    union = area[0] + area[1] - both
-    hull = jnp.prod(
-        jnp.maximum(found[..., 2:], wanted[..., 2:]) - jnp.minimum(found[..., :2], wanted[..., :2]),
-        -1,
-    )
-    overlap = both / jnp.maximum(union, 1e-3) - (hull - union) / jnp.maximum(hull, 1e-3)
-    return ((1 - overlap) * weights).sum() / jnp.maximum(weights.sum(), 1e-3)
+
+    def area(low: Any, high: Any) -> Any:
+        return tf.reduce_prod(tf.maximum(high - low, 0), -1)
+
+    (a, b), (c, d) = ((box[..., :2], box[..., 2:]) for box in (found, wanted))
+    both = area(tf.maximum(a, c), tf.minimum(b, d))
+    union = area(a, b) + area(c, d) - both
+    hull = area(tf.minimum(a, c), tf.maximum(b, d))
+    overlap = both / tf.maximum(union, 1e-3) - (hull - union) / tf.maximum(hull, 1e-3)
+    return tf.reduce_sum((1 - overlap) * weights) / tf.maximum(tf.reduce_sum(weights), 1e-3)
 
 
-def loss(params: net.Params, moments: net.Params, batch: Batch) -> tuple[Any, tuple[Any, Any, Any]]:
-    """Return the loss of a batch, and the new moments and both parts of the loss."""
-    pictures, heat, mask, boxes, weights = batch
-    out, new = net.apply(params, moments, pictures.astype(jnp.float32) / 255, True)
-    first = heat_loss(out[..., : len(CLASSES)], heat, mask)
-    second = box_loss(corners(out[..., len(CLASSES) :]), boxes, weights)
-    return first + BOX_WEIGHT * second, (new, first, second)
+def computing_type() -> Any:
+    """Return bfloat16 where the processor multiplies matrices of it, else float32."""
+    info = Path("/proc/cpuinfo")
+    return tf.bfloat16 if info.exists() and "amx_bf16" in info.read_text() else tf.float32
 
 
-@partial(jax.jit, static_argnums=0, donate_argnums=1)
-def step(optimiser: Any, state: State, batch: Batch, number: Any) -> tuple[State, Any]:
-    """Do the step of this number; return the new state and (heat loss, box loss)."""
-    grads, (moments, first, second) = jax.grad(loss, has_aux=True)(
-        state.params, state.moments, batch
-    )
-    updates, inner = optimiser.update(grads, state.optimiser, state.params)
-    params = optax.apply_updates(state.params, updates)
-    kept = jnp.minimum(
-        AVERAGED, (1 + number) / (10 + number)
-    )  # the first weights soon count little
-    averaged = jax.tree.map(lambda a, p: kept * a + (1 - kept) * p, state.averaged, params)
-    return State(params, moments, averaged, inner), jnp.stack([first, second])
+class Learner:
+    """All that a step changes, and how."""
+
+    def __init__(self, steps: int, seed: int) -> None:
+        params, moments = net.init(seed)
+        self.params = tf.nest.map_structure(tf.Variable, params)
+        self.moments = tf.nest.map_structure(tf.Variable, moments)
+        self.averaged = tf.nest.map_structure(tf.Variable, params)
+        warm_up = min(WARM_UP_STEPS, steps // 8)
+        rate = keras.optimizers.schedules.CosineDecay(
+            0.0, steps - warm_up, alpha=0.01, warmup_target=PEAK_RATE, warmup_steps=warm_up
+        )
+        self._optimiser = keras.optimizers.AdamW(
+            rate, weight_decay=WEIGHT_DECAY, epsilon=1e-8, global_clipnorm=10.0
+        )
+        self._optimiser.build(tf.nest.flatten(self.params))
+        self._type = computing_type()
+        self.step = tf.function(self._step)
+
+    def _step(self, batch: Batch, number: Any) -> Any:
+        """Do the step of this number; return (heat loss, box loss)."""
+        pictures, heat, mask, boxes, weights = batch
+        weighed = tf.nest.flatten(self.params)
+        with tf.GradientTape() as tape:
+            shown = tf.cast(tf.cast(pictures, tf.float32) / 255, self._type)
+            out, moments = net.apply(self.params, self.moments, shown, True)
+            first = heat_loss(out[..., : len(CLASSES)], heat, mask)
+            second = box_loss(corners(out[..., len(CLASSES) :]), boxes, weights)
+            loss = first + BOX_WEIGHT * second
+        self._optimiser.apply(tape.gradient(loss, weighed), weighed)
+        tf.nest.map_structure(lambda old, new: old.assign(new), self.moments, moments)
+        kept = tf.minimum(AVERAGED, (1 + number) / (10 + number))  # the first weights count little
+        for mean, new in zip(tf.nest.flatten(self.averaged), weighed, strict=True):
+            mean.assign(kept * mean + (1 - kept) * new)
+        return tf.stack([first, second])
+
+    def _variables(self) -> list[Any]:
+        return [
+            *tf.nest.flatten((self.params, self.moments, self.averaged)),
+            *self._optimiser.variables,
+        ]
+
+    def save(self, path: Path, number: int) -> None:
+        """Write everything to a file, and that this many steps are done."""
+        values = [np.asarray(one) for one in self._variables()]
+        path.with_suffix(".part").write_bytes(pickle.dumps((number, values)))
+        path.with_suffix(".part").replace(path)
+
+    def restore(self, path: Path) -> int:
+        """Read everything from a file; return the number of steps that are done."""
+        number, values = pickle.loads(path.read_bytes())
+        for one, value in zip(self._variables(), values, strict=True):
+            one.assign(value)
+        return int(number)
 
 
 def stage(number: int, steps: int) -> Stage:
@@ -146,31 +171,20 @@ def batches(
             yield done
 
 
-def learn(pictures: Sequence[Labelled], steps: int, folder: Path, seed: int = 0) -> State:
+def learn(pictures: Sequence[Labelled], steps: int, folder: Path, seed: int = 0) -> Learner:
     """Train for some steps; goes on from the folder's checkpoint where there is one."""
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint = folder / "checkpoint.pickle"
-    warm_up = min(WARM_UP_STEPS, steps // 8)
-    rate = optax.warmup_cosine_decay_schedule(0.0, PEAK_RATE, warm_up, steps, PEAK_RATE / 100)
-    optimiser = optax.chain(
-        optax.clip_by_global_norm(10.0), optax.adamw(rate, weight_decay=WEIGHT_DECAY)
-    )
-    params, moments = net.init(seed)
-    state, first = State(params, moments, params, optimiser.init(params)), 0
-    if checkpoint.exists():
-        first, leaves = pickle.loads(checkpoint.read_bytes())
-        state = jax.tree.unflatten(jax.tree.structure(state), leaves)
-    state = State(*jax.tree.map(jnp.array, tuple(state)))
+    learner = Learner(steps, seed)
+    first = learner.restore(checkpoint) if checkpoint.exists() else 0
     begun, sums = time.monotonic(), np.zeros(2)
     for number, batch in enumerate(batches(pictures, first, steps, seed), first):
-        state, parts = step(optimiser, state, batch, jnp.float32(number))
-        sums += np.asarray(parts)
-        if (number + 1) % 50 == 0:
+        sums += learner.step(batch, tf.constant(number, tf.float32)).numpy()
+        if (number + 1) % LOG_EVERY_STEPS == 0:
             pace = (time.monotonic() - begun) / (number + 1 - first)
-            log.info("step %d: heat %.3f, box %.3f, %.2f s a step", number + 1, *sums / 50, pace)
+            sums /= LOG_EVERY_STEPS
+            log.info("step %d: heat %.3f, box %.3f, %.3f s a step", number + 1, *sums, pace)
             sums[:] = 0
         if (number + 1) % SAVE_EVERY_STEPS == 0 or number + 1 == steps:
-            leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
-            checkpoint.with_suffix(".part").write_bytes(pickle.dumps((number + 1, leaves)))
-            checkpoint.with_suffix(".part").replace(checkpoint)
-    return state
+            learner.save(checkpoint, number + 1)
+    return learner

@@ -8,17 +8,15 @@ stride 16 sees 300 px around a cell. Training: TTFNet (Liu et al. 2020, arXiv 19
 from collections.abc import Mapping
 from typing import Any, Protocol, TypeVar
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
+import tensorflow as tf
 
 from gigabrain_zenoh.vision.labels import CLASSES
 
 T = TypeVar("T")
 OUTPUTS = len(CLASSES) + 4
 PRIOR = -4.0  # logit of a class at the start: nearly all cells are empty
-MOMENTUM, EPSILON = 0.95, 1e-3
+MOMENTUM, EPSILON = 0.98, 1e-3
 Params = dict[str, dict[str, Any]]
 
 
@@ -67,8 +65,11 @@ def _block(ops: Ops[T], x: T, name: str, channels: int, dilation: int = 1) -> T:
     return ops.relu(ops.add(x, ops.conv(y, f"{name}2", channels, dilation=dilation)))
 
 
-class JaxOps:
-    """The net in JAX. `training` uses the batch's own mean and variance, kept in `moments`."""
+class TensorFlowOps:
+    """The net in TensorFlow. `training` uses the batch's own mean and variance.
+
+    These are kept in `moments`, averaged with the old ones.
+    """
 
     def __init__(self, params: Params, moments: Params, training: bool) -> None:
         self._params, self._old, self._training = params, moments, training
@@ -76,7 +77,7 @@ class JaxOps:
 
     def conv(
         self,
-        x: jax.Array,
+        x: Any,
         name: str,
         channels: int,
         *,
@@ -84,45 +85,44 @@ class JaxOps:
         stride: int = 1,
         dilation: int = 1,
         normed: bool = True,
-    ) -> jax.Array:
+    ) -> Any:
         """Convolve, then normalise over the batch unless not `normed`."""
-        pad, own = dilation * (size // 2), self._params[name]
-        y = lax.conv_general_dilated(
-            x,
-            own["w"],
-            (stride, stride),
-            ((pad, pad), (pad, pad)),
-            rhs_dilation=(dilation, dilation),
-            dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        )
+        own = self._params[name]
+        if stride > 1:  # "SAME" would pad on two sides only
+            x = tf.pad(x, [[0, 0], [size // 2] * 2, [size // 2] * 2, [0, 0]])
+        padding = "SAME" if stride == 1 else "VALID"
+        y = tf.nn.conv2d(x, tf.cast(own["w"], x.dtype), stride, padding, dilations=dilation)
         if not normed:
-            return y + own["b"]
+            return tf.cast(y, tf.float32) + own["b"]
         old = self._old[name]
-        mean, variance = old["mean"], old["variance"]
-        if self._training:
-            mean = y.mean((0, 1, 2))
-            variance = (y * y).mean((0, 1, 2)) - mean * mean  # in one pass: a quarter of the time
-            variance = jnp.maximum(variance, 0)
-            self.moments[name] = {
-                "mean": MOMENTUM * old["mean"] + (1 - MOMENTUM) * mean,
-                "variance": MOMENTUM * old["variance"] + (1 - MOMENTUM) * variance,
-            }
-        scale = own["scale"] * lax.rsqrt(variance + EPSILON)
-        return y * scale + (own["b"] - mean * scale)
+        y, mean, variance, *_ = tf.raw_ops.FusedBatchNormV3(
+            x=y,
+            scale=own["scale"],
+            offset=own["b"],
+            mean=[] if self._training else old["mean"],
+            variance=[] if self._training else old["variance"],
+            epsilon=EPSILON,
+            is_training=self._training,
+        )
+        self.moments[name] = {
+            key: MOMENTUM * old[key] + (1 - MOMENTUM) * new
+            for key, new in (("mean", mean), ("variance", variance))
+        }
+        return y
 
-    def relu(self, x: jax.Array) -> jax.Array:
+    def relu(self, x: Any) -> Any:
         """Cut below zero."""
-        return jnp.maximum(x, 0)
+        return tf.nn.relu(x)
 
-    def add(self, a: jax.Array, b: jax.Array) -> jax.Array:
+    def add(self, a: Any, b: Any) -> Any:
         """Add."""
         return a + b
 
-    def double(self, x: jax.Array) -> jax.Array:
+    def double(self, x: Any) -> Any:
         """Repeat cells."""
         n, h, w, c = x.shape
-        wide = jnp.broadcast_to(x[:, :, None, :, None], (n, h, 2, w, 2, c))
-        return wide.reshape(n, 2 * h, 2 * w, c)
+        wide = tf.broadcast_to(x[:, :, None, :, None], (n, h, 2, w, 2, c))
+        return tf.reshape(wide, (n, 2 * h, 2 * w, c))
 
 
 class _Sizes:
@@ -184,9 +184,9 @@ def parameters(params: Mapping[str, Mapping[str, Any]]) -> int:
 
 
 def apply(params: Params, moments: Params, picture: Any, training: bool) -> tuple[Any, Params]:
-    """Run the net; return its outputs and, in training, the new moments."""
-    ops = JaxOps(params, moments, training)
-    return network(ops, picture), ops.moments or moments
+    """Run the net; return its outputs (float32) and the new moments. Computes in picture's type."""
+    ops = TensorFlowOps(params, moments, training)
+    return network(ops, picture), ops.moments
 
 
 def fold(params: Params, moments: Params) -> dict[str, tuple[Any, Any]]:

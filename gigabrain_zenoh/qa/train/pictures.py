@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gigabrain_zenoh.qa.train.looks import Random
 
-PER_STUDIO = 40
+PER_STUDIO = 16
 QUALITY = (80, 97)  # of JPEG
 
 

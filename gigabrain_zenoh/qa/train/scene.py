@@ -27,7 +27,7 @@ OCCLUDED = 0.95  # share of things before which something is tried to be put
 SHARES = np.array((14, 14, 10, 14, 11, 9, 11, 11, 6)) / 100  # of the classes, in their order
 TEXTURED = {"label": 0.6, "print": 0.6, "shirt": 0.4, "leaf": 0.3, "wall": 0.4, "carton": 0.0}
 VIVID = {  # chance of a bright colour, by class; else it is close to grey
-    "": 0.2, "cube": 0.9, "ball": 0.8, "cylinder": 0.4, "can": 0.8, "box": 0.2, "person": 0.4,
+    "": 0.2, "cube": 0.9, "ball": 0.8, "cylinder": 0.8, "can": 0.8, "box": 0.2, "person": 0.4,
     "robot": 0.5, "charger": 0.2, "door": 0.2,
 }  # fmt: skip
 # hue [deg] and its spread, least and greatest saturation and value
@@ -198,7 +198,7 @@ class StudioScene:
         active = int(rng.integers(1, 4))
         for n in range(3):
             model.light_active[n] = n < active
-            low, high = (0.35, 0.75) if other else (0.75, 1.5)  # elevation [rad]
+            low, high = _elevation(rng, other)
             azimuth, up = rng.uniform(0, 2 * math.pi), rng.uniform(low, high)
             towards = (
                 math.cos(azimuth) * math.cos(up),
@@ -340,6 +340,13 @@ class StudioScene:
             colour = textures.colour(rng, VIVID[label], 0.3)
         cubes = self._studio.cube_textures
         self._paint(material, cubes[rng.integers(len(cubes))] if textured else -1, colour)
+
+
+def _elevation(rng: Random, other: bool) -> tuple[float, float]:
+    """Return the least and the greatest elevation of a light [rad]; training leaves a gap."""
+    if other:
+        return 0.35, 0.75
+    return (0.75, 1.5) if rng.random() < 0.7 else (0.0, 0.35)
 
 
 def expose(rng: Random, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -10,7 +10,7 @@ from gigabrain_zenoh.vision.labels import CLASSES
 from gigabrain_zenoh.vision.recognizer import STRIDE_PX
 
 CORE = 0.54  # share of a box in which cells answer for it
-ZOOM = (0.9, 1.4)
+ZOOM = (0.8, 1.5)
 MIN_LEFT = 0.45  # share of a box that must be left by cutting, or it is to be ignored
 
 Floats = NDArray[np.float32]
@@ -42,7 +42,20 @@ def augment(
         boxes = np.clip(moved, 0, [width, height, width, height]).astype(np.float32)
         ignored |= _area(boxes) < MIN_LEFT * _area(moved)
         ignored |= np.minimum(boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]) < 3
-    return degrade(rng, picture), Labelled(b"", boxes, one.labels, one.fractions, ignored)
+    seen = degrade(rng, relight(rng, picture))
+    return seen, Labelled(b"", boxes, one.labels, one.fractions, ignored)
+
+
+def relight(rng: Random, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Change the light: a colour cast, contrast, and more light on one side than on the other."""
+    h, w = picture.shape[:2]
+    levels = np.linspace(0, 1, 256)[:, None] ** rng.uniform(0.7, 1.4) * rng.uniform(0.75, 1.1, 3)
+    out = cv2.LUT(picture, (255 * np.clip(levels, 0, 1)).astype(np.uint8)[:, None])
+    if rng.random() < 0.5:
+        corners = rng.uniform(0.6, 1.2, (2, 2)).astype(np.float32)
+        gain = cv2.resize(corners, (w, h), interpolation=cv2.INTER_LINEAR)[..., None]
+        out = np.clip(out * gain, 0, 255)
+    return np.asarray(out, np.uint8)
 
 
 def _area(boxes: Floats) -> Floats:

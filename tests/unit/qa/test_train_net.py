@@ -1,10 +1,9 @@
-"""The net in JAX and as ONNX is one; needs the extra `train` (and onnxruntime as a judge)."""
+"""The net in TensorFlow and as ONNX is one; needs the extra `train`, and onnxruntime as a judge."""
 
 import numpy as np
 import pytest
 
-pytest.importorskip("jax")
-pytest.importorskip("optax")
+pytest.importorskip("tensorflow")
 pytest.importorskip("onnx")
 
 import cv2
