@@ -248,9 +248,9 @@ async def times(judge: Judge, count: int, seconds: float) -> Table:
         say("measuring rates and load")
         share, rates = await load(robot, judge, seconds)
         rows: dict[str, Any] = {
-            "scan at rclpy, later than on our bus [ms]": added_latency,
-            "publisher killed: from its period to braking [ms]": brakings,
-            "/estop called: to zero [ms]": stops,
+            "scan at rclpy, later than on our bus (ms)": added_latency,
+            "publisher killed: from its period to braking (ms)": brakings,
+            "/estop called: to zero (ms)": stops,
         }
         for name, measure in rows.items():
             say(f"measuring: {name}")
@@ -258,7 +258,7 @@ async def times(judge: Judge, count: int, seconds: float) -> Table:
             shown = (statistics.median(values), percentile(values, 0.99), values[-1])
             table.add_row(name, str(len(values)), *(f"{one:.1f}" for one in shown if one))
     listed = ", ".join(f"{topic} {hz:.1f} Hz" for topic, hz in rates.items())
-    table.add_row(f"gateway's share of a core [%]; {listed}", "", f"{share:.1f}")
+    table.add_row(f"gateway's share of a core (%); {listed}", "", f"{share:.1f}")
     return table
 
 
