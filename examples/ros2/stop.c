@@ -6,8 +6,8 @@
  *         build/lib/libzenohpico.a -lpthread -lrt -o stop
  *   ./stop tcp/127.0.0.1:7447 [METRES]
  *
- * It reads /scan, and calls /estop once a beam is shorter. After that the robot stands until somebody
- * calls /release, then /enable. It has no liveliness tokens, so `ros2 node list` does not show it. For
+ * It reads /scan, and calls /estop once a beam is shorter. The robot then stays stopped until you call
+ * /release and /enable. It has no liveliness tokens, so `ros2 node list` does not show it. For
  * little-endian processors. Without the last two flags of cmake, zenoh-pico drops large messages.
  */
 #include <stdbool.h>

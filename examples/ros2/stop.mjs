@@ -3,8 +3,8 @@
 //   npm install rclnodejs       (in a terminal where ROS 2 is sourced)
 //   node stop.mjs [METRES] [--ros-args -r __ns:=/robot1]
 //
-// It reads `scan`, and calls `estop` once a beam is shorter. After that the robot stands until
-// somebody calls `release`, then `enable`.
+// It reads `scan`, and calls `estop` once a beam is shorter. The robot then stays stopped until you
+// call `release` and `enable`.
 import rclnodejs from 'rclnodejs'
 
 const near = Number(process.argv[2]) || 0.3 // [m]

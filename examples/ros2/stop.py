@@ -1,7 +1,7 @@
 """Stop a gigabrain robot when something comes near: a node in rclpy.
 
 python stop.py [METRES] [--ros-args -r __ns:=/robot1]. It reads `scan`, and calls `estop` once a
-beam is shorter. After that the robot stands until somebody calls `release`, then `enable`.
+beam is shorter. The robot then stays stopped until you call `release` and `enable`.
 """
 
 import contextlib

@@ -267,6 +267,8 @@ class DdsTransport:
 
     def remove(self, one: DdsPublisher | DdsSubscriber, entity: Entity) -> None:
         """Delete an endpoint, in another thread: a writer waits for its readers a while."""
+        if self._closed:  # deleted with the participant
+            return
         self._mine.remove(one)
         self._waiting.forget(entity)
         self._loop.run_in_executor(None, _delete, entity)

@@ -15,6 +15,12 @@ from tests.ros2.programs.say import say
 TWIST = "geometry_msgs/msg/Twist"
 
 
+def stamp(message: Any, now_ns: int, frame: str) -> None:
+    """Fill in the header of a TwistStamped."""
+    message.header.frame_id = frame
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(now_ns, 10**9)
+
+
 def main() -> None:
     """Run until stdin ends."""
     console = start()
@@ -39,16 +45,13 @@ def main() -> None:
         frame: str = "base_link",
         late_s: float = 0.0,
     ) -> None:
-        twist = {"linear": {"x": linear}, "angular": {"z": angular}}
-        stamped = type != TWIST
+        twist, stamped = {"linear": {"x": linear}, "angular": {"z": angular}}, type != TWIST
         message = make(find(type), {"twist": twist} if stamped else twist)
         to = publisher(topic, type, {})
 
         def send() -> None:
             if stamped:
-                now_ns = node.get_clock().now().nanoseconds - int(late_s * 1e9)
-                message.header.frame_id = frame
-                message.header.stamp.sec, message.header.stamp.nanosec = divmod(now_ns, 10**9)
+                stamp(message, node.get_clock().now().nanoseconds - int(late_s * 1e9), frame)
             say("sent", topic=topic)
             to.publish(message)
 

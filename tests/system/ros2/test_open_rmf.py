@@ -91,6 +91,23 @@ async def adapter(
             process.kill()
 
 
+async def refused(rmf: Adapter) -> None:
+    """Send garbage to each service, which answers why it refuses that."""
+    for name in ("send_goal", "get_result", "cancel_goal"):
+        for payload in ("", "00010000ff", "0001000001" + "00" * 70_000):
+            assert await rmf.call("garbage", name, payload) not in ("", "no answer")
+
+
+async def sent(rmf: Adapter, begin: list[float], x: float, y: float) -> None:
+    """Send a goal at (x, y) from where the robot began, and again if there is no map yet."""
+    while True:
+        assert await rmf.call("navigate", begin[0] + x, begin[1] + y) is True
+        while (status := await rmf.call("status")) in ACTIVE:
+            if (told := await rmf.call("feedback")) and told[-1]:
+                return
+        assert status == ABORTED
+
+
 async def test_open_rmf_sends_follows_and_cancels_goals_and_reads_battery_and_pose(
     home: Home, interpreter: Path, tmp_path: Path
 ) -> None:
@@ -116,23 +133,12 @@ async def test_open_rmf_sends_follows_and_cancels_goals_and_reads_battery_and_po
         assert 0.0 < await rmf.next("battery") <= 1.0
         await until(lambda: states and states[-1].gate.mode == "enabled", "it may drive")
 
-        for name in ("send_goal", "get_result", "cancel_goal"):
-            for payload in ("", "00010000ff", "0001000001" + "00" * 70_000):
-                assert await rmf.call("garbage", name, payload) not in ("", "no answer")
+        await refused(rmf)
         await until(lambda: healths and healths[-1].counters.get("free_fleet_refused") == 9)
         assert await rmf.call("stop") == 0  # there was nothing to cancel
         assert abs(states[-1].velocity.linear_x) < 0.01
 
-        async def sent(x: float, y: float) -> None:
-            """Send a goal, and again if there is no map yet."""
-            while True:
-                assert await rmf.call("navigate", begin[0] + x, begin[1] + y) is True
-                while (status := await rmf.call("status")) in ACTIVE:
-                    if (told := await rmf.call("feedback")) and told[-1]:
-                        return
-                assert status == ABORTED
-
-        await sent(0.6, 0.0)
+        await sent(rmf, begin, 0.6, 0.0)
         frame, distance, _, _ = await rmf.call("feedback")
         assert frame == "map"
         assert 0.0 < distance < 2.0
@@ -140,17 +146,17 @@ async def test_open_rmf_sends_follows_and_cancels_goals_and_reads_battery_and_po
         assert await rmf.call("stop") == 0
         assert await rmf.end() == CANCELED
         await until(lambda: abs(states[-1].velocity.linear_x) < 0.01, "it stands")
-        await sent(0.4, 0.0)
+        await sent(rmf, begin, 0.4, 0.0)
         assert await rmf.end() == SUCCEEDED
         assert await rmf.call("stop") == 0
         end = await rmf.call("pose")
         assert end[:2] == pytest.approx([begin[0] + 0.4, begin[1]], abs=0.3)
 
-        await sent(0.0, 0.0)
+        await sent(rmf, begin, 0.0, 0.0)
         (before,) = home.processes("ros2")
         os.kill(before, signal.SIGKILL)
         assert await rmf.poll("status", lambda found: found not in (*ACTIVE, *SILENT)) == UNKNOWN
-        await sent(0.4, 0.0)
+        await sent(rmf, begin, 0.4, 0.0)
         assert await rmf.end() == SUCCEEDED
 
 

@@ -165,3 +165,13 @@ async def test_nothing_is_called_after_the_end(nodes: Nodes) -> None:
         publisher.publish(nodes.string("hi"))
         await asyncio.sleep(0.01)
     assert len(got) == heard
+
+
+async def test_what_is_closed_after_the_end_was_closed_by_it(nodes: Nodes) -> None:
+    async with nodes.opened("talker") as talker:
+        publisher = talker.publisher("/chatter", STRING)
+        close = talker.subscribe("/cmd_vel", STRING, Qos(), lambda _: None)
+    publisher.close()
+    close()
+    publisher.publish(nodes.string("hi"))
+    assert talker.counts["not sent"] == 0

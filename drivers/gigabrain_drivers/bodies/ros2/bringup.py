@@ -191,7 +191,7 @@ def _commanded(options: Ros2Options, others: Sequence[GraphEndpoint]) -> list[Fi
     rivals = sorted({each.node for each in there if each.kind == "publisher"})
     rivals = [node for node in rivals if not _guards(node, options)]
     if rivals:
-        do = "end it: the robot obeys the newest command, whoever sent it, past our gate"
+        do = "stop that node: its commands bypass the gate"
         found.append(Finding(topic, "warning", f"commanded by {', '.join(rivals)} as well", do))
     return found
 
