@@ -50,7 +50,10 @@ Key = Annotated[str, Meta(pattern=r"^\w+(/\w+)*$", max_length=128)]
 
 
 MOST_JOINTS = 128
+MOST_ARM_JOINTS = 32
+MOST_MODEL_CHARACTERS = 262_144
 LEAST_AREA = 1e-4  # [m2]
+LEAST_SPEED = 0.001  # [m/s], [rad/s]
 
 
 class Joint(Record, frozen=True, kw_only=True):
@@ -61,6 +64,32 @@ class Joint(Record, frozen=True, kw_only=True):
     velocity: JointSpeed = 0.0  # [rad/s] or [m/s]
     effort: Effort | None = None  # [N m] or [N]; None where it is not measured
     temperature: Temperature | None = None  # [deg C] of its motor
+    current: Amperes | None = None  # [A] of its motor
+
+
+class JointDescription(Record, frozen=True, kw_only=True):
+    """A joint that can be commanded: how far, how fast and how hard it may move."""
+
+    name: Name
+    part: Literal["arm", "gripper"] = "arm"
+    lower: JointPosition  # [rad], or [m] for a sliding joint
+    upper: JointPosition  # [rad] or [m]
+    max_speed: SpeedLimit  # [rad/s] or [m/s]
+    max_acceleration: AccelerationLimit = 10.0  # [rad/s2] or [m/s2]
+    max_jerk: Annotated[float, Meta(ge=0.01, le=1e5)] = 200.0  # [rad/s3] or [m/s3]
+    max_effort: Annotated[float, Meta(ge=0.0, le=1e5)] = 0.0  # [N m] or [N]; 0: not known
+
+    def __post_init__(self) -> None:
+        if self.upper <= self.lower:
+            raise ValueError(f"{self.name}: upper must be larger than lower")
+
+
+class Arm(Record, frozen=True, kw_only=True):
+    """What the brain has to know of an arm besides its joints and its model."""
+
+    tool: Name = "tool"  # site of the model that reaches for things, along its x axis
+    home: Annotated[tuple[JointPosition, ...], Meta(min_length=1, max_length=MOST_ARM_JOINTS)]
+    # [rad] or [m], a posture in which it is out of the way; one number for each joint
 
 
 class Battery(Record, frozen=True, kw_only=True):
@@ -228,9 +257,9 @@ class BodyDescription(Record, frozen=True, kw_only=True):
     drive_type: DriveType  # how it moves
     footprint: Annotated[tuple[tuple[Offset, Offset], ...], Meta(min_length=3, max_length=64)]
     # [m], corners in the body's frame, in order
-    max_linear_speed: SpeedLimit  # [m/s]
+    max_linear_speed: SpeedCap = 0.0  # [m/s]; only an arm without a base has none
     max_lateral_speed: SpeedCap = 0.0  # [m/s]
-    max_angular_speed: SpeedLimit  # [rad/s]
+    max_angular_speed: SpeedCap = 0.0  # [rad/s]
     max_linear_acceleration: AccelerationLimit = 1.0  # [m/s2]
     max_linear_deceleration: AccelerationLimit = 1.0  # [m/s2]
     max_angular_acceleration: AccelerationLimit = 3.0  # [rad/s2]
@@ -242,6 +271,9 @@ class BodyDescription(Record, frozen=True, kw_only=True):
     min_turning_radius: Annotated[float, Meta(ge=0.0, le=100.0)] = 0.0
     # [m], of an Ackermann base; 0: max_linear_speed / max_angular_speed
     body_height: Annotated[float, Meta(ge=0.01, le=10.0)] = 0.5  # [m], of its highest part
+    joints: Annotated[tuple[JointDescription, ...], Meta(max_length=MOST_ARM_JOINTS)] = ()
+    # that can be commanded, from the base to the tool
+    arm: Arm | None = None
     lidar: Lidar | None = None
     cameras: Annotated[tuple[Camera, ...], Meta(max_length=MOST_CAMERAS)] = ()
     thresholds: Thresholds = DEFAULT
@@ -252,6 +284,10 @@ class BodyDescription(Record, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if _area(self.footprint) < LEAST_AREA:
             raise ValueError("footprint: it must enclose an area, its corners in order")
+        for name in ("max_linear_speed", "max_angular_speed"):
+            if self.drive_type != "arm" and getattr(self, name) < LEAST_SPEED:
+                raise ValueError(f"{name}: expected at least {LEAST_SPEED:g}")
+        self._check_joints()
         for name, speed in (
             ("follow_linear", self.max_linear_speed),
             ("follow_angular", self.max_angular_speed),
@@ -272,6 +308,22 @@ class BodyDescription(Record, frozen=True, kw_only=True):
                 f"max_linear_speed: it takes {needs:.2f} m to stop from it, "
                 f"and the lidar sees no farther than {self.lidar.range_max:g} m"
             )
+
+    def _check_joints(self) -> None:
+        if len({joint.name for joint in self.joints}) < len(self.joints):
+            raise ValueError("joints: each needs a name of its own")
+        if self.arm is None:
+            return
+        if len(self.arm.home) != len(self.joints):
+            raise ValueError(
+                f"arm: home: expected {len(self.joints)} positions, one for each joint"
+            )
+        for joint, position in zip(self.joints, self.arm.home, strict=True):
+            if not joint.lower <= position <= joint.upper:
+                raise ValueError(
+                    f"arm: home: {joint.name} at {position:g} is outside "
+                    f"{joint.lower:g} to {joint.upper:g}"
+                )
 
     @property
     def turning_radius(self) -> float:
@@ -299,3 +351,10 @@ class Body(Message, frozen=True, kw_only=True):
 
     description: BodyDescription
     link: Literal["sim", "emulated", "real"]
+
+
+class ArmModel(Message, frozen=True, kw_only=True):
+    """The model of a body with an arm. The last value is kept for those who join late."""
+
+    mjcf: Annotated[str, Meta(max_length=MOST_MODEL_CHARACTERS)]
+    # MuJoCo's XML, of primitives only; its joints have the names of the description

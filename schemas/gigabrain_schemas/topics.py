@@ -99,6 +99,9 @@ STATE = Topic(
     drawing="odometry", plotted=True,
 )  # fmt: skip
 BODY = Topic("robot/body", body.Body, 1, keep=True, max_bytes=16 * KB, drawing="lidar_frame")
+ARM_MODEL = Topic(
+    "robot/arm_model", body.ArmModel, 1, keep=True, max_bytes=512 * KB, priority="background",
+)  # fmt: skip
 IMAGE = Topic(
     "robot/image", sensors.Image, 10, max_bytes=1024 * KB, many=True, depth=8, drawing="image",
 )  # fmt: skip

@@ -133,9 +133,13 @@ class Driver(abc.ABC):
         wanted = Velocity(linear_x=linear_x, linear_y=linear_y, angular_z=angular_z)
         return clamp(wanted, limits_of(self.robot))
 
+    async def set_joint_positions(self, positions: Mapping[str, float]) -> Mapping[str, float]:
+        """Move joints together [rad or m]; returns what was really sent. Raises BodyLost."""
+        raise Unsupported(f"{type(self).__name__} has no joints to position")
+
     async def set_joint_position(self, joint_name: str, position: float) -> float:
         """Move one joint [rad or m]; returns what was really sent. Raises BodyLost."""
-        raise Unsupported(f"{type(self).__name__} has no joints to position")
+        return (await self.set_joint_positions({joint_name: position}))[joint_name]
 
     async def get_joint_states(self) -> tuple[Joint, ...]:
         """Return all joints as measured. Raises BodyLost."""

@@ -6,22 +6,12 @@ from typing import Annotated, Any
 from msgspec import Meta, Struct
 
 from gigabrain_drivers.links.serial_link import AUTO, check_port
-from gigabrain_schemas.base import Finite, Name, Positive
 from gigabrain_schemas.body import BodyDescription, Lidar
 from gigabrain_zenoh.config.settings import LinkName
 
 Length = Annotated[float, Meta(ge=0.0, le=10.0)]  # [m], of a part of a body
 
 LINKS: tuple[LinkName, ...] = ("sim", "emulated", "real")
-
-
-class JointLimits(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Range and speed of one joint."""
-
-    name: Name
-    lower: Finite  # [rad] or [m]
-    upper: Finite  # [rad] or [m]
-    max_speed: Positive  # [rad/s] or [m/s]
 
 
 class RobotFile(BodyDescription, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -31,7 +21,6 @@ class RobotFile(BodyDescription, frozen=True, kw_only=True, forbid_unknown_field
     wheel_base: Length = 0.0  # [m], front to rear, of mecanum and Ackermann bases
     effective_track: Length = 0.0
     # [m], of a skid-steered base: the separation of rolling wheels that would turn it as much
-    joints: tuple[JointLimits, ...] = ()
     sim: dict[str, Any] | None = None
     emulated: dict[str, Any] | None = None
     real: dict[str, Any] | None = None

@@ -17,6 +17,7 @@ from tests.unit.schemas.plain import as_map, at, codec, dotted, maps, numbers, r
 NULLABLE = {
     "Body.description.max_rim_speed", "RobotState.link.late_ms",
     "RobotState.joints.0.effort", "RobotState.joints.0.temperature",
+    "RobotState.joints.0.current", "RobotState.joints.1.current",
     "RobotState.joints.1.effort", "RobotState.joints.1.temperature",
     "WorldModel.distance_ahead",
     *(f"WorldModel.sectors.{index}" for index in (0, 1, 2, 4, 5)),

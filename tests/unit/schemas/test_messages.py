@@ -24,6 +24,7 @@ REQUIRED: dict[str, set[str]] = {
     "CameraInfo": {"camera"},
     "RobotState": {"robot_type", "pose", "velocity"},
     "Body": {"description", "link"},
+    "ArmModel": {"mjcf"},
     "WorldModel": {"scan_ok", "obstacle_ahead"},
     "Objects": {"objects"},
     "Detections": {"camera", "width", "height"},
@@ -93,6 +94,7 @@ def test_the_table_holds_the_keys_and_rates_of_the_design() -> None:
         "robot/imu": ("Imu", 100),
         "robot/state": ("RobotState", 50),
         "robot/body": ("Body", 1),
+        "robot/arm_model": ("ArmModel", 1),
         "robot/image/*": ("Image", 10),
         "robot/depth/*": ("DepthImage", 10),
         "robot/camera/*": ("CameraInfo", 1),
@@ -132,6 +134,7 @@ def test_a_value_stops_counting_after_so_many_missed_periods() -> None:
         "robot/imu": 50_000_000,
         "robot/state": 250_000_000,
         "robot/body": 5_000_000_000,
+        "robot/arm_model": 5_000_000_000,
         "robot/image": 500_000_000,
         "robot/depth": 250_000_000,
         "robot/camera": 5_000_000_000,
@@ -200,7 +203,7 @@ def test_every_message_is_frozen_and_documented_and_carries_the_header(
 def test_the_golden_folder_holds_the_examples_byte_for_byte() -> None:
     stored = {path.name: path.read_bytes() for path in examples.FOLDER.iterdir()}
     assert stored == examples.files()
-    assert len(stored) == 114
+    assert len(stored) == 116
 
 
 @by_name
