@@ -103,6 +103,7 @@ def _value(value: object) -> str:
 _ENCODER = msgspec.json.Encoder(enc_hook=_plain)
 log = logging.getLogger(__name__)
 QUEUED_RECORDS = 1000  # for each of file and console; more are dropped and counted
+QUIET_NS = 1_000_000_000  # without a QuietFault, after which it has ended
 LAST_WORDS_S = 0.5  # how long the end of a process waits until they are written
 FILE_BYTES = 10_000_000  # of one log file; then the next is begun
 OLD_FILES = 2  # of a process, beside the one that is written
@@ -133,6 +134,23 @@ class Fault:
         if times:
             about = {"event": "fault ended", "times": times}
             self._log.info("%s", text, extra={"data": about})
+
+
+class QuietFault:
+    """A fault that ends only after a second without it, as good and bad messages may alternate."""
+
+    def __init__(self, log: logging.Logger) -> None:
+        self._fault, self._last_ns = Fault(log), 0
+
+    def begin(self, text: str, now_ns: int) -> None:
+        """Log the fault, unless it goes on."""
+        self._last_ns = now_ns
+        self._fault.begin(text)
+
+    def end(self, text: str, now_ns: int) -> None:
+        """Log the end of the fault, if it has not come for a second."""
+        if self._fault.active and now_ns - self._last_ns >= QUIET_NS:
+            self._fault.end(text)
 
 
 class BusHandler(logging.Handler):

@@ -283,7 +283,7 @@ def _fault(config: Config, wanted: Wanted, now: Now) -> tuple[str, str]:
     if not all(math.isfinite(value) for value in (*wanted.linear, *wanted.angular)):
         return "not_finite", "a command holds NaN or infinity; repair the program that sends it"
     if wanted.frame.rpartition("/")[2] not in FRAMES:
-        return "frame", f"a command is in frame {wanted.frame!r}; expected base_link"
+        return "frame", f"a command is in frame {wanted.frame[:60]!r}; expected base_link"
     if wanted.stamp_ns:
         age_ns = now.ros_ns - wanted.stamp_ns
         if age_ns > config.timeout_ns:

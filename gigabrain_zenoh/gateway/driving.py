@@ -24,33 +24,15 @@ from gigabrain_zenoh.gateway.conversions.frames import MAP, stamp_ns
 from gigabrain_zenoh.gateway.conversions.maps import in_map, planar, planar_covariance
 from gigabrain_zenoh.gateway.scene import Scene, left_out
 from gigabrain_zenoh.geometry.limits import limits_of
-from gigabrain_zenoh.logs import Fault
+from gigabrain_zenoh.logs import QuietFault
 from gigabrain_zenoh.ros2.qos import DEFAULT, Qos
 from gigabrain_zenoh.ros2.transport import Received, RosTransport
 from gigabrain_zenoh.ros2.types import Types
 
 log = logging.getLogger(__name__)
 COMMANDS = Qos(reliable=False, depth=1)  # matches every publisher; only the newest counts
-QUIET_NS = 1_000_000_000
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 POSE, GUESS = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
-
-
-class QuietFault:
-    """A fault that ends only after a second without it, as good and bad senders may alternate."""
-
-    def __init__(self) -> None:
-        self._fault, self._last_ns = Fault(log), 0
-
-    def begin(self, text: str, now_ns: int) -> None:
-        """Log the fault, unless it goes on."""
-        self._last_ns = now_ns
-        self._fault.begin(text)
-
-    def end(self, text: str, now_ns: int) -> None:
-        """Log the end of the fault, if it has not come for a second."""
-        if self._fault.active and now_ns - self._last_ns >= QUIET_NS:
-            self._fault.end(text)
 
 
 class Background:
@@ -85,13 +67,13 @@ class RosCommander:
         self, scene: Scene, ros: RosTransport, types: Types, config: Ros2Config, work: Background
     ) -> None:
         self._scene, self._types, self._work = scene, types, work
-        self._bus, self._bad = scene.bus, QuietFault()
+        self._bus, self._bad = scene.bus, QuietFault(log)
         self._config = commander.Config(
             name=scene.bus.process,
             take=config.take,
             timeout_ns=round(config.cmd_vel_timeout * 1e9),
         )
-        self._memory, self._refused = Memory(), QuietFault()
+        self._memory, self._refused = Memory(), QuietFault(log)
         scene.on_state.append(self._observe)
         if not left_out(config, "cmd_vel"):
             ros.subscribe("cmd_vel", TWIST, COMMANDS, self._on_twist)
@@ -133,7 +115,7 @@ class RosCommander:
 
     def _decoded(self, name: str, received: Received) -> Any | None:
         try:
-            message = self._types.decode(name, received.payload)
+            message = self._types.decode_command(name, received.payload)
         except BadPayload as error:
             self._bus.counters["cmd_vel_broken"] += 1
             self._bad.begin(f"dropped a message on /cmd_vel: {error}", self._bus.clock.now_ns())
@@ -213,13 +195,13 @@ class PoseRequests:
     ) -> Callable[[Received], None]:
         """Return a handler that asks for one pose at a time; the newest one waits for it."""
         waiting: deque[bytes] = deque(maxlen=1)
-        busy, fault, clock = False, QuietFault(), self._scene.bus.clock
+        busy, fault, clock = False, QuietFault(log), self._scene.bus.clock
 
         async def work() -> None:
             nonlocal busy
             while waiting:
                 try:
-                    text = await ask(self._types.decode(name, waiting.pop()))
+                    text = await ask(self._types.decode_command(name, waiting.pop()))
                 except GigabrainError as error:
                     self.problems[topic] = str(error)
                     self._scene.bus.counters[f"{topic}_refused"] += 1
@@ -242,7 +224,7 @@ class PoseRequests:
     async def _initial_pose(self, message: Any) -> str:
         frame, guess = message.header.frame_id, message.pose
         if frame != MAP:
-            raise Refused(f"frame {frame!r} is not that of a first pose; expected {MAP}")
+            raise Refused(f"frame {frame[:60]!r} is not that of a first pose; expected {MAP}")
         at, covariance = planar(guess.pose), planar_covariance(guess.covariance)
         bus = self._scene.bus
         request = PoseRequest(x=at.x, y=at.y, yaw=at.yaw, covariance=covariance, source=bus.process)

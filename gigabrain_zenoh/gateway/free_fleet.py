@@ -11,14 +11,13 @@ from collections import Counter
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.topics import Topic
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.errors import BadPayload, GigabrainError
-from gigabrain_zenoh.gateway.driving import QuietFault
+from gigabrain_zenoh.errors import GigabrainError
+from gigabrain_zenoh.logs import QuietFault
 from gigabrain_zenoh.ros2.qos import DEFAULT, Qos
 from gigabrain_zenoh.ros2.transport import Answer, Close, OnReaders
 
 log = logging.getLogger(__name__)
 TOPICS = ("tf", "battery_state")  # that the adapter reads, beside the action navigate_to_pose
-MAX_REQUEST = 64 << 10  # bytes; a goal takes 150
 
 
 class FreeFleetPublisher:
@@ -59,12 +58,10 @@ class FreeFleet:
 
     def serve(self, service: str, type: str, handle: Answer) -> Close:
         """Answer requests of a service, each in a task of its own."""
-        fault, clock = QuietFault(), self._bus.clock
+        fault, clock = QuietFault(log), self._bus.clock
 
         async def answer(request: bytes) -> tuple[bytes, str]:
             try:
-                if len(request) > MAX_REQUEST:
-                    raise BadPayload(f"{len(request)} bytes; expected at most {MAX_REQUEST}")
                 response = await handle(request)
             except GigabrainError as error:
                 self.counts["refused"] += 1

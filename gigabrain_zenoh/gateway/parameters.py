@@ -56,7 +56,7 @@ class Parameters:
         request, response = (f"rcl_interfaces/srv/{name}_{end}" for end in ("Request", "Response"))
 
         async def answer(payload: bytes) -> bytes:
-            asked = self._types.decode(request, payload)
+            asked = self._types.decode_command(request, payload)
             for names in (getattr(asked, "names", ()), getattr(asked, "parameters", ())):
                 if len(names) > MAX_NAMES:
                     raise BadPayload(f"{len(names)} names; expected at most {MAX_NAMES}")

@@ -56,7 +56,7 @@ class Services:
         async def answer(payload: bytes) -> bytes:
             ok = True
             try:
-                text = await act(self._types.decode(f"{kind}_Request", payload))
+                text = await act(self._types.decode_command(f"{kind}_Request", payload))
             except GigabrainError as error:
                 ok, text = False, str(error)
             self._log(name, text, ok=ok)

@@ -23,6 +23,7 @@ MAX_KEPT = 200  # goals that have ended, whose results can still be asked for
 KEPT_S = 300.0  # how long they can
 CANCEL = "action_msgs/srv/CancelGoal"
 STATUSES = "action_msgs/msg/GoalStatusArray"
+STATUS_S = 0.02  # from one publication of all states to the next, however many goals come
 
 
 class GoalState(IntEnum):
@@ -182,6 +183,8 @@ class ActionServer:
         self._name, self._preempts, self._now_ns = name, preempts, now_ns
         self._ends: dict[bytes, asyncio.Event] = {}
         self._tasks: set[asyncio.Task[None]] = set()
+        self._loop, self._told_s = asyncio.get_running_loop(), 0.0
+        self._telling: asyncio.TimerHandle | None = None
         base = f"{name}/_action"
         servers = [transport, polled] if polled else [transport]
         message = f"{type}_FeedbackMessage"
@@ -195,7 +198,7 @@ class ActionServer:
                 one.serve(f"{base}/get_result", f"{type}_GetResult", get_result),
                 one.serve(f"{base}/cancel_goal", CANCEL, self._cancel_goal),
             ]
-        self._publish_status()
+        self._tell()
 
     async def close(self) -> None:
         """Withdraw the action; its goals end as aborted."""
@@ -207,11 +210,14 @@ class ActionServer:
         for goal in self.goals.active():  # whose task had not begun
             self.goals.end(goal, Outcome(GoalState.ABORTED), self._now_ns())
             self._ends.pop(goal.id).set()
+        if self._telling:
+            self._telling.cancel()
+        self._tell()
         for publisher in (*self._feedback, *self._status):
             publisher.close()
 
     async def _send_goal(self, request: bytes) -> bytes:
-        asked = self._types.decode(f"{self._type}_SendGoal_Request", request)
+        asked = self._types.decode_command(f"{self._type}_SendGoal_Request", request)
         id, now_ns = asked.goal_id.uuid.tobytes(), self._now_ns()
         self.goals.forget(now_ns)
         accepted = self.goals.may_accept(id) and self._handler.accept(asked.goal)
@@ -224,15 +230,15 @@ class ActionServer:
             for other in self.goals.active():
                 other.preempted = other is not goal
         self._ends[goal.id] = asyncio.Event()
-        task = asyncio.get_running_loop().create_task(self._run(goal))
+        task = self._loop.create_task(self._run(goal))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
-        self._publish_status()
+        self._tell_soon()
 
     async def _run(self, goal: Goal) -> None:
         if goal.state == GoalState.ACCEPTED:  # unless it was canceled already
             goal.state = GoalState.EXECUTING
-            self._publish_status()
+            self._tell_soon()
         outcome = Outcome(GoalState.ABORTED)
         try:
             outcome = await self._handler.run(goal, lambda fields: self._feed(goal, fields))
@@ -240,7 +246,7 @@ class ActionServer:
             log.warning("%s: goal aborted: %s", self._name, error)
         finally:
             self.goals.end(goal, outcome, self._now_ns())
-            self._publish_status()
+            self._tell_soon()
             self._ends.pop(goal.id).set()
 
     def _feed(self, goal: Goal, fields: Any) -> None:
@@ -253,7 +259,7 @@ class ActionServer:
                 publisher.publish(payload)
 
     async def _get_result(self, request: bytes, *, waits: bool) -> bytes:
-        asked = self._types.decode(f"{self._type}_GetResult_Request", request)
+        asked = self._types.decode_command(f"{self._type}_GetResult_Request", request)
         goal = self.goals.get(asked.goal_id.uuid.tobytes())
         if goal is None:
             return self._encode("GetResult_Response", status=int(GoalState.UNKNOWN))
@@ -263,7 +269,7 @@ class ActionServer:
         return self._encode("GetResult_Response", status=int(goal.state), result=result)
 
     async def _cancel_goal(self, request: bytes) -> bytes:
-        asked = self._types.decode(f"{CANCEL}_Request", request).goal_info
+        asked = self._types.decode_command(f"{CANCEL}_Request", request).goal_info
         until_ns = asked.stamp.sec * 10**9 + asked.stamp.nanosec
         meant, code = self.goals.to_cancel(asked.goal_id.uuid.tobytes(), until_ns)
         canceling = [goal for goal in meant if self._handler.cancel(goal)]
@@ -272,7 +278,7 @@ class ActionServer:
         if meant and not canceling:
             code = CancelCode.REJECTED
         if canceling:
-            self._publish_status()
+            self._tell_soon()
         response = self._types.make(
             f"{CANCEL}_Response",
             return_code=int(code),
@@ -280,7 +286,17 @@ class ActionServer:
         )
         return self._types.encode(f"{CANCEL}_Response", response)
 
-    def _publish_status(self) -> None:
+    def _tell_soon(self) -> None:
+        """Publish the states once this turn of the loop is over and the last time is a while ago.
+
+        The states of many goals take milliseconds to encode.
+        """
+        if self._telling is None:
+            at_s = max(self._loop.time(), self._told_s + STATUS_S)
+            self._telling = self._loop.call_at(at_s, self._tell)
+
+    def _tell(self) -> None:
+        self._telling, self._told_s = None, self._loop.time()
         states = [
             {"goal_info": _info(goal), "status": int(goal.state)} for goal in self.goals.all()
         ]

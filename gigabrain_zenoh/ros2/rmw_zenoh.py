@@ -29,6 +29,7 @@ from gigabrain_zenoh.bus.zenoh.session import (
 )
 from gigabrain_zenoh.config.settings import Endpoint, Ros2Link
 from gigabrain_zenoh.errors import ConfigError, GigabrainError, NoAnswer
+from gigabrain_zenoh.logs import QuietFault
 from gigabrain_zenoh.ros2.qos import DEFAULT, SERVICES, Qos
 from gigabrain_zenoh.ros2.rmw_declared import REMOTE, advanced_publisher, subscriber
 from gigabrain_zenoh.ros2.rmw_names import (
@@ -224,6 +225,7 @@ class RmwZenohTransport:
     def serve(self, service: str, type: str, handle: Answer) -> Close:
         """Answer requests of a service, each in a task of its own."""
         entity = _Entity(self, "server", service, type, SERVICES)
+        fault = QuietFault(log)
 
         async def run(query: zenoh.Query) -> None:
             with query:  # released at the end, else the client waits for its timeout
@@ -232,8 +234,9 @@ class RmwZenohTransport:
                 try:
                     response = await handle(request)
                 except GigabrainError as error:
-                    log.warning("%s: no answer: %s", entity.topic, error)
+                    fault.begin(f"{entity.topic}: no answer: {error}", time.monotonic_ns())
                     return
+                fault.end(f"{entity.topic} answers again", time.monotonic_ns())
                 attachment = known.answered().to_bytes() if known else None
                 with contextlib.suppress(zenoh.ZError):  # the client's session is lost
                     query.reply(entity.key, response, attachment=attachment)

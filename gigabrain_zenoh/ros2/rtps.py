@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, Self
 
 from gigabrain_zenoh.errors import BusError, ConfigError, GigabrainError, NoAnswer
+from gigabrain_zenoh.logs import QuietFault
 from gigabrain_zenoh.ros2.rtps_discovery import (
     MAX_DOMAIN,
     READER_KIND,
@@ -190,6 +191,7 @@ class Server:
         self.service, self.handle, self._bus = service, handle, bus
         self.dropped = 0  # requests that came while too many were handled
         self._running: set[asyncio.Task[None]] = set()
+        self._fault = QuietFault(log)
         requests, replies = service_topics(service)
         request, reply = service_types(type_.name)
         self._writer, self._reader, _ = bus.add_pair(
@@ -254,9 +256,11 @@ class Server:
         self._running.discard(task)
         error = None if task.cancelled() else task.exception()
         if isinstance(error, GigabrainError):
-            log.warning("%s: a request got no reply: %s", self.service, error)
+            self._fault.begin(f"{self.service}: no answer: {error}", time.monotonic_ns())
         elif error:
             log.error("%s: a request got no reply", self.service, exc_info=error)
+        else:
+            self._fault.end(f"{self.service} answers again", time.monotonic_ns())
 
 
 class _Client:

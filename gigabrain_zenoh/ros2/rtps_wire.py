@@ -18,6 +18,7 @@ PID_RELATED_SAMPLE, PID_RELATED_SAMPLE_OLD = 0x0083, 0x800F  # Fast DDS before 2
 DISPOSED = 0b11  # in a status: bit 0 is disposed, bit 1 is unregistered
 
 WINDOW = 256  # numbers in a set of an ACKNACK or a GAP
+MAX_SEQUENCE = 1 << 62  # so that the next ones have room in their 64 bits
 MAX_PARAMETERS = 200  # of one list
 HEADER_BYTES, MAX_SUBMESSAGES = 20, 64
 
@@ -317,14 +318,14 @@ def _read_inline(order: str, flags: int, body: bytes) -> _Inline:
     return _Inline(related, status, key, end)
 
 
-def _positive(seq: int) -> int:
-    if seq < 1:
-        raise BadMessage("sequence numbers begin with 1")
+def _number(seq: int, least: int = 1) -> int:
+    if not least <= seq <= MAX_SEQUENCE:
+        raise BadMessage(f"sequence number {seq}: expected {least} to {MAX_SEQUENCE}")
     return seq
 
 
 def _data(order: str, flags: int, body: bytes) -> Data:
-    seq = _positive(_read_sequence(order, body, 12))
+    seq = _number(_read_sequence(order, body, 12))
     inline = _read_inline(order, flags, body)
     payload = body[inline.end :] if flags & 12 else b""
     status = inline.status or (DISPOSED if flags & 8 else 0)  # only a key: gone
@@ -332,7 +333,7 @@ def _data(order: str, flags: int, body: bytes) -> Data:
 
 
 def _data_fragments(order: str, flags: int, body: bytes) -> DataFragments:
-    seq = _positive(_read_sequence(order, body, 12))
+    seq = _number(_read_sequence(order, body, 12))
     first, count, fragment, sample = struct.unpack_from(order + "IHHI", body, 20)
     if not (first and count and fragment and sample and (first - 1) * fragment < sample):
         raise BadMessage("impossible fragments")
@@ -344,10 +345,9 @@ def _data_fragments(order: str, flags: int, body: bytes) -> DataFragments:
 
 
 def _heartbeat(order: str, flags: int, body: bytes) -> Heartbeat:
-    first, last = _read_sequence(order, body, 8), _read_sequence(order, body, 16)
+    first = _number(_read_sequence(order, body, 8))
+    last = _number(_read_sequence(order, body, 16), first - 1)
     (count,) = struct.unpack_from(order + "I", body, 24)
-    if first < 1 or last < first - 1:
-        raise BadMessage("impossible range")
     return Heartbeat(body[:4], body[4:8], first, last, count, bool(flags & 2))
 
 
@@ -359,14 +359,14 @@ def _acknack(order: str, flags: int, body: bytes) -> AckNack:
 
 
 def _gap(order: str, flags: int, body: bytes) -> Gap:
-    start = _positive(_read_sequence(order, body, 8))
-    base = _read_sequence(order, body, 16)
+    start = _number(_read_sequence(order, body, 8))
+    base = _number(_read_sequence(order, body, 16))
     others, _ = _read_bitmap(order, body, 24, base)
     return Gap(body[:4], body[4:8], start, base, others)
 
 
 def _nack_fragments(order: str, flags: int, body: bytes) -> NackFragments:
-    seq = _positive(_read_sequence(order, body, 8))
+    seq = _number(_read_sequence(order, body, 8))
     (base,) = struct.unpack_from(order + "I", body, 16)
     missing, at = _read_bitmap(order, body, 20, base)
     (count,) = struct.unpack_from(order + "I", body, at)
@@ -374,7 +374,7 @@ def _nack_fragments(order: str, flags: int, body: bytes) -> NackFragments:
 
 
 def _heartbeat_fragments(order: str, flags: int, body: bytes) -> HeartbeatFragments:
-    seq = _positive(_read_sequence(order, body, 8))
+    seq = _number(_read_sequence(order, body, 8))
     last, count = struct.unpack_from(order + "II", body, 16)
     return HeartbeatFragments(body[:4], body[4:8], seq, last, count)
 

@@ -24,6 +24,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {  # of types in rosbags' store, which kee
     "sensor_msgs/msg/NavSatStatus": {"status": -2},
 }
 MAX_PAYLOAD = 64 << 20  # bytes of one message
+MAX_COMMAND = 64 << 10  # bytes of one that ROS commands or asks by; a goal takes 150
 LARGE = 1 << 16  # bytes
 
 
@@ -66,6 +67,15 @@ class Types:
         Arrays of numbers are views of the payload. Raises BadPayload, and nothing else.
         """
         return decoded(self._store, self.known(name), payload)
+
+    def decode_command(self, name: str, payload: bytes) -> Any:
+        """Return a command or request; to decode a large one would hold up the others.
+
+        Raises BadPayload, and nothing else.
+        """
+        if len(payload) > MAX_COMMAND:
+            raise BadPayload(f"{name}: {len(payload)} bytes; expected at most {MAX_COMMAND}")
+        return self.decode(name, payload)
 
     def make(self, name: str, /, **fields: Any) -> Any:
         """Make a message; fields that are left out get their defaults, in nested ones as well.

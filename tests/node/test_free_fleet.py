@@ -10,8 +10,9 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.topics import BODY, CMD_VEL, STATE
 from gigabrain_zenoh.config.settings import Ros2Config
-from gigabrain_zenoh.gateway.free_fleet import MAX_REQUEST
+from gigabrain_zenoh.ros2.types import MAX_COMMAND
 from gigabrain_zenoh.testing import samples
+from gigabrain_zenoh.testing.waiting import until
 from tests.node.ros2_robot import TYPES, RosNode, gateway_on
 from tests.node.test_ros2_hostile import mutated
 from tests.node.test_ros2_navigation import ACTION, Brain, Client, ros_goal
@@ -139,12 +140,15 @@ async def test_states_of_goals_are_published_as_they_change():
     async with adapter() as rmf:
         rmf.read("navigate_to_pose/_action/status")
         await rmf.send(1)
+        await until(lambda: told(rmf) == [[2]], "it is carried out")
         await rmf.brain.say("succeeded")
-        found = [
-            [one.status for one in message.status_list]
-            for message in rmf.received["navigate_to_pose/_action/status"]
-        ]
-        assert found == [[1], [2], [4]]
+        await until(lambda: told(rmf) == [[2], [4]], "its end")
+
+
+def told(rmf):
+    """Return the states on the status topic, of all goals each time."""
+    messages = rmf.received["navigate_to_pose/_action/status"]
+    return [[one.status for one in message.status_list] for message in messages]
 
 
 async def states(rmf, count, **about):
@@ -203,7 +207,7 @@ async def test_what_nobody_reads_is_not_encoded():
     [
         (b"", "no CDR: 0 bytes"),
         (b"\x00\x01\x00\x00\x01", "Request: "),
-        (b"\x00\x01\x00\x00" + bytes(MAX_REQUEST), "expected at most 65536"),
+        (b"\x00\x01\x00\x00" + bytes(MAX_COMMAND), "expected at most 65536"),
     ],
 )
 async def test_a_bad_request_is_refused_counted_and_said_once(name, payload, reason, caplog):

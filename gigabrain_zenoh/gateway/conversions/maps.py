@@ -73,7 +73,7 @@ def in_map(frame: str, at: Pose, odom_in_map: Pose | None) -> Pose:
     if frame == MAP:
         return at
     if frame != ODOM:
-        raise Refused(f"frame {frame!r} is not known as one of goals; expected {MAP} or {ODOM}")
+        raise Refused(f"frame {frame[:60]!r} is none of goals; expected {MAP} or {ODOM}")
     if odom_in_map is None:
         raise Refused(f"a goal in {ODOM} needs the robot's place in the map, which is not known")
     return compose(odom_in_map, at)
@@ -86,7 +86,8 @@ def planar_covariance(values: Any) -> tuple[float, ...]:
     """
     full = np.asarray(values, np.float64).reshape(6, 6)
     part = full[np.ix_(PLANAR, PLANAR)]
-    if not np.isfinite(part).all() or np.linalg.eigvalsh((part + part.T) / 2).min() < -1e-9:
+    bounded = (np.abs(part) <= FARTHEST**2).all()  # also False for NaN
+    if not bounded or np.linalg.eigvalsh((part + part.T) / 2).min() < -1e-9:
         raise Refused("the covariance is none: expected finite values, symmetric, none negative")
     if not part.any():
         return ()

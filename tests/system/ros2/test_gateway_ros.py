@@ -19,7 +19,7 @@ from gigabrain_zenoh.runtime.connect import connect
 from gigabrain_zenoh.testing.processes import Home, free_port
 from gigabrain_zenoh.testing.waiting import until
 from tests.places import ROOT
-from tests.ros2.judge import Judge, Program
+from tests.ros2.judge import Judge
 
 TRIGGER, SET_BOOL = "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"
 DEFAULT: dict[str, Any] = {}
@@ -41,8 +41,8 @@ READ = {
 class Robot:
     """A running robot as its own bus shows it."""
 
-    def __init__(self, home: Home, bus: Any) -> None:
-        self.home, self.bus = home, bus
+    def __init__(self, home: Home, bus: Any, router: str) -> None:
+        self.home, self.bus, self.router = home, bus, router
         self.states: list[RobotState] = []
         bus.subscribe(STATE, lambda _, state: self.states.append(state))
 
@@ -57,17 +57,19 @@ class Robot:
 
 
 @contextlib.asynccontextmanager
-async def running(home: Home, judge: Judge, **parts: Any) -> AsyncIterator[Robot]:
-    """Yield a robot whose gateway joins the judge's domain."""
+async def running(home: Home, judge: Judge | None, **parts: Any) -> AsyncIterator[Robot]:
+    """Yield a robot whose gateway joins the judge's domain; without one, its router is ROS's."""
     router = f"tcp/127.0.0.1:{free_port()}"
     parts = {"body": "turtlebot3_burger", "world": "arena"} | parts
-    given = {"transport": "dds", "domain": judge.domain, "localhost": True}
+    given: dict[str, Any] = {"transport": "rmw_zenoh"}
+    if judge:
+        given = {"transport": "dds", "domain": judge.domain, "localhost": True}
     parts["ros2"] = parts.get("ros2", {}) | given
     file = home.deployment(router=router, **parts)
     home.start("up", str(file))
     session = connect(Endpoint(connect=(router,)), "test", timeout_s=None)
     async with asyncio.timeout(400), session as bus:
-        made = Robot(home, bus)
+        made = Robot(home, bus, router)
         await until(lambda: home.processes("ros2"), "the gateway runs")
         await until(lambda: made.states, "states")
         yield made
@@ -89,7 +91,7 @@ async def released(robot: Robot) -> None:
         await until(lambda: len(robot.states) > count + 10, "states")  # noqa: B023
 
 
-async def driving(robot: Robot, driver: Program) -> None:
+async def driving(robot: Robot, driver: Any) -> None:
     """Let a program drive; on a busy machine the gate may stop it, and it has to pause."""
     while True:
         await driver.query("drive", linear=0.15, hz=20.0)

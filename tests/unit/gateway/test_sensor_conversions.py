@@ -161,9 +161,10 @@ def test_a_covariance_keeps_x_y_and_yaw():
     assert maps.planar_covariance(np.zeros(36)) == ()
 
 
-@pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])
+@pytest.mark.parametrize("value", [-1.0, math.nan, math.inf, 1e308])
 def test_what_is_no_covariance_is_refused(value):
     full = np.zeros(36)
     full[0] = value
-    with pytest.raises(Refused, match="covariance"):
-        maps.planar_covariance(full)
+    for values in (full, np.full(36, value)):
+        with pytest.raises(Refused, match="covariance"):
+            maps.planar_covariance(values)

@@ -12,6 +12,7 @@ from gigabrain_zenoh.ros2.actions import (
     CANCEL,
     KEPT_S,
     MAX_ACTIVE,
+    STATUS_S,
     STATUSES,
     ActionServer,
     CancelCode,
@@ -23,7 +24,7 @@ from gigabrain_zenoh.ros2.actions import (
 from gigabrain_zenoh.ros2.memory import MemoryNetwork, MemoryTransport
 from gigabrain_zenoh.ros2.qos import ACTION_STATUS, DEFAULT
 from gigabrain_zenoh.ros2.types import Types
-from gigabrain_zenoh.testing.waiting import settle
+from gigabrain_zenoh.testing.waiting import settle, until
 
 NAVIGATE = "nav2_msgs/action/NavigateToPose"
 S = GoalState
@@ -108,6 +109,10 @@ class World:
         )()
         return got[-1]
 
+    async def tells(self, states: list[int]) -> None:
+        """Wait for these statuses: they are told a little later."""
+        await until(lambda: self.statuses() == states, f"{states} on the status topic")
+
 
 A, B = bytes(15) + b"\1", bytes(15) + b"\2"
 
@@ -133,10 +138,10 @@ async def test_a_goal_is_followed_to_its_result(world: World) -> None:
         DEFAULT,
         lambda received: heard.append(world.types.decode(kind, received.payload)),
     )
-    assert world.statuses() == []
+    await world.tells([])
     assert await world.client.send(A, behavior_tree="here")
     await settle()
-    assert world.statuses() == [S.EXECUTING]
+    await world.tells([S.EXECUTING])
     waiting = asyncio.create_task(world.client.result(A))
     await settle()
     world.walk.feedback({"distance_remaining": 1.5})
@@ -144,7 +149,7 @@ async def test_a_goal_is_followed_to_its_result(world: World) -> None:
     world.walk.running[A].set_result(Outcome(S.SUCCEEDED, {"error_code": 7}))
     assert await waiting == (S.SUCCEEDED, 7)
     assert await world.client.result(A) == (S.SUCCEEDED, 7)
-    assert world.statuses() == [S.SUCCEEDED]
+    await world.tells([S.SUCCEEDED])
     assert (heard[0].goal_id.uuid.tobytes(), heard[0].feedback.distance_remaining) == (A, 1.5)
 
 
@@ -167,7 +172,7 @@ async def test_cancelling_asks_the_handler_and_ends_as_canceled(world: World) ->
     world.walk.cancels = True
     assert await world.client.cancel(A) == (CancelCode.NONE, [A])
     await settle()
-    assert world.statuses() == [S.CANCELING]
+    await world.tells([S.CANCELING])
     world.walk.running[A].set_result(Outcome(S.CANCELED))
     assert await world.client.result(A) == (S.CANCELED, 0)
     assert await world.client.cancel(A) == (CancelCode.GOAL_TERMINATED, [])
@@ -199,7 +204,29 @@ async def test_a_new_goal_preempts_the_running_one(world: World) -> None:
     await settle()
     world.walk.running[A].set_result(Outcome(S.ABORTED))
     assert await world.client.result(A) == (S.ABORTED, 0)
-    assert world.statuses() == [S.ABORTED, S.EXECUTING]
+    await world.tells([S.ABORTED, S.EXECUTING])
+
+
+async def test_the_states_of_many_goals_are_told_a_few_times(world: World) -> None:
+    told: list[int] = []
+    loop = asyncio.get_running_loop()
+    world.client.node.subscribe(
+        "/navigate_to_pose/_action/status",
+        STATUSES,
+        ACTION_STATUS,
+        lambda got: told.append(len(world.types.decode(STATUSES, got.payload).status_list)),
+    )
+    began_s = loop.time()
+    for number in range(30):
+        await world.client.send(number.to_bytes(16, "big"))
+    await until(lambda: told[-1] == 30, "all goals on the status topic")
+    assert len(told) <= 3 + (loop.time() - began_s) / STATUS_S
+
+
+async def test_a_large_request_is_not_decoded(world: World) -> None:
+    assert await world.client.send(A, behavior_tree="x" * 60_000)
+    with pytest.raises(NoAnswer):
+        await world.client.send(B, behavior_tree="x" * 70_000)
 
 
 async def test_a_fault_of_the_handler_aborts(world: World) -> None:

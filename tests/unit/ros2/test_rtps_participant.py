@@ -407,6 +407,28 @@ def test_mutated_datagrams_raise_nothing_and_are_not_amplified(seed):
     assert got == [b"fine"]
 
 
+def test_sequence_numbers_at_the_end_of_their_range_raise_nothing():
+    ether = Ether()
+    one = ether.join(1)
+    reader, _ = add_reader(ether, one)
+    prefix, last = b"\0\0" + b"m" * 10, (1 << 63) - 1
+    entity = b"\0\0\7\3"
+    endpoint = EndpointData(prefix + entity, "rq/aRequest", "T")
+    datagrams = [announcement(prefix, "10.0.0.66")] + [
+        encode_message(prefix, b"", [each], 0)
+        for each in (
+            Data(PUBLICATIONS_READER, PUBLICATIONS_WRITER, 1, endpoint.encode()),
+            Heartbeat(UNKNOWN_ENTITY, entity, last, last, 1),
+            Gap(UNKNOWN_ENTITY, entity, 1, last),
+            Data(UNKNOWN_ENTITY, entity, last, b"x"),
+            Heartbeat(UNKNOWN_ENTITY, entity, last, last, 2),
+        )
+    ]
+    for datagram in datagrams:
+        one.receive(datagram, "10.0.0.66", ether.now)
+    assert prefix + entity in reader.writers
+
+
 def test_random_datagrams_raise_nothing():
     rng, ether = random.Random(5), Ether()
     one = ether.join(1)

@@ -1,0 +1,102 @@
+"""The process `ros2` frozen and killed while ROS drives: the body stops, nothing else notices."""
+
+import asyncio
+import contextlib
+import os
+import signal
+from collections.abc import AsyncIterator
+from typing import Any
+
+import pytest
+
+from gigabrain_schemas.safety import Health
+from gigabrain_schemas.topics import HEALTH
+from gigabrain_zenoh.testing.processes import Home
+from gigabrain_zenoh.testing.waiting import until
+from tests.ros2.judge import Judge, frozen
+from tests.ros2.nodes import Nodes
+from tests.system.ros2.test_gateway_ros import Robot, driving, released, running
+
+TWIST = "geometry_msgs/msg/Twist"
+
+
+class ZenohDriver:
+    """A node of `rmw_zenoh` that is asked as the program `drive` of rclpy is."""
+
+    def __init__(self, nodes: Nodes, node: Any) -> None:
+        self._types, self._publisher = nodes.types, node.publisher("/cmd_vel", TWIST)
+        self._sending: asyncio.Task[None] | None = None
+
+    async def query(self, do: str, linear: float = 0.0, hz: float = 20.0) -> None:
+        if self._sending:
+            self._sending.cancel()
+        twist = self._types.make(TWIST, linear={"x": linear})
+        payload = self._types.encode(TWIST, twist)
+        self._sending = asyncio.create_task(self._send(payload, hz)) if do == "drive" else None
+
+    async def _send(self, payload: bytes, hz: float) -> None:
+        while True:
+            self._publisher.publish(payload)
+            await asyncio.sleep(1 / hz)
+
+
+@pytest.fixture(params=["dds", "rmw_zenoh"])
+async def driven(request: pytest.FixtureRequest, home: Home) -> AsyncIterator[tuple[Robot, Any]]:
+    """A robot that ROS drives, and who drives it."""
+    judge: Judge | None = None
+    if request.param == "dds":
+        judge = request.getfixturevalue("judge")
+    async with contextlib.AsyncExitStack() as stack:
+        robot = await stack.enter_async_context(running(home, judge))
+        if judge:
+            driver: Any = judge.start("drive")
+        else:
+            nodes = Nodes(transport="rmw_zenoh", router=robot.router)
+            await stack.enter_async_context(nodes.stack)
+            driver = ZenohDriver(nodes, await nodes.node("hands"))
+        await released(robot)
+        await driving(robot, driver)
+        yield robot, driver
+        await driver.query("rest")
+
+
+async def stopped(robot: Robot) -> None:
+    await until(lambda: robot.now.sent.linear_x == 0.0, "a command of zero")
+    await until(lambda: abs(robot.now.velocity.linear_x) < 0.01, "it stands")
+    await robot.becomes("idle")
+    assert robot.now.gate.commander == ""
+
+
+async def test_a_frozen_gateway_stops_the_body_and_its_backlog_moves_nothing(
+    driven: tuple[Robot, Any],
+) -> None:
+    robot, driver = driven
+    (gateway,) = robot.home.processes("ros2")
+    before, enables = set(robot.home.processes()), robot.now.gate.enables
+    alive: list[Health] = []
+    with frozen(gateway):
+        await stopped(robot)
+        await asyncio.sleep(1.0)  # of commands that wait for it
+        await driver.query("rest")
+        since = len(robot.states)
+    robot.bus.subscribe(HEALTH, lambda _, health: alive.append(health), name="ros2")
+    await until(lambda: len(alive) >= 3, "the gateway goes on")
+    assert {one.sent.linear_x for one in robot.states[since:]} == {0.0}
+    assert {one.gate.mode for one in robot.states[since:]} == {"idle"}
+    assert set(robot.home.processes()) == before
+    await driving(robot, driver)
+    assert robot.now.gate.enables > enables
+
+
+async def test_a_gateway_killed_while_ros_drives_stops_the_body_and_asks_for_it_again(
+    driven: tuple[Robot, Any],
+) -> None:
+    robot, _ = driven
+    (gateway,) = robot.home.processes("ros2")
+    others, enables = set(robot.home.processes()) - {gateway}, robot.now.gate.enables
+    os.kill(gateway, signal.SIGKILL)
+    await stopped(robot)
+    await until(lambda: robot.home.processes("ros2") not in ([], [gateway]), "it is restarted")
+    await until(lambda: robot.now.velocity.linear_x > 0.1, "the stream drives it again")
+    assert robot.now.gate.enables > enables
+    assert others <= set(robot.home.processes())
