@@ -10,16 +10,20 @@ echoed tick.
 from msgspec.structs import replace
 
 from gigabrain_schemas.base import TICK_S, Cause, Velocity
+from gigabrain_schemas.brain import CmdVel, JointCommand
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_zenoh.gate import causes as why
+from gigabrain_zenoh.gate import joints
 from gigabrain_zenoh.gate.state import (
     BRAIN,
     ISSUED_TICKS,
+    SILENCE_TICKS,
     Enable,
     Estop,
     Event,
     GateConfig,
     GateState,
+    JointsCommand,
     NotFinite,
     Outcome,
     Release,
@@ -32,6 +36,7 @@ from gigabrain_zenoh.gate.state import (
     status,
     stop_reasons,
 )
+from gigabrain_zenoh.geometry.joints import joints_at_rest
 from gigabrain_zenoh.geometry.limits import ZERO, at_rest, clamp, ramp, slowed
 
 STILL_TICKS = 25  # 0.5 s at rest before a release
@@ -84,6 +89,7 @@ __all__ = [
     "Event",
     "GateConfig",
     "GateState",
+    "JointsCommand",
     "NotFinite",
     "Outcome",
     "Release",
@@ -109,7 +115,8 @@ def step(config: GateConfig, state: GateState, event: Event) -> tuple[GateState,
     if after.mode == "enabled":
         found = stop_reasons(config, after, after.commander)
         after = _stop(after, found) if found else after
-    return replace(after, output=_output(config, after)), outcome
+    output = _output(config, after)
+    return replace(after, output=output, joints=joints.output(config, after, _calm(after))), outcome
 
 
 def _handle(config: GateConfig, state: GateState, event: Event) -> tuple[GateState, Outcome]:
@@ -117,7 +124,9 @@ def _handle(config: GateConfig, state: GateState, event: Event) -> tuple[GateSta
         case Tick():
             return _tick(config, state, event), Outcome()
         case VelocityCommand():
-            return _command(state, event)
+            return _command(config, state, event)
+        case JointsCommand():
+            return _command(config, state, event)
         case NotFinite():
             return _not_finite(state, event)
         case Safety():
@@ -137,9 +146,10 @@ def _tick(config: GateConfig, state: GateState, event: Tick) -> GateState:
         tick=state.tick + 1,
         issued_ns=issued[-ISSUED_TICKS:],
         faults=event.faults,
-        still_ticks=state.still_ticks + 1 if at_rest(event.measured) else 0,
+        still_ticks=state.still_ticks + 1 if _rests(event) else 0,
         late=event.late,
         before=state.output,
+        joints_before=joints.before(state, event),
     )
     if state.mode == "enabled":
         return state
@@ -150,6 +160,10 @@ def _tick(config: GateConfig, state: GateState, event: Tick) -> GateState:
     return _waiting(config, state, now)
 
 
+def _rests(event: Tick) -> bool:
+    return at_rest(event.measured) and joints_at_rest(event.joints)
+
+
 def _stop(state: GateState, found: tuple[Cause, ...]) -> GateState:
     return replace(state, mode="stopping", causes=found, stopped_tick=state.tick, healthy_ticks=0)
 
@@ -158,6 +172,8 @@ def _stopping(state: GateState, now: tuple[Cause, ...]) -> GateState:
     """Continue stopping. The commander must be enabled again afterwards."""
     state = replace(state, causes=why.merge(state.causes, why.latching(now)))
     if state.tick - state.stopped_tick < STOPPING_TICKS or state.before != ZERO:
+        return state
+    if any(joint.velocity for joint in state.joints_before):
         return state
     held = why.latching(state.causes)
     return replace(state, mode="latched" if held else "idle", causes=held or now, commander="")
@@ -188,6 +204,9 @@ def _enabled(state: GateState, source: str) -> GateState:
         command=None,
         command_tick=state.tick,
         next_seq=0,
+        joint_command=None,
+        joint_tick=state.tick,
+        next_joint_seq=0,
         nan_ticks=(),
     )
 
@@ -201,8 +220,8 @@ def _output(config: GateConfig, state: GateState) -> Velocity:
     if state.mode in ("latched", "idle"):
         return ZERO
     target, command = ZERO, state.command
-    calm = state.tick - state.enabled_tick < CALM_TICKS
-    if state.mode == "enabled" and command and state.safety and not calm:
+    live = command and state.tick - state.command_tick <= SILENCE_TICKS
+    if state.mode == "enabled" and command and live and state.safety and not _calm(state):
         target = clamp(
             Velocity(
                 linear_x=command.linear_x, linear_y=command.linear_y, angular_z=command.angular_z
@@ -214,11 +233,19 @@ def _output(config: GateConfig, state: GateState) -> Velocity:
     return change(state.before, target, config.limits, TICK_S)
 
 
-def _command(state: GateState, event: VelocityCommand) -> tuple[GateState, Outcome]:
+def _calm(state: GateState) -> bool:
+    return state.tick - state.enabled_tick < CALM_TICKS
+
+
+def _command(
+    config: GateConfig, state: GateState, event: VelocityCommand | JointsCommand
+) -> tuple[GateState, Outcome]:
     command = event.command
     if not is_finite(command):
         return _not_finite(state, NotFinite(command.source, command.boot))
     refused = refusal(state, command, event.wall_ns)
+    if not refused and isinstance(command, JointCommand):
+        refused = joints.refusal(config, state, command)
     if refused:
         return state, Outcome(refused=refused, ok=False)
     if command.source == BRAIN:
@@ -227,10 +254,21 @@ def _command(state: GateState, event: VelocityCommand) -> tuple[GateState, Outco
         return state, Outcome(refused="not_enabled", ok=False)
     if command.source != state.commander:
         return state, Outcome(refused="commander", ok=False)
-    if command.seq < state.next_seq:
+    if command.seq < _next_seq(state, command):
         return state, Outcome(refused="seq", ok=False)
-    state = replace(state, command=command, command_tick=state.tick, next_seq=command.seq + 1)
-    return state, Outcome()
+    return _obeyed(state, command), Outcome()
+
+
+def _next_seq(state: GateState, command: CmdVel | JointCommand) -> int:
+    return state.next_joint_seq if isinstance(command, JointCommand) else state.next_seq
+
+
+def _obeyed(state: GateState, command: CmdVel | JointCommand) -> GateState:
+    """Return the state with a command that counts from now on."""
+    after = command.seq + 1
+    if isinstance(command, JointCommand):
+        return replace(state, joint_command=command, joint_tick=state.tick, next_joint_seq=after)
+    return replace(state, command=command, command_tick=state.tick, next_seq=after)
 
 
 def _not_finite(state: GateState, event: NotFinite) -> tuple[GateState, Outcome]:

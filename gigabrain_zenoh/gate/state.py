@@ -5,10 +5,11 @@ import math
 import msgspec
 
 from gigabrain_schemas.base import TICK_NS, Cause, Velocity
-from gigabrain_schemas.body import GateMode, GateStatus
-from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.body import GateMode, GateStatus, JointDescription
+from gigabrain_schemas.brain import CmdVel, JointCommand
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_zenoh.gate import causes as why
+from gigabrain_zenoh.geometry.joints import JointMotion
 from gigabrain_zenoh.geometry.limits import ZERO, Limits
 
 BRAIN = "control"  # the commander of the normal chain
@@ -18,6 +19,7 @@ class GateConfig(msgspec.Struct, frozen=True, kw_only=True):
     """Settings of the gate, from the body and the deployment."""
 
     limits: Limits
+    joints: tuple[JointDescription, ...] = ()  # that can be commanded
     basis_ns: int = 250_000_000  # oldest sensor data that may move the body
     auto_resume: bool = False
 
@@ -39,7 +41,11 @@ class GateState(msgspec.Struct, frozen=True, kw_only=True):
     command: CmdVel | None = None  # last valid one of the commander
     command_tick: int = 0  # of its arrival
     next_seq: int = 0  # the lowest that the commander may use
-    brain_command: CmdVel | None = None  # last valid one of the brain, also while another commands
+    joint_command: JointCommand | None = None  # the same of the commander's other stream
+    joint_tick: int = 0
+    next_joint_seq: int = 0
+    brain_command: CmdVel | JointCommand | None = None
+    # last valid one of the brain, also while another commands
     brain_tick: int = -1000
     safety: SafetyState | None = None
     stopped_tick: int = 0  # when stopping began
@@ -49,6 +55,8 @@ class GateState(msgspec.Struct, frozen=True, kw_only=True):
     late: bool = False  # this tick was missed and is made up for
     before: Velocity = ZERO  # output of the last tick
     output: Velocity = ZERO  # velocity for the body
+    joints_before: tuple[JointMotion, ...] = ()  # output of the last tick, for each joint
+    joints: tuple[JointMotion, ...] = ()  # for the body; none before they were measured
 
 
 class Tick(msgspec.Struct, frozen=True):
@@ -58,12 +66,21 @@ class Tick(msgspec.Struct, frozen=True):
     wall_ns: int | None = None
     faults: tuple[Cause, ...] = ()  # reported by the driver
     late: bool = False  # it was missed and is made up for, right behind another one
+    joints: tuple[JointMotion, ...] = ()  # as measured, those that can be commanded
+    limp: bool = False  # the joints are let go of
 
 
 class VelocityCommand(msgspec.Struct, frozen=True):
     """A velocity command has arrived."""
 
     command: CmdVel
+    wall_ns: int | None = None
+
+
+class JointsCommand(msgspec.Struct, frozen=True):
+    """A command for joints has arrived."""
+
+    command: JointCommand
     wall_ns: int | None = None
 
 
@@ -100,7 +117,7 @@ class Enable(msgspec.Struct, frozen=True):
     by: str = ""  # sender of the request, if another than `source`
 
 
-Event = Tick | VelocityCommand | NotFinite | Safety | Estop | Release | Enable
+Event = Tick | VelocityCommand | JointsCommand | NotFinite | Safety | Estop | Release | Enable
 
 
 class Outcome(msgspec.Struct, frozen=True):
@@ -136,24 +153,29 @@ def age_ns(state: GateState, tick: int, wall_ns: int | None) -> int:
     return age
 
 
-def is_finite(command: CmdVel) -> bool:
-    """Return whether all speeds are finite; decoded messages always are."""
-    speeds = (command.linear_x, command.linear_y, command.angular_z)
-    return all(math.isfinite(speed) for speed in speeds)
+def is_finite(command: CmdVel | JointCommand) -> bool:
+    """Return whether all of its numbers are finite; decoded messages always are."""
+    if isinstance(command, JointCommand):
+        return all(map(math.isfinite, (*command.position, *command.velocity)))
+    return all(map(math.isfinite, (command.linear_x, command.linear_y, command.angular_z)))
 
 
 def stop_reasons(config: GateConfig, state: GateState, source: str) -> tuple[Cause, ...]:
     """Return the causes for which `source` must not move the body now."""
     found = [*state.faults, *_verdict(state)]
+    streams: tuple[tuple[CmdVel | JointCommand | None, int], ...]
     if state.mode == "enabled" and source == state.commander:
-        command, arrived = state.command, state.command_tick
+        streams = (state.command, state.command_tick), (state.joint_command, state.joint_tick)
     elif source == BRAIN:
-        command, arrived = state.brain_command, state.brain_tick
+        streams = ((state.brain_command, state.brain_tick),)
     else:
         return tuple(found)  # a new commander need not have sent a command yet
-    if state.tick - arrived > SILENCE_TICKS:
+    live = [command for command, arrived in streams if state.tick - arrived <= SILENCE_TICKS]
+    if not live:
         found.append(why.SILENCE)
-    if command and command.basis and age_ns(state, command.basis, None) > config.basis_ns:
+        live = [command for command, _ in streams]
+    bases = [command.basis for command in live if command and command.basis]
+    if any(age_ns(state, basis, None) > config.basis_ns for basis in bases):
         found.append(why.STALE)
     return tuple(found)
 
@@ -169,7 +191,7 @@ def _verdict(state: GateState) -> tuple[Cause, ...]:
     return why.latching(safety.causes)
 
 
-def refusal(state: GateState, command: CmdVel, wall_ns: int | None) -> str:
+def refusal(state: GateState, command: CmdVel | JointCommand, wall_ns: int | None) -> str:
     """Return the code for which a command is refused, from any sender; empty if it is valid."""
     if command.boot != state.boot:
         return "boot"
@@ -177,7 +199,13 @@ def refusal(state: GateState, command: CmdVel, wall_ns: int | None) -> str:
         return "future"
     if age_ns(state, command.tick, wall_ns) > ECHO_NS:
         return "old"
-    moves = command.linear_x or command.linear_y or command.angular_z
-    if moves and command.source == BRAIN and not command.basis:
+    if moves(command) and command.source == BRAIN and not command.basis:
         return "basis"  # the brain must not move without sensor data
     return ""
+
+
+def moves(command: CmdVel | JointCommand) -> bool:
+    """Return whether a command asks for motion."""
+    if isinstance(command, JointCommand):
+        return True
+    return bool(command.linear_x or command.linear_y or command.angular_z)

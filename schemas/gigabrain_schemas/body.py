@@ -128,6 +128,9 @@ class RobotState(Message, frozen=True, kw_only=True):
     velocity: Velocity  # as measured
     sent: Velocity = Velocity()  # last command to the body, as its protocol encodes it
     joints: Annotated[tuple[Joint, ...], Meta(max_length=MOST_JOINTS)] = ()
+    joints_sent: Annotated[tuple[JointPosition, ...], Meta(max_length=MOST_ARM_JOINTS)] = ()
+    # [rad] or [m], last positions to the body, in the order of its description
+    limp: bool = False  # its joints are let go of: a person can move them
     battery: Battery | None = None
     imu: ImuData | None = None
     bumpers: Annotated[tuple[bool, ...], Meta(max_length=64)] = ()
@@ -312,6 +315,8 @@ class BodyDescription(Record, frozen=True, kw_only=True):
     def _check_joints(self) -> None:
         if len({joint.name for joint in self.joints}) < len(self.joints):
             raise ValueError("joints: each needs a name of its own")
+        if bool(self.joints) != (self.arm is not None):
+            raise ValueError("arm: joints and arm belong together; one of them is missing")
         if self.arm is None:
             return
         if len(self.arm.home) != len(self.joints):

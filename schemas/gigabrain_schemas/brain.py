@@ -22,7 +22,7 @@ from gigabrain_schemas.base import (
     Velocity,
     array_meta,
 )
-from gigabrain_schemas.body import MOST_CAMERAS, MOST_JOINTS, JointPosition, JointSpeed
+from gigabrain_schemas.body import MOST_ARM_JOINTS, MOST_CAMERAS, JointPosition, JointSpeed
 
 if TYPE_CHECKING:
     import numpy as np
@@ -199,7 +199,7 @@ class Intent(Message, frozen=True, kw_only=True):
     """Decision's wish, the motion that it expects, and its reason."""
 
     twist: Velocity | None = None
-    joints: Annotated[tuple[JointTarget, ...], Meta(max_length=MOST_JOINTS)] = ()
+    joints: Annotated[tuple[JointTarget, ...], Meta(max_length=MOST_ARM_JOINTS)] = ()
     trajectory: Annotated[tuple[TrajectoryPoint, ...], Meta(max_length=256)] = ()
     follow: bool = False  # control keeps to the trajectory; without, it gives the body the twist
     response: ActuationModel = ActuationModel()  # what the trajectory counts on
@@ -227,20 +227,25 @@ class CmdVel(Message, frozen=True, kw_only=True):
 
 
 class JointCommand(Message, frozen=True, kw_only=True):
-    """Where, or how fast, the joints should move; one of position and velocity per name."""
+    """Where the joints should be a tick later, and how fast they move then.
 
-    name: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MOST_JOINTS)]
-    position: Annotated[tuple[JointPosition, ...], Meta(max_length=MOST_JOINTS)] = ()
+    Positions alone are to be reached and kept; velocities alone are kept up.
+    """
+
+    name: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MOST_ARM_JOINTS)]
+    position: Annotated[tuple[JointPosition, ...], Meta(max_length=MOST_ARM_JOINTS)] = ()
     # [rad] or [m]
     velocity: Annotated[
-        tuple[JointSpeed, ...], Meta(max_length=MOST_JOINTS)
+        tuple[JointSpeed, ...], Meta(max_length=MOST_ARM_JOINTS)
     ] = ()  # [rad/s] or [m/s]
-    source: Name = ""
+    source: Name = ""  # who commands
 
     def __post_init__(self) -> None:
-        lengths = sorted((len(self.position), len(self.velocity)))
-        if lengths != [0, len(self.name)]:
+        count, lengths = len(self.name), (len(self.position), len(self.velocity))
+        if lengths not in ((count, 0), (0, count), (count, count)):
             raise ValueError(
-                f"{len(self.name)} names need as many positions or velocities, "
-                f"got {len(self.position)} and {len(self.velocity)}"
+                f"{count} names need as many positions or velocities, or both, "
+                f"got {lengths[0]} and {lengths[1]}"
             )
+        if len(set(self.name)) < count:
+            raise ValueError("name: each joint at most once")

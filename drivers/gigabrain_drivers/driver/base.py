@@ -9,12 +9,19 @@ from typing import Any, ClassVar, Self
 
 from gigabrain_drivers.driver.robot import LinkOptions, RobotFile, Run
 from gigabrain_schemas.base import TICK_NS, Message, Velocity
-from gigabrain_schemas.body import Joint, RobotState, SafeState
+from gigabrain_schemas.body import (
+    MOST_MODEL_CHARACTERS,
+    ArmModel,
+    Joint,
+    RobotState,
+    SafeState,
+)
 from gigabrain_schemas.sim import SimReply, SimRequest
 from gigabrain_schemas.topics import Topic
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import GigabrainError, Unsupported
+from gigabrain_zenoh.errors import ConfigError, GigabrainError, Unsupported
 from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of
+from gigabrain_zenoh.host.files import read_bounded
 
 log = logging.getLogger(__name__)
 
@@ -93,7 +100,10 @@ class Driver(abc.ABC):
         raise Unsupported(f"{type(self).__name__} cannot park its body")
 
     async def limp(self) -> None:
-        """Let go of all joints, so that a person can move them. Raises BodyLost."""
+        """Let go of all joints, so that a person can move them. Raises BodyLost.
+
+        `read_state` says so until the next positions are sent.
+        """
         raise Unsupported(f"{type(self).__name__} cannot release its body's joints")
 
     def can(self, state: SafeState) -> bool:
@@ -144,6 +154,16 @@ class Driver(abc.ABC):
     async def get_joint_states(self) -> tuple[Joint, ...]:
         """Return all joints as measured. Raises BodyLost."""
         return (await self.read_state()).joints
+
+    def arm_model(self) -> ArmModel | None:
+        """Return the model of a body with an arm. Raises ConfigError."""
+        if self.robot.arm is None:
+            return None
+        path = self.run.folder / self.robot.arm_model
+        try:
+            return ArmModel(mjcf=read_bounded(path, MOST_MODEL_CHARACTERS).decode())
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"{path}: the model of the arm: {error}") from None
 
     async def change_world(self, request: SimRequest) -> SimReply:
         """Change the simulated world that the body is in. Raises Unsupported, and Refused."""

@@ -187,7 +187,7 @@ class Gatekeeper:
             self._note_change(before)
         return outcome
 
-    def command(self, event: gate.VelocityCommand) -> gate.Outcome:
+    def command(self, event: gate.VelocityCommand | gate.JointsCommand) -> gate.Outcome:
         """A command through the gate; one that is refused is counted, and its sender named."""
         outcome = self.step(event)
         reason, source = outcome.refused, event.command.source

@@ -5,7 +5,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 
-from gigabrain_schemas.brain import CmdVel, WorldModel
+from gigabrain_schemas.brain import CmdVel, JointCommand, WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_zenoh.gate.causes import BRAIN_SILENT
 from gigabrain_zenoh.gate.gate import BRAIN
@@ -60,7 +60,7 @@ class Lockstep:
         self._wanted = tick - REPEAT_TICKS + 1  # it need not say the same in every tick
         self._wake.clear()
 
-    def command(self, command: CmdVel) -> None:
+    def command(self, command: CmdVel | JointCommand) -> None:
         """Note a command. One without a basis comes from a commander that needs no scan.
 
         One that echoes a tick that has not been sent out yet answers nothing.

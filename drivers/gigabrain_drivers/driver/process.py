@@ -24,10 +24,11 @@ from gigabrain_drivers.links.frames import describe_command
 from gigabrain_drivers.sim import exposes
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.base import Message
-from gigabrain_schemas.body import Body, RobotState, SafeState
+from gigabrain_schemas.body import Body, BodyDescription, RobotState, SafeState
 from gigabrain_schemas.brain import CmdVel, JointCommand
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import (
+    ARM_MODEL,
     BODY,
     CAMERA,
     DEPTH,
@@ -49,6 +50,7 @@ from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.gate import causes as why
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.geometry.body_settings import SETTINGS, restricted, setting_of, split
+from gigabrain_zenoh.geometry.joints import JointMotion
 from gigabrain_zenoh.geometry.limits import ZERO, limits_of
 from gigabrain_zenoh.geometry.stopping import scan_limit_ns
 from gigabrain_zenoh.runtime.heartbeat import Progress
@@ -74,6 +76,7 @@ class DriverProcess:
         self._body = Body(description=description, link=config.link)
         gate_config = gate.GateConfig(
             limits=limits_of(description),
+            joints=description.joints,
             basis_ns=scan_limit_ns(robot),
             auto_resume=config.resume == "auto",
         )
@@ -90,6 +93,8 @@ class DriverProcess:
         self._round_trip = RoundTrip()
         self._line = asyncio.Lock()  # one call at a time goes out to the body
         self._sent = ZERO  # the newest command to the body
+        self._joints_sent: tuple[float, ...] = ()
+        self._limp = False  # in the newest state
         self._body_tick = 0  # when BODY was last published
         driver.emit = self._emit
         bus.report = self.report
@@ -106,7 +111,7 @@ class DriverProcess:
     async def _serve(self, ready: Callable[[], None]) -> None:
         bus = self._bus
         bus.subscribe(command_topic(self._robot), self._on_command, self._on_bad_command)
-        bus.subscribe(JOINT_CMD, self._on_joint_command)
+        bus.subscribe(JOINT_CMD, self._on_joint_command, self._on_bad_command)
         bus.latest(SAFETY, self._on_safety)
         self._gatekeeper.serve(self._driver.stop)
         if self._lockstep and self._robot.cameras:
@@ -115,6 +120,8 @@ class DriverProcess:
             serve_world(bus, self._driver.change_world)
         self._serve_settings()
         bus.publish(BODY, self._body)
+        if model := self._driver.arm_model():
+            bus.publish(ARM_MODEL, model)
         ready()
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._run_ticks())
@@ -195,11 +202,19 @@ class DriverProcess:
     async def _tick(self, passed: int) -> None:
         """20 ms of the body's time, or several where the process was held up."""
         state = clipped(await self._driver.read_state())
+        self._limp = state.limp
         if self._wake.is_set():
             await self._apply_command()  # the gate goes on from the body's newest command
         button = self._button.faults() if self._button else ()
         faults = button if state.link.connected else (why.LINK_LOST, *button)
-        self._gatekeeper.ticks(passed, gate.Tick(state.velocity, self._wall_ns(), faults))
+        tick = gate.Tick(
+            state.velocity,
+            self._wall_ns(),
+            faults,
+            joints=commanded_joints(self._body.description, state),
+            limp=state.limp,
+        )
+        self._gatekeeper.ticks(passed, tick)
         self._bus.time.tick = self._gate.tick
         if self._lockstep:
             await self._step_in_lockstep(self._lockstep, state)
@@ -224,7 +239,9 @@ class DriverProcess:
 
     def _publish_tick(self, state: RobotState) -> None:
         bus, tick = self._bus, self._gate.tick
-        state = replace(state, gate=gate.status(self._gate), sent=self._sent)
+        state = replace(
+            state, gate=gate.status(self._gate), sent=self._sent, joints_sent=self._joints_sent
+        )
         bus.publish(STATE, state, basis=tick)
         for topic, message in self._sensors:
             self._send(topic, message)
@@ -280,9 +297,12 @@ class DriverProcess:
         async with self._line:
             self._wake.clear()
             now = self._gate
+            await self._apply_joints(now)
             if now.mode == "latched":
                 self._sent = ZERO
                 await self._driver.stop()
+                return
+            if self._robot.drive_type == "arm":
                 return
             to = now.output
             sent = await self._driver.set_base_velocity(to.linear_x, to.linear_y, to.angular_z)
@@ -293,6 +313,15 @@ class DriverProcess:
             late = gate.age_ns(now, now.command.tick, self._wall_ns()) > STALE_NS
             self._bus.counters["stale_commands_executed"] += late
 
+    async def _apply_joints(self, now: gate.GateState) -> None:
+        """Have the joints go where the gate says; those of a limp body are left alone."""
+        if not now.joints or (self._limp and now.mode != "enabled"):
+            return
+        names = [joint.name for joint in self._body.description.joints]
+        wanted = [joint.position for joint in now.joints]
+        sent = await self._driver.set_joint_positions(dict(zip(names, wanted, strict=True)))
+        self._joints_sent = tuple(sent[name] for name in names)
+
     def _on_command(self, _key: str, command: CmdVel) -> None:
         arrived_ns = self._bus.clock.now_ns()
         self._gatekeeper.command(gate.VelocityCommand(command, self._wall_ns()))
@@ -302,9 +331,11 @@ class DriverProcess:
             if self._lockstep and command.source == (self._gate.commander or gate.BRAIN):
                 self._lockstep.command(command)
 
-    def _on_joint_command(self, _key: str, _command: JointCommand) -> None:
-        """Count a refusal: no body of this package has joints to command."""
-        self._bus.counters["refused_no_joints"] += 1
+    def _on_joint_command(self, _key: str, command: JointCommand) -> None:
+        self._gatekeeper.command(gate.JointsCommand(command, self._wall_ns()))
+        mine = command.source == (self._gate.commander or gate.BRAIN)
+        if self._lockstep and mine and command.boot == self._gate.boot:
+            self._lockstep.command(command)
 
     def _on_bad_command(self, payload: bytes) -> None:
         """Not a valid command: was it the commander, with a value that is not a number?"""
@@ -363,12 +394,14 @@ async def run(config: DriverConfig, bus: Bus, ready: Callable[[], None]) -> None
     await process.run(ready)
 
 
-class RawSpeeds(msgspec.Struct):
+class RawCommand(msgspec.Struct):
     """A command before its numbers are checked."""
 
     linear_x: float = 0.0
     linear_y: float = 0.0
     angular_z: float = 0.0
+    position: tuple[float, ...] = ()
+    velocity: tuple[float, ...] = ()
     source: str = ""
     boot: int = 0
 
@@ -376,13 +409,22 @@ class RawSpeeds(msgspec.Struct):
 def not_finite(payload: bytes) -> tuple[str, int] | None:
     """Return source and boot of a command with NaN or infinity; None for anything else."""
     try:
-        raw = msgspec.msgpack.decode(payload, type=RawSpeeds)
+        raw = msgspec.msgpack.decode(payload, type=RawCommand)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         return None
-    speeds = (raw.linear_x, raw.linear_y, raw.angular_z)
-    if all(abs(speed) < float("inf") for speed in speeds):
+    numbers = (raw.linear_x, raw.linear_y, raw.angular_z, *raw.position, *raw.velocity)
+    if all(map(math.isfinite, numbers)):
         return None
     return raw.source, raw.boot
+
+
+def commanded_joints(body: BodyDescription, state: RobotState) -> tuple[JointMotion, ...]:
+    """Return the joints that can be commanded, as measured; none while one is missing."""
+    measured = {joint.name: joint for joint in state.joints}
+    if any(joint.name not in measured for joint in body.joints):
+        return ()
+    found = (measured[joint.name] for joint in body.joints)
+    return tuple(JointMotion(joint.position, joint.velocity) for joint in found)
 
 
 def clipped(record: R) -> R:

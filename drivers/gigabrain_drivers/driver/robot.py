@@ -21,6 +21,7 @@ class RobotFile(BodyDescription, frozen=True, kw_only=True, forbid_unknown_field
     wheel_base: Length = 0.0  # [m], front to rear, of mecanum and Ackermann bases
     effective_track: Length = 0.0
     # [m], of a skid-steered base: the separation of rolling wheels that would turn it as much
+    arm_model: str = "model.xml"  # MJCF of a body with an arm, beside this file
     sim: dict[str, Any] | None = None
     emulated: dict[str, Any] | None = None
     real: dict[str, Any] | None = None

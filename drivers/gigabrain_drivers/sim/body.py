@@ -23,6 +23,7 @@ from gigabrain_drivers.kinematics.wheels import (
     wheels_of,
 )
 from gigabrain_schemas.base import NonNegative, Percentage, Positive
+from gigabrain_schemas.body import JointDescription
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import read_bounded
 
@@ -33,10 +34,11 @@ WHEELS = {  # drive types on wheels, and the driven parts of their models
     "omni": tuple(f"wheel_{name}" for name in Omni.wheels),
     "ackermann": ("wheel_rear_left", "wheel_rear_right", "steer_left", "steer_right"),
 }
-SIMULATED = (*WHEELS, "quadruped")
+SIMULATED = (*WHEELS, "quadruped", "arm")
 ROLLERS = ("mecanum", "omni")  # wheels with rollers on them
 SPARE_WHEEL_SPEED = 1.25  # times what the body's largest speeds, all at once, ask of a wheel
 MAX_MODEL_BYTES = 10_000_000
+ARM_SUBSTEPS = 5  # of 2 ms: fingers must not let go of what they hold
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,6 +79,16 @@ class SimMotor:
     ambient_celsius: float = 25.0
 
 
+@dataclass(frozen=True, kw_only=True)
+class SimServo(SimMotor):
+    """One joint's servo; the defaults are a Feetech STS3215 of 7.4 V."""
+
+    torque_per_ampere: float = 0.8  # [N m/A], stall: 1.9 N m at 2.4 A
+    resistance_ohm: float = 3.1
+    heat_capacity: float = 30.0  # [J/K]
+    encoder_ticks: int = 4096  # per turn
+
+
 class PartNames(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What a moving part is called in a model: its joint, and what else is not found by it."""
 
@@ -101,10 +113,16 @@ class SimModel:
     battery: SimBattery = field(default_factory=SimBattery)
     motor: SimMotor = field(default_factory=SimMotor)
     substeps: int = 2  # substeps in a step of 10 ms; wheels roll as well on 5 ms as on 1 ms
+    joints: tuple[JointDescription, ...] = ()  # of its arm; each has a position servo
+    posture: tuple[float, ...] = ()  # of the arm at the start [rad] or [m]
+    servo: SimServo = field(default_factory=SimServo)
+    fixed: bool = False  # its base is screwed to the floor
 
     def parts(self) -> tuple[tuple[str, str], ...]:
         """(kind, name) of what the model has to have besides base, sensors and lidar."""
-        return ()
+        return tuple(
+            part for one in self.joints for part in (("joint", one.name), ("actuator", one.name))
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,7 +159,7 @@ class SimBody(SimModel):
 
     def parts(self) -> tuple[tuple[str, str], ...]:
         """Wheels, and what steers."""
-        return tuple(
+        wheels = tuple(
             part
             for name in self.wheels
             for part in (
@@ -151,6 +169,7 @@ class SimBody(SimModel):
                 ("actuator", name),
             )
         )
+        return (*wheels, *super().parts())
 
 
 LEG_BATTERY = SimBattery(
@@ -226,12 +245,18 @@ def sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimModel:
         "named_by": options.model if options.model != "model.xml" else options.driver,
         "names": options.names,
         "footprint": robot.footprint,
+        "joints": robot.joints,
+        "posture": robot.arm.home if robot.arm else (),
     }
     if robot.drive_type not in SIMULATED:
         raise ConfigError(
             f"{robot.robot_type}: drive_type {robot.drive_type!r} cannot be simulated in MuJoCo; "
             f"{', '.join(SIMULATED)} can"
         )
+    if robot.joints:
+        found["substeps"] = ARM_SUBSTEPS
+    if robot.drive_type == "arm":
+        return SimModel(lidar=lidar, fixed=True, **found)
     if robot.drive_type == "quadruped":
         battery = replace(
             LEG_BATTERY,

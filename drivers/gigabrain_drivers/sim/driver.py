@@ -45,6 +45,7 @@ def state_message(simulation: Simulation, robot_type: str) -> RobotState:
         battery=Battery(**charge._asdict()),
         imu=ImuData(**imu._asdict()),
         bumpers=(simulation.bumper(),),
+        limp=bool(simulation.arm and simulation.arm.limp),
     )
 
 
@@ -127,8 +128,10 @@ class MujocoDriver(Driver):
         await self.stop()
 
     async def limp(self) -> None:
-        """Stop, see `park`."""
+        """Stop, see `park`; an arm's servos are switched off."""
         await self.stop()
+        if self._simulation.arm:
+            self._simulation.arm.let_go()
 
     async def ticks(self, clock: Clock) -> AsyncIterator[int]:
         """Yield one tick per 20 ms of simulated time, until the run's seconds are over."""
@@ -158,6 +161,13 @@ class MujocoDriver(Driver):
         wanted = self.bounded(linear_x, linear_y, angular_z)
         to = self._simulation.drive(wanted.linear_x, wanted.linear_y, wanted.angular_z)
         return Velocity(linear_x=to.linear_x, linear_y=to.linear_y, angular_z=to.angular_z)
+
+    async def set_joint_positions(self, positions: Mapping[str, float]) -> Mapping[str, float]:
+        """Have the arm's servos go to positions [rad] or [m]."""
+        if self._simulation.arm is None:
+            return await super().set_joint_positions(positions)
+        self._simulation.arm.aim(positions)
+        return positions
 
     async def read_state(self) -> RobotState:
         """The state at the end of the newest tick."""

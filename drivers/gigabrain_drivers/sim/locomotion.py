@@ -83,6 +83,7 @@ class Motor(NamedTuple):
     velocity: float  # [rad/s]
     effort: float  # [N m]
     temperature: float  # [deg C]
+    current: float | None = None  # [A], of servos that measure it
 
 
 class OdometryReading(NamedTuple):
@@ -137,6 +138,36 @@ class Locomotion(abc.ABC):
 
     def contacts(self) -> tuple[bool, ...]:
         """Return which feet bear weight; none for a body without feet."""
+        return ()
+
+
+class Fixed(Locomotion):
+    """A base that is screwed to the floor."""
+
+    def command(self, twist: Twist) -> Twist:
+        """Stay where it is."""
+        return REST
+
+    def act(self) -> None:
+        """Do nothing."""
+
+    def sense(self, imu: ImuSample) -> None:
+        """Do nothing."""
+
+    def wear(self) -> float:
+        """Return no current: it has no motors."""
+        return 0.0
+
+    def odometry(self) -> OdometryReading:
+        """Return the pose at which it is fixed."""
+        return OdometryReading(0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def velocity(self) -> Twist:
+        """Return that it rests."""
+        return REST
+
+    def motors(self) -> tuple[Motor, ...]:
+        """Return none."""
         return ()
 
 

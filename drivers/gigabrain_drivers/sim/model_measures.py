@@ -1,7 +1,7 @@
 """Compares a robot's MJCF model with the measures in the robot's file."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import mujoco
 import numpy as np
@@ -68,10 +68,18 @@ class ModelMeasures:
         low, high = self._model.actuator_ctrlrange[number].tolist()
         return low, high
 
-    def outline(self) -> tuple[float, float, float, float]:
-        """Return front, rear, left and right edge of all that can touch things [m]."""
+    def outline(self, arm: Sequence[str] = ()) -> tuple[float, float, float, float]:
+        """Return front, rear, left and right edge of all that can touch things [m].
+
+        What the joints of an arm move does not count.
+        """
         model = self._model
+        carried = np.zeros(model.nbody, bool)
+        carried[[model.jnt_bodyid[model.joint(name).id] for name in arm]] = True
+        for number in range(1, model.nbody):
+            carried[number] |= carried[model.body_parentid[number]]
         touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+        touching &= ~carried[model.geom_bodyid]
         geoms = np.flatnonzero(touching & (model.geom_rbound > 0.0))
         half = model.geom_aabb[geoms, 3:]
         axes = np.abs(self._axes.T @ self._data.geom_xmat[geoms].reshape(-1, 3, 3))
@@ -129,7 +137,8 @@ def mismatches(spec: mujoco.MjSpec, body: SimModel) -> Iterator[str]:
     if body.footprint:
         x, y = zip(*body.footprint, strict=True)
         edges = ("front", max(x)), ("rear", min(x)), ("left side", max(y)), ("right side", min(y))
-        for (edge, told), is_in_model in zip(edges, measures.outline(), strict=True):
+        outline = measures.outline([joint.name for joint in body.joints])
+        for (edge, told), is_in_model in zip(edges, outline, strict=True):
             if abs(is_in_model) > abs(told) + MAX_OFF_M:  # a wider footprint is only careful
                 yield _differs(f"the {edge} of the footprint", is_in_model, told)
 

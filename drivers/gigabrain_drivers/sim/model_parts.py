@@ -139,7 +139,10 @@ class PartFinder:
             kinds = ", ".join(one.name or "a joint" for one in joints)
             self._problem(f"a base that moves on rails ({kinds}); remove its joints", name)
             return None
-        self._rename("joint", free[0] if free else base.add_freejoint(), "free")
+        if not self._body.fixed:
+            self._rename("joint", free[0] if free else base.add_freejoint(), "free")
+        elif free:
+            self._spec.delete(free[0])
         return base
 
     def _text(self, key: str) -> str:

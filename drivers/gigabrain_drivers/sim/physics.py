@@ -11,6 +11,7 @@ from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.kinematics.legs import Gait
 from gigabrain_drivers.kinematics.wheels import Differential, Twist
 from gigabrain_drivers.sim import STEP_NS
+from gigabrain_drivers.sim.arm import SimArm
 from gigabrain_drivers.sim.body import (
     SimBody,
     SimModel,
@@ -19,6 +20,7 @@ from gigabrain_drivers.sim.body import (
 from gigabrain_drivers.sim.locomotion import (
     Battery,
     Charge,
+    Fixed,
     FreeRolling,
     Locomotion,
     Motor,
@@ -36,6 +38,11 @@ from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
 GRAVITY = 9.81  # [m/s2]
 STALL_AMPERES, STALL_SHARE = 1.4, 4.0  # of the usual motor; times its gear's friction
 EDGE_OF_THE_WORLD_M = 1e3
+DIVERGED = (
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_BADQACC,
+)
 
 
 class Simulation:
@@ -47,7 +54,8 @@ class Simulation:
         self.data = mujoco.MjData(self.model)
         self._steps, self._substeps = 0, body.substeps
         self._locomotion = make_locomotion(body, self.model, self.data)
-        self._height = int(self.model.joint(f"{ROBOT}free").qposadr[0]) + 2
+        self._base = self.model.body(f"{ROBOT}base").id
+        self.arm = SimArm(body, self.model, self.data) if body.joints else None
         self._battery = Battery(body.battery)
         self._people = {
             self.model.body(f"{PERSON}{number + 1 if number else ''}").id: Person(walk)
@@ -108,12 +116,18 @@ class Simulation:
                 person.advance(lambda x, y: self.truth.footprint.distance(robot, x, y))
             self._place_people()
         self._locomotion.act()
+        if self.arm:
+            self.arm.act()
         mujoco.mj_step(self.model, self.data, nstep=self._substeps)
         self._steps += 1
         self._check()
         self._sample = self._imu.sample()
         self._locomotion.sense(self._sample)
-        self._battery.drain(self._locomotion.wear())
+        current = self._locomotion.wear()
+        if self.arm:
+            self.arm.sense()
+            current += self.arm.wear()
+        self._battery.drain(current)
         self.truth.update()
 
     def scan(self) -> NDArray[np.float32]:
@@ -138,8 +152,8 @@ class Simulation:
         return self._sample
 
     def motors(self) -> tuple[Motor, ...]:
-        """Return all driven joints."""
-        return self._locomotion.motors()
+        """Return all driven joints, those of the arm last."""
+        return (*self._locomotion.motors(), *(self.arm.motors() if self.arm else ()))
 
     def contacts(self) -> tuple[bool, ...]:
         """Return which feet bear weight, by their own sensors; none on wheels."""
@@ -172,9 +186,11 @@ class Simulation:
             self.data.mocap_quat[place] = yaw_quaternion(person.pose)
 
     def _check(self) -> None:
-        """A diverging simulation shows as NaN, or as a robot that flies away."""
-        x, y, z = self.data.qpos[self._height - 2 : self._height + 1].tolist()
-        if not (abs(x) < EDGE_OF_THE_WORLD_M and abs(y) < EDGE_OF_THE_WORLD_M and abs(z) < 1):
+        """A diverging simulation shows as a warning of MuJoCo, or as a robot that flies away."""
+        x, y, z = self.data.xpos[self._base].tolist()
+        far = EDGE_OF_THE_WORLD_M
+        lost = any(self.data.warning[kind].number for kind in DIVERGED)
+        if lost or not (abs(x) < far and abs(y) < far and abs(z) < 1):
             raise BodyLost(f"the simulation diverged after {self.time_ns / 1e9:.2f} s")
 
 
@@ -198,6 +214,8 @@ def make_locomotion(body: SimModel, model: mujoco.MjModel, data: mujoco.MjData) 
         return kind(body, model, data)
     if isinstance(body, SimQuadruped):
         return Walking(body, model, data)
+    if body.fixed:
+        return Fixed()
     raise ConfigError(f"{type(body).__name__} has neither wheels nor legs")
 
 

@@ -123,6 +123,9 @@ def compile_scene(body: SimModel, world: World) -> mujoco.MjModel:
     mujoco.set_mju_user_warning(log.warning)  # instead of a file
     spec = world_spec(world)
     spec.option.timestep = STEP_S / body.substeps
+    if body.joints:  # so that fingers do not let go of what they hold
+        spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10.0
+        spec.option.noslip_iterations = 10
     start = world.start
     try:
         robot = _robot_spec(body)

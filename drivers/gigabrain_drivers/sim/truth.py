@@ -35,8 +35,10 @@ class Truth:
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         self._model, self._data = model, data
         self._base = model.body(f"{ROBOT}base").id
-        self._place = model.joint(f"{ROBOT}free").qposadr[0]
-        self._velocity = model.joint(f"{ROBOT}free").dofadr[0]
+        self.fixed = model.body_jntnum[self._base] == 0  # its base cannot move
+        if not self.fixed:
+            self._place = model.joint(f"{ROBOT}free").qposadr[0]
+            self._velocity = model.joint(f"{ROBOT}free").dofadr[0]
         self._is_robot = model.body_rootid[model.geom_bodyid] == self._base
         floor = np.array([is_floor(model, geom) for geom in range(model.ngeom)])
         self._may_be_obstacle = ~self._is_robot & ~floor
@@ -83,12 +85,18 @@ class Truth:
 
     def pose(self) -> Pose:
         """Return the pose of the base in the world."""
-        x, y, _, *quaternion = self._data.qpos[self._place : self._place + 7].tolist()
-        a, b, c, d = quaternion
+        if self.fixed:
+            x, y, _ = self._data.xpos[self._base].tolist()
+            a, b, c, d = self._data.xquat[self._base].tolist()
+        else:
+            place = self._place
+            x, y, _, a, b, c, d = self._data.qpos[place : place + 7].tolist()
         return Pose(x, y, math.atan2(2 * (a * d + b * c), 1 - 2 * (c * c + d * d)))
 
     def speed(self) -> tuple[float, float]:
         """(forward [m/s], turning [rad/s]) of the base."""
+        if self.fixed:
+            return 0.0, 0.0
         x, y, _, _, _, turning = self._data.qvel[self._velocity : self._velocity + 6].tolist()
         yaw = self.pose().yaw
         return math.cos(yaw) * x + math.sin(yaw) * y, turning

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Literal
 
 from gigabrain_schemas.base import Cause, Velocity
+from gigabrain_schemas.body import JointDescription
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_zenoh.gate import gate
@@ -33,8 +34,16 @@ def plain(causes: tuple[Cause, ...]) -> list[tuple[str, str]]:
 class Rig:
     """One gate and its present state. Times are counted back from now, in ticks."""
 
-    def __init__(self, *, auto_resume: bool = False, basis_ns: int = 250_000_000) -> None:
-        self.config = gate.GateConfig(limits=LIMITS, basis_ns=basis_ns, auto_resume=auto_resume)
+    def __init__(
+        self,
+        *,
+        auto_resume: bool = False,
+        basis_ns: int = 250_000_000,
+        joints: tuple[JointDescription, ...] = (),
+    ) -> None:
+        self.config = gate.GateConfig(
+            limits=LIMITS, joints=joints, basis_ns=basis_ns, auto_resume=auto_resume
+        )
         self.state = gate.GateState(boot=BOOT)
         self.seq = 0
         self.outcome = gate.Outcome()

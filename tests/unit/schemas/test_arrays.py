@@ -51,7 +51,8 @@ def image(encoding: Any, height: int, width: int, data: bytes) -> Image:
         (lambda: image("mono8", 0, 0, b""), "at least one pixel"),
         (lambda: Obstacle(id=1, x=0.0, y=0.0, radius=0.1, covariance=(0.0,) * 9), "16 values"),
         (lambda: JointCommand(name=("a", "b"), position=(0.0,)), "2 names"),
-        (lambda: JointCommand(name=("a",), position=(0.0,), velocity=(0.0,)), "1 names"),
+        (lambda: JointCommand(name=("a", "b"), position=(0.0,) * 2, velocity=(0.0,)), "2 names"),
+        (lambda: JointCommand(name=("a", "a"), position=(0.0, 1.0)), "at most once"),
         (lambda: JointCommand(name=("a",)), "1 names"),
         (
             lambda: Thresholds(battery_warn=4.0),

@@ -1,0 +1,89 @@
+"""The arm of a simulated body: position servos with encoders, and their wear."""
+
+import math
+from collections.abc import Mapping
+
+import mujoco
+
+from gigabrain_drivers.sim import STEP_S
+from gigabrain_drivers.sim.body import SimModel
+from gigabrain_drivers.sim.locomotion import Motor, MotorHeat
+from gigabrain_drivers.sim.scene import ROBOT
+
+SLIDES = mujoco.mjtJoint.mjJNT_SLIDE
+METRES_PER_TICK = 1e-5  # of a sliding joint's encoder
+
+
+class SimArm:
+    """Servos that hold what they were last told. It sees no more than its encoders do."""
+
+    def __init__(self, body: SimModel, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        self._data = data
+        self.names = tuple(joint.name for joint in body.joints)
+        joints = [model.joint(f"{ROBOT}{name}") for name in self.names]
+        self._places = [int(joint.qposadr[0]) for joint in joints]
+        self._motors = [int(model.actuator(f"{ROBOT}{name}").id) for name in self.names]
+        radians = math.tau / body.servo.encoder_ticks
+        self._units = [METRES_PER_TICK if joint.type[0] == SLIDES else radians for joint in joints]
+        self._heat = [MotorHeat(body.servo) for _ in joints]
+        self._amperes = [0.0] * len(joints)
+        data.qpos[self._places] = data.ctrl[self._motors] = body.posture
+        self._now = self._before = self._measured()
+        self._model = model
+        self._gains = model.actuator_gainprm[self._motors].copy()
+        self._biases = model.actuator_biasprm[self._motors].copy()
+        self._targets = dict(zip(self.names, body.posture, strict=True))
+        self.limp = self._was_limp = False
+
+    def aim(self, positions: Mapping[str, float]) -> None:
+        """Have servos go to positions [rad] or [m], and hold them; limp ones hold again."""
+        self._targets = {**self._targets, **positions}
+        self.limp = False
+
+    def let_go(self) -> None:
+        """Switch all servos off."""
+        self.limp = True
+
+    def act(self) -> None:
+        """Set the servos for the next step."""
+        if self.limp != self._was_limp:
+            self._was_limp = self.limp
+            on = 0.0 if self.limp else 1.0
+            self._model.actuator_gainprm[self._motors] = on * self._gains
+            self._model.actuator_biasprm[self._motors] = on * self._biases
+        targets = self._targets
+        for name, motor in zip(self.names, self._motors, strict=True):
+            self._data.ctrl[motor] = targets[name]
+
+    def sense(self) -> None:
+        """Read the encoders after a step."""
+        self._before, self._now = self._now, self._measured()
+
+    def wear(self) -> float:
+        """Warm the motors by the torque of the step; return the current [A] that it took."""
+        self._amperes = [
+            heat.warm(0.0, effort) for heat, effort in zip(self._heat, self._efforts(), strict=True)
+        ]
+        return sum(self._amperes)
+
+    def motors(self) -> tuple[Motor, ...]:
+        """Return all joints as their servos report them."""
+        return tuple(
+            Motor(name, now, (now - before) / STEP_S, effort, heat.celsius, amperes)
+            for name, now, before, effort, heat, amperes in zip(
+                self.names,
+                self._now,
+                self._before,
+                self._efforts(),
+                self._heat,
+                self._amperes,
+                strict=True,
+            )
+        )
+
+    def _measured(self) -> tuple[float, ...]:
+        places = zip(self._places, self._units, strict=True)
+        return tuple(round(float(self._data.qpos[place]) / unit) * unit for place, unit in places)
+
+    def _efforts(self) -> list[float]:
+        return [float(self._data.actuator_force[motor]) for motor in self._motors]

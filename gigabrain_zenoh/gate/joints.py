@@ -1,0 +1,63 @@
+"""The gate's part for joints: which commands count, and where each joint goes next.
+
+In every case but a live command of the commander, joints come to rest and are held there.
+"""
+
+from gigabrain_schemas.base import TICK_S
+from gigabrain_schemas.body import JointDescription
+from gigabrain_schemas.brain import JointCommand
+from gigabrain_zenoh.gate.state import GateConfig, GateState, Tick
+from gigabrain_zenoh.geometry.joints import JointMotion, accelerated, approach, braked, frozen
+
+LIVE_TICKS = 2  # 40 ms after a command, joints that get no other brake
+TOLERANCE = 1e-6  # [rad] or [m], of positions at a limit
+
+
+def refusal(config: GateConfig, state: GateState, command: JointCommand) -> str:
+    """Return the code for which a command for joints is refused; empty if it is valid."""
+    known = {joint.name: joint for joint in config.joints}
+    if not known:
+        return "no_joints"
+    if not state.joints:
+        return "joints_unknown"  # not measured yet
+    if any(name not in known for name in command.name):
+        return "joint"
+    for name, position in zip(command.name, command.position, strict=False):
+        joint = known[name]
+        if not joint.lower - TOLERANCE <= position <= joint.upper + TOLERANCE:
+            return "joint_limits"
+    return ""
+
+
+def before(state: GateState, event: Tick) -> tuple[JointMotion, ...]:
+    """Return where the joints were sent in the last tick; where they are, if nothing holds them."""
+    if event.joints and (event.limp or not state.joints):
+        return tuple(map(frozen, event.joints))
+    return state.joints
+
+
+def output(config: GateConfig, state: GateState, calm: bool) -> tuple[JointMotion, ...]:
+    """Return where each joint goes: one step from the output of the last tick.
+
+    A latched body's joints stop at once. Ticks that are made up for in a burst only brake.
+    """
+    now = state.joints_before
+    if state.mode == "latched":
+        return tuple(map(frozen, now))
+    command = state.joint_command
+    live = command and state.tick - state.joint_tick < LIVE_TICKS
+    if state.mode != "enabled" or not live or not state.safety or calm or state.late:
+        command = None
+    return tuple(
+        _step(joint, motion, command) for joint, motion in zip(config.joints, now, strict=False)
+    )
+
+
+def _step(joint: JointDescription, now: JointMotion, command: JointCommand | None) -> JointMotion:
+    if command is None or joint.name not in command.name:
+        return braked(now, joint, TICK_S)
+    index = command.name.index(joint.name)
+    velocity = command.velocity[index] if command.velocity else 0.0
+    if not command.position:
+        return accelerated(now, velocity, joint, TICK_S)
+    return approach(now, JointMotion(command.position[index], velocity), joint, TICK_S)

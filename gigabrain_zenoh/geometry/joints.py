@@ -1,0 +1,79 @@
+"""How far joints may move from tick to tick. Pure functions."""
+
+import math
+from collections.abc import Sequence
+
+import msgspec
+
+from gigabrain_schemas.body import JointDescription
+
+AT_REST_JOINT_SPEED = 0.05  # [rad/s] or [m/s], of a joint that stands still
+
+
+class JointMotion(msgspec.Struct, frozen=True):
+    """Where a joint is, and how fast it moves."""
+
+    position: float  # [rad] or [m]
+    velocity: float = 0.0  # [rad/s] or [m/s]
+
+
+def joints_at_rest(measured: Sequence[JointMotion]) -> bool:
+    """Return whether all joints stand still; False where a speed is NaN."""
+    return all(abs(joint.velocity) < AT_REST_JOINT_SPEED for joint in measured)
+
+
+def frozen(now: JointMotion) -> JointMotion:
+    """Return a joint that stops where it is."""
+    return JointMotion(now.position)
+
+
+def braked(now: JointMotion, limits: JointDescription, dt: float) -> JointMotion:
+    """Return where a joint is after `dt` [s] of braking at its greatest acceleration."""
+    slower = max(0.0, abs(now.velocity) - limits.max_acceleration * dt)
+    return _moved(now, math.copysign(slower, now.velocity), limits, dt)
+
+
+def approach(
+    now: JointMotion, target: JointMotion, limits: JointDescription, dt: float
+) -> JointMotion:
+    """Return where a joint gets within `dt` [s] on the way to where `target` is then.
+
+    It keeps to its greatest speed and acceleration, and does not run past a target that rests.
+    """
+    behind = target.position - target.velocity * dt - now.position
+    catch_up = min(abs(behind) / dt, braking_speed(abs(behind), limits.max_acceleration, dt))
+    wanted = target.velocity + math.copysign(catch_up, behind)
+    return accelerated(now, wanted, limits, dt)
+
+
+def accelerated(
+    now: JointMotion, velocity: float, limits: JointDescription, dt: float
+) -> JointMotion:
+    """Return where a joint gets within `dt` [s] that should move at `velocity`."""
+    change = limits.max_acceleration * dt
+    velocity = max(-limits.max_speed, min(limits.max_speed, velocity))
+    velocity = max(now.velocity - change, min(now.velocity + change, velocity))
+    return _moved(now, velocity, limits, dt)
+
+
+def braking_speed(distance: float, acceleration: float, dt: float) -> float:
+    """Return the greatest speed from which steps of `dt` [s] come to rest within `distance`.
+
+    From n whole changes of speed and a part of one, n + 1 steps are left.
+    """
+    change = acceleration * dt
+    steps = 2 * max(0.0, distance) / (change * dt)
+    n = math.floor((math.sqrt(1 + 4 * steps) - 1) / 2)
+    return max(0.0, distance) / ((n + 1) * dt) + n * change / 2
+
+
+def _moved(now: JointMotion, velocity: float, limits: JointDescription, dt: float) -> JointMotion:
+    """Return `now` after `dt` [s], slow enough to come to rest within the joint's range."""
+    a = limits.max_acceleration
+    highest = braking_speed(limits.upper - now.position, a, dt)
+    lowest = -braking_speed(now.position - limits.lower, a, dt)
+    velocity = max(lowest, min(highest, velocity))
+    position = now.position + velocity * dt
+    if limits.lower <= now.position <= limits.upper:
+        position = max(limits.lower, min(limits.upper, position))
+    return JointMotion(position, velocity)
