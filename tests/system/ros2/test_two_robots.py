@@ -1,0 +1,108 @@
+"""Two robots in namespaces of one ROS graph, both driven by rclpy at once."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from gigabrain_zenoh.testing.processes import Home
+from gigabrain_zenoh.testing.waiting import until
+from tests.ros2.judge import Judge, Program
+from tests.system.ros2.test_gateway_ros import READ, Robot, released, running
+
+SPEEDS = {"red": (0.15, 0.0), "blue": (0.0, 0.6)}  # forward, and turning on the spot
+OF_ROS = {"/rosout", "/parameter_events"}
+
+
+class Pair(NamedTuple):
+    """Both robots."""
+
+    red: Robot
+    blue: Robot
+
+
+@pytest.fixture
+async def pair(judge: Judge, tmp_path: Path) -> AsyncIterator[Pair]:
+    async with contextlib.AsyncExitStack() as stack:
+        made = []
+        for name in SPEEDS:
+            home = stack.enter_context(contextlib.closing(Home(tmp_path / name)))
+            ros2 = {"namespace": f"/{name}"}
+            made.append(await stack.enter_async_context(running(home, judge, ros2=ros2)))
+        yield Pair(*made)
+
+
+def moves(name: str, robot: Robot) -> bool:
+    """Return whether a robot moves as it is told, and not as the other one."""
+    forward, turning = SPEEDS[name]
+    now = robot.now.velocity
+    return (
+        robot.now.gate.commander == "ros2"
+        and abs(now.linear_x - forward) < 0.03
+        and abs(now.angular_z - turning) < 0.1
+    )
+
+
+async def driven(driver: Program, **robots: Robot) -> None:
+    """Let one program drive robots; on a busy machine a gate may stop, and it has to pause."""
+    while True:
+        for name in robots:
+            linear, angular = SPEEDS[name]
+            await driver.query("drive", topic=f"/{name}/cmd_vel", linear=linear, angular=angular)
+        with contextlib.suppress(TimeoutError):
+            await until(lambda: all(moves(*one) for one in robots.items()), "they move", 15.0)
+            return
+        for name in robots:
+            await driver.query("rest", topic=f"/{name}/cmd_vel")
+        await asyncio.sleep(1.0)
+
+
+async def test_two_robots_are_driven_at_once_and_do_not_mix(pair: Pair, judge: Judge) -> None:
+    await asyncio.gather(released(pair.red), released(pair.blue))
+    driver, listener = judge.start("drive", node="hands"), judge.start("listen")
+    for name in SPEEDS:
+        for topic in ("/scan", "/odom", "/tf", "/tf_static"):
+            kind, qos = READ[topic]
+            await listener.query("subscribe", topic=f"/{name}{topic}", type=kind, qos=qos)
+    await driven(driver, **pair._asdict())
+
+    async def value(topic: str) -> Any:
+        report = await asyncio.to_thread(
+            listener.poll, "report", lambda one: one["count"] > 3 or "static" in topic, topic=topic
+        )
+        return report["values"][-1]
+
+    for name, (linear, angular) in SPEEDS.items():
+        twist = (await value(f"/{name}/odom"))["twist"]["twist"]
+        assert twist["linear"]["x"] == pytest.approx(linear, abs=0.05)
+        assert twist["angular"]["z"] == pytest.approx(angular, abs=0.2)
+        assert (await value(f"/{name}/scan"))["header"]["frame_id"] == "base_scan"
+        frames = {
+            (one["header"]["frame_id"], one["child_frame_id"])
+            for topic in ("tf", "tf_static")
+            for one in (await value(f"/{name}/{topic}"))["transforms"]
+        }
+        assert {("odom", "base_footprint"), ("base_footprint", "base_link")} <= frames
+        ends = await listener.query("endpoints", topic=f"/{name}/tf")
+        assert {one["namespace"] for one in ends["publishers"]} == {f"/{name}"}
+    graph = await judge.start("graph").query("graph")
+    assert {"/red/gigabrain", "/blue/gigabrain"} <= set(graph["nodes"])
+    named = {topic.split("/")[1] for topic in graph["topics"].keys() - OF_ROS}
+    assert named == set(SPEEDS)
+
+    await driver.query("rest", topic="/red/cmd_vel")
+    await pair.red.becomes("idle")
+    since = len(pair.red.states)
+    await driven(driver, blue=pair.blue)
+    caller = judge.start("call")
+    stop = {"service": "/red/estop", "type": "std_srvs/srv/SetBool"}
+    await caller.available(**stop)
+    await caller.query("call", **stop, data=True)
+    assert (await caller.hear("response"))["value"]["success"]
+    await pair.red.becomes("latched")
+    await driven(driver, blue=pair.blue)
+    assert {one.sent.linear_x for one in pair.red.states[since:]} == {0.0}
+    assert pair.blue.now.gate.estop_generation == 0
