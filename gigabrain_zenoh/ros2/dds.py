@@ -65,7 +65,7 @@ LOCALHOST = """<CycloneDDS><Domain Id="any">
 <General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
 <AllowMulticast>false</AllowMulticast></General>
 <Discovery><ParticipantIndex>auto</ParticipantIndex>
-<MaxAutoParticipantIndex>100</MaxAutoParticipantIndex>
+<MaxAutoParticipantIndex>120</MaxAutoParticipantIndex>
 <Peers><Peer Address="127.0.0.1"/></Peers></Discovery>
 </Domain></CycloneDDS>"""
 
@@ -404,5 +404,7 @@ def _localhost(domain: int) -> list[Entity]:
     try:
         return [Domain(domain, LOCALHOST)]
     except DDSException as error:
+        if error.code != DDSException.DDS_RETCODE_PRECONDITION_NOT_MET:
+            raise
         log.debug("DDS domain %d is open already: %s", domain, error)
         return []

@@ -17,7 +17,7 @@ from gigabrain_zenoh.ros2.rtps_discovery import (
 )
 
 LOOPBACK = "127.0.0.1"
-LOCAL_PEERS = 32  # participants of this host that are looked for without multicast, as ROS does
+LOCAL_PEERS = 32  # participants of a host that are looked for without multicast, as ROS does
 RECEIVE_BYTES = 1 << 20  # of a socket's buffer
 PEER_EVERY = 8  # announcements to this host's ports, where multicast reaches most of them
 ANY = ""
@@ -102,7 +102,8 @@ class Sockets:
                     self._out.sendto(datagram, (MULTICAST_GROUP, multicast_port(self._domain)))
         local = self._localhost or self._announcements < 3 or self._announcements % PEER_EVERY == 0
         for host in (*self._peers, *([LOOPBACK] if local else [])):
-            for index in range(LOCAL_PEERS):
+            # ROS looks for the first ones only: of two later ones, one has to look further
+            for index in range(MAX_PARTICIPANTS if host == LOOPBACK else LOCAL_PEERS):
                 port, _ = participant_ports(self._domain, index)
                 if (host, port) != (LOOPBACK, self.builtin_port):
                     self.send(datagram, (host, port))

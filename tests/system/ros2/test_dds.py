@@ -1,12 +1,17 @@
 """What DDS alone does, with participants of ours in this process."""
 
+import contextlib
+import socket
 from collections.abc import AsyncIterator
 
 import pytest
 
+from gigabrain_zenoh.errors import BusError
 from gigabrain_zenoh.ros2.qos import SENSOR_DATA, Qos
+from gigabrain_zenoh.ros2.rtps_discovery import participant_ports
 from gigabrain_zenoh.ros2.transport import Received
 from gigabrain_zenoh.testing.waiting import until
+from tests.ros2.judge import free_domain
 from tests.ros2.nodes import STRING, Nodes, dds_nodes
 
 
@@ -24,6 +29,27 @@ async def test_a_reliable_reader_does_not_match_a_best_effort_publisher(nodes: N
     listener.subscribe("/other", STRING, Qos(), lambda _: None)
     await until(lambda: other.readers == 1, "the reader that matches")
     assert sensor.readers == 0
+
+
+@pytest.mark.parametrize("taken", [118, 119])
+async def test_where_many_have_joined_it_stays_on_the_loopback_or_is_refused(taken: int) -> None:
+    with free_domain() as domain, contextlib.ExitStack() as others:
+        for index in range(taken):
+            for port in participant_ports(domain, index):
+                probe = others.enter_context(socket.socket(type=socket.SOCK_DGRAM))
+                probe.bind(("127.0.0.1", port))
+        opened = Nodes(transport="dds", domain=domain, localhost=True).opened()
+        if taken == 119:
+            with pytest.raises(BusError, match=f"domain {domain}"):
+                await opened.__aenter__()
+            return
+        async with opened:
+            last, _ = participant_ports(domain, 119)
+            with (
+                pytest.raises(OSError, match="in use"),
+                socket.socket(type=socket.SOCK_DGRAM) as probe,
+            ):
+                probe.bind(("127.0.0.1", last))
 
 
 async def test_what_is_no_message_of_the_type_is_not_sent(nodes: Nodes) -> None:

@@ -1,6 +1,8 @@
 """Services of ours, called by rclpy over Fast DDS, and services of rclpy, called by us."""
 
 import asyncio
+import contextlib
+import socket
 import statistics
 import subprocess
 import sys
@@ -14,6 +16,7 @@ import pytest
 
 from gigabrain_zenoh.errors import NoAnswer, Refused
 from gigabrain_zenoh.ros2.rtps import RequestReply, ServiceType
+from gigabrain_zenoh.ros2.rtps_discovery import participant_ports
 from gigabrain_zenoh.ros2.types import Types
 from gigabrain_zenoh.testing.waiting import PATIENCE_S, until
 from tests.places import ROOT
@@ -111,6 +114,25 @@ async def test_a_client_that_was_there_first_finds_our_server(judge: Judge, bus:
     await call.available(**ESTOP)
 
     assert (await calls(call, 1, **ESTOP, data=True))[0]["value"]["success"]
+
+
+async def test_behind_many_other_participants_our_server_is_found(
+    judge: Judge, types: Types
+) -> None:
+    with contextlib.ExitStack() as others:
+        for index in range(40):  # more than ROS looks for without multicast
+            for port in participant_ports(judge.domain, index):
+                taken = others.enter_context(socket.socket(type=socket.SOCK_DGRAM))
+                taken.bind(("", port))
+        bus = Bus(await RequestReply.open(judge.domain, localhost=True), types)
+        try:
+            bus.serve("/estop", SET_BOOL, success=True)
+            call = judge.start("call")
+            await call.available(**ESTOP)
+            (response,) = await calls(call, 1, **ESTOP, data=True)
+            assert response["value"]["success"]
+        finally:
+            await bus.bus.close()
 
 
 @pytest.mark.slow
