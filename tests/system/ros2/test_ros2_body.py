@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from gigabrain_drivers.bodies.ros2.driver import Ros2Driver
+from gigabrain_drivers.bodies.ros2.guard import Guard
 from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_schemas.base import Velocity
@@ -142,6 +143,53 @@ async def test_a_killed_driver_is_replaced_by_its_guard(judge: Judge, tmp_path: 
         driver.kill()
         await driver.wait()
     await standing(robot)
+
+
+SLOW_GUARD = """#!/bin/sh
+echo started >> "$FOLDER/starts"
+until [ -e "$FOLDER/joined" ]; do sleep 0.02; done
+echo 0
+until [ -e "$FOLDER/found" ]; do sleep 0.02; done
+echo 1
+cat > /dev/null
+"""
+
+
+class SetClock(Clock):
+    """A clock that the test sets."""
+
+    ns = 0
+
+    def now_ns(self) -> int:
+        return self.ns
+
+
+async def test_a_guard_that_starts_slowly_is_not_started_again(
+    judge: Judge, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = tmp_path / "guard"
+    program.write_text(SLOW_GUARD)
+    program.chmod(0o755)
+    monkeypatch.setenv("FOLDER", str(tmp_path))
+    monkeypatch.setattr(sys, "executable", str(program))
+    _, driver = catalog.make_driver(
+        str(robot_file(judge, tmp_path)), Run(folder=tmp_path, link="real")
+    )
+    assert isinstance(driver, Ros2Driver)
+    clock = SetClock()
+    guard = Guard(driver.options, clock, lambda: True)
+    guard.open()
+    await until((tmp_path / "starts").exists, "its start")
+    clock.ns += 9_000_000_000
+    (tmp_path / "joined").touch()
+    await until(lambda: "does not reach it yet" in guard.problem, "its first word")
+    (tmp_path / "found").touch()
+    await until(lambda: not guard.problem, "the robot")
+    assert (tmp_path / "starts").read_text() == "started\n"
+    process = guard._process
+    assert process
+    await guard.close()
+    await process.communicate()
 
 
 async def test_bringup_finds_it_whole_or_names_the_wrong_type(judge: Judge, tmp_path: Path) -> None:

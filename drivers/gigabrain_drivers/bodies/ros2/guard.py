@@ -132,15 +132,15 @@ class Guard:
         self._process = process
         assert process.stdout
         assert process.stdin
-        alone_ns = self._clock.now_ns()
+        alone_ns: int | None = None  # from its first word on
         try:
-            while self._clock.now_ns() - alone_ns < LOST_NS:  # else it has failed to join
+            while alone_ns is None or self._clock.now_ns() - alone_ns < LOST_NS:  # else: not joined
                 async with asyncio.timeout(START_S if self._heard_ns is None else LOST_NS / 1e9):
                     line = await process.stdout.readline()
                 if not line:
                     return
                 self._heard_ns, self._readers = self._clock.now_ns(), int(line)
-                if self._readers or not self._reached():
+                if alone_ns is None or self._readers or not self._reached():
                     alone_ns = self._heard_ns
         except TimeoutError:
             return
