@@ -163,13 +163,17 @@ class Program:
         with frozen(self.pid):
             yield
 
-    def close(self) -> None:
-        """End it as its user would, and by force where that does not help."""
+    def end(self) -> None:
+        """Ask it to end, as its user would, without waiting for that."""
         assert self._process.stdin
         with suppress(ProcessLookupError):
             os.killpg(self.pid, signal.SIGCONT)
         with suppress(BrokenPipeError):
             self._process.stdin.close()
+
+    def close(self) -> None:
+        """End it as its user would, and by force where that does not help."""
+        self.end()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(LONGEST_END_S)
         with suppress(ProcessLookupError):  # it, where it still runs, and what it has started
@@ -213,7 +217,9 @@ class Judge:
         }
 
     def close(self) -> None:
-        """End all programs, the last one first."""
+        """End all programs."""
+        for program in self._programs:
+            program.end()
         while self._programs:
             self._programs.pop().close()
 

@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
+import pytest_asyncio
 
 from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import HEALTH
@@ -17,6 +18,7 @@ from tests.ros2.judge import Judge, frozen
 from tests.ros2.nodes import Nodes
 from tests.system.ros2.test_gateway_ros import Robot, driving, released, running
 
+pytestmark = pytest.mark.asyncio(loop_scope="module")
 TWIST = "geometry_msgs/msg/Twist"
 
 
@@ -40,13 +42,16 @@ class ZenohDriver:
             await asyncio.sleep(1 / hz)
 
 
-@pytest.fixture(params=["dds", "rmw_zenoh"])
-async def driven(request: pytest.FixtureRequest, home: Home) -> AsyncIterator[tuple[Robot, Any]]:
-    """A robot that ROS drives, and who drives it."""
+@pytest_asyncio.fixture(loop_scope="module", scope="module", params=["dds", "rmw_zenoh"])
+async def driven(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> AsyncIterator[tuple[Robot, Any]]:
+    """A robot, and a node of ROS that can drive it."""
     judge: Judge | None = None
     if request.param == "dds":
-        judge = request.getfixturevalue("judge")
+        judge = request.getfixturevalue("shared_judge")
     async with contextlib.AsyncExitStack() as stack:
+        home = stack.enter_context(contextlib.closing(Home(tmp_path_factory.mktemp("home"))))
         robot = await stack.enter_async_context(running(home, judge))
         if judge:
             driver: Any = judge.start("drive")
@@ -54,8 +59,8 @@ async def driven(request: pytest.FixtureRequest, home: Home) -> AsyncIterator[tu
             nodes = Nodes(transport="rmw_zenoh", router=robot.router)
             await stack.enter_async_context(nodes.stack)
             driver = ZenohDriver(nodes, await nodes.node("hands"))
+        await until(lambda: robot.states, "states")
         await released(robot)
-        await driving(robot, driver)
         yield robot, driver
         await driver.query("rest")
 
@@ -71,6 +76,7 @@ async def test_a_frozen_gateway_stops_the_body_and_its_backlog_moves_nothing(
     driven: tuple[Robot, Any],
 ) -> None:
     robot, driver = driven
+    await driving(robot, driver)
     (gateway,) = robot.home.processes("ros2")
     before, enables = set(robot.home.processes()), robot.now.gate.enables
     alive: list[Health] = []
@@ -86,12 +92,15 @@ async def test_a_frozen_gateway_stops_the_body_and_its_backlog_moves_nothing(
     assert set(robot.home.processes()) == before
     await driving(robot, driver)
     assert robot.now.gate.enables > enables
+    await driver.query("rest")
+    await robot.becomes("idle")
 
 
 async def test_a_gateway_killed_while_ros_drives_stops_the_body_and_asks_for_it_again(
     driven: tuple[Robot, Any],
 ) -> None:
-    robot, _ = driven
+    robot, driver = driven
+    await driving(robot, driver)
     (gateway,) = robot.home.processes("ros2")
     others, enables = set(robot.home.processes()) - {gateway}, robot.now.gate.enables
     os.kill(gateway, signal.SIGKILL)

@@ -4,11 +4,11 @@ import asyncio
 import contextlib
 import os
 import signal
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from typing import Any
 
 import pytest
-import yaml
+import pytest_asyncio
 
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.topics import STATE
@@ -18,9 +18,9 @@ from gigabrain_zenoh.errors import BodyLost, Refused
 from gigabrain_zenoh.runtime.connect import connect
 from gigabrain_zenoh.testing.processes import Home, free_port
 from gigabrain_zenoh.testing.waiting import until
-from tests.places import ROOT
 from tests.ros2.judge import Judge
 
+pytestmark = pytest.mark.asyncio(loop_scope="module")
 TRIGGER, SET_BOOL = "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"
 DEFAULT: dict[str, Any] = {}
 SENSOR = {"reliable": False, "depth": 5}
@@ -75,11 +75,19 @@ async def running(home: Home, judge: Judge | None, **parts: Any) -> AsyncIterato
         yield made
 
 
-@pytest.fixture
-async def robot(home: Home, judge: Judge) -> AsyncIterator[Robot]:
-    async with running(home, judge) as made:
+@pytest_asyncio.fixture(loop_scope="module", scope="module")
+async def robot(shared_home: Home, shared_judge: Judge) -> AsyncIterator[Robot]:
+    """A robot that the tests share; each has programs of its own."""
+    async with running(shared_home, shared_judge) as made:
         await made.becomes("latched")
         yield made
+
+
+@pytest.fixture
+def judge(shared_judge: Judge) -> Iterator[Judge]:
+    """The domain that the tests share, without the programs of the test before."""
+    yield shared_judge
+    shared_judge.close()
 
 
 async def released(robot: Robot) -> None:
@@ -181,71 +189,3 @@ async def test_a_killed_gateway_costs_the_robot_nothing_and_ros_finds_it_again(
         listener.poll, "report", lambda one: one["count"] > count + 20, topic="/odom"
     )
     assert others <= set(robot.home.processes())
-
-
-async def test_a_robot_without_a_brain_leaves_nav2_its_names(home: Home, judge: Judge) -> None:
-    parts = yaml.safe_load((ROOT / "examples/ros2/nav2.yaml").read_text())
-    async with running(home, judge, **parts) as robot:
-        listener, driver = judge.start("listen", node="listener"), judge.start("drive")
-        kind, qos = READ["/tf"]
-        await listener.query("subscribe", topic="/tf", type=kind, qos=qos)
-        await released(robot)
-        await driving(robot, driver)
-        assert robot.now.gate.commander == "ros2"
-        report = await asyncio.to_thread(
-            listener.poll, "report", lambda one: one["count"] > 0, topic="/tf"
-        )
-        parents = {one["header"]["frame_id"] for one in report["values"][-1]["transforms"]}
-        assert parents == {"odom", "base_link"}
-        heard = (await listener.query("endpoints", topic="/cmd_vel"))["subscribers"]
-        assert {one["node"] for one in heard} == {"gigabrain"}
-        for topic in OF_NAV2:
-            found = await listener.query("endpoints", topic=topic)
-            assert (topic, found["publishers"], found["subscribers"]) == (topic, [], [])
-
-
-OF_NAV2 = ("/map", "/plan", "/goal_pose", "/initialpose", "/navigate_to_pose/_action/status")
-NAVIGATE = "nav2_msgs/action/NavigateToPose"
-
-
-def goal_at(x: float, y: float, frame: str = "map") -> dict[str, Any]:
-    return {
-        "pose": {
-            "header": {"frame_id": frame},
-            "pose": {"position": {"x": x, "y": y}, "orientation": {"w": 1.0}},
-        }
-    }
-
-
-async def test_rclpy_sends_goals_cancels_and_preempts_them(home: Home, judge: Judge) -> None:
-    brain = {"perception": {"mapping": "slam"}, "decision": {"behaviour": "navigate"}}
-    async with running(home, judge, resume="auto", **brain) as robot:
-        client = judge.start("navigate")
-        action = "/navigate_to_pose"
-        await client.available(action=action, type=NAVIGATE)
-        await robot.becomes("enabled")
-
-        async def send(name: str, goal: dict[str, Any]) -> None:
-            await client.query("send", action=action, type=NAVIGATE, name=name, goal=goal)
-            await client.hear("accepted", name=name)
-
-        async def result(name: str) -> tuple[str, int]:
-            found = await client.hear("result", 120.0, name=name)
-            return found["status"], found["value"]["error_code"]
-
-        while True:  # until there is a map
-            await send(name := f"early-{len(client.seen('accepted'))}", goal_at(50.0, 50.0))
-            if (found := await result(name)) != ("aborted", 202):
-                break
-        assert found == ("aborted", 204)
-        await send("frame", goal_at(0.0, 0.0, "somewhere"))
-        assert await result("frame") == ("aborted", 9002)
-        await send("far", goal_at(0.6, 0.0))
-        feedback = await client.hear("feedback", name="far")
-        assert feedback["value"]["current_pose"]["header"]["frame_id"] == "map"
-        await send("back", goal_at(-0.4, 0.0))
-        assert await result("far") == ("aborted", 0)
-        await client.query("cancel", name="back")
-        assert await result("back") == ("canceled", 0)
-        await send("home", goal_at(0.2, 0.0))
-        assert await result("home") == ("succeeded", 0)
