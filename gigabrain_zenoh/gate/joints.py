@@ -30,9 +30,14 @@ def refusal(config: GateConfig, state: GateState, command: JointCommand) -> str:
 
 
 def before(state: GateState, event: Tick) -> tuple[JointMotion, ...]:
-    """Return where the joints were sent in the last tick; where they are, if nothing holds them."""
-    if event.joints and (event.limp or not state.joints):
+    """Return where the joints were sent in the last tick.
+
+    At the start that is where the body holds them; where they are, if nothing does.
+    """
+    if event.joints and event.limp:
         return tuple(map(frozen, event.joints))
+    if event.joints and not state.joints:
+        return tuple(map(JointMotion, event.held)) or tuple(map(frozen, event.joints))
     return state.joints
 
 

@@ -67,6 +67,7 @@ class Tick(msgspec.Struct, frozen=True):
     faults: tuple[Cause, ...] = ()  # reported by the driver
     late: bool = False  # it was missed and is made up for, right behind another one
     joints: tuple[JointMotion, ...] = ()  # as measured, those that can be commanded
+    held: tuple[float, ...] = ()  # where the body holds them by itself; none if it does not say so
     limp: bool = False  # the joints are let go of
 
 

@@ -128,7 +128,8 @@ def decode(raw: Floats, min_confidence: float = MIN_CONFIDENCE) -> Found:
     Logits of classes come first, then the logarithms of distances to left, top, right, bottom.
     """
     classes = len(raw) - 4
-    sure = compete(1 / (1 + np.exp(-np.clip(raw[:classes], *LOGIT_LIMITS))))
+    logits = np.clip(raw[:classes], *LOGIT_LIMITS)
+    sure = compete((1 / (1 + np.exp(-logits))).astype(np.float32))
     labels, rows, columns = np.nonzero(sure > min_confidence)
     found = sure[labels, rows, columns]
     best = np.argsort(-found, kind="stable")[:MAX_CANDIDATES]

@@ -143,6 +143,22 @@ class Driver(abc.ABC):
         wanted = Velocity(linear_x=linear_x, linear_y=linear_y, angular_z=angular_z)
         return clamp(wanted, limits_of(self.robot))
 
+    def bounded_joints(self, positions: Mapping[str, float]) -> dict[str, float]:
+        """Return positions within the joints' ranges, without those that are no numbers.
+
+        Raises Unsupported for a joint that the body does not have.
+        """
+        known = {joint.name: joint for joint in self.robot.joints}
+        for name in positions:
+            if name not in known:
+                has = ", ".join(known) or "none"
+                raise Unsupported(f"{self.robot.robot_type} has no joint {name!r}; it has: {has}")
+        return {
+            name: max(known[name].lower, min(known[name].upper, position))
+            for name, position in positions.items()
+            if math.isfinite(position)
+        }
+
     async def set_joint_positions(self, positions: Mapping[str, float]) -> Mapping[str, float]:
         """Move joints together [rad or m]; returns what was really sent. Raises BodyLost."""
         raise Unsupported(f"{type(self).__name__} has no joints to position")

@@ -212,6 +212,7 @@ class DriverProcess:
             self._wall_ns(),
             faults,
             joints=commanded_joints(self._body.description, state),
+            held=state.joints_sent,
             limp=state.limp,
         )
         self._gatekeeper.ticks(passed, tick)

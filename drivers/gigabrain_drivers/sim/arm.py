@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 
 import mujoco
+import numpy as np
 
 from gigabrain_drivers.sim import STEP_S
 from gigabrain_drivers.sim.body import SimModel
@@ -22,22 +23,28 @@ class SimArm:
         self.names = tuple(joint.name for joint in body.joints)
         joints = [model.joint(f"{ROBOT}{name}") for name in self.names]
         self._places = [int(joint.qposadr[0]) for joint in joints]
+        self._dofs = [int(joint.dofadr[0]) for joint in joints]
         self._motors = [int(model.actuator(f"{ROBOT}{name}").id) for name in self.names]
         radians = math.tau / body.servo.encoder_ticks
         self._units = [METRES_PER_TICK if joint.type[0] == SLIDES else radians for joint in joints]
         self._heat = [MotorHeat(body.servo) for _ in joints]
         self._amperes = [0.0] * len(joints)
-        data.qpos[self._places] = data.ctrl[self._motors] = body.posture
+        data.qpos[self._places] = body.posture
         self._now = self._before = self._measured()
         self._model = model
         self._gains = model.actuator_gainprm[self._motors].copy()
         self._biases = model.actuator_biasprm[self._motors].copy()
-        self._targets = dict(zip(self.names, body.posture, strict=True))
+        self._aims = dict(zip(self.names, self._at_rest(body.posture), strict=True))
         self.limp = self._was_limp = False
+
+    @property
+    def targets(self) -> tuple[float, ...]:
+        """Where the servos go [rad] or [m], in the order of the description."""
+        return tuple(self._aims[name] for name in self.names)
 
     def aim(self, positions: Mapping[str, float]) -> None:
         """Have servos go to positions [rad] or [m], and hold them; limp ones hold again."""
-        self._targets = {**self._targets, **positions}
+        self._aims = {**self._aims, **positions}
         self.limp = False
 
     def let_go(self) -> None:
@@ -51,9 +58,9 @@ class SimArm:
             on = 0.0 if self.limp else 1.0
             self._model.actuator_gainprm[self._motors] = on * self._gains
             self._model.actuator_biasprm[self._motors] = on * self._biases
-        targets = self._targets
+        aims = self._aims
         for name, motor in zip(self.names, self._motors, strict=True):
-            self._data.ctrl[motor] = targets[name]
+            self._data.ctrl[motor] = aims[name]
 
     def sense(self) -> None:
         """Read the encoders after a step."""
@@ -80,6 +87,13 @@ class SimArm:
                 strict=True,
             )
         )
+
+    def _at_rest(self, posture: tuple[float, ...]) -> list[float]:
+        """Return the targets with which servos hold a posture against gravity."""
+        mujoco.mj_forward(self._model, self._data)
+        weight = self._data.qfrc_bias[self._dofs]
+        held: list[float] = (np.asarray(posture) + weight / self._gains[:, 0]).tolist()
+        return held
 
     def _measured(self) -> tuple[float, ...]:
         places = zip(self._places, self._units, strict=True)

@@ -36,6 +36,7 @@ SPEED_RANGE = (0.1, 100.0)
 
 def state_message(simulation: Simulation, robot_type: str) -> RobotState:
     """Return the body's state by its own sensors."""
+    arm = simulation.arm
     odometry, charge, imu = simulation.odometry(), simulation.battery(), simulation.imu()
     return RobotState(
         robot_type=robot_type,
@@ -45,7 +46,8 @@ def state_message(simulation: Simulation, robot_type: str) -> RobotState:
         battery=Battery(**charge._asdict()),
         imu=ImuData(**imu._asdict()),
         bumpers=(simulation.bumper(),),
-        limp=bool(simulation.arm and simulation.arm.limp),
+        joints_sent=arm.targets if arm and not arm.limp else (),
+        limp=bool(arm and arm.limp),
     )
 
 
@@ -166,8 +168,9 @@ class MujocoDriver(Driver):
         """Have the arm's servos go to positions [rad] or [m]."""
         if self._simulation.arm is None:
             return await super().set_joint_positions(positions)
-        self._simulation.arm.aim(positions)
-        return positions
+        within = self.bounded_joints(positions)
+        self._simulation.arm.aim(within)
+        return within
 
     async def read_state(self) -> RobotState:
         """The state at the end of the newest tick."""

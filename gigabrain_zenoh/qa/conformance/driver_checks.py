@@ -119,6 +119,11 @@ class CheckedRobot:
         return self._way
 
     @property
+    def has_base(self) -> bool:
+        """True for a body that drives."""
+        return self.file.drive_type != "arm"
+
+    @property
     def has_peer(self) -> bool:
         """True where an emulated peer is at the other end of the line."""
         return self._emulator is not None
@@ -176,13 +181,19 @@ def link_of(driver: Driver) -> TracedLine:
 
 
 class DriverSession(Timeline):
-    """Commands `wanted` in every tick, and keeps the newest state. Used as `async with`."""
+    """Commands `wanted` and `aims` in every tick, and keeps the newest state.
+
+    Used as `async with`.
+    """
 
     def __init__(self, robot: CheckedRobot) -> None:
         super().__init__()
         self.driver = robot.driver()
         self.wanted = ZERO
         self.sent: Velocity | None = None  # newest velocity that the driver returned
+        self.aims: Mapping[str, float] = {}  # positions of joints
+        self.joints_sent: Mapping[str, float] = {}  # newest that the driver returned
+        self._has_base = robot.has_base
         self.state: RobotState | None = None
         self._live: asyncio.Task[None] | None = None
 
@@ -215,8 +226,13 @@ class DriverSession(Timeline):
         async for passed in self.driver.ticks(Clock()):
             self.tick += passed
             self.state = await self.driver.read_state()
-            to = self.wanted
-            self.sent = await self.driver.set_base_velocity(to.linear_x, to.linear_y, to.angular_z)
+            if self.aims:
+                self.joints_sent = await self.driver.set_joint_positions(self.aims)
+            if self._has_base:
+                to = self.wanted
+                self.sent = await self.driver.set_base_velocity(
+                    to.linear_x, to.linear_y, to.angular_z
+                )
 
 
 async def opens(checked: CheckedRobot) -> Finding:

@@ -1,6 +1,7 @@
 """A driver in its real process, behind the real gate, on a network inside this program."""
 
 import asyncio
+from collections.abc import Mapping
 from typing import Any, Self
 
 import msgspec
@@ -9,11 +10,20 @@ from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.process import DriverProcess
 from gigabrain_schemas.base import TICK_S, Velocity
 from gigabrain_schemas.body import RobotState
-from gigabrain_schemas.brain import CmdVel
-from gigabrain_schemas.requests import EnableRequest, ReleaseRequest
+from gigabrain_schemas.brain import CmdVel, JointCommand
+from gigabrain_schemas.requests import EnableRequest, EstopRequest, ReleaseRequest
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_schemas.topics import ENABLE, RELEASE, SAFETY, SCAN, STATE, command_topic
+from gigabrain_schemas.topics import (
+    ENABLE,
+    ESTOP,
+    JOINT_CMD,
+    RELEASE,
+    SAFETY,
+    SCAN,
+    STATE,
+    command_topic,
+)
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import LocalNetwork
@@ -57,13 +67,18 @@ class DriverTap:
 
 
 class GatedDriver(Timeline):
-    """Plays the brain and the safety process: a command per state while `wanted` is not None."""
+    """Plays the brain and the safety process.
+
+    It commands once per state while `wanted` is not None, and joints while there are
+    `joint_speeds`.
+    """
 
     def __init__(self, robot: CheckedRobot) -> None:
         super().__init__()
         self.checked, self.robot = robot, robot.file
         self.speed = SPEED_SHARE * self.robot.max_linear_speed
         self.wanted: Velocity | None = None
+        self.joint_speeds: Mapping[str, float] = {}  # [rad/s] or [m/s]
         self.state: RobotState | None = None
         self.states = self.scans = 0
         self.scan: LaserScan | None = None
@@ -135,7 +150,7 @@ class GatedDriver(Timeline):
         wanted = Velocity(linear_x=self.checked.next_direction() * self.speed)
         for _ in range(ATTEMPTS):
             self.wanted = ZERO
-            await self._enable()
+            await self.enable()
             self.wanted = wanted
             if await self.until(lambda: self._moves(wanted), MOVE_TICKS) is not None:
                 return wanted
@@ -149,7 +164,11 @@ class GatedDriver(Timeline):
         if await self.until(lambda: self.rests, MOVE_TICKS) is None:
             raise Failed("the body did not come to rest on commands of zero")
 
-    async def _enable(self) -> None:
+    async def press_estop(self) -> None:
+        """Press the e-stop."""
+        await self._bus.ask(ESTOP, EstopRequest(source=KIT))
+
+    async def enable(self) -> None:
         """Release and enable as soon as the gate agrees."""
         why = "no state from the driver"
         begin = self.tick
@@ -185,6 +204,10 @@ class GatedDriver(Timeline):
             self._bus.publish(SAFETY, SafetyState(verdict="ok"))
         if self.wanted is not None:
             self.command(self.wanted)
+        if self.joint_speeds:
+            names, speeds = zip(*self.joint_speeds.items(), strict=True)
+            command = JointCommand(name=names, velocity=speeds, source=KIT)
+            self._bus.publish(JOINT_CMD, command, basis=state.tick)
 
     def _on_scan(self, _key: str, scan: LaserScan) -> None:
         self.scan, self.scans = scan, self.scans + 1

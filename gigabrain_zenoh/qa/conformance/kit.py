@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Self
 from gigabrain_zenoh.config.settings import LinkName
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.host import this_process
-from gigabrain_zenoh.qa.conformance import driver_checks, gate_checks
+from gigabrain_zenoh.qa.conformance import arm_checks, driver_checks, gate_checks
 from gigabrain_zenoh.qa.conformance.driver_checks import CheckedRobot
 from gigabrain_zenoh.qa.conformance.gated_driver import GatedDriver
 from gigabrain_zenoh.qa.judging import DriverCheckResult, Failed, Finding, Skipped, summary
@@ -32,20 +32,31 @@ class DriverCheck(NamedTuple):
 
 
 CUT = "motors at zero {promise}; both + 100; at rest 15 ticks (legs: 30) later"
-ALONE = (
-    DriverCheck("opens", "received within 5 s", driver_checks.opens),
+OPENS = DriverCheck("opens", "received within 5 s", driver_checks.opens)
+NEVER_RAISES = DriverCheck(
+    "never raises", "stop and close, in any state, within 2 s", driver_checks.never_raises
+)
+KILLED = DriverCheck(
+    "stops when it is killed", "motors at zero {promise} + 100",
+    gate_checks.driver_killed, with_peer=True, repeated=True,
+)  # fmt: skip
+BASE_ALONE = (
     DriverCheck("obeys", "measured speed within 10 % + 0.02", driver_checks.obeys),
     DriverCheck("obeys within limits", "asked for 10 times its speed: at most its max speeds",
                 driver_checks.limits),
     DriverCheck("returns what it sent", "the body's commands, to 0.02; without a peer, its motion",
                 driver_checks.returns),
     DriverCheck("refuses NaN itself", "all zero, nothing raised", driver_checks.refuses_nan),
-    DriverCheck("never raises", "stop and close, in any state, within 2 s",
-                driver_checks.never_raises),
-    DriverCheck("stops when it is killed", "motors at zero {promise} + 100",
-                gate_checks.driver_killed, with_peer=True, repeated=True),
 )  # fmt: skip
-GATED = (
+JOINTS_ALONE = (
+    DriverCheck("opens without motion", "every joint within 0.5° for 2 s", arm_checks.opens_still),
+    DriverCheck("joints obey", "each within 2 % of its range, in 3 s", arm_checks.joints_obey),
+    DriverCheck("joints keep their ranges", "sent beyond: the end of the range is sent",
+                arm_checks.joint_limits),
+    DriverCheck("joints refuse NaN", "every joint within 0.5°, nothing raised",
+                arm_checks.joints_refuse_nan),
+)  # fmt: skip
+BASE_GATED = (
     DriverCheck("reports at its rate", "9 of 10 ticks, 100 ms old; scans to 25 %",
                 gate_checks.reports),
     DriverCheck("stops on silence", "7 ticks, its ramp, 15 of the body (legs: 30)",
@@ -63,6 +74,21 @@ GATED = (
                 gate_checks.reconnects, with_peer=True),
     DriverCheck("command to byte", "p50 at most 1 ms", gate_checks.latency),
 )  # fmt: skip
+JOINTS_GATED = (
+    DriverCheck("enables without motion", "every joint within 0.5° for 1 s",
+                arm_checks.enables_still),
+    DriverCheck("joints stop on silence", "at rest in 12 ticks, held to 2°",
+                arm_checks.joints_silence, repeated=True),
+    DriverCheck("joints stop on an e-stop", "at rest in 6 ticks, held to 2°",
+                arm_checks.joints_estop, repeated=True),
+)  # fmt: skip
+
+
+def checks_of(robot: CheckedRobot) -> tuple[tuple[DriverCheck, ...], tuple[DriverCheck, ...]]:
+    """Return the checks of a robot's driver alone, and those behind the gate."""
+    base, joints = robot.has_base, bool(robot.file.joints)
+    alone = (OPENS, *BASE_ALONE * base, *JOINTS_ALONE * joints, NEVER_RAISES, *(KILLED,) * base)
+    return alone, BASE_GATED * base + JOINTS_GATED * joints
 
 
 async def check(
@@ -82,11 +108,12 @@ async def run(
     """
     results: list[DriverCheckResult] = []
     call: Callable[[], Awaitable[Finding]]
-    for alone in ALONE:
+    all_alone, all_gated = checks_of(robot)
+    for alone in all_alone:
         call = functools.partial(alone.run, robot)
         results.append(await _judged(alone, robot, call, progress, repeat))
     async with SharedGate(robot) as shared:
-        for gated in GATED:
+        for gated in all_gated:
             call = functools.partial(shared.run, gated.run)
             results.append(await _judged(gated, robot, call, progress, repeat))
     return results

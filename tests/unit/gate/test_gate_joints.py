@@ -71,6 +71,13 @@ def test_neither_start_nor_release_nor_enable_moves_a_joint() -> None:
     assert rig.positions == [0.3, 0.05]
 
 
+def test_an_arm_that_is_held_at_the_start_is_held_on_where_it_was_sent() -> None:
+    rig = ArmRig()
+    for _ in range(3):
+        rig.feed(gate.Tick(ZERO, joints=START, held=(0.32, 0.05)))
+    assert rig.positions == [0.32, 0.05]
+
+
 def test_a_sagging_arm_is_held_where_it_was_sent() -> None:
     rig = enabled()
     rig.measured = (JointMotion(0.28), JointMotion(0.05))
