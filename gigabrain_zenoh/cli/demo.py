@@ -74,6 +74,8 @@ class RobotOptions:
 
     def values(self) -> dict[str, object]:
         """Return the fields of a Deployment, unchecked."""
+        from gigabrain_drivers.driver.catalog import load_robot
+
         settings = dict(behaviours.load(self.behaviour).DEMO)
         values: dict[str, object] = {
             "body": self.body,
@@ -86,7 +88,7 @@ class RobotOptions:
             "resume": self.resume or ("manual" if self.link == "real" else "auto"),
             "router": "tcp/127.0.0.1:0",
         }
-        if behaviours.needs_map(self.behaviour):
+        if behaviours.needs_map(self.behaviour) and load_robot(self.body).has_base:
             values["perception"] = {"mapping": "slam"}
         if self.map:
             values["perception"] = {"mapping": "localize", "map": checked_map(self.map)}

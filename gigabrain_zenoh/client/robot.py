@@ -2,12 +2,12 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from typing import Any, TypeVar, overload
 
 from msgspec.structs import asdict
 
-from gigabrain_schemas.base import Message, Velocity
+from gigabrain_schemas.base import TICK_S, Message, Velocity
 from gigabrain_schemas.body import BodyDescription, GateStatus, Joint, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.logs import AuditRecord
@@ -16,6 +16,7 @@ from gigabrain_schemas.requests import GateReply
 from gigabrain_schemas.tasks import Task
 from gigabrain_schemas.topics import (
     BODY,
+    JOINT_CMD,
     SAFETY,
     STATE,
     Topic,
@@ -23,6 +24,7 @@ from gigabrain_schemas.topics import (
 )
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.listening import listen, topic_named
+from gigabrain_zenoh.client.arm import JointPath, JointStream, checked_positions
 from gigabrain_zenoh.client.motion import OdometryMotion, Reached
 from gigabrain_zenoh.client.objects import known_objects
 from gigabrain_zenoh.client.requests import (
@@ -102,6 +104,7 @@ class Robot:
         self._bodies, self._safety = bus.latest(BODY), bus.latest(SAFETY)
         self._target: Velocity | None = None
         self._until_tick = 0
+        self._joints: JointStream | None = None  # once joints were commanded
         self._pressed = 0  # the number of this script's newest e-stop
         self._lease = ControlLease(bus.process)
         self._arrived = asyncio.Event()
@@ -169,6 +172,8 @@ class Robot:
         commander has taken the body over or latched it.
         """
         state, body = await self.read_state(), await self.read_body()
+        if not body.has_base:
+            raise Unsupported(f"{body.robot_type} has no base to drive")
         wanted = Velocity(linear_x=linear_x, linear_y=linear_y, angular_z=angular_z)
         wanted = clamp(wanted, limits_of(body))
         if not self._lease.has(state):
@@ -247,7 +252,7 @@ class Robot:
 
         Raises NotConfirmed if no body has confirmed it within two seconds.
         """
-        self._target = None
+        self._target = self._joints = None
         try:
             reply = await press_estop(self._bus, reason)
         except NotConfirmed as error:
@@ -285,10 +290,50 @@ class Robot:
         """Return all measured joints. Raises BodyLost."""
         return (await self.read_state()).joints
 
-    async def set_joint_position(self, joint_name: str, position: float) -> float:
-        """Raise Unsupported: no driver obeys joint commands yet."""
-        state = await self.read_state()
-        raise Unsupported(f"{state.robot_type} has no joint that can be positioned")
+    async def set_joint_position(
+        self, joint_name: str, position: float, *, speed: float | None = None, wait: bool = True
+    ) -> float:
+        """Move one joint to a position [rad or m]; return the measured one.
+
+        It raises what `set_joint_positions` raises.
+        """
+        positions = {joint_name: position}
+        return (await self.set_joint_positions(positions, speed=speed, wait=wait))[joint_name]
+
+    async def set_joint_positions(
+        self, positions: Mapping[str, float], *, speed: float | None = None, wait: bool = True
+    ) -> dict[str, float]:
+        """Move joints together to positions [rad or m]; return those of all joints, as measured.
+
+        The others are held. `speed` [rad/s or m/s] is an upper limit. The first call asks the gate
+        for the body, which this script then keeps. With `wait`, it returns once the joints are
+        there within their tolerance, or rest as near as they get; without, at once.
+
+        Raises Unsupported for a body without joints, UnknownName and ConfigError for a joint or a
+        position that it does not have, Refused as `set_base_velocity` does, and BodyLost.
+        """
+        body = await self.read_body()
+        positions = checked_positions(body, positions)
+        if speed is not None and not speed > 0:
+            raise ConfigError(f"speed: expected more than 0, got {speed:g}")
+        stream = await self._joint_stream(body)
+        stream.go(positions, speed)
+        return await self._joints_there(body, stream, wait)
+
+    async def set_joint_trajectory(
+        self, points: Sequence[tuple[float, Mapping[str, float]]], *, wait: bool = True
+    ) -> dict[str, float]:
+        """Follow points, each a time from now [s] and positions by joint [rad or m].
+
+        Between them positions are interpolated. Returns and raises as `set_joint_positions` does,
+        and raises ConfigError where a joint would have to move faster than it can.
+        """
+        body = await self.read_body()
+        for _, positions in points:
+            checked_positions(body, positions)
+        stream = await self._joint_stream(body)
+        stream.follow(JointPath(body, points, stream.posture))
+        return await self._joints_there(body, stream, wait)
 
     async def get_sensor_data(self, sensor_name: str) -> Message:
         """Return the next message of `scan`, `imu` or another topic. Raises BodyLost after 1 s."""
@@ -312,6 +357,29 @@ class Robot:
         """
         return listen(self._bus, topic_named(topic) if isinstance(topic, str) else topic)
 
+    async def _joint_stream(self, body: BodyDescription) -> JointStream:
+        """Return the stream of commands for joints, with the body for this script."""
+        state = await self.read_state()
+        if not self._lease.has(state):
+            self._joints = None
+            await self._acquire()
+        if self._joints is None:
+            self._joints = JointStream(body, await self.read_state(), self._bus.process)
+        return self._joints
+
+    async def _joints_there(
+        self, body: BodyDescription, stream: JointStream, wait: bool
+    ) -> dict[str, float]:
+        """Wait until the joints are where they were sent, or as near as they get."""
+        assert body.arm
+        left = round(body.arm.goal_time / TICK_S)
+        while wait and left and not stream.reached(state := await self.read_state()):
+            if not self._lease.has(state):
+                await self._acquire()
+            await self._ticks(1)
+            left -= stream.arrived
+        return {joint.name: joint.position for joint in await self.get_joint_states()}
+
     async def _acquire(self) -> None:
         """Ask the gate for the body, unless another commander has taken it."""
         if self._lease.lost:
@@ -326,6 +394,13 @@ class Robot:
         self._lease.update(state)
         self._arrived.set()
         self._send()
+        self._send_joints(state)
+
+    def _send_joints(self, state: RobotState) -> None:
+        if self._joints is None or self._lease.lost:
+            return
+        if command := self._joints.step(state):
+            self._bus.publish(JOINT_CMD, command)
 
     def _send(self) -> None:
         target, body = self._target, self._bodies.current

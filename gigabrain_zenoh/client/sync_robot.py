@@ -2,7 +2,7 @@
 
 import asyncio
 import threading
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
@@ -186,6 +186,26 @@ class SyncRobot:
     def get_joint_states(self) -> tuple[Joint, ...]:
         """Return all measured joints."""
         return self._run(self._robot.get_joint_states())
+
+    def set_joint_position(
+        self, joint_name: str, position: float, *, speed: float | None = None, wait: bool = True
+    ) -> float:
+        """Move one joint to a position [rad or m]; return the measured one."""
+        return self._run(
+            self._robot.set_joint_position(joint_name, position, speed=speed, wait=wait)
+        )
+
+    def set_joint_positions(
+        self, positions: Mapping[str, float], *, speed: float | None = None, wait: bool = True
+    ) -> dict[str, float]:
+        """Move joints together to positions [rad or m]; return those of all, as measured."""
+        return self._run(self._robot.set_joint_positions(positions, speed=speed, wait=wait))
+
+    def set_joint_trajectory(
+        self, points: Sequence[tuple[float, Mapping[str, float]]], *, wait: bool = True
+    ) -> dict[str, float]:
+        """Follow points, each a time from now [s] and positions by joint [rad or m]."""
+        return self._run(self._robot.set_joint_trajectory(points, wait=wait))
 
     def get_sensor_data(self, sensor_name: str) -> Message:
         """Return the next message of `scan`, `imu` or another topic."""

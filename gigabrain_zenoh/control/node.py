@@ -7,13 +7,24 @@ import msgspec
 from msgspec import structs
 from msgspec.structs import replace
 
-from gigabrain_schemas.base import TICK_NS, TICK_S, Message, Velocity
-from gigabrain_schemas.body import BodyDescription, ControlGains, RobotState
-from gigabrain_schemas.brain import CmdVel, Intent, Twist
+from gigabrain_schemas.base import TICK_S, Message, Velocity
+from gigabrain_schemas.body import Body, BodyDescription, ControlGains, RobotState
+from gigabrain_schemas.brain import CmdVel, Intent, JointSpeeds
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
-from gigabrain_schemas.topics import BODY, INTENT, SAFETY, STATE, TELEOP, command_topic
+from gigabrain_schemas.topics import (
+    BODY,
+    INTENT,
+    JOINT_CMD,
+    JOINT_TELEOP,
+    SAFETY,
+    STATE,
+    TELEOP,
+    command_topic,
+)
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.freshness import PreviousTick
+from gigabrain_zenoh.control.joints import JointInputs, JointMemory, step_joints
+from gigabrain_zenoh.control.teleop import OperatorStream, Teleop
 from gigabrain_zenoh.control.tracking import (
     LONGEST_DELAY_TICKS,
     track,
@@ -21,8 +32,9 @@ from gigabrain_zenoh.control.tracking import (
     within_turning_circle,
 )
 from gigabrain_zenoh.gate.state import BRAIN
+from gigabrain_zenoh.geometry import joint_ramp
 from gigabrain_zenoh.geometry.limits import NO_CAPS, ZERO, clamp, limits_of, ramp
-from gigabrain_zenoh.geometry.pose import PoseHistory, velocity_of
+from gigabrain_zenoh.geometry.pose import PoseHistory
 from gigabrain_zenoh.runtime.heartbeat import Progress
 
 log = logging.getLogger(__name__)
@@ -207,15 +219,24 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
     """Publish commands at the body's rate, and at once for each new intent."""
     memory, lost, commands = ControlMemory(), False, 0
     teleop, verdicts = Teleop(bus.clock.now_ns), PreviousTick[SafetyState]()
+    arm = ArmControl(bus)
 
-    def act(_: Message) -> None:
-        nonlocal memory, lost, commands
+    def act(message: Message) -> None:
+        nonlocal commands
         state, body = states.fresh(), bodies.current
         if state is None or body is None:
             return
+        intent = intents.fresh()
+        if body.description.has_base:
+            drive(state, body, intent)
+        if body.description.joints and message is state:
+            commands += arm.act(state, body, intent)
+
+    def drive(state: RobotState, body: Body, intent: Intent | None) -> None:
+        nonlocal memory, lost, commands
         inputs = ControlInputs(
             state=state,
-            intent=intents.fresh(),
+            intent=intent,
             teleop=teleop.velocity(state, echo_wanted=body.link == "real"),
             caps=caps_at(verdicts, state),
         )
@@ -237,68 +258,49 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
         if intent.basis > memory.basis and intent.tick <= bus.time.tick:
             act(intent)
 
-    bodies = bus.latest(BODY)
+    bodies = bus.latest(BODY, arm.prepare)
     states = bus.latest(STATE, act)
     intents = bus.latest(INTENT, on_intent)
     bus.latest(SAFETY, verdicts.receive)
     bus.latest(TELEOP, teleop.receive)
+    bus.latest(JOINT_TELEOP, arm.teleop.receive)
     bus.progress = Progress(received, lambda: commands)
     ready()
     await bus.failed
 
 
-GAP_NS = 200_000_000  # after a longer gap the stream has ended
-SETTLE_NS = 500_000_000  # how long a stream without an echo is ignored after a gap
+class ArmControl:
+    """Publishes commands for joints at each state."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._memory = JointMemory()
+        self.teleop: OperatorStream[JointSpeeds] = OperatorStream(bus.clock.now_ns)
+
+    def prepare(self, body: Body) -> None:
+        """Get ready for a body. Raises ConfigError where a library is missing."""
+        if joints := body.description.joints:
+            joint_ramp.prepare(len(joints))
+
+    def act(self, state: RobotState, body: Body, intent: Intent | None) -> int:
+        """Publish the command for a state; return how many that were."""
+        if intent and intent.basis > state.tick:
+            intent = None  # it rests on future data
+        teleop = self.teleop.live(state, echo_wanted=body.link == "real")
+        inputs = JointInputs(state=state, intent=intent, teleop=teleop)
+        before = self._memory.problem
+        self._memory, command = step_joints(body.description, self._memory, inputs)
+        if self._memory.problem != before:
+            _log_tolerance(state.tick, self._memory)
+        if command is None:
+            return 0
+        self._bus.publish(JOINT_CMD, command, basis=state.tick)
+        return 1
 
 
-class Teleop:
-    """An operator's stream, accepted only while it is clearly live.
-
-    After an outage, a network delivers the messages it had buffered. A client may echo the robot's
-    newest tick in its messages, so its live messages are recognized immediately. A stream without
-    an echo is ignored for half a second after a gap, and always on a real body.
-
-    When the gate is enabled, the body gets a new commander. Messages sent before that do not count,
-    even if they arrive later: their tick is older than that of the first state after the enable. A
-    stream without an echo is ignored for half a second, as after a gap.
-    """
-
-    def __init__(self, now_ns: Callable[[], int]) -> None:
-        self._now_ns = now_ns
-        self._newest: Twist | None = None
-        self._arrived_ns = 0
-        self._trusted_from_ns = 0
-        self._handed_over = (0, -1)  # boot, and the gate's count of enables
-        self._handed_over_tick = 0
-
-    def receive(self, twist: Twist) -> None:
-        """Store a message of the operator's stream."""
-        now = self._now_ns()
-        if self._newest is None or now - self._arrived_ns > GAP_NS:
-            self._trusted_from_ns = now + SETTLE_NS
-        self._newest, self._arrived_ns = twist, now
-
-    def velocity(self, state: RobotState, echo_wanted: bool) -> Velocity | None:
-        """Return the operator's velocity, or None if no live stream exists.
-
-        With `echo_wanted`, as on a real body, a stream without an echo is never accepted.
-        """
-        now, twist = self._now_ns(), self._newest
-        self._note_hand_over(state, now)
-        if twist is None or now - self._arrived_ns > GAP_NS:
-            return None
-        off_ns = abs(state.tick - twist.tick) * TICK_NS  # a future tick is as wrong as an old one
-        if echo_wanted or twist.boot:
-            if twist.boot != state.boot or off_ns > GAP_NS:
-                return None
-            if twist.tick < self._handed_over_tick:
-                return None
-        elif now < self._trusted_from_ns:
-            return None
-        return velocity_of(twist)
-
-    def _note_hand_over(self, state: RobotState, now: int) -> None:
-        handed_over = state.boot, state.gate.enables
-        if handed_over != self._handed_over:
-            self._handed_over, self._handed_over_tick = handed_over, state.tick
-            self._trusted_from_ns = max(self._trusted_from_ns, now + SETTLE_NS)
+def _log_tolerance(tick: int, memory: JointMemory) -> None:
+    data = {"event": memory.problem or "path_followed", "tick": tick}
+    if memory.problem:
+        log.warning("holding: %s: %s", memory.problem, memory.detail, extra={"data": data})
+    else:
+        log.info("joints follow again", extra={"data": data})

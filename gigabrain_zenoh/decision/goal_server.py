@@ -179,6 +179,9 @@ class GoalServer(InputSource):
 
     async def check(self, goal: Goal | None) -> str:
         """Return how the robot would reach `goal`, for people; see CheckGoal. Raises Refused."""
+        body = self._source.body
+        if body and not body.has_base:
+            raise Refused(f"{body.robot_type} has no base to drive")
         for _ in range(POSE_TIMEOUT_NS // POLL_NS):
             if (waits := self._waits) or self._navigator is None:
                 return f"accepted; {waits}"

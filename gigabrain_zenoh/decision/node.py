@@ -22,6 +22,7 @@ from gigabrain_zenoh.geometry.stopping import scan_limit_ns
 from gigabrain_zenoh.runtime.heartbeat import Progress
 
 NO_OBJECTS: ObjectsByPerceptor = {}
+NO_BASE = "idle: the body has no base to drive"
 log = logging.getLogger(__name__)
 
 SETTINGS_KEY = "decision.settings"  # place of a behaviour's settings in a deployment file
@@ -121,6 +122,11 @@ class DecisionLoop:
         self.intent, outcome = step
         self.activity = outcome.activity
 
+    def rest(self, state: RobotState, reason: str) -> None:
+        """Form an intent to do nothing, from a state alone."""
+        self.intent = Intent(behaviour=self._name, reason=reason)
+        self.activity, self.basis = "idle", state.tick
+
 
 async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> None:
     """Publish an intent at once for each world, and repeat it at each state."""
@@ -162,15 +168,22 @@ def _serve(config: DecisionConfig, bus: Bus, source: InputSource) -> None:
         return contours.merged(objects.merged(world), body.description if body else None)
 
     def decide(_: Message) -> None:
-        nonlocal logged
         state = states.fresh()
         if state is None:
             return
         source.observe(state)
+        if (body := bodies.current) and not body.description.has_base:
+            loop.rest(state, NO_BASE)
+            publish(state)
+            return
         verdict = verdicts.at(state.boot, state.tick, SAFETY.stale_after_ns)
         objects.observe(state)
         world = newest_world()
         loop.step(state, world and merged(world), verdict, objects.fresh())
+        publish(state)
+
+    def publish(state: RobotState) -> None:
+        nonlocal logged
         bus.publish(INTENT, loop.intent, basis=loop.basis)
         if loop.activity != logged:
             logged, reason = loop.activity, loop.intent.reason

@@ -274,6 +274,7 @@ class Demo:
             speed=self._deployment.speed,
             seconds=watch.seconds,
             distance_m=watch.distance_m,
+            drives=watch.drives,
             decisions=tuple(self._decisions),
             turns=watch.turns,
             deaths=self._supervisor.deaths,

@@ -238,19 +238,25 @@ class PipelineProgress(Struct, frozen=True, kw_only=True):
         return PipelineProgress(bases=bases, behind_ticks=(perception, decision, control))
 
     def causes(
-        self, limits: Thresholds, state: RobotState, silent: tuple[str, ...], *, first: bool
+        self,
+        limits: Thresholds,
+        state: RobotState,
+        silent: tuple[str, ...],
+        *,
+        first: bool,
+        needed: tuple[str, ...] = SYSTEMS,
     ) -> tuple[Cause, ...]:
         """Return why the body must stop; `silent` names the systems without fresh messages.
 
         The brain matters only while it drives, or may drive next. If no commander drives and all
-        systems are silent, there is no brain, and a script need not wait for one. With the `first`
-        scan that cannot be known yet.
+        systems that the body needs are silent, there is no brain, and a script need not wait for
+        one. With the `first` scan that cannot be known yet.
         """
         commander = state.gate.commander
-        brainless = not commander and len(silent) == len(SYSTEMS) and not first
+        brainless = not commander and set(silent) >= set(needed) and not first
         if commander not in ("", BRAIN) or brainless:
             return ()
-        found = [cause(f"{name}_silent") for name in silent]
+        found = [cause(f"{name}_silent") for name in silent if name in needed]
         for name, ticks in zip(SYSTEMS, self.behind_ticks, strict=True):
             if name not in silent and ticks >= ticks_of(limits.heartbeat):
                 found.append(cause(f"{name}_silent", f"{name} does not react to new data"))

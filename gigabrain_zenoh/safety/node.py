@@ -12,7 +12,7 @@ import psutil
 
 from gigabrain_schemas.base import Cause, Message
 from gigabrain_schemas.body import Body, BodyDescription, RobotState
-from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.brain import CmdVel, JointCommand
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.sensors import Imu
 from gigabrain_schemas.topics import (
@@ -23,6 +23,7 @@ from gigabrain_schemas.topics import (
     IMAGE,
     IMU,
     INTENT,
+    JOINT_CMD,
     LOG,
     MAP,
     POSE,
@@ -172,11 +173,13 @@ class InputCollector:
         self._echoes: deque[tuple[int, str]] = deque(maxlen=MAX_KEPT)
         self._shocks: deque[tuple[int, float]] = deque(maxlen=MAX_KEPT)
         self._commands = Latest(CMD_VEL, bus.clock, bus.time)  # the brain's
+        self._joint_commands = Latest(JOINT_CMD, bus.clock, bus.time)
         self._command_key, self._unsubscribe = CMD_VEL.key, _nothing
         self.bodies = bus.latest(BODY, self._on_body)
         self._states = bus.latest(STATE, on_new)
         self._scans = bus.latest(SCAN, on_new)
         bus.subscribe(CMD_VEL, self._on_command)
+        bus.subscribe(JOINT_CMD, self._on_joint_command)
         bus.subscribe(IMU, self._on_imu)
         for topic in COUNTED_TOPICS:
             bus.subscribe(topic, lambda _key, _message: None)
@@ -198,7 +201,7 @@ class InputCollector:
             scan_age_ns=self._scans.age_ns(),
             pictures=self._newest_pictures(),
             silent=self._silent(body),
-            bases=self._bases(),
+            bases=self._bases(body),
             command=(
                 received.at(state.boot, state.tick, STATE.stale_after_ns) if received else None
             ),
@@ -214,14 +217,19 @@ class InputCollector:
     def _silent(self, body: BodyDescription) -> tuple[str, ...]:
         beat_ns = round(body.thresholds.heartbeat * 1e9)
         limits_ns = (scan_limit_ns(body) + WORLD_MARGIN_NS, beat_ns, beat_ns)
-        systems: tuple[Latest[Any], ...] = (self._worlds, self._intents, self._commands)
+        commands = self._control(body)
+        systems: tuple[Latest[Any], ...] = (self._worlds, self._intents, commands)
         return tuple(
             name
             for name, system, limit_ns in zip(SYSTEMS, systems, limits_ns, strict=True)
             if not system.fresh(limit_ns)
         )
 
-    def _bases(self) -> Bases:
+    def _control(self, body: BodyDescription) -> Latest[Any]:
+        """Return the newest command by which control shows that it works."""
+        return self._commands if body.has_base else self._joint_commands
+
+    def _bases(self, body: BodyDescription) -> Bases:
         def basis(of: Latest[Any]) -> int:
             return of.current.basis if of.current else 0
 
@@ -229,7 +237,7 @@ class InputCollector:
             scan=basis(self._scans),
             world=basis(self._worlds),
             intent=basis(self._intents),
-            command=basis(self._commands),
+            command=basis(self._control(body)),
         )
 
     def _echo_ages(self, commander: str) -> tuple[int, ...]:
@@ -255,6 +263,14 @@ class InputCollector:
             if command.source not in self._by_commander:  # forget the last commander
                 self._by_commander = {command.source: PreviousTick()}
             self._by_commander[command.source].receive(command)
+        self._note_echo(command)
+
+    def _on_joint_command(self, _key: str, command: JointCommand) -> None:
+        if command.source == BRAIN:
+            self._joint_commands.store(command)
+        self._note_echo(command)
+
+    def _note_echo(self, command: CmdVel | JointCommand) -> None:
         if command.boot == self._bus.time.boot:
             self._echoes.append((max(0, self._bus.time.tick - command.tick), command.source))
 

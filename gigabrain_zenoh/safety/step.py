@@ -14,6 +14,7 @@ from gigabrain_zenoh.geometry.stopping import scan_limit_ns
 from gigabrain_zenoh.safety.cameras import NO_PICTURES, Pictures
 from gigabrain_zenoh.safety.catalogue import MAX_STEP_TICKS, cause
 from gigabrain_zenoh.safety.health import (
+    SYSTEMS,
     Attitude,
     Bases,
     Host,
@@ -119,12 +120,17 @@ def _stop_causes(
     return (
         *_scan_causes(body, memory, inputs),
         *((cause("starting"),) if body.lidar and scans < SCANS_TO_START else ()),
-        *memory.progress.causes(limits, state, inputs.silent, first=first),
+        *memory.progress.causes(limits, state, inputs.silent, first=first, needed=needed(body)),
         *memory.power.causes(limits),
         *memory.attitude.causes,
         *memory.latency.stop_causes(body),
         *memory.tracking.causes(body),
     )
+
+
+def needed(body: BodyDescription) -> tuple[str, ...]:
+    """Return the systems that a body waits for: a fixed arm without a lidar has no worlds."""
+    return SYSTEMS if body.has_base or body.lidar else SYSTEMS[1:]
 
 
 def _scan_causes(

@@ -77,6 +77,11 @@ class RunMonitor(RobotView):
         return self.bus.time.tick * TICK_S
 
     @property
+    def drives(self) -> bool:
+        """Return whether the body has a base."""
+        return self.body is None or self.body.description.has_base
+
+    @property
     def mapped_m2(self) -> float | None:
         """Return the area of the map known to be free or occupied [m2]; None without a map."""
         grid = self.map.current
@@ -154,6 +159,7 @@ class Observed(Struct, frozen=True, kw_only=True):
     speed: float
     seconds: float  # of the robot's time
     distance_m: float  # by odometry
+    drives: bool = True  # it has a base, which is expected to move
     decisions: tuple[tuple[float, str], ...]
     turns: int  # turns on the spot that the brain decided on
     deaths: int
@@ -248,7 +254,7 @@ def _verdict(distance_m: float, contacts: int, seen: Observed) -> str:
     faults, deaths = [], seen.deaths
     if contacts:
         faults.append(_count(contacts, "contact"))
-    if distance_m < MIN_DISTANCE_M:
+    if seen.drives and distance_m < MIN_DISTANCE_M:
         faults.append("no motion")
     if deaths:
         faults.append(f"{deaths} process{'es' if deaths > 1 else ''} died")

@@ -67,6 +67,23 @@ class Joint(Record, frozen=True, kw_only=True):
     current: Amperes | None = None  # [A] of its motor
 
 
+class JointGains(Record, frozen=True, kw_only=True):
+    """How control corrects what it sends to a joint that holds positions by itself.
+
+    Sent is the position wanted, and: the error by `p`, its integral while the joint should rest by
+    `i`, the error of speed by `d`, and the speed wanted by `feed_forward`.
+    """
+
+    p: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
+    i: Annotated[float, Meta(ge=0.0, le=20.0)] = 1.0  # [1/s]
+    d: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0  # [s]
+    feed_forward: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0  # [s], how late the joint follows
+    max_correction: Annotated[float, Meta(ge=0.0, le=0.5)] = 0.05  # [rad] or [m], of them all
+
+
+Tolerance = Annotated[float, Meta(ge=0.0, le=100.0)]  # [rad] or [m]
+
+
 class JointDescription(Record, frozen=True, kw_only=True):
     """A joint that can be commanded: how far, how fast and how hard it may move."""
 
@@ -78,6 +95,9 @@ class JointDescription(Record, frozen=True, kw_only=True):
     max_acceleration: AccelerationLimit = 10.0  # [rad/s2] or [m/s2]
     max_jerk: Annotated[float, Meta(ge=0.01, le=1e5)] = 200.0  # [rad/s3] or [m/s3]
     max_effort: Annotated[float, Meta(ge=0.0, le=1e5)] = 0.0  # [N m] or [N]; 0: not known
+    gains: JointGains = JointGains()
+    path_tolerance: Tolerance = 0.3  # [rad] or [m], off a trajectory on the way; 0: not checked
+    goal_tolerance: Tolerance = 0.05  # [rad] or [m], off its end at rest; 0: not checked
 
     def __post_init__(self) -> None:
         if self.upper <= self.lower:
@@ -90,6 +110,8 @@ class Arm(Record, frozen=True, kw_only=True):
     tool: Name = "tool"  # site of the model that reaches for things, along its x axis
     home: Annotated[tuple[JointPosition, ...], Meta(min_length=1, max_length=MOST_ARM_JOINTS)]
     # [rad] or [m], a posture in which it is out of the way; one number for each joint
+    rate_hz: Annotated[float, Meta(ge=50.0, le=200.0)] = 50.0  # of control's commands to its joints
+    goal_time: Sustain = 1.0  # [s] after the end of a trajectory until its joints are there
 
 
 class Battery(Record, frozen=True, kw_only=True):
@@ -329,6 +351,11 @@ class BodyDescription(Record, frozen=True, kw_only=True):
                     f"arm: home: {joint.name} at {position:g} is outside "
                     f"{joint.lower:g} to {joint.upper:g}"
                 )
+
+    @property
+    def has_base(self) -> bool:
+        """Whether it can drive; an arm that is fixed cannot."""
+        return self.drive_type != "arm"
 
     @property
     def turning_radius(self) -> float:

@@ -195,11 +195,48 @@ class JointTarget(Record, frozen=True, kw_only=True):
     position: JointPosition  # [rad] or [m]
 
 
+LONGEST_WINDOW_S = 3.0  # of a joint trajectory in an intent
+
+
+class JointTrajectory(Record, frozen=True, kw_only=True):
+    """Where joints should be from tick to tick: a window that decision renews as it goes on.
+
+    Between the points positions are interpolated; after the last one the joints stay there.
+    """
+
+    name: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MOST_ARM_JOINTS)]
+    start: Tick  # of the first point, by the robot's clock
+    period: Annotated[float, Meta(ge=0.001, le=1.0)]  # [s] from point to point
+    positions: Annotated[bytes, array_meta(12 * 1024, "float32", ("n", "joints"), "rad")]
+    # float32 little-endian [rad] or [m], (n, joints)
+
+    def __post_init__(self) -> None:
+        joints = len(self.name)
+        count, rest = divmod(len(self.positions), 4 * joints)
+        if rest or not count:
+            raise ValueError(f"positions: expected rows of {joints} float32")
+        if (count - 1) * self.period > LONGEST_WINDOW_S + 1e-9:
+            raise ValueError(f"positions: they may last {LONGEST_WINDOW_S:g} s")
+        import numpy as np
+
+        if not np.isfinite(self.array()).all():
+            raise ValueError("positions: expected finite numbers")
+        if len(set(self.name)) < joints:
+            raise ValueError("name: each joint at most once")
+
+    def array(self) -> "NDArray[np.float32]":
+        """Return the positions [rad] or [m], (n, joints), as a read-only view."""
+        import numpy as np
+
+        return np.frombuffer(self.positions, "<f4").reshape(-1, len(self.name))
+
+
 class Intent(Message, frozen=True, kw_only=True):
     """Decision's wish, the motion that it expects, and its reason."""
 
     twist: Velocity | None = None
     joints: Annotated[tuple[JointTarget, ...], Meta(max_length=MOST_ARM_JOINTS)] = ()
+    joint_trajectory: JointTrajectory | None = None  # instead of `joints`
     trajectory: Annotated[tuple[TrajectoryPoint, ...], Meta(max_length=256)] = ()
     follow: bool = False  # control keeps to the trajectory; without, it gives the body the twist
     response: ActuationModel = ActuationModel()  # what the trajectory counts on
@@ -214,6 +251,21 @@ class Twist(Message, frozen=True, kw_only=True):
     linear_x: LinearSpeed  # [m/s]
     linear_y: LinearSpeed = 0.0  # [m/s]
     angular_z: AngularSpeed = 0.0  # [rad/s]
+
+
+class JointSpeeds(Message, frozen=True, kw_only=True):
+    """Velocities of joints that an operator asks for; other joints are held."""
+
+    name: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MOST_ARM_JOINTS)]
+    velocity: Annotated[
+        tuple[JointSpeed, ...], Meta(max_length=MOST_ARM_JOINTS)
+    ]  # [rad/s] or [m/s]
+
+    def __post_init__(self) -> None:
+        if len(self.velocity) != len(self.name):
+            raise ValueError(f"{len(self.name)} names and {len(self.velocity)} velocities")
+        if len(set(self.name)) < len(self.name):
+            raise ValueError("name: each joint at most once")
 
 
 class CmdVel(Message, frozen=True, kw_only=True):
@@ -239,6 +291,7 @@ class JointCommand(Message, frozen=True, kw_only=True):
         tuple[JointSpeed, ...], Meta(max_length=MOST_ARM_JOINTS)
     ] = ()  # [rad/s] or [m/s]
     source: Name = ""  # who commands
+    operator: bool = False  # control follows an operator's stream, not decision's intent
 
     def __post_init__(self) -> None:
         count, lengths = len(self.name), (len(self.position), len(self.velocity))

@@ -43,6 +43,13 @@ class EnableRequest(Message, frozen=True, kw_only=True):
     by: Name = ""  # the person who asks, if the source is the brain
 
 
+class LimpRequest(Message, frozen=True, kw_only=True):
+    """Let go of all joints, which may fall; or hold them again, where they are then."""
+
+    limp: bool
+    source: Name = "anonymous"
+
+
 class GateReply(Message, frozen=True, kw_only=True):
     """The gate's answer to a request."""
 

@@ -145,6 +145,10 @@ TELEOP = Topic(
     "robot/teleop", brain.Twist, 20, priority="interactive_high", max_bytes=KB,
     publishers=OPERATOR,
 )  # fmt: skip
+JOINT_TELEOP = Topic(
+    "robot/joint_teleop", brain.JointSpeeds, 20, priority="interactive_high",
+    publishers=OPERATOR,
+)  # fmt: skip
 CMD_VEL = Topic(
     "robot/cmd_vel", brain.CmdVel, 50, priority="interactive_high", depth=16, max_bytes=KB,
     publishers=OPERATOR, plotted=True,
@@ -215,6 +219,7 @@ ESTOP_SAID = Topic(
 )  # fmt: skip
 RELEASE = Service("robot/release", requests.ReleaseRequest, requests.GateReply, callers=OPERATOR)
 ENABLE = Service("robot/enable", requests.EnableRequest, requests.GateReply, callers=OPERATOR)
+LIMP = Service("robot/limp", requests.LimpRequest, requests.GateReply, callers=OPERATOR)
 GOAL = Service("robot/goal", tasks.GoalRequest, tasks.GoalReply, callers=OPERATOR, servers=BRAIN)
 MISSION = Service(
     "robot/mission", tasks.MissionRequest, tasks.MissionReply, callers=OPERATOR, servers=BRAIN,

@@ -12,7 +12,8 @@ from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, SAFETY, STATE, TELEOP, Topic
 from gigabrain_zenoh.bus.freshness import PreviousTick
 from gigabrain_zenoh.control import node as control
-from gigabrain_zenoh.control.node import Teleop, caps_at
+from gigabrain_zenoh.control.node import caps_at
+from gigabrain_zenoh.control.teleop import Teleop
 from gigabrain_zenoh.geometry.limits import NO_CAPS
 from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import BOOT, DRIVING, TICK_NS, WAFFLE, body, state

@@ -17,6 +17,7 @@ from gigabrain_schemas.topics import (
     IMAGE,
     IMU,
     INTENT,
+    JOINT_CMD,
     LOG,
     MAP,
     POSE,
@@ -36,7 +37,7 @@ from tests.unit.gate.rig import driving
 from tests.unit.safety.patrol import BODY, Patrol
 
 MONITORED = (
-    BODY_TOPIC, STATE, SCAN, CMD_VEL, IMU, IMAGE, POSE, MAP, HEALTH, LOG, WORLD, INTENT,
+    BODY_TOPIC, STATE, SCAN, CMD_VEL, JOINT_CMD, IMU, IMAGE, POSE, MAP, HEALTH, LOG, WORLD, INTENT,
 )  # fmt: skip
 AHEAD = Velocity(linear_x=0.2)
 

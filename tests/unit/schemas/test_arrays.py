@@ -11,6 +11,8 @@ from gigabrain_schemas import arrays
 from gigabrain_schemas.body import Thresholds
 from gigabrain_schemas.brain import (
     JointCommand,
+    JointSpeeds,
+    JointTrajectory,
     Obstacle,
     OccupancyGrid,
     TrajectoryPoint,
@@ -35,6 +37,10 @@ def image(encoding: Any, height: int, width: int, data: bytes) -> Image:
     return Image(frame_id="camera", encoding=encoding, height=height, width=width, data=data)
 
 
+def trajectory(name: tuple[str, ...], positions: bytes) -> JointTrajectory:
+    return JointTrajectory(name=name, start=1, period=0.02, positions=positions)
+
+
 @pytest.mark.parametrize(
     ("build", "complaint"),
     [
@@ -54,6 +60,13 @@ def image(encoding: Any, height: int, width: int, data: bytes) -> Image:
         (lambda: JointCommand(name=("a", "b"), position=(0.0,) * 2, velocity=(0.0,)), "2 names"),
         (lambda: JointCommand(name=("a", "a"), position=(0.0, 1.0)), "at most once"),
         (lambda: JointCommand(name=("a",)), "1 names"),
+        (lambda: JointSpeeds(name=("a", "b"), velocity=(0.0,)), "2 names and 1 velocities"),
+        (lambda: JointSpeeds(name=("a", "a"), velocity=(0.0, 1.0)), "at most once"),
+        (lambda: trajectory(("a",), b""), "rows of 1 float32"),
+        (lambda: trajectory(("a", "b"), bytes(12)), "rows of 2 float32"),
+        (lambda: trajectory(("a",), bytes(4 * 152)), "may last 3 s"),
+        (lambda: trajectory(("a", "a"), bytes(8)), "at most once"),
+        (lambda: trajectory(("a",), b"\0\0\xc0\x7f"), "finite"),
         (
             lambda: Thresholds(battery_warn=4.0),
             "battery_stop, battery_return and battery_warn must ascend",

@@ -37,6 +37,7 @@ REQUIRED: dict[str, set[str]] = {
     "OccupancyGrid": {"resolution", "width", "height", "origin_x", "origin_y", "cells"},
     "Intent": {"behaviour", "reason"},
     "Twist": {"linear_x"},
+    "JointSpeeds": {"name", "velocity"},
     "CmdVel": {"linear_x"},
     "JointCommand": {"name"},
     "SafetyState": {"verdict"},
@@ -52,6 +53,7 @@ REQUIRED: dict[str, set[str]] = {
     "EstopRequest": set(),
     "ReleaseRequest": {"estop_generation"},
     "EnableRequest": {"source"},
+    "LimpRequest": {"limp"},
     "GateReply": {"ok", "text", "robot_type", "gate"},
     "GoalRequest": set(),
     "GoalReply": {"ok", "text"},
@@ -107,6 +109,7 @@ def test_the_table_holds_the_keys_and_rates_of_the_design() -> None:
         "robot/zones": ("Zones", 0.5),
         "robot/intent": ("Intent", 50),
         "robot/teleop": ("Twist", 20),
+        "robot/joint_teleop": ("JointSpeeds", 20),
         "robot/cmd_vel": ("CmdVel", 50),
         "robot/joint_cmd": ("JointCommand", 50),
         "robot/safety": ("SafetyState", 20),
@@ -121,10 +124,10 @@ def test_the_table_holds_the_keys_and_rates_of_the_design() -> None:
         "robot/audit": ("AuditRecord", 10),
     }
     assert [service.at("*") for service in SERVICES] == [
-        "robot/estop", "robot/release", "robot/enable", "robot/goal", "robot/mission",
-        "robot/task_change", "robot/map_save", "robot/sim_change", "robot/map_load",
-        "robot/map_list", "robot/zones_change", "robot/pose_set", "robot/objects_change",
-        "robot/audit_log", "robot/param/*", "robot/describe/*",
+        "robot/estop", "robot/release", "robot/enable", "robot/limp", "robot/goal",
+        "robot/mission", "robot/task_change", "robot/map_save", "robot/sim_change",
+        "robot/map_load", "robot/map_list", "robot/zones_change", "robot/pose_set",
+        "robot/objects_change", "robot/audit_log", "robot/param/*", "robot/describe/*",
     ]  # fmt: skip
 
 
@@ -147,6 +150,7 @@ def test_a_value_stops_counting_after_so_many_missed_periods() -> None:
         "robot/zones": 10_000_000_000,
         "robot/intent": 100_000_000,
         "robot/teleop": 250_000_000,
+        "robot/joint_teleop": 250_000_000,
         "robot/cmd_vel": 100_000_000,
         "robot/joint_cmd": 100_000_000,
         "robot/safety": 150_000_000,
@@ -203,7 +207,7 @@ def test_every_message_is_frozen_and_documented_and_carries_the_header(
 def test_the_golden_folder_holds_the_examples_byte_for_byte() -> None:
     stored = {path.name: path.read_bytes() for path in examples.FOLDER.iterdir()}
     assert stored == examples.files()
-    assert len(stored) == 116
+    assert len(stored) == 120
 
 
 @by_name

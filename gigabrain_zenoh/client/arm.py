@@ -1,0 +1,196 @@
+"""Motion of joints for scripts: postures and trajectories, streamed at the body's rate."""
+
+import math
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
+
+from gigabrain_schemas.base import TICK_S
+from gigabrain_schemas.body import BodyDescription, JointDescription, RobotState
+from gigabrain_schemas.brain import JointCommand
+from gigabrain_zenoh.errors import ConfigError, Unsupported, unknown
+from gigabrain_zenoh.geometry.joint_ramp import (
+    JointGoal,
+    JointPoint,
+    along,
+    held,
+    measured,
+    prepare,
+    ramp,
+)
+
+Positions = Mapping[str, float]  # [rad] or [m] by joint
+LOST_TICKS = 3  # by whose motion the joints may be away from where they were sent
+ARRIVED = 1e-4  # [rad] or [m], off a goal
+LONGEST_S = 600.0  # of a trajectory
+
+
+def checked_positions(body: BodyDescription, positions: Positions) -> dict[str, float]:
+    """Return positions [rad] or [m]. Raises Unsupported, UnknownName and ConfigError."""
+    if not body.joints:
+        raise Unsupported(f"{body.robot_type} has no joint that can be positioned")
+    prepare(len(body.joints))
+    known = {joint.name: joint for joint in body.joints}
+    if not positions:
+        raise ConfigError(f"expected the position of a joint; known: {', '.join(known)}")
+    for name, position in positions.items():
+        if name not in known:
+            raise unknown("joint", name, known)
+        _check_position(known[name], position)
+    return {name: float(position) for name, position in positions.items()}
+
+
+def _check_position(joint: JointDescription, position: float) -> None:
+    if isinstance(position, bool) or not isinstance(position, (int, float)):
+        raise ConfigError(f"{joint.name}: expected a number, got {position!r}")
+    if not joint.lower <= position <= joint.upper:  # NaN as well
+        raise ConfigError(
+            f"{joint.name}: expected {joint.lower:g} to {joint.upper:g}, got {position:g}"
+        )
+
+
+class JointPath:
+    """Points in time and positions [rad] or [m], from the present posture on."""
+
+    def __init__(
+        self, body: BodyDescription, points: Sequence[tuple[float, Positions]], start: Positions
+    ) -> None:
+        """Check the points. Raises Unsupported, UnknownName and ConfigError."""
+        if not points:
+            raise ConfigError("trajectory: expected at least one point, (seconds, positions)")
+        names = set(points[0][1])
+        self._times, self._rows = [0.0], [dict(start)]
+        for number, (t, positions) in enumerate(points):
+            if set(positions) != names:
+                raise ConfigError(f"trajectory: point {number} has other joints than the first")
+            before = self._times[-1]
+            if not (math.isfinite(t) and before < t <= LONGEST_S):
+                raise ConfigError(
+                    f"trajectory: point {number}: expected a time above {before:g} s, "
+                    f"up to {LONGEST_S:g} s, got {t:g}"
+                )
+            row = {**self._rows[-1], **checked_positions(body, positions)}
+            self._check_speeds(body, row, t, number)
+            self._times.append(t)
+            self._rows.append(row)
+
+    @property
+    def end(self) -> dict[str, float]:
+        """The posture at its end."""
+        return self._rows[-1]
+
+    @property
+    def seconds(self) -> float:
+        """How long it lasts [s]."""
+        return self._times[-1]
+
+    def at(self, t: float) -> dict[str, float]:
+        """Return the posture after `t` seconds."""
+        i = bisect_right(self._times, t)
+        if i == len(self._times):
+            return self.end
+        share = (t - self._times[i - 1]) / (self._times[i] - self._times[i - 1])
+        before, after = self._rows[i - 1], self._rows[i]
+        return {name: place + share * (after[name] - place) for name, place in before.items()}
+
+    def _check_speeds(self, body: BodyDescription, row: Positions, t: float, number: int) -> None:
+        for joint in body.joints:
+            speed = abs(row[joint.name] - self._rows[-1][joint.name]) / (t - self._times[-1])
+            if speed > joint.max_speed:
+                raise ConfigError(
+                    f"trajectory: point {number}: {joint.name} would have to move at {speed:.2f}, "
+                    f"more than {joint.max_speed:g}"
+                )
+
+
+class JointStream:
+    """Commands for joints, one for each state, from where they were sent to where they should be.
+
+    The joints that are not named stay where they were sent.
+    """
+
+    def __init__(self, body: BodyDescription, state: RobotState, source: str) -> None:
+        """Start where the joints are. Nothing moves before `go` or `follow`."""
+        self._body, self._source = body, source
+        self._now = held(body, state)
+        self._tick, self._sent = state.tick, self._now
+        self._ends: dict[str, float] = {}
+        self._speed: float | None = None
+        self._path: JointPath | None = None
+        self._path_tick = 0  # when it began
+
+    @property
+    def posture(self) -> dict[str, float]:
+        """Where the joints should be by now [rad] or [m]."""
+        names = (joint.name for joint in self._body.joints)
+        return dict(zip(names, (point.position for point in self._now), strict=True))
+
+    def go(self, positions: Positions, speed: float | None) -> None:
+        """Move joints to `positions` [rad] or [m] from now on."""
+        self._path, self._speed = None, speed
+        self._ends |= positions
+
+    def follow(self, path: JointPath) -> None:
+        """Follow a path from now on."""
+        self._path, self._path_tick = path, self._tick
+        self._ends, self._speed = path.end, None
+
+    def restart(self, state: RobotState) -> None:
+        """Start again at rest where the joints are, and stay there."""
+        self._now = self._sent = held(self._body, state)
+        self._tick, self._ends, self._path = state.tick, {}, None
+
+    def step(self, state: RobotState) -> JointCommand | None:
+        """Return the command for the tick after that of `state`; None while joints are missing."""
+        posture = held(self._body, state)
+        if not posture:
+            return None
+        if not self._now or self._lost(posture):
+            self._now = posture
+        ticks = max(0, min(state.tick - self._tick, LOST_TICKS))
+        self._tick = state.tick
+        if ticks:
+            self._now = self._moved(ticks)
+        self._sent = self._now
+        return JointCommand(
+            name=tuple(joint.name for joint in self._body.joints),
+            position=tuple(point.position for point in self._now),
+            velocity=tuple(point.velocity for point in self._now),
+            source=self._source,
+        )
+
+    def _moved(self, ticks: int) -> tuple[JointPoint, ...]:
+        joints, dt = self._body.joints, ticks * TICK_S
+        if self._path:
+            t = (self._tick - self._path_tick) * TICK_S
+            rows = (self._path.at(t - dt + TICK_S), self._path.at(t + TICK_S))
+            before, after = ([row[joint.name] for joint in joints] for row in rows)
+            return along(self._now, before, after, joints, dt)
+        goals = [
+            JointGoal(self._ends.get(joint.name, now.position), max_speed=self._speed)
+            for joint, now in zip(joints, self._now, strict=True)
+        ]
+        return ramp(self._now, goals, joints, dt)
+
+    def _lost(self, posture: tuple[JointPoint, ...]) -> bool:
+        """Return whether the gate holds the joints elsewhere: then they start from there."""
+        return any(
+            abs(sent.position - point.position) > LOST_TICKS * TICK_S * joint.max_speed
+            for sent, point, joint in zip(self._sent, posture, self._body.joints, strict=True)
+        )
+
+    @property
+    def arrived(self) -> bool:
+        """Whether all joints have been sent to where they should get."""
+        over = self._path is None or (self._tick - self._path_tick) * TICK_S >= self._path.seconds
+        return over and all(
+            abs(self.posture[name] - place) < ARRIVED for name, place in self._ends.items()
+        )
+
+    def reached(self, state: RobotState) -> bool:
+        """Return whether all joints are where they should get, as measured."""
+        here = measured(self._body, state)
+        return self.arrived and all(
+            abs(point.position - self._ends[joint.name]) <= (joint.goal_tolerance or math.inf)
+            for joint, point in zip(self._body.joints, here, strict=False)
+            if joint.name in self._ends
+        )

@@ -1,0 +1,243 @@
+"""Joint trajectory controller: turns intents, or an operator's speeds, into joint positions.
+
+It starts from where the joints were sent, and keeps to speed, acceleration and jerk of each. What
+a joint lags behind is corrected by its gains. A joint that leaves its tolerance stops them all.
+"""
+
+import msgspec
+from msgspec.structs import replace
+
+from gigabrain_schemas.base import TICK_S
+from gigabrain_schemas.body import BodyDescription, JointDescription, RobotState
+from gigabrain_schemas.brain import Intent, JointCommand, JointSpeeds, JointTrajectory
+from gigabrain_zenoh.gate.gate import CALM_TICKS
+from gigabrain_zenoh.gate.state import BRAIN
+from gigabrain_zenoh.geometry.joint_ramp import (
+    REST,
+    JointGoal,
+    JointPoint,
+    along,
+    held,
+    measured,
+    ramp,
+    within,
+)
+
+MAX_STEP_TICKS = 5  # longest step, also after a gap
+LOST_TICKS = 3  # by whose motion the joints may be away from where they were sent
+SLOW = 0.01  # [rad/s] or [m/s], below which a joint should rest
+Places = tuple[float, ...]
+
+
+class JointInputs(msgspec.Struct, frozen=True, kw_only=True):
+    """Inputs of one command for joints; None if stale, missing or malformed."""
+
+    state: RobotState
+    intent: Intent | None = None
+    teleop: JointSpeeds | None = None  # while the operator's stream is live
+
+
+class JointMemory(msgspec.Struct, frozen=True, kw_only=True):
+    """State from tick to tick."""
+
+    boot: int = 0
+    tick: int = 0
+    enables: int = 0  # the gate's count
+    enabled_tick: int = 0  # when the gate opened; 0 while it is closed
+    operator: bool = False  # an operator jogs, until the gate is enabled again
+    active: bool = False  # something was wanted since then: gains correct what joints lag behind
+    setpoint: tuple[JointPoint, ...] = ()  # for the tick after this one; none while closed
+    sent: Places = ()  # the last command
+    integral: Places = ()  # [rad] or [m], part of the correction
+    problem: str = ""  # code of the tolerance that was broken
+    detail: str = ""  # which joint broke it, and by how much
+    broken_tick: int = 0
+    hold: Places = ()  # where the joints were then
+
+
+def step_joints(
+    body: BodyDescription, memory: JointMemory, inputs: JointInputs
+) -> tuple[JointMemory, JointCommand | None]:
+    """Return the command for the tick after that of the state; None while joints are missing."""
+    state = inputs.state
+    here, posture = measured(body, state), held(body, state)
+    if not here:
+        return JointMemory(boot=state.boot, tick=state.tick), None
+    if state.gate.mode != "enabled" or state.gate.commander != BRAIN:
+        memory = JointMemory(
+            boot=state.boot,
+            tick=state.tick,
+            enables=memory.enables,
+            operator=memory.operator and memory.boot == state.boot,
+        )
+        return memory, _command(body, _places(posture))
+    memory, ticks = _next_tick(body, memory, state, posture)
+    if ticks == 0:
+        return memory, _command(body, memory.sent, memory)
+    if inputs.teleop:
+        memory = replace(memory, operator=True)
+    intent = None if memory.operator else inputs.intent
+    wants = intent and (intent.joints or intent.joint_trajectory)
+    memory = replace(memory, active=bool(memory.active or inputs.teleop or wants))
+    if intent and intent.joint_trajectory:
+        memory = _checked(body, memory, intent.joint_trajectory, here)
+    elif intent or inputs.teleop:
+        memory = replace(memory, problem="", detail="")
+    memory = replace(memory, setpoint=_moved(body, memory, inputs.teleop, intent, ticks))
+    return _corrected(body, memory, here, ticks)
+
+
+def _next_tick(
+    body: BodyDescription, memory: JointMemory, state: RobotState, posture: tuple[JointPoint, ...]
+) -> tuple[JointMemory, int]:
+    """Advance to the tick of `state`; return the ticks since the last step as well.
+
+    The joints start at rest where they were sent: after an enable, and when they did not get what
+    was commanded, for the gate held them.
+    """
+    opened = not memory.setpoint or memory.boot != state.boot
+    handed_over = state.gate.enables != memory.enables
+    if opened or handed_over:
+        memory = JointMemory(
+            boot=state.boot,
+            tick=state.tick,
+            enables=state.gate.enables,
+            enabled_tick=state.tick,
+            operator=memory.operator and not handed_over,
+            setpoint=posture,
+            sent=_places(posture),
+            integral=(0.0,) * len(posture),
+        )
+        return memory, 0
+    passed = max(0, min(state.tick - memory.tick, MAX_STEP_TICKS))
+    calm = state.tick - memory.enabled_tick <= CALM_TICKS
+    if calm or _lost(body, memory, posture):
+        integral = (0.0,) * len(posture)
+        memory = replace(memory, setpoint=posture, sent=_places(posture), integral=integral)
+    return replace(memory, tick=state.tick), 0 if calm else passed
+
+
+def _lost(body: BodyDescription, memory: JointMemory, posture: tuple[JointPoint, ...]) -> bool:
+    return any(
+        abs(sent - point.position) > LOST_TICKS * TICK_S * joint.max_speed
+        for sent, point, joint in zip(memory.sent, posture, body.joints, strict=True)
+    )
+
+
+def _moved(
+    body: BodyDescription,
+    memory: JointMemory,
+    teleop: JointSpeeds | None,
+    intent: Intent | None,
+    ticks: int,
+) -> tuple[JointPoint, ...]:
+    """Return the setpoint `ticks` later, as the operator wants, else decision, else at rest."""
+    now, joints, dt = memory.setpoint, body.joints, ticks * TICK_S
+    trajectory = intent.joint_trajectory if intent else None
+    if memory.problem:
+        return ramp(now, [JointGoal(place) for place in memory.hold], joints, dt)
+    if trajectory:
+        before, after = (sample(body, trajectory, now, t) for t in (memory.tick, memory.tick + 1))
+        return along(now, before, after, joints, dt)
+    if teleop:
+        speeds = dict(zip(teleop.name, teleop.velocity, strict=True))
+        goals = {name: JointGoal(velocity=speed) for name, speed in speeds.items()}
+    else:
+        targets = intent.joints if intent else ()
+        goals = {target.name: JointGoal(target.position) for target in targets}
+    if not goals and not any(point.velocity or point.acceleration for point in now):
+        return now
+    return ramp(now, [goals.get(joint.name, REST) for joint in joints], joints, dt)
+
+
+def sample(
+    body: BodyDescription, path: JointTrajectory, now: tuple[JointPoint, ...], tick: int
+) -> Places:
+    """Return where each joint should be at a tick; joints that are not named stay as they are."""
+    points = path.array()
+    at = max(0.0, min(len(points) - 1.0, (tick - path.start) * TICK_S / path.period))
+    first = int(at)
+    last, share = min(first + 1, len(points) - 1), at - first
+    row = (points[first] + share * (points[last] - points[first])).tolist()
+    wanted = dict(zip(path.name, row, strict=True))
+    return tuple(
+        within(joint, wanted.get(joint.name, point.position))
+        for joint, point in zip(body.joints, now, strict=True)
+    )
+
+
+def _checked(
+    body: BodyDescription, memory: JointMemory, path: JointTrajectory, here: tuple[JointPoint, ...]
+) -> JointMemory:
+    """Check the tolerances; a hold ends with a trajectory that was made after it began."""
+    assert body.arm
+    wanted = sample(body, path, here, memory.tick)
+    off = _off(body.joints, wanted, here)
+    ended_s = (memory.tick - path.start) * TICK_S - (len(path.array()) - 1) * path.period
+    found = _broken("path_tolerance", off, [joint.path_tolerance for joint in body.joints])
+    if not found[0] and ended_s > body.arm.goal_time:
+        found = _broken("goal_tolerance", off, [joint.goal_tolerance for joint in body.joints])
+    if memory.problem and (found[0] or path.start <= memory.broken_tick):
+        return memory
+    problem, detail = found
+    if not problem:
+        return replace(memory, problem="", detail="")
+    places = tuple(within(joint, p.position) for joint, p in zip(body.joints, here, strict=True))
+    return replace(memory, problem=problem, detail=detail, broken_tick=memory.tick, hold=places)
+
+
+def _off(
+    joints: tuple[JointDescription, ...], wanted: Places, here: tuple[JointPoint, ...]
+) -> dict[str, float]:
+    return {
+        joint.name: place - point.position
+        for joint, place, point in zip(joints, wanted, here, strict=True)
+    }
+
+
+def _broken(code: str, off: dict[str, float], tolerances: list[float]) -> tuple[str, str]:
+    """Return the code and the first joint that is beyond its tolerance; 0 is not checked."""
+    for (name, error), tolerance in zip(off.items(), tolerances, strict=True):
+        if tolerance and abs(error) > tolerance:
+            return code, f"{name} is {abs(error):.2f} off, more than {tolerance:g}"
+    return "", ""
+
+
+def _corrected(
+    body: BodyDescription, memory: JointMemory, here: tuple[JointPoint, ...], ticks: int
+) -> tuple[JointMemory, JointCommand]:
+    """Return the command: the setpoint, and what each joint's gains add to it."""
+    sent, integral = [], []
+    for joint, point, now, old in zip(
+        body.joints, memory.setpoint, here, memory.integral, strict=True
+    ):
+        gains = joint.gains
+        most = gains.max_correction
+        error = point.position - now.position
+        still = memory.active and abs(point.velocity) < SLOW and not memory.problem
+        grown = old + gains.i * error * TICK_S * ticks if still else old
+        grown = max(-most, min(most, grown))
+        fixed = gains.p * error + grown + gains.d * (point.velocity - now.velocity)
+        fixed = max(-most, min(most, fixed)) + gains.feed_forward * point.velocity
+        fixed = fixed if memory.active else 0.0
+        integral.append(grown)
+        sent.append(within(joint, point.position + fixed))
+    memory = replace(memory, sent=tuple(sent), integral=tuple(integral))
+    return memory, _command(body, memory.sent, memory)
+
+
+def _places(points: tuple[JointPoint, ...]) -> Places:
+    return tuple(point.position for point in points)
+
+
+def _command(
+    body: BodyDescription, places: Places, memory: JointMemory | None = None
+) -> JointCommand:
+    speeds = tuple(point.velocity for point in memory.setpoint) if memory else (0.0,) * len(places)
+    return JointCommand(
+        name=tuple(joint.name for joint in body.joints),
+        position=places,
+        velocity=speeds,
+        source=BRAIN,
+        operator=memory.operator if memory else False,
+    )

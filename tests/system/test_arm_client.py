@@ -1,0 +1,105 @@
+"""A script that moves the joints of an arm, through the gate of a whole robot."""
+
+import math
+from collections.abc import AsyncIterator
+
+import pytest
+
+from gigabrain_zenoh.client.connection import connect
+from gigabrain_zenoh.errors import ConfigError, Refused, UnknownName, Unsupported
+from gigabrain_zenoh.qa.probe import Probe, probing
+from gigabrain_zenoh.testing.processes import CommandProcess, Home, robot_of
+from gigabrain_zenoh.testing.waiting import until
+
+HOME = (0.0, -1.7, 1.6, 0.5, 0.0, 0.0)
+NEAR = 0.06  # [rad]: the goal tolerance, and an encoder's step
+
+
+@pytest.fixture(scope="module")
+def demo(shared_home: Home) -> CommandProcess:
+    return shared_home.start("demo", "--body", "so101", "--headless")
+
+
+@pytest.fixture
+async def arm(
+    shared_home: Home, demo: CommandProcess, monkeypatch: pytest.MonkeyPatch
+) -> AsyncIterator[Probe]:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(shared_home.folder / "run"))
+    async with probing(await robot_of(shared_home, demo)) as onlooker:
+        await until(lambda: onlooker.state.gate.mode == "enabled", "enabled")
+        yield onlooker
+
+
+def posture(arm: Probe) -> tuple[float, ...]:
+    return tuple(joint.position for joint in arm.state.joints)
+
+
+async def test_it_is_enabled_and_holds_still_for_its_brain(arm: Probe) -> None:
+    await arm.ticks(50)
+    assert arm.state.gate.commander == "control"
+    assert posture(arm) == pytest.approx(HOME, abs=0.03)
+    assert arm.state.joints_sent == pytest.approx(HOME, abs=0.01)
+
+
+async def test_a_script_moves_joints_and_they_stay_there(arm: Probe) -> None:
+    async with connect(take=True, source="reach") as script:
+        found = await script.set_joint_positions({"shoulder_pan": 0.6, "elbow_flex": 1.0})
+        assert found["shoulder_pan"] == pytest.approx(0.6, abs=NEAR)
+        assert found["elbow_flex"] == pytest.approx(1.0, abs=NEAR)
+        assert found["shoulder_lift"] == pytest.approx(-1.7, abs=NEAR)
+        assert await script.set_joint_position("gripper", 0.5) == pytest.approx(0.5, abs=NEAR)
+        await arm.ticks(25)
+        assert arm.state.joints_sent[0] == pytest.approx(0.6, abs=0.01)
+        assert {joint.name for joint in await script.get_joint_states()} == set(found)
+        found = await script.set_joint_trajectory(
+            [(0.5, {"shoulder_pan": 0.3}), (1.5, {"shoulder_pan": -0.5})]
+        )
+        assert found["shoulder_pan"] == pytest.approx(-0.5, abs=NEAR)
+    await until(lambda: arm.state.gate.commander == "control", "the brain goes on")
+    await arm.ticks(25)
+    assert arm.state.joints_sent[0] == pytest.approx(-0.5, abs=0.02)
+
+
+async def test_what_a_joint_cannot_do_is_refused_and_nothing_moves(arm: Probe) -> None:
+    before = posture(arm)
+    async with connect(take=True, source="wrong") as script:
+        with pytest.raises(UnknownName, match="no joint 'elbow'; did you mean 'elbow_flex'"):
+            await script.set_joint_position("elbow", 0.1)
+        with pytest.raises(ConfigError, match=r"elbow_flex: expected -1\.69 to 1\.69, got 3"):
+            await script.set_joint_position("elbow_flex", 3.0)
+        with pytest.raises(ConfigError, match=r"elbow_flex: expected -1\.69 to 1\.69, got nan"):
+            await script.set_joint_positions({"gripper": 0.1, "elbow_flex": math.nan})
+        with pytest.raises(ConfigError, match="expected the position of a joint"):
+            await script.set_joint_positions({})
+        with pytest.raises(ConfigError, match="more than 3"):
+            await script.set_joint_trajectory([(0.1, {"shoulder_pan": 1.5})])
+        with pytest.raises(ConfigError, match="other joints than the first"):
+            await script.set_joint_trajectory([(1.0, {"gripper": 0.1}), (2.0, {"wrist_flex": 0.1})])
+        with pytest.raises(ConfigError, match="at least one point"):
+            await script.set_joint_trajectory([])
+        with pytest.raises(ConfigError, match="speed: expected more than 0"):
+            await script.set_joint_position("gripper", 0.1, speed=0.0)
+        with pytest.raises(Unsupported, match="so101 has no base to drive"):
+            await script.set_base_velocity(0.1)
+        assert arm.state.gate.commander == "control"
+        assert posture(arm) == pytest.approx(before, abs=0.01)
+
+
+async def test_an_estop_holds_the_arm_where_it_is(arm: Probe) -> None:
+    async with connect(take=True, source="stopped") as script:
+        await script.set_joint_position("shoulder_pan", -1.0, speed=1.0)
+        await script.set_joint_position("shoulder_pan", 1.0, speed=0.5, wait=False)
+        await until(lambda: arm.state.joints[0].position > -0.7, "on its way")
+        await script.estop("test")
+        await until(lambda: arm.state.gate.mode == "latched", "latched")
+        await arm.ticks(10)
+        there = posture(arm)
+        await arm.ticks(25)
+        assert posture(arm) == pytest.approx(there, abs=0.005)
+        assert there[0] < 0.0
+        with pytest.raises(Refused, match="an e-stop has the body"):
+            await script.set_joint_position("shoulder_pan", 0.0)
+        await script.release()
+        await script.enable(take=True)
+        assert posture(arm) == pytest.approx(there, abs=0.01)
+        assert await script.set_joint_position("shoulder_pan", 0.0) == pytest.approx(0, abs=NEAR)
