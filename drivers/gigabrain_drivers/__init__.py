@@ -32,6 +32,10 @@ DRIVERS = {
         "gigabrain_drivers.bodies.turtlebot3.driver:OpenCrDriver",
         "gigabrain_drivers.bodies.turtlebot3.emulator:OpenCr",
     ),
+    "piper": Ends(
+        "gigabrain_drivers.bodies.piper.driver:PiperDriver",
+        "gigabrain_drivers.bodies.piper.emulator:Piper",
+    ),
     "ros2": Ends(
         "gigabrain_drivers.bodies.ros2.driver:Ros2Driver",
         "gigabrain_drivers.bodies.ros2.emulator:Ros2Robot",

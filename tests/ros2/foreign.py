@@ -47,7 +47,7 @@ def python() -> Path:
     Raises:
         NotBuilt: An installation failed.
     """
-    return _environment("python", PYTHON)
+    return environment("python", PYTHON)
 
 
 def free_fleet() -> Path:
@@ -56,7 +56,7 @@ def free_fleet() -> Path:
     Raises:
         NotBuilt: The installation failed.
     """
-    return _environment("free_fleet", FREE_FLEET)
+    return environment("free_fleet", FREE_FLEET)
 
 
 def javascript() -> Path:
@@ -115,7 +115,12 @@ def rclnodejs(python: Path) -> JavaScriptNode:
     return JavaScriptNode(modules, used)
 
 
-def _environment(name: str, packages: Sequence[str]) -> Path:
+def environment(name: str, packages: Sequence[str]) -> Path:
+    """Install packages where they are missing, in an environment; return its interpreter.
+
+    Raises:
+        NotBuilt: The installation failed.
+    """
     made = FOLDER / name
     return _built(
         made / "bin/python",

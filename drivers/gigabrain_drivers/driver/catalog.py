@@ -29,6 +29,7 @@ from gigabrain_zenoh.plugins import load_plugin, plugin_names
 GROUP = "gigabrain.drivers"  # of entry points
 EMULATOR = "{emulator}"  # in a robot's file: the folder of the emulator's ports
 Options = TypeVar("Options", bound=Struct)
+EXTRAS = {"can": "can"}  # by the package that is missing; without an entry the simulator's
 
 
 def robot_files() -> dict[str, Path]:
@@ -106,10 +107,11 @@ def driver_class(name: str) -> type[Driver]:
     """
     try:
         return cast("type[Driver]", load_plugin("driver", name, shipped_hosts(DRIVERS), GROUP))
-    except ModuleNotFoundError as error:  # of one of ours: only the simulator needs an extra
+    except ModuleNotFoundError as error:  # of one of ours: few need an extra
+        extra = EXTRAS.get(error.name or "", "sim")
         raise ConfigError(
             f"driver {name!r} needs the package {error.name!r}; "
-            "install it with: pip install 'gigabrain-zenoh[sim]'"
+            f"install it with: pip install 'gigabrain-zenoh[{extra}]'"
         ) from None
 
 

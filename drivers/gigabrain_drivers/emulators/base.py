@@ -39,7 +39,7 @@ class Snapshot(NamedTuple):
 
     time_ns: int  # by the electronics' own clock
     odometry: OdometryReading
-    wheels: tuple[Motor, ...]  # left, right; or all joints of legs
+    wheels: tuple[Motor, ...]  # left, right; or all joints of legs; then those of an arm
     imu: ImuSample
     battery: Charge
     bumper: bool
@@ -71,6 +71,7 @@ class EmulatedBody:
         self._pace: Pace | None = None  # once time has begun
         self._commanded = (0.0, 0.0, 0.0)
         self._gait: Gait | None = None  # instead of a velocity
+        self._aims: Mapping[str, float] | None = {}  # of its arm's servos; None: they are off
         self._cpu_s = 0.0
         self._moved_ns = 0  # time of the last command to move
         self._faulted_ns = 0  # when what is wrong with it last changed
@@ -98,6 +99,19 @@ class EmulatedBody:
     def walk(self, gait: Gait) -> None:
         """Set the gait that a quadruped aims for from the next step on."""
         self._gait = gait
+
+    def aim(self, positions: Mapping[str, float]) -> None:
+        """Set where its arm's servos go from the next step on [rad] or [m]."""
+        self._aims = {**(self._aims or {}), **positions}
+
+    def let_go(self) -> None:
+        """Switch its arm's servos off from the next step on, until they are aimed again."""
+        self._aims = None
+
+    @property
+    def joints(self) -> tuple[Motor, ...]:
+        """The joints of its arm as measured, in the order of the robot's file."""
+        return self.snapshot.wheels[-len(self.robot.joints) :] if self.robot.joints else ()
 
     @property
     def commanded(self) -> tuple[float, float, float]:
@@ -164,6 +178,7 @@ class EmulatedBody:
             self._simulation.walk(self._gait)
         else:
             self._simulation.drive(*commanded)
+        self._drive_arm()
         self._simulation.advance()
         snapshot = self._measure_all()
         self._account = run_report(self._simulation, self.robot, self.run)
@@ -172,6 +187,13 @@ class EmulatedBody:
             self._untaken.append(snapshot)
         for tell in self.on_step:
             tell(snapshot)
+
+    def _drive_arm(self) -> None:
+        arm, aims = self._simulation.arm, self._aims
+        if arm and aims is None:
+            arm.let_go()
+        elif arm and aims:
+            arm.aim(aims)
 
     def _faulty_velocity(self, commanded: tuple[float, float, float]) -> tuple[float, float, float]:
         """Return the velocity of broken motors under this command."""

@@ -128,6 +128,9 @@ async def _drive_traced(
     async for _ in driver.ticks(Clock()):
         await driver.read_state()
         shown.show(print_line)
+        if driver.robot.drive_type == "arm":
+            await driver.stop()  # holds it
+            continue
         sent = await driver.set_base_velocity(wanted.linear_x, wanted.linear_y, wanted.angular_z)
         text = describe_command(wanted, sent)
         if text != newest:

@@ -1,0 +1,287 @@
+"""AgileX Piper on its real link: six joints and a gripper on CAN.
+
+The arm keeps the last position that it was sent, so a dead driver leaves it where it is. Its own
+stop is never used: with that it sinks (see protocol.py).
+"""
+
+import asyncio
+import contextlib
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
+
+from msgspec import Meta
+from msgspec.structs import replace
+
+from gigabrain_drivers.bodies.piper import protocol as piper
+from gigabrain_drivers.bodies.piper.feedback import Feedback
+from gigabrain_drivers.driver.base import Driver
+from gigabrain_drivers.driver.robot import LinkOptions, RobotFile, Run
+from gigabrain_drivers.links.can_link import (
+    CanDecoder,
+    CanFrame,
+    CanLink,
+    CanSpelling,
+    check_can_port,
+    records,
+)
+from gigabrain_drivers.links.frames import Wording
+from gigabrain_drivers.links.link import Link
+from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.body import Joint, LinkHealth, RobotState
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.errors import BodyLost, unknown
+from gigabrain_zenoh.logs import Fault
+
+log = logging.getLogger(__name__)
+
+LOST_NS = 100_000_000  # without a report of all joints, and the arm counts as lost
+CHECK_PERIOD_NS = 20_000_000  # between two looks at what it reports
+ENABLE_PERIOD_NS = 100_000_000  # between two attempts to switch its motors on
+ENABLE_TIMEOUT_NS = 3_000_000_000  # until it is said that one does not switch on
+LOG_AFTER_NS = 500_000_000  # of a problem, before it is logged
+NOTHING_COMES = "no arm reports: is its power on, and its CAN cable plugged in?"
+
+
+class PiperOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The arm's part of a robot's file."""
+
+    port: str = "can0"  # a SocketCAN interface
+    gripper_torque: Annotated[float, Meta(gt=0.0, le=piper.MAX_GRIPPER_TORQUE)] = 1.0
+    # [N m], the most with which its motor squeezes
+
+    def __post_init__(self) -> None:
+        check_can_port(self.port)
+
+
+class PiperDriver(Driver):
+    """Switches the motors on where the arm is, and sends positions as they come."""
+
+    Options = PiperOptions
+
+    def __init__(
+        self,
+        robot: RobotFile,
+        options: PiperOptions,
+        run: Run,
+        *,
+        clock: Clock | None = None,
+        link: Link | None = None,
+    ) -> None:
+        """`link` instead of the CAN bus that the options name."""
+        super().__init__(robot, options, run)
+        self._clock = clock or Clock()
+        self.link = link or CanLink(options.port, self._clock, piper.RECEIVED)
+        self.link.wording = Wording(CanSpelling(piper.describe), CanSpelling(piper.describe))
+        self.link.on_bytes, self.link.on_open = self._received, self._opened
+        self.link.on_lost = self._lost
+        self._names = [joint.name for joint in robot.joints]
+        self._decoder, self._feedback = CanDecoder(), Feedback(robot.joints)
+        self._torque = options.gripper_torque
+        self._targets: list[float] | None = None  # of all joints; None: where they are
+        self._joints: tuple[Joint, ...] = ()  # as they were before the newest connection
+        self._hold_on = True  # whether its motors are to be on
+        self._were_on = False
+        self._enabling_ns: int | None = None  # since when they are being switched on
+        self._asked_ns = 0
+        self._untold = False  # whether a loss has not been reported yet
+        self._unplaced = True  # the gate does not know yet where a new connection has found it
+        self._open = False
+        self._well_ns = self._clock.now_ns()
+        self._fault, self._named = Fault(log), ""
+        self._task: asyncio.Task[None] | None = None
+
+    @classmethod
+    def check(cls, robot: RobotFile, options: Any) -> None:
+        """Raises ValueError where the joints are not those of a Piper."""
+        parts = [joint.part for joint in robot.joints]
+        if parts not in (["arm"] * piper.JOINTS, ["arm"] * piper.JOINTS + ["gripper"]):
+            raise ValueError("joints: expected the six of a Piper, and its gripper last if any")
+
+    @property
+    def problem(self) -> str:
+        """The reason in one line why the arm cannot be moved, or an empty text."""
+        if self.link.problem:
+            return self.link.problem
+        if not self._fresh():
+            return NOTHING_COMES
+        if text := self._feedback.problem():
+            return text
+        waited_ns = self._clock.now_ns() - (self._enabling_ns or self._clock.now_ns())
+        if waited_ns > ENABLE_TIMEOUT_NS:
+            motor = self._feedback.motors_on.index(False) + 1
+            return f"motor {motor} does not switch on: switch the arm off and on"
+        return ""
+
+    async def open(self) -> None:
+        """Begin to look for the arm, which does not have to be there yet; it will not move."""
+        self._open = self._hold_on = True
+        self.link.open()
+        self._task = asyncio.create_task(self._watch(), name="piper watch")
+
+    async def close(self) -> None:
+        """Leave the arm where it is, its motors as they are."""
+        task, self._task = self._task, None
+        await self.stop()
+        if task:
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+        self._open = False
+        await self.link.close()
+
+    async def stop(self) -> None:
+        """Keep the position that it was sent last, or the one that it has."""
+        if self._movable():
+            self._send(self._targets or self._feedback.positions)
+
+    async def limp(self) -> None:
+        """Let go of all joints, which fall where nothing holds them; positions hold them again."""
+        if not self._fresh():
+            raise BodyLost(f"{self.link}: {self.problem}")
+        self._hold_on = self._were_on = False
+        self._targets = self._enabling_ns = None
+        frames = [piper.enable(on=False)]
+        if len(self._names) > piper.JOINTS:
+            width = 2 * self._feedback.positions[-1]
+            frames.append(piper.move_gripper(width, 0.0, piper.GRIPPER_OFF))
+        self.link.write(records(frames))
+
+    async def set_joint_positions(self, positions: Mapping[str, float]) -> Mapping[str, float]:
+        """Move joints together [rad] or [m]; one that is not a number has all stay.
+
+        Returns where they were sent; while the arm cannot be moved, where it is to stay. Raises
+        UnknownName, and BodyLost before the arm has reported.
+        """
+        for name in positions:
+            if name not in self._names:
+                raise unknown("joint", name, self._names)
+        measured = [joint.position for joint in self._measured()]
+        if not self._open or not measured:
+            raise BodyLost(f"{self.link}: {self.problem or NOTHING_COMES}")
+        if not self._hold_on:
+            self._hold_on, self._asked_ns = True, 0
+        elif self._movable() and all(map(math.isfinite, positions.values())):
+            self._targets = self._bounded(positions)
+            self._send(self._targets)
+        held = dict(zip(self._names, self._targets or measured, strict=True))
+        return {name: held[name] for name in positions}
+
+    async def read_state(self) -> RobotState:
+        """Return what the arm reports; `link` tells whether that is recent, and all well.
+
+        The first state of a connection is limp in any case, so that the gate goes on from there.
+        """
+        limp = self._feedback.complete and (self._unplaced or not all(self._feedback.motors_on))
+        self._unplaced = self._unplaced and not self._feedback.complete
+        return RobotState(
+            robot_type=self.robot.robot_type,
+            pose=Pose(x=0.0, y=0.0, yaw=0.0),
+            velocity=Velocity(),
+            joints=self._measured(),
+            limp=limp,
+            link=self._health(),
+        )
+
+    def _measured(self) -> tuple[Joint, ...]:
+        """Return the newest joints, of the connection before where there are none yet."""
+        return self._feedback.joints() if self._feedback.complete else self._joints
+
+    def _fresh(self) -> bool:
+        stamp_ns = self._feedback.stamp_ns()
+        recent = stamp_ns is not None and self._clock.now_ns() - stamp_ns <= LOST_NS
+        return recent and self._feedback.complete and self.link.connected
+
+    def _movable(self) -> bool:
+        """Return whether positions reach motors that hold."""
+        return self._fresh() and not self._feedback.problem() and all(self._feedback.motors_on)
+
+    def _bounded(self, positions: Mapping[str, float]) -> list[float]:
+        """Return where all joints go, within their limits and in the arm's own units."""
+        now = self._targets or self._feedback.positions
+        goals = []
+        for joint, present in zip(self.robot.joints, now, strict=True):
+            wanted = positions.get(joint.name, present)
+            unit = piper.ANGLE_UNIT if joint.part == "arm" else piper.WIDTH_UNIT / 2
+            goals.append(round(max(joint.lower, min(joint.upper, wanted)) / unit) * unit)
+        return goals
+
+    def _send(self, targets: Sequence[float], *more: CanFrame) -> None:
+        """Send positions of all joints, with the mode that obeys them."""
+        frames = [
+            *piper.move(targets[: piper.JOINTS]),
+            piper.mode(piper.BY_CAN, piper.MOVE_J, piper.FULL_SPEED),
+            *(piper.move_gripper(2 * at, self._torque) for at in targets[piper.JOINTS :]),
+            *more,
+        ]
+        self.link.write(records(frames))
+
+    def _opened(self) -> None:
+        """A new connection: nothing from before counts."""
+        self._joints = self._measured()
+        self._feedback.clear()
+        self._targets, self._enabling_ns, self._unplaced = None, None, True
+
+    def _lost(self, _why: str) -> None:
+        self._untold = self._untold or self._feedback.complete
+
+    def _received(self, data: bytes) -> None:
+        now_ns = self._clock.now_ns()
+        for frame in self._decoder.feed(data):
+            self._feedback.take(frame, now_ns)
+        self.link.errors = self._decoder.errors + self._feedback.errors
+
+    async def _watch(self) -> None:
+        async for now_ns in self._clock.every(CHECK_PERIOD_NS):
+            self._supervise(now_ns)
+            self._log_problem(now_ns)
+
+    def _supervise(self, now_ns: int) -> None:
+        """Switch motors on where they are, and notice those that switch themselves off."""
+        if not self._fresh():
+            self._targets = None
+            return
+        on = self._feedback.motors_on
+        if all(on):
+            self._were_on, self._enabling_ns = self._hold_on, None
+            return
+        if self._were_on:
+            log.warning("motor %d has switched itself off; enable the robot again", _off(on))
+            self._were_on = self._hold_on = False
+            self._targets, self._untold = None, True
+        if self._hold_on and not self._feedback.problem():
+            self._switch_on(now_ns)
+
+    def _switch_on(self, now_ns: int) -> None:
+        """Send the arm where it is, and only then power; after a reset it wants that twice."""
+        self._enabling_ns = self._enabling_ns or now_ns
+        if now_ns - self._asked_ns >= ENABLE_PERIOD_NS:
+            self._asked_ns = now_ns
+            self._send(self._feedback.positions, piper.enable(on=True))
+
+    def _log_problem(self, now_ns: int) -> None:
+        """A problem that stays is logged once when it begins and once when it ends."""
+        problem = self.problem
+        if not problem:
+            self._well_ns, self._named = now_ns, ""
+            self._fault.end(f"{self.link}: the arm reports, and all is well")
+        elif now_ns - self._well_ns >= LOG_AFTER_NS and problem != self._named:
+            self._named, self._fault = problem, Fault(log)
+            self._fault.begin(problem if str(self.link) in problem else f"{self.link}: {problem}")
+
+    def _health(self) -> LinkHealth:
+        """Connected means that the arm reports and finds no fault; each loss is told once."""
+        told, self._untold = not self._untold, False
+        stamp_ns = self._feedback.stamp_ns()
+        age_ns = self._clock.now_ns() - stamp_ns if stamp_ns is not None else self.link.age_ns
+        return replace(
+            self.link.health,
+            connected=self._fresh() and told and not self._feedback.problem(),
+            age_ms=age_ns / 1e6,
+        )
+
+
+def _off(on: Sequence[bool]) -> int:
+    """Return the number of the first motor that is off."""
+    return on.index(False) + 1
