@@ -22,6 +22,10 @@ DRIVERS = {
         "gigabrain_drivers.bodies.alpha.driver:AlphaDriver",
         "gigabrain_drivers.bodies.alpha.emulator:Alpha",
     ),
+    "feetech": Ends(
+        "gigabrain_drivers.bodies.feetech.driver:FeetechDriver",
+        "gigabrain_drivers.bodies.feetech.emulator:FeetechArm",
+    ),
     "line": Ends(
         "gigabrain_drivers.bodies.line.driver:LineDriver",
         "gigabrain_drivers.bodies.line.emulator:LineBase",

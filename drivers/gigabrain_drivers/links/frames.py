@@ -34,7 +34,7 @@ def crc_table(polynomial: int, bits: int) -> tuple[int, ...]:
 class FrameDecoder(abc.ABC, Generic[Frame]):
     """Finds frames by their header, length and check. `errors` counts skipped stretches.
 
-    A broken frame costs no more than itself: the search goes on right behind its header.
+    A broken frame costs no more than itself: the search goes on inside it.
     """
 
     HEADER: ClassVar[bytes]
@@ -59,7 +59,7 @@ class FrameDecoder(abc.ABC, Generic[Frame]):
                 break
             frame = self._frame(bytes(buffer[:size])) if size else None
             if frame is None:
-                self._skip(len(self.HEADER))
+                self._skip(1)  # a header may begin inside a header
                 continue
             frames.append(frame)
             del buffer[:size]

@@ -1,0 +1,145 @@
+"""The calibration of an arm: from the ticks of its servos to the angles of its joints, and back.
+
+It is made by `gigabrain driver calibrate`, and kept in a YAML file. The servos' own offsets and
+limits are in it too, as the mark by which the arm is known again.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+import yaml
+from msgspec import Meta, Struct
+
+from gigabrain_drivers.bodies.feetech.protocol import MAX_ID, RADIANS_PER_TICK, TICKS, ServoMemory
+from gigabrain_schemas.body import JointDescription
+from gigabrain_zenoh.config import loading
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.files import make_folder, replace_file
+from gigabrain_zenoh.host.run_folders import state_dir
+
+Tick = Annotated[int, Meta(ge=0, le=TICKS - 1)]
+MAX_OFFSET = 2047  # ticks, in 11 bits
+SPAN_TOLERANCE = 0.17  # [rad], by which a joint's range may differ from that in the robot's file
+OUTSIDE = 0.17  # [rad], by which a joint may be outside its range as it is switched on
+
+
+class ServoCalibration(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One joint: the servo that moves it, and what its ticks mean."""
+
+    id: Annotated[int, Meta(ge=0, le=MAX_ID)]
+    direction: Literal[1, -1] = 1  # of the joint as the ticks go up
+    zero: Annotated[int, Meta(ge=-TICKS, le=2 * TICKS)]  # ticks at which the joint is at 0 rad
+    lower: Tick  # ticks, the range through which it was moved
+    upper: Tick
+    offset: Annotated[int, Meta(ge=-MAX_OFFSET, le=MAX_OFFSET)]  # that the servo keeps, and
+    min_position: Tick  # its limits: both as read when the calibration was made
+    max_position: Tick
+
+    def __post_init__(self) -> None:
+        if self.upper <= self.lower:
+            raise ValueError("upper: expected more than lower")
+
+    def to_radians(self, ticks: int) -> float:
+        """Return the angle of the joint [rad]."""
+        return self.direction * (ticks - self.zero) * RADIANS_PER_TICK
+
+    def to_ticks(self, radians: float) -> int:
+        """Return the nearest place of the servo within the calibrated range."""
+        ticks = round(self.zero + self.direction * radians / RADIANS_PER_TICK)
+        return max(self.lower, min(self.upper, ticks))
+
+    def is_of(self, memory: ServoMemory) -> bool:
+        """Return whether a servo keeps what the calibrated one kept."""
+        here = (memory.offset, memory.min_position, memory.max_position)
+        return here == (self.offset, self.min_position, self.max_position)
+
+
+class Calibration(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A whole arm, by the names of its joints."""
+
+    joints: dict[str, ServoCalibration]
+
+
+def calibration_path(robot_type: str, name: str, folder: Path) -> Path:
+    """Return the file that a robot's file names, or the one where calibrations are kept.
+
+    Raises ConfigError without a home folder.
+    """
+    if name:
+        return folder / Path(name).expanduser()
+    return state_dir() / "calibration" / f"{robot_type}.yaml"
+
+
+def load_calibration(
+    path: Path, robot_type: str, joints: Sequence[JointDescription], servos: Mapping[str, int]
+) -> Calibration:
+    """Read the calibration of an arm with these joints on these servos.
+
+    Raises ConfigError, also for that of another kind of arm.
+    """
+    if not path.exists():
+        raise ConfigError(
+            f"{path}: no such file: {robot_type} is not calibrated; "
+            f"run gigabrain driver calibrate {robot_type}"
+        )
+    calibration = loading.load(path, Calibration)
+    names = [joint.name for joint in joints]
+    if set(calibration.joints) != set(names):
+        there = ", ".join(calibration.joints) or "none"
+        raise ConfigError(f"{path}: joints: {there}; expected those of {robot_type}: {names}")
+    for name, its in calibration.joints.items():
+        if its.id != servos[name]:
+            raise ConfigError(
+                f"{path}: joints.{name}.id: {its.id}, but the robot's file has {servos[name]}: "
+                "this is the calibration of another arm"
+            )
+    return calibration
+
+
+def save_calibration(path: Path, calibration: Calibration) -> None:
+    """Write the file, durably. Raises ConfigError."""
+    text = yaml.safe_dump(msgspec.to_builtins(calibration), sort_keys=False)
+    try:
+        make_folder(path.parent)
+        replace_file(path, text.encode())
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error.strerror}") from None
+
+
+class JointRange:
+    """What was seen of one joint while a person moved it, unwrapped from its middle posture on."""
+
+    def __init__(self, joint: JointDescription, middle: int) -> None:
+        self.joint = joint
+        self.middle = self.ticks = self.lower = self.upper = middle
+
+    def add(self, ticks: int) -> None:
+        """Take a reading; from one to the next it turns less than half a turn."""
+        half = TICKS // 2
+        self.ticks += (ticks - self.ticks + half) % TICKS - half
+        self.lower, self.upper = min(self.lower, self.ticks), max(self.upper, self.ticks)
+
+    @property
+    def missing(self) -> float:
+        """How much more it should have moved [rad]; 0 where it went through its whole range."""
+        span = (self.upper - self.lower) * RADIANS_PER_TICK
+        return max(0.0, self.joint.upper - self.joint.lower - SPAN_TOLERANCE - span)
+
+    @property
+    def wraps(self) -> bool:
+        """True where the servo's count jumps inside the range."""
+        return self.lower < 0 or self.upper >= TICKS
+
+    def zero(self, direction: int) -> int:
+        """Return the ticks at which the joint is at 0 rad.
+
+        Both ends of its range say where that is; where it turns further than the file says, it
+        has no ends, and the middle posture does.
+        """
+        centre = (self.joint.lower + self.joint.upper) / 2
+        span = (self.upper - self.lower) * RADIANS_PER_TICK
+        endless = span > self.joint.upper - self.joint.lower + SPAN_TOLERANCE
+        at = self.middle if endless else (self.lower + self.upper) / 2
+        return round(at - direction * centre / RADIANS_PER_TICK)

@@ -1,0 +1,74 @@
+"""The emulated servo bus as other people's clients see it, over a real pty.
+
+Each runs in an environment of its own: both SDKs of the vendor have the same import name.
+"""
+
+import asyncio
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.places import ROOT
+from tests.system.servos import emulated_arm
+
+pytestmark = pytest.mark.qa
+PROGRAMS = ROOT / "tests/system/servo_clients"
+HOME = [2048, 1500, 2500, 2300, 2016, 1600]  # ticks from which the arm starts
+WITHIN = 8  # ticks, of the play of the gears and their friction
+PATIENCE = [3.0, 20.0]  # [s] that the arm gets to move; the longer where the machine was too busy
+
+
+async def told(package: str, program: str, port: Path, seconds: float) -> dict[str, Any]:
+    """What a client has seen."""
+    uv = [sys.executable, "-m", "uv", "run", "-q", "--isolated", "--no-project"]
+    command = [*uv, "--with", package, "python", str(PROGRAMS / program), str(port), str(seconds)]
+    client = await asyncio.create_subprocess_exec(
+        *command, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    out, error = await client.communicate()
+    assert client.returncode == 0, error.decode()
+    seen: dict[str, Any] = json.loads(out)
+    return seen
+
+
+async def moved(package: str, program: str, port: Path) -> dict[str, Any]:
+    """What a client has seen of an arm that had the time to move."""
+    for seconds in PATIENCE:
+        async with emulated_arm(port) as arm:
+            arm.place(HOME)
+            seen = await told(package, program, port, seconds)
+        goals = [2200, 1400, 2600, *HOME[3:]]
+        if all(abs(at - goal) <= WITHIN for at, goal in zip(seen["after"], goals, strict=True)):
+            break
+    else:
+        pytest.fail(f"{seen['after']} instead of {goals}")
+    assert seen["before"] == HOME
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("package", "program"),
+    [
+        ("feetech-servo-sdk==1.0.0", "feetech_servo_sdk.py"),
+        ("ftservo-python-sdk==2.0.1", "ftservo_python_sdk.py"),
+    ],
+)
+async def test_the_vendors_sdk_finds_reads_and_moves_the_arm(
+    package: str, program: str, tmp_path: Path
+) -> None:
+    seen = await moved(package, program, tmp_path / "base")
+    assert seen["models"] == [777] * 6
+    assert not any(seen["results"])
+    assert seen["missing"] == -6  # there is no status packet
+
+
+async def test_rustypot_finds_reads_and_moves_the_arm(tmp_path: Path) -> None:
+    seen = await moved("rustypot==1.13.1", "rustypot_client.py", tmp_path / "base")
+    assert seen["pinged"] == [True] * 6
+    assert seen["models"] == [777] * 6
+    assert seen["volts"] == [74] * 6
+    assert not seen["missing"]
