@@ -5,6 +5,7 @@ import contextlib
 import json
 import math
 import os
+import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,23 @@ from tests.ros2 import foreign
 
 PACKAGES = ("piper_sdk==0.6.2", "python-can>=4.4,<5", "msgpack>=1.0")
 JUDGE = Path(__file__).with_name("piper_judge.py")
+DRIVER = """
+import asyncio, sys
+from pathlib import Path
+from gigabrain_drivers.driver.catalog import make_driver
+from gigabrain_drivers.driver.robot import Run
+
+async def drive():
+    _, driver = make_driver("piper", Run(folder=Path(), link="emulated", emulator=sys.argv[1]))
+    async with driver:
+        while driver.problem:
+            await asyncio.sleep(0.02)
+        for tick in range(5000):
+            await driver.set_joint_positions({"joint1": min(0.01 * tick, 2.5)})
+            await asyncio.sleep(0.02)
+
+asyncio.run(drive())
+"""  # at 0.5 rad/s
 HOME = load_robot("piper").arm.home[:6]  # type: ignore[union-attr]
 
 
@@ -148,6 +166,25 @@ async def test_the_arm_is_found_again_and_holds_meanwhile(emulator: Emulator, ru
         await until(lambda: driver.problem == "")
         assert (await angles(driver)) == pytest.approx(HOME, abs=math.radians(0.5))
         assert (await driver.read_state()).link.reconnects == 1
+
+
+async def test_a_driver_that_is_killed_leaves_the_arm_held(emulator: Emulator, run: Run) -> None:
+    child = await asyncio.create_subprocess_exec(
+        sys.executable, "-c", DRIVER, run.emulator,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )  # fmt: skip
+    try:
+        await until(lambda: emulator.body.joints[0].velocity > 0.3, "it moves", 60.0)
+    finally:
+        child.kill()
+        await child.wait()
+    at_kill = emulator.body.joints
+    await until(lambda: all(abs(motor.velocity) < 0.01 for motor in emulator.body.joints))
+    for _ in range(20):
+        await asyncio.sleep(0.05)
+        now = [motor.position for motor in emulator.body.joints]
+        assert now[1:3] == pytest.approx(HOME[1:3], abs=math.radians(2))  # what gravity pulls at
+        assert abs(now[0] - at_kill[0].position) < 0.5 * 0.2  # its last target was near
 
 
 async def test_a_limp_arm_falls_and_a_frozen_one_holds(emulator: Emulator, run: Run) -> None:

@@ -8,7 +8,7 @@ import pytest
 from gigabrain_drivers.bodies.piper import protocol as piper
 from gigabrain_drivers.bodies.piper.driver import NOTHING_COMES, PiperDriver
 from gigabrain_drivers.links.can_link import CanDecoder, CanFrame, records
-from gigabrain_zenoh.errors import BodyLost, UnknownName
+from gigabrain_zenoh.errors import BodyLost, Unsupported
 from tests.unit.drivers.piper import ARM, OPTIONS, ROBOT, Rig, make_rig  # noqa: F401
 
 RAISED = (0.3, 1.0, -1.2, 0.2, 0.6, -0.4)  # [rad]
@@ -76,7 +76,7 @@ async def test_what_is_no_number_has_all_joints_stay(rig: Rig, bad: float) -> No
 
 async def test_a_joint_that_it_does_not_have_is_refused_and_nothing_moves(rig: Rig) -> None:
     before = len(rig.cable.sent)
-    with pytest.raises(UnknownName, match="no joint 'joint9'"):
+    with pytest.raises(Unsupported, match="no joint 'joint9'"):
         await rig.driver.set_joint_positions({"joint1": 0.5, "joint9": 0.1})
     assert len(rig.cable.sent) == before
 

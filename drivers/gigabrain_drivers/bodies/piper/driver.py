@@ -7,7 +7,6 @@ stop is never used: with that it sinks (see protocol.py).
 import asyncio
 import contextlib
 import logging
-import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
@@ -31,7 +30,7 @@ from gigabrain_drivers.links.link import Link
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import Joint, LinkHealth, RobotState
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import BodyLost, unknown
+from gigabrain_zenoh.errors import BodyLost
 from gigabrain_zenoh.logs import Fault
 
 log = logging.getLogger(__name__)
@@ -152,18 +151,16 @@ class PiperDriver(Driver):
         """Move joints together [rad] or [m]; one that is not a number has all stay.
 
         Returns where they were sent; while the arm cannot be moved, where it is to stay. Raises
-        UnknownName, and BodyLost before the arm has reported.
+        Unsupported, and BodyLost before the arm has reported.
         """
-        for name in positions:
-            if name not in self._names:
-                raise unknown("joint", name, self._names)
+        within = self.bounded_joints(positions)
         measured = [joint.position for joint in self._measured()]
         if not self._open or not measured:
             raise BodyLost(f"{self.link}: {self.problem or NOTHING_COMES}")
         if not self._hold_on:
             self._hold_on, self._asked_ns = True, 0
-        elif self._movable() and all(map(math.isfinite, positions.values())):
-            self._targets = self._bounded(positions)
+        elif self._movable() and within.keys() == positions.keys():
+            self._targets = self._quantised(within)
             self._send(self._targets)
         held = dict(zip(self._names, self._targets or measured, strict=True))
         return {name: held[name] for name in positions}
@@ -180,6 +177,7 @@ class PiperDriver(Driver):
             pose=Pose(x=0.0, y=0.0, yaw=0.0),
             velocity=Velocity(),
             joints=self._measured(),
+            joints_sent=tuple(self._targets or ()),
             limp=limp,
             link=self._health(),
         )
@@ -197,14 +195,13 @@ class PiperDriver(Driver):
         """Return whether positions reach motors that hold."""
         return self._fresh() and not self._feedback.problem() and all(self._feedback.motors_on)
 
-    def _bounded(self, positions: Mapping[str, float]) -> list[float]:
-        """Return where all joints go, within their limits and in the arm's own units."""
+    def _quantised(self, positions: Mapping[str, float]) -> list[float]:
+        """Return where all joints go, in the arm's own units."""
         now = self._targets or self._feedback.positions
         goals = []
         for joint, present in zip(self.robot.joints, now, strict=True):
-            wanted = positions.get(joint.name, present)
             unit = piper.ANGLE_UNIT if joint.part == "arm" else piper.WIDTH_UNIT / 2
-            goals.append(round(max(joint.lower, min(joint.upper, wanted)) / unit) * unit)
+            goals.append(round(positions.get(joint.name, present) / unit) * unit)
         return goals
 
     def _send(self, targets: Sequence[float], *more: CanFrame) -> None:
