@@ -1,4 +1,4 @@
-"""Bytes to and from bodies: serial lines and TCP connections that reopen after every loss.
+"""Bytes to and from bodies: serial lines, TCP connections and CAN buses, reopened after every loss.
 
 Imports no other room of this package and no bus. Drivers, lidars and packages of authors use it.
 """
