@@ -234,6 +234,7 @@ async def test_we_get_the_reply_of_an_rclpy_server(judge: Judge, bus: Bus) -> No
         reply = await bus.call("/estop", SET_BOOL, data=bool(number % 2))
         assert (reply.success, reply.message) == (True, "stopped")
 
+    await serve.hear("request", nth=19)  # said beside the reply, and read a little later
     values = [one["value"]["data"] for one in serve.seen("request")]
     assert values == [False, True] * 10
 
