@@ -9,6 +9,7 @@ from gigabrain_schemas.body import BodyDescription, JointDescription, RobotState
 from gigabrain_schemas.brain import JointCommand
 from gigabrain_zenoh.errors import ConfigError, Unsupported, unknown
 from gigabrain_zenoh.geometry.joint_ramp import (
+    REST,
     JointGoal,
     JointPoint,
     along,
@@ -134,10 +135,9 @@ class JointStream:
         self._path, self._path_tick = path, self._tick
         self._ends, self._speed = path.end, None
 
-    def restart(self, state: RobotState) -> None:
-        """Start again at rest where the joints are, and stay there."""
-        self._now = self._sent = held(self._body, state)
-        self._tick, self._ends, self._path = state.tick, {}, None
+    def rest(self) -> None:
+        """Brake, and stay where that ends."""
+        self._ends, self._path = {}, None
 
     def step(self, state: RobotState) -> JointCommand | None:
         """Return the command for the tick after that of `state`; None while joints are missing."""
@@ -166,8 +166,10 @@ class JointStream:
             before, after = ([row[joint.name] for joint in joints] for row in rows)
             return along(self._now, before, after, joints, dt)
         goals = [
-            JointGoal(self._ends.get(joint.name, now.position), max_speed=self._speed)
-            for joint, now in zip(joints, self._now, strict=True)
+            JointGoal(self._ends[joint.name], max_speed=self._speed)
+            if joint.name in self._ends
+            else REST
+            for joint in joints
         ]
         return ramp(self._now, goals, joints, dt)
 

@@ -1,17 +1,19 @@
 """Requests to a robot: of its gate, its e-stop and its audit log."""
 
 import asyncio
+from collections.abc import Mapping
 from typing import TypeVar
 
 from msgspec.structs import asdict
 
 from gigabrain_schemas.base import Message, Velocity
-from gigabrain_schemas.brain import Twist
+from gigabrain_schemas.brain import JointSpeeds, Twist
 from gigabrain_schemas.logs import AuditRecord, AuditRequest
 from gigabrain_schemas.requests import (
     EnableRequest,
     EstopRequest,
     GateReply,
+    LimpRequest,
     Param,
     ParamRequest,
     ReleaseRequest,
@@ -21,6 +23,8 @@ from gigabrain_schemas.topics import (
     AUDIT_LOG,
     ENABLE,
     ESTOP,
+    JOINT_TELEOP,
+    LIMP,
     PARAM,
     RELEASE,
     SIM_CHANGE,
@@ -74,6 +78,17 @@ async def release(bus: Bus, estop_generation: int, keys: str = "") -> GateReply:
     """Release the gate from the e-stop of that number. Raises Refused and BodyLost."""
     request = ReleaseRequest(estop_generation=estop_generation, source=bus.process)
     return await ask_gate(bus, RELEASE, request, keys)
+
+
+async def let_go(bus: Bus, limp: bool, keys: str = "") -> GateReply:
+    """Let go of all joints, which may fall, or hold them again. Raises Refused and BodyLost."""
+    return await ask_gate(bus, LIMP, LimpRequest(limp=limp, source=bus.process), keys)
+
+
+def jog(bus: Bus, speeds: Mapping[str, float]) -> None:
+    """Publish the velocities of joints [rad/s or m/s] that an operator wants."""
+    names, values = tuple(speeds), tuple(speeds.values())
+    bus.publish(JOINT_TELEOP, JointSpeeds(name=names, velocity=values))
 
 
 async def params(bus: Bus, process: str) -> tuple[Param, ...]:

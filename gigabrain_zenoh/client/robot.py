@@ -8,7 +8,7 @@ from typing import Any, TypeVar, overload
 from msgspec.structs import asdict
 
 from gigabrain_schemas.base import TICK_S, Message, Velocity
-from gigabrain_schemas.body import BodyDescription, GateStatus, Joint, RobotState
+from gigabrain_schemas.body import BodyDescription, Joint, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.logs import AuditRecord
 from gigabrain_schemas.objects import ObjectMap
@@ -25,12 +25,15 @@ from gigabrain_schemas.topics import (
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.listening import listen, topic_named
 from gigabrain_zenoh.client.arm import JointPath, JointStream, checked_positions
+from gigabrain_zenoh.client.lease import ControlLease
 from gigabrain_zenoh.client.motion import OdometryMotion, Reached
 from gigabrain_zenoh.client.objects import known_objects
 from gigabrain_zenoh.client.requests import (
     ANSWER_S,
     audit_log,
     enable,
+    jog,
+    let_go,
     press_estop,
     release,
     steer,
@@ -47,45 +50,6 @@ from gigabrain_zenoh.errors import (
 from gigabrain_zenoh.gate.gate import STILL_TICKS
 from gigabrain_zenoh.geometry.limits import ZERO, at_rest, clamp, limits_of
 from gigabrain_zenoh.security.identity_files import may_not_ask
-
-
-class ControlLease:
-    """Tracks whether one commander has the body, from the gate's states.
-
-    A passing stop, as for an obstacle, does not end the lease. It is lost when another commander
-    takes over or the gate latches. Then the script must ask again: it must not take the body
-    back from the person who has just stopped it.
-    """
-
-    def __init__(self, source: str) -> None:
-        self._source = source
-        self._boot = self._enables = 0  # of the gate when it granted the body
-        self._had = False  # in the last state
-        self.lost = False
-
-    def granted(self, boot: int, gate: GateStatus) -> None:
-        """Record that the gate has granted the body."""
-        self._boot, self._enables = boot, gate.enables
-        self._had, self.lost = True, False
-
-    def update(self, state: RobotState) -> None:
-        """Record a state, unless it is from before the gate's answer."""
-        if not self._boot or self._is_old(state):
-            return
-        has, gate = self.has(state), state.gate
-        taken = self._had and gate.commander not in ("", self._source)
-        self.lost = not has and (self.lost or taken or gate.mode == "latched")
-        self._had = has
-
-    def has(self, state: RobotState) -> bool:
-        """Return whether the body obeys this commander."""
-        gate = state.gate
-        mine = gate.mode == "enabled" and gate.commander == self._source
-        return mine or (self._boot > 0 and self._is_old(state))
-
-    def _is_old(self, state: RobotState) -> bool:
-        return state.boot == self._boot and state.gate.enables < self._enables
-
 
 M = TypeVar("M", bound=Message)
 
@@ -199,6 +163,24 @@ class Robot:
         """
         steer(self._bus, wanted)
 
+    def jog(self, speeds: Mapping[str, float]) -> None:
+        """Publish an operator's velocities of joints [rad/s or m/s]; repeat at 20 Hz.
+
+        Joints that are not named are held. Control obeys as it does for `steer`.
+        """
+        jog(self._bus, speeds)
+
+    async def limp(self) -> GateReply:
+        """Let go of all joints, so that a person can move them; an arm may fall.
+
+        Raises Refused while somebody moves it, or where its driver cannot, and BodyLost.
+        """
+        return await let_go(self._bus, True, self._keys)
+
+    async def hold(self) -> GateReply:
+        """Hold limp joints again, where they are. Raises Refused and BodyLost."""
+        return await let_go(self._bus, False, self._keys)
+
     async def _carry_out(self, distance: float, angle: float, speed: float | None) -> Reached:
         if speed is not None and speed <= 0:
             raise ConfigError(f"speed: expected more than 0, got {speed:g}")
@@ -214,6 +196,8 @@ class Robot:
 
     async def stop(self) -> None:
         """Come to rest, if this script drives; it keeps the body."""
+        if self._joints:
+            self._joints.rest()
         if self._target is None:
             return
         self._target, self._until_tick = ZERO, self._bus.time.tick + HOLD_TICKS

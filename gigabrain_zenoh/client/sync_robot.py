@@ -150,6 +150,18 @@ class SyncRobot:
         """Publish an operator's velocity to the robot's control; repeat at 20 Hz."""
         self._run(_called(lambda: self._robot.steer(wanted)))
 
+    def jog(self, speeds: Mapping[str, float]) -> None:
+        """Publish an operator's velocities of joints [rad/s or m/s]; repeat at 20 Hz."""
+        self._run(_called(lambda: self._robot.jog(speeds)))
+
+    def limp(self) -> GateReply:
+        """Let go of all joints, so that a person can move them; an arm may fall."""
+        return self._run(self._robot.limp())
+
+    def hold(self) -> GateReply:
+        """Hold limp joints again, where they are."""
+        return self._run(self._robot.hold())
+
     def stop(self) -> None:
         """Come to rest."""
         self._run(self._robot.stop())

@@ -226,6 +226,17 @@ def _corrected(
     return memory, _command(body, memory.sent, memory)
 
 
+def between(
+    body: BodyDescription, memory: JointMemory, command: JointCommand, after_s: float
+) -> JointCommand:
+    """Return the command `after_s` after that of a state: how the joints go on by then."""
+    places = tuple(
+        within(joint, place + point.velocity * after_s)
+        for joint, place, point in zip(body.joints, command.position, memory.setpoint, strict=True)
+    )
+    return replace(command, position=places)
+
+
 def _places(points: tuple[JointPoint, ...]) -> Places:
     return tuple(point.position for point in points)
 

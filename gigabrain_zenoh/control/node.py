@@ -1,5 +1,6 @@
 """Control node: turns intents, or an operator's velocities, into commands the body can follow."""
 
+import asyncio
 import logging
 from collections.abc import Callable
 
@@ -7,9 +8,9 @@ import msgspec
 from msgspec import structs
 from msgspec.structs import replace
 
-from gigabrain_schemas.base import TICK_S, Message, Velocity
+from gigabrain_schemas.base import TICK_NS, TICK_S, Message, Velocity
 from gigabrain_schemas.body import Body, BodyDescription, ControlGains, RobotState
-from gigabrain_schemas.brain import CmdVel, Intent, JointSpeeds
+from gigabrain_schemas.brain import CmdVel, Intent, JointCommand, JointSpeeds
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.topics import (
     BODY,
@@ -23,7 +24,7 @@ from gigabrain_schemas.topics import (
 )
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.freshness import PreviousTick
-from gigabrain_zenoh.control.joints import JointInputs, JointMemory, step_joints
+from gigabrain_zenoh.control.joints import JointInputs, JointMemory, between, step_joints
 from gigabrain_zenoh.control.teleop import OperatorStream, Teleop
 from gigabrain_zenoh.control.tracking import (
     LONGEST_DELAY_TICKS,
@@ -275,6 +276,7 @@ class ArmControl:
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
         self._memory = JointMemory()
+        self._more: asyncio.Future[None] | None = None  # commands between two states
         self.teleop: OperatorStream[JointSpeeds] = OperatorStream(bus.clock.now_ns)
 
     def prepare(self, body: Body) -> None:
@@ -295,7 +297,31 @@ class ArmControl:
         if command is None:
             return 0
         self._bus.publish(JOINT_CMD, command, basis=state.tick)
+        self._go_on(state, body, command)
         return 1
+
+    def _go_on(self, state: RobotState, body: Body, command: JointCommand) -> None:
+        """Publish more commands until the next state where an arm has a higher rate.
+
+        A simulation takes one for each of its ticks, so that runs can be repeated.
+        """
+        if self._more:
+            self._more.cancel()
+            self._more = None
+        arm, memory = body.description.arm, self._memory
+        count = round(arm.rate_hz * TICK_S) if arm and body.link != "sim" else 1
+        if count < 2 or not any(point.velocity for point in memory.setpoint):
+            return
+
+        async def more() -> None:
+            for _ in range(1, count):
+                await self._bus.clock.sleep_ns(TICK_NS // count)
+                after_s = (self._bus.clock.now_ns() - began_ns) / 1e9
+                later = between(body.description, memory, command, min(after_s, TICK_S))
+                self._bus.publish(JOINT_CMD, later, basis=state.tick)
+
+        began_ns = self._bus.clock.now_ns()
+        self._more = asyncio.ensure_future(more())
 
 
 def _log_tolerance(tick: int, memory: JointMemory) -> None:

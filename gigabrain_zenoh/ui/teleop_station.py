@@ -5,6 +5,7 @@ The gamepad is read by the kernel's joystick interface: Documentation/input/joyd
 
 import asyncio
 import contextlib
+import math
 import os
 import re
 import struct
@@ -29,6 +30,7 @@ PERIOD_S = 0.05
 KEYS_HELP = (
     "WASD or arrows drive · Q E sideways · + - speed · SPACE e-stop · R release · G go · X quit"
 )
+JOINT_KEYS_HELP = "1 2 3 … choose a joint · J K move it"
 PAD_HELP = "gamepad: hold a shoulder button to drive, B stops"
 
 # A terminal repeats a held key first after 0.25 to 0.6 s, then every 30 to 50 ms.
@@ -44,12 +46,15 @@ MOVES: Final[dict[str, Axes]] = {
     "d": (0, 0, -1), "right": (0, 0, -1),
     "q": (0, 1, 0), "e": (0, -1, 0),
 }  # fmt: skip
+JOG_KEYS: Final[dict[str, int]] = {"j": -1, "k": 1}  # of the chosen joint
 ARROW_KEYS = {"A": "up", "B": "down", "C": "right", "D": "left"}
 KEY_PATTERN = re.compile(r"\x1b[\[O](?:\d+(?:;\d+)*)?([A-Za-z~])|(.)", re.DOTALL)
 
 EVENT = struct.Struct("<IhBB")  # milliseconds, value, type, number
 BUTTON, AXIS, INITIAL = 0x01, 0x02, 0x80  # types of events
 DEAD_MAN_BUTTONS = (4, 5)  # the shoulder buttons: nothing moves unless one of them is held
+ARM_BUTTON = 5  # the right one moves joints, where there are some, and the left one the base
+JOINT_AXES = (0, 1, 3, 4, 6, 7)  # left stick, right stick, cross: of the joints in their order
 STOP_BUTTON = 1  # the button at the right (B, circle)
 AHEAD_AXIS, TURN_AXIS, SIDEWAYS_AXIS = 1, 3, 0  # left stick up and down, right stick, left stick
 AXIS_RANGE = 32767.0
@@ -72,6 +77,7 @@ class HeldKeys:
     def __init__(self) -> None:
         self._until_s: dict[str, float] = {}
         self._share = 0
+        self.joint = 0  # index of the chosen one
 
     @property
     def share(self) -> float:
@@ -83,7 +89,9 @@ class HeldKeys:
         if key in ("+", "-"):
             step = 1 if key == "+" else -1
             self._share = max(0, min(len(SPEED_SHARES) - 1, self._share + step))
-        elif key in MOVES:
+        elif key.isdecimal() and key != "0":
+            self.joint = int(key) - 1
+        elif key in MOVES or key in JOG_KEYS:
             repeated = now_s < self._until_s.get(key, now_s)
             held_s = HELD_S if repeated else TAP_S
             self._until_s[key] = now_s + held_s
@@ -97,7 +105,7 @@ class HeldKeys:
 
     def velocity(self, body: BodyDescription, now_s: float) -> Velocity:
         """Return the velocity for the keys that are held now."""
-        held = [MOVES[key] for key, until_s in self._until_s.items() if now_s < until_s]
+        held = [MOVES[key] for key in self._held(now_s) if key in MOVES]
         if not held:
             return ZERO
         x, y, z = (max(-1, min(1, sum(axis))) for axis in zip(*held, strict=True))
@@ -106,6 +114,15 @@ class HeldKeys:
             linear_y=y * self.share * body.max_lateral_speed,
             angular_z=z * self.share * body.max_angular_speed,
         )
+
+    def speeds(self, body: BodyDescription, now_s: float) -> dict[str, float]:
+        """Return the speed of the chosen joint [rad/s or m/s]; empty if there is none."""
+        way = sum(JOG_KEYS.get(key, 0) for key in self._held(now_s))
+        chosen = body.joints[self.joint : self.joint + 1]
+        return {joint.name: way * self.share * joint.max_speed for joint in chosen}
+
+    def _held(self, now_s: float) -> list[str]:
+        return [key for key, until_s in self._until_s.items() if now_s < until_s]
 
 
 class PadState:
@@ -136,7 +153,7 @@ class PadState:
 
     def velocity(self, body: BodyDescription, share: float) -> Velocity:
         """Return the velocity that the sticks ask for, at most `share` of the body's limits."""
-        if not self.held:
+        if not self.held or (body.joints and self._buttons.get(ARM_BUTTON)):
             return ZERO
         ahead, turn, left = (
             -self._pushed(axis) * share for axis in (AHEAD_AXIS, TURN_AXIS, SIDEWAYS_AXIS)
@@ -146,6 +163,13 @@ class PadState:
             linear_y=left * body.max_lateral_speed,
             angular_z=turn * body.max_angular_speed,
         )
+
+    def speeds(self, body: BodyDescription, share: float) -> dict[str, float]:
+        """Return the speeds of joints [rad/s or m/s], at most `share` of their limits."""
+        if not self._buttons.get(ARM_BUTTON):
+            return {}
+        pairs = zip(body.joints, JOINT_AXES, strict=False)
+        return {joint.name: -self._pushed(axis) * share * joint.max_speed for joint, axis in pairs}
 
     def _pushed(self, axis: int) -> float:
         value = max(-1.0, min(1.0, self._axes.get(axis, 0.0)))
@@ -195,6 +219,7 @@ class TeleopStation:
         self._robot, self._pad = robot, pad
         self._keys, self._reply = HeldKeys(), ""
         self._quit = False
+        self._body: BodyDescription | None = None
         self._asking: set[asyncio.Task[None]] = set()
 
     async def drive(self, take: bool) -> None:
@@ -203,7 +228,7 @@ class TeleopStation:
         It also hands back when it is cancelled. Raises Refused when another operator or the brain
         drives and `take` is not set.
         """
-        body = await self._robot.read_body()
+        body = self._body = await self._robot.read_body()
         state = await self._robot.read_state()
         if state.gate.mode == "enabled" and not take:
             raise Refused(f"{state.gate.commander} drives; take it over with --take")
@@ -224,9 +249,22 @@ class TeleopStation:
                 if self._pad.stop.is_set():
                     self._pad.stop.clear()
                     self._ask("stop")
-                self._robot.steer(wanted)
+                self._steer(body, wanted)
+                if body.joints:
+                    self._jog(body, loop.time())
                 live.update(Text("\n".join(self._lines(wanted))), refresh=True)
                 await asyncio.sleep(PERIOD_S)
+
+    def _steer(self, body: BodyDescription, wanted: Velocity) -> None:
+        if body.has_base:
+            self._robot.steer(wanted)
+
+    def _jog(self, body: BodyDescription, now_s: float) -> None:
+        speeds = self._keys.speeds(body, now_s)
+        if not any(speeds.values()) and self._pad.pad:
+            speeds = self._pad.pad.speeds(body, self._keys.share) or speeds
+        if speeds:
+            self._robot.jog(speeds)
 
     def _type(self, typed: str) -> None:
         for key in keys_of(typed):
@@ -279,8 +317,10 @@ class TeleopStation:
             return ["no messages from the robot; is its driver running?", self._reply, KEYS_HELP]
         return [
             *readout(state, wanted, self._keys.share),
+            *joint_readout(state, self._body, self._keys.joint),
             self._reply,
             KEYS_HELP,
+            *([JOINT_KEYS_HELP] if self._body and self._body.joints else []),
             *self._pad_line(),
         ]
 
@@ -299,6 +339,18 @@ def readout(state: RobotState, wanted: Velocity, share: float) -> list[str]:
     for cause in gate.causes:
         lines.append(f"  {cause.text}" + (f": {cause.remedy}" if cause.remedy else ""))
     return lines
+
+
+def joint_readout(state: RobotState, body: BodyDescription | None, chosen: int) -> list[str]:
+    """Return a line with the joints that can be moved, in degrees, and the chosen one marked."""
+    measured = {joint.name: joint.position for joint in state.joints}
+    shown = [
+        f"{'>' if number == chosen else ''}{number + 1} {joint.name} "
+        f"{math.degrees(measured[joint.name]):+.0f}°"
+        for number, joint in enumerate(body.joints if body else ())
+        if joint.name in measured
+    ]
+    return [" · ".join(shown)] if shown else []
 
 
 @contextmanager

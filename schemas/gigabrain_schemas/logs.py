@@ -14,6 +14,8 @@ What = Literal[
     "estop",
     "release",
     "enable",
+    "limp",  # an arm's joints are let go of
+    "hold",  # and held again
     "take",  # an enable that took the body from another source
     "mode",  # the gate's mode has changed
     "raised",  # a cause, by safety, the driver or the gate

@@ -1,6 +1,7 @@
 """The fenced blocks of README.md and docs/, and what their comments say about them.
 
     <!-- run: robot -->         run beside a robot that drives
+    <!-- run: arm -->           run beside an arm
     <!-- run: 5 s -->           each line is ended by Ctrl-C after 5 s
     <!-- run: robot, 5 s -->    both
     <!-- file: NAME -->         the block is such a file, for the blocks of the page

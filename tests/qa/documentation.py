@@ -27,20 +27,21 @@ LINE_S = 180.0  # for a line or a program
 JUDGES = ("gigabrain why", "gigabrain doctor")  # their exit code says what is wrong
 USAGE, INTERRUPTED = 2, 130
 MODE = "gigabrain topic echo state -n 1 --fields gate.mode"
+BODIES = {"robot": "turtlebot3_waffle", "arm": "so101"}  # what a block is run beside
 Words = str | Sequence[str]
 
 
 class Home:
-    """The folders of a user, and a robot in them once one is asked for."""
+    """The folders of a user, and a robot in them once one is asked for; each body alone."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._robot: subprocess.Popen[bytes] | None = None
-        self._driven = False  # the robot has been enabled
+        self._robots: dict[str, subprocess.Popen[bytes]] = {}  # by body
+        self._driven: set[str] = set()  # which have been enabled
 
-    def environment(self, place: Path, robot: bool) -> dict[str, str]:
-        """Return the environment of a page in `place`; with `robot` it sees the robot."""
-        run = self.folder / "run" if robot else place / "run"
+    def environment(self, place: Path, body: str) -> dict[str, str]:
+        """Return the environment of a page in `place`; with a `body` it sees that robot."""
+        run = self.folder / f"run-{body}" if body else place / "run"
         run.mkdir(exist_ok=True, mode=0o700)
         return os.environ | {
             "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
@@ -51,26 +52,26 @@ class Home:
             "XDG_CONFIG_HOME": str(self.folder / "config"),
         }
 
-    def robot(self) -> None:
+    def robot(self, body: str) -> None:
         """Start a robot, unless it runs, and wait until it may drive."""
-        environment = self.environment(self.folder, robot=True)
-        if not self._robot:
-            words = "exec gigabrain demo --headless --no-page"
-            self._robot = start(words, self.folder, environment, subprocess.DEVNULL)
+        environment = self.environment(self.folder, body)
+        if body not in self._robots:
+            words = f"exec gigabrain demo --headless --no-page --body {body}"
+            self._robots[body] = start(words, self.folder, environment, subprocess.DEVNULL)
         end_s = time.monotonic() + LINE_S
         while b"enabled" not in start(MODE, self.folder, environment).communicate()[0]:
             if time.monotonic() > end_s:
                 raise TimeoutError("no robot drives")
-            if self._driven:  # a page has stopped it
+            if body in self._driven:  # a page has stopped it
                 start("gigabrain release; gigabrain enable", self.folder, environment).wait()
             time.sleep(0.5)
-        self._driven = True
+        self._driven.add(body)
 
     def close(self) -> None:
-        """End the robot."""
-        if self._robot:
-            self._robot.send_signal(signal.SIGINT)
-            self._robot.wait(60)
+        """End the robots."""
+        for robot in self._robots.values():
+            robot.send_signal(signal.SIGINT)
+            robot.wait(60)
 
 
 def start(
@@ -128,10 +129,10 @@ def as_installed(line: str) -> str:
 
 def run_block(home: Home, folder: Path, block: Block) -> str:
     """Run a block; return what is wrong, or an empty text."""
-    robot = "robot" in block.value
-    if robot:
-        home.robot()
-    environment = home.environment(folder, robot)
+    body = next((known for word, known in BODIES.items() if word in block.value), "")
+    if body:
+        home.robot(body)
+    environment = home.environment(folder, body)
     ended = re.search(r"(\d+) s", block.value)
     after_s = float(ended[1]) if ended else 0.0
     if block.language == "python":

@@ -70,6 +70,11 @@ CALLS = {
     "place list": "place list",
     "place remove": "place remove nowhere",
     "zone add": "zone add {name} keepout 3 3 4 3 4 4",
+    "arm state": "arm state --watch",
+    "arm jog": "arm jog gripper 5",
+    "arm home": "arm home",
+    "arm limp": "arm limp --yes",
+    "arm hold": "arm hold",
     "objects": "objects",
     "pose": "pose 0 0",
     "world add": "world add box 1.5 1.5",
@@ -114,6 +119,7 @@ OWN_CODES = {
     # without a map, a simulation, or what is named
     **dict.fromkeys(("map load", "view", "world add", "world list", "world remove"), (1, 2)),
     **dict.fromkeys(("place add", "place list", "place remove", "zone add", "param save"), (1, 2)),
+    **dict.fromkeys(("arm state", "arm jog", "arm home", "arm limp", "arm hold"), (1,)),  # no arm
     "ros2 topics": (1,),  # without another node
     **dict.fromkeys(("objects", "pose"), (1,)),  # without cameras or a map, or not there
     **dict.fromkeys(("estop", "release", "enable", "topic pub", "doctor", "driver test"), (1, 3)),

@@ -5,13 +5,14 @@ from collections.abc import AsyncIterator
 
 import pytest
 
+from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_zenoh.client.connection import connect
 from gigabrain_zenoh.errors import ConfigError, Refused, UnknownName, Unsupported
 from gigabrain_zenoh.qa.probe import Probe, probing
 from gigabrain_zenoh.testing.processes import CommandProcess, Home, robot_of
 from gigabrain_zenoh.testing.waiting import until
 
-HOME = (0.0, -1.7, 1.6, 0.5, 0.0, 0.0)
+HOME = load_robot("so101").arm.home  # type: ignore[union-attr]
 NEAR = 0.06  # [rad]: the goal tolerance, and an encoder's step
 
 
@@ -38,7 +39,7 @@ async def test_it_is_enabled_and_holds_still_for_its_brain(arm: Probe) -> None:
     await arm.ticks(50)
     assert arm.state.gate.commander == "control"
     assert posture(arm) == pytest.approx(HOME, abs=0.03)
-    assert arm.state.joints_sent == pytest.approx(HOME, abs=0.01)
+    assert arm.state.joints_sent == pytest.approx(HOME, abs=0.03)
 
 
 async def test_a_script_moves_joints_and_they_stay_there(arm: Probe) -> None:
@@ -46,7 +47,7 @@ async def test_a_script_moves_joints_and_they_stay_there(arm: Probe) -> None:
         found = await script.set_joint_positions({"shoulder_pan": 0.6, "elbow_flex": 1.0})
         assert found["shoulder_pan"] == pytest.approx(0.6, abs=NEAR)
         assert found["elbow_flex"] == pytest.approx(1.0, abs=NEAR)
-        assert found["shoulder_lift"] == pytest.approx(-1.7, abs=NEAR)
+        assert found["shoulder_lift"] == pytest.approx(HOME[1], abs=NEAR)
         assert await script.set_joint_position("gripper", 0.5) == pytest.approx(0.5, abs=NEAR)
         await arm.ticks(25)
         assert arm.state.joints_sent[0] == pytest.approx(0.6, abs=0.01)
@@ -103,3 +104,71 @@ async def test_an_estop_holds_the_arm_where_it_is(arm: Probe) -> None:
         await script.enable(take=True)
         assert posture(arm) == pytest.approx(there, abs=0.01)
         assert await script.set_joint_position("shoulder_pan", 0.0) == pytest.approx(0, abs=NEAR)
+
+
+async def test_a_limp_arm_falls_by_a_persons_word_and_holds_again(arm: Probe) -> None:
+    async with connect(take=True, source="letting-go") as script:
+        stretched = {"shoulder_lift": 0.0, "elbow_flex": 0.0, "wrist_flex": 0.0}
+        await script.set_joint_positions(stretched)
+        with pytest.raises(Refused, match="letting-go holds the arm; press the e-stop first"):
+            await script.limp()
+        await script.estop("test")
+        await arm.ticks(25)
+        before = posture(arm)
+        assert (await script.limp()).text == "all joints are let go of"
+        await until(lambda: arm.state.limp, "limp")
+        await until(lambda: abs(posture(arm)[2] - before[2]) > 0.2, "falling")
+        assert (await script.hold()).text == "the joints hold where they are"
+        await until(lambda: not arm.state.limp, "held")
+        await arm.ticks(25)
+        there = posture(arm)
+        await arm.ticks(25)
+        assert posture(arm) == pytest.approx(there, abs=0.01)
+        await script.release()
+        await script.enable(take=True)
+
+
+async def test_an_operator_jogs_through_control(arm: Probe) -> None:
+    async with connect(source="operator") as script:
+        await until(lambda: arm.state.gate.commander == "control", "the brain goes on")
+        await arm.ticks(25)
+        before = posture(arm)
+        for _ in range(20):
+            script.jog({"shoulder_pan": 0.4})
+            await arm.ticks(3)
+        await until(lambda: posture(arm)[0] - before[0] > 0.1, "jogging")
+        await arm.ticks(50)
+        there = posture(arm)
+        await arm.ticks(25)
+        assert posture(arm) == pytest.approx(there, abs=0.01)
+        assert there[1] == pytest.approx(before[1], abs=0.06)
+        assert arm.state.gate.commander == "control"
+
+
+async def test_commands_show_and_move_the_arm(shared_home: Home, arm: Probe) -> None:
+    shown = await shared_home.run("arm", "state")
+    assert (await shown.ended(), len(shown.out.splitlines())) == (0, 8), shown.err
+    jogged = await shared_home.run("arm", "jog", "wrist_roll", "10", "--take")
+    assert (await jogged.ended(), jogged.out[:17]) == (0, "wrist_roll is at "), jogged.err
+    at_home = await shared_home.run("arm", "home", "--take")
+    assert await at_home.ended() == 0, at_home.err
+    assert posture(arm) == pytest.approx(HOME, abs=NEAR)
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (("jog", "wrist", "10"), "no joint 'wrist'"),
+        (("jog", "wrist_roll", "1000"), "wrist_roll: it goes from -157.2 to 162.8 degrees, not to"),
+        (("jog", "wrist_roll", "nan"), "expected a number, got nan"),
+        (("limp",), "--yes"),
+    ],
+)
+async def test_a_wrong_command_is_one_clear_line(
+    shared_home: Home, arm: Probe, words: tuple[str, ...], text: str
+) -> None:
+    before = posture(arm)
+    wrong = await shared_home.run("arm", *words)
+    assert (await wrong.ended(), wrong.out, len(wrong.err.splitlines())) == (2, "", 1)
+    assert text in wrong.err
+    assert posture(arm) == pytest.approx(before, abs=0.01)

@@ -12,8 +12,14 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.base import TICK_NS, Cause
 from gigabrain_schemas.logs import What
-from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
-from gigabrain_schemas.topics import ENABLE, ESTOP, ESTOP_SAID, RELEASE
+from gigabrain_schemas.requests import (
+    EnableRequest,
+    EstopRequest,
+    GateReply,
+    LimpRequest,
+    ReleaseRequest,
+)
+from gigabrain_schemas.topics import ENABLE, ESTOP, ESTOP_SAID, LIMP, RELEASE
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.errors import ConfigError
@@ -172,6 +178,23 @@ class Gatekeeper:
         )
         self._bus.serve(RELEASE, self._on_release)
         self._bus.serve(ENABLE, self._on_enable)
+
+    def serve_limp(self, let_go: Callable[[bool], Awaitable[None]]) -> None:
+        """Let operators have an arm let go of, and held again, while nobody moves it."""
+
+        async def answer(request: LimpRequest) -> GateReply:
+            limp, held_by = request.limp, self.state.commander
+            if self.state.mode in ("enabled", "stopping"):
+                text = f"{held_by or 'the gate'} holds the arm; press the e-stop first"
+                outcome = gate.Outcome(ok=False, text=text)
+            else:
+                await let_go(limp)
+                done = "all joints are let go of" if limp else "the joints hold where they are"
+                outcome = gate.Outcome(text=done)
+            self._audit("limp" if limp else "hold", request.source, outcome)
+            return self._reply(outcome)
+
+        self._bus.serve(LIMP, answer)
 
     def limit(self, limits: Limits) -> None:
         """Let no command exceed other limits from now on; a faster body is slowed at its ramp."""

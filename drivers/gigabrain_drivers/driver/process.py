@@ -94,7 +94,8 @@ class DriverProcess:
         self._line = asyncio.Lock()  # one call at a time goes out to the body
         self._sent = ZERO  # the newest command to the body
         self._joints_sent: tuple[float, ...] = ()
-        self._limp = False  # in the newest state
+        self._limp = False  # in the newest state, or by request
+        self._let_go = False  # by request, until somebody moves it or has it held
         self._body_tick = 0  # when BODY was last published
         driver.emit = self._emit
         bus.report = self.report
@@ -114,6 +115,8 @@ class DriverProcess:
         bus.subscribe(JOINT_CMD, self._on_joint_command, self._on_bad_command)
         bus.latest(SAFETY, self._on_safety)
         self._gatekeeper.serve(self._driver.stop)
+        if self._robot.joints:
+            self._gatekeeper.serve_limp(self._on_limp)
         if self._lockstep and self._robot.cameras:
             self._await_cameras(self._lockstep)
         if self._config.link != "emulated":  # the emulator has the world then
@@ -202,7 +205,7 @@ class DriverProcess:
     async def _tick(self, passed: int) -> None:
         """20 ms of the body's time, or several where the process was held up."""
         state = clipped(await self._driver.read_state())
-        self._limp = state.limp
+        self._limp = state.limp or self._let_go
         if self._wake.is_set():
             await self._apply_command()  # the gate goes on from the body's newest command
         button = self._button.faults() if self._button else ()
@@ -213,7 +216,7 @@ class DriverProcess:
             faults,
             joints=commanded_joints(self._body.description, state),
             held=state.joints_sent,
-            limp=state.limp,
+            limp=self._limp,
         )
         self._gatekeeper.ticks(passed, tick)
         self._bus.time.tick = self._gate.tick
@@ -318,10 +321,23 @@ class DriverProcess:
         """Have the joints go where the gate says; those of a limp body are left alone."""
         if not now.joints or (self._limp and now.mode != "enabled"):
             return
+        self._let_go = False
+        await self._send_joints(now)
+
+    async def _send_joints(self, now: gate.GateState) -> None:
         names = [joint.name for joint in self._body.description.joints]
         wanted = [joint.position for joint in now.joints]
         sent = await self._driver.set_joint_positions(dict(zip(names, wanted, strict=True)))
         self._joints_sent = tuple(sent[name] for name in names)
+
+    async def _on_limp(self, limp: bool) -> None:
+        """Let go of the joints, or hold them where they are."""
+        async with self._line:
+            if limp:
+                await self._driver.limp()
+            elif self._gate.joints:
+                await self._send_joints(self._gate)
+            self._let_go = self._limp = limp
 
     def _on_command(self, _key: str, command: CmdVel) -> None:
         arrived_ns = self._bus.clock.now_ns()

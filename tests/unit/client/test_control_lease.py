@@ -2,7 +2,7 @@
 
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import GateMode, GateStatus, RobotState
-from gigabrain_zenoh.client.robot import ControlLease
+from gigabrain_zenoh.client.lease import ControlLease
 
 
 def state(mode: GateMode, commander: str = "", enables: int = 1, boot: int = 7) -> RobotState:

@@ -80,7 +80,7 @@ class ArmBench:
             self.memory, command = step_joints(self.body, self.memory, inputs)
             if command:
                 self.places.append(command.position)
-                self._obey(command)
+                self.obey(command)
         return command
 
     def state(self) -> RobotState:
@@ -97,7 +97,8 @@ class ArmBench:
             boot=self.boot,
         )
 
-    def _obey(self, command: JointCommand) -> None:
+    def obey(self, command: JointCommand) -> None:
+        """Let the gate and the servos do it."""
         if self.gate.mode == "enabled" and self.gate.commander == "control":
             wanted = map(JointMotion, command.position, command.velocity)
             self.sent = [

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.base import Velocity
-from gigabrain_schemas.body import GateStatus, RobotState
+from gigabrain_schemas.body import Arm, GateStatus, Joint, JointDescription, RobotState
 from gigabrain_schemas.examples import example
 from gigabrain_schemas.requests import GateReply
 from gigabrain_zenoh.client.robot import Robot
@@ -22,10 +22,12 @@ from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.ui.teleop_station import (
+    EVENT,
     Gamepad,
     HeldKeys,
     PadState,
     TeleopStation,
+    joint_readout,
     keys_of,
     readout,
 )
@@ -65,7 +67,7 @@ def test_several_keys_add_up_and_opposite_ones_cancel() -> None:
 
 def test_the_operator_chooses_how_fast_within_what_the_body_can() -> None:
     keys = HeldKeys()
-    assert not keys.press("k", 0.0)
+    assert not keys.press("z", 0.0)
     for _ in range(9):
         keys.press("+", 0.0)
     keys.press("q", 0.0)
@@ -180,3 +182,49 @@ async def test_a_station_that_cannot_return_the_body_reports_it_and_ends(
 
     await cancelled_while_driving(Held(lost), tmp_path)
     assert "cannot return the body" in capsys.readouterr().err
+
+
+ARM = replace(
+    WAFFLE.description(),
+    arm=Arm(home=(0.0, 0.0, 0.0)),
+    joints=tuple(
+        JointDescription(name=name, lower=-1.0, upper=1.0, max_speed=2.0)
+        for name in ("pan", "lift", "gripper")
+    ),
+)
+
+
+def test_a_held_key_moves_the_chosen_joint_and_no_other() -> None:
+    keys = HeldKeys()
+    assert keys.speeds(ARM, 0.0) == {"pan": 0.0}
+    assert keys.press("k", 0.0)
+    assert keys.speeds(ARM, 0.1) == {"pan": 0.5}
+    assert keys.speeds(ARM, 0.5) == {"pan": 0.0}
+    assert keys.press("2", 1.0)
+    keys.press("j", 1.0)
+    assert keys.speeds(ARM, 1.1) == {"lift": -0.5}
+    assert keys.velocity(ARM, 1.1) == ZERO
+    keys.press("9", 1.2)
+    assert keys.speeds(ARM, 1.2) == {}
+
+
+def test_the_right_shoulder_button_moves_joints_and_the_left_one_the_base() -> None:
+    pad = PadState()
+    pad.feed(EVENT.pack(0, -32767, 0x02, 1))
+    assert pad.speeds(ARM, 0.5) == {}
+    pad.feed(EVENT.pack(0, 1, 0x01, 5))
+    assert pad.speeds(ARM, 0.5) == {"pan": 0.0, "lift": 1.0, "gripper": 0.0}
+    assert pad.velocity(ARM, 0.5) == ZERO
+    pad.feed(EVENT.pack(0, 0, 0x01, 5))
+    pad.feed(EVENT.pack(0, 1, 0x01, 4))
+    assert pad.speeds(ARM, 0.5) == {}
+    assert pad.velocity(ARM, 0.5).linear_x == pytest.approx(0.13)
+
+
+def test_the_joints_are_shown_in_degrees_and_the_chosen_one_marked() -> None:
+    state = replace(
+        example(RobotState),
+        joints=(Joint(name="pan", position=0.5), Joint(name="lift", position=-1)),
+    )
+    assert joint_readout(state, ARM, 1) == ["1 pan +29° · >2 lift -57°"]
+    assert joint_readout(state, WAFFLE, 0) == []
