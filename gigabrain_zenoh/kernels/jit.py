@@ -23,7 +23,7 @@ PARTS = ("numba", "numba.np.arraymath", "numba.core.typing.cffi_utils")
 F = TypeVar("F", bound=Callable[..., object])
 PACKAGE = Path(__file__).parents[1]
 NONE, ONE, TWO = np.int64(0), np.int64(1), np.int64(2)  # as literals they are compiled for apart
-HOLDERS = ("kernels", "mapping", "navigation", "qa/bench")  # packages with kernels
+HOLDERS = ("kernels", "manipulation", "mapping", "navigation", "qa/bench")  # packages with kernels
 
 
 def _import_numba() -> Any:

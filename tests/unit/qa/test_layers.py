@@ -25,9 +25,11 @@ ONLY_IN = {
     ),
     "rosbags": ("gigabrain_zenoh/ros2/",),
     "cyclonedds": ("gigabrain_zenoh/ros2/",),
+    "ruckig": ("gigabrain_zenoh/manipulation/",),
     "mujoco": (
         "drivers/gigabrain_drivers/sim/",
         "drivers/gigabrain_drivers/cameras/rendered.py",
+        "gigabrain_zenoh/manipulation/",
         "gigabrain_zenoh/qa/bench/eyes_worlds.py",
         "gigabrain_zenoh/qa/bench/jackal.py",
         "gigabrain_zenoh/qa/train/",

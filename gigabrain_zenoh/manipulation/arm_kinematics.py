@@ -1,0 +1,334 @@
+"""The kinematics of an arm, from its MJCF model: where its tool is, and how joints move it."""
+
+import functools
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.body import MOST_MODEL_CHARACTERS, JointDescription
+from gigabrain_zenoh.errors import ConfigError, unknown
+from gigabrain_zenoh.manipulation.descent import Chain
+
+BASE = "base"  # the body in whose frame all poses are
+PADS = "pad_fixed", "pad_moving"  # geoms that touch what is held
+NEAR_M, NEAR_POSTURES = 0.001, 3000  # see `neighbours`
+GRIPPER_STEPS = 41  # postures of the gripper at which its opening is measured
+# whatever reads files, or makes a small text a large model
+FORBIDDEN = re.compile(
+    r"<(include|mesh|hfield|skin|flex|flexcomp|composite|replicate|attach|model|plugin|extension)\b"
+    r"|\bfile\s*="
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Frame:
+    """A pose in the frame of the arm's base."""
+
+    position: Floats  # (3,) [m]
+    axes: Floats  # (3, 3), its columns are the axes x, y and z; a rotation
+
+    def place(self, points: Floats) -> Floats:
+        """Return points (..., 3) [m] of this frame in the frame of the base."""
+        return np.asarray(points @ self.axes.T + self.position)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Follower:
+    """A joint that is tied to another by an equality of the model: a second finger, usually."""
+
+    joint: str
+    follows: str
+    polynomial: tuple[float, ...]  # of the other's distance from its place in the model
+
+
+class ArmKinematics:
+    """An arm that reaches with its tool. Not for two threads at once.
+
+    Postures are arrays (n,) of the joints whose `part` is "arm", in the order of the description,
+    [rad] or [m]. Methods that take a posture leave it in the model.
+    """
+
+    def __init__(self, mjcf: str, joints: Sequence[JointDescription], tool: str = "tool") -> None:
+        """Read a model.
+
+        Raises:
+            ConfigError: It is no MJCF model of primitives alone, or lacks a joint or the tool.
+        """
+        self.tool = tool
+        self.joints = tuple(one for one in joints if one.part == "arm")
+        self.gripper = next((one for one in joints if one.part == "gripper"), None)
+        if not self.joints:
+            raise ConfigError("this body has no joints of an arm")
+        self._spec, self.followers = _read(mjcf, [one.name for one in joints], tool)
+        self._model = _compile(self._spec)
+        self._data = mujoco.MjData(self._model)
+        self.names = tuple(one.name for one in self.joints)
+        self.lower = np.array([one.lower for one in self.joints])
+        self.upper = np.array([one.upper for one in self.joints])
+        self._site = self._model.site(tool).id
+        self._dofs = np.array([self._model.joint(name).dofadr[0] for name in self.names])
+        self._set = PostureSetter(self._model, self)
+        self._jacobian = np.zeros((2, 3, self._model.nv))
+        slide = mujoco.mjtJoint.mjJNT_SLIDE
+        self.slides = np.array([self._model.joint(name).type[0] == slide for name in self.names])
+        self.chain = self._chain()
+
+    def spec(self) -> mujoco.MjSpec:
+        """Return a copy of the model, without what does not move with the arm's joints."""
+        return self._spec.copy()
+
+    def forward(self, posture: Floats) -> Frame:
+        """Return the pose of the tool."""
+        self._set(self._data, posture)
+        mujoco.mj_kinematics(self._model, self._data)
+        return Frame(
+            position=self._data.site_xpos[self._site].copy(),
+            axes=self._data.site_xmat[self._site].reshape(3, 3).copy(),
+        )
+
+    def jacobian(self, posture: Floats) -> tuple[Frame, Floats]:
+        """Return the pose of the tool, and its Jacobian (6, n).
+
+        Rows of the Jacobian: velocity [m/s] along x, y and z, then angular velocity [rad/s] about
+        them, for each joint's speed.
+        """
+        frame = self.forward(posture)
+        mujoco.mj_comPos(self._model, self._data)
+        moved, turned = self._jacobian
+        mujoco.mj_jacSite(self._model, self._data, moved, turned, self._site)
+        return frame, self._jacobian.reshape(6, -1)[:, self._dofs]
+
+    def levers(self, beyond: float) -> Floats:
+        """Return how far what a joint moves is from it at most (n,) [m]; 1 where it slides.
+
+        What sticks out farther than the tool does so by `beyond` [m].
+        """
+        links = np.linalg.norm([*self.chain.fixed[1:, :, 3], self.chain.tool[:, 3]], axis=1)
+        reach = np.cumsum(links[::-1])[::-1] + beyond
+        return np.where(self.slides, 1.0, reach)
+
+    def tool_frame(self) -> Frame:
+        """Return the pose of the tool in the frame of its body."""
+        axes = np.empty(9)
+        mujoco.mju_quat2Mat(axes, self._model.site_quat[self._site])
+        return Frame(position=self._model.site_pos[self._site].copy(), axes=axes.reshape(3, 3))
+
+    @functools.cached_property
+    def neighbours(self) -> list[tuple[str, str]]:
+        """The pairs of bodies whose distance says nothing.
+
+        Of one the other is joined to it, and one is fixed: MuJoCo itself leaves out only neighbours
+        of which both can move. Or two joints are between them, and they come near each other in
+        none of many postures, as a jaw and a wrist.
+        """
+        model = self._model
+        roots, parents = model.body_weldid, model.body_parentid  # a root is of a rigid part
+        above = [int(roots[parents[roots[body]]]) for body in range(model.nbody)]
+        near, found = self._near(), []
+        for one in range(1, model.nbody):
+            for other in range(1, model.nbody):
+                joined = roots[other] and not roots[one] and above[other] == 0
+                apart = roots[other] and above[other] and above[above[other]] == roots[one]
+                if joined or (apart and (min(one, other), max(one, other)) not in near):
+                    found.append((str(model.body(one).name), str(model.body(other).name)))
+        return found
+
+    def _near(self) -> set[tuple[int, int]]:
+        """Return pairs of bodies (the lower number first) that can come near each other."""
+        spec = self.spec()
+        for geom in spec.geoms:
+            geom.contype = geom.conaffinity = int(bool(geom.contype or geom.conaffinity))
+            geom.margin = NEAR_M
+        model = _compile(spec)
+        data, put = mujoco.MjData(model), PostureSetter(model, self)
+        found: set[tuple[int, int]] = set()
+        random = np.random.default_rng(0)
+        grip = self.gripper
+        for posture in random.uniform(self.lower, self.upper, (NEAR_POSTURES, len(self.joints))):
+            put(data, posture, random.uniform(grip.lower, grip.upper) if grip else None)
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_collision(model, data)
+            if data.ncon:
+                bodies = np.sort(model.geom_bodyid[data.contact.geom], axis=1)
+                found.update((int(one), int(other)) for one, other in bodies)
+        return found
+
+    def show(self, joint: int, position: float) -> str:
+        """Return the position of the arm's joint with this number as text, with its unit."""
+        slides = self.slides[joint]
+        return f"{position * 1000:.0f} mm" if slides else f"{math.degrees(position):.0f}°"
+
+    def inside(self, posture: Floats, tolerance: float = 1e-6) -> bool:
+        """Return whether a posture is finite and within the limits of the joints."""
+        low, high = self.lower - tolerance, self.upper + tolerance
+        return bool(np.all((posture >= low) & (posture <= high)))
+
+    def opening(self) -> "Opening":
+        """Return how far the gripper opens. Raises ConfigError for a model without pads."""
+        if not self.gripper:
+            raise ConfigError("this arm has no gripper")
+        known = [geom.name for geom in self._spec.geoms if geom.name]
+        for pad in PADS:
+            if pad not in known:
+                raise unknown("geom", pad, known)
+        positions = np.linspace(self.gripper.lower, self.gripper.upper, GRIPPER_STEPS)
+        faces = np.array([self._faces(position) for position in positions])
+        return Opening(positions=positions, low=faces[:, 0], high=faces[:, 1])
+
+    def _chain(self) -> Chain:
+        """Return the joints and what lies between them, from the model at its rest."""
+        data = self._data
+        self._set(data, np.zeros(len(self.joints)))
+        mujoco.mj_kinematics(self._model, data)
+        numbers = [self._model.joint(name).id for name in self.names]
+        turns, places = [np.eye(3)], [np.zeros(3)]
+        for joint in numbers:
+            turns.append(data.xmat[self._model.jnt_bodyid[joint]].reshape(3, 3).copy())
+            places.append(data.xanchor[joint].copy())
+        turns.append(data.site_xmat[self._site].reshape(3, 3).copy())
+        places.append(data.site_xpos[self._site].copy())
+        steps = np.zeros((len(turns) - 1, 3, 4))
+        for step, before, after, begin, end in zip(
+            steps, turns, turns[1:], places, places[1:], strict=False
+        ):
+            step[:, :3], step[:, 3] = before.T @ after, before.T @ (end - begin)
+        axes = self._model.jnt_axis[numbers].copy()
+        return Chain(fixed=steps[:-1].copy(), axes=axes, slides=self.slides, tool=steps[-1].copy())
+
+    def _faces(self, gripper: float) -> tuple[float, float]:
+        """Return where the faces of the pads are along the tool's z axis [m]."""
+        self._set(self._data, (self.lower + self.upper) / 2, gripper)
+        mujoco.mj_kinematics(self._model, self._data)
+        axis = self._data.site_xmat[self._site].reshape(3, 3)[:, 2]
+        middles, halves = [], []
+        for pad in PADS:
+            geom = self._model.geom(pad).id
+            along = self._data.geom_xmat[geom].reshape(3, 3).T @ axis
+            middles.append(axis @ (self._data.geom_xpos[geom] - self._data.site_xpos[self._site]))
+            halves.append(np.abs(along) @ self._model.geom_aabb[geom, 3:])
+        low, high = np.argsort(middles)
+        return float(middles[low] + halves[low]), float(middles[high] - halves[high])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Opening:
+    """The faces of the gripper's pads along the tool's z axis, at some positions of its joint."""
+
+    positions: Floats  # (k,) [rad] or [m] of the gripper's joint, rising
+    low: Floats  # (k,) [m] from the tool's origin
+    high: Floats  # (k,) [m]
+
+    @property
+    def widest(self) -> float:
+        """The largest width between the pads [m]."""
+        return float((self.high - self.low).max())
+
+    def position(self, width: float) -> float:
+        """Return the gripper's position at which the pads are `width` [m] apart, or nearly so."""
+        widths = self.high - self.low
+        end = int(widths.argmax())  # a jaw that swings wide may come nearer again
+        begin = int(widths.argmin())
+        part = slice(min(begin, end), max(begin, end) + 1)
+        order = np.argsort(widths[part])
+        return float(np.interp(width, widths[part][order], self.positions[part][order]))
+
+    def middle(self, position: float) -> float:
+        """Return where the middle between the pads is along the tool's z axis [m]."""
+        both = (self.low + self.high) / 2
+        return float(np.interp(position, self.positions, both))
+
+
+class PostureSetter:
+    """Puts postures into the data of a model that was made from `ArmKinematics.spec`."""
+
+    def __init__(self, model: mujoco.MjModel, arm: ArmKinematics) -> None:
+        def address(name: str) -> int:
+            return int(model.joint(name).qposadr[0])
+
+        self._arm = np.array([address(one.name) for one in arm.joints])
+        self._gripper = address(arm.gripper.name) if arm.gripper else None
+        self._followers = [
+            (address(one.joint), address(one.follows), one.polynomial) for one in arm.followers
+        ]
+        self._rest = model.qpos0
+
+    def __call__(self, data: mujoco.MjData, posture: Floats, gripper: float | None = None) -> None:
+        """Set the joints of the arm, and where it is given, the gripper's."""
+        data.qpos[self._arm] = posture
+        if gripper is not None and self._gripper is not None:
+            data.qpos[self._gripper] = gripper
+        for joint, follows, polynomial in self._followers:
+            moved = data.qpos[follows] - self._rest[follows]
+            shift = sum(factor * moved**power for power, factor in enumerate(polynomial))
+            data.qpos[joint] = self._rest[joint] + shift
+
+
+def _read(
+    mjcf: str, joints: Sequence[str], tool: str
+) -> tuple[mujoco.MjSpec, tuple[Follower, ...]]:
+    """Return the model with the given joints alone, its base at the origin, and followers."""
+    if len(mjcf) > MOST_MODEL_CHARACTERS:
+        raise ConfigError(
+            f"the arm's model has {len(mjcf)} characters; at most {MOST_MODEL_CHARACTERS} are read"
+        )
+    if found := FORBIDDEN.search(mjcf):
+        raise ConfigError(
+            f"the arm's model has {found[0]!r}; expected primitives alone, without files"
+        )
+    try:
+        spec = mujoco.MjSpec.from_string(mjcf)
+    except ValueError as error:
+        raise unusable(error) from None
+    known = {one.name: one for one in spec.joints}
+    for name in joints:
+        if name not in known:
+            raise unknown("joint in the arm's model", name, filter(None, known))
+    if not any(site.name == tool for site in spec.sites):
+        raise unknown("site in the arm's model", tool, (s.name for s in spec.sites if s.name))
+    base = spec.body(BASE)
+    if base is None or base.parent.name != "world":
+        raise ConfigError(f"the arm's model has no body {BASE!r} in the world's body")
+    _keep(spec, joints, followers := _followers(spec, joints))
+    for number, body in enumerate(spec.bodies):
+        body.name = body.name or f"body {number}"
+    base.pos, base.quat, base.alt.type = (0, 0, 0), (1, 0, 0, 0), mujoco.mjtOrientation(0)
+    return spec, followers
+
+
+def _followers(spec: mujoco.MjSpec, joints: Sequence[str]) -> tuple[Follower, ...]:
+    found = []
+    for one in spec.equalities:
+        if one.type == mujoco.mjtEq.mjEQ_JOINT and one.name2 in joints:
+            polynomial = tuple(float(value) for value in one.data[:5])
+            found.append(Follower(joint=one.name1, follows=one.name2, polynomial=polynomial))
+    return tuple(one for one in found if one.joint not in joints)
+
+
+def _keep(spec: mujoco.MjSpec, joints: Sequence[str], followers: Sequence[Follower]) -> None:
+    """Delete all that is not needed, and joints that stay: a base's wheels are part of it."""
+    kept = {*joints, *(one.joint for one in followers)}
+    for kind in (spec.keys, spec.equalities, spec.actuators, spec.sensors, spec.tendons):
+        for one in list(kind):
+            spec.delete(one)
+    for joint in list(spec.joints):
+        if joint.name not in kept:
+            spec.delete(joint)
+
+
+def _compile(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise unusable(error) from None
+
+
+def unusable(error: ValueError) -> ConfigError:
+    """Return the error for a model that MuJoCo refuses, in one line."""
+    problem = " ".join(str(error).split())[:300]
+    return ConfigError(f"the arm's model cannot be used: {problem}")

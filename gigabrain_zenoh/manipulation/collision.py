@@ -1,0 +1,219 @@
+"""Tells what an arm touches in a posture: itself, its base, a floor, things, what it holds."""
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import mujoco
+import numpy as np
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.errors import ConfigError, unknown
+from gigabrain_zenoh.manipulation.arm_kinematics import (
+    ArmKinematics,
+    Frame,
+    PostureSetter,
+    unusable,
+)
+
+MARGIN_M = 0.005
+DISTANCE_CUTOFF_M = 0.1
+ROOM_CUTOFF_M = 0.06
+LEAST_SWEEP_M = 0.001  # of a line of postures, by which the margin may be undercut
+LINK_RADIUS_M = 0.03  # by which links and tools stick out, beyond the line from joint to joint
+HELD = "held"  # the body of what the tool holds
+SIZES = {"box": 3, "cylinder": 2, "sphere": 1, "floor": 0}
+BASE_FRAME = Frame(position=np.zeros(3), axes=np.eye(3))
+LEAST_M, MOST_M = 1e-4, 100.0
+GEOMS = {
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "floor": mujoco.mjtGeom.mjGEOM_PLANE,
+}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Thing:
+    """A solid: something in the way, a keep-out box, a floor, or what is to be held.
+
+    Sizes [m]: of a box its lengths along x, y and z; of a cylinder its radius and its length along
+    z; of a sphere its radius. A floor is all that is below its place along z.
+    """
+
+    name: str
+    kind: Literal["box", "cylinder", "sphere", "floor"]
+    size: tuple[float, ...] = ()
+    position: Floats = field(default_factory=lambda: np.zeros(3))  # (3,) [m] of its middle
+    axes: Floats = field(default_factory=lambda: np.eye(3))  # (3, 3), a rotation
+
+    def __post_init__(self) -> None:
+        numbers = (*self.size, *self.position, *self.axes.flat)
+        if not all(math.isfinite(number) for number in numbers):
+            raise ConfigError(f"{self.name}: size and place have to be finite")
+        if len(self.size) != SIZES[self.kind]:
+            raise ConfigError(f"{self.name}: a {self.kind} has {SIZES[self.kind]} sizes")
+        if not all(LEAST_M <= size <= MOST_M for size in self.size):
+            raise ConfigError(f"{self.name}: expected sizes of {LEAST_M} to {MOST_M:g} m")
+
+    @property
+    def half(self) -> Floats:
+        """Half its lengths along its own axes (3,) [m]."""
+        if self.kind == "cylinder":
+            radius, length = self.size
+            return np.array([radius, radius, length / 2])
+        return np.resize(np.array(self.size) / (2 if self.kind == "box" else 1), 3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clearance:
+    """The smallest distance of an arm's parts from all that they should not touch."""
+
+    distance: float  # [m], below 0 where they overlap; the cutoff if nothing is nearer
+    pair: tuple[str, str] | None = None  # names of the two; None beyond the cutoff
+
+
+class CollisionChecker:
+    """An arm among things, perhaps with something held. Not for two threads at once.
+
+    Links that are joined to each other do not count, nor do parts of the hand against what it
+    holds. Things stay where they are: make another checker when they have moved.
+    """
+
+    def __init__(
+        self,
+        arm: ArmKinematics,
+        things: Sequence[Thing] = (),
+        *,
+        held: Thing | None = None,
+        margin: float = MARGIN_M,
+        ignore: Sequence[tuple[str, str]] = (),
+        gripper: float | None = None,
+    ) -> None:
+        """Build a model of all.
+
+        Args:
+            arm: The arm.
+            things: What is in the way, in the frame of the arm's base.
+            held: A thing in the frame of the tool, fixed to it.
+            margin: What is nearer [m] counts as touching.
+            ignore: Names of things (or "held") and of bodies of the arm that may touch.
+            gripper: Position of the gripper's joint [rad] or [m]; otherwise as in the model.
+
+        Raises:
+            ConfigError: Two things have one name, or the model cannot be used.
+        """
+        self.arm, self.margin, self.gripper = arm, margin, gripper
+        spec = arm.spec()
+        for geom in spec.geoms:  # what can touch anything touches everything
+            geom.contype = geom.conaffinity = int(bool(geom.contype or geom.conaffinity))
+        for thing in things:
+            _add(spec, spec.worldbody, thing, thing.name, BASE_FRAME)
+        if held:
+            _add(spec, spec.site(arm.tool).parent, held, HELD, arm.tool_frame())
+        added = {HELD, *(thing.name for thing in things)}
+        self._model = _compiled(spec, [*arm.neighbours, *ignore])
+        self._data = mujoco.MjData(self._model)
+        self._set = PostureSetter(self._model, arm)
+        beyond = float(np.linalg.norm(np.abs(held.position) + held.half)) if held else 0.0
+        self._levers = arm.levers(LINK_RADIUS_M + beyond)
+        self._names = [_name(self._model, geom, added) for geom in range(self._model.ngeom)]
+
+    def touches(self, posture: Floats) -> str:
+        """Return what touches what within the margin, as text; empty for nothing."""
+        if not self.is_free(posture):
+            contact = min(self._data.contact, key=lambda one: one.dist)
+            return f"{self._names[contact.geom1]} and {self._names[contact.geom2]}"
+        return ""
+
+    def is_free(self, posture: Floats) -> bool:
+        """Return whether nothing touches anything within the margin."""
+        self._place(posture, self.margin)
+        return int(self._data.ncon) == 0
+
+    def room(self, posture: Floats, cutoff: float = ROOM_CUTOFF_M) -> float:
+        """Return a distance [m] below which nothing is near; the smallest may be a bit larger."""
+        self._place(posture, cutoff)
+        return float(self._data.contact.dist.min()) if self._data.ncon else cutoff
+
+    def sweep(self, start: Floats, goal: Floats) -> float:
+        """Return how far any part of the arm moves at most on a straight line of postures [m]."""
+        return float(np.abs(goal - start) @ self._levers)
+
+    def is_line_free(self, start: Floats, goal: Floats, share: float = 1.0) -> bool:
+        """Return whether nothing is within a share of the margin between two postures.
+
+        It is divided until each part is shorter than the room around its middle, so that nothing is
+        missed between two postures that are looked at.
+        """
+        parts = [(0.0, 1.0)]
+        whole = self.sweep(start, goal)
+        while parts:
+            begin, end = parts.pop(0)
+            middle, half = (begin + end) / 2, whole * (end - begin) / 2
+            room = self.room(start + (goal - start) * middle) - share * self.margin
+            if room <= 0.0:
+                return False
+            if half > max(room, LEAST_SWEEP_M):
+                parts += [(begin, middle), (middle, end)]
+        return True
+
+    def clearance(self, posture: Floats, cutoff: float = DISTANCE_CUTOFF_M) -> Clearance:
+        """Return the smallest distance, if it is below `cutoff` [m]."""
+        self._place(posture, cutoff)
+        contacts = self._data.contact
+        pairs = {(int(a), int(b)) for a, b in contacts.geom} if self._data.ncon else set()
+        nearest, found = cutoff, None
+        ends = np.zeros(6)
+        for one, other in sorted(pairs):
+            distance = mujoco.mj_geomDistance(self._model, self._data, one, other, cutoff, ends)
+            if distance < nearest:
+                nearest, found = float(distance), (self._names[one], self._names[other])
+        return Clearance(distance=nearest, pair=found)
+
+    def _place(self, posture: Floats, margin: float) -> None:
+        """Find all contacts nearer than `margin` [m]."""
+        if self._model.geom_margin[0] != margin:
+            self._model.geom_margin[:] = self._model.body_margin[:] = margin
+        self._set(self._data, posture, self.gripper)
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_comPos(self._model, self._data)
+        mujoco.mj_collision(self._model, self._data)
+
+
+def _add(
+    spec: mujoco.MjSpec, parent: mujoco.MjsBody, thing: Thing, name: str, within: Frame
+) -> None:
+    """Add a thing that lies in a frame of a body."""
+    if spec.body(name):
+        raise ConfigError(f"two things, or a thing and a part of the arm, are called {name!r}")
+    quaternion, size = np.empty(4), np.zeros(3)
+    mujoco.mju_mat2Quat(quaternion, (within.axes @ thing.axes).ravel())
+    if thing.kind == "box":
+        size = thing.half
+    elif thing.kind == "floor":
+        size[2] = 1.0
+    else:
+        size[:2] = thing.half[0], thing.half[2]
+    body = parent.add_body(name=name, pos=within.place(thing.position), quat=quaternion)
+    body.add_geom(type=GEOMS[thing.kind], size=size, contype=1, conaffinity=1)
+
+
+def _compiled(spec: mujoco.MjSpec, apart: Sequence[tuple[str, str]]) -> mujoco.MjModel:
+    """Compile, with pairs of bodies that may touch. Raises ConfigError."""
+    names = [body.name for body in spec.bodies]
+    for pair in apart:
+        for name in pair:
+            if name not in names:
+                raise unknown("thing or body of the arm", name, names)
+        spec.add_exclude(bodyname1=pair[0], bodyname2=pair[1])
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise unusable(error) from None
+
+
+def _name(model: mujoco.MjModel, geom: int, added: Collection[str]) -> str:
+    body = str(model.body(model.geom_bodyid[geom]).name)
+    return body if body in added else str(model.geom(geom).name) or body

@@ -1,0 +1,159 @@
+"""Times a path of postures within the limits of speed, acceleration and jerk, by Ruckig.
+
+Ruckig's community edition plans from one state to the next; intermediate waypoints need its cloud
+service. So states at the corners of a path are chosen here: where all joints go on in the direction
+in which they came, they pass through with a speed, as monotone cubic interpolation does; where the
+path bends back they stop. A curve through corners strays from the straight lines that were
+found free, so its postures are looked at once more: where one is not free, it passes more slowly,
+and at last stops, which is a straight line again.
+
+Berscheid and Kröger, Jerk-limited real-time trajectory generation with arbitrary target states,
+RSS 2021.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import ruckig
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.body import JointDescription
+from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.manipulation.collision import CollisionChecker
+
+PERIOD_S = 0.02  # between points
+SPEEDS = (1.0, 0.7, 0.5, 0.35, 0.2, 0.1, 0.0)  # shares of the speed at corners that are tried
+SPARE = 1e-9
+MARGIN_SHARE = 0.5  # of the checker's margin, that is kept where corners are cut
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JointTrajectory:
+    """Where the joints are at which time. It begins with the present state and ends at rest."""
+
+    names: tuple[str, ...]
+    times: Floats  # (k,) [s] from the start, rising
+    positions: Floats  # (k, n) [rad] or [m]
+    velocities: Floats  # (k, n) [rad/s] or [m/s]
+    accelerations: Floats  # (k, n) [rad/s2] or [m/s2]
+
+    @property
+    def duration(self) -> float:
+        """How long it takes [s]."""
+        return float(self.times[-1])
+
+
+class TimeParametrization:
+    """Makes trajectories within the limits of some joints."""
+
+    def __init__(self, joints: Sequence[JointDescription], period: float = PERIOD_S) -> None:
+        """Take the joints' limits; points are `period` [s] apart."""
+        self.joints, self.period = tuple(joints), period
+        self._otg = ruckig.Ruckig(len(joints))
+        self._speeds = np.array([one.max_speed for one in joints])
+
+    def trajectory(
+        self,
+        postures: Floats,
+        *,
+        velocity: Floats | None = None,
+        checker: CollisionChecker | None = None,
+    ) -> JointTrajectory:
+        """Return the trajectory through `postures` (k, n).
+
+        Args:
+            postures: From the start to the goal, with straight lines between them.
+            velocity: Of the joints at the start (n,); at rest otherwise.
+            checker: Says where the arm may be.
+
+        Raises:
+            Refused: Ruckig finds none, as the start is faster than the limits.
+        """
+        rest = np.zeros(postures.shape[1])
+        start = rest if velocity is None else velocity
+        distinct = np.abs(np.diff(postures, axis=0)).max(axis=1) > SPARE
+        postures = postures[np.concatenate(([True], distinct))]
+        speeds = self._corner_speeds(postures)
+        shares = np.zeros(len(speeds), int)  # of SPEEDS, of each posture
+        while True:
+            states = [start, *(speeds[k] * SPEEDS[shares[k]] for k in range(1, len(speeds)))]
+            parts, bad = self._parts(postures, states, checker)
+            if not bad:
+                return self._sampled(postures[0], parts)
+            for corner in bad:  # pass both ends of a part more slowly
+                shares[corner] = min(shares[corner] + 1, len(SPEEDS) - 1)
+
+    def _corner_speeds(self, postures: Floats) -> list[Floats]:
+        """Return the velocity (n,) at each posture: 0 at the ends and where a joint turns back."""
+        moves = np.diff(postures, axis=0)
+        times = (np.abs(moves) / self._speeds).max(axis=1, initial=SPARE)
+        slopes = moves / times[:, None]
+        rest = np.zeros(postures.shape[1])
+        found = [rest]
+        for before, after in pairwise(slopes):
+            onward = before * after > 0
+            mean = 2 * before * after / np.where(onward, before + after, 1.0)
+            found.append(np.where(onward, mean, 0.0))
+        return [*found, rest] if len(postures) > 1 else found
+
+    def _parts(
+        self, postures: Floats, states: Sequence[Floats], checker: CollisionChecker | None
+    ) -> tuple[list[ruckig.Trajectory], list[int]]:
+        """Return the trajectories between postures, and corners that were passed too fast."""
+        parts, bad = [], set()
+        for k in range(len(postures) - 1):
+            part = self._part(postures[k], states[k], postures[k + 1], states[k + 1])
+            parts.append(part)
+            corners = [c for c in (k, k + 1) if 0 < c < len(postures) - 1 and np.any(states[c])]
+            if corners and not self._is_good(part, postures[k : k + 2], checker):
+                bad.update(corners)
+        return parts, sorted(bad)
+
+    def _part(
+        self, start: Floats, velocity: Floats, goal: Floats, goal_velocity: Floats
+    ) -> ruckig.Trajectory:
+        count = len(start)
+        given, result = ruckig.InputParameter(count), ruckig.Trajectory(count)
+        given.current_position, given.current_velocity = start.tolist(), velocity.tolist()
+        given.current_acceleration = given.target_acceleration = [0.0] * count
+        given.target_position, given.target_velocity = goal.tolist(), goal_velocity.tolist()
+        given.max_velocity = [one.max_speed for one in self.joints]
+        given.max_acceleration = [one.max_acceleration for one in self.joints]
+        given.max_jerk = [one.max_jerk for one in self.joints]
+        given.synchronization = ruckig.Synchronization.Phase  # a straight line from rest to rest
+        code = self._otg.calculate(given, result)
+        if code not in (ruckig.Result.Working, ruckig.Result.Finished):
+            raise Refused(f"no trajectory within the limits of the joints: {code.name}")
+        return result
+
+    def _is_good(
+        self, part: ruckig.Trajectory, ends: Floats, checker: CollisionChecker | None
+    ) -> bool:
+        """Return whether a part stays between its ends, and touches nothing."""
+        spare = 0.02 * np.abs(ends[1] - ends[0]).max()
+        low, high = ends.min(axis=0) - spare, ends.max(axis=0) + spare
+        for extreme, lower, upper in zip(part.position_extrema, low, high, strict=True):
+            if extreme.min < lower or extreme.max > upper:
+                return False
+        if checker is None:
+            return True
+        times = np.append(np.arange(0.0, part.duration, self.period), part.duration)
+        postures = [np.array(part.at_time(time)[0]) for time in times]
+        return all(checker.is_line_free(a, b, MARGIN_SHARE) for a, b in pairwise(postures))
+
+    def _sampled(self, start: Floats, parts: Sequence[ruckig.Trajectory]) -> JointTrajectory:
+        rest = np.zeros(len(start))
+        ends = np.cumsum([0.0, *(part.duration for part in parts)])
+        times = np.append(np.arange(0.0, ends[-1], self.period), ends[-1])
+        rows = []
+        for time in times:
+            part = min(int(np.searchsorted(ends, time, "right")) - 1, len(parts) - 1)
+            state = parts[part].at_time(time - ends[part]) if parts else (start, rest, rest)
+            rows.append(np.array(state))
+        states = np.array(rows)
+        return JointTrajectory(
+            names=tuple(one.name for one in self.joints), times=times,
+            positions=states[:, 0], velocities=states[:, 1], accelerations=states[:, 2],
+        )  # fmt: skip

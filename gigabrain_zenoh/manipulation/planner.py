@@ -1,0 +1,176 @@
+"""Plans paths of postures that touch nothing: RRT-Connect, then shortcuts.
+
+Kuffner and LaValle, RRT-Connect: an efficient approach to single-query path planning, ICRA 2000.
+"""
+
+import time
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.manipulation.collision import CollisionChecker
+
+BRANCH = 0.5  # [rad] or [m] of the joint that moves most, of a branch of a tree
+SHORTCUTS = 80
+TIME_LIMIT_S = 2.0
+
+NoPathCause = Literal["limits", "start", "goal", "time"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JointPath:
+    """Postures from the start to the goal; straight lines between them touch nothing."""
+
+    postures: Floats  # (k, n) [rad] or [m]
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoPath:
+    """Why there is no path."""
+
+    cause: NoPathCause
+    reason: str  # for people
+
+
+class Tree:
+    """Postures that can be reached from a root, each by a straight line from an earlier one."""
+
+    def __init__(self, root: Floats) -> None:
+        self._postures = np.empty((256, len(root)))
+        self._before = [-1]
+        self._postures[0] = root
+
+    def nearest(self, posture: Floats) -> int:
+        """Return the number of the posture that is nearest."""
+        off = self._postures[: len(self._before)] - posture
+        return int(np.argmin(np.einsum("ij,ij->i", off, off)))
+
+    def posture(self, number: int) -> Floats:
+        """Return a posture (n,) by its number."""
+        return np.asarray(self._postures[number])
+
+    def add(self, posture: Floats, before: int) -> int:
+        """Add a posture behind another, and return its number."""
+        number = len(self._before)
+        if number == len(self._postures):
+            self._postures = np.concatenate((self._postures, np.empty_like(self._postures)))
+        self._postures[number] = posture
+        self._before.append(before)
+        return number
+
+    def way(self, number: int) -> list[Floats]:
+        """Return the postures from the root to one."""
+        found = []
+        while number >= 0:
+            found.append(self._postures[number].copy())
+            number = self._before[number]
+        return found[::-1]
+
+
+def plan(
+    checker: CollisionChecker,
+    start: Floats,
+    goal: Floats,
+    *,
+    seed: int = 0,
+    time_limit: float = TIME_LIMIT_S,
+) -> JointPath | NoPath:
+    """Return a path of postures from `start` to `goal` (n,), or why there is none.
+
+    The same `seed` gives the same path, unless the `time_limit` [s] cuts the search off.
+    """
+    if fault := _fault(checker, start, goal):
+        return fault
+    if checker.is_line_free(start, goal):
+        return JointPath(postures=np.stack((start, goal)))
+    random, until = np.random.default_rng(seed), time.monotonic() + time_limit
+    found = _connect(checker, start, goal, random, until)
+    if found is None:
+        return NoPath(cause="time", reason=f"no way round was found within {time_limit:g} s")
+    return JointPath(postures=np.array(_shortened(checker, found, random)))
+
+
+def _fault(checker: CollisionChecker, start: Floats, goal: Floats) -> NoPath | None:
+    for name, posture in (("start", start), ("goal", goal)):
+        if not checker.arm.inside(posture):
+            return NoPath(cause="limits", reason=f"the {name} is outside the limits of the joints")
+    if touches := checker.touches(start):
+        return NoPath(cause="start", reason=f"the start collides: {touches}")
+    if touches := checker.touches(goal):
+        return NoPath(cause="goal", reason=f"the goal collides: {touches}")
+    return None
+
+
+def _connect(
+    checker: CollisionChecker,
+    start: Floats,
+    goal: Floats,
+    random: np.random.Generator,
+    until: float,
+) -> list[Floats] | None:
+    """Grow a tree from each end towards random postures and each other, until they meet."""
+    arm = checker.arm
+    growing, other = Tree(start), Tree(goal)
+    forwards = True
+    while time.monotonic() < until:
+        aim = random.uniform(arm.lower, arm.upper)
+        new, _ = _extend(checker, growing, growing.nearest(aim), aim)
+        if new >= 0:
+            aim = growing.posture(new).copy()
+            number, arrived = other.nearest(aim), False
+            while number >= 0 and not arrived:
+                number, arrived = _extend(checker, other, number, aim)
+            if arrived:
+                ways = growing.way(new), other.way(number)
+                first, second = ways if forwards else ways[::-1]
+                return [*first, *second[-2::-1]]
+        growing, other, forwards = other, growing, not forwards
+    return None
+
+
+def _extend(checker: CollisionChecker, tree: Tree, number: int, aim: Floats) -> tuple[int, bool]:
+    """Add a branch towards `aim`; return its number, -1 for none, and whether it has arrived."""
+    here = tree.posture(number).copy()
+    length = float(np.abs(aim - here).max())
+    arrives = length <= BRANCH
+    new = aim if arrives else here + (aim - here) * (BRANCH / length)
+    if checker.is_free(new) and checker.is_line_free(here, new):
+        return tree.add(new, number), arrives
+    return -1, False
+
+
+def _shortened(
+    checker: CollisionChecker, way: list[Floats], random: np.random.Generator
+) -> list[Floats]:
+    """Replace parts of a way by straight lines."""
+    way = _without_detours(checker, way)
+    for _ in range(SHORTCUTS):
+        if len(way) < 3:
+            break
+        lengths = np.array([float(np.linalg.norm(b - a)) for a, b in pairwise(way)])
+        ends = np.sort(random.uniform(0.0, lengths.sum(), 2))
+        (i, first), (k, second) = (_along(way, lengths, end) for end in ends)
+        if i != k and checker.is_line_free(first, second):
+            way = [*way[: i + 1], first, second, *way[k + 1 :]]
+    return _without_detours(checker, way)
+
+
+def _without_detours(checker: CollisionChecker, way: list[Floats]) -> list[Floats]:
+    """Go from each posture to the farthest one that can be seen from it."""
+    kept, here = [way[0]], 0
+    while here < len(way) - 1:
+        ahead = range(len(way) - 1, here + 1, -1)
+        here = next((k for k in ahead if checker.is_line_free(way[here], way[k])), here + 1)
+        kept.append(way[here])
+    return kept
+
+
+def _along(way: list[Floats], lengths: Floats, length: float) -> tuple[int, Floats]:
+    """Return the part of a way that is `length` from its start, and the posture there."""
+    ends = np.cumsum(lengths)
+    part = min(int(np.searchsorted(ends, length)), len(lengths) - 1)
+    share = 1.0 - (ends[part] - length) / max(float(lengths[part]), 1e-12)
+    return part, way[part] + (way[part + 1] - way[part]) * share

@@ -1,0 +1,123 @@
+"""Postures for the tool: reachable ones are found, others are explained."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gigabrain_zenoh.manipulation.inverse_kinematics import OutOfReach, Reachable, ToolGoal
+from tests.unit.manipulation.arms import arm, inverse, postures
+
+DOWN = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+
+
+def test_every_pose_that_the_arm_has_is_found() -> None:
+    for posture, start in zip(postures(200), postures(200, seed=1), strict=True):
+        frame = arm().forward(posture)
+        found = inverse().solve(ToolGoal(position=frame.position, axes=frame.axes), start)
+        assert isinstance(found, Reachable), found
+        assert arm().inside(found.posture)
+        there = arm().forward(found.posture)
+        assert np.linalg.norm(there.position - frame.position) < 1e-4
+        assert math.acos(min(1.0, (np.trace(there.axes.T @ frame.axes) - 1) / 2)) < 0.011
+
+
+def test_nearly_every_direction_that_the_arm_has_is_found() -> None:
+    found = 0
+    for posture in postures(200):
+        frame = arm().forward(posture)
+        goal = ToolGoal(position=frame.position, approach=frame.axes[:, 0])
+        found += isinstance(inverse().solve(goal), Reachable)
+    assert found >= 190  # the rest end in valleys
+
+
+@pytest.mark.parametrize("radius", [0.08, 0.14, 0.20, 0.26])
+@pytest.mark.parametrize("azimuth", [-90, -30, 0, 60])
+def test_the_tool_can_point_down_over_the_table(radius: float, azimuth: float) -> None:
+    angle = math.radians(azimuth)
+    place = [0.0388 + radius * math.cos(angle), radius * math.sin(angle), 0.02]
+    found = inverse().solve(ToolGoal(position=np.array(place), approach=np.array([0.0, 0, -1])))
+    assert isinstance(found, Reachable)
+
+
+def test_the_answer_is_the_same_each_time() -> None:
+    goal = ToolGoal(position=np.array([0.2, 0.1, 0.05]), axes=DOWN)
+    first, second = inverse().solve(goal), inverse().solve(goal)
+    assert isinstance(first, Reachable)
+    assert isinstance(second, Reachable)
+    assert np.array_equal(first.posture, second.posture)
+
+
+def test_a_start_near_the_goal_is_kept() -> None:
+    for posture in postures(50):
+        near = np.clip(posture + 0.02, arm().lower, arm().upper)
+        frame = arm().forward(posture)
+        found = inverse().solve(ToolGoal(position=frame.position, axes=frame.axes), near)
+        assert isinstance(found, Reachable)
+        assert np.abs(found.posture - posture).max() < 0.1
+
+
+def test_a_goal_that_is_too_far_says_by_how_much() -> None:
+    found = inverse().solve(ToolGoal(position=np.array([1.0388, 0.0, 0.1166])))
+    assert isinstance(found, OutOfReach)
+    assert found.posture is not None
+    left = 1.0388 - np.linalg.norm(arm().forward(found.posture).position * [1, 0, 0])
+    assert found.position_error == pytest.approx(left, abs=0.01)
+    assert f"too far by {found.position_error * 100:.1f} cm" in found.reason
+
+
+def test_a_goal_behind_the_arm_names_the_joint_at_its_limit() -> None:
+    found = inverse().solve(ToolGoal(position=np.array([-0.6, 0.0, 0.02])))
+    assert isinstance(found, OutOfReach)
+    assert found.cause == "joint_limit"
+    assert "is at its limit of" in found.reason
+
+
+def test_an_orientation_that_is_not_possible_says_by_how_much_and_keeps_the_place() -> None:
+    goal = ToolGoal(position=np.array([0.25, 0.0, 0.1]), approach=np.array([0.0, 1.0, 0.0]))
+    found = inverse().solve(goal)
+    assert isinstance(found, OutOfReach)
+    assert found.cause == "orientation"
+    assert found.posture is not None
+    assert np.linalg.norm(arm().forward(found.posture).position - goal.position) < 1e-4
+    off = math.acos(arm().forward(found.posture).axes[1, 0])
+    assert found.orientation_error == pytest.approx(off, abs=1e-3)
+    assert f"off by {math.degrees(off):.0f}°" in found.reason
+
+
+def test_a_posture_that_collides_is_not_taken() -> None:
+    goal = ToolGoal(position=np.array([0.2, 0.0, 0.1]))
+    found = inverse().solve(goal, collides=lambda posture: "palm and shelf")
+    assert isinstance(found, OutOfReach)
+    assert found.cause == "collision"
+    assert found.reason == "collides: palm and shelf"
+
+
+@pytest.mark.parametrize(
+    "goal",
+    [
+        ToolGoal(position=np.array([math.nan, 0.0, 0.0])),
+        ToolGoal(position=np.zeros(3), axes=np.zeros((3, 3))),
+        ToolGoal(position=np.zeros(3), axes=-np.eye(3)),
+        ToolGoal(position=np.zeros(3), approach=np.array([2.0, 0.0, 0.0])),
+    ],
+)
+def test_what_is_no_goal_is_refused(goal: ToolGoal) -> None:
+    found = inverse().solve(goal)
+    assert isinstance(found, OutOfReach)
+    assert (found.cause, found.posture) == ("invalid", None)
+
+
+@given(st.tuples(*(st.floats(-1.0, 1.0) for _ in range(3))))
+def test_no_answer_is_outside_the_limits_or_lies_about_its_place(
+    place: tuple[float, float, float],
+) -> None:
+    goal = ToolGoal(position=np.array(place))
+    found = inverse().solve(goal)
+    assert found.posture is not None
+    assert arm().inside(found.posture)
+    off = np.linalg.norm(arm().forward(found.posture).position - goal.position)
+    assert found.position_error == pytest.approx(off, abs=1e-9)
+    assert isinstance(found, OutOfReach) == (off >= 1e-4)

@@ -1,0 +1,215 @@
+"""Paths and trajectories that touch nothing, and grasps; judged by models built apart."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.manipulation.collision import CollisionChecker, Thing
+from gigabrain_zenoh.manipulation.grasps import Grasp, GraspPlanner, NoGrasp
+from gigabrain_zenoh.manipulation.inverse_kinematics import Reachable, ToolGoal
+from gigabrain_zenoh.manipulation.joint_trajectory import JointTrajectory, TimeParametrization
+from gigabrain_zenoh.manipulation.planner import JointPath, NoPath, plan
+from tests.unit.manipulation.arms import JOINTS, MODEL, arm, inverse, postures
+
+FLOOR = Thing(name="floor", kind="floor")
+SHELF = Thing(name="shelf", kind="box", size=(0.2, 0.4, 0.02), position=np.array([0.3, 0, 0.16]))
+CUBE = Thing(name="cube", kind="box", size=(0.03,) * 3, position=np.array([0, 0, 0.015]))
+WORLD = """
+<geom name="floor" type="plane" size="0 0 1"/>
+<geom name="shelf" type="box" size=".1 .2 .01" pos=".3 0 .16"/>
+<body name="base">"""
+BOX = '<geom name="cube" type="box" size=".015 .015 .015" pos=".0981274 -.000218 .0071"/>'
+
+
+class Judge:
+    """Contacts in a world that is written by hand, by MuJoCo."""
+
+    def __init__(self, *, held: bool = False) -> None:
+        text = MODEL.read_text().replace('<body name="base">', WORLD)
+        text = text.replace('<site name="tool"', f'{BOX}<site name="tool"') if held else text
+        self.model = mujoco.MjModel.from_xml_string(text)
+        self.data = mujoco.MjData(self.model)
+
+    def contacts(self, posture: Floats) -> list[str]:
+        self.data.qpos[:5] = posture
+        mujoco.mj_fwdPosition(self.model, self.data)
+        return [
+            f"{self.model.geom(one.geom1).name} {self.model.geom(one.geom2).name} {one.dist:.4f}"
+            for one in self.data.contact
+            if one.dist < 0
+        ]
+
+
+def test_what_the_checker_lets_pass_touches_nothing() -> None:
+    checker, judge = CollisionChecker(arm(), [FLOOR, SHELF], margin=0.0), Judge()
+    free = 0
+    for posture in postures(1000):
+        free += (is_free := checker.is_free(posture))
+        assert is_free == (not judge.contacts(posture)), judge.contacts(posture)
+    assert 200 < free < 800
+
+
+def test_the_clearance_is_the_distance_to_what_is_named() -> None:
+    ball = Thing(name="ball", kind="sphere", size=(0.02,), position=np.array([0.45, 0.0, 0.2205]))
+    found = CollisionChecker(arm(), [ball]).clearance(np.zeros(5))
+    assert set(found.pair or ()) == {"pad_fixed", "ball"}
+    assert found.distance == pytest.approx(0.45 - 0.02 - 0.2932354 - 0.1045, abs=0.001)
+
+
+def test_a_held_thing_counts_and_may_be_let_touch() -> None:
+    low = Thing(name="table", kind="box", size=(1, 1, 0.1), position=np.array([0.6, 0, 0.13]))
+    posture = np.zeros(5)
+    hand = CollisionChecker(arm(), [low], margin=0.0)
+    assert hand.touches(posture) == ""
+    bag = Thing(name="bag", kind="box", size=(0.03, 0.03, 0.1), position=np.array([0, 0, 0.0]))
+    assert "held" in CollisionChecker(arm(), [low], held=bag, margin=0.0).touches(posture)
+    ignoring = CollisionChecker(arm(), [low], held=bag, margin=0.0, ignore=[("held", "table")])
+    assert ignoring.touches(posture) == ""
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Thing(name="a", kind="box", size=(0.1,)),
+        lambda: Thing(name="a", kind="sphere", size=(math.inf,)),
+        lambda: Thing(name="a", kind="sphere", size=(0.1,), position=np.full(3, math.nan)),
+        lambda: CollisionChecker(arm(), [FLOOR, FLOOR]),
+        lambda: CollisionChecker(arm(), [Thing(name="wrist", kind="sphere", size=(0.1,))]),
+        lambda: CollisionChecker(arm(), [], ignore=[("held", "floor")]),
+    ],
+)
+def test_wrong_things_are_refused(make: object) -> None:
+    with pytest.raises(ConfigError):
+        make()  # type: ignore[operator]
+
+
+def below_and_above(checker: CollisionChecker, count: int) -> list[tuple[Floats, Floats]]:
+    """Postures below the shelf and above it, that touch nothing."""
+    random, found = np.random.default_rng(3), []
+
+    def reach(low: float, high: float) -> Floats:
+        while True:
+            place = random.uniform((0.2, -0.15, low), (0.33, 0.15, high))
+            solved = inverse().solve(ToolGoal(position=place), None, checker.touches)
+            if isinstance(solved, Reachable):
+                return solved.posture
+
+    while len(found) < count:
+        found.append((reach(0.03, 0.1), reach(0.22, 0.3)))
+    return found
+
+
+def assert_within_limits(trajectory: JointTrajectory) -> None:
+    for values, limit in (
+        (trajectory.velocities, 3.0),
+        (trajectory.accelerations, 10.0),
+        (np.diff(trajectory.accelerations, axis=0) / np.diff(trajectory.times)[:, None], 200.0),
+    ):
+        assert np.abs(values).max() <= limit * 1.0001
+    assert all(arm().inside(posture) for posture in trajectory.positions)
+    assert not np.any(trajectory.velocities[-1]) or np.abs(trajectory.velocities[-1]).max() < 1e-9
+
+
+def test_a_trajectory_round_a_shelf_with_a_held_cube_touches_nothing() -> None:
+    checker = CollisionChecker(arm(), [FLOOR, SHELF], held=CUBE)
+    judge, timing = Judge(held=True), TimeParametrization(arm().joints, period=0.005)
+    for number, (start, goal) in enumerate(below_and_above(checker, 4)):
+        path = plan(checker, start, goal, seed=number, time_limit=60.0)
+        assert isinstance(path, JointPath)
+        trajectory = timing.trajectory(path.postures, checker=checker)
+        assert np.allclose(trajectory.positions[[0, -1]], (start, goal), atol=1e-6)
+        assert_within_limits(trajectory)
+        stops = sum(
+            timing.trajectory(path.postures[k : k + 2]).duration
+            for k in range(len(path.postures) - 1)
+        )
+        assert trajectory.duration <= stops + 1e-6
+        for posture in trajectory.positions:
+            assert judge.contacts(posture) == []
+
+
+def test_a_plan_is_the_same_for_the_same_seed() -> None:
+    checker = CollisionChecker(arm(), [FLOOR, SHELF])
+    ((start, goal),) = below_and_above(checker, 1)
+    first, second = (plan(checker, start, goal, seed=5, time_limit=60.0) for _ in range(2))
+    assert isinstance(first, JointPath)
+    assert isinstance(second, JointPath)
+    assert np.array_equal(first.postures, second.postures)
+
+
+def test_a_plan_that_cannot_be_says_why() -> None:
+    checker = CollisionChecker(arm(), [FLOOR, SHELF])
+    ((below, above),) = below_and_above(checker, 1)
+    into = np.array([0.0, 1.2, 0.5, 0.0, 0.0])
+    causes = {
+        "limits": plan(checker, below, np.full(5, 9.0)),
+        "start": plan(checker, into, above),
+        "goal": plan(checker, below, into),
+        "time": plan(checker, below, above, time_limit=0.0),
+    }
+    for cause, found in causes.items():
+        assert isinstance(found, NoPath)
+        assert found.cause == cause
+    assert "floor" in causes["goal"].reason  # type: ignore[union-attr]
+
+
+def test_a_start_in_motion_goes_on_smoothly() -> None:
+    timing = TimeParametrization(arm().joints)
+    speed = np.array([1.0, 0.0, -0.5, 0.0, 0.0])
+    moving = timing.trajectory(np.stack((np.zeros(5), np.full(5, 0.5))), velocity=speed)
+    assert np.allclose(moving.velocities[0], speed)
+    assert_within_limits(moving)
+
+
+def test_no_move_takes_no_time() -> None:
+    still = TimeParametrization(arm().joints).trajectory(np.zeros((2, 5)))
+    assert still.duration == 0.0
+    assert np.array_equal(still.positions, np.zeros((1, 5)))
+
+
+@pytest.mark.parametrize(
+    ("kind", "size"),
+    [("box", (0.03, 0.03, 0.03)), ("cylinder", (0.015, 0.04)), ("sphere", (0.02,))],
+)
+def test_things_on_the_table_can_be_grasped(kind: str, size: tuple[float, ...]) -> None:
+    planner = GraspPlanner(arm(), inverse())
+    thing = Thing(name="it", kind=kind, size=size, position=np.array([0.22, 0.05, 0.02]))  # type: ignore[arg-type]
+    found = planner.grasps(thing, [FLOOR])
+    assert isinstance(found, list)
+    clearances = [one.clearance for one in found]
+    assert clearances == sorted(clearances, reverse=True)
+    for grasp in found:
+        assert_held(grasp, thing)
+
+
+def assert_held(grasp: Grasp, thing: Thing) -> None:
+    """Assert that the thing is between the fingers, which touch nothing until they close."""
+    tool = arm().forward(grasp.posture)
+    middle = tool.axes.T @ (thing.position - tool.position)
+    opening = arm().opening()
+    assert middle[2] == pytest.approx(opening.middle(grasp.opening), abs=0.003)
+    assert abs(middle[1]) < 0.002
+    assert opening.position(grasp.width) < grasp.opening
+    checker = CollisionChecker(arm(), [FLOOR, thing], gripper=grasp.opening, margin=0.0)
+    for share in np.linspace(0, 1, 50):
+        posture = grasp.before + (grasp.posture - grasp.before) * share
+        assert checker.touches(posture) == ""
+
+
+def test_what_cannot_be_grasped_says_why() -> None:
+    planner = GraspPlanner(arm(), inverse())
+    wide = Thing(name="crate", kind="box", size=(0.2,) * 3, position=np.array([0.25, 0, 0.1]))
+    far = Thing(name="ball", kind="sphere", size=(0.02,), position=np.array([1.0, 0, 0.02]))
+    for thing, said in ((wide, "crate is 20.0 cm wide"), (far, "too far by")):
+        found = planner.grasps(thing, [FLOOR])
+        assert isinstance(found, NoGrasp)
+        assert said in found.reason
+
+
+def test_joints_of_another_arm_are_refused() -> None:
+    with pytest.raises(ConfigError):
+        type(arm())(MODEL.read_text(), JOINTS[5:])
