@@ -96,6 +96,7 @@ COMMANDS = {
     "driver run": ("processes:driver", "Run the driver of a robot."),
     "driver new": ("driver:new", "Create the package of a new driver."),
     "driver test": ("driver:test", "Run the conformance checks on a driver."),
+    "driver calibrate": ("driver:calibrate", "Calibrate an arm by moving its joints by hand."),
     "driver bringup": ("driver:bringup", "Compare a ROS 2 robot with its file."),
     "driver trace": ("driver:trace", "Print the bytes on a robot's line, decoded."),
     "emulate": ("driver:emulate", "Emulate a robot's hardware on serial and TCP ports."),

@@ -155,6 +155,37 @@ def bringup(name: Body, *, link: Literal["emulated", "real"] = "real", seconds: 
     return int(any(one.verdict == "error" for one in found))
 
 
+def calibrate(name: Body, *, port: str | None = None, file: Path | None = None) -> None:
+    """Calibrate an arm: its motors let go, and a person moves each joint by hand.
+
+    Example: gigabrain driver calibrate so101 --port /dev/ttyACM0
+
+    It asks before each step. Only if you agree, it writes the middle and the
+    limits of each joint into the servos. No process may drive the arm meanwhile.
+
+    Args:
+        port: Port of the arm, if it is another than in the robot's file.
+        file: File to write. Default: that of the robot's file, or one in the state folder.
+    """
+    from msgspec.structs import replace
+
+    from gigabrain_drivers.bodies.feetech.calibrate import calibrate as make
+    from gigabrain_drivers.bodies.feetech.calibration import calibration_path
+    from gigabrain_drivers.bodies.feetech.driver import FeetechOptions
+    from gigabrain_drivers.driver.catalog import load_link
+    from gigabrain_drivers.driver.robot import Run
+    from gigabrain_zenoh.cli.calibrating import Terminal
+    from gigabrain_zenoh.errors import ConfigError
+
+    robot, _, options, folder = load_link(name, Run(folder=Path(), link="real"))
+    if not isinstance(options, FeetechOptions):
+        raise ConfigError(f"{robot.robot_type} needs no calibration: its driver is none of servos")
+    options = replace(options, port=port) if port else options
+    path = file or calibration_path(robot.robot_type, options.calibration, folder)
+    run_async(make(robot, options, path, Terminal()))
+    print(f"{path}: the calibration of {robot.robot_type}")
+
+
 def _print_trace(
     name: str, link: LinkName, part: str, seconds: float, speeds: dict[str, float]
 ) -> bool:

@@ -114,3 +114,31 @@ def typed_lines(take: Callable[[str], None]) -> Iterator[None]:
         yield
     finally:
         loop.remove_reader(fd)
+
+
+async def typed_text() -> str | None:
+    """Wait for a line of standard input, which may be empty; None at its end.
+
+    It may be cancelled; a line that is typed later is then left for the next call.
+    """
+    loop = asyncio.get_running_loop()
+    fd, text = sys.stdin.fileno(), b""
+    while not text.endswith(b"\n"):
+        await _readable(loop, fd)
+        byte = os.read(fd, 1)  # the rest belongs to the next call
+        if not byte:
+            return None
+        text += byte
+    return text.decode(errors="replace").strip()
+
+
+async def _readable(loop: asyncio.AbstractEventLoop, fd: int) -> None:
+    ready = asyncio.Event()
+    try:
+        loop.add_reader(fd, ready.set)
+    except OSError:  # a file, which is always readable
+        return
+    try:
+        await ready.wait()
+    finally:
+        loop.remove_reader(fd)

@@ -15,6 +15,7 @@ CALLS = {
     "driver new": "driver new some_base --folder {file}",
     "process new": "process new some_process --folder {file}",
     "driver test": "driver test mock",
+    "driver calibrate": "driver calibrate so101 --port {file}",
     "driver bringup": "driver bringup turtlebot3_ros2 --link emulated --seconds 30",
     "driver trace": "driver trace mycustombot --seconds 30",
     "button": "button --port /dev/nothing --connect {robot}",

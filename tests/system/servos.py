@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
+from gigabrain_drivers.bodies.feetech.driver import FeetechOptions
 from gigabrain_drivers.bodies.feetech.emulator import FeetechArm
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.base import EmulatedBody
@@ -16,11 +17,11 @@ from tests.unit.drivers.feetech import FOLDER, OPTIONS, ROBOT
 
 
 @asynccontextmanager
-async def emulated_arm(port: Path) -> AsyncIterator[FeetechArm]:
+async def emulated_arm(port: Path, options: FeetechOptions = OPTIONS) -> AsyncIterator[FeetechArm]:
     """An arm whose line appears at `port`, and whose time goes on by itself."""
     body = cast(EmulatedBody, SimpleNamespace(robot=ROBOT, run=Run(folder=FOLDER)))
     station = Station(
-        lambda wire: FeetechArm(body, OPTIONS, wire), Pty(port, FeetechArm.baud), Clock()
+        lambda wire: FeetechArm(body, options, wire), Pty(port, FeetechArm.baud), Clock()
     )
     station.start()
     try:

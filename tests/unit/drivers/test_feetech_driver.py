@@ -295,7 +295,7 @@ def wheel(rig: Rig) -> None:
     ("spoil", "text"),
     [
         (twice, r"answers as servo 3 \(elbow_flex\) is garbled, and servo 4 \(wrist_flex\) is mis"),
-        (missing, r"servo 4 \(wrist_flex\) does not answer, others do"),
+        (missing, r"servo 4 \(wrist_flex\) does not answer: are its cable"),
         (another_arm, r"servo 3 \(elbow_flex\) keeps offset 12 .* this is another arm; run gig"),
         (another_variant, r"servo 6 \(gripper\) takes up to 14 V, but the robot's file has serv"),
         (wheel, r"servo 6 \(gripper\) is of model 777 in mode 1; expected an STS3215"),

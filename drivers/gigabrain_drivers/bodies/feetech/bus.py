@@ -9,9 +9,9 @@ from gigabrain_drivers.links.frames import Spelling, Wording
 from gigabrain_drivers.links.link import Link
 from gigabrain_zenoh.clock import Clock
 
-ANSWER_TIMEOUT_NS = (
-    12_000_000  # USB adds 1 ms each way; a missing servo costs its successors a wait
-)
+ANSWER_TIMEOUT_NS = 12_000_000  # of a cycle's; USB adds 1 ms each way
+PATIENT_TIMEOUT_NS = 60_000_000  # of an answer that must come, on a host that is busy
+
 ATTEMPTS = 4  # of a question that must be answered
 
 
@@ -47,7 +47,13 @@ class HostBus:
         async with self._line:
             return self.link.write(frame)
 
-    async def ask(self, frame: bytes, servos: Sequence[int], length: int) -> dict[int, bytes]:
+    async def ask(
+        self,
+        frame: bytes,
+        servos: Sequence[int],
+        length: int,
+        timeout_ns: int = PATIENT_TIMEOUT_NS,
+    ) -> dict[int, bytes]:
         """Ask servos for `length` bytes each; return what came in time, by id.
 
         The first byte of each answer is its error.
@@ -59,7 +65,7 @@ class HostBus:
             self._complete.clear()
             before = self._decoder.errors
             if self.link.write(frame):
-                await self._until_complete()
+                await self._until_complete(timeout_ns)
             self.unanswered += len(self._waiting)
             self._waiting = set()
             self._garbled = self._decoder.errors > before
@@ -96,18 +102,18 @@ class HostBus:
                 return True
         return False
 
-    async def _until_complete(self) -> None:
+    async def _until_complete(self, timeout_ns: int) -> None:
         """Wait for all answers, but no longer than they may take."""
         if self._complete.is_set():
             return
-        timeout = asyncio.create_task(self._time_out())
+        timeout = asyncio.create_task(self._time_out(timeout_ns))
         try:
             await self._complete.wait()
         finally:
             timeout.cancel()
 
-    async def _time_out(self) -> None:
-        await self._clock.sleep_ns(ANSWER_TIMEOUT_NS)
+    async def _time_out(self, timeout_ns: int) -> None:
+        await self._clock.sleep_ns(timeout_ns)
         self._complete.set()
 
     def _take(self, data: bytes) -> None:

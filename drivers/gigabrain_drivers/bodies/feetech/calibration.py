@@ -132,14 +132,32 @@ class JointRange:
         """True where the servo's count jumps inside the range."""
         return self.lower < 0 or self.upper >= TICKS
 
-    def zero(self, direction: int) -> int:
-        """Return the ticks at which the joint is at 0 rad.
+    @property
+    def endless(self) -> bool:
+        """True where it turned further than the robot's file says, so that it has no ends."""
+        span = (self.upper - self.lower) * RADIANS_PER_TICK
+        return span > self.joint.upper - self.joint.lower + SPAN_TOLERANCE
 
-        Both ends of its range say where that is; where it turns further than the file says, it
-        has no ends, and the middle posture does.
+    def calibrated(self, servo: int, direction: Literal[1, -1]) -> ServoCalibration:
+        """Return the calibration of a servo that keeps no offset and has no limits.
+
+        The middle between both ends is that of the robot's file; of an endless joint, the middle
+        posture is.
         """
         centre = (self.joint.lower + self.joint.upper) / 2
-        span = (self.upper - self.lower) * RADIANS_PER_TICK
-        endless = span > self.joint.upper - self.joint.lower + SPAN_TOLERANCE
-        at = self.middle if endless else (self.lower + self.upper) / 2
-        return round(at - direction * centre / RADIANS_PER_TICK)
+        middle = self.middle if self.endless else (self.lower + self.upper) / 2
+        zero = round(middle - direction * centre / RADIANS_PER_TICK)
+        lower, upper = self.lower, self.upper
+        if self.endless:
+            half = round((self.joint.upper - self.joint.lower) / 2 / RADIANS_PER_TICK)
+            lower, upper = self.middle - half, self.middle + half
+        return ServoCalibration(
+            id=servo,
+            direction=direction,
+            zero=zero,
+            lower=max(0, lower),
+            upper=min(TICKS - 1, upper),
+            offset=0,
+            min_position=0,
+            max_position=TICKS - 1,
+        )

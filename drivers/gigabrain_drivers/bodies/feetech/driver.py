@@ -15,7 +15,7 @@ from msgspec import Meta
 from msgspec.structs import replace
 
 from gigabrain_drivers.bodies.feetech import protocol as feetech
-from gigabrain_drivers.bodies.feetech.bus import HostBus
+from gigabrain_drivers.bodies.feetech.bus import ANSWER_TIMEOUT_NS, HostBus
 from gigabrain_drivers.bodies.feetech.calibration import (
     OUTSIDE,
     calibration_path,
@@ -115,7 +115,7 @@ class FeetechDriver(Driver):
     def problem(self) -> str:
         """The reason in one line why the arm cannot be moved, or an empty text."""
         if self.link.problem:
-            return f"{self.link}: {self.link.problem}"
+            return line_problem(self.link)
         if not self._armed:
             return self._complaint
         now_ns = self._clock.now_ns()
@@ -141,7 +141,7 @@ class FeetechDriver(Driver):
         while not await self._find() and self._clock.now_ns() < until_ns:
             await self._clock.sleep_ns(RETRY_NS // 10)
         if not self.link.connected and not describe_absent(options.port):
-            raise ConfigError(f"{self.link}: {self.link.problem}")
+            raise ConfigError(line_problem(self.link))
         self._cycles = asyncio.create_task(self._run(), name="servo bus")
 
     async def close(self) -> None:
@@ -249,7 +249,8 @@ class FeetechDriver(Driver):
 
     async def _read(self, now_ns: int) -> None:
         servos = [joint.id for joint in self._joints.values()]
-        answers = await self._bus.ask(feetech.sync_read(servos, FIRST, LENGTH), servos, LENGTH)
+        question = feetech.sync_read(servos, FIRST, LENGTH)
+        answers = await self._bus.ask(question, servos, LENGTH, ANSWER_TIMEOUT_NS)
         for joint in self._joints.values():
             if joint.id in answers:
                 joint.take(feetech.decode_readings(answers[joint.id][1:]), now_ns)
@@ -308,28 +309,12 @@ class FeetechDriver(Driver):
         if self._found != before:  # its power may just have been switched on
             self._complaint = f"{self.link}: the arm has just begun to answer"
             return False
-        self._refuse_incomplete(self._found)
+        refuse_incomplete(str(self.link), {str(joint): how for joint, how in self._found.items()})
         for joint in self._joints.values():
             await self._check_servo(joint)
         self._complaint = await self._arm()
         self._armed = not self._complaint
         return self._armed
-
-    def _refuse_incomplete(self, found: Mapping[ServoJoint, str]) -> None:
-        """Raise ConfigError where a servo is missing, or two have the same id."""
-        missing = ", ".join(str(joint) for joint, how in found.items() if how == "missing")
-        garbled = ", ".join(str(joint) for joint, how in found.items() if how == "garbled")
-        if garbled:
-            also = f", and {missing} is missing" if missing else ""
-            raise ConfigError(
-                f"{self.link}: what answers as {garbled} is garbled{also}: "
-                "two servos have the same id, or the cable is bad; give each servo its own id"
-            )
-        if missing:
-            raise ConfigError(
-                f"{self.link}: {missing} does not answer, others do: is its cable plugged in, "
-                "and does it have this id?"
-            )
 
     async def _check_servo(self, joint: ServoJoint) -> None:
         """Raise ConfigError where a servo is not the one that was calibrated."""
@@ -359,7 +344,7 @@ class FeetechDriver(Driver):
             first, now = await self._block(joint), await self._block(joint)
             if first is None or now is None:
                 return f"{joint} answers only at times"
-            if abs(first.position - now.position) * RADIANS_PER_TICK > JUMP_SLACK:
+            if abs(first.position - now.position) * RADIANS_PER_TICK > 2 * JUMP_SLACK:
                 return f"{joint} is being moved: let go of the arm"
             self._check_supply(joint, now)
             if outside := _outside(joint, now):
@@ -406,6 +391,29 @@ class FeetechDriver(Driver):
                 f"{self.link}: {joint} measures {volts:.1f} V; expected {least:g} to {most:g} V "
                 f"for servos of {voltage:g} V: wrong supply, or wrong voltage in the robot's file"
             )
+
+
+def line_problem(link: Link) -> str:
+    """Return what is wrong with a line, with its name."""
+    problem, name = link.problem, str(link)
+    return problem if name in problem else f"{name}: {problem}"
+
+
+def refuse_incomplete(port: str, found: Mapping[str, str]) -> None:
+    """Raise ConfigError where a servo is missing, or two have the same id."""
+    missing = ", ".join(servo for servo, how in found.items() if how == "missing")
+    garbled = ", ".join(servo for servo, how in found.items() if how == "garbled")
+    if garbled:
+        also = f", and {missing} is missing" if missing else ""
+        raise ConfigError(
+            f"{port}: what answers as {garbled} is garbled{also}: "
+            "two servos have the same id, or the cable is bad; give each servo its own id"
+        )
+    if missing:
+        raise ConfigError(
+            f"{port}: {missing} does not answer: are its cable and its power plugged in, "
+            "and does it have this id?"
+        )
 
 
 def _other_arm(robot_type: str, joint: ServoJoint, memory: ServoMemory) -> str:

@@ -10,7 +10,8 @@ from gigabrain_schemas.body import Joint, JointDescription
 
 LOST_NS = 100_000_000  # without an answer it counts as lost
 PUSHED_FACTOR = 2.0  # times as fast as it may move a joint may be pushed, and
-JUMP_SLACK = math.radians(1.5)  # [rad] more between two readings; the rest is no motion
+MAX_ACCELERATION = 150.0  # [rad/s2] of a joint that is pushed, or runs into something;
+JUMP_SLACK = math.radians(0.5)  # [rad] more between two readings; the rest is no motion
 VOLTAGE_STEP, TEMPERATURE_STEP = 5, 2  # 0.1 V, [deg C] that may lie between two readings
 AT_REST = 0.05  # [rad/s]
 CONTACT = math.radians(4.0)  # [rad] that a gripper stops short of its goal where it holds something
@@ -59,6 +60,7 @@ class ServoJoint:
         self._stall_torque = stall_torque
         self._full, self._gentle = round(torque_limit * 1000), round(grip_torque * 1000)
         self._last: ServoReadings | None = None  # believed or not
+        self._speed = 0.0  # [rad/s] between the two newest that are believed
         self._held = False
         self._contact_ns: int | None = None  # since when something has been between its fingers
 
@@ -87,7 +89,7 @@ class ServoJoint:
         A servo that holds already keeps what it holds: any other goal would move it.
         """
         self.newest = self._last = now
-        self.heard_ns = asked_ns
+        self.heard_ns, self._speed = asked_ns, 0.0
         self.position = self.calibration.to_radians(now.position)
         self._contact_ns = None
         holds = now.torque and abs(self.velocity) < AT_REST
@@ -101,11 +103,15 @@ class ServoJoint:
         """
         position = self.calibration.to_radians(now.position)
         passed_s = (asked_ns - self.heard_ns) / 1e9
+        moved = position - self.position
         furthest = PUSHED_FACTOR * self.description.max_speed * passed_s + JUMP_SLACK
+        change = abs(moved - self._speed * passed_s)
+        smooth = change <= MAX_ACCELERATION * passed_s**2 + JUMP_SLACK
         before, self._last = self._last, now
-        if abs(position - self.position) > furthest or not (before and _agree(before, now)):
+        if abs(moved) > furthest or not smooth or not (before and _agree(before, now)):
             self.refused += 1
             return
+        self._speed = moved / passed_s if passed_s > 0.0 else 0.0
         self.newest, self.position, self.heard_ns = now, position, asked_ns
 
     def command(self, position: float) -> float:

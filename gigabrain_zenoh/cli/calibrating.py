@@ -1,0 +1,53 @@
+"""The terminal of `gigabrain driver calibrate`: questions, and a table of the joints' ranges."""
+
+import math
+from collections.abc import Mapping
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from gigabrain_drivers.bodies.feetech.calibration import JointRange
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.terminal import typed_text
+
+REFRESH_HZ = 5
+
+
+class Terminal:
+    """Asks the person at the arm."""
+
+    def __init__(self) -> None:
+        self._console = Console()
+        self._live: Live | None = None
+
+    async def ask(self, text: str) -> str:
+        """Print a request, and return the line that is typed. Raises ConfigError at the end."""
+        self._console.print(text, markup=False, soft_wrap=True)
+        try:
+            line = await typed_text()
+        finally:
+            live, self._live = self._live, None
+            if live:
+                live.stop()
+        if line is None:
+            raise ConfigError("nobody types: the calibration was not finished, and none is written")
+        return line
+
+    def show(self, ranges: Mapping[str, JointRange]) -> None:
+        """Show how far each joint has been moved."""
+        if self._live is None:
+            self._live = Live(console=self._console, refresh_per_second=REFRESH_HZ)
+            self._live.start()
+        self._live.update(_table(ranges))
+
+
+def _table(ranges: Mapping[str, JointRange]) -> Table:
+    table = Table()
+    for title in ("joint", "least", "now", "most", "missing"):
+        table.add_column(title, justify="left" if title == "joint" else "right")
+    for name, its in ranges.items():
+        missing = f"{math.degrees(its.missing):.0f} deg" if its.missing else "nothing"
+        ticks = map(str, (its.lower, its.ticks, its.upper))
+        table.add_row(name, *ticks, missing)
+    return table
