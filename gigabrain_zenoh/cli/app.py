@@ -73,7 +73,7 @@ COMMANDS = {
     "place remove": ("zone:remove", "Remove a named place or a zone."),
     "zone add": ("zone:add_zone", "Add a keep-out zone, a speed zone or a one-way lane."),
     "arm state": ("arm:state", "Show the joints: position, speed, effort, temperature, range."),
-    "arm jog": ("arm:jog", "Move one joint by some degrees."),
+    "arm jog": ("arm:jog", "Move one joint by some degrees, or millimetres."),
     "arm home": ("arm:home", "Move the arm to where it is out of the way."),
     "arm limp": ("arm:limp", "Let go of all joints, so that a person can move them."),
     "arm hold": ("arm:hold", "Hold limp joints again, where they are."),

@@ -16,7 +16,7 @@ from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.errors import ConfigError, Unsupported, unknown
 from gigabrain_zenoh.host.signals import run_async
 
-Degrees = Annotated[float, Parameter(allow_leading_hyphen=True)]
+Distance = Annotated[float, Parameter(allow_leading_hyphen=True)]
 BAR = 20  # characters of a joint's range
 WATCH_S = 0.2
 SLOW = math.radians(45)  # [rad/s], of an arm that a person sends somewhere
@@ -50,16 +50,16 @@ def state(*, watch: bool = False, at: RobotAddress = LOCAL) -> None:
     _with_robot(at, "", show)
 
 
-def jog(joint: str, degrees: Degrees, /, *, take: Take = False, at: RobotAddress = LOCAL) -> None:
-    """Move one joint by some degrees, slowly.
+def jog(joint: str, distance: Distance, /, *, take: Take = False, at: RobotAddress = LOCAL) -> None:
+    """Move one joint by some degrees, or millimetres if it slides, slowly.
 
     Example: gigabrain arm jog shoulder_pan 10 --take
 
     Args:
         joint: Name of the joint; see `gigabrain arm state`.
-        degrees: How far, from where it is; negative for the other way.
+        distance: How far, from where it was sent; negative for the other way.
     """
-    check_finite("degrees", degrees)
+    check_finite("distance", distance)
 
     async def move(robot: Robot) -> None:
         body = await _arm(robot)
@@ -67,11 +67,12 @@ def jog(joint: str, degrees: Degrees, /, *, take: Take = False, at: RobotAddress
         if joint not in known:
             raise unknown("joint", joint, known)
         one, sent = body.joints[known.index(joint)], (await robot.read_state()).joints_sent
-        place = sent[known.index(joint)] + math.radians(degrees)
+        scale, unit = shown_in(one)
+        place = sent[known.index(joint)] + distance / scale
         if not one.lower <= place <= one.upper:
-            low, high, there = map(math.degrees, (one.lower, one.upper, place))
+            low, high, there = (scale * at for at in (one.lower, one.upper, place))
             raise ConfigError(
-                f"{joint}: it goes from {low:.1f} to {high:.1f} degrees, not to {there:.1f}"
+                f"{joint}: it goes from {low:.1f} to {high:.1f} {unit}, not to {there:.1f}"
             )
         await _move(robot, take, {joint: place})
 
@@ -150,12 +151,19 @@ async def _move(robot: Robot, take: bool, positions: dict[str, float]) -> None:
     if take:
         await robot.enable(take=True)
     found = await robot.set_joint_positions(positions, speed=SLOW)
-    for name in positions:
-        print_line(f"{name} is at {math.degrees(found[name]):.1f}°")
+    for joint in (await robot.read_body()).joints:
+        if joint.name in positions:
+            scale, unit = shown_in(joint)
+            print_line(f"{joint.name} is at {scale * found[joint.name]:.1f} {unit}")
+
+
+def shown_in(joint: JointDescription) -> tuple[float, str]:
+    """Return the factor and the unit in which people read a joint's positions."""
+    return (1e3, "mm") if joint.unit == "m" else (math.degrees(1.0), "°")
 
 
 def lines(body: BodyDescription, state: RobotState) -> list[str]:
-    """Return a table of the joints, in degrees and degrees per second."""
+    """Return a table of the joints, in degrees, or millimetres of those that slide."""
     measured = {joint.name: joint for joint in state.joints}
     sent = dict(zip((joint.name for joint in body.joints), state.joints_sent, strict=False))
     gate = state.gate
@@ -178,12 +186,13 @@ def _row(joint: JointDescription, found: Joint, sent: float | None) -> str:
     if effort and joint.max_effort:
         effort += f" ({abs(found.effort or 0.0) / joint.max_effort:.0%})"
     motor = "" if found.temperature is None else f"{found.temperature:.0f} °C"
-    wanted = "" if sent is None else f"{math.degrees(sent):+.1f}°"
-    speed = f"{math.degrees(found.velocity):+.0f} °/s"
-    low, high = (f"{math.degrees(end):+.0f}°" for end in (joint.lower, joint.upper))
+    scale, unit = shown_in(joint)
+    wanted = "" if sent is None else f"{scale * sent:+.1f}{unit}"
+    here, speed = f"{scale * found.position:+.1f}{unit}", f"{scale * found.velocity:+.0f} {unit}/s"
+    low, high = (f"{scale * end:+.0f}{unit}" for end in (joint.lower, joint.upper))
     return (
-        f"{math.degrees(found.position):+8.1f}° {wanted:>8} {speed:>9} {effort:>14} {motor:>6}  "
-        f"{low:>5} {bar(joint, found.position)} {high}"
+        f"{here:>9} {wanted:>8} {speed:>9} {effort:>14} {motor:>6}  "
+        f"{low:>6} {bar(joint, found.position)} {high}"
     )
 
 

@@ -17,13 +17,14 @@ from msgspec import Struct
 from serial.tools import list_ports
 
 from gigabrain_schemas.base import TICK_S
-from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.body import Body, RobotState
 from gigabrain_schemas.requests import Description
 from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import (
     BODY,
     CMD_VEL,
     INTENT,
+    JOINT_CMD,
     SAFETY,
     SCAN,
     STATE,
@@ -47,12 +48,13 @@ Grade = Literal["ok", "hint", "bad"]
 SYSTEMS = ("router", "driver", "perception", "decision", "control", "safety")
 LIBRARIES: Mapping[str, tuple[int, ...]] = {  # with the lowest version
     "eclipse-zenoh": (1, 10), "msgspec": (0, 19), "numpy": (1, 26), "pyserial": (), "pyyaml": (),
-    "cyclopts": (5, 0), "rich": (), "mujoco-core": (), "cryptography": (), "mcap": (),
-    "textual": (), "uvloop": (), "rosbags": (0, 11), "xxhash": (3,), "cyclonedds": (11,),
+    "cyclopts": (5, 0), "rich": (), "mujoco-core": (), "ruckig": (0, 17), "cryptography": (),
+    "mcap": (), "textual": (), "uvloop": (), "rosbags": (0, 11), "xxhash": (3,),
+    "cyclonedds": (11,),
 }  # fmt: skip
 EXTRAS = {  # optional libraries, and the extra of the package that installs each
-    "mujoco-core": "sim", "cryptography": "keys", "mcap": "record", "textual": "view",
-    "uvloop": "fast", "rosbags": "ros2", "xxhash": "ros2", "cyclonedds": "dds",
+    "mujoco-core": "sim", "ruckig": "arm", "cryptography": "keys", "mcap": "record",
+    "textual": "view", "uvloop": "fast", "rosbags": "ros2", "xxhash": "ros2", "cyclonedds": "dds",
 }  # fmt: skip
 SENDERS: dict[Topic[Any], str] = {
     STATE: "driver", SCAN: "driver", BODY: "driver", WORLD: "perception", INTENT: "decision",
@@ -125,6 +127,7 @@ class RobotFacts(Struct, frozen=True, kw_only=True):
     health: Mapping[str, Health] = {}  # newest, by process
     lead_ms: Mapping[str, float] = {}  # by host: smallest offset by which its clock is behind ours
     control_topic: str = CMD_VEL.key  # which the body obeys
+    unneeded: frozenset[str] = frozenset()  # keys of what the body has no use for
     pace: float | None = None  # robot's time over real time
 
 
@@ -277,6 +280,8 @@ def _rates(robot: RobotFacts) -> Iterator[Diagnosis]:
         if health is None:
             continue
         key = robot.control_topic if topic is CMD_VEL else topic.key
+        if key in robot.unneeded:
+            continue
         hz, promised = health.sent_hz.get(key, 0.0), topic.hz * pace
         if hz < MIN_RATE * promised and topic.key != BODY.key:
             cure = f"reduce the load here, or read its log: gigabrain log --process {process}"
@@ -409,9 +414,22 @@ async def _collect(bus: Bus, router: str, seconds: float) -> RobotFacts:
         described=described,
         health=health.newest,
         lead_ms=lead_ms,
-        control_topic=body.description.control_topic if body else CMD_VEL.key,
+        control_topic=_control_topic(body),
+        unneeded=_unneeded(body),
         pace=_pace(states),
     )
+
+
+def _control_topic(body: Body | None) -> str:
+    if body is None:
+        return CMD_VEL.key
+    return body.description.control_topic if body.description.has_base else JOINT_CMD.key
+
+
+def _unneeded(body: Body | None) -> frozenset[str]:
+    """Return the keys of scans and worlds for an arm that is fixed and has no lidar."""
+    fixed = body is not None and not body.description.has_base and not body.description.lidar
+    return frozenset((SCAN.key, WORLD.key)) if fixed else frozenset()
 
 
 def _pace(states: list[RobotState]) -> float | None:

@@ -12,13 +12,14 @@ from msgspec import Struct
 
 from gigabrain_schemas.base import Cause, Message, Velocity
 from gigabrain_schemas.body import Body, RobotState
-from gigabrain_schemas.brain import CmdVel, Intent, WorldModel
+from gigabrain_schemas.brain import CmdVel, Intent, JointCommand, WorldModel
 from gigabrain_schemas.requests import Description
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.tasks import TaskStatus
 from gigabrain_schemas.topics import (
     CMD_VEL,
     INTENT,
+    JOINT_CMD,
     SCAN,
     STATE,
     WORLD,
@@ -47,6 +48,7 @@ START_ROUTER = (
 )
 READ_SAFETY_LOG = "read its log with `gigabrain log --process safety`"
 GOES_ON = "remove the cause; decision then goes on by itself"
+BY_HAND = "move it with `gigabrain teleop` or `gigabrain arm jog`"
 FIND_IT = (
     "drive it a turn with `gigabrain teleop`, show its camera a tag that it knows, "
     "or tell it where it is with `gigabrain pose X Y`"
@@ -65,6 +67,7 @@ class ChainFacts(Struct, frozen=True, kw_only=True):
     world: WorldModel | None = None
     intent: Intent | None = None
     command: CmdVel | None = None  # of the robot's own control
+    joint_command: JointCommand | None = None  # the same, for joints
     fastest: Velocity = ZERO  # largest of the commander's commands, per axis
     strangers: tuple[str, ...] = ()  # other senders of commands
     safety: SafetyState | None = None
@@ -180,6 +183,8 @@ def _scan(facts: ChainFacts) -> LinkStatus:
 
 def _world(facts: ChainFacts) -> LinkStatus:
     world = facts.world
+    if _fixed(facts) and facts.body and facts.body.description.lidar is None:
+        return _ok("world", "not needed: the body has no lidar, and no base to drive")
     if world is None:
         return _silent(facts, "world", "perception", "world")
     ahead = "free ahead"
@@ -187,6 +192,10 @@ def _world(facts: ChainFacts) -> LinkStatus:
         near = world.distance_ahead
         ahead = "obstacle ahead" if near is None else f"obstacle {near:.2f} m ahead"
     return _ok("world", f"{ahead}{_after(facts, WORLD.key, 'the scan')}")
+
+
+def _fixed(facts: ChainFacts) -> bool:
+    return facts.body is not None and not facts.body.description.has_base
 
 
 def _other_commander(facts: ChainFacts) -> str:
@@ -204,6 +213,9 @@ def _intent(facts: ChainFacts) -> LinkStatus:
         return _waits("intent", "decision is starting up", "wait until it is ready")
     if intent is None:
         return _silent(facts, "intent", "decision", "intent")
+    if _fixed(facts):
+        wants = intent.joints or intent.joint_trajectory
+        return _ok("intent", intent.reason) if wants else _waits("intent", intent.reason, BY_HAND)
     if not _wants_to_move(facts):
         return _idle(facts.tasks) or LinkStatus(
             link="intent",
@@ -239,6 +251,9 @@ def _control(facts: ChainFacts) -> LinkStatus:
     command, intent, other = facts.command, facts.intent, _other_commander(facts)
     if other:
         return _ok("control", f"not used: {other} drives")
+    if _fixed(facts) and facts.joint_command:
+        by = "an operator moves joints" if facts.joint_command.operator else "it commands joints"
+        return _ok("control", by)
     if command is None:
         return _silent(facts, "control", "control", "command")
     gate = facts.state.gate if facts.state else None
@@ -360,6 +375,7 @@ class ChainWatcher(RobotView):
 
     def __init__(self, bus: Bus) -> None:
         self._commands: dict[str, list[tuple[int, CmdVel]]] = {}  # by sender, with their arrival
+        self._joint_commands = bus.latest(JOINT_CMD)
         super().__init__(bus)
         self._monitor = monitor_chain(bus)
         bus.subscribe(CMD_VEL, self._add_command)
@@ -383,7 +399,7 @@ class ChainWatcher(RobotView):
         state = self.state.fresh()
         elapsed_s = (bus.clock.now_ns() - start_ns) / 1e9
         commander = state.gate.commander if state else ""
-        scan_ns = self.scan.age_ns()
+        scan_ns, joints = self.scan.age_ns(), self._joint_commands.fresh()
         return ChainFacts(
             described=described,
             state=state,
@@ -392,6 +408,7 @@ class ChainWatcher(RobotView):
             world=self.world.fresh(),
             intent=self.intent.fresh(),
             command=self._newest(BRAIN),
+            joint_command=joints if joints and joints.source == BRAIN else None,
             fastest=_fastest([command for _, command in self._commands.get(commander, [])]),
             strangers=tuple(sorted(set(self._commands) - {BRAIN, commander})),
             safety=self.safety.fresh(),

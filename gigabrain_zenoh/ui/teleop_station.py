@@ -19,7 +19,7 @@ from rich.live import Live
 from rich.text import Text
 
 from gigabrain_schemas.base import Velocity
-from gigabrain_schemas.body import BodyDescription, RobotState
+from gigabrain_schemas.body import BodyDescription, JointDescription, RobotState
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.errors import GigabrainError, Refused
 from gigabrain_zenoh.gate.gate import BRAIN
@@ -342,15 +342,20 @@ def readout(state: RobotState, wanted: Velocity, share: float) -> list[str]:
 
 
 def joint_readout(state: RobotState, body: BodyDescription | None, chosen: int) -> list[str]:
-    """Return a line with the joints that can be moved, in degrees, and the chosen one marked."""
+    """Return a line with the joints, in degrees or millimetres, and the chosen one marked."""
     measured = {joint.name: joint.position for joint in state.joints}
     shown = [
         f"{'>' if number == chosen else ''}{number + 1} {joint.name} "
-        f"{math.degrees(measured[joint.name]):+.0f}°"
+        + _place(joint, measured[joint.name])
         for number, joint in enumerate(body.joints if body else ())
         if joint.name in measured
     ]
     return [" · ".join(shown)] if shown else []
+
+
+def _place(joint: JointDescription, position: float) -> str:
+    sliding = joint.unit == "m"
+    return f"{1e3 * position:+.0f} mm" if sliding else f"{math.degrees(position):+.0f}°"
 
 
 @contextmanager

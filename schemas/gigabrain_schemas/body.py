@@ -89,6 +89,7 @@ class JointDescription(Record, frozen=True, kw_only=True):
 
     name: Name
     part: Literal["arm", "gripper"] = "arm"
+    unit: Literal["rad", "m"] = "rad"  # m: it slides
     lower: JointPosition  # [rad], or [m] for a sliding joint
     upper: JointPosition  # [rad] or [m]
     max_speed: SpeedLimit  # [rad/s] or [m/s]

@@ -155,11 +155,22 @@ async def test_commands_show_and_move_the_arm(shared_home: Home, arm: Probe) -> 
     assert posture(arm) == pytest.approx(HOME, abs=NEAR)
 
 
+async def test_the_tools_miss_no_scans_worlds_or_wheels(shared_home: Home, arm: Probe) -> None:
+    await until(lambda: arm.state.gate.commander == "control", "the brain goes on")
+    why = await shared_home.run("why")
+    links = dict(line.split()[:2] for line in why.out.splitlines() if line.startswith("  "))
+    assert {link for link, found in links.items() if found == "BROKEN"} == set(), why.out
+    assert (links["world"], links["intent"], links["control"]) == ("ok", "waits", "ok")
+    doctor = await shared_home.run("doctor")
+    for key in ("scan", "world", "cmd_vel"):
+        assert f"robot/{key}" not in doctor.out
+
+
 @pytest.mark.parametrize(
     ("words", "text"),
     [
         (("jog", "wrist", "10"), "no joint 'wrist'"),
-        (("jog", "wrist_roll", "1000"), "wrist_roll: it goes from -157.2 to 162.8 degrees, not to"),
+        (("jog", "wrist_roll", "1000"), "wrist_roll: it goes from -157.2 to 162.8 °, not to"),
         (("jog", "wrist_roll", "nan"), "expected a number, got nan"),
         (("limp",), "--yes"),
     ],

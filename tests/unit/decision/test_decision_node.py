@@ -7,6 +7,7 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.base import Cause
+from gigabrain_schemas.body import Body
 from gigabrain_schemas.brain import Intent, WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import BODY, INTENT, SAFETY, STATE, WORLD
@@ -15,6 +16,7 @@ from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.errors import UnknownName
 from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import LIDAR, WAFFLE, body, state
+from tests.unit.control.arm import arm_body
 
 CONFIG = DecisionConfig()
 
@@ -134,6 +136,17 @@ async def test_a_change_of_mind_is_logged_once(caplog: pytest.LogCaptureFixture)
         "forward 0.20 m/s",
         "turning right: obstacle 0.83 m ahead",
     ]
+
+
+async def test_for_an_arm_that_is_fixed_it_idles_with_a_reason_and_waits_for_no_world() -> None:
+    async with bench() as node:
+        node.send(BODY, Body(description=arm_body(), link="sim", boot=7, tick=9))
+        node.send(STATE, state(10))
+        node.send(STATE, state(11))
+        found = node.sent(INTENT)
+    assert [(intent.tick, intent.basis) for intent in found] == [(10, 10), (11, 11)]
+    assert {intent.reason for intent in found} == {"idle: the body has no base to drive"}
+    assert {(intent.twist, intent.joints) for intent in found} == {(None, ())}
 
 
 async def test_without_a_state_it_says_nothing() -> None:
