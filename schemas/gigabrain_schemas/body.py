@@ -338,6 +338,8 @@ class BodyDescription(Record, frozen=True, kw_only=True):
     def _check_joints(self) -> None:
         if len({joint.name for joint in self.joints}) < len(self.joints):
             raise ValueError("joints: each needs a name of its own")
+        if self.drive_type == "arm" and not self.joints:
+            raise ValueError("joints: missing; a body that is an arm alone has some")
         if bool(self.joints) != (self.arm is not None):
             raise ValueError("arm: joints and arm belong together; one of them is missing")
         if self.arm is None:

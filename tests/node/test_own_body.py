@@ -109,11 +109,9 @@ def test_a_model_whose_wheels_are_others_is_told(
     )
 
 
-def test_a_drive_that_has_no_physics_is_called_so(tmp_path: Path) -> None:
+def test_an_arm_without_joints_is_refused(tmp_path: Path) -> None:
     own = mine(tmp_path, ("drive_type: differential", "drive_type: arm"))
-    text = Path(own).read_text()
-    Path(own).write_text(text[: text.index("real:")])
-    with pytest.raises(ConfigError, match=r"drive_type 'arm' cannot be simulated in MuJoCo"):
+    with pytest.raises(ConfigError, match=r"joints: missing; a body that is an arm alone has some"):
         compiled(own, tmp_path)
 
 

@@ -34,7 +34,6 @@ WHEELS = {  # drive types on wheels, and the driven parts of their models
     "omni": tuple(f"wheel_{name}" for name in Omni.wheels),
     "ackermann": ("wheel_rear_left", "wheel_rear_right", "steer_left", "steer_right"),
 }
-SIMULATED = (*WHEELS, "quadruped", "arm")
 ROLLERS = ("mecanum", "omni")  # wheels with rollers on them
 SPARE_WHEEL_SPEED = 1.25  # times what the body's largest speeds, all at once, ask of a wheel
 MAX_MODEL_BYTES = 10_000_000
@@ -248,11 +247,6 @@ def sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimModel:
         "joints": robot.joints,
         "posture": robot.arm.home if robot.arm else (),
     }
-    if robot.drive_type not in SIMULATED:
-        raise ConfigError(
-            f"{robot.robot_type}: drive_type {robot.drive_type!r} cannot be simulated in MuJoCo; "
-            f"{', '.join(SIMULATED)} can"
-        )
     if robot.joints:
         found["substeps"] = ARM_SUBSTEPS
     if robot.drive_type == "arm":
