@@ -19,7 +19,7 @@ from gigabrain_zenoh.manipulation.arm_kinematics import (
 
 MARGIN_M = 0.005
 DISTANCE_CUTOFF_M = 0.1
-ROOM_CUTOFF_M = 0.06
+ROOM_CUTOFF_M = 0.012
 LEAST_SWEEP_M = 0.001  # of a line of postures, by which the margin may be undercut
 LINK_RADIUS_M = 0.03  # by which links and tools stick out, beyond the line from joint to joint
 HELD = "held"  # the body of what the tool holds
@@ -122,20 +122,24 @@ class CollisionChecker:
 
     def touches(self, posture: Floats) -> str:
         """Return what touches what within the margin, as text; empty for nothing."""
-        if not self.is_free(posture):
-            contact = min(self._data.contact, key=lambda one: one.dist)
-            return f"{self._names[contact.geom1]} and {self._names[contact.geom2]}"
-        return ""
+        self._place(posture, self.margin)
+        distance, pair = self._nearest(self.margin)
+        return " and ".join(pair) if pair and distance < self.margin else ""
 
     def is_free(self, posture: Floats) -> bool:
         """Return whether nothing touches anything within the margin."""
-        self._place(posture, self.margin)
-        return int(self._data.ncon) == 0
+        return not self.touches(posture)
 
     def room(self, posture: Floats, cutoff: float = ROOM_CUTOFF_M) -> float:
-        """Return a distance [m] below which nothing is near; the smallest may be a bit larger."""
+        """Return a distance [m] that all parts keep; their smallest one may be a bit larger.
+
+        It is exact where it is no more than the margin.
+        """
         self._place(posture, cutoff)
-        return float(self._data.contact.dist.min()) if self._data.ncon else cutoff
+        if not self._data.ncon:
+            return cutoff
+        room = float(self._data.contact.dist.min())
+        return self._nearest(self.margin)[0] if 0.0 < room <= self.margin else room
 
     def sweep(self, start: Floats, goal: Floats) -> float:
         """Return how far any part of the arm moves at most on a straight line of postures [m]."""
@@ -162,15 +166,24 @@ class CollisionChecker:
     def clearance(self, posture: Floats, cutoff: float = DISTANCE_CUTOFF_M) -> Clearance:
         """Return the smallest distance, if it is below `cutoff` [m]."""
         self._place(posture, cutoff)
+        distance, pair = self._nearest(cutoff)
+        return Clearance(distance=distance, pair=pair)
+
+    def _nearest(self, cutoff: float) -> tuple[float, tuple[str, str] | None]:
+        """Return the smallest distance [m] among contacts that may be nearer than `cutoff`.
+
+        Contacts of boxes that do not touch are said to be nearer than they are.
+        """
         contacts = self._data.contact
-        pairs = {(int(a), int(b)) for a, b in contacts.geom} if self._data.ncon else set()
-        nearest, found = cutoff, None
-        ends = np.zeros(6)
+        nearest, found, ends = cutoff, None, np.zeros(6)
+        if not self._data.ncon:
+            return nearest, found
+        pairs = {(int(one), int(other)) for one, other in contacts.geom[contacts.dist < cutoff]}
         for one, other in sorted(pairs):
             distance = mujoco.mj_geomDistance(self._model, self._data, one, other, cutoff, ends)
             if distance < nearest:
                 nearest, found = float(distance), (self._names[one], self._names[other])
-        return Clearance(distance=nearest, pair=found)
+        return nearest, found
 
     def _place(self, posture: Floats, margin: float) -> None:
         """Find all contacts nearer than `margin` [m]."""

@@ -25,6 +25,7 @@ from gigabrain_zenoh.manipulation.collision import CollisionChecker
 
 PERIOD_S = 0.02  # between points
 SPEEDS = (1.0, 0.7, 0.5, 0.35, 0.2, 0.1, 0.0)  # shares of the speed at corners that are tried
+MAX_STRAY = 0.02  # of a part's longest move
 SPARE = 1e-9
 MARGIN_SHARE = 0.5  # of the checker's margin, that is kept where corners are cut
 
@@ -69,7 +70,7 @@ class TimeParametrization:
             checker: Says where the arm may be.
 
         Raises:
-            Refused: Ruckig finds none, as the start is faster than the limits.
+            Refused: The start is so fast that limits or the checker's margin would be broken.
         """
         rest = np.zeros(postures.shape[1])
         start = rest if velocity is None else velocity
@@ -81,9 +82,11 @@ class TimeParametrization:
             states = [start, *(speeds[k] * SPEEDS[shares[k]] for k in range(1, len(speeds)))]
             parts, bad = self._parts(postures, states, checker)
             if not bad:
-                return self._sampled(postures[0], parts)
+                break
             for corner in bad:  # pass both ends of a part more slowly
                 shares[corner] = min(shares[corner] + 1, len(SPEEDS) - 1)
+        stops, _ = self._parts(postures, [start, *(rest for _ in speeds[1:])], checker)
+        return self._sampled(postures[0], min(parts, stops, key=_duration))
 
     def _corner_speeds(self, postures: Floats) -> list[Floats]:
         """Return the velocity (n,) at each posture: 0 at the ends and where a joint turns back."""
@@ -107,7 +110,11 @@ class TimeParametrization:
             part = self._part(postures[k], states[k], postures[k + 1], states[k + 1])
             parts.append(part)
             corners = [c for c in (k, k + 1) if 0 < c < len(postures) - 1 and np.any(states[c])]
-            if corners and not self._is_good(part, postures[k : k + 2], checker):
+            moving = k == 0 and bool(np.any(states[0]))  # it may have to turn back first
+            strays = not moving and _strays(part, postures[k : k + 2])
+            if (corners or moving) and (strays or not self._is_clear(part, checker)):
+                if not corners:
+                    raise Refused("the arm moves too fast to turn into the path without a contact")
                 bad.update(corners)
         return parts, sorted(bad)
 
@@ -128,15 +135,8 @@ class TimeParametrization:
             raise Refused(f"no trajectory within the limits of the joints: {code.name}")
         return result
 
-    def _is_good(
-        self, part: ruckig.Trajectory, ends: Floats, checker: CollisionChecker | None
-    ) -> bool:
-        """Return whether a part stays between its ends, and touches nothing."""
-        spare = 0.02 * np.abs(ends[1] - ends[0]).max()
-        low, high = ends.min(axis=0) - spare, ends.max(axis=0) + spare
-        for extreme, lower, upper in zip(part.position_extrema, low, high, strict=True):
-            if extreme.min < lower or extreme.max > upper:
-                return False
+    def _is_clear(self, part: ruckig.Trajectory, checker: CollisionChecker | None) -> bool:
+        """Return whether a part touches nothing."""
         if checker is None:
             return True
         times = np.append(np.arange(0.0, part.duration, self.period), part.duration)
@@ -157,3 +157,15 @@ class TimeParametrization:
             names=tuple(one.name for one in self.joints), times=times,
             positions=states[:, 0], velocities=states[:, 1], accelerations=states[:, 2],
         )  # fmt: skip
+
+
+def _duration(parts: Sequence[ruckig.Trajectory]) -> float:
+    return float(sum(part.duration for part in parts))
+
+
+def _strays(part: ruckig.Trajectory, ends: Floats) -> bool:
+    """Return whether a part leaves the box between its ends (2, n)."""
+    spare = MAX_STRAY * np.abs(ends[1] - ends[0]).max()
+    low, high = ends.min(axis=0) - spare, ends.max(axis=0) + spare
+    extremes = zip(part.position_extrema, low, high, strict=True)
+    return any(one.min < lower or one.max > upper for one, lower, upper in extremes)

@@ -14,7 +14,7 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.manipulation.collision import CollisionChecker
 
 BRANCH = 0.5  # [rad] or [m] of the joint that moves most, of a branch of a tree
-SHORTCUTS = 80
+SHORTCUTS = 40
 TIME_LIMIT_S = 2.0
 
 NoPathCause = Literal["limits", "start", "goal", "time"]
