@@ -21,7 +21,7 @@ from gigabrain_zenoh.host.terminal import READ_BYTES
 from gigabrain_zenoh.testing.processes import GIGABRAIN
 from gigabrain_zenoh.testing.waiting import until
 from tests.system.servos import emulated_arm
-from tests.unit.drivers.feetech import FOLDER, OPTIONS, ROBOT
+from tests.unit.drivers.feetech import FOLDER, OPTIONS, ROBOT, FreeArm
 
 MOUNTED = [2100, 1900, 3900, 300, 2048, 1500]  # ticks of the encoders where the joints are at 0
 ONE_DEGREE = 0.0175
@@ -30,8 +30,8 @@ ONE_DEGREE = 0.0175
 class Calibration:
     """The command in a terminal, and the arm beside it."""
 
-    def __init__(self, arm: FeetechArm, file: Path) -> None:
-        self.arm, self.file = arm, file
+    def __init__(self, arm: FeetechArm, body: FreeArm, file: Path) -> None:
+        self.arm, self.body, self.file = arm, body, file
         self.text = ""
         self.reads: Counter[int] = Counter()  # of positions, by servo
         self._execute = arm.bus.execute
@@ -66,7 +66,7 @@ class Calibration:
 
     async def move(self, share: float) -> None:
         """Move all joints to a share of their range, and wait until that was looked at."""
-        for joint, its in zip(ROBOT.joints, self.arm.joints.values(), strict=True):
+        for joint, its in zip(ROBOT.joints, self.body.free.values(), strict=True):
             its.position = joint.lower + share * (joint.upper - joint.lower)
             its.velocity = 0.0
         before = self.reads.copy()
@@ -87,11 +87,11 @@ class Calibration:
 async def calibrating(folder: Path) -> AsyncIterator[Calibration]:
     """A new arm, whose servos keep nothing, and the command that begins to calibrate it."""
     port, file = folder / "base", folder / "so101.yaml"
-    async with emulated_arm(port, replace(OPTIONS, calibration=str(file))) as arm:
+    async with emulated_arm(port, replace(OPTIONS, calibration=str(file))) as (arm, body):
         servos = [ServoModel(n, centre=at) for n, at in enumerate(MOUNTED, 1)]
         arm.servos = dict(zip(arm.servos, servos, strict=True))
         arm.bus.servos = servos
-        it = Calibration(arm, file)
+        it = Calibration(arm, body, file)
         await it.run(port)
         try:
             yield it
@@ -103,7 +103,7 @@ async def begin(it: Calibration, consent: str) -> None:
     await it.answer("Hold the arm")
     await until(lambda: "to the middle of its range" in it.text)
     assert not any(servo[feetech.TORQUE] for servo in it.arm.servos.values())
-    for joint, its in zip(ROBOT.joints, it.arm.joints.values(), strict=True):
+    for joint, its in zip(ROBOT.joints, it.body.free.values(), strict=True):
         its.position = (joint.lower + joint.upper) / 2
     await asyncio.sleep(0.1)
     await it.answer("to the middle of its range")
@@ -124,7 +124,7 @@ async def test_an_arm_that_was_moved_by_hand_can_be_driven(tmp_path: Path) -> No
         await it.answer("Go on, and press Enter")
         assert await it.ended() == 0, it.text
         calibration = load_calibration(it.file, "so101", ROBOT.joints, OPTIONS.servos)
-        for (name, servo), joint in zip(it.arm.servos.items(), it.arm.joints.values(), strict=True):
+        for (name, servo), joint in zip(it.arm.servos.items(), it.body.free.values(), strict=True):
             at = calibration.joints[name].to_radians(servo[feetech.POSITION])
             assert at == pytest.approx(joint.position, abs=ONE_DEGREE)
             servo.power_on()

