@@ -21,7 +21,8 @@ from gigabrain_zenoh.errors import BodyLost, ConfigError, UnknownName, unknown
 
 PREFIX = "robot/"
 COMMAND_OF_SERVICE = {  # services that people take for topics, and the commands that call them
-    "estop": "estop", "release": "release", "enable": "enable", "goal": "goto X Y",
+    "estop": "estop", "release": "release", "enable": "enable", "limp": "arm limp",
+    "goal": "goto X Y",
     "mission": "mission FILE", "task_change": "task", "map_save": "map save",
     "param": "param", "audit_log": "audit", "describe": "node info", "sim_change": "world",
     "map_list": "map list", "map_load": "map load NAME", "zones_change": "zone",

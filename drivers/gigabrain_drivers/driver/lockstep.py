@@ -57,7 +57,7 @@ class Lockstep:
         """
         self._exposed.update(dict.fromkeys(exposed, tick))
         self._tick, self._basis, self._newest = tick - tick % self._period, basis, tick
-        self._wanted = tick - REPEAT_TICKS + 1  # it need not say the same in every tick
+        self._wanted = max(1, tick - REPEAT_TICKS + 1)  # it need not say the same in every tick
         self._wake.clear()
 
     def command(self, command: CmdVel | JointCommand) -> None:

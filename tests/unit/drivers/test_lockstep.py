@@ -48,9 +48,9 @@ def test_a_verdict_that_misses_a_part_of_the_brain_does_not_count() -> None:
     steps.begin(1, 1)
     steps.command(command(1, 1))
     starting, missing = cause("starting"), cause("perception_silent")
-    steps.verdict(SafetyState(verdict="stop", basis=1, causes=(starting, missing)))
+    steps.verdict(SafetyState(verdict="stop", tick=1, basis=1, causes=(starting, missing)))
     assert not steps.complete
-    steps.verdict(SafetyState(verdict="stop", basis=1, causes=(starting,)))
+    steps.verdict(SafetyState(verdict="stop", tick=1, basis=1, causes=(starting,)))
     assert steps.complete
 
 
@@ -76,12 +76,22 @@ def test_a_commander_that_looks_itself_needs_no_basis() -> None:
     assert steps.complete
 
 
+def test_the_first_tick_waits_for_safety_though_no_scan_is_to_come() -> None:
+    steps = Lockstep()
+    steps.begin(1, 0)
+    steps.command(command(1, 0))
+    assert not steps.complete
+    steps.verdict(SafetyState(verdict="ok", tick=1))
+    assert steps.complete
+
+
 async def test_the_answer_wakes_the_one_who_waits() -> None:
     steps = Lockstep()
     steps.begin(1, 0)
     waiting = asyncio.ensure_future(steps.wait(10.0))
     await asyncio.sleep(0)
     steps.command(command(1, 0))
+    steps.verdict(SafetyState(verdict="ok", tick=1))
     assert await waiting
     assert steps.timeouts == 0
 
