@@ -10,7 +10,8 @@ def test_every_topic_and_service_has_somebody_who_may_use_it() -> None:
     only_the_robot = {topic.key for topic in TOPICS if not topic.publishers}
     assert only_the_robot == {
         "robot/scan", "robot/imu", "robot/state", "robot/body", "robot/arm_model", "robot/image",
-        "robot/depth", "robot/camera", "robot/safety", "robot/audit", "robot/sim_scene", "robot/sim_poses",
+        "robot/depth", "robot/camera", "robot/safety", "robot/audit", "robot/sim_scene",
+        "robot/sim_poses",
     }  # fmt: skip
     assert [service.key for service in SERVICES if not service.callers] == []
 
