@@ -1,14 +1,27 @@
 """The gate's part for joints: which commands count, and where each joint goes next.
 
-In every case but a live command of the commander, joints come to rest and are held there.
+In every case but a live command of the commander, joints come to rest and are held there. They move
+no faster in a direction than safety's newest verdict allows, and not at all by an old one.
 """
+
+import math
 
 from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import JointDescription
 from gigabrain_schemas.brain import JointCommand
+from gigabrain_schemas.safety import JointCap
 from gigabrain_zenoh.gate.state import GateConfig, GateState, Tick
-from gigabrain_zenoh.geometry.joints import JointMotion, accelerated, approach, braked, frozen
+from gigabrain_zenoh.geometry.joints import (
+    ANY_SPEED,
+    JointMotion,
+    SpeedBand,
+    accelerated,
+    approach,
+    braked,
+    frozen,
+)
 
+VERDICT_TICKS = 4  # 80 ms, the oldest verdict of safety by which joints move
 LIVE_TICKS = 2  # 40 ms after a command, joints that get no other brake
 TOLERANCE = 1e-6  # [rad] or [m], of positions at a limit
 
@@ -51,18 +64,34 @@ def output(config: GateConfig, state: GateState, calm: bool) -> tuple[JointMotio
         return tuple(map(frozen, now))
     command = state.joint_command
     live = command and state.tick - state.joint_tick < LIVE_TICKS
-    if state.mode != "enabled" or not live or not state.safety or calm or state.late:
+    safety = state.safety
+    known = safety is not None and state.tick - safety.tick <= VERDICT_TICKS
+    if state.mode != "enabled" or not live or not known or calm or state.late:
         command = None
+    bands = _bands(safety.joints if safety else ())
     return tuple(
-        _step(joint, motion, command) for joint, motion in zip(config.joints, now, strict=False)
+        _step(joint, motion, command, bands.get(joint.name, ANY_SPEED))
+        for joint, motion in zip(config.joints, now, strict=False)
     )
 
 
-def _step(joint: JointDescription, now: JointMotion, command: JointCommand | None) -> JointMotion:
+def _bands(caps: tuple[JointCap, ...]) -> dict[str, SpeedBand]:
+    return {
+        cap.name: SpeedBand(
+            -math.inf if cap.fall is None else -cap.fall,
+            math.inf if cap.rise is None else cap.rise,
+        )
+        for cap in caps
+    }
+
+
+def _step(
+    joint: JointDescription, now: JointMotion, command: JointCommand | None, band: SpeedBand
+) -> JointMotion:
     if command is None or joint.name not in command.name:
         return braked(now, joint, TICK_S)
     index = command.name.index(joint.name)
     velocity = command.velocity[index] if command.velocity else 0.0
     if not command.position:
-        return accelerated(now, velocity, joint, TICK_S)
-    return approach(now, JointMotion(command.position[index], velocity), joint, TICK_S)
+        return accelerated(now, velocity, joint, TICK_S, band)
+    return approach(now, JointMotion(command.position[index], velocity), joint, TICK_S, band)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import msgspec
 
@@ -33,8 +34,22 @@ def braked(now: JointMotion, limits: JointDescription, dt: float) -> JointMotion
     return _moved(now, math.copysign(slower, now.velocity), limits, dt)
 
 
+class SpeedBand(NamedTuple):
+    """The velocities that a joint may have now [rad/s] or [m/s]."""
+
+    lowest: float
+    highest: float
+
+
+ANY_SPEED = SpeedBand(-math.inf, math.inf)
+
+
 def approach(
-    now: JointMotion, target: JointMotion, limits: JointDescription, dt: float
+    now: JointMotion,
+    target: JointMotion,
+    limits: JointDescription,
+    dt: float,
+    band: SpeedBand = ANY_SPEED,
 ) -> JointMotion:
     """Return where a joint gets within `dt` [s] on the way to where `target` is then.
 
@@ -43,15 +58,23 @@ def approach(
     behind = target.position - target.velocity * dt - now.position
     catch_up = min(abs(behind) / dt, braking_speed(abs(behind), limits.max_acceleration, dt))
     wanted = target.velocity + math.copysign(catch_up, behind)
-    return accelerated(now, wanted, limits, dt)
+    return accelerated(now, wanted, limits, dt, band)
 
 
 def accelerated(
-    now: JointMotion, velocity: float, limits: JointDescription, dt: float
+    now: JointMotion,
+    velocity: float,
+    limits: JointDescription,
+    dt: float,
+    band: SpeedBand = ANY_SPEED,
 ) -> JointMotion:
-    """Return where a joint gets within `dt` [s] that should move at `velocity`."""
+    """Return where a joint gets within `dt` [s] that should move at `velocity`.
+
+    A joint that is faster than `band` allows brakes at its greatest acceleration.
+    """
     change = limits.max_acceleration * dt
     velocity = max(-limits.max_speed, min(limits.max_speed, velocity))
+    velocity = max(band.lowest, min(band.highest, velocity))
     velocity = max(now.velocity - change, min(now.velocity + change, velocity))
     return _moved(now, velocity, limits, dt)
 

@@ -46,12 +46,16 @@ JointPosition = Annotated[float, Meta(ge=-1e9, le=1e9)]  # [rad] or [m]; a wheel
 JointSpeed = Annotated[float, Meta(ge=-10_000.0, le=10_000.0)]  # [rad/s] or [m/s]
 Effort = Annotated[float, Meta(ge=-1e5, le=1e5)]  # [N m] or [N]
 Temperature = Annotated[float, Meta(ge=-273.15, le=1000.0)]  # [deg C]
+BoxSide = Annotated[float, Meta(ge=0.001, le=20.0)]  # [m]
+Clearance = Annotated[float, Meta(ge=0.002, le=0.5)]  # [m]
 Key = Annotated[str, Meta(pattern=r"^\w+(/\w+)*$", max_length=128)]
 
 
 MOST_JOINTS = 128
 MOST_ARM_JOINTS = 32
 MOST_MODEL_CHARACTERS = 262_144
+MOST_KEEP_OUT = 16
+FOLLOW_SHARE = 0.06  # of a joint's range, by which it may be off what was sent
 LEAST_AREA = 1e-4  # [m2]
 LEAST_SPEED = 0.001  # [m/s], [rad/s]
 
@@ -99,10 +103,29 @@ class JointDescription(Record, frozen=True, kw_only=True):
     gains: JointGains = JointGains()
     path_tolerance: Tolerance = 0.3  # [rad] or [m], off a trajectory on the way; 0: not checked
     goal_tolerance: Tolerance = 0.05  # [rad] or [m], off its end at rest; 0: not checked
+    max_current: Annotated[float, Meta(ge=0.0, le=10_000.0)] = 0.0  # [A]; 0: not known
+    follow: Annotated[float, Meta(gt=0.0, le=10.0)] | None = None
+    # [rad] or [m], measured position off what was sent; None: FOLLOW_SHARE of its range
 
     def __post_init__(self) -> None:
         if self.upper <= self.lower:
             raise ValueError(f"{self.name}: upper must be larger than lower")
+        if self.follow is not None and self.follow > (self.upper - self.lower) / 4:
+            raise ValueError(f"{self.name}: follow must not be more than a quarter of its range")
+
+    @property
+    def follow_error(self) -> float:
+        """How far it may be off what was sent before safety speaks up [rad] or [m]."""
+        return self.follow or FOLLOW_SHARE * (self.upper - self.lower)
+
+
+class KeepOut(Record, frozen=True, kw_only=True):
+    """A box that no part of the arm may enter, in the frame of the arm's model."""
+
+    name: Name
+    center: tuple[Offset, Offset, Offset]  # [m]
+    size: tuple[BoxSide, BoxSide, BoxSide]  # [m], along its own x, y and z
+    yaw: MountingAngle = 0.0  # [rad]
 
 
 class Arm(Record, frozen=True, kw_only=True):
@@ -113,6 +136,16 @@ class Arm(Record, frozen=True, kw_only=True):
     # [rad] or [m], a posture in which it is out of the way; one number for each joint
     rate_hz: Annotated[float, Meta(ge=50.0, le=200.0)] = 50.0  # of control's commands to its joints
     goal_time: Sustain = 1.0  # [s] after the end of a trajectory until its joints are there
+    floor: Annotated[float, Meta(ge=-10.0, le=10.0)] | None = None
+    # [m], height of the floor or table in the frame of its model; None: it cannot reach one
+    keep_out: Annotated[tuple[KeepOut, ...], Meta(max_length=MOST_KEEP_OUT)] = ()
+    voltage: tuple[Volts, Volts] | None = None  # [V], least and greatest of its supply
+
+    def __post_init__(self) -> None:
+        if len({box.name for box in self.keep_out}) < len(self.keep_out):
+            raise ValueError("keep_out: each box needs a name of its own")
+        if self.voltage and self.voltage[1] <= self.voltage[0]:
+            raise ValueError("voltage: expected the least and the greatest, in this order")
 
 
 class Battery(Record, frozen=True, kw_only=True):
@@ -265,6 +298,9 @@ class Thresholds(Record, frozen=True, kw_only=True):
     stop_margin: Margin = 0.08  # [m], kept free in front of a stopped robot
     resume_margin: Margin = 0.10  # [m], more than the stop zone before the body may go on
     side_margin: Margin = 0.03  # [m], kept free beside the body as it moves on
+    joint_sustain: Sustain = 0.5  # [s], a joint is off what was sent; it stops and latches
+    effort_sustain: Sustain = 1.0  # [s] at its greatest effort or current; it stops and latches
+    arm_clearance: Clearance = 0.005  # [m], kept free between the arm and what it must not touch
 
     def __post_init__(self) -> None:
         if not self.battery_stop <= self.battery_return <= self.battery_warn:

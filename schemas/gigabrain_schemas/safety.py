@@ -16,6 +16,7 @@ from gigabrain_schemas.base import (
     SpeedCap,
     Text,
 )
+from gigabrain_schemas.body import MOST_ARM_JOINTS
 
 Figures = Annotated[dict[Key, NonNegative], Meta(max_length=256)]
 Data = Annotated[str, Meta(max_length=4096)]
@@ -34,11 +35,21 @@ class SpeedCaps(Record, frozen=True, kw_only=True):
     turn_right: SpeedCap | None = None  # [rad/s]
 
 
+class JointCap(Record, frozen=True, kw_only=True):
+    """Greatest speeds of a joint each way now, away from and towards what it must not touch."""
+
+    name: Name
+    rise: SpeedCap | None = None  # [rad/s] or [m/s]; None for no limit
+    fall: SpeedCap | None = None  # [rad/s] or [m/s], of a position that decreases
+
+
 class SafetyState(Message, frozen=True, kw_only=True):
     """The verdict of the safety process. The gate obeys it, and stops when it falls silent."""
 
     verdict: Literal["ok", "slow", "stop"]
     caps: SpeedCaps = SpeedCaps()
+    joints: Annotated[tuple[JointCap, ...], Meta(max_length=MOST_ARM_JOINTS)] = ()
+    # of those that have a limit
     causes: Causes = ()  # why the verdict is what it is
     warnings: Causes = ()  # become causes if no one acts
 

@@ -6,6 +6,7 @@ import pytest
 
 from gigabrain_schemas.body import JointDescription
 from gigabrain_schemas.brain import JointCommand
+from gigabrain_schemas.safety import JointCap, SafetyState
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.geometry.joints import JointMotion
 from gigabrain_zenoh.geometry.limits import ZERO
@@ -28,10 +29,17 @@ class ArmRig(Rig):
         super().__init__(joints=JOINTS)
         self.measured, self.limp = START, False
 
+        self.caps: tuple[JointCap, ...] = ()
+        self.silent = False  # safety
+
     def arm_tick(self, count: int = 1) -> None:
         for _ in range(count):
             self.feed(gate.Tick(ZERO, joints=self.measured, limp=self.limp))
-            self.safety()
+            if not self.silent:
+                now = self.state.tick
+                self.feed(
+                    gate.Safety(SafetyState(verdict="ok", joints=self.caps, boot=BOOT, tick=now))
+                )
 
     def aim(self, source: str = "script", **fields: Any) -> gate.Outcome:
         self.seq += 1
@@ -231,3 +239,52 @@ def test_velocities_of_the_base_do_not_live_on_while_joints_are_commanded() -> N
         rig.aim(position=(0.3,))
     assert rig.state.output == ZERO
     assert rig.mode == "enabled"
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+@pytest.mark.parametrize("fields", [{"velocity": (1.0,)}, {"position": (1.0,)}])
+def test_a_joint_keeps_to_its_cap_one_way_and_is_free_the_other(
+    way: float, fields: dict[str, tuple[float]]
+) -> None:
+    there = {key: (way * value[0],) for key, value in fields.items()}
+    back = {key: (-way * value[0],) for key, value in fields.items()}
+    rig = enabled()
+    rig.caps = (JointCap(name="lift", **({"rise": 0.1} if way > 0 else {"fall": 0.1})),)
+    rig.follow(20, **there)
+    assert rig.state.joints[0].velocity == pytest.approx(0.1 * way)
+    rig.follow(20, **back)
+    assert rig.state.joints[0].velocity * way < -0.5
+
+
+def test_a_joint_that_is_faster_than_its_new_cap_brakes_at_its_acceleration() -> None:
+    rig = enabled()
+    rig.follow(20, velocity=(1.0,))
+    rig.caps = (JointCap(name="lift", rise=0.0),)
+    rig.follow(1, velocity=(1.0,))  # the verdict comes with this tick
+    speeds = [rig.state.joints[0].velocity]
+    for _ in range(5):
+        rig.follow(1, velocity=(1.0,))
+        speeds.append(rig.state.joints[0].velocity)
+    assert speeds == pytest.approx([0.8, 0.6, 0.4, 0.2, 0.0, 0.0])
+
+
+def test_a_cap_of_one_joint_leaves_the_others_alone() -> None:
+    rig = enabled()
+    rig.caps = (JointCap(name="lift", rise=0.0, fall=0.0),)
+    rig.follow(10, name=("lift", "grip"), velocity=(0.5, 0.02))
+    assert rig.state.joints[0] == JointMotion(0.3)
+    assert rig.state.joints[1].velocity == pytest.approx(0.02)
+
+
+def test_joints_do_not_move_by_a_verdict_older_than_80_ms() -> None:
+    rig = enabled()
+    rig.follow(20, velocity=(0.5,))
+    rig.silent = True
+    rig.follow(4, velocity=(0.5,))
+    assert rig.state.joints[0].velocity == pytest.approx(0.5)
+    rig.follow(1, velocity=(0.5,))
+    assert rig.state.joints[0].velocity == pytest.approx(0.3)
+    assert rig.mode == "enabled"
+    rig.silent = False
+    rig.follow(10, velocity=(0.5,))
+    assert rig.state.joints[0].velocity == pytest.approx(0.5)
