@@ -19,6 +19,12 @@ def _causes(*rows: tuple[str, str, str], latching: bool = False) -> dict[str, Ca
 
 _CHECK_LIDAR = "check the lidar's power and cable"
 _MAKE_ROOM = "turn or back away, or clear the way"
+_MOVE_AWAY = "move the arm away from it, or clear the way"
+_LOOK_AT_SERVO = "check that servo and its cable, then release the robot"
+_FREE_ARM = (
+    "find what holds it and free it; `gigabrain arm limp` lets go of the joints; "
+    "then release the robot"
+)
 _CLOSE_PROGRAMS = "close programs that need not run on it"
 
 CAUSES = _causes(
@@ -99,7 +105,34 @@ CAUSES = _causes(
     ("zone_right", "obstacle to the right of the body", _MAKE_ROOM),
     ("zone_turn_left", "obstacle where the body would turn left", _MAKE_ROOM),
     ("zone_turn_right", "obstacle where the body would turn right", _MAKE_ROOM),
+    (
+        "arm_model",
+        "safety has no model of the arm",
+        "correct the model beside the body's file, and start the driver again",
+    ),
+    (
+        "joint_frozen",
+        "a joint repeats the same values although it should move",
+        "check the cable of the servos, then restart the driver or move the joint by hand",
+    ),
+    ("arm_self", "parts of the arm are too near each other", "move them apart"),
+    ("arm_floor", "the arm is too near the floor", _MOVE_AWAY),
+    ("arm_keep_out", "the arm is too near a box to keep out of", _MOVE_AWAY),
 ) | _causes(
+    ("joint_lost", "a joint is no longer reported", _LOOK_AT_SERVO),
+    ("joint_jump", "a joint jumped farther than it can move", _LOOK_AT_SERVO),
+    ("joint_off", "a joint is not where it was sent", _FREE_ARM),
+    ("joint_overload", "a joint has been at its greatest effort for too long", _FREE_ARM),
+    (
+        "voltage_low",
+        "the supply's voltage is too low for the servos",
+        "check the power supply and its cable, then release the robot",
+    ),
+    (
+        "voltage_high",
+        "the supply's voltage is too high for the servos",
+        "unplug it, take the right power supply, then release the robot",
+    ),
     ("battery_empty", "the battery is empty", "charge it, then release the robot"),
     ("motor_hot", "a motor is too hot", "let it cool, then release the robot"),
     (

@@ -11,11 +11,12 @@ from typing import Any
 import psutil
 
 from gigabrain_schemas.base import Cause, Message
-from gigabrain_schemas.body import Body, BodyDescription, RobotState
+from gigabrain_schemas.body import Arm, ArmModel, Body, BodyDescription, RobotState
 from gigabrain_schemas.brain import CmdVel, JointCommand
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.sensors import Imu
 from gigabrain_schemas.topics import (
+    ARM_MODEL,
     BODY,
     CMD_VEL,
     DEPTH,
@@ -37,11 +38,13 @@ from gigabrain_schemas.topics import (
 from gigabrain_schemas.vision import DepthImage
 from gigabrain_zenoh.bus.bus import Bus, Latest
 from gigabrain_zenoh.bus.freshness import LEAD_TICKS, PreviousTick
+from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate.causes import in_words
 from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.geometry.stopping import REPEAT_TICKS, scan_limit_ns
 from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.runtime.heartbeat import Progress
+from gigabrain_zenoh.safety.arm_motion import ArmShape
 from gigabrain_zenoh.safety.cameras import Picture, Pictures, depth_cameras
 from gigabrain_zenoh.safety.health import SYSTEMS, Bases, Host, horizontal
 from gigabrain_zenoh.safety.step import SafetyInputs, SafetyMemory, step
@@ -63,7 +66,9 @@ async def run(bus: Bus, ready: Callable[[], None], probe: "HostProbe | None" = N
             return
         before, state = memory, inputs.state
         memory, verdict = step(body.description, memory, inputs)
-        due = state.tick - last_tick >= REPEAT_TICKS or state.boot != before.boot
+        # joints do not move by a verdict that is some ticks old
+        repeat = 1 if body.description.joints else REPEAT_TICKS
+        due = state.tick - last_tick >= repeat or state.boot != before.boot
         new = memory.field.basis != before.field.basis
         if due or new or _differs(verdict, last):
             _log_changes(state, last, verdict)
@@ -80,7 +85,7 @@ async def run(bus: Bus, ready: Callable[[], None], probe: "HostProbe | None" = N
 
 
 def _differs(now: SafetyState, before: SafetyState) -> bool:
-    return (now.causes, now.caps) != (before.causes, before.caps)
+    return (now.causes, now.caps, now.joints) != (before.causes, before.caps, before.joints)
 
 
 def _log_changes(state: RobotState, before: SafetyState, now: SafetyState) -> None:
@@ -175,6 +180,8 @@ class InputCollector:
         self._commands = Latest(CMD_VEL, bus.clock, bus.time)  # the brain's
         self._joint_commands = Latest(JOINT_CMD, bus.clock, bus.time)
         self._command_key, self._unsubscribe = CMD_VEL.key, _nothing
+        self._shape: tuple[ArmModel, Arm | None, ArmShape | None, str] | None = None
+        self._arm_models = bus.latest(ARM_MODEL)
         self.bodies = bus.latest(BODY, self._on_body)
         self._states = bus.latest(STATE, on_new)
         self._scans = bus.latest(SCAN, on_new)
@@ -195,6 +202,7 @@ class InputCollector:
             return None
         commander = state.gate.commander
         received = self._by_commander.get(commander)
+        arm, arm_problem = self._arm(body)
         return SafetyInputs(
             state=state,
             scan=self._scans.current,
@@ -208,7 +216,19 @@ class InputCollector:
             echo_ages=self._echo_ages(commander),
             shock=self._shock(state),
             host=self._probe(self._bus.clock.now_ns()),
+            arm=arm,
+            arm_problem=arm_problem,
         )
+
+    def _arm(self, body: BodyDescription) -> tuple[ArmShape | None, str]:
+        """Return the shapes of the body's arm, or why there are none; compiled once a model."""
+        model = self._arm_models.current
+        if body.arm is None or model is None:
+            return None, "no model of the arm has come yet" if body.arm else ""
+        known = self._shape
+        if known is None or known[:2] != (model, body.arm):
+            known = self._shape = (model, body.arm, *arm_shape(model.mjcf, body))
+        return known[2:]
 
     def _newest_pictures(self) -> Pictures:
         newest = ((name, one.current, one.age_ns()) for name, one in self._pictures.items())
@@ -306,6 +326,18 @@ class InputCollector:
         self._command_key, self._unsubscribe = topic.key, _nothing
         if topic.key != CMD_VEL.key:
             self._unsubscribe = self._bus.subscribe(topic, self._on_command)
+
+
+def arm_shape(mjcf: str, body: BodyDescription) -> tuple[ArmShape | None, str]:
+    """Return the shapes of an arm, or the problem with them; MuJoCo is imported here alone."""
+    try:
+        from gigabrain_zenoh.safety.arm_shape import MujocoArm
+
+        return MujocoArm(mjcf, body), ""
+    except ImportError as error:
+        return None, f"safety of an arm needs MuJoCo: {error}"
+    except ConfigError as error:
+        return None, str(error)
 
 
 def _nothing() -> None:

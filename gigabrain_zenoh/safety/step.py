@@ -11,6 +11,8 @@ from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.geometry.limits import NO_CAPS, ZERO
 from gigabrain_zenoh.geometry.pose import PoseHistory, velocity_of
 from gigabrain_zenoh.geometry.stopping import scan_limit_ns
+from gigabrain_zenoh.safety.arm import ArmMonitor
+from gigabrain_zenoh.safety.arm_motion import ArmShape
 from gigabrain_zenoh.safety.cameras import NO_PICTURES, Pictures
 from gigabrain_zenoh.safety.catalogue import MAX_STEP_TICKS, cause
 from gigabrain_zenoh.safety.health import (
@@ -43,6 +45,8 @@ class SafetyInputs(Struct, frozen=True, kw_only=True):
     echo_ages: tuple[int, ...] = ()  # of the commander's commands since the last verdict [ticks]
     shock: float = 0.0  # largest horizontal acceleration since then [m/s2]
     host: Host = Host()
+    arm: ArmShape | None = None  # of a body with an arm, by its model
+    arm_problem: str = ""  # why there is none
 
 
 class SafetyMemory(Struct, frozen=True, kw_only=True):
@@ -59,6 +63,7 @@ class SafetyMemory(Struct, frozen=True, kw_only=True):
     progress: PipelineProgress = PipelineProgress()
     history: PoseHistory = PoseHistory()
     field: ProtectiveField = ProtectiveField()
+    arm: ArmMonitor = ArmMonitor()
 
 
 def step(
@@ -74,10 +79,12 @@ def step(
     caps = memory.field.caps(body)
     if slow:
         caps = halved(body, caps)
+    held = memory.arm.limits.causes
     verdict = SafetyState(
-        verdict="stop" if stop else "slow" if caps != NO_CAPS else "ok",
+        verdict="stop" if stop else "slow" if held or caps != NO_CAPS else "ok",
         caps=caps,
-        causes=(*stop, *slow, *memory.field.causes),
+        joints=memory.arm.limits.caps,
+        causes=(*stop, *slow, *memory.field.causes, *held),
         warnings=(*memory.power.warnings(limits, state), *inputs.host.warnings(limits)),
     )
     return replace(memory, caps=caps), verdict
@@ -86,7 +93,8 @@ def step(
 def _observe(body: BodyDescription, memory: SafetyMemory, inputs: SafetyInputs) -> SafetyMemory:
     """Update every monitor."""
     state, limits, command = inputs.state, body.thresholds, inputs.command
-    elapsed = min(max(0, state.tick - memory.tick), MAX_STEP_TICKS)
+    passed = max(0, state.tick - memory.tick)
+    elapsed = min(passed, MAX_STEP_TICKS)
     history = memory.history.then(state)
     latency = memory.latency.then(body, state, inputs.scan, history, elapsed)
     late_ticks = latency.late_ticks(body)
@@ -109,6 +117,7 @@ def _observe(body: BodyDescription, memory: SafetyMemory, inputs: SafetyInputs) 
         progress=memory.progress.then(inputs.bases, elapsed),
         history=history,
         field=memory.field.then(body, inputs.scan, state, history, motion, inputs.pictures),
+        arm=memory.arm.then(body, state, elapsed, passed, inputs.arm, inputs.arm_problem),
     )
 
 
@@ -125,6 +134,7 @@ def _stop_causes(
         *memory.attitude.causes,
         *memory.latency.stop_causes(body),
         *memory.tracking.causes(body),
+        *memory.arm.causes(body),
     )
 
 

@@ -11,7 +11,7 @@ from gigabrain_drivers.driver.robot import Run
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.clock import Clock
 
-HOME = (0.0, -1.7, 1.5, 0.6, 0.0, 0.0)
+HOME = (0.0, -1.7, 1.4, 0.6, 0.0, 0.0)
 NAMES = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 SAG = 0.03  # [rad], of a servo that is held by its gain alone
 

@@ -33,6 +33,7 @@ ONLY_IN = {
         "gigabrain_zenoh/qa/bench/eyes_worlds.py",
         "gigabrain_zenoh/qa/bench/jackal.py",
         "gigabrain_zenoh/qa/train/",
+        "gigabrain_zenoh/safety/arm_shape.py",
     ),
 }
 

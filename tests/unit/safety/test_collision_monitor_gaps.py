@@ -10,8 +10,8 @@ from msgspec.structs import replace
 from gigabrain_drivers.driver.robot import RobotFile
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import BodyDescription, Thresholds
-from gigabrain_schemas.topics import BODY as BODY_TOPIC
 from gigabrain_schemas.topics import (
+    ARM_MODEL,
     CMD_VEL,
     HEALTH,
     IMAGE,
@@ -27,6 +27,7 @@ from gigabrain_schemas.topics import (
     STATE,
     WORLD,
 )
+from gigabrain_schemas.topics import BODY as BODY_TOPIC
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.geometry.stopping import brakes
 from gigabrain_zenoh.safety import node as safety
@@ -37,7 +38,8 @@ from tests.unit.gate.rig import driving
 from tests.unit.safety.patrol import BODY, Patrol
 
 MONITORED = (
-    BODY_TOPIC, STATE, SCAN, CMD_VEL, JOINT_CMD, IMU, IMAGE, POSE, MAP, HEALTH, LOG, WORLD, INTENT,
+    ARM_MODEL, BODY_TOPIC, STATE, SCAN, CMD_VEL, JOINT_CMD, IMU, IMAGE, POSE, MAP, HEALTH, LOG,
+    WORLD, INTENT,
 )  # fmt: skip
 AHEAD = Velocity(linear_x=0.2)
 

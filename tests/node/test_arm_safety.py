@@ -1,0 +1,238 @@
+"""A hostile commander and an arm in MuJoCo: by the physics, it comes to touch nothing."""
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import msgspec
+import mujoco
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from gigabrain_drivers.driver.catalog import load_robot, robot_path
+from gigabrain_drivers.driver.process import commanded_joints
+from gigabrain_drivers.driver.robot import Run
+from gigabrain_drivers.sim.body import MujocoOptions, sim_body
+from gigabrain_drivers.sim.driver import STEPS_PER_TICK, state_message
+from gigabrain_drivers.sim.physics import Simulation
+from gigabrain_drivers.sim.scene import ROBOT
+from gigabrain_drivers.sim.worlds import load_world
+from gigabrain_schemas.body import BodyDescription, KeepOut
+from gigabrain_schemas.brain import JointCommand
+from gigabrain_zenoh.gate import gate
+from gigabrain_zenoh.geometry.limits import ZERO, limits_of
+from gigabrain_zenoh.safety.arm_shape import MujocoArm
+from gigabrain_zenoh.safety.step import SafetyInputs, SafetyMemory, step
+
+BOOT, LATE_TICKS = 7, 2  # a verdict of safety reaches the gate so many ticks later
+BOXES = (
+    KeepOut(name="shelf", center=(0.32, 0.12, 0.22), size=(0.1, 0.2, 0.02), yaw=0.3),
+    KeepOut(name="post", center=(0.15, -0.22, 0.15), size=(0.04, 0.04, 0.3)),
+)
+FOLDER = robot_path("so101").parent
+MJCF = (FOLDER / "model.xml").read_text()
+REST = 0.05  # [rad/s]
+
+
+class Truth:
+    """The arm's shapes with floor and boxes in a model of their own, posed as the physics is."""
+
+    def __init__(self, body: BodyDescription) -> None:
+        spec = mujoco.MjSpec.from_string(MJCF)
+        solid = {"contype": -1, "conaffinity": -1}
+        spec.worldbody.add_geom(
+            name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 0.1], **solid
+        )
+        assert body.arm
+        for box in body.arm.keep_out:
+            turn = [np.cos(box.yaw / 2), 0, 0, np.sin(box.yaw / 2)]
+            half = [side / 2 for side in box.size]
+            spec.worldbody.add_geom(
+                name=box.name, type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=box.center, quat=turn,
+                **solid,
+            )  # fmt: skip
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        chain = ["base", "shoulder", "upper_arm", "lower_arm", "wrist", "gripper", "jaw"]
+        self._neighbours = {frozenset(pair) for pair in pairwise(chain)}
+
+    def touching(self, posture: NDArray[np.float64]) -> set[tuple[str, str]]:
+        """The pairs in contact that must not be."""
+        self.data.qpos[:] = posture
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_collision(self.model, self.data)
+        found = set()
+        for contact in self.data.contact:
+            a, b = (self._name(geom) for geom in contact.geom)
+            still = {a, b} <= {"base", "table", "shelf", "post"}
+            if contact.dist < 0 and not still and frozenset((a, b)) not in self._neighbours:
+                found.add((a, b))
+        return found
+
+    def _name(self, geom: int) -> str:
+        body = self.model.geom_bodyid[geom]
+        return str(self.model.body(body).name if body else self.model.geom(geom).name)
+
+
+class Rig:
+    """The physics, gate and safety of an arm, a tick at a time, and who commands it."""
+
+    def __init__(self) -> None:
+        robot = load_robot("so101")
+        assert robot.sim
+        assert robot.arm
+        self.body = replace(robot.description(), arm=replace(robot.arm, floor=0.0, keep_out=BOXES))
+        options = msgspec.convert(robot.sim, MujocoOptions)
+        self.simulation = Simulation(
+            sim_body(robot, options, Run(folder=FOLDER)), load_world("arena", 0), 0
+        )
+        assert self.simulation.arm
+        self.arm = self.simulation.arm
+        self.truth, self.touched = Truth(self.body), set[tuple[str, str]]()
+        self.config = gate.GateConfig(limits=limits_of(self.body), joints=self.body.joints)
+        self.gate = gate.GateState(boot=BOOT)
+        self.memory, self.shape = SafetyMemory(), MujocoArm(MJCF, self.body)
+        self.verdicts: list[gate.Safety] = []
+        self.names = tuple(joint.name for joint in self.body.joints)
+        self.seen: set[str] = set()  # codes of causes
+        self.alive = True  # safety
+        for _ in range(60):
+            self.tick()
+        assert self.feed(gate.Release(0)).ok
+        assert self.feed(gate.Enable("script")).ok
+
+    def feed(self, event: gate.Event) -> gate.Outcome:
+        self.gate, outcome = gate.step(self.config, self.gate, event)
+        return outcome
+
+    @property
+    def posture(self) -> NDArray[np.float64]:
+        """Where the joints are by the physics, not by their encoders."""
+        return np.array([self._joint(name).qpos[0] for name in self.names])
+
+    @property
+    def speeds(self) -> NDArray[np.float64]:
+        """How fast the joints are by the physics [rad/s]."""
+        return np.array([self._joint(name).qvel[0] for name in self.names])
+
+    def _joint(self, name: str) -> Any:
+        return self.simulation.data.joint(f"{ROBOT}{name}")
+
+    def tick(self, **command: tuple[float, ...]) -> None:
+        state = state_message(self.simulation, "so101")
+        now = commanded_joints(self.body, state)
+        self.feed(gate.Tick(ZERO, joints=now))
+        tick = self.gate.tick
+        state = replace(state, boot=BOOT, tick=tick, gate=gate.status(self.gate), bumpers=())
+        if self.alive:
+            self.memory, verdict = step(
+                self.body, self.memory, SafetyInputs(state=state, arm=self.shape)
+            )
+            self.seen |= {cause.code for cause in verdict.causes}
+            self.verdicts.append(gate.Safety(replace(verdict, boot=BOOT, tick=tick)))
+        if self.verdicts and self.verdicts[0].state.tick <= tick - LATE_TICKS:
+            self.feed(self.verdicts.pop(0))
+        if command:
+            said = JointCommand(
+                name=self.names, source="script", boot=BOOT, tick=tick, seq=tick, **command
+            )
+            self.feed(gate.JointsCommand(said))
+        self.arm.aim({n: m.position for n, m in zip(self.names, self.gate.joints, strict=True)})
+        for _ in range(STEPS_PER_TICK):
+            self.simulation.advance()
+            self.touched |= self.truth.touching(self.posture)
+
+
+def attack(rig: Rig, targets: int, seed: int) -> None:
+    """Send the arm to random postures, by positions and by greatest velocities, without a pause."""
+    rng = np.random.default_rng(seed)
+    lower, upper = np.array([(joint.lower, joint.upper) for joint in rig.body.joints]).T
+    for _ in range(targets):
+        target = rng.uniform(lower, upper)
+        by_speed = rng.random() < 0.3
+        for _ in range(int(rng.integers(5, 60))):
+            if by_speed:
+                way = np.where(target > rig.posture, 3.0, -3.0)
+                rig.tick(velocity=tuple(way.tolist()))
+            else:
+                rig.tick(position=tuple(target.tolist()))
+        assert not rig.touched, f"at tick {rig.gate.tick}"
+        assert rig.gate.mode == "enabled", rig.gate.causes
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_hostile_commander_brings_the_arm_to_touch_nothing(seed: int) -> None:
+    rig = Rig()
+    attack(rig, 10, seed)
+    assert rig.seen & {"arm_self", "arm_floor", "arm_keep_out"}
+
+
+@pytest.mark.parametrize(
+    ("posture", "code"),
+    [
+        ((0.0, 0.9, 0.9, 0.9, 0.0, 0.0), "arm_floor"),
+        ((0.0, -1.7, 1.69, 1.65, 0.0, 0.0), "arm_self"),
+        ((1.1, 0.8, 0.3, 0.0, 0.0, 0.0), "arm_keep_out"),
+    ],
+)
+def test_it_stops_before_it_touches_says_why_and_can_go_back(
+    posture: tuple[float, ...], code: str
+) -> None:
+    rig = Rig()
+    assert rig.body.arm
+    start = rig.body.arm.home
+    for _ in range(150):
+        rig.tick(position=posture)
+    assert rig.gate.safety
+    assert code in [cause.code for cause in rig.gate.safety.causes]
+    assert np.abs(rig.speeds).max() < REST
+    assert rig.gate.mode == "enabled"
+    for _ in range(150):
+        rig.tick(position=start)
+    assert rig.posture == pytest.approx(np.array(start), abs=0.1)
+    assert not rig.touched
+
+
+def press(rig: Rig) -> None:
+    rig.feed(gate.Estop("somebody"))
+
+
+def kill_control(_: Rig) -> None:
+    """End the commands."""
+
+
+def kill_safety(rig: Rig) -> None:
+    rig.alive = False
+    rig.verdicts.clear()
+
+
+@pytest.mark.parametrize(("end", "ticks"), [(press, 1), (kill_safety, 12), (kill_control, 9)])
+def test_an_estop_or_a_dead_process_holds_a_moving_arm(
+    end: Callable[[Rig], None], ticks: int
+) -> None:
+    """It is sent no farther after so many ticks, and sags by less than 2 degrees from there.
+
+    A servo swings on for as long as its own damping takes; that is not the gate's.
+    """
+    rig = Rig()
+    out = (0.0, 0.0, 0.3, 0.0, 0.0, 0.0)
+    for _ in range(22):
+        rig.tick(position=out)
+    assert np.abs(rig.speeds).max() > 1.0
+    end(rig)
+    for _ in range(ticks):
+        rig.tick(**({"position": out} if end is kill_safety else {}))
+    assert [joint.velocity for joint in rig.gate.joints] == [0.0] * 6
+    sent = [joint.position for joint in rig.gate.joints]
+    for _ in range(75):
+        rig.tick()
+    held = rig.posture
+    assert np.abs(rig.speeds).max() < REST
+    for _ in range(100):
+        rig.tick()
+    assert [joint.position for joint in rig.gate.joints] == sent
+    assert np.degrees(np.abs(rig.posture - held)).max() < 2.0
+    assert rig.gate.mode != "enabled"
+    assert not rig.touched
