@@ -25,7 +25,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from gigabrain_zenoh.cli import bench, bench_eyes, bench_navigation
+from gigabrain_zenoh.cli import bench, bench_eyes, bench_hands, bench_navigation
 from gigabrain_zenoh.qa.bench.barn import BarnResult
 from gigabrain_zenoh.qa.bench.bodies import BodiesResult
 from gigabrain_zenoh.qa.bench.camera_cost import CameraCost, cameras_table
@@ -34,6 +34,7 @@ from gigabrain_zenoh.qa.bench.clutter import ClutterResult
 from gigabrain_zenoh.qa.bench.estop import EstopResult, estop_page
 from gigabrain_zenoh.qa.bench.eyes import EyesResult
 from gigabrain_zenoh.qa.bench.goals import GoalsResult
+from gigabrain_zenoh.qa.bench.hands import HandsResult
 from gigabrain_zenoh.qa.bench.objects import ObjectsResult
 from gigabrain_zenoh.qa.bench.plan import PlanResult
 from gigabrain_zenoh.qa.bench.slam_logs import SlamResult
@@ -51,6 +52,7 @@ DRAWN: dict[str, tuple[type[Struct], Callable[[Any], Any]]] = {  # by the words 
     "estop": (EstopResult, estop_page),
     "eyes": (EyesResult, bench_eyes._eyes_table),
     "goals": (GoalsResult, bench_navigation._goals_table),
+    "hands": (HandsResult, bench_hands._hands_table),
     "objects": (ObjectsResult, bench_eyes._objects_table),
     "plan": (PlanResult, bench._plan_table),
     "slam": (SlamResult, bench_navigation._logs_table),

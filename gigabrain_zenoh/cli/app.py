@@ -119,6 +119,7 @@ COMMANDS = {
     "bench cameras": ("bench_eyes:cameras", "Measure what cameras cost a whole robot."),
     "bench clutter": ("bench_eyes:clutter", "Drive to goals among what a lidar cannot see."),
     "bench objects": ("bench_eyes:objects", "Measure what a robot remembers of things."),
+    "bench hands": ("bench_hands:hands", "Pick things up and put them down with an arm."),
     "bench barn": ("bench_navigation:barn", "Run the BARN and DynaBARN benchmarks."),
     "precompile": ("map:precompile", "Compile mapping and navigation for a quick first start."),
     "schema export": ("topic:export", "Write JSON Schema of every message."),

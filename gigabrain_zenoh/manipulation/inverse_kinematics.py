@@ -103,9 +103,11 @@ class _Found:
 class InverseKinematics:
     """Solves for postures of one arm, deterministically. Not for two threads at once."""
 
-    def __init__(self, arm: ArmKinematics) -> None:
+    def __init__(self, arm: ArmKinematics, spare: float = 0.0) -> None:
+        """Take an arm; `spare` is the share of each joint's range to keep free at its ends."""
         self.arm = arm
-        self._limits = np.stack((arm.lower, arm.upper))
+        free = spare * (arm.upper - arm.lower)
+        self._limits = np.stack((arm.lower + free, arm.upper - free))
         self._table = arm.lower + spread(TABLE_POSTURES, len(arm.joints)) * (arm.upper - arm.lower)
         frames = [arm.forward(posture) for posture in self._table]
         self._places = np.array([frame.position for frame in frames])

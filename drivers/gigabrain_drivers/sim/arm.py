@@ -42,6 +42,11 @@ class SimArm:
         """Where the servos go [rad] or [m], in the order of the description."""
         return tuple(self._aims[name] for name in self.names)
 
+    def truth(self) -> tuple[list[float], list[float]]:
+        """Return positions [rad] or [m] and speeds of the joints, by the physics."""
+        data = self._data
+        return data.qpos[self._places].tolist(), data.qvel[self._dofs].tolist()
+
     def aim(self, positions: Mapping[str, float]) -> None:
         """Have servos go to positions [rad] or [m], and hold them; limp ones hold again."""
         self._aims = {**self._aims, **positions}

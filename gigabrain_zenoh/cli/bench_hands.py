@@ -1,0 +1,67 @@
+"""`gigabrain bench hands`: what an arm picks up and puts down."""
+
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from rich.table import Table
+
+from gigabrain_zenoh.cli.bench import finish
+from gigabrain_zenoh.cli.options import Body, JsonFile, check_names, print_progress
+from gigabrain_zenoh.host import files
+from gigabrain_zenoh.host.bounded import percentile
+from gigabrain_zenoh.qa.judging import table_of
+
+if TYPE_CHECKING:
+    from gigabrain_zenoh.qa.bench.hands import HandsResult, HandsRun
+
+
+def hands(*, seeds: str = "0-99", body: Body = "so101", json: JsonFile = None) -> int:
+    """Have an arm pick things up and put them down elsewhere, judged by the physics.
+
+    Example: gigabrain bench hands --seeds 0-99
+
+    Cubes, cylinders and balls of 2 to 4 cm and 20 to 200 g lie on the table, 10 to 26 cm from the
+    axis of the first joint and 90° to both sides, with frictions of 0.4 and 1. The pose is given.
+    Planner, control and gate are those of a robot. It needs the extra `arm`.
+
+    Args:
+        seeds: Seeds of the things, such as 0-9 or 3,5,20-22.
+    """
+    from gigabrain_zenoh.qa.bench.clutter import seeds_of
+    from gigabrain_zenoh.qa.bench.hands import measure_hands
+
+    check_names([body])
+    files.check_result_path(json)
+    result = measure_hands(seeds_of(seeds), body, print_progress)
+    finish(_hands_table(result), result, json)
+    return 0
+
+
+def _hands_table(result: "HandsResult") -> Table:
+    runs = result.runs
+    table = table_of(
+        "things", "n", "placed", "unreachable", "otherwise", "off p95", title="Picked and placed"
+    )
+    for kind in sorted({run.kind for run in runs}):
+        _add_row(table, kind, [run for run in runs if run.kind == kind])
+    _add_row(table, "all", list(runs))
+    wrong = Counter(run.outcome for run in runs if run.outcome not in ("placed", "unreachable"))
+    seconds = percentile(sorted(run.seconds for run in runs), 0.5) or 0.0
+    planning = sorted(run.planning_s for run in runs)
+    p50, p95 = (percentile(planning, share) or 0.0 for share in (0.5, 0.95))
+    table.caption = (
+        f"{result.body}. {'; '.join(f'{n} {what}' for what, n in wrong.items()) or 'None failed'}. "
+        f"Joints beyond their ranges, by the physics: {sum(run.broken_limits for run in runs)} "
+        f"ticks; fastest {max(run.fastest for run in runs):.0%} of the greatest speed. "
+        f"A thing takes {seconds:.1f} s (p50); planning {p50:.2f} s, p95 {p95:.2f} s."
+    )
+    return table
+
+
+def _add_row(table: Table, name: str, runs: "list[HandsRun]") -> None:
+    outcomes = Counter(run.outcome for run in runs)
+    off = percentile(sorted(run.off_m for run in runs if run.off_m is not None), 0.95)
+    placed, unreachable = outcomes["placed"], outcomes["unreachable"]
+    rest = len(runs) - placed - unreachable
+    counts = (str(one) for one in (len(runs), placed, unreachable, rest))
+    table.add_row(name, *counts, "-" if off is None else f"{off * 100:.1f} cm")

@@ -1,0 +1,286 @@
+"""Plans to pick a thing up and to put it down: phases, each a trajectory or a grip.
+
+    open  hover  descend  close  lift     of a pick
+    traverse  lower  open  retreat        of a place
+
+Whoever carries a plan out checks the grip after `close`: the gripper has to stop short.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from msgspec.structs import replace as changed
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.body import JointDescription
+from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics, Frame
+from gigabrain_zenoh.manipulation.collision import CollisionChecker, Thing
+from gigabrain_zenoh.manipulation.grasps import Grasp, GraspPlanner, NoGrasp
+from gigabrain_zenoh.manipulation.inverse_kinematics import (
+    InverseKinematics,
+    OutOfReach,
+    Reachable,
+    ToolGoal,
+)
+from gigabrain_zenoh.manipulation.joint_trajectory import JointTrajectory, TimeParametrization
+from gigabrain_zenoh.manipulation.planner import NoPath, plan
+
+PhaseName = Literal[
+    "hover", "descend", "close", "lift", "traverse", "lower", "open", "retreat"
+]  # fmt: skip
+LIMIT_SPARE = 0.006  # of a joint's range, at its ends: servos swing a bit too far
+SLOW = 0.35  # of the joints' speeds, near the thing
+SQUEEZE = 0.12  # of the gripper's range, beyond the thing's width
+HELD_SHARE = 0.02  # of the gripper's range, short of its target: something is between the fingers
+LIFT_M = 0.05  # straight up
+PLACE_GAP_M = 0.003  # above what it is put on, when it is let go of
+PLACE_YAWS = 16  # turns of what is put down that are tried
+PLACE_TILT_RAD = math.radians(8)  # by which it may lean when it is let go of
+TRIES = 3  # grasps whose ways are planned
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Phase:
+    """A part of a plan: the arm moves, or the gripper does."""
+
+    name: PhaseName
+    arm: JointTrajectory | None = None
+    gripper: float | None = None  # [rad] or [m], where its joint goes
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pick:
+    """How a thing is picked up."""
+
+    grasp: Grasp
+    phases: tuple[Phase, ...]
+    held: Thing  # in the frame of the tool
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Place:
+    """How a thing that is held is put down."""
+
+    phases: tuple[Phase, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoWay:
+    """Why something cannot be picked up or put down."""
+
+    reason: str  # for people
+
+
+class PickPlacePlanner:
+    """Plans picks and places of one arm. Not for two threads at once."""
+
+    def __init__(self, arm: ArmKinematics) -> None:
+        """Take an arm. Raises ConfigError for one without a gripper that can hold things."""
+        self.arm = arm
+        self._inverse = InverseKinematics(arm, LIMIT_SPARE)
+        self._grasps = GraspPlanner(arm, self._inverse)
+        self._fast = TimeParametrization(arm.joints)
+        self._slow = TimeParametrization([_slowed(joint) for joint in arm.joints])
+        self._opening = arm.opening()
+        assert arm.gripper
+        self._gripper = arm.gripper
+
+    def pick(
+        self, thing: Thing, others: Sequence[Thing], posture: Floats, without: int = 0
+    ) -> Pick | NoWay:
+        """Return how to pick a thing up, or why it cannot be.
+
+        Args:
+            thing: A box, cylinder or sphere, in the frame of the arm's base.
+            others: What is around it: the table, other things.
+            posture: Where the arm is (n,).
+            without: Grasps that have failed already: the next ones are taken.
+        """
+        found = self._grasps.grasps(thing, others, posture)
+        if isinstance(found, NoGrasp):
+            return NoWay(reason=found.reason)
+        if without >= len(found):
+            return NoWay(reason=f"{thing.name}: all {len(found)} ways to grasp it have failed")
+        fault = NoWay(reason=f"{thing.name}: no way to it")
+        for grasp in found[without : without + TRIES]:
+            one = self._pick(grasp, thing, others, posture)
+            if isinstance(one, Pick):
+                return one
+            fault = one
+        return fault
+
+    def place(
+        self, held: Thing, target: Floats, others: Sequence[Thing], posture: Floats, opening: float
+    ) -> Place | NoWay:
+        """Return how to put a held thing down, or why it cannot be.
+
+        Args:
+            held: What is held, in the frame of the tool.
+            target: Where its middle shall be (3,) [m], standing as it was picked up.
+            others: What is around.
+            posture: Where the arm is (n,).
+            opening: Where the gripper's joint goes to let go [rad] or [m].
+        """
+        fault = NoWay(reason=f"{held.name} cannot be put there")
+        checker = CollisionChecker(
+            self.arm, others, held=held, margin=0.001, ignore=_may_touch(held, others)
+        )
+        for tool in self._tools_at(held, target, posture):
+            one = self._place(checker, tool, held, others, posture, opening)
+            if isinstance(one, Place):
+                return one
+            fault = one
+        return fault
+
+    def _pick(
+        self, grasp: Grasp, thing: Thing, others: Sequence[Thing], posture: Floats
+    ) -> Pick | NoWay:
+        around = CollisionChecker(self.arm, [thing, *others], gripper=grasp.opening, margin=0.002)
+        way = plan(around, posture, grasp.before)
+        if isinstance(way, NoPath):
+            return NoWay(reason=f"{thing.name}: {way.reason}")
+        held = self._held(thing, grasp)
+        lifting = CollisionChecker(
+            self.arm, others, held=held, margin=0.001, ignore=_may_touch(held, others)
+        )
+        up = self._lifted(lifting, grasp)
+        phases = (
+            Phase(name="open", gripper=grasp.opening),
+            Phase(name="hover", arm=self._fast.trajectory(way.postures, checker=around)),
+            Phase(name="descend", arm=self._straight(grasp.before, grasp.posture)),
+            Phase(name="close", gripper=self._squeezed(grasp)),
+            Phase(name="lift", arm=self._slow.trajectory(up)),
+        )
+        return Pick(grasp=grasp, phases=phases, held=held)
+
+    def _lifted(self, checker: CollisionChecker, grasp: Grasp) -> Floats:
+        """Return postures (k, n) up from the grasp: straight up, or back where it came from."""
+        here = self.arm.forward(grasp.posture)
+        raised = here.position + np.array([0.0, 0.0, LIFT_M])
+        goal = ToolGoal(position=raised, approach=here.axes[:, 0], orientation_tolerance=math.pi)
+        up = self._inverse.solve(goal, grasp.posture, checker.touches)
+        if isinstance(up, Reachable) and checker.is_line_free(grasp.posture, up.posture):
+            return np.stack((grasp.posture, up.posture))
+        return np.stack((grasp.posture, grasp.before))
+
+    def _place(
+        self,
+        checker: CollisionChecker,
+        tool: Frame,
+        held: Thing,
+        others: Sequence[Thing],
+        posture: Floats,
+        opening: float,
+    ) -> Place | NoWay:
+        goal = ToolGoal(
+            position=tool.position, axes=tool.axes, orientation_tolerance=PLACE_TILT_RAD
+        )
+        down = self._inverse.solve(goal, posture, checker.touches)
+        if isinstance(down, OutOfReach):
+            return NoWay(reason=f"{held.name}: {down.reason}")
+        raised = tool.position + np.array([0.0, 0.0, LIFT_M])
+        above = self._inverse.solve(
+            ToolGoal(position=raised, approach=tool.axes[:, 0], orientation_tolerance=math.pi),
+            down.posture, checker.touches,
+        )  # fmt: skip
+        if isinstance(above, OutOfReach):
+            return NoWay(reason=f"{held.name}: above it: {above.reason}")
+        way = plan(checker, posture, above.posture)
+        if isinstance(way, NoPath):
+            return NoWay(reason=f"{held.name}: {way.reason}")
+        return Place(
+            phases=(
+                Phase(name="traverse", arm=self._slow.trajectory(way.postures, checker=checker)),
+                Phase(name="lower", arm=self._straight(above.posture, down.posture)),
+                Phase(name="open", gripper=opening),
+                Phase(name="retreat", arm=self._retreat(tool, down, held, others, opening)),
+            )
+        )
+
+    def _retreat(
+        self, tool: Frame, down: Reachable, held: Thing, others: Sequence[Thing], opening: float
+    ) -> JointTrajectory:
+        """Return the way back from what was put down: along the approach, as far as it goes."""
+        left = _at(self.arm.forward(down.posture), held)
+        checker = CollisionChecker(self.arm, [left, *others], margin=0.0, gripper=opening)
+        for far in (0.06, 0.04, 0.02):
+            back = tool.position - far * tool.axes[:, 0]
+            goal = ToolGoal(position=back, axes=tool.axes, orientation_tolerance=math.pi)
+            away = self._inverse.solve(goal, down.posture, checker.touches)
+            if isinstance(away, Reachable) and checker.is_line_free(down.posture, away.posture):
+                return self._straight(down.posture, away.posture)
+        return self._straight(down.posture, down.posture)
+
+    def _tools_at(self, held: Thing, target: Floats, posture: Floats) -> list[Frame]:
+        """Return poses of the tool in which what it holds stands at its target."""
+        now = self.arm.forward(posture)
+        thing = _at(now, held)
+        lowest = target + np.array([0.0, 0.0, PLACE_GAP_M])
+        found = []
+        for number in range(PLACE_YAWS):
+            angle = 2 * math.pi * number / PLACE_YAWS
+            turn = _about_z(angle) @ _upright(thing.axes) @ thing.axes.T
+            axes = turn @ now.axes
+            found.append(Frame(position=lowest - axes @ held.position, axes=axes))
+        order = [float(np.trace(now.axes.T @ one.axes)) for one in found]
+        return [found[k] for k in np.argsort(order)[::-1]]
+
+    def _straight(self, start: Floats, goal: Floats) -> JointTrajectory:
+        return self._slow.trajectory(np.stack((start, goal)))
+
+    def _held(self, thing: Thing, grasp: Grasp) -> Thing:
+        """Return a thing in the frame of the tool, between fingers that have closed on it.
+
+        Where one finger alone moves, it pushes the thing to the other one.
+        """
+        tool = self.arm.forward(grasp.posture)
+        place = tool.axes.T @ (thing.position - tool.position)
+        place[2] = self._opening.middle(grasp.closed)
+        return replace(thing, position=place, axes=tool.axes.T @ thing.axes)
+
+    def _squeezed(self, grasp: Grasp) -> float:
+        """Return where the gripper's joint goes to hold a thing: beyond its width."""
+        closing = math.copysign(1.0, grasp.closed - grasp.opening)
+        span = self._gripper.upper - self._gripper.lower
+        aim = grasp.closed + closing * SQUEEZE * span
+        return max(self._gripper.lower, min(self._gripper.upper, aim))
+
+    def holds(self, measured: float, wanted: float) -> bool:
+        """Return whether the gripper has stopped short of where it was sent."""
+        return abs(measured - wanted) > HELD_SHARE * (self._gripper.upper - self._gripper.lower)
+
+
+def _slowed(joint: JointDescription) -> JointDescription:
+    return changed(joint, max_speed=SLOW * joint.max_speed)
+
+
+def _may_touch(held: Thing, others: Sequence[Thing]) -> list[tuple[str, str]]:
+    """Return what the held thing may touch: that on which it stands."""
+    return [("held", other.name) for other in others if other.kind == "floor"]
+
+
+def _at(tool: Frame, held: Thing) -> Thing:
+    """Return a held thing in the frame of the base."""
+    return replace(held, position=tool.place(held.position), axes=tool.axes @ held.axes)
+
+
+def _about_z(angle: float) -> Floats:
+    cos, sin = math.cos(angle), math.sin(angle)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _upright(axes: Floats) -> Floats:
+    """Return axes (3, 3) turned by the smallest angle so that one of them points up or down."""
+    k = int(np.argmax(np.abs(axes[2])))
+    up = np.array([0.0, 0.0, math.copysign(1.0, axes[2, k])])
+    axis = np.cross(axes[:, k], up)
+    sin, cos = float(np.linalg.norm(axis)), float(axes[:, k] @ up)
+    if sin < 1e-9:
+        return axes
+    x, y, z = axis / sin
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    turn = np.eye(3) + sin * cross + (1 - cos) * cross @ cross
+    return np.asarray(turn @ axes)

@@ -1,0 +1,348 @@
+"""`gigabrain bench hands`: an arm picks things up and puts them down, judged by the physics.
+
+Planner, control and gate are those of a robot, stepped in memory on a simulated body.
+"""
+
+import math
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+
+from gigabrain_drivers.driver.catalog import load_link
+from gigabrain_drivers.driver.robot import RobotFile, Run
+from gigabrain_drivers.sim.body import MujocoOptions, SimModel, sim_body
+from gigabrain_drivers.sim.driver import state_message
+from gigabrain_drivers.sim.physics import Simulation
+from gigabrain_drivers.sim.worlds import load_world
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import TICK_S
+from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.brain import Intent, JointTarget, JointTrajectory
+from gigabrain_schemas.safety import SafetyState
+from gigabrain_zenoh.control.joints import JointInputs, JointMemory, step_joints
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.gate import gate
+from gigabrain_zenoh.gate.state import BRAIN
+from gigabrain_zenoh.geometry.joints import JointMotion
+from gigabrain_zenoh.geometry.limits import ZERO, limits_of
+from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics
+from gigabrain_zenoh.manipulation.collision import Thing
+from gigabrain_zenoh.manipulation.pick_place import (
+    NoWay,
+    Phase,
+    PickPlacePlanner,
+    Place,
+)
+
+KINDS = ("cube", "cylinder", "sphere")
+SIZES_M, MASSES_KG, FRICTIONS = (0.02, 0.04), (0.02, 0.08, 0.2), (0.4, 1.0)
+REACH_M, AROUND_RAD = (0.10, 0.26), math.pi / 2  # from the first joint's axis, to both sides
+TALL = 1.2  # length over diameter of a cylinder
+LIFTED_M = 0.01  # from which a thing counts as picked up
+PLACED_M = 0.01  # from its place, within which it counts as put there
+GRIP_TICKS, SETTLE_TICKS = 40, 25
+WINDOW_TICKS = 100  # of a trajectory in an intent
+TARGETS = 20  # places that are drawn until one can be reached
+STILL = "0.02 0.0005"  # torsional and rolling friction of things
+SLACK = 0.001  # of a joint's range, beyond which it counts as broken
+TABLE = Thing(name="table", kind="floor", position=np.array([0.0, 0.0, -0.001]))
+Progress = Callable[[str], None]
+
+
+class HandsRun(Struct, frozen=True, kw_only=True):
+    """One thing."""
+
+    seed: int
+    kind: str
+    size_m: float
+    mass_kg: float
+    friction: float
+    distance_m: float  # from the first joint's axis
+    outcome: str  # placed, unreachable, or what went wrong
+    reason: str = ""
+    off_m: float | None = None  # from its place, by the physics
+    seconds: float = 0.0  # of the robot's time
+    planning_s: float = 0.0  # of wall time
+    fastest: float = 0.0  # joint's speed over its greatest, by the physics
+    broken_limits: int = 0  # ticks in which a joint was too far or too fast, by the physics
+
+
+class HandsResult(Struct, frozen=True, kw_only=True):
+    """All things."""
+
+    body: str
+    runs: tuple[HandsRun, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawn:
+    """A thing on the table."""
+
+    kind: str
+    size: float  # [m], edge or diameter
+    mass: float  # [kg]
+    friction: float
+    distance: float  # [m]
+    x: float  # [m], in the frame of the arm's base
+    y: float  # [m]
+    yaw: float  # [rad]
+
+    @property
+    def height(self) -> float:
+        """Of its middle above the table [m]."""
+        return self.size * (TALL if self.kind == "cylinder" else 1.0) / 2
+
+    def thing(self) -> Thing:
+        """Return it as the planner knows it."""
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        radius, tall = self.size / 2, 2 * self.height
+        sizes = {"cube": (self.size,) * 3, "cylinder": (radius, tall), "sphere": (radius,)}
+        return Thing(
+            name="the thing",
+            kind="box" if self.kind == "cube" else "cylinder" if tall > self.size else "sphere",
+            size=sizes[self.kind],
+            position=np.array([self.x, self.y, self.height]),
+            axes=np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]),
+        )
+
+    def mjcf(self) -> str:
+        """Return it on a floor, as the physics knows it."""
+        half = self.size / 2
+        sizes = {"cube": (half,) * 3, "cylinder": (half, self.height), "sphere": (half,)}
+        kind = "box" if self.kind == "cube" else self.kind
+        size = " ".join(f"{one:g}" for one in sizes[self.kind])
+        yaw = math.degrees(self.yaw)
+        return f"""<mujoco><worldbody>
+          <geom name="floor" type="plane" size="2 2 .1"/>
+          <body name="thing" pos="{self.x} {self.y} {self.height}" euler="0 0 {yaw}">
+            <freejoint/>
+            <geom type="{kind}" size="{size}" mass="{self.mass}" condim="6"
+              friction="{self.friction} {STILL}"/>
+          </body></worldbody></mujoco>"""
+
+
+def draw(rng: np.random.Generator, pan: float) -> Drawn:
+    """Draw a thing on the table; `pan` is where the first joint's axis is along x [m]."""
+    distance = float(rng.uniform(*REACH_M))
+    angle = float(rng.uniform(-AROUND_RAD, AROUND_RAD))
+    return Drawn(
+        kind=str(rng.choice(KINDS)),
+        size=float(rng.uniform(*SIZES_M)),
+        mass=float(rng.choice(MASSES_KG)),
+        friction=float(rng.choice(FRICTIONS)),
+        distance=distance,
+        x=pan + distance * math.cos(angle),
+        y=distance * math.sin(angle),
+        yaw=float(rng.uniform(-math.pi, math.pi)),
+    )
+
+
+def pan_axis(arm: ArmKinematics) -> float:
+    """Return where the axis of the first joint is along x [m]."""
+    return float(arm.chain.fixed[0, 0, 3])
+
+
+class ArmInMemory:
+    """A simulated arm behind the gate, with control; the brain is whoever calls it."""
+
+    def __init__(self, robot: RobotFile, body: SimModel, world: Path) -> None:
+        self.robot, self.description = robot, robot.description()
+        self.simulation = Simulation(body, load_world(str(world), 0), 0)
+        assert self.simulation.arm
+        self.arm = self.simulation.arm
+        self._gate_config = gate.GateConfig(
+            limits=limits_of(self.description), joints=self.description.joints, auto_resume=True
+        )
+        self._gate, self._memory, self._seq = gate.GateState(boot=1), JointMemory(), 0
+        self.broken, self.ticks, self.fastest = 0, 0, 0.0
+        while self._gate.mode != "enabled":
+            self.step(Intent(behaviour="hands", reason="waiting"))
+
+    def state(self) -> RobotState:
+        """Return the state as the driver publishes it."""
+        state = state_message(self.simulation, self.robot.robot_type)
+        return msgspec.structs.replace(
+            state, boot=1, tick=self._gate.tick, gate=gate.status(self._gate)
+        )
+
+    def step(self, intent: Intent) -> None:
+        """Have 20 ms pass: gate, control, gate, servos, physics."""
+        state = self.state()
+        joints = tuple(JointMotion(joint.position, joint.velocity) for joint in state.joints)
+        self._feed(gate.Tick(ZERO, joints=joints, held=state.joints_sent))
+        self._feed(gate.Safety(SafetyState(verdict="ok", boot=1, tick=self._gate.tick)))
+        self._memory, command = step_joints(
+            self.description, self._memory, JointInputs(state=self.state(), intent=intent)
+        )
+        if command:
+            self._seq += 1
+            header = {"boot": 1, "tick": self._gate.tick, "basis": self._gate.tick}
+            command = msgspec.structs.replace(command, seq=self._seq, source=BRAIN, **header)
+            self._feed(gate.JointsCommand(command))
+        names = [joint.name for joint in self.description.joints]
+        wanted = (joint.position for joint in self._gate.joints)
+        self.arm.aim(dict(zip(names, wanted, strict=True)))
+        for _ in range(2):
+            self.simulation.advance()
+        self.ticks += 1
+        self.broken += self._breaks()
+
+    def carry_out(self, phase: Phase, gripper: str) -> None:
+        """Carry out one phase of a plan."""
+        if phase.gripper is not None:
+            target = JointTarget(name=gripper, position=phase.gripper)
+            for _ in range(GRIP_TICKS):
+                self.step(Intent(joints=(target,), behaviour="hands", reason=phase.name))
+        if phase.arm is None:
+            return
+        count = math.ceil(phase.arm.duration / TICK_S) + 1
+        times = np.minimum(np.arange(count) * TICK_S, phase.arm.duration)
+        rows = np.stack(
+            [np.interp(times, phase.arm.times, column) for column in phase.arm.positions.T], axis=1
+        )
+        start = self._gate.tick + 1
+        for done in range(count + SETTLE_TICKS // 2):
+            first = min(done, count - 1)
+            window = rows[first : first + WINDOW_TICKS].astype("<f4")
+            path = JointTrajectory(
+                name=phase.arm.names, start=start + first, period=TICK_S, positions=window.tobytes()
+            )
+            self.step(Intent(joint_trajectory=path, behaviour="hands", reason=phase.name))
+
+    def settle(self) -> None:
+        """Hold still."""
+        for _ in range(SETTLE_TICKS):
+            self.step(Intent(behaviour="hands", reason="done"))
+
+    def posture(self, names: Sequence[str]) -> Floats:
+        """Return the positions of some joints, as they were sent [rad] or [m]."""
+        sent = dict(zip(self.arm.names, self.arm.targets, strict=True))
+        return np.array([sent[name] for name in names])
+
+    def measured(self, name: str) -> float:
+        """Return where a joint is [rad] or [m]."""
+        return next(motor.position for motor in self.arm.motors() if motor.name == name)
+
+    def thing(self) -> Floats:
+        """Return where the thing is (3,) [m], by the physics."""
+        model, data = self.simulation.model, self.simulation.data
+        return np.array(data.xpos[model.body("world/thing").id])
+
+    def _feed(self, event: gate.Event) -> None:
+        self._gate, _ = gate.step(self._gate_config, self._gate, event)
+
+    def _breaks(self) -> bool:
+        """Return whether a joint is beyond its range or its speed, by the physics."""
+        for joint, position, speed in zip(self.description.joints, *self.arm.truth(), strict=True):
+            slack = SLACK * (joint.upper - joint.lower)
+            self.fastest = max(self.fastest, abs(speed) / joint.max_speed)
+            if not joint.lower - slack <= position <= joint.upper + slack:
+                return True
+        return False
+
+
+def measure_hands(seeds: Sequence[int], body: str, show: Progress) -> HandsResult:
+    """Have an arm pick one thing up for each seed, and put it down elsewhere.
+
+    Raises ConfigError for a body that has no arm in MuJoCo.
+    """
+    robot, _, options, folder = load_link(body, Run(folder=Path()))
+    if robot.arm is None or not isinstance(options, MujocoOptions):
+        raise ConfigError(f"{body} has no arm in MuJoCo; choose so101 or piper")
+    model = sim_body(robot, options, Run(folder=folder))
+    runs = []
+    for seed in seeds:
+        arm = ArmKinematics(model.model, robot.joints, robot.arm.tool)
+        runs.append(_run(seed, robot, model, PickPlacePlanner(arm)))
+        show(in_words(runs[-1]))
+    return HandsResult(body=body, runs=tuple(runs))
+
+
+def in_words(run: HandsRun) -> str:
+    """Return what came of one thing."""
+    what = f"{run.kind} {run.size_m * 100:.1f} cm, {run.mass_kg * 1000:.0f} g"
+    where = f"{run.distance_m * 100:.0f} cm away"
+    off = "" if run.off_m is None else f", {run.off_m * 100:.1f} cm off"
+    return f"{run.seed}: {what}, {where}: {run.outcome}{off}{f': {run.reason}' * bool(run.reason)}"
+
+
+@dataclass
+class Attempt:
+    """What came of one thing."""
+
+    outcome: str = ""
+    reason: str = ""
+    target: Floats | None = None  # (3,) [m], where it was to be put
+    planning_s: float = 0.0
+
+    def end(self, outcome: str, reason: str = "") -> None:
+        """Record how it ended."""
+        self.outcome, self.reason = outcome, reason
+
+
+def _run(seed: int, robot: RobotFile, model: SimModel, planner: PickPlacePlanner) -> HandsRun:
+    rng = np.random.default_rng(seed)
+    drawn = draw(rng, pan_axis(planner.arm))
+    with tempfile.TemporaryDirectory(prefix="gigabrain-") as folder:
+        (Path(folder) / "thing.xml").write_text(drawn.mjcf())
+        world = Path(folder) / "world.yaml"
+        world.write_text("model: thing.xml\nstart: [0.0, 0.0, 0.0]\n")
+        arm = ArmInMemory(robot, model, world)
+    attempt = Attempt()
+    _pick_and_place(arm, planner, drawn, rng, attempt)
+    off = None
+    if attempt.target is not None:
+        off = float(np.hypot(*(arm.thing()[:2] - attempt.target[:2])))
+        attempt.outcome = "placed" if off <= PLACED_M else "misplaced"
+    return HandsRun(
+        seed=seed, kind=drawn.kind, size_m=drawn.size, mass_kg=drawn.mass,
+        friction=drawn.friction, distance_m=drawn.distance, outcome=attempt.outcome,
+        reason=attempt.reason, off_m=off, seconds=arm.ticks * TICK_S,
+        planning_s=attempt.planning_s, fastest=arm.fastest, broken_limits=arm.broken,
+    )  # fmt: skip
+
+
+def _pick_and_place(
+    arm: ArmInMemory,
+    planner: PickPlacePlanner,
+    drawn: Drawn,
+    rng: np.random.Generator,
+    attempt: Attempt,
+) -> None:
+    """Pick the thing up and put it down where a place can be reached; fill in what came of it."""
+    names, gripper = planner.arm.names, arm.description.joints[-1].name
+    began = time.monotonic()
+    pick = planner.pick(drawn.thing(), [TABLE], arm.posture(names))
+    attempt.planning_s = time.monotonic() - began
+    if isinstance(pick, NoWay):
+        return attempt.end("unreachable", pick.reason)
+    for phase in pick.phases:
+        arm.carry_out(phase, gripper)
+        if phase.name == "close" and not planner.holds(arm.measured(gripper), phase.gripper or 0.0):
+            return attempt.end("not gripped")
+    if arm.thing()[2] < drawn.height + LIFTED_M:
+        return attempt.end("not lifted")
+    place: Place | NoWay = NoWay(reason="")
+    for target in _targets(rng, drawn.height, pan_axis(planner.arm)):
+        place = planner.place(pick.held, target, [TABLE], arm.posture(names), pick.grasp.opening)
+        if isinstance(place, Place):
+            break
+    if isinstance(place, NoWay):
+        return attempt.end("no place", place.reason)
+    for phase in place.phases:
+        arm.carry_out(phase, gripper)
+    arm.settle()
+    attempt.target = target
+    return None
+
+
+def _targets(rng: np.random.Generator, height: float, pan: float) -> Iterator[Floats]:
+    for _ in range(TARGETS):
+        far, angle = rng.uniform(*REACH_M), rng.uniform(-AROUND_RAD, AROUND_RAD)
+        yield np.array([pan + far * math.cos(angle), far * math.sin(angle), height])

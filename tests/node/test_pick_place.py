@@ -1,0 +1,69 @@
+"""An arm picks things up and puts them down in MuJoCo, through control and the gate."""
+
+import numpy as np
+import pytest
+
+from gigabrain_drivers.driver.catalog import load_robot, robot_path
+from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics
+from gigabrain_zenoh.manipulation.collision import Thing
+from gigabrain_zenoh.manipulation.pick_place import NoWay, PickPlacePlanner
+from gigabrain_zenoh.qa.bench.hands import TABLE, draw, measure_hands, pan_axis
+
+SEEDS = (0, 2, 4, 5, 9, 13)  # two of each kind, light and heavy
+
+
+@pytest.fixture(scope="module")
+def planner() -> PickPlacePlanner:
+    robot = load_robot("so101")
+    assert robot.arm
+    model = robot_path("so101").with_name("model.xml").read_text()
+    return PickPlacePlanner(ArmKinematics(model, robot.joints, robot.arm.tool))
+
+
+def home(planner: PickPlacePlanner) -> np.ndarray:
+    robot = load_robot("so101")
+    assert robot.arm
+    return np.array(robot.arm.home[: len(planner.arm.joints)])
+
+
+def test_things_of_all_kinds_are_picked_up_and_put_down() -> None:
+    result = measure_hands(SEEDS, "so101", lambda _: None)
+    assert {run.kind for run in result.runs} == {"cube", "cylinder", "sphere"}
+    assert [run.outcome for run in result.runs] == ["placed"] * len(SEEDS)
+    assert all(run.broken_limits == 0 for run in result.runs)
+
+
+def test_a_plan_is_the_same_each_time(planner: PickPlacePlanner) -> None:
+    thing = draw(np.random.default_rng(1), pan_axis(planner.arm)).thing()
+    plans = [planner.pick(thing, [TABLE], home(planner)) for _ in range(2)]
+    assert not any(isinstance(one, NoWay) for one in plans)
+    first, second = (one.phases[1].arm.positions for one in plans)  # type: ignore[union-attr]
+    assert np.array_equal(first, second)
+
+
+@pytest.mark.parametrize(
+    ("thing", "why"),
+    [
+        (Thing(name="far", kind="box", size=(0.03,) * 3, position=np.array([0.7, 0.0, 0.015])),
+         "too far"),
+        (Thing(name="wide", kind="box", size=(0.2,) * 3, position=np.array([0.2, 0.0, 0.1])),
+         "cm wide"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_grasped_is_refused_with_its_reason(
+    planner: PickPlacePlanner, thing: Thing, why: str
+) -> None:
+    found = planner.pick(thing, [TABLE], home(planner))
+    assert isinstance(found, NoWay)
+    assert why in found.reason
+
+
+def test_a_place_out_of_reach_is_refused_with_its_reason(planner: PickPlacePlanner) -> None:
+    thing = draw(np.random.default_rng(1), pan_axis(planner.arm)).thing()
+    pick = planner.pick(thing, [TABLE], home(planner))
+    assert not isinstance(pick, NoWay)
+    found = planner.place(
+        pick.held, np.array([0.6, 0.0, 0.02]), [TABLE], pick.grasp.posture, pick.grasp.opening
+    )
+    assert isinstance(found, NoWay)
+    assert "too far" in found.reason
