@@ -288,6 +288,8 @@ class _StrictStream(ReadDataStream):
     """Content of one record. Raises EndOfFile where the library would return less than asked."""
 
     def read(self, length: int) -> bytes:
+        if length > MAX_RECORD_BYTES:  # more than a stream may be asked for
+            raise EndOfFile
         data = super().read(length)
         if len(data) < length:
             raise EndOfFile

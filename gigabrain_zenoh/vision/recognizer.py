@@ -15,7 +15,6 @@ WEIGHTS = Path(__file__).parent / "weights" / "things.onnx"
 WIDTH_PX, HEIGHT_PX, STRIDE_PX = 320, 240, 8
 UNIT_PX = 16.0  # distance to a side at raw 0
 RAW_LIMITS = (-4.0, 3.5)  # of raw distances
-LOGIT_LIMITS = (-30.0, 30.0)
 MAX_CANDIDATES = 200  # before overlapping ones are dropped
 MIN_CONFIDENCE, MAX_OVERLAP = 0.4, 0.5
 GREY = (114, 114, 114)  # around pictures of another shape
@@ -128,29 +127,19 @@ def decode(raw: Floats, min_confidence: float = MIN_CONFIDENCE) -> Found:
     Logits of classes come first, then the logarithms of distances to left, top, right, bottom.
     """
     classes = len(raw) - 4
-    logits = np.clip(raw[:classes], *LOGIT_LIMITS)
-    sure = compete((1 / (1 + np.exp(-logits))).astype(np.float32))
-    labels, rows, columns = np.nonzero(sure > min_confidence)
-    found = sure[labels, rows, columns]
-    best = np.argsort(-found, kind="stable")[:MAX_CANDIDATES]
-    labels, rows, columns, confidences = labels[best], rows[best], columns[best], found[best]
+    odds = np.log(min_confidence) - np.log1p(-min_confidence)
+    labels, rows, columns = np.nonzero(raw[:classes] > odds)
+    logits = raw[labels, rows, columns]
+    best = np.argsort(-logits, kind="stable")[:MAX_CANDIDATES]
+    labels, rows, columns, logits = labels[best], rows[best], columns[best], logits[best]
     d = UNIT_PX * np.exp(np.clip(raw[classes:, rows, columns], *RAW_LIMITS))
     x, y = (columns + 0.5) * STRIDE_PX, (rows + 0.5) * STRIDE_PX
     boxes = np.stack([x - d[0], y - d[1], x + d[2], y + d[3]], axis=1)
     height, width = raw.shape[1] * STRIDE_PX, raw.shape[2] * STRIDE_PX
     boxes = np.clip(boxes, 0, [width, height, width, height]).astype(np.float32)
+    confidences = (1 / (1 + np.exp(-logits))).astype(np.float32)
     kept = suppress(boxes, labels, confidences)
     return Found(boxes[kept], labels[kept].astype(np.int64), confidences[kept])
-
-
-def compete(confidences: Floats) -> Floats:
-    """Weaken the classes (classes, h, w) of a cell by the surest other one: a thing is of one."""
-    if len(confidences) < 2:
-        return confidences
-    surest = np.sort(confidences, axis=0)[-2:]
-    other = np.where(confidences < surest[1], surest[1], surest[0])
-    weakened: Floats = (confidences * np.sqrt(1 - other)).astype(np.float32)
-    return weakened
 
 
 def suppress(
