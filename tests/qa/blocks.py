@@ -45,6 +45,7 @@ BLOCK = re.compile(
 VERBS = ("run", "not run", "file", "data")
 NOT_RUN = ("hardware (", "what CI runs itself")
 PART_OF = ROOT / "drivers/gigabrain_drivers/bodies/mycustombot"  # what a part of a robot.yaml joins
+ARM = ROOT / "drivers/gigabrain_drivers/bodies/so101"  # the same, for a part with joints
 
 
 class Block(NamedTuple):
@@ -107,7 +108,7 @@ def _read_part_of_robot(text: str) -> None:
     part = yaml.safe_load(text)
     with tempfile.TemporaryDirectory(prefix="docs-") as name:
         folder = Path(name) / "robot"
-        shutil.copytree(PART_OF, folder)
+        shutil.copytree(ARM if {"arm", "joints"} & set(part) else PART_OF, folder)
         file = folder / "robot.yaml"
         file.write_text(yaml.safe_dump(_joined(yaml.safe_load(file.read_text()), part)))
         load_link(str(file), Run(folder=folder, link="sim" if "sim" in part else "real"))

@@ -16,6 +16,8 @@ from tests.unit.schemas.plain import as_map, at, codec, dotted, maps, numbers, r
 # numbers that may be null: nothing measured, nothing in the way, no limit, any yaw, no clock
 NULLABLE = {
     "Body.description.max_rim_speed", "RobotState.link.late_ms",
+    "Body.description.joints.0.follow", "Body.description.joints.1.follow",
+    "Body.description.arm.floor", "SafetyState.joints.0.rise", "SafetyState.joints.0.fall",
     "RobotState.joints.0.effort", "RobotState.joints.0.temperature",
     "RobotState.joints.0.current", "RobotState.joints.1.current",
     "RobotState.joints.1.effort", "RobotState.joints.1.temperature",
