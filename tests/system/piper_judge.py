@@ -68,9 +68,10 @@ def drive(group: str) -> dict[str, Any]:
     slow = arm.GetArmLowSpdInfoMsgs().motor_2
     told["volts"], told["celsius"] = slow.vol * 0.1, slow.motor_temp
     told["on"] = arm.GetArmEnableStatus()
+    # of one motor: the SDK keeps the newest answer for all
     told["limits"] = until(
         lambda: arm.GetAllMotorAngleLimitMaxSpd().all_motor_angle_limit_max_spd.motor[2]
-        .max_angle_limit == 1799, arm.SearchAllMotorMaxAngleSpd)  # fmt: skip
+        .max_angle_limit == 1799, lambda: arm.SearchMotorMaxAngleSpdAccLimit(2, 1))  # fmt: skip
     told["firmware"] = until(
         lambda: arm.GetPiperFirmwareVersion() == "S-V1.8-1", arm.SearchPiperFirmwareVersion
     )

@@ -17,13 +17,13 @@ from tests.system.keys import Site, make_fleet, raw, site
 SAYS = {
     "brain": "world perceived/perception detections objects pose map zones intent task "
     "request_log input_log/perception health/perception log estop",
-    "operator": "teleop cmd_vel joint_cmd button log estop",
+    "operator": "teleop joint_teleop cmd_vel joint_cmd button log estop",
     "viewer": "",
 }
 ASKS = {
     "brain": "estop describe/driver",
     "operator": "estop release enable goal mission task_change map_save map_list map_load "
-    "zones_change pose_set objects_change sim_change audit_log param/driver describe/driver",
+    "zones_change pose_set objects_change sim_change limp audit_log param/driver describe/driver",
     "viewer": "map_list audit_log describe/driver",
 }
 SAID = [topic.at("perception") for topic in (*TOPICS, ESTOP_SAID)]
