@@ -107,10 +107,9 @@ class GoalServer(InputSource):
         if not self._loaded or self._awaits_map(state):
             return self._start_up(state, world, verdict)
         navigator = self._make_navigator()
-        body = self._source.body
-        if body and body.has_base and self._config.start == "explore" and not self._started:
+        if self._config.start == "explore" and not self._started:
             self._tasks.begin(missions.explore_mission(), "roaming", state.boot)
-        self._started = self._started or body is not None
+        self._started = True
         tick = world.basis if world else state.tick
         command, idle = self._tasks.step(state, self._outcome, tick)
         context = navigator.at_scan(state, world, verdict)
