@@ -180,7 +180,7 @@ class Gatekeeper:
         self._bus.serve(ENABLE, self._on_enable)
 
     def serve_limp(self, let_go: Callable[[bool], Awaitable[None]]) -> None:
-        """Let operators have an arm let go of, and held again, while nobody moves it."""
+        """Serve requests to let go of an arm and to hold it, while the gate is not enabled."""
 
         async def answer(request: LimpRequest) -> GateReply:
             limp, held_by = request.limp, self.state.commander

@@ -95,7 +95,7 @@ class DriverProcess:
         self._sent = ZERO  # the newest command to the body
         self._joints_sent: tuple[float, ...] = ()
         self._limp = False  # in the newest state, or by request
-        self._let_go = False  # by request, until somebody moves it or has it held
+        self._let_go = False  # by request, until it is moved or held again
         self._body_tick = 0  # when BODY was last published
         driver.emit = self._emit
         bus.report = self.report

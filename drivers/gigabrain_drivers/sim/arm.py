@@ -39,7 +39,7 @@ class SimArm:
 
     @property
     def targets(self) -> tuple[float, ...]:
-        """Where the servos go [rad] or [m], in the order of the description."""
+        """The servos' goals [rad] or [m], in the order of the description."""
         return tuple(self._aims[name] for name in self.names)
 
     def truth(self) -> tuple[list[float], list[float]]:

@@ -17,7 +17,8 @@ TRAVEL_TICKS = 150
 MOVE_TICKS = 30
 SPEED_SHARE = 0.3  # of a joint's greatest speed
 SLOW = 0.2  # [rad/s] or [m/s], as encoders show it: a few counts between two states
-EXCESS_RAD = 1.0  # beyond a joint's range
+EXCESS = 1.0  # [rad] or [m], beyond a joint's range
+ROUNDED = 0.01  # of a joint's range, by which its protocol may round
 FREEZE_TICKS = 6  # 120 ms
 SILENT_TICKS = 12  # 40 ms of a stream that has ended, then the ramp and the joint's own lag
 FELL_RAD = math.radians(2.0)  # that an arm may sag where it is held
@@ -29,7 +30,7 @@ async def opens_still(checked: CheckedRobot) -> Finding:
         await it.connected()
         before = _positions(it.state, checked.file.joints)
         await it.run_for(STILL_TICKS)
-        it.aims = _held(it.state) or before
+        it.aims = _held(it.state, checked.file.joints) or before
         await it.run_for(STILL_TICKS)
         moved = _largest_gap(before, _positions(it.state, checked.file.joints))
     return Finding(moved <= STILL_RAD, f"moved by {math.degrees(moved):.2f}°")
@@ -57,14 +58,15 @@ async def joints_obey(checked: CheckedRobot) -> Finding:
 
 async def joint_limits(checked: CheckedRobot) -> Finding:
     """Send joints beyond their ranges: the driver sends the end of the range, and says so."""
-    for joint in checked.file.joints:
-        async with DriverSession(checked) as it:
-            await it.connected()
-            sent = await it.driver.set_joint_positions({joint.name: joint.upper + EXCESS_RAD})
-            if sent[joint.name] > joint.upper + SLACK:
-                return Finding(False, f"{joint.name} was sent to {sent[joint.name]:.3f}")
-            it.aims = _positions(it.state, checked.file.joints)
-            await it.run_for(5)
+    async with DriverSession(checked) as it:
+        await it.connected()
+        for joint in checked.file.joints:
+            here = _positions(it.state, checked.file.joints)
+            for end, beyond in ((joint.upper, EXCESS), (joint.lower, -EXCESS)):
+                sent = await it.driver.set_joint_positions({joint.name: end + beyond})
+                if abs(sent[joint.name] - end) > ROUNDED * (joint.upper - joint.lower):
+                    return Finding(False, f"{joint.name} was sent to {sent[joint.name]:.3f}")
+            await it.driver.set_joint_positions(here)
     return Finding(True, f"{len(checked.file.joints)} joints end at their ranges")
 
 
@@ -155,11 +157,11 @@ def _positions(state: RobotState | None, joints: tuple[JointDescription, ...]) -
     return {joint.name: measured[joint.name] for joint in joints}
 
 
-def _held(state: RobotState | None) -> dict[str, float]:
-    """Return where the body says that it holds its joints."""
+def _held(state: RobotState | None, joints: tuple[JointDescription, ...]) -> dict[str, float]:
+    """Return where the body says that it holds its joints; nothing if it does not say so."""
     if state is None or not state.joints_sent:
         return {}
-    return dict(zip((joint.name for joint in state.joints), state.joints_sent, strict=False))
+    return dict(zip((joint.name for joint in joints), state.joints_sent, strict=True))
 
 
 def _speed(state: RobotState | None, name: str) -> float:

@@ -60,6 +60,15 @@ async def driven(driver: Program, **robots: Robot) -> None:
         await asyncio.sleep(1.0)
 
 
+def drives(report: dict[str, Any], linear: float, angular: float) -> bool:
+    """Return whether the newest odometry in a report has these speeds [m/s, rad/s]."""
+    if not report["values"]:
+        return False
+    twist = report["values"][-1]["twist"]["twist"]
+    moves = abs(twist["linear"]["x"] - linear) < 0.05
+    return moves and abs(twist["angular"]["z"] - angular) < 0.2
+
+
 async def test_two_robots_are_driven_at_once_and_do_not_mix(pair: Pair, judge: Judge) -> None:
     await asyncio.gather(released(pair.red), released(pair.blue))
     driver, listener = judge.start("drive", node="hands"), judge.start("listen")
@@ -74,13 +83,6 @@ async def test_two_robots_are_driven_at_once_and_do_not_mix(pair: Pair, judge: J
             listener.poll, "report", lambda one: one["count"] > 3 or "static" in topic, topic=topic
         )
         return report["values"][-1]
-
-    def drives(report: dict[str, Any], linear: float, angular: float) -> bool:
-        if not report["values"]:
-            return False
-        twist = report["values"][-1]["twist"]["twist"]
-        moves = abs(twist["linear"]["x"] - linear) < 0.05
-        return moves and abs(twist["angular"]["z"] - angular) < 0.2
 
     for name, speeds in SPEEDS.items():
         odom = f"/{name}/odom"

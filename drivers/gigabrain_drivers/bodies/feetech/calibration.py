@@ -109,7 +109,7 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
 
 
 class JointRange:
-    """What was seen of one joint while a person moved it, unwrapped from its middle posture on."""
+    """The range of one joint while a person moves it, unwrapped from its middle posture on."""
 
     def __init__(self, joint: JointDescription, middle: int) -> None:
         self.joint = joint
@@ -123,7 +123,7 @@ class JointRange:
 
     @property
     def missing(self) -> float:
-        """How much more it should have moved [rad]; 0 where it went through its whole range."""
+        """The rest of its range that it has not been moved through [rad]; 0 for none."""
         span = (self.upper - self.lower) * RADIANS_PER_TICK
         return max(0.0, self.joint.upper - self.joint.lower - SPAN_TOLERANCE - span)
 

@@ -20,7 +20,7 @@ SPEED_MARGIN = 1.2  # of the servo's own speed limit over the joint's
 
 
 class Settings(NamedTuple):
-    """What the servo has to hold in its RAM beside the goal."""
+    """Values in the servo's RAM beside the goal."""
 
     acceleration: int
     velocity: int  # ticks/s
@@ -80,7 +80,7 @@ class ServoJoint:
 
     @property
     def status(self) -> int:
-        """What it reports as wrong itself, in bits."""
+        """The servo's own status bits; 0 if all is well."""
         return self.newest.status if self.newest else 0
 
     def begin(self, now: ServoReadings, asked_ns: int) -> None:

@@ -221,7 +221,7 @@ def decode_readings(data: bytes) -> ServoReadings:
 
 
 class ServoMemory(NamedTuple):
-    """What a servo keeps without power, as far as a driver has to know it."""
+    """The values in a servo's EEPROM that a driver uses."""
 
     model: int
     min_position: int  # ticks

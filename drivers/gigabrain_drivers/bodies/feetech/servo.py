@@ -172,7 +172,7 @@ class ServoModel:
 
     @property
     def goal(self) -> float:
-        """Where it goes [rad], within the limits of its EEPROM."""
+        """The goal [rad], within the limits of its EEPROM."""
         lower, upper = self[feetech.MIN_POSITION], self[feetech.MAX_POSITION]
         ticks = self[feetech.GOAL]
         ticks = max(lower, min(upper, ticks)) if lower < upper else ticks

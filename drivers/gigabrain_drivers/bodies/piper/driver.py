@@ -268,7 +268,7 @@ class PiperDriver(Driver):
             self._fault.begin(problem if str(self.link) in problem else f"{self.link}: {problem}")
 
     def _health(self) -> LinkHealth:
-        """Connected means that the arm reports and finds no fault; each loss is told once."""
+        """Return the link's health: connected if the arm reports and has no fault."""
         told, self._untold = not self._untold, False
         stamp_ns = self._feedback.stamp_ns()
         age_ns = self._clock.now_ns() - stamp_ns if stamp_ns is not None else self.link.age_ns

@@ -1,4 +1,4 @@
-"""What an AgileX Piper reports: the newest values that can be believed, and what is wrong."""
+"""Collects the newest feedback of an AgileX Piper, and names its faults."""
 
 from collections import deque
 from collections.abc import Sequence
