@@ -21,6 +21,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from gigabrain_zenoh.ros2.rtps_discovery import multicast_port, participant_ports
 from gigabrain_zenoh.testing.waiting import PATIENCE_S
 from tests.places import ROOT
 
@@ -252,8 +253,8 @@ def free_domain() -> Iterator[int]:
 
 def is_free(domain: int) -> bool:
     """Return whether no participant of DDS uses a domain on this machine."""
-    first = 7400 + 250 * domain
-    for port in (first, first + 10, first + 11):  # for all, and of the first participant
+    ports = itertools.chain.from_iterable(participant_ports(domain, each) for each in range(120))
+    for port in (multicast_port(domain), *ports):
         with socket.socket(type=socket.SOCK_DGRAM) as probe:
             try:
                 probe.bind(("", port))
