@@ -19,6 +19,7 @@ from gigabrain_zenoh.geometry.joints import (
     approach,
     braked,
     frozen,
+    stopped,
 )
 
 VERDICT_TICKS = 4  # 80 ms, the oldest verdict of safety by which joints move
@@ -61,7 +62,7 @@ def output(config: GateConfig, state: GateState, calm: bool) -> tuple[JointMotio
     """
     now = state.joints_before
     if state.mode == "latched":
-        return tuple(map(frozen, now))
+        return tuple(map(stopped, now, config.joints))
     command = state.joint_command
     live = command and state.tick - state.joint_tick < LIVE_TICKS
     safety = state.safety

@@ -9,6 +9,7 @@ import msgspec
 from gigabrain_schemas.body import JointDescription
 
 AT_REST_JOINT_SPEED = 0.05  # [rad/s] or [m/s], of a joint that stands still
+OVERRUN = 0.6  # of the way that a joint lags behind, which it runs on if nothing takes it back
 
 
 class JointMotion(msgspec.Struct, frozen=True):
@@ -26,6 +27,15 @@ def joints_at_rest(measured: Sequence[JointMotion]) -> bool:
 def frozen(now: JointMotion) -> JointMotion:
     """Return a joint that stops where it is."""
     return JointMotion(now.position)
+
+
+def stopped(now: JointMotion, limits: JointDescription) -> JointMotion:
+    """Return a joint that comes to rest as soon as its servo can make it.
+
+    The servo is still on its way to `now`. It stops on the rest of that way.
+    """
+    taken_back = OVERRUN * limits.gains.feed_forward * now.velocity
+    return JointMotion(now.position - taken_back)
 
 
 def braked(now: JointMotion, limits: JointDescription, dt: float) -> JointMotion:

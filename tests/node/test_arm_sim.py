@@ -10,9 +10,11 @@ from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.geometry.joints import JointMotion, accelerated, stopped
 
 HOME = (0.0, -1.7, 1.4, 0.6, 0.0, 0.0)
 NAMES = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+OUTSTRETCHED = (-0.8, 0.4, -0.8, -0.5, 0.0, 0.0)
 SAG = 0.03  # [rad], of a servo that is held by its gain alone
 
 
@@ -78,3 +80,31 @@ def test_the_brain_gets_its_model_as_text() -> None:
     model = make().arm_model()
     assert model
     assert "<mujoco" in model.mjcf
+
+
+@pytest.mark.parametrize("name", NAMES[:5])
+async def test_a_joint_at_its_greatest_speed_is_at_rest_120_ms_after_it_is_stopped(
+    name: str,
+) -> None:
+    robot, driver = catalog.make_driver("so101", Run(folder=Path(), world="arena", speed=50.0))
+    index = NAMES.index(name)
+    joint = robot.joints[index]
+    posture = dict(zip(NAMES, OUTSTRETCHED, strict=True))
+    sent = JointMotion(posture[name])
+
+    async def aim() -> None:
+        await driver.set_joint_positions(posture | {name: sent.position})
+
+    async with driver:
+        ticks = driver.ticks(Clock())
+        await run(driver, ticks, 100, aim)
+        for _ in range(18):
+            sent = accelerated(sent, joint.max_speed, joint, 0.02)
+            state = await run(driver, ticks, 1, aim)
+        assert state.joints[index].velocity > 0.9 * joint.max_speed
+        sent = stopped(sent, joint)
+        await run(driver, ticks, 6, aim)
+        for _ in range(25):
+            state = await run(driver, ticks, 1, aim)
+            assert abs(state.joints[index].velocity) < 0.2
+        await ticks.aclose()  # type: ignore[attr-defined]

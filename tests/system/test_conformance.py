@@ -8,7 +8,7 @@ import pytest
 from gigabrain_drivers.driver.catalog import load_robot, robot_files, robot_links
 from gigabrain_zenoh.qa.conformance import kit
 
-QUICK = ("mock", "mycustombot")  # the others in `make qa`
+QUICK = ("mock", "mycustombot", "so101")  # the others in `make qa`
 BODIES = [
     pytest.param(name, marks=() if name in QUICK else pytest.mark.qa) for name in robot_files()
 ]

@@ -36,6 +36,8 @@ class SimArm:
         self._biases = model.actuator_biasprm[self._motors].copy()
         self._aims = dict(zip(self.names, self._at_rest(body.posture), strict=True))
         self.limp = self._was_limp = False
+        self.act()
+        mujoco.mj_forward(model, data)  # for the torques with which they hold
 
     @property
     def targets(self) -> tuple[float, ...]:

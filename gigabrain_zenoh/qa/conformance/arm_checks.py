@@ -135,7 +135,9 @@ async def _frozen(gated: GatedDriver, most: int) -> Finding:
     while gated.tick - begin < most + STILL_TICKS:
         await gated.run_for(1)
         if any(_speed(gated.state, joint.name) > SLOW for joint in joints):
-            moving, stopped = gated.tick - begin, _positions(gated.state, joints)
+            moving = gated.tick - begin
+        if gated.tick - begin <= max(most, moving):
+            stopped = _positions(gated.state, joints)
     sagged = _largest_gap(stopped, _positions(gated.state, joints))
     return Finding(
         moving < most and sagged <= FELL_RAD,

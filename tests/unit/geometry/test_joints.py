@@ -6,8 +6,9 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
-from gigabrain_schemas.body import JointDescription
+from gigabrain_schemas.body import JointDescription, JointGains
 from gigabrain_zenoh.geometry.joints import (
     JointMotion,
     accelerated,
@@ -15,6 +16,7 @@ from gigabrain_zenoh.geometry.joints import (
     braked,
     frozen,
     joints_at_rest,
+    stopped,
 )
 
 DT = 0.02
@@ -90,3 +92,11 @@ def test_rest_is_judged_by_all_joints_and_nan_is_no_rest() -> None:
     assert not joints_at_rest([still, moving])
     assert not joints_at_rest([JointMotion(0.0, math.nan)])
     assert frozen(moving) == JointMotion(0.0)
+
+
+def test_a_joint_that_stops_takes_back_most_of_what_its_servo_lags_behind() -> None:
+    moving = JointMotion(0.5, 2.0)
+    assert stopped(moving, JOINT) == JointMotion(0.5)
+    late = replace(JOINT, gains=JointGains(feed_forward=0.1))
+    assert 0.3 < stopped(moving, late).position < 0.5
+    assert stopped(JointMotion(0.5), late) == JointMotion(0.5)

@@ -45,7 +45,7 @@ class FeetechArm(Device):
             servo.step(0.0, motor.position, 0.0, 0.0)
             servo.power_on()
             if not self._started:
-                servo.write(feetech.TORQUE.address, b"\1")
+                servo.begin_holding(motor.effort / STIFFNESS)
         self._started = True
 
     def feed(self, data: bytes) -> None:

@@ -106,6 +106,13 @@ class ServoModel:
         self._measure()
         self[feetech.GOAL] = self[feetech.POSITION]
 
+    def begin_holding(self, lead: float) -> None:
+        """Hold the joint as if it had long done so, its goal `lead` [rad] before the position."""
+        lead += math.copysign(BACKLASH / 2, lead)
+        self[feetech.GOAL] += round(self._direction * lead / RADIANS_PER_TICK)
+        self.write(feetech.TORQUE.address, b"\1")
+        self._setpoint += lead
+
     def read(self, address: int, length: int) -> bytes:
         """Return bytes of the table; what is behind its end is zero."""
         return bytes(self._table[address : address + length]).ljust(length, b"\0")
