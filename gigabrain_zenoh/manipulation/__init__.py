@@ -7,5 +7,5 @@ Decision, control, safety, ui and qa may import it.
 An arm is known by its description (joints with limits) and its MJCF model alone; all poses are in
 the frame of the model's body `base`. Of the model it needs: that body, the joints, the tool's site
 (x is the approach, z the direction in which fingers close), and for grasps two geoms, `pad_fixed`
-and `pad_moving`, at the fingers' tips.
+and `pad_moving`, at the fingers' tips. Those may have a prefix, as in `arm_pad_fixed`.
 """

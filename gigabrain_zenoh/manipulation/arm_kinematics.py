@@ -173,12 +173,9 @@ class ArmKinematics:
         """Return how far the gripper opens. Raises ConfigError for a model without pads."""
         if not self.gripper:
             raise ConfigError("this arm has no gripper")
-        known = [geom.name for geom in self._spec.geoms if geom.name]
-        for pad in PADS:
-            if pad not in known:
-                raise unknown("geom", pad, known)
+        pads = self._pads()
         positions = np.linspace(self.gripper.lower, self.gripper.upper, GRIPPER_STEPS)
-        faces = np.array([self._faces(position) for position in positions])
+        faces = np.array([self._faces(position, pads) for position in positions])
         return Opening(positions=positions, low=faces[:, 0], high=faces[:, 1])
 
     def _chain(self) -> Chain:
@@ -201,13 +198,24 @@ class ArmKinematics:
         axes = self._model.jnt_axis[numbers].copy()
         return Chain(fixed=steps[:-1].copy(), axes=axes, slides=self.slides, tool=steps[-1].copy())
 
-    def _faces(self, gripper: float) -> tuple[float, float]:
+    def _pads(self) -> list[str]:
+        """Return the names of the pads, perhaps with a prefix. Raises ConfigError."""
+        known = [geom.name for geom in self._spec.geoms if geom.name]
+        found = []
+        for pad in PADS:
+            name = next((one for one in known if one == pad or one.endswith(f"_{pad}")), None)
+            if name is None:
+                raise unknown("geom", pad, known)
+            found.append(name)
+        return found
+
+    def _faces(self, gripper: float, pads: Sequence[str]) -> tuple[float, float]:
         """Return where the faces of the pads are along the tool's z axis [m]."""
         self._set(self._data, (self.lower + self.upper) / 2, gripper)
         mujoco.mj_kinematics(self._model, self._data)
         axis = self._data.site_xmat[self._site].reshape(3, 3)[:, 2]
         middles, halves = [], []
-        for pad in PADS:
+        for pad in pads:
             geom = self._model.geom(pad).id
             along = self._data.geom_xmat[geom].reshape(3, 3).T @ axis
             middles.append(axis @ (self._data.geom_xpos[geom] - self._data.site_xpos[self._site]))

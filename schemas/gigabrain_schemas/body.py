@@ -329,7 +329,7 @@ class BodyDescription(Record, frozen=True, kw_only=True):
     # [m], left to right; of omni wheels, to the next one
     wheel_radius: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.0  # [m]; 0: not known, or no wheels
     max_rim_speed: SpeedLimit | None = None
-    # [m/s], of a wheel of a differential base; None: it has its largest speeds both at once
+    # [m/s], of a wheel of a differential or omni base; None: it has its largest speeds all at once
     min_turning_radius: Annotated[float, Meta(ge=0.0, le=100.0)] = 0.0
     # [m], of an Ackermann base; 0: max_linear_speed / max_angular_speed
     body_height: Annotated[float, Meta(ge=0.01, le=10.0)] = 0.5  # [m], of its highest part

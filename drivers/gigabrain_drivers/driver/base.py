@@ -7,10 +7,10 @@ import math
 from collections.abc import AsyncIterator, Callable, Mapping
 from typing import Any, ClassVar, Self
 
+from gigabrain_drivers.driver.arm_model import arm_text
 from gigabrain_drivers.driver.robot import LinkOptions, RobotFile, Run
 from gigabrain_schemas.base import TICK_NS, Message, Velocity
 from gigabrain_schemas.body import (
-    MOST_MODEL_CHARACTERS,
     ArmModel,
     Joint,
     RobotState,
@@ -19,9 +19,8 @@ from gigabrain_schemas.body import (
 from gigabrain_schemas.sim import SimReply, SimRequest
 from gigabrain_schemas.topics import Topic
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import ConfigError, GigabrainError, Unsupported
+from gigabrain_zenoh.errors import GigabrainError, Unsupported
 from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of
-from gigabrain_zenoh.host.files import read_bounded
 
 log = logging.getLogger(__name__)
 
@@ -176,10 +175,7 @@ class Driver(abc.ABC):
         if self.robot.arm is None:
             return None
         path = self.run.folder / self.robot.arm_model
-        try:
-            return ArmModel(mjcf=read_bounded(path, MOST_MODEL_CHARACTERS).decode())
-        except (OSError, ValueError) as error:
-            raise ConfigError(f"{path}: the model of the arm: {error}") from None
+        return ArmModel(mjcf=arm_text(path, [joint.name for joint in self.robot.joints]))
 
     async def change_world(self, request: SimRequest) -> SimReply:
         """Change the simulated world that the body is in. Raises Unsupported, and Refused."""

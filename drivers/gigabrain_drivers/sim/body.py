@@ -307,12 +307,14 @@ def _wheels(robot: RobotFile, options: MujocoOptions) -> dict[str, Any]:
         steering = math.atan(robot.wheel_base / robot.turning_radius)
         car = replace(base, max_steering=steering)
         base = AckermannAxles(car, robot.wheel_separation)
-    speeds = base.to_wheels(fastest)
+    fastest_wheel = SPARE_WHEEL_SPEED * max(map(abs, base.to_wheels(fastest)))
+    if drive == "omni" and robot.max_rim_speed:
+        fastest_wheel = robot.max_rim_speed / robot.wheel_radius
     return {
         "base": base,
         "wheels": WHEELS[drive],
         "needed_wheel_speed": robot.max_linear_speed / robot.wheel_radius,
-        "max_wheel_speed": SPARE_WHEEL_SPEED * max(map(abs, speeds)),
+        "max_wheel_speed": fastest_wheel,
         "gyro_heading": drive == "skid_steer",
     }
 

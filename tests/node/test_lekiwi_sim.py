@@ -1,0 +1,153 @@
+"""LeKiwi in MuJoCo: a base on omni wheels with the arm of the body so101, from one model of it."""
+
+import itertools
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from gigabrain_drivers.driver import catalog
+from gigabrain_drivers.driver.arm_model import arm_text
+from gigabrain_drivers.driver.robot import Run
+from gigabrain_drivers.sim.body import sim_body
+from gigabrain_drivers.sim.physics import Simulation
+from gigabrain_drivers.sim.worlds import load_world
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics
+from gigabrain_zenoh.safety.arm_shape import MujocoArm
+
+SETTLE_STEPS, DRIVE_STEPS = 50, 200  # of 10 ms
+MODEL = catalog.robot_path("lekiwi").with_name("model.xml")
+SO101 = mujoco.MjModel.from_xml_path(str(catalog.robot_path("so101").with_name("model.xml")))
+FIGURES: Mapping[str, tuple[str, ...]] = {
+    "body": ("mass", "inertia", "ipos"),
+    "geom": ("type", "size", "quat", "friction", "solref", "solimp", "condim", "contype"),
+    "joint": ("range", "damping", "armature", "frictionloss", "axis"),
+    "actuator": ("ctrlrange", "forcerange", "gainprm", "biasprm"),
+    "site": ("pos", "quat"),
+}
+
+
+def make() -> Simulation:
+    robot, _, options, folder = catalog.load_link("lekiwi", Run(folder=Path()))
+    return Simulation(sim_body(robot, options, Run(folder=folder)), load_world("arena", 0), 0)  # type: ignore[arg-type]
+
+
+def text() -> str:
+    _, driver = catalog.make_driver("lekiwi", Run(folder=Path()))
+    model = driver.arm_model()
+    assert model
+    return model.mjcf
+
+
+@pytest.mark.parametrize(
+    ("twist", "ahead", "aside", "turned"),
+    [((0.2, 0, 0), 0.4, 0, 0), ((0, 0.15, 0), 0, 0.3, 0), ((0, 0, -0.8), 0, 0, -1.6)],
+)
+def test_it_drives_all_ways_and_its_arm_holds_still(
+    twist: tuple[float, float, float], ahead: float, aside: float, turned: float
+) -> None:
+    simulation = make()
+    arm = simulation.arm
+    assert arm
+    home = catalog.load_robot("lekiwi").arm.home  # type: ignore[union-attr]
+    begin = simulation.truth.pose()
+    for _ in range(DRIVE_STEPS):
+        simulation.drive(*twist)
+        simulation.advance()
+        assert arm.truth()[0] == pytest.approx(home, abs=0.01)
+    for _ in range(SETTLE_STEPS):
+        simulation.drive(0, 0, 0)
+        simulation.advance()
+    end = simulation.truth.pose()
+    x, y = end.x - begin.x, end.y - begin.y
+    cos, sin = math.cos(begin.yaw), math.sin(begin.yaw)
+    assert (cos * x + sin * y, cos * y - sin * x) == pytest.approx((ahead, aside), abs=0.03)
+    assert math.remainder(end.yaw - begin.yaw, math.tau) == pytest.approx(turned, abs=0.08)
+    assert (simulation.truth.falls, simulation.truth.contacts) == (0, 0)
+
+
+def test_at_home_its_arm_does_not_stick_out_of_the_base() -> None:
+    simulation = make()
+    model, data = simulation.model, simulation.data
+    geoms = [n for n in range(model.ngeom) if model.geom(n).name.startswith("robot/arm_")]
+    corners = np.array(list(itertools.product((-1, 1), repeat=3)))
+    boxes = [
+        data.geom_xpos[n] + corners * model.geom_size[n] @ data.geom_xmat[n].reshape(3, 3).T
+        for n in geoms
+    ]
+    away = np.linalg.norm(np.concatenate(boxes)[:, :2] - data.body("robot/base").xpos[:2], axis=1)
+    assert len(geoms) == SO101.ngeom
+    assert away.max() < 0.15
+
+
+def test_wheels_that_would_be_too_fast_all_slow_down_alike() -> None:
+    sent = make().drive(0.2, 0.0, 1.0)
+    assert sent.linear_x < 0.17
+    assert sent.angular_z / sent.linear_x == pytest.approx(5.0)
+
+
+def test_its_arm_is_that_of_the_so101_in_the_physics_and_in_the_text_for_the_brain() -> None:
+    whole = mujoco.MjSpec.from_file(str(MODEL)).compile()
+    told = mujoco.MjModel.from_xml_string(text())
+    for kind, figures in FIGURES.items():
+        count = {"body": "nbody", "joint": "njnt", "actuator": "nu"}.get(kind, f"n{kind}")
+        for number in range(getattr(SO101, count)):
+            theirs = getattr(SO101, kind)(number)
+            if theirs.name == "world":
+                continue
+            for model in (whole, told):
+                ours = getattr(model, kind)(f"arm_{theirs.name}")
+                for figure in figures:
+                    np.testing.assert_allclose(getattr(ours, figure), getattr(theirs, figure))
+    assert told.njnt == told.nu == SO101.njnt
+
+
+def test_the_brain_knows_its_base_by_the_text_alone() -> None:
+    robot = catalog.load_robot("lekiwi")
+    shape = MujocoArm(text(), robot.description())
+    pairs = {shape.describe(pair) for pair in range(len(shape.levers))}
+    assert ("self", "base", "arm_gripper") in pairs
+    assert ("floor", "arm_gripper", "the floor") in pairs
+    home = np.array(robot.arm.home)  # type: ignore[union-attr]
+    clear = robot.thresholds.arm_clearance
+    assert not len(shape.near(home, np.full(len(shape.levers), clear)).pairs)
+    onto_its_plate = np.array((0.0, 0.1, 1.1, 0.5, 0.0, 0.0))
+    touched = shape.near(onto_its_plate, np.zeros(len(shape.levers))).pairs
+    assert {shape.describe(pair)[:2] for pair in touched.tolist()} == {("self", "base")}
+
+
+def test_it_reaches_what_the_so101_reaches_from_its_top_plate() -> None:
+    robot, so101 = catalog.load_robot("lekiwi"), catalog.load_robot("so101")
+    ours = ArmKinematics(text(), robot.joints, "arm_tool")
+    path = catalog.robot_path("so101").with_name("model.xml")
+    theirs = ArmKinematics(path.read_text(), so101.joints)
+    posture = np.array((0.3, -0.2, 0.6, 0.9, 0.1))
+    raised = ours.forward(posture).position - theirs.forward(posture).position
+    assert raised == pytest.approx((-0.04, 0.0, 0.119))
+    assert ours.opening().widest == pytest.approx(theirs.opening().widest)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "problem"),
+    [
+        ('model="so101" body', 'model="so102" body', "no model 'so102' in its assets"),
+        ('body="base" prefix', 'body="bace" prefix', "no body 'bace' to attach"),
+        ("../so101", "../so102", "No such file"),
+        ("</mujoco>", "", "no XML"),
+        ('<body name="base">', '<body name="trunk">', "no body 'base' in the worldbody"),
+    ],
+)
+def test_a_model_that_cannot_be_put_together_is_refused(
+    tmp_path: Path, before: str, after: str, problem: str
+) -> None:
+    folder = tmp_path / "lekiwi"
+    folder.mkdir()
+    (tmp_path / "so101").symlink_to(MODEL.parent.with_name("so101"))
+    path = folder / "model.xml"
+    path.write_text(MODEL.read_text().replace(before, after))
+    with pytest.raises(ConfigError, match=problem):
+        arm_text(path, [])
