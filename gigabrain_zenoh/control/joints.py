@@ -56,14 +56,26 @@ class JointMemory(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def step_joints(
-    body: BodyDescription, memory: JointMemory, inputs: JointInputs
+    body: BodyDescription, memory: JointMemory, inputs: JointInputs, commander: str = BRAIN
 ) -> tuple[JointMemory, JointCommand | None]:
-    """Return the command for the tick after that of the state; None while joints are missing."""
+    """Return the command for the tick after that of the state; None while joints are missing.
+
+    It moves the joints while the gate obeys `commander`.
+    """
+    state = inputs.state
+    obeyed = state.gate.mode == "enabled" and state.gate.commander == commander
+    memory, command = _step(body, memory, inputs, obeyed)
+    return memory, command and replace(command, source=commander)
+
+
+def _step(
+    body: BodyDescription, memory: JointMemory, inputs: JointInputs, obeyed: bool
+) -> tuple[JointMemory, JointCommand | None]:
     state = inputs.state
     here, posture = measured(body, state), held(body, state)
     if not here:
         return JointMemory(boot=state.boot, tick=state.tick), None
-    if state.gate.mode != "enabled" or state.gate.commander != BRAIN:
+    if not obeyed:
         memory = JointMemory(
             boot=state.boot,
             tick=state.tick,
@@ -249,6 +261,5 @@ def _command(
         name=tuple(joint.name for joint in body.joints),
         position=places,
         velocity=speeds,
-        source=BRAIN,
         operator=memory.operator if memory else False,
     )

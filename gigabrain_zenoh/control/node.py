@@ -271,13 +271,18 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
 
 
 class ArmControl:
-    """Publishes commands for joints at each state."""
+    """Publishes commands for joints at each state, while the gate obeys its commander."""
 
-    def __init__(self, bus: Bus) -> None:
-        self._bus = bus
+    def __init__(self, bus: Bus, commander: str = BRAIN) -> None:
+        self._bus, self._commander = bus, commander
         self._memory = JointMemory()
         self._more: asyncio.Future[None] | None = None  # commands between two states
         self.teleop: OperatorStream[JointSpeeds] = OperatorStream(bus.clock.now_ns)
+
+    @property
+    def memory(self) -> JointMemory:
+        """State after the last command."""
+        return self._memory
 
     def prepare(self, body: Body) -> None:
         """Get ready for a body. Raises ConfigError where a library is missing."""
@@ -291,7 +296,7 @@ class ArmControl:
         teleop = self.teleop.live(state, echo_wanted=body.link == "real")
         inputs = JointInputs(state=state, intent=intent, teleop=teleop)
         before = self._memory.problem
-        self._memory, command = step_joints(body.description, self._memory, inputs)
+        self._memory, command = step_joints(body.description, self._memory, inputs, self._commander)
         if self._memory.problem != before:
             _log_tolerance(state.tick, self._memory)
         if command is None:

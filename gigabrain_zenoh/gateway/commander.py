@@ -246,9 +246,12 @@ def _obey(config: Config, memory: Memory, now: Now) -> Step:
 
 def _obstacle(config: Config, memory: Memory, gate: GateStatus) -> str:
     """Return why the gate need not be asked for the body now; empty if it may be."""
-    if memory.blocked:
-        return memory.blocked
-    if gate.commander not in ("", config.name) and not config.take:
+    return memory.blocked or obstacle(gate, config.name, take=config.take)
+
+
+def obstacle(gate: GateStatus, name: str, *, take: bool) -> str:
+    """Return why the gate would not give the body to the commander `name`; empty if it may."""
+    if gate.commander not in ("", name) and not take:
         return f"{gate.commander} drives; end that first, or set `ros2: {{take: true}}`"
     if gate.mode == "latched":
         causes = "; ".join(cause.text for cause in gate.causes)
@@ -258,12 +261,17 @@ def _obstacle(config: Config, memory: Memory, gate: GateStatus) -> str:
 
 def _lost(config: Config, memory: Memory) -> Memory:
     """Note that a stop or another commander has ended the lease."""
-    gate = memory.gate
-    assert gate
-    other = gate.commander if gate.commander != config.name else ""
-    why = f"{other} has taken the body" if other else f"the gate has stopped: {gate.mode}"
+    assert memory.gate
+    why = lost(memory.gate, config.name)
     return replace(memory, holds=False, velocity=ZERO, blocked=f"{why}; {PAUSE}",
                    refusal=f"{why}; {PAUSE}")  # fmt: skip
+
+
+def lost(gate: GateStatus, name: str) -> str:
+    """Return what has ended the lease of the commander `name`."""
+    if gate.commander not in ("", name):
+        return f"{gate.commander} has taken the body"
+    return f"the gate has stopped: {gate.mode}"
 
 
 def _mine(config: Config, memory: Memory) -> bool:

@@ -1,9 +1,7 @@
 """Commands of ROS on the bus: /cmd_vel by the commander, and the poses that RViz publishes."""
 
-import asyncio
 import logging
-from collections import deque
-from collections.abc import Awaitable, Callable, Coroutine, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 from msgspec.structs import asdict
@@ -18,14 +16,16 @@ from gigabrain_zenoh.client.tasks import PLAN_S
 from gigabrain_zenoh.config.settings import Ros2Config
 from gigabrain_zenoh.errors import BadPayload, GigabrainError, Refused
 from gigabrain_zenoh.gateway import commander
+from gigabrain_zenoh.gateway.background import Background
 from gigabrain_zenoh.gateway.commander import Action, Ask, Memory, Now, Refuse, Send, wanted_of
 from gigabrain_zenoh.gateway.conversions.diagnostics import Level, Status
 from gigabrain_zenoh.gateway.conversions.frames import MAP, stamp_ns
 from gigabrain_zenoh.gateway.conversions.maps import in_map, planar, planar_covariance
 from gigabrain_zenoh.gateway.scene import Scene, left_out
+from gigabrain_zenoh.gateway.topic_requests import TopicRequests
 from gigabrain_zenoh.geometry.limits import limits_of
 from gigabrain_zenoh.logs import QuietFault
-from gigabrain_zenoh.ros2.qos import DEFAULT, Qos
+from gigabrain_zenoh.ros2.qos import Qos
 from gigabrain_zenoh.ros2.transport import Received, RosTransport
 from gigabrain_zenoh.ros2.types import Types
 
@@ -33,31 +33,6 @@ log = logging.getLogger(__name__)
 COMMANDS = Qos(reliable=False, depth=1)  # matches every publisher; only the newest counts
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 POSE, GUESS = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
-
-
-class Background:
-    """Tasks that answer ROS; one that fails unexpectedly ends the process."""
-
-    def __init__(self) -> None:
-        self._tasks: set[asyncio.Task[None]] = set()
-        self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-
-    def start(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Start a task."""
-        task = asyncio.get_running_loop().create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._done)
-        return task
-
-    def close(self) -> None:
-        """Cancel all tasks."""
-        for task in self._tasks:
-            task.cancel()
-
-    def _done(self, task: asyncio.Task[None]) -> None:
-        self._tasks.discard(task)
-        if not task.cancelled() and (error := task.exception()) and not self.failed.done():
-            self.failed.set_exception(error)
 
 
 class RosCommander:
@@ -176,50 +151,15 @@ class PoseRequests:
     def __init__(
         self, scene: Scene, ros: RosTransport, types: Types, config: Ros2Config, work: Background
     ) -> None:
-        self._scene, self._types, self._work = scene, types, work
-        self.problems: dict[str, str] = {}  # the last refusal, by topic; gone once one is accepted
+        self._scene = scene
+        requests = TopicRequests(scene.bus, ros, types, work)
         for topic, name, ask in (
             ("initialpose", GUESS, self._initial_pose),
             ("goal_pose", POSE, self._goal),
         ):
             if not left_out(config, topic):
-                ros.subscribe(topic, name, DEFAULT, self._handler(topic, name, ask))
-
-    def status(self) -> list[Status]:
-        """Return lines of diagnostics for what was refused last."""
-        return [Status(topic, Level.WARN, f"refused: {text}")
-                for topic, text in self.problems.items()]  # fmt: skip
-
-    def _handler(
-        self, topic: str, name: str, ask: Callable[[Any], Awaitable[str]]
-    ) -> Callable[[Received], None]:
-        """Return a handler that asks for one pose at a time; the newest one waits for it."""
-        waiting: deque[bytes] = deque(maxlen=1)
-        busy, fault, clock = False, QuietFault(log), self._scene.bus.clock
-
-        async def work() -> None:
-            nonlocal busy
-            while waiting:
-                try:
-                    text = await ask(self._types.decode_command(name, waiting.pop()))
-                except GigabrainError as error:
-                    self.problems[topic] = str(error)
-                    self._scene.bus.counters[f"{topic}_refused"] += 1
-                    fault.begin(f"refused /{topic}: {error}", clock.now_ns())
-                else:
-                    self.problems.pop(topic, None)
-                    fault.end(f"/{topic} is accepted again", clock.now_ns())
-                    log.info("/%s: %s", topic, text)
-            busy = False
-
-        def handle(received: Received) -> None:
-            nonlocal busy
-            waiting.append(received.payload)
-            if not busy:
-                busy = True
-                self._work.start(work())
-
-        return handle
+                requests.serve(topic, name, ask)
+        self.status = requests.status
 
     async def _initial_pose(self, message: Any) -> str:
         frame, guess = message.header.frame_id, message.pose

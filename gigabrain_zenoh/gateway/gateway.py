@@ -8,10 +8,12 @@ from gigabrain_schemas.base import Cause
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import Ros2Config
 from gigabrain_zenoh.gateway import free_fleet
+from gigabrain_zenoh.gateway.background import Background
 from gigabrain_zenoh.gateway.conversions.diagnostics import Level, Status
 from gigabrain_zenoh.gateway.diagnosing import Diagnosing
-from gigabrain_zenoh.gateway.driving import Background, PoseRequests, RosCommander
+from gigabrain_zenoh.gateway.driving import PoseRequests, RosCommander
 from gigabrain_zenoh.gateway.graph_watch import GraphWatch
+from gigabrain_zenoh.gateway.joint_requests import JointRequests
 from gigabrain_zenoh.gateway.nav2 import Nav2Actions
 from gigabrain_zenoh.gateway.parameters import Parameters
 from gigabrain_zenoh.gateway.publishing import Publishing
@@ -38,7 +40,8 @@ class Gateway:
             self.publishing.append(Publishing(scene, fleet, types, config, free_fleet.TOPICS))
         self.commander = RosCommander(scene, ros, types, config, work)
         self.poses = PoseRequests(scene, ros, types, config, work)
-        self.services = Services(scene, ros, types, config, self.commander)
+        self.joints = JointRequests(scene, ros, types, config, work)
+        self.services = Services(scene, ros, types, config, self._forget)
         self.actions = Nav2Actions(scene, ros, types, config, fleet)
         self.parameters = Parameters(ros, types, config, lambda: scene.simulated)
         self.graph = GraphWatch(ros, config, self.commander.offsets_s)
@@ -50,6 +53,7 @@ class Gateway:
     async def close(self) -> None:
         """End what runs for ROS; a body that it drives is stopped by the gate."""
         await self.actions.close()
+        await self.joints.close()
         for publishing in self.publishing:
             publishing.close()
         self.work.close()
@@ -79,7 +83,11 @@ class Gateway:
                 self._bus.counters["free_fleet_refused"] = self._fleet.counts["refused"]
 
     def _statuses(self) -> list[Status]:
-        return [self.commander.status(), *self.poses.status()]
+        return [self.commander.status(), *self.poses.status(), *self.joints.status()]
+
+    def _forget(self, why: str) -> None:
+        self.commander.forget(why)
+        self.joints.forget(why)
 
 
 async def serve(

@@ -4,11 +4,11 @@ As in Nav2, a new goal of the same action preempts the one before, which ends as
 the other action is rejected meanwhile, and one that cannot be understood does not end the present.
 """
 
-import asyncio
 from collections.abc import Callable
 from typing import Any
 
 from gigabrain_zenoh.config.settings import Ros2Config
+from gigabrain_zenoh.gateway.goal_tasks import GoalTasks
 from gigabrain_zenoh.gateway.navigation import (
     EndState,
     Navigator,
@@ -23,37 +23,24 @@ from gigabrain_zenoh.ros2.actions import ActionServer, Goal, GoalState, Outcome
 from gigabrain_zenoh.ros2.transport import RosServer, RosTransport
 from gigabrain_zenoh.ros2.types import Types
 
-Work = asyncio.Future[Ended]
 TO_POSE_TYPE = "nav2_msgs/action/NavigateToPose"
 THROUGH_POSES_TYPE = "nav2_msgs/action/NavigateThroughPoses"
 
 
-class NavigateHandler:
+class NavigateHandler(GoalTasks):
     """Carries out the goals of one of the actions."""
 
     def __init__(
         self, scene: Scene, types: Types, navigator: Navigator, type: str, codes: Codes
     ) -> None:
+        super().__init__()
         self._scene, self._types, self._navigator = scene, types, navigator
         self._type, self._codes = type, codes
-        self._works: dict[bytes, Work] = {}  # by goal
         self.others: list[NavigateHandler] = []
-
-    @property
-    def busy(self) -> bool:
-        """Whether a goal is carried out."""
-        return bool(self._works)
 
     def accept(self, message: Any) -> bool:
         """Accept any goal while no other action has the robot; `run` says what is wrong with it."""
         return not any(other.busy for other in self.others)
-
-    def cancel(self, goal: Goal) -> bool:
-        """Cancel a goal, whose task then ends."""
-        work = self._works.get(goal.id)
-        if work:
-            work.cancel()
-        return True
 
     async def run(self, goal: Goal, feed: Callable[[Any], None]) -> Outcome:
         """Carry out a goal until its end."""
@@ -62,33 +49,15 @@ class NavigateHandler:
         asked = requested(self._codes, poses, message.behavior_tree, self._scene.odom_in_map)
         if asked.fault:
             return _outcome(asked.fault)
-        if goal.cancel_requested:
-            return Outcome(GoalState.CANCELED)
 
         def tell(progress: Progress) -> None:
             made = self._types.make
             feed(feedback(made, self._type, self._scene.ros_ns(), progress))
 
-        before = list(self._works.values())
-        carrying = self._navigator.carry_out(self._codes, asked.poses, tell)
-        work = self._works[goal.id] = asyncio.ensure_future(carrying)
-        for one in before:  # after the new one is begun, whose task takes the place of its own
-            one.cancel()
-        try:
-            return _outcome(await work)
-        except asyncio.CancelledError:
-            if not work.cancelled() or self._closing():
-                work.cancel()
-                raise
-            return Outcome(GoalState.CANCELED if goal.cancel_requested else GoalState.ABORTED)
-        finally:
-            del self._works[goal.id]
+        async def carry_out() -> Outcome:
+            return _outcome(await self._navigator.carry_out(self._codes, asked.poses, tell))
 
-    @staticmethod
-    def _closing() -> bool:
-        """Return whether the task that runs this is itself cancelled."""
-        task = asyncio.current_task()
-        return task is not None and task.cancelling() > 0
+        return await self.carried_out(goal, carry_out)
 
 
 def _outcome(ended: Ended) -> Outcome:

@@ -15,7 +15,6 @@ from gigabrain_zenoh.client.requests import enable, press_estop, release
 from gigabrain_zenoh.config.settings import Ros2Config
 from gigabrain_zenoh.errors import BodyLost, GigabrainError, Refused
 from gigabrain_zenoh.gate.state import BRAIN
-from gigabrain_zenoh.gateway.driving import RosCommander
 from gigabrain_zenoh.gateway.scene import Scene, left_out
 from gigabrain_zenoh.ros2.transport import RosTransport
 from gigabrain_zenoh.ros2.types import Types
@@ -36,9 +35,10 @@ class Services:
         ros: RosTransport,
         types: Types,
         config: Ros2Config,
-        commander: RosCommander,
+        forget: Callable[[str], None],
     ) -> None:
-        self._scene, self._types, self._commander = scene, types, commander
+        """Serve them; `forget` has ROS stop commanding, for a reason."""
+        self._scene, self._types, self._forget = scene, types, forget
         self._logged = ("", "", 0)  # the last call that was logged, and when
         acts: dict[str, tuple[str, Callable[[Any], Awaitable[str]]]] = {
             "estop": (SET_BOOL, self._estop),
@@ -76,7 +76,7 @@ class Services:
     async def _estop(self, request: Any) -> str:
         if not request.data:
             raise Refused(NOT_HERE)
-        self._commander.forget("an e-stop was pressed")
+        self._forget("an e-stop was pressed")
         return (await press_estop(self._scene.bus, "a service call of ROS")).text
 
     async def _release(self, _: Any) -> str:
@@ -89,7 +89,7 @@ class Services:
         """Let the robot's brain drive; the body is taken from this gateway's own commander only."""
         state, bus = self._scene.fresh_state, self._scene.bus
         ours = state is not None and state.gate.commander == bus.process
-        self._commander.forget("the robot's brain was enabled")
+        self._forget("the robot's brain was enabled")
         return (await enable(bus, BRAIN, take=ours)).text
 
     async def _map_save(self, _: Any) -> str:

@@ -15,6 +15,7 @@ from gigabrain_schemas.topics import (
     GOAL,
     HEALTH,
     IMAGE,
+    JOINT_CMD,
     MAP_SAVE,
     MISSION,
     POSE_SET,
@@ -31,6 +32,7 @@ COMMANDED = {  # what ROS asks of the robot; what it reads is in `table`
     "cmd_vel": CMD_VEL.key, "initialpose": POSE_SET.key, "goal_pose": GOAL.key,
     "navigate_to_pose": GOAL.key, "navigate_through_poses": MISSION.key, "estop": ESTOP.key,
     "release": RELEASE.key, "enable": ENABLE.key, "map_save": MAP_SAVE.key,
+    "joint_trajectory": JOINT_CMD.key, "follow_joint_trajectory": JOINT_CMD.key,
 }  # fmt: skip
 EVERY_NODE = ("rcl_interfaces/", "type_description_interfaces/")  # types of what all nodes have
 ACTION = "/_action/"

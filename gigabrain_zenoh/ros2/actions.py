@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Protocol
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.ros2.qos import ACTION_STATUS, DEFAULT
 from gigabrain_zenoh.ros2.transport import Close, RosServer
-from gigabrain_zenoh.ros2.types import Types
+from gigabrain_zenoh.ros2.types import MAX_COMMAND, Types
 
 log = logging.getLogger(__name__)
 MAX_ACTIVE = 32  # goals of a server at once
@@ -170,15 +170,16 @@ class ActionServer:
         *,
         preempts: bool = False,
         polled: RosServer | None = None,
+        max_bytes: int = MAX_COMMAND,
         now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         """Offer the action `name` of a type such as nav2_msgs/action/NavigateToPose.
 
         With `preempts`, a new goal sets `preempted` of those that are active. `polled` is a second
         transport that has the action too, where a request for a result does not wait for the goal's
-        end: it is answered at once with the present state.
+        end: it is answered at once with the present state. Goals have `max_bytes` at most.
         """
-        self.goals = Goals()
+        self.goals, self._max_bytes = Goals(), max_bytes
         self._types, self._type, self._handler = types, type, handler
         self._name, self._preempts, self._now_ns = name, preempts, now_ns
         self._ends: dict[bytes, asyncio.Event] = {}
@@ -217,7 +218,8 @@ class ActionServer:
             publisher.close()
 
     async def _send_goal(self, request: bytes) -> bytes:
-        asked = self._types.decode_command(f"{self._type}_SendGoal_Request", request)
+        kind = f"{self._type}_SendGoal_Request"
+        asked = self._types.decode_command(kind, request, self._max_bytes)
         id, now_ns = asked.goal_id.uuid.tobytes(), self._now_ns()
         self.goals.forget(now_ns)
         accepted = self.goals.may_accept(id) and self._handler.accept(asked.goal)

@@ -68,13 +68,13 @@ class Types:
         """
         return decoded(self._store, self.known(name), payload)
 
-    def decode_command(self, name: str, payload: bytes) -> Any:
+    def decode_command(self, name: str, payload: bytes, max_bytes: int = MAX_COMMAND) -> Any:
         """Return a command or request; to decode a large one would hold up the others.
 
         Raises BadPayload, and nothing else.
         """
-        if len(payload) > MAX_COMMAND:
-            raise BadPayload(f"{name}: {len(payload)} bytes; expected at most {MAX_COMMAND}")
+        if len(payload) > max_bytes:
+            raise BadPayload(f"{name}: {len(payload)} bytes; expected at most {max_bytes}")
         return self.decode(name, payload)
 
     def make(self, name: str, /, **fields: Any) -> Any:

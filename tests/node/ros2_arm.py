@@ -1,0 +1,177 @@
+"""An arm in memory with the gateway: the driver's process with its gate, and safety by hand."""
+
+import asyncio
+import uuid
+from contextlib import AsyncExitStack
+
+import numpy as np
+from msgspec.structs import replace
+
+from gigabrain_drivers.bodies.mock.driver import MockBody, MockOptions
+from gigabrain_drivers.driver.catalog import load_robot, robot_path
+from gigabrain_drivers.driver.process import DriverProcess
+from gigabrain_drivers.driver.robot import Run
+from gigabrain_schemas.body import Joint
+from gigabrain_schemas.brain import JointCommand
+from gigabrain_schemas.safety import SafetyState
+from gigabrain_schemas.topics import JOINT_CMD, SAFETY, STATE
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork
+from gigabrain_zenoh.client.requests import enable
+from gigabrain_zenoh.clock import FakeClock
+from gigabrain_zenoh.config.settings import DriverConfig
+from gigabrain_zenoh.gateway.joint_requests import FOLLOW_TYPE, TRAJECTORY
+from tests.node.ros2_robot import TICK_NS, TYPES, RosNode, gateway_on
+
+POINT = "trajectory_msgs/msg/JointTrajectoryPoint"
+NAMES = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+
+
+class MockArm(MockBody):
+    """Joints that follow 80 ms late, as servos do, unless they are blocked."""
+
+    def __init__(self, robot, options, run):
+        super().__init__(robot, options, run)
+        self.blocked, self.let_go = False, False
+        self.places = self.targets = dict(zip(NAMES, robot.arm.home, strict=True))
+        self.history = []  # of the targets, one a call
+
+    async def set_joint_positions(self, positions):
+        self.targets, self.let_go = self.targets | dict(positions), False
+        self.history.append(self.targets)
+        return positions
+
+    async def limp(self):
+        self.let_go = True
+
+    async def read_state(self):
+        before = self.places
+        if not (self.blocked or self.let_go):
+            self.places = {
+                name: at + 0.22 * (self.targets[name] - at) for name, at in before.items()
+            }
+        joints = tuple(
+            Joint(name=name, position=at, velocity=(at - before[name]) / 0.02, effort=0.1)
+            for name, at in self.places.items()
+        )
+        return replace(await super().read_state(), joints=joints, limp=self.let_go)
+
+
+class ArmRobot:
+    """A robot that is an arm: `async with ArmRobot(folder) as robot:`."""
+
+    def __init__(self, folder, config=None):
+        self._folder, self._config = folder, config
+        self.network, self.clock = LocalNetwork(), FakeClock()
+        self.state, self.safe = None, True
+
+    async def __aenter__(self):
+        self.robot = load_robot("so101")
+        run = Run(folder=robot_path("so101").parent)
+        self.arm = MockArm(self.robot, MockOptions(driver="mock"), run)
+        bus = Bus(self.network.transport(), self.clock, "driver")
+        config = DriverConfig(body="so101", resume="manual", state_dir=str(self._folder))
+        process = DriverProcess(config, self.robot, self.arm, bus)
+        self._running = asyncio.ensure_future(process.run(lambda: None))
+        self.operator = Bus(self.network.transport(), self.clock)
+        self.operator.subscribe(STATE, self._see)
+        self._stack = AsyncExitStack()
+        self.gateway_bus, self.ros = await self._stack.enter_async_context(
+            gateway_on(self.network, self.clock, self._config)
+        )
+        self.node = RosNode(self.ros, self.clock)
+        await self.go(60)
+        return self
+
+    async def __aexit__(self, *_):
+        await self._stack.aclose()
+        self._running.cancel()
+        await asyncio.gather(self._running, return_exceptions=True)
+
+    def _see(self, _key, state):
+        self.state = state
+        if self.safe:
+            self.operator.publish(SAFETY, SafetyState(verdict="ok"), basis=state.tick)
+
+    async def released(self):
+        assert (await self.node.call("/release", "std_srvs/srv/Trigger")).success
+        await self.go(5)
+        assert self.state.gate.mode == "idle"
+
+    async def commanded(self):
+        """Have the robot's brain command the arm: control holds it."""
+        self.operator.subscribe(STATE, self._hold)
+        await self.go(50)
+        await enable(self.operator, "control")
+        await self.go(5)
+        assert self.state.gate.commander == "control"
+
+    def _hold(self, _key, state):
+        command = JointCommand(name=NAMES, position=self.robot.arm.home, source="control")
+        self.operator.publish(JOINT_CMD, command, basis=state.tick)
+
+    async def go(self, ticks):
+        await self.clock.advance(ticks * TICK_NS)
+        if self._running.done():
+            self._running.result()
+
+    def at(self, name):
+        """Return where a joint is."""
+        return self.arm.places[name]
+
+    def diagnostics(self):
+        """Return the newest statuses by name."""
+        found = self.node.received["/diagnostics"][-1].status
+        return {one.name: one for one in found}
+
+    def trajectory(self, *points, names=("shoulder_pan",), **fields):
+        """Return a message: points are (seconds, positions...)."""
+        made = [
+            TYPES.make(
+                POINT, positions=np.array(places, float),
+                time_from_start={"sec": int(t), "nanosec": round(t % 1 * 1e9)},
+            )
+            for t, *places in points
+        ]  # fmt: skip
+        return TYPES.make(TRAJECTORY, joint_names=list(names), points=made, **fields)
+
+    def publish(self, message):
+        """Publish a trajectory on the topic."""
+        self.node.publish("/joint_trajectory", TRAJECTORY, header=message.header,
+                          joint_names=message.joint_names, points=message.points)  # fmt: skip
+
+
+class Client:
+    """A client of the action."""
+
+    BASE = "/follow_joint_trajectory/_action"
+
+    def __init__(self, robot):
+        self._robot = robot
+        robot.node.read(f"{self.BASE}/feedback", f"{FOLLOW_TYPE}_FeedbackMessage")
+
+    @property
+    def feedback(self):
+        return [one.feedback for one in self._robot.node.received[f"{self.BASE}/feedback"]]
+
+    async def send(self, message, **goal):
+        """Send a goal; return its id."""
+        id = uuid.uuid4().bytes
+        made = TYPES.make(f"{FOLLOW_TYPE}_Goal", trajectory=message, **goal)
+        answer = await self._robot.node.call(
+            f"{self.BASE}/send_goal", f"{FOLLOW_TYPE}_SendGoal", goal_id={"uuid": id}, goal=made
+        )
+        assert answer.accepted
+        return id
+
+    async def cancel(self, id):
+        info = {"goal_id": {"uuid": id}}
+        service = f"{self.BASE}/cancel_goal"
+        return await self._robot.node.call(service, "action_msgs/srv/CancelGoal", goal_info=info)
+
+    async def result(self, id):
+        """Return status, error code and text; time has to have passed before."""
+        service = f"{self.BASE}/get_result"
+        answer = await self._robot.node.call(service, f"{FOLLOW_TYPE}_GetResult",
+                                             goal_id={"uuid": id})  # fmt: skip
+        return answer.status, answer.result.error_code, answer.result.error_string
