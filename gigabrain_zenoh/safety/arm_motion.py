@@ -39,11 +39,16 @@ Floats = NDArray[np.float64]
 
 
 class Near(Struct, frozen=True):
-    """Pairs of shapes that are near each other in some posture."""
+    """Pairs of shapes that are near each other in some postures, in the order of these."""
 
+    where: NDArray[np.int64]  # (n,), the numbers of the postures
     pairs: NDArray[np.int64]  # (n,), their numbers
     distances: Floats  # (n,) [m], negative where they overlap
     gradients: Floats  # (n, joints) [m] per [rad] or [m], by which distances grow with joints
+
+    def part(self, rows: slice) -> "Near":
+        """Return some of them."""
+        return Near(self.where[rows], self.pairs[rows], self.distances[rows], self.gradients[rows])
 
 
 class ArmShape(Protocol):
@@ -53,8 +58,8 @@ class ArmShape(Protocol):
     def levers(self) -> Floats:
         """The greatest gradients that there can be, (pairs, joints), all positive."""
 
-    def near(self, posture: Floats, within: Floats) -> Near:
-        """Return each pair that is nearer than its value in `within`, (pairs,) [m]."""
+    def near(self, postures: Floats, within: Floats) -> Near:
+        """Return each pair that is nearer than its value in `within`, (postures, pairs) [m]."""
 
     def describe(self, pair: int) -> tuple[Kind, str, str]:
         """Return what a pair is: its kind, and the names of both."""
@@ -107,33 +112,27 @@ def limits(
     turning = np.array([joint.velocity for joint in measured])
     rising = brakes.reachable(np.maximum(now, turning))
     falling = brakes.reachable(-np.minimum(now, turning))
-    caps = _Caps(brakes, len(joints))
     there = [joint.position for joint in measured]
     reach = shape.levers @ brakes.way(np.maximum(rising, falling)) + HELD_M
     reach = clearance + np.minimum(reach, SEEN_M)
-    here = _both(*(shape.near(np.array(posture), reach) for posture in (sent, there)))
-    caps.keep_off(here, rising, falling, clearance)
-    free = reach.copy()
-    np.minimum.at(free, here.pairs, here.distances)
     swings = (np.abs(turning) > SWINGING) & (np.abs(turning) > np.abs(now))
     moving = np.where(swings, turning, now)
     ways = np.where(moving > 0, brakes.way(rising), -brakes.way(falling))
     ways[np.abs(moving) < MOVING] = 0.0
-    if ways.any():
-        touching = np.full(len(reach), clearance)
-        longest = float((shape.levers @ np.abs(ways)).max(initial=0.0))
-        steps = min(MOST_STEPS, math.ceil(longest / STEP_M))
-        for step in range(steps):
-            shares = step / steps, (step + 1) / steps
-            ahead = np.clip(np.array(sent) + shares[1] * ways, brakes.lower, brakes.upper)
-            caps.stop_short(shape.near(ahead, touching), ways, shares, free, clearance)
+    longest = float((shape.levers @ np.abs(ways)).max(initial=0.0))
+    steps = min(MOST_STEPS, math.ceil(longest / STEP_M))
+    ends = np.arange(1, steps + 1) / max(1, steps)
+    ahead = np.clip(np.array(sent) + ends[:, None] * ways, brakes.lower, brakes.upper)
+    within = np.full((2 + steps, len(reach)), clearance)
+    within[:2] = reach
+    near = shape.near(np.concatenate(((sent, there), ahead)), within)
+    split = int(np.searchsorted(near.where, 2))
+    here, later = near.part(slice(split)), near.part(slice(split, None))
+    caps = _Caps(brakes, len(joints))
+    caps.keep_off(here, rising, falling, clearance)
+    np.minimum.at(reach, here.pairs, here.distances)
+    caps.stop_short(later, ways, ends[later.where - 2], 1 / max(1, steps), reach, clearance)
     return ArmLimits(caps=caps.result(joints), causes=_held(shape, here, clearance))
-
-
-def _both(first: Near, second: Near) -> Near:
-    pairs = np.concatenate((first.pairs, second.pairs))
-    distances = np.concatenate((first.distances, second.distances))
-    return Near(pairs, distances, np.concatenate((first.gradients, second.gradients)))
 
 
 class _Caps:
@@ -158,21 +157,17 @@ class _Caps:
             np.minimum(caps, allowed.min(axis=0, initial=np.inf), out=caps)
 
     def stop_short(
-        self,
-        near: Near,
-        ways: Floats,
-        shares: tuple[float, float],
-        free: Floats,
-        clearance: float,
+        self, near: Near, ways: Floats, ends: Floats, step: float, free: Floats, clearance: float
     ) -> None:
-        """Have moving joints stop where pairs get too near between two `shares` of their ways.
+        """Have moving joints stop where pairs get too near.
 
-        `free` are the distances of all pairs now [m].
+        They do so on the `step` that ends at `ends`, both in parts of `ways`. `free` are the
+        distances of all pairs now [m].
         """
         now, then = free[near.pairs] - clearance, near.distances - clearance
         worse = (then < 0) & (then < now)
-        reached = shares[1] * np.maximum(0.0, now) / np.where(worse, now - then, 1.0)
-        reached = np.maximum(reached, shares[0])
+        reached = ends * np.maximum(0.0, now) / np.where(worse, now - then, 1.0)
+        reached = np.maximum(reached, ends - step)
         a = self._brakes.acceleration
         allowed = _root(1 / (2 * a), np.array(LATE_S), reached[:, None] * np.abs(ways))
         counts = worse[:, None] & (np.abs(near.gradients) > NO_LEVER)
@@ -204,14 +199,13 @@ def _root(square: Floats, linear: Floats, value: Floats) -> Floats:
 
 def _held(shape: ArmShape, here: Near, clearance: float) -> tuple[Cause, ...]:
     """Return the nearest pair of each kind that keeps the arm from going on."""
-    (held,) = np.nonzero(here.distances < clearance + HELD_M)
+    movable = (np.abs(here.gradients) > NO_LEVER).any(axis=1)
+    (held,) = np.nonzero(movable & (here.distances < clearance + HELD_M))
     nearest: dict[Kind, Cause] = {}
     for index in held[np.argsort(here.distances[held])].tolist():
         kind, first, second = shape.describe(int(here.pairs[index]))
-        if kind not in nearest and (np.abs(here.gradients[index]) > NO_LEVER).any():
+        if kind not in nearest:
             nearest[kind] = _cause(kind, float(here.distances[index]), first, second)
-        if len(nearest) == len(KINDS):
-            break
     return tuple(nearest.values())
 
 

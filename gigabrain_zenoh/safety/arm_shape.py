@@ -4,9 +4,11 @@ Imported where an arm is described, since MuJoCo takes memory and time that a ba
 """
 
 import re
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
+from mujoco import mj_geomDistance
 from numpy.typing import NDArray
 
 from gigabrain_schemas.body import MOST_MODEL_CHARACTERS, BodyDescription
@@ -21,11 +23,24 @@ REFUSED = re.compile(
 FILES = re.compile(r"\b(file|fileright|fileleft|fileup|filedown|filefront|fileback)\s*=")
 NEXT, LAST = (1, 2, 0), (2, 0, 1)  # of the axes x, y, z
 TOUCH_M = 1e-9
-FAR_M = 10.0  # farther, distances are not measured
 SLIDE = mujoco.mjtJoint.mjJNT_SLIDE.value
 FLAT = mujoco.mjtGeom.mjGEOM_PLANE.value
 BOX = mujoco.mjtGeom.mjGEOM_BOX.value
+CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE.value
+ELLIPSOID = mujoco.mjtGeom.mjGEOM_ELLIPSOID.value
+SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE.value
 Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+class _Poses(NamedTuple):
+    """Where shapes and joints are in some postures."""
+
+    positions: Floats  # (postures, movable joints) [rad] or [m]
+    middles: Floats  # (postures, shapes, 3) [m]
+    turns: Floats  # (postures, shapes, 9)
+    axes: Floats  # (postures, joints, 3)
+    anchors: Floats  # (postures, joints, 3) [m]
 
 
 class MujocoArm:
@@ -54,8 +69,8 @@ class MujocoArm:
         reach = _reach(model, moves)
         reach = np.where(first, reach[self._ends[:, 0]], reach[self._ends[:, 1]])
         self._levers: Floats = np.abs(self._signs) * reach @ np.abs(self._coupling)
-        self._known = np.full(len(self._ends), -np.inf)  # distances, in these postures
-        self._postures = np.zeros((len(self._ends), len(body.joints)))
+        self._radii = model.geom_rbound[self._ends].sum(axis=1, where=self._ends >= 0)
+        self._words = [self._in_words(a, b) for a, b in self._ends.tolist()]
 
     @property
     def levers(self) -> Floats:
@@ -64,7 +79,9 @@ class MujocoArm:
 
     def describe(self, pair: int) -> tuple[Kind, str, str]:
         """Return what a pair is: its kind, and the names of both."""
-        a, b = self._ends[pair].tolist()
+        return self._words[pair]
+
+    def _in_words(self, a: int, b: int) -> tuple[Kind, str, str]:
         if b < 0:
             return "floor", self._name(a), FLOOR
         box = self._model.geom(b).name
@@ -72,65 +89,84 @@ class MujocoArm:
             return "keep_out", self._name(a), box.removeprefix(KEEP_OUT)
         return "self", self._name(a), self._name(b)
 
-    def near(self, posture: Floats, within: Floats) -> Near:
-        """Return each pair that is nearer than its value in `within`, (pairs,) [m].
+    def near(self, postures: Floats, within: Floats) -> Near:
+        """Return each pair that is nearer than its value in `within`, (postures, pairs) [m].
 
-        Pairs that cannot be so near, by their last distance and how far the joints have moved since
-        then, are left out without measuring them.
+        Pairs whose enclosing spheres are farther apart are left out without measuring them.
         """
-        moved = (np.abs(posture - self._postures) * self._levers).sum(axis=1)
-        (asked,) = np.nonzero(self._known - moved < within)
-        if not len(asked):
-            return self._nothing()
-        self._data.qpos[self._places] = self._start + self._coupling @ posture
+        poses = self._posed(postures)
+        where, pairs = np.nonzero(self._apart(poses.middles) < within)
+        most = within[where, pairs]
+        distances, points, normals = self._measured(poses, where, pairs, most)
+        (near,) = np.nonzero(distances < most)
+        where, pairs = where[near], pairs[near]
+        speeds = self._speeds(poses, where, points[near], normals[near])
+        gradients = (speeds * self._signs[pairs]) @ self._coupling
+        return Near(where, pairs, distances[near], gradients)
+
+    def _posed(self, postures: Floats) -> _Poses:
+        model, data, count = self._model, self._data, len(postures)
+        shapes, joints = (count, model.ngeom), (count, model.njnt)
+        poses = _Poses(
+            self._start + postures @ self._coupling.T,
+            np.empty((*shapes, 3)), np.empty((*shapes, 9)),
+            np.empty((*joints, 3)), np.empty((*joints, 3)),
+        )  # fmt: skip
+        for index in range(count):
+            self._pose(poses.positions[index])
+            poses.middles[index], poses.turns[index] = data.geom_xpos, data.geom_xmat
+            poses.axes[index], poses.anchors[index] = data.xaxis, data.xanchor
+        return poses
+
+    def _pose(self, positions: Floats) -> None:
+        self._data.qpos[self._places] = positions
         mujoco.mj_kinematics(self._model, self._data)
-        self._known[asked], self._postures[asked] = self._apart(asked), posture
-        asked = asked[self._known[asked] < within[asked]]
-        distances, points, normals = self._measured(asked)
-        self._known[asked] = distances
-        near = distances < within[asked]
-        if not near.any():
-            return self._nothing()
-        pairs = asked[near]
-        levers = self._speeds(points[near], normals[near]) * self._signs[pairs]
-        return Near(pairs, distances[near], levers @ self._coupling)
 
-    def _apart(self, pairs: NDArray[np.int64]) -> Floats:
-        """Return the least distances that pairs can have, by spheres round the shapes (n,) [m]."""
-        a, b = self._ends[pairs, 0], self._ends[pairs, 1]
-        middles, radii = self._data.geom_xpos, self._model.geom_rbound
-        between = middles[a] - middles[b]
-        apart = np.sqrt(np.einsum("ni,ni->n", between, between)) - radii[b]
-        height = middles[a, 2] - (self._floor or 0.0)
-        return np.asarray(np.where(self._below[pairs], height, apart) - radii[a])
+    def _apart(self, middles: Floats) -> Floats:
+        """Return the least distances by spheres round the shapes, (postures, pairs) [m]."""
+        a, b = self._ends.T
+        between = middles[:, a] - middles[:, b]
+        apart = np.sqrt(np.einsum("kni,kni->kn", between, between))
+        height = middles[:, a, 2] - (self._floor or 0.0)
+        return np.asarray(np.where(self._below, height, apart) - self._radii)
 
-    def _nothing(self) -> Near:
-        joints = self._coupling.shape[1]
-        return Near(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, joints)))
+    def _measured(
+        self, poses: _Poses, where: Indices, pairs: Indices, most: Floats
+    ) -> tuple[Floats, Floats, Floats]:
+        """Return distances (n,), points between the shapes and normals to the second (n, 3).
 
-    def _measured(self, pairs: NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:
-        """Return distances (n,), points between the shapes and normals to the second (n, 3)."""
+        From its value in `most` on, (n,) [m], a distance is not measured.
+        """
         model, data = self._model, self._data
         distances, lines = np.zeros(len(pairs)), np.zeros((len(pairs), 6))
-        ends, below = self._ends[pairs].tolist(), self._below[pairs]
-        for index, (a, b) in enumerate(ends):
-            if b >= 0:
-                line = lines[index]
-                distances[index] = mujoco.mj_geomDistance(model, data, a, b, FAR_M, line)
-        points = (lines[:, :3] + lines[:, 3:]) / 2
+        below, posed = self._below[pairs], -1
+        rows = zip(where.tolist(), *self._ends[pairs].T.tolist(), most.tolist(), lines, strict=True)
+        for row, (index, a, b, cutoff, line) in enumerate(rows):
+            if b < 0:
+                continue
+            if index != posed:
+                self._pose(poses.positions[index])
+                posed = index
+            distances[row] = mj_geomDistance(model, data, a, b, cutoff, line)
+        starts, stops = lines[:, :3], lines[:, 3:]
         apart = np.where(np.abs(distances) < TOUCH_M, TOUCH_M, distances)
-        normals = (lines[:, 3:] - lines[:, :3]) / apart[:, None]  # outwards where they overlap
-        if self._floor is not None and below.any():
-            lowest = _lowest(model, data, self._ends[pairs[below], 0])
-            distances[below] = lowest[:, 2] - self._floor
+        points, normals = (starts + stops) / 2, (stops - starts) / apart[:, None]  # outwards, too
+        if below.any():
+            index, shapes = where[below], self._ends[pairs[below], 0]
+            turns = poses.turns[index, shapes].reshape(-1, 3, 3)
+            lowest = poses.middles[index, shapes] + _lowest(model, shapes, turns)
+            distances[below] = lowest[:, 2] - (self._floor or 0.0)
             points[below], normals[below] = lowest, (0.0, 0.0, -1.0)
         return distances, points, normals
 
-    def _speeds(self, points: Floats, normals: Floats) -> Floats:
+    def _speeds(self, poses: _Poses, where: Indices, points: Floats, normals: Floats) -> Floats:
         """Return how fast points move along normals with each movable joint, (n, joints)."""
-        axes, anchors = self._data.xaxis[self._joints], self._data.xanchor[self._joints]
-        turns = _cross(points, normals) @ axes.T + normals @ _cross(anchors, axes).T
-        return np.asarray(np.where(self._slides, normals @ axes.T, turns))
+        axes, anchors = poses.axes[:, self._joints], poses.anchors[:, self._joints]
+        turns = np.concatenate((axes, _cross(anchors, axes)), axis=2)
+        slides = np.concatenate((np.zeros_like(axes), axes), axis=2)
+        lines = np.where(self._slides[:, None], slides, turns)[where]
+        along = np.concatenate((_cross(points, normals), normals), axis=1)
+        return np.asarray(np.einsum("nji,ni->nj", lines, along))
 
     def _name(self, geom: int) -> str:
         return str(self._model.body(self._model.geom_bodyid[geom]).name) or "the base"
@@ -265,30 +301,35 @@ def _collides(model: mujoco.MjModel, a: int, b: int) -> bool:
     return bool((kinds[a] & others[b]) | (kinds[b] & others[a]))
 
 
-def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.int64]) -> Floats:
-    """Return the lowest point of each shape, (n, 3) [m]."""
-    turns = data.geom_xmat[geoms].reshape(-1, 3, 3)
-    down, size, kinds = -turns[:, 2], model.geom_size[geoms], model.geom_type[geoms]
-    offset = np.sign(down) * size  # of boxes
-    for index in np.flatnonzero(kinds != BOX).tolist():
-        offset[index] = _lowest_of(int(kinds[index]), size[index], down[index])
-    return np.asarray(data.geom_xpos[geoms] + np.einsum("nij,nj->ni", turns, offset))
+def _lowest(model: mujoco.MjModel, shapes: Indices, turns: Floats) -> Floats:
+    """Return the lowest point of shapes turned by (n, 3, 3), from their middles (n, 3) [m]."""
+    down, sizes, kinds = -turns[:, 2], model.geom_size[shapes], model.geom_type[shapes]
+    offsets = np.sign(down) * sizes  # of boxes
+    for kind in set(kinds.tolist()) - {BOX}:
+        (rows,) = np.nonzero(kinds == kind)
+        offsets[rows] = _lowest_of(kind, sizes[rows], down[rows])
+    return np.asarray(np.einsum("nij,nj->ni", turns, offsets))
 
 
-def _lowest_of(kind: int, size: Floats, down: Floats) -> Floats:
-    """Return the point of a round shape that lies farthest in a direction, in its own frame."""
-    if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID.value:
-        scaled = size * down
-        return np.asarray(size * scaled / max(float(np.linalg.norm(scaled)), 1e-12))
-    if kind == mujoco.mjtGeom.mjGEOM_SPHERE.value:
-        return np.asarray(size[0] * down)
-    end = np.array((0.0, 0.0, np.sign(down[2]) * size[1]))
-    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE.value:
-        return np.asarray(size[0] * down + end)
-    across = np.array((down[0], down[1], 0.0))
-    return np.asarray(size[0] * across / max(float(np.linalg.norm(across)), 1e-12) + end)
+def _lowest_of(kind: int, sizes: Floats, down: Floats) -> Floats:
+    """Return the points of round shapes that lie farthest in directions, in their own frames."""
+    if kind == ELLIPSOID:
+        scaled = sizes * down
+        return np.asarray(sizes * scaled / _lengths(scaled))
+    if kind == SPHERE:
+        return np.asarray(sizes[:, :1] * down)
+    ends = np.zeros_like(down)
+    ends[:, 2] = np.sign(down[:, 2]) * sizes[:, 1]
+    if kind == CAPSULE:
+        return np.asarray(sizes[:, :1] * down + ends)
+    across = down * (1.0, 1.0, 0.0)
+    return np.asarray(sizes[:, :1] * across / _lengths(across) + ends)
+
+
+def _lengths(vectors: Floats) -> Floats:
+    return np.asarray(np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
-    """Return the cross products of rows, as np.cross does in five times the time."""
-    return a[:, NEXT] * b[:, LAST] - a[:, LAST] * b[:, NEXT]
+    """Return the cross products of the last axes, as np.cross does in five times the time."""
+    return a[..., NEXT] * b[..., LAST] - a[..., LAST] * b[..., NEXT]

@@ -19,7 +19,7 @@ from gigabrain_schemas.body import (
 )
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.joints import JointMotion
-from gigabrain_zenoh.safety.arm_motion import limits
+from gigabrain_zenoh.safety.arm_motion import Near, limits
 from gigabrain_zenoh.safety.arm_shape import MujocoArm
 
 SO101 = load_robot("so101").description()
@@ -54,8 +54,12 @@ def model() -> str:
     return path.read_text()
 
 
+def within(arm: MujocoArm, posture: NDArray[np.float64], far: float = FAR) -> Near:
+    return arm.near(posture[None], np.full((1, len(arm.levers)), far))
+
+
 def distances(arm: MujocoArm, posture: NDArray[np.float64]) -> dict[int, float]:
-    near = arm.near(posture, np.full(len(arm.levers), FAR))
+    near = within(arm, posture)
     return dict(zip(near.pairs.tolist(), near.distances.tolist(), strict=True))
 
 
@@ -79,7 +83,7 @@ def test_a_model_that_safety_does_not_take_is_refused_in_one_line(text: str, say
 def check_gradients(arm: MujocoArm, postures: NDArray[np.float64]) -> None:
     step, checked = 1e-6, 0
     for posture in postures:
-        near = arm.near(posture, np.full(len(arm.levers), FAR))
+        near = within(arm, posture)
         before = distances(arm, posture)
         assert (np.abs(near.gradients) <= arm.levers[near.pairs] + 1e-9).all()
         for joint in range(len(posture)):
@@ -117,22 +121,26 @@ def test_the_lowest_point_of_each_kind_of_shape_is_above_the_floor(kind: str, si
 
 def test_a_joint_that_an_equality_ties_to_another_moves_with_it() -> None:
     arm = MujocoArm(ROUND.format(kind="sphere", size=".05"), TWO)
-    near = arm.near(np.array([0.3, 0.1]), np.full(len(arm.levers), FAR))
+    near = within(arm, np.array([0.3, 0.1]))
     named = {arm.describe(pair)[1:]: index for index, pair in enumerate(near.pairs.tolist())}
     tip = near.gradients[named["end", "the floor"], 1]
     other = near.gradients[named["mirror", "the floor"], 1]
     assert other == pytest.approx(-tip)  # it goes back twice as far as what carries it
 
 
-def test_what_was_measured_before_changes_nothing() -> None:
+def test_what_is_near_in_many_postures_is_what_is_near_in_each() -> None:
     lower, upper = np.array([(joint.lower, joint.upper) for joint in BODY.joints]).T
     arm, rng = MujocoArm(model(), BODY), np.random.default_rng(3)
-    posture, within = rng.uniform(lower, upper), np.full(len(arm.levers), 0.05)
-    for _ in range(50):
-        posture = np.clip(posture + rng.normal(0.0, 0.1, len(posture)), lower, upper)
-        kept, fresh = arm.near(posture, within), MujocoArm(model(), BODY).near(posture, within)
-        assert kept.pairs.tolist() == fresh.pairs.tolist()
-        assert kept.distances == pytest.approx(fresh.distances)
+    postures = rng.uniform(lower, upper, (20, len(lower)))
+    limits_of_pairs = rng.uniform(-0.01, 0.15, (20, len(arm.levers)))
+    near = arm.near(postures, limits_of_pairs)
+    for index, posture in enumerate(postures):
+        each, one = distances(arm, posture), near.where == index
+        found = dict(zip(near.pairs[one].tolist(), near.distances[one].tolist(), strict=True))
+        most = limits_of_pairs[index].tolist()
+        assert found == pytest.approx({p: d for p, d in each.items() if d < most[p]}, abs=1e-6)
+        gradients = within(arm, posture).gradients[[list(each).index(pair) for pair in found]]
+        assert near.gradients[one] == pytest.approx(gradients, abs=1e-6)
 
 
 def test_neighbours_and_what_cannot_move_apart_are_no_pairs() -> None:

@@ -43,10 +43,11 @@ class Wall:
 
     levers = np.array([[0.4, 0.0]])
 
-    def near(self, posture: NDArray[np.float64], within: NDArray[np.float64]) -> Near:
-        distance = 0.4 * (0.5 - posture[0])
-        seen = np.array([0] if distance < within[0] else [], np.int64)
-        return Near(seen, np.array([distance])[: len(seen)], np.array([[-0.4, 0.0]])[: len(seen)])
+    def near(self, postures: NDArray[np.float64], within: NDArray[np.float64]) -> Near:
+        distances = 0.4 * (0.5 - postures[:, 0])
+        (where,) = np.nonzero(distances < within[:, 0])
+        gradients = np.tile((-0.4, 0.0), (len(where), 1))
+        return Near(where, np.zeros_like(where), distances[where], gradients)
 
     def describe(self, pair: int) -> tuple[Kind, str, str]:
         return "keep_out", "jaw", "shelf"
@@ -159,8 +160,9 @@ def test_a_joint_that_follows_late_is_not_off() -> None:
 
 
 class Far(Wall):
-    def near(self, posture: NDArray[np.float64], within: NDArray[np.float64]) -> Near:
-        return Near(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 2)))
+    def near(self, postures: NDArray[np.float64], within: NDArray[np.float64]) -> Near:
+        none = np.zeros(0, np.int64)
+        return Near(none, none, np.zeros(0), np.zeros((0, 2)))
 
 
 def test_a_joint_that_repeats_itself_while_it_is_sent_elsewhere_is_frozen() -> None:
