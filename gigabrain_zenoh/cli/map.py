@@ -104,13 +104,13 @@ def precompile() -> None:
 
 
 async def _compile_all() -> None:
-    from gigabrain_zenoh.decision.drive_kernels import CAR_KERNELS, DRIVE_KERNELS
+    from gigabrain_zenoh.decision.drive_kernels import ARM_KERNELS, CAR_KERNELS, DRIVE_KERNELS
     from gigabrain_zenoh.perception.node import LOCALIZE_KERNELS, MAP_KERNELS
 
     print_line("compiling, which takes up to a minute")
     await asyncio.gather(  # they share no kernel
         _compile("mapping", MAP_KERNELS, LOCALIZE_KERNELS),
-        _compile("planning and driving", DRIVE_KERNELS, CAR_KERNELS),
+        _compile("planning and driving", DRIVE_KERNELS, CAR_KERNELS, ARM_KERNELS),
     )
 
 

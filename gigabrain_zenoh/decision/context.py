@@ -7,9 +7,16 @@ from msgspec.structs import asdict, replace
 
 from gigabrain_schemas.base import TICK_NS, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState
-from gigabrain_schemas.brain import ActuationModel, CmdVel, OccupancyGrid, PoseInMap, WorldModel
+from gigabrain_schemas.brain import (
+    ActuationModel,
+    CmdVel,
+    JointCommand,
+    OccupancyGrid,
+    PoseInMap,
+    WorldModel,
+)
 from gigabrain_schemas.safety import SafetyState
-from gigabrain_schemas.topics import BODY, MAP, POSE, STATE, command_topic
+from gigabrain_schemas.topics import BODY, JOINT_CMD, MAP, POSE, STATE, command_topic
 from gigabrain_schemas.zones import Zone
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.freshness import PreviousTick
@@ -101,6 +108,7 @@ class ContextSource:
         self._poses: PreviousTick[PoseInMap] = PreviousTick()
         self._maps: deque[OccupancyGrid] = deque(maxlen=2)
         self._commands: PreviousTick[CmdVel] = PreviousTick()
+        self._joint_commands: PreviousTick[JointCommand] = PreviousTick()
         self._subscribed_commands = False
         self._bodies = bus.latest(BODY)
         bus.latest(POSE, self._poses.receive)
@@ -115,7 +123,10 @@ class ContextSource:
         body = self._bodies.current
         if body and not self._subscribed_commands:
             self._subscribed_commands = True
-            self._bus.subscribe(command_topic(body.description), self._on_command)
+            if body.description.has_base:
+                self._bus.subscribe(command_topic(body.description), self._on_command)
+            if body.description.joints:
+                self._bus.subscribe(JOINT_CMD, self._on_joint_command)
 
     def at_scan(
         self, state: RobotState, world: WorldModel | None, verdict: SafetyState | None
@@ -143,7 +154,7 @@ class ContextSource:
             lost=lost,
             actuation=self._estimator.response,
             sent=tuple(SentCommand(*one) for one in sent),
-            held=self._held(state),
+            held=self.held(state),
             slowed_by="; ".join(one.text for one in verdict.causes)[:300] if verdict else "",
             zones=self._zones.at(state.boot, tick).zones,
         )
@@ -203,12 +214,20 @@ class ContextSource:
             return None, WaitReason.NO_ODOMETRY_OF_POSE
         return compose(Pose(x=found.x, y=found.y, yaw=found.yaw), inverse(then)), None
 
-    def _held(self, state: RobotState) -> str:
+    def held(self, state: RobotState) -> str:
+        """Return why the body does not follow decision, for people; empty while it does."""
         gate = state.gate
         if gate.mode != "enabled":
             why = "; ".join(cause.text for cause in gate.causes)
             return f"the gate is {gate.mode}{f': {why}' if why else ''}"[:300]
         if gate.commander != BRAIN:
             return f"{gate.commander} has the body"
-        command = self._commands.at(state.boot, state.tick, STATE.stale_after_ns)
-        return OPERATOR_HOLDS if command and command.operator else ""
+        for commands in (self._commands, self._joint_commands):
+            command = commands.at(state.boot, state.tick, STATE.stale_after_ns)
+            if command and command.operator:
+                return OPERATOR_HOLDS
+        return ""
+
+    def _on_joint_command(self, _key: str, command: JointCommand) -> None:
+        if command.source == BRAIN:
+            self._joint_commands.receive(command)

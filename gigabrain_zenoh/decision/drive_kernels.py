@@ -1,4 +1,4 @@
-"""Loads the kernels of planning and driving: those of all bodies, and those that only cars need."""
+"""Loads the kernels of planning and moving: those of all bodies, of cars, and of arms."""
 
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_zenoh.host.threads import InTime
@@ -7,14 +7,16 @@ from gigabrain_zenoh.kernels.precompile import Kernels
 # each calls its kernels once
 DRIVE_KERNELS = "gigabrain_zenoh.decision.navigator:warm_up"
 CAR_KERNELS = "gigabrain_zenoh.navigation.car_planner:warm_up"
+ARM_KERNELS = "gigabrain_zenoh.manipulation.descent:warm_up"
 
 
 class DriveKernels:
-    """Loads the kernels that all bodies need, and those of cars once the body is one."""
+    """Loads the kernels that all bodies need, and those of a car or an arm once there is one."""
 
     def __init__(self, in_time: InTime) -> None:
         self._for_all = Kernels(DRIVE_KERNELS, in_time)
         self._for_cars = Kernels(CAR_KERNELS, in_time)
+        self._for_arms = Kernels(ARM_KERNELS, in_time)
 
     async def load(self, *, wait: bool) -> bool:
         """Load those that all bodies need, and return whether that is done.
@@ -41,7 +43,13 @@ class DriveKernels:
         self._for_cars.begin()
         return self._for_cars.loaded
 
+    def arm_loaded(self) -> bool:
+        """Return whether what an arm needs can be used from this step on. Raises ConfigError."""
+        self._for_arms.begin()
+        return self._for_arms.loaded
+
     async def close(self) -> None:
         """Stop compiling."""
         await self._for_all.close()
         await self._for_cars.close()
+        await self._for_arms.close()

@@ -8,16 +8,18 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import Intent, WorldModel
 from gigabrain_schemas.safety import SafetyState
-from gigabrain_schemas.tasks import (
-    Goal,
-)
+from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision.behaviours import (
+    ArmCommand,
     Behaviour,
+    Command,
+    DriveCommand,
+    Idle,
     Inputs,
     NavigationConfig,
     StepOutcome,
@@ -36,6 +38,7 @@ from gigabrain_zenoh.decision.zones import ZoneSource
 from gigabrain_zenoh.errors import Refused
 
 if TYPE_CHECKING:
+    from gigabrain_zenoh.decision.manipulator import Manipulator
     from gigabrain_zenoh.decision.navigator import Navigator
 
 COMPILING = "mapping and planning compile meanwhile, once per installation"
@@ -50,6 +53,8 @@ class GoalServer(InputSource):
     At the first start of an installation the robot can drive before the kernels are compiled: with
     `start: explore` it then roams by `avoid`, until there is a map or somebody gives it a task.
     """
+
+    moves_arms = True
 
     def __init__(self, settings: NavigationConfig, bus: Bus, config: DecisionConfig) -> None:
         self._bus, self._config, self._name = bus, settings, config.behaviour
@@ -66,6 +71,7 @@ class GoalServer(InputSource):
         self._began_late = False  # there were steps without the kernels
         self._loaded_tick: int | None = None  # of the first step with them
         self._navigator: Navigator | None = None  # once the kernels are loaded
+        self._manipulator: Manipulator | None = None  # likewise, of a body with an arm
         self._outcome: StepOutcome | None = None  # of the last command
         self._started = False
 
@@ -103,7 +109,13 @@ class GoalServer(InputSource):
         objects: ObjectsByPerceptor,
     ) -> StepResult:
         """Advance the queue and step the behaviour with the command that it wants."""
-        self._loaded = self._kernels.loaded(self._source.body)
+        body = self._source.body
+        if body and not body.has_base:
+            command, idle = self._tasks.step(state, self._outcome, state.tick)
+            step = self._move_arm(state, body, command, idle)
+            self._outcome = step[1] if command else None
+            return step
+        self._loaded = self._kernels.loaded(body)
         if not self._loaded or self._awaits_map(state):
             return self._start_up(state, world, verdict)
         navigator = self._make_navigator()
@@ -119,12 +131,44 @@ class GoalServer(InputSource):
                 pose=context.pose,
                 must_charge=context.must_charge,
                 objects=objects,
-                command=command,
+                command=command if isinstance(command, DriveCommand) else None,
                 drive=lambda wanted: navigator.drive(wanted, idle),
             )
         )
+        if body and (isinstance(command, ArmCommand) or self._manipulator):
+            moved, done = self._move_arm(state, body, command, idle)
+            if isinstance(command, ArmCommand):
+                outcome = done
+                intent = replace(moved, twist=intent.twist, response=intent.response)
         self._outcome = outcome if command else None
         return intent, outcome
+
+    def _move_arm(
+        self, state: RobotState, body: BodyDescription, command: Command | None, idle: Idle
+    ) -> StepResult:
+        """Carry out a command for the arm; without one, it holds still."""
+        wanted = command if isinstance(command, ArmCommand) else None
+        number = command.number if command else 0
+        if wanted and body.arm is None:
+            return self._refused(number, f"{body.robot_type} has no arm")
+        if wanted is None and command and not body.has_base:
+            return self._refused(number, f"{body.robot_type} has no base to drive")
+        if wanted and not self._kernels.arm_loaded():
+            text = f"waiting: {WaitReason.STARTING}"
+            intent = Intent(behaviour=self._name, reason=text)
+            return intent, StepOutcome(number=number, activity="waiting", reason=text)
+        if self._manipulator is None and wanted:
+            from gigabrain_zenoh.decision.manipulator import Manipulator  # imports MuJoCo
+
+            self._manipulator = Manipulator(self._bus, self._name)
+        if self._manipulator is None:
+            return Intent(behaviour=self._name, reason=idle.reason), StepOutcome()
+        return self._manipulator.step(state, body, wanted, idle, self._source.held(state))
+
+    def _refused(self, number: int, reason: str) -> StepResult:
+        """Return that a command cannot be carried out."""
+        intent = Intent(behaviour=self._name, reason=reason)
+        return intent, StepOutcome(number=number, state="failed", reason=reason)
 
     def _make_navigator(self) -> "Navigator":
         if self._navigator is None:
@@ -176,6 +220,8 @@ class GoalServer(InputSource):
         await self._tasks.close()
         if self._navigator:
             self._navigator.close()
+        if self._manipulator:
+            self._manipulator.close()
 
     async def check(self, goal: Goal | None) -> str:
         """Return how the robot would reach `goal`, for people; see CheckGoal. Raises Refused."""

@@ -35,6 +35,8 @@ RENAMED_PARAMS = {  # by behaviour; removed in 0.3, like the words in config/ren
 class InputSource:
     """Steps a behaviour with its inputs: here the world model and the odometry alone."""
 
+    moves_arms = False
+
     async def prepare(self) -> None:
         """Prepare what must be there before the first step."""
 
@@ -172,13 +174,17 @@ def _serve(config: DecisionConfig, bus: Bus, source: InputSource) -> None:
         if state is None:
             return
         source.observe(state)
-        if (body := bodies.current) and not body.description.has_base:
+        body = bodies.current
+        fixed = body is not None and not body.description.has_base
+        if fixed and not source.moves_arms:
             loop.rest(state, NO_BASE)
             publish(state)
             return
         verdict = verdicts.at(state.boot, state.tick, SAFETY.stale_after_ns)
         objects.observe(state)
         world = newest_world()
+        if fixed:
+            loop.basis = state.tick
         loop.step(state, world and merged(world), verdict, objects.fresh())
         publish(state)
 

@@ -27,7 +27,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.freshness import PreviousTick
 from gigabrain_zenoh.bus.input_log import log_accepted
 from gigabrain_zenoh.decision.behaviours import (
-    DriveCommand,
+    Command,
     Idle,
     StepOutcome,
     WaitReason,
@@ -35,6 +35,7 @@ from gigabrain_zenoh.decision.behaviours import (
 )
 from gigabrain_zenoh.decision.context import ContextSource
 from gigabrain_zenoh.decision.known_objects import ObjectSource, Sought, Wanted, named, sought
+from gigabrain_zenoh.decision.tasks import arm_steps
 from gigabrain_zenoh.decision.tasks import mission as missions
 from gigabrain_zenoh.decision.tasks.mission import Mission
 from gigabrain_zenoh.decision.tasks.scripts import Scripts
@@ -100,7 +101,7 @@ class TaskServer:
 
     def step(
         self, state: RobotState, outcome: StepOutcome | None, basis: int = 0
-    ) -> tuple[DriveCommand | None, Idle]:
+    ) -> tuple[Command | None, Idle]:
         """Advance the queue, with the world of tick `basis`.
 
         Return the next command, and why the robot stands if there is none.
@@ -229,6 +230,9 @@ class TaskServer:
                 self._scripts.path(script)
             if mission.looks:
                 self._refuse_blind()
+            body = self._source.body
+            if body and (actions := mission.arm_actions):
+                arm_steps.check(body, actions)
             if mission.drives:
                 await self._check(None)
             name = self._queue.add_mission(mission, label, request.how, request.source)

@@ -169,6 +169,11 @@ class ArmKinematics:
         low, high = self.lower - tolerance, self.upper + tolerance
         return bool(np.all((posture >= low) & (posture <= high)))
 
+    @property
+    def hand(self) -> tuple[str, ...]:
+        """The bodies whose pads touch what is held."""
+        return tuple(geom.parent.name for geom in self._spec.geoms if geom.name in PADS)
+
     def opening(self) -> "Opening":
         """Return how far the gripper opens. Raises ConfigError for a model without pads."""
         if not self.gripper:

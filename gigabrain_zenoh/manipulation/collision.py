@@ -66,6 +66,12 @@ class Thing:
         return np.resize(np.array(self.size) / (2 if self.kind == "box" else 1), 3)
 
 
+def turned(yaw: float) -> Floats:
+    """Return axes (3, 3) that are turned by `yaw` [rad] about z."""
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
 @dataclass(frozen=True, kw_only=True)
 class Clearance:
     """The smallest distance of an arm's parts from all that they should not touch."""

@@ -248,3 +248,13 @@ def descend(
 def _is_fine(error: Floats) -> bool:
     place, turn = math.sqrt(_cost(error, 0.0)), np.abs(error[3:]).max()
     return place < FINE_M and turn < FINE_RAD
+
+
+def warm_up() -> None:
+    """Compile the kernels, by an arm of one joint."""
+    frame = np.eye(3, 4)
+    chain = Chain(
+        fixed=frame[None].copy(), axes=np.eye(3)[2:], slides=np.zeros(1, np.bool_), tool=frame
+    )
+    limits, posture = np.array([[-1.0], [1.0]]), np.zeros(1)
+    descend(chain, limits, frame, PLACE, 1.0, posture, np.zeros(1, np.bool_), np.zeros(6))

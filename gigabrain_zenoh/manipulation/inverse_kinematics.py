@@ -198,8 +198,3 @@ def spread(count: int, dimensions: int) -> Floats:
         root = (1.0 + root) ** (1.0 / (dimensions + 1))
     steps = root ** -np.arange(1.0, dimensions + 1)
     return np.asarray((0.5 + np.outer(np.arange(1, count + 1), steps)) % 1.0)
-
-
-def warm_up(arm: ArmKinematics) -> None:
-    """Compile the kernels."""
-    InverseKinematics(arm).solve(ToolGoal(position=np.zeros(3)))

@@ -9,7 +9,6 @@ Whoever carries a plan out checks the grip after `close`: the gripper has to sto
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from msgspec.structs import replace as changed
@@ -17,7 +16,7 @@ from msgspec.structs import replace as changed
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.body import JointDescription
 from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics, Frame
-from gigabrain_zenoh.manipulation.collision import CollisionChecker, Thing
+from gigabrain_zenoh.manipulation.collision import CollisionChecker, Thing, turned
 from gigabrain_zenoh.manipulation.grasps import Grasp, GraspPlanner, NoGrasp
 from gigabrain_zenoh.manipulation.inverse_kinematics import (
     InverseKinematics,
@@ -26,11 +25,9 @@ from gigabrain_zenoh.manipulation.inverse_kinematics import (
     ToolGoal,
 )
 from gigabrain_zenoh.manipulation.joint_trajectory import JointTrajectory, TimeParametrization
+from gigabrain_zenoh.manipulation.phases import Phase
 from gigabrain_zenoh.manipulation.planner import NoPath, plan
 
-PhaseName = Literal[
-    "hover", "descend", "close", "lift", "traverse", "lower", "open", "retreat"
-]  # fmt: skip
 LIMIT_SPARE = 0.006  # of a joint's range, at its ends: servos swing a bit too far
 SLOW = 0.35  # of the joints' speeds, near the thing
 SQUEEZE = 0.12  # of the gripper's range, beyond the thing's width
@@ -43,20 +40,12 @@ TRIES = 3  # grasps whose ways are planned
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Phase:
-    """A part of a plan: the arm moves, or the gripper does."""
-
-    name: PhaseName
-    arm: JointTrajectory | None = None
-    gripper: float | None = None  # [rad] or [m], where its joint goes
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Pick:
     """How a thing is picked up."""
 
     grasp: Grasp
     phases: tuple[Phase, ...]
+    back: tuple[Phase, ...]  # away from a thing that was not caught
     held: Thing  # in the frame of the tool
 
 
@@ -77,10 +66,10 @@ class NoWay:
 class PickPlacePlanner:
     """Plans picks and places of one arm. Not for two threads at once."""
 
-    def __init__(self, arm: ArmKinematics) -> None:
+    def __init__(self, arm: ArmKinematics, inverse: InverseKinematics | None = None) -> None:
         """Take an arm. Raises ConfigError for one without a gripper that can hold things."""
         self.arm = arm
-        self._inverse = InverseKinematics(arm, LIMIT_SPARE)
+        self._inverse = inverse or InverseKinematics(arm, LIMIT_SPARE)
         self._grasps = GraspPlanner(arm, self._inverse)
         self._fast = TimeParametrization(arm.joints)
         self._slow = TimeParametrization([_slowed(joint) for joint in arm.joints])
@@ -126,7 +115,7 @@ class PickPlacePlanner:
         """
         fault = NoWay(reason=f"{held.name} cannot be put there")
         checker = CollisionChecker(
-            self.arm, others, held=held, margin=0.001, ignore=_may_touch(held, others)
+            self.arm, others, held=held, margin=0.001, ignore=may_touch(held, others)
         )
         for tool in self._tools_at(held, target, posture):
             one = self._place(checker, tool, held, others, posture, opening)
@@ -144,7 +133,7 @@ class PickPlacePlanner:
             return NoWay(reason=f"{thing.name}: {way.reason}")
         held = self._held(thing, grasp)
         lifting = CollisionChecker(
-            self.arm, others, held=held, margin=0.001, ignore=_may_touch(held, others)
+            self.arm, others, held=held, margin=0.001, ignore=may_touch(held, others)
         )
         up = self._lifted(lifting, grasp)
         phases = (
@@ -154,7 +143,11 @@ class PickPlacePlanner:
             Phase(name="close", gripper=self._squeezed(grasp)),
             Phase(name="lift", arm=self._slow.trajectory(up)),
         )
-        return Pick(grasp=grasp, phases=phases, held=held)
+        back = (
+            Phase(name="open", gripper=grasp.opening),
+            Phase(name="retreat", arm=self._straight(grasp.posture, grasp.before)),
+        )
+        return Pick(grasp=grasp, phases=phases, back=back, held=held)
 
     def _lifted(self, checker: CollisionChecker, grasp: Grasp) -> Floats:
         """Return postures (k, n) up from the grasp: straight up, or back where it came from."""
@@ -205,7 +198,10 @@ class PickPlacePlanner:
     ) -> JointTrajectory:
         """Return the way back from what was put down: along the approach, as far as it goes."""
         left = _at(self.arm.forward(down.posture), held)
-        checker = CollisionChecker(self.arm, [left, *others], margin=0.0, gripper=opening)
+        beside = [(left.name, body) for body in self.arm.hand]  # a finger rests against it
+        checker = CollisionChecker(
+            self.arm, [left, *others], margin=0.0, ignore=beside, gripper=opening
+        )
         for far in (0.06, 0.04, 0.02):
             back = tool.position - far * tool.axes[:, 0]
             goal = ToolGoal(position=back, axes=tool.axes, orientation_tolerance=math.pi)
@@ -222,7 +218,7 @@ class PickPlacePlanner:
         found = []
         for number in range(PLACE_YAWS):
             angle = 2 * math.pi * number / PLACE_YAWS
-            turn = _about_z(angle) @ _upright(thing.axes) @ thing.axes.T
+            turn = turned(angle) @ _upright(thing.axes) @ thing.axes.T
             axes = turn @ now.axes
             found.append(Frame(position=lowest - axes @ held.position, axes=axes))
         order = [float(np.trace(now.axes.T @ one.axes)) for one in found]
@@ -257,7 +253,7 @@ def _slowed(joint: JointDescription) -> JointDescription:
     return changed(joint, max_speed=SLOW * joint.max_speed)
 
 
-def _may_touch(held: Thing, others: Sequence[Thing]) -> list[tuple[str, str]]:
+def may_touch(held: Thing, others: Sequence[Thing]) -> list[tuple[str, str]]:
     """Return what the held thing may touch: that on which it stands."""
     return [("held", other.name) for other in others if other.kind == "floor"]
 
@@ -265,11 +261,6 @@ def _may_touch(held: Thing, others: Sequence[Thing]) -> list[tuple[str, str]]:
 def _at(tool: Frame, held: Thing) -> Thing:
     """Return a held thing in the frame of the base."""
     return replace(held, position=tool.place(held.position), axes=tool.axes @ held.axes)
-
-
-def _about_z(angle: float) -> Floats:
-    cos, sin = math.cos(angle), math.sin(angle)
-    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _upright(axes: Floats) -> Floats:

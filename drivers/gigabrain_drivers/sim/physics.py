@@ -169,7 +169,7 @@ class Simulation:
         return self._battery.read()
 
     def bumper(self) -> bool:
-        """Return whether the robot touches anything but the floor right now."""
+        """Return whether the robot, but for its hand, touches anything but the floor right now."""
         return self.truth.touching
 
     def _set_walking(self, body: int, person: Person | None) -> None:

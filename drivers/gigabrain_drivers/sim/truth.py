@@ -24,8 +24,9 @@ MAX_CLEARANCE_M = 10.0  # larger clearances count as this
 class Truth:
     """Contacts, clearance and path of the robot. `update` once a step.
 
-    contacts: how often the robot touched something else than the floor; sliding along one thing
-    is one contact, touching it again half a second later another. touching: right now.
+    contacts: how often the robot, but for its hand, touched something else than the floor;
+    sliding along one thing is one contact, touching it again half a second later another.
+    touching: right now.
     min_clearance_m: the least distance from the robot's outline to anything, sampled at 10 Hz,
     0 in contact. falls: how often the robot tipped over, or a part of it sank below the level of
     the floor on which it began; sampled at 10 Hz. distance_m: the length of the path of the base's
@@ -40,6 +41,7 @@ class Truth:
             self._place = model.joint(f"{ROBOT}free").qposadr[0]
             self._velocity = model.joint(f"{ROBOT}free").dofadr[0]
         self._is_robot = model.body_rootid[model.geom_bodyid] == self._base
+        self._must_not_touch = self._is_robot & ~np.isin(model.geom_bodyid, _hand(model))
         floor = np.array([is_floor(model, geom) for geom in range(model.ngeom)])
         self._may_be_obstacle = ~self._is_robot & ~floor
         self._hull = [
@@ -116,7 +118,7 @@ class Truth:
         """Count contacts between the robot and obstacles that begin in this step."""
         pairs = self._data.contact.geom
         # things of an MJCF world touch each other and the floor, too
-        with_obstacle = self._is_obstacle[pairs] & self._is_robot[pairs[:, ::-1]]
+        with_obstacle = self._is_obstacle[pairs] & self._must_not_touch[pairs[:, ::-1]]
         self.touching = bool(with_obstacle.any())
         if not self.touching:
             return
@@ -159,6 +161,13 @@ class Truth:
         front = max(float(middle[0] + half[0]) for middle, half in pairs)
         rear = min(float(middle[0] - half[0]) for middle, half in pairs)
         return Footprint(front, rear, max(float(abs(m[1]) + half[1]) for m, half in pairs))
+
+
+def _hand(model: mujoco.MjModel) -> list[int]:
+    """Return the bodies whose pads touch what the robot holds."""
+    names = (f"{ROBOT}pad_fixed", f"{ROBOT}pad_moving")
+    geoms = [geom for geom in range(model.ngeom) if model.geom(geom).name in names]
+    return [int(model.geom_bodyid[geom]) for geom in geoms]
 
 
 def _half_sizes(model: mujoco.MjModel, geoms: NDArray[np.int64] | list[int]) -> NDArray[np.float64]:

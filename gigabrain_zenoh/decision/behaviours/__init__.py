@@ -20,6 +20,7 @@ from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import Goal, Task
 from gigabrain_zenoh.config import loading
 from gigabrain_zenoh.config.settings import DecisionConfig
+from gigabrain_zenoh.decision.tasks.arm_steps import ArmAction, Solid
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.plugins import load_plugin, plugin_names
 
@@ -56,6 +57,17 @@ class DriveCommand(Struct, frozen=True):
     seek: int = 0  # of `look`: which search it belongs to; a new one has seen nothing
 
 
+class ArmCommand(Struct, frozen=True):
+    """A request to move the arm."""
+
+    number: int  # as of a DriveCommand
+    do: ArmAction
+    things: Mapping[str, Solid]  # what stands round it
+
+
+Command = DriveCommand | ArmCommand
+
+
 class StepOutcome(Struct, frozen=True, kw_only=True):
     """Result of one step of a behaviour, and progress of the command that it carries out."""
 
@@ -71,6 +83,8 @@ class StepOutcome(Struct, frozen=True, kw_only=True):
     path: tuple[tuple[float, float], ...] = ()  # [m] in the map, for drawing
     position_error: float | None = None  # [m] from the requested place
     heading_error: float | None = None  # [rad] from the requested heading
+    picked: str = ""  # the thing that the gripper holds since this command
+    placed: tuple[str, Solid] | None = None  # a thing, and where it was put down
 
 
 class Idle(NamedTuple):

@@ -5,7 +5,7 @@ All nodes use the robot's time.
 
 import math
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from msgspec import Meta
@@ -16,12 +16,15 @@ from py_trees.decorators import Decorator, Repeat, Retry
 
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.decision.behaviours import (
+    ArmCommand,
+    Command,
     DriveCommand,
     DriveKind,
     StepOutcome,
     describe_goal,
 )
 from gigabrain_zenoh.decision.known_objects import Seek, Sought, Wanted, named
+from gigabrain_zenoh.decision.tasks.arm_steps import ArmAction, Solid, describe
 from gigabrain_zenoh.decision.tasks.conditions import Condition, Read, parse
 from gigabrain_zenoh.decision.tasks.mission import (
     AtTag,
@@ -56,12 +59,13 @@ class MissionContext:
 
     read: Read
     start: StartScript
-    numbers: Iterator[int]  # of drive commands, each only once
+    numbers: Iterator[int]  # of commands, each only once
     seek: Seek = seek_nothing
     now_s: float = 0.0
     held_s: float = 0.0  # of that, while the body did not follow a command
     outcome: StepOutcome | None = None  # of the command of the last tick
-    command: DriveCommand | None = None  # of the active node
+    command: Command | None = None  # of the active node
+    things: dict[str, Solid] = field(default_factory=dict)  # what stands round the arm by now
     doing: str = ""  # the active step, for people
     problem: str = ""  # the last failure, for people
     progress: float | None = None  # of a step that does not drive
@@ -115,6 +119,33 @@ class _DriveNode(_Leaf):
         if outcome and outcome.number == self._command.number and outcome.state != "running":
             done = outcome.state == "done"
             return Status.SUCCESS if done else self.failed(self._prefix + outcome.reason)
+        self.context.command = self._command
+        return Status.RUNNING
+
+
+class _ArmNode(_Leaf):
+    """Issues a command to the arm, ends with its outcome, and records where things are then."""
+
+    def __init__(self, action: ArmAction, context: MissionContext) -> None:
+        super().__init__(describe(action), context)
+        self._action = action
+        self._command: ArmCommand | None = None
+
+    def initialise(self) -> None:
+        number, things = next(self.context.numbers), dict(self.context.things)
+        self._command = ArmCommand(number, self._action, things)
+
+    def update(self) -> Status:
+        outcome, self.context.doing = self.context.outcome, self.name
+        assert self._command
+        if outcome and outcome.number == self._command.number and outcome.state != "running":
+            if outcome.picked:
+                self.context.things.pop(outcome.picked, None)
+            if outcome.placed:
+                name, solid = outcome.placed
+                self.context.things[name] = solid
+            done = outcome.state == "done"
+            return Status.SUCCESS if done else self.failed(f"{self.name}: {outcome.reason}")
         self.context.command = self._command
         return Status.RUNNING
 
@@ -310,6 +341,7 @@ class TreeBuilder:
 
     def __init__(self, mission: Mission, context: MissionContext) -> None:
         self._mission, self._context = mission, context
+        context.things = dict(mission.things)
 
     def tree(self) -> Behaviour:
         """Return the root of the whole mission."""
@@ -341,6 +373,8 @@ class TreeBuilder:
             return self._go_to(step.goto)
         if step.find is not None:
             return _SeekNode(step.find if isinstance(step.find, str) else step.find.tag, context)
+        if step.arm:
+            return _ArmNode(step.arm, context)
         if step.explore or step.visit:
             return _DriveNode("explore" if step.explore else "visit", context)
         if step.wait is not None:

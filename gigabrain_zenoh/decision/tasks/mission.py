@@ -17,6 +17,18 @@ from gigabrain_schemas.tasks import Goal
 from gigabrain_schemas.zones import Place as MapPlace
 from gigabrain_zenoh.config import loading, yaml_text
 from gigabrain_zenoh.decision.tasks import conditions
+from gigabrain_zenoh.decision.tasks.arm_steps import (
+    ArmAction,
+    Gripper,
+    GripperPlace,
+    Pick,
+    PlaceThing,
+    Point3,
+    Posture,
+    Reach,
+    Solid,
+    TakePosture,
+)
 from gigabrain_zenoh.errors import ConfigError, unknown
 
 MAX_LOOPS = 1_000_000
@@ -126,6 +138,11 @@ class Step(Part, frozen=True, kw_only=True):
     find: Wanted | None = None  # a thing by its class: look for one, and drive before it
     explore: Explore | None = None
     visit: Visit | None = None
+    reach: Point3 | Reach | None = None  # with the arm's tool
+    posture: Posture | None = None  # of the arm's joints
+    gripper: GripperPlace | None = None
+    pick: Name | None = None  # one of the mission's `things`
+    place: Point3 | None = None  # where the middle of what is held shall be
     wait: Seconds | None = None
     wait_until: Comparison | None = None
     check: Comparison | None = None  # fails if it does not hold
@@ -154,11 +171,25 @@ class Step(Part, frozen=True, kw_only=True):
         """Name of the field that is set."""
         return next(kind for kind in self.__struct_fields__ if getattr(self, kind) is not None)
 
+    @property
+    def arm(self) -> ArmAction | None:
+        """What the arm does; None for a step that does not move it."""
+        if self.reach is not None:
+            return self.reach if isinstance(self.reach, Reach) else Reach(at=self.reach)
+        if self.posture is not None:
+            return TakePosture({} if self.posture == "home" else self.posture)
+        if self.gripper is not None:
+            return Gripper(self.gripper)
+        if self.pick is not None:
+            return Pick(self.pick)
+        return PlaceThing(self.place) if self.place is not None else None
+
 
 class Mission(Part, frozen=True, kw_only=True):
     """A mission file."""
 
     places: dict[Name, Point] = {}  # names of places: x, y [m] and optionally yaw [rad]
+    things: dict[Name, Solid] = {}  # what stands round the arm at the beginning
     trees: dict[Name, Steps] = {}  # names of steps that are used several times
     do: Steps  # in order
 
@@ -176,6 +207,11 @@ class Mission(Part, frozen=True, kw_only=True):
     def drives(self) -> bool:
         """Whether any step drives."""
         return any(step.kind in DRIVING for _, step in _steps(self))
+
+    @property
+    def arm_actions(self) -> list[ArmAction]:
+        """What all steps want of the arm."""
+        return [step.arm for _, step in _steps(self) if step.arm]
 
     @property
     def looks(self) -> bool:
@@ -291,6 +327,8 @@ def _in_step(
             conditions.parse(text)
         except (ValueError, ConfigError) as error:
             yield (*keys, *more), str(error)
+    if step.pick is not None and step.pick not in mission.things:
+        yield (*keys, "pick"), str(unknown("thing", step.pick, mission.things or ("none",)))
     if step.tree is not None and step.tree not in mission.trees:
         known = mission.trees or ("none",)
         yield (*keys, "tree"), str(unknown("tree", step.tree, known))

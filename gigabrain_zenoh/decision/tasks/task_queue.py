@@ -11,7 +11,13 @@ from py_trees.common import Status
 
 from gigabrain_schemas.tasks import Goal, How, Task, TaskState, TaskStatus
 from gigabrain_zenoh.codec import DECODE_ERRORS
-from gigabrain_zenoh.decision.behaviours import DriveCommand, Idle, StepOutcome, describe_goal
+from gigabrain_zenoh.decision.behaviours import (
+    Command,
+    DriveCommand,
+    Idle,
+    StepOutcome,
+    describe_goal,
+)
 from gigabrain_zenoh.decision.known_objects import Seek, Wanted, named
 from gigabrain_zenoh.decision.tasks.behaviour_tree import (
     MissionContext,
@@ -162,7 +168,7 @@ class TaskQueue:
         job.held, job.why_held = False, ""
         return f"{job.id} is resumed"
 
-    def step(self, seconds: float, outcome: StepOutcome | None) -> tuple[DriveCommand | None, Idle]:
+    def step(self, seconds: float, outcome: StepOutcome | None) -> tuple[Command | None, Idle]:
         """Advance by `seconds` with the last command's outcome.
 
         Return the next command, and why the robot stands if there is none.
@@ -208,7 +214,7 @@ class TaskQueue:
         return TaskStatus(
             current=job.task("active", outcome.reason or context.doing),
             doing=context.doing[:500],
-            drives=command is not None,
+            drives=isinstance(command, DriveCommand),
             progress=min(1.0, max(0.0, outcome.progress)),
             distance_remaining=outcome.distance,
             eta=outcome.eta,

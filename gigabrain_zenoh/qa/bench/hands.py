@@ -23,7 +23,7 @@ from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import RobotState
-from gigabrain_schemas.brain import Intent, JointTarget, JointTrajectory
+from gigabrain_schemas.brain import Intent
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_zenoh.control.joints import JointInputs, JointMemory, step_joints
 from gigabrain_zenoh.errors import ConfigError
@@ -33,12 +33,8 @@ from gigabrain_zenoh.geometry.joints import JointMotion
 from gigabrain_zenoh.geometry.limits import ZERO, limits_of
 from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics
 from gigabrain_zenoh.manipulation.collision import Thing
-from gigabrain_zenoh.manipulation.pick_place import (
-    NoWay,
-    Phase,
-    PickPlacePlanner,
-    Place,
-)
+from gigabrain_zenoh.manipulation.phases import Phase, PhaseRun
+from gigabrain_zenoh.manipulation.pick_place import NoWay, PickPlacePlanner, Place
 
 KINDS = ("cube", "cylinder", "sphere")
 SIZES_M, MASSES_KG, FRICTIONS = (0.02, 0.04), (0.02, 0.08, 0.2), (0.4, 1.0)
@@ -46,8 +42,7 @@ REACH_M, AROUND_RAD = (0.10, 0.26), math.pi / 2  # from the first joint's axis, 
 TALL = 1.2  # length over diameter of a cylinder
 LIFTED_M = 0.01  # from which a thing counts as picked up
 PLACED_M = 0.01  # from its place, within which it counts as put there
-GRIP_TICKS, SETTLE_TICKS = 40, 25
-WINDOW_TICKS = 100  # of a trajectory in an intent
+SETTLE_TICKS = 25
 TARGETS = 20  # places that are drawn until one can be reached
 STILL = "0.02 0.0005"  # torsional and rolling friction of things
 SLACK = 0.001  # of a joint's range, beyond which it counts as broken
@@ -195,25 +190,12 @@ class ArmInMemory:
 
     def carry_out(self, phase: Phase, gripper: str) -> None:
         """Carry out one phase of a plan."""
-        if phase.gripper is not None:
-            target = JointTarget(name=gripper, position=phase.gripper)
-            for _ in range(GRIP_TICKS):
-                self.step(Intent(joints=(target,), behaviour="hands", reason=phase.name))
-        if phase.arm is None:
-            return
-        count = math.ceil(phase.arm.duration / TICK_S) + 1
-        times = np.minimum(np.arange(count) * TICK_S, phase.arm.duration)
-        rows = np.stack(
-            [np.interp(times, phase.arm.times, column) for column in phase.arm.positions.T], axis=1
-        )
-        start = self._gate.tick + 1
-        for done in range(count + SETTLE_TICKS // 2):
-            first = min(done, count - 1)
-            window = rows[first : first + WINDOW_TICKS].astype("<f4")
-            path = JointTrajectory(
-                name=phase.arm.names, start=start + first, period=TICK_S, positions=window.tobytes()
+        run = PhaseRun([phase], gripper, self._gate.tick)
+        while not run.advance(self._gate.tick):
+            joints, window = run.wish(self._gate.tick)
+            self.step(
+                Intent(joints=joints, joint_trajectory=window, behaviour="hands", reason=phase.name)
             )
-            self.step(Intent(joint_trajectory=path, behaviour="hands", reason=phase.name))
 
     def settle(self) -> None:
         """Hold still."""

@@ -1,0 +1,328 @@
+"""Moves the arm: plans each command in a worker thread, and carries it out from tick to tick."""
+
+import math
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Literal
+
+import numpy as np
+from msgspec.structs import replace
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import TICK_S
+from gigabrain_schemas.body import BodyDescription, RobotState
+from gigabrain_schemas.brain import Intent
+from gigabrain_schemas.topics import ARM_MODEL
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.decision.behaviours import ArmCommand, Idle, StepOutcome, StepResult
+from gigabrain_zenoh.decision.tasks.arm_steps import (
+    Gripper,
+    Pick,
+    PlaceThing,
+    Reach,
+    Solid,
+    TakePosture,
+)
+from gigabrain_zenoh.errors import GigabrainError
+from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold, Plan
+from gigabrain_zenoh.manipulation.collision import Thing, turned
+from gigabrain_zenoh.manipulation.phases import PhaseRun
+from gigabrain_zenoh.manipulation.pick_place import NoWay
+
+TRIES = 3  # to pick a thing up, each with another grasp
+HOLD_UPS = 5  # of one command, after which it fails
+CARRYING = ("lift", "traverse", "lower")  # phases in which a thing has to be held
+NO_MODEL = Idle("waiting", "waiting: for the arm's model, robot/arm_model")
+PLANNING = Idle("planning", "planning")
+Planned = Plan | NoWay
+
+
+class Manipulator:
+    """Carries out one command for the arm at a time, and knows what its gripper holds."""
+
+    def __init__(self, bus: Bus, behaviour: str) -> None:
+        self._behaviour, self._in_time = behaviour, bus.input_log.in_time
+        self._models = bus.latest(ARM_MODEL)
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="arm")
+        self._made_for: tuple[str, BodyDescription] | None = None
+        self._making: Future[ArmPlanner] | None = None
+        self._planner: ArmPlanner | None = None
+        self._planning: Future[Planned] | None = None
+        self._plan = Plan(phases=())
+        self._run: PhaseRun | None = None
+        self._hold: Hold | None = None
+        self._number = 0  # of the present command
+        self._misses = 0  # grasps of it that caught nothing
+        self._hold_ups = 0  # of it, by a joint that did not follow
+        self._achieved = StepOutcome()  # of a command that is done but for the way back
+
+    def step(
+        self,
+        state: RobotState,
+        body: BodyDescription,
+        command: ArmCommand | None,
+        idle: Idle,
+        held: str,
+    ) -> StepResult:
+        """Carry out `command` for one step, or hold still as `idle` says.
+
+        While the body does not follow, as `held` says, the arm holds; it plans again afterwards.
+        """
+        number = command.number if command else 0
+        if number != self._number:
+            self._drop()
+            self._number, self._achieved = number, StepOutcome()
+            self._misses = self._hold_ups = 0
+        planner = self._ready(body)
+        if command is None:
+            return self._still(idle)
+        if held:
+            self._drop()
+            return self._still(Idle("waiting", f"waiting: {held}"), held=True)
+        if planner is None:
+            return self._still(NO_MODEL)
+        if self._run is None and self._achieved.number:
+            return self._still(Idle("done", self._achieved.reason), self._achieved)
+        try:
+            return self._carry_out(planner, state, body, command)
+        except GigabrainError as error:  # a thing that does not fit, or an arm without pads
+            return self._fail(str(error))
+
+    def close(self) -> None:
+        """Stop the worker thread, after the plan that it makes."""
+        self._pool.shutdown(cancel_futures=True)
+
+    def _ready(self, body: BodyDescription) -> ArmPlanner | None:
+        """Return the planner of the present body and model, once there is one."""
+        model = self._models.current
+        if model is None:
+            return None
+        wanted = model.mjcf, body
+        if wanted != self._made_for:
+            self._drop()
+            self._made_for, self._planner, self._hold = wanted, None, None
+            self._making = self._pool.submit(ArmPlanner, *wanted)
+        if self._making and self._in_time(self._making, 0.0):
+            making, self._making = self._making, None
+            self._planner = making.result()
+        return self._planner
+
+    def _carry_out(
+        self, planner: ArmPlanner, state: RobotState, body: BodyDescription, command: ArmCommand
+    ) -> StepResult:
+        if self._run is None:
+            if self._planning is None:
+                work = self._work(planner, state, body, command)
+                if isinstance(work, str):
+                    return self._fail(work)
+                self._planning = self._pool.submit(work)
+            if not self._in_time(self._planning, 0.0):
+                return self._still(PLANNING)
+            planning, self._planning = self._planning, None
+            found = planning.result()
+            if isinstance(found, NoWay):
+                return self._fail(found.reason)
+            self._begin(planner, found, state)
+        return self._follow(planner, state, body)
+
+    def _work(
+        self, planner: ArmPlanner, state: RobotState, body: BodyDescription, command: ArmCommand
+    ) -> Callable[[], Planned] | str:
+        """Return what plans a command, or why it cannot be planned."""
+        if len(state.joints_sent) != len(body.joints):
+            return "the joints are not measured, or limp"
+        posture = _sent(planner, body, state)
+        hold, others = self._hold, [_thing(name, one) for name, one in command.things.items()]
+        match command.do:
+            case Reach(at=at, pitch=pitch):
+                return lambda: planner.reach(np.array(at), pitch, others, posture, hold)
+            case TakePosture(positions=positions):
+                goal = positions or _home(body)
+                return lambda: planner.take_posture(goal, others, posture, hold)
+            case Gripper(to=to):
+                return lambda: planner.grip(to)
+            case Pick(thing=name):
+                if hold:
+                    return f"the gripper holds {hold.thing.name} already"
+                if name not in command.things:
+                    return f"where {name} is, is not known"
+                thing, misses = _thing(name, command.things[name]), self._misses
+                around = [one for one in others if one.name != name]
+                return lambda: planner.pick(thing, around, posture, misses)
+            case PlaceThing(at=at):
+                if hold is None:
+                    return "the gripper holds nothing"
+                return lambda: planner.place(hold, np.array(at), others, posture)
+
+    def _begin(self, planner: ArmPlanner, plan: Plan, state: RobotState) -> None:
+        gripper = planner.arm.gripper
+        self._plan = plan
+        self._run = PhaseRun(plan.phases, gripper.name if gripper else "", state.tick)
+
+    def _follow(self, planner: ArmPlanner, state: RobotState, body: BodyDescription) -> StepResult:
+        """Go on with the present plan by one step."""
+        run, plan, hold = self._run, self._plan, self._hold
+        assert run
+        if hold and run.phase and run.phase.name in CARRYING and not _holds(planner, hold, state):
+            self._hold = None
+            return self._fail(f"{hold.thing.name} has slipped out of the gripper")
+        if off := _off(body, state, run.expected(state.tick), "path_tolerance"):
+            return self._held_up(off)
+        over = run.advance(state.tick)
+        if over and over.name == "close" and plan.hold:
+            if not _holds(planner, plan.hold, state):
+                self._misses += 1
+                self._begin(planner, Plan(phases=plan.back), state)
+                return self._moving(state)
+            self._achieve(plan.hold)
+        if over and over.name == "open" and hold:
+            self._achieve(None, placed=_placed(planner, plan, hold))
+        if over and over.name == "grip":
+            self._hold = None
+        if run.phase is None:
+            return self._end(body, state, run)
+        return self._moving(state)
+
+    def _held_up(self, why: str) -> StepResult:
+        """Plan again from where the joints are, as safety or a late process held them up."""
+        self._hold_ups += 1
+        if self._hold_ups > HOLD_UPS:
+            return self._fail(why)
+        self._drop()
+        return self._still(PLANNING)
+
+    def _achieve(self, hold: Hold | None, placed: tuple[str, Solid] | None = None) -> None:
+        """Record that the gripper holds a thing, or has put one down."""
+        self._hold = hold
+        self._achieved = StepOutcome(
+            number=self._number,
+            state="done",
+            reason=f"it holds {hold.thing.name}" if hold else "",
+            progress=1.0,
+            picked=hold.thing.name if hold else "",
+            placed=placed,
+        )
+
+    def _end(self, body: BodyDescription, state: RobotState, run: PhaseRun) -> StepResult:
+        """End a command whose phases are over, once the joints are where they should be."""
+        assert body.arm
+        last = self._plan.phases[-1].arm
+        end = dict(zip(last.names, last.positions[-1].tolist(), strict=True)) if last else {}
+        if off := _off(body, state, end, "goal_tolerance"):
+            late = run.over_for(state.tick) * TICK_S > body.arm.goal_time
+            return self._fail(off) if late else self._moving(state)
+        missed = self._misses and not self._achieved.number  # it has backed off
+        if missed and self._misses < TRIES:
+            self._drop()
+            return self._still(PLANNING)
+        if missed:
+            return self._fail(f"it was not caught, {TRIES} times")
+        if not self._achieved.number:
+            self._achieve(self._hold)
+        self._drop()
+        return self._still(Idle("done", self._achieved.reason), self._achieved)
+
+    def _moving(self, state: RobotState) -> StepResult:
+        run = self._run
+        assert run
+        joints, window = run.wish(state.tick)
+        text = run.phase.name if run.phase else "coming to rest"
+        outcome = StepOutcome(
+            number=self._number,
+            activity=text,
+            reason=text,
+            progress=run.progress(state.tick),
+            eta=run.left_ticks(state.tick) * TICK_S,
+        )
+        intent = Intent(
+            joints=joints,
+            joint_trajectory=window,
+            progress=outcome.progress,
+            behaviour=self._behaviour,
+            reason=text,
+        )
+        return intent, outcome
+
+    def _fail(self, reason: str) -> StepResult:
+        self._drop()
+        outcome = StepOutcome(state="failed", reason=reason[:500])
+        return self._still(Idle("failed", reason), outcome)
+
+    def _still(
+        self, why: Idle, outcome: StepOutcome | None = None, *, held: bool = False
+    ) -> StepResult:
+        """Return the intent to hold still."""
+        reason = why.reason[:500]
+        outcome = outcome or StepOutcome(activity=why.activity, reason=reason, held=held)
+        intent = Intent(behaviour=self._behaviour, reason=reason)
+        return intent, replace(outcome, number=self._number)
+
+    def _drop(self) -> None:
+        """Forget the plan, and the one that is being made."""
+        if self._planning:
+            self._planning.cancel()
+        self._planning = self._run = None
+
+
+def _sent(planner: ArmPlanner, body: BodyDescription, state: RobotState) -> Floats:
+    """Return where the arm's joints were sent (n,) [rad] or [m]."""
+    sent = dict(zip((joint.name for joint in body.joints), state.joints_sent, strict=True))
+    return np.array([sent[name] for name in planner.arm.names])
+
+
+def _home(body: BodyDescription) -> dict[str, float]:
+    assert body.arm
+    return dict(zip((joint.name for joint in body.joints), body.arm.home, strict=True))
+
+
+def _thing(name: str, solid: Solid) -> Thing:
+    """Return a thing of a mission as the planner knows it."""
+    position, axes = np.array(solid.at), turned(solid.yaw)
+    if solid.box:
+        return Thing(name=name, kind="box", size=solid.box, position=position, axes=axes)
+    if solid.cylinder:
+        return Thing(name=name, kind="cylinder", size=solid.cylinder, position=position, axes=axes)
+    assert solid.sphere
+    return Thing(name=name, kind="sphere", size=(solid.sphere,), position=position, axes=axes)
+
+
+def _placed(planner: ArmPlanner, plan: Plan, hold: Hold) -> tuple[str, Solid]:
+    """Return a thing that was let go of, and where it is."""
+    lowered = next(phase.arm for phase in plan.phases if phase.name == "lower")
+    assert lowered
+    tool, thing = planner.arm.forward(lowered.positions[-1]), hold.thing
+    x, y, z = tool.place(thing.position).tolist()
+    ahead = tool.axes @ thing.axes[:, 0]
+    box, round_ = thing.kind == "box", thing.kind == "cylinder"
+    return thing.name, Solid(
+        box=thing.size if box else None,  # type: ignore[arg-type]
+        cylinder=thing.size if round_ else None,  # type: ignore[arg-type]
+        sphere=None if box or round_ else thing.size[0],
+        at=(x, y, z),
+        yaw=math.atan2(ahead[1], ahead[0]),
+    )
+
+
+def _holds(planner: ArmPlanner, hold: Hold, state: RobotState) -> bool:
+    """Return whether the gripper has stopped short of where it was sent."""
+    gripper = planner.arm.gripper
+    assert gripper
+    found = next((one.position for one in state.joints if one.name == gripper.name), hold.grip)
+    return planner.holds(found, hold.grip)
+
+
+def _off(
+    body: BodyDescription,
+    state: RobotState,
+    wanted: Mapping[str, float],
+    which: Literal["path_tolerance", "goal_tolerance"],
+) -> str:
+    """Return which joint is too far from where it should be, and how far; empty for none."""
+    measured = {joint.name: joint.position for joint in state.joints}
+    for joint in body.joints:
+        if joint.name in wanted:
+            tolerance: float = getattr(joint, which)
+            error = abs(measured.get(joint.name, math.inf) - wanted[joint.name])
+            if tolerance and error > tolerance:
+                return f"{joint.name} is {error:.2f} off, more than its {which} of {tolerance:g}"
+    return ""

@@ -1,0 +1,117 @@
+"""Steps of a mission that move an arm, and the things round it. All is in its base's frame."""
+
+from collections.abc import Iterable
+from importlib.util import find_spec
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+from gigabrain_schemas.base import Angle, Name
+from gigabrain_schemas.body import BodyDescription, JointDescription
+from gigabrain_zenoh.errors import Refused, unknown
+
+NEEDED = ("mujoco", "ruckig", "numba")  # packages of the extra `arm`
+
+Metres = Annotated[float, Meta(ge=-10.0, le=10.0)]
+Side = Annotated[float, Meta(ge=0.001, le=10.0)]  # [m]
+Point3 = tuple[Metres, Metres, Metres]  # x, y, z [m]
+JointPlace = Annotated[float, Meta(ge=-100.0, le=100.0)]  # [rad] or [m]
+Posture = Literal["home"] | Annotated[dict[Name, JointPlace], Meta(min_length=1)]
+GripperPlace = Literal["open", "close"] | JointPlace
+
+
+class Solid(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A thing that can be picked up, or that is in the way. It has one shape."""
+
+    box: tuple[Side, Side, Side] | None = None  # [m], lengths along its x, y and z
+    cylinder: tuple[Side, Side] | None = None  # [m], radius, and length along z
+    sphere: Side | None = None  # [m], radius
+    at: Point3  # of its middle
+    yaw: Angle = 0.0  # [rad]
+
+    def __post_init__(self) -> None:
+        if sum(one is not None for one in (self.box, self.cylinder, self.sphere)) != 1:
+            raise ValueError("expected a box, a cylinder or a sphere")
+
+
+class Reach(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Bring the tool to a point."""
+
+    at: Point3
+    pitch: Angle | None = None  # [rad] down from level; None: any way
+
+
+class TakePosture(Struct, frozen=True):
+    """Move joints to positions [rad] or [m]; without any, to the home posture."""
+
+    positions: dict[str, float]
+
+
+class Gripper(Struct, frozen=True):
+    """Move the gripper alone."""
+
+    to: GripperPlace
+
+
+class Pick(Struct, frozen=True):
+    """Pick a thing up."""
+
+    thing: str
+
+
+class PlaceThing(Struct, frozen=True):
+    """Put down what is held, its middle at a point."""
+
+    at: Point3
+
+
+ArmAction = Reach | TakePosture | Gripper | Pick | PlaceThing
+
+
+def describe(action: ArmAction) -> str:
+    """Return what the arm does, for people."""
+    match action:
+        case Reach(at=at):
+            return f"reaching for {describe_point(at)}"
+        case TakePosture(positions=positions):
+            return f"moving {', '.join(positions)}" if positions else "moving to the home posture"
+        case Gripper(to=to):
+            words = {"open": "opening the gripper", "close": "closing the gripper"}
+            return words.get(str(to), "moving the gripper")
+        case Pick(thing=thing):
+            return f"picking up {thing}"
+        case PlaceThing(at=at):
+            return f"placing at {describe_point(at)}"
+
+
+def describe_point(point: Point3) -> str:
+    """Return a point as text [m]."""
+    return f"({', '.join(f'{one:.3f}' for one in point)})"
+
+
+def check(body: BodyDescription, actions: Iterable[ArmAction]) -> None:
+    """Raise Refused or UnknownName for what the body's arm cannot do."""
+    if body.arm is None:
+        raise Refused(f"{body.robot_type} has no arm")
+    for package in NEEDED:
+        if find_spec(package) is None:
+            raise Refused(f"moving an arm needs {package}; pip install 'gigabrain-zenoh[arm]'")
+    known = {joint.name: joint for joint in body.joints}
+    gripper = next((joint for joint in body.joints if joint.part == "gripper"), None)
+    for action in actions:
+        if isinstance(action, TakePosture):
+            for name, position in action.positions.items():
+                if name not in known:
+                    raise unknown("joint", name, known)
+                _check_range(known[name], position)
+        if isinstance(action, Gripper | Pick | PlaceThing) and gripper is None:
+            raise Refused(f"{body.robot_type} has no gripper")
+        if isinstance(action, Gripper) and gripper and not isinstance(action.to, str):
+            _check_range(gripper, action.to)
+
+
+def _check_range(joint: JointDescription, position: float) -> None:
+    if not joint.lower <= position <= joint.upper:
+        raise Refused(
+            f"{joint.name}: expected {joint.lower:g} to {joint.upper:g}, got {position:g}"
+        )

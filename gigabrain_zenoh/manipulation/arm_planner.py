@@ -1,0 +1,192 @@
+"""Plans what an arm is asked to do: reach, take a posture, move its gripper, pick and place."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.body import Arm, BodyDescription
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics
+from gigabrain_zenoh.manipulation.collision import CollisionChecker, Thing, turned
+from gigabrain_zenoh.manipulation.inverse_kinematics import (
+    InverseKinematics,
+    OutOfReach,
+    ToolGoal,
+)
+from gigabrain_zenoh.manipulation.joint_trajectory import TimeParametrization
+from gigabrain_zenoh.manipulation.phases import Phase
+from gigabrain_zenoh.manipulation.pick_place import (
+    LIMIT_SPARE,
+    NoWay,
+    PickPlacePlanner,
+    may_touch,
+)
+from gigabrain_zenoh.manipulation.planner import NoPath, plan
+
+TABLE = "the table"
+SUNK_M = 0.001  # of the floor below its place, as things stand on it
+ORIENTATION_RAD = math.radians(2)  # by which the approach of a tool that reaches may be off
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Hold:
+    """A thing in the gripper."""
+
+    thing: Thing  # in the frame of the tool
+    grip: float  # [rad] or [m], where the gripper's joint was sent
+    opening: float  # [rad] or [m], where it goes to let go
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plan:
+    """Phases; of a pick also what the gripper holds once it has closed, and the way back."""
+
+    phases: tuple[Phase, ...]
+    hold: Hold | None = None
+    back: tuple[Phase, ...] = ()  # away from a thing that was not caught
+
+
+class ArmPlanner:
+    """Plans for one arm. Not for two threads at once."""
+
+    def __init__(self, mjcf: str, body: BodyDescription) -> None:
+        """Read the arm's model. Raises ConfigError for one that does not fit the body."""
+        if body.arm is None:
+            raise ConfigError(f"{body.robot_type} has no arm")
+        self.arm = ArmKinematics(mjcf, body.joints, body.arm.tool)
+        self._inverse = InverseKinematics(self.arm, LIMIT_SPARE)
+        self._times = TimeParametrization(self.arm.joints)
+        self._around = surroundings(body.arm)
+        self._pick_place: PickPlacePlanner | None = None
+
+    def reach(
+        self,
+        point: Floats,
+        pitch: float | None,
+        things: Sequence[Thing],
+        posture: Floats,
+        hold: Hold | None,
+    ) -> Plan | NoWay:
+        """Return how to bring the tool to a point (3,) [m] in the frame of the arm's base.
+
+        Args:
+            point: Where the tool should be.
+            pitch: How far the tool points down [rad], 0 for level; None for any way.
+            things: What is around.
+            posture: Where the arm is (n,).
+            hold: What it holds.
+        """
+        checker = self._checker(things, hold)
+        goal = ToolGoal(
+            position=point,
+            approach=None if pitch is None else self._approach(point, pitch),
+            orientation_tolerance=ORIENTATION_RAD,
+        )
+        found = self._inverse.solve(goal, posture, checker.touches)
+        if isinstance(found, OutOfReach):
+            return NoWay(reason=self._explained(found))
+        return self._move(checker, posture, found.posture)
+
+    def take_posture(
+        self,
+        positions: Mapping[str, float],
+        things: Sequence[Thing],
+        posture: Floats,
+        hold: Hold | None,
+    ) -> Plan | NoWay:
+        """Return how to move joints to `positions` [rad] or [m], and the gripper at the end."""
+        wanted = zip(self.arm.names, posture, strict=True)
+        goal = np.array([positions.get(name, here) for name, here in wanted])
+        moved = self._move(self._checker(things, hold), posture, goal)
+        gripper = self.arm.gripper
+        if isinstance(moved, NoWay) or gripper is None or gripper.name not in positions or hold:
+            return moved
+        return Plan(phases=(*moved.phases, Phase(name="grip", gripper=positions[gripper.name])))
+
+    def grip(self, to: float | Literal["open", "close"]) -> Plan:
+        """Return how to move the gripper. Raises ConfigError for an arm without one."""
+        gripper = self.arm.gripper
+        if gripper is None:
+            raise ConfigError("this arm has no gripper")
+        if isinstance(to, str):
+            opening = self.arm.opening()
+            to = opening.position(opening.widest if to == "open" else 0.0)
+        return Plan(phases=(Phase(name="grip", gripper=to),))
+
+    def pick(
+        self, thing: Thing, things: Sequence[Thing], posture: Floats, without: int
+    ) -> Plan | NoWay:
+        """Return how to pick a thing up; `without` as in `PickPlacePlanner.pick`."""
+        found = self._picker().pick(thing, self._all(things), posture, without)
+        if isinstance(found, NoWay):
+            return found
+        grip = next(phase.gripper for phase in found.phases if phase.name == "close")
+        assert grip is not None
+        hold = Hold(thing=found.held, grip=grip, opening=found.grasp.opening)
+        return Plan(phases=found.phases, hold=hold, back=found.back)
+
+    def place(
+        self, hold: Hold, target: Floats, things: Sequence[Thing], posture: Floats
+    ) -> Plan | NoWay:
+        """Return how to put down what is held, its middle at `target` (3,) [m]."""
+        around = self._all(things)
+        found = self._picker().place(hold.thing, target, around, posture, hold.opening)
+        return found if isinstance(found, NoWay) else Plan(phases=found.phases)
+
+    def holds(self, measured: float, wanted: float) -> bool:
+        """Return whether the gripper has stopped short of where it was sent."""
+        return self._picker().holds(measured, wanted)
+
+    def _picker(self) -> PickPlacePlanner:
+        """Return the planner of picks. Raises ConfigError for an arm that cannot hold things."""
+        if self._pick_place is None:
+            self._pick_place = PickPlacePlanner(self.arm, self._inverse)
+        return self._pick_place
+
+    def _all(self, things: Sequence[Thing]) -> list[Thing]:
+        return [*self._around, *things]
+
+    def _checker(self, things: Sequence[Thing], hold: Hold | None) -> CollisionChecker:
+        around = self._all(things)
+        if hold is None:
+            return CollisionChecker(self.arm, around, margin=0.002)
+        ignore = may_touch(hold.thing, around)
+        return CollisionChecker(self.arm, around, held=hold.thing, margin=0.001, ignore=ignore)
+
+    def _move(self, checker: CollisionChecker, start: Floats, goal: Floats) -> Plan | NoWay:
+        way = plan(checker, start, goal)
+        if isinstance(way, NoPath):
+            return NoWay(reason=way.reason)
+        trajectory = self._times.trajectory(way.postures, checker=checker)
+        return Plan(phases=(Phase(name="move", arm=trajectory),))
+
+    def _approach(self, point: Floats, pitch: float) -> Floats:
+        """Return the direction of a tool that comes from above the first joint's axis."""
+        away = point[:2] - self.arm.chain.fixed[0, :2, 3]
+        azimuth = math.atan2(away[1], away[0])
+        level = math.cos(pitch)
+        return np.array([level * math.cos(azimuth), level * math.sin(azimuth), -math.sin(pitch)])
+
+    def _explained(self, found: OutOfReach) -> str:
+        if found.posture is None:
+            return found.reason
+        x, y, z = self.arm.forward(found.posture).position
+        return f"not reachable: {found.reason}; the nearest is ({x:.3f}, {y:.3f}, {z:.3f})"
+
+
+def surroundings(arm: Arm) -> list[Thing]:
+    """Return the floor and the boxes that no part of an arm may enter."""
+    found = []
+    if arm.floor is not None:
+        place = np.array([0.0, 0.0, arm.floor - SUNK_M])
+        found.append(Thing(name=TABLE, kind="floor", position=place))
+    for box in arm.keep_out:
+        found.append(Thing(
+            name=box.name, kind="box", size=box.size, position=np.array(box.center),
+            axes=turned(box.yaw),
+        ))  # fmt: skip
+    return found

@@ -1,0 +1,108 @@
+"""Phases of a plan, and how they are carried out: one wish for the joints in each tick."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import TICK_S
+from gigabrain_schemas.brain import LONGEST_WINDOW_S, JointTarget
+from gigabrain_schemas.brain import JointTrajectory as JointWindow
+from gigabrain_zenoh.manipulation.joint_trajectory import JointTrajectory
+
+PhaseName = Literal[
+    "hover", "descend", "close", "lift", "traverse", "lower", "open", "retreat", "move", "grip"
+]  # fmt: skip
+GRIP_TICKS = 40  # until a gripper has closed, or has stopped at what is between its fingers
+SETTLE_TICKS = 12  # after a trajectory
+AHEAD_TICKS = 1  # from a state to the tick in which a command by it moves joints
+WINDOW_TICKS = 100  # of a trajectory in an intent
+assert WINDOW_TICKS * TICK_S <= LONGEST_WINDOW_S
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Phase:
+    """A part of a plan: the arm moves, or the gripper does."""
+
+    name: PhaseName
+    arm: JointTrajectory | None = None
+    gripper: float | None = None  # [rad] or [m], where its joint goes
+
+    @property
+    def ticks(self) -> int:
+        """How long it takes."""
+        if self.arm is None:
+            return GRIP_TICKS
+        return math.ceil(self.arm.duration / TICK_S) + 1 + SETTLE_TICKS
+
+
+class PhaseRun:
+    """Carries out phases one after the other, by the robot's ticks."""
+
+    def __init__(self, phases: Sequence[Phase], gripper: str, tick: int) -> None:
+        """Begin at `tick`; `gripper` names its joint."""
+        self._phases, self._gripper = tuple(phases), gripper
+        self._begun, self._at = tick, 0
+        self._total = sum(phase.ticks for phase in phases)
+
+    @property
+    def phase(self) -> Phase | None:
+        """The present phase; None once all are over."""
+        return self._phases[self._at] if self._at < len(self._phases) else None
+
+    def advance(self, tick: int) -> Phase | None:
+        """Return the phase that is over at `tick`, and begin the next one; else None."""
+        phase = self.phase
+        if phase is None or tick - self._begun < phase.ticks:
+            return None
+        self._begun, self._at = tick, self._at + 1
+        return phase
+
+    def wish(self, tick: int) -> tuple[tuple[JointTarget, ...], JointWindow | None]:
+        """Return the targets, or the part of a trajectory, for the intent of a state of `tick`."""
+        phase = self.phase
+        if phase is None:
+            return (), None
+        if phase.arm is None:
+            assert phase.gripper is not None
+            return (JointTarget(name=self._gripper, position=phase.gripper),), None
+        first = max(0, tick - self._begun)
+        rows = _rows(phase.arm, first + np.arange(WINDOW_TICKS))
+        return (), JointWindow(
+            name=phase.arm.names,
+            start=self._begun + first + AHEAD_TICKS,
+            period=TICK_S,
+            positions=rows.astype("<f4").tobytes(),
+        )
+
+    def expected(self, tick: int) -> dict[str, float]:
+        """Return where the arm's joints should be at `tick` [rad] or [m]; empty for a gripper's."""
+        phase = self.phase
+        if phase is None or phase.arm is None:
+            return {}
+        row = _rows(phase.arm, np.array([tick - self._begun - AHEAD_TICKS]))[0]
+        return dict(zip(phase.arm.names, row.tolist(), strict=True))
+
+    def over_for(self, tick: int) -> int:
+        """Return how many ticks ago the last phase ended."""
+        return 0 if self.phase else tick - self._begun
+
+    def left_ticks(self, tick: int) -> int:
+        """Return how many ticks all that is left takes."""
+        left = sum(phase.ticks for phase in self._phases[self._at :])
+        return max(0, left - (tick - self._begun)) if left else 0
+
+    def progress(self, tick: int) -> float:
+        """Return the share that is done."""
+        return 1.0 - self.left_ticks(tick) / self._total if self._total else 1.0
+
+
+def _rows(trajectory: JointTrajectory, ticks: NDArray[np.int64]) -> Floats:
+    """Return the postures (k, n) some ticks after the start."""
+    times = ticks * TICK_S
+    columns = trajectory.positions.T
+    return np.stack([np.interp(times, trajectory.times, column) for column in columns], axis=1)

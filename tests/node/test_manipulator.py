@@ -1,0 +1,190 @@
+"""Missions move an arm in MuJoCo: task queue, manipulator, control and gate, stepped in memory."""
+
+from concurrent.futures import Future
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gigabrain_drivers.driver.catalog import load_link, robot_path
+from gigabrain_drivers.driver.robot import Run
+from gigabrain_drivers.sim.body import MujocoOptions, sim_body
+from gigabrain_schemas.base import TICK_S
+from gigabrain_schemas.body import ArmModel
+from gigabrain_schemas.brain import Intent
+from gigabrain_schemas.tasks import Task
+from gigabrain_zenoh.decision.behaviours import ArmCommand, StepOutcome
+from gigabrain_zenoh.decision.manipulator import Manipulator
+from gigabrain_zenoh.decision.tasks.mission import loads
+from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskQueue
+from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner
+from gigabrain_zenoh.qa.bench.hands import ArmInMemory
+from gigabrain_zenoh.testing.waiting import PATIENCE_S
+
+MODEL = robot_path("so101").with_name("model.xml").read_text()
+CUBE = """<mujoco><worldbody>
+  <geom name="floor" type="plane" size="2 2 .1"/>
+  <body name="thing" pos="{x} {y} 0.015"><freejoint/>
+    <geom type="box" size=".015 .015 .015" mass=".05" condim="6" friction="1 .02 .0005"/>
+  </body></worldbody></mujoco>"""
+THERE, ELSEWHERE = (0.2388, 0.0), (0.1388, 0.15)
+IDLE = Intent(behaviour="test", reason="still")
+MOST_TICKS = 4000
+
+
+def waits(job: Future[Any], _patience_s: float) -> bool:
+    job.exception(PATIENCE_S)
+    return True
+
+
+class Rig:
+    """An arm with a queue of tasks."""
+
+    def __init__(self, folder: Path, cube: tuple[float, float] = THERE) -> None:
+        (folder / "thing.xml").write_text(CUBE.format(x=cube[0], y=cube[1]))
+        world = folder / "world.yaml"
+        world.write_text("model: thing.xml\nstart: [0.0, 0.0, 0.0]\n")
+        robot, _, options, model_folder = load_link("so101", Run(folder=Path()))
+        assert isinstance(options, MujocoOptions)
+        self.arm = ArmInMemory(robot, sim_body(robot, options, Run(folder=model_folder)), world)
+        bus: Any = SimpleNamespace(
+            input_log=SimpleNamespace(in_time=waits),
+            latest=lambda _topic: SimpleNamespace(current=ArmModel(mjcf=MODEL)),
+        )
+        self.manipulator = Manipulator(bus, "navigate")
+        self.queue = TaskQueue(lambda _topic: None, lambda _script: None, Saved())  # type: ignore[arg-type, return-value]
+        self.outcome: StepOutcome | None = None
+        self.held, self.blocked = "", False
+        self.phases: list[str] = []  # that it was in, each time it began
+
+    @property
+    def planner(self) -> ArmPlanner:
+        assert self.manipulator._planner
+        return self.manipulator._planner
+
+    def give(self, text: str) -> None:
+        self.queue.add_mission(loads(text, "mission"), "mission", "replace", "test")
+
+    def tick(self) -> None:
+        command, idle = self.queue.step(TICK_S, self.outcome)
+        assert command is None or isinstance(command, ArmCommand)
+        intent, outcome = self.manipulator.step(
+            self.arm.state(), self.arm.description, command, idle, self.held
+        )
+        self.outcome = outcome if command else None
+        if not self.phases or self.phases[-1] != outcome.reason:
+            self.phases.append(outcome.reason)
+        self.arm.step(IDLE if self.blocked else intent)
+
+    def take_away(self) -> None:
+        """Have what the gripper holds be somewhere else."""
+        simulation = self.arm.simulation
+        joint = simulation.model.body("world/thing").jntadr[0]
+        at = simulation.model.jnt_qposadr[joint]
+        simulation.data.qpos[at : at + 3] = 0.5, 0.5, 0.015
+
+    def carry_out(self, text: str) -> Task:
+        """Give a mission, and return what became of it."""
+        self.give(text)
+        return self.carry_on()
+
+    def carry_on(self) -> Task:
+        """Return what becomes of the present task."""
+        for _ in range(MOST_TICKS):
+            self.tick()
+            if not self.queue.status.current:
+                return self.queue.status.done[0]
+        raise AssertionError(f"not done: {self.queue.status.current}")
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Any:
+    made = Rig(tmp_path)
+    yield made
+    made.manipulator.close()
+
+
+THINGS = "things: {cube: {box: [0.03, 0.03, 0.03], at: [0.2388, 0.0, 0.015]}}\n"
+
+
+def test_a_cube_is_picked_up_and_put_down_there_and_back(rig: Rig) -> None:
+    task = rig.carry_out(
+        THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]},"
+        " {pick: cube}, {place: [0.2388, 0.0, 0.015]}, {posture: home}]"
+    )
+    assert (task.state, task.reason) == ("succeeded", "")
+    assert rig.arm.thing()[:2] == pytest.approx(THERE, abs=0.01)
+    assert rig.arm.broken == 0
+
+
+def test_the_tool_reaches_a_point_from_the_asked_direction(rig: Rig) -> None:
+    task = rig.carry_out("do: [{reach: {at: [0.22, 0.05, 0.06], pitch: 1.2}}]")
+    assert (task.state, task.reason) == ("succeeded", "")
+    arm = rig.planner.arm
+    tool = arm.forward(np.array([rig.arm.measured(name) for name in arm.names]))
+    assert tool.position == pytest.approx([0.22, 0.05, 0.06], abs=0.01)
+    assert tool.axes[2, 0] == pytest.approx(-np.sin(1.2), abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("step", "why"),
+    [
+        ("reach: [0.9, 0.0, 0.1]", "not reachable: too far by"),
+        ("reach: [0.2, 0.0, -0.05]", "collides: "),
+        ("place: [0.2, 0.0, 0.015]", "the gripper holds nothing"),
+        ("pick: far", "too far by"),
+    ],
+)
+def test_what_cannot_be_done_fails_with_its_reason_and_nothing_moves(
+    rig: Rig, step: str, why: str
+) -> None:
+    far = "things: {far: {sphere: 0.015, at: [0.8, 0.0, 0.015]}}\n"
+    before = rig.arm.posture(rig.arm.arm.names)
+    task = rig.carry_out(f"{far}do: [{{{step}}}]")
+    assert task.state == "failed"
+    assert why in task.reason
+    assert rig.arm.posture(rig.arm.arm.names) == pytest.approx(before, abs=1e-3)
+
+
+def test_what_is_not_there_is_tried_three_times_and_the_arm_goes_back(tmp_path: Path) -> None:
+    rig = Rig(tmp_path, cube=(-0.3, 0.3))
+    task = rig.carry_out(THINGS + "do: [{pick: cube}]")
+    assert (task.state, task.reason) == ("failed", "picking up cube: it was not caught, 3 times")
+    assert rig.phases.count("close") == 3
+    rig.manipulator.close()
+
+
+@pytest.mark.parametrize("phase", ["descend", "lift", "traverse", "open", "retreat"])
+def test_after_an_interruption_it_goes_on_from_where_it_is(rig: Rig, phase: str) -> None:
+    rig.give(THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]}]")
+    while rig.outcome is None or rig.outcome.reason != phase:
+        rig.tick()
+    rig.tick()
+    rig.held = "the gate is latched: e-stop"
+    for _ in range(100):
+        rig.tick()
+        assert rig.outcome.held
+    rig.held = ""
+    task = rig.carry_on()
+    assert (task.state, task.reason) == ("succeeded", "")
+    assert rig.arm.thing()[:2] == pytest.approx(ELSEWHERE, abs=0.012)
+
+
+def test_what_slips_out_of_the_gripper_is_told(rig: Rig) -> None:
+    rig.give(THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]}]")
+    while rig.outcome is None or rig.outcome.reason != "traverse":
+        rig.tick()
+    rig.take_away()
+    task = rig.carry_on()
+    assert task.state == "failed"
+    assert "cube has slipped out of the gripper" in task.reason
+
+
+def test_a_joint_that_does_not_follow_ends_the_command_after_a_few_tries(rig: Rig) -> None:
+    rig.blocked = True
+    task = rig.carry_out("do: [{posture: {shoulder_pan: 1.0}}]")
+    assert task.state == "failed"
+    assert "is 0.3" in task.reason
+    assert "more than its path_tolerance of 0.3" in task.reason
