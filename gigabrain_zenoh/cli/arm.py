@@ -5,17 +5,23 @@ import getpass
 import math
 import sys
 from collections.abc import Awaitable, Callable
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from gigabrain_schemas.body import BodyDescription, Joint, JointDescription, RobotState
 from gigabrain_schemas.requests import GateReply
 from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, Take, check_finite, print_line
+from gigabrain_zenoh.cli.task import Mode, Wait, send
 from gigabrain_zenoh.client.robot import Robot
+from gigabrain_zenoh.decision.tasks.arm_steps import describe
 from gigabrain_zenoh.errors import ConfigError, Unsupported, unknown
 from gigabrain_zenoh.host.signals import run_async
 
+if TYPE_CHECKING:
+    from gigabrain_zenoh.decision.tasks.mission import Mission
+
+Metres = Annotated[float, Parameter(allow_leading_hyphen=True)]
 Distance = Annotated[float, Parameter(allow_leading_hyphen=True)]
 BAR = 20  # characters of a joint's range
 WATCH_S = 0.2
@@ -94,6 +100,98 @@ def home(*, take: Take = False, at: RobotAddress = LOCAL) -> None:
     _with_robot(at, "arm", move)
 
 
+def goto(
+    x: Metres,
+    y: Metres,
+    z: Metres,
+    /,
+    *,
+    pitch: Distance | None = None,
+    mode: Mode = "replace",
+    wait: Wait = True,
+    at: RobotAddress = LOCAL,
+) -> None:
+    """Bring the tool to a point, round what is in the way.
+
+    Example: gigabrain arm goto 0.22 0.05 0.12 --pitch 60
+
+    If it cannot, it says why, and which point is nearest.
+
+    Args:
+        x: Forwards, from the arm's base [m].
+        y: To the left [m].
+        z: Up [m].
+        pitch: How far the tool points down [degrees], 0 for level. Default: any way.
+    """
+    from gigabrain_zenoh.decision.tasks.arm_steps import Reach
+    from gigabrain_zenoh.decision.tasks.mission import Mission, Step
+
+    down = None if pitch is None else math.radians(pitch)
+    _carry_out(at, Mission(do=(Step(reach=Reach(at=(x, y, z), pitch=down)),)), mode, wait)
+
+
+def pick(
+    x: Metres,
+    y: Metres,
+    z: Metres,
+    /,
+    *,
+    box: tuple[float, float, float] | None = None,
+    cylinder: tuple[float, float] | None = None,
+    sphere: float | None = None,
+    yaw: Distance = 0.0,
+    mode: Mode = "replace",
+    wait: Wait = True,
+    at: RobotAddress = LOCAL,
+) -> None:
+    """Pick a thing up, whose middle is at a point.
+
+    Example: gigabrain arm pick 0.2388 0 0.015 --box 0.03 0.03 0.03
+
+    Args:
+        x: Forwards, from the arm's base [m].
+        y: To the left [m].
+        z: Up [m].
+        box: Its lengths along x, y and z [m].
+        cylinder: Its radius and its height [m].
+        sphere: Its radius [m].
+        yaw: How it is turned [degrees].
+    """
+    from gigabrain_zenoh.decision.tasks.arm_steps import Solid
+    from gigabrain_zenoh.decision.tasks.mission import Mission, Step
+
+    shapes = sum(one is not None for one in (box, cylinder, sphere))
+    if shapes != 1:
+        raise ConfigError(f"arm pick: expected --box, --cylinder or --sphere, got {shapes} of them")
+    thing = Solid(box=box, cylinder=cylinder, sphere=sphere, at=(x, y, z), yaw=math.radians(yaw))
+    mission = Mission(things={"the thing": thing}, do=(Step(pick="the thing"),))
+    _carry_out(at, mission, mode, wait)
+
+
+def place(
+    x: Metres,
+    y: Metres,
+    z: Metres,
+    /,
+    *,
+    mode: Mode = "replace",
+    wait: Wait = True,
+    at: RobotAddress = LOCAL,
+) -> None:
+    """Put down what the gripper holds, its middle at a point.
+
+    Example: gigabrain arm place 0.14 0.15 0.015
+
+    Args:
+        x: Forwards, from the arm's base [m].
+        y: To the left [m].
+        z: Up [m].
+    """
+    from gigabrain_zenoh.decision.tasks.mission import Mission, Step
+
+    _carry_out(at, Mission(do=(Step(place=(x, y, z)),)), mode, wait)
+
+
 def limp(*, yes: bool = False, at: RobotAddress = LOCAL) -> None:
     """Let go of all joints, so that a person can move them. The arm may fall: hold it.
 
@@ -119,6 +217,14 @@ def hold(*, at: RobotAddress = LOCAL) -> None:
     Example: gigabrain arm hold
     """
     _ask(at, lambda robot: robot.hold())
+
+
+def _carry_out(at: RobotAddress, mission: "Mission", mode: Mode, wait: bool) -> None:
+    from gigabrain_zenoh.decision.tasks.mission import loads, text_of
+
+    text, label = text_of(mission), describe(mission.arm_actions[0])
+    loads(text, "arm")  # refuse wrong numbers before connecting
+    send(at, lambda tasks: tasks.carry_out(text, how=mode, label=label), wait)
 
 
 def _ask(at: RobotAddress, request: Callable[[Robot], Awaitable[GateReply]]) -> None:

@@ -47,7 +47,8 @@ class RobotOptions:
     body: Body = "turtlebot3_waffle"
     link: LinkName = "sim"
     "How to reach the robot: simulated, emulated or real."
-    world: World = "arena"
+    world: World | None = None
+    "Default: that of the robot's file, mostly arena."
     seconds: float | None = None
     "End after this much simulated time [s]."
     seed: Seed = 0
@@ -69,18 +70,24 @@ class RobotOptions:
     def check(self) -> None:
         """Raise ConfigError or UnknownName for a value that does not fit."""
         behaviours.load(self.behaviour)
-        check_names([self.body], [self.world])
+        check_names([self.body], [self.world] if self.world else [])
         check_positive(seconds=self.seconds)
 
     def values(self) -> dict[str, object]:
         """Return the fields of a Deployment, unchecked."""
-        from gigabrain_drivers.driver.catalog import load_robot
+        from gigabrain_drivers.driver.catalog import load_robot, robot_path
 
-        settings = dict(behaviours.load(self.behaviour).DEMO)
+        robot, settings = load_robot(self.body), dict(behaviours.load(self.behaviour).DEMO)
+        mapped = behaviours.needs_map(self.behaviour)
+        world = self.world or robot.demo.world
+        if robot.demo.mission and mapped and world == robot.demo.world and self.link != "real":
+            settings = {
+                "mission": str(robot_path(self.body).absolute().parent / robot.demo.mission)
+            }
         values: dict[str, object] = {
             "body": self.body,
             "link": self.link,
-            "world": beside(self.world, Path()),
+            "world": beside(world, Path()),
             "seed": self.seed,
             "speed": self.speed,
             "lockstep_timeout_s": self.lockstep_timeout,
@@ -88,7 +95,7 @@ class RobotOptions:
             "resume": self.resume or ("manual" if self.link == "real" else "auto"),
             "router": "tcp/127.0.0.1:0",
         }
-        if behaviours.needs_map(self.behaviour) and load_robot(self.body).has_base:
+        if mapped and robot.has_base:
             values["perception"] = {"mapping": "slam"}
         if self.map:
             values["perception"] = {"mapping": "localize", "map": checked_map(self.map)}

@@ -64,19 +64,19 @@ def goto(
     if object or tag is not None:
         if place or (object and tag is not None):
             raise ConfigError("goto: expected a place, --object or --tag; got more than one")
-        _send(at, lambda tasks: tasks.go_to_object(object, tag=tag, how=mode), wait)
+        send(at, lambda tasks: tasks.go_to_object(object, tag=tag, how=mode), wait)
         return
     if not place:
         raise ConfigError("goto: expected a place, --object CLASS or --tag NUMBER")
     if y is None:
         if _is_number(place):
             raise ConfigError(f"goto: Y is missing: expected two numbers, or a name; got {place!r}")
-        _send(at, lambda tasks: tasks.go_to_place(place, how=mode), wait)
+        send(at, lambda tasks: tasks.go_to_place(place, how=mode), wait)
         return
     if not _is_number(place):
         raise ConfigError(f"goto: expected two numbers, or the name of a place; got {place!r}")
     x = float(place)
-    _send(at, lambda tasks: tasks.go_to(x, y, yaw, how=mode), wait)
+    send(at, lambda tasks: tasks.go_to(x, y, yaw, how=mode), wait)
 
 
 def _is_number(text: str) -> bool:
@@ -92,7 +92,7 @@ def explore(*, mode: Mode = "replace", wait: Wait = True, at: RobotAddress = LOC
 
     Example: gigabrain explore
     """
-    _send(at, lambda tasks: tasks.explore(how=mode), wait)
+    send(at, lambda tasks: tasks.explore(how=mode), wait)
 
 
 def patrol(
@@ -117,7 +117,7 @@ def patrol(
     if loops is not None and not 1 <= loops <= MAX_LOOPS:
         raise ConfigError(f"--loops: expected 1 to {MAX_LOOPS}, got {loops}")
     text = patrol_mission(load_patrol(file), loops)
-    _send(at, lambda tasks: tasks.carry_out(text, how=mode, label=file.stem), wait)
+    send(at, lambda tasks: tasks.carry_out(text, how=mode, label=file.stem), wait)
 
 
 def mission(
@@ -144,7 +144,7 @@ def mission(
         needs = ", ".join(sorted(set(map_places(loaded))))
         print_line(f"{file}: valid{f'; the map must have the places {needs}' if needs else ''}")
         return
-    _send(at, lambda tasks: tasks.carry_out(file, how=mode), wait)
+    send(at, lambda tasks: tasks.carry_out(file, how=mode), wait)
 
 
 def list_(*, at: RobotAddress = LOCAL) -> None:
@@ -201,11 +201,13 @@ def _with_tasks(at: RobotAddress, do: "Callable[[Tasks], Awaitable[None]]") -> N
     on_bus(at, lambda bus: do(Tasks(bus, at.folder, on_wait=print_line)), name)
 
 
-def _send(at: RobotAddress, send: "Callable[[Tasks], Awaitable[str]]", wait: bool) -> None:
+def send(at: RobotAddress, give: "Callable[[Tasks], Awaitable[str]]", wait: bool) -> None:
+    """Give a robot a task, and show its progress to the end. Raises Refused where it fails."""
+
     async def run(tasks: "Tasks") -> None:
         from gigabrain_zenoh.decision.behaviours import describe_end
 
-        name = await send(tasks)
+        name = await give(tasks)
         if not wait:
             return print_line(f"{name}: accepted")
         line = ProgressLine()

@@ -4,6 +4,7 @@ The robot can drive before the planning kernels are compiled.
 """
 
 import asyncio
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
@@ -34,6 +35,7 @@ from gigabrain_zenoh.decision.drive_kernels import DriveKernels
 from gigabrain_zenoh.decision.node import InputSource
 from gigabrain_zenoh.decision.task_server import TaskServer
 from gigabrain_zenoh.decision.tasks import mission as missions
+from gigabrain_zenoh.decision.tasks.mission import Mission
 from gigabrain_zenoh.decision.zones import ZoneSource
 from gigabrain_zenoh.errors import Refused
 
@@ -74,6 +76,7 @@ class GoalServer(InputSource):
         self._manipulator: Manipulator | None = None  # likewise, of a body with an arm
         self._outcome: StepOutcome | None = None  # of the last command
         self._started = False
+        self._first = _first_mission(settings)
 
     async def prepare(self) -> None:
         """Load the kernels, or begin to compile them. Raises ConfigError."""
@@ -111,6 +114,7 @@ class GoalServer(InputSource):
         """Advance the queue and step the behaviour with the command that it wants."""
         body = self._source.body
         if body and not body.has_base:
+            self._begin(state, body)
             command, idle = self._tasks.step(state, self._outcome, state.tick)
             step = self._move_arm(state, body, command, idle)
             self._outcome = step[1] if command else None
@@ -119,9 +123,7 @@ class GoalServer(InputSource):
         if not self._loaded or self._awaits_map(state):
             return self._start_up(state, world, verdict)
         navigator = self._make_navigator()
-        if self._config.start == "explore" and not self._started:
-            self._tasks.begin(missions.explore_mission(), "roaming", state.boot)
-        self._started = True
+        self._begin(state, body)
         tick = world.basis if world else state.tick
         command, idle = self._tasks.step(state, self._outcome, tick)
         context = navigator.at_scan(state, world, verdict)
@@ -142,6 +144,13 @@ class GoalServer(InputSource):
                 intent = replace(moved, twist=intent.twist, response=intent.response)
         self._outcome = outcome if command else None
         return intent, outcome
+
+    def _begin(self, state: RobotState, body: BodyDescription | None) -> None:
+        """Begin what the robot does by itself, once, if there was no task and its body can."""
+        drives = body is None or body.has_base
+        if self._first and not self._started and (drives or not self._first[0].drives):
+            self._tasks.begin(*self._first, state.boot)
+        self._started = True
 
     def _move_arm(
         self, state: RobotState, body: BodyDescription, command: Command | None, idle: Idle
@@ -252,6 +261,14 @@ class GoalServer(InputSource):
         while True:
             self._tasks.publish_starting()
             await self._bus.clock.sleep_ns(STARTING_STATUS_NS)
+
+
+def _first_mission(config: NavigationConfig) -> tuple[Mission, str] | None:
+    """Return what a robot does by itself, with its label. Raises ConfigError."""
+    if config.mission:
+        path = Path(config.mission).expanduser()
+        return missions.load(path)[0], path.stem
+    return (missions.explore_mission(), "roaming") if config.start == "explore" else None
 
 
 def _roaming(config: NavigationConfig) -> AvoidConfig:

@@ -33,6 +33,7 @@ TRIES = 3  # to pick a thing up, each with another grasp
 HOLD_UPS = 5  # of one command, after which it fails
 CARRYING = ("lift", "traverse", "lower")  # phases in which a thing has to be held
 NO_MODEL = Idle("waiting", "waiting: for the arm's model, robot/arm_model")
+NOT_MEASURED = Idle("waiting", "waiting: for all joints to be measured")
 PLANNING = Idle("planning", "planning")
 Planned = Plan | NoWay
 
@@ -81,6 +82,8 @@ class Manipulator:
             return self._still(Idle("waiting", f"waiting: {held}"), held=True)
         if planner is None:
             return self._still(NO_MODEL)
+        if len(state.joints) < len(body.joints):
+            return self._still(NOT_MEASURED)
         if self._run is None and self._achieved.number:
             return self._still(Idle("done", self._achieved.reason), self._achieved)
         try:
@@ -123,7 +126,7 @@ class Manipulator:
             if isinstance(found, NoWay):
                 return self._fail(found.reason)
             self._begin(planner, found, state)
-        return self._follow(planner, state, body)
+        return self._follow(planner, state, body, command)
 
     def _work(
         self, planner: ArmPlanner, state: RobotState, body: BodyDescription, command: ArmCommand
@@ -159,7 +162,9 @@ class Manipulator:
         self._plan = plan
         self._run = PhaseRun(plan.phases, gripper.name if gripper else "", state.tick)
 
-    def _follow(self, planner: ArmPlanner, state: RobotState, body: BodyDescription) -> StepResult:
+    def _follow(
+        self, planner: ArmPlanner, state: RobotState, body: BodyDescription, command: ArmCommand
+    ) -> StepResult:
         """Go on with the present plan by one step."""
         run, plan, hold = self._run, self._plan, self._hold
         assert run
@@ -174,9 +179,11 @@ class Manipulator:
                 self._misses += 1
                 self._begin(planner, Plan(phases=plan.back), state)
                 return self._moving(state)
-            self._achieve(plan.hold)
+            name = plan.hold.thing.name
+            stood = _thing(name, command.things[name])
+            self._achieve(planner.gripped(plan.hold, stood, _measured(planner, state)))
         if over and over.name == "open" and hold:
-            self._achieve(None, placed=_placed(planner, plan, hold))
+            self._achieve(None, placed=_placed(planner, state, command, hold))
         if over and over.name == "grip":
             self._hold = None
         if run.phase is None:
@@ -270,6 +277,12 @@ def _sent(planner: ArmPlanner, body: BodyDescription, state: RobotState) -> Floa
     return np.array([sent[name] for name in planner.arm.names])
 
 
+def _measured(planner: ArmPlanner, state: RobotState) -> Floats:
+    """Return where the arm's joints are (n,) [rad] or [m]."""
+    found = {joint.name: joint.position for joint in state.joints}
+    return np.array([found[name] for name in planner.arm.names])
+
+
 def _home(body: BodyDescription) -> dict[str, float]:
     assert body.arm
     return dict(zip((joint.name for joint in body.joints), body.arm.home, strict=True))
@@ -286,12 +299,14 @@ def _thing(name: str, solid: Solid) -> Thing:
     return Thing(name=name, kind="sphere", size=(solid.sphere,), position=position, axes=axes)
 
 
-def _placed(planner: ArmPlanner, plan: Plan, hold: Hold) -> tuple[str, Solid]:
-    """Return a thing that was let go of, and where it is."""
-    lowered = next(phase.arm for phase in plan.phases if phase.name == "lower")
-    assert lowered
-    tool, thing = planner.arm.forward(lowered.positions[-1]), hold.thing
+def _placed(
+    planner: ArmPlanner, state: RobotState, command: ArmCommand, hold: Hold
+) -> tuple[str, Solid]:
+    """Return a thing that was let go of, and where it stands now."""
+    tool, thing = planner.arm.forward(_measured(planner, state)), hold.thing
     x, y, z = tool.place(thing.position).tolist()
+    if isinstance(command.do, PlaceThing):  # it stands on something there
+        z = command.do.at[2]
     ahead = tool.axes @ thing.axes[:, 0]
     box, round_ = thing.kind == "box", thing.kind == "cylinder"
     return thing.name, Solid(

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -17,7 +17,7 @@ from gigabrain_zenoh.manipulation.inverse_kinematics import (
     OutOfReach,
     ToolGoal,
 )
-from gigabrain_zenoh.manipulation.joint_trajectory import TimeParametrization
+from gigabrain_zenoh.manipulation.joint_trajectory import FAST, TimeParametrization, eased
 from gigabrain_zenoh.manipulation.phases import Phase
 from gigabrain_zenoh.manipulation.pick_place import (
     LIMIT_SPARE,
@@ -59,7 +59,7 @@ class ArmPlanner:
             raise ConfigError(f"{body.robot_type} has no arm")
         self.arm = ArmKinematics(mjcf, body.joints, body.arm.tool)
         self._inverse = InverseKinematics(self.arm, LIMIT_SPARE)
-        self._times = TimeParametrization(self.arm.joints)
+        self._times = TimeParametrization(eased(self.arm.joints, FAST))
         self._around = surroundings(body.arm)
         self._pick_place: PickPlacePlanner | None = None
 
@@ -136,6 +136,23 @@ class ArmPlanner:
         around = self._all(things)
         found = self._picker().place(hold.thing, target, around, posture, hold.opening)
         return found if isinstance(found, NoWay) else Plan(phases=found.phases)
+
+    def gripped(self, hold: Hold, thing: Thing, measured: Floats) -> Hold:
+        """Return what is held by fingers that have just closed on a thing.
+
+        Along the axis in which they close it is between them; else where it stood.
+
+        Args:
+            hold: As it was planned.
+            thing: Where it stood.
+            measured: Where the arm is (n,).
+        """
+        tool = self.arm.forward(measured)
+        place = tool.axes.T @ (thing.position - tool.position)
+        place[2] = hold.thing.position[2]
+        return replace(
+            hold, thing=replace(hold.thing, position=place, axes=tool.axes.T @ thing.axes)
+        )
 
     def holds(self, measured: float, wanted: float) -> bool:
         """Return whether the gripper has stopped short of where it was sent."""

@@ -17,6 +17,7 @@ from itertools import pairwise
 
 import numpy as np
 import ruckig
+from msgspec.structs import replace
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.body import JointDescription
@@ -25,6 +26,8 @@ from gigabrain_zenoh.manipulation.collision import CollisionChecker
 
 PERIOD_S = 0.02  # between points
 SPEEDS = (1.0, 0.7, 0.5, 0.35, 0.2, 0.1, 0.0)  # shares of the speed at corners that are tried
+FAST = 0.7  # of the joints' speeds
+ACCELERATION_SHARE = 0.5
 MAX_STRAY = 0.02  # of a part's longest move
 SPARE = 1e-9
 MARGIN_SHARE = 0.5  # of the checker's margin, that is kept where corners are cut
@@ -44,6 +47,22 @@ class JointTrajectory:
     def duration(self) -> float:
         """How long it takes [s]."""
         return float(self.times[-1])
+
+
+def eased(joints: Sequence[JointDescription], speed: float) -> list[JointDescription]:
+    """Return joints with a share `speed` of what they can, and less acceleration and jerk.
+
+    What is left is for control: a joint that lags is sent ahead by its speed, and corrected.
+    """
+    return [
+        replace(
+            joint,
+            max_speed=speed * joint.max_speed,
+            max_acceleration=ACCELERATION_SHARE * joint.max_acceleration,
+            max_jerk=ACCELERATION_SHARE * joint.max_jerk,
+        )
+        for joint in joints
+    ]
 
 
 class TimeParametrization:

@@ -11,10 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from msgspec.structs import replace as changed
 
 from gigabrain_schemas.arrays import Floats
-from gigabrain_schemas.body import JointDescription
 from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics, Frame
 from gigabrain_zenoh.manipulation.collision import CollisionChecker, Thing, turned
 from gigabrain_zenoh.manipulation.grasps import Grasp, GraspPlanner, NoGrasp
@@ -24,7 +22,12 @@ from gigabrain_zenoh.manipulation.inverse_kinematics import (
     Reachable,
     ToolGoal,
 )
-from gigabrain_zenoh.manipulation.joint_trajectory import JointTrajectory, TimeParametrization
+from gigabrain_zenoh.manipulation.joint_trajectory import (
+    FAST,
+    JointTrajectory,
+    TimeParametrization,
+    eased,
+)
 from gigabrain_zenoh.manipulation.phases import Phase
 from gigabrain_zenoh.manipulation.planner import NoPath, plan
 
@@ -71,8 +74,8 @@ class PickPlacePlanner:
         self.arm = arm
         self._inverse = inverse or InverseKinematics(arm, LIMIT_SPARE)
         self._grasps = GraspPlanner(arm, self._inverse)
-        self._fast = TimeParametrization(arm.joints)
-        self._slow = TimeParametrization([_slowed(joint) for joint in arm.joints])
+        self._fast = TimeParametrization(eased(arm.joints, FAST))
+        self._slow = TimeParametrization(eased(arm.joints, SLOW))
         self._opening = arm.opening()
         assert arm.gripper
         self._gripper = arm.gripper
@@ -247,10 +250,6 @@ class PickPlacePlanner:
     def holds(self, measured: float, wanted: float) -> bool:
         """Return whether the gripper has stopped short of where it was sent."""
         return abs(measured - wanted) > HELD_SHARE * (self._gripper.upper - self._gripper.lower)
-
-
-def _slowed(joint: JointDescription) -> JointDescription:
-    return changed(joint, max_speed=SLOW * joint.max_speed)
 
 
 def may_touch(held: Thing, others: Sequence[Thing]) -> list[tuple[str, str]]:

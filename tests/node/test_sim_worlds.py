@@ -24,7 +24,15 @@ SOME_WORLDS = ("arena", "house", "warehouse", "random:0", "random:7")
 
 def test_the_worlds_are_listed_with_a_line_each() -> None:
     names = world_names()
-    assert list(names) == ["arena", "house", "playroom", "warehouse", "random:SEED", "FILE"]
+    assert list(names) == [
+        "arena",
+        "house",
+        "playroom",
+        "table",
+        "warehouse",
+        "random:SEED",
+        "FILE",
+    ]
     assert all(text and "\n" not in text for text in names.values())
 
 

@@ -74,6 +74,9 @@ CALLS = {
     "arm state": "arm state --watch",
     "arm jog": "arm jog gripper 5",
     "arm home": "arm home",
+    "arm goto": "arm goto 0.2 0 0.1",
+    "arm pick": "arm pick 0.2 0 0.02 --sphere 0.02",
+    "arm place": "arm place 0.2 0 0.02",
     "arm limp": "arm limp --yes",
     "arm hold": "arm hold",
     "objects": "objects",
@@ -116,7 +119,9 @@ CALLS = {
 # These may also end with others by themselves, as the state of the robot has it.
 OWN_CODES = {
     "why": range(10, 20),
-    **dict.fromkeys(("goto", "explore", "patrol", "mission"), (1,)),
+    **dict.fromkeys(
+        ("goto", "explore", "patrol", "mission", "arm goto", "arm pick", "arm place"), (1,)
+    ),
     **dict.fromkeys(("task cancel", "task pause", "task resume", "map save", "map info"), (1, 2)),
     # without a map, a simulation, or what is named
     **dict.fromkeys(("map load", "view", "world add", "world list", "world remove"), (1, 2)),

@@ -14,6 +14,13 @@ Length = Annotated[float, Meta(ge=0.0, le=10.0)]  # [m], of a part of a body
 LINKS: tuple[LinkName, ...] = ("sim", "emulated", "real")
 
 
+class Demo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What `gigabrain demo` shows of a body."""
+
+    world: str = "arena"
+    mission: str = ""  # file beside the robot's file; empty: it explores
+
+
 class RobotFile(BodyDescription, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A whole robot.yaml. Each link names its driver; the rest of it is the driver's own."""
 
@@ -22,6 +29,7 @@ class RobotFile(BodyDescription, frozen=True, kw_only=True, forbid_unknown_field
     effective_track: Length = 0.0
     # [m], of a skid-steered base: the separation of rolling wheels that would turn it as much
     arm_model: str = "model.xml"  # MJCF of a body with an arm, beside this file
+    demo: Demo = Demo()
     sim: dict[str, Any] | None = None
     emulated: dict[str, Any] | None = None
     real: dict[str, Any] | None = None

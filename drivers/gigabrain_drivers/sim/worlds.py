@@ -103,7 +103,7 @@ def _by_wall(random: np.random.Generator) -> Placed:
     return Box(sign * off, along, depth, width, height, material), radius
 
 
-NAMED_WORLDS = ("arena", "house", "playroom", "warehouse")  # files in `shipped_worlds`
+NAMED_WORLDS = ("arena", "house", "playroom", "table", "warehouse")  # files in `shipped_worlds`
 
 
 def world_names() -> dict[str, str]:

@@ -153,6 +153,7 @@ class NavigationConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     unknown_space: Literal["avoid", "allow", "forbid"] = "avoid"
     samples: Annotated[int, Meta(ge=64, le=20_000)] = 1000  # candidate plans per scan
     start: Literal["wait", "explore"] = "wait"  # explore, then visit places, until a task comes
+    mission: str = ""  # file of a mission to begin with instead; empty: none
     scripts: str = ""  # folder of the programs that missions may run; empty: none
 
 

@@ -250,7 +250,12 @@ def find_mission(wanted: str | int) -> Mission:
 def patrol_mission(patrol: PatrolFile, loops: int | None) -> str:
     """Return the text of the mission for a patrol file."""
     step = Step(patrol=Patrol(points=patrol.points, loops=loops, wait=patrol.wait))
-    return msgspec.json.encode(Mission(places=patrol.places, do=(step,))).decode()
+    return text_of(Mission(places=patrol.places, do=(step,)))
+
+
+def text_of(mission: Mission) -> str:
+    """Return a mission as the text that a robot takes."""
+    return msgspec.json.encode(mission).decode()
 
 
 def load(path: Path) -> tuple[Mission, str]:

@@ -1,0 +1,84 @@
+"""What missions may ask of an arm, and what is refused before anything moves."""
+
+import pytest
+
+from gigabrain_drivers.driver.catalog import load_robot
+from gigabrain_zenoh.decision.tasks import arm_steps
+from gigabrain_zenoh.decision.tasks.arm_steps import (
+    ArmAction,
+    Gripper,
+    Pick,
+    PlaceThing,
+    Reach,
+    TakePosture,
+)
+from gigabrain_zenoh.decision.tasks.mission import loads
+from gigabrain_zenoh.errors import ConfigError, GigabrainError
+
+ARM = load_robot("so101").description()
+BASE = load_robot("turtlebot3_burger").description()
+
+
+def test_steps_of_a_mission_are_actions_of_the_arm() -> None:
+    mission = loads(
+        "things: {can: {cylinder: [0.03, 0.1], at: [0.2, 0, 0.05]}}\n"
+        "do: [{reach: [0.2, 0, 0.1]}, {reach: {at: [0.2, 0, 0.1], pitch: 1}}, {posture: home},"
+        " {posture: {shoulder_pan: 0.5}}, {gripper: open}, {gripper: 0.3}, {pick: can},"
+        " {place: [0.1, 0.1, 0.05]}, {wait: 1}]",
+        "mission",
+    )
+    assert mission.arm_actions == [
+        Reach(at=(0.2, 0, 0.1)), Reach(at=(0.2, 0, 0.1), pitch=1), TakePosture({}),
+        TakePosture({"shoulder_pan": 0.5}), Gripper("open"), Gripper(0.3), Pick("can"),
+        PlaceThing((0.1, 0.1, 0.05)),
+    ]  # fmt: skip
+    assert not mission.drives
+    arm_steps.check(ARM, mission.arm_actions)
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("do: [{pick: can}]", "do[0].pick: no thing 'can'; known: none"),
+        ("things: {can: {at: [0, 0, 0]}}\ndo: [{pick: can}]", "expected a box, a cylinder or a sp"),
+        ("things: {can: {sphere: 0.1, box: [1, 1, 1], at: [0, 0, 0]}}\ndo: [{pick: can}]",
+         "expected a box, a cylinder or a sphere"),
+        ("things: {can: {sphere: -1, at: [0, 0, 0]}}\ndo: [{pick: can}]", "expected a number"),
+        ("do: [{reach: [0.2, 0]}]", "do[0].reach"),
+        ("do: [{reach: [.nan, 0, 0]}]", ".nan is not allowed; expected a finite number"),
+        ("do: [{posture: away}]", "do[0].posture"),
+        ("do: [{posture: {}}]", "do[0].posture"),
+        ("do: [{gripper: wide}]", "do[0].gripper"),
+        ("do: [{place: [0.2, 0, 1.0e+30]}]", "do[0].place"),
+    ],
+)  # fmt: skip
+def test_wrong_steps_are_refused_with_their_line(text: str, why: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        loads(text, "mission")
+    assert why in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("action", "why"),
+    [
+        (TakePosture({"elbow": 0.5}), "no joint 'elbow'; did you mean 'elbow_flex'?"),
+        (TakePosture({"elbow_flex": 3.0}), "elbow_flex: expected -1.69 to 1.69, got 3"),
+        (Gripper(2.0), "gripper: expected -0.174533 to 1.74533, got 2"),
+    ],
+)
+def test_what_the_joints_cannot_do_is_refused(action: ArmAction, why: str) -> None:
+    with pytest.raises(GigabrainError) as refused:
+        arm_steps.check(ARM, [action])
+    assert why in str(refused.value)
+
+
+def test_a_body_without_an_arm_refuses_all() -> None:
+    with pytest.raises(GigabrainError, match="turtlebot3_burger has no arm"):
+        arm_steps.check(BASE, [Reach(at=(0.2, 0.0, 0.1))])
+
+
+def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(arm_steps, "find_spec", lambda name: None if name == "ruckig" else True)
+    with pytest.raises(GigabrainError, match=r"needs ruckig; pip install 'gigabrain-zenoh\[arm\]'"):
+        arm_steps.check(ARM, [Reach(at=(0.2, 0.0, 0.1))])
