@@ -1,4 +1,4 @@
-"""SE(2), swept footprints, limits of motion, ramps, scans and the poses they were taken at. Pure.
+"""SE(2), swept footprints, limits of motion, ramps, scans, their poses, and links of arms. Pure.
 
 It imports no other room but errors.
 Every room that computes with poses may import it.

@@ -1,7 +1,7 @@
 """Converts messages into those that Foxglove, Lichtblick and Rerun draw.
 
 The recorder and the live bridge share this table. Frames by REP-105: map → odom → base_link → the
-lidar's own frame.
+lidar's own frame, and the links of an arm.
 """
 
 import functools
@@ -30,6 +30,7 @@ from gigabrain_schemas.topics import Drawing, Topic
 from gigabrain_schemas.zones import Place, Zone, Zones
 from gigabrain_zenoh.geometry.pose import to_frame
 from gigabrain_zenoh.recording import camera_drawing
+from gigabrain_zenoh.recording.arm_drawing import ArmDrawing
 from gigabrain_zenoh.recording.drawn import (
     BASE,
     BLUE,
@@ -97,6 +98,7 @@ class Drawer:
     def __init__(self) -> None:
         self._odometry = Pose(x=0.0, y=0.0, yaw=0.0)
         self._zones_drawn = KnownEntities()
+        self._arm = ArmDrawing()
         self._last_intent = (0, -1)  # boot and basis of the last path drawn
         self._converters: dict[Drawing, Callable[[Any, str], Iterable[Drawn]]] = {
             "scan": self._scan,
@@ -109,6 +111,7 @@ class Drawer:
             "log": self._log,
             "odometry": self._state,
             "lidar_frame": self._body,
+            "arm_model": self._arm.draw_model,
             "image": camera_drawing.picture,
             "depth": camera_drawing.depth,
             "camera": camera_drawing.calibration,
@@ -217,6 +220,7 @@ class Drawer:
     def _state(self, state: RobotState, _: str) -> Iterable[Drawn]:
         self._odometry = state.pose
         yield self._frame(state, ODOM, BASE, state.pose)
+        yield from self._arm.draw_joints(state)
 
     def _body(self, body: Body, _: str) -> Iterable[Drawn]:
         lidar = body.description.lidar

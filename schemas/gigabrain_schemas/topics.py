@@ -33,7 +33,7 @@ Role = Literal[  # of an identity
 # How viewers show a topic; `recording/drawing.py` has a function for each.
 Drawing = Literal[
     "scan", "map", "zones", "pose", "path", "obstacles", "task", "image", "log", "odometry",
-    "lidar_frame", "depth", "camera", "detections", "objects", "perceived",
+    "lidar_frame", "arm_model", "depth", "camera", "detections", "objects", "perceived",
 ]  # fmt: skip
 
 
@@ -101,6 +101,7 @@ STATE = Topic(
 BODY = Topic("robot/body", body.Body, 1, keep=True, max_bytes=16 * KB, drawing="lidar_frame")
 ARM_MODEL = Topic(
     "robot/arm_model", body.ArmModel, 1, keep=True, max_bytes=512 * KB, priority="background",
+    drawing="arm_model",
 )  # fmt: skip
 IMAGE = Topic(
     "robot/image", sensors.Image, 10, max_bytes=1024 * KB, many=True, depth=8, drawing="image",

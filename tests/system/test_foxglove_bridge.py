@@ -1,5 +1,6 @@
 """The bridge to Foxglove and Lichtblick: what a viewer sees is what was said, and who may steer."""
 
+import asyncio
 import base64
 import json
 import math
@@ -15,7 +16,7 @@ from websockets.asyncio.client import connect
 
 from gigabrain_schemas.arrays import hits_bytes
 from gigabrain_schemas.base import Message, Pose, Velocity
-from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.body import ArmModel, Joint, RobotState
 from gigabrain_schemas.brain import Obstacle, OccupancyGrid, PoseInMap, WorldModel
 from gigabrain_schemas.examples import EXAMPLES, example
 from gigabrain_schemas.objects import Detections
@@ -23,6 +24,7 @@ from gigabrain_schemas.requests import GateReply
 from gigabrain_schemas.safety import Health
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import (
+    ARM_MODEL,
     CAMERA,
     DEPTH,
     DETECTIONS,
@@ -48,10 +50,12 @@ from gigabrain_zenoh.testing.processes import Home, free_port, listens
 from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.ui.foxglove.access import topic_to_steer, write_layout
 from gigabrain_zenoh.ui.page.access import token_file, tokens
+from tests.places import ROOT
 from tests.system.foxglove_bridge import Bridge, bridged, hold
 from tests.system.foxglove_viewer import Viewer, fields
 
 STANDING = RobotState(robot_type="waffle", pose=Pose(x=0.0, y=0.0, yaw=0.0), velocity=Velocity())
+LINKS = ("base", "shoulder", "upper_arm", "lower_arm", "wrist", "gripper", "jaw")
 LEFT = {"linear": {"x": 0, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0.5}}
 
 
@@ -230,6 +234,39 @@ async def test_the_frames_join_map_and_robot(bridge: Bridge) -> None:
     expected = {(b"map", b"odom"), (b"odom", b"base_link"), (b"base_link", b"base_scan")}
     assert joined == expected
     assert Pose(x=1.0, y=0.0, yaw=0.0) != state.pose
+
+
+async def sees_the_arm(viewer: Viewer) -> None:
+    """The shapes of all links, and the first of them turned a quarter to the left."""
+    await viewer.subscribe("/viz/arm")
+    scene = await viewer.message("/viz/arm")
+    frames = {dict(fields(entity))[2].decode() for _, entity in fields(scene)}
+    assert frames == {f"arm/{name}" for name in LINKS}
+    await viewer.subscribe("/viz/arm_tf")
+    transforms = [dict(fields(one)) for _, one in fields(await viewer.message("/viz/arm_tf"))]
+    (pan,) = (one for one in transforms if one[3] == b"arm/shoulder")
+    turn = dict(fields(pan[5]))
+    assert pan[2] == b"arm/base"
+    assert (turn[3], turn[4]) == pytest.approx((math.sqrt(0.5), math.sqrt(0.5)))
+
+
+async def test_an_arm_is_drawn_for_viewers_before_and_after_its_model(bridge: Bridge) -> None:
+    mjcf = (ROOT / "drivers/gigabrain_drivers/bodies/so101/model.xml").read_text("utf-8")
+    joints = (Joint(name="shoulder_pan", position=-math.pi / 2),)
+
+    async def talk() -> None:
+        while True:
+            bridge.robot.publish(STATE, replace(STANDING, joints=joints))
+            await asyncio.sleep(0.05)
+
+    talking = asyncio.ensure_future(talk())
+    async with bridge.viewer() as early:
+        await early.channel("/viz/tf")
+        bridge.robot.publish(ARM_MODEL, ArmModel(mjcf=mjcf))
+        await sees_the_arm(early)
+    async with bridge.viewer() as late:
+        await sees_the_arm(late)
+    talking.cancel()
 
 
 async def test_a_viewer_sees_the_connection_graph(bridge: Bridge) -> None:

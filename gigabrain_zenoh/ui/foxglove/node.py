@@ -27,7 +27,9 @@ from foxglove.websocket import (
 from msgspec import Struct
 
 from gigabrain_schemas.base import Finite, Message, Velocity
+from gigabrain_schemas.body import ArmModel
 from gigabrain_schemas.topics import (
+    ARM_MODEL,
     CAMERA,
     DEPTH,
     DETECTIONS,
@@ -36,6 +38,7 @@ from gigabrain_schemas.topics import (
     LOG,
     OBJECT_MAP,
     PERCEIVED,
+    STATE,
     Topic,
 )
 from gigabrain_zenoh.bus.bus import Bus
@@ -79,6 +82,7 @@ class FoxgloveView(ViewerScene):
         self._feed = CameraFeed(bus, *FED)
         bus.subscribe(CAMERA, lambda key, info: self._keep(CAMERA, info, key.rpartition("/")[2]))
         bus.latest(OBJECT_MAP, lambda stored: self._keep(OBJECT_MAP, stored))
+        bus.latest(ARM_MODEL, self._on_arm_model)
 
     def draw_new(self, viewers: int) -> None:
         """Draw everything received since the last call; pictures are received for viewers only."""
@@ -105,6 +109,12 @@ class FoxgloveView(ViewerScene):
             self._draw(topic, message)
         elif topic is not HEALTH:
             self._keep(topic, message)
+
+    def _on_arm_model(self, model: ArmModel) -> None:
+        """Draw the arm, and states once more without a viewer: there are more channels now."""
+        for topic in (ARM_MODEL, STATE):
+            self._channel_names.pop(topic.key, None)
+        self._keep(ARM_MODEL, model)
 
     def _keep(self, topic: Topic[Any], message: Message, name: str = "") -> None:
         put_newest(self._kept, _key(topic, name), (topic, message, name), MAX_CHANNELS)

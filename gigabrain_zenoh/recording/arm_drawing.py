@@ -1,0 +1,116 @@
+"""Draws an arm for viewers: its shapes once, and the frames of its links for each state."""
+
+import logging
+from collections.abc import Iterable
+
+from foxglove import messages as fox
+
+from gigabrain_schemas.body import ArmModel, RobotState
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.geometry.link_model import LinkModel, Place, Quaternion, Shape, Vector
+from gigabrain_zenoh.recording.drawn import BASE, Drawn, KnownEntities, as_drawn, stamp
+
+log = logging.getLogger(__name__)
+LINKS = "arm/"  # begins the names of the links' frames
+
+
+class ArmDrawing:
+    """The arm of the newest model."""
+
+    def __init__(self) -> None:
+        self._model: LinkModel | None = None
+        self._drawn = KnownEntities()
+
+    def draw_model(self, model: ArmModel, _: str) -> Iterable[Drawn]:
+        """Draw the shapes of each link in its own frame; a model that cannot be read is logged."""
+        try:
+            self._model = LinkModel(model.mjcf)
+        except ConfigError as error:
+            self._model = None
+            log.warning("%s", error)
+            return
+        entities = {
+            self._frame(link): _entity(model, self._frame(link), shapes)
+            for link in range(len(self._model.links))
+            if (shapes := [shape for shape in self._model.shapes if shape.link == link])
+        }
+        yield as_drawn("arm", self._drawn.update(model, entities))
+
+    def draw_joints(self, state: RobotState) -> Iterable[Drawn]:
+        """Draw the frame of each link in that of its parent, by the joints as measured."""
+        if self._model is None or not state.joints:
+            return
+        places = self._model.places({joint.name: joint.position for joint in state.joints})
+        frames = [
+            fox.FrameTransform(
+                timestamp=stamp(state),
+                parent_frame_id=self._frame(link.parent),
+                child_frame_id=f"{LINKS}{link.name}",
+                translation=_vector(place.position),
+                rotation=_quaternion(place.rotation),
+            )
+            for link, place in zip(self._model.links, places, strict=True)
+            if link.parent >= 0
+        ]
+        yield as_drawn("arm_tf", fox.FrameTransforms(transforms=frames))
+
+    def _frame(self, link: int) -> str:
+        assert self._model
+        return f"{LINKS}{self._model.links[link].name}" if link else BASE
+
+
+def _entity(at: ArmModel, frame: str, shapes: list[Shape]) -> fox.SceneEntity:
+    """Draw the shapes of a link; they move with its frame."""
+    return fox.SceneEntity(
+        timestamp=stamp(at), frame_id=frame, id=frame, frame_locked=True,
+        cubes=[
+            fox.CubePrimitive(pose=_pose(one.place), size=_doubled(*one.size), color=_colour(one))
+            for one in shapes if one.kind == "box"
+        ],
+        cylinders=[
+            _cylinder(one) for one in shapes if one.kind in ("cylinder", "capsule")
+        ],
+        spheres=[ball for one in shapes for ball in _balls(one)],
+    )  # fmt: skip
+
+
+def _cylinder(one: Shape) -> fox.CylinderPrimitive:
+    radius, half, _ = one.size
+    return fox.CylinderPrimitive(
+        pose=_pose(one.place), size=_doubled(radius, radius, half), color=_colour(one),
+        top_scale=1.0, bottom_scale=1.0,
+    )  # fmt: skip
+
+
+def _balls(one: Shape) -> Iterable[fox.SpherePrimitive]:
+    """Yield a ball, an ellipsoid, or both ends of a capsule."""
+    radius, half, _ = one.size
+    size, places = _doubled(radius, radius, radius), list[Place]()
+    if one.kind == "capsule":
+        places = [one.place @ Place((0.0, 0.0, end)) for end in (-half, half)]
+    elif one.kind in ("sphere", "ellipsoid"):
+        places = [one.place]
+        size = size if one.kind == "sphere" else _doubled(*one.size)
+    for place in places:
+        yield fox.SpherePrimitive(pose=_pose(place), size=size, color=_colour(one))
+
+
+def _pose(place: Place) -> fox.Pose:
+    return fox.Pose(position=_vector(place.position), orientation=_quaternion(place.rotation))
+
+
+def _vector(of: Vector) -> fox.Vector3:
+    return fox.Vector3(x=of[0], y=of[1], z=of[2])
+
+
+def _quaternion(of: Quaternion) -> fox.Quaternion:
+    return fox.Quaternion(w=of[0], x=of[1], y=of[2], z=of[3])
+
+
+def _doubled(x: float, y: float, z: float) -> fox.Vector3:
+    return fox.Vector3(x=2 * x, y=2 * y, z=2 * z)
+
+
+def _colour(one: Shape) -> fox.Color:
+    r, g, b, a = one.colour
+    return fox.Color(r=r, g=g, b=b, a=a)
