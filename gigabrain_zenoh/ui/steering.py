@@ -2,18 +2,20 @@
 
 import functools
 from collections import Counter
-from typing import Any, TypeVar
+from collections.abc import Mapping
+from typing import Any, NamedTuple, TypeVar
 
 from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.topics import LOG, MAP, STATE, Topic
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.freshness import Latest
 from gigabrain_zenoh.bus.listening import Sampled
-from gigabrain_zenoh.client.requests import steer
+from gigabrain_zenoh.client.requests import jog, steer
 from gigabrain_zenoh.diagnostics.robot_view import RobotView
 from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of
 
 M = TypeVar("M", bound=Message)
+Wanted = Velocity | dict[str, float]  # of the base, or speeds of joints [rad/s or m/s]
 
 LEASE_S = 0.5  # after this time without a command, another viewer may steer
 STREAM_GAP_S = 0.2  # after a longer gap, commands count as a new stream
@@ -41,10 +43,13 @@ class ViewerScene(RobotView):
         state = self.state.fresh()
         return state.gate.enables if state else None
 
-    def steer(self, wanted: Velocity) -> None:
-        """Publish the operator's wanted velocity with the newest tick."""
+    def publish(self, wanted: Wanted) -> None:
+        """Publish the velocity or the joints' speeds that an operator wants, by the newest tick."""
         self.sampled[STATE].poll()
-        steer(self.bus, wanted)
+        if isinstance(wanted, Velocity):
+            steer(self.bus, wanted)
+        else:
+            jog(self.bus, wanted)
 
 
 class RateLimiter:
@@ -63,13 +68,25 @@ class RateLimiter:
         return self._received[viewer] > MAX_RECEIVED_HZ
 
 
+class _Stream(NamedTuple):
+    """Commands of one kind that arrive from the viewer that steers."""
+
+    obey_from_s: float
+    last_s: float
+    rest: Wanted  # the command that ends them
+
+
 class TeleopArbiter:
-    """Lets one viewer steer at a time, while its commands arrive. Commands are never repeated."""
+    """Lets one viewer steer at a time, while its commands arrive. Commands are never repeated.
+
+    It may drive the base and move joints at once: each is a stream that ends by itself.
+    """
 
     def __init__(self, scene: ViewerScene) -> None:
         self._scene = scene
         self._viewer = 0
-        self._lease_end_s = self._last_command_s = self._obey_from_s = 0.0
+        self._lease_end_s = 0.0
+        self._streams: dict[type, _Stream] = {}  # of that viewer, by what it wants
         self._enables: int | None = None  # the gate's count when a viewer last steered
 
     def driving(self, now_s: float) -> int:
@@ -81,36 +98,56 @@ class TeleopArbiter:
 
         A zero velocity from another viewer is ignored, and returns True.
         """
-        if self.driving(now_s) not in (0, viewer):
-            return wanted == ZERO
         body = self._scene.body
-        if body is None or (wanted == ZERO and viewer != self._viewer):
+        if body is None:
             return True
-        if viewer != self._viewer or now_s - self._last_command_s > STREAM_GAP_S:
-            self._obey_from_s = now_s + SETTLE_S
-        self._viewer, self._last_command_s, self._lease_end_s = viewer, now_s, now_s + LEASE_S
-        if wanted == ZERO:
-            self._end()
-        elif now_s >= self._obey_from_s:
+        return self._pass_on(viewer, clamp(wanted, limits_of(body.description)), ZERO, now_s)
+
+    def jog(self, viewer: int, speeds: Mapping[str, float], now_s: float) -> bool:
+        """Pass on the speeds of joints [rad/s or m/s] likewise; unknown joints are left out."""
+        joints = self._scene.body.description.joints if self._scene.body else ()
+        limits = {joint.name: joint.max_speed for joint in joints if joint.name in speeds}
+        if not limits:
+            return True
+        wanted = {name: max(-limits[name], min(limits[name], speeds[name])) for name in limits}
+        return self._pass_on(viewer, wanted, dict.fromkeys(limits, 0.0), now_s)
+
+    def _pass_on(self, viewer: int, wanted: Wanted, rest: Wanted, now_s: float) -> bool:
+        if self.driving(now_s) not in (0, viewer):
+            return wanted == rest
+        if viewer != self._viewer:
+            if wanted == rest:
+                return True
+            self._streams.clear()
+        stream = self._streams.get(type(wanted))
+        goes_on = stream is not None and now_s - stream.last_s <= STREAM_GAP_S
+        obey_from_s = stream.obey_from_s if stream and goes_on else now_s + SETTLE_S
+        self._viewer, self._lease_end_s = viewer, now_s + LEASE_S
+        self._streams[type(wanted)] = _Stream(obey_from_s, now_s, rest)
+        if wanted == rest:
+            self._end(type(wanted))
+        elif now_s >= obey_from_s:
             self._enables = self._scene.enables
-            self._scene.steer(clamp(wanted, limits_of(body.description)))
+            self._scene.publish(wanted)
         return True
 
     def leave(self, viewer: int) -> None:
         """Stop the robot if the viewer that leaves was steering it."""
         if viewer == self._viewer:
-            self._end()
+            self.clear()
 
     def clear(self) -> None:
-        """End steering by any viewer, because an e-stop was pressed."""
-        if self._viewer:
-            self._end()
+        """End steering by any viewer, as when an e-stop was pressed."""
+        for kind in tuple(self._streams):
+            self._end(kind)
 
-    def _end(self) -> None:
-        """Publish a zero velocity, unless the gate was enabled again since the last command.
+    def _end(self, kind: type) -> None:
+        """Publish zero speeds, unless the gate was enabled again since the last command.
 
-        In that case a zero would take the body back from its new commander.
+        In that case they would take the body back from its new commander.
         """
-        self._viewer = 0
+        rest = self._streams.pop(kind).rest
+        if not self._streams:
+            self._viewer = 0
         if self._scene.enables in (None, self._enables):
-            self._scene.steer(ZERO)
+            self._scene.publish(rest)

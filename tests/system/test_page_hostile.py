@@ -13,7 +13,7 @@ import pytest
 from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from gigabrain_schemas.topics import TELEOP
+from gigabrain_schemas.topics import JOINT_TELEOP, TELEOP
 from gigabrain_zenoh.qa.probe import probing
 from gigabrain_zenoh.testing.processes import AVOID, Home
 from gigabrain_zenoh.testing.waiting import until
@@ -68,17 +68,35 @@ async def served(robot: Robot) -> None:
         (OPERATOR, struct.pack("<4B3f", frames.DRIVE, 0, 0, 0, float("nan"), 0.0, 0.0)),
         (OPERATOR, DRIVE[:-1]),
         (OPERATOR, b"x" * 5000),
+        (OPERATOR, frames.as_json(frames.JOG, {"speeds": {"pan": "fast"}})),
+        (OPERATOR, frames.as_json(frames.JOG, {"speeds": {"pan": 20_000.0}})),
         (VIEWER, DRIVE),
+        (VIEWER, frames.as_json(frames.JOG, {"speeds": {"pan": 1.0}})),
         (VIEWER, ESTOP),
     ],
-    ids=["empty", "noise", "json", "unknown", "more", "nan", "short", "long", "looker", "stop"],
+    ids=[
+        "empty",
+        "noise",
+        "json",
+        "unknown",
+        "more",
+        "nan",
+        "short",
+        "long",
+        "jog",
+        "racing",
+        "looker",
+        "jogger",
+        "stop",
+    ],
 )
 async def test_what_no_page_of_ours_sends_ends_the_connection_and_moves_nothing(
     robot: Robot, token: str, frame: bytes
 ) -> None:
     async with probing(robot.endpoint) as seen:
         steered: list[object] = []
-        seen.bus.subscribe(TELEOP, lambda _key, twist: steered.append(twist))
+        for topic in (TELEOP, JOINT_TELEOP):
+            seen.bus.subscribe(topic, lambda _key, wanted: steered.append(wanted))
         generation = seen.state.gate.estop_generation
         async with client(robot, token) as socket:
             await socket.send(frame)

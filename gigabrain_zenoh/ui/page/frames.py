@@ -1,6 +1,7 @@
 """Frames between the page's server and a browser: a byte for their kind, then JSON or arrays."""
 
 import itertools
+import logging
 import struct
 from collections.abc import Callable, Iterator
 from typing import Annotated, Any, Literal, TypeVar
@@ -11,23 +12,34 @@ from msgspec.structs import replace
 
 from gigabrain_schemas import topics
 from gigabrain_schemas.base import Count, Finite, Message, Name, Pose, Text, Velocity
-from gigabrain_schemas.body import Body, BodyDescription, RobotState
+from gigabrain_schemas.body import (
+    MOST_ARM_JOINTS,
+    ArmModel,
+    Body,
+    BodyDescription,
+    JointSpeed,
+    RobotState,
+)
 from gigabrain_schemas.brain import Intent, OccupancyGrid, WorldModel
 from gigabrain_schemas.requests import Param
 from gigabrain_schemas.safety import Health, LogRecord, SafetyState
 from gigabrain_schemas.sensors import Image, LaserScan
-from gigabrain_schemas.sim import SimPoses, SimRequest
+from gigabrain_schemas.sim import SimPoses, SimRequest, SimScene
 from gigabrain_schemas.tasks import GoalRequest
 from gigabrain_schemas.zones import SavedMapInfo, Zones, ZonesRequest
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.codec import DECODE_ERRORS
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.ui.page.arm_scene import ArmScene
 from gigabrain_zenoh.ui.steering import ViewerScene
 
 ABOUT, STATE, SCAN, MAP, HEALTH, LOG, REPLY, IMAGE, TASK = range(1, 10)  # to the browser
 SCENE, POSES, ZONES = 10, 11, 12
 CAMERA, FOUND, CONTOURS, PERCEIVED, OBJECTS = range(13, 18)
-LOGIN, DRIVE, ASK, WATCH, SHOWN = range(1, 6)  # from the browser
+LOGIN, DRIVE, ASK, WATCH, SHOWN, JOG = range(1, 7)  # from the browser
 MAX_KEPT_LINES = 30  # of the log, for viewers that connect later
+
+log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
@@ -59,6 +71,12 @@ class Login(Struct, frozen=True, forbid_unknown_fields=True):
     """First frame of a browser."""
 
     token: Annotated[str, Meta(max_length=128)] = ""
+
+
+class Jog(Struct, frozen=True, forbid_unknown_fields=True):
+    """Frame of an operator: speeds of joints while their buttons are held."""
+
+    speeds: Annotated[dict[Name, JointSpeed], Meta(max_length=MOST_ARM_JOINTS)]  # [rad/s or m/s]
 
 
 class PageRequest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -152,7 +170,7 @@ def drive_of(content: bytes) -> Velocity:
 
 
 def decoded(content: bytes, kind: type[T]) -> T:
-    """Return the Login or PageRequest in a frame. Raises ValueError."""
+    """Return the Login, Jog or PageRequest in a frame. Raises ValueError."""
     try:
         return msgspec.json.decode(content, type=kind)
     except DECODE_ERRORS as error:
@@ -178,7 +196,9 @@ class PageView(ViewerScene):
         bus.latest(topics.ZONES, self._on_zones)
         bus.latest(topics.OBJECT_MAP, lambda one: self._keep("objects", as_json(OBJECTS, one)))
         self.newest_of(topics.SIM_POSES)
-        bus.latest(topics.SIM_SCENE, lambda scene: self._keep("scene", as_json(SCENE, scene)))
+        self._arm: ArmScene | None = None  # where no simulation sends its world
+        self._arm_models = bus.latest(topics.ARM_MODEL, self._on_arm_model)
+        self._scenes = bus.latest(topics.SIM_SCENE, self._on_scene)
 
     def state_frame(self, driving: int, viewers: int) -> bytes:
         """Return the present state of the robot."""
@@ -205,6 +225,8 @@ class PageView(ViewerScene):
             yield "scan", scan_frame(scan, self.body.description, pose)
         if poses := self.sampled[topics.SIM_POSES].poll():
             yield "poses", poses_frame(poses)
+        elif self._arm and pose and (state := self.state.fresh()):
+            yield "poses", poses_frame(self._arm.poses(state, pose))
 
     def kept_frames(self) -> Iterator[tuple[str, bytes]]:
         """Yield the frames for a new viewer: map, task, health and log."""
@@ -228,6 +250,21 @@ class PageView(ViewerScene):
             self._keep("map", map_frame(message))
         else:
             self._keep("task", as_json(TASK, message))
+
+    def _on_scene(self, scene: SimScene) -> None:
+        self._arm = None
+        self._keep("scene", as_json(SCENE, scene))
+
+    def _on_arm_model(self, model: ArmModel) -> None:
+        """Show an arm by its model, unless a simulation shows it."""
+        if self._scenes.newest:
+            return
+        try:
+            self._arm = ArmScene(model.mjcf)
+        except ConfigError as error:
+            log.warning("%s", error)
+        else:
+            self._keep("scene", as_json(SCENE, self._arm.scene()))
 
     def _on_zones(self, zones: Zones) -> None:
         """Send zones that have changed; they are published again and again."""

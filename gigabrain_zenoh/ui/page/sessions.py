@@ -36,7 +36,7 @@ from gigabrain_zenoh.ui.page.cameras import (
     SurroundingsFrames,
     Watch,
 )
-from gigabrain_zenoh.ui.page.frames import PageReply, PageRequest, PageView, Setting
+from gigabrain_zenoh.ui.page.frames import Jog, PageReply, PageRequest, PageView, Setting
 from gigabrain_zenoh.ui.steering import RateLimiter, TeleopArbiter
 
 log = logging.getLogger(__name__)
@@ -51,7 +51,9 @@ MAX_REPLY_CHARS = 500
 MAX_REASON_BYTES = 120  # of a reason for closing
 MAX_WAITING_FRAMES = 64  # for a slow browser
 BAD_FRAME, WRONG_TOKEN, FULL = 1008, 4401, 4429  # codes for closing a WebSocket (RFC 6455 7.4)
-OTHER_STEERS = "another page steers the robot; wait until it stops"
+OTHER_STEERS = PageReply(
+    id=0, what="drive", ok=False, text="another page steers the robot; wait until it stops"
+)
 
 
 class Viewer:
@@ -337,7 +339,11 @@ class Sessions:
             raise ValueError("viewers may not drive")
         elif kind == bytes((frames.DRIVE,)):
             if not self._arbiter.drive(viewer.number, frames.drive_of(content), now_s):
-                self._reply(viewer, PageReply(id=0, what="drive", ok=False, text=OTHER_STEERS))
+                self._reply(viewer, OTHER_STEERS)
+        elif kind == bytes((frames.JOG,)):
+            speeds = frames.decoded(content, Jog).speeds
+            if not self._arbiter.jog(viewer.number, speeds, now_s):
+                self._reply(viewer, OTHER_STEERS)
         elif kind == bytes((frames.ASK,)):
             self._start_request(viewer, frames.decoded(content, PageRequest))
         else:

@@ -1,7 +1,7 @@
 // The WebSocket. A frame is a byte for its kind, then its content. Nothing is queued while it is down.
 const ABOUT = 1, STATE = 2, SCAN = 3, MAP = 4, HEALTH = 5, LOG = 6, REPLY = 7, IMAGE = 8, TASK = 9, SCENE = 10, POSES = 11, ZONES = 12
 const CAMERA = 13, FOUND = 14, CONTOURS = 15, PERCEIVED = 16, OBJECTS = 17
-const LOGIN = 1, DRIVE = 2, ASK = 3, WATCH = 4, SHOWN = 5
+const LOGIN = 1, DRIVE = 2, ASK = 3, WATCH = 4, SHOWN = 5, JOG = 6
 const SILENT_AFTER_MS = 1000, RETRY_MS = [300, 600, 1200, 2500], FULL_RETRY_MS = 5000
 const WRONG_TOKEN = 4401, FULL = 4429 // codes of a closed WebSocket
 
@@ -41,6 +41,9 @@ export class Link {
     [x, y, z].forEach((value, i) => frame.setFloat32(4 + 4 * i, value, true))
     this.#socket.send(frame.buffer)
   }
+
+  /** Send the speeds of joints. */
+  jog(speeds) { this.#tell(JOG, { speeds }) }
 
   /** Say which pictures are wanted. */
   watch(wanted) { this.#tell(WATCH, wanted) }

@@ -1,4 +1,5 @@
 // Connects the parts of the page: shows the frames that the link receives, and sends the operator's requests.
+import { Arm } from './arm.js'
 import { Cameras } from './cameras.js'
 import { Drive } from './drive.js'
 import { Link } from './link.js'
@@ -9,6 +10,7 @@ import { Settings } from './settings.js'
 import { WorldView } from './world_view.js'
 import { Zones } from './zones.js'
 
+const ARM_DISTANCE_M = 1.3 // from which an arm is seen
 const NARROW_PX = 860 // below, the page is that of a phone; see style.css
 const STOP_TIMEOUT_MS = 2500 // the server gives up after two seconds
 const BY_HAND = 'press the hardware e-stop or cut the power'
@@ -42,18 +44,20 @@ const link = new Link({
     cameras.know((info.body?.cameras ?? []).map(({ name }) => name))
     if (first && info.body?.cameras.length && innerWidth > NARROW_PX) cameras.open(true)
     else cameras.resume()
+    showDrives(info.body)
     $('estop').disabled = viewOnly()
     $('edit-zones').hidden = viewOnly()
     $('estop').querySelector('small').textContent = viewOnly() ? 'view only: this token cannot stop the robot' : 'space bar'
   },
   robot(now) {
     robot = now
-    if (now.state?.gate.mode === 'latched') drive.releaseAll() // a held key must not move the robot right after the release
+    if (now.state?.gate.mode === 'latched') releaseAll() // a held key must not move the robot right after the release
     map.setRobot(now)
     cameras.setStatus(now.world?.cameras ?? [])
     showGate(now.state, viewOnly())
     showFigures(now.state, now)
     showSafety(now.safety, about.body)
+    arm.setState(now.state)
     $('stick').classList.toggle('off', !mayDrive())
   },
   scan: (head, ranges) => map.setScan(head, ranges),
@@ -76,6 +80,7 @@ const link = new Link({
   scene(scene) {
     world.setScene(scene)
     $('show-world').hidden = false
+    showWorldOfArm()
   },
   zones: (now) => zones.set(now),
   poses: (version, poses) => world.setPoses(version, poses),
@@ -86,8 +91,9 @@ const link = new Link({
     $('link').classList.toggle('live', live)
     document.body.classList.toggle('silent', !live)
     if (!live) {
-      drive.releaseAll()
+      releaseAll()
       robot = null
+      arm.setState(null)
       showGate(null, viewOnly())
       showFigures(null, {})
       showSafety(null, about.body)
@@ -105,11 +111,41 @@ const drive = new Drive({
   limits: () => ({ x: about.body?.max_linear_speed ?? 0, y: about.body?.max_lateral_speed ?? 0, z: about.body?.max_angular_speed ?? 0 }),
   send: (x, y, z) => link.drive(x, y, z),
   stop: () => stop(),
-  allowed: mayDrive,
+  allowed: () => mayDrive() && !isArmAlone(),
   show(wanted) {
     setText($('wanted'), wanted ? `${wanted[0].toFixed(2)} m/s · ${wanted[2].toFixed(2)} rad/s` : 'released')
   },
 })
+
+const arm = new Arm({
+  list: $('joints'),
+  speedShare: () => $('jog-share').value / 100,
+  send: (speeds) => link.jog(speeds),
+  allowed: mayDrive,
+  show: (text) => setText($('arm-status'), text),
+})
+
+/** Show what moves this body: its base, its joints, or both. */
+function showDrives(body) {
+  arm.know(body?.joints ?? [])
+  $('arm').hidden = !body?.joints.length
+  document.body.classList.toggle('arm-alone', isArmAlone())
+  showWorldOfArm()
+}
+
+/** Show an arm without a base in three dimensions: a map says nothing of it. */
+function showWorldOfArm() {
+  if (!isArmAlone() || !world.scene || world.shown) return
+  world.closeTo(ARM_DISTANCE_M)
+  $('show-world').click()
+}
+
+function isArmAlone() { return about.body?.drive_type === 'arm' }
+
+function releaseAll() {
+  drive.releaseAll()
+  arm.releaseAll()
+}
 
 function viewOnly() { return about.role !== 'operator' }
 
@@ -120,7 +156,7 @@ function mayDrive() {
 
 async function stop() {
   if (viewOnly()) return
-  drive.releaseAll()
+  releaseAll()
   const startMs = performance.now()
   show($('confirmed'), 'stopping …', '')
   const reply = await link.request('estop', {}, STOP_TIMEOUT_MS)
@@ -130,7 +166,7 @@ async function stop() {
 }
 
 async function request(what) {
-  drive.releaseAll()
+  releaseAll()
   const generation = robot?.state?.gate.estop_generation ?? 0
   const reply = await link.request(what, what === 'release' ? { estop_generation: generation } : {})
   showReply(reply)
@@ -162,7 +198,9 @@ function show(element, text, kind) {
 $('estop').addEventListener('pointerdown', (event) => { event.preventDefault(); stop() })
 $('estop').addEventListener('click', (event) => { if (event.detail === 0) stop() }) // by keyboard or by a screen reader
 for (const what of ['release', 'enable', 'take', 'cancel']) $(what).addEventListener('click', () => request(what))
-$('speed-share').addEventListener('input', () => setText($('percent'), `${$('speed-share').value} %`))
+for (const [slider, percent] of [['speed-share', 'percent'], ['jog-share', 'jog-percent']]) {
+  $(slider).addEventListener('input', () => setText($(percent), `${$(slider).value} %`))
+}
 const view = () => (world.shown ? world : map)
 $('zoom-in').addEventListener('click', () => view().zoom(1.3))
 $('zoom-out').addEventListener('click', () => view().zoom(1 / 1.3))

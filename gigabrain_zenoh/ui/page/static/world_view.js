@@ -6,7 +6,9 @@ const CLICK_PIXELS = 5 // a longer drag is no click
 const MIN_WALK_M = 0.3 // a shorter drag makes a person that stands
 const REACH_M = 0.4 // from a thing's middle, within which a click is on it
 const SIZES = { box: [0.3, 0.3, 0.5], cylinder: [0.3, 0.3, 0.5] }
-const BASE = 'robot/base'
+const CLOSE_ELEVATION = 0.5 // [rad]
+const CLOSE_HEIGHT_M = 0.12 // of what is looked at
+const ROBOT = 'robot/', BASE = 'robot/base' // a simulation has no base of a fixed arm, which does not move
 
 const bytesOf = (base64) => Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0))
 const floatsOf = (base64) => new Float32Array(bytesOf(base64).buffer)
@@ -18,6 +20,7 @@ export class WorldView {
   #drag = null
   #drawScheduled = false
   #renderer = null
+  #height = 0
 
   /** `change(request)` asks the simulation for a change of its world; `say(text, ok)` shows a result. */
   constructor(canvas, { change, say }) {
@@ -59,9 +62,17 @@ export class WorldView {
   setPoses(version, poses) {
     if (!this.scene || version !== this.scene.version % 2 ** 32) return
     for (let i = 0; 7 * i < poses.length; i++) this.#matrices[i + 1] = matrixOf([...poses.subarray(7 * i, 7 * i + 7)])
-    const base = this.#matrices[this.scene.bodies.indexOf(BASE)]
-    if (this.follow && base) this.#camera.target = [base[12], base[13], 0]
+    const { bodies } = this.scene, robot = bodies.includes(BASE) ? bodies.indexOf(BASE) : bodies.findIndex((name) => name.startsWith(ROBOT))
+    const base = this.#matrices[robot]
+    if (this.follow && base) this.#camera.target = [base[12], base[13], this.#height]
     this.draw()
+  }
+
+  /** Look from this distance [m]. */
+  closeTo(distance) {
+    this.#camera.distance = distance
+    this.#height = CLOSE_HEIGHT_M
+    this.#camera.elevation = CLOSE_ELEVATION
   }
 
   zoom(factor) {

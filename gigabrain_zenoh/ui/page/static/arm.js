@@ -1,0 +1,111 @@
+// The joints of an arm: where they are in their ranges, and buttons that move one while they are held.
+import { makeElement, setText } from './panels.js'
+
+const PERIOD_MS = 40
+const AT_REST_SPEED = 0.05 // [rad/s] or [m/s]
+const LIMP = 'limp: let go of, so it may fall. “gigabrain arm hold” holds it'
+
+/** Return a position or a speed of a joint as text: degrees, or millimetres where it slides. */
+function inUnit(joint, value, suffix = '') {
+  const [factor, unit] = joint.unit === 'm' ? [1000, ' mm'] : [180 / Math.PI, '°']
+  return `${(value * factor).toFixed(1)}${unit}${suffix}`
+}
+
+function activity(state) {
+  if (!state) return 'silent'
+  if (state.limp) return LIMP
+  return state.joints.some(({ velocity }) => Math.abs(velocity) > AT_REST_SPEED) ? 'moving' : 'held'
+}
+
+export class Arm {
+  #joints = []
+  #rows = new Map() // by joint
+  #held = new Map() // by button that is held: the joint, and 1 or -1
+  #sent = [] // joints of the last speeds sent; empty when all are released
+
+  /** `send(speeds)` sends the speeds of joints, `allowed()` says whether they may be moved now. */
+  constructor({ list, speedShare, send, allowed, show }) {
+    Object.assign(this, { list, speedShare, send, allowed, show })
+    addEventListener('blur', () => this.releaseAll())
+    document.addEventListener('visibilitychange', () => this.releaseAll())
+    setInterval(() => this.#sendWanted(), PERIOD_MS)
+  }
+
+  /** Show these joints, as their description has them. */
+  know(joints) {
+    if (JSON.stringify(joints) === JSON.stringify(this.#joints)) return
+    this.releaseAll()
+    this.#joints = joints
+    this.#rows = new Map(joints.map((joint) => [joint.name, this.#makeRow(joint)]))
+    this.list.replaceChildren(...[...this.#rows.values()].map(({ row }) => row))
+  }
+
+  /** Show the newest state, or none. */
+  setState(state) {
+    this.list.classList.toggle('off', !this.allowed())
+    this.#joints.forEach((joint, i) => this.#fill(joint, state?.joints.find(({ name }) => name === joint.name), state?.joints_sent[i]))
+    if (!this.#sent.length) this.show(activity(state))
+  }
+
+  /** Count all buttons as released. */
+  releaseAll() {
+    this.#held.clear()
+    this.#sendWanted()
+  }
+
+  #sendWanted() {
+    const held = this.allowed() ? [...this.#held.values()] : []
+    if (!held.length && !this.#sent.length) return
+    const speeds = Object.fromEntries(this.#sent.map((name) => [name, 0]))
+    for (const { joint, way } of held) speeds[joint.name] = (speeds[joint.name] ?? 0) + way * this.speedShare() * joint.max_speed
+    this.#sent = held.map(({ joint }) => joint.name)
+    this.send(speeds)
+    this.show(held.map(({ joint }) => `${joint.name} ${inUnit(joint, speeds[joint.name], '/s')}`).join(' · ') || 'released')
+  }
+
+  #makeRow(joint) {
+    const row = makeElement('li', '', 'joint'), range = makeElement('i', '', 'range'), sent = makeElement('s'), here = makeElement('b')
+    const number = makeElement('output', '–'), more = makeElement('small')
+    range.setAttribute('role', 'meter')
+    range.setAttribute('aria-label', joint.name)
+    range.setAttribute('aria-valuemin', joint.lower)
+    range.setAttribute('aria-valuemax', joint.upper)
+    range.title = `${inUnit(joint, joint.lower)} to ${inUnit(joint, joint.upper)}`
+    range.append(sent, here)
+    row.append(this.#makeButton(joint, -1, '−'), makeElement('span', joint.name), number, range, more, this.#makeButton(joint, 1, '+'))
+    return { row, range, sent, here, number, more }
+  }
+
+  #makeButton(joint, way, text) {
+    const button = makeElement('button', text, 'jog')
+    button.setAttribute('aria-label', `${joint.name} ${way > 0 ? 'up' : 'down'}: hold to move it`)
+    const hold = () => { this.#held.set(button, { joint, way }); this.#sendWanted() }
+    const release = () => { if (this.#held.delete(button)) this.#sendWanted() }
+    button.addEventListener('pointerdown', (event) => {
+      if (event.button > 0) return
+      button.setPointerCapture(event.pointerId)
+      hold()
+    })
+    for (const end of ['pointerup', 'pointercancel', 'lostpointercapture', 'blur']) button.addEventListener(end, release)
+    button.addEventListener('contextmenu', (event) => event.preventDefault()) // of a long press
+    button.addEventListener('keydown', (event) => { if (event.key === 'Enter' && !event.repeat) hold() })
+    button.addEventListener('keyup', (event) => { if (event.key === 'Enter') release() })
+    return button
+  }
+
+  #fill(joint, measured, sentTo) {
+    const { range, sent, here, number, more } = this.#rows.get(joint.name)
+    const share = (position) => `${100 * Math.min(1, Math.max(0, (position - joint.lower) / (joint.upper - joint.lower)))}%`
+    here.hidden = !measured
+    sent.hidden = !measured || sentTo == null
+    if (sentTo != null) sent.style.left = share(sentTo)
+    setText(number, measured ? inUnit(joint, measured.position) : '–')
+    if (!measured) return range.removeAttribute('aria-valuenow')
+    here.style.left = share(measured.position)
+    range.setAttribute('aria-valuenow', measured.position)
+    range.setAttribute('aria-valuetext', number.textContent)
+    const { effort, temperature, current } = measured, force = joint.unit === 'm' ? 'N' : 'N m'
+    const known = [[effort, 2, force], [current, 2, 'A'], [temperature, 0, '°C']].filter(([value]) => value != null)
+    setText(more, known.map(([value, digits, unit]) => `${value.toFixed(digits).replace(/^-(0\.?0*)$/, '$1')} ${unit}`).join(' · '))
+  }
+}

@@ -1,0 +1,264 @@
+"""An arm on the operator page: its joints are shown, and move only while a button is held."""
+
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+import pytest_asyncio
+from msgspec.structs import replace
+from playwright.async_api import Page
+
+from gigabrain_drivers.driver.catalog import load_robot
+from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.body import ArmModel, Body, BodyDescription, GateStatus, Joint, RobotState
+from gigabrain_schemas.brain import JointSpeeds
+from gigabrain_schemas.topics import ARM_MODEL, BODY, JOINT_TELEOP, STATE
+from gigabrain_zenoh.testing.waiting import until
+from tests.places import ROOT
+from tests.system.fake_page import Fake, serving
+from tests.system.page import VIEWER, Browser, browser, needs_browser
+
+pytestmark = [needs_browser, pytest.mark.asyncio(loop_scope="module")]
+
+MODEL = (ROOT / "drivers/gigabrain_drivers/bodies/so101/model.xml").read_text("utf-8")
+ARM = load_robot("so101").description()
+SLIDER = replace(ARM.joints[-1], unit="m", lower=0.0, upper=0.04)
+CRANE = replace(ARM, joints=(*ARM.joints[:-1], SLIDER))  # its gripper slides
+DRIVES = replace(
+    ARM, robot_type="mobile", drive_type="omni", max_linear_speed=0.3, max_lateral_speed=0.3,
+    max_angular_speed=1.0,
+)  # fmt: skip
+READY = GateStatus(mode="enabled", commander="control", enables=1)
+LATCHED = GateStatus(mode="latched", estop_generation=1)
+PAN = "shoulder_pan up: hold to move it"
+
+
+class FakeArm(Fake):
+    """An arm without a simulation, whose driver says what a test wants."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.body: BodyDescription = CRANE
+        self.gate, self.limp = READY, False
+        self.jogged: list[JointSpeeds] = []
+        self.robot.subscribe(JOINT_TELEOP, lambda _key, speeds: self.jogged.append(speeds))
+
+    def become(self, body: BodyDescription = CRANE, gate: GateStatus = READY) -> None:
+        """Be another robot; forget what was wanted of the last."""
+        self.body, self.gate, self.limp = body, gate, False
+        self.jogged.clear()
+        self.say_once()
+
+    def say(self) -> None:
+        first, *others, last = self.body.joints
+        middle = [Joint(name=joint.name, position=0.1) for joint in others]
+        measured = (
+            Joint(name=first.name, position=0.95993, effort=0.42, temperature=31.4, current=0.2),
+            *middle,
+            Joint(name=last.name, position=0.01, effort=-0.004),
+        )
+        here, still = Pose(x=0.0, y=0.0, yaw=0.0), Velocity()
+        sent = (0.0, *(joint.position for joint in measured[1:]))
+        self.robot.publish(
+            STATE,
+            RobotState(
+                robot_type="so101", pose=here, velocity=still, joints=measured, joints_sent=sent,
+                gate=self.gate, limp=self.limp,
+            ),
+        )  # fmt: skip
+
+    def say_once(self) -> None:
+        self.robot.publish(BODY, Body(description=self.body, link="real"))
+        self.robot.publish(ARM_MODEL, ArmModel(mjcf=MODEL))
+
+    @property
+    def wanted(self) -> dict[str, float]:
+        """The newest speeds that were asked for."""
+        if not self.jogged:
+            return {}
+        return dict(zip(self.jogged[-1].name, self.jogged[-1].velocity, strict=True))
+
+    async def rests(self) -> None:
+        """Wait for the end of the stream."""
+        await until(lambda: self.wanted and not any(self.wanted.values()), "a last word")
+
+
+@pytest_asyncio.fixture(loop_scope="module", scope="module")
+async def fake(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[FakeArm]:
+    made = FakeArm(tmp_path_factory.mktemp("fake"))
+    async with serving(made):
+        yield made
+
+
+@pytest_asyncio.fixture(loop_scope="module", scope="module")
+async def started(
+    fake: FakeArm, tmp_path_factory: pytest.TempPathFactory
+) -> AsyncIterator[Browser]:
+    async with browser(fake, tmp_path_factory.mktemp("profile")) as made:
+        yield made
+
+
+@pytest_asyncio.fixture(loop_scope="module")
+async def chromium(started: Browser, fake: FakeArm) -> AsyncIterator[Browser]:
+    fake.become()
+    yield started
+    await started.close_pages()
+
+
+async def opened(chromium: Browser, token: str | None = None) -> Page:
+    page = await chromium.open(token) if token else await chromium.open()
+    await page.wait_for_selector("#joints output:has-text('°')")
+    return page
+
+
+async def hold(page: Page, fake: FakeArm, name: str = PAN) -> None:
+    """Press a button until its joint moves."""
+    await page.get_by_label(name).hover()
+    await page.mouse.down()
+    await until(lambda: any(fake.wanted.values()), "speeds of joints")
+
+
+async def test_each_joint_is_shown_in_its_range(chromium: Browser) -> None:
+    page = await opened(chromium)
+    rows = page.locator("#joints li")
+    assert await rows.count() == 6
+    first, last = rows.first, rows.last
+    assert await first.locator("output").inner_text() == "55.0°"
+    assert await first.locator("small").inner_text() == "0.42 N m · 0.20 A · 31 °C"
+    assert await last.locator("output").inner_text() == "10.0 mm"
+    assert await last.locator("small").inner_text() == "0.00 N"
+    meter = first.get_by_role("meter")
+    assert await meter.get_attribute("title") == "-110.0° to 110.0°"
+    assert await meter.get_attribute("aria-valuetext") == "55.0°"
+    left = "(mark, part) => mark.querySelector(part).style.left"
+    assert await meter.evaluate(left, "b") == "75%"  # 55 of -110 to 110 degrees
+    assert await meter.evaluate(left, "s") == "50%"
+    assert await last.get_by_role("meter").evaluate(left, "b") == "25%"
+    assert await page.inner_text("#arm-status") == "held"
+
+
+async def test_of_an_arm_alone_no_map_and_no_joystick_are_shown(
+    chromium: Browser, fake: FakeArm
+) -> None:
+    page = await opened(chromium)
+    await page.wait_for_selector("#world", state="visible")
+    for hidden in ("#map", "#stick", ".legend", "#follow", "#edit-zones", "#speed"):
+        assert not await page.is_visible(hidden), hidden
+    await page.keyboard.down("w")
+    await hold(page, fake)
+    assert not fake.steered
+    await page.mouse.up()
+    await page.keyboard.up("w")
+    fake.become(DRIVES)
+    await page.wait_for_selector("#stick", state="visible")
+    assert await page.is_visible("#arm")
+    assert await page.is_visible("#edit-zones")
+
+
+async def test_a_joint_moves_while_its_button_is_held_and_at_the_speed_chosen(
+    chromium: Browser, fake: FakeArm
+) -> None:
+    page = await opened(chromium)
+    await hold(page, fake)
+    assert fake.wanted == pytest.approx({"shoulder_pan": 0.6})  # a fifth of 3 rad/s
+    await page.wait_for_selector("#arm-status:has-text('shoulder_pan 34.4°/s')")
+    await page.mouse.move(5, 5)  # a pointer that slips off still holds it
+    count = len(fake.jogged)
+    await until(lambda: len(fake.jogged) > count + 3, "more speeds")
+    await page.mouse.up()
+    await fake.rests()
+    fake.jogged.clear()
+    await page.locator("#jog-share").fill("50")
+    await hold(page, fake, "gripper down: hold to move it")
+    assert fake.wanted == {"gripper": -1.5}
+    await page.mouse.up()
+    await fake.rests()
+
+
+async def test_the_enter_key_holds_a_button_as_well(chromium: Browser, fake: FakeArm) -> None:
+    page = await opened(chromium)
+    await page.get_by_label(PAN).focus()
+    await page.keyboard.down("Enter")
+    await until(lambda: any(fake.wanted.values()), "speeds of joints")
+    await page.keyboard.up("Enter")
+    await fake.rests()
+
+
+@pytest.mark.parametrize("end", ["blur", "hidden", "e-stop", "latched", "closed", "cancelled"])
+async def test_whatever_ends_a_hold_stops_the_joint(
+    chromium: Browser, fake: FakeArm, end: str
+) -> None:
+    page = await opened(chromium)
+    await hold(page, fake)
+    if end == "blur":
+        await page.evaluate("window.dispatchEvent(new Event('blur'))")
+    elif end == "hidden":
+        await page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
+    elif end == "e-stop":
+        await page.keyboard.press("Space")
+        await page.wait_for_selector('#confirmed:has-text("CONFIRMED by")')
+    elif end == "latched":
+        fake.gate = LATCHED
+    elif end == "closed":
+        await page.close()
+    else:
+        await page.get_by_label(PAN).dispatch_event("pointercancel")
+    await fake.rests()
+    if end == "latched":  # after a release the button must be pressed again
+        fake.jogged.clear()
+        fake.gate = READY
+        await page.wait_for_selector("#gate[data-mode=enabled]")
+        await page.wait_for_timeout(400)
+        assert not fake.jogged
+    if end != "closed":
+        await page.mouse.up()
+
+
+async def test_an_arm_that_is_limp_says_so(chromium: Browser, fake: FakeArm) -> None:
+    fake.gate, fake.limp = LATCHED, True
+    page = await opened(chromium)
+    await page.wait_for_selector("#arm-status:has-text('limp: let go of')")
+    assert "limp" in await page.inner_text("#doing")
+    await page.get_by_label(PAN).hover()
+    await page.mouse.down()
+    await page.wait_for_timeout(400)
+    await page.mouse.up()
+    assert not fake.jogged
+
+
+async def test_of_two_operators_one_moves_the_arm(chromium: Browser, fake: FakeArm) -> None:
+    one, two = await opened(chromium), await opened(chromium)
+    await hold(one, fake)
+    await two.get_by_label(PAN.replace("up", "down")).focus()
+    await two.keyboard.down("Enter")
+    await two.wait_for_selector("#reply:has-text('another page steers the robot')")
+    await two.keyboard.up("Enter")
+    await one.mouse.up()
+    await fake.rests()
+
+
+async def test_a_viewer_sees_joints_without_buttons(chromium: Browser) -> None:
+    page = await opened(chromium, VIEWER)
+    assert await page.locator("#joints li").count() == 6
+    assert not await page.get_by_label(PAN).is_visible()
+    assert not await page.is_visible("#jog-share")
+
+
+async def test_the_arm_is_drawn_in_three_dimensions(chromium: Browser) -> None:
+    page = await opened(chromium)
+    await page.wait_for_selector("#world", state="visible")
+    yellow = """() => new Promise((resolve) => requestAnimationFrame(() => {
+      const canvas = document.getElementById('world'), copy = document.createElement('canvas')
+      copy.width = canvas.width; copy.height = canvas.height
+      const pen = copy.getContext('2d')
+      pen.drawImage(canvas, 0, 0)
+      const { data } = pen.getImageData(0, 0, copy.width, copy.height)
+      let count = 0
+      for (let i = 0; i < data.length; i += 4) count += data[i] > 2 * data[i + 2] && data[i] > 80
+      resolve(count)
+    }))"""
+    for _ in range(300):
+        if await page.evaluate(yellow) > 500:
+            return
+        await page.wait_for_timeout(100)
+    raise AssertionError("nothing yellow is drawn")
