@@ -12,7 +12,7 @@ import cyclopts
 from gigabrain_zenoh.vision.recognizer import WEIGHTS
 
 app = cyclopts.App(name="python -m gigabrain_zenoh.qa.train", help="Train the shipped recogniser.")
-TRAIN_PICTURES, TEST_PICTURES, STEPS = 22_000, 1_040, 32_000
+TRAIN_PICTURES, TEST_PICTURES, STEPS = 28_000, 1_040, 44_000
 FOLDER = Path("things")
 
 

@@ -49,7 +49,7 @@ def augment(
 def relight(rng: Random, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Change the light: a colour cast, contrast, and more light on one side than on the other."""
     h, w = picture.shape[:2]
-    levels = np.linspace(0, 1, 256)[:, None] ** rng.uniform(0.7, 1.4) * rng.uniform(0.75, 1.1, 3)
+    levels = np.linspace(0, 1, 256)[:, None] ** rng.uniform(0.7, 1.4) * rng.uniform(0.65, 1.15, 3)
     out = cv2.LUT(picture, (255 * np.clip(levels, 0, 1)).astype(np.uint8)[:, None])
     if rng.random() < 0.5:
         corners = rng.uniform(0.6, 1.2, (2, 2)).astype(np.float32)
