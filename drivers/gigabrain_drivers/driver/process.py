@@ -300,8 +300,8 @@ class DriverProcess:
         """Have the body do what the gate lets through."""
         async with self._line:
             self._wake.clear()
-            now = self._gate
-            await self._apply_joints(now)
+            await self._apply_joints(self._gate)
+            now = self._gate  # which may have changed while the joints were sent
             if now.mode == "latched":
                 self._sent = ZERO
                 await self._driver.stop()

@@ -114,6 +114,11 @@ class EmulatedBody:
         return self.snapshot.wheels[-len(self.robot.joints) :] if self.robot.joints else ()
 
     @property
+    def wheels(self) -> tuple[Motor, ...]:
+        """The wheels, or joints of legs, as measured."""
+        return self.snapshot.wheels[: len(self.snapshot.wheels) - len(self.robot.joints)]
+
+    @property
     def commanded(self) -> tuple[float, float, float]:
         """The velocity that the motors aim for; of a gait, that of its steps."""
         gait = self._gait
@@ -246,6 +251,7 @@ class Device(abc.ABC):
     baud: ClassVar[int | None] = None  # of its line; None: as fast as the host
     period_s: ClassVar[float] = 0.01  # between two steps
     watchdog_ns = 150_000_000  # from the last command until its motors stop
+    goes_on: ClassVar[bool] = False  # whether they do not stop by themselves at all
     promised_in = "the rule for firmware"  # where its makers say so
 
     def __init__(self, body: EmulatedBody, options: Any, wire: Wire) -> None:

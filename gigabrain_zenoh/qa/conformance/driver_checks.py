@@ -143,12 +143,19 @@ class CheckedRobot:
     def promise(self) -> str:
         """Time after which the firmware stops the motors without a command, with its source."""
         device = self._emulator.stations[BASE].device if self._emulator else Device
+        if device.goes_on:
+            return f"never ({device.promised_in})"
         return f"{device.watchdog_ns / 1e6:.0f} ms ({device.promised_in})"
 
     @property
     def promised_ms(self) -> float:
         """The same time [ms]."""
         return self.peer.stations[BASE].device.watchdog_ns / 1e6
+
+    @property
+    def goes_on(self) -> bool:
+        """True where the motors have no watchdog. Raises Skipped where there is no peer."""
+        return self.peer.stations[BASE].device.goes_on
 
     def commanded(self, state: RobotState | None) -> tuple[float, float, float]:
         """Return the velocity commanded to the motors; without a peer, the measured one."""

@@ -22,7 +22,7 @@ from gigabrain_zenoh.qa.conformance.gated_driver import (
     GatedDriver,
     stop_ticks,
 )
-from gigabrain_zenoh.qa.judging import Failed, Finding
+from gigabrain_zenoh.qa.judging import Failed, Finding, Skipped
 from gigabrain_zenoh.qa.probe import until
 
 SILENCE_TICKS = 7  # 100 ms without a command, applied in the next tick
@@ -252,13 +252,16 @@ async def reconnects(gated: GatedDriver) -> Finding:
         if await gated.until(lambda: "link_lost" in gated.causes, NOTICED_TICKS) is None:
             raise Failed("the loss was not noticed")
         # before it stands: only old bytes could move it afterwards
-        if await gated.until(lambda: gated.rests, _rest_ticks(gated)) is None:
+        ticks = gated.checked.goes_on or await gated.until(lambda: gated.rests, _rest_ticks(gated))
+        if ticks is None:
             raise Failed("the body did not stop by itself")
     finally:
         gated.checked.break_peer("")
     back = await gated.until(lambda: gated.state and gated.state.link.connected, BACK_TICKS)
     if back is None:
         return Finding(False, f"not back after {BACK_TICKS} ticks")
+    if gated.checked.goes_on:
+        await _until_stopped(gated)
     moved = await gated.until(lambda: any(gated.checked.commanded(gated.state)), QUIET_TICKS)
     reconnects = gated.state.link.reconnects if gated.state else 0
     await gated.drive()
@@ -271,6 +274,8 @@ async def reconnects(gated: GatedDriver) -> Finding:
 
 async def driver_killed(robot: CheckedRobot) -> Finding:
     """Kill the driver by SIGKILL: the body stops by its own watchdog."""
+    if robot.goes_on:
+        raise Skipped(f"motors at zero {robot.promise}: they go on until a driver starts again")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     child = await asyncio.create_subprocess_exec(
         *(sys.executable, "-P", "-m", __name__),
@@ -297,7 +302,38 @@ def _rest_ticks(gated: GatedDriver) -> int:
     return stop_ticks(gated, round((gated.checked.promised_ms + SLACK_MS) * 1e6 / TICK_NS))
 
 
+async def _until_stopped(gated: GatedDriver) -> None:
+    """Wait until the driver has stopped motors that have no watchdog. Raises Failed."""
+
+    def stopped() -> bool:
+        return not any(gated.checked.commanded(gated.state))
+
+    if await gated.until(stopped, QUIET_TICKS) is None:
+        raise Failed("connected again, and the motors go on")
+
+
+async def _cut_off(gated: GatedDriver, fault: str, reported_ms: float) -> Finding:
+    """Cut the line to motors without a watchdog: it is reported, and stops them once it is back."""
+    await gated.drive()
+    gated.checked.break_peer(fault)
+    try:
+        times = await gated.firsts({REPORTED: lambda: "link_lost" in gated.causes}, NOTICED_TICKS)
+        gated.wanted = None
+        await gated.run_for(QUIET_TICKS)
+    finally:
+        gated.checked.break_peer("")
+    if await gated.until(lambda: gated.state and gated.state.link.connected, BACK_TICKS) is None:
+        raise Failed(f"not received again after {BACK_TICKS} ticks")
+    await _until_stopped(gated)
+    late = times.get(REPORTED, math.inf) - reported_ms - SLACK_MS
+    text = f"{REPORTED} after {times[REPORTED]:.0f} ms" if times else f"never {REPORTED}"
+    text += "; motors without a watchdog go on until the line is back"
+    return Finding(late <= 0, text, times, max(late, 0.0) if math.isfinite(late) else 0.0)
+
+
 async def _cut(gated: GatedDriver, fault: str, reported_ms: float) -> Finding:
+    if gated.checked.goes_on:
+        return await _cut_off(gated, fault, reported_ms)
     await gated.drive()
     gated.checked.break_peer(fault)
     try:

@@ -14,7 +14,7 @@ from gigabrain_drivers.bodies.feetech.emulator import FeetechArm
 from gigabrain_drivers.bodies.feetech.protocol import FeetechDecoder, FeetechPacket
 from gigabrain_drivers.bodies.feetech.servo import NO_LOAD_SPEED, SUBSTEP_S, ServoModel
 from gigabrain_drivers.driver.catalog import load_link
-from gigabrain_drivers.driver.robot import Run
+from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.emulators.base import EmulatedBody
 from gigabrain_drivers.links.link import Link
 from gigabrain_drivers.sim.locomotion import Motor
@@ -122,12 +122,12 @@ class FreeJoint:
 class FreeArm:
     """A body whose joints move each by itself; it stands for that of an emulator."""
 
-    def __init__(self) -> None:
-        self.robot, self.run = ROBOT, Run(folder=FOLDER)
-        home = ROBOT.arm.home if ROBOT.arm else ()
+    def __init__(self, robot: RobotFile = ROBOT, folder: Path = FOLDER) -> None:
+        self.robot, self.run = robot, Run(folder=folder)
+        home = robot.arm.home if robot.arm else ()
         self.free = {
             joint.name: FreeJoint(joint.lower - 0.02, joint.upper + 0.02, at, stall_torque=1.91)
-            for joint, at in zip(ROBOT.joints, home, strict=True)
+            for joint, at in zip(robot.joints, home, strict=True)
         }
         self._aims: dict[str, float] | None = {}
 
@@ -150,12 +150,20 @@ class FreeArm:
 class Rig:
     """Driver, line and arm on one clock that the test moves."""
 
-    def __init__(self, **changes: Any) -> None:
+    def __init__(
+        self,
+        robot: RobotFile = ROBOT,
+        folder: Path = FOLDER,
+        options: FeetechOptions = OPTIONS,
+        body: FreeArm | None = None,
+        **changes: Any,
+    ) -> None:
+        self._robot, self._folder, self._options = robot, folder, options
         self.clock = FakeClock()
         self.link = MemoryLink(self.clock)
-        self.body = FreeArm()
+        self.body = body or FreeArm()
         wire = SimpleNamespace(write=self.link.arrive)
-        self.arm = FeetechArm(cast(EmulatedBody, self.body), OPTIONS, wire)
+        self.arm = FeetechArm(cast(EmulatedBody, self.body), options, wire)
         self.arm.reset()
         self.link.to_arm = self.arm.feed
         self.driver = self.another_driver(**changes)
@@ -166,13 +174,14 @@ class Rig:
             **{
                 "driver": "feetech",
                 "port": "memory",
-                "servos": OPTIONS.servos,
-                "calibration": OPTIONS.calibration,
+                "servos": self._options.servos,
+                "wheels": self._options.wheels,
+                "calibration": self._options.calibration,
                 **changes,
             }
         )
-        run = Run(folder=FOLDER, link="emulated")
-        return FeetechDriver(ROBOT, options, run, clock=self.clock, link=self.link)
+        run = Run(folder=self._folder, link="emulated")
+        return FeetechDriver(self._robot, options, run, clock=self.clock, link=self.link)
 
     def servo(self, name: str) -> ServoModel:
         return self.arm.servos[name]

@@ -1,42 +1,37 @@
-"""An arm on a bus of Feetech STS servos, on its real link or on the emulator.
+"""An arm on a bus of Feetech STS servos, and the wheels of a base where it is on one.
 
-The servos hold their goals by themselves: should the driver die, the arm stays where it is. No
-start moves it: a servo that holds keeps its goal, another gets the place where it is.
+The servos hold their goals by themselves: should the driver die, the arm stays where it is, and
+wheels turn on until something sends zero. No start moves an arm: a servo that holds keeps its goal,
+another gets the place where it is.
 """
 
 import asyncio
 import contextlib
 import logging
-import math
 from collections.abc import Mapping
 from typing import Annotated
 
+import msgspec
 from msgspec import Meta
 from msgspec.structs import replace
 
 from gigabrain_drivers.bodies.feetech import protocol as feetech
+from gigabrain_drivers.bodies.feetech.arming import VOLTS, Arming
 from gigabrain_drivers.bodies.feetech.bus import ANSWER_TIMEOUT_NS, HostBus
-from gigabrain_drivers.bodies.feetech.calibration import (
-    OUTSIDE,
-    calibration_path,
-    load_calibration,
-)
-from gigabrain_drivers.bodies.feetech.joint import JUMP_SLACK, ServoJoint
-from gigabrain_drivers.bodies.feetech.protocol import (
-    FIRST,
-    LENGTH,
-    RADIANS_PER_TICK,
-    ServoMemory,
-    ServoReadings,
-)
+from gigabrain_drivers.bodies.feetech.calibration import calibration_path, load_calibration
+from gigabrain_drivers.bodies.feetech.joint import ServoJoint
+from gigabrain_drivers.bodies.feetech.protocol import FIRST, LENGTH
+from gigabrain_drivers.bodies.feetech.wheels import ServoBase, ServoWheel, check_wheels
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import LinkOptions, RobotFile, Run
+from gigabrain_drivers.lidars.base import ScanSource, open_lidar
 from gigabrain_drivers.links.link import Link
 from gigabrain_drivers.links.serial_link import SerialLink, check_port, describe_absent
 from gigabrain_schemas.base import Name, Pose, Velocity
 from gigabrain_schemas.body import LinkHealth, RobotState
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, ConfigError, GigabrainError, unknown
+from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.logs import Fault
 
 log = logging.getLogger(__name__)
@@ -44,10 +39,7 @@ log = logging.getLogger(__name__)
 FIRST_ANSWER_NS = 1_500_000_000  # that a start waits for the arm
 RETRY_NS = 200_000_000  # between two attempts to find it
 YIELD_NS = 500_000_000  # between two attempts to end an overload
-SETTLED_TICKS = 6  # 0.5 deg: by no more may it move while it is switched on
-ARM_ATTEMPTS = 10
-VOLTS = {7.4: (4.5, 8.7), 12.0: (9.0, 14.5)}  # that a supply may have, by the servos' variant
-VARIANT_LIMIT = 100  # 0.1 V, between the greatest voltages that the two variants take
+ServoId = Annotated[int, Meta(ge=0, le=feetech.MAX_ID)]
 Share = Annotated[float, Meta(ge=0.05, le=1.0)]
 
 
@@ -55,8 +47,9 @@ class FeetechOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fiel
     """The bus's part of a robot's file."""
 
     port: str = f"usb:{feetech.USB_ID}"  # a path, or usb:VID:PID[:SERIAL]
-    servos: dict[Name, Annotated[int, Meta(ge=0, le=feetech.MAX_ID)]]  # id, by the joint's name
-    inverted: tuple[Name, ...] = ()  # joints that turn backward as the ticks go up
+    servos: dict[Name, ServoId]  # by the joint's name
+    wheels: Mapping[Name, ServoId] = msgspec.field(default_factory=dict)  # by the wheel's name
+    inverted: tuple[Name, ...] = ()  # joints and wheels that turn backward as the ticks go up
     voltage: float = 7.4  # [V], of the servos' variant: 7.4 or 12
     calibration: str = ""  # file, beside the robot's; empty: where calibrate keeps it
     rate_hz: Annotated[float, Meta(ge=50.0, le=200.0)] = 100.0  # of reading and writing
@@ -67,7 +60,8 @@ class FeetechOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fiel
         check_port(self.port)
         if self.voltage not in VOLTS:
             raise ValueError(f"voltage: expected 7.4 or 12, got {self.voltage:g}")
-        if len(set(self.servos.values())) < len(self.servos):
+        ids = [*self.servos.values(), *self.wheels.values()]
+        if len(set(ids)) < len(ids):
             raise ValueError("servos: each needs an id of its own")
 
 
@@ -90,26 +84,37 @@ class FeetechDriver(Driver):
         self._clock = clock or Clock()
         self.link = link or SerialLink(options.port, feetech.BAUD, self._clock)
         self._bus = HostBus(self.link, self._clock)
+        self._arming = Arming(self._bus, self._clock, robot.robot_type, options.voltage)
+        self._base = ServoBase(robot, options, self._bus, self._arming) if options.wheels else None
+        self._wheels = self._base.wheels if self._base else []
         self._joints: dict[str, ServoJoint] = {}
         self._armed = self._limp = False
         self._complaint = "not opened"  # while it is not armed
-        self._found: dict[ServoJoint, str] = {}  # how each answered when it was last looked for
+        self._found: dict[ServoJoint | ServoWheel, str] = {}  # how each answered the last time
         self._failure: GigabrainError | None = None
         self._fault = Fault(log)
         self._yielded_ns = self._tried_ns = 0
         self._rewritten = 0
         self._cycles: asyncio.Task[None] | None = None
+        self._lidar: ScanSource | None = None
+        self.sensors = {"scan": None} if robot.lidar else {}
 
     @classmethod
     def check(cls, robot: RobotFile, options: FeetechOptions) -> None:
         """Raises ValueError where the servos are not those of the body's joints."""
         names = [joint.name for joint in robot.joints]
-        for field, given in (("servos", options.servos), ("inverted", options.inverted)):
+        parts = [*names, *options.wheels]
+        for field, given, known in (
+            ("servos", options.servos, names),
+            ("inverted", options.inverted, parts),
+        ):
             for name in given:
-                if name not in names:
-                    raise ValueError(f"{field}: {unknown('joint', name, names)}")
+                if name not in known:
+                    raise ValueError(f"{field}: {unknown('joint', name, known)}")
         if missing := [name for name in names if name not in options.servos]:
             raise ValueError(f"servos: none for {', '.join(missing)}")
+        if options.wheels or robot.drive_type != "arm":
+            check_wheels(robot, options.wheels)
 
     @property
     def problem(self) -> str:
@@ -119,7 +124,10 @@ class FeetechDriver(Driver):
         if not self._armed:
             return self._complaint
         now_ns = self._clock.now_ns()
-        return next(filter(None, (joint.problem(now_ns) for joint in self._joints.values())), "")
+        return next(filter(None, (servo.problem(now_ns) for servo in self._servos())), "")
+
+    def _servos(self) -> list[ServoJoint | ServoWheel]:
+        return [*self._joints.values(), *self._wheels]
 
     async def open(self) -> None:
         """Find the arm and have it hold; it may come later. Raises ConfigError for another one."""
@@ -136,6 +144,7 @@ class FeetechDriver(Driver):
                 grip_torque=options.grip_torque,
             )
         self._limp = False
+        self._lidar = open_lidar(self, self._clock)
         self.link.open()
         until_ns = self._clock.now_ns() + FIRST_ANSWER_NS
         while not await self._find() and self._clock.now_ns() < until_ns:
@@ -145,7 +154,7 @@ class FeetechDriver(Driver):
         self._cycles = asyncio.create_task(self._run(), name="servo bus")
 
     async def close(self) -> None:
-        """Let go of the port; the arm holds what it was last told to."""
+        """Let go of the ports; the arm holds what it was last told to, and wheels stand."""
         cycles, self._cycles = self._cycles, None
         if cycles:
             await self.hold()
@@ -156,6 +165,8 @@ class FeetechDriver(Driver):
             await self._bus.ask(feetech.ping(servo), [servo], 0)  # the goals have gone out before
         self._armed = False
         await self.link.close()
+        if self._lidar:
+            await self._lidar.close()
 
     async def stop(self) -> None:
         """Come to rest, and hold: an arm that is let go falls."""
@@ -166,6 +177,9 @@ class FeetechDriver(Driver):
         for joint in self._joints.values():
             joint.hold()
         await self._send_goals()
+        if self._base:
+            self._base.stop()
+            await self._base.send()
 
     async def limp(self) -> None:
         """Let go of all joints, until they are sent somewhere. Raises BodyLost."""
@@ -185,23 +199,35 @@ class FeetechDriver(Driver):
                 raise unknown("joint", name, [joint.name for joint in self.robot.joints])
         joints = {name: self._joints[name] for name in positions}
         if self._limp and self._armed:
-            self._limp = bool(await self._arm())
+            self._limp = bool(await self._arming.arm(self._joints.values()))
         if self._limp or self.problem:
             return {name: joint.position for name, joint in joints.items()}
         sent = {name: joint.command(positions[name]) for name, joint in joints.items()}
         await self._send_goals()
         return sent
 
+    async def set_base_velocity(
+        self, linear_x: float, linear_y: float, angular_z: float
+    ) -> Velocity:
+        """Drive, where there are wheels; nothing is sent while the robot has a problem."""
+        if self._base is None:
+            return await super().set_base_velocity(linear_x, linear_y, angular_z)
+        wanted = ZERO if self.problem else self.bounded(linear_x, linear_y, angular_z)
+        sent = self._base.command(wanted)
+        if self._bus.busy:  # the cycle sends it once its answers are there
+            return sent
+        return sent if await self._base.send() else ZERO
+
     async def read_state(self) -> RobotState:
         """Return the newest readings that are believed. Raises BodyLost, and ConfigError."""
         if self._failure:
             raise self._failure
-        measured = (joint.measured() for joint in self._joints.values())
+        base, measured = self._base, (joint.measured() for joint in self._joints.values())
         return RobotState(
             robot_type=self.robot.robot_type,
-            pose=Pose(x=0.0, y=0.0, yaw=0.0),
-            velocity=Velocity(),
-            joints=tuple(filter(None, measured)),
+            pose=base.pose if base else Pose(x=0.0, y=0.0, yaw=0.0),
+            velocity=base.velocity if base else ZERO,
+            joints=(*(base.joints() if base else ()), *filter(None, measured)),
             joints_sent=() if self._limp or not self._armed else self._goals(),
             limp=self._limp,
             link=self._health(),
@@ -220,10 +246,10 @@ class FeetechDriver(Driver):
         }
 
     def _refused(self) -> int:
-        return sum(joint.refused for joint in self._joints.values())
+        return sum(servo.refused for servo in self._servos())
 
     def _health(self) -> LinkHealth:
-        heard_ns = min((joint.heard_ns for joint in self._joints.values()), default=0)
+        heard_ns = min((servo.heard_ns for servo in self._servos()), default=0)
         self.link.errors = self._bus.errors + self._refused()
         return replace(
             self.link.health,
@@ -248,6 +274,8 @@ class FeetechDriver(Driver):
                 await self._find()
         else:
             await self._read(now_ns)
+            if self._base:
+                await self._keep_base(self._base, now_ns)
             if not self._limp:
                 await self._keep(now_ns)
         if problem := self.problem:
@@ -256,12 +284,25 @@ class FeetechDriver(Driver):
             self._fault.end(f"{self.link}: the arm answers")
 
     async def _read(self, now_ns: int) -> None:
-        servos = [joint.id for joint in self._joints.values()]
+        servos = [servo.id for servo in self._servos()]
         question = feetech.sync_read(servos, FIRST, LENGTH)
-        answers = await self._bus.ask(question, servos, LENGTH, ANSWER_TIMEOUT_NS)
+        answers = await self._bus.ask(question, servos, LENGTH, len(servos) * ANSWER_TIMEOUT_NS)
+        readings = {n: feetech.decode_readings(answer[1:]) for n, answer in answers.items()}
         for joint in self._joints.values():
-            if joint.id in answers:
-                joint.take(feetech.decode_readings(answers[joint.id][1:]), now_ns)
+            if joint.id in readings:
+                joint.take(readings[joint.id], now_ns)
+        if self._base:
+            self._base.take(readings, now_ns)
+
+    async def _keep_base(self, base: ServoBase, now_ns: int) -> None:
+        """Have the wheels turn as commanded, or stand while anything has a problem."""
+        if self.problem:
+            base.stop()
+        if base.overloaded and now_ns - self._yielded_ns >= YIELD_NS:
+            self._yielded_ns = now_ns
+            await base.end_overload()
+        self._rewritten += await base.keep()
+        await base.send()
 
     async def _keep(self, now_ns: int) -> None:
         """Have each servo hold its goal with the right settings, and see to those that fail."""
@@ -307,9 +348,12 @@ class FeetechDriver(Driver):
         """Look for the whole arm, and have it hold; return whether it does. Raises ConfigError."""
         if not self.link.connected:
             return False
+        if self._base:  # what ran before may have left its wheels turning
+            self._base.stop()
+            await self._base.send()
         before, self._found = (
             self._found,
-            {joint: await self._bus.find(joint.id) for joint in self._joints.values()},
+            {servo: await self._bus.find(servo.id) for servo in self._servos()},
         )
         if set(self._found.values()) == {"missing"}:
             self._complaint = f"{self.link} is open, but no servo answers: right port, power on?"
@@ -319,86 +363,12 @@ class FeetechDriver(Driver):
             return False
         refuse_incomplete(str(self.link), {str(joint): how for joint, how in self._found.items()})
         for joint in self._joints.values():
-            await self._check_servo(joint)
-        self._complaint = await self._arm()
+            await self._arming.check(joint)
+        self._complaint = await self._arming.arm(self._joints.values())
+        if self._base and not self._complaint:
+            self._complaint = await self._base.start(self._clock.now_ns())
         self._armed = not self._complaint
         return self._armed
-
-    async def _check_servo(self, joint: ServoJoint) -> None:
-        """Raise ConfigError where a servo is not the one that was calibrated."""
-        data = await self._bus.read(joint.id, 0, feetech.EEPROM_SIZE)
-        if data is None:
-            raise ConfigError(f"{self.link}: {joint} does not answer any more")
-        memory, voltage = feetech.decode_memory(data), self.options.voltage
-        if memory.model != feetech.MODEL or memory.mode:
-            raise ConfigError(
-                f"{self.link}: {joint} is of model {memory.model} in mode {memory.mode}; "
-                f"expected an STS3215 (model {feetech.MODEL}) in mode 0, position"
-            )
-        if (memory.max_voltage > VARIANT_LIMIT) != (voltage > VARIANT_LIMIT / 10):
-            raise ConfigError(
-                f"{self.link}: {joint} takes up to {memory.max_voltage / 10:g} V, but the "
-                f"robot's file has servos of {voltage:g} V; change voltage there"
-            )
-        if not joint.calibration.is_of(memory):
-            raise ConfigError(_other_arm(self.robot.robot_type, joint, memory))
-
-    async def _arm(self) -> str:
-        """Have all servos hold, without a motion; return why not, or an empty text.
-
-        Raises ConfigError where the supply is not that of the servos.
-        """
-        for joint in self._joints.values():
-            first, now = await self._block(joint), await self._block(joint)
-            if first is None or now is None:
-                return f"{joint} answers only at times"
-            if abs(first.position - now.position) * RADIANS_PER_TICK > 2 * JUMP_SLACK:
-                return f"{joint} is being moved: let go of the arm"
-            self._check_supply(joint, now)
-            if outside := _outside(joint, now):
-                return (
-                    f"{joint} is {math.degrees(outside):.0f} deg outside its calibrated range: "
-                    "move it back by hand, or calibrate again"
-                )
-            joint.begin(now, self._clock.now_ns())
-        for _ in range(ARM_ATTEMPTS):
-            if await self._switched_on():
-                return ""
-        return "the arm moves while it is switched on: let go of it"
-
-    async def _switched_on(self) -> bool:
-        """Give each servo its goal, and torque once it is seen to be there."""
-        now_ns = self._clock.now_ns()
-        parts = {j.id: j.settings(now_ns).frame_part(j.goal) for j in self._joints.values()}
-        await self._bus.send(feetech.sync_write(feetech.ACCELERATION.address, parts))
-        for joint in self._joints.values():
-            now = await self._block(joint)
-            if now is None:
-                return False
-            if not now.torque and abs(now.position - now.goal) > SETTLED_TICKS:
-                joint.begin(now, self._clock.now_ns())
-                return False
-            if now.goal != joint.goal:
-                return False
-            locked = now.lock == 1 or await self._bus.write(joint.id, feetech.LOCK, 1)
-            if not locked or not await self._bus.write(joint.id, feetech.TORQUE, 1):
-                return False
-            if on := await self._block(joint):
-                joint.begin(on, self._clock.now_ns())
-        return True
-
-    async def _block(self, joint: ServoJoint) -> ServoReadings | None:
-        data = await self._bus.read(joint.id, FIRST, LENGTH)
-        return feetech.decode_readings(data) if data else None
-
-    def _check_supply(self, joint: ServoJoint, now: ServoReadings) -> None:
-        volts, voltage = now.voltage * feetech.VOLTAGE_UNIT, self.options.voltage
-        least, most = VOLTS[voltage]
-        if not least <= volts <= most:
-            raise ConfigError(
-                f"{self.link}: {joint} measures {volts:.1f} V; expected {least:g} to {most:g} V "
-                f"for servos of {voltage:g} V: wrong supply, or wrong voltage in the robot's file"
-            )
 
 
 def line_problem(link: Link) -> str:
@@ -422,21 +392,3 @@ def refuse_incomplete(port: str, found: Mapping[str, str]) -> None:
             f"{port}: {missing} does not answer: are its cable and its power plugged in, "
             "and does it have this id?"
         )
-
-
-def _other_arm(robot_type: str, joint: ServoJoint, memory: ServoMemory) -> str:
-    its = joint.calibration
-    return (
-        f"{joint} keeps offset {memory.offset} and limits {memory.min_position} to "
-        f"{memory.max_position}, its calibration has {its.offset} and {its.min_position} to "
-        f"{its.max_position}: this is another arm; run gigabrain driver calibrate {robot_type}"
-    )
-
-
-def _outside(joint: ServoJoint, now: ServoReadings) -> float:
-    """Return by how much it is where switching it on would move it [rad], 0 where it is not."""
-    its, at = joint.calibration, now.position
-    slack = round(OUTSIDE / RADIANS_PER_TICK)
-    lower = max(its.min_position - SETTLED_TICKS, its.lower - slack)
-    upper = min(its.max_position + SETTLED_TICKS, its.upper + slack)
-    return max(lower - at, at - upper, 0) * RADIANS_PER_TICK

@@ -1,4 +1,4 @@
-"""An arm on a servo bus, emulated: six or more servos, each with the joint that it moves."""
+"""A servo bus, emulated: six or more servos, each with the joint or the wheel that it moves."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,26 +14,31 @@ from gigabrain_drivers.bodies.feetech.protocol import FeetechDecoder
 from gigabrain_drivers.bodies.feetech.servo import ServoBus, ServoModel
 from gigabrain_drivers.driver.robot import RobotFile
 from gigabrain_drivers.emulators.base import Device, EmulatedBody, Wire
+from gigabrain_drivers.kinematics.wheels import Twist, wheels_of
+from gigabrain_drivers.sim.locomotion import Motor
 
 MAX_STEP_S = 0.1  # of time at once; a machine that was held up longer drops the rest
 STIFFNESS = 17.8  # [N m/rad], of the position servos in the model
 
 
 class FeetechArm(Device):
-    """A bus of servos that move the joints of the simulated arm.
+    """A bus of servos that move the joints of the simulated arm, and its wheels where it has some.
 
     It begins as an arm that was switched on before, held where it is; a restart lets it fall. The
-    servos hold their last goals for ever: there is no watchdog.
+    servos keep their last goals for ever, also the speeds of wheels: there is no watchdog.
     """
 
     Options = FeetechOptions
     baud = feetech.BAUD
-    promised_in = "the STS3215, which holds its goal without a host"
+    goes_on = True
+    promised_in = "the STS3215, which keeps its goal without a host"
 
     def __init__(self, body: EmulatedBody, options: FeetechOptions, wire: Wire) -> None:
         super().__init__(body, options, wire)
         self.servos = _servos(body.robot, options, body.run.folder)
-        self.bus = ServoBus(list(self.servos.values()))
+        self.wheels = new_servos(options.wheels, options)
+        self._base = wheels_of(body.robot) if self.wheels else None
+        self.bus = ServoBus([*self.servos.values(), *self.wheels.values()])
         self._decoder = FeetechDecoder()
         self._stepped_ns: int | None = None
         self._started = False
@@ -47,6 +52,9 @@ class FeetechArm(Device):
             if not self._started:
                 servo.begin_holding(motor.effort / STIFFNESS)
         self._started = True
+        for servo in self.wheels.values():
+            servo.power_on()
+        self._drive()
 
     def feed(self, data: bytes) -> None:
         """Execute instructions, and answer."""
@@ -65,10 +73,26 @@ class FeetechArm(Device):
             most = servo.max_effort / STIFFNESS
             pull = 0.0 if servo.target is None else servo.target - motor.position
             aims[motor.name] = motor.position + max(-most, min(most, pull))
+        for name, servo in self.wheels.items():
+            motor = self._wheel(name)
+            servo.supply = max(0.0, self.options.voltage - self.sag_volts)
+            servo.step(seconds, motor.position, motor.velocity, motor.effort)
+        self._drive()
         if any(servo.target is not None for servo in self.servos.values()):
             self.body.aim(aims)
         else:
             self.body.let_go()
+
+    def _wheel(self, name: str) -> Motor:
+        joint = f"wheel_{name}_joint"
+        return next(one for one in self.body.wheels if one.name == joint)
+
+    def _drive(self) -> None:
+        """Have the body aim for the velocity at which its servos turn."""
+        if self._base:
+            speeds = tuple(self.wheels[name].speed for name in self._base.wheels)
+            twist = self._base.to_body(speeds) if any(speeds) else Twist(0.0, 0.0, 0.0)
+            self.body.command(*twist)
 
 
 def _servos(robot: RobotFile, options: FeetechOptions, folder: Path) -> dict[str, ServoModel]:

@@ -14,6 +14,7 @@ TABLE_SIZE = 71
 FIRMWARE = (3, 10)
 READ_ONLY = (*range(5), *range(50, 55), *range(56, TABLE_SIZE))
 VOLTAGES = {7.4: (80, 40), 12.0: (140, 95)}  # 0.1 V: most and least that a variant takes
+VELOCITY_MODE = 1
 NO_LOAD_SPEED = 4.7  # [rad/s]
 DERIVATIVE_S = 0.02  # of its position loop, over the proportional gain
 MAX_LEAD = 0.15  # [rad] of the setpoint before the joint, which is more than its stall torque takes
@@ -36,6 +37,7 @@ class ServoModel:
     ) -> None:
         self.stall_torque = feetech.STALL_TORQUE[voltage]  # [N m]
         self.target: float | None = None  # [rad] that the motor holds; None: it holds nothing
+        self.speed = 0.0  # [rad/s] at which it turns in velocity mode
         self.max_effort = 0.0  # [N m]
         self.supply = voltage  # [V]
         self.goals = 0  # how many goals were written
@@ -102,7 +104,7 @@ class ServoModel:
         self[feetech.TORQUE_LIMIT] = self[feetech.MAX_TORQUE]
         self[feetech.LOCK] = 1
         self._latched, self._overloaded_s, self._queued = False, 0.0, None
-        self.target, self.max_effort = None, 0.0
+        self.target, self.max_effort, self.speed = None, 0.0, 0.0
         self._measure()
         self[feetech.GOAL] = self[feetech.POSITION]
 
@@ -157,7 +159,10 @@ class ServoModel:
             return
         self._watch_load(load, seconds)
         if not self[feetech.TORQUE]:
-            self.target, self.max_effort = None, 0.0
+            self.target, self.max_effort, self.speed = None, 0.0, 0.0
+            return
+        if self[feetech.MODE] == VELOCITY_MODE:
+            self._follow_speed()
             return
         self._follow_profile(seconds)
         share = self[feetech.TORQUE_LIMIT] / 1000
@@ -208,6 +213,13 @@ class ServoModel:
             at += speed * SUBSTEP_S if abs(speed * SUBSTEP_S) < abs(left) else left
         lead = max(-MAX_LEAD, min(MAX_LEAD, at - self._position))
         self._setpoint, self._setpoint_speed = self._position + lead, speed
+
+    def _follow_speed(self) -> None:
+        """Turn at the goal's speed; there is no end to it. What it moves has a ramp of its own."""
+        wanted = self._direction * self[feetech.GOAL_VELOCITY] * RADIANS_PER_TICK
+        wanted = 0.0 if self._latched else wanted
+        self.target, self.max_effort = None, self.stall_torque
+        self.speed = max(-NO_LOAD_SPEED, min(NO_LOAD_SPEED, wanted))
 
     def _measure(self) -> None:
         ticks = self._direction * self._position / RADIANS_PER_TICK
