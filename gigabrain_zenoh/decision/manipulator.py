@@ -26,11 +26,13 @@ from gigabrain_zenoh.decision.tasks.arm_steps import (
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold, Plan
 from gigabrain_zenoh.manipulation.collision import Thing, turned
+from gigabrain_zenoh.manipulation.grasps import Grasp
 from gigabrain_zenoh.manipulation.phases import PhaseRun
 from gigabrain_zenoh.manipulation.pick_place import NoWay
 
 TRIES = 3  # to pick a thing up, each with another grasp
 HOLD_UPS = 5  # of one command, after which it fails
+MISSED = f"it was not caught, {TRIES} times"
 CARRYING = ("lift", "traverse", "lower")  # phases in which a thing has to be held
 NO_MODEL = Idle("waiting", "waiting: for the arm's model, robot/arm_model")
 NOT_MEASURED = Idle("waiting", "waiting: for all joints to be measured")
@@ -56,6 +58,8 @@ class Manipulator:
         self._misses = 0  # grasps of it that caught nothing
         self._hold_ups = 0  # of it, by a joint that did not follow
         self._achieved = StepOutcome()  # of a command that is done but for the way back
+        self._left: Grasp | None = None  # at which the hand still is, without holding the thing
+        self._backs = False  # it goes back from there
 
     def step(
         self,
@@ -74,15 +78,18 @@ class Manipulator:
             self._drop()
             self._number, self._achieved = number, StepOutcome()
             self._misses = self._hold_ups = 0
-        planner = self._ready(body)
+        try:
+            planner = self._ready(body)
+        except GigabrainError as error:
+            return self._fail(str(error))
         if command is None:
             return self._still(idle)
         if held:
-            self._drop()
+            self._interrupt()
             return self._still(Idle("waiting", f"waiting: {held}"), held=True)
         if planner is None:
             return self._still(NO_MODEL)
-        if len(state.joints) < len(body.joints):
+        if {joint.name for joint in body.joints} - {joint.name for joint in state.joints}:
             return self._still(NOT_MEASURED)
         if self._run is None and self._achieved.number:
             return self._still(Idle("done", self._achieved.reason), self._achieved)
@@ -105,15 +112,16 @@ class Manipulator:
             self._drop()
             self._made_for, self._planner, self._hold = wanted, None, None
             self._making = self._pool.submit(ArmPlanner, *wanted)
-        if self._making and self._in_time(self._making, 0.0):
-            making, self._making = self._making, None
-            self._planner = making.result()
+        if self._planner is None and self._making and self._in_time(self._making, 0.0):
+            self._planner = self._making.result()  # raises as long as there is no other model
         return self._planner
 
     def _carry_out(
         self, planner: ArmPlanner, state: RobotState, body: BodyDescription, command: ArmCommand
     ) -> StepResult:
-        if self._run is None:
+        if self._run is None and self._left:
+            self._back_off(planner, body, state, self._left)
+        elif self._run is None:
             if self._planning is None:
                 work = self._work(planner, state, body, command)
                 if isinstance(work, str):
@@ -157,6 +165,13 @@ class Manipulator:
                     return "the gripper holds nothing"
                 return lambda: planner.place(hold, np.array(at), others, posture)
 
+    def _back_off(
+        self, planner: ArmPlanner, body: BodyDescription, state: RobotState, grasp: Grasp
+    ) -> None:
+        """Begin to go back from a thing that is not held; afterwards it is planned again."""
+        self._left, self._backs = grasp, True
+        self._begin(planner, planner.back_off(grasp, _sent(planner, body, state)), state)
+
     def _begin(self, planner: ArmPlanner, plan: Plan, state: RobotState) -> None:
         gripper = planner.arm.gripper
         self._plan = plan
@@ -176,8 +191,9 @@ class Manipulator:
         over = run.advance(state.tick)
         if over and over.name == "close" and plan.hold:
             if not _holds(planner, plan.hold, state):
+                assert plan.grasp
                 self._misses += 1
-                self._begin(planner, Plan(phases=plan.back), state)
+                self._back_off(planner, body, state, plan.grasp)
                 return self._moving(state)
             name = plan.hold.thing.name
             stood = _thing(name, command.things[name])
@@ -195,7 +211,7 @@ class Manipulator:
         self._hold_ups += 1
         if self._hold_ups > HOLD_UPS:
             return self._fail(why)
-        self._drop()
+        self._interrupt()
         return self._still(PLANNING)
 
     def _achieve(self, hold: Hold | None, placed: tuple[str, Solid] | None = None) -> None:
@@ -218,12 +234,10 @@ class Manipulator:
         if off := _off(body, state, end, "goal_tolerance"):
             late = run.over_for(state.tick) * TICK_S > body.arm.goal_time
             return self._fail(off) if late else self._moving(state)
-        missed = self._misses and not self._achieved.number  # it has backed off
-        if missed and self._misses < TRIES:
+        if self._backs:
             self._drop()
-            return self._still(PLANNING)
-        if missed:
-            return self._fail(f"it was not caught, {TRIES} times")
+            missed = self._misses >= TRIES
+            return self._fail(MISSED) if missed else self._still(PLANNING)
         if not self._achieved.number:
             self._achieve(self._hold)
         self._drop()
@@ -264,11 +278,20 @@ class Manipulator:
         intent = Intent(behaviour=self._behaviour, reason=reason)
         return intent, replace(outcome, number=self._number)
 
+    def _interrupt(self) -> None:
+        """Forget the plan, but not that the hand is at a thing that it does not hold yet."""
+        left, phase = self._left, self._run.phase if self._run else None
+        if phase and phase.name in ("descend", "close") and self._plan.grasp:
+            left = self._plan.grasp
+        self._drop()
+        self._left = left
+
     def _drop(self) -> None:
         """Forget the plan, and the one that is being made."""
         if self._planning:
             self._planning.cancel()
-        self._planning = self._run = None
+        self._planning = self._run = self._left = None
+        self._backs = False
 
 
 def _sent(planner: ArmPlanner, body: BodyDescription, state: RobotState) -> Floats:

@@ -12,6 +12,7 @@ from gigabrain_schemas.body import Arm, BodyDescription
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics
 from gigabrain_zenoh.manipulation.collision import CollisionChecker, Thing, turned
+from gigabrain_zenoh.manipulation.grasps import Grasp
 from gigabrain_zenoh.manipulation.inverse_kinematics import (
     InverseKinematics,
     OutOfReach,
@@ -43,11 +44,11 @@ class Hold:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plan:
-    """Phases; of a pick also what the gripper holds once it has closed, and the way back."""
+    """Phases; of a pick also what the gripper holds once it has closed."""
 
     phases: tuple[Phase, ...]
     hold: Hold | None = None
-    back: tuple[Phase, ...] = ()  # away from a thing that was not caught
+    grasp: Grasp | None = None
 
 
 class ArmPlanner:
@@ -127,7 +128,7 @@ class ArmPlanner:
         grip = next(phase.gripper for phase in found.phases if phase.name == "close")
         assert grip is not None
         hold = Hold(thing=found.held, grip=grip, opening=found.grasp.opening)
-        return Plan(phases=found.phases, hold=hold, back=found.back)
+        return Plan(phases=found.phases, hold=hold, grasp=found.grasp)
 
     def place(
         self, hold: Hold, target: Floats, things: Sequence[Thing], posture: Floats
@@ -136,6 +137,10 @@ class ArmPlanner:
         around = self._all(things)
         found = self._picker().place(hold.thing, target, around, posture, hold.opening)
         return found if isinstance(found, NoWay) else Plan(phases=found.phases)
+
+    def back_off(self, grasp: Grasp, posture: Floats) -> Plan:
+        """Return the way from a thing that is not held."""
+        return Plan(phases=self._picker().back_off(grasp, posture))
 
     def gripped(self, hold: Hold, thing: Thing, measured: Floats) -> Hold:
         """Return what is held by fingers that have just closed on a thing.

@@ -48,7 +48,6 @@ class Pick:
 
     grasp: Grasp
     phases: tuple[Phase, ...]
-    back: tuple[Phase, ...]  # away from a thing that was not caught
     held: Thing  # in the frame of the tool
 
 
@@ -104,6 +103,13 @@ class PickPlacePlanner:
             fault = one
         return fault
 
+    def back_off(self, grasp: Grasp, posture: Floats) -> tuple[Phase, ...]:
+        """Return the way from a thing that is not held: open, and back where it came from."""
+        return (
+            Phase(name="open", gripper=grasp.opening),
+            Phase(name="retreat", arm=self._straight(posture, grasp.before)),
+        )
+
     def place(
         self, held: Thing, target: Floats, others: Sequence[Thing], posture: Floats, opening: float
     ) -> Place | NoWay:
@@ -146,11 +152,7 @@ class PickPlacePlanner:
             Phase(name="close", gripper=self._squeezed(grasp)),
             Phase(name="lift", arm=self._slow.trajectory(up)),
         )
-        back = (
-            Phase(name="open", gripper=grasp.opening),
-            Phase(name="retreat", arm=self._straight(grasp.posture, grasp.before)),
-        )
-        return Pick(grasp=grasp, phases=phases, back=back, held=held)
+        return Pick(grasp=grasp, phases=phases, held=held)
 
     def _lifted(self, checker: CollisionChecker, grasp: Grasp) -> Floats:
         """Return postures (k, n) up from the grasp: straight up, or back where it came from."""

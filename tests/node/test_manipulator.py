@@ -42,7 +42,7 @@ def waits(job: Future[Any], _patience_s: float) -> bool:
 class Rig:
     """An arm with a queue of tasks."""
 
-    def __init__(self, folder: Path, cube: tuple[float, float] = THERE) -> None:
+    def __init__(self, folder: Path, cube: tuple[float, float] = THERE, mjcf: str = MODEL) -> None:
         (folder / "thing.xml").write_text(CUBE.format(x=cube[0], y=cube[1]))
         world = folder / "world.yaml"
         world.write_text("model: thing.xml\nstart: [0.0, 0.0, 0.0]\n")
@@ -51,7 +51,7 @@ class Rig:
         self.arm = ArmInMemory(robot, sim_body(robot, options, Run(folder=model_folder)), world)
         bus: Any = SimpleNamespace(
             input_log=SimpleNamespace(in_time=waits),
-            latest=lambda _topic: SimpleNamespace(current=ArmModel(mjcf=MODEL)),
+            latest=lambda _topic: SimpleNamespace(current=ArmModel(mjcf=mjcf)),
         )
         self.manipulator = Manipulator(bus, "navigate")
         self.queue = TaskQueue(lambda _topic: None, lambda _script: None, Saved())  # type: ignore[arg-type, return-value]
@@ -156,7 +156,7 @@ def test_what_is_not_there_is_tried_three_times_and_the_arm_goes_back(tmp_path: 
     rig.manipulator.close()
 
 
-@pytest.mark.parametrize("phase", ["descend", "lift", "traverse", "open", "retreat"])
+@pytest.mark.parametrize("phase", ["descend", "close", "lift", "traverse", "open", "retreat"])
 def test_after_an_interruption_it_goes_on_from_where_it_is(rig: Rig, phase: str) -> None:
     rig.give(THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]}]")
     while rig.outcome is None or rig.outcome.reason != phase:
@@ -170,6 +170,14 @@ def test_after_an_interruption_it_goes_on_from_where_it_is(rig: Rig, phase: str)
     task = rig.carry_on()
     assert (task.state, task.reason) == ("succeeded", "")
     assert rig.arm.thing()[:2] == pytest.approx(ELSEWHERE, abs=0.012)
+
+
+def test_a_model_that_cannot_be_used_fails_the_command_in_one_line(tmp_path: Path) -> None:
+    rig = Rig(tmp_path, mjcf="<mujoco/>")
+    task = rig.carry_out("do: [{posture: home}]")
+    assert task.state == "failed"
+    assert "joint in the arm's model" in task.reason
+    rig.manipulator.close()
 
 
 def test_what_slips_out_of_the_gripper_is_told(rig: Rig) -> None:
