@@ -271,7 +271,8 @@ def lost(gate: GateStatus, name: str) -> str:
     """Return what has ended the lease of the commander `name`."""
     if gate.commander not in ("", name):
         return f"{gate.commander} has taken the body"
-    return f"the gate has stopped: {gate.mode}"
+    causes = "; ".join(cause.text for cause in gate.causes)
+    return f"the gate has stopped: {causes or gate.mode}"
 
 
 def _mine(config: Config, memory: Memory) -> bool:

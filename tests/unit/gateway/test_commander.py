@@ -5,7 +5,7 @@ import math
 import pytest
 from msgspec.structs import replace
 
-from gigabrain_schemas.base import Velocity
+from gigabrain_schemas.base import Cause, Velocity
 from gigabrain_schemas.body import GateStatus
 from gigabrain_zenoh.gateway.commander import (
     Ask,
@@ -227,7 +227,8 @@ def test_a_command_after_giving_back_goes_on_while_the_gate_is_still_open():
     assert machine.command(0.2) == [Send(AHEAD)]
 
 
-LATCHED = GateStatus(mode="latched", enables=4, estop_generation=1)
+PRESSED = Cause(code="estop", text="e-stop pressed", remedy="look")
+LATCHED = GateStatus(mode="latched", causes=(PRESSED,), enables=4, estop_generation=1)
 
 
 @pytest.mark.parametrize(
@@ -235,7 +236,7 @@ LATCHED = GateStatus(mode="latched", enables=4, estop_generation=1)
     [
         (GateStatus(mode="enabled", commander="ann", enables=9), "ann has taken the body"),
         (GateStatus(mode="stopping", commander="ros2", enables=4), "the gate has stopped"),
-        (LATCHED, "the gate has stopped: latched"),
+        (LATCHED, "the gate has stopped: e-stop pressed"),
     ],
 )
 def test_a_lost_body_is_asked_for_only_after_the_sender_has_sent_zero(gate, words):

@@ -65,6 +65,11 @@ def test_services_and_actions_are_one_row_each() -> None:
     assert navigate.robot_keys == ("robot/goal",)
 
 
+def test_trajectories_of_joints_are_commands_for_joints() -> None:
+    for name in ("joint_trajectory", "follow_joint_trajectory"):
+        assert robot_keys(name) == ("robot/joint_cmd",)
+
+
 def test_all_topics_are_those_of_every_node_and_the_parts_of_actions_as_well() -> None:
     found = listed(all_topics=True)
     assert found["/red/gigabrain/get_parameters"].kind == "service"

@@ -1,0 +1,238 @@
+"""A simulated SO-101, moved by real ROS 2 as a MoveIt or ros2_control user would."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import pytest_asyncio
+
+from gigabrain_zenoh.client.requests import press_estop
+from gigabrain_zenoh.testing.processes import Home
+from gigabrain_zenoh.testing.waiting import until
+from tests.places import ROOT
+from tests.ros2.judge import Judge, Program
+from tests.system.ros2.test_gateway_ros import Robot, judge, released, running
+
+__all__ = ["judge"]
+pytestmark = pytest.mark.asyncio(loop_scope="module")
+NAMES = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"]
+HOME = (0.0, -1.7, 1.4, 0.6, 0.0, 0.0)
+ACTION, FOLLOW = "/follow_joint_trajectory", "control_msgs/action/FollowJointTrajectory"
+TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+STATES = "sensor_msgs/msg/JointState"
+NEAR = 0.06  # [rad]: the goal tolerance, and an encoder's step
+SAG = 0.03  # [rad]
+
+
+@pytest_asyncio.fixture(loop_scope="module", scope="module")
+async def robot(shared_home: Home, shared_judge: Judge) -> AsyncIterator[Robot]:
+    """An arm that the tests share; its brain does not ask for it."""
+    parts = {"body": "so101", "resume": "manual"}
+    async with running(shared_home, shared_judge, **parts) as made:
+        await made.becomes("latched")
+        await released(made)
+        yield made
+
+
+def pan(robot: Robot) -> float:
+    return robot.now.joints[0].position
+
+
+def point(seconds: float, *positions: float, **fields: Any) -> dict[str, Any]:
+    since = {"sec": int(seconds), "nanosec": round(seconds % 1 * 1e9)}
+    return {"positions": list(positions), "time_from_start": since} | fields
+
+
+def trajectory(*points: dict[str, Any], names: tuple[str, ...] = ("shoulder_pan",)) -> Any:
+    return {"joint_names": list(names), "points": list(points)}
+
+
+class Client:
+    """A client of the action in a process of ROS."""
+
+    def __init__(self, program: Program, robot: Robot) -> None:
+        self.program, self._robot = program, robot
+
+    async def send(self, name: str, sent: Any, **goal: Any) -> None:
+        await self.program.query(
+            "send", action=ACTION, type=FOLLOW, name=name, goal={"trajectory": sent} | goal
+        )
+        await self.program.hear("accepted", name=name)
+
+    async def result(self, name: str) -> tuple[str, int]:
+        found = await self.program.hear("result", name=name)
+        return found["status"], found["value"]["error_code"]
+
+    async def done(self, sent: Any, **goal: Any) -> tuple[str, str, int]:
+        """Send a goal, again where a busy machine let the gate stop it; return name and result."""
+        while True:
+            name = f"goal-{len(self.program.seen('accepted'))}"
+            await self.send(name, sent, **goal)
+            result = await self.result(name)
+            if not self._stopped(name):
+                return name, *result
+            await self._robot.becomes("idle")
+
+    async def moving(self, sent: Any, way: float) -> str:
+        """Send a goal until the first joint moves that way; return its name."""
+        while True:
+            name = f"goal-{len(self.program.seen('accepted'))}"
+            await self.send(name, sent)
+            now = self._robot
+            await until(
+                lambda: now.now.joints[0].velocity * way > 0.05 or self._stopped(name),  # noqa: B023
+                "it moves",
+            )
+            if not self._stopped(name):
+                return name
+            await self._robot.becomes("idle")
+
+    def _stopped(self, name: str) -> bool:
+        """Return whether the gate has stopped a goal, as it does where commands come late."""
+        found = self.program.seen("result", name=name)
+        return bool(found) and "no valid command for" in found[0]["value"]["error_string"]
+
+
+async def following(judge: Judge, robot: Robot) -> Client:
+    """Return a client that has found the action."""
+    client = Client(judge.start("navigate", node="arm_client"), robot)
+    await client.program.available(action=ACTION, type=FOLLOW)
+    return client
+
+
+async def test_joint_states_have_all_joints_of_the_arm(robot: Robot, judge: Judge) -> None:
+    listener = judge.start("listen")
+    await listener.query("subscribe", topic="/joint_states", type=STATES, qos={}, stream=True)
+    message = (await listener.hear("message", nth=10))["value"]
+    assert message["name"] == NAMES
+    assert message["position"] == pytest.approx(HOME, abs=SAG)
+    assert [len(message[field]) for field in ("velocity", "effort")] == [6, 6]
+    assert robot.now.gate.mode == "idle"
+
+
+async def test_a_goal_moves_the_arm_with_feedback_and_frees_it(robot: Robot, judge: Judge) -> None:
+    client = await following(judge, robot)
+    rest = {"velocities": [0.0, 0.0], "accelerations": [0.0, 0.0]}
+    there = trajectory(
+        point(0.0, pan(robot), robot.now.joints[2].position, **rest),
+        point(2.0, 0.6, 1.0, **rest),
+        names=("shoulder_pan", "elbow_flex"),
+    )
+    name, *result = await client.done(there)
+    assert result == ["succeeded", 0]
+    assert pan(robot) == pytest.approx(0.6, abs=NEAR)
+    assert robot.now.joints[2].position == pytest.approx(1.0, abs=NEAR)
+    assert robot.now.gate.commander == "ros2"
+    told = [one["value"] for one in client.program.seen("feedback", name=name)]
+    assert len(told) > 10
+    assert {tuple(one["joint_names"]) for one in told} == {tuple(NAMES)}
+    half = min(told, key=lambda one: abs(one["desired"]["positions"][0] - 0.3))
+    actual, desired = (half[part]["positions"][0] for part in ("actual", "desired"))
+    assert actual == pytest.approx(desired, abs=0.15)
+    assert half["error"]["positions"][0] == pytest.approx(desired - actual)
+    await robot.becomes("idle")
+    assert robot.now.gate.commander == ""
+
+
+async def test_goals_that_cannot_be_followed_have_codes_and_move_nothing(
+    robot: Robot, judge: Judge
+) -> None:
+    client, before = await following(judge, robot), pan(robot)
+    wrong = {
+        "fast": (trajectory(point(0.1, -1.5)), -1),
+        "far": (trajectory(point(5.0, 3.0)), -1),
+        "nan": (trajectory(point(5.0, float("nan"))), -1),
+        "huge": (trajectory(point(5.0, 1e308)), -1),
+        "late": (trajectory(point(2.0**31 - 1, 0.0)), -1),
+        "back": (trajectory(point(2.0, 0.1), point(1.0, 0.0)), -1),
+        "nobody": (trajectory(point(1.0, 0.0), names=("",)), -2),
+        "old": (trajectory(point(1.0, 0.0)) | {"header": {"stamp": {"sec": 1000}}}, -3),
+    }
+    for name, (sent, code) in wrong.items():
+        await client.send(name, sent)
+        assert (name, *await client.result(name)) == (name, "aborted", code)
+    assert robot.now.gate.mode == "idle"
+    assert pan(robot) == pytest.approx(before, abs=0.01)
+
+
+async def test_goals_are_cancelled_and_preempted(robot: Robot, judge: Judge) -> None:
+    client = await following(judge, robot)
+    first = await client.moving(trajectory(point(20.0, -1.5)), -1.0)
+    other = await client.moving(trajectory(point(20.0, 1.5)), 1.0)
+    assert await client.result(first) in (("aborted", 0), ("aborted", -1))
+    await client.program.query("cancel", name=other)
+    assert await client.result(other) == ("canceled", 0)
+    await until(lambda: abs(robot.now.joints[0].velocity) < 0.05, "it rests")
+    await robot.becomes("idle")
+
+
+async def test_a_tolerance_that_cannot_be_kept_ends_a_goal(robot: Robot, judge: Judge) -> None:
+    client = await following(judge, robot)
+    tight = [{"name": "shoulder_pan", "position": 1e-6}]
+    _, *result = await client.done(trajectory(point(3.0, -0.5)), path_tolerance=tight)
+    assert result == ["aborted", -4]
+    sharp = [{"name": "shoulder_pan", "position": 1e-9}]
+    _, *result = await client.done(trajectory(point(3.0, -0.5)), goal_tolerance=sharp)
+    assert result == ["aborted", -5]
+    await robot.becomes("idle")
+
+
+async def test_the_topic_moves_the_arm_and_wild_messages_are_named(
+    robot: Robot, judge: Judge
+) -> None:
+    sender, listener = judge.start("drive"), judge.start("listen", node="listener")
+    kind = "diagnostic_msgs/msg/DiagnosticArray"
+    await listener.query("subscribe", topic="/diagnostics", type=kind, qos={}, stream=True)
+
+    async def publish(message: Any) -> None:
+        await sender.query("publish", topic="/joint_trajectory", type=TRAJECTORY, value=message)
+
+    def refused() -> str:
+        heard = listener.seen("message", topic="/diagnostics")
+        lines = heard[-1]["value"]["status"] if heard else []
+        name = "gigabrain: joint_trajectory"
+        return next((one["message"] for one in lines if one["name"] == name), "")
+
+    while not refused():  # the subscription is found
+        await publish(trajectory(point(1.0, 0.1), names=("elbow",)))
+        await listener.hear("message", nth=len(listener.seen("message")))
+    await until(lambda: "no joint 'elbow'" in refused(), "it is named")
+    for count in (9_000, 1_500):  # too many for a message, and for the joint
+        await publish(trajectory(*(point(0.001 * n, 0.1) for n in range(1, count))))
+    await until(lambda: "would have to move" in refused(), "it is too fast")
+    assert robot.now.gate.mode == "idle"
+    while abs(pan(robot) - 0.3) > NEAR:  # on a busy machine the gate may stop it
+        await publish(trajectory(point(2.0, 0.3)))
+        await until(lambda: robot.now.gate.commander == "ros2", "it moves")
+        await robot.becomes("idle")
+    await until(lambda: "refused" not in refused(), "nothing is refused")
+
+
+async def test_the_example_moves_two_joints(robot: Robot, judge: Judge, ros2: Path) -> None:
+    command = (str(ros2), str(ROOT / "examples/ros2/move_arm.py"))
+    text = ""
+    while "ended with code 0" not in text:
+        process = await asyncio.create_subprocess_exec(
+            *command, env=judge.environment(), stdout=asyncio.subprocess.PIPE
+        )
+        text = (await process.communicate())[0].decode()
+        assert "ended with code 0" in text or "no valid command for" in text  # a busy machine
+        await robot.becomes("idle")
+    assert process.returncode == 0
+    assert "3 s: 0." in text
+
+
+async def test_an_estop_ends_a_goal_and_the_next_is_refused(robot: Robot, judge: Judge) -> None:
+    client = await following(judge, robot)
+    slow = await client.moving(trajectory(point(15.0, -1.5)), -1.0)
+    await press_estop(robot.bus, "a test")
+    assert await client.result(slow) == ("aborted", -1)
+    await robot.becomes("latched")
+    await until(lambda: abs(robot.now.joints[0].velocity) < 0.05, "it rests")
+    where = robot.now.joints_sent
+    await client.send("again", trajectory(point(1.0, 0.0)))
+    assert await client.result("again") == ("aborted", -1)
+    assert robot.now.joints_sent == where
+    await released(robot)
