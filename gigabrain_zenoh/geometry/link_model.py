@@ -107,6 +107,11 @@ class LinkModel:
             found.append(found[link.parent] @ place if link.parent >= 0 else place)
         return found
 
+    def place_in_base(self, name: str, positions: Mapping[str, float]) -> Place:
+        """Return the pose of the link with this name, likewise. Raises ValueError for no such."""
+        number = [link.name for link in self.links].index(name)
+        return self.places_in_base(positions)[number]
+
     def _add(self, top: xml.Element, reader: "_Reader") -> None:
         """Add the links and shapes below an element, without recursion: a text may be deep."""
         waiting: list[tuple[xml.Element, int, Place, str]] = [(top, 0, Place(), "")]
@@ -291,7 +296,8 @@ def _difference(a: Vector, b: Vector) -> Vector:
     return _sum(a, b, -1.0)
 
 
-def _cross(a: Sequence[float], b: Sequence[float]) -> Vector:
+def cross(a: Sequence[float], b: Sequence[float]) -> Vector:
+    """Return the cross product."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
@@ -313,7 +319,7 @@ def _of_z(along: Sequence[float]) -> Quaternion:
 def _of_axes(x: Sequence[float], y: Sequence[float]) -> Quaternion:
     """Return the rotation to a frame of which the x axis and the plane to y are given."""
     a = _unit(x)
-    c = _unit(_cross(a, y))
+    c = _unit(cross(a, y))
     to_z = _of_z(c)
     w, i, j, k = to_z
     in_plane = rotated((w, -i, -j, -k), _vector(a))

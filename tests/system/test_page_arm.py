@@ -3,6 +3,7 @@
 from collections.abc import AsyncIterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import pytest_asyncio
 from msgspec.structs import replace
@@ -13,6 +14,7 @@ from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import ArmModel, Body, BodyDescription, GateStatus, Joint, RobotState
 from gigabrain_schemas.brain import JointSpeeds
 from gigabrain_schemas.topics import ARM_MODEL, BODY, JOINT_TELEOP, STATE
+from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics
 from gigabrain_zenoh.testing.waiting import until
 from tests.places import ROOT
 from tests.system.fake_page import Fake, serving
@@ -175,6 +177,20 @@ async def test_a_joint_moves_while_its_button_is_held_and_at_the_speed_chosen(
     await fake.rests()
 
 
+async def test_the_tool_moves_along_an_axis_while_its_button_is_held(
+    chromium: Browser, fake: FakeArm
+) -> None:
+    page = await opened(chromium)
+    await hold(page, fake, "tool z up: hold to move it")
+    await page.wait_for_selector("#arm-status:has-text('tool z 6 cm/s')")
+    posture = np.array([0.95993, 0.1, 0.1, 0.1, 0.1])
+    _, jacobian = ArmKinematics(MODEL, CRANE.joints).jacobian(posture)
+    speeds = [fake.wanted[joint.name] for joint in CRANE.joints[:-1]]
+    assert jacobian[:3] @ speeds == pytest.approx([0.0, 0.0, 0.06], abs=0.01)
+    await page.mouse.up()
+    await fake.rests()
+
+
 async def test_the_enter_key_holds_a_button_as_well(chromium: Browser, fake: FakeArm) -> None:
     page = await opened(chromium)
     await page.get_by_label(PAN).focus()
@@ -242,6 +258,7 @@ async def test_a_viewer_sees_joints_without_buttons(chromium: Browser) -> None:
     assert await page.locator("#joints li").count() == 6
     assert not await page.get_by_label(PAN).is_visible()
     assert not await page.is_visible("#jog-share")
+    assert not await page.is_visible("#tool")
 
 
 async def test_the_arm_is_drawn_in_three_dimensions(chromium: Browser) -> None:

@@ -16,9 +16,8 @@ _versions = itertools.count(1)
 class ArmScene:
     """The shapes of an arm as a scene whose bodies are its links."""
 
-    def __init__(self, mjcf: str) -> None:
-        """Read a model. Raises ConfigError for text that is none."""
-        self._links = LinkModel(mjcf)
+    def __init__(self, links: LinkModel) -> None:
+        self._links = links
         self._version = next(_versions)
 
     def scene(self) -> SimScene:

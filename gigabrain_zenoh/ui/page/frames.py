@@ -30,7 +30,9 @@ from gigabrain_schemas.zones import SavedMapInfo, Zones, ZonesRequest
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.geometry.link_model import LinkModel
 from gigabrain_zenoh.ui.page.arm_scene import ArmScene
+from gigabrain_zenoh.ui.page.tool_jog import tool_speeds
 from gigabrain_zenoh.ui.steering import ViewerScene
 
 ABOUT, STATE, SCAN, MAP, HEALTH, LOG, REPLY, IMAGE, TASK = range(1, 10)  # to the browser
@@ -42,6 +44,7 @@ MAX_KEPT_LINES = 30  # of the log, for viewers that connect later
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
+ToolSpeed = Annotated[float, Meta(ge=-2.0, le=2.0)]  # [m/s]
 
 
 class About(Struct, frozen=True, kw_only=True):
@@ -76,7 +79,10 @@ class Login(Struct, frozen=True, forbid_unknown_fields=True):
 class Jog(Struct, frozen=True, forbid_unknown_fields=True):
     """Frame of an operator: speeds of joints while their buttons are held."""
 
-    speeds: Annotated[dict[Name, JointSpeed], Meta(max_length=MOST_ARM_JOINTS)]  # [rad/s or m/s]
+    speeds: Annotated[dict[Name, JointSpeed], Meta(max_length=MOST_ARM_JOINTS)] = {}
+    # [rad/s or m/s]
+    tool: tuple[ToolSpeed, ToolSpeed, ToolSpeed] | None = None
+    # [m/s], of the arm's tool, along x, y and z of the base
 
 
 class PageRequest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -196,6 +202,7 @@ class PageView(ViewerScene):
         bus.latest(topics.ZONES, self._on_zones)
         bus.latest(topics.OBJECT_MAP, lambda one: self._keep("objects", as_json(OBJECTS, one)))
         self.newest_of(topics.SIM_POSES)
+        self._links: LinkModel | None = None  # of an arm
         self._arm: ArmScene | None = None  # where no simulation sends its world
         self._arm_models = bus.latest(topics.ARM_MODEL, self._on_arm_model)
         self._scenes = bus.latest(topics.SIM_SCENE, self._on_scene)
@@ -234,6 +241,13 @@ class PageView(ViewerScene):
         yield from ((f"health/{name}", as_json(HEALTH, one)) for name, one in self.health.items())
         yield from ((f"log/{next(self._numbers)}", frame) for frame in self._lines)
 
+    def joint_speeds(self, jog: Jog) -> dict[str, float]:
+        """Return the speeds of joints [rad/s or m/s] that a browser wants."""
+        state = self.state.fresh()
+        if jog.tool is None or self._links is None or self.body is None or state is None:
+            return jog.speeds
+        return tool_speeds(self._links, self.body.description, state, jog.tool) | jog.speeds
+
     def on_rare(self, topic: topics.Topic[Any], message: Message) -> None:
         """Send a rare message at once, and keep it for later viewers."""
         if isinstance(message, Body):
@@ -257,13 +271,14 @@ class PageView(ViewerScene):
 
     def _on_arm_model(self, model: ArmModel) -> None:
         """Show an arm by its model, unless a simulation shows it."""
-        if self._scenes.newest:
-            return
+        self._links = self._arm = None
         try:
-            self._arm = ArmScene(model.mjcf)
+            self._links = LinkModel(model.mjcf)
         except ConfigError as error:
             log.warning("%s", error)
-        else:
+            return
+        if not self._scenes.newest:
+            self._arm = ArmScene(self._links)
             self._keep("scene", as_json(SCENE, self._arm.scene()))
 
     def _on_zones(self, zones: Zones) -> None:

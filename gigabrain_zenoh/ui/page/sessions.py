@@ -341,7 +341,7 @@ class Sessions:
             if not self._arbiter.drive(viewer.number, frames.drive_of(content), now_s):
                 self._reply(viewer, OTHER_STEERS)
         elif kind == bytes((frames.JOG,)):
-            speeds = frames.decoded(content, Jog).speeds
+            speeds = self._view.joint_speeds(frames.decoded(content, Jog))
             if not self._arbiter.jog(viewer.number, speeds, now_s):
                 self._reply(viewer, OTHER_STEERS)
         elif kind == bytes((frames.ASK,)):

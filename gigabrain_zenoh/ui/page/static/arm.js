@@ -2,6 +2,8 @@
 import { makeElement, setText } from './panels.js'
 
 const PERIOD_MS = 40
+const TOOL_SPEED = 0.3 // [m/s] at most
+const AXES = ['x', 'y', 'z'] // of the base
 const AT_REST_SPEED = 0.05 // [rad/s] or [m/s]
 const LIMP = 'limp: let go of, so it may fall. “gigabrain arm hold” holds it'
 
@@ -20,12 +22,15 @@ function activity(state) {
 export class Arm {
   #joints = []
   #rows = new Map() // by joint
-  #held = new Map() // by button that is held: the joint, and 1 or -1
-  #sent = [] // joints of the last speeds sent; empty when all are released
+  #held = new Map() // by button that is held: the joint or the axis of the tool, and 1 or -1
+  #sent = [] // what was held when speeds were sent last
 
-  /** `send(speeds)` sends the speeds of joints, `allowed()` says whether they may be moved now. */
-  constructor({ list, speedShare, send, allowed, show }) {
+  /** `send(speeds, tool)` sends speeds of joints and of the tool, `allowed()` says whether they may be moved now. */
+  constructor({ list, tool, speedShare, send, allowed, show }) {
     Object.assign(this, { list, speedShare, send, allowed, show })
+    tool.append('tool', ...AXES.flatMap((name, axis) => [
+      this.#makeButton({ axis, way: -1 }, `tool ${name}`, '−'), makeElement('span', name), this.#makeButton({ axis, way: 1 }, `tool ${name}`, '+'),
+    ]))
     addEventListener('blur', () => this.releaseAll())
     document.addEventListener('visibilitychange', () => this.releaseAll())
     setInterval(() => this.#sendWanted(), PERIOD_MS)
@@ -56,11 +61,17 @@ export class Arm {
   #sendWanted() {
     const held = this.allowed() ? [...this.#held.values()] : []
     if (!held.length && !this.#sent.length) return
-    const speeds = Object.fromEntries(this.#sent.map((name) => [name, 0]))
-    for (const { joint, way } of held) speeds[joint.name] = (speeds[joint.name] ?? 0) + way * this.speedShare() * joint.max_speed
-    this.#sent = held.map(({ joint }) => joint.name)
-    this.send(speeds)
-    this.show(held.map(({ joint }) => `${joint.name} ${inUnit(joint, speeds[joint.name], '/s')}`).join(' · ') || 'released')
+    const all = [...this.#sent, ...held], speeds = {}, tool = all.some(({ axis }) => axis != null) ? [0, 0, 0] : undefined
+    for (const { joint } of all) if (joint) speeds[joint.name] = 0
+    for (const { joint, axis, way } of held) {
+      if (joint) speeds[joint.name] += way * this.speedShare() * joint.max_speed
+      else tool[axis] += way * this.speedShare() * TOOL_SPEED
+    }
+    this.#sent = held
+    this.send(speeds, tool)
+    this.show(held.map(({ joint, axis }) => (
+      joint ? `${joint.name} ${inUnit(joint, speeds[joint.name], '/s')}` : `tool ${AXES[axis]} ${(100 * tool[axis]).toFixed(0)} cm/s`
+    )).join(' · ') || 'released')
   }
 
   #makeRow(joint) {
@@ -72,14 +83,15 @@ export class Arm {
     range.setAttribute('aria-valuemax', joint.upper)
     range.title = `${inUnit(joint, joint.lower)} to ${inUnit(joint, joint.upper)}`
     range.append(sent, here)
-    row.append(this.#makeButton(joint, -1, '−'), makeElement('span', joint.name), number, range, more, this.#makeButton(joint, 1, '+'))
+    const button = (way, text) => this.#makeButton({ joint, way }, joint.name, text)
+    row.append(button(-1, '−'), makeElement('span', joint.name), number, range, more, button(1, '+'))
     return { row, range, sent, here, number, more }
   }
 
-  #makeButton(joint, way, text) {
+  #makeButton(moves, name, text) {
     const button = makeElement('button', text, 'jog')
-    button.setAttribute('aria-label', `${joint.name} ${way > 0 ? 'up' : 'down'}: hold to move it`)
-    const hold = () => { this.#held.set(button, { joint, way }); this.#sendWanted() }
+    button.setAttribute('aria-label', `${name} ${moves.way > 0 ? 'up' : 'down'}: hold to move it`)
+    const hold = () => { this.#held.set(button, moves); this.#sendWanted() }
     const release = () => { if (this.#held.delete(button)) this.#sendWanted() }
     button.addEventListener('pointerdown', (event) => {
       if (event.button > 0) return

@@ -42,8 +42,8 @@ export class Link {
     this.#socket.send(frame.buffer)
   }
 
-  /** Send the speeds of joints. */
-  jog(speeds) { this.#tell(JOG, { speeds }) }
+  /** Send the speeds of joints, and that of the tool. */
+  jog(speeds, tool) { this.#tell(JOG, { speeds, tool }) }
 
   /** Say which pictures are wanted. */
   watch(wanted) { this.#tell(WATCH, wanted) }

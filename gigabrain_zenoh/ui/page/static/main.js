@@ -10,7 +10,7 @@ import { Settings } from './settings.js'
 import { WorldView } from './world_view.js'
 import { Zones } from './zones.js'
 
-const ARM_DISTANCE_M = 1.3 // from which an arm is seen
+const ARM_DISTANCE_M = 0.9 // from which an arm is seen
 const NARROW_PX = 860 // below, the page is that of a phone; see style.css
 const STOP_TIMEOUT_MS = 2500 // the server gives up after two seconds
 const BY_HAND = 'press the hardware e-stop or cut the power'
@@ -120,7 +120,8 @@ const drive = new Drive({
 const arm = new Arm({
   list: $('joints'),
   speedShare: () => $('jog-share').value / 100,
-  send: (speeds) => link.jog(speeds),
+  tool: $('tool'),
+  send: (speeds, tool) => link.jog(speeds, tool),
   allowed: mayDrive,
   show: (text) => setText($('arm-status'), text),
 })

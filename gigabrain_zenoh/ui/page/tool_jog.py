@@ -1,0 +1,70 @@
+"""Speeds of joints that move an arm's tool along a line, by damped least squares."""
+
+import math
+from collections.abc import Sequence
+
+from gigabrain_schemas.body import BodyDescription, JointDescription, RobotState
+from gigabrain_zenoh.geometry.link_model import LinkModel, Vector, cross
+
+DAMPING_M = 0.02  # [m/rad]; where joints move the tool less than that, they are left out
+STEP = 1e-5  # [rad] or [m], by which positions are varied
+NEAR_LIMIT = 0.02  # [rad] or [m], within which a joint moves no nearer to the end of its range
+
+
+def tool_speeds(
+    model: LinkModel, body: BodyDescription, state: RobotState, wanted: Vector
+) -> dict[str, float]:
+    """Return the speeds of the arm's joints at which its tool moves by `wanted` [m/s].
+
+    The direction that the tool looks in is not kept. All are slower where one would be too fast.
+    Empty where the model has no such tool, or a joint is not measured.
+    """
+    at = {joint.name: joint.position for joint in state.joints}
+    tool = body.arm.tool if body.arm else ""
+    joints = [joint for joint in body.joints if joint.part == "arm"]
+    if tool not in (link.name for link in model.links) or any(j.name not in at for j in joints):
+        return {}
+    columns = {joint.name: _gradient(model, tool, at, joint.name) for joint in joints}
+    free = list(joints)
+    while True:
+        speeds = _least_squares([columns[joint.name] for joint in free], wanted)
+        pairs = list(zip(free, speeds, strict=True))
+        still = [joint for joint, speed in pairs if not _at_end(joint, at[joint.name], speed)]
+        if len(still) == len(free):
+            break
+        free = still
+    over = max([1.0, *(abs(speed) / joint.max_speed for joint, speed in pairs)])
+    found = {joint.name: speed / over for joint, speed in pairs}
+    return {joint.name: found.get(joint.name, 0.0) for joint in joints}
+
+
+def _gradient(model: LinkModel, tool: str, at: dict[str, float], joint: str) -> Vector:
+    """Return how far the tool moves for a joint's position [m/rad or m/m], along x, y and z."""
+    here, there = (
+        model.place_in_base(tool, {**at, joint: at[joint] + step}).position
+        for step in (-STEP, STEP)
+    )
+    x, y, z = ((b - a) / (2 * STEP) for a, b in zip(here, there, strict=True))
+    return x, y, z
+
+
+def _at_end(joint: JointDescription, position: float, speed: float) -> bool:
+    left = joint.upper - position if speed > 0 else position - joint.lower
+    return speed != 0 and left < NEAR_LIMIT
+
+
+def _least_squares(columns: Sequence[Vector], wanted: Vector) -> list[float]:
+    """Return Jᵀ (J Jᵀ + λ² I)⁻¹ v, for the columns of J."""
+    damping = DAMPING_M**2
+    rows = [[column[axis] for column in columns] for axis in range(3)]
+    a, b, c = (
+        [_dot(rows[i], rows[j]) + (damping if i == j else 0.0) for j in range(3)] for i in range(3)
+    )
+    bc, ca, ab = cross(b, c), cross(c, a), cross(a, b)
+    whole = _dot(a, bc)  # the determinant; the matrix is symmetric
+    by = [_dot(wanted, part) / whole for part in (bc, ca, ab)]
+    return [_dot(column, by) for column in columns]
+
+
+def _dot(a: Sequence[float], b: Sequence[float]) -> float:
+    return math.fsum(x * y for x, y in zip(a, b, strict=True))

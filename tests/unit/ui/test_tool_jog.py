@@ -1,0 +1,94 @@
+"""An arm's tool goes where the page's buttons send it, and no joint beyond its range or speed."""
+
+import math
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_drivers.driver.catalog import load_robot
+from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.body import BodyDescription, Joint, RobotState
+from gigabrain_zenoh.geometry.link_model import LinkModel
+from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics
+from gigabrain_zenoh.ui.page.tool_jog import tool_speeds
+from tests.places import ROOT
+
+BODIES = ROOT / "drivers/gigabrain_drivers/bodies"
+ALONG = [(0.06, 0.0, 0.0), (0.0, -0.06, 0.0), (0.0, 0.0, 0.06), (-0.03, 0.03, -0.03)]
+READY = {
+    "so101": {"shoulder_lift": 0.1, "elbow_flex": 0.3, "wrist_flex": 0.6},
+    "piper": {"joint2": 1.2, "joint3": -1.2, "joint5": 0.4},
+}
+
+
+class Jogged:
+    """An arm whose joints move as they are told."""
+
+    def __init__(self, body: str) -> None:
+        mjcf = (BODIES / body / "model.xml").read_text("utf-8")
+        self.about: BodyDescription = load_robot(body).description()
+        self.model = LinkModel(mjcf)
+        self.judge = ArmKinematics(mjcf, self.about.joints)
+        self.at = {joint.name: READY[body].get(joint.name, 0.0) for joint in self.about.joints}
+
+    def speeds(self, wanted: tuple[float, float, float]) -> dict[str, float]:
+        joints = tuple(Joint(name=name, position=place) for name, place in self.at.items())
+        state = RobotState(
+            robot_type="arm", pose=Pose(x=0.0, y=0.0, yaw=0.0), velocity=Velocity(), joints=joints
+        )
+        return tool_speeds(self.model, self.about, state, wanted)
+
+    def go(self, wanted: tuple[float, float, float], seconds: float) -> None:
+        for _ in range(round(seconds / 0.04)):
+            for name, speed in self.speeds(wanted).items():
+                self.at[name] += 0.04 * speed
+
+    @property
+    def tool(self) -> np.ndarray:
+        return self.judge.forward(np.array([self.at[name] for name in self.judge.names])).position
+
+
+@pytest.mark.parametrize("body", ["so101", "piper"])
+@pytest.mark.parametrize("wanted", ALONG)
+def test_the_tool_moves_along_the_line(body: str, wanted: tuple[float, float, float]) -> None:
+    arm = Jogged(body)
+    before, gripper = arm.tool, arm.at[arm.about.joints[-1].name]
+    arm.go(wanted, 0.8)
+    assert arm.tool - before == pytest.approx(np.multiply(0.8, wanted), abs=0.002)
+    assert arm.at[arm.about.joints[-1].name] == gripper
+
+
+def test_at_the_edge_of_its_reach_no_joint_is_too_fast_or_leaves_its_range() -> None:
+    arm = Jogged("so101")
+    limits = {joint.name: joint for joint in arm.about.joints}
+    for wanted in ((2.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.0, -2.0), (0.0, 0.0, 2.0)):
+        for _ in range(100):
+            speeds = arm.speeds(wanted)
+            assert all(abs(s) <= limits[name].max_speed + 1e-9 for name, s in speeds.items())
+            for name, speed in speeds.items():
+                arm.at[name] += 0.005 * speed
+                assert limits[name].lower <= arm.at[name] <= limits[name].upper
+    assert not any(arm.speeds((0.0, 0.0, 0.0)).values())
+
+
+def test_a_joint_at_its_end_stays_and_others_go_on() -> None:
+    arm = Jogged("so101")
+    arm.at["shoulder_pan"] = 1.9
+    toward = math.copysign(0.05, arm.tool[1])
+    speeds = arm.speeds((0.0, toward, 0.0))
+    back = arm.speeds((0.0, -toward, 0.0))
+    assert speeds["shoulder_pan"] * back["shoulder_pan"] <= 0
+    assert 0.0 in (speeds["shoulder_pan"], back["shoulder_pan"])
+    assert any(speeds.values())
+    assert any(back.values())
+
+
+def test_without_the_tool_or_a_measured_joint_nothing_moves() -> None:
+    arm = Jogged("so101")
+    del arm.at["elbow_flex"]
+    assert arm.speeds((0.1, 0.0, 0.0)) == {}
+    arm = Jogged("so101")
+    assert arm.about.arm
+    arm.about = replace(arm.about, arm=replace(arm.about.arm, tool="none"))
+    assert arm.speeds((0.1, 0.0, 0.0)) == {}
