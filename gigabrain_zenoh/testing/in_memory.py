@@ -171,7 +171,15 @@ class RobotInMemory:
     Time passes in `go` alone, in ticks of 20 ms.
     """
 
-    def __init__(self, folder: Path, *, resume: Resume = "auto", button: bool = False) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        resume: Resume = "auto",
+        button: bool = False,
+        make_body: type[RecordedBody] = RecordedBody,
+    ) -> None:
+        self._make_body = make_body
         self.network, self.clock = LocalNetwork(), FakeClock()
         self._config = DriverConfig(
             body="mock", resume=resume, state_dir=str(folder), button=button
@@ -202,10 +210,11 @@ class RobotInMemory:
 
     def start_driver(self) -> None:
         """Start the driver's process, with a body at rest."""
-        robot = load_robot("mock")
-        self.body = RecordedBody(robot, MockOptions(driver="mock"), Run(folder=Path()))
+        self.body = self._make_body(
+            load_robot("mock"), MockOptions(driver="mock"), Run(folder=Path())
+        )
         bus = Bus(self.network.transport(), self.clock, "driver")
-        process = DriverProcess(self._config, robot, self.body, bus)
+        process = DriverProcess(self._config, self.body.robot, self.body, bus)
         self._running["driver"] = asyncio.ensure_future(process.run(lambda: None)), bus
 
     async def kill(self, name: str) -> None:

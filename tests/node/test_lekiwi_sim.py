@@ -19,6 +19,7 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics
 from gigabrain_zenoh.safety.arm_shape import MujocoArm
 
+ONTO_ITS_PLATE = (0.0, 0.1, 1.1, 0.5, 0.0, 0.0)
 SETTLE_STEPS, DRIVE_STEPS = 50, 200  # of 10 ms
 MODEL = catalog.robot_path("lekiwi").with_name("model.xml")
 SO101 = mujoco.MjModel.from_xml_path(str(catalog.robot_path("so101").with_name("model.xml")))
@@ -112,12 +113,11 @@ def test_the_brain_knows_its_base_by_the_text_alone() -> None:
     pairs = {shape.describe(pair) for pair in range(len(shape.levers))}
     assert ("self", "base", "arm_gripper") in pairs
     assert ("floor", "arm_gripper", "the floor") in pairs
-    home = np.array(robot.arm.home)  # type: ignore[union-attr]
-    clear = robot.thresholds.arm_clearance
-    assert not len(shape.near(home, np.full(len(shape.levers), clear)).pairs)
-    onto_its_plate = np.array((0.0, 0.1, 1.1, 0.5, 0.0, 0.0))
-    touched = shape.near(onto_its_plate, np.zeros(len(shape.levers))).pairs
-    assert {shape.describe(pair)[:2] for pair in touched.tolist()} == {("self", "base")}
+    postures = np.array((robot.arm.home, ONTO_ITS_PLATE))  # type: ignore[union-attr]
+    within = np.full((2, len(shape.levers)), robot.thresholds.arm_clearance)
+    near = shape.near(postures, within)
+    assert set(near.where.tolist()) == {1}
+    assert {shape.describe(pair)[:2] for pair in near.pairs.tolist()} == {("self", "base")}
 
 
 def test_it_reaches_what_the_so101_reaches_from_its_top_plate() -> None:

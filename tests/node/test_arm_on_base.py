@@ -1,0 +1,71 @@
+"""A base that carries an arm, by all of the robot's processes in memory."""
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from msgspec.structs import replace
+
+from gigabrain_drivers.bodies.mock.driver import MockOptions
+from gigabrain_drivers.driver.catalog import load_robot, robot_path
+from gigabrain_drivers.driver.robot import RobotFile, Run
+from gigabrain_schemas.base import Velocity
+from gigabrain_schemas.body import Joint, RobotState
+from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.topics import CMD_VEL
+from gigabrain_zenoh import codec
+from gigabrain_zenoh.testing.in_memory import RecordedBody, RobotInMemory
+
+LEKIWI = load_robot("lekiwi")
+assert LEKIWI.arm
+ARM = LEKIWI.arm
+
+
+class Carrier(RecordedBody):
+    """A body in memory with LeKiwi's arm, which is at once where it is sent."""
+
+    def __init__(self, robot: RobotFile, options: MockOptions, run: Run) -> None:
+        carrier = replace(robot, joints=LEKIWI.joints, arm=ARM)
+        folder = robot_path("lekiwi").parent
+        super().__init__(carrier, options, replace(run, folder=folder))
+        names = (joint.name for joint in LEKIWI.joints)
+        self.at = dict(zip(names, ARM.home, strict=True))
+        self.asked: list[float] = []  # forward [m/s]
+        self.while_sending: Callable[[], None] = lambda: None
+
+    async def set_joint_positions(self, positions: Mapping[str, float]) -> Mapping[str, float]:
+        self.at |= positions
+        self.while_sending()
+        return dict(positions)
+
+    async def set_base_velocity(
+        self, linear_x: float, linear_y: float, angular_z: float
+    ) -> Velocity:
+        self.asked.append(linear_x)
+        return await super().set_base_velocity(linear_x, linear_y, angular_z)
+
+    async def read_state(self) -> RobotState:
+        joints = tuple(Joint(name=name, position=at) for name, at in self.at.items())
+        return replace(await super().read_state(), joints=joints)
+
+
+async def test_what_arrives_while_joints_are_sent_holds_for_the_wheels_at_once(
+    tmp_path: Path,
+) -> None:
+    async with RobotInMemory(tmp_path, make_body=Carrier) as robot:
+        await robot.go(200)
+        body = robot.body
+        assert isinstance(body, Carrier)
+        assert body.asked[-1] > 0.2
+        assert tuple(body.at.values()) == ARM.home
+
+        def say_nonsense() -> None:
+            assert robot.state
+            body.while_sending = lambda: None
+            body.asked.clear()
+            wrong = CmdVel(linear_x=math.nan, source="control", boot=robot.state.boot)
+            robot.network.deliver(CMD_VEL.at(), codec.encode(wrong))
+
+        body.while_sending = say_nonsense
+        await robot.go(2)
+        assert body.asked[0] == 0.0
