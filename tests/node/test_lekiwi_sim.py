@@ -113,7 +113,8 @@ def test_the_brain_knows_its_base_by_the_text_alone() -> None:
     pairs = {shape.describe(pair) for pair in range(len(shape.levers))}
     assert ("self", "base", "arm_gripper") in pairs
     assert ("floor", "arm_gripper", "the floor") in pairs
-    postures = np.array((robot.arm.home, ONTO_ITS_PLATE))  # type: ignore[union-attr]
+    assert robot.arm
+    postures = np.array([robot.arm.home, ONTO_ITS_PLATE])
     within = np.full((2, len(shape.levers)), robot.thresholds.arm_clearance)
     near = shape.near(postures, within)
     assert set(near.where.tolist()) == {1}
