@@ -23,7 +23,6 @@ from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner
 from gigabrain_zenoh.qa.bench.hands import ArmInMemory
 from gigabrain_zenoh.testing.waiting import PATIENCE_S
 
-MODEL = robot_path("so101").with_name("model.xml").read_text()
 CUBE = """<mujoco><worldbody>
   <geom name="floor" type="plane" size="2 2 .1"/>
   <body name="thing" pos="{x} {y} 0.015"><freejoint/>
@@ -42,16 +41,23 @@ def waits(job: Future[Any], _patience_s: float) -> bool:
 class Rig:
     """An arm with a queue of tasks."""
 
-    def __init__(self, folder: Path, cube: tuple[float, float] = THERE, mjcf: str = MODEL) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        cube: tuple[float, float] = THERE,
+        mjcf: str | None = None,
+        body: str = "so101",
+    ) -> None:
         (folder / "thing.xml").write_text(CUBE.format(x=cube[0], y=cube[1]))
         world = folder / "world.yaml"
         world.write_text("model: thing.xml\nstart: [0.0, 0.0, 0.0]\n")
-        robot, _, options, model_folder = load_link("so101", Run(folder=Path()))
+        robot, _, options, model_folder = load_link(body, Run(folder=Path()))
         assert isinstance(options, MujocoOptions)
         self.arm = ArmInMemory(robot, sim_body(robot, options, Run(folder=model_folder)), world)
+        text = mjcf or robot_path(body).with_name("model.xml").read_text()
         bus: Any = SimpleNamespace(
             input_log=SimpleNamespace(in_time=waits),
-            latest=lambda _topic: SimpleNamespace(current=ArmModel(mjcf=mjcf)),
+            latest=lambda _topic: SimpleNamespace(current=ArmModel(mjcf=text)),
         )
         self.manipulator = Manipulator(bus, "navigate")
         self.queue = TaskQueue(lambda _topic: None, lambda _script: None, Saved())  # type: ignore[arg-type, return-value]
@@ -109,7 +115,9 @@ def rig(tmp_path: Path) -> Any:
 THINGS = "things: {cube: {box: [0.03, 0.03, 0.03], at: [0.2388, 0.0, 0.015]}}\n"
 
 
-def test_a_cube_is_picked_up_and_put_down_there_and_back(rig: Rig) -> None:
+@pytest.mark.parametrize("body", ["so101", "piper"])
+def test_one_mission_moves_a_cube_there_and_back_by_any_arm(tmp_path: Path, body: str) -> None:
+    rig = Rig(tmp_path, body=body)
     task = rig.carry_out(
         THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]},"
         " {pick: cube}, {place: [0.2388, 0.0, 0.015]}, {posture: home}]"
@@ -117,6 +125,7 @@ def test_a_cube_is_picked_up_and_put_down_there_and_back(rig: Rig) -> None:
     assert (task.state, task.reason) == ("succeeded", "")
     assert rig.arm.thing()[:2] == pytest.approx(THERE, abs=0.01)
     assert rig.arm.broken == 0
+    rig.manipulator.close()
 
 
 def test_the_tool_reaches_a_point_from_the_asked_direction(rig: Rig) -> None:
