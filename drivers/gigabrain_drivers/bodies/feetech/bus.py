@@ -9,7 +9,7 @@ from gigabrain_drivers.links.frames import Spelling, Wording
 from gigabrain_drivers.links.link import Link
 from gigabrain_zenoh.clock import Clock
 
-ANSWER_TIMEOUT_NS = 2_000_000  # of a cycle's, for each servo; USB adds 1 ms each way
+ANSWER_TIMEOUT_NS = 3_000_000  # of a cycle's, for each servo; USB adds 1 ms each way
 PATIENT_TIMEOUT_NS = 60_000_000  # of an answer that must come, on a host that is busy
 
 ATTEMPTS = 4  # of a question that must be answered
