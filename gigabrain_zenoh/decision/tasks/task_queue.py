@@ -20,15 +20,13 @@ from gigabrain_zenoh.decision.behaviours import (
 )
 from gigabrain_zenoh.decision.known_objects import Seek, Wanted, named
 from gigabrain_zenoh.decision.tasks.behaviour_tree import (
-    MissionContext,
     Progress,
-    StartScript,
     TreeBuilder,
     progress_of,
     restore,
-    seek_nothing,
 )
 from gigabrain_zenoh.decision.tasks.conditions import Read
+from gigabrain_zenoh.decision.tasks.leaves import MissionContext, StartScript, seek_nothing
 from gigabrain_zenoh.decision.tasks.mission import Mission, find_mission, goal_mission, loads
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file

@@ -1,0 +1,260 @@
+"""Leaves of mission trees, for py-trees: they drive, move the arm, wait, check, or run a program.
+
+All use the robot's time.
+"""
+
+import math
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field
+
+from py_trees.behaviour import Behaviour
+from py_trees.common import Status
+
+from gigabrain_schemas.tasks import Goal
+from gigabrain_zenoh.decision.behaviours import (
+    ArmCommand,
+    Command,
+    DriveCommand,
+    DriveKind,
+    StepOutcome,
+    describe_goal,
+)
+from gigabrain_zenoh.decision.known_objects import Seek, Sought, Wanted, named
+from gigabrain_zenoh.decision.tasks.arm_steps import ArmAction, Solid, describe
+from gigabrain_zenoh.decision.tasks.conditions import Condition, Read
+from gigabrain_zenoh.decision.tasks.mission import Script
+from gigabrain_zenoh.decision.tasks.scripts import Run
+
+StartScript = Callable[[Script], Run]
+MOVED_M = 0.15  # that a target may be off where the robot drives to
+
+NOBODY_LOOKS = "waiting: nothing is recognised in pictures; run the process `recognition`"
+
+
+def seek_nothing(_wanted: Wanted, _without: Collection[int], _preferred: int | None) -> Sought:
+    """Return that nothing is known."""
+    return Sought()
+
+
+@dataclass
+class MissionContext:
+    """Inputs and outputs of a mission's nodes in one tick. Time stops while a mission waits."""
+
+    read: Read
+    start: StartScript
+    numbers: Iterator[int]  # of commands, each only once
+    seek: Seek = seek_nothing
+    now_s: float = 0.0
+    held_s: float = 0.0  # of that, while the body did not follow a command
+    outcome: StepOutcome | None = None  # of the command of the last tick
+    command: Command | None = None  # of the active node
+    things: dict[str, Solid] = field(default_factory=dict)  # what stands round the arm by now
+    doing: str = ""  # the active step, for people
+    problem: str = ""  # the last failure, for people
+    progress: float | None = None  # of a step that does not drive
+    left_s: float | None = None  # until such a step is done, if known
+
+    @property
+    def free_s(self) -> float:
+        """Time that the mission has run while nothing held the body [s]."""
+        return self.now_s - self.held_s
+
+    def begin(self, seconds: float, outcome: StepOutcome | None) -> None:
+        """Begin the next tick, `seconds` after the last."""
+        self.now_s += seconds
+        if outcome and outcome.held:
+            self.held_s += seconds
+        self.outcome, self.command, self.doing = outcome, None, ""
+        self.progress = self.left_s = None
+
+
+class Leaf(Behaviour):
+    """A node without children."""
+
+    def __init__(self, name: str, context: MissionContext) -> None:
+        super().__init__(name)
+        self.context = context
+
+    def failed(self, why: str) -> Status:
+        """Record why the node failed, and return FAILURE."""
+        self.context.problem = why
+        return Status.FAILURE
+
+
+class DriveNode(Leaf):
+    """Issues a drive command, and ends with its outcome."""
+
+    def __init__(
+        self, kind: DriveKind, context: MissionContext, goal: Goal | None = None, place: str = ""
+    ) -> None:
+        doing = {"explore": "exploring", "visit": "visiting a place"}.get(kind)
+        super().__init__(doing or f"going to {place or (goal and describe_goal(goal))}", context)
+        self._command = DriveCommand(0, kind, goal)
+        self._prefix = f"{place}: " if place else ""
+
+    def initialise(self) -> None:
+        """Begin anew."""
+        self._command = DriveCommand(
+            next(self.context.numbers), self._command.kind, self._command.goal
+        )
+
+    def update(self) -> Status:
+        """Go on by one tick."""
+        outcome, self.context.doing = self.context.outcome, self.name
+        if outcome and outcome.number == self._command.number and outcome.state != "running":
+            done = outcome.state == "done"
+            return Status.SUCCESS if done else self.failed(self._prefix + outcome.reason)
+        self.context.command = self._command
+        return Status.RUNNING
+
+
+class ArmNode(Leaf):
+    """Issues a command to the arm, ends with its outcome, and records where things are then."""
+
+    def __init__(self, action: ArmAction, context: MissionContext) -> None:
+        super().__init__(describe(action), context)
+        self._action = action
+        self._command: ArmCommand | None = None
+
+    def initialise(self) -> None:
+        """Begin anew."""
+        number, things = next(self.context.numbers), dict(self.context.things)
+        self._command = ArmCommand(number, self._action, things)
+
+    def update(self) -> Status:
+        """Go on by one tick."""
+        outcome, self.context.doing = self.context.outcome, self.name
+        assert self._command
+        if outcome and outcome.number == self._command.number and outcome.state != "running":
+            if outcome.picked:
+                self.context.things.pop(outcome.picked, None)
+            if outcome.placed:
+                name, solid = outcome.placed
+                self.context.things[name] = solid
+            done = outcome.state == "done"
+            return Status.SUCCESS if done else self.failed(f"{self.name}: {outcome.reason}")
+        self.context.command = self._command
+        return Status.RUNNING
+
+
+class SeekNode(Leaf):
+    """Drives before the nearest wanted thing or tag, and looks for one while none is known."""
+
+    def __init__(self, wanted: Wanted, context: MissionContext) -> None:
+        super().__init__(f"looking for {named(wanted)}", context)
+        self._wanted = wanted
+        self._command = DriveCommand(0, "look")
+        self._id: int | None = None  # of the target
+        self._seek = 0
+        self._missed: dict[int, str] = {}  # ids that it cannot get to, and why
+
+    def initialise(self) -> None:
+        """Begin anew."""
+        self._seek = next(self.context.numbers)
+        self._command, self._id = DriveCommand(self._seek, "look", seek=self._seek), None
+        self._missed = {}
+
+    def update(self) -> Status:
+        """Go on by one tick."""
+        outcome = self.context.outcome
+        if outcome and outcome.number == self._command.number and outcome.state != "running":
+            if self._command.kind == "look":
+                return self.failed(self._why(outcome.reason))
+            if outcome.state == "done":
+                return Status.SUCCESS
+            if self._id is not None:
+                self._missed[self._id] = outcome.reason
+        found = self.context.seek(self._wanted, self._missed, self._id)
+        self._choose(found)
+        target = self._command.target
+        self.context.doing = f"going before {target.name}" if target else self.name
+        if target is None and not found.recognizing:
+            self.context.doing = NOBODY_LOOKS
+        else:
+            self.context.command = self._command
+        return Status.RUNNING
+
+    def _choose(self, found: Sought) -> None:
+        """Give another command if there is another target, or if it is somewhere else."""
+        target, before = found.target, self._command.target
+        if target is None:
+            if before or self._command.kind != "look":
+                number = next(self.context.numbers)
+                self._command, self._id = DriveCommand(number, "look", seek=self._seek), None
+            return
+        off = math.hypot(target.x - before.x, target.y - before.y) if before else math.inf
+        if found.id != self._id or off > MOVED_M:
+            number = next(self.context.numbers)
+            self._command = DriveCommand(number, "approach", target=target)
+            self._id = found.id
+
+    def _why(self, reason: str) -> str:
+        text = f"{named(self._wanted)} was not found: {reason}"
+        if self._missed:
+            text = "; ".join((*dict.fromkeys(self._missed.values()), text))
+        return text
+
+
+class WaitNode(Leaf):
+    """Succeeds after some seconds of the robot's time."""
+
+    def __init__(self, seconds: float, context: MissionContext) -> None:
+        super().__init__(f"waiting {seconds:g} s", context)
+        self._seconds, self._until_s = seconds, 0.0
+
+    def initialise(self) -> None:
+        """Begin anew."""
+        self._until_s = self.context.now_s + self._seconds
+
+    def update(self) -> Status:
+        """Go on by one tick."""
+        left_s = self._until_s - self.context.now_s
+        if left_s <= 1e-9:
+            return Status.SUCCESS
+        self.context.doing, self.context.left_s = self.name, left_s
+        self.context.progress = 1.0 - left_s / self._seconds
+        return Status.RUNNING
+
+
+class ConditionNode(Leaf):
+    """Succeeds if a condition holds; otherwise waits or fails. An unknown value does not hold."""
+
+    def __init__(self, condition: Condition, context: MissionContext, *, waits: bool) -> None:
+        super().__init__(f"{'waiting until' if waits else 'checking'} {condition.text}", context)
+        self._condition, self._waits = condition, waits
+
+    def update(self) -> Status:
+        """Go on by one tick."""
+        self.context.doing = self.name
+        holds = self._condition.holds(self.context.read)
+        if holds or self._waits:
+            return Status.SUCCESS if holds else Status.RUNNING
+        why = "is not known" if holds is None else "does not hold"
+        return self.failed(f"{self._condition.text} {why}")
+
+
+class ScriptNode(Leaf):
+    """Runs a program of the host, which ends with the node."""
+
+    def __init__(self, script: Script, context: MissionContext) -> None:
+        super().__init__(f"running {script.run}", context)
+        self._script = script
+        self._running: Run | None = None
+
+    def initialise(self) -> None:
+        """Begin anew."""
+        self._running = self.context.start(self._script)
+
+    def update(self) -> Status:
+        """Go on by one tick."""
+        self.context.doing = self.name
+        result = self._running.result if self._running else None
+        if result is None:
+            return Status.RUNNING
+        return Status.SUCCESS if result[0] else self.failed(f"{self._script.run} {result[1]}")
+
+    def terminate(self, new_status: Status) -> None:
+        """End."""
+        if self._running:
+            self._running.stop()
+            self._running = None
