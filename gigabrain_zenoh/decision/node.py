@@ -124,10 +124,10 @@ class DecisionLoop:
         self.intent, outcome = step
         self.activity = outcome.activity
 
-    def rest(self, state: RobotState, reason: str) -> None:
-        """Form an intent to do nothing, from a state alone."""
+    def rest(self, reason: str) -> None:
+        """Form an intent to do nothing."""
         self.intent = Intent(behaviour=self._name, reason=reason)
-        self.activity, self.basis = "idle", state.tick
+        self.activity = "idle"
 
 
 async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> None:
@@ -165,27 +165,22 @@ def _serve(config: DecisionConfig, bus: Bus, source: InputSource) -> None:
         body = bodies.current
         return worlds.fresh(scan_limit_ns(body.description) if body else None)
 
-    def merged(world: WorldModel) -> WorldModel:
-        body = bodies.current
-        return contours.merged(objects.merged(world), body.description if body else None)
-
     def decide(_: Message) -> None:
         state = states.fresh()
         if state is None:
             return
         source.observe(state)
         body = bodies.current
-        fixed = body is not None and not body.description.has_base
-        if fixed and not source.moves_arms:
-            loop.rest(state, NO_BASE)
-            publish(state)
-            return
-        verdict = verdicts.at(state.boot, state.tick, SAFETY.stale_after_ns)
-        objects.observe(state)
-        world = newest_world()
-        if fixed:
+        if body and not body.description.has_base:
             loop.basis = state.tick
-        loop.step(state, world and merged(world), verdict, objects.fresh())
+        if body and not (body.description.has_base or source.moves_arms):
+            loop.rest(NO_BASE)
+        else:
+            verdict = verdicts.at(state.boot, state.tick, SAFETY.stale_after_ns)
+            objects.observe(state)
+            if world := newest_world():
+                world = contours.merged(objects.merged(world), body.description if body else None)
+            loop.step(state, world, verdict, objects.fresh())
         publish(state)
 
     def publish(state: RobotState) -> None:

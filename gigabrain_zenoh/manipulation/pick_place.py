@@ -33,7 +33,7 @@ from gigabrain_zenoh.manipulation.planner import NoPath, plan
 
 LIMIT_SPARE = 0.006  # of a joint's range, at its ends: servos swing a bit too far
 SLOW = 0.35  # of the joints' speeds, near the thing
-SQUEEZE = 0.12  # of the gripper's range, beyond the thing's width
+SQUEEZE = 0.05  # of the gripper's range, beyond the thing's width
 HELD_SHARE = 0.02  # of the gripper's range, short of its target: something is between the fingers
 LIFT_M = 0.05  # straight up
 PLACE_GAP_M = 0.003  # above what it is put on, when it is let go of

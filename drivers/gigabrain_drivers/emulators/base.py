@@ -72,6 +72,7 @@ class EmulatedBody:
         self._commanded = (0.0, 0.0, 0.0)
         self._gait: Gait | None = None  # instead of a velocity
         self._aims: Mapping[str, float] | None = {}  # of its arm's servos; None: they are off
+        self._efforts: Mapping[str, float] = {}  # [N m] or [N], with which they pull at most
         self._cpu_s = 0.0
         self._moved_ns = 0  # time of the last command to move
         self._faulted_ns = 0  # when what is wrong with it last changed
@@ -100,9 +101,15 @@ class EmulatedBody:
         """Set the gait that a quadruped aims for from the next step on."""
         self._gait = gait
 
-    def aim(self, positions: Mapping[str, float]) -> None:
-        """Set where its arm's servos go from the next step on [rad] or [m]."""
+    def aim(
+        self, positions: Mapping[str, float], efforts: Mapping[str, float] | None = None
+    ) -> None:
+        """Set where its arm's servos go from the next step on [rad] or [m].
+
+        They pull with `efforts` [N m] or [N] at most; without, with all they can.
+        """
         self._aims = {**(self._aims or {}), **positions}
+        self._efforts = efforts or {}
 
     def let_go(self) -> None:
         """Switch its arm's servos off from the next step on, until they are aimed again."""
@@ -198,6 +205,7 @@ class EmulatedBody:
         if arm and aims is None:
             arm.let_go()
         elif arm and aims:
+            arm.limit(self._efforts)
             arm.aim(aims)
 
     def _faulty_velocity(self, commanded: tuple[float, float, float]) -> tuple[float, float, float]:

@@ -32,6 +32,8 @@ class SimArm:
         data.qpos[self._places] = body.posture
         self._now = self._before = self._measured()
         self._model = model
+        ranges = model.actuator_forcerange[self._motors]
+        self._strongest = dict(zip(self.names, ranges[:, 1].tolist(), strict=True))
         self._gains = model.actuator_gainprm[self._motors].copy()
         self._biases = model.actuator_biasprm[self._motors].copy()
         self._aims = dict(zip(self.names, self._at_rest(body.posture), strict=True))
@@ -53,6 +55,13 @@ class SimArm:
         """Have servos go to positions [rad] or [m], and hold them; limp ones hold again."""
         self._aims = {**self._aims, **positions}
         self.limp = False
+
+    def limit(self, efforts: Mapping[str, float]) -> None:
+        """Have servos pull with no more than `efforts` [N m] or [N], within what they can."""
+        for name, motor in zip(self.names, self._motors, strict=True):
+            if name in efforts:
+                most = min(efforts[name], self._strongest[name])
+                self._model.actuator_forcerange[motor] = -most, most
 
     def let_go(self) -> None:
         """Switch all servos off."""

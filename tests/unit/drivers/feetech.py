@@ -130,13 +130,14 @@ class FreeArm:
             for joint, at in zip(robot.joints, home, strict=True)
         }
         self._aims: dict[str, float] | None = {}
+        self._efforts: dict[str, float] = {}  # [N m]
 
     @property
     def joints(self) -> list[Motor]:
         return [Motor(n, j.position, j.velocity, j.effort, 25.0, 0.0) for n, j in self.free.items()]
 
-    def aim(self, positions: dict[str, float]) -> None:
-        self._aims = positions
+    def aim(self, positions: dict[str, float], efforts: dict[str, float]) -> None:
+        self._aims, self._efforts = positions, efforts
 
     def let_go(self) -> None:
         self._aims = None
@@ -144,7 +145,7 @@ class FreeArm:
     def step(self, seconds: float) -> None:
         for name, joint in self.free.items():
             aim = self._aims.get(name, joint.position) if self._aims is not None else None
-            joint.step(seconds, aim, 1.91)
+            joint.step(seconds, aim, self._efforts.get(name, 1.91))
 
 
 class Rig:

@@ -66,20 +66,19 @@ class FeetechArm(Device):
         """Let all servos go on."""
         before_ns = now_ns if self._stepped_ns is None else self._stepped_ns
         self._stepped_ns = now_ns
-        seconds, aims = min(MAX_STEP_S, (now_ns - before_ns) / 1e9), {}
+        seconds, aims, efforts = min(MAX_STEP_S, (now_ns - before_ns) / 1e9), {}, {}
         for servo, motor in zip(self.servos.values(), self.body.joints, strict=True):
             servo.supply = max(0.0, self.options.voltage - self.sag_volts)
             servo.step(seconds, motor.position, motor.velocity, motor.effort)
-            most = servo.max_effort / STIFFNESS
-            pull = 0.0 if servo.target is None else servo.target - motor.position
-            aims[motor.name] = motor.position + max(-most, min(most, pull))
+            aims[motor.name] = motor.position if servo.target is None else servo.target
+            efforts[motor.name] = servo.max_effort
         for name, servo in self.wheels.items():
             motor = self._wheel(name)
             servo.supply = max(0.0, self.options.voltage - self.sag_volts)
             servo.step(seconds, motor.position, motor.velocity, motor.effort)
         self._drive()
         if any(servo.target is not None for servo in self.servos.values()):
-            self.body.aim(aims)
+            self.body.aim(aims, efforts)
         else:
             self.body.let_go()
 
