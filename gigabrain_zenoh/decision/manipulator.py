@@ -1,5 +1,6 @@
 """Moves the arm: plans each command in a worker thread, and carries it out from tick to tick."""
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -195,9 +196,7 @@ class Manipulator:
                 self._misses += 1
                 self._back_off(planner, body, state, plan.grasp)
                 return self._moving(state)
-            name = plan.hold.thing.name
-            stood = _thing(name, command.things[name])
-            self._achieve(planner.gripped(plan.hold, stood, _measured(planner, state)))
+            self._grip(planner, run, plan.hold, state, command)
         if over and over.name == "open" and hold:
             self._achieve(None, placed=_placed(planner, state, command, hold))
         if over and over.name == "grip":
@@ -205,6 +204,17 @@ class Manipulator:
         if run.phase is None:
             return self._end(body, state, run)
         return self._moving(state)
+
+    def _grip(
+        self, planner: ArmPlanner, run: PhaseRun, hold: Hold, state: RobotState, command: ArmCommand
+    ) -> None:
+        """Record that the gripper holds a thing, and have it squeeze less from now on."""
+        stood = _thing(hold.thing.name, command.things[hold.thing.name])
+        ease = planner.eased(hold, _gripper(planner, state, hold.grip))
+        assert ease.gripper is not None
+        run.insert(ease)
+        held = planner.gripped(hold, stood, _measured(planner, state))
+        self._achieve(dataclasses.replace(held, grip=ease.gripper))
 
     def _held_up(self, why: str) -> StepResult:
         """Plan again from where the joints are, as safety or a late process held them up."""
@@ -343,10 +353,14 @@ def _placed(
 
 def _holds(planner: ArmPlanner, hold: Hold, state: RobotState) -> bool:
     """Return whether the gripper has stopped short of where it was sent."""
+    return planner.holds(_gripper(planner, state, hold.grip), hold.grip)
+
+
+def _gripper(planner: ArmPlanner, state: RobotState, unknown: float) -> float:
+    """Return where the gripper is [rad] or [m]."""
     gripper = planner.arm.gripper
-    assert gripper
-    found = next((one.position for one in state.joints if one.name == gripper.name), hold.grip)
-    return planner.holds(found, hold.grip)
+    name = gripper.name if gripper else ""
+    return next((joint.position for joint in state.joints if joint.name == name), unknown)
 
 
 def _off(

@@ -142,6 +142,10 @@ class ArmPlanner:
         """Return the way from a thing that is not held."""
         return Plan(phases=self._picker().back_off(grasp, posture))
 
+    def eased(self, hold: Hold, measured: float) -> Phase:
+        """Return the phase in which the gripper, measured there, squeezes what it holds less."""
+        return self._picker().eased(measured, hold.grip)
+
     def gripped(self, hold: Hold, thing: Thing, measured: Floats) -> Hold:
         """Return what is held by fingers that have just closed on a thing.
 

@@ -15,7 +15,8 @@ from gigabrain_schemas.brain import JointTrajectory as JointWindow
 from gigabrain_zenoh.manipulation.joint_trajectory import JointTrajectory
 
 PhaseName = Literal[
-    "hover", "descend", "close", "lift", "traverse", "lower", "open", "retreat", "move", "grip"
+    "hover", "descend", "close", "ease", "lift", "traverse", "lower", "open", "retreat", "move",
+    "grip",
 ]  # fmt: skip
 GRIP_TICKS = 40  # until a gripper has closed, or has stopped at what is between its fingers
 SETTLE_TICKS = 12  # after a trajectory
@@ -61,6 +62,11 @@ class PhaseRun:
             return None
         self._begun, self._at = tick, self._at + 1
         return phase
+
+    def insert(self, phase: Phase) -> None:
+        """Carry out another phase before the present one, which has just begun."""
+        self._phases = (*self._phases[: self._at], phase, *self._phases[self._at :])
+        self._total += phase.ticks
 
     def wish(self, tick: int) -> tuple[tuple[JointTarget, ...], JointWindow | None]:
         """Return the targets, or the part of a trajectory, for the intent of a state of `tick`."""

@@ -1,7 +1,7 @@
 """Plans to pick a thing up and to put it down: phases, each a trajectory or a grip.
 
-    open  hover  descend  close  lift     of a pick
-    traverse  lower  open  retreat        of a place
+    open  hover  descend  close  ease  lift     of a pick
+    traverse  lower  open  retreat              of a place
 
 Whoever carries a plan out checks the grip after `close`: the gripper has to stop short.
 """
@@ -33,7 +33,8 @@ from gigabrain_zenoh.manipulation.planner import NoPath, plan
 
 LIMIT_SPARE = 0.006  # of a joint's range, at its ends: servos swing a bit too far
 SLOW = 0.35  # of the joints' speeds, near the thing
-SQUEEZE = 0.05  # of the gripper's range, beyond the thing's width
+SQUEEZE = 0.12  # of the gripper's range, beyond the thing's width
+EASED = 0.05  # the same, once it is held: what servos can do for long
 HELD_SHARE = 0.02  # of the gripper's range, short of its target: something is between the fingers
 LIFT_M = 0.05  # straight up
 PLACE_GAP_M = 0.003  # above what it is put on, when it is let go of
@@ -248,6 +249,12 @@ class PickPlacePlanner:
         span = self._gripper.upper - self._gripper.lower
         aim = grasp.closed + closing * SQUEEZE * span
         return max(self._gripper.lower, min(self._gripper.upper, aim))
+
+    def eased(self, measured: float, wanted: float) -> Phase:
+        """Return the phase in which a gripper that was sent to `wanted` squeezes less."""
+        most = EASED * (self._gripper.upper - self._gripper.lower)
+        less = max(-most, min(most, wanted - measured))
+        return Phase(name="ease", gripper=measured + less)
 
     def holds(self, measured: float, wanted: float) -> bool:
         """Return whether the gripper has stopped short of where it was sent."""

@@ -306,8 +306,12 @@ def _pick_and_place(
         return attempt.end("unreachable", pick.reason)
     for phase in pick.phases:
         arm.carry_out(phase, gripper)
-        if phase.name == "close" and not planner.holds(arm.measured(gripper), phase.gripper or 0.0):
-            return attempt.end("not gripped")
+        if phase.name == "close":
+            assert phase.gripper is not None
+            closed = arm.measured(gripper)
+            if not planner.holds(closed, phase.gripper):
+                return attempt.end("not gripped")
+            arm.carry_out(planner.eased(closed, phase.gripper), gripper)
     if arm.thing()[2] < drawn.height + LIFTED_M:
         return attempt.end("not lifted")
     place: Place | NoWay = NoWay(reason="")
