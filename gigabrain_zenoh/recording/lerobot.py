@@ -1,10 +1,11 @@
 """Converts a recording into a LeRobot dataset: format version 3.0, as lerobot 0.4 reads it.
 
-A frame is a tenth of a second of the robot's time. An episode lasts while the gate is enabled
-without a gap. Pictures and depth become videos.
+A frame is a tenth of a second of the robot's time, and a twenty-fifth where there is an arm. An
+episode lasts while the gate is enabled without a gap. Pictures and depth become videos.
 """
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import accumulate
 from pathlib import Path
@@ -14,12 +15,14 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from gigabrain_schemas.body import Body, RobotState
+from gigabrain_schemas.base import TICK_S, Velocity
+from gigabrain_schemas.body import Body, JointDescription, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import BODY
 from gigabrain_schemas.topics import STATE as STATE_TOPIC
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.geometry.pose import velocity_of
 from gigabrain_zenoh.recording.bag_reader import Bag, samples
 from gigabrain_zenoh.recording.lerobot_video import VIDEO_PATH, VideoFeature, write_videos
 from gigabrain_zenoh.recording.message_tables import message_of
@@ -30,15 +33,57 @@ try:
 except ModuleNotFoundError:
     raise ConfigError("datasets need pyarrow: pip install 'gigabrain-zenoh[lerobot]'") from None
 
-FRAME_HZ, TICKS_PER_FRAME = 10, 5
+TICKS_PER_FRAME, ARM_TICKS_PER_FRAME = 5, 2
 VERSION, TASK = "v3.0", "drive"
 STATE, SCAN, ACTION = "observation.state", "observation.environment_state", "action"
-STATE_NAMES = ("x", "y", "yaw", "linear_x", "linear_y", "angular_z")
-ACTION_NAMES = ("linear_x", "linear_y", "angular_z")
+BASE_STATE = ("x", "y", "yaw", "linear_x", "linear_y", "angular_z")
+BASE_ACTION = ("linear_x", "linear_y", "angular_z")
 LATERAL = "linear_y"
+OPEN = 100.0  # of a gripper that is open, as LeRobot has it; 0 is closed
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 FILE = "chunk-000/file-000.parquet"
 Floats = NDArray[np.float32]
+
+
+class Layout(Struct, frozen=True, kw_only=True):
+    """What a dataset holds of a body."""
+
+    robot_type: str | None = None
+    base: bool = True
+    lateral: bool = True  # it can move to the side
+    joints: tuple[JointDescription, ...] = ()
+
+    @property
+    def ticks(self) -> int:
+        """Ticks of a frame."""
+        return ARM_TICKS_PER_FRAME if self.joints else TICKS_PER_FRAME
+
+    @property
+    def hz(self) -> int:
+        """Frames a second."""
+        return round(1 / (self.ticks * TICK_S))
+
+    @property
+    def joint_names(self) -> list[str]:
+        """Names of the joints' values, as LeRobot's robots call them."""
+        return [f"{joint.name}.pos" for joint in self.joints]
+
+    def of_base(self, names: Sequence[str]) -> list[str]:
+        """Return those of the base's values that the dataset has."""
+        return [name for name in names if self.base and (self.lateral or name != LATERAL)]
+
+    def degrees(self, places: Sequence[float]) -> list[float]:
+        """Return positions of all joints [rad] or [m] as LeRobot has them.
+
+        Joints are in degrees, those that slide in millimetres, and a gripper in per cent.
+        """
+        found = []
+        for joint, place in zip(self.joints, places, strict=True):
+            if joint.part == "gripper":
+                found.append(OPEN * (place - joint.lower) / (joint.upper - joint.lower))
+            else:
+                found.append(place * 1e3 if joint.unit == "m" else math.degrees(place))
+        return found
 
 
 class LeRobotFrame(Struct, frozen=True, kw_only=True):
@@ -46,39 +91,58 @@ class LeRobotFrame(Struct, frozen=True, kw_only=True):
 
     boot: int
     tick: int
-    state: Floats  # (6,)
+    state: Floats  # see Layout and BASE_STATE
     scan: Floats  # (n,), [m]; the lidar's range where nothing was hit, 0 where unknown
-    action: Floats  # (3,), [m/s], [m/s], [rad/s]
+    action: Floats  # of the base, [m/s], [m/s], [rad/s], then where the joints were sent
 
 
-def frames(path: Path) -> Iterator[LeRobotFrame]:
-    """Iterate over every fifth state of an enabled gate, with the newest scan and command."""
-    scan, action = np.empty(0, np.float32), np.zeros(3, np.float32)
+def frames(path: Path, layout: Layout | None = None) -> Iterator[LeRobotFrame]:
+    """Iterate over the states of an enabled gate, with the newest scan and command."""
+    layout = layout or layout_of(path)
+    scan, command = np.empty(0, np.float32), Velocity()
     for sample in samples(path):
         message = message_of(sample)
         if isinstance(message, LaserScan):
             seen = np.minimum(message.ranges_m, np.float32(message.range_max))
             scan = np.nan_to_num(seen, nan=0.0)
         elif isinstance(message, CmdVel):
-            speeds = (message.linear_x, message.linear_y, message.angular_z)
-            action = np.array(speeds, np.float32)
+            command = velocity_of(message)
         elif isinstance(message, RobotState) and message.gate.mode == "enabled":
-            if message.tick % TICKS_PER_FRAME:
-                continue
-            pose, speed = message.pose, message.velocity
-            known = (pose.x, pose.y, pose.yaw, speed.linear_x, speed.linear_y, speed.angular_z)
-            state = np.array(known, np.float32)
-            yield LeRobotFrame(
-                boot=message.boot, tick=message.tick, state=state, scan=scan, action=action
-            )
+            values = None if message.tick % layout.ticks else _values(layout, message, command)
+            if values:
+                state, action = (np.array(one, np.float32) for one in values)
+                yield LeRobotFrame(
+                    boot=message.boot, tick=message.tick, state=state, scan=scan, action=action
+                )
 
 
-def episodes(path: Path) -> list[list[LeRobotFrame]]:
+def _values(
+    layout: Layout, state: RobotState, command: Velocity
+) -> tuple[list[float], list[float]] | None:
+    """Return what is observed, and the command; None where joints are missing."""
+    pose, speed = state.pose, state.velocity
+    base = {
+        "x": pose.x, "y": pose.y, "yaw": pose.yaw,
+        "linear_x": speed.linear_x, "linear_y": speed.linear_y, "angular_z": speed.angular_z,
+    }  # fmt: skip
+    observed = [base[name] for name in layout.of_base(BASE_STATE)]
+    wanted = [getattr(command, name) for name in layout.of_base(BASE_ACTION)]
+    if not layout.joints:
+        return observed, wanted
+    measured = {joint.name: joint.position for joint in state.joints}
+    places = [measured[joint.name] for joint in layout.joints if joint.name in measured]
+    if not len(places) == len(state.joints_sent) == len(layout.joints):
+        return None
+    return observed + layout.degrees(places), wanted + layout.degrees(state.joints_sent)
+
+
+def episodes(path: Path, layout: Layout | None = None) -> list[list[LeRobotFrame]]:
     """Return the frames in unbroken rows of two or more. Raises ConfigError if there are none."""
     rows: list[list[LeRobotFrame]] = []
-    for frame in frames(path):
+    layout = layout or layout_of(path)
+    for frame in frames(path, layout):
         last = rows[-1][-1] if rows else None
-        follows = last and (last.boot, last.tick + TICKS_PER_FRAME) == (frame.boot, frame.tick)
+        follows = last and (last.boot, last.tick + layout.ticks) == (frame.boot, frame.tick)
         if follows and last and last.scan.shape == frame.scan.shape:
             rows[-1].append(frame)
         else:
@@ -90,18 +154,13 @@ def episodes(path: Path) -> list[list[LeRobotFrame]]:
     return rows
 
 
-def columns(
-    row: list[LeRobotFrame], episode: int, first: int, *, lateral: bool = True
-) -> dict[str, NDArray[Any]]:
-    """Return an episode's columns; `first` is the number of its first frame in the dataset.
-
-    Without `lateral` the speed to the side is left out.
-    """
+def columns(row: list[LeRobotFrame], episode: int, first: int, hz: int) -> dict[str, NDArray[Any]]:
+    """Return an episode's columns; `first` is the number of its first frame in the dataset."""
     count = np.arange(len(row), dtype=np.int64)
     found: dict[str, NDArray[Any]] = {
-        STATE: np.stack([frame.state for frame in row])[:, _kept(STATE_NAMES, lateral)],
-        ACTION: np.stack([frame.action for frame in row])[:, _kept(ACTION_NAMES, lateral)],
-        "timestamp": (count / FRAME_HZ).astype(np.float32),
+        STATE: np.stack([frame.state for frame in row]),
+        ACTION: np.stack([frame.action for frame in row]),
+        "timestamp": (count / hz).astype(np.float32),
         "frame_index": count,
         "episode_index": np.full(len(row), episode, np.int64),
         "index": count + first,
@@ -112,15 +171,10 @@ def columns(
     return found
 
 
-def _kept(names: Sequence[str], lateral: bool) -> list[int]:
-    """Return which values of a vector the dataset has."""
-    return [number for number, name in enumerate(names) if lateral or name != LATERAL]
-
-
-def features(beams: int, *, lateral: bool = True) -> dict[str, dict[str, Any]]:
+def features(layout: Layout, beams: int) -> dict[str, dict[str, Any]]:
     """Return the format's description of the columns."""
     state, action = (
-        [names[number] for number in _kept(names, lateral)] for names in (STATE_NAMES, ACTION_NAMES)
+        layout.of_base(names) + layout.joint_names for names in (BASE_STATE, BASE_ACTION)
     )
     found: dict[str, dict[str, Any]] = {
         STATE: {"dtype": "float32", "shape": [len(state)], "names": state},
@@ -151,33 +205,34 @@ def statistics(data: Mapping[str, NDArray[Any]]) -> dict[str, dict[str, list[flo
 
 def convert(path: Path, folder: Path) -> str:
     """Write the dataset into a new folder; return a summary in words. Raises ConfigError."""
-    rows, tables, first = episodes(path), [], 0
-    robot_type, lateral = _body(path)
+    layout = layout_of(path)
+    rows, tables, first = episodes(path, layout), [], 0
     for episode, row in enumerate(rows):
-        tables.append(columns(row, episode, first, lateral=lateral))
+        tables.append(columns(row, episode, first, layout.hz))
         first += len(row)
     whole = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
     ticks = [(frame.boot, frame.tick) for row in rows for frame in row]
     try:
         folder.mkdir(parents=True)
-        videos = write_videos(path, ticks, folder, FRAME_HZ)
+        videos = write_videos(path, ticks, folder, layout.hz)
         _write_columns(whole, folder / "data" / FILE)
-        _write_episodes([len(row) for row in rows], videos, folder / "meta/episodes" / FILE)
+        lengths = [len(row) for row in rows]
+        _write_episodes(lengths, videos, layout.hz, folder / "meta/episodes" / FILE)
         _write_task(TASK, folder / "meta/tasks.parquet")
         info = {
             "codebase_version": VERSION,
-            "robot_type": robot_type,
+            "robot_type": layout.robot_type,
             "total_episodes": len(rows),
             "total_frames": first,
             "total_tasks": 1,
             "chunks_size": 1000,
             "data_files_size_in_mb": 100,
             "video_files_size_in_mb": 200,
-            "fps": FRAME_HZ,
+            "fps": layout.hz,
             "splits": {"train": f"0:{len(rows)}"},
             "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
             "video_path": VIDEO_PATH if videos else None,
-            "features": features(len(rows[0][0].scan), lateral=lateral)
+            "features": features(layout, len(rows[0][0].scan))
             | {video.key: video.feature for video in videos},
         }
         stats = statistics(whole) | {video.key: video.statistics for video in videos}
@@ -189,16 +244,22 @@ def convert(path: Path, folder: Path) -> str:
     return "\n  ".join(found + [video.summary for video in videos])
 
 
-def _body(path: Path) -> tuple[str | None, bool]:
-    """Return the type of the recorded body, and whether it can move to the side, if known."""
+def layout_of(path: Path) -> Layout:
+    """Return what a dataset of the recorded body holds."""
     robot_type = None
     for sample in Bag(path):
         message = message_of(sample) if sample.key in (BODY.key, STATE_TOPIC.key) else None
         if isinstance(message, Body):
-            return message.description.robot_type, message.description.max_lateral_speed > 0
+            body = message.description
+            return Layout(
+                robot_type=body.robot_type,
+                base=body.has_base,
+                lateral=body.max_lateral_speed > 0,
+                joints=body.joints,
+            )
         if isinstance(message, RobotState):
             robot_type = message.robot_type
-    return robot_type, True
+    return Layout(robot_type=robot_type)
 
 
 def _write_columns(columns: Mapping[str, NDArray[Any]], path: Path) -> None:
@@ -212,7 +273,9 @@ def _write_columns(columns: Mapping[str, NDArray[Any]], path: Path) -> None:
     _write_table(pa.table(arrays), path)
 
 
-def _write_episodes(lengths: Sequence[int], videos: Sequence[VideoFeature], path: Path) -> None:
+def _write_episodes(
+    lengths: Sequence[int], videos: Sequence[VideoFeature], hz: int, path: Path
+) -> None:
     """Write the rows of each episode in the data file, and its time in videos. Raises OSError."""
     ends, zeros = list(accumulate(lengths)), [0] * len(lengths)
     table: dict[str, list[Any]] = {
@@ -230,8 +293,8 @@ def _write_episodes(lengths: Sequence[int], videos: Sequence[VideoFeature], path
         table |= {
             f"videos/{key}/chunk_index": zeros,
             f"videos/{key}/file_index": zeros,
-            f"videos/{key}/from_timestamp": [start / FRAME_HZ for start in [0, *ends[:-1]]],
-            f"videos/{key}/to_timestamp": [end / FRAME_HZ for end in ends],
+            f"videos/{key}/from_timestamp": [start / hz for start in [0, *ends[:-1]]],
+            f"videos/{key}/to_timestamp": [end / hz for end in ends],
         }
     _write_table(pa.table(table), path)
 

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,13 +10,21 @@ import msgspec
 import numpy as np
 import pytest
 
-from gigabrain_schemas.body import GateStatus, RobotState
+from gigabrain_drivers.driver.catalog import load_robot
+from gigabrain_schemas.body import Body, GateStatus, Joint, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.qa.drives import file_of
 from gigabrain_zenoh.recording.bag_writer import ReceivedMessage
-from gigabrain_zenoh.recording.lerobot import columns, convert, episodes, frames
+from gigabrain_zenoh.recording.lerobot import (
+    columns,
+    convert,
+    episodes,
+    features,
+    frames,
+    layout_of,
+)
 from tests.node.test_record_replay import RECORDINGS
 from tests.unit.recording import bags
 
@@ -40,6 +49,37 @@ def test_a_frame_is_every_fifth_state_with_the_command_of_then(tmp_path: Path) -
     assert found[1].action == pytest.approx([0.010, 0.0, 0.0])
 
 
+def arm(states: range) -> Iterator[ReceivedMessage]:
+    """States of an SO-101 whose pan goes from -90 degrees on, 1 degree before where it was sent."""
+    body = load_robot("so101").description()
+    yield bags.arrival(0, "robot/body", codec.encode(Body(description=body, link="sim")))
+    for seq in states:
+        pan = math.radians(seq - 90)
+        places = (pan, -1.0, 0.5, 0.0, 0.0, body.joints[-1].upper)
+        joints = zip(body.joints, places, strict=True)
+        state = msgspec.structs.replace(
+            msgspec.msgpack.decode(bags.state(seq), type=RobotState),
+            gate=GateStatus(mode="enabled"),
+            joints=tuple(Joint(name=joint.name, position=place) for joint, place in joints),
+            joints_sent=(pan + math.radians(1.0), *places[1:]),
+        )
+        yield bags.arrival(seq * 20_000_000, "robot/state", codec.encode(state))
+
+
+def test_joints_are_in_degrees_and_the_gripper_in_per_cent(tmp_path: Path) -> None:
+    path = tmp_path / "arm.mcap"
+    bags.write(path, arm(range(1, 12)))
+    layout = layout_of(path)
+    found = list(frames(path, layout))
+    assert (layout.hz, [frame.tick for frame in found]) == (25, [2, 4, 6, 8, 10])
+    right = [-88.0, math.degrees(-1.0), math.degrees(0.5), 0.0, 0.0, 100.0]
+    assert found[0].state == pytest.approx(right, abs=1e-3)
+    assert found[0].action == pytest.approx([-87.0, *right[1:]], abs=1e-3)
+    names = features(layout, 0)["observation.state"]["names"]
+    assert (names[0], names[-1]) == ("shoulder_pan.pos", "gripper.pos")
+    assert features(layout, 0)["action"]["names"] == names
+
+
 def test_an_episode_ends_where_the_states_break_off_or_the_gate_shuts(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     shut = (a for a in bags.drive(80) if a.header.seq > 60)
@@ -53,7 +93,7 @@ def test_an_episode_ends_where_the_states_break_off_or_the_gate_shuts(tmp_path: 
 
 def test_a_column_has_a_row_per_frame() -> None:
     (row,) = episodes(file_of(RECORDINGS, "arena"))
-    table = columns(row, episode=2, first=7)
+    table = columns(row, episode=2, first=7, hz=10)
     assert table["observation.environment_state"].shape == (len(row), 360)
     assert np.isfinite(table["observation.environment_state"]).all()
     assert table["index"][:3].tolist() == [7, 8, 9]

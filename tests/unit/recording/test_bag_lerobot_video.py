@@ -248,7 +248,9 @@ def test_episodes_of_two_starts_follow_each_other_in_the_video(tmp_path: Path) -
 def test_the_speed_to_the_side_is_left_out_where_the_body_has_none(tmp_path: Path) -> None:
     path, folder = tmp_path / "a.mcap", tmp_path / "dataset"
     body = example(Body)
-    description: BodyDescription = msgspec.structs.replace(body.description, max_lateral_speed=0.0)
+    description: BodyDescription = msgspec.structs.replace(
+        body.description, max_lateral_speed=0.0, joints=(), arm=None
+    )
     told = codec.encode(msgspec.structs.replace(body, description=description))
     write(path, driving(50), iter([(1, "robot/body", told)]))
     convert(path, folder)
