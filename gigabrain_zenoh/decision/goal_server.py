@@ -34,10 +34,11 @@ from gigabrain_zenoh.decision.detected_objects import ObjectsByPerceptor
 from gigabrain_zenoh.decision.drive_kernels import DriveKernels
 from gigabrain_zenoh.decision.node import InputSource
 from gigabrain_zenoh.decision.task_server import TaskServer
+from gigabrain_zenoh.decision.tasks import arm_steps
 from gigabrain_zenoh.decision.tasks import mission as missions
 from gigabrain_zenoh.decision.tasks.mission import Mission
 from gigabrain_zenoh.decision.zones import ZoneSource
-from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.errors import GigabrainError, Refused
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.decision.manipulator import Manipulator
@@ -77,6 +78,7 @@ class GoalServer(InputSource):
         self._outcome: StepOutcome | None = None  # of the last command
         self._started = False
         self._first = _first_mission(settings)
+        self._checked = 0  # number of a command that the arm can carry out
 
     async def prepare(self) -> None:
         """Load the kernels, or begin to compile them. Raises ConfigError."""
@@ -158,8 +160,12 @@ class GoalServer(InputSource):
         """Carry out a command for the arm; without one, it holds still."""
         wanted = command if isinstance(command, ArmCommand) else None
         number = command.number if command else 0
-        if wanted and body.arm is None:
-            return self._refused(number, f"{body.robot_type} has no arm")
+        if wanted and number != self._checked:  # before packages are imported that may be missing
+            try:
+                arm_steps.check(body, [wanted.do])
+            except GigabrainError as error:
+                return self._refused(number, str(error))
+            self._checked = number
         if wanted is None and command and not body.has_base:
             return self._refused(number, f"{body.robot_type} has no base to drive")
         if wanted and not self._kernels.arm_loaded():

@@ -56,7 +56,7 @@ class Home:
         """Start a robot, unless it runs, and wait until it may drive."""
         environment = self.environment(self.folder, body)
         if body not in self._robots:
-            words = f"exec gigabrain demo --headless --no-page --body {body}"
+            words = f"exec gigabrain demo --headless --no-page --world arena --body {body}"
             self._robots[body] = start(words, self.folder, environment, subprocess.DEVNULL)
         end_s = time.monotonic() + LINE_S
         while b"enabled" not in start(MODE, self.folder, environment).communicate()[0]:

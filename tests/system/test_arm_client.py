@@ -18,7 +18,7 @@ NEAR = 0.06  # [rad]: the goal tolerance, and an encoder's step
 
 @pytest.fixture(scope="module")
 def demo(shared_home: Home) -> CommandProcess:
-    return shared_home.start("demo", "--body", "so101", "--headless")
+    return shared_home.start("demo", "--body", "so101", "--world", "arena", "--headless")
 
 
 @pytest.fixture
@@ -183,3 +183,22 @@ async def test_a_wrong_command_is_one_clear_line(
     assert (await wrong.ended(), wrong.out, len(wrong.err.splitlines())) == (2, "", 1)
     assert text in wrong.err
     assert posture(arm) == pytest.approx(before, abs=0.01)
+
+
+async def test_decision_reaches_a_point_and_says_what_it_cannot(arm: Probe) -> None:
+    async with connect(source="tasks") as robot:
+        task = await robot.tasks.carry_out("do: [{reach: [0.22, 0.05, 0.12]}]")
+        done = await robot.tasks.result(task)
+        assert (done.state, done.reason) == ("succeeded", "")
+        assert arm.state.joints_sent[0] == pytest.approx(-math.atan2(0.05, 0.22 - 0.0388), abs=0.05)
+        far = await robot.tasks.carry_out("do: [{reach: [0.9, 0.0, 0.1]}]")
+        ended = await robot.tasks.result(far)
+        assert ended.state == "failed"
+        assert "not reachable: too far by" in ended.reason
+        with pytest.raises(Refused, match="no joint 'elbow'"):
+            await robot.tasks.carry_out("do: [{posture: {elbow: 0.1}}]")
+        with pytest.raises(Refused, match="has no base to drive"):
+            await robot.tasks.go_to(1.0, 0.0)
+        home = await robot.tasks.carry_out("do: [{posture: home}]")
+        assert (await robot.tasks.result(home)).state == "succeeded"
+    assert posture(arm) == pytest.approx(HOME, abs=NEAR)
