@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("numba")
 
 from gigabrain_zenoh.cli import map as map_commands
-from gigabrain_zenoh.decision.drive_kernels import CAR_KERNELS, DRIVE_KERNELS
+from gigabrain_zenoh.decision.drive_kernels import ARM_KERNELS, CAR_KERNELS, DRIVE_KERNELS
 from gigabrain_zenoh.kernels import jit, precompile
 from gigabrain_zenoh.kernels import jit as kernels
 from gigabrain_zenoh.perception.node import LOCALIZE_KERNELS, MAP_KERNELS
@@ -26,7 +26,7 @@ def warm_up():
         print(os.getpid(), file=file)
 """
 WARM_UP = "counted:warm_up"
-WARM_UPS = (MAP_KERNELS, LOCALIZE_KERNELS, DRIVE_KERNELS, CAR_KERNELS)
+WARM_UPS = (MAP_KERNELS, LOCALIZE_KERNELS, DRIVE_KERNELS, CAR_KERNELS, ARM_KERNELS)
 
 
 @pytest.fixture
