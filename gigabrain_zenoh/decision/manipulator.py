@@ -34,6 +34,7 @@ from gigabrain_zenoh.manipulation.pick_place import NoWay
 TRIES = 3  # to pick a thing up, each with another grasp
 HOLD_UPS = 5  # of one command, after which it fails
 MISSED = f"it was not caught, {TRIES} times"
+GRIPS = 0.1  # of the gripper's greatest speed, above which it moves: an encoder's steps are less
 CARRYING = ("lift", "traverse", "lower")  # phases in which a thing has to be held
 NO_MODEL = Idle("waiting", "waiting: for the arm's model, robot/arm_model")
 NOT_MEASURED = Idle("waiting", "waiting: for all joints to be measured")
@@ -189,7 +190,7 @@ class Manipulator:
             return self._fail(f"{hold.thing.name} has slipped out of the gripper")
         if off := _off(body, state, run.expected(state.tick), "path_tolerance"):
             return self._held_up(off)
-        over = run.advance(state.tick)
+        over = run.advance(state.tick, grips=_grips(planner, state))
         if over and over.name == "close" and plan.hold:
             if not _holds(planner, plan.hold, state):
                 assert plan.grasp
@@ -354,6 +355,15 @@ def _placed(
 def _holds(planner: ArmPlanner, hold: Hold, state: RobotState) -> bool:
     """Return whether the gripper has stopped short of where it was sent."""
     return planner.holds(_gripper(planner, state, hold.grip), hold.grip)
+
+
+def _grips(planner: ArmPlanner, state: RobotState) -> bool:
+    """Return whether the gripper still moves."""
+    gripper = planner.arm.gripper
+    return gripper is not None and any(
+        joint.name == gripper.name and abs(joint.velocity) > GRIPS * gripper.max_speed
+        for joint in state.joints
+    )
 
 
 def _gripper(planner: ArmPlanner, state: RobotState, unknown: float) -> float:

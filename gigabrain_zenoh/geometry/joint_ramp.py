@@ -16,6 +16,7 @@ from gigabrain_zenoh.errors import ConfigError
 
 OVER = 1.02  # by which a step along a path may be beyond the limits: rounding, float32
 CATCH_UP = 0.95  # of a joint's greatest speed, at which a path may run away from it
+NOTHING = 1e-9  # speed and acceleration that are rounding, for which Ruckig may find no way
 SLACK = 1e-3  # [rad/s] or [m/s], the same for joints that barely move
 
 
@@ -157,17 +158,42 @@ def _braking_in_time(velocity: float, now: JointPoint, joint: JointDescription) 
 def _input(now: Sequence[JointPoint], limits: Sequence[JointDescription]) -> Any:
     given = _ruckig().InputParameter(len(limits))
     given.current_position = [point.position for point in now]
-    given.current_velocity = [point.velocity for point in now]
-    given.current_acceleration = [point.acceleration for point in now]
+    given.current_velocity = [_rounded(point.velocity) for point in now]
+    given.current_acceleration = [_rounded(point.acceleration) for point in now]
     given.max_acceleration = [joint.max_acceleration for joint in limits]
     given.max_jerk = [joint.max_jerk for joint in limits]
     return given
 
 
+def _rounded(value: float) -> float:
+    return 0.0 if abs(value) < NOTHING else value
+
+
 def _after(given: Any, dt: float) -> tuple[JointPoint, ...]:
-    path = _ruckig().Trajectory(given.degrees_of_freedom)
-    _solver(given.degrees_of_freedom).calculate(given, path)
-    return tuple(map(JointPoint, *path.at_time(dt)))
+    """Return the points `dt` [s] later; where Ruckig finds no common way, each joint has its own.
+
+    Joints for which it finds none either brake.
+    """
+    ruckig = _ruckig()
+    path = ruckig.Trajectory(given.degrees_of_freedom)
+    for synchronization in (given.synchronization, ruckig.Synchronization.No):
+        given.synchronization = synchronization
+        try:
+            _solver(given.degrees_of_freedom).calculate(given, path)
+        except ruckig.RuckigError:  # numerical, where a joint hardly moves
+            continue
+        return tuple(map(JointPoint, *path.at_time(dt)))
+    return tuple(
+        _braked(*motion, dt)
+        for motion in zip(
+            given.current_position, given.current_velocity, given.max_acceleration, strict=True
+        )
+    )
+
+
+def _braked(position: float, velocity: float, most: float, dt: float) -> JointPoint:
+    slower = math.copysign(max(0.0, abs(velocity) - most * dt), velocity)
+    return JointPoint(position + slower * dt, slower)
 
 
 def _possible(step: JointPoint, limits: JointDescription) -> bool:

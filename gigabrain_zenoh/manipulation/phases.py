@@ -19,6 +19,7 @@ PhaseName = Literal[
     "grip",
 ]  # fmt: skip
 GRIP_TICKS = 40  # until a gripper has closed, or has stopped at what is between its fingers
+LATE_TICKS = 100  # by which that may last longer
 SETTLE_TICKS = 12  # after a trajectory
 AHEAD_TICKS = 1  # from a state to the tick in which a command by it moves joints
 WINDOW_TICKS = 100  # of a trajectory in an intent
@@ -55,10 +56,16 @@ class PhaseRun:
         """The present phase; None once all are over."""
         return self._phases[self._at] if self._at < len(self._phases) else None
 
-    def advance(self, tick: int) -> Phase | None:
-        """Return the phase that is over at `tick`, and begin the next one; else None."""
+    def advance(self, tick: int, *, grips: bool = False) -> Phase | None:
+        """Return the phase that is over at `tick`, and begin the next one; else None.
+
+        While the gripper still `grips`, which a busy machine delays, its phase lasts longer.
+        """
         phase = self.phase
-        if phase is None or tick - self._begun < phase.ticks:
+        if phase is None:
+            return None
+        late = tick - self._begun - phase.ticks
+        if late < 0 or (grips and phase.arm is None and late < LATE_TICKS):
             return None
         self._begun, self._at = tick, self._at + 1
         return phase

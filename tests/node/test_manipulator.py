@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from gigabrain_drivers.driver.catalog import load_link, robot_path
 from gigabrain_drivers.driver.robot import Run
@@ -186,6 +187,23 @@ def test_a_model_that_cannot_be_used_fails_the_command_in_one_line(tmp_path: Pat
     task = rig.carry_out("do: [{posture: home}]")
     assert task.state == "failed"
     assert "joint in the arm's model" in task.reason
+    rig.manipulator.close()
+
+
+def test_a_gripper_that_is_late_is_not_taken_for_one_that_holds_something(tmp_path: Path) -> None:
+    rig = Rig(tmp_path, cube=(-0.3, 0.3))
+    rig.give(THINGS + "do: [{pick: cube}]")
+    while rig.outcome is None or rig.outcome.reason != "close":
+        rig.tick()
+    late = rig.arm.state
+    for _ in range(60):  # its state shows a gripper that still closes
+        rig.tick()
+        moving = replace(late().joints[-1], velocity=-1.0)
+        rig.arm.state = lambda m=moving: replace(late(), joints=(*late().joints[:-1], m))  # type: ignore[method-assign, misc]
+        assert rig.outcome.reason == "close"
+    rig.arm.state = late  # type: ignore[method-assign]
+    task = rig.carry_on()
+    assert (task.state, task.reason) == ("failed", "picking up cube: it was not caught, 3 times")
     rig.manipulator.close()
 
 

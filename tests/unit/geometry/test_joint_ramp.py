@@ -5,9 +5,13 @@ import math
 import sys
 
 import pytest
+import ruckig
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gigabrain_schemas.body import JointDescription
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.geometry import joint_ramp
 from gigabrain_zenoh.geometry.joint_ramp import (
     REST,
     JointGoal,
@@ -19,6 +23,8 @@ from gigabrain_zenoh.geometry.joint_ramp import (
 
 DT = 0.02
 ELBOW = JointDescription(name="elbow", lower=-2.0, upper=2.0, max_speed=3.0, max_acceleration=20.0)
+tiny = st.builds(lambda sign, power: sign * 10.0**power, st.sampled_from((-1.0, 0.0, 1.0)),
+                 st.floats(-19.0, -3.0))  # fmt: skip
 STEP_CHANGE = 20.0 * DT * 1.03  # [rad/s], of speed in a step
 
 
@@ -87,3 +93,37 @@ def test_without_ruckig_one_line_says_what_to_install(monkeypatch: pytest.Monkey
         ramp([JointPoint(0.0)], [REST], [ELBOW], DT)
     with pytest.raises(ConfigError, match="needs ruckig"):
         prepare(31)
+
+
+def test_joints_that_rest_but_for_rounding_are_held() -> None:
+    """Ruckig found no way from such speeds and accelerations, at which a robot had arrived."""
+    places = (-0.5943974399396441, -0.2666303726565727, 0.08470855106320617, 0.3707360604093174)
+    speeds = (0.0, 6.23416249179165e-19, -7.589415207398531e-19, 1.301042606982605e-18)
+    pulls = (0.0, -1.165734175856414e-15, -1.332267629550188e-15, -1.110223024625157e-15)
+    now = [JointPoint(*point) for point in zip(places, speeds, pulls, strict=True)]
+    found = ramp(now, [JointGoal(place) for place in places], [ELBOW] * 4, DT)
+    assert [point.position for point in found] == pytest.approx(places, abs=1e-9)
+
+
+@given(st.lists(st.tuples(tiny, tiny, tiny), min_size=6, max_size=6))
+def test_a_way_is_found_however_small_speeds_and_ways_are(
+    joints: list[tuple[float, float, float]],
+) -> None:
+    now = [JointPoint(0.5, speed, pull) for speed, pull, _ in joints]
+    goals = [JointGoal(0.5 + way) for _, _, way in joints]
+    found = ramp(now, goals, [ELBOW] * len(joints), DT)
+    assert [point.position for point in found] == pytest.approx([0.5] * len(joints), abs=0.01)
+    along(now, [0.5] * 6, [0.5 + way for _, _, way in joints], [ELBOW] * len(joints), DT)
+
+
+def test_where_ruckig_finds_no_way_at_all_the_joints_brake(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class NoWay:
+        def calculate(self, given: object, path: object) -> None:
+            raise ruckig.RuckigError("no way")
+
+    monkeypatch.setattr(joint_ramp, "_solver", lambda joints: NoWay())
+    (point,) = ramp([JointPoint(0.0, 1.0)], [JointGoal(1.0)], [ELBOW], DT)
+    assert point.velocity == pytest.approx(1.0 - 20.0 * DT)
+    assert point.position == pytest.approx(0.6 * DT)
