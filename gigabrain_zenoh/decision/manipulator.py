@@ -28,13 +28,14 @@ from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold, Plan
 from gigabrain_zenoh.manipulation.collision import Thing, turned
 from gigabrain_zenoh.manipulation.grasps import Grasp
-from gigabrain_zenoh.manipulation.phases import PhaseRun
+from gigabrain_zenoh.manipulation.phases import Phase, PhaseRun
 from gigabrain_zenoh.manipulation.pick_place import NoWay
 
 TRIES = 3  # to pick a thing up, each with another grasp
 HOLD_UPS = 5  # of one command, after which it fails
 MISSED = f"it was not caught, {TRIES} times"
 GRIPS = 0.1  # of the gripper's greatest speed, above which it moves: an encoder's steps are less
+SENT = 0.01  # of the gripper's range, within which it was sent to its target
 CARRYING = ("lift", "traverse", "lower")  # phases in which a thing has to be held
 NO_MODEL = Idle("waiting", "waiting: for the arm's model, robot/arm_model")
 NOT_MEASURED = Idle("waiting", "waiting: for all joints to be measured")
@@ -190,7 +191,8 @@ class Manipulator:
             return self._fail(f"{hold.thing.name} has slipped out of the gripper")
         if off := _off(body, state, run.expected(state.tick), "path_tolerance"):
             return self._held_up(off)
-        over = run.advance(state.tick, grips=_grips(planner, state))
+        grips = run.phase is not None and _grips(planner, state, body, run.phase)
+        over = run.advance(state.tick, grips=grips)
         if over and over.name == "close" and plan.hold:
             if not _holds(planner, plan.hold, state):
                 assert plan.grasp
@@ -357,13 +359,18 @@ def _holds(planner: ArmPlanner, hold: Hold, state: RobotState) -> bool:
     return planner.holds(_gripper(planner, state, hold.grip), hold.grip)
 
 
-def _grips(planner: ArmPlanner, state: RobotState) -> bool:
-    """Return whether the gripper still moves."""
+def _grips(planner: ArmPlanner, state: RobotState, body: BodyDescription, phase: Phase) -> bool:
+    """Return whether the gripper is still on its way: it moves, or was not sent there yet."""
     gripper = planner.arm.gripper
-    return gripper is not None and any(
+    if gripper is None or phase.gripper is None:
+        return False
+    moves = any(
         joint.name == gripper.name and abs(joint.velocity) > GRIPS * gripper.max_speed
         for joint in state.joints
     )
+    sent = dict(zip((joint.name for joint in body.joints), state.joints_sent, strict=False))
+    slack = gripper.gains.max_correction + SENT * (gripper.upper - gripper.lower)
+    return moves or abs(sent.get(gripper.name, phase.gripper) - phase.gripper) > slack
 
 
 def _gripper(planner: ArmPlanner, state: RobotState, unknown: float) -> float:

@@ -26,7 +26,7 @@ from gigabrain_zenoh.manipulation.collision import CollisionChecker
 
 PERIOD_S = 0.02  # between points
 SPEEDS = (1.0, 0.7, 0.5, 0.35, 0.2, 0.1, 0.0)  # shares of the speed at corners that are tried
-FAST = 0.7  # of the joints' speeds
+FAST = 0.5  # of the joints' speeds
 ACCELERATION_SHARE = 0.5
 MAX_STRAY = 0.02  # of a part's longest move
 SPARE = 1e-9

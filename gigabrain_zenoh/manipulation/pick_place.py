@@ -34,7 +34,7 @@ from gigabrain_zenoh.manipulation.planner import NoPath, plan
 LIMIT_SPARE = 0.006  # of a joint's range, at its ends: servos swing a bit too far
 SLOW = 0.35  # of the joints' speeds, near the thing
 SQUEEZE = 0.12  # of the gripper's range, beyond the thing's width
-EASED = 0.05  # the same, once it is held: what servos can do for long
+EASED = 0.035  # the same, once it is held: what servos can do for long
 HELD_SHARE = 0.02  # of the gripper's range, short of its target: something is between the fingers
 LIFT_M = 0.05  # straight up
 PLACE_GAP_M = 0.003  # above what it is put on, when it is let go of

@@ -181,6 +181,13 @@ def test_the_integral_lifts_a_joint_that_sags_no_further_than_its_largest_correc
     assert heavy.places[-1][0] == pytest.approx(0.55, abs=0.001)
 
 
+def test_a_gripper_is_not_pressed_ever_harder_on_what_it_holds() -> None:
+    arm = ArmBench(arm_body(PAN, replace(LIFT, part="gripper")), sag=0.03)
+    arm.go(ticks=CALM)
+    arm.go(targets(pan=0.5, lift=0.5), ticks=200)
+    assert arm.places[-1] == pytest.approx((0.53, 0.5), abs=0.002)
+
+
 def test_feed_forward_leads_a_moving_joint() -> None:
     ahead = replace(PAN, gains=JointGains(i=0.0, feed_forward=0.1))
     arm = ArmBench(arm_body(ahead, LIFT))
