@@ -251,8 +251,12 @@ class PickPlacePlanner:
         return max(self._gripper.lower, min(self._gripper.upper, aim))
 
     def eased(self, measured: float, wanted: float) -> Phase:
-        """Return the phase in which a gripper that was sent to `wanted` squeezes less."""
-        most = EASED * (self._gripper.upper - self._gripper.lower)
+        """Return the phase in which a gripper that was sent to `wanted` squeezes less.
+
+        One whose greatest effort is not known goes on squeezing.
+        """
+        span = self._gripper.upper - self._gripper.lower
+        most = EASED * span if self._gripper.max_effort else span
         less = max(-most, min(most, wanted - measured))
         return Phase(name="ease", gripper=measured + less)
 
