@@ -15,7 +15,7 @@ LINKS: tuple[LinkName, ...] = ("sim", "emulated", "real")
 
 
 class Demo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What `gigabrain demo` shows of a body."""
+    """World and mission of a body's `gigabrain demo`."""
 
     world: str = "arena"
     mission: str = ""  # file beside the robot's file; empty: it explores

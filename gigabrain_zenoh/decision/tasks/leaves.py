@@ -93,13 +93,13 @@ class DriveNode(Leaf):
         self._prefix = f"{place}: " if place else ""
 
     def initialise(self) -> None:
-        """Begin anew."""
+        """Start the node, or start it again."""
         self._command = DriveCommand(
             next(self.context.numbers), self._command.kind, self._command.goal
         )
 
     def update(self) -> Status:
-        """Go on by one tick."""
+        """Advance the node by one tick, and return its status."""
         outcome, self.context.doing = self.context.outcome, self.name
         if outcome and outcome.number == self._command.number and outcome.state != "running":
             done = outcome.state == "done"
@@ -117,12 +117,12 @@ class ArmNode(Leaf):
         self._command: ArmCommand | None = None
 
     def initialise(self) -> None:
-        """Begin anew."""
+        """Start the node, or start it again."""
         number, things = next(self.context.numbers), dict(self.context.things)
         self._command = ArmCommand(number, self._action, things)
 
     def update(self) -> Status:
-        """Go on by one tick."""
+        """Advance the node by one tick, and return its status."""
         outcome, self.context.doing = self.context.outcome, self.name
         assert self._command
         if outcome and outcome.number == self._command.number and outcome.state != "running":
@@ -149,13 +149,13 @@ class SeekNode(Leaf):
         self._missed: dict[int, str] = {}  # ids that it cannot get to, and why
 
     def initialise(self) -> None:
-        """Begin anew."""
+        """Start the node, or start it again."""
         self._seek = next(self.context.numbers)
         self._command, self._id = DriveCommand(self._seek, "look", seek=self._seek), None
         self._missed = {}
 
     def update(self) -> Status:
-        """Go on by one tick."""
+        """Advance the node by one tick, and return its status."""
         outcome = self.context.outcome
         if outcome and outcome.number == self._command.number and outcome.state != "running":
             if self._command.kind == "look":
@@ -203,11 +203,11 @@ class WaitNode(Leaf):
         self._seconds, self._until_s = seconds, 0.0
 
     def initialise(self) -> None:
-        """Begin anew."""
+        """Start the node, or start it again."""
         self._until_s = self.context.now_s + self._seconds
 
     def update(self) -> Status:
-        """Go on by one tick."""
+        """Advance the node by one tick, and return its status."""
         left_s = self._until_s - self.context.now_s
         if left_s <= 1e-9:
             return Status.SUCCESS
@@ -224,7 +224,7 @@ class ConditionNode(Leaf):
         self._condition, self._waits = condition, waits
 
     def update(self) -> Status:
-        """Go on by one tick."""
+        """Advance the node by one tick, and return its status."""
         self.context.doing = self.name
         holds = self._condition.holds(self.context.read)
         if holds or self._waits:
@@ -242,11 +242,11 @@ class ScriptNode(Leaf):
         self._running: Run | None = None
 
     def initialise(self) -> None:
-        """Begin anew."""
+        """Start the node, or start it again."""
         self._running = self.context.start(self._script)
 
     def update(self) -> Status:
-        """Go on by one tick."""
+        """Advance the node by one tick, and return its status."""
         self.context.doing = self.name
         result = self._running.result if self._running else None
         if result is None:
@@ -254,7 +254,7 @@ class ScriptNode(Leaf):
         return Status.SUCCESS if result[0] else self.failed(f"{self._script.run} {result[1]}")
 
     def terminate(self, new_status: Status) -> None:
-        """End."""
+        """Stop what the node has started."""
         if self._running:
             self._running.stop()
             self._running = None

@@ -173,7 +173,7 @@ class Step(Part, frozen=True, kw_only=True):
 
     @property
     def arm(self) -> ArmAction | None:
-        """What the arm does; None for a step that does not move it."""
+        """The arm's action; None for a step that does not move it."""
         if self.reach is not None:
             return self.reach if isinstance(self.reach, Reach) else Reach(at=self.reach)
         if self.posture is not None:
@@ -210,7 +210,7 @@ class Mission(Part, frozen=True, kw_only=True):
 
     @property
     def arm_actions(self) -> list[ArmAction]:
-        """What all steps want of the arm."""
+        """The arm's actions in all steps."""
         return [step.arm for _, step in _steps(self) if step.arm]
 
     @property

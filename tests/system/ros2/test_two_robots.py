@@ -69,6 +69,11 @@ def drives(report: dict[str, Any], linear: float, angular: float) -> bool:
     return moves and abs(twist["angular"]["z"] - angular) < 0.2
 
 
+def namespaces(graph: dict[str, Any]) -> set[str]:
+    """Return the first parts of the names of all topics, but for those of ROS itself."""
+    return {topic.split("/")[1] for topic in graph["topics"].keys() - OF_ROS}
+
+
 async def test_two_robots_are_driven_at_once_and_do_not_mix(pair: Pair, judge: Judge) -> None:
     await asyncio.gather(released(pair.red), released(pair.blue))
     driver, listener = judge.start("drive", node="hands"), judge.start("listen")
@@ -100,15 +105,12 @@ async def test_two_robots_are_driven_at_once_and_do_not_mix(pair: Pair, judge: J
         assert {one["namespace"] for one in ends["publishers"]} == {f"/{name}"}
     nodes = {"/red/gigabrain", "/blue/gigabrain"}
 
-    def named(graph: dict[str, Any]) -> set[str]:
-        return {topic.split("/")[1] for topic in graph["topics"].keys() - OF_ROS}
-
     graph = await asyncio.to_thread(
         judge.start("graph").poll,
         "graph",
-        lambda found: nodes <= set(found["nodes"]) and named(found) >= set(SPEEDS),
+        lambda found: nodes <= set(found["nodes"]) and namespaces(found) >= set(SPEEDS),
     )
-    assert named(graph) == set(SPEEDS)
+    assert namespaces(graph) == set(SPEEDS)
 
     await driver.query("rest", topic="/red/cmd_vel")
     await pair.red.becomes("idle")
