@@ -33,6 +33,7 @@ from gigabrain_zenoh.manipulation.pick_place import NoWay
 
 TRIES = 3  # to pick a thing up, each with another grasp
 HOLD_UPS = 5  # of one command, after which it fails
+WAIT_TICKS = 100  # for a joint that the gate holds back, before another way is planned
 MISSED = f"it was not caught, {TRIES} times"
 GRIPS = 0.1  # of the gripper's greatest speed, above which it moves: an encoder's steps are less
 SENT = 0.01  # of the gripper's range, within which it was sent to its target
@@ -189,6 +190,9 @@ class Manipulator:
         if hold and run.phase and run.phase.name in CARRYING and not _holds(planner, hold, state):
             self._hold = None
             return self._fail(f"{hold.thing.name} has slipped out of the gripper")
+        waits = run.wait(state.tick, *_pace(body, state))
+        if run.waited > WAIT_TICKS:
+            return self._held_up(f"{waits} is held back for {WAIT_TICKS * TICK_S:g} s")
         if off := _off(body, state, run.expected(state.tick), "path_tolerance"):
             return self._held_up(off)
         grips = run.phase is not None and _grips(planner, state, body, run.phase)
@@ -220,7 +224,7 @@ class Manipulator:
         self._achieve(dataclasses.replace(held, grip=ease.gripper))
 
     def _held_up(self, why: str) -> StepResult:
-        """Plan again from where the joints are, as safety or a late process held them up."""
+        """Plan again from where the joints are, as something held them up."""
         self._hold_ups += 1
         if self._hold_ups > HOLD_UPS:
             return self._fail(why)
@@ -311,6 +315,16 @@ def _sent(planner: ArmPlanner, body: BodyDescription, state: RobotState) -> Floa
     """Return where the arm's joints were sent (n,) [rad] or [m]."""
     sent = dict(zip((joint.name for joint in body.joints), state.joints_sent, strict=True))
     return np.array([sent[name] for name in planner.arm.names])
+
+
+def _pace(
+    body: BodyDescription, state: RobotState
+) -> tuple[Mapping[str, float], Mapping[str, float]]:
+    """Return where each joint was sent, and by how much that may be behind [rad] or [m]."""
+    names = [joint.name for joint in body.joints]
+    sent = dict(zip(names, state.joints_sent, strict=False))
+    measured = {joint.name: joint.position for joint in state.joints}
+    return measured | sent, {joint.name: joint.gains.max_correction for joint in body.joints}
 
 
 def _measured(planner: ArmPlanner, state: RobotState) -> Floats:

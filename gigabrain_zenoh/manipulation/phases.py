@@ -1,7 +1,7 @@
 """Phases of a plan, and how they are carried out: one wish for the joints in each tick."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,6 +22,8 @@ GRIP_TICKS = 40  # until a gripper has closed, or has stopped at what is between
 LATE_TICKS = 100  # by which that may last longer
 SETTLE_TICKS = 12  # after a trajectory
 AHEAD_TICKS = 1  # from a state to the tick in which a command by it moves joints
+LAG_TICKS = 1  # from there until a state shows that it did, where a process is late
+NO_WAY = 1e-6  # [rad] or [m] in a tick, of a joint that a path leaves where it is
 WINDOW_TICKS = 100  # of a trajectory in an intent
 assert WINDOW_TICKS * TICK_S <= LONGEST_WINDOW_S
 
@@ -49,6 +51,7 @@ class PhaseRun:
         """Begin at `tick`; `gripper` names its joint."""
         self._phases, self._gripper = tuple(phases), gripper
         self._begun, self._at = tick, 0
+        self._paced, self.waited = tick, 0  # ticks for which the present phase has not gone on
         self._total = sum(phase.ticks for phase in phases)
 
     @property
@@ -68,7 +71,40 @@ class PhaseRun:
         if late < 0 or (grips and phase.arm is None and late < LATE_TICKS):
             return None
         self._begun, self._at = tick, self._at + 1
+        self.waited = 0
         return phase
+
+    def wait(self, tick: int, sent: Mapping[str, float], spare: Mapping[str, float]) -> str:
+        """Stretch time while joints are sent less far along their path than they should be.
+
+        So a trajectory waits for a gate that slows joints down, and all of them stay on it. How
+        well they follow what is sent does not count.
+
+        Args:
+            tick: Of the state.
+            sent: Where the joints were sent [rad] or [m].
+            spare: By how much that may be behind [rad] or [m]: what control corrects.
+
+        Returns:
+            The joint for which it waits, or an empty text.
+        """
+        phase, before, self._paced = self.phase, self._paced - self._begun, tick
+        if phase is None or phase.arm is None:
+            return ""
+        names, late = phase.arm.names, AHEAD_TICKS + LAG_TICKS
+        rows = _rows(phase.arm, np.arange(before, tick - self._begun + 1) - late)
+        ways = np.diff(rows, axis=0)
+        off = np.sign(ways) * (rows[1:] - [sent[name] for name in names])
+        behind = (off > [spare[name] for name in names]) & (np.abs(ways) > NO_WAY)
+        (held,) = np.nonzero(behind.any(axis=1))
+        if not len(held):
+            self.waited = 0
+            return ""
+        gone = int(held[0])
+        ticks = len(ways) - gone
+        self._begun += ticks
+        self.waited = ticks + (0 if gone else self.waited)
+        return names[int(np.argmax(behind[gone]))]
 
     def insert(self, phase: Phase) -> None:
         """Carry out another phase before the present one, which has just begun."""

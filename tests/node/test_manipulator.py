@@ -15,6 +15,7 @@ from gigabrain_drivers.sim.body import MujocoOptions, sim_body
 from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import ArmModel
 from gigabrain_schemas.brain import Intent
+from gigabrain_schemas.safety import JointCap
 from gigabrain_schemas.tasks import Task
 from gigabrain_zenoh.decision.behaviours import ArmCommand, StepOutcome
 from gigabrain_zenoh.decision.manipulator import Manipulator
@@ -63,7 +64,7 @@ class Rig:
         self.manipulator = Manipulator(bus, "navigate")
         self.queue = TaskQueue(lambda _topic: None, lambda _script: None, Saved())  # type: ignore[arg-type, return-value]
         self.outcome: StepOutcome | None = None
-        self.held, self.blocked = "", False
+        self.held = ""
         self.phases: list[str] = []  # that it was in, each time it began
 
     @property
@@ -83,7 +84,7 @@ class Rig:
         self.outcome = outcome if command else None
         if not self.phases or self.phases[-1] != outcome.reason:
             self.phases.append(outcome.reason)
-        self.arm.step(IDLE if self.blocked else intent)
+        self.arm.step(intent)
 
     def take_away(self) -> None:
         """Have what the gripper holds be somewhere else."""
@@ -218,8 +219,31 @@ def test_what_slips_out_of_the_gripper_is_told(rig: Rig) -> None:
 
 
 def test_a_joint_that_does_not_follow_ends_the_command_after_a_few_tries(rig: Rig) -> None:
-    rig.blocked = True
+    rig.arm.arm.limit({"shoulder_pan": 0.0})  # its servo has no torque
     task = rig.carry_out("do: [{posture: {shoulder_pan: 1.0}}]")
     assert task.state == "failed"
-    assert "is 0.3" in task.reason
+    assert "shoulder_pan is 0." in task.reason
     assert "more than its path_tolerance of 0.3" in task.reason
+
+
+def test_a_trajectory_waits_for_a_joint_that_safety_slows_down(rig: Rig) -> None:
+    rig.carry_out("do: [{posture: {shoulder_pan: 0.0, wrist_roll: 0.0}}]")
+    rig.arm.caps = (JointCap(name="shoulder_pan", rise=0.2, fall=0.2),)
+    rig.give("do: [{posture: {shoulder_pan: 1.0, wrist_roll: 1.0}}]")
+    rig.phases, apart = [], 0.0
+    while rig.outcome is None or rig.outcome.reason != "move":
+        rig.tick()
+    while rig.queue.status.current:
+        rig.tick()
+        apart = max(apart, abs(rig.arm.measured("shoulder_pan") - rig.arm.measured("wrist_roll")))
+    assert rig.queue.status.done[0].state == "succeeded"
+    assert rig.phases.count("move") == 1  # no other way was planned
+    assert apart < 0.3
+
+
+def test_what_safety_holds_back_for_long_ends_the_command_after_a_few_tries(rig: Rig) -> None:
+    rig.arm.caps = (JointCap(name="shoulder_pan", rise=0.0, fall=0.0),)
+    task = rig.carry_out("do: [{posture: {shoulder_pan: 1.0}}]")
+    assert task.state == "failed"
+    assert "shoulder_pan is held back for 2 s" in task.reason
+    assert rig.phases.count("move") == 6

@@ -24,7 +24,7 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import Intent
-from gigabrain_schemas.safety import SafetyState
+from gigabrain_schemas.safety import JointCap, SafetyState
 from gigabrain_zenoh.control.joints import JointInputs, JointMemory, step_joints
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate import gate
@@ -156,6 +156,7 @@ class ArmInMemory:
         )
         self._gate, self._memory, self._seq = gate.GateState(boot=1), JointMemory(), 0
         self.broken, self.ticks, self.fastest = 0, 0, 0.0
+        self.caps: tuple[JointCap, ...] = ()  # that safety sets
         while self._gate.mode != "enabled":
             self.step(Intent(behaviour="hands", reason="waiting"))
 
@@ -171,7 +172,9 @@ class ArmInMemory:
         state = self.state()
         joints = tuple(JointMotion(joint.position, joint.velocity) for joint in state.joints)
         self._feed(gate.Tick(ZERO, joints=joints, held=state.joints_sent))
-        self._feed(gate.Safety(SafetyState(verdict="ok", boot=1, tick=self._gate.tick)))
+        self._feed(
+            gate.Safety(SafetyState(verdict="ok", joints=self.caps, boot=1, tick=self._gate.tick))
+        )
         self._memory, command = step_joints(
             self.description, self._memory, JointInputs(state=self.state(), intent=intent)
         )
