@@ -6,12 +6,21 @@ looks ahead, x to the right of the picture and y down. It hangs below `base_link
 
 import math
 from collections.abc import Iterable
+from typing import Any
 
 from foxglove import messages as fox
 
 from gigabrain_schemas.body import Camera
 from gigabrain_schemas.brain import Contour, WorldModel
-from gigabrain_schemas.objects import Detection, Detections, MapObject, MapTag, ObjectMap
+from gigabrain_schemas.objects import (
+    Detection,
+    Detections,
+    MapObject,
+    MapTag,
+    ObjectMap,
+    SeenSolid,
+    Solids,
+)
 from gigabrain_schemas.sensors import Image
 from gigabrain_schemas.vision import CameraInfo, DepthImage
 from gigabrain_zenoh.recording.drawn import (
@@ -249,3 +258,40 @@ def _tag(stored: ObjectMap, one: MapTag) -> fox.SceneEntity:
         timestamp=stamp(stored), frame_id=MAP, id=f"tag {one.id}", cubes=[plate], arrows=[arrow],
         texts=[label(one.x, one.y, f"tag {one.id}", one.z + one.size)],
     )  # fmt: skip
+
+
+class SolidsDrawing:
+    """Draws what stands near an arm."""
+
+    def __init__(self) -> None:
+        self._known = KnownEntities()
+
+    def draw(self, seen: Solids, _: str) -> Iterable[Drawn]:
+        """Draw each thing by its shape, with its class and its number."""
+        entities = {f"solid {one.id}": _solid(seen, one) for one in seen.solids}
+        yield as_drawn("solids", self._known.update(seen, entities))
+
+
+def _solid(seen: Solids, one: SeenSolid) -> fox.SceneEntity:
+    x, y, z = one.position
+    pose, colour = pose_of(x, y, one.yaw, z), fox.Color(r=0.85, g=0.45, b=0.1, a=0.6)
+    shape: dict[str, Any] = {}
+    if one.shape == "box":
+        long, wide, tall = one.size
+        size = fox.Vector3(x=long, y=wide, z=tall)
+        shape["cubes"] = [fox.CubePrimitive(pose=pose, size=size, color=colour)]
+    elif one.shape == "cylinder":
+        size = fox.Vector3(x=2 * one.size[0], y=2 * one.size[0], z=one.size[1])
+        shape["cylinders"] = [
+            fox.CylinderPrimitive(
+                pose=pose, size=size, bottom_scale=1.0, top_scale=1.0, color=colour
+            )
+        ]
+    else:
+        wide = 2 * one.size[0]
+        size = fox.Vector3(x=wide, y=wide, z=wide)
+        shape["spheres"] = [fox.SpherePrimitive(pose=pose, size=size, color=colour)]
+    text = label(x, y, f"{one.label} {one.id}".strip(), z + one.size[-1])
+    return fox.SceneEntity(
+        timestamp=stamp(seen), frame_id=BASE, id=f"solid {one.id}", texts=[text], **shape
+    )

@@ -117,6 +117,7 @@ class Drawer:
             "camera": camera_drawing.calibration,
             "detections": camera_drawing.recognised,
             "objects": camera_drawing.ObjectMapDrawing().draw,
+            "solids": camera_drawing.SolidsDrawing().draw,
             "perceived": self._perceived,
         }
 

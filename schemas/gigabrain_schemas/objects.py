@@ -1,6 +1,6 @@
-"""What was recognised: things and tags in one picture, and a memory of what stands where."""
+"""What cameras found: things and tags in one picture, what stands where, what an arm may grasp."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from msgspec import Meta
 
@@ -24,6 +24,9 @@ Pixel = tuple[PixelOffset, PixelOffset]
 TagId = Annotated[int, Meta(ge=0, le=1_000_000)]
 Label = Annotated[str, Meta(min_length=1, max_length=64)]
 Extent = tuple[Distance, Distance]  # [m] width and height
+Length = Annotated[float, Meta(gt=0.0, le=10.0)]  # [m]
+Seconds = Annotated[float, Meta(ge=0.0, le=1e9)]
+SIZES = {"box": 3, "cylinder": 2, "sphere": 1}  # lengths that say how large a solid is
 
 
 class Detection(Record, frozen=True, kw_only=True):
@@ -94,6 +97,30 @@ class ObjectMap(Message, frozen=True, kw_only=True):
     tags: Annotated[tuple[MapTag, ...], Meta(max_length=256)] = ()
     map: Name = ""  # the saved map that it is kept with; empty for a growing one
     recognizing: bool = False  # detections have come within the last seconds
+
+
+class SeenSolid(Record, frozen=True, kw_only=True):
+    """A thing that stands near an arm, by its shape. What is not seen of it is guessed."""
+
+    id: Count  # the same for as long as it is known
+    shape: Literal["box", "cylinder", "sphere"]  # cylinders stand upright
+    size: Annotated[tuple[Length, ...], Meta(min_length=1, max_length=3)]
+    # [m]: of a box x, y, z; of a cylinder radius, height; of a sphere its radius
+    position: Point  # [m], of its middle, in the body's frame at the message's basis
+    yaw: Angle = 0.0  # [rad] of a box
+    label: Name = ""  # its class, where it was recognised
+    seen: Count = 1  # pictures
+    age: Seconds = 0.0  # [s] since it was seen last
+
+    def __post_init__(self) -> None:
+        if len(self.size) != SIZES[self.shape]:
+            raise ValueError(f"size: expected {SIZES[self.shape]} lengths of a {self.shape}")
+
+
+class Solids(Message, frozen=True, kw_only=True):
+    """What stands near an arm, in the body's frame at the basis, the nearest first."""
+
+    solids: Annotated[tuple[SeenSolid, ...], Meta(max_length=64)] = ()
 
 
 class ObjectsRequest(Message, frozen=True, kw_only=True):

@@ -33,7 +33,7 @@ Role = Literal[  # of an identity
 # How viewers show a topic; `recording/drawing.py` has a function for each.
 Drawing = Literal[
     "scan", "map", "zones", "pose", "path", "obstacles", "task", "image", "log", "odometry",
-    "lidar_frame", "arm_model", "depth", "camera", "detections", "objects", "perceived",
+    "lidar_frame", "arm_model", "depth", "camera", "detections", "objects", "solids", "perceived",
 ]  # fmt: skip
 
 
@@ -128,6 +128,10 @@ DETECTIONS = Topic(
 OBJECT_MAP = Topic(
     "robot/objects", objects.ObjectMap, 1, keep=True, max_bytes=128 * KB, publishers=BRAIN,
     drawing="objects",
+)  # fmt: skip
+SOLIDS = Topic(
+    "robot/solids", objects.Solids, 5, missed=10.0, max_bytes=32 * KB, publishers=BRAIN,
+    drawing="solids",
 )  # fmt: skip
 POSE = Topic("robot/pose", brain.PoseInMap, 10, publishers=BRAIN, drawing="pose")
 MAP = Topic(

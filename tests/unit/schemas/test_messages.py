@@ -29,6 +29,7 @@ REQUIRED: dict[str, set[str]] = {
     "Objects": {"objects"},
     "Detections": {"camera", "width", "height"},
     "ObjectMap": set(),
+    "Solids": set(),
     "PoseRequest": {"x", "y"},
     "PoseReply": {"ok", "text"},
     "ObjectsRequest": set(),
@@ -104,6 +105,7 @@ def test_the_table_holds_the_keys_and_rates_of_the_design() -> None:
         "robot/perceived/*": ("Objects", 10),
         "robot/detections": ("Detections", 5),
         "robot/objects": ("ObjectMap", 1),
+        "robot/solids": ("Solids", 5),
         "robot/pose": ("PoseInMap", 10),
         "robot/map": ("OccupancyGrid", 1),
         "robot/zones": ("Zones", 0.5),
@@ -145,6 +147,7 @@ def test_a_value_stops_counting_after_so_many_missed_periods() -> None:
         "robot/perceived": 500_000_000,
         "robot/detections": 1_000_000_000,
         "robot/objects": 5_000_000_000,
+        "robot/solids": 2_000_000_000,
         "robot/pose": 500_000_000,
         "robot/map": 5_000_000_000,
         "robot/zones": 10_000_000_000,
@@ -207,7 +210,7 @@ def test_every_message_is_frozen_and_documented_and_carries_the_header(
 def test_the_golden_folder_holds_the_examples_byte_for_byte() -> None:
     stored = {path.name: path.read_bytes() for path in examples.FOLDER.iterdir()}
     assert stored == examples.files()
-    assert len(stored) == 120
+    assert len(stored) == 122
 
 
 @by_name
