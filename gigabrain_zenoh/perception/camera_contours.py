@@ -9,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
@@ -24,8 +24,12 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.geometry.pose import ORIGIN, PoseHistory, relative
 from gigabrain_zenoh.geometry.se2 import from_pose, transform
 from gigabrain_zenoh.host.threads import Job
-from gigabrain_zenoh.vision.obstacle_contours import ObstacleContours
+from gigabrain_zenoh.vision.obstacle_contours import ObstacleContours, OwnPoints, Seen
 from gigabrain_zenoh.vision.pictures import decoded
+
+if TYPE_CHECKING:
+    from gigabrain_zenoh.perception.solid_keeper import SolidKeeper
+    from gigabrain_zenoh.vision.solid_fit import SolidFit
 
 SILENT_PERIODS, SILENT_S = 2.5, 0.4  # without a picture, whichever is longer
 MIN_PERIOD_SHARE = 0.5  # of its period: pictures that come faster are skipped
@@ -53,6 +57,15 @@ class View:
             at += len(one.polygon)
             found.append(replace(one, polygon=polygon, age=one.age + older))
         return tuple(found)
+
+
+class _Look(NamedTuple):
+    """What came of a picture."""
+
+    refused: str  # why it was, if it was
+    view: View
+    seen: Seen | None = None  # of a body with an arm
+    solids: "tuple[SolidFit, ...]" = ()  # what stands in it
 
 
 @dataclass
@@ -96,6 +109,7 @@ class CameraContours:
         self._busy = False
         self._view = View()
         self._history = PoseHistory()
+        self._solids = _solid_keeper(bus, description)
         self._ends = [
             bus.subscribe(CAMERA, self._on_info),
             bus.subscribe(STATE, lambda _, state: self._on_state(state)),
@@ -109,6 +123,8 @@ class CameraContours:
         """Stop listening, and end the thread after its work."""
         for end in self._ends:
             end()
+        if self._solids:
+            self._solids.close()
         self._eyes.clear()  # no work is begun any more
         self._pool.shutdown()
 
@@ -126,6 +142,8 @@ class CameraContours:
             self._contours = ObstacleContours(self._description)
             self._eyes = {name: _Eye(eye.camera) for name, eye in self._eyes.items()}
         self._history = self._history.then(state)
+        if self._solids:
+            self._solids.on_state(state)
         self._start()
         self._pass_on(state)
 
@@ -163,31 +181,55 @@ class CameraContours:
                 self._bus.counters[SKIPPED] += 1
                 continue
             self._busy = True
-            job = self._pool.submit(_look, self._contours, eye.camera.name, picture, pose)
+            on_arm = self._solids.own(picture.basis) if self._solids else None
+            find = self._solids.find if self._solids and on_arm else None
+            work = self._contours, eye.camera.name, picture, pose, on_arm, find
+            job = self._pool.submit(_look, *work)
             self._bus.input_log.when_done(job, partial(self._finish, eye, self._boot))
             return
 
     def _finish(self, eye: _Eye, boot: int, job: Job) -> None:
         self._busy = False
-        refused, view = job.result()
+        look: _Look = job.result()
         if boot == self._boot:
-            self._view, eye.exposure, eye.refused = view, view.tick, refused
+            view = self._view = look.view
+            eye.exposure, eye.refused = view.tick, look.refused
+            if self._solids and look.seen:
+                self._solids.look(look.seen, look.solids, view.pose, view.tick)
             self._on_new()
         self._start()
 
 
 def _look(
-    contours: ObstacleContours, name: str, picture: DepthImage | Image, pose: Pose
-) -> tuple[str, View]:
-    """Add a picture; return why it was refused, and what is known then."""
+    contours: ObstacleContours,
+    name: str,
+    picture: DepthImage | Image,
+    pose: Pose,
+    on_arm: OwnPoints | None,
+    find: "Callable[[Seen], tuple[SolidFit, ...]] | None",
+) -> _Look:
+    """Add a picture, and find what stands in it where it is known what of it is the arm."""
     now = picture.basis * TICK_S
     if picture.frame_id != name:
         refused = f"it is a picture of the camera {picture.frame_id!r}"
     elif isinstance(picture, DepthImage):
-        refused = contours.add_depth(name, picture, pose, now)
+        refused = contours.add_depth(name, picture, pose, now, on_arm)
     else:
         try:
             refused = contours.add_colour(name, decoded(picture), pose, now)
         except ValueError as error:
             refused = str(error)
-    return refused, View(contours.contours(pose, now), pose, picture.basis)
+    view = View(contours.contours(pose, now), pose, picture.basis)
+    seen = contours.seen
+    if find is None or seen is None:
+        return _Look(refused, view)
+    return _Look(refused, view, seen, find(seen))
+
+
+def _solid_keeper(bus: Bus, description: BodyDescription) -> "SolidKeeper | None":
+    """Return who finds things near an arm, for a body that has one."""
+    if description.arm is None:
+        return None
+    from gigabrain_zenoh.perception.solid_keeper import SolidKeeper  # imports OpenCV
+
+    return SolidKeeper(bus, description)

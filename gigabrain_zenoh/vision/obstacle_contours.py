@@ -1,6 +1,8 @@
 """Obstacle contours: what the cameras of a body saw, in its frame, remembered where it drives."""
 
 import math
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
@@ -24,7 +26,7 @@ from gigabrain_zenoh.vision.cell_memory import (
     Cells,
     Picture,
 )
-from gigabrain_zenoh.vision.depth_picture import HIGH_M, DepthCamera
+from gigabrain_zenoh.vision.depth_picture import HIGH_M, DepthCamera, DepthView
 from gigabrain_zenoh.vision.floor_colour import ColourCamera
 from gigabrain_zenoh.vision.outlines import Labels, connected, distinct, split, support_polygons
 
@@ -37,6 +39,15 @@ LATER_POINTS = 2.0  # ... in its second
 GROUPS = ((OBSTACLE,), (HOLE, MISSING), (COLOUR,))  # kinds of cells that make a contour together
 LEAST_SEEN = {OBSTACLE: 2.0, HOLE: 2.0, MISSING: 3.0, COLOUR: 3.0}  # pictures
 UNSURE = {MISSING: 0.5, COLOUR: 0.5}  # confidence of kinds that other things look like
+OwnPoints = Callable[[Floats], NDArray[np.bool_]]  # which points (n, 3) are on the body's own arm
+
+
+class Seen(NamedTuple):
+    """A depth picture, taken apart."""
+
+    view: DepthView
+    model: CameraModel
+    own: NDArray[np.bool_]  # (n,) of its obstacles that are the body itself
 
 
 class ObstacleContours:
@@ -55,13 +66,22 @@ class ObstacleContours:
         self._colour: dict[str, ColourCamera] = {}
         self._memory = CellMemory()
         self._tracks = 0
+        self.seen: Seen | None = None  # the newest depth picture, unless it was refused
 
     def reset(self) -> None:
         """Forget everything, as after a restart of the odometry."""
         self._memory = CellMemory()
 
-    def add_depth(self, name: str, image: DepthImage, pose: Pose, now: float) -> str:
+    def add_depth(
+        self,
+        name: str,
+        image: DepthImage,
+        pose: Pose,
+        now: float,
+        on_arm: OwnPoints | None = None,
+    ) -> str:
         """Take a depth picture of the camera `name`; return why it was refused, or ''."""
+        self.seen = None
         problem = self._refused(name, image.width, image.height)
         if problem:
             return problem
@@ -83,7 +103,10 @@ class ObstacleContours:
         floor = view.floor.coefficients
         picture = Picture(camera.model, view.depth, view.is_floor, floor)
         self._memory.look(picture, (OBSTACLE, HOLE, MISSING))
-        own = contains(self._footprint, view.obstacles[:, :2].astype(np.float64))
+        standing = view.obstacles.astype(np.float64)
+        own = contains(self._footprint, standing[:, :2])
+        own |= on_arm(standing) if on_arm else False
+        self.seen = Seen(view, camera.model, own)
         self._memory.add(view.obstacles[~own], OBSTACLE)
         self._memory.add(view.holes, HOLE)
         self._memory.add(

@@ -17,11 +17,11 @@ _angles = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
 AXES: Floats = np.stack((np.cos(_angles), np.sin(_angles)))
 
 
-def connected(places: Floats) -> Labels:
-    """Return the number of the group of each place (n, 2) [m]; groups are LINK_M apart."""
+def connected(places: Floats, link: float = LINK_M) -> Labels:
+    """Return the number of the group of each place (n, 2) [m]; groups are `link` [m] apart."""
     if not len(places):
         return np.empty(0, np.intp)
-    index = np.floor(places / LINK_M).astype(np.int64)
+    index = np.floor(places / link).astype(np.int64)
     index -= index.min(axis=0)
     width = int(index[:, 1].max()) + 3
     flat = (index[:, 0] + 1) * width + index[:, 1] + 1

@@ -1,0 +1,96 @@
+"""Keeper of what stands near the arm of a body with a depth camera; publishes `robot/solids`."""
+
+import logging
+from collections import deque
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING
+
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.body import ArmModel, BodyDescription, RobotState
+from gigabrain_schemas.objects import Detections, Solids
+from gigabrain_schemas.topics import ARM_MODEL, DETECTIONS, SOLIDS
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.errors import GigabrainError
+from gigabrain_zenoh.geometry.pose import PoseHistory
+from gigabrain_zenoh.perception.solid_memory import SolidMemory
+from gigabrain_zenoh.vision.obstacle_contours import OwnPoints, Seen
+from gigabrain_zenoh.vision.solid_fit import SolidFit
+from gigabrain_zenoh.vision.solids import find_solids, is_gone
+
+if TYPE_CHECKING:
+    from gigabrain_zenoh.manipulation.arm_mask import ArmMask
+
+KEPT_STATES = 50  # whose joints are known at the exposure of a picture
+LATE_TICKS = 3  # joints move no farther than the mask's margin meanwhile
+log = logging.getLogger(__name__)
+
+
+class SolidKeeper:
+    """Remembers what stands near an arm, on the loop."""
+
+    def __init__(self, bus: Bus, description: BodyDescription) -> None:
+        self._bus, self._description = bus, description
+        self._memory, self._history = SolidMemory(), PoseHistory()
+        self._mask: ArmMask | None = None
+        self._joints: deque[tuple[int, dict[str, float]]] = deque(maxlen=KEPT_STATES)
+        self._ends = [
+            bus.subscribe(ARM_MODEL, lambda _, model: self._on_model(model)),
+            bus.subscribe(DETECTIONS, lambda _, found: self._on_detections(found)),
+        ]
+
+    def close(self) -> None:
+        """Stop listening."""
+        for end in self._ends:
+            end()
+
+    def on_state(self, state: RobotState) -> None:
+        """Record where joints and body are; another start of the driver forgets everything."""
+        if state.boot != self._history.boot:
+            self._memory = SolidMemory()
+            self._joints.clear()
+        self._history = self._history.then(state)
+        self._joints.append((state.tick, {one.name: one.position for one in state.joints}))
+
+    def own(self, tick: int) -> OwnPoints | None:
+        """Return what tells which points of a picture of `tick` are on the arm, if it is known."""
+        if self._mask is None or not self._joints:
+            return None
+        then, joints = min(self._joints, key=lambda one: abs(one[0] - tick))
+        if abs(then - tick) > LATE_TICKS or not self._mask.knows(joints):
+            return None
+        return partial(self._mask.covers, joints=joints)
+
+    @staticmethod
+    def find(seen: Seen) -> tuple[SolidFit, ...]:
+        """Return what stands in a picture; to be called in a thread beside the loop."""
+        return tuple(find_solids(seen.view, seen.model, seen.own))
+
+    def look(self, seen: Seen, fits: Sequence[SolidFit], pose: Pose, tick: int) -> None:
+        """Take what was found in a picture of `tick`, seen from a body at `pose`, and publish."""
+        self._memory.look(fits, pose, tick, partial(is_gone, seen.view, seen.model))
+        self._bus.publish(SOLIDS, Solids(solids=self._memory.solids(pose, tick)), basis=tick)
+
+    def _on_model(self, model: ArmModel) -> None:
+        self._mask = None
+        try:
+            from gigabrain_zenoh.manipulation.arm_mask import ArmMask  # imports MuJoCo
+
+            self._mask = ArmMask(model.mjcf, self._description)
+        except ModuleNotFoundError as error:
+            problem = f"{error.name} is missing; pip install 'gigabrain-zenoh[arm]'"
+        except GigabrainError as error:
+            problem = str(error)
+        else:
+            return
+        text = f"things near the arm are not looked for: {problem}"
+        log.warning("%s", text, extra={"data": {"event": "solids"}})
+
+    def _on_detections(self, found: Detections) -> None:
+        """Take the classes of what was recognised in a picture."""
+        pose = self._history.at(found.boot, found.basis)
+        if pose is None:
+            return
+        for one in found.things:
+            if one.position:
+                self._memory.name(one.label, one.position[0], one.position[1], pose)

@@ -1,0 +1,144 @@
+"""Memory of what stands near an arm: fits of several pictures, tracked in the odometry's frame."""
+
+import math
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import TICK_S, Pose
+from gigabrain_schemas.objects import SeenSolid
+from gigabrain_zenoh.geometry.pose import to_frame, to_parent
+from gigabrain_zenoh.vision.solid_fit import SolidFit
+
+FITS = 9  # newest ones whose median counts
+SURE_SEEN = 2  # pictures, from which on a thing counts
+SAME_M, SAME_SHARE = 0.03, 0.5  # how far off the same thing may be: at least, and of its width
+MOVED_M = 0.02  # from its median: it was moved, and what was known of its place is dropped
+MISSES = 3  # pictures in which it is seen through
+KEPT_S = 120.0  # without being seen: odometry drifts
+MOST, MOST_LABELS = 64, 8
+LABEL_M = 0.06  # beside the middle of a thing, within which something recognised is this thing
+QUARTER = math.pi / 2  # a box looks the same by each of its sides
+
+
+@dataclass
+class Track:
+    """One thing. Places are in the odometry's frame."""
+
+    id: int
+    tick: int  # when it was seen last
+    seen: int = 0  # pictures
+    misses: int = 0
+    fits: deque[SolidFit] = field(default_factory=lambda: deque(maxlen=FITS))
+    labels: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def fit(self) -> SolidFit:
+        """The median of the newest fits of the shape that most of them have."""
+        shape = Counter(fit.shape for fit in self.fits).most_common(1)[0][0]
+        same = [fit for fit in self.fits if fit.shape == shape]
+        size = np.median([fit.size for fit in same], axis=0)
+        position = np.median([fit.position for fit in same], axis=0)
+        yaw = same[-1].yaw + float(np.median([_turn(fit.yaw - same[-1].yaw) for fit in same]))
+        x, y, z = position.tolist()
+        return SolidFit(shape, tuple(size.tolist()), (x, y, z), yaw, same[-1].error)
+
+
+class SolidMemory:
+    """What stands near the arm of one body."""
+
+    def __init__(self) -> None:
+        self._tracks: list[Track] = []
+        self._count = 0
+
+    def look(
+        self, fits: Sequence[SolidFit], pose: Pose, tick: int, gone: Callable[[Floats], bool]
+    ) -> None:
+        """Take what a picture shows, as seen from a body at `pose` at `tick`.
+
+        `gone` tells whether the picture shows what is behind a place (3,) in the body's frame.
+        """
+        placed = [_moved(fit, lambda x, y: to_parent(pose, x, y), pose.yaw) for fit in fits]
+        open_ = list(self._tracks)
+        for fit in sorted(placed, key=lambda one: self._off(one, open_)):
+            track = min(open_, key=lambda one: _distance(one.fit, fit), default=None)
+            if track is None or _distance(track.fit, fit) > _gate(fit):
+                self._count += 1
+                track = Track(id=self._count, tick=tick)
+                self._tracks.append(track)
+            else:
+                open_.remove(track)
+            _take(track, fit, tick)
+        for track in open_:
+            x, y = to_frame(pose, *track.fit.position[:2])
+            missed = gone(np.array((x, y, track.fit.position[2])))
+            track.misses = track.misses + 1 if missed else 0
+        oldest = tick - KEPT_S / TICK_S
+        kept = [one for one in self._tracks if one.misses < MISSES and one.tick >= oldest]
+        self._tracks = sorted(kept, key=lambda one: -one.tick)[:MOST]
+
+    def name(self, label: str, x: float, y: float, pose: Pose) -> None:
+        """Record that something was recognised at a place [m] in the frame of a body at `pose`."""
+        there = to_parent(pose, x, y)
+        track = min(
+            self._tracks, key=lambda one: math.dist(one.fit.position[:2], there), default=None
+        )
+        if track is None:
+            return
+        reach = max(LABEL_M, _width(track.fit))
+        if math.dist(track.fit.position[:2], there) > reach:
+            return
+        if label in track.labels or len(track.labels) < MOST_LABELS:
+            track.labels[label] += 1
+
+    def solids(self, pose: Pose, tick: int) -> tuple[SeenSolid, ...]:
+        """Return what counts, in the frame of a body at `pose` at `tick`, the nearest first."""
+        found = []
+        for track in self._tracks:
+            if track.seen >= SURE_SEEN:
+                fit = _moved(track.fit, lambda x, y: to_frame(pose, x, y), -pose.yaw)
+                label = track.labels.most_common(1)[0][0] if track.labels else ""
+                found.append(SeenSolid(
+                    id=track.id, shape=fit.shape, size=fit.size, position=fit.position,
+                    yaw=_turn(fit.yaw), label=label, seen=track.seen,
+                    age=max(0, tick - track.tick) * TICK_S,
+                ))  # fmt: skip
+        return tuple(sorted(found, key=lambda one: math.hypot(*one.position[:2])))
+
+    def _off(self, fit: SolidFit, tracks: Sequence[Track]) -> float:
+        return min((_distance(track.fit, fit) for track in tracks), default=math.inf)
+
+
+def _take(track: Track, fit: SolidFit, tick: int) -> None:
+    """Add a fit to a track; those before it are dropped where the thing was moved."""
+    if track.fits and _distance(track.fit, fit) > MOVED_M:
+        track.fits.clear()
+    track.fits.append(fit)
+    track.tick, track.seen, track.misses = tick, track.seen + 1, 0
+
+
+def _moved(
+    fit: SolidFit, place: Callable[[float, float], tuple[float, float]], turn: float
+) -> SolidFit:
+    x, y = place(*fit.position[:2])
+    return fit._replace(position=(x, y, fit.position[2]), yaw=fit.yaw + turn)
+
+
+def _distance(one: SolidFit, other: SolidFit) -> float:
+    return math.dist(one.position[:2], other.position[:2])
+
+
+def _width(fit: SolidFit) -> float:
+    return max(fit.size[:2]) if fit.shape == "box" else 2 * fit.size[0]
+
+
+def _gate(fit: SolidFit) -> float:
+    return max(SAME_M, SAME_SHARE * _width(fit))
+
+
+def _turn(angle: float) -> float:
+    """Return a box's yaw from -45 to 45 degrees [rad]."""
+    return math.remainder(angle, QUARTER)
