@@ -33,6 +33,7 @@ from gigabrain_zenoh.decision.context import ContextSource
 from gigabrain_zenoh.decision.detected_objects import ObjectsByPerceptor
 from gigabrain_zenoh.decision.drive_kernels import DriveKernels
 from gigabrain_zenoh.decision.node import InputSource
+from gigabrain_zenoh.decision.seen_things import SeenThings
 from gigabrain_zenoh.decision.task_server import TaskServer
 from gigabrain_zenoh.decision.tasks import arm_steps
 from gigabrain_zenoh.decision.tasks import mission as missions
@@ -61,7 +62,7 @@ class GoalServer(InputSource):
 
     def __init__(self, settings: NavigationConfig, bus: Bus, config: DecisionConfig) -> None:
         self._bus, self._config, self._name = bus, settings, config.behaviour
-        self._zones = ZoneSource(bus)
+        self._zones, self._seen = ZoneSource(bus), SeenThings(bus)
         self._source = ContextSource(bus, self._zones)
         self._tasks = TaskServer(
             bus, self.check, self._zones, self._source,
@@ -104,6 +105,7 @@ class GoalServer(InputSource):
     def observe(self, state: RobotState) -> None:
         """Record a robot state; to be called with every state."""
         self._source.observe(state)
+        self._seen.observe(self._source.body, state)
 
     def step(
         self,
@@ -162,7 +164,7 @@ class GoalServer(InputSource):
         number = command.number if command else 0
         if wanted and number != self._checked:  # before packages are imported that may be missing
             try:
-                arm_steps.check(body, [wanted.do])
+                arm_steps.check(body, [wanted.do], wanted.things.values())
             except GigabrainError as error:
                 return self._refused(number, str(error))
             self._checked = number
@@ -178,7 +180,8 @@ class GoalServer(InputSource):
             self._manipulator = Manipulator(self._bus, self._name)
         if self._manipulator is None:
             return Intent(behaviour=self._name, reason=idle.reason), StepOutcome()
-        return self._manipulator.step(state, body, wanted, idle, self._source.held(state))
+        held, seen = self._source.held(state), self._seen.at(state)
+        return self._manipulator.step(state, body, wanted, idle, held, seen)
 
     def _refused(self, number: int, reason: str) -> StepResult:
         """Return that a command cannot be carried out."""

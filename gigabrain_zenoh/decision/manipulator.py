@@ -13,10 +13,14 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import Intent
+from gigabrain_schemas.objects import SeenSolid
 from gigabrain_schemas.topics import ARM_MODEL
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.decision.behaviours import ArmCommand, Idle, StepOutcome, StepResult
+from gigabrain_zenoh.decision.lookout import Lookout
+from gigabrain_zenoh.decision.seen_things import located
 from gigabrain_zenoh.decision.tasks.arm_steps import (
+    ArmAction,
     Gripper,
     Pick,
     PlaceThing,
@@ -63,7 +67,9 @@ class Manipulator:
         self._hold_ups = 0  # of it, by a joint that did not follow
         self._achieved = StepOutcome()  # of a command that is done but for the way back
         self._left: Grasp | None = None  # at which the hand still is, without holding the thing
-        self._backs = False  # it goes back from there
+        self._interim = False  # it goes back from there, or out of a camera's sight
+        self._lookout = Lookout()
+        self._target: Thing | None = None  # to be picked up, where it stands
 
     def step(
         self,
@@ -72,16 +78,19 @@ class Manipulator:
         command: ArmCommand | None,
         idle: Idle,
         held: str,
+        seen: tuple[SeenSolid, ...] = (),
     ) -> StepResult:
         """Carry out `command` for one step, or hold still as `idle` says.
 
         While the body does not follow, as `held` says, the arm holds; it plans again afterwards.
+        Things without a place are where they are `seen`, in the body's frame.
         """
         number = command.number if command else 0
         if number != self._number:
             self._drop()
             self._number, self._achieved = number, StepOutcome()
             self._misses = self._hold_ups = 0
+            self._lookout.reset()
         try:
             planner = self._ready(body)
         except GigabrainError as error:
@@ -98,7 +107,7 @@ class Manipulator:
         if self._run is None and self._achieved.number:
             return self._still(Idle("done", self._achieved.reason), self._achieved)
         try:
-            return self._carry_out(planner, state, body, command)
+            return self._carry_out(planner, state, body, command, seen)
         except GigabrainError as error:  # a thing that does not fit, or an arm without pads
             return self._fail(str(error))
 
@@ -121,13 +130,21 @@ class Manipulator:
         return self._planner
 
     def _carry_out(
-        self, planner: ArmPlanner, state: RobotState, body: BodyDescription, command: ArmCommand
+        self,
+        planner: ArmPlanner,
+        state: RobotState,
+        body: BodyDescription,
+        command: ArmCommand,
+        seen: tuple[SeenSolid, ...],
     ) -> StepResult:
         if self._run is None and self._left:
             self._back_off(planner, body, state, self._left)
         elif self._run is None:
             if self._planning is None:
-                work = self._work(planner, state, body, command)
+                things = located(command.things, seen)
+                if name := self._unseen(command, things):
+                    return self._look_for(name, planner, state, body, things)
+                work = self._work(planner, state, body, command.do, things)
                 if isinstance(work, str):
                     return self._fail(work)
                 self._planning = self._pool.submit(work)
@@ -136,19 +153,52 @@ class Manipulator:
             planning, self._planning = self._planning, None
             found = planning.result()
             if isinstance(found, NoWay):
+                if self._interim:  # it cannot get out of sight that way
+                    self._interim = False
+                    return self._still(PLANNING)
                 return self._fail(found.reason)
             self._begin(planner, found, state)
         return self._follow(planner, state, body, command)
 
+    def _unseen(self, command: ArmCommand, things: Mapping[str, Solid]) -> str:
+        """Return the name of the thing that is to be picked up, if it is not seen."""
+        if self._hold or not isinstance(command.do, Pick) or command.do.thing in things:
+            return ""
+        return command.do.thing if command.do.thing in command.things else ""
+
+    def _look_for(
+        self,
+        name: str,
+        planner: ArmPlanner,
+        state: RobotState,
+        body: BodyDescription,
+        things: Mapping[str, Solid],
+    ) -> StepResult:
+        """Hold still until a thing is seen, or begin to move the arm out of sight."""
+        if not self._lookout.waits(state.tick):
+            posture = self._lookout.aside(body)
+            if posture is None:
+                return self._fail(f"{name} is not seen")
+            work = self._work(planner, state, body, TakePosture(posture), things)
+            if isinstance(work, str):
+                return self._fail(work)
+            self._interim, self._planning = True, self._pool.submit(work)
+        return self._still(Idle("looking", f"looking for {name}"))
+
     def _work(
-        self, planner: ArmPlanner, state: RobotState, body: BodyDescription, command: ArmCommand
+        self,
+        planner: ArmPlanner,
+        state: RobotState,
+        body: BodyDescription,
+        do: ArmAction,
+        things: Mapping[str, Solid],
     ) -> Callable[[], Planned] | str:
-        """Return what plans a command, or why it cannot be planned."""
+        """Return what plans an action, or why it cannot be planned."""
         if len(state.joints_sent) != len(body.joints):
             return "the joints are not measured, or limp"
         posture = _sent(planner, body, state)
-        hold, others = self._hold, [_thing(name, one) for name, one in command.things.items()]
-        match command.do:
+        hold, others = self._hold, [_thing(name, one) for name, one in things.items()]
+        match do:
             case Reach(at=at, pitch=pitch):
                 return lambda: planner.reach(np.array(at), pitch, others, posture, hold)
             case TakePosture(positions=positions):
@@ -159,9 +209,10 @@ class Manipulator:
             case Pick(thing=name):
                 if hold:
                     return f"the gripper holds {hold.thing.name} already"
-                if name not in command.things:
+                if name not in things:
                     return f"where {name} is, is not known"
-                thing, misses = _thing(name, command.things[name]), self._misses
+                thing, misses = _thing(name, things[name]), self._misses
+                self._target = thing
                 around = [one for one in others if one.name != name]
                 return lambda: planner.pick(thing, around, posture, misses)
             case PlaceThing(at=at):
@@ -173,7 +224,7 @@ class Manipulator:
         self, planner: ArmPlanner, body: BodyDescription, state: RobotState, grasp: Grasp
     ) -> None:
         """Begin to go back from a thing that is not held; afterwards it is planned again."""
-        self._left, self._backs = grasp, True
+        self._left, self._interim = grasp, True
         self._begin(planner, planner.back_off(grasp, _sent(planner, body, state)), state)
 
     def _begin(self, planner: ArmPlanner, plan: Plan, state: RobotState) -> None:
@@ -203,7 +254,7 @@ class Manipulator:
                 self._misses += 1
                 self._back_off(planner, body, state, plan.grasp)
                 return self._moving(state)
-            self._grip(planner, run, plan.hold, state, command)
+            self._grip(planner, run, plan.hold, state)
         if over and over.name == "open" and hold:
             self._achieve(None, placed=_placed(planner, state, command, hold))
         if over and over.name == "grip":
@@ -212,15 +263,13 @@ class Manipulator:
             return self._end(body, state, run)
         return self._moving(state)
 
-    def _grip(
-        self, planner: ArmPlanner, run: PhaseRun, hold: Hold, state: RobotState, command: ArmCommand
-    ) -> None:
+    def _grip(self, planner: ArmPlanner, run: PhaseRun, hold: Hold, state: RobotState) -> None:
         """Record that the gripper holds a thing, and have it squeeze less from now on."""
-        stood = _thing(hold.thing.name, command.things[hold.thing.name])
+        assert self._target
         ease = planner.eased(hold, _gripper(planner, state, hold.grip))
         assert ease.gripper is not None
         run.insert(ease)
-        held = planner.gripped(hold, stood, _measured(planner, state))
+        held = planner.gripped(hold, self._target, _measured(planner, state))
         self._achieve(dataclasses.replace(held, grip=ease.gripper))
 
     def _held_up(self, why: str) -> StepResult:
@@ -251,7 +300,7 @@ class Manipulator:
         if off := _off(body, state, end, "goal_tolerance"):
             late = run.over_for(state.tick) * TICK_S > body.arm.goal_time
             return self._fail(off) if late else self._moving(state)
-        if self._backs:
+        if self._interim:
             self._drop()
             missed = self._misses >= TRIES
             return self._fail(MISSED) if missed else self._still(PLANNING)
@@ -308,7 +357,7 @@ class Manipulator:
         if self._planning:
             self._planning.cancel()
         self._planning = self._run = self._left = None
-        self._backs = False
+        self._interim = False
 
 
 def _sent(planner: ArmPlanner, body: BodyDescription, state: RobotState) -> Floats:
@@ -340,12 +389,13 @@ def _home(body: BodyDescription) -> dict[str, float]:
 
 def _thing(name: str, solid: Solid) -> Thing:
     """Return a thing of a mission as the planner knows it."""
+    assert solid.at
     position, axes = np.array(solid.at), turned(solid.yaw)
     if solid.box:
         return Thing(name=name, kind="box", size=solid.box, position=position, axes=axes)
     if solid.cylinder:
         return Thing(name=name, kind="cylinder", size=solid.cylinder, position=position, axes=axes)
-    assert solid.sphere
+    assert solid.sphere is not None
     return Thing(name=name, kind="sphere", size=(solid.sphere,), position=position, axes=axes)
 
 

@@ -232,7 +232,7 @@ class TaskServer:
                 self._refuse_blind()
             body = self._source.body
             if body and (actions := mission.arm_actions):
-                arm_steps.check(body, actions)
+                arm_steps.check(body, actions, mission.things.values())
             if mission.drives:
                 await self._check(None)
             name = self._queue.add_mission(mission, label, request.how, request.source)

@@ -8,6 +8,7 @@ from msgspec import Meta, Struct
 
 from gigabrain_schemas.base import Angle, Name
 from gigabrain_schemas.body import BodyDescription, JointDescription
+from gigabrain_schemas.objects import Label
 from gigabrain_zenoh.errors import Refused, unknown
 
 NEEDED = ("mujoco", "ruckig", "numba")  # packages of the extra `arm`
@@ -21,17 +22,24 @@ GripperPlace = Literal["open", "close"] | JointPlace
 
 
 class Solid(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A thing that can be picked up, or that is in the way. It has one shape."""
+    """A thing that can be picked up, or that is in the way: of one shape, or of a class.
+
+    Without a place it is where a camera sees it.
+    """
 
     box: tuple[Side, Side, Side] | None = None  # [m], lengths along its x, y and z
     cylinder: tuple[Side, Side] | None = None  # [m], radius, and length along z
     sphere: Side | None = None  # [m], radius
-    at: Point3  # of its middle
+    label: Label | None = None  # its class, as a camera recognises it
+    at: Point3 | None = None  # of its middle
     yaw: Angle = 0.0  # [rad]
 
     def __post_init__(self) -> None:
-        if sum(one is not None for one in (self.box, self.cylinder, self.sphere)) != 1:
-            raise ValueError("expected a box, a cylinder or a sphere")
+        shapes = sum(one is not None for one in (self.box, self.cylinder, self.sphere))
+        if shapes > 1 or not (shapes or self.label):
+            raise ValueError("expected a box, a cylinder or a sphere, or a label that is seen")
+        if self.label and self.at:
+            raise ValueError("expected a label that is seen, or a place, not both")
 
 
 class Reach(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -89,13 +97,20 @@ def describe_point(point: Point3) -> str:
     return f"({', '.join(f'{one:.3f}' for one in point)})"
 
 
-def check(body: BodyDescription, actions: Iterable[ArmAction]) -> None:
+def check(
+    body: BodyDescription, actions: Iterable[ArmAction], things: Iterable[Solid] = ()
+) -> None:
     """Raise Refused or UnknownName for what the body's arm cannot do."""
     if body.arm is None:
         raise Refused(f"{body.robot_type} has no arm")
     for package in NEEDED:
         if find_spec(package) is None:
             raise Refused(f"moving an arm needs {package}; pip install 'gigabrain-zenoh[arm]'")
+    if any(thing.at is None for thing in things) and not any(one.depth for one in body.cameras):
+        raise Refused(
+            "things without a place have to be seen, and the robot has no depth camera; "
+            "start it with --cameras, or `cameras: on`"
+        )
     known = {joint.name: joint for joint in body.joints}
     gripper = next((joint for joint in body.joints if joint.part == "gripper"), None)
     for action in actions:

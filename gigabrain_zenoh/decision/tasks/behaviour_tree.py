@@ -112,7 +112,7 @@ class TreeBuilder:
 
     def __init__(self, mission: Mission, context: MissionContext) -> None:
         self._mission, self._context = mission, context
-        context.things = dict(mission.things)
+        context.given, context.things = mission.things, dict(mission.things)
 
     def tree(self) -> Behaviour:
         """Return the root of the whole mission."""

@@ -4,7 +4,7 @@ All use the robot's time.
 """
 
 import math
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 
 from py_trees.behaviour import Behaviour
@@ -48,6 +48,7 @@ class MissionContext:
     held_s: float = 0.0  # of that, while the body did not follow a command
     outcome: StepOutcome | None = None  # of the command of the last tick
     command: Command | None = None  # of the active node
+    given: Mapping[str, Solid] = field(default_factory=dict)  # things of the mission's file
     things: dict[str, Solid] = field(default_factory=dict)  # what stands round the arm by now
     doing: str = ""  # the active step, for people
     problem: str = ""  # the last failure, for people
@@ -130,7 +131,8 @@ class ArmNode(Leaf):
                 self.context.things.pop(outcome.picked, None)
             if outcome.placed:
                 name, solid = outcome.placed
-                self.context.things[name] = solid
+                given = self.context.given.get(name, solid)
+                self.context.things[name] = solid if given.at else given
             done = outcome.state == "done"
             return Status.SUCCESS if done else self.failed(f"{self.name}: {outcome.reason}")
         self.context.command = self._command
