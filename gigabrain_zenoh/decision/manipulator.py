@@ -1,27 +1,37 @@
 """Moves the arm: plans each command in a worker thread, and carries it out from tick to tick."""
 
 import dataclasses
-import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Literal
 
 import numpy as np
 from msgspec.structs import replace
 
-from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import Intent
 from gigabrain_schemas.objects import SeenSolid
 from gigabrain_schemas.topics import ARM_MODEL
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.decision.arm_readings import (
+    gripper_moves,
+    gripper_place,
+    holds,
+    home,
+    measured_posture,
+    off_from,
+    pace,
+    sent_posture,
+    sent_to,
+)
 from gigabrain_zenoh.decision.behaviours import ArmCommand, Idle, StepOutcome, StepResult
+from gigabrain_zenoh.decision.held_things import held_thing, hold_of, placed, thing_of
 from gigabrain_zenoh.decision.lookout import Lookout
 from gigabrain_zenoh.decision.seen_things import located
 from gigabrain_zenoh.decision.tasks.arm_steps import (
     ArmAction,
     Gripper,
+    HeldThing,
     Pick,
     PlaceThing,
     Reach,
@@ -30,17 +40,15 @@ from gigabrain_zenoh.decision.tasks.arm_steps import (
 )
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold, Plan
-from gigabrain_zenoh.manipulation.collision import Thing, turned
+from gigabrain_zenoh.manipulation.collision import Thing
 from gigabrain_zenoh.manipulation.grasps import Grasp
-from gigabrain_zenoh.manipulation.phases import Phase, PhaseRun
+from gigabrain_zenoh.manipulation.phases import PhaseRun
 from gigabrain_zenoh.manipulation.pick_place import NoWay
 
 TRIES = 3  # to pick a thing up, each with another grasp
 HOLD_UPS = 5  # of one command, after which it fails
 WAIT_TICKS = 100  # for a joint that the gate holds back, before another way is planned
 MISSED = f"it was not caught, {TRIES} times"
-GRIPS = 0.1  # of the gripper's greatest speed, above which it moves: an encoder's steps are less
-SENT = 0.01  # of the gripper's range, within which it was sent to its target
 CARRYING = ("lift", "traverse", "lower")  # phases in which a thing has to be held
 NO_MODEL = Idle("waiting", "waiting: for the arm's model, robot/arm_model")
 NOT_MEASURED = Idle("waiting", "waiting: for all joints to be measured")
@@ -62,6 +70,8 @@ class Manipulator:
         self._plan = Plan(phases=())
         self._run: PhaseRun | None = None
         self._hold: Hold | None = None
+        self._held: HeldThing | None = None  # the same, for the file of tasks
+        self._recalls = True  # it does not know yet what the gripper holds
         self._number = 0  # of the present command
         self._misses = 0  # grasps of it that caught nothing
         self._hold_ups = 0  # of it, by a joint that did not follow
@@ -85,6 +95,19 @@ class Manipulator:
         While the body does not follow, as `held` says, the arm holds; it plans again afterwards.
         Things without a place are where they are `seen`, in the body's frame.
         """
+        intent, outcome = self._step(state, body, command, idle, held, seen)
+        known = command.held if command and self._recalls else self._held
+        return intent, replace(outcome, holds=known)
+
+    def _step(
+        self,
+        state: RobotState,
+        body: BodyDescription,
+        command: ArmCommand | None,
+        idle: Idle,
+        held: str,
+        seen: tuple[SeenSolid, ...],
+    ) -> StepResult:
         number = command.number if command else 0
         if number != self._number:
             self._drop()
@@ -107,6 +130,8 @@ class Manipulator:
         if self._run is None and self._achieved.number:
             return self._still(Idle("done", self._achieved.reason), self._achieved)
         try:
+            if self._recalls:
+                self._recall(planner, body, state, command.held)
             return self._carry_out(planner, state, body, command, seen)
         except GigabrainError as error:  # a thing that does not fit, or an arm without pads
             return self._fail(str(error))
@@ -123,11 +148,29 @@ class Manipulator:
         wanted = model.mjcf, body
         if wanted != self._made_for:
             self._drop()
-            self._made_for, self._planner, self._hold = wanted, None, None
+            self._made_for, self._planner = wanted, None
+            self._set_hold(None)
             self._making = self._pool.submit(ArmPlanner, *wanted)
         if self._planner is None and self._making and self._in_time(self._making, 0.0):
             self._planner = self._making.result()  # raises as long as there is no other model
         return self._planner
+
+    def _recall(
+        self,
+        planner: ArmPlanner,
+        body: BodyDescription,
+        state: RobotState,
+        held: HeldThing | None,
+    ) -> None:
+        """Believe that something is held since before a restart, if the gripper agrees."""
+        self._recalls = False
+        hold = hold_of(held) if held else None
+        if hold and sent_to(planner, body, state, hold.grip) and holds(planner, hold, state):
+            self._set_hold(hold)
+
+    def _set_hold(self, hold: Hold | None) -> None:
+        """Record what the gripper holds."""
+        self._hold, self._held = hold, held_thing(hold) if hold else None
 
     def _carry_out(
         self,
@@ -137,6 +180,10 @@ class Manipulator:
         command: ArmCommand,
         seen: tuple[SeenSolid, ...],
     ) -> StepResult:
+        do, hold = command.do, self._hold
+        if isinstance(do, Pick) and self._run is None and hold and hold.thing.name == do.thing:
+            self._achieve(hold)
+            return self._still(Idle("done", self._achieved.reason), self._achieved)
         if self._run is None and self._left:
             self._back_off(planner, body, state, self._left)
         elif self._run is None:
@@ -196,13 +243,13 @@ class Manipulator:
         """Return what plans an action, or why it cannot be planned."""
         if len(state.joints_sent) != len(body.joints):
             return "the joints are not measured, or limp"
-        posture = _sent(planner, body, state)
-        hold, others = self._hold, [_thing(name, one) for name, one in things.items()]
+        posture = sent_posture(planner, body, state)
+        hold, others = self._hold, [thing_of(name, one) for name, one in things.items()]
         match do:
             case Reach(at=at, pitch=pitch):
                 return lambda: planner.reach(np.array(at), pitch, others, posture, hold)
             case TakePosture(positions=positions):
-                goal = positions or _home(body)
+                goal = positions or home(body)
                 return lambda: planner.take_posture(goal, others, posture, hold)
             case Gripper(to=to):
                 return lambda: planner.grip(to)
@@ -211,7 +258,7 @@ class Manipulator:
                     return f"the gripper holds {hold.thing.name} already"
                 if name not in things:
                     return f"where {name} is, is not known"
-                thing, misses = _thing(name, things[name]), self._misses
+                thing, misses = thing_of(name, things[name]), self._misses
                 self._target = thing
                 around = [one for one in others if one.name != name]
                 return lambda: planner.pick(thing, around, posture, misses)
@@ -225,7 +272,7 @@ class Manipulator:
     ) -> None:
         """Begin to go back from a thing that is not held; afterwards it is planned again."""
         self._left, self._interim = grasp, True
-        self._begin(planner, planner.back_off(grasp, _sent(planner, body, state)), state)
+        self._begin(planner, planner.back_off(grasp, sent_posture(planner, body, state)), state)
 
     def _begin(self, planner: ArmPlanner, plan: Plan, state: RobotState) -> None:
         gripper = planner.arm.gripper
@@ -238,27 +285,29 @@ class Manipulator:
         """Go on with the present plan by one step."""
         run, plan, hold = self._run, self._plan, self._hold
         assert run
-        if hold and run.phase and run.phase.name in CARRYING and not _holds(planner, hold, state):
-            self._hold = None
+        if hold and run.phase and run.phase.name in CARRYING and not holds(planner, hold, state):
+            self._set_hold(None)
             return self._fail(f"{hold.thing.name} has slipped out of the gripper")
-        waits = run.wait(state.tick, *_pace(body, state))
+        waits = run.wait(state.tick, *pace(body, state))
         if run.waited > WAIT_TICKS:
             return self._held_up(f"{waits} is held back for {WAIT_TICKS * TICK_S:g} s")
-        if off := _off(body, state, run.expected(state.tick), "path_tolerance"):
+        if off := off_from(body, state, run.expected(state.tick), "path_tolerance"):
             return self._held_up(off)
-        grips = run.phase is not None and _grips(planner, state, body, run.phase)
+        grips = run.phase is not None and gripper_moves(planner, state, body, run.phase)
         over = run.advance(state.tick, grips=grips)
         if over and over.name == "close" and plan.hold:
-            if not _holds(planner, plan.hold, state):
+            if not holds(planner, plan.hold, state):
                 assert plan.grasp
                 self._misses += 1
                 self._back_off(planner, body, state, plan.grasp)
                 return self._moving(state)
             self._grip(planner, run, plan.hold, state)
         if over and over.name == "open" and hold:
-            self._achieve(None, placed=_placed(planner, state, command, hold))
+            self._achieve(
+                None, placed=placed(planner, measured_posture(planner, state), command.do, hold)
+            )
         if over and over.name == "grip":
-            self._hold = None
+            self._set_hold(None)
         if run.phase is None:
             return self._end(body, state, run)
         return self._moving(state)
@@ -266,10 +315,10 @@ class Manipulator:
     def _grip(self, planner: ArmPlanner, run: PhaseRun, hold: Hold, state: RobotState) -> None:
         """Record that the gripper holds a thing, and have it squeeze less from now on."""
         assert self._target
-        ease = planner.eased(hold, _gripper(planner, state, hold.grip))
+        ease = planner.eased(hold, gripper_place(planner, state, hold.grip))
         assert ease.gripper is not None
         run.insert(ease)
-        held = planner.gripped(hold, self._target, _measured(planner, state))
+        held = planner.gripped(hold, self._target, measured_posture(planner, state))
         self._achieve(dataclasses.replace(held, grip=ease.gripper))
 
     def _held_up(self, why: str) -> StepResult:
@@ -282,13 +331,12 @@ class Manipulator:
 
     def _achieve(self, hold: Hold | None, placed: tuple[str, Solid] | None = None) -> None:
         """Record that the gripper holds a thing, or has put one down."""
-        self._hold = hold
+        self._set_hold(hold)
         self._achieved = StepOutcome(
             number=self._number,
             state="done",
             reason=f"it holds {hold.thing.name}" if hold else "",
             progress=1.0,
-            picked=hold.thing.name if hold else "",
             placed=placed,
         )
 
@@ -297,7 +345,7 @@ class Manipulator:
         assert body.arm
         last = self._plan.phases[-1].arm
         end = dict(zip(last.names, last.positions[-1].tolist(), strict=True)) if last else {}
-        if off := _off(body, state, end, "goal_tolerance"):
+        if off := off_from(body, state, end, "goal_tolerance"):
             late = run.over_for(state.tick) * TICK_S > body.arm.goal_time
             return self._fail(off) if late else self._moving(state)
         if self._interim:
@@ -358,104 +406,3 @@ class Manipulator:
             self._planning.cancel()
         self._planning = self._run = self._left = None
         self._interim = False
-
-
-def _sent(planner: ArmPlanner, body: BodyDescription, state: RobotState) -> Floats:
-    """Return where the arm's joints were sent (n,) [rad] or [m]."""
-    sent = dict(zip((joint.name for joint in body.joints), state.joints_sent, strict=True))
-    return np.array([sent[name] for name in planner.arm.names])
-
-
-def _pace(
-    body: BodyDescription, state: RobotState
-) -> tuple[Mapping[str, float], Mapping[str, float]]:
-    """Return where each joint was sent, and by how much that may be behind [rad] or [m]."""
-    names = [joint.name for joint in body.joints]
-    sent = dict(zip(names, state.joints_sent, strict=False))
-    measured = {joint.name: joint.position for joint in state.joints}
-    return measured | sent, {joint.name: joint.gains.max_correction for joint in body.joints}
-
-
-def _measured(planner: ArmPlanner, state: RobotState) -> Floats:
-    """Return where the arm's joints are (n,) [rad] or [m]."""
-    found = {joint.name: joint.position for joint in state.joints}
-    return np.array([found[name] for name in planner.arm.names])
-
-
-def _home(body: BodyDescription) -> dict[str, float]:
-    assert body.arm
-    return dict(zip((joint.name for joint in body.joints), body.arm.home, strict=True))
-
-
-def _thing(name: str, solid: Solid) -> Thing:
-    """Return a thing of a mission as the planner knows it."""
-    assert solid.at
-    position, axes = np.array(solid.at), turned(solid.yaw)
-    if solid.box:
-        return Thing(name=name, kind="box", size=solid.box, position=position, axes=axes)
-    if solid.cylinder:
-        return Thing(name=name, kind="cylinder", size=solid.cylinder, position=position, axes=axes)
-    assert solid.sphere is not None
-    return Thing(name=name, kind="sphere", size=(solid.sphere,), position=position, axes=axes)
-
-
-def _placed(
-    planner: ArmPlanner, state: RobotState, command: ArmCommand, hold: Hold
-) -> tuple[str, Solid]:
-    """Return a thing that was let go of, and where it stands now."""
-    tool, thing = planner.arm.forward(_measured(planner, state)), hold.thing
-    x, y, z = tool.place(thing.position).tolist()
-    if isinstance(command.do, PlaceThing):  # it stands on something there
-        z = command.do.at[2]
-    ahead = tool.axes @ thing.axes[:, 0]
-    box, round_ = thing.kind == "box", thing.kind == "cylinder"
-    return thing.name, Solid(
-        box=thing.size if box else None,  # type: ignore[arg-type]
-        cylinder=thing.size if round_ else None,  # type: ignore[arg-type]
-        sphere=None if box or round_ else thing.size[0],
-        at=(x, y, z),
-        yaw=math.atan2(ahead[1], ahead[0]),
-    )
-
-
-def _holds(planner: ArmPlanner, hold: Hold, state: RobotState) -> bool:
-    """Return whether the gripper has stopped short of where it was sent."""
-    return planner.holds(_gripper(planner, state, hold.grip), hold.grip)
-
-
-def _grips(planner: ArmPlanner, state: RobotState, body: BodyDescription, phase: Phase) -> bool:
-    """Return whether the gripper is still on its way: it moves, or was not sent there yet."""
-    gripper = planner.arm.gripper
-    if gripper is None or phase.gripper is None:
-        return False
-    moves = any(
-        joint.name == gripper.name and abs(joint.velocity) > GRIPS * gripper.max_speed
-        for joint in state.joints
-    )
-    sent = dict(zip((joint.name for joint in body.joints), state.joints_sent, strict=False))
-    slack = gripper.gains.max_correction + SENT * (gripper.upper - gripper.lower)
-    return moves or abs(sent.get(gripper.name, phase.gripper) - phase.gripper) > slack
-
-
-def _gripper(planner: ArmPlanner, state: RobotState, unknown: float) -> float:
-    """Return where the gripper is [rad] or [m]."""
-    gripper = planner.arm.gripper
-    name = gripper.name if gripper else ""
-    return next((joint.position for joint in state.joints if joint.name == name), unknown)
-
-
-def _off(
-    body: BodyDescription,
-    state: RobotState,
-    wanted: Mapping[str, float],
-    which: Literal["path_tolerance", "goal_tolerance"],
-) -> str:
-    """Return which joint is too far from where it should be, and how far; empty for none."""
-    measured = {joint.name: joint.position for joint in state.joints}
-    for joint in body.joints:
-        if joint.name in wanted:
-            tolerance: float = getattr(joint, which)
-            error = abs(measured.get(joint.name, math.inf) - wanted[joint.name])
-            if tolerance and error > tolerance:
-                return f"{joint.name} is {error:.2f} off, more than its {which} of {tolerance:g}"
-    return ""

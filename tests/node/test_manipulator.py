@@ -5,6 +5,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace
@@ -14,7 +15,7 @@ from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.sim.body import MujocoOptions, sim_body
 from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import ArmModel
-from gigabrain_schemas.brain import Intent
+from gigabrain_schemas.brain import Intent, JointTarget
 from gigabrain_schemas.safety import JointCap
 from gigabrain_schemas.tasks import Task
 from gigabrain_zenoh.decision.behaviours import ArmCommand, StepOutcome
@@ -57,15 +58,27 @@ class Rig:
         assert isinstance(options, MujocoOptions)
         self.arm = ArmInMemory(robot, sim_body(robot, options, Run(folder=model_folder)), world)
         text = mjcf or robot_path(body).with_name("model.xml").read_text()
-        bus: Any = SimpleNamespace(
+        self._bus: Any = SimpleNamespace(
             input_log=SimpleNamespace(in_time=waits),
             latest=lambda _topic: SimpleNamespace(current=ArmModel(mjcf=text)),
         )
-        self.manipulator = Manipulator(bus, "navigate")
-        self.queue = TaskQueue(lambda _topic: None, lambda _script: None, Saved())  # type: ignore[arg-type, return-value]
-        self.outcome: StepOutcome | None = None
+        self.start(Saved())
         self.held = ""
         self.phases: list[str] = []  # that it was in, each time it began
+
+    def start(self, saved: Saved) -> None:
+        """Start decision."""
+        self.manipulator = Manipulator(self._bus, "navigate")
+        self.queue = TaskQueue(lambda _topic: None, lambda _script: None, saved)  # type: ignore[arg-type, return-value]
+        self.outcome: StepOutcome | None = None
+
+    def restart(self) -> None:
+        """Have decision die, and start it again with its file."""
+        self.manipulator.close()
+        saved = msgspec.json.decode(msgspec.json.encode(self.queue.saved), type=Saved)
+        for _ in range(20):
+            self.arm.step(IDLE)
+        self.start(saved)
 
     @property
     def planner(self) -> ArmPlanner:
@@ -181,6 +194,52 @@ def test_after_an_interruption_it_goes_on_from_where_it_is(rig: Rig, phase: str)
     task = rig.carry_on()
     assert (task.state, task.reason) == ("succeeded", "")
     assert rig.arm.thing()[:2] == pytest.approx(ELSEWHERE, abs=0.012)
+
+
+@pytest.mark.parametrize("phase", ["descend", "lift", "traverse", "lower", "retreat"])
+def test_after_a_restart_of_decision_it_goes_on_with_what_it_holds(rig: Rig, phase: str) -> None:
+    rig.give(THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]}]")
+    while rig.outcome is None or rig.outcome.reason != phase:
+        rig.tick()
+    rig.tick()
+    rig.restart()
+    task = rig.carry_on()
+    if phase == "retreat":  # it has let go already
+        assert task.state == "failed"
+        assert task.reason.endswith("the gripper holds nothing")
+    else:
+        assert (task.state, task.reason) == ("succeeded", "")
+    assert rig.arm.thing()[:2] == pytest.approx(ELSEWHERE, abs=0.012)
+
+
+def test_after_a_restart_things_are_where_they_were_put(rig: Rig) -> None:
+    rig.give(
+        THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]}, {posture: home}, {pick: cube}]"
+    )
+    while rig.outcome is None or rig.outcome.reason != "move":
+        rig.tick()
+    rig.restart()
+    task = rig.carry_on()
+    assert (task.state, task.reason) == ("succeeded", "it holds cube")
+
+
+@pytest.mark.parametrize("opened", [False, True])
+def test_what_was_lost_during_a_restart_is_not_believed(rig: Rig, opened: bool) -> None:
+    rig.give(THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]}]")
+    while rig.outcome is None or rig.outcome.reason != "traverse":
+        rig.tick()
+    if opened:
+        wide = Intent(
+            joints=(JointTarget(name="gripper", position=1.2),), behaviour="test", reason="open"
+        )
+        for _ in range(50):
+            rig.arm.step(wide)
+    else:
+        rig.take_away()
+    rig.restart()
+    task = rig.carry_on()
+    assert task.state == "failed"
+    assert task.reason.endswith("the gripper holds nothing")
 
 
 def test_a_model_that_cannot_be_used_fails_the_command_in_one_line(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import Goal, Task
 from gigabrain_zenoh.config import loading
 from gigabrain_zenoh.config.settings import DecisionConfig
-from gigabrain_zenoh.decision.tasks.arm_steps import ArmAction, Solid
+from gigabrain_zenoh.decision.tasks.arm_steps import ArmAction, HeldThing, Solid
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.plugins import load_plugin, plugin_names
 
@@ -63,6 +63,7 @@ class ArmCommand(Struct, frozen=True):
     number: int  # as of a DriveCommand
     do: ArmAction
     things: Mapping[str, Solid]  # what stands round it
+    held: HeldThing | None = None  # what the gripper held when decision was started
 
 
 Command = DriveCommand | ArmCommand
@@ -83,7 +84,7 @@ class StepOutcome(Struct, frozen=True, kw_only=True):
     path: tuple[tuple[float, float], ...] = ()  # [m] in the map, for drawing
     position_error: float | None = None  # [m] from the requested place
     heading_error: float | None = None  # [rad] from the requested heading
-    picked: str = ""  # the thing that the gripper holds since this command
+    holds: HeldThing | None = None  # what the gripper holds after a command that is done
     placed: tuple[str, Solid] | None = None  # a thing, and where it was put down
 
 

@@ -18,6 +18,8 @@ Side = Annotated[float, Meta(ge=0.001, le=10.0)]  # [m]
 Point3 = tuple[Metres, Metres, Metres]  # x, y, z [m]
 JointPlace = Annotated[float, Meta(ge=-100.0, le=100.0)]  # [rad] or [m]
 Posture = Literal["home"] | Annotated[dict[Name, JointPlace], Meta(min_length=1)]
+Cosine = Annotated[float, Meta(ge=-1.001, le=1.001)]
+Rotation = Annotated[tuple[Cosine, ...], Meta(min_length=9, max_length=9)]
 GripperPlace = Literal["open", "close"] | JointPlace
 
 
@@ -40,6 +42,16 @@ class Solid(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_
             raise ValueError("expected a box, a cylinder or a sphere, or a label that is seen")
         if self.label and self.at:
             raise ValueError("expected a label that is seen, or a place, not both")
+
+
+class HeldThing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A thing in the gripper."""
+
+    name: Name
+    solid: Solid  # in the frame of the tool
+    axes: Rotation  # of the thing in that frame, row by row
+    grip: JointPlace  # [rad] or [m], where the gripper's joint was sent
+    opening: JointPlace  # [rad] or [m], where it goes to let go
 
 
 class Reach(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):

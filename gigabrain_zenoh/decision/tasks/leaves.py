@@ -20,7 +20,7 @@ from gigabrain_zenoh.decision.behaviours import (
     describe_goal,
 )
 from gigabrain_zenoh.decision.known_objects import Seek, Sought, Wanted, named
-from gigabrain_zenoh.decision.tasks.arm_steps import ArmAction, Solid, describe
+from gigabrain_zenoh.decision.tasks.arm_steps import ArmAction, HeldThing, Solid, describe
 from gigabrain_zenoh.decision.tasks.conditions import Condition, Read
 from gigabrain_zenoh.decision.tasks.mission import Script
 from gigabrain_zenoh.decision.tasks.scripts import Run
@@ -37,6 +37,13 @@ def seek_nothing(_wanted: Wanted, _without: Collection[int], _preferred: int | N
 
 
 @dataclass
+class Hand:
+    """What the gripper holds, as far as is known."""
+
+    held: HeldThing | None = None
+
+
+@dataclass
 class MissionContext:
     """Inputs and outputs of a mission's nodes in one tick. Time stops while a mission waits."""
 
@@ -44,6 +51,7 @@ class MissionContext:
     start: StartScript
     numbers: Iterator[int]  # of commands, each only once
     seek: Seek = seek_nothing
+    hand: Hand = field(default_factory=Hand)
     now_s: float = 0.0
     held_s: float = 0.0  # of that, while the body did not follow a command
     outcome: StepOutcome | None = None  # of the command of the last tick
@@ -120,15 +128,17 @@ class ArmNode(Leaf):
     def initialise(self) -> None:
         """Start the node, or start it again."""
         number, things = next(self.context.numbers), dict(self.context.things)
-        self._command = ArmCommand(number, self._action, things)
+        self._command = ArmCommand(number, self._action, things, self.context.hand.held)
 
     def update(self) -> Status:
         """Advance the node by one tick, and return its status."""
         outcome, self.context.doing = self.context.outcome, self.name
         assert self._command
+        if outcome and outcome.number == self._command.number:
+            self.context.hand.held = outcome.holds
+            if outcome.holds:
+                self.context.things.pop(outcome.holds.name, None)
         if outcome and outcome.number == self._command.number and outcome.state != "running":
-            if outcome.picked:
-                self.context.things.pop(outcome.picked, None)
             if outcome.placed:
                 name, solid = outcome.placed
                 given = self.context.given.get(name, solid)

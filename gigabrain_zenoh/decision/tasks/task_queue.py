@@ -9,6 +9,7 @@ import msgspec
 from msgspec import Struct
 from py_trees.common import Status
 
+from gigabrain_schemas.base import Name
 from gigabrain_schemas.tasks import Goal, How, Task, TaskState, TaskStatus
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.decision.behaviours import (
@@ -19,6 +20,7 @@ from gigabrain_zenoh.decision.behaviours import (
     describe_goal,
 )
 from gigabrain_zenoh.decision.known_objects import Seek, Wanted, named
+from gigabrain_zenoh.decision.tasks.arm_steps import HeldThing, Solid
 from gigabrain_zenoh.decision.tasks.behaviour_tree import (
     Progress,
     TreeBuilder,
@@ -26,7 +28,7 @@ from gigabrain_zenoh.decision.tasks.behaviour_tree import (
     restore,
 )
 from gigabrain_zenoh.decision.tasks.conditions import Read
-from gigabrain_zenoh.decision.tasks.leaves import MissionContext, StartScript, seek_nothing
+from gigabrain_zenoh.decision.tasks.leaves import Hand, MissionContext, StartScript, seek_nothing
 from gigabrain_zenoh.decision.tasks.mission import Mission, find_mission, goal_mission, loads
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file
@@ -47,6 +49,7 @@ class SavedJob(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     mission: str  # as JSON, which is YAML too
     held: bool = False
     memory: Progress = {}
+    things: dict[Name, Solid] | None = None  # where they are by now; None: as the mission says
 
 
 class Job:
@@ -58,6 +61,9 @@ class Job:
         self.begun = bool(saved.memory)
         self.why_held = ""
         self._root = TreeBuilder(mission, context).tree()
+        self._things = bool(mission.things)
+        if saved.things is not None:
+            context.things = dict(saved.things)
         restore(self._root, saved.memory)
 
     def step(self, seconds: float, outcome: StepOutcome | None) -> Status:
@@ -78,6 +84,7 @@ class Job:
             id=self.id, kind=self._saved.kind, label=self._saved.label, source=self._saved.source,
             mission=self._saved.mission, held=self.held,
             memory=progress_of(self._root, self.context.free_s),
+            things=dict(self.context.things) if self._things else None,
         )  # fmt: skip
 
     def task(self, state: TaskState, reason: str = "", outcome: StepOutcome | None = None) -> Task:
@@ -98,6 +105,7 @@ class Saved(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="
     boot: int = 0  # start of the driver in which they were begun
     count: int = 0  # of all tasks so far
     jobs: tuple[SavedJob, ...] = ()  # the active one first
+    held: HeldThing | None = None  # what the gripper holds
 
 
 class TaskQueue:
@@ -107,7 +115,7 @@ class TaskQueue:
         self, read: Read, start: StartScript, saved: Saved, seek: Seek = seek_nothing
     ) -> None:
         self._read, self._start, self._numbers = read, start, itertools.count(1)
-        self._seek = seek
+        self._seek, self._hand = seek, Hand(saved.held)
         self._count, self._boot = saved.count, saved.boot
         self._jobs: list[Job] = []
         self._done: list[Task] = []
@@ -193,7 +201,7 @@ class TaskQueue:
     def saved(self) -> Saved:
         """The part that survives a restart."""
         jobs = tuple(job.saved for job in self._jobs)
-        return Saved(boot=self._boot, count=self._count, jobs=jobs)
+        return Saved(boot=self._boot, count=self._count, jobs=jobs, held=self._hand.held)
 
     @property
     def status(self) -> TaskStatus:
@@ -238,7 +246,7 @@ class TaskQueue:
         return name
 
     def _context(self) -> MissionContext:
-        return MissionContext(self._read, self._start, self._numbers, self._seek)
+        return MissionContext(self._read, self._start, self._numbers, self._seek, self._hand)
 
     def _job(self, name: str) -> Job:
         if not self._jobs:

@@ -1,0 +1,95 @@
+"""What a state says about an arm, as its planner asks."""
+
+import math
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.body import BodyDescription, RobotState
+from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold
+from gigabrain_zenoh.manipulation.phases import Phase
+
+GRIPS = 0.1  # of the gripper's greatest speed, above which it moves: an encoder's steps are less
+SENT = 0.01  # of the gripper's range, within which it was sent to its target
+
+
+def sent_posture(planner: ArmPlanner, body: BodyDescription, state: RobotState) -> Floats:
+    """Return where the arm's joints were sent (n,) [rad] or [m]."""
+    sent = dict(zip((joint.name for joint in body.joints), state.joints_sent, strict=True))
+    return np.array([sent[name] for name in planner.arm.names])
+
+
+def pace(
+    body: BodyDescription, state: RobotState
+) -> tuple[Mapping[str, float], Mapping[str, float]]:
+    """Return where each joint was sent, and by how much that may be behind [rad] or [m]."""
+    names = [joint.name for joint in body.joints]
+    sent = dict(zip(names, state.joints_sent, strict=False))
+    measured = {joint.name: joint.position for joint in state.joints}
+    return measured | sent, {joint.name: joint.gains.max_correction for joint in body.joints}
+
+
+def measured_posture(planner: ArmPlanner, state: RobotState) -> Floats:
+    """Return where the arm's joints are (n,) [rad] or [m]."""
+    found = {joint.name: joint.position for joint in state.joints}
+    return np.array([found[name] for name in planner.arm.names])
+
+
+def home(body: BodyDescription) -> dict[str, float]:
+    """Return the home posture [rad] or [m]."""
+    assert body.arm
+    return dict(zip((joint.name for joint in body.joints), body.arm.home, strict=True))
+
+
+def holds(planner: ArmPlanner, hold: Hold, state: RobotState) -> bool:
+    """Return whether the gripper has stopped short of where it was sent."""
+    return planner.holds(gripper_place(planner, state, hold.grip), hold.grip)
+
+
+def gripper_moves(
+    planner: ArmPlanner, state: RobotState, body: BodyDescription, phase: Phase
+) -> bool:
+    """Return whether the gripper is still on its way: it moves, or was not sent there yet."""
+    gripper = planner.arm.gripper
+    if gripper is None or phase.gripper is None:
+        return False
+    moves = any(
+        joint.name == gripper.name and abs(joint.velocity) > GRIPS * gripper.max_speed
+        for joint in state.joints
+    )
+    return moves or not sent_to(planner, body, state, phase.gripper)
+
+
+def sent_to(planner: ArmPlanner, body: BodyDescription, state: RobotState, place: float) -> bool:
+    """Return whether the gripper was sent to a place [rad] or [m], or where that is not known."""
+    gripper = planner.arm.gripper
+    assert gripper
+    sent = dict(zip((joint.name for joint in body.joints), state.joints_sent, strict=False))
+    slack = gripper.gains.max_correction + SENT * (gripper.upper - gripper.lower)
+    return abs(sent.get(gripper.name, place) - place) <= slack
+
+
+def gripper_place(planner: ArmPlanner, state: RobotState, unknown: float) -> float:
+    """Return where the gripper is [rad] or [m]."""
+    gripper = planner.arm.gripper
+    name = gripper.name if gripper else ""
+    return next((joint.position for joint in state.joints if joint.name == name), unknown)
+
+
+def off_from(
+    body: BodyDescription,
+    state: RobotState,
+    wanted: Mapping[str, float],
+    which: Literal["path_tolerance", "goal_tolerance"],
+) -> str:
+    """Return which joint is too far from where it should be, and how far; empty for none."""
+    measured = {joint.name: joint.position for joint in state.joints}
+    for joint in body.joints:
+        if joint.name in wanted:
+            tolerance: float = getattr(joint, which)
+            error = abs(measured.get(joint.name, math.inf) - wanted[joint.name])
+            if tolerance and error > tolerance:
+                return f"{joint.name} is {error:.2f} off, more than its {which} of {tolerance:g}"
+    return ""

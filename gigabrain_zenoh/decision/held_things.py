@@ -1,0 +1,70 @@
+"""Things as missions and their file have them, and as the planner of an arm has them."""
+
+import math
+
+import numpy as np
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.decision.tasks.arm_steps import ArmAction, HeldThing, PlaceThing, Solid
+from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold
+from gigabrain_zenoh.manipulation.collision import Thing, turned
+
+
+def thing_of(name: str, solid: Solid) -> Thing:
+    """Return a thing of a mission as the planner knows it."""
+    assert solid.at
+    position, axes = np.array(solid.at), turned(solid.yaw)
+    if solid.box:
+        return Thing(name=name, kind="box", size=solid.box, position=position, axes=axes)
+    if solid.cylinder:
+        return Thing(name=name, kind="cylinder", size=solid.cylinder, position=position, axes=axes)
+    assert solid.sphere is not None
+    return Thing(name=name, kind="sphere", size=(solid.sphere,), position=position, axes=axes)
+
+
+def solid_of(thing: Thing, at: Floats, yaw: float) -> Solid:
+    """Return a thing as a mission knows it, at a place (3,) [m]."""
+    box, round_ = thing.kind == "box", thing.kind == "cylinder"
+    x, y, z = at.tolist()
+    return Solid(
+        box=thing.size if box else None,  # type: ignore[arg-type]
+        cylinder=thing.size if round_ else None,  # type: ignore[arg-type]
+        sphere=None if box or round_ else thing.size[0],
+        at=(x, y, z),
+        yaw=yaw,
+    )
+
+
+def placed(
+    planner: ArmPlanner, measured: Floats, action: ArmAction, hold: Hold
+) -> tuple[str, Solid]:
+    """Return a thing that was let go of by an arm at `measured` (n,), and where it stands now."""
+    tool, thing = planner.arm.forward(measured), hold.thing
+    at, ahead = tool.place(thing.position), tool.axes @ thing.axes[:, 0]
+    if isinstance(action, PlaceThing):  # it stands on something there
+        at = np.array([at[0], at[1], action.at[2]])
+    return thing.name, solid_of(thing, at, math.atan2(ahead[1], ahead[0]))
+
+
+def held_thing(hold: Hold) -> HeldThing:
+    """Return what the gripper holds as it is kept over a restart."""
+    return HeldThing(
+        name=hold.thing.name,
+        solid=solid_of(hold.thing, hold.thing.position, 0.0),
+        axes=tuple(hold.thing.axes.ravel().tolist()),
+        grip=hold.grip,
+        opening=hold.opening,
+    )
+
+
+def hold_of(held: HeldThing) -> Hold:
+    """Return what the gripper holds as the planner knows it."""
+    thing = thing_of(held.name, held.solid)
+    axes = np.array(held.axes).reshape(3, 3)
+    return Hold(
+        thing=Thing(
+            name=held.name, kind=thing.kind, size=thing.size, position=thing.position, axes=axes
+        ),
+        grip=held.grip,
+        opening=held.opening,
+    )
