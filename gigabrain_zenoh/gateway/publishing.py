@@ -47,7 +47,7 @@ class Row:
     sources: tuple[tuple[Topic[Any], Convert], ...]
     name: str = "*"  # of the camera
     every_ns: int = 0  # shortest time between two
-    content: Callable[[Any], object] | None = None  # published again only if this has changed
+    content: Callable[[Any, Scene], object] | None = None  # published again only if it changed
     simulated: bool = False  # of a simulation only
 
 
@@ -56,6 +56,8 @@ def _tf(make: Make, state: RobotState, scene: Scene) -> Any:
     frames = of_body.moving_frames(scene.body, state)
     if odom := scene.odom_in_map:
         frames.insert(0, on_floor(MAP_FRAME, ODOM, odom))
+    if scene.arm:
+        frames += scene.arm.moving(state)
     return transforms(make, state.stamp_ns, frames)
 
 
@@ -86,8 +88,8 @@ def table() -> tuple[Row, ...]:
             (SCAN, lambda make, scan, scene: sensors.laser_scan(make, scan, scene.body)),)),
         Row("odom", "nav_msgs/msg/Odometry", DEFAULT, ((STATE, _plain(of_body.odometry)),)),
         Row("tf", "tf2_msgs/msg/TFMessage", TF, ((STATE, _tf),)),
-        Row("tf_static", "tf2_msgs/msg/TFMessage", LATCHED, ((BODY, _plain(tf_static)),),
-            content=_description),
+        Row("tf_static", "tf2_msgs/msg/TFMessage", LATCHED, (
+            (BODY, _tf_static),), content=_content),
         Row("map", "nav_msgs/msg/OccupancyGrid", LATCHED, ((MAP, _plain(maps.occupancy_grid)),)),
         Row("imu", "sensor_msgs/msg/Imu", SENSOR_DATA, (
             (IMU, imu.of_topic), (STATE, imu.of_state))),
@@ -97,14 +99,23 @@ def table() -> tuple[Row, ...]:
             (STATE, _plain(of_body.battery_state)),), every_ns=SECOND_NS),
         Row("plan", "nav_msgs/msg/Path", DEFAULT, ((TASK, _plain(_Plans()),),)),
         Row("robot_description", "std_msgs/msg/String", LATCHED, (
-            (BODY, _plain(robot_description)),), content=_description),
+            (BODY, _robot_description),), content=_content),
         Row("clock", "rosgraph_msgs/msg/Clock", CLOCK, ((STATE, _plain(of_body.clock)),),
             simulated=True),
     )  # fmt: skip
 
 
-def _description(body: Body) -> object:
-    return body.description
+def _content(body: Body, scene: Scene) -> object:
+    return body.description, scene.arm
+
+
+def _tf_static(make: Make, body: Body, scene: Scene) -> Any:
+    return tf_static(make, body, scene.arm.static() if scene.arm else ())
+
+
+def _robot_description(make: Make, body: Body, scene: Scene) -> Any | None:
+    """Return the URDF, which is whole: readers may take the first one for good."""
+    return None if scene.awaits_arm else robot_description(make, body, scene.arm)
 
 
 def _plain(convert: Callable[[Make, Any], Any | None]) -> Convert:
@@ -237,7 +248,7 @@ class Publishing:
 
     def _take(self, one: _Published, convert: Convert, message: Any) -> None:
         now_ns = self._scene.bus.clock.now_ns()
-        content = one.row.content(message) if one.row.content else None
+        content = one.row.content(message, self._scene) if one.row.content else None
         same = content is not None and content == one.content
         if one.publisher is None or same or now_ns - one.sent_ns < one.row.every_ns:
             return

@@ -1,17 +1,23 @@
 """What the gateway knows of the robot, each message decoded once for all that use it."""
 
+import logging
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 from gigabrain_schemas.base import Message, Pose
 from gigabrain_schemas.body import Body, BodyDescription, RobotState
 from gigabrain_schemas.brain import PoseInMap
-from gigabrain_schemas.topics import BODY, POSE, STATE, Topic
+from gigabrain_schemas.topics import ARM_MODEL, BODY, POSE, STATE, Topic
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import Close
 from gigabrain_zenoh.config.settings import Ros2Config
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.gateway.conversions.arm_frames import ArmFrames
+from gigabrain_zenoh.gateway.conversions.description import arm_frames
+from gigabrain_zenoh.geometry.link_model import LinkModel
 from gigabrain_zenoh.geometry.pose import PoseHistory, compose, inverse
 
+log = logging.getLogger(__name__)
 M = TypeVar("M", bound=Message)
 Handle = Callable[[Any], None]
 
@@ -70,6 +76,9 @@ class Scene:
             bus.latest(STATE, self._take_state),
             bus.latest(POSE, self._place),
         )
+        self.arm: ArmFrames | None = None  # None also for a model that cannot be read
+        self._described: tuple[BodyDescription, str] | None = None
+        self._arm_models = bus.latest(ARM_MODEL, lambda _: self._follow_arm())
         self._bodies = bus.latest(BODY, self._take_body)
 
     @property
@@ -81,6 +90,12 @@ class Scene:
     def description(self) -> BodyDescription | None:
         """The body's own part of it."""
         return self._bodies.newest.description if self._bodies.newest else None
+
+    @property
+    def awaits_arm(self) -> bool:
+        """Whether the model of the body's arm has not come yet."""
+        about = self.description
+        return about is not None and about.arm is not None and self._described is None
 
     @property
     def fresh_state(self) -> RobotState | None:
@@ -128,6 +143,22 @@ class Scene:
         elif then:
             self._odom_in_map = compose(Pose(x=pose.x, y=pose.y, yaw=pose.yaw), inverse(then))
 
+    def _follow_arm(self) -> None:
+        """Take an arm's model once its body is known, and again when either is another one."""
+        body, model = self._bodies.newest, self._arm_models.newest
+        if not (body and body.description.arm and model):
+            self._described = self.arm = None
+            return
+        described = body.description, model.mjcf
+        if described == self._described:
+            return
+        self._described, self.arm = described, None
+        try:
+            self.arm = arm_frames(LinkModel(model.mjcf), body)
+        except ConfigError as error:
+            log.warning("%s", error)
+
     def _take_body(self, body: Body) -> None:
+        self._follow_arm()
         for handle in tuple(self.on_body):
             handle(body)

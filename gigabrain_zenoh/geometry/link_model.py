@@ -1,7 +1,7 @@
-"""The links of an arm and their shapes, from the text of its MJCF model, for those who draw it.
+"""The links of an arm, their shapes and masses, from the text of its MJCF model.
 
-Read by the standard library, since viewers need no MuJoCo. Read is what MuJoCo's reference calls
-body, frame, joint, geom and site, with defaults, materials and joint equalities; not meshes.
+Read without MuJoCo, which viewers do not need. Read is what MuJoCo's reference calls body, frame,
+inertial, joint, geom and site, with defaults, materials and joint equalities; not meshes.
 """
 
 import math
@@ -9,9 +9,19 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple, get_args
 from xml.etree import ElementTree as xml
 
+import numpy as np
+
 from gigabrain_schemas.body import MOST_MODEL_CHARACTERS
 from gigabrain_schemas.sim import ShapeKind
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.geometry.link_inertia import (
+    DENSITY,
+    Inertial,
+    moments,
+    together,
+    turned,
+    volume,
+)
 
 MAX_LINKS, MAX_SHAPES = 200, 1000
 MAX_NUMBER = 1e6
@@ -65,6 +75,23 @@ class Shape(NamedTuple):
     size: Vector  # [m]; half sides or half axes; radius and half the length; radius
     place: Place
     colour: tuple[float, ...]  # red, green, blue and alpha of 0 to 1
+    mass: float  # [kg]
+    seen: bool
+    solid: bool  # touches other things
+
+    @property
+    def inertial(self) -> Inertial:
+        """Its inertia in the frame of its link."""
+        tensor = turned(moments(self.kind, self.size, self.mass), self.place.rotation)
+        return Inertial(self.mass, np.array(self.place.position), tensor)
+
+
+class Follower(NamedTuple):
+    """A joint that moves with another one, both from where they are at rest."""
+
+    name: str
+    leader: str
+    polynomial: list[float]  # of the leader's way
 
 
 class LinkModel:
@@ -75,8 +102,9 @@ class LinkModel:
 
     def __init__(self, mjcf: str) -> None:
         """Read a model. Raises ConfigError, in one line, for text that is none."""
-        self.links, self.shapes = [Link("", -1, Place())], list[Shape]()
-        self._followers: list[tuple[str, str, list[float]]] = []
+        self.links, self.every_shape = [Link("", -1, Place())], list[Shape]()
+        self.followers = list[Follower]()
+        self._inertials = dict[int, Inertial]()  # that the model gives, by link
         try:
             root = _parsed(mjcf)
             reader = _Reader(root)
@@ -87,18 +115,29 @@ class LinkModel:
             raise ConfigError(f"the arm's model cannot be drawn: {str(error)[:200]}") from None
         self._rests = {joint.name: joint.rest for link in self.links for joint in link.joints}
 
+    @property
+    def shapes(self) -> list[Shape]:
+        """The shapes that are to be seen."""
+        return [shape for shape in self.every_shape if shape.seen]
+
+    def inertial(self, link: int) -> Inertial | None:
+        """Return the inertia of a link in its frame; None for one without mass."""
+        if link in self._inertials:
+            return self._inertials[link]
+        return together(shape.inertial for shape in self.every_shape if shape.link == link)
+
     def places(self, positions: Mapping[str, float]) -> list[Place]:
         """Return the pose of each link in its parent, for positions of joints [rad or m].
 
         Joints without a position are at rest, or follow another one by an equality.
         """
         at = {name: positions.get(name, rest) for name, rest in self._rests.items()}
-        for follower, leader, polynomial in self._followers:
+        for follower, leader, polynomial in self.followers:
             if follower not in positions and follower in at and leader in at:
-                moved = at[leader] - self._rests[leader]
-                shift = sum(factor * moved**power for power, factor in enumerate(polynomial))
+                way = at[leader] - self._rests[leader]
+                shift = sum(factor * way**power for power, factor in enumerate(polynomial))
                 at[follower] = self._rests[follower] + shift
-        return [_moved(link, at) for link in self.links]
+        return [_at(link, at) for link in self.links]
 
     def places_in_base(self, positions: Mapping[str, float]) -> list[Place]:
         """Return the pose of each link in the frame of the model, likewise."""
@@ -120,13 +159,15 @@ class LinkModel:
             kind = element.get("childclass", kind)
             for child in element:
                 if child.tag == "geom":
-                    self.shapes += reader.shapes(child, link, within, kind)
+                    self.every_shape += reader.shapes(child, link, within, kind)
+                elif child.tag == "inertial":
+                    self._inertials[link] = reader.inertial(child)
                 elif child.tag == "frame":
                     waiting.append((child, link, within @ reader.place(child.attrib), kind))
                 elif child.tag in ("body", "site"):
                     self._add_link(child, link, within, reader, kind)
                     waiting.append((child, len(self.links) - 1, Place(), kind))
-            if len(self.links) > MAX_LINKS or len(self.shapes) > MAX_SHAPES:
+            if len(self.links) > MAX_LINKS or len(self.every_shape) > MAX_SHAPES:
                 raise ValueError(f"more than {MAX_LINKS} links or {MAX_SHAPES} shapes")
 
     def _add_link(
@@ -150,7 +191,7 @@ class LinkModel:
         for one in root.iterfind("equality/joint"):
             polynomial = _numbers(one.get("polycoef", "0 1 0 0 0"))
             names = one.get("joint1", ""), one.get("joint2", "")
-            self._followers.append((*names, polynomial[:5]))
+            self.followers.append(Follower(*names, polynomial[:5]))
 
 
 class _Reader:
@@ -221,7 +262,7 @@ class _Reader:
         )
 
     def shapes(self, element: xml.Element, link: int, within: Place, kind: str) -> Iterator[Shape]:
-        """Yield the shape of a geom, if it is to be seen."""
+        """Yield the shape of a geom, if it is a primitive one."""
         values = self.attributes(element, kind)
         colour = tuple(_numbers(values.get("rgba", "0.5 0.5 0.5 1"), 4))
         if "material" in values and colour == GREY:
@@ -229,7 +270,7 @@ class _Reader:
             colour = tuple(_numbers(painted.get("rgba", "1 1 1 1"), 4))
         hidden = int(values.get("group", "0")) >= HIDDEN_GROUP or colour[3] == 0
         found = KINDS.get(values.get("type", "sphere"))
-        if hidden or found is None:
+        if found is None:
             return
         size, place = _numbers(values.get("size", "0")), self.place(values)
         if "fromto" in values:
@@ -239,7 +280,23 @@ class _Reader:
             middle = _sum(begin, _difference(end, begin), 0.5)
             place, half = Place(middle, _of_z(along)), math.hypot(*along) / 2
             size = [size[0], half] if found in ("capsule", "cylinder") else [*size[:1] * 2, half]
-        yield Shape(found, link, _vector((*size, 0.0, 0.0)[:3]), within @ place, colour)
+        vector = _vector((*size, 0.0, 0.0)[:3])
+        mass = volume(found, vector) * _numbers(values.get("density", f"{DENSITY}"), 1)[0]
+        if "mass" in values:
+            mass = _numbers(values["mass"], 1)[0]
+        solid = any(values.get(name, "1") != "0" for name in ("contype", "conaffinity"))
+        yield Shape(found, link, vector, within @ place, colour, mass, not hidden, solid)
+
+    def inertial(self, element: xml.Element) -> Inertial:
+        """Return what an element says of its link's mass."""
+        place, values = self.place(element.attrib), element.attrib
+        if "fullinertia" in values:
+            xx, yy, zz, xy, xz, yz = _numbers(values["fullinertia"], 6)
+            tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        else:
+            tensor = np.array(_vector(values.get("diaginertia", "0 0 0")))
+        mass = _numbers(values.get("mass", "0"), 1)[0]
+        return Inertial(mass, np.array(place.position), turned(tensor, place.rotation))
 
 
 def _parsed(mjcf: str) -> xml.Element:
@@ -253,17 +310,20 @@ def _parsed(mjcf: str) -> xml.Element:
     return root
 
 
-def _moved(link: Link, at: Mapping[str, float]) -> Place:
+def _at(link: Link, at: Mapping[str, float]) -> Place:
     place = link.place
     for joint in link.joints:
-        moved = at[joint.name] - joint.rest
-        if joint.slides:
-            step = Place(_sum((0.0, 0.0, 0.0), joint.axis, moved))
-        else:  # about the anchor, which stays
-            turned = turn(joint.axis, moved)
-            step = Place(_difference(joint.anchor, rotated(turned, joint.anchor)), turned)
-        place = place @ step
+        step = moved(joint, at[joint.name] - joint.rest)
+        shift = _difference(joint.anchor, rotated(step.rotation, joint.anchor))  # which stays
+        place = place @ Place(_sum(step.position, shift), step.rotation)
     return place
+
+
+def moved(joint: LinkJoint, way: float) -> Place:
+    """Return the pose of a frame at a joint's anchor once it has moved by `way` [rad] or [m]."""
+    if joint.slides:
+        return Place(_sum((0.0, 0.0, 0.0), joint.axis, way))
+    return Place(rotation=turn(joint.axis, way))
 
 
 def turn(axis: Vector, angle: float) -> Quaternion:

@@ -11,7 +11,7 @@ from gigabrain_drivers.bodies.mock.driver import MockBody, MockOptions
 from gigabrain_drivers.driver.catalog import load_robot, robot_path
 from gigabrain_drivers.driver.process import DriverProcess
 from gigabrain_drivers.driver.robot import Run
-from gigabrain_schemas.body import Joint
+from gigabrain_schemas.body import ArmModel, Joint
 from gigabrain_schemas.brain import JointCommand
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import JOINT_CMD, SAFETY, STATE
@@ -30,8 +30,9 @@ NAMES = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_rol
 class MockArm(MockBody):
     """Joints that follow 80 ms late, as servos do, unless they are blocked."""
 
-    def __init__(self, robot, options, run):
+    def __init__(self, robot, options, run, mjcf=None):
         super().__init__(robot, options, run)
+        self._mjcf = mjcf
         self.blocked, self.let_go = False, False
         self.places = self.targets = dict(zip(NAMES, robot.arm.home, strict=True))
         self.history = []  # of the targets, one a call
@@ -40,6 +41,9 @@ class MockArm(MockBody):
         self.targets, self.let_go = self.targets | dict(positions), False
         self.history.append(self.targets)
         return positions
+
+    def arm_model(self):
+        return ArmModel(mjcf=self._mjcf) if self._mjcf else super().arm_model()
 
     async def limp(self):
         self.let_go = True
@@ -60,15 +64,15 @@ class MockArm(MockBody):
 class ArmRobot:
     """A robot that is an arm: `async with ArmRobot(folder) as robot:`."""
 
-    def __init__(self, folder, config=None):
-        self._folder, self._config = folder, config
+    def __init__(self, folder, config=None, mjcf=None):
+        self._folder, self._config, self._mjcf = folder, config, mjcf
         self.network, self.clock = LocalNetwork(), FakeClock()
         self.state, self.safe = None, True
 
     async def __aenter__(self):
         self.robot = load_robot("so101")
         run = Run(folder=robot_path("so101").parent)
-        self.arm = MockArm(self.robot, MockOptions(driver="mock"), run)
+        self.arm = MockArm(self.robot, MockOptions(driver="mock"), run, self._mjcf)
         bus = Bus(self.network.transport(), self.clock, "driver")
         config = DriverConfig(body="so101", resume="manual", state_dir=str(self._folder))
         process = DriverProcess(config, self.robot, self.arm, bus)

@@ -3,6 +3,7 @@
 import math
 import random
 from contextlib import asynccontextmanager
+from xml.etree import ElementTree as xml
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from gigabrain_zenoh.client import requests
 from gigabrain_zenoh.config.settings import Ros2Config
 from gigabrain_zenoh.errors import NoAnswer
 from gigabrain_zenoh.gateway.joint_requests import FOLLOW_TYPE, TRAJECTORY
-from gigabrain_zenoh.ros2.qos import DEFAULT
+from gigabrain_zenoh.ros2.qos import DEFAULT, LATCHED
 from tests.node.ros2_arm import NAMES, ArmRobot, Client
 from tests.node.ros2_robot import TYPES
 from tests.node.test_ros2_hostile import mutated, payload_of
@@ -48,6 +49,50 @@ async def test_joint_states_have_all_joints_also_limp_ones(tmp_path):
         assert message.position == pytest.approx([*robot.robot.arm.home])
         assert len(message.velocity) == 6
         assert message.effort == pytest.approx([0.1] * 6)
+
+
+STRING, TF = "std_msgs/msg/String", "tf2_msgs/msg/TFMessage"
+LINKS = ["shoulder", "upper_arm", "lower_arm", "wrist", "gripper", "jaw"]  # each with a joint
+
+
+def arm_links(message):
+    return [one.child_frame_id for one in message.transforms if one.child_frame_id in LINKS]
+
+
+async def test_a_description_with_the_whole_arm_and_the_frames_of_its_links_are_published(tmp_path):
+    async with ArmRobot(tmp_path) as robot:
+        robot.node.read("/robot_description", STRING, LATCHED)
+        robot.node.read("/tf_static", TF, LATCHED)
+        robot.node.read("/tf", TF)
+        robot.arm.places, robot.arm.blocked = {**robot.arm.places, "shoulder_pan": 1.0}, True
+        await robot.go(150)
+        (text,) = robot.node.received["/robot_description"]
+        urdf = xml.fromstring(text.data)
+        kinds = {joint.get("name"): joint.get("type") for joint in urdf.findall("joint")}
+        assert [kinds[name] for name in NAMES] == ["revolute"] * 6
+        static = robot.node.received["/tf_static"][-1]
+        found = {one.child_frame_id: one.header.frame_id for one in static.transforms}
+        assert (found["base"], found["tool"]) == ("base_link", "gripper")
+        moving = robot.node.received["/tf"][-1]
+        assert arm_links(moving) == LINKS
+        pan = next(one for one in moving.transforms if one.child_frame_id == "shoulder")
+        turn = pan.transform.rotation  # about -z
+        assert 2 * math.atan2(turn.z, turn.w) == pytest.approx(-1.0)
+        joints = {joint.find("child").get("link") for joint in urdf.findall("joint")}
+        frames = {*found, *(one.child_frame_id for one in moving.transforms)}
+        assert joints == frames - {"base_footprint"}
+
+
+async def test_a_model_that_cannot_be_read_leaves_the_rest_of_the_description(tmp_path, caplog):
+    async with ArmRobot(tmp_path, mjcf="<mujoco><worldbody>") as robot:
+        robot.node.read("/robot_description", STRING, LATCHED)
+        robot.node.read("/tf", TF)
+        await robot.go(150)
+        (text,) = robot.node.received["/robot_description"]
+        assert 'link name="base_link"' in text.data
+        assert "shoulder" not in text.data
+        assert arm_links(robot.node.received["/tf"][-1]) == []
+        assert caplog.text.count("the arm's model cannot be drawn") == 1
 
 
 async def test_a_trajectory_of_the_topic_is_followed_and_the_body_given_back(tmp_path):

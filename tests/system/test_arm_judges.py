@@ -1,4 +1,4 @@
-"""The arm's model and inverse kinematics against those of others, in environments of their own.
+"""Arms against the programs of others, in environments of their own: models, IK and URDF.
 
 They are left to `make qa`, and skipped, with the reason, where packages cannot be had.
 """
@@ -14,8 +14,12 @@ import mujoco
 import numpy as np
 import pytest
 
+from gigabrain_zenoh.gateway.conversions.description import arm_frames, urdf
+from gigabrain_zenoh.geometry.link_model import LinkModel
 from gigabrain_zenoh.manipulation.inverse_kinematics import Reachable, ToolGoal
+from tests.ros2 import foreign
 from tests.system.test_exported_nets import pip
+from tests.unit.gateway.arms import ARMS, body_of
 from tests.unit.manipulation.arms import MODEL, arm, inverse, postures
 
 pytestmark = pytest.mark.qa
@@ -67,3 +71,48 @@ def test_mink_reaches_no_more_than_we_do(tmp_path: Path) -> None:
     theirs = json.loads(made.stdout)
     assert sum(theirs) >= 50  # so many have been judged: it begins once, we at many postures
     assert all(our or not their for our, their in zip(ours, theirs, strict=True))
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_pinocchio_finds_links_masses_and_limits_in_the_urdf_as_mujoco_does(
+    name: str, tmp_path: Path
+) -> None:
+    python = foreign.built(lambda: foreign.environment("pinocchio", ("pin==4.1.0",)))
+    body, mjcf = body_of(name)
+    about, links = body.description, LinkModel(mjcf)
+    model = mujoco.MjModel.from_xml_string(mjcf)
+    rng = np.random.default_rng(0)
+    drawn = [{one.name: float(rng.uniform(one.lower, one.upper)) for one in about.joints}
+             for _ in range(100)]  # fmt: skip
+    for posture in drawn:
+        posture.update({one.name: posture[one.leader] for one in links.followers})
+    file = tmp_path / "arm.json"
+    file.write_text(json.dumps({
+        "urdf": urdf(body, arm_frames(links, body)), "postures": drawn,
+        "frames": [model.body(number).name for number in range(1, model.nbody)],
+    }))  # fmt: skip
+    judge = subprocess.run(
+        (python, Path(__file__).with_name("urdf_judge.py"), file),
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert judge.returncode == 0, judge.stderr[-2000:]
+    found, data = json.loads(judge.stdout), mujoco.MjData(model)
+    for posture, places in zip(drawn, found["places"], strict=True):
+        for joint, position in posture.items():
+            data.joint(joint).qpos[0] = position
+        mujoco.mj_fwdPosition(model, data)
+        matrices = np.array(places)
+        assert np.allclose(matrices[:, :3, 3], data.xpos[1:], atol=1e-7)
+        assert np.allclose(matrices[:, :3, :3].reshape(-1, 9), data.xmat[1:], atol=1e-7)
+    assert found["mass"] == pytest.approx(model.body_mass.sum())
+    assert np.allclose(found["centre"], data.subtree_com[0], atol=1e-7)
+    tensor = np.zeros((3, 3))
+    for mass, at, axes, moments in zip(
+        model.body_mass, data.xipos, data.ximat, model.body_inertia, strict=True
+    ):
+        turn, off = axes.reshape(3, 3), at - data.subtree_com[0]
+        tensor += turn @ np.diag(moments) @ turn.T
+        tensor += mass * (off @ off * np.eye(3) - np.outer(off, off))
+    assert np.allclose(found["tensor"], tensor, atol=1e-8)
+    for joint in about.joints:
+        assert found["limits"][joint.name] == pytest.approx([joint.lower, joint.upper])

@@ -1,11 +1,15 @@
-"""A URDF of the body, from the footprint, wheels and sensors of its file."""
+"""A URDF of the body, from the footprint, wheels and sensors of its file, and its arm's model."""
 
 import math
 from typing import Any, NamedTuple
 from xml.etree import ElementTree as xml
 
 from gigabrain_schemas.body import Body, BodyDescription
+from gigabrain_zenoh.gateway.conversions import urdf_elements as elements
+from gigabrain_zenoh.gateway.conversions.arm_description import add_arm
+from gigabrain_zenoh.gateway.conversions.arm_frames import ArmFrames
 from gigabrain_zenoh.gateway.conversions.frames import BASE, FOOTPRINT, Make, Placed, static_frames
+from gigabrain_zenoh.geometry.link_model import LinkModel
 
 WHEEL_WIDTH = 0.15  # of its diameter; files do not give it
 ROUND_CORNERS, ROUND_SHARE = 8, 0.03  # a footprint of so many corners, so equally far, is round
@@ -30,29 +34,36 @@ def wheels(about: BodyDescription) -> tuple[Wheel, ...]:
     return tuple(Wheel(f"wheel_{s}_joint", f"wheel_{s}_link", y, radius) for s, y in sides)
 
 
-def urdf(body: Body) -> str:
-    """Return the URDF: the hull on `base_link`, wheels where they are known, sensor frames."""
+def arm_frames(model: LinkModel, body: Body) -> ArmFrames:
+    """Return the frames of the arm on a body."""
+    taken = {frame.child for frame in static_frames(body)} | {FOOTPRINT}
+    taken |= {wheel.link for wheel in wheels(body.description)}
+    return ArmFrames(model, body.description, taken)
+
+
+def urdf(body: Body, arm: ArmFrames | None = None) -> str:
+    """Return the URDF: the hull or the arm's model, wheels where known, sensor frames."""
     about = body.description
     robot = xml.Element("robot", name=about.robot_type)
-    _link(robot, FOOTPRINT)
-    _hull(_link(robot, BASE), about)
+    elements.link(robot, FOOTPRINT)
+    base = elements.link(robot, BASE)
+    if arm is None:
+        _hull(base, about)
     for placed in static_frames(body):
         if placed.child != BASE:
-            _link(robot, placed.child)
-        _joint(robot, f"{placed.child}_joint", "fixed", placed)
+            elements.link(robot, placed.child)
+        elements.joint(robot, f"{placed.child}_joint", "fixed", placed)
     for wheel in wheels(about):
         _wheel(robot, wheel)
+    if arm:
+        add_arm(robot, base, arm)
     xml.indent(robot)
     return xml.tostring(robot, "unicode", xml_declaration=True)
 
 
-def robot_description(make: Make, body: Body) -> Any:
+def robot_description(make: Make, body: Body, arm: ArmFrames | None = None) -> Any:
     """Return std_msgs/String with the URDF."""
-    return make("std_msgs/msg/String", data=urdf(body))
-
-
-def _link(robot: xml.Element, name: str) -> xml.Element:
-    return xml.SubElement(robot, "link", name=name)
+    return make("std_msgs/msg/String", data=urdf(body, arm))
 
 
 def _hull(link: xml.Element, about: BodyDescription) -> None:
@@ -64,49 +75,20 @@ def _hull(link: xml.Element, about: BodyDescription) -> None:
     reaches = [math.hypot(x - middle[0], y - middle[1]) for x, y in about.footprint]
     is_round = max(reaches) - min(reaches) <= ROUND_SHARE * max(reaches)
     for part in ("visual", "collision"):
-        drawn = xml.SubElement(link, part)
-        _origin(drawn, (*middle, lift + height / 2), (0.0, 0.0, 0.0))
-        shape = xml.SubElement(drawn, "geometry")
+        _, shape = elements.drawn(link, part, (*middle, lift + height / 2), elements.NOWHERE)
         if is_round and len(reaches) >= ROUND_CORNERS:
             xml.SubElement(shape, "cylinder", radius=f"{max(reaches):g}", length=f"{height:g}")
         else:
             size = max(xs) - min(xs), max(ys) - min(ys), height
-            xml.SubElement(shape, "box", size=_numbers(size))
+            xml.SubElement(shape, "box", size=elements.numbers(size))
 
 
 def _wheel(robot: xml.Element, wheel: Wheel) -> None:
-    link = _link(robot, wheel.link)
+    link = elements.link(robot, wheel.link)
     for part in ("visual", "collision"):
-        drawn = xml.SubElement(link, part)
-        _origin(drawn, (0.0, 0.0, 0.0), (math.pi / 2, 0.0, 0.0))
-        shape, length = xml.SubElement(drawn, "geometry"), 2 * WHEEL_WIDTH * wheel.radius
+        _, shape = elements.drawn(link, part, elements.NOWHERE, (math.pi / 2, 0.0, 0.0))
+        length = 2 * WHEEL_WIDTH * wheel.radius
         xml.SubElement(shape, "cylinder", radius=f"{wheel.radius:g}", length=f"{length:g}")
     placed = Placed(BASE, wheel.link, 0.0, wheel.y, wheel.radius)
-    joint = _joint(robot, wheel.joint, "continuous", placed)
+    joint = elements.joint(robot, wheel.joint, "continuous", placed)
     xml.SubElement(joint, "axis", xyz="0 1 0")
-
-
-def _joint(robot: xml.Element, name: str, kind: str, placed: Placed) -> xml.Element:
-    joint = xml.SubElement(robot, "joint", name=name, type=kind)
-    _origin(joint, (placed.x, placed.y, placed.z), _angles(placed))
-    xml.SubElement(joint, "parent", link=placed.parent)
-    xml.SubElement(joint, "child", link=placed.child)
-    return joint
-
-
-def _origin(
-    element: xml.Element, xyz: tuple[float, float, float], rpy: tuple[float, float, float]
-) -> None:
-    xml.SubElement(element, "origin", xyz=_numbers(xyz), rpy=_numbers(rpy))
-
-
-def _angles(placed: Placed) -> tuple[float, float, float]:
-    """Return roll, pitch and yaw [rad] of a rotation."""
-    x, y, z, w = placed.rotation
-    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
-    return roll, pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-
-
-def _numbers(values: tuple[float, ...]) -> str:
-    return " ".join(f"{value:.6g}" for value in values)

@@ -1,7 +1,7 @@
 """Headers, poses and transforms of ROS, and the names of the frames."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 from gigabrain_schemas.base import Pose
@@ -152,6 +152,6 @@ def _camera_frames(camera: Camera) -> list[Placed]:
     ]
 
 
-def tf_static(make: Make, body: Body) -> Any:
-    """Return tf2_msgs/TFMessage of the frames that do not move on the body."""
-    return transforms(make, body.stamp_ns, static_frames(body))
+def tf_static(make: Make, body: Body, of_arm: Sequence[Placed] = ()) -> Any:
+    """Return tf2_msgs/TFMessage of the frames that do not move on the body, and on its arm."""
+    return transforms(make, body.stamp_ns, [*static_frames(body), *of_arm])

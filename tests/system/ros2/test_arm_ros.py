@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as xml
 
 import pytest
 import pytest_asyncio
@@ -13,7 +14,7 @@ from gigabrain_zenoh.testing.processes import Home
 from gigabrain_zenoh.testing.waiting import until
 from tests.places import ROOT
 from tests.ros2.judge import Judge, Program
-from tests.system.ros2.test_gateway_ros import Robot, judge, released, running
+from tests.system.ros2.test_gateway_ros import READ, Robot, judge, released, running
 
 __all__ = ["judge"]
 pytestmark = pytest.mark.asyncio(loop_scope="module")
@@ -110,6 +111,22 @@ async def test_joint_states_have_all_joints_of_the_arm(robot: Robot, judge: Judg
     assert message["position"] == pytest.approx(HOME, abs=SAG)
     assert [len(message[field]) for field in ("velocity", "effort")] == [6, 6]
     assert robot.now.gate.mode == "idle"
+
+
+async def test_the_urdf_and_the_frames_of_all_links_reach_ros(robot: Robot, judge: Judge) -> None:
+    listener, values = judge.start("listen"), {}
+    for topic in ("/robot_description", "/tf_static", "/tf"):
+        kind, qos = READ[topic]
+        await listener.query("subscribe", topic=topic, type=kind, qos=qos)
+        report = await asyncio.to_thread(
+            listener.poll, "report", lambda one: one["count"] > 0, topic=topic
+        )
+        values[topic] = report["values"][-1]
+    joints = xml.fromstring(values["/robot_description"]["data"]).findall("joint")
+    transforms = [*values["/tf"]["transforms"], *values["/tf_static"]["transforms"]]
+    frames = {one["child_frame_id"] for one in transforms}
+    assert {"shoulder", "jaw", "tool"} < frames
+    assert {joint.find("child").get("link") for joint in joints} == frames - {"base_footprint"}
 
 
 async def test_a_goal_moves_the_arm_with_feedback_and_frees_it(robot: Robot, judge: Judge) -> None:

@@ -179,7 +179,8 @@ def test_a_urdf_has_the_hull_the_wheels_and_all_frames_of_tf():
     hull = robot.find("link[@name='base_link']/visual")
     assert hull.find("geometry/box").get("size") == "0.275 0.31 0.159"
     assert hull.find("origin").get("xyz") == "-0.0625 0 0.1125"
-    assert joints["front_optical_frame_joint"].find("origin").get("rpy") == "-1.5708 0 -1.5708"
+    lens = joints["front_optical_frame_joint"].find("origin")
+    assert lens.get("rpy") == "-1.57079633 0 -1.57079633"
 
 
 def test_a_round_footprint_is_a_cylinder():

@@ -84,7 +84,26 @@ def check(mjcf: str, positions: dict[str, float], followers: dict[str, float]) -
         if material >= 0 and np.allclose(colour, (0.5, 0.5, 0.5, 1.0)):
             colour = model.mat_rgba[material]
         np.testing.assert_allclose(shape.colour, colour, atol=1e-6)
+    check_masses(model, read)
     return len(read.shapes)
+
+
+def check_masses(model: mujoco.MjModel, read: LinkModel) -> None:
+    bodies = [model.body(number).name for number in range(1, model.nbody)]
+    for number, link in enumerate(read.links):
+        if link.name not in bodies:
+            continue
+        body = model.body(link.name)
+        found = read.inertial(number)
+        if found is None:
+            assert body.mass == 0
+            continue
+        assert found.mass == pytest.approx(body.mass[0])
+        np.testing.assert_allclose(found.centre, body.ipos, atol=1e-9)
+        axes = np.empty(9)
+        mujoco.mju_quat2Mat(axes, body.iquat)
+        tensor = axes.reshape(3, 3) @ np.diag(body.inertia) @ axes.reshape(3, 3).T
+        np.testing.assert_allclose(found.tensor, tensor, atol=1e-10)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -94,6 +113,17 @@ def test_a_model_in_every_way_of_writing_is_where_mujoco_has_it(seed: int) -> No
     follows = 0.01 + 2 * moved + 3 * moved**2
     positions = {"hinge": hinge, "slide": slide}
     assert check(EVERY_WAY, positions, {"follower": follows}) == 6
+
+
+def test_masses_by_inertial_elements_and_of_ellipsoids_are_those_of_mujoco() -> None:
+    mjcf = """<mujoco><worldbody>
+      <body name="given"><geom size="1"/>
+        <inertial pos="1 2 3" mass="2" fullinertia="3 4 5 .1 .2 .3"/></body>
+      <body name="egg"><geom type="ellipsoid" size=".1 .2 .3" euler="10 20 30" density="20"/></body>
+      <body name="light"><geom size="1" mass="0"/><joint/></body></worldbody></mujoco>"""
+    read = LinkModel(mjcf)
+    check_masses(mujoco.MjModel.from_xml_string(mjcf.replace("<joint/>", "")), read)
+    assert [read.inertial(number) is None for number in range(4)] == [True, False, False, True]
 
 
 @pytest.mark.parametrize("body", ["so101", "piper"])
