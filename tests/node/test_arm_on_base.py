@@ -1,5 +1,6 @@
 """A base that carries an arm, by all of the robot's processes in memory."""
 
+import asyncio
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -12,7 +13,8 @@ from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import Joint, RobotState
 from gigabrain_schemas.brain import CmdVel
-from gigabrain_schemas.topics import CMD_VEL
+from gigabrain_schemas.requests import EstopRequest
+from gigabrain_schemas.topics import CMD_VEL, ESTOP
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.testing.in_memory import RecordedBody, RobotInMemory
 
@@ -32,6 +34,7 @@ class Carrier(RecordedBody):
         self.at = dict(zip(names, ARM.home, strict=True))
         self.asked: list[float] = []  # forward [m/s]
         self.while_sending: Callable[[], None] = lambda: None
+        self.stops = 0
 
     async def set_joint_positions(self, positions: Mapping[str, float]) -> Mapping[str, float]:
         self.at |= positions
@@ -43,6 +46,10 @@ class Carrier(RecordedBody):
     ) -> Velocity:
         self.asked.append(linear_x)
         return await super().set_base_velocity(linear_x, linear_y, angular_z)
+
+    async def stop(self) -> None:
+        self.stops += 1
+        await super().stop()
 
     async def read_state(self) -> RobotState:
         joints = tuple(Joint(name=name, position=at) for name, at in self.at.items())
@@ -69,3 +76,23 @@ async def test_what_arrives_while_joints_are_sent_holds_for_the_wheels_at_once(
         body.while_sending = say_nonsense
         await robot.go(2)
         assert body.asked[0] == 0.0
+
+
+async def test_a_latched_gate_stops_the_wheels_and_holds_the_joints_where_it_says(
+    tmp_path: Path,
+) -> None:
+    async with RobotInMemory(tmp_path, make_body=Carrier) as robot:
+        await robot.go(200)
+        body = robot.body
+        assert isinstance(body, Carrier)
+        asked = asyncio.ensure_future(robot.operator.ask(ESTOP, EstopRequest(source="test")))
+        await robot.go(5)
+        assert (await asked)[0].ok
+        assert robot.mode == "latched"
+        body.at[LEKIWI.joints[1].name] -= 0.05  # it sags
+        body.stops = 0
+        body.asked.clear()
+        await robot.go(5)
+        assert body.stops == 0  # which would hold joints where they sag to
+        assert set(body.asked) == {0.0}
+        assert tuple(body.at.values()) == ARM.home

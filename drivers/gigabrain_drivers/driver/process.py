@@ -302,7 +302,7 @@ class DriverProcess:
             self._wake.clear()
             await self._apply_joints(self._gate)
             now = self._gate  # which may have changed while the joints were sent
-            if now.mode == "latched":
+            if now.mode == "latched" and not now.joints:  # those are held where the gate says
                 self._sent = ZERO
                 await self._driver.stop()
                 return
