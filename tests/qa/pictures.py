@@ -7,7 +7,8 @@ from pathlib import Path
 
 from playwright.async_api import Page, async_playwright
 
-from gigabrain_zenoh.qa.probe import probing
+from gigabrain_drivers.driver.catalog import robot_path
+from gigabrain_zenoh.qa.probe import Probe, probing
 from gigabrain_zenoh.testing.processes import Home
 from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.ui.run_report import RunMonitor
@@ -49,6 +50,38 @@ async def take_screenshots(folder: Path) -> None:
     """Take all screenshots."""
     await take_map_screenshots(folder)
     await take_camera_screenshot(folder)
+    await take_arm_screenshot(folder)
+
+
+async def take_arm_screenshot(folder: Path) -> None:
+    """Have an arm move blocks, and show it while it carries one."""
+    mission = robot_path("so101").with_name("demo.yaml")
+    decision = {"behaviour": "navigate", "settings": {"mission": str(mission)}}
+    with tempfile.TemporaryDirectory() as place:
+        home = Home(Path(place) / "home")
+        try:
+            robot = Robot(home, body="so101", world="table", decision=decision)
+            async with probing(robot.endpoint) as seen:
+                await robot.served()
+                async with async_playwright() as playwright:
+                    chromium = await playwright.chromium.launch(
+                        executable_path=CHROMIUM, args=FLAGS
+                    )
+                    page = await chromium.new_page()
+                    await page.goto(f"{robot.origin}/#{OPERATOR}")
+                    await prepare(page, "light")
+                    await until(lambda: carries(seen), "it carries a block", READY_S)
+                    await page.screenshot(path=folder / "page_arm.png")
+                    await chromium.close()
+        finally:
+            home.close()
+
+
+def carries(seen: Probe) -> bool:
+    """Return whether the gripper squeezes something while the arm turns."""
+    pan, *_, gripper = seen.state.joints
+    squeezed = gripper.position - seen.state.joints_sent[-1] > 0.05
+    return squeezed and abs(pan.velocity) > 0.3
 
 
 async def take_camera_screenshot(folder: Path) -> None:

@@ -13,7 +13,9 @@ from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import ArmModel, Body, BodyDescription, GateStatus, Joint, RobotState
 from gigabrain_schemas.brain import JointSpeeds
-from gigabrain_schemas.topics import ARM_MODEL, BODY, JOINT_TELEOP, STATE
+from gigabrain_schemas.examples import example
+from gigabrain_schemas.requests import GateReply, LimpRequest
+from gigabrain_schemas.topics import ARM_MODEL, BODY, JOINT_TELEOP, LIMP, STATE
 from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics
 from gigabrain_zenoh.testing.waiting import until
 from tests.places import ROOT
@@ -31,7 +33,7 @@ DRIVES = replace(
     max_angular_speed=1.0,
 )  # fmt: skip
 READY = GateStatus(mode="enabled", commander="control", enables=1)
-LATCHED = GateStatus(mode="latched", estop_generation=1)
+LATCHED = GateStatus(mode="latched", estop_generation=1, enables=1)
 PAN = "shoulder_pan up: hold to move it"
 
 
@@ -43,13 +45,21 @@ class FakeArm(Fake):
         self.body: BodyDescription = CRANE
         self.gate, self.limp = READY, False
         self.jogged: list[JointSpeeds] = []
+        self.asked: list[bool] = []  # requests to let go, and to hold
+        self.robot.serve(LIMP, self._let_go)
         self.robot.subscribe(JOINT_TELEOP, lambda _key, speeds: self.jogged.append(speeds))
 
     def become(self, body: BodyDescription = CRANE, gate: GateStatus = READY) -> None:
         """Be another robot; forget what was wanted of the last."""
         self.body, self.gate, self.limp = body, gate, False
         self.jogged.clear()
+        self.asked.clear()
         self.say_once()
+
+    async def _let_go(self, request: LimpRequest) -> GateReply:
+        self.asked.append(request.limp)
+        self.limp = request.limp
+        return replace(example(GateReply), text="all joints are let go of")
 
     def say(self) -> None:
         first, *others, last = self.body.joints
@@ -242,6 +252,46 @@ async def test_an_arm_that_is_limp_says_so(chromium: Browser, fake: FakeArm) -> 
     assert not fake.jogged
 
 
+async def test_an_arm_is_let_go_of_once_a_person_agrees_and_held_again(
+    chromium: Browser, fake: FakeArm
+) -> None:
+    fake.gate = LATCHED
+    page = await opened(chromium)
+    assert await page.is_disabled("#arm-hold")
+    await page.click("#arm-limp")
+    await page.wait_for_selector("#let-go:has-text('may fall')", state="visible")
+    await page.keyboard.press("Enter")  # the answer that has the focus keeps it
+    await page.wait_for_selector("#let-go", state="hidden")
+    assert not fake.asked
+    await page.click("#arm-limp")
+    await page.click("#estop")  # which stays within reach
+    await page.wait_for_selector('#confirmed:has-text("CONFIRMED by")')
+    await page.click("#let-go-yes")
+    await page.wait_for_selector("#reply:has-text('all joints are let go of')")
+    await page.wait_for_selector("#arm-status:has-text('“Hold” holds it')")
+    assert fake.asked == [True]
+    assert await page.is_disabled("#arm-limp")
+    await page.click("#arm-hold")
+    await page.wait_for_selector("#arm-status:has-text('held')")
+    assert fake.asked == [True, False]
+
+
+async def test_a_moving_arm_is_held_and_not_let_go_of(chromium: Browser, fake: FakeArm) -> None:
+    page = await opened(chromium)
+    assert await page.is_disabled("#arm-limp")
+    assert await page.get_attribute("#arm-limp", "title") == "Press STOP first"
+    await page.click("#arm-hold")
+    await page.wait_for_selector("#reply:has-text('held until the brain is let drive again')")
+    await until(lambda: fake.wanted, "speeds of joints")
+    assert fake.wanted == dict.fromkeys((joint.name for joint in CRANE.joints), 0.0)
+    assert not fake.asked
+    fake.gate = LATCHED
+    await page.click("#arm-limp")
+    await page.wait_for_selector("#let-go", state="visible")
+    fake.gate = READY  # which takes the question away
+    await page.wait_for_selector("#let-go", state="hidden")
+
+
 async def test_of_two_operators_one_moves_the_arm(chromium: Browser, fake: FakeArm) -> None:
     one, two = await opened(chromium), await opened(chromium)
     await hold(one, fake)
@@ -259,6 +309,8 @@ async def test_a_viewer_sees_joints_without_buttons(chromium: Browser) -> None:
     assert not await page.get_by_label(PAN).is_visible()
     assert not await page.is_visible("#jog-share")
     assert not await page.is_visible("#tool")
+    assert not await page.is_visible("#arm-hold")
+    assert not await page.is_visible("#arm-limp")
 
 
 async def test_the_arm_is_drawn_in_three_dimensions(chromium: Browser) -> None:

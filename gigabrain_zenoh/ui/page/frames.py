@@ -30,6 +30,7 @@ from gigabrain_schemas.zones import SavedMapInfo, Zones, ZonesRequest
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.geometry.link_model import LinkModel
 from gigabrain_zenoh.ui.page.arm_scene import ArmScene
 from gigabrain_zenoh.ui.page.tool_jog import tool_speeds
@@ -91,7 +92,7 @@ class PageRequest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     id: Annotated[int, Meta(ge=0, le=2**31)]
     what: Literal[
         "estop", "release", "enable", "take", "goal", "cancel", "settings", "set", "world",
-        "zones", "maps", "map_save", "map_load",
+        "zones", "maps", "map_save", "map_load", "hold", "limp",
     ]  # fmt: skip
     estop_generation: Count = 0  # as the page shows it: a newer e-stop is not released unseen
     goal: GoalRequest | None = None
@@ -99,7 +100,7 @@ class PageRequest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     zones: ZonesRequest | None = None
     process: Name = ""  # of a setting
     name: Name = ""  # of a setting, or of a map
-    value: Text = ""
+    value: Text = ""  # of a setting; "yes" where a person has agreed that an arm may fall
 
 
 class Setting(Struct, frozen=True, kw_only=True):
@@ -247,6 +248,19 @@ class PageView(ViewerScene):
         if jog.tool is None or self._links is None or self.body is None or state is None:
             return jog.speeds
         return tool_speeds(self._links, self.body.description, state, jog.tool) | jog.speeds
+
+    def hold_joints(self) -> bool:
+        """Have control hold the joints while the brain may move them; return whether it may.
+
+        It holds them until the gate is enabled again.
+        """
+        state = self.state.fresh()
+        joints = self.body.description.joints if self.body else ()
+        moves = state and state.gate.mode == "enabled" and state.gate.commander == BRAIN
+        if not moves or not joints:
+            return False
+        self.publish({joint.name: 0.0 for joint in joints})
+        return True
 
     def on_rare(self, topic: topics.Topic[Any], message: Message) -> None:
         """Send a rare message at once, and keep it for later viewers."""

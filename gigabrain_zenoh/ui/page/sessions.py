@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from msgspec.structs import replace
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from gigabrain_schemas.requests import GateReply
 from gigabrain_schemas.sim import SimRequest
 from gigabrain_schemas.tasks import GoalReply, TaskReply, TaskRequest
 from gigabrain_schemas.topics import GOAL, TASK_CHANGE
@@ -18,6 +19,7 @@ from gigabrain_zenoh.client.requests import (
     ANSWER_S,
     change_world,
     enable,
+    let_go,
     params,
     press_estop,
     release,
@@ -85,8 +87,13 @@ class Viewer:
 class RequestHandler:
     """Carries out the requests of operators."""
 
-    def __init__(self, bus: Bus, processes: Callable[[], Iterable[str]] = tuple) -> None:
-        self._bus, self._processes = bus, processes
+    def __init__(
+        self,
+        bus: Bus,
+        processes: Callable[[], Iterable[str]] = tuple,
+        hold_joints: Callable[[], bool] = bool,
+    ) -> None:
+        self._bus, self._processes, self._hold_joints = bus, processes, hold_joints
 
     async def handle(self, request: PageRequest) -> PageReply:
         """Carry out a request. Errors are part of the reply."""
@@ -130,13 +137,24 @@ class RequestHandler:
         if request.what == "world":
             wanted = replace(request.world or SimRequest(), source=self._bus.process)
             return (await change_world(self._bus, wanted)).text, ""
+        if request.what == "hold" and self._hold_joints():
+            return "the arm is held until the brain is let drive again", ""
         if request.what == "estop":
             reply = await press_estop(self._bus, "operator page")
         elif request.what == "release":
             reply = await release(self._bus, request.estop_generation)
+        elif request.what in ("hold", "limp"):
+            reply = await self._let_go(request)
         else:
             reply = await enable(self._bus, BRAIN, take=request.what == "take")
         return reply.text, reply.robot_type
+
+    async def _let_go(self, request: PageRequest) -> GateReply:
+        """Let go of an arm, or hold a limp one."""
+        limp = request.what == "limp"
+        if limp and request.value != "yes":
+            raise Refused("an arm that is let go of may fall: a person must agree to it first")
+        return await let_go(self._bus, limp)
 
     async def _change_zones(self, request: PageRequest) -> str:
         if request.zones is None:
@@ -192,7 +210,7 @@ class Sessions:
         self._cameras = CameraFrames(bus, self.send)
         self._surroundings = SurroundingsFrames(bus)
         self._view = PageView(bus, self.send, self._introduce_all)
-        self._handler = RequestHandler(bus, self._view.health.keys)
+        self._handler = RequestHandler(bus, self._view.health.keys, self._view.hold_joints)
         self._arbiter = TeleopArbiter(self._view)
 
     def send(self, slot: str, frame: bytes) -> None:

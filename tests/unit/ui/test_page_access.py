@@ -12,7 +12,9 @@ from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import Body
 from gigabrain_schemas.brain import Twist
-from gigabrain_schemas.topics import BODY, TELEOP
+from gigabrain_schemas.examples import example
+from gigabrain_schemas.requests import GateReply, LimpRequest
+from gigabrain_schemas.topics import BODY, LIMP, TELEOP
 from gigabrain_zenoh.config.settings import PageConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.limits import ZERO
@@ -245,6 +247,25 @@ async def test_a_goal_without_a_server_is_refused_with_the_reason() -> None:
     reply = await RequestHandler(page.net.one).handle(goal)
     assert (reply.id, reply.ok) == (7, False)
     assert reply.text == "no process serves goals: this robot runs no navigation"
+
+
+async def test_an_arm_is_not_let_go_of_unless_a_person_has_agreed() -> None:
+    page, asked = Seated(), list[bool]()
+
+    async def let_go(request: LimpRequest) -> GateReply:
+        asked.append(request.limp)
+        return example(GateReply)
+
+    page.net.two.serve(LIMP, let_go)
+    handler = RequestHandler(page.net.one)
+    for value in ("", "no"):
+        reply = await handler.handle(PageRequest(id=7, what="limp", value=value))
+        assert not reply.ok
+        assert reply.text == "an arm that is let go of may fall: a person must agree to it first"
+    assert not asked
+    assert (await handler.handle(PageRequest(id=8, what="limp", value="yes"))).ok
+    assert (await handler.handle(PageRequest(id=9, what="hold"))).ok
+    assert asked == [True, False]
 
 
 def test_a_demo_on_a_shared_machine_prints_an_address_that_logs_in(

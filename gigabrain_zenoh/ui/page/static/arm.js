@@ -5,7 +5,7 @@ const PERIOD_MS = 40
 const TOOL_SPEED = 0.3 // [m/s] at most
 const AXES = ['x', 'y', 'z'] // of the base
 const AT_REST_SPEED = 0.05 // [rad/s] or [m/s]
-const LIMP = 'limp: let go of, so it may fall. “gigabrain arm hold” holds it'
+const LIMP = 'limp: let go of, so it may fall; “Hold” holds it'
 
 /** Return a position or a speed of a joint as text: degrees, or millimetres where it slides. */
 function inUnit(joint, value, suffix = '') {
@@ -17,6 +17,28 @@ function activity(state) {
   if (!state) return 'silent'
   if (state.limp) return LIMP
   return state.joints.some(({ velocity }) => Math.abs(velocity) > AT_REST_SPEED) ? 'moving' : 'held'
+}
+
+/** The buttons that hold an arm and let go of it; the second asks a person first. */
+export class ArmHold {
+  /** `request(what, more)` sends a request; the rest are the buttons, and the question with its answers. */
+  constructor({ hold, limp, ask, yes, no, request }) {
+    Object.assign(this, { hold, limp, ask })
+    hold.addEventListener('click', () => request('hold'))
+    limp.addEventListener('click', () => { ask.hidden = false; no.focus() })
+    no.addEventListener('click', () => { ask.hidden = true })
+    yes.addEventListener('click', () => { ask.hidden = true; request('limp', { value: 'yes' }) })
+  }
+
+  /** Offer what does something in this state, or nothing without one. */
+  setState(state) {
+    const mode = state?.gate.mode, shut = mode === 'idle' || mode === 'latched'
+    this.hold.disabled = !(state?.limp ? shut : mode === 'enabled')
+    this.limp.disabled = !shut || state.limp
+    this.hold.title = state?.limp ? 'Hold the joints where they are' : 'Take the arm from the brain, and hold it'
+    this.limp.title = mode === 'enabled' ? 'Press STOP first' : 'Switch the motors off, to move the arm by hand'
+    if (this.limp.disabled) this.ask.hidden = true
+  }
 }
 
 export class Arm {

@@ -1,5 +1,5 @@
 // Connects the parts of the page: shows the frames that the link receives, and sends the operator's requests.
-import { Arm } from './arm.js'
+import { Arm, ArmHold } from './arm.js'
 import { Cameras } from './cameras.js'
 import { Drive } from './drive.js'
 import { Link } from './link.js'
@@ -58,6 +58,7 @@ const link = new Link({
     showFigures(now.state, now)
     showSafety(now.safety, about.body)
     arm.setState(now.state)
+    armHold.setState(now.state)
     $('stick').classList.toggle('off', !mayDrive())
   },
   scan: (head, ranges) => map.setScan(head, ranges),
@@ -94,6 +95,7 @@ const link = new Link({
       releaseAll()
       robot = null
       arm.setState(null)
+      armHold.setState(null)
       showGate(null, viewOnly())
       showFigures(null, {})
       showSafety(null, about.body)
@@ -124,6 +126,10 @@ const arm = new Arm({
   send: (speeds, tool) => link.jog(speeds, tool),
   allowed: mayDrive,
   show: (text) => setText($('arm-status'), text),
+})
+
+const armHold = new ArmHold({
+  hold: $('arm-hold'), limp: $('arm-limp'), ask: $('let-go'), yes: $('let-go-yes'), no: $('let-go-no'), request,
 })
 
 /** Show what moves this body: its base, its joints, or both. */
@@ -166,10 +172,10 @@ async function stop() {
   show($('confirmed'), text, 'bad')
 }
 
-async function request(what) {
+async function request(what, more = {}) {
   releaseAll()
   const generation = robot?.state?.gate.estop_generation ?? 0
-  const reply = await link.request(what, what === 'release' ? { estop_generation: generation } : {})
+  const reply = await link.request(what, what === 'release' ? { estop_generation: generation } : more)
   showReply(reply)
   if (reply.ok && what === 'release') show($('confirmed'), '', '')
 }
