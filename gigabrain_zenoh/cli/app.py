@@ -37,7 +37,7 @@ COMMANDS = {
     "release": ("gate:release", "Release a latched robot."),
     "enable": ("gate:enable", "Let the robot's brain drive."),
     "audit": ("gate:audit", "Show who did what to the robot."),
-    "teleop": ("views:teleop", "Drive the robot by keyboard or gamepad."),
+    "teleop": ("views:teleop", "Drive the robot by keyboard, gamepad or a second arm."),
     "page": ("views:page", "Serve the operator page: the robot in a browser."),
     "view": ("views:view", "Open a live window of the simulation, or save a picture of it."),
     "foxglove": ("views:foxglove", "Show the robot live in Foxglove or Lichtblick."),

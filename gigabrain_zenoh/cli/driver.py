@@ -155,7 +155,9 @@ def bringup(name: Body, *, link: Literal["emulated", "real"] = "real", seconds: 
     return int(any(one.verdict == "error" for one in found))
 
 
-def calibrate(name: Body, *, port: str | None = None, file: Path | None = None) -> None:
+def calibrate(
+    name: Body, *, port: str | None = None, file: Path | None = None, leader: bool = False
+) -> None:
     """Calibrate an arm: its motors let go, and a person moves each joint by hand.
 
     Example: gigabrain driver calibrate so101 --port /dev/ttyACM0
@@ -166,12 +168,14 @@ def calibrate(name: Body, *, port: str | None = None, file: Path | None = None) 
     Args:
         port: Port of the arm, if it is another than in the robot's file.
         file: File to write. Default: that of the robot's file, or one in the state folder.
+        leader: It is a second arm, which leads the robot's: `gigabrain teleop --leader`.
     """
     from msgspec.structs import replace
 
     from gigabrain_drivers.bodies.feetech.calibrate import calibrate as make
     from gigabrain_drivers.bodies.feetech.calibration import calibration_path
     from gigabrain_drivers.bodies.feetech.driver import FeetechOptions
+    from gigabrain_drivers.bodies.feetech.leader import LEADER, leader_file
     from gigabrain_drivers.driver.catalog import load_link
     from gigabrain_drivers.driver.robot import Run
     from gigabrain_zenoh.cli.calibrating import Terminal
@@ -181,9 +185,13 @@ def calibrate(name: Body, *, port: str | None = None, file: Path | None = None) 
     if not isinstance(options, FeetechOptions):
         raise ConfigError(f"{robot.robot_type} needs no calibration: its driver is none of servos")
     options = replace(options, port=port) if port else options
-    path = file or calibration_path(robot.robot_type, options.calibration, folder)
-    run_async(make(robot, options, path, Terminal()))
-    print(f"{path}: the calibration of {robot.robot_type}")
+    path = calibration_path(robot.robot_type, options.calibration, folder)
+    if leader:
+        if name != LEADER or not port:
+            raise ConfigError(f"--leader: expected {LEADER} --port PORT, as only an SO-101 leads")
+        robot, options, path = leader_file(port)
+    run_async(make(robot, options, path := file or path, Terminal(), leader=leader))
+    print(f"{path}: the calibration of {'the leader' if leader else robot.robot_type}")
 
 
 def _print_trace(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from cyclopts import Parameter
 
-from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, Take, checked
+from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, Take, checked, print_line
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.signals import run_async
 
@@ -16,14 +16,30 @@ if TYPE_CHECKING:
     from gigabrain_zenoh.config.settings import PageConfig
 
 
-def teleop(*, at: RobotAddress = LOCAL, take: Take = False) -> None:
-    """Drive the robot by keyboard or gamepad.
+def teleop(
+    *,
+    at: RobotAddress = LOCAL,
+    take: Take = False,
+    leader: str | None = None,
+    leader_calibration: str = "",
+) -> None:
+    """Drive the robot by keyboard or gamepad, or move its arm with a second one.
 
     Example: gigabrain teleop --take
 
     Speeds stay within the limits of safety. Releasing a key stops the robot.
     The space bar is the e-stop. At the end the robot's brain drives again.
+
+    With a leader, the robot's arm goes slowly to its posture, then follows it.
+    The leader's motors are switched off. At the end the arm holds where it is.
+
+    Args:
+        leader: Port of a second SO-101, such as /dev/ttyACM1, that you move by hand.
+        leader_calibration: Its file. Default: that of `driver calibrate so101 --leader`.
     """
+    if leader is not None:
+        _follow(leader, leader_calibration, at, take)
+        return
     from gigabrain_zenoh.ui.teleop_station import Gamepad, TeleopStation
 
     async def run() -> None:
@@ -35,6 +51,20 @@ def teleop(*, at: RobotAddress = LOCAL, take: Take = False) -> None:
                 await TeleopStation(robot, pad).drive(take)
         finally:
             pad.close()
+
+    run_async(run())
+
+
+def _follow(port: str, calibration: str, at: RobotAddress, take: bool) -> None:
+    from gigabrain_drivers.bodies.feetech.leader import LeaderArm
+    from gigabrain_zenoh.ui.leader_station import LeaderStation
+
+    async def run() -> None:
+        async with LeaderArm(port, calibration) as leader:
+            if leader.let_go:
+                print_line("the leader's motors are off now: hold it")
+            async with at.robot(f"{getpass.getuser()}-leader") as robot:
+                await LeaderStation(robot, leader, print_line).drive(take)
 
     run_async(run())
 
@@ -137,7 +167,7 @@ def view(*, picture: Path | None = None, at: RobotAddress = LOCAL) -> None:
         picture: Save one picture of the simulation, as it is now, to this PNG file instead.
     """
     from gigabrain_drivers.sim.window import check_display, show
-    from gigabrain_zenoh.cli.options import on_bus, print_line
+    from gigabrain_zenoh.cli.options import on_bus
     from gigabrain_zenoh.host.files import check_result_path
 
     check_result_path(picture)

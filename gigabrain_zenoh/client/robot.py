@@ -304,6 +304,23 @@ class Robot:
         stream.go(positions, speed)
         return await self._joints_there(body, stream, wait)
 
+    async def track_joint_positions(
+        self, positions: Mapping[str, float], *, speed: float | None = None
+    ) -> dict[str, float]:
+        """Have joints follow positions [rad or m] that change all the time, as of a leading arm.
+
+        It returns where the joints were sent, at the next state: then call it again. They are on
+        the fastest way to rest at the newest positions, so they lag by about a tenth of a second,
+        and do not shoot over. `speed` [rad/s or m/s] is an upper limit. It raises what
+        `set_joint_positions` raises.
+        """
+        body = await self.read_body()
+        positions = checked_positions(body, positions)
+        stream = await self._joint_stream(body)
+        stream.go(positions, speed)
+        await self._ticks(1)
+        return stream.posture
+
     async def set_joint_trajectory(
         self, points: Sequence[tuple[float, Mapping[str, float]]], *, wait: bool = True
     ) -> dict[str, float]:

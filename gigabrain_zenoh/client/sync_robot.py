@@ -213,6 +213,12 @@ class SyncRobot:
         """Move joints together to positions [rad or m]; return those of all, as measured."""
         return self._run(self._robot.set_joint_positions(positions, speed=speed, wait=wait))
 
+    def track_joint_positions(
+        self, positions: Mapping[str, float], *, speed: float | None = None
+    ) -> dict[str, float]:
+        """Have joints follow positions [rad or m] that change; return where they were sent."""
+        return self._run(self._robot.track_joint_positions(positions, speed=speed))
+
     def set_joint_trajectory(
         self, points: Sequence[tuple[float, Mapping[str, float]]], *, wait: bool = True
     ) -> dict[str, float]:

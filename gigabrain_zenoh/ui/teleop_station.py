@@ -241,7 +241,7 @@ class TeleopStation:
 
     async def _until_quit(self, body: BodyDescription) -> None:
         loop = asyncio.get_running_loop()
-        with _typed(self._type), Live(auto_refresh=False, screen=False) as live:
+        with typed_keys(self._type), Live(auto_refresh=False, screen=False) as live:
             while not self._quit:
                 wanted = self._keys.velocity(body, loop.time())
                 if wanted == ZERO and self._pad.pad:
@@ -359,7 +359,7 @@ def _place(joint: JointDescription, position: float) -> str:
 
 
 @contextmanager
-def _typed(take: Callable[[str], None]) -> Iterator[None]:
+def typed_keys(take: Callable[[str], None]) -> Iterator[None]:
     """Pass keys to `take` as they are pressed, without Enter; restore the terminal afterwards."""
     if not sys.stdin.isatty():
         yield

@@ -4,6 +4,7 @@
     <!-- run: arm -->           run beside an arm
     <!-- run: 5 s -->           each line is ended by Ctrl-C after 5 s
     <!-- run: robot, 5 s -->    both
+    <!-- run: stays -->         run until the end of the page; a robot that it starts may drive
     <!-- file: NAME -->         the block is such a file, for the blocks of the page
     <!-- data: FOLDER/NAME -->  run with such a file of the folder GIGABRAIN_DATA
     <!-- not run: hardware (WHAT) -->  it needs hardware, other hosts, or root

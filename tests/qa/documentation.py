@@ -58,13 +58,7 @@ class Home:
         if body not in self._robots:
             words = f"exec gigabrain demo --headless --no-page --world arena --body {body}"
             self._robots[body] = start(words, self.folder, environment, subprocess.DEVNULL)
-        end_s = time.monotonic() + LINE_S
-        while b"enabled" not in start(MODE, self.folder, environment).communicate()[0]:
-            if time.monotonic() > end_s:
-                raise TimeoutError("no robot drives")
-            if body in self._driven:  # a page has stopped it
-                start("gigabrain release; gigabrain enable", self.folder, environment).wait()
-            time.sleep(0.5)
+        until_enabled(self.folder, environment, driven=body in self._driven)
         self._driven.add(body)
 
     def close(self) -> None:
@@ -89,6 +83,29 @@ def start(
         stderr=subprocess.STDOUT,
         start_new_session=True,
     )
+
+
+def start_behind(
+    words: str, folder: Path, environment: dict[str, str], behind: contextlib.ExitStack
+) -> None:
+    """Start something that runs until Ctrl-C at the end of `behind`."""
+    process = start(words, folder, environment, subprocess.DEVNULL)
+    behind.callback(_end_of, process)
+    behind.callback(os.killpg, process.pid, signal.SIGINT)
+
+
+def until_enabled(folder: Path, environment: dict[str, str], *, driven: bool = False) -> None:
+    """Wait until a robot may drive; enable it where a page has stopped one that was `driven`.
+
+    Raises TimeoutError.
+    """
+    end_s = time.monotonic() + LINE_S
+    while b"enabled" not in start(MODE, folder, environment).communicate()[0]:
+        if time.monotonic() > end_s:
+            raise TimeoutError("no robot drives")
+        if driven:
+            start("gigabrain release; gigabrain enable", folder, environment).wait()
+        time.sleep(0.5)
 
 
 def run(words: Words, folder: Path, environment: dict[str, str], after_s: float) -> str:
@@ -127,23 +144,25 @@ def as_installed(line: str) -> str:
     return f"{pip} install --dry-run --no-index {what}"
 
 
-def run_block(home: Home, folder: Path, block: Block) -> str:
-    """Run a block; return what is wrong, or an empty text."""
+def run_block(home: Home, folder: Path, block: Block, page: contextlib.ExitStack) -> str:
+    """Run a block; return what is wrong, or an empty text. At the end of `page` it ends."""
     body = next((known for word, known in BODIES.items() if word in block.value), "")
     if body:
         home.robot(body)
     environment = home.environment(folder, body)
     ended = re.search(r"(\d+) s", block.value)
     after_s = float(ended[1]) if ended else 0.0
+    if block.value == "stays":
+        start_behind(block.text, folder, environment, page)
+        until_enabled(folder, environment)
+        return ""
     if block.language == "python":
         (folder / "program.py").write_text(block.text)
         return run((sys.executable, "program.py"), folder, environment, after_s)
     with contextlib.ExitStack() as behind:
         for line in block.text.splitlines():
             if line.endswith("&"):
-                process = start(line[:-1], folder, environment, subprocess.DEVNULL)
-                behind.callback(_end_of, process)
-                behind.callback(os.killpg, process.pid, signal.SIGINT)
+                start_behind(line[:-1], folder, environment, behind)
                 time.sleep(3)
             elif wrong := run(as_installed(line), folder, environment, after_s):
                 return f"{line}\n{wrong}"
@@ -157,7 +176,9 @@ def data_of(block: Block) -> Path | None:
     return folder if root and folder.is_dir() else None
 
 
-def judge(home: Home, page: Path, folder: Path) -> Iterator[tuple[str, str]]:
+def judge(
+    home: Home, page: Path, folder: Path, behind: contextlib.ExitStack
+) -> Iterator[tuple[str, str]]:
     """Run what is to be run of a page; yield the kind of each block and what is wrong with it."""
     (folder / "deploy").symlink_to(ROOT / "deploy")
     found = list(blocks(page))
@@ -183,7 +204,7 @@ def judge(home: Home, page: Path, folder: Path) -> Iterator[tuple[str, str]]:
                     with contextlib.suppress(FileExistsError):
                         (folder / path.name).symlink_to(path)
             began_s = time.monotonic()
-            wrong = run_block(home, folder, block)
+            wrong = run_block(home, folder, block, behind)
             print(f"{page.name}:{block.line}: {time.monotonic() - began_s:.0f} s", flush=True)
             yield "FAILED" if wrong else "run", wrong and f"{page.name}:{block.line}: {wrong}"
 
@@ -199,11 +220,12 @@ def main() -> None:
             for number, page in enumerate(chosen):
                 folder = Path(name, f"page{number}")
                 folder.mkdir()
-                for kind, text in judge(home, page, folder):
-                    counts[kind] += 1
-                    if text:
-                        print(text, flush=True)
-                        wrong.append(text)
+                with contextlib.ExitStack() as behind:
+                    for kind, text in judge(home, page, folder, behind):
+                        counts[kind] += 1
+                        if text:
+                            print(text, flush=True)
+                            wrong.append(text)
                 shutil.rmtree(folder, ignore_errors=True)
     for kind, count in sorted(counts.items()):
         print(f"{count:4} {kind}")

@@ -14,6 +14,7 @@ from gigabrain_drivers.bodies.feetech import protocol as feetech
 from gigabrain_drivers.bodies.feetech.calibration import load_calibration
 from gigabrain_drivers.bodies.feetech.driver import FeetechDriver
 from gigabrain_drivers.bodies.feetech.emulator import FeetechArm
+from gigabrain_drivers.bodies.feetech.leader import LeaderArm
 from gigabrain_drivers.bodies.feetech.protocol import FeetechPacket
 from gigabrain_drivers.bodies.feetech.servo import ServoModel
 from gigabrain_drivers.driver.robot import Run
@@ -32,6 +33,7 @@ class Calibration:
 
     def __init__(self, arm: FeetechArm, body: FreeArm, file: Path) -> None:
         self.arm, self.body, self.file = arm, body, file
+        self.trigger = 1.0  # share of a gripper's range that its joint can be moved through
         self.text = ""
         self.reads: Counter[int] = Counter()  # of positions, by servo
         self._execute = arm.bus.execute
@@ -42,11 +44,11 @@ class Calibration:
             self.reads[packet.id] += 1
         return self._execute(packet)
 
-    async def run(self, port: Path) -> None:
+    async def run(self, port: Path, *options: str) -> None:
         self._terminal, theirs = os.openpty()
         command = [*GIGABRAIN, "driver", "calibrate", "so101"]
         self._program = await asyncio.create_subprocess_exec(
-            *command, "--port", str(port), "--file", str(self.file),
+            *command, "--port", str(port), "--file", str(self.file), *options,
             stdin=theirs, stdout=theirs, stderr=theirs,
         )  # fmt: skip
         os.close(theirs)
@@ -67,7 +69,9 @@ class Calibration:
     async def move(self, share: float) -> None:
         """Move all joints to a share of their range, and wait until that was looked at."""
         for joint, its in zip(ROBOT.joints, self.body.free.values(), strict=True):
-            its.position = joint.lower + share * (joint.upper - joint.lower)
+            reach = self.trigger if joint.part == "gripper" else 1.0
+            off = (share - 0.5) * reach * (joint.upper - joint.lower)
+            its.position = (joint.lower + joint.upper) / 2 + off
             its.velocity = 0.0
         before = self.reads.copy()
         await until(lambda: all(self.reads[n] >= before[n] + 3 for n in range(1, 7)))
@@ -84,7 +88,7 @@ class Calibration:
 
 
 @asynccontextmanager
-async def calibrating(folder: Path) -> AsyncIterator[Calibration]:
+async def calibrating(folder: Path, *options: str) -> AsyncIterator[Calibration]:
     """A new arm, whose servos keep nothing, and the command that begins to calibrate it."""
     port, file = folder / "base", folder / "so101.yaml"
     async with emulated_arm(port, replace(OPTIONS, calibration=str(file))) as (arm, body):
@@ -92,7 +96,7 @@ async def calibrating(folder: Path) -> AsyncIterator[Calibration]:
         arm.servos = dict(zip(arm.servos, servos, strict=True))
         arm.bus.servos = servos
         it = Calibration(arm, body, file)
-        await it.run(port)
+        await it.run(port, *options)
         try:
             yield it
         finally:
@@ -134,6 +138,21 @@ async def test_an_arm_that_was_moved_by_hand_can_be_driven(tmp_path: Path) -> No
         driver = FeetechDriver(ROBOT, options, Run(folder=FOLDER, link="real"))
         async with driver:
             await until(lambda: not driver.problem)
+
+
+async def test_a_leader_s_trigger_needs_no_more_than_its_own_range(tmp_path: Path) -> None:
+    async with calibrating(tmp_path, "--leader") as it:
+        it.trigger = 0.3
+        await begin(it, "y")
+        for share in (0.5, 0.0, 0.5, 1.0):
+            await it.move(share)
+        await it.answer("from one end of its range")
+        assert await it.ended() == 0, it.text
+        await until(lambda: "the calibration of the leader" in it.text)
+        async with LeaderArm(str(tmp_path / "base"), str(it.file)) as leader:
+            found = await leader.read()
+        expected = {joint.name: joint.upper for joint in ROBOT.joints}
+        assert found == pytest.approx(expected, abs=ONE_DEGREE)
 
 
 async def test_without_consent_no_servo_is_changed(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from msgspec import Struct
 
 from gigabrain_drivers.driver.robot import RobotFile, Run
+from gigabrain_drivers.emulators.hand import Hand
 from gigabrain_drivers.emulators.ports import Pty
 from gigabrain_drivers.kinematics.legs import WALKER, Gait
 from gigabrain_drivers.kinematics.wheels import Twist, wheels_of
@@ -73,6 +74,7 @@ class EmulatedBody:
         self._gait: Gait | None = None  # instead of a velocity
         self._aims: Mapping[str, float] | None = {}  # of its arm's servos; None: they are off
         self._efforts: Mapping[str, float] = {}  # [N m] or [N], with which they pull at most
+        self.hand = Hand(robot.joints)  # of a person who moves its arm while they are off
         self._cpu_s = 0.0
         self._moved_ns = 0  # time of the last command to move
         self._faulted_ns = 0  # when what is wrong with it last changed
@@ -202,9 +204,15 @@ class EmulatedBody:
 
     def _drive_arm(self) -> None:
         arm, aims = self._simulation.arm, self._aims
-        if arm and aims is None:
+        if arm is None:
+            return
+        places = {joint.name: joint.position for joint in self.joints}
+        if by_hand := self.hand.step(places, limp=aims is None):
+            arm.limit(dict.fromkeys(by_hand, math.inf))
+            arm.aim(by_hand)
+        elif aims is None:
             arm.let_go()
-        elif arm and aims:
+        elif aims:
             arm.limit(self._efforts)
             arm.aim(aims)
 

@@ -12,6 +12,7 @@ from gigabrain_drivers.driver.world_requests import serve_world
 from gigabrain_drivers.emulators.base import Snapshot
 from gigabrain_drivers.emulators.emulator import Emulator
 from gigabrain_drivers.emulators.faults import Faults
+from gigabrain_drivers.emulators.hand import posture_in
 from gigabrain_drivers.sim.live_world import LiveWorld, News
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import EmulatorConfig
@@ -23,6 +24,7 @@ from gigabrain_zenoh.runtime.heartbeat import Progress
 log = logging.getLogger(__name__)
 
 POLL_S = 0.05  # between two looks at the file with the faults
+MOVE = "move"  # the word before positions of joints
 FAULTS_FILE = "faults.json"  # {STATION: {FAULT: VALUE}}, in the folder of the ports
 
 
@@ -71,6 +73,8 @@ async def _serve_terminal(
         say(f"{config.body} in {config.world}: {name} at {where(port)}")
     say(f"faults, one line each: [{'|'.join(emulator.stations)}] "
         f"{' '.join(Faults.__struct_fields__)}; off ends them")  # fmt: skip
+    if joints := emulator.body.robot.joints:
+        say(f"a hand on limp joints: {MOVE} {joints[0].name}=20 ...; {MOVE} off takes it away")
     with typed_lines(lambda line: _apply_line(emulator, line, say)):
         await watch(emulator, Path(config.folder) / FAULTS_FILE)
 
@@ -139,7 +143,12 @@ def _from_file(emulator: Emulator, path: Path) -> None:
 
 
 def _apply_line(emulator: Emulator, line: str, say: Callable[[str], None]) -> None:
+    move, *words = line.split()
     try:
+        if move == MOVE:
+            body = emulator.body
+            body.hand.move(posture_in(words, body.robot.joints))
+            return
         emulator.set(emulator.parse_faults(line))
     except ConfigError as error:
         say(str(error))

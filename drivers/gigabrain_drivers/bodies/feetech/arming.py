@@ -26,29 +26,37 @@ VARIANT_LIMIT = 100  # 0.1 V, between the greatest voltages that the two variant
 class Arming:
     """Checks servos, and has them hold."""
 
-    def __init__(self, bus: HostBus, clock: Clock, robot_type: str, voltage: float) -> None:
-        """`voltage` is that of the servos' variant, 7.4 or 12."""
+    def __init__(self, bus: HostBus, clock: Clock, calibrated: str, voltage: float) -> None:
+        """`voltage` is that of the servos' variant, 7.4 or 12.
+
+        `calibrated` is what `gigabrain driver calibrate` is called with for them.
+        """
         self._bus, self._clock = bus, clock
-        self._robot_type, self._voltage = robot_type, voltage
+        self._calibrated, self._voltage = calibrated, voltage
 
     async def check(self, joint: ServoJoint) -> None:
-        """Raise ConfigError where a servo is not the one that was calibrated."""
-        data = await self._bus.read(joint.id, 0, feetech.EEPROM_SIZE)
-        if data is None:
-            raise ConfigError(f"{self._bus.link}: {joint} does not answer any more")
-        memory, voltage = feetech.decode_memory(data), self._voltage
-        if memory.model != feetech.MODEL or memory.mode:
-            raise ConfigError(
-                f"{self._bus.link}: {joint} is of model {memory.model} in mode {memory.mode}; "
-                f"expected an STS3215 (model {feetech.MODEL}) in mode 0, position"
-            )
+        """Raise ConfigError for another servo than was calibrated, or another variant."""
+        memory, voltage = await self.recognise(joint), self._voltage
         if (memory.max_voltage > VARIANT_LIMIT) != (voltage > VARIANT_LIMIT / 10):
             raise ConfigError(
                 f"{self._bus.link}: {joint} takes up to {memory.max_voltage / 10:g} V, but the "
                 f"robot's file has servos of {voltage:g} V; change voltage there"
             )
+
+    async def recognise(self, joint: ServoJoint) -> ServoMemory:
+        """Return what a servo keeps. Raises ConfigError where it was not the calibrated one."""
+        data = await self._bus.read(joint.id, 0, feetech.EEPROM_SIZE)
+        if data is None:
+            raise ConfigError(f"{self._bus.link}: {joint} does not answer any more")
+        memory = feetech.decode_memory(data)
+        if memory.model != feetech.MODEL or memory.mode:
+            raise ConfigError(
+                f"{self._bus.link}: {joint} is of model {memory.model} in mode {memory.mode}; "
+                f"expected an STS3215 (model {feetech.MODEL}) in mode 0, position"
+            )
         if not joint.calibration.is_of(memory):
-            raise ConfigError(_other_arm(self._robot_type, joint, memory))
+            raise ConfigError(_other_arm(self._calibrated, joint, memory))
+        return memory
 
     async def arm(self, joints: Collection[ServoJoint]) -> str:
         """Have all servos hold, without a motion; return why not, or an empty text.
@@ -110,12 +118,12 @@ class Arming:
             )
 
 
-def _other_arm(robot_type: str, joint: ServoJoint, memory: ServoMemory) -> str:
+def _other_arm(calibrated: str, joint: ServoJoint, memory: ServoMemory) -> str:
     its = joint.calibration
     return (
         f"{joint} keeps offset {memory.offset} and limits {memory.min_position} to "
         f"{memory.max_position}, its calibration has {its.offset} and {its.min_position} to "
-        f"{its.max_position}: this is another arm; run gigabrain driver calibrate {robot_type}"
+        f"{its.max_position}: this is another arm; run gigabrain driver calibrate {calibrated}"
     )
 
 

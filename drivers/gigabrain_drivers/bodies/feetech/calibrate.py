@@ -4,7 +4,6 @@ Nothing is written into a servo's EEPROM unless the person agrees to it.
 """
 
 import asyncio
-import contextlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
@@ -20,14 +19,13 @@ from gigabrain_drivers.bodies.feetech.calibration import (
     ServoCalibration,
     save_calibration,
 )
-from gigabrain_drivers.bodies.feetech.driver import FeetechOptions, line_problem, refuse_incomplete
+from gigabrain_drivers.bodies.feetech.driver import FeetechOptions, refuse_incomplete, until_open
 from gigabrain_drivers.bodies.feetech.protocol import TICKS, Register, ServoMemory
 from gigabrain_drivers.driver.robot import RobotFile
 from gigabrain_drivers.links.serial_link import SerialLink
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import ConfigError
 
-CONNECT_S = 3.0
 SAMPLE_S = 0.02
 MIDDLE = TICKS // 2
 LIMIT_MARGIN = 12  # ticks, 1 deg, that a servo may go beyond the range that was seen
@@ -44,22 +42,23 @@ class Dialogue(Protocol):
 
 
 async def calibrate(
-    robot: RobotFile, options: FeetechOptions, path: Path, dialogue: Dialogue
+    robot: RobotFile,
+    options: FeetechOptions,
+    path: Path,
+    dialogue: Dialogue,
+    *,
+    leader: bool = False,
 ) -> None:
     """Make the calibration of the arm on the port of the options, and write it to `path`.
 
-    Raises ConfigError.
+    The gripper of a `leader` is a trigger, whose range is its own. Raises ConfigError.
     """
     link = SerialLink(options.port, feetech.BAUD, clock := Clock())
-    bus, opened = HostBus(link, clock), asyncio.Event()
-    link.on_open = opened.set
-    link.open()
+    bus = HostBus(link, clock)
     try:
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(opened.wait(), CONNECT_S)
-        if not link.connected:
-            raise ConfigError(line_problem(link))
-        save_calibration(path, await Calibrator(robot, options, bus, dialogue).run())
+        await until_open(link)
+        calibrator = Calibrator(robot, options, bus, dialogue, leader=leader)
+        save_calibration(path, await calibrator.run())
     finally:
         await link.close()
 
@@ -68,8 +67,15 @@ class Calibrator:
     """One calibration on an open bus."""
 
     def __init__(
-        self, robot: RobotFile, options: FeetechOptions, bus: HostBus, dialogue: Dialogue
+        self,
+        robot: RobotFile,
+        options: FeetechOptions,
+        bus: HostBus,
+        dialogue: Dialogue,
+        *,
+        leader: bool,
     ) -> None:
+        self._leader = leader
         self._joints = {joint.name: joint for joint in robot.joints}
         self._options, self._bus, self._dialogue = options, bus, dialogue
         self._servos = {name: options.servos[name] for name in self._joints}
@@ -102,7 +108,14 @@ class Calibrator:
     async def _ranges(self) -> dict[str, JointRange]:
         """Watch the joints being moved until each has been through its whole range."""
         now = await self._positions()
-        ranges = {name: JointRange(self._joints[name], ticks) for name, ticks in now.items()}
+        ranges = {
+            name: JointRange(
+                self._joints[name],
+                ticks,
+                trigger=self._leader and self._joints[name].part == "gripper",
+            )
+            for name, ticks in now.items()
+        }
         text = (
             "Move each joint from one end of its range to the other. Press Enter when all are done."
         )

@@ -22,6 +22,7 @@ from gigabrain_zenoh.host.run_folders import state_dir
 Tick = Annotated[int, Meta(ge=0, le=TICKS - 1)]
 MAX_OFFSET = 2047  # ticks, in 11 bits
 SPAN_TOLERANCE = 0.17  # [rad], by which a joint's range may differ from that in the robot's file
+TRIGGER_SPAN = 0.35  # [rad], the least range of a leader's trigger
 OUTSIDE = 0.17  # [rad], by which a joint may be outside its range as it is switched on
 
 
@@ -111,8 +112,9 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
 class JointRange:
     """The range of one joint while a person moves it, unwrapped from its middle posture on."""
 
-    def __init__(self, joint: JointDescription, middle: int) -> None:
-        self.joint = joint
+    def __init__(self, joint: JointDescription, middle: int, *, trigger: bool = False) -> None:
+        """The range of a `trigger` is its own, and not that of the gripper that it leads."""
+        self.joint, self._trigger = joint, trigger
         self.middle = self.ticks = self.lower = self.upper = middle
 
     def add(self, ticks: int) -> None:
@@ -124,8 +126,12 @@ class JointRange:
     @property
     def missing(self) -> float:
         """The rest of its range that it has not been moved through [rad]; 0 for none."""
-        span = (self.upper - self.lower) * RADIANS_PER_TICK
-        return max(0.0, self.joint.upper - self.joint.lower - SPAN_TOLERANCE - span)
+        whole = self.joint.upper - self.joint.lower - SPAN_TOLERANCE
+        return max(0.0, (TRIGGER_SPAN if self._trigger else whole) - self._span)
+
+    @property
+    def _span(self) -> float:
+        return (self.upper - self.lower) * RADIANS_PER_TICK
 
     @property
     def wraps(self) -> bool:
@@ -135,8 +141,8 @@ class JointRange:
     @property
     def endless(self) -> bool:
         """True where it turned further than the robot's file says, so that it has no ends."""
-        span = (self.upper - self.lower) * RADIANS_PER_TICK
-        return span > self.joint.upper - self.joint.lower + SPAN_TOLERANCE
+        whole = self.joint.upper - self.joint.lower + SPAN_TOLERANCE
+        return not self._trigger and self._span > whole
 
     def calibrated(self, servo: int, direction: Literal[1, -1]) -> ServoCalibration:
         """Return the calibration of a servo that keeps no offset and has no limits.

@@ -36,6 +36,8 @@ from gigabrain_zenoh.logs import Fault
 
 log = logging.getLogger(__name__)
 
+NO_ANSWER = "is open, but no servo answers: right port, power on?"
+CONNECT_S = 3.0
 FIRST_ANSWER_NS = 1_500_000_000  # that a start waits for the arm
 RETRY_NS = 200_000_000  # between two attempts to find it
 YIELD_NS = 500_000_000  # between two attempts to end an overload
@@ -356,7 +358,7 @@ class FeetechDriver(Driver):
             {servo: await self._bus.find(servo.id) for servo in self._servos()},
         )
         if set(self._found.values()) == {"missing"}:
-            self._complaint = f"{self.link} is open, but no servo answers: right port, power on?"
+            self._complaint = f"{self.link} {NO_ANSWER}"
             return False
         if self._found != before:  # its power may just have been switched on
             self._complaint = f"{self.link}: the arm has just begun to answer"
@@ -377,8 +379,21 @@ def line_problem(link: Link) -> str:
     return problem if name in problem else f"{name}: {problem}"
 
 
+async def until_open(link: Link) -> None:
+    """Open a link, and wait for its port. Raises ConfigError where it cannot be opened."""
+    opened = asyncio.Event()
+    link.on_open = opened.set
+    link.open()
+    with contextlib.suppress(TimeoutError):
+        await asyncio.wait_for(opened.wait(), CONNECT_S)
+    if not link.connected:
+        raise ConfigError(line_problem(link))
+
+
 def refuse_incomplete(port: str, found: Mapping[str, str]) -> None:
     """Raise ConfigError where a servo is missing, or two have the same id."""
+    if set(found.values()) == {"missing"}:
+        raise ConfigError(f"{port} {NO_ANSWER}")
     missing = ", ".join(servo for servo, how in found.items() if how == "missing")
     garbled = ", ".join(servo for servo, how in found.items() if how == "garbled")
     if garbled:

@@ -69,7 +69,8 @@ class FeetechArm(Device):
         seconds, aims, efforts = min(MAX_STEP_S, (now_ns - before_ns) / 1e9), {}, {}
         for servo, motor in zip(self.servos.values(), self.body.joints, strict=True):
             servo.supply = max(0.0, self.options.voltage - self.sag_volts)
-            servo.step(seconds, motor.position, motor.velocity, motor.effort)
+            pull = 0.0 if servo.target is None else motor.effort  # that of a hand is not its own
+            servo.step(seconds, motor.position, motor.velocity, pull)
             aims[motor.name] = motor.position if servo.target is None else servo.target
             efforts[motor.name] = servo.max_effort
         for name, servo in self.wheels.items():

@@ -41,6 +41,8 @@ class Settings(NamedTuple):
 class ServoJoint:
     """A joint, its servo and its calibration. Positions are radians, places are ticks."""
 
+    pushed_factor, pushed_acceleration = PUSHED_FACTOR, MAX_ACCELERATION
+
     def __init__(
         self,
         description: JointDescription,
@@ -104,9 +106,9 @@ class ServoJoint:
         position = self.calibration.to_radians(now.position)
         passed_s = (asked_ns - self.heard_ns) / 1e9
         moved = position - self.position
-        furthest = PUSHED_FACTOR * self.description.max_speed * passed_s + JUMP_SLACK
+        furthest = self.pushed_factor * self.description.max_speed * passed_s + JUMP_SLACK
         change = abs(moved - self._speed * passed_s)
-        smooth = change <= MAX_ACCELERATION * passed_s**2 + JUMP_SLACK
+        smooth = change <= self.pushed_acceleration * passed_s**2 + JUMP_SLACK
         before, self._last = self._last, now
         if abs(moved) > furthest or not smooth or not (before and _agree(before, now)):
             self.refused += 1
@@ -171,11 +173,16 @@ class ServoJoint:
 
     def problem(self, now_ns: int) -> str:
         """Return what is wrong with it in one line, or an empty text."""
-        if now_ns - self.heard_ns > LOST_NS:
-            return f"{self} answers no more: cable, power?"
+        if lost := self.lost(now_ns):
+            return lost
         if status := feetech.faults_of(self.status):
             return f"{self} protects itself: {status}"
         return ""
+
+    def lost(self, now_ns: int) -> str:
+        """Return that it answers no more, or an empty text."""
+        silent = now_ns - self.heard_ns > LOST_NS
+        return f"{self} answers no more: cable, power?" if silent else ""
 
     def measured(self) -> Joint | None:
         """Return it as measured, or None before the first reading."""

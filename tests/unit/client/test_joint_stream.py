@@ -1,0 +1,64 @@
+"""A script's commands for joints that follow a posture which changes all the time."""
+
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_drivers.driver.catalog import load_robot
+from gigabrain_schemas.base import TICK_S
+from gigabrain_schemas.body import Joint, RobotState
+from gigabrain_schemas.brain import JointCommand
+from gigabrain_schemas.examples import example
+from gigabrain_zenoh.client.arm import JointStream
+
+ARM = load_robot("so101").description()
+PAN, LIFT = 0, 1
+
+
+class Arm:
+    """A simulated gate and body: each command is where the joints are sent, and are."""
+
+    def __init__(self) -> None:
+        self.tick, self.at = 100, (0.0,) * len(ARM.joints)
+        self.stream = JointStream(ARM, self.state(), "leader")
+
+    def state(self) -> RobotState:
+        places = zip(ARM.joints, self.at, strict=True)
+        joints = tuple(Joint(name=joint.name, position=place) for joint, place in places)
+        return replace(example(RobotState), tick=self.tick, joints=joints, joints_sent=self.at)
+
+    def step(self, ticks: int = 1) -> JointCommand:
+        self.tick += ticks
+        command = self.stream.step(self.state())
+        assert command
+        self.at = command.position
+        return command
+
+
+@pytest.mark.parametrize("new", [1, 4])
+def test_a_moving_posture_is_followed_closely_and_never_shot_over(new: int) -> None:
+    arm, wanted, off = Arm(), 0.0, []
+    for n in range(100):
+        if n % new == 0 and n < 60:  # 0.75 rad/s, then at rest
+            wanted += 0.015 * new
+        arm.stream.go({"shoulder_pan": wanted, "shoulder_lift": -wanted}, None)
+        command = arm.step()
+        off += [wanted - command.position[PAN], wanted + command.position[LIFT]]
+    assert min(off) > -1e-6
+    assert max(off) < 0.75 * 0.1 + 0.015 * new
+    assert off[-1] == pytest.approx(0.0, abs=1e-4)
+
+
+def test_a_jump_is_followed_within_speed_and_acceleration() -> None:
+    arm = Arm()
+    pan, places, speeds = ARM.joints[PAN], [], []
+    for _ in range(60):
+        arm.stream.go({"shoulder_pan": 1.0}, None)
+        command = arm.step()
+        places.append(command.position[PAN])
+        speeds.append(command.velocity[PAN])
+    steps = [b - a for a, b in zip([0.0, *places], places, strict=False)]
+    assert max(steps) <= pan.max_speed * TICK_S * 1.01
+    gains = [b - a for a, b in zip([0.0, *speeds], speeds, strict=False)]
+    assert max(map(abs, gains)) <= pan.max_acceleration * TICK_S * 1.01
+    assert places[-1] == pytest.approx(1.0, abs=1e-4)
+    assert max(places) < 1.0 + 1e-6
