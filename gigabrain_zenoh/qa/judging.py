@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 Verdict = Literal["passed", "FAILED", "skipped"]
 COLOURS: dict[Verdict, str] = {"passed": "green", "FAILED": "bold red", "skipped": "yellow"}
-Stage = Literal["sim", "auto", "line", "serial", "tcp", ""]
+Stage = Literal["sim", "auto", "line", "serial", "tcp", "arm", ""]
 
 
 class Failed(GigabrainError):

@@ -5,6 +5,7 @@ import contextlib
 import os
 import signal
 import tempfile
+import time
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import replace
@@ -38,6 +39,7 @@ STOP_S = 1.5
 BENCH_START_S = 30.0  # longer than anything takes to start on a busy machine
 START_S = 300.0  # far more than it takes to compile what a navigating robot calls
 ASK_S = 0.5
+PROMPT_S = 0.005  # an older answer is too old to count from
 POLL_S = 0.02
 # turn rate that counts as straight [rad/s], and share of the speed that counts as full
 STRAIGHT_RAD_S, FULL_SPEED = 0.1, 0.96
@@ -304,6 +306,15 @@ class RobotUnderTest(ProcessGroup):
         """Return the physics' own values: contacts, distance_m, true_speed and more."""
         source = "emulator" if self.deployment.link == "emulated" else "driver"
         return dict((await self.probe.describe(source)).report)
+
+    async def prompt_truth(self) -> dict[str, Any]:
+        """Return a truth that is at most 5 ms old, if the machine allows."""
+        for _ in range(50):
+            begin_s = time.monotonic()
+            truth = await self.truth()
+            if time.monotonic() - begin_s < PROMPT_S:
+                break
+        return truth
 
     async def travelled(self) -> float:
         """Return the length of the body's path so far, by the physics [m]."""

@@ -15,6 +15,7 @@ import numpy as np
 from msgspec import Struct
 
 from gigabrain_drivers.driver.robot import RobotFile, Run
+from gigabrain_drivers.emulators.arm_truth import ArmTruth
 from gigabrain_drivers.emulators.hand import Hand
 from gigabrain_drivers.emulators.ports import Pty
 from gigabrain_drivers.kinematics.legs import WALKER, Gait
@@ -79,6 +80,8 @@ class EmulatedBody:
         self._moved_ns = 0  # time of the last command to move
         self._faulted_ns = 0  # when what is wrong with it last changed
         self._broken = Broken()
+        arm = simulation.arm
+        self._arm_truth = ArmTruth(simulation.model, simulation.data, arm) if arm else None
         self.snapshot = self._measure_all()
         self._account = run_report(self._simulation, robot, run)  # as of the newest step
         self._untaken: deque[Snapshot] = deque(maxlen=MAX_SNAPSHOTS)
@@ -160,11 +163,16 @@ class EmulatedBody:
 
     def report(self) -> Mapping[str, float | int | str | None]:
         """The truth of the run so far."""
-        return self._account | {
-            "motors_moved_s": round(self._moved_ns / 1e9, 2),
-            "faulted_s": round(self._faulted_ns / 1e9, 2),
-            "physics_cpu_s": round(self._cpu_s, 3),
-        }
+        arm = self._arm_truth.report() if self._arm_truth else {}
+        return (
+            self._account
+            | arm
+            | {
+                "motors_moved_s": round(self._moved_ns / 1e9, 2),
+                "faulted_s": round(self._faulted_ns / 1e9, 2),
+                "physics_cpu_s": round(self._cpu_s, 3),
+            }
+        )
 
     def _work(self) -> None:
         began = time.thread_time()
@@ -196,6 +204,8 @@ class EmulatedBody:
         self._simulation.advance()
         snapshot = self._measure_all()
         self._account = run_report(self._simulation, self.robot, self.run)
+        if self._arm_truth:
+            self._arm_truth.update(self._simulation.time_ns)
         if not broken.frozen_values:
             self.snapshot = snapshot
             self._untaken.append(snapshot)
@@ -273,6 +283,7 @@ class Device(abc.ABC):
     def __init__(self, body: EmulatedBody, options: Any, wire: Wire) -> None:
         self.body, self.options, self.wire = body, options, wire
         self.sag_volts = 0.0  # brown-out: by how much the supply has fallen [V]
+        self.silent_servo = 0  # the id of one that neither hears nor answers
         self.halted = False  # frozen or unplugged: for devices with a processor beside the board
 
     @classmethod

@@ -112,6 +112,7 @@ class Station:
         """Have these faults and no others from now on."""
         before, self.faults, self._wire.faults = self.faults, faults, faults
         self.device.sag_volts = faults.brown_out
+        self.device.silent_servo = faults.silent_servo
         self.device.halted = faults.frozen or faults.unplugged
         if faults.unplugged:
             self._port.unplug()

@@ -11,6 +11,7 @@ from gigabrain_drivers.emulators.base import Wire
 from gigabrain_schemas.base import Finite, NonNegative
 from gigabrain_zenoh.errors import ConfigError, unknown
 
+Natural = Annotated[int, Meta(ge=0, le=255)]
 Chance = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 MAX_GARBAGE_BYTES = 64  # bytes
@@ -21,6 +22,7 @@ VALUE_HINTS = {  # what is expected of those that take one
     "half_frames": "from 0 to 1, such as half_frames=0.1",
     "brown_out": "of volts from 0, such as brown_out=6",
     "runaway": "of m/s, such as runaway=0.1",
+    "silent_servo": "that is an id, such as silent_servo=3",
 }
 
 
@@ -39,6 +41,7 @@ class Faults(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     frozen_values: bool = False  # it reports as ever, but what it measures no longer changes
     runaway: Finite = 0.0  # [m/s], of the wheels, whatever is commanded
     stuck_wheel: bool = False  # the first one does not turn
+    silent_servo: Natural = 0  # the id of one on a bus that neither hears nor answers
 
     def __str__(self) -> str:
         """The words for those that there are."""

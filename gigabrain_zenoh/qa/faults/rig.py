@@ -50,6 +50,7 @@ BODIES: dict[Stage, str] = {
     "line": "mycustombot",
     "serial": "mycustombot",
     "tcp": "alpha",
+    "arm": "so101",
 }
 SLOWER = 0.01  # [m/s], half of what a body brakes in a tick
 RESTED_TICKS = 50  # how long a robot must stand once all is well again
@@ -179,8 +180,19 @@ def deployment_of(options: Options, stage: Stage, resume: Resume = "manual") -> 
     body = options.body or BODIES[stage]
     link: LinkName = "sim" if stage in ("sim", "auto") else "emulated"
     wire: Literal["serial", "tcp", ""] = wire_kind(body) if link == "emulated" else ""
-    if link == "emulated" and not (wire == stage or (wire and stage == "line")):
+    if stage == "arm" and not load_robot(body).joints:
+        raise Skipped(f"{body} has no arm")
+    if link == "emulated" and not (wire == stage or (wire and stage in ("line", "arm"))):
         raise Skipped(f"{body} has no {stage} line" if stage != "line" else f"{body} has no line")
+    if stage == "arm":
+        return Deployment(
+            body=body,
+            link=link,
+            world=load_robot(body).demo.world,
+            resume=resume,
+            router=LOOPBACK,
+            decision=DecisionConfig(behaviour="navigate"),
+        )
     return Deployment(
         body=body,
         link=link,

@@ -225,6 +225,19 @@ async def test_a_servo_that_answers_no_more_is_named_and_the_others_hold() -> No
         assert (await rig.driver.read_state()).link.connected
 
 
+async def test_an_emulated_servo_that_is_silent_neither_hears_nor_answers() -> None:
+    rig = Rig()
+    async with opened(rig):
+        rig.arm.silent_servo = 3
+        goals = rig.arm.servos["elbow_flex"].goals
+        await rig.wait(300)
+        assert rig.driver.problem == "servo 3 (elbow_flex) answers no more: cable, power?"
+        assert rig.arm.servos["elbow_flex"].goals == goals
+        rig.arm.silent_servo = 0
+        await rig.wait(200)
+        assert rig.driver.problem == ""
+
+
 async def test_a_plugged_in_line_is_found_again_without_a_motion() -> None:
     rig = Rig()
     async with opened(rig):

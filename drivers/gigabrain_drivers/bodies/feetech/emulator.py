@@ -58,6 +58,7 @@ class FeetechArm(Device):
 
     def feed(self, data: bytes) -> None:
         """Execute instructions, and answer."""
+        self.bus.silent = self.silent_servo
         for packet in self._decoder.feed(data):
             if answers := self.bus.execute(packet):
                 self.wire.write(answers)

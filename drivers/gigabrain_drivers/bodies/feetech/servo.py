@@ -252,6 +252,7 @@ class ServoBus:
 
     def __init__(self, servos: Sequence[ServoModel]) -> None:
         self.servos = list(servos)
+        self.silent = 0  # the id of one that neither hears nor answers
 
     def execute(self, packet: FeetechPacket) -> bytes:
         """Execute an instruction; return the answers."""
@@ -266,12 +267,13 @@ class ServoBus:
             return b"".join(self._asked(servo, read) for servo in params[2:])
         if packet.id == feetech.BROADCAST:
             for model in self.servos:
-                _executed(model, packet)
+                if model.id != self.silent:
+                    _executed(model, packet)
             return b""
         return self._asked(packet.id, packet)
 
     def _at(self, servo: int) -> list[ServoModel]:
-        return [model for model in self.servos if model.id == servo]
+        return [model for model in self.servos if model.id == servo != self.silent]
 
     def _asked(self, servo: int, packet: FeetechPacket) -> bytes:
         """Return the answer of a servo; of two with one id, what is left when both talk."""

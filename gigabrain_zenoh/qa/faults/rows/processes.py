@@ -5,7 +5,6 @@ import itertools
 import random
 import signal
 import time
-from typing import Any
 
 from gigabrain_schemas.base import TICK_MS
 from gigabrain_schemas.topics import CMD_VEL
@@ -51,7 +50,6 @@ CONTROL_DELAYED = Figure("control delayed", "ms")
 
 VICTIMS = ("router", "driver", "perception", "decision", "control", "safety")
 ORDERS = 60  # sampled, in the long form
-PROMPT_S = 0.005  # an older answer is too old to count from
 AFTER_S = 1.0  # of simulated time, for which a body is observed after a death
 OLD_COMMANDS = 25
 MAX_STARTS = 20
@@ -253,22 +251,12 @@ async def _without_driver(robot: RobotUnderTest) -> tuple[float, float]:
     The time is the physics' own, to within one of its steps.
     """
     await robot.until_driving()
-    pid, before = robot.pid("driver"), await _prompt_truth(robot)
+    pid, before = robot.pid("driver"), await robot.prompt_truth()
     robot.kill("driver")
     after = await robot.wait_simulated(AFTER_S)
     await robot.until_restarted("driver", pid)
     zero_s = float(after["motors_moved_s"]) - float(before["sim_seconds"])
     return zero_s * 1e3, float(after["distance_m"]) - float(before["distance_m"])
-
-
-async def _prompt_truth(robot: RobotUnderTest) -> dict[str, Any]:
-    """Return a truth that is at most 5 ms old, if the machine allows."""
-    for _ in range(50):
-        begin_s = time.monotonic()
-        truth = await robot.truth()
-        if time.monotonic() - begin_s < PROMPT_S:
-            break
-    return truth
 
 
 @fault_row(11, "line", IDLE.at_most(10), STAYS_STILL)
