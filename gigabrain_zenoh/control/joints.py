@@ -88,6 +88,8 @@ def _step(
         return memory, _command(body, memory.sent, memory)
     if inputs.teleop:
         memory = replace(memory, operator=True)
+    if inputs.intent is None and not (memory.operator or memory.problem):
+        return _resting(body, memory, posture)
     intent = None if memory.operator else inputs.intent
     wants = intent and (intent.joints or intent.joint_trajectory)
     memory = replace(memory, active=bool(memory.active or inputs.teleop or wants))
@@ -127,6 +129,15 @@ def _next_tick(
         integral = (0.0,) * len(posture)
         memory = replace(memory, setpoint=posture, sent=_places(posture), integral=integral)
     return replace(memory, tick=state.tick), 0 if calm else passed
+
+
+def _resting(
+    body: BodyDescription, memory: JointMemory, posture: tuple[JointPoint, ...]
+) -> tuple[JointMemory, JointCommand]:
+    """Have the gate brake the joints and hold them, as while decision is silent."""
+    names, still = tuple(joint.name for joint in body.joints), (0.0,) * len(posture)
+    memory = replace(memory, active=False, setpoint=posture, sent=_places(posture), integral=still)
+    return memory, JointCommand(name=names, velocity=still)
 
 
 def _lost(body: BodyDescription, memory: JointMemory, posture: tuple[JointPoint, ...]) -> bool:

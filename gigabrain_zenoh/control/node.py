@@ -42,6 +42,7 @@ log = logging.getLogger(__name__)
 
 MAX_RAMP_TICKS = 5  # longest step of the ramp, also after a gap
 STEADY_TICKS = 10  # until the measured speed has reached a constant setpoint
+INTENT_TICKS = 2  # by no older intent joints move: an arm rests within 120 ms of its last one
 MIN_LEARN_LINEAR, MIN_LEARN_ANGULAR = 0.05, 0.1  # [m/s], [rad/s]; encoders are coarse below
 
 
@@ -231,7 +232,8 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
         if body.description.has_base:
             drive(state, body, intent)
         if body.description.joints and message is state:
-            commands += arm.act(state, body, intent)
+            live = intent and state.tick - intent.tick <= INTENT_TICKS
+            commands += arm.act(state, body, intent if live else None)
 
     def drive(state: RobotState, body: Body, intent: Intent | None) -> None:
         nonlocal memory, lost, commands

@@ -22,7 +22,7 @@ from gigabrain_zenoh.geometry.joints import (
     stopped,
 )
 
-VERDICT_TICKS = 4  # 80 ms, the oldest verdict of safety by which joints move
+VERDICT_TICKS = 2  # 40 ms, the oldest verdict of safety by which joints move
 LIVE_TICKS = 2  # 40 ms after a command, joints that get no other brake
 TOLERANCE = 1e-6  # [rad] or [m], of positions at a limit
 
@@ -93,6 +93,8 @@ def _step(
         return braked(now, joint, TICK_S)
     index = command.name.index(joint.name)
     velocity = command.velocity[index] if command.velocity else 0.0
+    if not command.position and not velocity:
+        return braked(now, joint, TICK_S)
     if not command.position:
         return accelerated(now, velocity, joint, TICK_S, band)
     return approach(now, JointMotion(command.position[index], velocity), joint, TICK_S, band)

@@ -39,9 +39,14 @@ def stopped(now: JointMotion, limits: JointDescription) -> JointMotion:
 
 
 def braked(now: JointMotion, limits: JointDescription, dt: float) -> JointMotion:
-    """Return where a joint is after `dt` [s] of braking at its greatest acceleration."""
+    """Return where a joint is sent after `dt` [s] of braking at its greatest acceleration.
+
+    As `stopped`, it takes back what was sent ahead for the speed that is lost.
+    """
     slower = max(0.0, abs(now.velocity) - limits.max_acceleration * dt)
-    return _moved(now, math.copysign(slower, now.velocity), limits, dt)
+    after = _moved(now, math.copysign(slower, now.velocity), limits, dt)
+    taken_back = OVERRUN * limits.gains.feed_forward * (now.velocity - after.velocity)
+    return JointMotion(after.position - taken_back, after.velocity)
 
 
 class SpeedBand(NamedTuple):

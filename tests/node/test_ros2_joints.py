@@ -190,7 +190,7 @@ async def test_a_joint_that_is_held_up_breaks_the_path_tolerance(tmp_path):
         assert (status, code) == (ABORTED, -4)
         assert "shoulder_pan is 0.3" in text
         await robot.go(20)
-        assert robot.state.joints_sent[0] == pytest.approx(where, abs=0.01)
+        assert robot.state.joints_sent[0] == pytest.approx(where, abs=0.03)  # braked on the way
 
 
 async def test_a_joint_that_does_not_get_there_breaks_the_goal_tolerance(tmp_path):

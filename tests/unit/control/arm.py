@@ -1,6 +1,7 @@
 """Control's step for joints, with a gate and servos that follow late and sag."""
 
 from collections.abc import Sequence
+from itertools import zip_longest
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from gigabrain_schemas.body import (
 )
 from gigabrain_schemas.brain import Intent, JointCommand, JointSpeeds, JointTarget, JointTrajectory
 from gigabrain_zenoh.control.joints import JointInputs, JointMemory, step_joints
-from gigabrain_zenoh.geometry.joints import JointMotion, approach
+from gigabrain_zenoh.geometry.joints import JointMotion, approach, braked
 from gigabrain_zenoh.testing.samples import DRIVING
 
 PAN, LIFT = (
@@ -79,8 +80,9 @@ class ArmBench:
             inputs = JointInputs(state=self.state(), intent=intent, teleop=teleop)
             self.memory, command = step_joints(self.body, self.memory, inputs)
             if command:
-                self.places.append(command.position)
                 self.obey(command)
+                sent = tuple(motion.position for motion in self.sent)
+                self.places.append(command.position or sent)
         return command
 
     def state(self) -> RobotState:
@@ -102,8 +104,8 @@ class ArmBench:
         if self.gate.mode == "enabled" and self.gate.commander == "control":
             wanted = map(JointMotion, command.position, command.velocity)
             self.sent = [
-                approach(now, to, joint, 0.02)
-                for now, to, joint in zip(self.sent, wanted, self.body.joints, strict=True)
+                approach(now, to, joint, 0.02) if to else braked(now, joint, 0.02)
+                for now, to, joint in zip_longest(self.sent, wanted, self.body.joints)
             ]
         if not self.blocked:
             self.here = [

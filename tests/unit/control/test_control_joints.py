@@ -90,6 +90,17 @@ def test_an_intent_that_ends_leaves_the_joints_braked_where_they_are() -> None:
     assert arm.places[-1][0] == pytest.approx(there, abs=0.01)
 
 
+def test_after_a_silence_of_decision_joints_go_on_from_where_they_were_held() -> None:
+    arm = enabled()
+    arm.go(targets(pan=1.0), ticks=15)
+    arm.go(None, ticks=10)
+    held = arm.sent[0].position
+    arm.go(targets(pan=1.0), ticks=1)
+    assert arm.sent[0].position == pytest.approx(held, abs=0.01)
+    arm.go(targets(pan=1.0), ticks=100)
+    assert arm.sent[0].position == pytest.approx(1.0, abs=0.01)
+
+
 def test_a_trajectory_is_followed_to_the_tick() -> None:
     arm = enabled()
     wave = [(0.3 * math.sin(0.05 * k) ** 2, 0.001 * k) for k in range(60)]

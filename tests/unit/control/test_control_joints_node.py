@@ -18,9 +18,9 @@ STEPS = 4  # in which a tick passes
 
 
 async def sent_while_moving(
-    rate_hz: float, link: Literal["sim", "emulated"]
+    rate_hz: float, link: Literal["sim", "emulated"], silent_from: int = 100
 ) -> list[list[JointCommand]]:
-    """What is sent in each of 40 ticks, with a target from the 11th on."""
+    """What is sent in each of 40 ticks, with a target; decision may fall silent."""
     description = arm_body()
     assert description.arm
     description = replace(description, arm=replace(description.arm, rate_hz=rate_hz))
@@ -30,7 +30,8 @@ async def sent_while_moving(
         for tick in range(1, 41):
             arm.tick = tick
             bench.send(STATE, arm.state())
-            bench.send(INTENT, replace(targets(pan=1.0), boot=BOOT, tick=tick, basis=tick))
+            if tick < silent_from:
+                bench.send(INTENT, replace(targets(pan=1.0), boot=BOOT, tick=tick, basis=tick))
             for _ in range(STEPS):
                 await bench.clock.advance(TICK_NS // STEPS)
             found.append(bench.sent(JOINT_CMD))
@@ -62,3 +63,11 @@ async def test_an_arm_with_a_higher_rate_gets_commands_between_two_states(
 
 async def test_a_simulation_gets_one_command_for_each_of_its_ticks() -> None:
     assert {len(commands) for commands in await sent_while_moving(200.0, "sim")} == {1}
+
+
+async def test_joints_come_to_rest_from_the_third_tick_without_an_intent() -> None:
+    moving = [one[0] for one in await sent_while_moving(50.0, "emulated")]
+    braking = [one[0] for one in await sent_while_moving(50.0, "emulated", silent_from=15)]
+    assert braking[:16] == moving[:16]
+    assert moving[16].velocity[0] > 0.5
+    assert {(one.position, one.velocity) for one in braking[16:]} == {((), (0.0, 0.0))}

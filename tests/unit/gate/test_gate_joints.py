@@ -3,8 +3,9 @@
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
-from gigabrain_schemas.body import JointDescription
+from gigabrain_schemas.body import JointDescription, JointGains
 from gigabrain_schemas.brain import JointCommand
 from gigabrain_schemas.safety import JointCap, SafetyState
 from gigabrain_zenoh.gate import gate
@@ -128,6 +129,17 @@ def test_a_stream_that_ends_brakes_the_joints_within_40_ms_and_holds_them() -> N
     rig.arm_tick(200)
     assert rig.positions == held
     assert rig.mode == "idle"
+
+
+def test_a_speed_of_zero_brakes_a_joint_that_was_sent_ahead() -> None:
+    rig = enabled()
+    lift = replace(JOINTS[0], gains=JointGains(feed_forward=0.08))
+    rig.config = replace(rig.config, joints=(lift, JOINTS[1]))
+    rig.follow(20, velocity=(1.0,))
+    at = rig.positions[0]
+    rig.follow(5, velocity=(0.0,))
+    assert rig.state.joints[0].velocity == pytest.approx(0.0)
+    assert rig.positions[0] == pytest.approx(at + 0.04 - 0.6 * 0.08)
 
 
 def test_an_estop_holds_every_joint_in_the_same_tick() -> None:
@@ -276,11 +288,11 @@ def test_a_cap_of_one_joint_leaves_the_others_alone() -> None:
     assert rig.state.joints[1].velocity == pytest.approx(0.02)
 
 
-def test_joints_do_not_move_by_a_verdict_older_than_80_ms() -> None:
+def test_joints_do_not_move_by_a_verdict_older_than_40_ms() -> None:
     rig = enabled()
     rig.follow(20, velocity=(0.5,))
     rig.silent = True
-    rig.follow(4, velocity=(0.5,))
+    rig.follow(2, velocity=(0.5,))
     assert rig.state.joints[0].velocity == pytest.approx(0.5)
     rig.follow(1, velocity=(0.5,))
     assert rig.state.joints[0].velocity == pytest.approx(0.3)
