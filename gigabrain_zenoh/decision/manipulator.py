@@ -347,7 +347,7 @@ class Manipulator:
         end = dict(zip(last.names, last.positions[-1].tolist(), strict=True)) if last else {}
         if off := off_from(body, state, end, "goal_tolerance"):
             late = run.over_for(state.tick) * TICK_S > body.arm.goal_time
-            return self._fail(off) if late else self._moving(state)
+            return self._held_up(off) if late else self._moving(state)
         if self._interim:
             self._drop()
             missed = self._misses >= TRIES
