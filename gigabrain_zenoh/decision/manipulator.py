@@ -297,11 +297,10 @@ class Manipulator:
         over = run.advance(state.tick, grips=grips)
         if over and over.name == "close" and plan.hold:
             if not holds(planner, plan.hold, state):
-                assert plan.grasp
-                self._misses += 1
-                self._back_off(planner, body, state, plan.grasp)
-                return self._moving(state)
+                return self._missed(planner, body, state)
             self._grip(planner, run, plan.hold, state)
+        if over and over.name == "ease" and hold and not holds(planner, hold, state):
+            return self._missed(planner, body, state)
         if over and over.name == "open" and hold:
             self._achieve(
                 None, placed=placed(planner, measured_posture(planner, state), command.do, hold)
@@ -310,6 +309,15 @@ class Manipulator:
             self._set_hold(None)
         if run.phase is None:
             return self._end(body, state, run)
+        return self._moving(state)
+
+    def _missed(self, planner: ArmPlanner, body: BodyDescription, state: RobotState) -> StepResult:
+        """Go back from a thing that was not caught; afterwards another grasp is tried."""
+        assert self._plan.grasp
+        self._misses += 1
+        self._set_hold(None)
+        self._achieved = StepOutcome()
+        self._back_off(planner, body, state, self._plan.grasp)
         return self._moving(state)
 
     def _grip(self, planner: ArmPlanner, run: PhaseRun, hold: Hold, state: RobotState) -> None:
