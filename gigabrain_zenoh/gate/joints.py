@@ -10,6 +10,7 @@ from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import JointDescription
 from gigabrain_schemas.brain import JointCommand
 from gigabrain_schemas.safety import JointCap
+from gigabrain_zenoh.gate import causes as why
 from gigabrain_zenoh.gate.state import GateConfig, GateState, Tick
 from gigabrain_zenoh.geometry.joints import (
     ANY_SPEED,
@@ -46,10 +47,13 @@ def refusal(config: GateConfig, state: GateState, command: JointCommand) -> str:
 def before(state: GateState, event: Tick) -> tuple[JointMotion, ...]:
     """Return where the joints were sent in the last tick.
 
-    At the start that is where the body holds them; where they are, if nothing does.
+    At the start, and while the body cannot be reached, that is where it holds them by itself; at
+    the start where they are, if nothing does.
     """
     if event.joints and event.limp:
         return tuple(map(frozen, event.joints))
+    if event.held and why.LINK_LOST in (*state.faults, *event.faults):
+        return tuple(map(JointMotion, event.held))
     if event.joints and not state.joints:
         return tuple(map(JointMotion, event.held)) or tuple(map(frozen, event.joints))
     return state.joints

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from gigabrain_schemas.body import JointDescription, JointGains
 from gigabrain_schemas.brain import JointCommand
 from gigabrain_schemas.safety import JointCap, SafetyState
-from gigabrain_zenoh.gate import gate
+from gigabrain_zenoh.gate import causes, gate
 from gigabrain_zenoh.geometry.joints import JointMotion
 from gigabrain_zenoh.geometry.limits import ZERO
 from tests.unit.gate.rig import BLIND, BOOT, Rig
@@ -129,6 +129,22 @@ def test_a_stream_that_ends_brakes_the_joints_within_40_ms_and_holds_them() -> N
     rig.arm_tick(200)
     assert rig.positions == held
     assert rig.mode == "idle"
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_body_that_is_reached_again_moves_no_joint_from_where_it_held_it(known: bool) -> None:
+    rig = enabled()
+    rig.follow(20, velocity=(1.0,))
+    places = (0.5, 0.06)  # after its own brakes, or after somebody has moved it
+    lost = gate.Tick(
+        ZERO, joints=rig.measured, faults=(causes.LINK_LOST,), held=places if known else ()
+    )
+    for _ in range(30):
+        rig.feed(lost)
+    assert (rig.positions == list(places)) is known
+    for _ in range(30):
+        rig.feed(gate.Tick(ZERO, joints=rig.measured, held=places))
+        assert rig.positions == list(places)
 
 
 def test_a_speed_of_zero_brakes_a_joint_that_was_sent_ahead() -> None:
