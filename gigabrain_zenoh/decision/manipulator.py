@@ -296,7 +296,8 @@ class Manipulator:
         grips = run.phase is not None and gripper_moves(planner, state, body, run.phase)
         over = run.advance(state.tick, grips=grips)
         if over and over.name == "close" and plan.hold:
-            if not holds(planner, plan.hold, state):
+            closed = sent_to(planner, body, state, plan.hold.grip)  # unless safety holds it back
+            if not (closed and holds(planner, plan.hold, state)):
                 return self._missed(planner, body, state)
             self._grip(planner, run, plan.hold, state)
         if over and over.name == "ease" and hold and not holds(planner, hold, state):

@@ -19,7 +19,7 @@ PhaseName = Literal[
     "grip",
 ]  # fmt: skip
 GRIP_TICKS = 40  # until a gripper has closed, or has stopped at what is between its fingers
-LATE_TICKS = 100  # by which that may last longer
+LATE_TICKS = 250  # by which that may last longer, where safety slows it down
 SETTLE_TICKS = 12  # after a trajectory
 AHEAD_TICKS = 1  # from a state to the tick in which a command by it moves joints
 LAG_TICKS = 1  # from there until a state shows that it did, where a process is late

@@ -277,6 +277,15 @@ def test_what_slips_out_of_the_gripper_is_told(rig: Rig) -> None:
     assert "cube has slipped out of the gripper" in task.reason
 
 
+def test_a_gripper_that_safety_holds_back_is_not_taken_for_one_that_holds_something(
+    rig: Rig,
+) -> None:
+    rig.arm.caps = (JointCap(name="gripper", fall=0.02),)
+    task = rig.carry_out(THINGS + "do: [{pick: cube}]")
+    assert (task.state, task.reason) == ("failed", "picking up cube: it was not caught, 3 times")
+    assert rig.phases.count("close") == 3
+
+
 def test_what_is_lost_while_the_grip_eases_is_tried_again(rig: Rig) -> None:
     rig.give(THINGS + "do: [{pick: cube}]")
     while rig.outcome is None or rig.outcome.reason != "ease":
