@@ -143,6 +143,27 @@ async def test_a_leader_that_is_unplugged_leaves_the_follower_where_it_is(
     assert there < 1.4
 
 
+async def test_an_estop_ends_it_and_the_arm_is_held(
+    shared_home: Home, arm: Probe, tmp_path: Path
+) -> None:
+    async with leader_at(tmp_path / "leader") as leader:
+        command = leader.start(shared_home)
+        await until(lambda: "following" in command.out or not command.running)
+        moving = asyncio.ensure_future(leader.move(shoulder_pan=-1.5))
+        await until(lambda: sent(arm, "shoulder_pan") < -0.3, "on its way")
+        assert await (await shared_home.run("estop")).ended() == 0
+        assert await command.ended() == 1
+        assert "an e-stop has the body" in command.err
+        moving.cancel()
+    await arm.ticks(25)
+    there = sent(arm, "shoulder_pan")
+    await arm.ticks(25)
+    assert sent(arm, "shoulder_pan") == pytest.approx(there, abs=0.001)
+    assert -1.4 < there < -0.2
+    for again in ("release", "enable"):
+        assert await (await shared_home.run(again)).ended() == 0
+
+
 async def test_a_leader_of_which_a_servo_is_missing_moves_nothing(
     shared_home: Home, arm: Probe, tmp_path: Path
 ) -> None:
