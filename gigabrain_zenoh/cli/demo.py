@@ -76,14 +76,14 @@ class RobotOptions:
     def values(self) -> dict[str, object]:
         """Return the fields of a Deployment, unchecked."""
         from gigabrain_drivers.driver.catalog import load_robot, robot_path
+        from gigabrain_drivers.sim.worlds import mission_file
 
         robot, settings = load_robot(self.body), dict(behaviours.load(self.behaviour).DEMO)
         mapped = behaviours.needs_map(self.behaviour)
         world = self.world or robot.demo.world
         if robot.demo.mission and mapped and world == robot.demo.world and self.link != "real":
-            settings = {
-                "mission": str(robot_path(self.body).absolute().parent / robot.demo.mission)
-            }
+            folder = robot_path(self.body).parent
+            settings = {"mission": mission_file(robot.demo.mission, folder)}
         values: dict[str, object] = {
             "body": self.body,
             "link": self.link,

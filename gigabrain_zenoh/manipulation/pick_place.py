@@ -32,7 +32,8 @@ from gigabrain_zenoh.manipulation.phases import Phase
 from gigabrain_zenoh.manipulation.planner import NoPath, plan
 
 LIMIT_SPARE = 0.006  # of a joint's range, at its ends: servos swing a bit too far
-SLOW = 0.35  # of the joints' speeds, near the thing
+SLOW = 0.35  # of the joints' speeds, with a thing in the gripper
+CREEP = 0.1  # the same straight to a thing or its place: safety slows single joints near the table
 SQUEEZE = 0.12  # of the gripper's range, beyond the thing's width
 EASED = 0.035  # the same, once it is held: what servos can do for long
 HELD_SHARE = 0.02  # of the gripper's range, short of its target: something is between the fingers
@@ -76,6 +77,7 @@ class PickPlacePlanner:
         self._grasps = GraspPlanner(arm, self._inverse)
         self._fast = TimeParametrization(eased(arm.joints, FAST))
         self._slow = TimeParametrization(eased(arm.joints, SLOW))
+        self._creep = TimeParametrization(eased(arm.joints, CREEP))
         self._opening = arm.opening()
         assert arm.gripper
         self._gripper = arm.gripper
@@ -231,7 +233,7 @@ class PickPlacePlanner:
         return [found[k] for k in np.argsort(order)[::-1]]
 
     def _straight(self, start: Floats, goal: Floats) -> JointTrajectory:
-        return self._slow.trajectory(np.stack((start, goal)))
+        return self._creep.trajectory(np.stack((start, goal)))
 
     def _held(self, thing: Thing, grasp: Grasp) -> Thing:
         """Return a thing in the frame of the tool, between fingers that have closed on it.

@@ -3,13 +3,19 @@
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 
+import mujoco
+import numpy as np
 import pytest
 
 from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import Run
+from gigabrain_drivers.sim.body import MujocoOptions, sim_body
+from gigabrain_drivers.sim.physics import Simulation
+from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.joints import JointMotion, accelerated, stopped
 
 HOME = (0.0, -1.7, 1.4, 0.6, 0.0, 0.0)
@@ -80,6 +86,54 @@ def test_the_brain_gets_its_model_as_text() -> None:
     model = make().arm_model()
     assert model
     assert "<mujoco" in model.mjcf
+
+
+def simulation_of(body: str) -> Simulation:
+    robot, _, options, folder = catalog.load_link(body, Run(folder=Path()))
+    assert isinstance(options, MujocoOptions)
+    return Simulation(sim_body(robot, options, Run(folder=folder)), load_world("table", 0), 0)
+
+
+def test_an_outstretched_piper_holds_its_payload_for_ever_and_warms_no_motor_beyond_its_limit() -> (
+    None
+):
+    simulation, limit = simulation_of("piper"), catalog.load_robot("piper").thresholds.motor_stop
+    assert simulation.arm
+    hand = simulation.model.body("robot/link6").id
+    simulation.model.body_mass[hand] += 1.5
+    simulation.arm.aim({"joint1": 0.0, "joint2": 2.2, "joint3": -2.2, "joint5": 0.0})
+    for _ in range(300):
+        simulation.advance()
+    motors = simulation.arm.motors()
+    assert abs(motors[1].effort) > 15.0
+    for _ in range(360_000):  # an hour
+        simulation.arm.wear()
+    assert 40.0 < max(motor.temperature for motor in simulation.arm.motors()) < limit
+
+
+def test_a_servo_that_is_smoothed_goes_to_a_new_goal_without_a_blow() -> None:
+    simulation = simulation_of("piper")
+    assert simulation.arm
+    data, joint = simulation.data, simulation.model.actuator("robot/joint1").id
+    efforts, speeds = [], []
+    for number in range(50):
+        simulation.arm.aim({"joint1": 0.02 * number})  # 1 rad/s, as control sends it
+        for _ in range(10):
+            simulation.arm.act()
+            mujoco.mj_step(simulation.model, data)
+            efforts.append(abs(data.actuator_force[joint]))
+            speeds.append(data.joint("robot/joint1").qvel[0])
+    assert np.mean(speeds[250:]) == pytest.approx(1.0, rel=0.05)
+    assert max(efforts[250:]) < 25.0  # of 40 N m
+
+
+def test_servos_of_a_joint_that_is_not_there_are_refused_with_the_line(tmp_path: Path) -> None:
+    path = catalog.robot_path("piper")
+    mine = tmp_path / "robot.yaml"
+    mine.write_text(path.read_text().replace("joints: [gripper]", "joints: [griper]"))
+    (tmp_path / "model.xml").write_text(path.with_name("model.xml").read_text())
+    with pytest.raises(ConfigError, match=r":\d+: no joint 'griper'; did you mean 'gripper'"):
+        catalog.make_driver(str(mine), Run(folder=Path()))
 
 
 @pytest.mark.parametrize("name", NAMES[:5])

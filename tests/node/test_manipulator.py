@@ -13,6 +13,7 @@ from msgspec.structs import replace
 from gigabrain_drivers.driver.catalog import load_link, robot_path
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.sim.body import MujocoOptions, sim_body
+from gigabrain_drivers.sim.worlds import mission_file
 from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import ArmModel
 from gigabrain_schemas.brain import Intent, JointTarget
@@ -24,6 +25,8 @@ from gigabrain_zenoh.decision.tasks.mission import loads
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskQueue
 from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner
 from gigabrain_zenoh.qa.bench.hands import ArmInMemory
+from gigabrain_zenoh.safety.arm_shape import MujocoArm
+from gigabrain_zenoh.safety.step import SafetyInputs, SafetyMemory, step
 from gigabrain_zenoh.testing.waiting import PATIENCE_S
 
 CUBE = """<mujoco><worldbody>
@@ -50,13 +53,14 @@ class Rig:
         cube: tuple[float, float] = THERE,
         mjcf: str | None = None,
         body: str = "so101",
+        world: Path | None = None,
     ) -> None:
         (folder / "thing.xml").write_text(CUBE.format(x=cube[0], y=cube[1]))
-        world = folder / "world.yaml"
-        world.write_text("model: thing.xml\nstart: [0.0, 0.0, 0.0]\n")
+        (folder / "world.yaml").write_text("model: thing.xml\nstart: [0.0, 0.0, 0.0]\n")
         robot, _, options, model_folder = load_link(body, Run(folder=Path()))
         assert isinstance(options, MujocoOptions)
-        self.arm = ArmInMemory(robot, sim_body(robot, options, Run(folder=model_folder)), world)
+        self.arm = ArmInMemory(robot, sim_body(robot, options, Run(folder=model_folder)),
+                               world or folder / "world.yaml")  # fmt: skip
         text = mjcf or robot_path(body).with_name("model.xml").read_text()
         self._bus: Any = SimpleNamespace(
             input_log=SimpleNamespace(in_time=waits),
@@ -140,6 +144,38 @@ def test_one_mission_moves_a_cube_there_and_back_by_any_arm(tmp_path: Path, body
     assert (task.state, task.reason) == ("succeeded", "")
     assert rig.arm.thing()[:2] == pytest.approx(THERE, abs=0.01)
     assert rig.arm.broken == 0
+    rig.manipulator.close()
+
+
+@pytest.mark.parametrize("body", ["so101", "piper"])
+def test_the_demo_of_any_arm_moves_blocks_and_heats_no_motor(tmp_path: Path, body: str) -> None:
+    rig = Rig(tmp_path, body=body, world=Path("table"))
+    demo = rig.arm.robot.demo
+    assert demo.world == "table"
+    rig.give(Path(mission_file(demo.mission, tmp_path)).read_text())
+    data, red = rig.arm.simulation.data, rig.arm.simulation.model.body("world/red").id
+    while rig.phases.count("retreat") < 1:
+        rig.tick()
+        assert rig.queue.status.current, rig.queue.status.done
+    assert data.xpos[red][:2] == pytest.approx((0.20, -0.10), abs=0.01)
+    assert max(motor.temperature for motor in rig.arm.arm.motors()) < 40.0
+    rig.manipulator.close()
+
+
+def test_safety_near_the_table_bends_no_way_of_the_piper_to_a_block(tmp_path: Path) -> None:
+    rig = Rig(tmp_path, body="piper", world=Path("table"))
+    rig.give(Path(mission_file("blocks", tmp_path)).read_text())
+    shape = MujocoArm(robot_path("piper").with_name("model.xml").read_text(), rig.arm.description)
+    memory, forced = SafetyMemory(), [0.0]
+    while rig.phases.count("retreat") < 2:  # red and green
+        inputs = SafetyInputs(state=rig.arm.state(), arm=shape)
+        memory, verdict = step(rig.arm.description, memory, inputs)
+        rig.arm.caps = verdict.joints
+        rig.tick()
+        if rig.phases[-1] == "descend":  # a finger on a block is forced open
+            (sent,) = rig.arm.posture(["gripper"])
+            forced.append(abs(rig.arm.measured("gripper") - sent))
+    assert max(forced) < 0.0005
     rig.manipulator.close()
 
 

@@ -1,13 +1,17 @@
 """An arm picks things up and puts them down in MuJoCo, through control and the gate."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from gigabrain_drivers.driver.catalog import load_robot, robot_path
+from gigabrain_drivers.driver.catalog import load_link, load_robot, robot_path
+from gigabrain_drivers.driver.robot import Run
+from gigabrain_drivers.sim.body import MujocoOptions, sim_body
 from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics
 from gigabrain_zenoh.manipulation.collision import Thing
 from gigabrain_zenoh.manipulation.pick_place import NoWay, PickPlacePlanner
-from gigabrain_zenoh.qa.bench.hands import TABLE, draw, measure_hands, pan_axis
+from gigabrain_zenoh.qa.bench.hands import TABLE, arm_before, draw, measure_hands, pan_axis
 
 SEEDS = (0, 2, 4, 5, 9, 13)  # two of each kind, light and heavy
 
@@ -31,6 +35,35 @@ def test_things_of_all_kinds_are_picked_up_and_put_down() -> None:
     assert {run.kind for run in result.runs} == {"cube", "cylinder", "sphere"}
     assert [run.outcome for run in result.runs] == ["placed"] * len(SEEDS)
     assert all(run.broken_limits == 0 for run in result.runs)
+
+
+@pytest.mark.parametrize("body", ["so101", "piper"])
+def test_what_is_held_does_not_slide_along_the_pads_while_the_arm_swings(body: str) -> None:
+    robot, _, options, folder = load_link(body, Run(folder=Path()))
+    assert isinstance(options, MujocoOptions)
+    assert robot.arm
+    model = sim_body(robot, options, Run(folder=folder))
+    kinematics = ArmKinematics(model.model, robot.joints, robot.arm.tool)
+    planner, names = PickPlacePlanner(kinematics), kinematics.names
+    drawn = draw(np.random.default_rng(5), pan_axis(kinematics))
+    arm = arm_before(drawn, robot, model)
+    gripper = robot.joints[-1].name
+
+    def in_tool() -> np.ndarray:
+        tool = kinematics.forward(np.array([arm.measured(name) for name in names]))
+        return tool.axes.T @ (arm.thing() - tool.position)
+
+    pick = planner.pick(drawn.thing(), [TABLE], arm.posture(names))
+    assert not isinstance(pick, NoWay)
+    for phase in pick.phases:
+        arm.carry_out(phase, gripper)
+    before = in_tool()
+    across = np.array([drawn.x, -drawn.y, drawn.height])
+    place = planner.place(pick.held, across, [TABLE], arm.posture(names), pick.grasp.opening)
+    assert not isinstance(place, NoWay)
+    assert place.phases[0].name == "traverse"
+    arm.carry_out(place.phases[0], gripper)
+    assert np.linalg.norm(in_tool() - before) < 0.003
 
 
 def test_a_plan_is_the_same_each_time(planner: PickPlacePlanner) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from playwright.async_api import Page, async_playwright
 
-from gigabrain_drivers.driver.catalog import robot_path
+from gigabrain_drivers.sim.worlds import mission_file
 from gigabrain_zenoh.qa.probe import Probe, probing
 from gigabrain_zenoh.testing.processes import Home
 from gigabrain_zenoh.testing.waiting import until
@@ -55,8 +55,7 @@ async def take_screenshots(folder: Path) -> None:
 
 async def take_arm_screenshot(folder: Path) -> None:
     """Have an arm move blocks, and show it while it carries one."""
-    mission = robot_path("so101").with_name("demo.yaml")
-    decision = {"behaviour": "navigate", "settings": {"mission": str(mission)}}
+    decision = {"behaviour": "navigate", "settings": {"mission": mission_file("blocks", Path())}}
     with tempfile.TemporaryDirectory() as place:
         home = Home(Path(place) / "home")
         try:

@@ -18,7 +18,7 @@ class Demo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """World and mission of a body's `gigabrain demo`."""
 
     world: str = "arena"
-    mission: str = ""  # file beside the robot's file; empty: it explores
+    mission: str = ""  # shipped one, or a file beside the robot's file; empty: it explores
 
 
 class RobotFile(BodyDescription, frozen=True, kw_only=True, forbid_unknown_fields=True):

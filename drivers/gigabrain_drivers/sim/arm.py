@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from gigabrain_drivers.sim import STEP_S
-from gigabrain_drivers.sim.body import SimModel
+from gigabrain_drivers.sim.body import SimModel, SimServo
 from gigabrain_drivers.sim.locomotion import Motor, MotorHeat
 from gigabrain_drivers.sim.scene import ROBOT
 
@@ -25,9 +25,16 @@ class SimArm:
         self._places = [int(joint.qposadr[0]) for joint in joints]
         self._dofs = [int(joint.dofadr[0]) for joint in joints]
         self._motors = [int(model.actuator(f"{ROBOT}{name}").id) for name in self.names]
-        radians = math.tau / body.servo.encoder_ticks
-        self._units = [METRES_PER_TICK if joint.type[0] == SLIDES else radians for joint in joints]
-        self._heat = [MotorHeat(body.servo) for _ in joints]
+        servos = [body.servos.get(name, SimServo()) for name in self.names]
+        self._units = [
+            METRES_PER_TICK if joint.type[0] == SLIDES else math.tau / servo.encoder_ticks
+            for joint, servo in zip(joints, servos, strict=True)
+        ]
+        self._heat = [MotorHeat(servo) for servo in servos]
+        step = model.opt.timestep
+        self._kept = np.array(
+            [math.exp(-step / s.smoothing) if s.smoothing else 0.0 for s in servos]
+        )
         self._amperes = [0.0] * len(joints)
         data.qpos[self._places] = body.posture
         self._now = self._before = self._measured()
@@ -37,6 +44,7 @@ class SimArm:
         self._gains = model.actuator_gainprm[self._motors].copy()
         self._biases = model.actuator_biasprm[self._motors].copy()
         self._aims = dict(zip(self.names, self._at_rest(body.posture), strict=True))
+        self._sent = np.array(self.targets)  # to the motors
         self.limp = self._was_limp = False
         self.act()
         mujoco.mj_forward(model, data)  # for the torques with which they hold
@@ -68,15 +76,16 @@ class SimArm:
         self.limp = True
 
     def act(self) -> None:
-        """Set the servos for the next step."""
+        """Set the servos for the next substep."""
         if self.limp != self._was_limp:
             self._was_limp = self.limp
             on = 0.0 if self.limp else 1.0
             self._model.actuator_gainprm[self._motors] = on * self._gains
             self._model.actuator_biasprm[self._motors] = on * self._biases
-        aims = self._aims
-        for name, motor in zip(self.names, self._motors, strict=True):
-            self._data.ctrl[motor] = aims[name]
+        before = self._data.qpos[self._places] if self.limp else self._sent
+        goals = np.array(self.targets)
+        self._sent = goals + self._kept * (before - goals)
+        self._data.ctrl[self._motors] = self._sent
 
     def sense(self) -> None:
         """Read the encoders after a step."""

@@ -24,7 +24,7 @@ from gigabrain_drivers.kinematics.wheels import (
 )
 from gigabrain_schemas.base import NonNegative, Percentage, Positive
 from gigabrain_schemas.body import JointDescription
-from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.host.files import read_bounded
 
 WHEELS = {  # drive types on wheels, and the driven parts of their models
@@ -67,25 +67,30 @@ class SimBattery:
     percentage: float = 100.0  # at the start, 0-100
 
 
-@dataclass(frozen=True, kw_only=True)
-class SimMotor:
+class SimMotor(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One wheel's gear motor as seen at the wheel; the defaults are a Dynamixel XL430-W250."""
 
-    torque_per_ampere: float = 1.07  # [N m/A], stall: 1.5 N m at 1.4 A
-    resistance_ohm: float = 8.6  # 12 V at 1.4 A
-    heat_capacity: float = 50.0  # [J/K]
-    thermal_resistance: float = 12.0  # [K/W], to the air
+    torque_per_ampere: Positive = 1.07  # [N m/A], stall: 1.5 N m at 1.4 A
+    resistance_ohm: Positive = 8.6  # 12 V at 1.4 A
+    heat_capacity: Positive = 50.0  # [J/K]
+    thermal_resistance: Positive = 12.0  # [K/W], to the air
     ambient_celsius: float = 25.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class SimServo(SimMotor):
+class SimServo(SimMotor, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One joint's servo; the defaults are a Feetech STS3215 of 7.4 V."""
 
-    torque_per_ampere: float = 0.8  # [N m/A], stall: 1.9 N m at 2.4 A
-    resistance_ohm: float = 3.1
-    heat_capacity: float = 30.0  # [J/K]
-    encoder_ticks: int = 4096  # per turn
+    torque_per_ampere: Positive = 0.8  # [N m/A] or [N/A], stall: 1.9 N m at 2.4 A
+    resistance_ohm: Positive = 3.1
+    heat_capacity: Positive = 30.0  # [J/K]
+    encoder_ticks: Annotated[int, Meta(ge=1)] = 4096  # per turn
+    smoothing: NonNegative = 0.0  # [s], time constant with which it goes to a new goal
+
+
+class JointServos(SimServo, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The servos of some joints, which are alike."""
+
+    joints: tuple[str, ...]
 
 
 class PartNames(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -114,7 +119,7 @@ class SimModel:
     substeps: int = 2  # substeps in a step of 10 ms; wheels roll as well on 5 ms as on 1 ms
     joints: tuple[JointDescription, ...] = ()  # of its arm; each has a position servo
     posture: tuple[float, ...] = ()  # of the arm at the start [rad] or [m]
-    servo: SimServo = field(default_factory=SimServo)
+    servos: Mapping[str, SimServo] = field(default_factory=dict)  # by joint, others by default
     fixed: bool = False  # its base is screwed to the floor
 
     def parts(self) -> tuple[tuple[str, str], ...]:
@@ -223,6 +228,7 @@ class MujocoOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_field
     lidar_noise: NonNegative = 0.01  # [m], standard deviation
     wheel_scale: Annotated[float, Meta(ge=0.5, le=2.0)] = 1.0  # true wheel radius / wheel_radius
     odometry_wheel_radius: Positive | None = None  # [m], where odometry is calibrated by itself
+    servos: tuple[JointServos, ...] = ()  # of an arm, where they are other than SimServo's
 
 
 def sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimModel:
@@ -245,6 +251,7 @@ def sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimModel:
         "names": options.names,
         "footprint": robot.footprint,
         "joints": robot.joints,
+        "servos": _servos(robot, options),
         "posture": robot.arm.home if robot.arm else (),
     }
     if robot.joints:
@@ -272,6 +279,16 @@ def sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimModel:
         **found,
         **(_two_wheels(robot) if robot.drive_type == "differential" else _wheels(robot, options)),
     )
+
+
+def _servos(robot: RobotFile, options: MujocoOptions) -> dict[str, SimServo]:
+    """Return the servos by joint. Raises UnknownName for a joint that the robot does not have."""
+    known = [joint.name for joint in robot.joints]
+    found = {name: servo for servo in options.servos for name in servo.joints}
+    for name in found:
+        if name not in known:
+            raise unknown("joint", name, known)
+    return dict(found)
 
 
 def _two_wheels(robot: RobotFile) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+import msgspec
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -117,8 +118,11 @@ class Simulation:
             self._place_people()
         self._locomotion.act()
         if self.arm:
-            self.arm.act()
-        mujoco.mj_step(self.model, self.data, nstep=self._substeps)
+            for _ in range(self._substeps):
+                self.arm.act()
+                mujoco.mj_step(self.model, self.data)
+        else:
+            mujoco.mj_step(self.model, self.data, nstep=self._substeps)
         self._steps += 1
         self._check()
         self._sample = self._imu.sample()
@@ -204,7 +208,7 @@ def with_motors(body: SimModel, model: mujoco.MjModel) -> SimModel:
     friction = float(model.dof_frictionloss[wheels].max())
     stall = grip + STALL_SHARE * friction
     torque = max(stall / STALL_AMPERES, body.motor.torque_per_ampere)
-    return replace(body, motor=replace(body.motor, torque_per_ampere=torque))
+    return replace(body, motor=msgspec.structs.replace(body.motor, torque_per_ampere=torque))
 
 
 def make_locomotion(body: SimModel, model: mujoco.MjModel, data: mujoco.MjData) -> Locomotion:

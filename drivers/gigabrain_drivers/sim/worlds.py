@@ -27,7 +27,7 @@ from gigabrain_drivers.sim.world import (
 )
 from gigabrain_drivers.sim.world_file import read_world
 from gigabrain_zenoh.config import loading as config
-from gigabrain_zenoh.config.loading import names_file
+from gigabrain_zenoh.config.loading import beside, names_file
 from gigabrain_zenoh.errors import ConfigError, UnknownName, unknown
 
 RANDOM_HALF_M = 3.5
@@ -103,7 +103,8 @@ def _by_wall(random: np.random.Generator) -> Placed:
     return Box(sign * off, along, depth, width, height, material), radius
 
 
-NAMED_WORLDS = ("arena", "house", "playroom", "table", "warehouse")  # files in `shipped_worlds`
+SHIPPED = Path(str(resources.files("gigabrain_drivers") / "sim" / "shipped_worlds"))
+NAMED_WORLDS = ("arena", "house", "playroom", "table", "warehouse")  # files in SHIPPED
 
 
 def world_names() -> dict[str, str]:
@@ -118,9 +119,20 @@ def world_names() -> dict[str, str]:
 
 def shipped_world(name: str) -> Path:
     """Return the file of one of NAMED_WORLDS."""
-    return Path(str(resources.files("gigabrain_drivers") / "sim" / "shipped_worlds")) / (
-        f"{name}.yaml"
-    )
+    return SHIPPED / f"{name}.yaml"
+
+
+def mission_file(name: str, folder: Path) -> str:
+    """Return the file of a mission: a shipped one, or one beside the robot's file, in `folder`.
+
+    Raises UnknownName.
+    """
+    if names_file(name):
+        return beside(name, folder)
+    known = {path.stem: path for path in (SHIPPED / "missions").glob("*.yaml")}
+    if name not in known:
+        raise unknown("mission", name, known)
+    return str(known[name])
 
 
 def load_world(name: str, seed: int) -> World:

@@ -232,6 +232,15 @@ class ArmInMemory:
         return False
 
 
+def arm_before(drawn: Drawn, robot: RobotFile, model: SimModel) -> ArmInMemory:
+    """Return an arm before a thing on a table."""
+    with tempfile.TemporaryDirectory(prefix="gigabrain-") as folder:
+        (Path(folder) / "thing.xml").write_text(drawn.mjcf())
+        world = Path(folder) / "world.yaml"
+        world.write_text("model: thing.xml\nstart: [0.0, 0.0, 0.0]\n")
+        return ArmInMemory(robot, model, world)
+
+
 def measure_hands(seeds: Sequence[int], body: str, show: Progress) -> HandsResult:
     """Have an arm pick one thing up for each seed, and put it down elsewhere.
 
@@ -274,11 +283,7 @@ class Attempt:
 def _run(seed: int, robot: RobotFile, model: SimModel, planner: PickPlacePlanner) -> HandsRun:
     rng = np.random.default_rng(seed)
     drawn = draw(rng, pan_axis(planner.arm))
-    with tempfile.TemporaryDirectory(prefix="gigabrain-") as folder:
-        (Path(folder) / "thing.xml").write_text(drawn.mjcf())
-        world = Path(folder) / "world.yaml"
-        world.write_text("model: thing.xml\nstart: [0.0, 0.0, 0.0]\n")
-        arm = ArmInMemory(robot, model, world)
+    arm = arm_before(drawn, robot, model)
     attempt = Attempt()
     _pick_and_place(arm, planner, drawn, rng, attempt)
     off = None

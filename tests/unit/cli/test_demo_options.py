@@ -1,0 +1,44 @@
+"""Which mission `gigabrain demo` begins with."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gigabrain_drivers.driver.catalog import robot_path
+from gigabrain_zenoh.cli.demo import RobotOptions
+from gigabrain_zenoh.decision.tasks.mission import loads
+from gigabrain_zenoh.errors import UnknownName
+
+
+def mission_of(**options: Any) -> str:
+    values: Any = RobotOptions(**options).values()
+    return str(values["decision"]["settings"].get("mission", ""))
+
+
+def test_both_arms_move_the_blocks_of_the_table_by_one_mission() -> None:
+    path = mission_of(body="so101")
+    assert mission_of(body="piper") == path
+    assert set(loads(Path(path).read_text(), path).things) == {"red", "green", "blue"}
+    assert RobotOptions(body="piper").values()["world"] == "table"
+
+
+def test_a_mission_is_for_the_world_of_its_demo_and_for_no_real_arm() -> None:
+    assert mission_of(body="piper", world="arena") == ""
+    assert mission_of(body="piper", link="real") == ""
+    assert mission_of(body="piper", behaviour="avoid") == ""
+
+
+def robot_with(folder: Path, mission: str) -> str:
+    text = robot_path("so101").read_text().replace("mission: blocks", f"mission: {mission}")
+    (folder / "robot.yaml").write_text(text)
+    return str(folder / "robot.yaml")
+
+
+def test_a_mission_beside_the_robots_file_is_taken(tmp_path: Path) -> None:
+    assert mission_of(body=robot_with(tmp_path, "mine.yaml")) == str(tmp_path / "mine.yaml")
+
+
+def test_an_unknown_mission_names_the_shipped_ones(tmp_path: Path) -> None:
+    with pytest.raises(UnknownName, match="no mission 'block'; did you mean 'blocks'"):
+        mission_of(body=robot_with(tmp_path, "block"))
