@@ -7,6 +7,7 @@ from rich.table import Table
 
 from gigabrain_zenoh.cli.bench import finish
 from gigabrain_zenoh.cli.options import Body, JsonFile, check_names, print_progress
+from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host import files
 from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.qa.judging import table_of
@@ -14,8 +15,12 @@ from gigabrain_zenoh.qa.judging import table_of
 if TYPE_CHECKING:
     from gigabrain_zenoh.qa.bench.hands import HandsResult, HandsRun
 
+MOST_BACKLASH_DEG = 10.0
 
-def hands(*, seeds: str = "0-99", body: Body = "so101", json: JsonFile = None) -> int:
+
+def hands(
+    *, seeds: str = "0-99", body: Body = "so101", backlash: float = 0.0, json: JsonFile = None
+) -> int:
     """Have an arm pick things up and put them down elsewhere, judged by the physics.
 
     Example: gigabrain bench hands --seeds 0-99
@@ -26,13 +31,16 @@ def hands(*, seeds: str = "0-99", body: Body = "so101", json: JsonFile = None) -
 
     Args:
         seeds: Seeds of the things, such as 0-9 or 3,5,20-22.
+        backlash: Play of each joint that turns, between motor and joint [degrees], 0 to 10.
     """
     from gigabrain_zenoh.qa.bench.clutter import seeds_of
     from gigabrain_zenoh.qa.bench.hands import measure_hands
 
     check_names([body])
+    if not 0.0 <= backlash <= MOST_BACKLASH_DEG:
+        raise ConfigError(f"--backlash: expected 0 to {MOST_BACKLASH_DEG:g} degrees")
     files.check_result_path(json)
-    result = measure_hands(seeds_of(seeds), body, print_progress)
+    result = measure_hands(seeds_of(seeds), body, print_progress, backlash)
     finish(_hands_table(result), result, json)
     return 0
 
@@ -49,8 +57,10 @@ def _hands_table(result: "HandsResult") -> Table:
     seconds = percentile(sorted(run.seconds for run in runs), 0.5) or 0.0
     planning = sorted(run.planning_s for run in runs)
     p50, p95 = (percentile(planning, share) or 0.0 for share in (0.5, 0.95))
+    play = f" with {result.backlash_deg:g}° of backlash" if result.backlash_deg else ""
+    failed = "; ".join(f"{n} {what}" for what, n in wrong.items()) or "None failed"
     table.caption = (
-        f"{result.body}. {'; '.join(f'{n} {what}' for what, n in wrong.items()) or 'None failed'}. "
+        f"{result.body}{play}. {failed}. "
         f"Joints beyond their ranges, by the physics: {sum(run.broken_limits for run in runs)} "
         f"ticks; fastest {max(run.fastest for run in runs):.0%} of the greatest speed. "
         f"A thing takes {seconds:.1f} s (p50); planning {p50:.2f} s, p95 {p95:.2f} s."

@@ -17,6 +17,7 @@ from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.joints import JointMotion, accelerated, stopped
+from gigabrain_zenoh.qa.bench.hands import with_backlash
 
 HOME = (0.0, -1.7, 1.4, 0.6, 0.0, 0.0)
 NAMES = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
@@ -88,10 +89,11 @@ def test_the_brain_gets_its_model_as_text() -> None:
     assert "<mujoco" in model.mjcf
 
 
-def simulation_of(body: str) -> Simulation:
+def simulation_of(body: str, backlash: float = 0.0) -> Simulation:
     robot, _, options, folder = catalog.load_link(body, Run(folder=Path()))
     assert isinstance(options, MujocoOptions)
-    return Simulation(sim_body(robot, options, Run(folder=folder)), load_world("table", 0), 0)
+    model = with_backlash(sim_body(robot, options, Run(folder=folder)), backlash)
+    return Simulation(model, load_world("table", 0), 0)
 
 
 def test_an_outstretched_piper_holds_its_payload_for_ever_and_warms_no_motor_beyond_its_limit() -> (
@@ -125,6 +127,33 @@ def test_a_servo_that_is_smoothed_goes_to_a_new_goal_without_a_blow() -> None:
             speeds.append(data.joint("robot/joint1").qvel[0])
     assert np.mean(speeds[250:]) == pytest.approx(1.0, rel=0.05)
     assert max(efforts[250:]) < 25.0  # of 40 N m
+
+
+OUT = {
+    "so101": {"shoulder_lift": 0.3, "elbow_flex": -0.3, "wrist_flex": 0.0},
+    "piper": {"joint2": 1.6, "joint3": -1.3},
+}
+
+
+@pytest.mark.parametrize("body", OUT)
+def test_a_joint_with_backlash_is_free_within_it_and_gravity_takes_it_to_its_end(body: str) -> None:
+    rests = {}
+    for play in (0.0, 0.04):
+        simulation = simulation_of(body, play)
+        assert simulation.arm
+        simulation.arm.aim(OUT[body])
+        for _ in range(300):
+            simulation.advance()
+        rests[play] = [motor.position for motor in simulation.arm.motors()]
+        pan = simulation.model.joint(f"robot/{simulation.arm.names[0]}")
+        simulation.data.qpos[pan.qposadr[0]] += 0.015
+        simulation.data.qvel[:] = 0.0
+        for _ in range(100):
+            simulation.advance()
+        back = simulation.arm.motors()[0].position - rests[play][0]
+        assert back == pytest.approx(0.015 if play else 0.0, abs=0.006)
+    sagged = np.abs(np.subtract(rests[0.04], rests[0.0]))
+    assert sagged[1:3] == pytest.approx([0.02, 0.02], abs=0.004)
 
 
 def test_servos_of_a_joint_that_is_not_there_are_refused_with_the_line(tmp_path: Path) -> None:

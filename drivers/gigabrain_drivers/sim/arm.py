@@ -35,6 +35,7 @@ class SimArm:
         self._kept = np.array(
             [math.exp(-step / s.smoothing) if s.smoothing else 0.0 for s in servos]
         )
+        self._half_play = np.array([servo.backlash / 2 for servo in servos])
         self._amperes = [0.0] * len(joints)
         data.qpos[self._places] = body.posture
         self._now = self._before = self._measured()
@@ -82,10 +83,10 @@ class SimArm:
             on = 0.0 if self.limp else 1.0
             self._model.actuator_gainprm[self._motors] = on * self._gains
             self._model.actuator_biasprm[self._motors] = on * self._biases
-        before = self._data.qpos[self._places] if self.limp else self._sent
-        goals = np.array(self.targets)
-        self._sent = goals + self._kept * (before - goals)
-        self._data.ctrl[self._motors] = self._sent
+        now, goals = self._data.qpos[self._places], np.array(self.targets)
+        self._sent = goals + self._kept * ((now if self.limp else self._sent) - goals)
+        free = np.clip(self._sent - now, -self._half_play, self._half_play)
+        self._data.ctrl[self._motors] = self._sent - free
 
     def sense(self) -> None:
         """Read the encoders after a step."""

@@ -85,6 +85,7 @@ class SimServo(SimMotor, frozen=True, kw_only=True, forbid_unknown_fields=True):
     heat_capacity: Positive = 30.0  # [J/K]
     encoder_ticks: Annotated[int, Meta(ge=1)] = 4096  # per turn
     smoothing: NonNegative = 0.0  # [s], time constant with which it goes to a new goal
+    backlash: NonNegative = 0.0  # [rad] or [m] that the joint is free to move between its gears
 
 
 class JointServos(SimServo, frozen=True, kw_only=True, forbid_unknown_fields=True):

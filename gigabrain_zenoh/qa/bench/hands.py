@@ -3,6 +3,7 @@
 Planner, control and gate are those of a robot, stepped in memory on a simulated body.
 """
 
+import dataclasses
 import math
 import tempfile
 import time
@@ -16,7 +17,7 @@ from msgspec import Struct
 
 from gigabrain_drivers.driver.catalog import load_link
 from gigabrain_drivers.driver.robot import RobotFile, Run
-from gigabrain_drivers.sim.body import MujocoOptions, SimModel, sim_body
+from gigabrain_drivers.sim.body import MujocoOptions, SimModel, SimServo, sim_body
 from gigabrain_drivers.sim.driver import state_message
 from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.worlds import load_world
@@ -72,6 +73,7 @@ class HandsResult(Struct, frozen=True, kw_only=True):
     """All things."""
 
     body: str
+    backlash_deg: float = 0.0
     runs: tuple[HandsRun, ...]
 
 
@@ -241,7 +243,21 @@ def arm_before(drawn: Drawn, robot: RobotFile, model: SimModel) -> ArmInMemory:
         return ArmInMemory(robot, model, world)
 
 
-def measure_hands(seeds: Sequence[int], body: str, show: Progress) -> HandsResult:
+def with_backlash(model: SimModel, backlash: float) -> SimModel:
+    """Return a body whose joints that turn are free to move by `backlash` [rad]."""
+    servos = {
+        joint.name: msgspec.structs.replace(
+            model.servos.get(joint.name, SimServo()), backlash=backlash
+        )
+        for joint in model.joints
+        if joint.unit == "rad"
+    }
+    return dataclasses.replace(model, servos={**model.servos, **servos})
+
+
+def measure_hands(
+    seeds: Sequence[int], body: str, show: Progress, backlash_deg: float = 0.0
+) -> HandsResult:
     """Have an arm pick one thing up for each seed, and put it down elsewhere.
 
     Raises ConfigError for a body that has no arm in MuJoCo.
@@ -250,12 +266,13 @@ def measure_hands(seeds: Sequence[int], body: str, show: Progress) -> HandsResul
     if robot.arm is None or not isinstance(options, MujocoOptions):
         raise ConfigError(f"{body} has no arm in MuJoCo; choose so101 or piper")
     model = sim_body(robot, options, Run(folder=folder))
+    model = with_backlash(model, math.radians(backlash_deg))
     runs = []
     for seed in seeds:
         arm = ArmKinematics(model.model, robot.joints, robot.arm.tool)
         runs.append(_run(seed, robot, model, PickPlacePlanner(arm)))
         show(in_words(runs[-1]))
-    return HandsResult(body=body, runs=tuple(runs))
+    return HandsResult(body=body, backlash_deg=backlash_deg, runs=tuple(runs))
 
 
 def in_words(run: HandsRun) -> str:
