@@ -19,18 +19,25 @@ MOST_BACKLASH_DEG = 10.0
 
 
 def hands(
-    *, seeds: str = "0-99", body: Body = "so101", backlash: float = 0.0, json: JsonFile = None
+    *,
+    seeds: str = "0-99",
+    body: Body = "so101",
+    camera: bool = False,
+    backlash: float = 0.0,
+    json: JsonFile = None,
 ) -> int:
     """Have an arm pick things up and put them down elsewhere, judged by the physics.
 
     Example: gigabrain bench hands --seeds 0-99
 
     Cubes, cylinders and balls of 2 to 4 cm and 20 to 200 g lie on the table, 10 to 26 cm from the
-    axis of the first joint and 90° to both sides, with frictions of 0.4 and 1. The pose is given.
-    Planner, control and gate are those of a robot. It needs the extra `arm`.
+    axis of the first joint and 90° to both sides, with frictions of 0.4 and 1. Pose and size are
+    given, or what the arm's depth camera sees, with the errors of one. Planner, control and gate
+    are those of a robot. It needs the extra `arm`.
 
     Args:
         seeds: Seeds of the things, such as 0-9 or 3,5,20-22.
+        camera: Know of the things only what the camera sees.
         backlash: Play of each joint that turns, between motor and joint [degrees], 0 to 10.
     """
     from gigabrain_zenoh.qa.bench.clutter import seeds_of
@@ -40,7 +47,9 @@ def hands(
     if not 0.0 <= backlash <= MOST_BACKLASH_DEG:
         raise ConfigError(f"--backlash: expected 0 to {MOST_BACKLASH_DEG:g} degrees")
     files.check_result_path(json)
-    result = measure_hands(seeds_of(seeds), body, print_progress, backlash)
+    result = measure_hands(
+        seeds_of(seeds), body, print_progress, backlash_deg=backlash, camera=camera
+    )
     finish(_hands_table(result), result, json)
     return 0
 
@@ -58,9 +67,11 @@ def _hands_table(result: "HandsResult") -> Table:
     planning = sorted(run.planning_s for run in runs)
     p50, p95 = (percentile(planning, share) or 0.0 for share in (0.5, 0.95))
     play = f" with {result.backlash_deg:g}° of backlash" if result.backlash_deg else ""
+    seen = percentile(sorted(run.seen_off_m for run in runs if run.seen_off_m is not None), 0.95)
+    by_camera = f"By the camera, off p95 {seen * 100:.1f} cm. " if result.camera and seen else ""
     failed = "; ".join(f"{n} {what}" for what, n in wrong.items()) or "None failed"
     table.caption = (
-        f"{result.body}{play}. {failed}. "
+        f"{result.body}{play}. {by_camera}{failed}. "
         f"Joints beyond their ranges, by the physics: {sum(run.broken_limits for run in runs)} "
         f"ticks; fastest {max(run.fastest for run in runs):.0%} of the greatest speed. "
         f"A thing takes {seconds:.1f} s (p50); planning {p50:.2f} s, p95 {p95:.2f} s."

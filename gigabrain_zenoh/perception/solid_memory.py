@@ -17,6 +17,7 @@ FITS = 9  # newest ones whose median counts
 SURE_SEEN = 2  # pictures, from which on a thing counts
 SAME_M, SAME_SHARE = 0.03, 0.5  # how far off the same thing may be: at least, and of its width
 MOVED_M = 0.02  # from its median: it was moved, and what was known of its place is dropped
+LOOKED_AT = 1.6  # of the height of its middle: there it would hide the floor, or what is behind
 MISSES = 3  # pictures in which it is seen through
 KEPT_S = 120.0  # without being seen: odometry drifts
 MOST, MOST_LABELS = 64, 8
@@ -74,7 +75,7 @@ class SolidMemory:
             _take(track, fit, tick)
         for track in open_:
             x, y = to_frame(pose, *track.fit.position[:2])
-            missed = gone(np.array((x, y, track.fit.position[2])))
+            missed = gone(np.array((x, y, LOOKED_AT * track.fit.position[2])))
             track.misses = track.misses + 1 if missed else 0
         oldest = tick - KEPT_S / TICK_S
         kept = [one for one in self._tracks if one.misses < MISSES and one.tick >= oldest]

@@ -17,6 +17,7 @@ from gigabrain_drivers.sim.worlds import mission_file
 from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import ArmModel
 from gigabrain_schemas.brain import Intent, JointTarget
+from gigabrain_schemas.objects import SeenSolid
 from gigabrain_schemas.safety import JointCap
 from gigabrain_schemas.tasks import Task
 from gigabrain_zenoh.decision.behaviours import ArmCommand, StepOutcome
@@ -68,6 +69,7 @@ class Rig:
         )
         self.start(Saved())
         self.held = ""
+        self.seen: tuple[SeenSolid, ...] = ()
         self.phases: list[str] = []  # that it was in, each time it began
 
     def start(self, saved: Saved) -> None:
@@ -96,7 +98,7 @@ class Rig:
         command, idle = self.queue.step(TICK_S, self.outcome)
         assert command is None or isinstance(command, ArmCommand)
         intent, outcome = self.manipulator.step(
-            self.arm.state(), self.arm.description, command, idle, self.held
+            self.arm.state(), self.arm.description, command, idle, self.held, self.seen
         )
         self.outcome = outcome if command else None
         if not self.phases or self.phases[-1] != outcome.reason:

@@ -8,8 +8,11 @@ import math
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -27,15 +30,23 @@ from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import Intent
 from gigabrain_schemas.safety import JointCap, SafetyState
 from gigabrain_zenoh.control.joints import JointInputs, JointMemory, step_joints
+from gigabrain_zenoh.decision.held_things import thing_of
+from gigabrain_zenoh.decision.lookout import Lookout
+from gigabrain_zenoh.decision.manipulator import TRIES
+from gigabrain_zenoh.decision.seen_things import located
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.geometry.joints import JointMotion
 from gigabrain_zenoh.geometry.limits import ZERO, limits_of
 from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics
+from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold, Plan
 from gigabrain_zenoh.manipulation.collision import Thing
 from gigabrain_zenoh.manipulation.phases import Phase, PhaseRun
-from gigabrain_zenoh.manipulation.pick_place import NoWay, PickPlacePlanner, Place
+from gigabrain_zenoh.manipulation.pick_place import NoWay
+
+if TYPE_CHECKING:
+    from gigabrain_zenoh.qa.bench.hands_camera import ArmCamera
 
 KINDS = ("cube", "cylinder", "sphere")
 SIZES_M, MASSES_KG, FRICTIONS = (0.02, 0.04), (0.02, 0.08, 0.2), (0.4, 1.0)
@@ -47,7 +58,6 @@ SETTLE_TICKS = 25
 TARGETS = 20  # places that are drawn until one can be reached
 STILL = "0.02 0.0005"  # torsional and rolling friction of things
 SLACK = 0.001  # of a joint's range, beyond which it counts as broken
-TABLE = Thing(name="table", kind="floor", position=np.array([0.0, 0.0, -0.001]))
 Progress = Callable[[str], None]
 
 
@@ -67,6 +77,7 @@ class HandsRun(Struct, frozen=True, kw_only=True):
     planning_s: float = 0.0  # of wall time
     fastest: float = 0.0  # joint's speed over its greatest, by the physics
     broken_limits: int = 0  # ticks in which a joint was too far or too fast, by the physics
+    seen_off_m: float | None = None  # of where the camera saw it last, by the physics
 
 
 class HandsResult(Struct, frozen=True, kw_only=True):
@@ -75,6 +86,7 @@ class HandsResult(Struct, frozen=True, kw_only=True):
     body: str
     backlash_deg: float = 0.0
     runs: tuple[HandsRun, ...]
+    camera: bool = False  # it knew of things only what a camera sees
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,14 +205,19 @@ class ArmInMemory:
         self.ticks += 1
         self.broken += self._breaks()
 
-    def carry_out(self, phase: Phase, gripper: str) -> None:
+    def carry_out(self, phase: Phase) -> None:
         """Carry out one phase of a plan."""
-        run = PhaseRun([phase], gripper, self._gate.tick)
+        run = PhaseRun([phase], self.description.joints[-1].name, self._gate.tick)
         while not run.advance(self._gate.tick):
             joints, window = run.wish(self._gate.tick)
             self.step(
                 Intent(joints=joints, joint_trajectory=window, behaviour="hands", reason=phase.name)
             )
+
+    def carry_out_all(self, phases: Sequence[Phase]) -> None:
+        """Carry out the phases of a plan."""
+        for phase in phases:
+            self.carry_out(phase)
 
     def settle(self) -> None:
         """Hold still."""
@@ -256,23 +273,30 @@ def with_backlash(model: SimModel, backlash: float) -> SimModel:
 
 
 def measure_hands(
-    seeds: Sequence[int], body: str, show: Progress, backlash_deg: float = 0.0
+    seeds: Sequence[int],
+    body: str,
+    show: Progress,
+    *,
+    backlash_deg: float = 0.0,
+    camera: bool = False,
 ) -> HandsResult:
     """Have an arm pick one thing up for each seed, and put it down elsewhere.
 
-    Raises ConfigError for a body that has no arm in MuJoCo.
+    With `camera` it knows of the thing only what its first camera sees. Raises ConfigError for a
+    body that has no arm in MuJoCo, or no such camera.
     """
-    robot, _, options, folder = load_link(body, Run(folder=Path()))
+    robot, _, options, folder = load_link(body, Run(folder=Path(), cameras=camera))
     if robot.arm is None or not isinstance(options, MujocoOptions):
         raise ConfigError(f"{body} has no arm in MuJoCo; choose so101 or piper")
+    if camera and not robot.cameras:
+        raise ConfigError(f"{body} has no camera; choose so101")
     model = sim_body(robot, options, Run(folder=folder))
     model = with_backlash(model, math.radians(backlash_deg))
     runs = []
     for seed in seeds:
-        arm = ArmKinematics(model.model, robot.joints, robot.arm.tool)
-        runs.append(_run(seed, robot, model, PickPlacePlanner(arm)))
+        runs.append(_run(seed, robot, model))
         show(in_words(runs[-1]))
-    return HandsResult(body=body, backlash_deg=backlash_deg, runs=tuple(runs))
+    return HandsResult(body=body, backlash_deg=backlash_deg, camera=camera, runs=tuple(runs))
 
 
 def in_words(run: HandsRun) -> str:
@@ -291,18 +315,27 @@ class Attempt:
     reason: str = ""
     target: Floats | None = None  # (3,) [m], where it was to be put
     planning_s: float = 0.0
+    seen_off: float | None = None  # [m]
 
     def end(self, outcome: str, reason: str = "") -> None:
         """Record how it ended."""
         self.outcome, self.reason = outcome, reason
 
 
-def _run(seed: int, robot: RobotFile, model: SimModel, planner: PickPlacePlanner) -> HandsRun:
+def _run(seed: int, robot: RobotFile, model: SimModel) -> HandsRun:
     rng = np.random.default_rng(seed)
+    planner = ArmPlanner(model.model, robot.description())
     drawn = draw(rng, pan_axis(planner.arm))
     arm = arm_before(drawn, robot, model)
     attempt = Attempt()
-    _pick_and_place(arm, planner, drawn, rng, attempt)
+    if robot.cameras:
+        from gigabrain_zenoh.qa.bench.hands_camera import ArmCamera  # imports OpenCV
+
+        with closing(ArmCamera(arm.description, model.model, arm.simulation, seed)) as camera:
+            look = partial(_seen, arm, planner, camera)
+            _pick_and_place(arm, planner, look, drawn, rng, attempt)
+    else:
+        _pick_and_place(arm, planner, drawn.thing, drawn, rng, attempt)
     off = None
     if attempt.target is not None:
         off = float(np.hypot(*(arm.thing()[:2] - attempt.target[:2])))
@@ -312,45 +345,96 @@ def _run(seed: int, robot: RobotFile, model: SimModel, planner: PickPlacePlanner
         friction=drawn.friction, distance_m=drawn.distance, outcome=attempt.outcome,
         reason=attempt.reason, off_m=off, seconds=arm.ticks * TICK_S,
         planning_s=attempt.planning_s, fastest=arm.fastest, broken_limits=arm.broken,
+        seen_off_m=attempt.seen_off,
     )  # fmt: skip
+
+
+def _seen(arm: ArmInMemory, planner: ArmPlanner, camera: "ArmCamera") -> Thing | None:
+    """Return the nearest thing that the camera sees; the arm moves out of its sight for that."""
+    lookout = Lookout()
+    while not (seen := camera.look(arm.state())):
+        posture = lookout.aside(arm.description)
+        if posture is None:
+            return None
+        aside = planner.take_posture(posture, [], arm.posture(planner.arm.names), None)
+        if isinstance(aside, Plan):
+            arm.carry_out_all(aside.phases)
+    return thing_of("the thing", located({}, seen)[f"seen {seen[0].id}"])
 
 
 def _pick_and_place(
     arm: ArmInMemory,
-    planner: PickPlacePlanner,
+    planner: ArmPlanner,
+    look: Callable[[], Thing | None],
     drawn: Drawn,
     rng: np.random.Generator,
     attempt: Attempt,
 ) -> None:
     """Pick the thing up and put it down where a place can be reached; fill in what came of it."""
-    names, gripper = planner.arm.names, arm.description.joints[-1].name
-    began = time.monotonic()
-    pick = planner.pick(drawn.thing(), [TABLE], arm.posture(names))
-    attempt.planning_s = time.monotonic() - began
-    if isinstance(pick, NoWay):
-        return attempt.end("unreachable", pick.reason)
-    for phase in pick.phases:
-        arm.carry_out(phase, gripper)
-        if phase.name == "close":
-            assert phase.gripper is not None
-            closed = arm.measured(gripper)
-            if not planner.holds(closed, phase.gripper):
-                return attempt.end("not gripped")
-            arm.carry_out(planner.eased(closed, phase.gripper), gripper)
+    names = planner.arm.names
+    hold = _picked(arm, planner, look, drawn, attempt)
+    if hold is None:
+        return
     if arm.thing()[2] < drawn.height + LIFTED_M:
         return attempt.end("not lifted")
-    place: Place | NoWay = NoWay(reason="")
-    for target in _targets(rng, drawn.height, pan_axis(planner.arm)):
-        place = planner.place(pick.held, target, [TABLE], arm.posture(names), pick.grasp.opening)
-        if isinstance(place, Place):
+    place: Plan | NoWay = NoWay(reason="")
+    for target in _targets(rng, hold.thing.half[2], pan_axis(planner.arm)):
+        place = planner.place(hold, target, [], arm.posture(names))
+        if isinstance(place, Plan):
             break
     if isinstance(place, NoWay):
         return attempt.end("no place", place.reason)
-    for phase in place.phases:
-        arm.carry_out(phase, gripper)
+    arm.carry_out_all(place.phases)
     arm.settle()
     attempt.target = target
     return None
+
+
+def _picked(
+    arm: ArmInMemory,
+    planner: ArmPlanner,
+    look: Callable[[], Thing | None],
+    drawn: Drawn,
+    attempt: Attempt,
+) -> Hold | None:
+    """Return what the gripper holds after a few tries, as decision would try."""
+    for misses in range(TRIES):
+        thing = look()
+        if thing is None:
+            attempt.end("not seen")
+            return None
+        attempt.seen_off = float(np.hypot(*(thing.position - arm.thing())[:2]))
+        began = time.monotonic()
+        pick = planner.pick(thing, [], arm.posture(planner.arm.names), misses)
+        attempt.planning_s = time.monotonic() - began
+        if isinstance(pick, NoWay):
+            attempt.end("not gripped" if misses else "unreachable", pick.reason)
+            return None
+        hold = _gripped(arm, planner, pick, thing)
+        if hold:
+            return hold
+        assert pick.grasp
+        back = planner.back_off(pick.grasp, arm.posture(planner.arm.names))
+        arm.carry_out_all(back.phases)
+    attempt.end("not gripped")
+    return None
+
+
+def _gripped(arm: ArmInMemory, planner: ArmPlanner, pick: Plan, thing: Thing) -> Hold | None:
+    """Carry out a pick; return what is held, or None as soon as nothing is."""
+    assert pick.hold
+    assert planner.arm.gripper
+    gripper, hold = planner.arm.gripper.name, pick.hold
+    for phase in pick.phases:
+        arm.carry_out(phase)
+        if phase.name == "close":
+            closed = arm.measured(gripper)
+            if not planner.holds(closed, hold.grip):
+                return None
+            posture = np.array([arm.measured(name) for name in planner.arm.names])
+            hold = planner.gripped(hold, thing, posture)
+            arm.carry_out(planner.eased(hold, closed))
+    return hold
 
 
 def _targets(rng: np.random.Generator, height: float, pan: float) -> Iterator[Floats]:

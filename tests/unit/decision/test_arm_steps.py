@@ -1,8 +1,10 @@
 """What missions may ask of an arm, and what is refused before anything moves."""
 
 import pytest
+from msgspec.structs import replace
 
 from gigabrain_drivers.driver.catalog import load_robot
+from gigabrain_schemas.body import Camera
 from gigabrain_zenoh.decision.tasks import arm_steps
 from gigabrain_zenoh.decision.tasks.arm_steps import (
     ArmAction,
@@ -13,7 +15,7 @@ from gigabrain_zenoh.decision.tasks.arm_steps import (
     TakePosture,
 )
 from gigabrain_zenoh.decision.tasks.mission import loads
-from gigabrain_zenoh.errors import ConfigError, GigabrainError
+from gigabrain_zenoh.errors import ConfigError, GigabrainError, Refused
 
 ARM = load_robot("so101").description()
 BASE = load_robot("turtlebot3_burger").description()
@@ -43,6 +45,9 @@ def test_steps_of_a_mission_are_actions_of_the_arm() -> None:
         ("things: {can: {at: [0, 0, 0]}}\ndo: [{pick: can}]", "expected a box, a cylinder or a sp"),
         ("things: {can: {sphere: 0.1, box: [1, 1, 1], at: [0, 0, 0]}}\ndo: [{pick: can}]",
          "expected a box, a cylinder or a sphere"),
+        ("things: {can: {label: can, at: [0, 0, 0]}}\ndo: [{pick: can}]",
+         "expected a label that is seen, or a place, not both"),
+        ("things: {can: {}}\ndo: [{pick: can}]", "or a label that is seen"),
         ("things: {can: {sphere: -1, at: [0, 0, 0]}}\ndo: [{pick: can}]", "expected a number"),
         ("do: [{reach: [0.2, 0]}]", "do[0].reach"),
         ("do: [{reach: [.nan, 0, 0]}]", ".nan is not allowed; expected a finite number"),
@@ -82,3 +87,11 @@ def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(arm_steps, "find_spec", lambda name: None if name == "ruckig" else True)
     with pytest.raises(GigabrainError, match=r"needs ruckig; pip install 'gigabrain-zenoh\[arm\]'"):
         arm_steps.check(ARM, [Reach(at=(0.2, 0.0, 0.1))])
+
+
+def test_a_thing_without_a_place_needs_a_depth_camera() -> None:
+    mission = loads("things: {can: {label: can}}\ndo: [{pick: can}]", "mission")
+    steps = mission.arm_actions, mission.things.values()
+    with pytest.raises(Refused, match="no depth camera; start it with --cameras"):
+        arm_steps.check(replace(ARM, cameras=()), *steps)
+    arm_steps.check(replace(ARM, cameras=(Camera(name="top", depth=True),)), *steps)

@@ -1,0 +1,144 @@
+"""An arm picks up what its depth camera sees: perception from pictures, and missions by that."""
+
+import functools
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_drivers.driver.catalog import load_robot, robot_path
+from gigabrain_schemas.body import ArmModel, Joint
+from gigabrain_schemas.objects import Detection, Detections, SeenSolid
+from gigabrain_schemas.topics import ARM_MODEL, BODY, DEPTH, DETECTIONS, SOLIDS, STATE
+from gigabrain_zenoh import codec
+from gigabrain_zenoh.config.settings import PerceptionConfig
+from gigabrain_zenoh.perception import node as perception
+from gigabrain_zenoh.qa.bench.hands_camera import ArmCamera
+from gigabrain_zenoh.testing.in_memory import NodeBench
+from gigabrain_zenoh.testing.samples import BOOT, body, state
+from tests.node.test_manipulator import Rig
+from tests.unit.vision.scenes import Box, depth_of, image, millimetres
+
+SO101 = load_robot("so101").description()
+(TOP,) = SO101.cameras
+MODEL = robot_path("so101").with_name("model.xml").read_text()
+assert SO101.arm
+HOME = dict(zip((joint.name for joint in SO101.joints), SO101.arm.home, strict=True))
+CUBE = Box(x=0.2, y=0.12, half_x=0.015, half_y=0.015, top=0.03)
+BESIDE = Box(x=0.12, y=-0.15, half_x=0.02, half_y=0.01, top=0.03)
+ASIDE = (0.15, -0.16)
+BELOW_ITS_HAND = (0.17, 0.0)  # of an arm in its home posture
+NAMED = Detection(label="cube", confidence=0.9, box=(0, 0, 9, 9), position=(0.21, 0.11, 0.015))
+
+
+class Eyes(NodeBench):
+    """Perception of a robot that is an arm with a camera above its table."""
+
+    def __init__(self, model: str = MODEL) -> None:
+        super().__init__(functools.partial(perception.run, PerceptionConfig(mapping="off")))
+        self._model = model
+
+    async def look(self, tick: int, *boxes: Box) -> None:
+        """Take a picture of boxes at a tick."""
+        if tick == 1:
+            await self.ready()
+            self.send(BODY, body(SO101))
+            self.send(ARM_MODEL, ArmModel(mjcf=self._model))
+        joints = tuple(Joint(name=name, position=place) for name, place in HOME.items())
+        self.send(STATE, replace(state(tick), joints=joints))
+        seen = image(millimetres(TOP, depth_of(TOP, boxes)))
+        picture = replace(seen, frame_id="top", boot=BOOT, tick=tick, basis=tick)
+        self.network.deliver(DEPTH.at("top"), codec.encode(picture))
+        await self.clock.advance(0)
+
+    def seen(self) -> tuple[SeenSolid, ...]:
+        """Return what was published last."""
+        return self.sent(SOLIDS)[-1].solids
+
+
+async def test_perception_publishes_what_stands_on_the_table_of_an_arm() -> None:
+    async with Eyes() as eyes:
+        for tick in (1, 11):
+            await eyes.look(tick, CUBE, BESIDE)
+        one, other = sorted(eyes.seen(), key=lambda one: -one.position[1])
+        assert one.position == pytest.approx((0.2, 0.12, 0.015), abs=0.003)
+        assert one.size == pytest.approx((0.03, 0.03, 0.03), abs=0.004)
+        assert sorted(other.size) == pytest.approx([0.02, 0.03, 0.04], abs=0.004)
+        eyes.send(DETECTIONS, Detections(
+            camera="top", width=320, height=240, things=(NAMED,), boot=BOOT, tick=11, basis=11,
+        ))  # fmt: skip
+        for tick in (21, 31, 41):
+            await eyes.look(tick, CUBE)
+        (left,) = eyes.seen()
+        assert (left.id, left.label) == (one.id, "cube")
+
+
+async def test_what_the_arm_itself_shows_or_hides_is_no_thing() -> None:
+    hand = Box(x=0.2, y=0.0, half_x=0.04, half_y=0.02, top=0.17, bottom=0.11)  # where its hand is
+    hidden = Box(x=0.2, y=0.0, half_x=0.015, half_y=0.03, top=0.03)
+    async with Eyes() as eyes:
+        for tick in (1, 11, 21):
+            await eyes.look(tick, hand, hidden)
+        assert eyes.seen() == ()
+
+
+async def test_without_a_usable_model_of_the_arm_nothing_is_looked_for() -> None:
+    async with Eyes("<mujoco/>") as eyes:
+        for tick in (1, 11):
+            await eyes.look(tick, CUBE)
+        assert eyes.sent(SOLIDS) == []
+
+
+class SeeingRig(Rig):
+    """An arm with a queue of tasks and a camera."""
+
+    camera: ArmCamera
+
+    def look(self) -> None:
+        """Have the camera take pictures."""
+        self.seen = self.camera.look(self.arm.state())
+
+
+@pytest.fixture
+def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[SeeingRig]:
+    made = SeeingRig(tmp_path, request.param)
+    made.arm.description = SO101
+    with closing(ArmCamera(SO101, MODEL, made.arm.simulation, 1)) as made.camera:
+        yield made
+
+
+@pytest.mark.parametrize("rig", [ASIDE], indirect=True)
+def test_a_mission_picks_up_what_is_seen_and_puts_it_down(rig: SeeingRig) -> None:
+    rig.look()
+    done = rig.carry_out(
+        "things: {cube: {box: [0.03, 0.03, 0.03]}}\n"
+        "do: [{pick: cube}, {place: [0.14, 0.15, 0.015]}]"
+    )
+    assert done.state == "succeeded", done.reason
+    x, y, _ = rig.arm.thing()
+    assert (x, y) == pytest.approx((0.14, 0.15), abs=0.01)
+
+
+@pytest.mark.parametrize("rig", [BELOW_ITS_HAND], indirect=True)
+def test_a_thing_below_its_own_hand_is_seen_once_the_arm_is_out_of_the_way(rig: SeeingRig) -> None:
+    rig.look()
+    assert rig.seen == ()
+    rig.give("things: {cube: {box: [0.03, 0.03, 0.03]}}\ndo: [{pick: cube}]")
+    for _ in range(1500):
+        rig.tick()
+        if rig.queue.status.done:
+            break
+        if abs(rig.arm.measured("shoulder_pan")) > 1.3:
+            rig.look()
+    assert rig.queue.status.done[0].state == "succeeded"
+    assert "looking for cube" in rig.phases
+    assert rig.arm.thing()[2] > 0.03
+
+
+@pytest.mark.parametrize("rig", [ASIDE], indirect=True)
+def test_what_is_nowhere_seen_fails_in_one_line(rig: SeeingRig) -> None:
+    done = rig.carry_out("things: {can: {label: can}}\ndo: [{pick: can}]")
+    assert done.state == "failed"
+    assert done.reason == "picking up can: can is not seen"

@@ -1,0 +1,132 @@
+"""Which of the things that a camera sees a mission means, and where the arm looks from."""
+
+import math
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from gigabrain_drivers.driver.catalog import load_robot
+from gigabrain_schemas.body import BodyDescription
+from gigabrain_schemas.objects import SeenSolid, Solids
+from gigabrain_zenoh.decision.lookout import LOOK_TICKS, Lookout
+from gigabrain_zenoh.decision.seen_things import SeenThings, located
+from gigabrain_zenoh.decision.tasks.arm_steps import Solid
+from gigabrain_zenoh.testing.samples import BOOT, state
+
+ARM = load_robot("so101").description()
+CAN = SeenSolid(id=1, shape="cylinder", size=(0.033, 0.115), position=(0.3, 0, 0.057), label="can")
+CUBE = SeenSolid(id=2, shape="box", size=(0.031, 0.03, 0.029), position=(0.2, 0.1, 0.015), yaw=0.3)
+BALL = SeenSolid(id=3, shape="sphere", size=(0.02,), position=(0.4, 0.0, 0.02))
+
+
+def test_a_thing_of_a_class_is_the_nearest_one_of_it() -> None:
+    known = located({"it": Solid(label="can")}, (CUBE, CAN))
+    assert known["it"] == Solid(cylinder=(0.033, 0.115), at=(0.3, 0, 0.057))
+    assert known["seen 2"] == Solid(box=CUBE.size, at=CUBE.position, yaw=0.3)  # type: ignore[arg-type]
+
+
+def test_a_thing_by_its_lengths_keeps_them_and_takes_the_place() -> None:
+    cube = Solid(box=(0.03, 0.03, 0.03))
+    known = located({"cube": cube}, (CUBE, CAN, BALL))
+    assert known["cube"] == Solid(box=(0.03, 0.03, 0.03), at=(0.2, 0.1, 0.015), yaw=0.3)
+    assert known.keys() == {"cube", "seen 1", "seen 3"}
+    assert known["seen 3"] == Solid(sphere=0.02, at=BALL.position)
+
+
+def test_a_long_box_is_turned_as_its_longer_side_is_seen() -> None:
+    seen = SeenSolid(id=4, shape="box", size=(0.03, 0.061, 0.03), position=(0.2, 0, 0.015), yaw=0.1)
+    known = located({"bar": Solid(box=(0.06, 0.03, 0.03))}, (seen,))
+    assert known["bar"].yaw == pytest.approx(0.1 + math.pi / 2)
+
+
+@pytest.mark.parametrize(
+    "wanted",
+    [
+        Solid(label="ball"),
+        Solid(box=(0.06, 0.06, 0.06)),
+        Solid(cylinder=(0.01, 0.1)),
+        Solid(sphere=0.1),
+    ],
+)
+def test_what_is_not_seen_has_no_place(wanted: Solid) -> None:
+    assert "it" not in located({"it": wanted}, (CUBE, CAN))
+
+
+def test_two_things_of_one_kind_are_two() -> None:
+    other = SeenSolid(id=5, shape="box", size=(0.03, 0.03, 0.03), position=(0.25, 0, 0.015))
+    cube = Solid(box=(0.03, 0.03, 0.03))
+    known = located({"one": cube, "other": cube}, (CUBE, other))
+    assert known["one"].at == CUBE.position
+    assert known["other"].at == other.position
+
+
+def test_a_thing_that_stands_where_its_mission_says_is_no_second_one() -> None:
+    given = Solid(box=(0.03, 0.03, 0.03), at=(0.21, 0.1, 0.015))
+    assert located({"cube": given}, (CUBE,)) == {"cube": given}
+
+
+def test_what_is_seen_far_away_is_not_in_the_way() -> None:
+    far = SeenSolid(id=6, shape="sphere", size=(0.1,), position=(3.0, 0.0, 0.1))
+    assert located({}, (far,)) == {}
+
+
+class Heard:
+    """A bus on which things are seen."""
+
+    def __init__(self) -> None:
+        self.subscribed: Callable[[Solids], None] | None = None
+        self.bus: Any = SimpleNamespace(latest=self._latest)
+
+    def _latest(self, _topic: object, on_new: Callable[[Solids], None]) -> None:
+        self.subscribed = on_new
+
+
+def watching(body: BodyDescription) -> tuple[Heard, SeenThings]:
+    heard = Heard()
+    seen = SeenThings(heard.bus)
+    seen.observe(body, state(1))
+    return heard, seen
+
+
+def test_things_are_where_they_are_after_the_body_has_driven_on() -> None:
+    heard, seen = watching(load_robot("lekiwi").description())
+    assert heard.subscribed
+    heard.subscribed(Solids(solids=(CAN,), boot=BOOT, tick=1, basis=1))
+    assert seen.at(state(1)) == ()  # it was not there before that state
+    there = state(2, pose=(0.1, 0.0, math.pi / 2))
+    seen.observe(None, there)
+    (one,) = seen.at(there)
+    assert one.position == pytest.approx((0.0, -0.2, 0.057))
+    assert one.yaw == pytest.approx(-math.pi / 2)
+
+
+def test_things_of_another_start_of_the_driver_do_not_count() -> None:
+    heard, seen = watching(ARM)
+    assert heard.subscribed
+    heard.subscribed(Solids(solids=(CAN,), boot=BOOT + 1, tick=1, basis=1))
+    assert seen.at(state(2)) == ()
+
+
+def test_a_body_without_a_camera_is_not_watched() -> None:
+    heard, seen = watching(load_robot("piper").description())
+    assert heard.subscribed is None
+    assert seen.at(state(2)) == ()
+
+
+def test_the_arm_waits_then_goes_home_then_to_both_sides_and_then_gives_up() -> None:
+    lookout, tick, pans = Lookout(), 10, list[float]()
+    while True:
+        assert lookout.waits(tick)
+        assert lookout.waits(tick + LOOK_TICKS - 1)
+        assert not lookout.waits(tick + LOOK_TICKS)
+        posture = lookout.aside(ARM)
+        if posture is None:
+            break
+        assert "gripper" not in posture
+        pans.append(posture["shoulder_pan"])
+        tick += 500
+    assert pans == pytest.approx([0.0, -1.344, 1.344], abs=1e-3)
+    lookout.reset()
+    assert lookout.aside(ARM)

@@ -1,0 +1,112 @@
+"""Things near an arm over several pictures: the median counts, what moved or went is followed."""
+
+import math
+
+import pytest
+
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.objects import SeenSolid
+from gigabrain_zenoh.geometry.pose import ORIGIN
+from gigabrain_zenoh.perception.solid_memory import KEPT_S, MISSES, MOST, SolidMemory
+from gigabrain_zenoh.vision.solid_fit import SolidFit
+
+
+def box(x: float, y: float, yaw: float = 0.0, long: float = 0.03) -> SolidFit:
+    return SolidFit("box", (long, 0.02, 0.03), (x, y, 0.015), yaw, 0.0)
+
+
+def can(x: float, y: float) -> SolidFit:
+    return SolidFit("cylinder", (0.033, 0.115), (x, y, 0.0575), 0.0, 0.0)
+
+
+def looked(memory: SolidMemory, *fits: SolidFit, tick: int = 1, gone: bool = False) -> None:
+    memory.look(fits, ORIGIN, tick, lambda _: gone)
+
+
+def only(memory: SolidMemory, pose: Pose = ORIGIN, tick: int = 1) -> SeenSolid:
+    (one,) = memory.solids(pose, tick)
+    return one
+
+
+def test_a_thing_counts_from_its_second_picture_on_by_the_median() -> None:
+    memory = SolidMemory()
+    looked(memory, box(0.200, 0.1), tick=1)
+    assert memory.solids(ORIGIN, 1) == ()
+    for tick, x in enumerate((0.202, 0.215, 0.201, 0.203), start=2):
+        looked(memory, box(x, 0.1), tick=tick)
+    assert only(memory).position == pytest.approx((0.202, 0.1, 0.015))
+    assert only(memory).seen == 5
+    assert only(memory, tick=55).age == pytest.approx(1.0)
+
+
+def test_two_things_side_by_side_keep_their_numbers() -> None:
+    memory = SolidMemory()
+    for tick, first in enumerate((box(0.2, 0.0), box(0.201, 0.0), box(0.199, 0.0)), start=1):
+        looked(memory, *((first, can(0.2, 0.06)) if tick % 2 else (can(0.2, 0.06), first)))
+    near, far = memory.solids(ORIGIN, 3)
+    assert (near.id, near.shape, far.id, far.shape) == (1, "box", 2, "cylinder")
+
+
+def test_a_thing_that_was_moved_is_where_it_is_now() -> None:
+    memory = SolidMemory()
+    for tick in range(1, 6):
+        looked(memory, can(0.2, 0.0), tick=tick)
+    looked(memory, can(0.226, 0.0), tick=6)
+    assert only(memory).position[0] == pytest.approx(0.226)
+    assert only(memory).id == 1
+
+
+def test_a_thing_that_is_seen_through_goes_and_one_that_is_hidden_stays() -> None:
+    memory = SolidMemory()
+    for tick in (1, 2):
+        looked(memory, can(0.2, 0.0), tick=tick)
+    for tick in range(3, 30):
+        looked(memory, tick=tick)
+    assert only(memory).age == 0.0
+    for tick in range(30, 30 + MISSES):
+        looked(memory, tick=tick, gone=True)
+    assert memory.solids(ORIGIN, 40) == ()
+
+
+def test_what_was_not_seen_for_long_is_forgotten_and_there_are_not_too_many() -> None:
+    memory = SolidMemory()
+    for tick in (1, 2):
+        looked(memory, *(can(0.1 * k, 1.0) for k in range(MOST + 20)), tick=tick)
+    assert len(memory.solids(ORIGIN, 2)) == MOST
+    looked(memory, tick=3 + round(KEPT_S * 50))
+    assert memory.solids(ORIGIN, 3) == ()
+
+
+def test_a_body_that_has_driven_on_finds_the_thing_in_its_own_frame() -> None:
+    memory = SolidMemory()
+    before, there = Pose(x=1.0, y=2.0, yaw=math.pi / 2), Pose(x=1.0, y=2.2, yaw=math.pi)
+    for tick in (1, 2):
+        memory.look([box(0.3, 0.1, yaw=0.2)], before, tick, lambda _: False)
+    seen = only(memory, there)
+    assert seen.position == pytest.approx((0.1, -0.1, 0.015))
+    assert math.remainder(seen.yaw - (0.2 - math.pi / 2), math.pi / 2) == pytest.approx(0.0)
+
+
+def test_yaws_of_a_box_that_jump_by_a_quarter_are_the_same() -> None:
+    memory = SolidMemory()
+    for tick, yaw in enumerate((0.78, -0.79, 0.77, -0.78), start=1):
+        looked(memory, box(0.2, 0.0, yaw, long=0.02), tick=tick)
+    off = math.remainder(only(memory).yaw - math.pi / 4, math.pi / 2)
+    assert abs(off) < 0.02
+
+
+def test_the_class_that_was_recognised_most_often_is_its_label() -> None:
+    memory = SolidMemory()
+    for tick in (1, 2):
+        looked(memory, can(0.3, 0.0), box(0.5, 0.2), tick=tick)
+    for label in ("cylinder", "can", "can"):
+        memory.name(label, 0.32, 0.01, ORIGIN)
+    memory.name("cube", 0.9, 0.9, ORIGIN)  # stands nowhere near
+    near, far = memory.solids(ORIGIN, 2)
+    assert (near.label, far.label) == ("can", "")
+
+
+def test_a_memory_without_anything_is_named_in_vain() -> None:
+    memory = SolidMemory()
+    memory.name("can", 0.3, 0.0, ORIGIN)
+    assert memory.solids(ORIGIN, 1) == ()
