@@ -22,7 +22,7 @@ LINK_M = 0.006  # least gap between two things
 NEARER_M = 0.02  # than a thing: what is so may hide a part of it
 RING_PX, MOST_HIDDEN = 2, 0.08  # round a thing, and the share of that which may be nearer
 EDGE_PX = 2  # at the edges of a picture
-TOUCH_M = 0.02  # from a thing, within which the arm hides a part of it, or holds it
+TOUCH_M = 0.01  # from a thing, within which the arm hides a part of it, or holds it
 THROUGH_M = 0.01  # behind a thing: what is seen there shows that it is gone
 Mask = NDArray[np.bool_]
 
