@@ -14,6 +14,8 @@ from gigabrain_drivers.driver.arm_model import arm_text
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.sim.body import sim_body
 from gigabrain_drivers.sim.physics import Simulation
+from gigabrain_drivers.sim.scene_message import SceneWriter
+from gigabrain_drivers.sim.scene_model import SceneModel
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics
@@ -152,3 +154,11 @@ def test_a_model_that_cannot_be_put_together_is_refused(
     path.write_text(MODEL.read_text().replace(before, after))
     with pytest.raises(ConfigError, match=problem):
         arm_text(path, [])
+
+
+def test_a_viewer_shows_its_rollers_too_though_they_have_no_names() -> None:
+    simulation = make()
+    writer = SceneWriter(simulation.model, simulation.data, "arena")
+    scene = writer.scene(1, (), {})
+    assert len(set(scene.bodies)) == len(scene.bodies)
+    assert SceneModel(scene).place(writer.poses(1))

@@ -67,7 +67,7 @@ class SceneWriter:
         return SimScene(
             version=version,
             world=self._world[-256:],
-            bodies=("world", *(used.get(body, model.body(body).name[:128]) for body in bodies)),
+            bodies=("world", *(used.get(body) or self._name(body) for body in bodies)),
             kinds=rows.kinds.tobytes(),
             owners=numbers[rows.bodies].astype("<u2").tobytes(),
             sizes=rows.sizes.tobytes(),
@@ -88,6 +88,9 @@ class SceneWriter:
             body for body in np.flatnonzero(self._moving)
             if body in used or not self._spare[body]
         ], np.int64)  # fmt: skip
+
+    def _name(self, body: int) -> str:
+        return str(self._model.body(body).name[:128]) or f"body {body}"
 
     def _rows(self, geoms: list[int]) -> "_Rows":
         """Return the shapes of those geoms that are drawn."""

@@ -165,8 +165,10 @@ class Truth:
 
 def _hand(model: mujoco.MjModel) -> list[int]:
     """Return the bodies whose pads touch what the robot holds."""
-    names = (f"{ROBOT}pad_fixed", f"{ROBOT}pad_moving")
-    geoms = [geom for geom in range(model.ngeom) if model.geom(geom).name in names]
+    pads = "pad_fixed", "pad_moving"  # with a prefix, where the arm stands on a base
+    names = [str(model.geom(geom).name) for geom in range(model.ngeom)]
+    mine = [name.startswith(ROBOT) and name.endswith(pads) for name in names]
+    geoms = [geom for geom, is_mine in enumerate(mine) if is_mine]
     return [int(model.geom_bodyid[geom]) for geom in geoms]
 
 
