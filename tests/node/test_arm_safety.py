@@ -239,3 +239,34 @@ def test_an_estop_or_a_dead_process_holds_a_moving_arm(
     assert np.degrees(np.abs(rig.posture - held)).max() < 2.0
     assert rig.gate.mode != "enabled"
     assert not rig.touched
+
+
+def test_the_jaw_opens_and_rolls_all_the_way_as_it_never_touches_the_wrist() -> None:
+    body = load_robot("so101").description()
+    shape = MujocoArm(MJCF, body)
+    names = [joint.name for joint in body.joints]
+    assert body.arm
+    rolls = [np.array(body.arm.home) for _ in range(200)]
+    random = np.random.default_rng(1)
+    for posture in rolls:
+        for name in ("wrist_roll", "gripper"):
+            joint = body.joints[names.index(name)]
+            posture[names.index(name)] = random.uniform(joint.lower, joint.upper)
+    everything = np.full((len(rolls), len(shape.levers)), 0.03)
+    near = shape.near(np.array(rolls), everything)
+    kinds = {frozenset(shape.describe(int(pair))[1:]) for pair in near.pairs}
+    assert {"wrist", "jaw"} not in kinds
+    model = mujoco.MjModel.from_xml_string(MJCF)
+    data = mujoco.MjData(model)
+    geoms = [
+        [geom for geom in range(model.ngeom) if model.body(model.geom_bodyid[geom]).name == name]
+        for name in ("wrist", "jaw")
+    ]
+    for posture in rolls:
+        for name, place in zip(names, posture, strict=True):
+            data.joint(name).qpos = place
+        mujoco.mj_kinematics(model, data)
+        apart = [
+            mujoco.mj_geomDistance(model, data, a, b, 1.0, None) for a in geoms[0] for b in geoms[1]
+        ]
+        assert min(apart) > 0.004
