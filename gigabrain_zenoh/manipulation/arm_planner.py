@@ -30,6 +30,8 @@ from gigabrain_zenoh.manipulation.planner import NoPath, plan
 
 TABLE = "the table"
 SUNK_M = 0.001  # of the floor below its place, as things stand on it
+SHARES = (0.6, 0.55, 0.7, 0.48, 0.78)  # of its reach, at which a thing is best grasped
+BEFORE_M = 0.08  # between the body and a thing that it picks up
 ORIENTATION_RAD = math.radians(2)  # by which the approach of a tool that reaches may be off
 
 
@@ -63,6 +65,9 @@ class ArmPlanner:
         self._times = TimeParametrization(eased(self.arm.joints, FAST))
         self._around = surroundings(body.arm)
         self._pick_place: PickPlacePlanner | None = None
+        self._front = max(x for x, _ in body.footprint)  # [m]
+        base = self.arm.chain.fixed[0, :2, 3]
+        self._reach = float(np.linalg.norm(base) + self.arm.levers(0.0)[0])  # [m]
 
     def reach(
         self,
@@ -119,12 +124,24 @@ class ArmPlanner:
         return Plan(phases=(Phase(name="grip", gripper=to),))
 
     def pick(
-        self, thing: Thing, things: Sequence[Thing], posture: Floats, without: int
+        self,
+        thing: Thing,
+        things: Sequence[Thing],
+        posture: Floats,
+        without: int,
+        *,
+        drives: bool = False,
     ) -> Plan | NoWay:
-        """Return how to pick a thing up; `without` as in `PickPlacePlanner.pick`."""
+        """Return how to pick a thing up; `without` as in `PickPlacePlanner.pick`.
+
+        Where there is no way from here, a body that `drives` is told how far it should stand.
+        """
+        if drives and math.hypot(*thing.position[:2]) > self._reach:
+            return NoWay(reason=f"{thing.name}: too far", stand_off=self._stand_off(thing, posture))
         found = self._picker().pick(thing, self._all(things), posture, without)
         if isinstance(found, NoWay):
-            return found
+            stand_off = self._stand_off(thing, posture) if drives and not without else None
+            return replace(found, stand_off=stand_off)
         grip = next(phase.gripper for phase in found.phases if phase.name == "close")
         assert grip is not None
         hold = Hold(thing=found.held, grip=grip, opening=found.grasp.opening)
@@ -166,6 +183,16 @@ class ArmPlanner:
     def holds(self, measured: float, wanted: float) -> bool:
         """Return whether the gripper has stopped short of where it was sent."""
         return self._picker().holds(measured, wanted)
+
+    def _stand_off(self, thing: Thing, posture: Floats) -> float | None:
+        """Return how far ahead of the base a thing is grasped well [m]; None for nowhere."""
+        least = self._front + float(np.hypot(*thing.half[:2])) + BEFORE_M
+        for far in (share * self._reach for share in SHARES):
+            place = np.array([far, 0.0, thing.position[2]])
+            there = replace(thing, position=place, axes=turned(0.0))
+            if far >= least and self._picker().can_grasp(there, self._around, posture):
+                return far
+        return None
 
     def _picker(self) -> PickPlacePlanner:
         """Return the planner of picks. Raises ConfigError for an arm that cannot hold things."""

@@ -66,7 +66,11 @@ class GraspPlanner:
         self.arm, self._inverse, self._opening = arm, inverse, arm.opening()
 
     def grasps(
-        self, thing: Thing, others: Sequence[Thing], start: Floats | None = None
+        self,
+        thing: Thing,
+        others: Sequence[Thing],
+        start: Floats | None = None,
+        enough: int = ENOUGH,
     ) -> list[Grasp] | NoGrasp:
         """Return the ways to grasp a thing, those with the largest clearance first.
 
@@ -74,6 +78,7 @@ class GraspPlanner:
             thing: A box, cylinder or sphere, in the frame of the arm's base.
             others: What is around it: the table, other things.
             start: A posture (n,); results tend to be near it.
+            enough: How many are looked for.
         """
         if thing.kind == "floor":
             raise ConfigError(f"{thing.name}: a floor cannot be grasped")
@@ -97,7 +102,7 @@ class GraspPlanner:
                 closed=self._opening.position(width),
                 clearance=checkers[width][1].clearance(posture).distance,
             ))  # fmt: skip
-            if len(found) == ENOUGH:
+            if len(found) == enough:
                 break
         if found:
             return sorted(found, key=lambda one: -one.clearance)

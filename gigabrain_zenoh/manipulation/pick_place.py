@@ -36,7 +36,7 @@ SLOW = 0.35  # of the joints' speeds, with a thing in the gripper
 CREEP = 0.1  # the same straight to a thing or its place: safety slows single joints near the table
 SQUEEZE = 0.12  # of the gripper's range, beyond the thing's width
 EASED = 0.035  # the same, once it is held: what servos can do for long
-HELD_SHARE = 0.02  # of the gripper's range, short of its target: something is between the fingers
+HELD_SHARE = 0.01  # of the gripper's range, short of its target: something is between the fingers
 LIFT_M = 0.05  # straight up
 PLACE_GAP_M = 0.003  # above what it is put on, when it is let go of
 PLACE_YAWS = 16  # turns of what is put down that are tried
@@ -65,6 +65,7 @@ class NoWay:
     """Why something cannot be picked up or put down."""
 
     reason: str  # for people
+    stand_off: float | None = None  # [m], how far ahead of its base a thing can be picked up
 
 
 class PickPlacePlanner:
@@ -105,6 +106,10 @@ class PickPlacePlanner:
                 return one
             fault = one
         return fault
+
+    def can_grasp(self, thing: Thing, others: Sequence[Thing], posture: Floats) -> bool:
+        """Return whether there is a way to grasp a thing."""
+        return not isinstance(self._grasps.grasps(thing, others, posture, enough=1), NoGrasp)
 
     def back_off(self, grasp: Grasp, posture: Floats) -> tuple[Phase, ...]:
         """Return the way from a thing that is not held: open, and back where it came from."""
@@ -278,13 +283,12 @@ def _at(tool: Frame, held: Thing) -> Thing:
 
 
 def _upright(axes: Floats) -> Floats:
-    """Return axes (3, 3) turned by the smallest angle so that one of them points up or down."""
-    k = int(np.argmax(np.abs(axes[2])))
-    up = np.array([0.0, 0.0, math.copysign(1.0, axes[2, k])])
-    axis = np.cross(axes[:, k], up)
-    sin, cos = float(np.linalg.norm(axis)), float(axes[:, k] @ up)
-    if sin < 1e-9:
-        return axes
+    """Return axes (3, 3) turned by the smallest angle so that the last one points up."""
+    up = np.array([0.0, 0.0, 1.0])
+    axis = np.cross(axes[:, 2], up)
+    sin, cos = float(np.linalg.norm(axis)), float(axes[2, 2])
+    if sin < 1e-9:  # upright already, or upside down
+        return axes if cos > 0.0 else axes @ np.diag([1.0, -1.0, -1.0])
     x, y, z = axis / sin
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     turn = np.eye(3) + sin * cross + (1 - cos) * cross @ cross

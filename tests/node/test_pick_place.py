@@ -11,8 +11,9 @@ from gigabrain_drivers.sim.body import MujocoOptions, sim_body
 from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics
 from gigabrain_zenoh.manipulation.collision import Thing
 from gigabrain_zenoh.manipulation.pick_place import NoWay, PickPlacePlanner
-from gigabrain_zenoh.qa.bench.hands import TABLE, arm_before, draw, measure_hands, pan_axis
+from gigabrain_zenoh.qa.bench.hands import arm_before, draw, measure_hands, pan_axis
 
+TABLE = Thing(name="table", kind="floor", position=np.array([0.0, 0.0, -0.001]))
 SEEDS = (0, 2, 4, 5, 9, 13)  # two of each kind, light and heavy
 
 
@@ -100,3 +101,23 @@ def test_a_place_out_of_reach_is_refused_with_its_reason(planner: PickPlacePlann
     )
     assert isinstance(found, NoWay)
     assert "too far" in found.reason
+
+
+@pytest.mark.parametrize("wrist", [-1.2, 0.0, 1.2])
+def test_a_thing_that_was_tilted_on_the_way_is_put_down_on_its_foot(
+    planner: PickPlacePlanner, wrist: float
+) -> None:
+    foot = Thing(
+        name="can", kind="cylinder", size=(0.02, 0.06), position=np.array([0.24, 0.0, 0.03])
+    )
+    pick = planner.pick(foot, [TABLE], home(planner))
+    assert not isinstance(pick, NoWay)
+    carrying = np.array([0.0, -1.0, 0.4, wrist, 0.3])
+    found = planner.place(
+        pick.held, np.array([0.2, 0.12, 0.03]), [TABLE], carrying, pick.grasp.opening
+    )
+    assert not isinstance(found, NoWay), found.reason
+    lowered = found.phases[1].arm
+    assert lowered
+    end = planner.arm.forward(lowered.positions[-1])
+    assert (end.axes @ pick.held.axes[:, 2])[2] > 0.98
