@@ -25,6 +25,7 @@ Metres = Annotated[float, Parameter(allow_leading_hyphen=True)]
 Distance = Annotated[float, Parameter(allow_leading_hyphen=True)]
 BAR = 20  # characters of a joint's range
 WATCH_S = 0.2
+MOST_LABEL = 64
 SLOW = math.radians(45)  # [rad/s], of an arm that a person sends somewhere
 SURE = "all joints are let go of, and the arm may fall; hold it, and type yes: "
 
@@ -165,6 +166,27 @@ def pick(
         raise ConfigError(f"arm pick: expected --box, --cylinder or --sphere, got {shapes} of them")
     thing = Solid(box=box, cylinder=cylinder, sphere=sphere, at=(x, y, z), yaw=math.radians(yaw))
     mission = Mission(things={"the thing": thing}, do=(Step(pick="the thing"),))
+    _carry_out(at, mission, mode, wait)
+
+
+def pick_seen(
+    label: str, /, *, mode: Mode = "replace", wait: Wait = True, at: RobotAddress = LOCAL
+) -> None:
+    """Pick up a thing that the camera recognises; a robot that drives looks for one first.
+
+    Example: gigabrain pick can
+
+    It needs a depth camera, and the process `recognition`: start the robot with --cameras.
+
+    Args:
+        label: Class of the thing; docs/how-to/recognition.md lists them.
+    """
+    from gigabrain_zenoh.decision.tasks.arm_steps import Solid
+    from gigabrain_zenoh.decision.tasks.mission import Mission, Step
+
+    if not 0 < len(label) <= MOST_LABEL:
+        raise ConfigError(f"pick: expected a class of at most {MOST_LABEL} characters, such as can")
+    mission = Mission(things={label: Solid(label=label)}, do=(Step(pick=label),))
     _carry_out(at, mission, mode, wait)
 
 

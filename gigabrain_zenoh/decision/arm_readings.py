@@ -8,10 +8,12 @@ import numpy as np
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.body import BodyDescription, RobotState
-from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold
+from gigabrain_zenoh.decision.tasks.arm_steps import NamedPosture
+from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold, Plan
 from gigabrain_zenoh.manipulation.phases import Phase
 
 GRIPS = 0.1  # of the gripper's greatest speed, above which it moves: an encoder's steps are less
+MOVED = 0.02  # [rad] or [m] off the beginning of a plan: it was made for another posture
 SENT = 0.01  # of the gripper's range, within which it was sent to its target
 
 
@@ -37,10 +39,17 @@ def measured_posture(planner: ArmPlanner, state: RobotState) -> Floats:
     return np.array([found[name] for name in planner.arm.names])
 
 
-def home(body: BodyDescription) -> dict[str, float]:
-    """Return the home posture [rad] or [m]."""
+def posture_of(body: BodyDescription, name: NamedPosture) -> dict[str, float]:
+    """Return a posture of the robot's file [rad] or [m]."""
     assert body.arm
-    return dict(zip((joint.name for joint in body.joints), body.arm.home, strict=True))
+    places = body.arm.home if name == "home" else body.arm.carry
+    return dict(zip((joint.name for joint in body.joints), places, strict=True))
+
+
+def begins_at(plan: Plan, posture: Floats) -> bool:
+    """Return whether a plan's first trajectory begins where the arm was sent (n,) [rad] or [m]."""
+    first = next((phase.arm for phase in plan.phases if phase.arm), None)
+    return first is None or bool(np.abs(first.positions[0] - posture).max() < MOVED)
 
 
 def holds(planner: ArmPlanner, hold: Hold, state: RobotState) -> bool:

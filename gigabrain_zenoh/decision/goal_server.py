@@ -40,6 +40,7 @@ from gigabrain_zenoh.decision.tasks import mission as missions
 from gigabrain_zenoh.decision.tasks.mission import Mission
 from gigabrain_zenoh.decision.zones import ZoneSource
 from gigabrain_zenoh.errors import GigabrainError, Refused
+from gigabrain_zenoh.geometry.pose import to_parent
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.decision.manipulator import Manipulator
@@ -181,7 +182,19 @@ class GoalServer(InputSource):
         if self._manipulator is None:
             return Intent(behaviour=self._name, reason=idle.reason), StepOutcome()
         held, seen = self._source.held(state), self._seen.at(state)
-        return self._manipulator.step(state, body, wanted, idle, held, seen)
+        intent, outcome = self._manipulator.step(state, body, wanted, idle, held, seen)
+        return intent, self._on_map(outcome, state)
+
+    def _on_map(self, outcome: StepOutcome, state: RobotState) -> StepOutcome:
+        """Return an outcome with what to approach in the map, instead of in the body's frame."""
+        near = outcome.approach
+        if near is None:
+            return outcome
+        here = self._source.here(state.boot, state.tick)
+        if here is None:
+            return replace(outcome, approach=None)
+        x, y = to_parent(here, near.x, near.y)
+        return replace(outcome, approach=replace(near, x=x, y=y))
 
     def _refused(self, number: int, reason: str) -> StepResult:
         """Return that a command cannot be carried out."""

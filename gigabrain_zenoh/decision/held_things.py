@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.body import BodyDescription
 from gigabrain_zenoh.decision.tasks.arm_steps import ArmAction, HeldThing, PlaceThing, Solid
 from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold
 from gigabrain_zenoh.manipulation.collision import Thing, turned
@@ -42,8 +43,14 @@ def placed(
     tool, thing = planner.arm.forward(measured), hold.thing
     at, ahead = tool.place(thing.position), tool.axes @ thing.axes[:, 0]
     if isinstance(action, PlaceThing):  # it stands on something there
-        at = np.array([at[0], at[1], action.at[2]])
+        at = np.array([at[0], at[1], action.at[2] if len(action.at) == 3 else at[2]])
     return thing.name, solid_of(thing, at, math.atan2(ahead[1], ahead[0]))
+
+
+def standing_height(hold: Hold, body: BodyDescription) -> float:
+    """Return how high the middle of what is held is while it stands on the floor [m]."""
+    assert body.arm
+    return (body.arm.floor or 0.0) + float(hold.thing.half[2])
 
 
 def held_thing(hold: Hold) -> HeldThing:

@@ -14,20 +14,33 @@ from gigabrain_schemas.objects import SeenSolid
 from gigabrain_schemas.topics import ARM_MODEL
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.decision.arm_readings import (
+    begins_at,
     gripper_moves,
     gripper_place,
     holds,
-    home,
     measured_posture,
     off_from,
     pace,
+    posture_of,
     sent_posture,
     sent_to,
 )
-from gigabrain_zenoh.decision.behaviours import ArmCommand, Idle, StepOutcome, StepResult
-from gigabrain_zenoh.decision.held_things import held_thing, hold_of, placed, thing_of
+from gigabrain_zenoh.decision.behaviours import (
+    ArmCommand,
+    Idle,
+    StepOutcome,
+    StepResult,
+    Target,
+)
+from gigabrain_zenoh.decision.held_things import (
+    held_thing,
+    hold_of,
+    placed,
+    standing_height,
+    thing_of,
+)
 from gigabrain_zenoh.decision.lookout import Lookout
-from gigabrain_zenoh.decision.seen_things import located
+from gigabrain_zenoh.decision.seen_things import approach, located, still_stands, unseen
 from gigabrain_zenoh.decision.tasks.arm_steps import (
     ArmAction,
     Gripper,
@@ -49,7 +62,7 @@ TRIES = 3  # to pick a thing up, each with another grasp
 HOLD_UPS = 5  # of one command, after which it fails
 WAIT_TICKS = 100  # for a joint that the gate holds back, before another way is planned
 MISSED = f"it was not caught, {TRIES} times"
-CARRYING = ("lift", "traverse", "lower")  # phases in which a thing has to be held
+CARRYING = ("lift", "traverse", "lower", "move")  # phases in which a thing has to be held
 NO_MODEL = Idle("waiting", "waiting: for the arm's model, robot/arm_model")
 NOT_MEASURED = Idle("waiting", "waiting: for all joints to be measured")
 PLANNING = Idle("planning", "planning")
@@ -79,6 +92,8 @@ class Manipulator:
         self._left: Grasp | None = None  # at which the hand still is, without holding the thing
         self._interim = False  # it goes back from there, or out of a camera's sight
         self._lookout = Lookout()
+        self._seen_as: int | None = None  # number by which a camera knew what is held
+        self._gripped = 0  # tick since which it is held
         self._target: Thing | None = None  # to be picked up, where it stands
 
     def step(
@@ -121,7 +136,8 @@ class Manipulator:
         if command is None:
             return self._still(idle)
         if held:
-            self._interrupt()
+            if self._run:  # a plan that is being made will do, if the arm has not been moved then
+                self._interrupt()
             return self._still(Idle("waiting", f"waiting: {held}"), held=True)
         if planner is None:
             return self._still(NO_MODEL)
@@ -184,13 +200,21 @@ class Manipulator:
         if isinstance(do, Pick) and self._run is None and hold and hold.thing.name == do.thing:
             self._achieve(hold)
             return self._still(Idle("done", self._achieved.reason), self._achieved)
+        if self._hold and still_stands(seen, self._seen_as, state.tick - self._gripped):
+            name = self._hold.thing.name
+            self._set_hold(None)
+            return self._fail(f"{name} is not in the gripper: it is seen where it was")
         if self._run is None and self._left:
             self._back_off(planner, body, state, self._left)
         elif self._run is None:
             if self._planning is None:
-                things = located(command.things, seen)
-                if name := self._unseen(command, things):
-                    return self._look_for(name, planner, state, body, things)
+                held = self._seen_as if self._hold else None
+                things, numbers = located(command.things, seen, held)
+                if isinstance(command.do, Pick) and not self._hold:
+                    self._seen_as = numbers.get(command.do.thing)
+                missing = None if self._hold else unseen(command.do, command.things, things)
+                if missing:
+                    return self._look_for(missing, command, planner, state, body, things)
                 work = self._work(planner, state, body, command.do, things)
                 if isinstance(work, str):
                     return self._fail(work)
@@ -203,29 +227,31 @@ class Manipulator:
                 if self._interim:  # it cannot get out of sight that way
                     self._interim = False
                     return self._still(PLANNING)
-                return self._fail(found.reason)
+                return self._fail(found.reason, approach(self._target, found.stand_off))
+            if not begins_at(found, sent_posture(planner, body, state)):
+                self._interim = False
+                return self._still(PLANNING)
             self._begin(planner, found, state)
         return self._follow(planner, state, body, command)
-
-    def _unseen(self, command: ArmCommand, things: Mapping[str, Solid]) -> str:
-        """Return the name of the thing that is to be picked up, if it is not seen."""
-        if self._hold or not isinstance(command.do, Pick) or command.do.thing in things:
-            return ""
-        return command.do.thing if command.do.thing in command.things else ""
 
     def _look_for(
         self,
         name: str,
+        command: ArmCommand,
         planner: ArmPlanner,
         state: RobotState,
         body: BodyDescription,
         things: Mapping[str, Solid],
     ) -> StepResult:
-        """Hold still until a thing is seen, or begin to move the arm out of sight."""
+        """Hold still until a thing is seen, or begin to move the arm out of sight.
+
+        A body that can drive looks for it elsewhere instead.
+        """
         if not self._lookout.waits(state.tick):
-            posture = self._lookout.aside(body)
+            elsewhere = (command.things[name].label or "") if body.has_base else ""
+            posture = None if elsewhere else self._lookout.aside(body)
             if posture is None:
-                return self._fail(f"{name} is not seen")
+                return self._fail(f"{name} is not seen", seek=elsewhere)
             work = self._work(planner, state, body, TakePosture(posture), things)
             if isinstance(work, str):
                 return self._fail(work)
@@ -248,8 +274,8 @@ class Manipulator:
         match do:
             case Reach(at=at, pitch=pitch):
                 return lambda: planner.reach(np.array(at), pitch, others, posture, hold)
-            case TakePosture(positions=positions):
-                goal = positions or home(body)
+            case TakePosture(to=to):
+                goal = posture_of(body, to) if isinstance(to, str) else to
                 return lambda: planner.take_posture(goal, others, posture, hold)
             case Gripper(to=to):
                 return lambda: planner.grip(to)
@@ -261,11 +287,13 @@ class Manipulator:
                 thing, misses = thing_of(name, things[name]), self._misses
                 self._target = thing
                 around = [one for one in others if one.name != name]
-                return lambda: planner.pick(thing, around, posture, misses)
+                drives = body.has_base
+                return lambda: planner.pick(thing, around, posture, misses, drives=drives)
             case PlaceThing(at=at):
                 if hold is None:
                     return "the gripper holds nothing"
-                return lambda: planner.place(hold, np.array(at), others, posture)
+                target = np.array(at if len(at) == 3 else (*at, standing_height(hold, body)))
+                return lambda: planner.place(hold, target, others, posture)
 
     def _back_off(
         self, planner: ArmPlanner, body: BodyDescription, state: RobotState, grasp: Grasp
@@ -286,6 +314,8 @@ class Manipulator:
         run, plan, hold = self._run, self._plan, self._hold
         assert run
         if hold and run.phase and run.phase.name in CARRYING and not holds(planner, hold, state):
+            if run.phase.name == "lift":
+                return self._missed(planner, body, state)
             self._set_hold(None)
             return self._fail(f"{hold.thing.name} has slipped out of the gripper")
         waits = run.wait(state.tick, *pace(body, state))
@@ -324,6 +354,7 @@ class Manipulator:
     def _grip(self, planner: ArmPlanner, run: PhaseRun, hold: Hold, state: RobotState) -> None:
         """Record that the gripper holds a thing, and have it squeeze less from now on."""
         assert self._target
+        self._gripped = state.tick
         ease = planner.eased(hold, gripper_place(planner, state, hold.grip))
         assert ease.gripper is not None
         run.insert(ease)
@@ -387,9 +418,9 @@ class Manipulator:
         )
         return intent, outcome
 
-    def _fail(self, reason: str) -> StepResult:
+    def _fail(self, reason: str, approach: Target | None = None, seek: str = "") -> StepResult:
         self._drop()
-        outcome = StepOutcome(state="failed", reason=reason[:500])
+        outcome = StepOutcome(state="failed", reason=reason[:500], approach=approach, seek=seek)
         return self._still(Idle("failed", reason), outcome)
 
     def _still(

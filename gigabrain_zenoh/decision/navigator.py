@@ -4,6 +4,7 @@ The import takes long; until it is done, `task_server` already serves goals.
 """
 
 import asyncio
+import dataclasses
 import math
 from typing import Any
 
@@ -46,6 +47,7 @@ from gigabrain_zenoh.navigation.global_planner import Unreachable
 from gigabrain_zenoh.navigation.local_planner import DEFAULTS, LocalSettings
 from gigabrain_zenoh.navigation.zones import NO_ZONES, SpeedCap, ZoneMap
 
+EXACT_M = 0.05  # from where an arm needs the body
 MAX_SCAN_AGE_TICKS = 10  # of a scan to drive by
 MAX_NEAR_OVER_M = 0.25  # beyond, the clearance within reach of the local planner costs alike
 NO_ROUTE = Idle("waiting", "waiting: for a path through the map")
@@ -204,6 +206,8 @@ class Navigator:
         here = compose(context.map_from_odom, context.pose)
         cap = self._speed_cap(context, here, points)
         request = self._request(context, here, route, goal, points, cap)
+        if command.target and command.target.away is not None:
+            request = dataclasses.replace(request, tolerance=EXACT_M)
         plan = self._local_planner(context).plan(request)
         self._routes.report(
             RouteFeedback(

@@ -48,8 +48,8 @@ def place_before(
     front = max(x for x, _ in body.footprint)
     best: tuple[float, Goal] | None = None
     angles = ROUND_RAD if target.yaw is None else target.yaw + BEFORE_RAD
-    for farther in FARTHER_M:
-        away = front + target.radius + GAP_M + farther
+    for farther in FARTHER_M if target.away is None else (0.0,):
+        away = target.away or front + target.radius + GAP_M + farther
         for angle in angles.tolist():
             x, y = target.x + away * math.cos(angle), target.y + away * math.sin(angle)
             cell = costs.cell(x, y)

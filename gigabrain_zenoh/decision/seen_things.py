@@ -3,18 +3,25 @@
 import math
 from collections import deque
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
+from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.objects import SeenSolid, Solids
 from gigabrain_schemas.topics import SOLIDS
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.decision.tasks.arm_steps import Solid
+from gigabrain_zenoh.decision.behaviours import Target
+from gigabrain_zenoh.decision.tasks.arm_steps import ArmAction, Pick, Solid
 from gigabrain_zenoh.geometry.pose import PoseHistory, relative, to_parent
+
+if TYPE_CHECKING:
+    from gigabrain_zenoh.manipulation.collision import Thing  # imports MuJoCo
 
 LIKE_M, LIKE_SHARE = 0.006, 0.3  # by which lengths may differ of what is taken for a thing
 SAME_M = 0.03  # beside where a thing stands by its mission: it is the same, seen
+SEEN_AFTER_TICKS = 50  # since a thing is held: a camera that still sees it stand is right
 NEAR_M = 1.0  # of the body, within which what is seen may be in the arm's way
 Lengths = tuple[float, float, float]
 
@@ -46,29 +53,57 @@ class SeenThings:
         then = self._history.at(boot, newest.basis) if newest else None
         if newest is None or then is None:
             return ()
-        here = relative(state.pose, then)
+        here, older = relative(state.pose, then), (tick - newest.basis) * TICK_S
         moved = []
         for one in newest.solids:
             x, y = to_parent(here, *one.position[:2])
-            moved.append(replace(one, position=(x, y, one.position[2]), yaw=one.yaw + here.yaw))
+            place, yaw = (x, y, one.position[2]), one.yaw + here.yaw
+            moved.append(replace(one, position=place, yaw=yaw, age=one.age + older))
         return tuple(sorted(moved, key=lambda one: math.hypot(*one.position[:2])))
 
 
-def located(things: Mapping[str, Solid], seen: tuple[SeenSolid, ...]) -> dict[str, Solid]:
+def located(
+    things: Mapping[str, Solid], seen: tuple[SeenSolid, ...], held: int | None = None
+) -> tuple[dict[str, Solid], dict[str, int]]:
     """Return where things are, those without a place by what is seen; without what is not seen.
 
-    All else that is seen nearby is in the way, by the name `seen` with its number.
+    All else that is seen nearby is in the way, by the name `seen` with its number. What the gripper
+    has `held` since it was seen with that number stands there no more. The second result has the
+    numbers of things that are where they are seen.
     """
     known = {name: one for name, one in things.items() if one.at}
-    left = [one for one in seen if not any(_stands(one, other) for other in known.values())]
+    left = [one for one in seen if one.id != held]
+    left = [one for one in left if not any(_stands(one, other) for other in known.values())]
+    numbers: dict[str, int] = {}
     for name, wanted in things.items():
         if wanted.at is None and (found := next((one for one in left if _fits(wanted, one)), None)):
             left.remove(found)
-            known[name] = _placed(wanted, found)
+            known[name], numbers[name] = _placed(wanted, found), found.id
     for one in left:
         if math.hypot(*one.position[:2]) < NEAR_M:
             known[f"seen {one.id}"] = _placed(Solid(label="thing"), one)
-    return known
+    return known, numbers
+
+
+def unseen(do: ArmAction, things: Mapping[str, Solid], known: Mapping[str, Solid]) -> str | None:
+    """Return the name of the thing that is to be picked up, if it is one that is not `known`."""
+    wanted = isinstance(do, Pick) and do.thing in things and do.thing not in known
+    return do.thing if isinstance(do, Pick) and wanted else None
+
+
+def still_stands(seen: tuple[SeenSolid, ...], number: int | None, held_ticks: int) -> bool:
+    """Return whether what is held for so long was seen standing since, by its number."""
+    since_s = (held_ticks - SEEN_AFTER_TICKS) * TICK_S
+    return any(one.id == number and one.age < since_s for one in seen)
+
+
+def approach(thing: "Thing | None", stand_off: float | None) -> Target | None:
+    """Return a thing that the body should stand so far from [m], in the body's frame."""
+    if thing is None or stand_off is None:
+        return None
+    x, y, _ = thing.position.tolist()
+    radius = float(math.hypot(*thing.half[:2]))
+    return Target(name=thing.name, x=x, y=y, radius=radius, away=stand_off)
 
 
 def _stands(one: SeenSolid, other: Solid) -> bool:

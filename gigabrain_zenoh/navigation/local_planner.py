@@ -105,6 +105,7 @@ class PlanRequest:
     keepouts: tuple[Floats, ...] = ()  # polygons (k, 2) [m] that the body must not enter
     avoid: tuple[Floats, ...] = ()  # polygons (k, 2) [m] that no way should lead through
     max_speed: float | None = None  # [m/s], of a speed zone; the other limits hold as well
+    tolerance: float | None = None  # [m], from the goal at which it is reached; None: the settings'
     response: ActuationModel = field(default_factory=ActuationModel)
     sent: tuple[SentCommand, ...] = ()  # oldest first; those of the last 0.5 s are enough
     delayed: float = 0.0  # [s], how much later than usual what is planned will be obeyed
@@ -310,7 +311,7 @@ class LocalPlanner:
         to, aside = (goal.x, goal.y), self._half_width
         field = self._costs.field(grid, aside, to, moment.path, ways, moment.avoid)
         yaw = math.nan if goal.yaw is None else goal.yaw
-        near, turned = self._settings.position_tolerance, self._settings.yaw_tolerance
+        near, turned = self._tolerance(moment), self._settings.yaw_tolerance
         return Scene(looked, field, discs, goal.x, goal.y, yaw, near, turned, self._track(moment))
 
     def _track(self, moment: PlanRequest) -> Floats:
@@ -365,8 +366,12 @@ class LocalPlanner:
         turn = 0.0 if goal.yaw is None else abs(math.remainder(goal.yaw - pose.yaw, math.tau))
         settings, model = self._settings, self._model
         slow = math.hypot(v.linear_x, v.linear_y) <= max(0.02, ARRIVED_SPEED_SHARE * model.forward)
-        near = off <= settings.position_tolerance and turn <= settings.yaw_tolerance
+        near = off <= self._tolerance(moment) and turn <= settings.yaw_tolerance
         return near and slow and abs(v.angular_z) <= max(0.05, ARRIVED_SPEED_SHARE * model.turning)
+
+    def _tolerance(self, moment: PlanRequest) -> float:
+        given = moment.tolerance
+        return self._settings.position_tolerance if given is None else given
 
     def _stuck(self, moment: PlanRequest) -> bool:
         here, then = moment.pose, self._anchor

@@ -134,6 +134,8 @@ class Arm(Record, frozen=True, kw_only=True):
     tool: Name = "tool"  # site of the model that reaches for things, along its x axis
     home: Annotated[tuple[JointPosition, ...], Meta(min_length=1, max_length=MOST_ARM_JOINTS)]
     # [rad] or [m], a posture in which it is out of the way; one number for each joint
+    carry: Annotated[tuple[JointPosition, ...], Meta(max_length=MOST_ARM_JOINTS)] = ()
+    # the same, in which it holds a thing above its base while that drives; none: it has no such
     rate_hz: Annotated[float, Meta(ge=50.0, le=200.0)] = 50.0  # of control's commands to its joints
     goal_time: Sustain = 1.0  # [s] after the end of a trajectory until its joints are there
     floor: Annotated[float, Meta(ge=-10.0, le=10.0)] | None = None
@@ -380,14 +382,19 @@ class BodyDescription(Record, frozen=True, kw_only=True):
             raise ValueError("arm: joints and arm belong together; one of them is missing")
         if self.arm is None:
             return
-        if len(self.arm.home) != len(self.joints):
+        self._check_posture("home", self.arm.home)
+        if self.arm.carry:
+            self._check_posture("carry", self.arm.carry)
+
+    def _check_posture(self, name: str, positions: tuple[float, ...]) -> None:
+        if len(positions) != len(self.joints):
             raise ValueError(
-                f"arm: home: expected {len(self.joints)} positions, one for each joint"
+                f"arm: {name}: expected {len(self.joints)} positions, one for each joint"
             )
-        for joint, position in zip(self.joints, self.arm.home, strict=True):
+        for joint, position in zip(self.joints, positions, strict=True):
             if not joint.lower <= position <= joint.upper:
                 raise ValueError(
-                    f"arm: home: {joint.name} at {position:g} is outside "
+                    f"arm: {name}: {joint.name} at {position:g} is outside "
                     f"{joint.lower:g} to {joint.upper:g}"
                 )
 

@@ -9,6 +9,7 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_drivers.driver.catalog import load_robot, robot_path
+from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import ArmModel, Joint
 from gigabrain_schemas.objects import Detection, Detections, SeenSolid
 from gigabrain_schemas.topics import ARM_MODEL, BODY, DEPTH, DETECTIONS, SOLIDS, STATE
@@ -100,6 +101,11 @@ class SeeingRig(Rig):
         """Have the camera take pictures."""
         self.seen = self.camera.look(self.arm.state())
 
+    def tick(self) -> None:
+        """Have 20 ms pass."""
+        self.seen = tuple(replace(one, age=one.age + TICK_S) for one in self.seen)
+        super().tick()
+
 
 @pytest.fixture
 def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[SeeingRig]:
@@ -142,3 +148,20 @@ def test_what_is_nowhere_seen_fails_in_one_line(rig: SeeingRig) -> None:
     done = rig.carry_out("things: {can: {label: can}}\ndo: [{pick: can}]")
     assert done.state == "failed"
     assert done.reason == "picking up can: can is not seen"
+
+
+@pytest.mark.parametrize("rig", [ASIDE], indirect=True)
+def test_what_is_seen_standing_where_it_was_is_not_in_the_gripper(rig: SeeingRig) -> None:
+    rig.look()
+    rig.give("things: {cube: {box: [0.03, 0.03, 0.03]}}\ndo: [{pick: cube}, {posture: home}]")
+    while rig.phases[-1:] != ["lift"]:
+        rig.tick()
+    (standing,) = rig.seen
+    for _ in range(300):
+        rig.seen = (replace(standing, age=0.0),)
+        rig.tick()
+        if rig.queue.status.done:
+            break
+    done = rig.queue.status.done[0]
+    assert done.state == "failed"
+    assert "cube is not in the gripper: it is seen where it was" in done.reason

@@ -45,6 +45,7 @@ class Target(Struct, frozen=True, kw_only=True):
     y: float  # [m]
     radius: float  # [m]
     yaw: float | None = None  # [rad], where the face of a tag looks
+    away: float | None = None  # [m], from the body's middle to its own; None: a bit before it
 
 
 class DriveCommand(Struct, frozen=True):
@@ -86,6 +87,8 @@ class StepOutcome(Struct, frozen=True, kw_only=True):
     heading_error: float | None = None  # [rad] from the requested heading
     holds: HeldThing | None = None  # what the gripper holds after a command that is done
     placed: tuple[str, Solid] | None = None  # a thing, and where it was put down
+    approach: Target | None = None  # a thing that the body has to stand nearer to
+    seek: str = ""  # the class of a thing that it has to look for elsewhere
 
 
 class Idle(NamedTuple):

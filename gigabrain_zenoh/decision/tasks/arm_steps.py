@@ -1,6 +1,6 @@
 """Steps of a mission that move an arm, and the things round it. All is in its base's frame."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from importlib.util import find_spec
 from typing import Annotated, Literal
 
@@ -16,8 +16,10 @@ NEEDED = ("mujoco", "ruckig", "numba")  # packages of the extra `arm`
 Metres = Annotated[float, Meta(ge=-10.0, le=10.0)]
 Side = Annotated[float, Meta(ge=0.001, le=10.0)]  # [m]
 Point3 = tuple[Metres, Metres, Metres]  # x, y, z [m]
+Spot = Annotated[tuple[Metres, ...], Meta(min_length=2, max_length=3)]  # x, y, and maybe z [m]
 JointPlace = Annotated[float, Meta(ge=-100.0, le=100.0)]  # [rad] or [m]
-Posture = Literal["home"] | Annotated[dict[Name, JointPlace], Meta(min_length=1)]
+NamedPosture = Literal["home", "carry"]  # of the robot's file
+Posture = NamedPosture | Annotated[dict[Name, JointPlace], Meta(min_length=1)]
 Cosine = Annotated[float, Meta(ge=-1.001, le=1.001)]
 Rotation = Annotated[tuple[Cosine, ...], Meta(min_length=9, max_length=9)]
 GripperPlace = Literal["open", "close"] | JointPlace
@@ -62,9 +64,9 @@ class Reach(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_
 
 
 class TakePosture(Struct, frozen=True):
-    """Move joints to positions [rad] or [m]; without any, to the home posture."""
+    """Move joints to positions [rad] or [m], or the arm to a posture of the robot's file."""
 
-    positions: dict[str, float]
+    to: NamedPosture | dict[str, float]
 
 
 class Gripper(Struct, frozen=True):
@@ -80,9 +82,9 @@ class Pick(Struct, frozen=True):
 
 
 class PlaceThing(Struct, frozen=True):
-    """Put down what is held, its middle at a point."""
+    """Put down what is held, its middle at a point; without a height, on the floor."""
 
-    at: Point3
+    at: Spot
 
 
 ArmAction = Reach | TakePosture | Gripper | Pick | PlaceThing
@@ -93,8 +95,9 @@ def describe(action: ArmAction) -> str:
     match action:
         case Reach(at=at):
             return f"reaching for {describe_point(at)}"
-        case TakePosture(positions=positions):
-            return f"moving {', '.join(positions)}" if positions else "moving to the home posture"
+        case TakePosture(to=to):
+            posture = isinstance(to, str)
+            return f"moving to the {to} posture" if posture else f"moving {', '.join(to)}"
         case Gripper(to=to):
             words = {"open": "opening the gripper", "close": "closing the gripper"}
             return words.get(str(to), "moving the gripper")
@@ -104,7 +107,7 @@ def describe(action: ArmAction) -> str:
             return f"placing at {describe_point(at)}"
 
 
-def describe_point(point: Point3) -> str:
+def describe_point(point: Sequence[float]) -> str:
     """Return a point as text [m]."""
     return f"({', '.join(f'{one:.3f}' for one in point)})"
 
@@ -126,8 +129,14 @@ def check(
     known = {joint.name: joint for joint in body.joints}
     gripper = next((joint for joint in body.joints if joint.part == "gripper"), None)
     for action in actions:
-        if isinstance(action, TakePosture):
-            for name, position in action.positions.items():
+        if action == TakePosture("carry") and not body.arm.carry:
+            raise Refused(
+                f"{body.robot_type} has no carry posture; expected arm: carry in its file"
+            )
+        if isinstance(action, PlaceThing) and len(action.at) == 2 and body.arm.floor is None:
+            raise Refused(f"{body.robot_type} reaches no floor; give a height to place at")
+        if isinstance(action, TakePosture) and not isinstance(action.to, str):
+            for name, position in action.to.items():
                 if name not in known:
                     raise unknown("joint", name, known)
                 _check_range(known[name], position)

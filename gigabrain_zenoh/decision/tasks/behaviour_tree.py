@@ -12,12 +12,14 @@ from py_trees.common import Status
 from py_trees.composites import Selector, Sequence
 from py_trees.decorators import Decorator, Repeat, Retry
 
+from gigabrain_zenoh.decision.tasks.arm_steps import Pick
 from gigabrain_zenoh.decision.tasks.conditions import Condition, parse
 from gigabrain_zenoh.decision.tasks.leaves import (
     ArmNode,
     ConditionNode,
     DriveNode,
     MissionContext,
+    PickNode,
     ScriptNode,
     SeekNode,
     WaitNode,
@@ -144,6 +146,8 @@ class TreeBuilder:
             return self._go_to(step.goto)
         if step.find is not None:
             return SeekNode(step.find if isinstance(step.find, str) else step.find.tag, context)
+        if isinstance(step.arm, Pick):
+            return PickNode(step.arm, context)
         if step.arm:
             return ArmNode(step.arm, context)
         if step.explore or step.visit:

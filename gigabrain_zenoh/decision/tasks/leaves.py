@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 
+from msgspec.structs import replace
 from py_trees.behaviour import Behaviour
 from py_trees.common import Status
 
@@ -17,17 +18,18 @@ from gigabrain_zenoh.decision.behaviours import (
     DriveCommand,
     DriveKind,
     StepOutcome,
+    Target,
     describe_goal,
 )
 from gigabrain_zenoh.decision.known_objects import Seek, Sought, Wanted, named
-from gigabrain_zenoh.decision.tasks.arm_steps import ArmAction, HeldThing, Solid, describe
+from gigabrain_zenoh.decision.tasks.arm_steps import ArmAction, HeldThing, Pick, Solid, describe
 from gigabrain_zenoh.decision.tasks.conditions import Condition, Read
 from gigabrain_zenoh.decision.tasks.mission import Script
 from gigabrain_zenoh.decision.tasks.scripts import Run
 
 StartScript = Callable[[Script], Run]
 MOVED_M = 0.15  # that a target may be off where the robot drives to
-
+MOST_WAYS = 4  # to a thing that is to be picked up
 NOBODY_LOOKS = "waiting: nothing is recognised in pictures; run the process `recognition`"
 
 
@@ -94,18 +96,23 @@ class DriveNode(Leaf):
     """Issues a drive command, and ends with its outcome."""
 
     def __init__(
-        self, kind: DriveKind, context: MissionContext, goal: Goal | None = None, place: str = ""
+        self,
+        kind: DriveKind,
+        context: MissionContext,
+        goal: Goal | None = None,
+        place: str = "",
+        target: Target | None = None,
     ) -> None:
         doing = {"explore": "exploring", "visit": "visiting a place"}.get(kind)
+        if target:
+            doing = f"going before {target.name}"
         super().__init__(doing or f"going to {place or (goal and describe_goal(goal))}", context)
-        self._command = DriveCommand(0, kind, goal)
+        self._command = DriveCommand(0, kind, goal, target)
         self._prefix = f"{place}: " if place else ""
 
     def initialise(self) -> None:
         """Start the node, or start it again."""
-        self._command = DriveCommand(
-            next(self.context.numbers), self._command.kind, self._command.goal
-        )
+        self._command = replace(self._command, number=next(self.context.numbers))
 
     def update(self) -> Status:
         """Advance the node by one tick, and return its status."""
@@ -205,6 +212,44 @@ class SeekNode(Leaf):
         if self._missed:
             text = "; ".join((*dict.fromkeys(self._missed.values()), text))
         return text
+
+
+class PickNode(ArmNode):
+    """Picks a thing up; a body that can drive looks for it first, and goes near enough."""
+
+    def __init__(self, action: Pick, context: MissionContext) -> None:
+        super().__init__(action, context)
+        self._way: DriveNode | SeekNode | None = None  # to where the arm tries again
+        self._ways = 0
+
+    def initialise(self) -> None:
+        """Start the node, or start it again."""
+        super().initialise()
+        self._way, self._ways = None, 0
+
+    def update(self) -> Status:
+        """Advance the node by one tick, and return its status."""
+        if self._way:
+            status = self._way.update()
+            if status is not Status.SUCCESS:
+                return status
+            self._way = None
+            super().initialise()
+        self._way = self._next_way()
+        if self._way is None:
+            return super().update()
+        self._ways += 1
+        self._way.initialise()
+        return self._way.update()
+
+    def _next_way(self) -> DriveNode | SeekNode | None:
+        outcome, command = self.context.outcome, self._command
+        assert command
+        if outcome is None or outcome.number != command.number or self._ways == MOST_WAYS:
+            return None
+        if outcome.approach:
+            return DriveNode("approach", self.context, target=outcome.approach)
+        return SeekNode(outcome.seek, self.context) if outcome.seek else None
 
 
 class WaitNode(Leaf):

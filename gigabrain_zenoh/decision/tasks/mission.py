@@ -27,6 +27,7 @@ from gigabrain_zenoh.decision.tasks.arm_steps import (
     Posture,
     Reach,
     Solid,
+    Spot,
     TakePosture,
 )
 from gigabrain_zenoh.errors import ConfigError, unknown
@@ -142,7 +143,7 @@ class Step(Part, frozen=True, kw_only=True):
     posture: Posture | None = None  # of the arm's joints
     gripper: GripperPlace | None = None
     pick: Name | None = None  # one of the mission's `things`
-    place: Point3 | None = None  # where the middle of what is held shall be
+    place: Spot | None = None  # where the middle of what is held shall be; on the floor without z
     wait: Seconds | None = None
     wait_until: Comparison | None = None
     check: Comparison | None = None  # fails if it does not hold
@@ -177,7 +178,7 @@ class Step(Part, frozen=True, kw_only=True):
         if self.reach is not None:
             return self.reach if isinstance(self.reach, Reach) else Reach(at=self.reach)
         if self.posture is not None:
-            return TakePosture({} if self.posture == "home" else self.posture)
+            return TakePosture(self.posture)
         if self.gripper is not None:
             return Gripper(self.gripper)
         if self.pick is not None:

@@ -359,7 +359,8 @@ def _seen(arm: ArmInMemory, planner: ArmPlanner, camera: "ArmCamera") -> Thing |
         aside = planner.take_posture(posture, [], arm.posture(planner.arm.names), None)
         if isinstance(aside, Plan):
             arm.carry_out_all(aside.phases)
-    return thing_of("the thing", located({}, seen)[f"seen {seen[0].id}"])
+    known, _ = located({}, seen)
+    return thing_of("the thing", known[f"seen {seen[0].id}"])
 
 
 def _pick_and_place(

@@ -30,7 +30,7 @@ def test_steps_of_a_mission_are_actions_of_the_arm() -> None:
         "mission",
     )
     assert mission.arm_actions == [
-        Reach(at=(0.2, 0, 0.1)), Reach(at=(0.2, 0, 0.1), pitch=1), TakePosture({}),
+        Reach(at=(0.2, 0, 0.1)), Reach(at=(0.2, 0, 0.1), pitch=1), TakePosture("home"),
         TakePosture({"shoulder_pan": 0.5}), Gripper("open"), Gripper(0.3), Pick("can"),
         PlaceThing((0.1, 0.1, 0.05)),
     ]  # fmt: skip
@@ -95,3 +95,12 @@ def test_a_thing_without_a_place_needs_a_depth_camera() -> None:
     with pytest.raises(Refused, match="no depth camera; start it with --cameras"):
         arm_steps.check(replace(ARM, cameras=()), *steps)
     arm_steps.check(replace(ARM, cameras=(Camera(name="top", depth=True),)), *steps)
+
+
+def test_postures_and_places_that_a_body_does_not_have_are_refused() -> None:
+    carrying, floorless = load_robot("lekiwi").description(), replace(ARM.arm, floor=None)  # type: ignore[type-var]
+    arm_steps.check(carrying, [TakePosture("carry"), PlaceThing((0.3, 0.0))])
+    with pytest.raises(Refused, match="so101 has no carry posture"):
+        arm_steps.check(ARM, [TakePosture("carry")])
+    with pytest.raises(Refused, match="so101 reaches no floor; give a height to place at"):
+        arm_steps.check(replace(ARM, arm=floorless), [PlaceThing((0.3, 0.0))])

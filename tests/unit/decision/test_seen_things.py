@@ -22,14 +22,14 @@ BALL = SeenSolid(id=3, shape="sphere", size=(0.02,), position=(0.4, 0.0, 0.02))
 
 
 def test_a_thing_of_a_class_is_the_nearest_one_of_it() -> None:
-    known = located({"it": Solid(label="can")}, (CUBE, CAN))
+    known, _ = located({"it": Solid(label="can")}, (CUBE, CAN))
     assert known["it"] == Solid(cylinder=(0.033, 0.115), at=(0.3, 0, 0.057))
     assert known["seen 2"] == Solid(box=CUBE.size, at=CUBE.position, yaw=0.3)  # type: ignore[arg-type]
 
 
 def test_a_thing_by_its_lengths_keeps_them_and_takes_the_place() -> None:
     cube = Solid(box=(0.03, 0.03, 0.03))
-    known = located({"cube": cube}, (CUBE, CAN, BALL))
+    known, _ = located({"cube": cube}, (CUBE, CAN, BALL))
     assert known["cube"] == Solid(box=(0.03, 0.03, 0.03), at=(0.2, 0.1, 0.015), yaw=0.3)
     assert known.keys() == {"cube", "seen 1", "seen 3"}
     assert known["seen 3"] == Solid(sphere=0.02, at=BALL.position)
@@ -37,7 +37,7 @@ def test_a_thing_by_its_lengths_keeps_them_and_takes_the_place() -> None:
 
 def test_a_long_box_is_turned_as_its_longer_side_is_seen() -> None:
     seen = SeenSolid(id=4, shape="box", size=(0.03, 0.061, 0.03), position=(0.2, 0, 0.015), yaw=0.1)
-    known = located({"bar": Solid(box=(0.06, 0.03, 0.03))}, (seen,))
+    known, _ = located({"bar": Solid(box=(0.06, 0.03, 0.03))}, (seen,))
     assert known["bar"].yaw == pytest.approx(0.1 + math.pi / 2)
 
 
@@ -51,25 +51,32 @@ def test_a_long_box_is_turned_as_its_longer_side_is_seen() -> None:
     ],
 )
 def test_what_is_not_seen_has_no_place(wanted: Solid) -> None:
-    assert "it" not in located({"it": wanted}, (CUBE, CAN))
+    assert "it" not in located({"it": wanted}, (CUBE, CAN))[0]
 
 
 def test_two_things_of_one_kind_are_two() -> None:
     other = SeenSolid(id=5, shape="box", size=(0.03, 0.03, 0.03), position=(0.25, 0, 0.015))
     cube = Solid(box=(0.03, 0.03, 0.03))
-    known = located({"one": cube, "other": cube}, (CUBE, other))
+    known, _ = located({"one": cube, "other": cube}, (CUBE, other))
     assert known["one"].at == CUBE.position
     assert known["other"].at == other.position
 
 
 def test_a_thing_that_stands_where_its_mission_says_is_no_second_one() -> None:
     given = Solid(box=(0.03, 0.03, 0.03), at=(0.21, 0.1, 0.015))
-    assert located({"cube": given}, (CUBE,)) == {"cube": given}
+    assert located({"cube": given}, (CUBE,)) == ({"cube": given}, {})
 
 
 def test_what_is_seen_far_away_is_not_in_the_way() -> None:
     far = SeenSolid(id=6, shape="sphere", size=(0.1,), position=(3.0, 0.0, 0.1))
-    assert located({}, (far,)) == {}
+    assert located({}, (far,)) == ({}, {})
+
+
+def test_what_the_gripper_holds_does_not_stand_where_it_was_seen() -> None:
+    _, numbers = located({"it": Solid(label="can")}, (CUBE, CAN))
+    assert numbers == {"it": CAN.id}
+    known, _ = located({}, (CUBE, CAN), held=numbers["it"])
+    assert known.keys() == {"seen 2"}
 
 
 class Heard:
@@ -100,6 +107,7 @@ def test_things_are_where_they_are_after_the_body_has_driven_on() -> None:
     (one,) = seen.at(there)
     assert one.position == pytest.approx((0.0, -0.2, 0.057))
     assert one.yaw == pytest.approx(-math.pi / 2)
+    assert one.age == pytest.approx(CAN.age + 0.02)
 
 
 def test_things_of_another_start_of_the_driver_do_not_count() -> None:

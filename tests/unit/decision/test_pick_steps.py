@@ -1,0 +1,106 @@
+"""A body that can drive goes before what it cannot reach, and picks it up from there."""
+
+import itertools
+from typing import Any
+
+import pytest
+
+from gigabrain_zenoh.decision.behaviours import ArmCommand, DriveCommand, StepOutcome, Target
+from gigabrain_zenoh.decision.known_objects import Seek, Sought
+from gigabrain_zenoh.decision.tasks.arm_steps import Solid
+from gigabrain_zenoh.decision.tasks.leaves import seek_nothing
+from gigabrain_zenoh.decision.tasks.mission import loads
+from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskQueue
+
+CAN = Target(name="can", x=1.0, y=2.0, radius=0.03, away=0.3)
+FAR = {"state": "failed", "reason": "too far", "approach": CAN}
+PICK = "things: {can: {label: can}}\ndo: [{pick: can}]"
+
+
+class Steps:
+    """A queue with one mission, and a body that answers each command."""
+
+    def __init__(self, text: str = PICK, seek: Seek = seek_nothing) -> None:
+        self.queue = TaskQueue(lambda _topic: None, lambda _script: None, Saved(), seek)  # type: ignore[arg-type, return-value]
+        self.queue.add_mission(loads(text, "mission"), "mission", "replace", "test")
+        self.command: Any = None
+        self.step(None)
+
+    def step(self, outcome: StepOutcome | None) -> None:
+        self.command, _ = self.queue.step(0.02, outcome)
+
+    def answer(self, **outcome: Any) -> None:
+        """End the present command."""
+        self.step(StepOutcome(number=self.command.number, **outcome))
+
+
+def test_what_is_out_of_reach_is_driven_before_and_picked_up_from_there() -> None:
+    steps = Steps()
+    assert isinstance(steps.command, ArmCommand)
+    first = steps.command.number
+    steps.answer(**FAR)
+    assert steps.command == DriveCommand(first + 1, "approach", target=CAN)
+    steps.step(StepOutcome(number=first + 1, reason="on the way"))
+    assert steps.command.number == first + 1
+    steps.answer(state="done")
+    assert isinstance(steps.command, ArmCommand)
+    assert steps.command.number == first + 2
+    steps.answer(state="done")
+    assert steps.queue.status.done[0].state == "succeeded"
+
+
+def test_it_drives_four_times_and_then_says_why_it_fails() -> None:
+    steps = Steps()
+    for _ in range(4):
+        steps.answer(**FAR)
+        assert isinstance(steps.command, DriveCommand)
+        steps.answer(state="done")
+    steps.answer(**FAR)
+    done = steps.queue.status.done[0]
+    assert (done.state, done.reason) == ("failed", "picking up can: too far")
+
+
+def test_a_way_that_fails_is_the_reason() -> None:
+    steps = Steps()
+    steps.answer(**FAR)
+    steps.answer(state="failed", reason="no free and reachable place before can")
+    assert steps.queue.status.done[0].reason == "no free and reachable place before can"
+
+
+def test_what_is_not_seen_is_looked_for_and_picked_up_where_it_is_found() -> None:
+    known = Sought()
+    steps = Steps(seek=lambda wanted, _without, _preferred: known if wanted == "can" else Sought())
+    steps.answer(state="failed", reason="can is not seen", seek="can")
+    assert (steps.command.kind, steps.command.target) == ("look", None)
+    known = Sought(target=CAN, id=3)
+    steps.step(None)
+    assert (steps.command.kind, steps.command.target) == ("approach", CAN)
+    steps.answer(state="done")
+    assert isinstance(steps.command, ArmCommand)
+
+
+def test_an_arm_alone_that_cannot_reach_fails_at_once() -> None:
+    steps = Steps()
+    steps.answer(state="failed", reason="too far")
+    assert steps.queue.status.done[0].state == "failed"
+
+
+@pytest.mark.parametrize("given", ["label: can", "sphere: 0.03"])
+def test_what_was_seen_is_to_be_seen_again_after_it_was_put_down(given: str) -> None:
+    steps = Steps(
+        f"things: {{can: {{{given}}}}}\ndo: [{{pick: can}}, {{place: [0.2, 0]}}, {{pick: can}}]"
+    )
+    steps.answer(state="done")
+    steps.answer(state="done", placed=("can", Solid(sphere=0.03, at=(0.2, 0.0, 0.03))))
+    assert steps.command.things["can"].at is None
+
+
+def test_numbers_go_on() -> None:
+    steps = Steps()
+    numbers = [steps.command.number]
+    for _ in range(3):
+        steps.answer(**FAR)
+        numbers.append(steps.command.number)
+        steps.answer(state="done")
+        numbers.append(steps.command.number)
+    assert all(a < b for a, b in itertools.pairwise(numbers))
