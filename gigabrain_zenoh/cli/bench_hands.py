@@ -1,4 +1,4 @@
-"""`gigabrain bench hands`: what an arm picks up and puts down."""
+"""`gigabrain bench hands` and `fetch`: what an arm picks up, puts down and brings."""
 
 from collections import Counter
 from typing import TYPE_CHECKING
@@ -6,13 +6,15 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from gigabrain_zenoh.cli.bench import finish
-from gigabrain_zenoh.cli.options import Body, JsonFile, check_names, print_progress
+from gigabrain_zenoh.cli.options import Body, JsonFile, check_names, check_positive, print_progress
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host import files
 from gigabrain_zenoh.host.bounded import percentile
+from gigabrain_zenoh.host.signals import run_async
 from gigabrain_zenoh.qa.judging import table_of
 
 if TYPE_CHECKING:
+    from gigabrain_zenoh.qa.bench.fetch import FetchResult
     from gigabrain_zenoh.qa.bench.hands import HandsResult, HandsRun
 
 MOST_BACKLASH_DEG = 10.0
@@ -52,6 +54,57 @@ def hands(
     )
     finish(_hands_table(result), result, json)
     return 0
+
+
+def fetch(
+    *,
+    seeds: str = "0-19",
+    body: Body = "lekiwi",
+    speed: float = 2.0,
+    seconds: float = 400.0,
+    people: bool = False,
+    json: JsonFile = None,
+) -> int:
+    """Have a robot with a base and an arm fetch a can from another room, judged by the physics.
+
+    Example: gigabrain bench fetch --seeds 0-19 --people
+
+    Two rooms, cartons, the can, and where the robot begins are drawn at random. The robot knows
+    neither room: it looks for the can with its camera, picks it up, carries it to a place in the
+    other room, and puts it down there. It needs the extras `arm` and `eyes`, and EGL or OSMesa: set
+    MUJOCO_GL=egl.
+
+    Args:
+        seeds: Seeds of the worlds, such as 0-9 or 3,5,20-22.
+        speed: Simulated over real time, at most.
+        seconds: Time in each world [s of its own time].
+        people: A person walks through the door and back, all the time.
+    """
+    from gigabrain_zenoh.qa.bench.clutter import seeds_of
+    from gigabrain_zenoh.qa.bench.fetch import measure_fetch
+
+    check_positive(speed=speed, seconds=seconds)
+    check_names([body])
+    files.check_result_path(json)
+    work = measure_fetch(seeds_of(seeds), body, speed, seconds, print_progress, people=people)
+    result = run_async(work)
+    finish(_fetch_table(result), result, json)
+    return 0
+
+
+def _fetch_table(result: "FetchResult") -> Table:
+    runs = result.runs
+    brought = [run for run in runs if run.outcome == "brought"]
+    table = table_of("worlds", "brought", "contacts", "off p95", "time p50", title="Fetched")
+    off = percentile(sorted(run.off_m or 0.0 for run in brought), 0.95)
+    time = percentile(sorted(run.seconds for run in brought), 0.5)
+    table.add_row(
+        str(len(runs)), str(len(brought)), str(sum(run.contacts for run in runs)),
+        "-" if off is None else f"{off * 100:.0f} cm", "-" if time is None else f"{time:.0f} s",
+    )  # fmt: skip
+    people = "a person walks about" if result.people else "nobody walks about"
+    table.caption = f"{result.body}, x{result.speed:g} real time at most; {people}."
+    return table
 
 
 def _hands_table(result: "HandsResult") -> Table:

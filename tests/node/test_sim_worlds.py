@@ -27,6 +27,7 @@ def test_the_worlds_are_listed_with_a_line_each() -> None:
     assert list(names) == [
         "arena",
         "house",
+        "kitchen",
         "playroom",
         "table",
         "warehouse",

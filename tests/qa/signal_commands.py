@@ -101,6 +101,7 @@ CALLS = {
     "bench stack": "bench stack --seconds 3",
     "bench cameras": "bench cameras --seconds 3",
     "bench objects": "bench objects --seeds 0",
+    "bench fetch": "bench fetch --seeds 0",
     "bench hands": "bench hands --seeds 0",
     "bench eyes": "bench eyes --worlds 1 --seconds 1 --ghosts 1",
     "bench clutter": "bench clutter --seeds 0",

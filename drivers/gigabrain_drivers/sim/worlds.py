@@ -104,7 +104,8 @@ def _by_wall(random: np.random.Generator) -> Placed:
 
 
 SHIPPED = Path(str(resources.files("gigabrain_drivers") / "sim" / "shipped_worlds"))
-NAMED_WORLDS = ("arena", "house", "playroom", "table", "warehouse")  # files in SHIPPED
+# files in SHIPPED
+NAMED_WORLDS = ("arena", "house", "kitchen", "playroom", "table", "warehouse")
 
 
 def world_names() -> dict[str, str]:

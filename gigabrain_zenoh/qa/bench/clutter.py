@@ -232,7 +232,7 @@ async def _drive(world: ClutteredWorld, course: ClutterCourse, folder: Path) -> 
     )
 
 
-class _Over(Exception):
+class Over(Exception):
     """Time is up, or the robot cannot drive on; the text says why."""
 
 
@@ -258,21 +258,25 @@ class CourseDriver:
         """The robot's time since the first goal [s]."""
         return self._bus.time.tick * TICK_NS / 1e9 - self._began_s
 
-    async def drive(self) -> None:
-        """Send the robot to all goals, until time is up."""
+    async def begin(self) -> None:
+        """Wait until the robot has a map, and tell where that is in the world."""
         await self._group.until(self._is_localized, "a map, and the robot in it", START_S)
         await self.look()
         here = self._poses.current
         assert here
         in_map = Pose(x=here.x, y=here.y, yaw=here.yaw)
-        world_from_map = self.world_from_map = compose(self._true_pose(), inverse(in_map))
+        self.world_from_map = compose(self._true_pose(), inverse(in_map))
         self._began_s += self.seconds
-        over = ""
+
+    async def drive(self) -> None:
+        """Send the robot to all goals, until time is up."""
+        await self.begin()
+        over, world_from_map = "", self.world_from_map
         for number, (x, y) in enumerate(self._world.goals, 1):
             there = compose(inverse(world_from_map), Pose(x=x, y=y, yaw=0.0))
             try:
                 reason = over or await self._go(there.x, there.y)
-            except _Over as end:
+            except Over as end:
                 reason = over = str(end)
             off = await self._off(x, y)
             if not reason and off > REACHED_M:
@@ -323,7 +327,7 @@ class CourseDriver:
                     raise
 
     async def _while_running(self, work: Awaitable[T]) -> T:
-        """Wait for `work`. Raises _Over, and GigabrainError when a process dies."""
+        """Wait for `work`. Raises Over, and GigabrainError when a process dies."""
         waiting, polls = asyncio.ensure_future(work), 0
         try:
             while not waiting.done():
@@ -338,13 +342,13 @@ class CourseDriver:
 
     def _check(self) -> None:
         if self._truth.get("falls"):
-            raise _Over("it has fallen")
+            raise Over("it has fallen")
         if self.seconds > self._longest_s:
-            raise _Over(f"{self._longest_s:g} s are over: {self._doing()}")
+            raise Over(f"{self._longest_s:g} s are over: {self._doing()}")
         state = self._states.current
         latching = [cause.text for cause in state.gate.causes if cause.latching] if state else []
         if state and state.gate.mode == "latched" and latching:
-            raise _Over(f"it has latched: {', '.join(latching)}")
+            raise Over(f"it has latched: {', '.join(latching)}")
 
     def _doing(self) -> str:
         newest = self._tasks.newest
