@@ -76,14 +76,16 @@ class RobotOptions:
     def values(self) -> dict[str, object]:
         """Return the fields of a Deployment, unchecked."""
         from gigabrain_drivers.driver.catalog import load_robot, robot_path
+        from gigabrain_drivers.driver.robot import Demo as PlainDemo
         from gigabrain_drivers.sim.worlds import mission_file
 
         robot, settings = load_robot(self.body), dict(behaviours.load(self.behaviour).DEMO)
         mapped = behaviours.needs_map(self.behaviour)
-        world = self.world or robot.demo.world
-        if robot.demo.mission and mapped and world == robot.demo.world and self.link != "real":
+        plan = robot.demo if self.cameras or not robot.demo.cameras else PlainDemo()
+        world = self.world or plan.world
+        if plan.mission and mapped and world == plan.world and self.link != "real":
             folder = robot_path(self.body).parent
-            settings = {"mission": mission_file(robot.demo.mission, folder)}
+            settings = {"mission": mission_file(plan.mission, folder)}
         values: dict[str, object] = {
             "body": self.body,
             "link": self.link,

@@ -218,7 +218,7 @@ class Navigator:
             )
         )
         outcome = self._outcome(context, command, route, plan)
-        headline = f"{route.activity}: {route.reason}" if route.activity else outcome.activity
+        headline = ": ".join(filter(None, (route.activity, route.reason))) or outcome.activity
         intent = self._intent(
             twist=plan.twist,
             trajectory=plan.trajectory,

@@ -19,6 +19,7 @@ class Demo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     world: str = "arena"
     mission: str = ""  # shipped one, or a file beside the robot's file; empty: it explores
+    cameras: bool = False  # only with --cameras; without, it explores the usual world
 
 
 class RobotFile(BodyDescription, frozen=True, kw_only=True, forbid_unknown_fields=True):
