@@ -232,8 +232,7 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
         if body.description.has_base:
             drive(state, body, intent)
         if body.description.joints and message is state:
-            live = intent and state.tick - intent.tick <= INTENT_TICKS
-            commands += arm.act(state, body, intent if live else None)
+            commands += arm.act(state, body, _recent(intent, state.tick))
 
     def drive(state: RobotState, body: Body, intent: Intent | None) -> None:
         nonlocal memory, lost, commands
@@ -253,9 +252,6 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
             bus.publish(command_topic(body.description), command, basis=memory.basis)
             commands += 1
 
-    def received() -> tuple[object, ...]:
-        return (bus.arrived.get(STATE.key),) if bodies.current else ()
-
     def on_intent(intent: Intent) -> None:
         # an intent whose state has not arrived waits for it
         if intent.basis > memory.basis and intent.tick <= bus.time.tick:
@@ -267,9 +263,16 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
     bus.latest(SAFETY, verdicts.receive)
     bus.latest(TELEOP, teleop.receive)
     bus.latest(JOINT_TELEOP, arm.teleop.receive)
-    bus.progress = Progress(received, lambda: commands)
+    bus.progress = Progress(
+        lambda: (bus.arrived.get(STATE.key),) if bodies.current else (), lambda: commands
+    )
     ready()
     await bus.failed
+
+
+def _recent(intent: Intent | None, tick: int) -> Intent | None:
+    """Return an intent that joints may still move by."""
+    return intent if intent and tick - intent.tick <= INTENT_TICKS else None
 
 
 class ArmControl:

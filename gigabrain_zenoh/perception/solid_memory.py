@@ -13,14 +13,14 @@ from gigabrain_schemas.objects import SeenSolid
 from gigabrain_zenoh.geometry.pose import to_frame, to_parent
 from gigabrain_zenoh.vision.solid_fit import SolidFit
 
-FITS = 9  # newest ones whose median counts
+FITS = 9  # newest ones, whose median counts: from near by a thing is seen best
 SURE_SEEN = 2  # pictures, from which on a thing counts
 SAME_M, SAME_SHARE = 0.03, 0.5  # how far off the same thing may be: at least, and of its width
 MOVED_M = 0.02  # from its median: it was moved, and what was known of its place is dropped
 LOOKED_AT = 1.6  # of the height of its middle: there it would hide the floor, or what is behind
 MISSES = 3  # pictures in which it is seen through
 KEPT_S = 120.0  # without being seen: odometry drifts
-MOST, MOST_LABELS = 64, 8
+MOST = 64
 LABEL_M = 0.06  # beside the middle of a thing, within which something recognised is this thing
 QUARTER = math.pi / 2  # a box looks the same by each of its sides
 
@@ -34,7 +34,7 @@ class Track:
     seen: int = 0  # pictures
     misses: int = 0
     fits: deque[SolidFit] = field(default_factory=lambda: deque(maxlen=FITS))
-    labels: Counter[str] = field(default_factory=Counter)
+    labels: deque[str] = field(default_factory=lambda: deque(maxlen=FITS))  # newest classes
 
     @property
     def fit(self) -> SolidFit:
@@ -90,10 +90,8 @@ class SolidMemory:
         if track is None:
             return
         reach = max(LABEL_M, _width(track.fit))
-        if math.dist(track.fit.position[:2], there) > reach:
-            return
-        if label in track.labels or len(track.labels) < MOST_LABELS:
-            track.labels[label] += 1
+        if math.dist(track.fit.position[:2], there) <= reach:
+            track.labels.append(label)
 
     def solids(self, pose: Pose, tick: int) -> tuple[SeenSolid, ...]:
         """Return what counts, in the frame of a body at `pose` at `tick`, the nearest first."""
@@ -101,7 +99,7 @@ class SolidMemory:
         for track in self._tracks:
             if track.seen >= SURE_SEEN:
                 fit = _moved(track.fit, lambda x, y: to_frame(pose, x, y), -pose.yaw)
-                label = track.labels.most_common(1)[0][0] if track.labels else ""
+                label = Counter(track.labels).most_common(1)[0][0] if track.labels else ""
                 found.append(SeenSolid(
                     id=track.id, shape=fit.shape, size=fit.size, position=fit.position,
                     yaw=_turn(fit.yaw), label=label, seen=track.seen,

@@ -57,13 +57,13 @@ def test_what_is_held_does_not_slide_along_the_pads_while_the_arm_swings(body: s
     pick = planner.pick(drawn.thing(), [TABLE], arm.posture(names))
     assert not isinstance(pick, NoWay)
     for phase in pick.phases:
-        arm.carry_out(phase, gripper)
+        arm.carry_out(phase)
     before = in_tool()
     across = np.array([drawn.x, -drawn.y, drawn.height])
     place = planner.place(pick.held, across, [TABLE], arm.posture(names), pick.grasp.opening)
     assert not isinstance(place, NoWay)
     assert place.phases[0].name == "traverse"
-    arm.carry_out(place.phases[0], gripper)
+    arm.carry_out(place.phases[0])
     assert np.linalg.norm(in_tool() - before) < 0.003
 
 

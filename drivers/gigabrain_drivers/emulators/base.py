@@ -15,12 +15,12 @@ import numpy as np
 from msgspec import Struct
 
 from gigabrain_drivers.driver.robot import RobotFile, Run
-from gigabrain_drivers.emulators.arm_truth import ArmTruth
 from gigabrain_drivers.emulators.hand import Hand
 from gigabrain_drivers.emulators.ports import Pty
 from gigabrain_drivers.kinematics.legs import WALKER, Gait
 from gigabrain_drivers.kinematics.wheels import Twist, wheels_of
 from gigabrain_drivers.sim import STEP_S, Pace
+from gigabrain_drivers.sim.arm_truth import ArmTruth
 from gigabrain_drivers.sim.body import SimLidar
 from gigabrain_drivers.sim.locomotion import Charge, Motor, OdometryReading
 from gigabrain_drivers.sim.physics import Simulation, run_report

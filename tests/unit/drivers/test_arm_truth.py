@@ -5,7 +5,7 @@ import math
 import mujoco
 import pytest
 
-from gigabrain_drivers.emulators.arm_truth import ArmTruth
+from gigabrain_drivers.sim.arm_truth import ArmTruth
 
 ON_FLOOR, ON_ROBOT = "0.5 0 0.05", "0 0 0.25"
 MODEL = """<mujoco><worldbody>
