@@ -48,7 +48,6 @@ def test_what_is_held_does_not_slide_along_the_pads_while_the_arm_swings(body: s
     planner, names = PickPlacePlanner(kinematics), kinematics.names
     drawn = draw(np.random.default_rng(5), pan_axis(kinematics))
     arm = arm_before(drawn, robot, model)
-    gripper = robot.joints[-1].name
 
     def in_tool() -> np.ndarray:
         tool = kinematics.forward(np.array([arm.measured(name) for name in names]))
