@@ -33,6 +33,7 @@ from gigabrain_zenoh.qa.bench.chain import ChainResult, chain_page
 from gigabrain_zenoh.qa.bench.clutter import ClutterResult
 from gigabrain_zenoh.qa.bench.estop import EstopResult, estop_page
 from gigabrain_zenoh.qa.bench.eyes import EyesResult
+from gigabrain_zenoh.qa.bench.fetch import FetchResult
 from gigabrain_zenoh.qa.bench.goals import GoalsResult
 from gigabrain_zenoh.qa.bench.hands import HandsResult
 from gigabrain_zenoh.qa.bench.objects import ObjectsResult
@@ -51,6 +52,7 @@ DRAWN: dict[str, tuple[type[Struct], Callable[[Any], Any]]] = {  # by the words 
     "clutter": (ClutterResult, bench_eyes._clutter_table),
     "estop": (EstopResult, estop_page),
     "eyes": (EyesResult, bench_eyes._eyes_table),
+    "fetch": (FetchResult, bench_hands._fetch_table),
     "goals": (GoalsResult, bench_navigation._goals_table),
     "hands": (HandsResult, bench_hands._hands_table),
     "objects": (ObjectsResult, bench_eyes._objects_table),

@@ -142,9 +142,11 @@ class ArmNode(Leaf):
         outcome, self.context.doing = self.context.outcome, self.name
         assert self._command
         if outcome and outcome.number == self._command.number:
-            self.context.hand.held = outcome.holds
+            lost, self.context.hand.held = self.context.hand.held, outcome.holds
             if outcome.holds:
                 self.context.things.pop(outcome.holds.name, None)
+            elif lost and (given := self.context.given.get(lost.name)) and given.at is None:
+                self.context.things[lost.name] = given  # it stands somewhere, to be seen
         if outcome and outcome.number == self._command.number and outcome.state != "running":
             if outcome.placed:
                 name, solid = outcome.placed

@@ -7,7 +7,7 @@ import pytest
 
 from gigabrain_zenoh.decision.behaviours import ArmCommand, DriveCommand, StepOutcome, Target
 from gigabrain_zenoh.decision.known_objects import Seek, Sought
-from gigabrain_zenoh.decision.tasks.arm_steps import Solid
+from gigabrain_zenoh.decision.tasks.arm_steps import HeldThing, Solid
 from gigabrain_zenoh.decision.tasks.leaves import seek_nothing
 from gigabrain_zenoh.decision.tasks.mission import loads
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskQueue
@@ -93,6 +93,19 @@ def test_what_was_seen_is_to_be_seen_again_after_it_was_put_down(given: str) -> 
     steps.answer(state="done")
     steps.answer(state="done", placed=("can", Solid(sphere=0.03, at=(0.2, 0.0, 0.03))))
     assert steps.command.things["can"].at is None
+
+
+def test_what_was_lost_on_the_way_can_be_seen_and_picked_up_again() -> None:
+    steps = Steps("things: {can: {label: can}}\ndo: [{retry: {times: 2, do: [{pick: can}]}}]")
+    held = HeldThing(
+        name="can", solid=Solid(sphere=0.03, at=(0, 0, 0)), axes=(1, 0, 0, 0, 1, 0, 0, 0, 1),
+        grip=0.3, opening=0.9,
+    )  # fmt: skip
+    steps.step(StepOutcome(number=steps.command.number, holds=held))
+    steps.answer(state="failed", reason="can has slipped out of the gripper")
+    steps.step(None)
+    assert isinstance(steps.command, ArmCommand)
+    assert steps.command.things == {"can": Solid(label="can")}
 
 
 def test_numbers_go_on() -> None:
