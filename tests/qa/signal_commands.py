@@ -71,6 +71,7 @@ CALLS = {
     "place list": "place list",
     "place remove": "place remove nowhere",
     "zone add": "zone add {name} keepout 3 3 4 3 4 4",
+    "pick": "pick can",
     "arm state": "arm state --watch",
     "arm jog": "arm jog gripper 5",
     "arm home": "arm home",
@@ -121,7 +122,7 @@ CALLS = {
 OWN_CODES = {
     "why": range(10, 20),
     **dict.fromkeys(
-        ("goto", "explore", "patrol", "mission", "arm goto", "arm pick", "arm place"), (1,)
+        ("goto", "explore", "patrol", "mission", "pick", "arm goto", "arm pick", "arm place"), (1,)
     ),
     **dict.fromkeys(("task cancel", "task pause", "task resume", "map save", "map info"), (1, 2)),
     # without a map, a simulation, or what is named
