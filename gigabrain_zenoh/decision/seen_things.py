@@ -81,14 +81,15 @@ def located(
             known[name], numbers[name] = _placed(wanted, found), found.id
     for one in left:
         if math.hypot(*one.position[:2]) < NEAR_M:
-            known[f"seen {one.id}"] = _placed(Solid(label="thing"), one)
+            known[f"seen {one.id}"] = _as_seen(one)
     return known, numbers
 
 
 def unseen(do: ArmAction, things: Mapping[str, Solid], known: Mapping[str, Solid]) -> str | None:
     """Return the name of the thing that is to be picked up, if it is one that is not `known`."""
-    wanted = isinstance(do, Pick) and do.thing in things and do.thing not in known
-    return do.thing if isinstance(do, Pick) and wanted else None
+    if not isinstance(do, Pick) or do.thing in known or do.thing not in things:
+        return None
+    return do.thing
 
 
 def still_stands(seen: tuple[SeenSolid, ...], number: int | None, held_ticks: int) -> bool:
@@ -144,13 +145,17 @@ def _seen_lengths(one: SeenSolid) -> Lengths:
     return wide, wide, one.size[1] if one.shape == "cylinder" else wide
 
 
+def _as_seen(one: SeenSolid) -> Solid:
+    shape = {one.shape: one.size if len(one.size) > 1 else one.size[0]}
+    return Solid(**shape, at=one.position, yaw=one.yaw)  # type: ignore[arg-type]
+
+
 def _placed(wanted: Solid, one: SeenSolid) -> Solid:
     """Return a thing where it is seen, by its own lengths where they are given."""
-    x, y, z = one.position
     lengths = _lengths(wanted)
     if lengths is None:
-        shape = {one.shape: one.size if len(one.size) > 1 else one.size[0]}
-        return Solid(**shape, at=(x, y, z), yaw=one.yaw)  # type: ignore[arg-type]
+        return _as_seen(one)
+    x, y, _ = one.position
     long, wide, _ = _seen_lengths(one)
     turned = (long - wide) * (lengths[0] - lengths[1]) < 0.0  # its longer side is the other one
     yaw = one.yaw + (math.pi / 2 if turned else 0.0)

@@ -22,6 +22,7 @@ MISSES = 3  # pictures in which it is seen through
 KEPT_S = 120.0  # without being seen: odometry drifts
 MOST = 64
 LABEL_M = 0.06  # beside the middle of a thing, within which something recognised is this thing
+Place = tuple[float, float]  # x, y [m]
 QUARTER = math.pi / 2  # a box looks the same by each of its sides
 
 
@@ -64,9 +65,9 @@ class SolidMemory:
         """
         placed = [_moved(fit, lambda x, y: to_parent(pose, x, y), pose.yaw) for fit in fits]
         open_ = list(self._tracks)
-        for fit in sorted(placed, key=lambda one: self._off(one, open_)):
-            track = min(open_, key=lambda one: _distance(one.fit, fit), default=None)
-            if track is None or _distance(track.fit, fit) > _gate(fit):
+        for fit in sorted(placed, key=lambda one: _nearest(one.position[:2], self._tracks)[0]):
+            off, track = _nearest(fit.position[:2], open_)
+            if track is None or off > _gate(fit):
                 self._count += 1
                 track = Track(id=self._count, tick=tick)
                 self._tracks.append(track)
@@ -83,14 +84,8 @@ class SolidMemory:
 
     def name(self, label: str, x: float, y: float, pose: Pose) -> None:
         """Record that something was recognised at a place [m] in the frame of a body at `pose`."""
-        there = to_parent(pose, x, y)
-        track = min(
-            self._tracks, key=lambda one: math.dist(one.fit.position[:2], there), default=None
-        )
-        if track is None:
-            return
-        reach = max(LABEL_M, _width(track.fit))
-        if math.dist(track.fit.position[:2], there) <= reach:
+        off, track = _nearest(to_parent(pose, x, y), self._tracks)
+        if track and off <= max(LABEL_M, _width(track.fit)):
             track.labels.append(label)
 
     def solids(self, pose: Pose, tick: int) -> tuple[SeenSolid, ...]:
@@ -107,13 +102,17 @@ class SolidMemory:
                 ))  # fmt: skip
         return tuple(sorted(found, key=lambda one: math.hypot(*one.position[:2])))
 
-    def _off(self, fit: SolidFit, tracks: Sequence[Track]) -> float:
-        return min((_distance(track.fit, fit) for track in tracks), default=math.inf)
+
+def _nearest(place: Place, tracks: Sequence[Track]) -> tuple[float, Track | None]:
+    """Return how far the nearest track is from a place [m], and the track."""
+    away = [(math.dist(track.fit.position[:2], place), track.id, track) for track in tracks]
+    off, _, track = min(away, default=(math.inf, 0, None))
+    return off, track
 
 
 def _take(track: Track, fit: SolidFit, tick: int) -> None:
     """Add a fit to a track; those before it are dropped where the thing was moved."""
-    if track.fits and _distance(track.fit, fit) > MOVED_M:
+    if track.fits and math.dist(track.fit.position[:2], fit.position[:2]) > MOVED_M:
         track.fits.clear()
     track.fits.append(fit)
     track.tick, track.seen, track.misses = tick, track.seen + 1, 0
@@ -124,10 +123,6 @@ def _moved(
 ) -> SolidFit:
     x, y = place(*fit.position[:2])
     return fit._replace(position=(x, y, fit.position[2]), yaw=fit.yaw + turn)
-
-
-def _distance(one: SolidFit, other: SolidFit) -> float:
-    return math.dist(one.position[:2], other.position[:2])
 
 
 def _width(fit: SolidFit) -> float:
