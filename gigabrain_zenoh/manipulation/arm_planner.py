@@ -30,7 +30,7 @@ from gigabrain_zenoh.manipulation.planner import NoPath, plan
 
 TABLE = "the table"
 SUNK_M = 0.001  # of the floor below its place, as things stand on it
-SHARES = (0.6, 0.55, 0.7, 0.48, 0.78)  # of its reach, at which a thing is best grasped
+SHARES = (0.57, 0.62, 0.7, 0.5, 0.78)  # of its reach, at which a thing is best grasped
 BEFORE_M = 0.08  # between the body and a thing that it picks up
 ORIENTATION_RAD = math.radians(2)  # by which the approach of a tool that reaches may be off
 
@@ -186,7 +186,7 @@ class ArmPlanner:
 
     def _stand_off(self, thing: Thing, posture: Floats) -> float | None:
         """Return how far ahead of the base a thing is grasped well [m]; None for nowhere."""
-        least = self._front + float(np.hypot(*thing.half[:2])) + BEFORE_M
+        least = self._front + float(thing.half[:2].max()) + BEFORE_M
         for far in (share * self._reach for share in SHARES):
             place = np.array([far, 0.0, thing.position[2]])
             there = replace(thing, position=place, axes=turned(0.0))

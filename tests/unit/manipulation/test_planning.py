@@ -9,7 +9,7 @@ import pytest
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.manipulation.collision import CollisionChecker, Thing
-from gigabrain_zenoh.manipulation.grasps import Grasp, GraspPlanner, NoGrasp
+from gigabrain_zenoh.manipulation.grasps import ROOM_M, Grasp, GraspPlanner, NoGrasp
 from gigabrain_zenoh.manipulation.inverse_kinematics import Reachable, ToolGoal
 from gigabrain_zenoh.manipulation.joint_trajectory import JointTrajectory, TimeParametrization
 from gigabrain_zenoh.manipulation.planner import JointPath, NoPath, plan
@@ -180,8 +180,8 @@ def test_things_on_the_table_can_be_grasped(kind: str, size: tuple[float, ...]) 
     thing = Thing(name="it", kind=kind, size=size, position=np.array([0.22, 0.05, 0.02]))  # type: ignore[arg-type]
     found = planner.grasps(thing, [FLOOR])
     assert isinstance(found, list)
-    clearances = [one.clearance for one in found]
-    assert clearances == sorted(clearances, reverse=True)
+    order = [(-min(one.clearance, ROOM_M), one.tilt) for one in found]
+    assert order == sorted(order)
     for grasp in found:
         assert_held(grasp, thing)
 
