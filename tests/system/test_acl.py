@@ -15,7 +15,7 @@ from gigabrain_zenoh.testing.waiting import until
 from tests.system.keys import Site, make_fleet, raw, site
 
 SAYS = {
-    "brain": "world perceived/perception detections objects pose map zones intent task "
+    "brain": "world perceived/perception detections objects solids pose map zones intent task "
     "request_log input_log/perception health/perception log estop",
     "operator": "teleop joint_teleop cmd_vel joint_cmd button log estop",
     "viewer": "",

@@ -76,7 +76,7 @@ async def test_robots_and_worlds_are_listed(home: Home) -> None:
     assert all(re.search(r"  \S.* \(sim.*\)  /.*robot\.yaml$", line) for line in robots)
     worlds = (await home.run("worlds")).out.splitlines()
     assert [line.split()[0] for line in worlds] == [
-        "arena", "house", "playroom", "table", "warehouse", "random:SEED", "FILE",
+        "arena", "house", "kitchen", "playroom", "table", "warehouse", "random:SEED", "FILE",
     ]  # fmt: skip
 
 
