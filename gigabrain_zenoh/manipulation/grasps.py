@@ -24,7 +24,7 @@ from gigabrain_zenoh.manipulation.inverse_kinematics import (
 )
 
 GAP_M = 0.006  # between each finger and the thing, before they close
-ROOM_M = 0.01  # of clearance, beyond which more makes no difference
+WIDE, ROOM_M = 0.6, 0.01  # of the widest opening; clearance beyond which more does not count
 MARGIN_M = 0.001  # of the open hand from all else
 TILTS_RAD = tuple(math.radians(angle) for angle in (0, 15, 30, 45, 60, 75, 90))
 YAWS = 12  # directions round what is round
@@ -73,7 +73,9 @@ class GraspPlanner:
         start: Floats | None = None,
         enough: int = ENOUGH,
     ) -> list[Grasp] | NoGrasp:
-        """Return the ways to grasp a thing: those with the largest clearance first, then upright.
+        """Return the ways to grasp a thing, those with the largest clearance first.
+
+        Of a wide thing the most upright come first that have room enough: it slips out of others.
 
         Args:
             thing: A box, cylinder or sphere, in the frame of the arm's base.
@@ -106,7 +108,8 @@ class GraspPlanner:
             if len(found) == enough:
                 break
         if found:
-            return sorted(found, key=lambda one: (-min(one.clearance, ROOM_M), one.tilt))
+            room = ROOM_M if narrowest_width(thing) > WIDE * self._opening.widest else math.inf
+            return sorted(found, key=lambda one: (-min(one.clearance, room), one.tilt))
         if not faults:
             narrowest, widest = narrowest_width(thing), self._opening.widest - 2 * GAP_M
             return NoGrasp(

@@ -180,10 +180,22 @@ def test_things_on_the_table_can_be_grasped(kind: str, size: tuple[float, ...]) 
     thing = Thing(name="it", kind=kind, size=size, position=np.array([0.22, 0.05, 0.02]))  # type: ignore[arg-type]
     found = planner.grasps(thing, [FLOOR])
     assert isinstance(found, list)
-    order = [(-min(one.clearance, ROOM_M), one.tilt) for one in found]
-    assert order == sorted(order)
+    clearances = [one.clearance for one in found]
+    assert clearances == sorted(clearances, reverse=True)
     for grasp in found:
         assert_held(grasp, thing)
+
+
+def test_a_wide_thing_is_grasped_from_above_where_there_is_room() -> None:
+    planner = GraspPlanner(arm(), inverse())
+    can = Thing(
+        name="can", kind="cylinder", size=(0.034, 0.11), position=np.array([0.22, 0.05, 0.055])
+    )
+    found = planner.grasps(can, [FLOOR])
+    assert isinstance(found, list)
+    order = [(-min(one.clearance, ROOM_M), one.tilt) for one in found]
+    assert order == sorted(order)
+    assert found[0].tilt == min(one.tilt for one in found)
 
 
 def assert_held(grasp: Grasp, thing: Thing) -> None:
