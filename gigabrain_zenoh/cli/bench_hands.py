@@ -102,7 +102,7 @@ def _fetch_table(result: "FetchResult") -> Table:
         str(len(runs)), str(len(brought)), str(sum(run.contacts for run in runs)),
         "-" if off is None else f"{off * 100:.0f} cm", "-" if time is None else f"{time:.0f} s",
     )  # fmt: skip
-    people = "a person walks about" if result.people else "nobody walks about"
+    people = "with a person walking" if result.people else "without people"
     table.caption = f"{result.body}, x{result.speed:g} real time at most; {people}."
     return table
 

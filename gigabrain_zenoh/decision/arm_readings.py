@@ -1,4 +1,4 @@
-"""What a state says about an arm, as its planner asks."""
+"""Reads from a robot's state what the planner of an arm needs."""
 
 import math
 from collections.abc import Mapping

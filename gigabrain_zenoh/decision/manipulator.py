@@ -39,8 +39,7 @@ from gigabrain_zenoh.decision.held_things import (
     standing_height,
     thing_of,
 )
-from gigabrain_zenoh.decision.lookout import Lookout
-from gigabrain_zenoh.decision.seen_things import approach, located, still_stands, unseen
+from gigabrain_zenoh.decision.seen_things import Lookout, approach, located, still_stands, unseen
 from gigabrain_zenoh.decision.tasks.arm_steps import (
     ArmAction,
     Gripper,
@@ -287,7 +286,7 @@ class Manipulator:
                 thing, misses = thing_of(name, things[name]), self._misses
                 self._target = thing
                 around = [one for one in others if one.name != name]
-                drives = body.has_base
+                drives = body.has_base and self._seen_as is not None  # others do not stay behind
                 return lambda: planner.pick(thing, around, posture, misses, drives=drives)
             case PlaceThing(at=at):
                 if hold is None:

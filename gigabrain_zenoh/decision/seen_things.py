@@ -23,6 +23,8 @@ LIKE_M, LIKE_SHARE = 0.006, 0.3  # by which lengths may differ of what is taken 
 SAME_M = 0.03  # beside where a thing stands by its mission: it is the same, seen
 SEEN_AFTER_TICKS = 50  # since a thing is held: a camera that still sees it stand is right
 NEAR_M = 1.0  # of the body, within which what is seen may be in the arm's way
+LOOK_TICKS = 75  # at rest, until a thing in sight is known: pictures come five times a second
+ASIDE = 0.7  # of the first joint's range, to either side, where the arm hides nothing
 Lengths = tuple[float, float, float]
 
 
@@ -60,6 +62,40 @@ class SeenThings:
             place, yaw = (x, y, one.position[2]), one.yaw + here.yaw
             moved.append(replace(one, position=place, yaw=yaw, age=one.age + older))
         return tuple(sorted(moved, key=lambda one: math.hypot(*one.position[:2])))
+
+
+class Lookout:
+    """Waits for a thing to be seen, and names postures to look for it from."""
+
+    def __init__(self) -> None:
+        self._since: int | None = None
+        self._gone = 0  # of the postures
+
+    def reset(self) -> None:
+        """Begin with another command, or once the thing is seen."""
+        self._since, self._gone = None, 0
+
+    def waits(self, tick: int) -> bool:
+        """Return whether it may still come to be seen from where the arm rests."""
+        if self._since is None or tick < self._since:
+            self._since = tick
+        return tick - self._since < LOOK_TICKS
+
+    def aside(self, body: BodyDescription) -> dict[str, float] | None:
+        """Return the next posture to look from [rad] or [m]; None after the last one."""
+        assert body.arm
+        first, places = body.joints[0], dict[str, float]()
+        postures = [None, first.lower * ASIDE, first.upper * ASIDE]
+        if self._gone >= len(postures):
+            return None
+        for joint, place in zip(body.joints, body.arm.home, strict=True):
+            if joint.part == "arm":
+                places[joint.name] = place
+        if (aside := postures[self._gone]) is not None:
+            places[first.name] = aside
+        self._gone += 1
+        self._since = None
+        return places
 
 
 def located(

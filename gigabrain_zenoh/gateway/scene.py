@@ -93,7 +93,7 @@ class Scene:
 
     @property
     def awaits_arm(self) -> bool:
-        """Whether the model of the body's arm has not come yet."""
+        """True until the model of the body's arm has arrived."""
         about = self.description
         return about is not None and about.arm is not None and self._described is None
 

@@ -134,7 +134,7 @@ class ArmPlanner:
     ) -> Plan | NoWay:
         """Return how to pick a thing up; `without` as in `PickPlacePlanner.pick`.
 
-        Where there is no way from here, a body that `drives` is told how far it should stand.
+        For a body that `drives`, the refusal says how far from the thing it should stand.
         """
         if drives and math.hypot(*thing.position[:2]) > self._reach:
             return NoWay(reason=f"{thing.name}: too far", stand_off=self._stand_off(thing, posture))

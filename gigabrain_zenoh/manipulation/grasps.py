@@ -108,8 +108,7 @@ class GraspPlanner:
             if len(found) == enough:
                 break
         if found:
-            room = ROOM_M if narrowest_width(thing) > WIDE * self._opening.widest else math.inf
-            return sorted(found, key=lambda one: (-min(one.clearance, room), one.tilt))
+            return self._ordered(found, thing)
         if not faults:
             narrowest, widest = narrowest_width(thing), self._opening.widest - 2 * GAP_M
             return NoGrasp(
@@ -118,6 +117,10 @@ class GraspPlanner:
             )
         nearest = min(faults, key=lambda one: (one.position_error, one.orientation_error))
         return NoGrasp(reason=f"{thing.name}: {nearest.reason}")
+
+    def _ordered(self, found: Sequence[Grasp], thing: Thing) -> list[Grasp]:
+        room = ROOM_M if narrowest_width(thing) > WIDE * self._opening.widest else math.inf
+        return sorted(found, key=lambda one: (-min(one.clearance, room), one.tilt))
 
     def _checker(self, things: Sequence[Thing], width: float) -> CollisionChecker:
         opening = self._opening.position(width + 2 * GAP_M)

@@ -60,7 +60,7 @@ class View:
 
 
 class _Look(NamedTuple):
-    """What came of a picture."""
+    """Result of one picture."""
 
     refused: str  # why it was, if it was
     view: View

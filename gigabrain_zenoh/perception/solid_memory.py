@@ -50,11 +50,15 @@ class Track:
 
 
 class SolidMemory:
-    """What stands near the arm of one body."""
+    """Tracks things near the arm of one body.
+
+    Its numbers begin at the tick of its first picture, so that after a restart of perception no
+    other thing gets the number of an earlier one.
+    """
 
     def __init__(self) -> None:
         self._tracks: list[Track] = []
-        self._count = 0
+        self._number = 0  # of the newest track
 
     def look(
         self, fits: Sequence[SolidFit], pose: Pose, tick: int, gone: Callable[[Floats], bool]
@@ -63,13 +67,14 @@ class SolidMemory:
 
         `gone` tells whether the picture shows what is behind a place (3,) in the body's frame.
         """
+        self._number = self._number or tick
         placed = [_moved(fit, lambda x, y: to_parent(pose, x, y), pose.yaw) for fit in fits]
         open_ = list(self._tracks)
         for fit in sorted(placed, key=lambda one: _nearest(one.position[:2], self._tracks)[0]):
             off, track = _nearest(fit.position[:2], open_)
             if track is None or off > _gate(fit):
-                self._count += 1
-                track = Track(id=self._count, tick=tick)
+                self._number += 1
+                track = Track(id=self._number, tick=tick)
                 self._tracks.append(track)
             else:
                 open_.remove(track)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from gigabrain_drivers.driver.catalog import load_link, robot_path
+from gigabrain_drivers.driver.catalog import load_link, make_driver, robot_path
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.sim.body import MujocoOptions, sim_body
 from gigabrain_drivers.sim.worlds import mission_file
@@ -366,3 +366,31 @@ def test_what_safety_holds_back_for_long_ends_the_command_after_a_few_tries(rig:
     assert task.state == "failed"
     assert "shoulder_pan is held back for 2 s" in task.reason
     assert rig.phases.count("move") == 6
+
+
+FAR = "{box: [0.03, 0.03, 0.03]%s}"
+
+
+@pytest.mark.parametrize(("place", "goes"), [(", at: [0.9, 0, 0.015]", False), ("", True)])
+def test_a_body_that_drives_goes_to_what_is_seen_not_to_what_is_given(
+    tmp_path: Path, place: str, goes: bool
+) -> None:
+    robot, driver = make_driver("lekiwi", Run(folder=Path()))
+    model = driver.arm_model()
+    assert model
+    rig = Rig(tmp_path, (0.9, 0.0), model.mjcf, "lekiwi")
+    cube = SeenSolid(id=7, shape="box", size=(0.03, 0.03, 0.03), position=(0.9, 0.0, 0.015))
+    rig.seen = () if place else (cube,)
+    rig.give(f"things: {{cube: {FAR % place}}}\ndo: [{{pick: cube}}]")
+    outcomes = []
+    for _ in range(200):
+        command, idle = rig.queue.step(TICK_S, None)
+        assert isinstance(command, ArmCommand)
+        _, outcome = rig.manipulator.step(
+            rig.arm.state(), robot.description(), command, idle, "", rig.seen
+        )
+        outcomes.append(outcome)
+        if outcome.state == "failed":
+            break
+    assert outcomes[-1].state == "failed"
+    assert bool(outcomes[-1].approach) is goes

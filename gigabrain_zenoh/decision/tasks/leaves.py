@@ -40,7 +40,7 @@ def seek_nothing(_wanted: Wanted, _without: Collection[int], _preferred: int | N
 
 @dataclass
 class Hand:
-    """What the gripper holds, as far as is known."""
+    """Holds what the gripper is believed to hold, over all tasks."""
 
     held: HeldThing | None = None
 

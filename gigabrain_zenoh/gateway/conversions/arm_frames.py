@@ -18,7 +18,7 @@ HERE = Place()
 
 
 class Mimic(NamedTuple):
-    """How a joint follows another one: `multiplier` * its position + `offset`."""
+    """Mimic joint: its position is `multiplier` times that of another one, plus `offset`."""
 
     joint: str
     multiplier: float

@@ -200,18 +200,27 @@ def _folder(course: ClutterCourse, seed: int) -> Iterator[Path]:
         yield Path(temporary)
 
 
-async def _drive(world: ClutteredWorld, course: ClutterCourse, folder: Path) -> ClutterRun:
-    deployment = Deployment(
-        body=course.body,
-        world=str(write_world(world, folder)),
-        seed=world.seed,
-        speed=course.speed,
+def lock_stepped(
+    body: str, world: Path, seed: int, speed: float, *, cameras: bool = True
+) -> Deployment:
+    """Return the deployment of a whole robot that maps a world, each tick waiting for its brain."""
+    return Deployment(
+        body=body,
+        world=str(world),
+        seed=seed,
+        speed=speed,
         lockstep_timeout_s=WAIT_S,
         resume="auto",
         router=LOOPBACK,
-        cameras=course.cameras,
+        cameras=cameras,
         perception=PerceptionConfig(mapping="slam"),
         decision=DecisionConfig(behaviour="navigate", settings={"unknown_space": "allow"}),
+    )
+
+
+async def _drive(world: ClutteredWorld, course: ClutterCourse, folder: Path) -> ClutterRun:
+    deployment = lock_stepped(
+        course.body, write_world(world, folder), world.seed, course.speed, cameras=course.cameras
     )
     async with measured_robot(deployment, folder, START_S) as (group, bus):
         driven = CourseDriver(bus, group, world, course.seconds)

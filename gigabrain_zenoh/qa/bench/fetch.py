@@ -15,22 +15,20 @@ from gigabrain_schemas.base import Pose
 from gigabrain_schemas.sim import SimPoses
 from gigabrain_schemas.topics import SIM_POSES, SIM_SCENE
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
 from gigabrain_zenoh.decision.tasks.arm_steps import Solid
 from gigabrain_zenoh.decision.tasks.mission import Mission, Step, text_of
 from gigabrain_zenoh.errors import BodyLost, Refused
 from gigabrain_zenoh.geometry.pose import compose, inverse, to_parent
-from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.navigation.global_planner import warm_up
 from gigabrain_zenoh.qa.bench.clutter import (
     START_S,
-    WAIT_S,
     CourseDriver,
     Over,
     Progress,
+    lock_stepped,
 )
 from gigabrain_zenoh.qa.bench.cluttered_worlds import ClutteredWorld, Point
-from gigabrain_zenoh.qa.robot_under_test import LOOPBACK, ProcessGroup, measured_robot
+from gigabrain_zenoh.qa.robot_under_test import ProcessGroup, measured_robot
 
 LONG_M, WIDE_M = 6.0, 4.0  # of two rooms with a door in the wall between them
 DOOR_M = 1.2
@@ -224,18 +222,7 @@ async def _fetch(
     seed: int, body: str, speed: float, seconds: float, folder: Path, *, people: bool
 ) -> FetchRun:
     world = draw(seed)
-    deployment = Deployment(
-        body=body,
-        world=str(write(world, folder, people=people)),
-        seed=seed,
-        speed=speed,
-        lockstep_timeout_s=WAIT_S,
-        resume="auto",
-        router=LOOPBACK,
-        cameras=True,
-        perception=PerceptionConfig(mapping="slam"),
-        decision=DecisionConfig(behaviour="navigate", settings={"unknown_space": "allow"}),
-    )
+    deployment = lock_stepped(body, write(world, folder, people=people), seed, speed)
     course = ClutteredWorld(seed, (), (), (), world.start, (), ())
     async with measured_robot(deployment, folder, START_S) as (group, bus):
         driver = FetchDriver(bus, group, course, seconds)

@@ -31,9 +31,8 @@ from gigabrain_schemas.brain import Intent
 from gigabrain_schemas.safety import JointCap, SafetyState
 from gigabrain_zenoh.control.joints import JointInputs, JointMemory, step_joints
 from gigabrain_zenoh.decision.held_things import thing_of
-from gigabrain_zenoh.decision.lookout import Lookout
 from gigabrain_zenoh.decision.manipulator import TRIES
-from gigabrain_zenoh.decision.seen_things import located
+from gigabrain_zenoh.decision.seen_things import Lookout, located
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.gate.state import BRAIN

@@ -1,4 +1,4 @@
-"""What an arm's camera sees in `gigabrain bench hands`, with a sensor's errors and mounting."""
+"""Camera of the arm in `gigabrain bench hands`, with the errors of a real one."""
 
 from functools import partial
 

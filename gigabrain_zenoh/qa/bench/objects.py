@@ -13,13 +13,11 @@ from msgspec import Struct
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.objects import MapObject
 from gigabrain_schemas.topics import OBJECT_MAP
-from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
 from gigabrain_zenoh.geometry.pose import to_parent
-from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.navigation.global_planner import warm_up
-from gigabrain_zenoh.qa.bench.clutter import START_S, WAIT_S, CourseDriver
+from gigabrain_zenoh.qa.bench.clutter import START_S, CourseDriver, lock_stepped
 from gigabrain_zenoh.qa.bench.cluttered_worlds import ClutteredWorld, Point
-from gigabrain_zenoh.qa.robot_under_test import LOOPBACK, measured_robot
+from gigabrain_zenoh.qa.robot_under_test import measured_robot
 from gigabrain_zenoh.qa.train.looks import MAKERS, Geom, Look
 
 CLASSES = ("cube", "ball", "cylinder", "can", "box")  # things that stay where they are
@@ -92,18 +90,7 @@ def in_words(run: ObjectRun) -> str:
 
 async def _drive(seed: int, body: str, speed: float, seconds: float, folder: Path) -> ObjectRun:
     placed, course = draw(seed)
-    deployment = Deployment(
-        body=body,
-        world=str(write(course, placed, folder)),
-        seed=seed,
-        speed=speed,
-        lockstep_timeout_s=WAIT_S,
-        resume="auto",
-        router=LOOPBACK,
-        cameras=True,
-        perception=PerceptionConfig(mapping="slam"),
-        decision=DecisionConfig(behaviour="navigate", settings={"unknown_space": "allow"}),
-    )
+    deployment = lock_stepped(body, write(course, placed, folder), seed, speed)
     async with measured_robot(deployment, folder, START_S) as (group, bus):
         objects = bus.latest(OBJECT_MAP)
         driven = CourseDriver(bus, group, course, seconds)

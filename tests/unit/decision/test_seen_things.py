@@ -10,8 +10,7 @@ import pytest
 from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.objects import SeenSolid, Solids
-from gigabrain_zenoh.decision.lookout import LOOK_TICKS, Lookout
-from gigabrain_zenoh.decision.seen_things import SeenThings, located
+from gigabrain_zenoh.decision.seen_things import LOOK_TICKS, Lookout, SeenThings, located
 from gigabrain_zenoh.decision.tasks.arm_steps import Solid
 from gigabrain_zenoh.testing.samples import BOOT, state
 

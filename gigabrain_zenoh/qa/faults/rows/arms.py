@@ -149,7 +149,7 @@ def _frozen(robot: RobotUnderTest, victim: str) -> tuple[Action, Action]:
     if victim != "router":
         return lambda: robot.freeze(victim), robot.thaw
 
-    async def cut() -> None:  # meanwhile nobody can be asked
+    async def cut() -> None:  # no process answers meanwhile
         robot.freeze(victim)
         await asyncio.sleep(REST_S)
         robot.thaw()
