@@ -33,7 +33,7 @@ class LeaderJoint(ServoJoint):
 
     @property
     def leads_to(self) -> float:
-        """Return the target of the other arm's joint [rad]; a trigger is scaled to a gripper's range."""
+        """Return the target of the other arm's joint [rad]; a trigger takes a gripper's range."""
         its, joint = self.calibration, self.description
         if joint.part != "gripper" or self.newest is None:
             return self.position
