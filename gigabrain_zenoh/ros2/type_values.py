@@ -2,6 +2,7 @@
 
 import base64
 import binascii
+import functools
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -17,7 +18,8 @@ from gigabrain_zenoh.ros2.type_files import DUMMY, Description
 BYTES = ("uint8", "char", "byte")
 DTYPES = {"bool": np.dtype(np.bool_), "char": np.dtype(np.uint8), "byte": np.dtype(np.int8)}
 Make = Callable[[], Any]
-Plan = dict[str, tuple[Description, Make]]  # by the name of the attribute, in the wire's order
+Fit = Callable[[Any], Any]  # a value as rosbags encodes it
+Plan = dict[str, tuple[Description, Make, Fit]]  # by the attribute's name, in the wire's order
 
 
 def dtype(primitive: str) -> np.dtype[Any]:
@@ -41,8 +43,8 @@ class Values:
         """Make a message of `fields`, and of defaults."""
         plan = self._plan(name)
         values = [
-            self._fitting(kind, fields[field]) if field in fields else default()
-            for field, (kind, default) in plan.items()
+            fit(fields[field]) if field in fields else default()
+            for field, (_, default, fit) in plan.items()
         ]
         if not fields.keys() <= plan.keys():
             wrong = ", ".join(sorted(fields.keys() - plan.keys()))
@@ -61,7 +63,7 @@ class Values:
             self._checked(kind, data[field], f"{path}.{field}" if path else field)
             if field in data
             else default()
-            for field, (kind, default) in plan.items()
+            for field, (kind, default, _) in plan.items()
         ]
         return self._store.types[name](*values)
 
@@ -69,7 +71,7 @@ class Values:
         """Return the message's fields in JSON's values."""
         return {
             field: self._plain(kind, getattr(message, field))
-            for field, (kind, _) in self._plan(message.__msgtype__).items()
+            for field, (kind, *_) in self._plan(message.__msgtype__).items()
             if field != DUMMY
         }
 
@@ -77,7 +79,7 @@ class Values:
         """Return those of JSON's values that a type has fields for."""
         return {
             field: self._known(kind, data[field])
-            for field, (kind, _) in self._plan(name).items()
+            for field, (kind, *_) in self._plan(name).items()
             if field in data
         }
 
@@ -94,13 +96,14 @@ class Values:
             given = self._defaults.get(name, {})
             plan = self._plans[name] = {}
             for field, kind in self._store.fielddefs[name][1]:
-                key = normalize_fieldname(field)
-                plan[key] = (kind, self._default(kind, given.get(key)))
+                key, fit = normalize_fieldname(field), self._fit(kind)
+                default = self._default(kind)
+                if key in given:
+                    default = functools.partial(fit, given[key])
+                plan[key] = (kind, default, fit)
         return plan
 
-    def _default(self, kind: Description, given: Any) -> Make:
-        if given is not None:
-            return lambda: self._fitting(kind, given)
+    def _default(self, kind: Description) -> Make:
         if kind[0] == Nodetype.NAME:
             return lambda: self.make(kind[1], {})
         if kind[0] == Nodetype.BASE:
@@ -113,23 +116,26 @@ class Values:
         if inner[0] == Nodetype.BASE and inner[1][0] != "string":
             element = dtype(inner[1][0])
             return lambda: np.zeros(count, element)
-        one = self._default(inner, None)
+        one = self._default(inner)
         return lambda: [one() for _ in range(count)]
 
-    def _fitting(self, kind: Description, value: Any) -> Any:
-        """Return the value as rosbags encodes it: mappings and lists are turned, others taken."""
+    def _fit(self, kind: Description) -> Fit:
+        """Return what turns a field's mappings and lists; other values are taken as they are."""
         if kind[0] == Nodetype.BASE:
-            return value
+            return lambda value: value
         if kind[0] == Nodetype.NAME:
-            return self.make(kind[1], value) if isinstance(value, Mapping) else value
+            message = self._store.types[kind[1]]
+            return lambda value: value if type(value) is message else self._nested(kind[1], value)
         inner = kind[1][0]
         if inner[0] == Nodetype.NAME:
-            return [self._fitting(inner, each) for each in value]
+            one = self._fit(inner)
+            return lambda value: [one(each) for each in value]
         if inner[1][0] == "string":
-            return list(value)
-        if isinstance(value, bytes | bytearray | memoryview):
-            return np.frombuffer(value, dtype(inner[1][0]))
-        return np.ascontiguousarray(value, dtype(inner[1][0])).reshape(-1)
+            return list
+        return functools.partial(_array, dtype(inner[1][0]))
+
+    def _nested(self, name: str, value: Any) -> Any:
+        return self.make(name, value) if isinstance(value, Mapping) else value
 
     def _checked(self, kind: Description, value: Any, path: str) -> Any:
         if kind[0] == Nodetype.NAME:
@@ -167,6 +173,12 @@ class Values:
             return base64.b64encode(value.tobytes()).decode()
         elements = value.tolist()
         return [_text(each) for each in elements] if value.dtype.kind == "f" else elements
+
+
+def _array(element: np.dtype[Any], value: Any) -> Any:
+    if isinstance(value, bytes | bytearray | memoryview):
+        return np.frombuffer(value, element)
+    return np.ascontiguousarray(value, element).reshape(-1)
 
 
 def _text(number: float) -> float | str:
