@@ -34,7 +34,8 @@ log = logging.getLogger(__name__)
 SECOND_NS = 1_000_000_000
 TF = Qos(depth=100)  # as tf2's broadcaster
 CLOCK = Qos(reliable=False, depth=1)  # as ROS's own subscription
-Convert = Callable[[Make, Any, Scene], Any | None]  # None: nothing to publish
+# a message, or its CDR; None: nothing to publish
+Convert = Callable[[Make, Any, Scene], Any | None]
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ def table() -> tuple[Row, ...]:
     imu = _ImuSource()
     return (
         Row("scan", "sensor_msgs/msg/LaserScan", SENSOR_DATA, (
-            (SCAN, lambda make, scan, scene: sensors.laser_scan(make, scan, scene.body)),)),
+            (SCAN, lambda _, scan, scene: sensors.laser_scan(scan, scene.body)),)),
         Row("odom", "nav_msgs/msg/Odometry", DEFAULT, ((STATE, _plain(of_body.odometry)),)),
         Row("tf", "tf2_msgs/msg/TFMessage", TF, ((STATE, _tf),)),
         Row("tf_static", "tf2_msgs/msg/TFMessage", LATCHED, (
@@ -262,5 +263,6 @@ class Publishing:
         if made is None:
             return
         one.content, one.sent_ns = content, now_ns
-        one.publisher.publish(self._types.encode(one.row.type, made))
+        cdr = made if isinstance(made, bytes) else self._types.encode(one.row.type, made)
+        one.publisher.publish(cdr)
         self._scene.bus.counters["published"] += 1

@@ -1,5 +1,6 @@
 """Scans, pictures and depth."""
 
+import struct
 from typing import Any
 
 import numpy as np
@@ -7,36 +8,41 @@ import numpy as np
 from gigabrain_schemas.body import Body, Camera
 from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_schemas.vision import DepthImage
-from gigabrain_zenoh.gateway.conversions.frames import Make, header, optical_frame
+from gigabrain_zenoh.gateway.conversions.frames import SECOND_NS, Make, header, optical_frame
 
-NO_INTENSITIES = np.empty(0, np.float32)
+LITTLE_ENDIAN = b"\0\1\0\0"
+HEAD = struct.Struct("<4siII")  # of a message with a header, up to the length of its frame
+NUMBERS = struct.Struct("<7fI")  # of a scan, up to the number of its ranges
+NO_INTENSITIES = bytes(4)
 PLUMB_BOB, RATIONAL = 5, 8  # coefficients of ROS's two models
 STRAIGHT = np.eye(3).ravel()
 STRAIGHT.flags.writeable = False
 
 
-def laser_scan(make: Make, scan: LaserScan, body: Body | None = None) -> Any:
-    """Return sensor_msgs/LaserScan.
+def laser_scan(scan: LaserScan, body: Body | None = None) -> bytes:
+    """Return sensor_msgs/LaserScan as CDR, packed by hand: a message takes six times as long.
 
     REP-117: infinite is free as far as the sensor reaches, NaN is unknown. So infinite ranges of a
     lidar that cannot tell them apart become NaN.
     """
-    ranges, lidar = scan.ranges_m, body.description.lidar if body else None
+    ranges, lidar = scan.ranges, body.description.lidar if body else None
     if lidar and lidar.no_return == "unknown":
-        ranges = np.where(np.isinf(ranges), np.float32(np.nan), ranges)
-    return make(
-        "sensor_msgs/msg/LaserScan",
-        header=header(make, scan.stamp_ns, scan.frame_id),
-        angle_min=scan.angle_min,
-        angle_max=scan.angle_min + scan.angle_increment * (len(ranges) - 1),
-        angle_increment=scan.angle_increment,
-        time_increment=0.0,
-        scan_time=1.0 / lidar.rate_hz if lidar else 0.0,
-        range_min=scan.range_min,
-        range_max=scan.range_max,
-        ranges=ranges,
-        intensities=NO_INTENSITIES,
+        found = scan.ranges_m
+        ranges = np.where(np.isinf(found), np.float32(np.nan), found).tobytes()
+    count, frame = len(ranges) // 4, scan.frame_id.encode() + b"\0"
+    head = HEAD.pack(LITTLE_ENDIAN, *divmod(scan.stamp_ns, SECOND_NS), len(frame))
+    numbers = NUMBERS.pack(
+        scan.angle_min,
+        scan.angle_min + scan.angle_increment * (count - 1),
+        scan.angle_increment,
+        0.0,  # from beam to beam [s]
+        1.0 / lidar.rate_hz if lidar else 0.0,
+        scan.range_min,
+        scan.range_max,
+        count,
     )
+    padding = bytes(-len(frame) % 4)
+    return b"".join((head, frame, padding, numbers, ranges, NO_INTENSITIES))
 
 
 def compressed_image(make: Make, picture: Image, camera: str) -> Any:

@@ -30,8 +30,12 @@ def through_cdr(name, message):
     return TYPES.decode(name, TYPES.encode(name, message))
 
 
+def scan_of(body):
+    return TYPES.decode("sensor_msgs/msg/LaserScan", sensors.laser_scan(SCAN, body))
+
+
 def test_a_scan_keeps_angles_limits_and_what_was_not_hit():
-    got = through_cdr("sensor_msgs/msg/LaserScan", sensors.laser_scan(MAKE, SCAN, samples.body()))
+    got = scan_of(samples.body())
     assert got.header.frame_id == "base_scan"
     assert (got.header.stamp.sec, got.header.stamp.nanosec) == (1_795_580_000, 500_000_000)
     assert (got.angle_min, got.angle_max, got.angle_increment) == (-1.0, 0.5, 0.5)
@@ -45,13 +49,24 @@ def test_a_scan_keeps_angles_limits_and_what_was_not_hit():
 def test_infinite_ranges_of_a_lidar_that_cannot_tell_are_unknown():
     lidar = replace(samples.LIDAR, no_return="unknown")
     body = samples.body(replace(samples.WAFFLE, lidar=lidar))
-    got = sensors.laser_scan(MAKE, SCAN, body)
+    got = scan_of(body)
     assert np.isnan(got.ranges).tolist() == [False, True, True, False]
     assert got.ranges.dtype == np.float32
 
 
 def test_a_scan_of_a_body_that_is_not_known_yet_has_no_scan_time():
-    assert sensors.laser_scan(MAKE, SCAN).scan_time == 0.0
+    assert scan_of(None).scan_time == 0.0
+
+
+@pytest.mark.parametrize("frame", ["lid", "scan", "base_scan", "front_scanner"])
+@pytest.mark.parametrize("beams", [1, 4, 360])
+def test_a_scan_packed_by_hand_is_what_the_library_writes(frame, beams):
+    ranges = np.linspace(0.2, 3.0, beams, dtype="f4")
+    scan = replace(samples.scan(ranges), frame_id=frame, stamp_ns=STAMP)
+    payload = sensors.laser_scan(scan, samples.body())
+    got = TYPES.decode("sensor_msgs/msg/LaserScan", payload)
+    assert (got.header.frame_id, got.ranges.tolist()) == (frame, ranges.tolist())
+    assert TYPES.encode("sensor_msgs/msg/LaserScan", got) == payload
 
 
 def test_a_jpeg_goes_unchanged_and_a_raw_picture_not_at_all():
