@@ -26,12 +26,21 @@ from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN, STATE
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.client.requests import release
-from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig, Ros2Config
+from gigabrain_zenoh.config.settings import (
+    DecisionConfig,
+    PerceptionConfig,
+    Ros2Config,
+    Ros2Link,
+)
 from gigabrain_zenoh.errors import BodyLost, Refused
+from gigabrain_zenoh.gateway.conversions.sensors import laser_scan
 from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.qa.bench.goals import START_S, GoalSender
 from gigabrain_zenoh.qa.robot_under_test import LOOPBACK, ProcessGroup, measured_robot
+from gigabrain_zenoh.ros2.dds import DdsTransport
+from gigabrain_zenoh.ros2.qos import SENSOR_DATA
+from gigabrain_zenoh.ros2.types import Types
 from gigabrain_zenoh.testing.waiting import until
 from tests.ros2.environment import build, say
 from tests.ros2.judge import Judge, Program, judging
@@ -111,20 +120,46 @@ async def running(judge: Judge, world: str, **parts: Any) -> AsyncIterator[Robot
         yield robot
 
 
-async def added_latency(robot: Robot, judge: Judge, count: int) -> list[float]:
-    """Return by how much later [ms] scans arrive at rclpy than at a process on our bus."""
+async def arrivals(judge: Judge, topic: str, count: int) -> dict[int, int]:
+    """Return when [ns] scans have arrived at rclpy, ten for each of `count`, by their stamps."""
     listen = judge.start("listen")
     kind, qos = READ["/scan"]
-    await listen.query("subscribe", topic="/scan", type=kind, qos=qos, stream=True)
-    await listen.hear("message", nth=count + 5)
-    found = []
-    for event in listen.seen("message", topic="/scan")[5:]:
+    await listen.query("subscribe", topic=topic, type=kind, qos=qos, stream=True)
+    await listen.hear("message", GOAL_S, nth=10 * count + 5)
+    found = {}
+    for event in listen.seen("message", topic=topic)[5:]:
         stamp = event["value"]["header"]["stamp"]
-        came_ns = robot.scans.get(stamp["sec"] * 10**9 + stamp["nanosec"])
-        if came_ns is not None:
-            found.append((event["at_ns"] - came_ns) / 1e6)
+        found[stamp["sec"] * 10**9 + stamp["nanosec"]] = event["at_ns"]
     listen.close()
     return found
+
+
+def later(arrived: dict[int, int], than: dict[int, int]) -> list[float]:
+    """Return how much later [ms] scans have arrived."""
+    return [(at_ns - than[stamp]) / 1e6 for stamp, at_ns in arrived.items() if stamp in than]
+
+
+async def added_latency(robot: Robot, judge: Judge, count: int) -> list[float]:
+    """Return by how much later [ms] scans arrive at rclpy than at a process on our bus."""
+    return later(await arrivals(judge, "/scan", count), robot.scans)
+
+
+async def bare_hops(robot: Robot, judge: Judge, count: int) -> list[float]:
+    """Return the times [ms] of scans that this process writes to DDS itself, until rclpy."""
+    link = Ros2Link(node="bare", transport="dds", domain=judge.domain, localhost=True)
+    written: dict[int, int] = {}
+    async with DdsTransport(link, Types()) as ros:
+        publisher = ros.publisher("/bare_scan", READ["/scan"][0], SENSOR_DATA)
+
+        def write(_key: str, scan: LaserScan) -> None:
+            payload = laser_scan(scan)
+            written[scan.stamp_ns] = time.monotonic_ns()
+            publisher.publish(payload)
+
+        close = robot.bus.subscribe(SCAN, write)
+        arrived = await arrivals(judge, "/bare_scan", count)
+        close()
+    return later(arrived, written)
 
 
 async def brakings(robot: Robot, judge: Judge, count: int) -> list[float]:
@@ -249,6 +284,7 @@ async def times(judge: Judge, count: int, seconds: float) -> Table:
         share, rates = await load(robot, judge, seconds)
         rows: dict[str, Any] = {
             "scan at rclpy, later than on our bus (ms)": added_latency,
+            "of that, by DDS and rclpy alone (ms)": bare_hops,
             "publisher killed: from its period to braking (ms)": brakings,
             "/estop called: to zero (ms)": stops,
         }
