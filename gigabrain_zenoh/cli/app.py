@@ -79,6 +79,8 @@ COMMANDS = {
     "arm goto": ("arm:goto", "Bring the tool to a point."),
     "arm pick": ("arm:pick", "Pick a thing up."),
     "arm place": ("arm:place", "Put down what the gripper holds."),
+    "arm press": ("arm:press", "Press a place with the closed gripper."),
+    "arm hand-over": ("arm:hand_over", "Hand what the gripper holds to a person."),
     "arm limp": ("arm:limp", "Let go of all joints, so that a person can move them."),
     "arm hold": ("arm:hold", "Hold limp joints again, where they are."),
     "objects": ("objects:objects", "List the things and tags that the cameras have recognised."),

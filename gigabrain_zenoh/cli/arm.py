@@ -214,6 +214,69 @@ def place(
     _carry_out(at, Mission(do=(Step(place=(x, y, z)),)), mode, wait)
 
 
+def press(
+    x: Metres,
+    y: Metres,
+    z: Metres,
+    /,
+    *,
+    pitch: Distance | None = None,
+    depth: float = 0.03,
+    force: float = 4.0,
+    seconds: float = 0.5,
+    mode: Mode = "replace",
+    wait: Wait = True,
+    at: RobotAddress = LOCAL,
+) -> None:
+    """Press a place with the closed gripper, such as a button, and go back.
+
+    Example: gigabrain arm press 0.25 0 0.05 --pitch 90
+
+    Args:
+        x: Forwards, from the arm's base [m].
+        y: To the left [m].
+        z: Up [m].
+        pitch: How far the tool points down [degrees], 0 for level. Default: any way.
+        depth: How far it goes on behind that place at most [m].
+        force: With which it presses [N].
+        seconds: How long.
+    """
+    from gigabrain_zenoh.decision.tasks.arm_steps import Press
+    from gigabrain_zenoh.decision.tasks.mission import Mission, Step
+
+    down = None if pitch is None else math.radians(pitch)
+    what = Press(at=(x, y, z), pitch=down, depth=depth, force=force, seconds=seconds)
+    _carry_out(at, Mission(do=(Step(press=what),)), mode, wait)
+
+
+def hand_over(
+    *,
+    to: tuple[float, float, float] | None = None,
+    pitch: Distance | None = None,
+    seconds: float = 60.0,
+    mode: Mode = "replace",
+    wait: Wait = True,
+    at: RobotAddress = LOCAL,
+) -> None:
+    """Hand what the gripper holds to a person: it lets go once somebody pulls at it.
+
+    Example: gigabrain arm hand-over
+
+    `gigabrain task resume` has it let go as well.
+
+    Args:
+        to: Where: forwards, to the left and up from the arm's base [m]. Default: well ahead.
+        pitch: How far the tool points down [degrees], 0 for level. Default: any way.
+        seconds: How long it waits; then it keeps the thing.
+    """
+    from gigabrain_zenoh.decision.tasks.arm_steps import HandOver
+    from gigabrain_zenoh.decision.tasks.mission import Mission, Step
+
+    down = None if pitch is None else math.radians(pitch)
+    what = HandOver(at=to, pitch=down, seconds=seconds)
+    _carry_out(at, Mission(do=(Step(hand_over=what),)), mode, wait)
+
+
 def limp(*, yes: bool = False, at: RobotAddress = LOCAL) -> None:
     """Let go of all joints, so that a person can move them. The arm may fall: hold it.
 

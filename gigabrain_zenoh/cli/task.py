@@ -181,7 +181,7 @@ def pause(task: TaskName = "", /, *, at: RobotAddress = LOCAL) -> None:
 
 
 def resume(task: TaskName = "", /, *, at: RobotAddress = LOCAL) -> None:
-    """Resume a paused task.
+    """Resume a paused task, or have an arm let go of what it hands over.
 
     Example: gigabrain task resume
     """

@@ -39,6 +39,13 @@ def measured_posture(planner: ArmPlanner, state: RobotState) -> Floats:
     return np.array([found[name] for name in planner.arm.names])
 
 
+def measured_efforts(planner: ArmPlanner, state: RobotState) -> Floats | None:
+    """Return the efforts of the arm's joints (n,) [N m] or [N]; None where one is not measured."""
+    found = {joint.name: joint.effort for joint in state.joints}
+    efforts = [found.get(name) for name in planner.arm.names]
+    return None if None in efforts else np.array(efforts)
+
+
 def posture_of(body: BodyDescription, name: NamedPosture) -> dict[str, float]:
     """Return a posture of the robot's file [rad] or [m]."""
     assert body.arm

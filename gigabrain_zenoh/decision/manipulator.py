@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 
-import numpy as np
 from msgspec.structs import replace
 
 from gigabrain_schemas.base import TICK_S
@@ -21,10 +20,11 @@ from gigabrain_zenoh.decision.arm_readings import (
     measured_posture,
     off_from,
     pace,
-    posture_of,
     sent_posture,
     sent_to,
 )
+from gigabrain_zenoh.decision.arm_touch import Touch
+from gigabrain_zenoh.decision.arm_work import Planned, WorkInputs, moving, work_for
 from gigabrain_zenoh.decision.behaviours import (
     ArmCommand,
     Idle,
@@ -36,24 +36,21 @@ from gigabrain_zenoh.decision.held_things import (
     held_thing,
     hold_of,
     placed,
-    standing_height,
     thing_of,
 )
 from gigabrain_zenoh.decision.seen_things import Lookout, approach, located, still_stands, unseen
 from gigabrain_zenoh.decision.tasks.arm_steps import (
     ArmAction,
-    Gripper,
+    AwaitTaken,
     HeldThing,
     Pick,
-    PlaceThing,
-    Reach,
+    Press,
     Solid,
     TakePosture,
 )
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold, Plan
 from gigabrain_zenoh.manipulation.collision import Thing
-from gigabrain_zenoh.manipulation.grasps import Grasp
 from gigabrain_zenoh.manipulation.phases import PhaseRun
 from gigabrain_zenoh.manipulation.pick_place import NoWay
 
@@ -65,7 +62,7 @@ CARRYING = ("lift", "traverse", "lower", "move")  # phases in which a thing has 
 NO_MODEL = Idle("waiting", "waiting: for the arm's model, robot/arm_model")
 NOT_MEASURED = Idle("waiting", "waiting: for all joints to be measured")
 PLANNING = Idle("planning", "planning")
-Planned = Plan | NoWay
+OFFERING = "waiting for somebody to pull at {}; `gigabrain task resume` lets go of it"
 
 
 class Manipulator:
@@ -88,8 +85,10 @@ class Manipulator:
         self._misses = 0  # grasps of it that caught nothing
         self._hold_ups = 0  # of it, by a joint that did not follow
         self._achieved = StepOutcome()  # of a command that is done but for the way back
-        self._left: Grasp | None = None  # at which the hand still is, without holding the thing
+        self._left: Plan | None = None  # whose thing the hand is still at, without holding it
         self._interim = False  # it goes back from there, or out of a camera's sight
+        self._why_not = ""  # why it fails once it is back
+        self._touch: Touch | None = None  # while it presses, or offers something
         self._lookout = Lookout()
         self._seen_as: int | None = None  # number by which a camera knew what is held
         self._gripped = 0  # tick since which it is held
@@ -135,6 +134,7 @@ class Manipulator:
         if command is None:
             return self._still(idle)
         if held:
+            self._touch = None
             if self._run:  # a plan that is being made will do, if the arm has not been moved then
                 self._interrupt()
             return self._still(Idle("waiting", f"waiting: {held}"), held=True)
@@ -142,7 +142,7 @@ class Manipulator:
             return self._still(NO_MODEL)
         if {joint.name for joint in body.joints} - {joint.name for joint in state.joints}:
             return self._still(NOT_MEASURED)
-        if self._run is None and self._achieved.number:
+        if self._run is None and self._achieved.number and not self._left:
             return self._still(Idle("done", self._achieved.reason), self._achieved)
         try:
             if self._recalls:
@@ -203,6 +203,8 @@ class Manipulator:
             name = self._hold.thing.name
             self._set_hold(None)
             return self._fail(f"{name} is not in the gripper: it is seen where it was")
+        if isinstance(do, AwaitTaken):
+            return self._offer(planner, body, state)
         if self._run is None and self._left:
             self._back_off(planner, body, state, self._left)
         elif self._run is None:
@@ -266,40 +268,49 @@ class Manipulator:
         things: Mapping[str, Solid],
     ) -> Callable[[], Planned] | str:
         """Return what plans an action, or why it cannot be planned."""
-        if len(state.joints_sent) != len(body.joints):
-            return "the joints are not measured, or limp"
-        posture = sent_posture(planner, body, state)
-        hold, others = self._hold, [thing_of(name, one) for name, one in things.items()]
-        match do:
-            case Reach(at=at, pitch=pitch):
-                return lambda: planner.reach(np.array(at), pitch, others, posture, hold)
-            case TakePosture(to=to):
-                goal = posture_of(body, to) if isinstance(to, str) else to
-                return lambda: planner.take_posture(goal, others, posture, hold)
-            case Gripper(to=to):
-                return lambda: planner.grip(to)
-            case Pick(thing=name):
-                if hold:
-                    return f"the gripper holds {hold.thing.name} already"
-                if name not in things:
-                    return f"where {name} is, is not known"
-                thing, misses = thing_of(name, things[name]), self._misses
-                self._target = thing
-                around = [one for one in others if one.name != name]
-                drives = body.has_base and self._seen_as is not None  # others do not stay behind
-                return lambda: planner.pick(thing, around, posture, misses, drives=drives)
-            case PlaceThing(at=at):
-                if hold is None:
-                    return "the gripper holds nothing"
-                target = np.array(at if len(at) == 3 else (*at, standing_height(hold, body)))
-                return lambda: planner.place(hold, target, others, posture)
+        if isinstance(do, Pick) and do.thing in things:
+            self._target = thing_of(do.thing, things[do.thing])
+        drives = body.has_base and self._seen_as is not None  # others do not stay behind
+        now = WorkInputs(
+            state=state, body=body, things=things, hold=self._hold, misses=self._misses,
+            drives=drives,
+        )  # fmt: skip
+        return work_for(planner, do, now)
+
+    def _offer(self, planner: ArmPlanner, body: BodyDescription, state: RobotState) -> StepResult:
+        """Hold still until somebody pulls at what the gripper holds, or has taken it."""
+        hold, self._touch = self._hold, self._touch or Touch(planner)
+        pulled = self._touch.is_pulled(body, state)
+        if hold and holds(planner, hold, state) and not pulled:
+            return self._still(Idle("offering", OFFERING.format(hold.thing.name)))
+        self._achieve(hold if pulled else None)
+        return self._still(Idle("done", ""), replace(self._achieved, reason=""))
 
     def _back_off(
-        self, planner: ArmPlanner, body: BodyDescription, state: RobotState, grasp: Grasp
+        self, planner: ArmPlanner, body: BodyDescription, state: RobotState, left: Plan
     ) -> None:
         """Begin to go back from a thing that is not held; afterwards it is planned again."""
-        self._left, self._interim = grasp, True
-        self._begin(planner, planner.back_off(grasp, sent_posture(planner, body, state)), state)
+        self._left, self._interim = left, True
+        self._begin(planner, planner.back_off(left, sent_posture(planner, body, state)), state)
+
+    def _press(
+        self, planner: ArmPlanner, body: BodyDescription, state: RobotState, do: Press, over: bool
+    ) -> StepResult:
+        """Go on to press, until it is felt enough or the way is `over`; then go back."""
+        self._touch = self._touch or Touch(planner)
+        pressure = self._touch.pressure(body, state)
+        if over or (pressure and pressure.reaches(do.force)):
+            touched = pressure is not None and pressure.touched
+            if touched:
+                self._achieve(None)
+                self._achieved = replace(self._achieved, reason=str(pressure))
+            else:
+                self._why_not = f"nothing was touched, {do.depth * 100:g} cm behind that place"
+            self._left, self._interim = self._plan, True
+            posture = sent_posture(planner, body, state)
+            back = planner.after_press(self._plan, posture, do.seconds if touched else 0.0)
+            self._begin(planner, back, state)
+        return self._moving(state)
 
     def _begin(self, planner: ArmPlanner, plan: Plan, state: RobotState) -> None:
         gripper = planner.arm.gripper
@@ -323,7 +334,10 @@ class Manipulator:
         if off := off_from(body, state, run.expected(state.tick), "path_tolerance"):
             return self._held_up(off)
         grips = run.phase is not None and gripper_moves(planner, state, body, run.phase)
+        presses = run.phase is not None and run.phase.name == "press"
         over = run.advance(state.tick, grips=grips)
+        if presses and isinstance(command.do, Press):
+            return self._press(planner, body, state, command.do, over is not None)
         if over and over.name == "close" and plan.hold:
             closed = sent_to(planner, body, state, plan.hold.grip)  # unless safety holds it back
             if not (closed and holds(planner, plan.hold, state)):
@@ -343,11 +357,10 @@ class Manipulator:
 
     def _missed(self, planner: ArmPlanner, body: BodyDescription, state: RobotState) -> StepResult:
         """Go back from a thing that was not caught; afterwards another grasp is tried."""
-        assert self._plan.grasp
         self._misses += 1
         self._set_hold(None)
         self._achieved = StepOutcome()
-        self._back_off(planner, body, state, self._plan.grasp)
+        self._back_off(planner, body, state, self._plan)
         return self._moving(state)
 
     def _grip(self, planner: ArmPlanner, run: PhaseRun, hold: Hold, state: RobotState) -> None:
@@ -387,35 +400,18 @@ class Manipulator:
         if off := off_from(body, state, end, "goal_tolerance"):
             late = run.over_for(state.tick) * TICK_S > body.arm.goal_time
             return self._held_up(off) if late else self._moving(state)
-        if self._interim:
+        if self._interim and not self._achieved.number:
+            why = self._why_not or (MISSED if self._misses >= TRIES else "")
             self._drop()
-            missed = self._misses >= TRIES
-            return self._fail(MISSED) if missed else self._still(PLANNING)
+            return self._fail(why) if why else self._still(PLANNING)
         if not self._achieved.number:
             self._achieve(self._hold)
         self._drop()
         return self._still(Idle("done", self._achieved.reason), self._achieved)
 
     def _moving(self, state: RobotState) -> StepResult:
-        run = self._run
-        assert run
-        joints, window = run.wish(state.tick)
-        text = run.phase.name if run.phase else "coming to rest"
-        outcome = StepOutcome(
-            number=self._number,
-            activity=text,
-            reason=text,
-            progress=run.progress(state.tick),
-            eta=run.left_ticks(state.tick) * TICK_S,
-        )
-        intent = Intent(
-            joints=joints,
-            joint_trajectory=window,
-            progress=outcome.progress,
-            behaviour=self._behaviour,
-            reason=text,
-        )
-        return intent, outcome
+        assert self._run
+        return moving(self._run, state.tick, self._number, self._behaviour)
 
     def _fail(self, reason: str, approach: Target | None = None, seek: str = "") -> StepResult:
         self._drop()
@@ -434,8 +430,8 @@ class Manipulator:
     def _interrupt(self) -> None:
         """Forget the plan, but not that the hand is at a thing that it does not hold yet."""
         left, phase = self._left, self._run.phase if self._run else None
-        if phase and phase.name in ("descend", "close") and self._plan.grasp:
-            left = self._plan.grasp
+        if phase and phase.name in ("descend", "close", "press"):
+            left = self._plan
         self._drop()
         self._left = left
 
@@ -443,5 +439,5 @@ class Manipulator:
         """Forget the plan, and the one that is being made."""
         if self._planning:
             self._planning.cancel()
-        self._planning = self._run = self._left = None
-        self._interim = False
+        self._planning = self._run = self._left = self._touch = None
+        self._interim, self._why_not = False, ""

@@ -13,7 +13,7 @@ from gigabrain_schemas.objects import SeenSolid, Solids
 from gigabrain_schemas.topics import SOLIDS
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.decision.behaviours import Target
-from gigabrain_zenoh.decision.tasks.arm_steps import ArmAction, Pick, Solid
+from gigabrain_zenoh.decision.tasks.arm_steps import ArmAction, Solid, thing_meant
 from gigabrain_zenoh.geometry.pose import PoseHistory, relative, to_parent
 
 if TYPE_CHECKING:
@@ -122,10 +122,9 @@ def located(
 
 
 def unseen(do: ArmAction, things: Mapping[str, Solid], known: Mapping[str, Solid]) -> str | None:
-    """Return the name of the thing that is to be picked up, if it is one that is not `known`."""
-    if not isinstance(do, Pick) or do.thing in known or do.thing not in things:
-        return None
-    return do.thing
+    """Return the name of the thing that an action needs, if it is one that is not `known`."""
+    thing = thing_meant(do)
+    return None if thing in known or thing not in things else thing
 
 
 def still_stands(seen: tuple[SeenSolid, ...], number: int | None, held_ticks: int) -> bool:

@@ -103,6 +103,15 @@ class ArmKinematics:
         mujoco.mj_jacSite(self._model, self._data, moved, turned, self._site)
         return frame, self._jacobian.reshape(6, -1)[:, self._dofs]
 
+    def weights(self, posture: Floats) -> Floats:
+        """Return the efforts that hold the arm against gravity (n,) [N m] or [N]."""
+        self._set(self._data, posture)
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_comPos(self._model, self._data)
+        efforts = np.zeros(self._model.nv)
+        mujoco.mj_rne(self._model, self._data, 0, efforts)
+        return np.asarray(efforts[self._dofs])
+
     def levers(self, beyond: float) -> Floats:
         """Return how far what a joint moves is from it at most (n,) [m]; 1 where it slides.
 

@@ -27,12 +27,16 @@ from gigabrain_zenoh.manipulation.pick_place import (
     may_touch,
 )
 from gigabrain_zenoh.manipulation.planner import NoPath, plan
+from gigabrain_zenoh.manipulation.press import PressPlanner
 
 TABLE = "the table"
 SUNK_M = 0.001  # of the floor below its place, as things stand on it
 SHARES = (0.57, 0.62, 0.7, 0.5, 0.78)  # of its reach, at which a thing is best grasped
 BEFORE_M = 0.08  # between the body and a thing that it picks up
 ORIENTATION_RAD = math.radians(2)  # by which the approach of a tool that reaches may be off
+OFFERS = ((0.7, 0.5), (0.6, 0.55), (0.6, 0.4), (0.5, 0.5), (0.5, 0.3))  # ahead and up, of its reach
+OFFER_PITCHES = (0.0, math.radians(30), None)
+PRESS_PITCHES = tuple(math.radians(angle) for angle in (90, 70, 50, 30, 0))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,6 +55,7 @@ class Plan:
     phases: tuple[Phase, ...]
     hold: Hold | None = None
     grasp: Grasp | None = None
+    before: Floats | None = None  # (n,) of a press: the posture to which it goes back
 
 
 class ArmPlanner:
@@ -65,6 +70,7 @@ class ArmPlanner:
         self._times = TimeParametrization(eased(self.arm.joints, FAST))
         self._around = surroundings(body.arm)
         self._pick_place: PickPlacePlanner | None = None
+        self._press_planner: PressPlanner | None = None
         self._front = max(x for x, _ in body.footprint)  # [m]
         base = self.arm.chain.fixed[0, :2, 3]
         self._reach = float(np.linalg.norm(base) + self.arm.levers(0.0)[0])  # [m]
@@ -155,9 +161,63 @@ class ArmPlanner:
         found = self._picker().place(hold.thing, target, around, posture, hold.opening)
         return found if isinstance(found, NoWay) else Plan(phases=found.phases)
 
-    def back_off(self, grasp: Grasp, posture: Floats) -> Plan:
-        """Return the way from a thing that is not held."""
-        return Plan(phases=self._picker().back_off(grasp, posture))
+    def press(
+        self,
+        target: Floats | Thing,
+        pitch: float | None,
+        depth: float,
+        things: Sequence[Thing],
+        posture: Floats,
+    ) -> Plan | NoWay:
+        """Return how to press a place (3,) [m], or the near side of a thing.
+
+        Args:
+            target: The place, or the thing.
+            pitch: How far the tool points down [rad], 0 for level; None for any way.
+            depth: How far it goes on behind the place at most [m].
+            things: What else is around.
+            posture: Where the arm is (n,).
+        """
+        pitches = PRESS_PITCHES if pitch is None else (pitch,)
+        middle = target.position if isinstance(target, Thing) else target
+        ways = [self._approach(middle, one) for one in pitches]
+        found = self._presser().press(target, ways, depth, self._all(things), posture)
+        if isinstance(found, NoWay):
+            return found
+        return Plan(phases=found.phases, before=found.before)
+
+    def after_press(self, pressed: Plan, posture: Floats, seconds: float) -> Plan:
+        """Return how to hold what is pressed for some seconds, and to go back."""
+        assert pressed.before is not None
+        phases = self._presser().back(posture, pressed.before, seconds)
+        return replace(pressed, phases=phases)
+
+    def offer(
+        self,
+        at: Floats | None,
+        pitch: float | None,
+        things: Sequence[Thing],
+        posture: Floats,
+        hold: Hold,
+    ) -> Plan | NoWay:
+        """Return how to bring what is held to a point (3,) [m]; None: well ahead, and high."""
+        if at is not None:
+            return self.reach(at, pitch, things, posture, hold)
+        pitches = OFFER_PITCHES if pitch is None else (pitch,)
+        fault = NoWay(reason="there is no place before it where it can be offered")
+        for ahead, up in OFFERS:
+            point = self._reach * np.array([ahead, 0.0, up])
+            for one in pitches:
+                found = self.reach(point, one, things, posture, hold)
+                if isinstance(found, Plan):
+                    return found
+        return fault
+
+    def back_off(self, left: Plan, posture: Floats) -> Plan:
+        """Return the way from a thing that is not held, or from what was pressed."""
+        if left.grasp is None:
+            return self.after_press(left, posture, 0.0)
+        return Plan(phases=self._picker().back_off(left.grasp, posture), grasp=left.grasp)
 
     def eased(self, hold: Hold, measured: float) -> Phase:
         """Return the phase in which the gripper, measured there, squeezes what it holds less."""
@@ -199,6 +259,12 @@ class ArmPlanner:
         if self._pick_place is None:
             self._pick_place = PickPlacePlanner(self.arm, self._inverse)
         return self._pick_place
+
+    def _presser(self) -> PressPlanner:
+        """Return the planner of presses. Raises ConfigError for an arm without gripper or pads."""
+        if self._press_planner is None:
+            self._press_planner = PressPlanner(self.arm, self._inverse)
+        return self._press_planner
 
     def _all(self, things: Sequence[Thing]) -> list[Thing]:
         return [*self._around, *things]

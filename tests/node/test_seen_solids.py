@@ -19,7 +19,7 @@ from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.qa.bench.hands_camera import ArmCamera
 from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import BOOT, body, state
-from tests.node.test_manipulator import Rig
+from tests.node.arm_rig import Rig
 from tests.unit.vision.scenes import Box, depth_of, image, millimetres
 
 SO101 = load_robot("so101").description()

@@ -78,6 +78,8 @@ CALLS = {
     "arm goto": "arm goto 0.2 0 0.1",
     "arm pick": "arm pick 0.2 0 0.02 --sphere 0.02",
     "arm place": "arm place 0.2 0 0.02",
+    "arm press": "arm press 0.2 0 0.05",
+    "arm hand-over": "arm hand-over",
     "arm limp": "arm limp --yes",
     "arm hold": "arm hold",
     "objects": "objects",
@@ -122,7 +124,19 @@ CALLS = {
 OWN_CODES = {
     "why": range(10, 20),
     **dict.fromkeys(
-        ("goto", "explore", "patrol", "mission", "pick", "arm goto", "arm pick", "arm place"), (1,)
+        (
+            "goto",
+            "explore",
+            "patrol",
+            "mission",
+            "pick",
+            "arm goto",
+            "arm pick",
+            "arm place",
+            "arm press",
+            "arm hand-over",
+        ),
+        (1,),
     ),
     **dict.fromkeys(("task cancel", "task pause", "task resume", "map save", "map info"), (1, 2)),
     # without a map, a simulation, or what is named

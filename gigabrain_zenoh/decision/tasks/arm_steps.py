@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from importlib.util import find_spec
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
@@ -16,6 +16,8 @@ NEEDED = ("mujoco", "ruckig", "numba")  # packages of the extra `arm`
 Metres = Annotated[float, Meta(ge=-10.0, le=10.0)]
 Side = Annotated[float, Meta(ge=0.001, le=10.0)]  # [m]
 Point3 = tuple[Metres, Metres, Metres]  # x, y, z [m]
+# msgspec 0.22 crashes where a tuple of a fixed length may be a text with limits instead
+PointOrThing = Annotated[tuple[Metres, ...], Meta(min_length=3, max_length=3)] | Name
 Spot = Annotated[tuple[Metres, ...], Meta(min_length=2, max_length=3)]  # x, y, and maybe z [m]
 JointPlace = Annotated[float, Meta(ge=-100.0, le=100.0)]  # [rad] or [m]
 NamedPosture = Literal["home", "carry"]  # of the robot's file
@@ -23,6 +25,10 @@ Posture = NamedPosture | Annotated[dict[Name, JointPlace], Meta(min_length=1)]
 Cosine = Annotated[float, Meta(ge=-1.001, le=1.001)]
 Rotation = Annotated[tuple[Cosine, ...], Meta(min_length=9, max_length=9)]
 GripperPlace = Literal["open", "close"] | JointPlace
+Depth = Annotated[float, Meta(ge=0.001, le=0.1)]  # [m]
+HoldTime = Annotated[float, Meta(ge=0.0, le=5.0)]  # [s]
+PressForce = Annotated[float, Meta(ge=1.0, le=50.0)]  # [N]
+Patience = Annotated[float, Meta(gt=0.0, le=1e5)]  # [s]
 
 
 class Solid(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -87,7 +93,57 @@ class PlaceThing(Struct, frozen=True):
     at: Spot
 
 
-ArmAction = Reach | TakePosture | Gripper | Pick | PlaceThing
+class Press(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Press a place with the closed tool, or the near side of a thing, until it is felt enough."""
+
+    at: PointOrThing  # x, y, z [m], or one of the mission's `things`
+    pitch: Angle | None = None  # [rad] down from level; None: any way
+    depth: Depth = 0.03  # [m] behind the place, at most
+    force: PressForce = 4.0  # [N] at which it is pressed
+    seconds: HoldTime = 0.5  # for which it is held so
+
+
+class HandOver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Bring what is held before a person, and open once that pulls at it or says so."""
+
+    at: Point3 | None = None  # [m], of the tool; None: well ahead, and high
+    pitch: Angle | None = None  # [rad] down from level; None: any way
+    seconds: Patience = 60.0  # for which it waits
+
+
+class AwaitTaken(Struct, frozen=True):
+    """Hold still until somebody pulls at what is held, or has taken it."""
+
+
+ArmAction = Reach | TakePosture | Gripper | Pick | PlaceThing | Press | HandOver | AwaitTaken
+NEED_GRIPPER = Gripper | Pick | PlaceThing | Press | HandOver
+
+
+def action_of(kind: str, value: Any) -> ArmAction | None:
+    """Return the action of a mission's step; None for a step that does not move the arm."""
+    match kind:
+        case "reach":
+            return value if isinstance(value, Reach) else Reach(at=value)
+        case "posture":
+            return TakePosture(value)
+        case "gripper":
+            return Gripper(value)
+        case "pick":
+            return Pick(value)
+        case "place":
+            return PlaceThing(value)
+        case "press":
+            return value if isinstance(value, Press) else Press(at=value)
+        case "hand_over":
+            return value if isinstance(value, HandOver) else HandOver(at=value)
+    return None
+
+
+def thing_meant(action: ArmAction | None) -> str | None:
+    """Return the name of the thing that an action needs to know; None for none."""
+    if isinstance(action, Pick):
+        return action.thing
+    return action.at if isinstance(action, Press) and isinstance(action.at, str) else None
 
 
 def describe(action: ArmAction) -> str:
@@ -105,6 +161,12 @@ def describe(action: ArmAction) -> str:
             return f"picking up {thing}"
         case PlaceThing(at=at):
             return f"placing at {describe_point(at)}"
+        case Press(at=at):
+            return f"pressing {at if isinstance(at, str) else describe_point(at)}"
+        case HandOver():
+            return "handing over"
+        case AwaitTaken():
+            return "waiting for somebody to take it"
 
 
 def describe_point(point: Sequence[float]) -> str:
@@ -140,7 +202,7 @@ def check(
                 if name not in known:
                     raise unknown("joint", name, known)
                 _check_range(known[name], position)
-        if isinstance(action, Gripper | Pick | PlaceThing) and gripper is None:
+        if isinstance(action, NEED_GRIPPER) and gripper is None:
             raise Refused(f"{body.robot_type} has no gripper")
         if isinstance(action, Gripper) and gripper and not isinstance(action.to, str):
             _check_range(gripper, action.to)

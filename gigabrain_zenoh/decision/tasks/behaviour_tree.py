@@ -12,13 +12,14 @@ from py_trees.common import Status
 from py_trees.composites import Selector, Sequence
 from py_trees.decorators import Decorator, Repeat, Retry
 
-from gigabrain_zenoh.decision.tasks.arm_steps import Pick
+from gigabrain_zenoh.decision.tasks.arm_steps import Gripper, HandOver, Pick, TakePosture
 from gigabrain_zenoh.decision.tasks.conditions import Condition, parse
 from gigabrain_zenoh.decision.tasks.leaves import (
     ArmNode,
     ConditionNode,
     DriveNode,
     MissionContext,
+    OfferNode,
     PickNode,
     ScriptNode,
     SeekNode,
@@ -34,6 +35,7 @@ from gigabrain_zenoh.decision.tasks.mission import (
 )
 
 FOREVER = -1  # for py-trees
+AWAY_S = 1.5  # for a person to take the hand away, after the gripper has opened
 Index = Annotated[float, Meta(ge=0, le=1e9)]
 Progress = dict[str, Index]  # of each running node, by its number in depth-first order
 
@@ -148,6 +150,8 @@ class TreeBuilder:
             return SeekNode(step.find if isinstance(step.find, str) else step.find.tag, context)
         if isinstance(step.arm, Pick):
             return PickNode(step.arm, context)
+        if isinstance(step.arm, HandOver):
+            return self._hand_over(step.arm)
         if step.arm:
             return ArmNode(step.arm, context)
         if step.explore or step.visit:
@@ -183,6 +187,17 @@ class TreeBuilder:
             then = Sequence("charge", memory=True, children=[then, wait])
         when = parse(f"battery.percentage < {low.percentage:g}")
         return _GuardNode(when, then, self._sequence(low.do), self._context)
+
+    def _hand_over(self, do: HandOver) -> Behaviour:
+        context = self._context
+        children = [
+            ArmNode(do, context),
+            OfferNode(do.seconds, context),
+            ArmNode(Gripper("open"), context),
+            WaitNode(AWAY_S, context),
+            ArmNode(TakePosture("home"), context),
+        ]
+        return Sequence("hand over", memory=True, children=children)
 
     def _patrol(self, patrol: Patrol) -> Behaviour:
         children: list[Behaviour] = []

@@ -22,7 +22,14 @@ from gigabrain_zenoh.decision.behaviours import (
     describe_goal,
 )
 from gigabrain_zenoh.decision.known_objects import Seek, Sought, Wanted, named
-from gigabrain_zenoh.decision.tasks.arm_steps import ArmAction, HeldThing, Pick, Solid, describe
+from gigabrain_zenoh.decision.tasks.arm_steps import (
+    ArmAction,
+    AwaitTaken,
+    HeldThing,
+    Pick,
+    Solid,
+    describe,
+)
 from gigabrain_zenoh.decision.tasks.conditions import Condition, Read
 from gigabrain_zenoh.decision.tasks.mission import Script
 from gigabrain_zenoh.decision.tasks.scripts import Run
@@ -60,6 +67,8 @@ class MissionContext:
     command: Command | None = None  # of the active node
     given: Mapping[str, Solid] = field(default_factory=dict)  # things of the mission's file
     things: dict[str, Solid] = field(default_factory=dict)  # what stands round the arm by now
+    offers: bool = False  # the active step waits for a person to take something
+    told: bool = False  # a person has said that it may let go
     doing: str = ""  # the active step, for people
     problem: str = ""  # the last failure, for people
     progress: float | None = None  # of a step that does not drive
@@ -77,6 +86,7 @@ class MissionContext:
             self.held_s += seconds
         self.outcome, self.command, self.doing = outcome, None, ""
         self.progress = self.left_s = None
+        self.offers = False
 
 
 class Leaf(Behaviour):
@@ -155,6 +165,38 @@ class ArmNode(Leaf):
             done = outcome.state == "done"
             return Status.SUCCESS if done else self.failed(f"{self.name}: {outcome.reason}")
         self.context.command = self._command
+        return Status.RUNNING
+
+
+class OfferNode(ArmNode):
+    """Holds still until what is held is pulled at, or a person says that it may let go."""
+
+    def __init__(self, seconds: float, context: MissionContext) -> None:
+        super().__init__(AwaitTaken(), context)
+        self._seconds, self._until_s = seconds, 0.0
+
+    def initialise(self) -> None:
+        """Start the node, or start it again."""
+        super().initialise()
+        self.context.told = False
+        self._until_s = self.context.free_s + self._seconds
+
+    def update(self) -> Status:
+        """Advance the node by one tick, and return its status."""
+        status = super().update()
+        if status is not Status.RUNNING:
+            return status
+        if self.context.told:
+            self.context.command = None
+            return Status.SUCCESS
+        if self.context.free_s > self._until_s:
+            self.context.command = None
+            held = self.context.hand.held
+            name = held.name if held else "it"
+            return self.failed(
+                f"nobody took {name} within {self._seconds:g} s; the gripper holds it still"
+            )
+        self.context.offers = True
         return Status.RUNNING
 
 

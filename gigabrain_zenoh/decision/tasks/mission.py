@@ -19,16 +19,17 @@ from gigabrain_zenoh.config import loading, yaml_text
 from gigabrain_zenoh.decision.tasks import conditions
 from gigabrain_zenoh.decision.tasks.arm_steps import (
     ArmAction,
-    Gripper,
     GripperPlace,
-    Pick,
-    PlaceThing,
+    HandOver,
     Point3,
+    PointOrThing,
     Posture,
+    Press,
     Reach,
     Solid,
     Spot,
-    TakePosture,
+    action_of,
+    thing_meant,
 )
 from gigabrain_zenoh.errors import ConfigError, unknown
 
@@ -144,6 +145,8 @@ class Step(Part, frozen=True, kw_only=True):
     gripper: GripperPlace | None = None
     pick: Name | None = None  # one of the mission's `things`
     place: Spot | None = None  # where the middle of what is held shall be; on the floor without z
+    press: PointOrThing | Press | None = None  # a place, or one of the mission's `things`
+    hand_over: Point3 | HandOver | None = None  # what is held, to a person
     wait: Seconds | None = None
     wait_until: Comparison | None = None
     check: Comparison | None = None  # fails if it does not hold
@@ -175,15 +178,7 @@ class Step(Part, frozen=True, kw_only=True):
     @property
     def arm(self) -> ArmAction | None:
         """The arm's action; None for a step that does not move it."""
-        if self.reach is not None:
-            return self.reach if isinstance(self.reach, Reach) else Reach(at=self.reach)
-        if self.posture is not None:
-            return TakePosture(self.posture)
-        if self.gripper is not None:
-            return Gripper(self.gripper)
-        if self.pick is not None:
-            return Pick(self.pick)
-        return PlaceThing(self.place) if self.place is not None else None
+        return action_of(self.kind, getattr(self, self.kind))
 
 
 class Mission(Part, frozen=True, kw_only=True):
@@ -333,8 +328,8 @@ def _in_step(
             conditions.parse(text)
         except (ValueError, ConfigError) as error:
             yield (*keys, *more), str(error)
-    if step.pick is not None and step.pick not in mission.things:
-        yield (*keys, "pick"), str(unknown("thing", step.pick, mission.things or ("none",)))
+    if (thing := thing_meant(step.arm)) is not None and thing not in mission.things:
+        yield (*keys, step.kind), str(unknown("thing", thing, mission.things or ("none",)))
     if step.tree is not None and step.tree not in mission.trees:
         known = mission.trees or ("none",)
         yield (*keys, "tree"), str(unknown("tree", step.tree, known))

@@ -167,8 +167,14 @@ class TaskQueue:
         return f"{job.id} is paused"
 
     def resume(self, name: str) -> str:
-        """Resume a paused task; return a text. Raises Refused."""
+        """Resume a paused task, or have one that hands something over let go of it.
+
+        Return a text. Raises Refused.
+        """
         job = self._job(name)
+        if not job.held and job is self._jobs[0] and job.context.offers:
+            job.context.told = True
+            return f"{job.id} lets go of it"
         if not job.held:
             raise Refused(f"{job.id} is not paused")
         job.held, job.why_held = False, ""

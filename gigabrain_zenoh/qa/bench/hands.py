@@ -413,8 +413,7 @@ def _picked(
         hold = _gripped(arm, planner, pick, thing)
         if hold:
             return hold
-        assert pick.grasp
-        back = planner.back_off(pick.grasp, arm.posture(planner.arm.names))
+        back = planner.back_off(pick, arm.posture(planner.arm.names))
         arm.carry_out_all(back.phases)
     attempt.end("not gripped")
     return None

@@ -9,8 +9,10 @@ from gigabrain_zenoh.decision.tasks import arm_steps
 from gigabrain_zenoh.decision.tasks.arm_steps import (
     ArmAction,
     Gripper,
+    HandOver,
     Pick,
     PlaceThing,
+    Press,
     Reach,
     TakePosture,
 )
@@ -26,13 +28,17 @@ def test_steps_of_a_mission_are_actions_of_the_arm() -> None:
         "things: {can: {cylinder: [0.03, 0.1], at: [0.2, 0, 0.05]}}\n"
         "do: [{reach: [0.2, 0, 0.1]}, {reach: {at: [0.2, 0, 0.1], pitch: 1}}, {posture: home},"
         " {posture: {shoulder_pan: 0.5}}, {gripper: open}, {gripper: 0.3}, {pick: can},"
-        " {place: [0.1, 0.1, 0.05]}, {wait: 1}]",
+        " {place: [0.1, 0.1, 0.05]}, {wait: 1}, {press: [0.2, 0, 0.05]}, {press: can},"
+        " {press: {at: can, pitch: 0, depth: 0.01, force: 2, seconds: 0}}, {hand_over: {}},"
+        " {hand_over: [0.2, 0, 0.2]}, {hand_over: {seconds: 5}}]",
         "mission",
     )
     assert mission.arm_actions == [
         Reach(at=(0.2, 0, 0.1)), Reach(at=(0.2, 0, 0.1), pitch=1), TakePosture("home"),
         TakePosture({"shoulder_pan": 0.5}), Gripper("open"), Gripper(0.3), Pick("can"),
-        PlaceThing((0.1, 0.1, 0.05)),
+        PlaceThing((0.1, 0.1, 0.05)), Press(at=(0.2, 0, 0.05)), Press(at="can"),
+        Press(at="can", pitch=0, depth=0.01, force=2, seconds=0), HandOver(),
+        HandOver(at=(0.2, 0, 0.2)), HandOver(seconds=5),
     ]  # fmt: skip
     assert not mission.drives
     arm_steps.check(ARM, mission.arm_actions)
@@ -55,6 +61,15 @@ def test_steps_of_a_mission_are_actions_of_the_arm() -> None:
         ("do: [{posture: {}}]", "do[0].posture"),
         ("do: [{gripper: wide}]", "do[0].gripper"),
         ("do: [{place: [0.2, 0, 1.0e+30]}]", "do[0].place"),
+        ("do: [{press: can}]", "do[0].press: no thing 'can'; known: none"),
+        ("do: [{press: {at: can}}]", "do[0].press: no thing 'can'; known: none"),
+        ("do: [{press: [0.2, 0]}]", "do[0].press: expected a list of length >= 3"),
+        ("do: [{press: [0.2, 0, .nan]}]", ".nan is not allowed"),
+        ("do: [{press: {at: [0.2, 0, 0], depth: 0.5}}]", "do[0].press.depth: expected a number"),
+        ("do: [{press: {at: [0.2, 0, 0], force: 0}}]", "do[0].press.force: expected a number"),
+        ("do: [{press: {depth: 0.01}}]", "do[0].press: missing field 'at'"),
+        ("do: [{hand_over: {secs: 1}}]", "unknown field 'secs'; did you mean 'seconds'?"),
+        ("do: [{hand_over: {seconds: 0}}]", "do[0].hand_over.seconds: expected a number > 0.0"),
     ],
 )  # fmt: skip
 def test_wrong_steps_are_refused_with_their_line(text: str, why: str) -> None:

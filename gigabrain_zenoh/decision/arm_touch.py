@@ -1,0 +1,73 @@
+"""What an arm's tool feels: whether it presses against something, and whether somebody pulls."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from gigabrain_schemas.body import BodyDescription, RobotState
+from gigabrain_zenoh.decision.arm_readings import (
+    measured_efforts,
+    measured_posture,
+    sent_posture,
+)
+from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner
+from gigabrain_zenoh.manipulation.contact import ContactSense, Push
+
+TOUCHED_N, TOUCHED_M = 1.0, 0.003  # of a push, from which something was touched
+PRESSED_M = 0.015  # by which the tool lags where it is pressed enough, if efforts do not tell
+PULLED_N, PULLED_M, PULLED_TICKS = 2.0, 0.008, 5  # of a person that pulls
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pressure:
+    """How hard a tool presses along its approach."""
+
+    newtons: float | None  # None where efforts are not measured
+    metres: float  # by which it lags
+
+    @property
+    def touched(self) -> bool:
+        """Whether it presses against something at all."""
+        return (self.newtons or 0.0) > TOUCHED_N or self.metres > TOUCHED_M
+
+    def reaches(self, force: float) -> bool:
+        """Return whether it is as much as `force` [N], or the lag says so."""
+        return (self.newtons or 0.0) >= force or self.metres > PRESSED_M
+
+    def __str__(self) -> str:
+        return "pressed" if self.newtons is None else f"pressed with {math.floor(self.newtons)} N"
+
+
+class Touch:
+    """What an arm's tool feels, compared with the first states. To be asked at each state."""
+
+    def __init__(self, planner: ArmPlanner) -> None:
+        self._planner, self._sense = planner, ContactSense(planner.arm)
+        self._pulled_ticks = 0
+
+    def pressure(self, body: BodyDescription, state: RobotState) -> Pressure | None:
+        """Return how hard the tool presses; None during the first states."""
+        push = self._feel(body, state)
+        if push is None:
+            return None
+        approach = self._planner.arm.forward(measured_posture(self._planner, state)).axes[:, 0]
+        force = None if push.force is None else -float(push.force @ approach)
+        return Pressure(newtons=force, metres=float(push.lag @ approach))
+
+    def is_pulled(self, body: BodyDescription, state: RobotState) -> bool:
+        """Return whether somebody has pulled at it for a moment."""
+        push = self._feel(body, state)
+        pulls = push is not None and (
+            float(np.linalg.norm(push.lag)) > PULLED_M
+            or (push.force is not None and float(np.linalg.norm(push.force)) > PULLED_N)
+        )
+        self._pulled_ticks = self._pulled_ticks + 1 if pulls else 0
+        return self._pulled_ticks >= PULLED_TICKS
+
+    def _feel(self, body: BodyDescription, state: RobotState) -> Push | None:
+        return self._sense.feel(
+            measured_posture(self._planner, state),
+            sent_posture(self._planner, body, state),
+            measured_efforts(self._planner, state),
+        )

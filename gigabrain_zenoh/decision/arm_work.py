@@ -1,0 +1,107 @@
+"""What is planned for an action of an arm, and what is told while it moves."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from gigabrain_schemas.base import TICK_S
+from gigabrain_schemas.body import BodyDescription, RobotState
+from gigabrain_schemas.brain import Intent
+from gigabrain_zenoh.decision.arm_readings import posture_of, sent_posture
+from gigabrain_zenoh.decision.behaviours import StepOutcome, StepResult
+from gigabrain_zenoh.decision.held_things import standing_height, thing_of
+from gigabrain_zenoh.decision.tasks.arm_steps import (
+    ArmAction,
+    AwaitTaken,
+    Gripper,
+    HandOver,
+    Pick,
+    PlaceThing,
+    Press,
+    Reach,
+    Solid,
+    TakePosture,
+    thing_meant,
+)
+from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold, Plan
+from gigabrain_zenoh.manipulation.phases import PhaseRun
+from gigabrain_zenoh.manipulation.pick_place import NoWay
+
+Planned = Plan | NoWay
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkInputs:
+    """What an action is planned by."""
+
+    state: RobotState
+    body: BodyDescription
+    things: Mapping[str, Solid]  # that are around
+    hold: Hold | None
+    misses: int  # grasps that have failed
+    drives: bool  # the body may go to what it does not reach
+
+
+def work_for(planner: ArmPlanner, do: ArmAction, now: WorkInputs) -> Callable[[], Planned] | str:
+    """Return what plans an action, or why it cannot be planned."""
+    if len(now.state.joints_sent) != len(now.body.joints):
+        return "the joints are not measured, or limp"
+    name = thing_meant(do)
+    if name is not None and now.hold:
+        return f"the gripper holds {now.hold.thing.name} already"
+    if name is not None and name not in now.things:
+        return f"where {name} is, is not known"
+    posture, hold = sent_posture(planner, now.body, now.state), now.hold
+    others = {one: thing_of(one, solid) for one, solid in now.things.items()}
+    thing = others.pop(name) if name is not None else None
+    around = [*others.values()]
+    match do:
+        case Reach(at=at, pitch=pitch):
+            return lambda: planner.reach(np.array(at), pitch, around, posture, hold)
+        case TakePosture(to=to):
+            goal = posture_of(now.body, to) if isinstance(to, str) else to
+            return lambda: planner.take_posture(goal, around, posture, hold)
+        case Gripper(to=to):
+            return lambda: planner.grip(to)
+        case Pick():
+            assert thing
+            return lambda: planner.pick(thing, around, posture, now.misses, drives=now.drives)
+        case Press(at=at, pitch=pitch, depth=depth):
+            if hold:
+                return f"the gripper holds {hold.thing.name}"
+            target = thing or np.array(at)
+            return lambda: planner.press(target, pitch, depth, around, posture)
+        case PlaceThing() | HandOver() if hold is None:
+            return "the gripper holds nothing"
+        case PlaceThing(at=at):
+            assert hold
+            target = np.array(at if len(at) == 3 else (*at, standing_height(hold, now.body)))
+            return lambda: planner.place(hold, target, around, posture)
+        case HandOver(at=at, pitch=pitch):
+            assert hold
+            point = None if at is None else np.array(at)
+            return lambda: planner.offer(point, pitch, around, posture, hold)
+        case AwaitTaken():
+            raise AssertionError("nothing is planned for it")
+
+
+def moving(run: PhaseRun, tick: int, number: int, behaviour: str) -> StepResult:
+    """Return the intent to go on with a plan, and the progress of the command."""
+    joints, window = run.wish(tick)
+    text = run.phase.name if run.phase else "coming to rest"
+    outcome = StepOutcome(
+        number=number,
+        activity=text,
+        reason=text,
+        progress=run.progress(tick),
+        eta=run.left_ticks(tick) * TICK_S,
+    )
+    intent = Intent(
+        joints=joints,
+        joint_trajectory=window,
+        progress=outcome.progress,
+        behaviour=behaviour,
+        reason=text,
+    )
+    return intent, outcome
