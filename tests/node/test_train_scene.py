@@ -10,7 +10,7 @@ import pytest
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.qa.train import pictures
 from gigabrain_zenoh.qa.train.scene import SPLITS, StudioScene
-from gigabrain_zenoh.qa.train.studio import Studio
+from gigabrain_zenoh.qa.train.studio import RGB, Studio
 from gigabrain_zenoh.vision.labels import CLASSES
 
 
@@ -55,6 +55,20 @@ def test_a_thing_behind_another_is_seen_only_in_part(studio: Studio) -> None:
     seen = int((studio.owners() == back).sum())
     studio.show([studio.things[back]], room=False, labelled=True)
     assert 0 < seen < int((studio.owners() == back).sum())
+
+
+def test_what_is_painted_plain_has_no_texture(studio: Studio) -> None:
+    number = put(studio, "cube", 1.0, 0.0)
+    look_ahead(studio)
+    thing = studio.things[number]
+    studio.show([thing], room=False)
+    kinds = []
+    for texture in (-1, studio.cube_textures[0]):
+        for material in thing.paints.values():
+            studio.model.mat_texid[material, RGB] = texture
+        seen = studio.owners() == number
+        kinds.append(len(np.unique(studio.picture()[seen], axis=0)))
+    assert kinds[0] < 10 < kinds[1]
 
 
 def test_a_door_is_not_the_wall_around_it(studio: Studio) -> None:

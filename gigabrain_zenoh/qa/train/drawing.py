@@ -53,6 +53,10 @@ class Drawing:
         mujoco.mjv_updateScene(
             self._model, data, options, None, self._camera, everything, self._scene
         )
+        # the context keeps a copy of which textures materials have, from when it was made
+        for name in ("mat_texid", "mat_texrepeat"):
+            now = getattr(self._model, name).ravel()
+            getattr(self._context, name)[: now.size] = now
 
     def _pixels(self) -> NDArray[np.uint8]:
         height, width = self._size

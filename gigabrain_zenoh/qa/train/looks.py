@@ -45,6 +45,7 @@ class Look:
     height: float  # [m]
     hides: float = 0.0  # half the width that it hides [m]; 0 for its radius
     lies: float = 0.0  # chance to lie on its side
+    fits: bool = True  # most of it must be within the picture, or it cannot be asked for
     facing: float = math.pi  # greatest yaw away from the camera [rad]
     nearest: float = 0.5  # [m] from the camera
 
@@ -164,7 +165,7 @@ def person(rng: Random, wide: int) -> Look:
     for side in (-1, 1):
         foot = (math.sin(step * side) * hip, side * 0.055 * tall, 0.05 * tall)
         parts += [*_leg(tall, fat, foot), *_arm(rng, tall, fat, foot[0], side)]
-    return Look("person", tuple(parts), 0.3, tall, hides=0.15, nearest=0.9)
+    return Look("person", tuple(parts), 0.3, tall, hides=0.15, fits=False, nearest=0.9)
 
 
 def _leg(tall: float, fat: float, foot: Vector) -> list[Geom]:
@@ -318,7 +319,7 @@ def door(rng: Random, wide: int) -> Look:
                 labelled=False,
             )
         ]
-    return Look("door", tuple(parts), 0.35, high, facing=0.9, nearest=1.3)
+    return Look("door", tuple(parts), 0.35, high, fits=False, facing=0.9, nearest=1.3)
 
 
 def _leaf(rng: Random, w: float, h: float, ajar: float, side: float) -> list[Geom]:

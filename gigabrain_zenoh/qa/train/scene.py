@@ -19,7 +19,6 @@ FAR_M = 4.0
 MAX_THINGS = 6
 # Less of a thing than this cannot be asked for: it is to be ignored.
 MIN_FRACTION, MIN_INSIDE, MIN_PIXELS, MIN_SIDE_PX = 0.4, 0.5, 60, 6
-LARGE = ("person", "door")  # seldom fit into the picture
 SMALL_M = 0.4  # what is lower may stand on a table
 TRIES = 30
 DRAWN_PX = 14.0  # across: what is smaller stands nearer, so that it is as large in the picture
@@ -115,9 +114,9 @@ class StudioScene:
         return expose(self._rng, picture), truths
 
     def _is_cut(self, thing: Thing, number: int, seen: NDArray[np.bool_]) -> bool:
-        """Return whether most of it is outside the picture; people and doors need not fit."""
+        """Return whether most of it is outside the picture, though it should fit."""
         edges = seen[0].any() or seen[-1].any() or seen[:, 0].any() or seen[:, -1].any()
-        if thing.look.label in LARGE or not edges:
+        if not (thing.look.fits and edges):
             return False
         fovy = self._model.cam_fovy[0]
         self._model.cam_fovy[0] = math.degrees(2 * math.atan(2 * math.tan(self._fovy / 2)))
@@ -327,7 +326,7 @@ class StudioScene:
     def _repaint(self, label: str, paint: str, material: int) -> None:
         """Draw colour and texture by what a paint stands for, on a thing of this class."""
         rng = self._rng
-        textured = rng.random() < TEXTURED.get(paint, 0.1)
+        textured = rng.random() < TEXTURED.get(paint, 0.25)
         if paint in HUES:
             (hue, spread), saturation, value = HUES[paint]
             colour = _hsv(
