@@ -32,6 +32,7 @@ from gigabrain_zenoh.manipulation.press import PressPlanner
 TABLE = "the table"
 SUNK_M = 0.001  # of the floor below its place, as things stand on it
 SHARES = (0.57, 0.62, 0.7, 0.5, 0.78)  # of its reach, at which a thing is best grasped
+NEARER_M = 0.05  # farther than there, it goes nearer before it grasps
 BEFORE_M = 0.08  # between the body and a thing that it picks up
 ORIENTATION_RAD = math.radians(2)  # by which the approach of a tool that reaches may be off
 OFFERS = ((0.7, 0.5), (0.6, 0.55), (0.6, 0.4), (0.5, 0.5), (0.5, 0.3))  # ahead and up, of its reach
@@ -142,11 +143,13 @@ class ArmPlanner:
 
         For a body that `drives`, the refusal says how far from the thing it should stand.
         """
-        if drives and math.hypot(*thing.position[:2]) > self._reach:
-            return NoWay(reason=f"{thing.name}: too far", stand_off=self._stand_off(thing, posture))
+        far = math.hypot(*thing.position[:2])
+        goes = drives and (not without or far > self._reach)
+        stand_off = self._stand_off(thing, posture) if goes else None
+        if stand_off is not None and far > stand_off + NEARER_M:
+            return NoWay(reason=f"{thing.name}: too far", stand_off=stand_off)
         found = self._picker().pick(thing, self._all(things), posture, without)
         if isinstance(found, NoWay):
-            stand_off = self._stand_off(thing, posture) if drives and not without else None
             return replace(found, stand_off=stand_off)
         grip = next(phase.gripper for phase in found.phases if phase.name == "close")
         assert grip is not None

@@ -19,6 +19,9 @@ from gigabrain_drivers.sim.scene_model import SceneModel
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics
+from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Plan
+from gigabrain_zenoh.manipulation.collision import Thing
+from gigabrain_zenoh.manipulation.pick_place import NoWay
 from gigabrain_zenoh.safety.arm_shape import MujocoArm
 
 ONTO_ITS_PLATE = (0.0, 0.1, 1.1, 0.5, 0.0, 0.0)
@@ -162,3 +165,19 @@ def test_a_viewer_shows_its_rollers_too_though_they_have_no_names() -> None:
     scene = writer.scene(1, (), {})
     assert len(set(scene.bodies)) == len(scene.bodies)
     assert SceneModel(scene).place(writer.poses(1))
+
+
+@pytest.mark.parametrize("far", [0.27, 0.32, 0.36, 0.42, 0.9])
+def test_it_goes_so_near_that_it_can_grasp_a_can_from_above(far: float) -> None:
+    robot = catalog.load_robot("lekiwi")
+    assert robot.arm
+    planner = ArmPlanner(text(), robot.description())
+    home = np.array(robot.arm.home[:-1])
+    can = Thing(name="can", kind="cylinder", size=(0.0335, 0.12), position=np.array((far, 0, 0.06)))
+    found = planner.pick(can, [], home, 0, drives=True)
+    if far < 0.33:
+        assert isinstance(found, Plan) and found.grasp
+        assert found.grasp.tilt < math.radians(16)
+    else:
+        assert isinstance(found, NoWay) and found.stand_off
+        assert 0.2 < found.stand_off < 0.29
