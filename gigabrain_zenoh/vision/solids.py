@@ -1,7 +1,8 @@
 """Finds things that stand on the floor, or on a table that an arm stands on, in a depth picture.
 
-A thing that is cut off by an edge of the picture, hidden by something nearer, or touched by the
-robot's own arm gives nothing: what would be fitted to a part of it is not there.
+A thing that is cut off by an edge of the picture, hidden by something nearer, so near that the
+camera cannot measure it, or touched by the robot's own arm gives nothing: what would be fitted to a
+part of it is not there.
 """
 
 from collections.abc import Iterator
@@ -22,6 +23,7 @@ LINK_M = 0.006  # least gap between two things
 NEARER_M = 0.02  # than a thing: what is so may hide a part of it
 RING_PX, MOST_HIDDEN = 2, 0.08  # round a thing, and the share of that which may be nearer
 EDGE_PX = 2  # at the edges of a picture
+BLIND_M = 0.01  # beyond the least depth: a part that is nearer may not be seen
 TOUCH_M = 0.01  # from a thing, within which the arm hides a part of it, or holds it
 THROUGH_M = 0.01  # behind a thing: what is seen there shows that it is gone
 Mask = NDArray[np.bool_]
@@ -47,7 +49,8 @@ def find_solids(view: DepthView, model: CameraModel, own: Mask) -> list[SolidFit
     found = []
     for group in _groups(level[:, :2]):
         far = float(depth[group].mean())
-        if _is_cut(view, pixels[group], far) or _near(raw[group], mine):
+        blind = bool(depth[group].min() < model.camera.depth_min + BLIND_M)
+        if blind or _is_cut(view, pixels[group], far) or _near(raw[group], mine):
             continue
         if fit := fit_solid(level[group], over, far * spacing):
             found.append(fit)
