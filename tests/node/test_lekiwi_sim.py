@@ -176,8 +176,10 @@ def test_it_goes_so_near_that_it_can_grasp_a_can_from_above(far: float) -> None:
     can = Thing(name="can", kind="cylinder", size=(0.0335, 0.12), position=np.array((far, 0, 0.06)))
     found = planner.pick(can, [], home, 0, drives=True)
     if far < 0.33:
-        assert isinstance(found, Plan) and found.grasp
+        assert isinstance(found, Plan)
+        assert found.grasp
         assert found.grasp.tilt < math.radians(16)
     else:
-        assert isinstance(found, NoWay) and found.stand_off
+        assert isinstance(found, NoWay)
+        assert found.stand_off
         assert 0.2 < found.stand_off < 0.29

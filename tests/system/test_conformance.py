@@ -6,6 +6,8 @@ import pytest
 
 from gigabrain_drivers.driver.catalog import load_robot, robot_files, robot_links
 from gigabrain_zenoh.qa.conformance import kit
+from gigabrain_zenoh.qa.conformance.driver_checks import CheckedRobot
+from gigabrain_zenoh.qa.conformance.gate_checks import driver_killed
 
 QUICK = ("mock", "mycustombot", "so101")  # the others in `make qa`
 BODIES = [
@@ -18,8 +20,6 @@ NEEDS_A_PEER = {
     "reconnects",
     "command to byte",
 }
-
-GO_ON = {"lekiwi"}  # the servos of its wheels have no watchdog
 
 
 @pytest.mark.parametrize("name", BODIES)
@@ -41,7 +41,12 @@ async def test_every_robot_passes_the_kit(
             for result in results
             if result.verdict == "skipped" and "too busy to judge" not in result.measured
         }
-        expected = NEEDS_A_PEER if link == "sim" and base else set()
-        if link == "emulated" and name in GO_ON:
-            expected = {"stops when it is killed"}
-        assert not_applicable == expected
+        assert not_applicable == (NEEDS_A_PEER if link == "sim" and base else set())
+
+
+async def test_wheels_without_a_watchdog_are_stopped_when_their_driver_is_killed(
+    tmp_path: Path,
+) -> None:
+    async with CheckedRobot("lekiwi", "emulated", tmp_path) as robot:
+        assert robot.goes_on
+        await driver_killed(robot)  # raises Failed if they turn on

@@ -129,6 +129,11 @@ class Driver(abc.ABC):
                 return
             await asyncio.sleep(TICK_NS / 1e9)
 
+    @property
+    def guard_ms(self) -> float | None:
+        """Time in which a process of its own stops the motors if this one dies; None for none."""
+        return None
+
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
     ) -> Velocity:

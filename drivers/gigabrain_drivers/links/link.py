@@ -63,6 +63,11 @@ class Link(abc.ABC):
         return self._fd is not None
 
     @property
+    def fd(self) -> int | None:
+        """The descriptor of the open port, for a process that shares it."""
+        return self._fd
+
+    @property
     def age_ns(self) -> int:
         """Time since the newest bytes, or since the link was opened [ns]."""
         return self._clock.now_ns() - self._heard_ns

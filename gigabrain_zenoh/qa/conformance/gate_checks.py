@@ -273,8 +273,9 @@ async def reconnects(gated: GatedDriver) -> Finding:
 
 
 async def driver_killed(robot: CheckedRobot) -> Finding:
-    """Kill the driver by SIGKILL: the body stops by its own watchdog."""
-    if robot.goes_on:
+    """Kill the driver by SIGKILL: the body stops by its own watchdog, or the driver's guard."""
+    guard_ms = robot.driver().guard_ms
+    if robot.goes_on and guard_ms is None:
         raise Skipped(f"motors at zero {robot.promise}: they go on until a driver starts again")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     child = await asyncio.create_subprocess_exec(
@@ -292,8 +293,8 @@ async def driver_killed(robot: CheckedRobot) -> Finding:
         await child.wait()
     await until(lambda: not any(robot.commanded(None)), "the motors stop", 2.0)
     took = (loop.time() - begin) * 1e3
-    late = took - robot.promised_ms - SLACK_MS
-    text = f"{ZEROED} after {took:.0f} ms"
+    late = took - (guard_ms or robot.promised_ms) - SLACK_MS
+    text = f"{ZEROED} after {took:.0f} ms{', by its guard' if guard_ms else ''}"
     return Finding(late <= 0, text, {ZEROED: took}, max(late, 0.0))
 
 

@@ -37,7 +37,7 @@ NEVER_RAISES = DriverCheck(
     "never raises", "stop and close, in any state, within 2 s", driver_checks.never_raises
 )
 KILLED = DriverCheck(
-    "stops when it is killed", "motors at zero {promise} + 100",
+    "stops when it is killed", "motors at zero {promise}, or its guard's 100 ms; + 100",
     gate_checks.driver_killed, with_peer=True, repeated=True,
 )  # fmt: skip
 BASE_ALONE = (

@@ -44,6 +44,10 @@ class MemoryLink(Link):
     def __str__(self) -> str:
         return "memory"
 
+    @property
+    def fd(self) -> None:
+        """No other process can share it."""
+
     def open(self) -> None:
         self._fd, self.problem = 0, ""
 

@@ -163,12 +163,12 @@ async def test_what_is_no_number_stops_all_wheels() -> None:
         assert rig.rolling.commanded == (0.0, 0.0, 0.0)
 
 
-async def test_wheels_turn_on_without_a_driver_and_the_next_one_stops_them() -> None:
+async def test_wheels_turn_on_while_the_line_is_cut_and_stop_once_it_is_back() -> None:
     """The servos have no watchdog: this is what the documents warn of."""
     rig = LeKiwi()
     async with opened(rig):
         await rig.drive(300, 0.2, 0.0, 0.0)
-        rig.link.drop("the process was killed")
+        rig.link.drop("the cable was pulled out")
         await rig.wait(3000)
         assert rig.rolling.commanded[0] == pytest.approx(0.2, abs=0.01)
         rig.link.open()

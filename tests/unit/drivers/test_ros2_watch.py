@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from gigabrain_drivers.bodies.ros2.guard import GuardState
 from gigabrain_drivers.bodies.ros2.watch import SETTLE_NS, OdometrySample, OdometryWatch
 from gigabrain_schemas.base import Velocity
 
@@ -132,35 +131,3 @@ def test_a_new_transport_starts_again(robot: Robot) -> None:
     assert robot.problem == "odom: no message yet"
     robot.report()
     assert robot.problem == ""
-
-
-def test_the_guard_sends_zero_when_a_moving_driver_falls_silent() -> None:
-    state = GuardState()
-    state.take(b"0m", 0)
-    assert not state.stops(149 * MS)
-    assert state.stops(150 * MS)
-    assert state.stops(1150 * MS)
-    assert not state.stops(1151 * MS)
-    state.take(b"m", 2000 * MS)
-    assert not state.stops(2100 * MS)
-    assert state.stops(2200 * MS)
-    state.take(b"m0", 2210 * MS)
-    assert not state.stops(9000 * MS)
-
-
-def test_the_guard_stops_at_once_when_the_driver_is_gone_and_then_ends() -> None:
-    state = GuardState()
-    state.take(b"m", 0)
-    state.take(b"", MS)
-    assert state.stops(MS)
-    assert not state.ended(1000 * MS)
-    assert state.ended(1002 * MS)
-
-
-@pytest.mark.parametrize("words", [b"0", b"mq"])
-def test_the_guard_leaves_a_robot_that_was_let_go_alone(words: bytes) -> None:
-    state = GuardState()
-    state.take(words, 0)
-    state.take(b"", MS)
-    assert not state.stops(MS)
-    assert state.ended(MS)

@@ -1,7 +1,7 @@
 """An arm on a bus of Feetech STS servos, and the wheels of a base where it is on one.
 
-The servos hold their goals by themselves: should the driver die, the arm stays where it is, and
-wheels turn on until something sends zero. No start moves an arm: a servo that holds keeps its goal,
+The servos hold their goals by themselves: should the driver die, the arm stays where it is. Wheels
+would turn on, so a guard stops them then. No start moves an arm: a servo that holds keeps its goal,
 another gets the place where it is.
 """
 
@@ -25,6 +25,7 @@ from gigabrain_drivers.bodies.feetech.wheels import ServoBase, ServoWheel, check
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import LinkOptions, RobotFile, Run
 from gigabrain_drivers.lidars.base import ScanSource, open_lidar
+from gigabrain_drivers.links.line_guard import SILENCE_NS
 from gigabrain_drivers.links.link import Link
 from gigabrain_drivers.links.serial_link import SerialLink, check_port, describe_absent
 from gigabrain_schemas.base import Name, Pose, Velocity
@@ -40,6 +41,7 @@ NO_ANSWER = "is open, but no servo answers: right port, power on?"
 CONNECT_S = 3.0
 FIRST_ANSWER_NS = 1_500_000_000  # that a start waits for the arm
 RETRY_NS = 200_000_000  # between two attempts to find it
+COMMAND_TIMEOUT_NS = 80_000_000  # without a command; wheels then stand by 100 ms
 YIELD_NS = 500_000_000  # between two attempts to end an overload
 ServoId = Annotated[int, Meta(ge=0, le=feetech.MAX_ID)]
 Share = Annotated[float, Meta(ge=0.05, le=1.0)]
@@ -95,7 +97,7 @@ class FeetechDriver(Driver):
         self._found: dict[ServoJoint | ServoWheel, str] = {}  # how each answered the last time
         self._failure: GigabrainError | None = None
         self._fault = Fault(log)
-        self._yielded_ns = self._tried_ns = 0
+        self._yielded_ns = self._tried_ns = self._commanded_ns = 0
         self._rewritten = 0
         self._cycles: asyncio.Task[None] | None = None
         self._lidar: ScanSource | None = None
@@ -127,6 +129,11 @@ class FeetechDriver(Driver):
             return self._complaint
         now_ns = self._clock.now_ns()
         return next(filter(None, (servo.problem(now_ns) for servo in self._servos())), "")
+
+    @property
+    def guard_ms(self) -> float | None:
+        """Within this time wheels are stopped if this process dies; an arm holds by itself."""
+        return SILENCE_NS / 1e6 if self._base else None
 
     def _servos(self) -> list[ServoJoint | ServoWheel]:
         return [*self._joints.values(), *self._wheels]
@@ -166,6 +173,8 @@ class FeetechDriver(Driver):
             servo = next(iter(self._joints.values())).id
             await self._bus.ask(feetech.ping(servo), [servo], 0)  # the goals have gone out before
         self._armed = False
+        if self._base:
+            self._base.close()
         await self.link.close()
         if self._lidar:
             await self._lidar.close()
@@ -214,6 +223,7 @@ class FeetechDriver(Driver):
         """Drive, where there are wheels; nothing is sent while the robot has a problem."""
         if self._base is None:
             return await super().set_base_velocity(linear_x, linear_y, angular_z)
+        self._commanded_ns = self._clock.now_ns()
         wanted = ZERO if self.problem else self.bounded(linear_x, linear_y, angular_z)
         sent = self._base.command(wanted)
         if self._bus.busy:  # the cycle sends it once its answers are there
@@ -298,7 +308,7 @@ class FeetechDriver(Driver):
 
     async def _keep_base(self, base: ServoBase, now_ns: int) -> None:
         """Have the wheels turn as commanded, or stand while anything has a problem."""
-        if self.problem:
+        if self.problem or self._clock.now_ns() - self._commanded_ns > COMMAND_TIMEOUT_NS:
             base.stop()
         if base.overloaded and now_ns - self._yielded_ns >= YIELD_NS:
             self._yielded_ns = now_ns

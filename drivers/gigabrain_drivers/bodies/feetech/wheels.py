@@ -11,6 +11,7 @@ from gigabrain_drivers.bodies.feetech.joint import LOST_NS
 from gigabrain_drivers.bodies.feetech.protocol import RADIANS_PER_TICK, TICKS, ServoReadings
 from gigabrain_drivers.driver.robot import RobotFile
 from gigabrain_drivers.kinematics.wheels import Twist, advance_pose, wheels_of
+from gigabrain_drivers.links.line_guard import LineGuard
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import Joint
 from gigabrain_zenoh.errors import BodyLost, ConfigError
@@ -177,6 +178,11 @@ class ServoBase:
             for name in base.wheels
         ]
         self.pose = Pose(x=0.0, y=0.0, yaw=0.0)
+        self._guard = LineGuard(self._goals())
+
+    def close(self) -> None:
+        """End the process that would stop the wheels if this one died."""
+        self._guard.close()
 
     def command(self, wanted: Velocity) -> Velocity:
         """Drive; return what was sent. All wheels slow down alike if one would be too fast."""
@@ -213,8 +219,17 @@ class ServoBase:
 
     async def send(self) -> bool:
         """Send all speeds; return whether they went out."""
+        moving = any(wheel.goal for wheel in self.wheels)
+        if moving:  # the guard knows it before the wheels do
+            self._guard.tell(self._bus.link.fd, moving=True)
+        sent = await self._bus.send(self._goals())
+        if not moving:
+            self._guard.tell(self._bus.link.fd, moving=False)
+        return sent
+
+    def _goals(self) -> bytes:
         goals = {wheel.id: feetech.GOAL_VELOCITY.encode(wheel.goal) for wheel in self.wheels}
-        return await self._bus.send(feetech.sync_write(feetech.GOAL_VELOCITY.address, goals))
+        return feetech.sync_write(feetech.GOAL_VELOCITY.address, goals)
 
     async def start(self, now_ns: int) -> str:
         """Have servos that were told to stop turn by speed; return why not, or an empty text.

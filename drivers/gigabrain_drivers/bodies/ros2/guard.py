@@ -19,10 +19,10 @@ import msgspec
 
 from gigabrain_drivers.bodies.ros2.link import RosLink
 from gigabrain_drivers.bodies.ros2.options import Ros2Options
+from gigabrain_drivers.links.line_guard import AT_REST, MOVING, QUIT, GuardState
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.clock import Clock
 
-MOVING, AT_REST, QUIT = b"m", b"0", b"q"
 SILENCE_NS = 150_000_000  # after the last word of a moving robot, until zero is sent,
 ZEROS_NS = 1_000_000_000  # for so long, as a single message may get lost
 PERIOD_NS = 20_000_000
@@ -31,38 +31,6 @@ LOST_NS = 3_000_000_000  # without a word of the guard, after which the driver c
 RESTART_NS = 500_000_000
 CLOSE_S = 1.0
 START_S = 60.0  # for its first word, on a busy machine; to start it again would make that slower
-
-
-class GuardState:
-    """Decides when zero is sent. Pure."""
-
-    def __init__(self) -> None:
-        self.gone = False  # whether the driver is
-        self._moving_ns: int | None = None  # when it last said that the robot moves
-        self._stop_ns: int | None = None  # since when zeros are sent
-
-    def take(self, words: bytes, now_ns: int) -> None:
-        """Take what the driver has said; nothing means that it has ended."""
-        if not words:
-            self.gone = True
-            return
-        if QUIT in words:
-            self.gone, self._moving_ns, self._stop_ns = True, None, None
-            return
-        self._moving_ns = now_ns if words[-1:] == MOVING else None
-        self._stop_ns = None
-
-    def stops(self, now_ns: int) -> bool:
-        """Return whether zero is to be sent now."""
-        since = self._moving_ns
-        begins = since is not None and (self.gone or now_ns - since >= SILENCE_NS)
-        if begins and self._stop_ns is None:
-            self._stop_ns = now_ns
-        return self._stop_ns is not None and now_ns - self._stop_ns <= ZEROS_NS
-
-    def ended(self, now_ns: int) -> bool:
-        """Return whether there is nothing left to do."""
-        return self.gone and not self.stops(now_ns)
 
 
 class Guard:
@@ -153,7 +121,7 @@ class Guard:
 
 async def guard(options: Ros2Options) -> None:
     """Guard the robot until the driver ends, and a moment longer."""
-    clock, state = Clock(), GuardState()
+    clock, state = Clock(), GuardState(SILENCE_NS, ZEROS_NS)
     link = RosLink(msgspec.structs.replace(options, node=f"{options.node}_guard"[:64]), clock)
     link.open()
     loop = asyncio.get_running_loop()
