@@ -38,6 +38,7 @@ from gigabrain_zenoh.decision.held_things import (
     placed,
     thing_of,
 )
+from gigabrain_zenoh.decision.plan_display import PlanDisplay
 from gigabrain_zenoh.decision.seen_things import Lookout, approach, located, still_stands, unseen
 from gigabrain_zenoh.decision.tasks.arm_steps import (
     ArmAction,
@@ -70,7 +71,7 @@ class Manipulator:
 
     def __init__(self, bus: Bus, behaviour: str) -> None:
         self._behaviour, self._in_time = behaviour, bus.input_log.in_time
-        self._models = bus.latest(ARM_MODEL)
+        self._models, self._display = bus.latest(ARM_MODEL), PlanDisplay(bus)
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="arm")
         self._made_for: tuple[str, BodyDescription] | None = None
         self._making: Future[ArmPlanner] | None = None
@@ -109,6 +110,7 @@ class Manipulator:
         Things without a place are where they are `seen`, in the body's frame.
         """
         intent, outcome = self._step(state, body, command, idle, held, seen)
+        self._display.show(self._planner, self._plan if self._run else None)
         known = command.held if command and self._recalls else self._held
         return intent, replace(outcome, holds=known)
 
@@ -153,6 +155,7 @@ class Manipulator:
 
     def close(self) -> None:
         """Stop the worker thread, after the plan that it makes."""
+        self._display.close()
         self._pool.shutdown(cancel_futures=True)
 
     def _ready(self, body: BodyDescription) -> ArmPlanner | None:

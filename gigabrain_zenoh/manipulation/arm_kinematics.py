@@ -36,6 +36,13 @@ class Frame:
         """Return points (..., 3) [m] of this frame in the frame of the base."""
         return np.asarray(points @ self.axes.T + self.position)
 
+    @property
+    def quaternion(self) -> Floats:
+        """Its rotation (4,), as w, x, y, z."""
+        found = np.empty(4)
+        mujoco.mju_mat2Quat(found, self.axes.ravel())
+        return found
+
 
 @dataclass(frozen=True, kw_only=True)
 class Follower:

@@ -56,6 +56,7 @@ class Plan:
     phases: tuple[Phase, ...]
     hold: Hold | None = None
     grasp: Grasp | None = None
+    grasps: tuple[Grasp, ...] = ()  # all that were found, the chosen one first
     before: Floats | None = None  # (n,) of a press: the posture to which it goes back
 
 
@@ -154,7 +155,10 @@ class ArmPlanner:
         grip = next(phase.gripper for phase in found.phases if phase.name == "close")
         assert grip is not None
         hold = Hold(thing=found.held, grip=grip, opening=found.grasp.opening)
-        return Plan(phases=found.phases, hold=hold, grasp=found.grasp)
+        others = (one for one in found.grasps if one is not found.grasp)
+        return Plan(
+            phases=found.phases, hold=hold, grasp=found.grasp, grasps=(found.grasp, *others)
+        )
 
     def place(
         self, hold: Hold, target: Floats, things: Sequence[Thing], posture: Floats

@@ -51,6 +51,7 @@ class Pick:
     grasp: Grasp
     phases: tuple[Phase, ...]
     held: Thing  # in the frame of the tool
+    grasps: tuple[Grasp, ...] = ()  # all that were found, the best first
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -103,7 +104,7 @@ class PickPlacePlanner:
         for grasp in found[without : without + TRIES]:
             one = self._pick(grasp, thing, others, posture)
             if isinstance(one, Pick):
-                return one
+                return replace(one, grasps=tuple(found))
             fault = one
         return fault
 

@@ -6,12 +6,15 @@ from collections.abc import Iterable
 from foxglove import messages as fox
 
 from gigabrain_schemas.body import ArmModel, RobotState
+from gigabrain_schemas.brain import ArmPlan, GraspPose
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.geometry.link_model import LinkModel, Place, Quaternion, Shape, Vector
-from gigabrain_zenoh.recording.drawn import BASE, Drawn, KnownEntities, as_drawn, stamp
+from gigabrain_zenoh.geometry.link_model import LinkModel, Place, Quaternion, Shape, Vector, rotated
+from gigabrain_zenoh.recording.drawn import BASE, BLUE, Drawn, KnownEntities, as_drawn, stamp
 
 log = logging.getLogger(__name__)
 LINKS = "arm/"  # begins the names of the links' frames
+PATH_M, ARROW_M, ARROW_WIDTH_M = 0.004, 0.05, 0.006
+GREY = fox.Color(r=0.5, g=0.5, b=0.5, a=0.6)
 
 
 class ArmDrawing:
@@ -19,7 +22,7 @@ class ArmDrawing:
 
     def __init__(self) -> None:
         self._model: LinkModel | None = None
-        self._drawn = KnownEntities()
+        self._drawn, self._planned = KnownEntities(), KnownEntities()
 
     def draw_model(self, model: ArmModel, _: str) -> Iterable[Drawn]:
         """Draw the shapes of each link in its own frame; a model that cannot be read is logged."""
@@ -54,6 +57,20 @@ class ArmDrawing:
         ]
         yield as_drawn("arm_tf", fox.FrameTransforms(transforms=frames))
 
+    def draw_plan(self, plan: ArmPlan, _: str) -> Iterable[Drawn]:
+        """Draw the path of the tool, and an arrow for each grasp; the chosen one is blue."""
+        points = [fox.Point3(x=x, y=y, z=z) for x, y, z in plan.points().tolist()]
+        line = fox.LinePrimitive(
+            type=fox.LinePrimitiveLineType.LineStrip, thickness=PATH_M, points=points, color=BLUE
+        )
+        colours = [BLUE, *[GREY] * len(plan.grasps)]
+        arrows = [_arrow(one, colour) for one, colour in zip(plan.grasps, colours, strict=False)]
+        entity = fox.SceneEntity(
+            timestamp=stamp(plan), frame_id=BASE, id="arm plan", arrows=arrows,
+            lines=[line] if points else [],
+        )  # fmt: skip
+        yield as_drawn("arm_plan", self._planned.update(plan, {"arm plan": entity}))
+
     def _frame(self, link: int) -> str:
         assert self._model
         return f"{LINKS}{self._model.links[link].name}" if link else BASE
@@ -71,6 +88,20 @@ def _entity(at: ArmModel, frame: str, shapes: list[Shape]) -> fox.SceneEntity:
             _cylinder(one) for one in shapes if one.kind in ("cylinder", "capsule")
         ],
         spheres=[ball for one in shapes for ball in _balls(one)],
+    )  # fmt: skip
+
+
+def _arrow(grasp: GraspPose, colour: fox.Color) -> fox.ArrowPrimitive:
+    """Draw an arrow along the approach that ends at the tool."""
+    x, y, z, w = grasp.orientation
+    ahead = rotated((w, x, y, z), (ARROW_M, 0.0, 0.0))
+    tail = fox.Vector3(**{
+        axis: at - way for axis, at, way in zip("xyz", grasp.position, ahead, strict=True)
+    })  # fmt: skip
+    return fox.ArrowPrimitive(
+        pose=fox.Pose(position=tail, orientation=_quaternion((w, x, y, z))),
+        shaft_length=0.7 * ARROW_M, shaft_diameter=ARROW_WIDTH_M, head_length=0.3 * ARROW_M,
+        head_diameter=2 * ARROW_WIDTH_M, color=colour,
     )  # fmt: skip
 
 

@@ -112,6 +112,7 @@ class Drawer:
             "odometry": self._state,
             "lidar_frame": self._body,
             "arm_model": self._arm.draw_model,
+            "arm_plan": self._arm.draw_plan,
             "image": camera_drawing.picture,
             "depth": camera_drawing.depth,
             "camera": camera_drawing.calibration,

@@ -23,6 +23,7 @@ from gigabrain_schemas.base import (
     array_meta,
 )
 from gigabrain_schemas.body import MOST_ARM_JOINTS, MOST_CAMERAS, JointPosition, JointSpeed
+from gigabrain_schemas.sensors import Quaternion
 
 if TYPE_CHECKING:
     import numpy as np
@@ -243,6 +244,33 @@ class Intent(Message, frozen=True, kw_only=True):
     progress: Fraction = 0.0  # how far the present step has come, as expected against as measured
     behaviour: Name
     reason: Text  # in words, for people
+
+
+class GraspPose(Record, frozen=True, kw_only=True):
+    """Where fingers may hold a thing: x is the approach, and they close along z."""
+
+    position: tuple[Coordinate, Coordinate, Coordinate]  # [m], between them, in the body's frame
+    orientation: Quaternion  # x, y, z, w
+    opening: Annotated[float, Meta(gt=0.0, le=10.0)]  # [m], between the fingers at the thing
+
+
+class ArmPlan(Message, frozen=True, kw_only=True):
+    """Where an arm's tool will go, for viewers. It is empty once the arm is there."""
+
+    path: Annotated[bytes, array_meta(12 * 1024, "float32", ("n", 3), "m")] = b""
+    # float32 little-endian [m], (n, 3) in the body's frame
+    grasps: Annotated[tuple[GraspPose, ...], Meta(max_length=16)] = ()  # the chosen one first
+
+    def __post_init__(self) -> None:
+        if len(self.path) % 12:
+            raise ValueError(f"path must be triples of float32, got {len(self.path)} bytes")
+
+    def points(self) -> "NDArray[np.float32]":
+        """Return the path [m], (n, 3), without points that are not finite."""
+        import numpy as np
+
+        points = np.frombuffer(self.path, "<f4").reshape(-1, 3)
+        return np.asarray(points[np.isfinite(points).all(axis=1)])
 
 
 class Twist(Message, frozen=True, kw_only=True):

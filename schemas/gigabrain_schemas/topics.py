@@ -34,6 +34,7 @@ Role = Literal[  # of an identity
 Drawing = Literal[
     "scan", "map", "zones", "pose", "path", "obstacles", "task", "image", "log", "odometry",
     "lidar_frame", "arm_model", "depth", "camera", "detections", "objects", "solids", "perceived",
+    "arm_plan",
 ]  # fmt: skip
 
 
@@ -145,6 +146,10 @@ ZONES = Topic(
 INTENT = Topic(
     "robot/intent", brain.Intent, 50, echo_ns=150_000_000, max_bytes=16 * KB,
     publishers=BRAIN, drawing="path", plotted=True,
+)  # fmt: skip
+ARM_PLAN = Topic(
+    "robot/arm_plan", brain.ArmPlan, 1, keep=True, max_bytes=16 * KB, priority="background",
+    publishers=BRAIN, drawing="arm_plan",
 )  # fmt: skip
 TELEOP = Topic(
     "robot/teleop", brain.Twist, 20, priority="interactive_high", max_bytes=KB,

@@ -1,5 +1,6 @@
 """An arm in MuJoCo with a queue of tasks, stepped in memory, for the tests of missions."""
 
+from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +13,7 @@ from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.sim.body import MujocoOptions, sim_body
 from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import ArmModel
-from gigabrain_schemas.brain import Intent
+from gigabrain_schemas.brain import ArmPlan, Intent
 from gigabrain_schemas.objects import SeenSolid
 from gigabrain_schemas.tasks import Task
 from gigabrain_zenoh.decision.behaviours import ArmCommand, StepOutcome
@@ -60,17 +61,24 @@ class Rig:
         self._bus: Any = SimpleNamespace(
             input_log=SimpleNamespace(in_time=waits),
             latest=lambda _topic: SimpleNamespace(current=ArmModel(mjcf=text)),
+            transport=SimpleNamespace(watch_readers=self._watch),
+            publish=lambda _topic, message: self.plans.append(message),
         )
         self.start(Saved())
         self.held = ""
         self.seen: tuple[SeenSolid, ...] = ()
         self.phases: list[str] = []  # that it was in, each time it began
+        self.plans: list[ArmPlan] = []  # that were published
 
     def start(self, saved: Saved) -> None:
         """Start decision."""
         self.manipulator = Manipulator(self._bus, "navigate")
         self.queue = TaskQueue(lambda _topic: None, lambda _script: None, saved)  # type: ignore[arg-type, return-value]
         self.outcome: StepOutcome | None = None
+
+    def _watch(self, _key: str, on_readers: Callable[[bool], None]) -> Callable[[], None]:
+        self.watch_plans = on_readers
+        return lambda: None
 
     def restart(self) -> None:
         """Have decision die, and start it again with its file."""

@@ -12,10 +12,10 @@ from playwright.async_api import Page
 from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import ArmModel, Body, BodyDescription, GateStatus, Joint, RobotState
-from gigabrain_schemas.brain import JointSpeeds
+from gigabrain_schemas.brain import ArmPlan, GraspPose, JointSpeeds
 from gigabrain_schemas.examples import example
 from gigabrain_schemas.requests import GateReply, LimpRequest
-from gigabrain_schemas.topics import ARM_MODEL, BODY, JOINT_TELEOP, LIMP, STATE
+from gigabrain_schemas.topics import ARM_MODEL, ARM_PLAN, BODY, JOINT_TELEOP, LIMP, STATE
 from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics
 from gigabrain_zenoh.testing.waiting import until
 from tests.places import ROOT
@@ -147,6 +147,10 @@ async def test_each_joint_is_shown_in_its_range(chromium: Browser) -> None:
     assert await meter.evaluate(left, "s") == "50%"
     assert await last.get_by_role("meter").evaluate(left, "b") == "25%"
     assert await page.inner_text("#arm-status") == "held"
+    tool = ArmKinematics(MODEL, CRANE.joints).forward(np.array([0.95993, 0.1, 0.1, 0.1, 0.1]))
+    place = ", ".join(f"{100 * metres:.1f}" for metres in tool.position)
+    down = np.degrees(np.arcsin(-tool.axes[2, 0]))
+    assert await page.inner_text("#tool-place") == f"tool at {place} cm, {down:.0f}° down"
 
 
 async def test_of_an_arm_alone_no_map_and_no_joystick_are_shown(
@@ -316,18 +320,46 @@ async def test_a_viewer_sees_joints_without_buttons(chromium: Browser) -> None:
 async def test_the_arm_is_drawn_in_three_dimensions(chromium: Browser) -> None:
     page = await opened(chromium)
     await page.wait_for_selector("#world", state="visible")
-    yellow = """() => new Promise((resolve) => requestAnimationFrame(() => {
+    await drawn(page, "r > 2 * b && r > 80", 500)  # yellow
+
+
+async def test_the_way_of_the_tool_and_the_grasps_are_drawn_for_those_who_look(
+    chromium: Browser, fake: FakeArm
+) -> None:
+    await until(lambda: ARM_PLAN.key not in fake.bus.listens, "nobody to look")
+    page = await opened(chromium)
+    await until(lambda: ARM_PLAN.key in fake.bus.listens, "the page to look")
+    way = np.linspace((0.1, -0.25, 0.3), (0.25, -0.15, 0.02), 30, dtype="<f4")
+    grasps = [
+        GraspPose(position=place, orientation=(0.0, 0.7071068, 0.0, 0.7071068), opening=0.03)
+        for place in ((0.25, -0.15, 0.02), (0.2, -0.25, 0.02))
+    ]
+    fake.robot.publish(ARM_PLAN, ArmPlan(path=way.tobytes(), grasps=tuple(grasps)))
+    await drawn(page, "b > 2.5 * r && b > 1.4 * g", 60)  # the way is blue
+    await drawn(page, "g > 2 * r && g > 1.6 * b", 20)  # the grasp that is chosen is green
+    late = await opened(chromium)  # what is kept is shown to those who come later
+    await drawn(late, "b > 2.5 * r && b > 1.4 * g", 60)
+    fake.robot.publish(ARM_PLAN, ArmPlan())
+    await drawn(page, "b > 2.5 * r && b > 1.4 * g", 0, most=0)
+
+
+async def drawn(page: Page, colour: str, least: int, most: int = 10**9) -> None:
+    """Wait until so many pixels of the world have a colour: a condition on r, g and b."""
+    count = """() => new Promise((resolve) => requestAnimationFrame(() => {
       const canvas = document.getElementById('world'), copy = document.createElement('canvas')
       copy.width = canvas.width; copy.height = canvas.height
       const pen = copy.getContext('2d')
       pen.drawImage(canvas, 0, 0)
       const { data } = pen.getImageData(0, 0, copy.width, copy.height)
       let count = 0
-      for (let i = 0; i < data.length; i += 4) count += data[i] > 2 * data[i + 2] && data[i] > 80
+      for (let i = 0; i < data.length; i += 4) {
+        const [r, g, b] = data.subarray(i, i + 3)
+        count += COLOUR
+      }
       resolve(count)
-    }))"""
+    }))""".replace("COLOUR", colour)
     for _ in range(300):
-        if await page.evaluate(yellow) > 500:
+        if least <= await page.evaluate(count) <= most:
             return
         await page.wait_for_timeout(100)
-    raise AssertionError("nothing yellow is drawn")
+    raise AssertionError(f"expected {least} to {most} pixels with {colour}")

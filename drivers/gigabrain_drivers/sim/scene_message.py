@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_drivers.sim.scene import SPARE
+from gigabrain_drivers.sim.scene import ROBOT, SPARE
 from gigabrain_schemas.sim import MAX_MESH_BYTES, SHAPE_KINDS, SceneMesh, SimPoses, SimScene, Thing
 
 TYPES = {
@@ -19,6 +19,7 @@ TYPES = {
     mujoco.mjtGeom.mjGEOM_ELLIPSOID: "ellipsoid",
     mujoco.mjtGeom.mjGEOM_MESH: "mesh",
 }
+BASE = f"{ROBOT}base"
 SHOWN_GROUPS = 3  # MuJoCo's viewers draw geom groups 0 to 2
 
 
@@ -40,6 +41,7 @@ class SceneWriter:
         moving = (model.body_weldid != 0) | (model.body_mocapid >= 0)
         for body in range(1, model.nbody):  # what is fixed to a mocap body moves with it
             moving[body] |= moving[model.body_parentid[body]]
+            moving[body] |= model.body(body).name == BASE  # of an arm: viewers draw its plan there
         spare = [model.body(body).name.startswith(SPARE) for body in range(model.nbody)]
         self._moving, self._spare = moving, np.array(spare)
         self._bodies = self._moving_bodies(())

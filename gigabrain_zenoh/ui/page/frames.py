@@ -20,7 +20,7 @@ from gigabrain_schemas.body import (
     JointSpeed,
     RobotState,
 )
-from gigabrain_schemas.brain import Intent, OccupancyGrid, WorldModel
+from gigabrain_schemas.brain import ArmPlan, Intent, OccupancyGrid, WorldModel
 from gigabrain_schemas.requests import Param
 from gigabrain_schemas.safety import Health, LogRecord, SafetyState
 from gigabrain_schemas.sensors import Image, LaserScan
@@ -28,17 +28,18 @@ from gigabrain_schemas.sim import SimPoses, SimRequest, SimScene
 from gigabrain_schemas.tasks import GoalRequest
 from gigabrain_schemas.zones import SavedMapInfo, Zones, ZonesRequest
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import Close
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.geometry.link_model import LinkModel
 from gigabrain_zenoh.ui.page.arm_scene import ArmScene
-from gigabrain_zenoh.ui.page.tool_jog import tool_speeds
+from gigabrain_zenoh.ui.page.tool_jog import ToolPlace, tool_place, tool_speeds
 from gigabrain_zenoh.ui.steering import ViewerScene
 
 ABOUT, STATE, SCAN, MAP, HEALTH, LOG, REPLY, IMAGE, TASK = range(1, 10)  # to the browser
 SCENE, POSES, ZONES = 10, 11, 12
-CAMERA, FOUND, CONTOURS, PERCEIVED, OBJECTS = range(13, 18)
+CAMERA, FOUND, CONTOURS, PERCEIVED, OBJECTS, ARM_PLAN = range(13, 19)
 LOGIN, DRIVE, ASK, WATCH, SHOWN, JOG = range(1, 7)  # from the browser
 MAX_KEPT_LINES = 30  # of the log, for viewers that connect later
 
@@ -67,6 +68,7 @@ class StateFrame(Struct, frozen=True, kw_only=True):
     intent: Intent | None
     safety: SafetyState | None
     world: WorldModel | None
+    tool: ToolPlace | None = None  # of an arm
     driving: int = 0  # number of the viewer that steers
     viewers: int = 1
 
@@ -207,12 +209,23 @@ class PageView(ViewerScene):
         self._arm: ArmScene | None = None  # where no simulation sends its world
         self._arm_models = bus.latest(topics.ARM_MODEL, self._on_arm_model)
         self._scenes = bus.latest(topics.SIM_SCENE, self._on_scene)
+        self._end_plans: Close | None = None
+
+    def watch_plans(self, on: bool) -> None:
+        """Begin or end to receive the plans of an arm, which are made for those who look."""
+        if on and self._end_plans is None:
+            self._end_plans = self.bus.subscribe(topics.ARM_PLAN, self._on_plan)
+        elif not on and self._end_plans:
+            self._end_plans()
+            self._end_plans = None
 
     def state_frame(self, driving: int, viewers: int) -> bytes:
         """Return the present state of the robot."""
         state = self.state.fresh()
         pose, in_map = self._newest_pose(state)
-        world = self.world.fresh()
+        world, tool = self.world.fresh(), None
+        if state and self.body and self._links:
+            tool = tool_place(self._links, self.body.description, state)
         content = StateFrame(
             state=state,
             pose=pose,
@@ -220,6 +233,7 @@ class PageView(ViewerScene):
             intent=self.intent.fresh(),
             safety=self.safety.fresh(),
             world=world and replace(world, hits=b"", contours=()),  # drawn by frames of their own
+            tool=tool and tuple(round(value, 6) for value in tool),  # type: ignore[arg-type]
             driving=driving,
             viewers=viewers,
         )
@@ -294,6 +308,10 @@ class PageView(ViewerScene):
         if not self._scenes.newest:
             self._arm = ArmScene(self._links)
             self._keep("scene", as_json(SCENE, self._arm.scene()))
+
+    def _on_plan(self, _key: str, plan: ArmPlan) -> None:
+        content = {"path": plan.points().round(4).tolist(), "grasps": plan.grasps}
+        self._keep("arm_plan", as_json(ARM_PLAN, content))
 
     def _on_zones(self, zones: Zones) -> None:
         """Send zones that have changed; they are published again and again."""

@@ -221,6 +221,7 @@ class Sessions:
     def send_news(self) -> None:
         """Send the present state, scan and pictures to the viewers; receive nothing for none."""
         self._surroundings.watch(bool(self.viewers))
+        self._view.watch_plans(bool(self.viewers))
         by_pace = {viewer.pace: viewer for viewer in self.viewers}
         now_ns = self._clock.now_ns()
         for pace, slot, frame in self._cameras.new_frames(tuple(by_pace), now_ns):

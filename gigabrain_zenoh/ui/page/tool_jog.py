@@ -1,14 +1,32 @@
-"""Speeds of joints that move an arm's tool along a line, by damped least squares."""
+"""Where an arm's tool is, and the speeds of joints that move it along a line.
+
+The speeds are found by damped least squares.
+"""
 
 import math
 from collections.abc import Sequence
 
 from gigabrain_schemas.body import BodyDescription, JointDescription, RobotState
-from gigabrain_zenoh.geometry.link_model import LinkModel, Vector, cross
+from gigabrain_zenoh.geometry.link_model import LinkModel, Vector, cross, rotated
 
 DAMPING_M = 0.02  # [m/rad]; where joints move the tool less than that, they are left out
 STEP = 1e-5  # [rad] or [m], by which positions are varied
 NEAR_LIMIT = 0.02  # [rad] or [m], within which a joint moves no nearer to the end of its range
+
+
+ToolPlace = tuple[float, float, float, float]  # x, y, z [m], and how far it points down [rad]
+
+
+def tool_place(model: LinkModel, body: BodyDescription, state: RobotState) -> ToolPlace | None:
+    """Return where the arm's tool is in the frame of its base; None where that is not known."""
+    at = {joint.name: joint.position for joint in state.joints}
+    tool = body.arm.tool if body.arm else ""
+    known = tool in (link.name for link in model.links)
+    if not known or any(joint.name not in at for joint in body.joints):
+        return None
+    place = model.place_in_base(tool, at)
+    ahead, aside, up = rotated(place.rotation, (1.0, 0.0, 0.0))
+    return *place.position, -math.atan2(up, math.hypot(ahead, aside))
 
 
 def tool_speeds(

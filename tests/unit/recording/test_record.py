@@ -115,6 +115,7 @@ def test_every_kind_of_message_is_drawn_for_viewers(tmp_path: Path) -> None:
         "/viz/objects": "foxglove.SceneUpdate",
         "/viz/solids": "foxglove.SceneUpdate",
         "/viz/arm": "foxglove.SceneUpdate",
+        "/viz/arm_plan": "foxglove.SceneUpdate",
         "/viz/perceived/front": "foxglove.SceneUpdate",
         "/viz/obstacles": "foxglove.SceneUpdate",
         "/viz/way": "foxglove.PosesInFrame",

@@ -17,6 +17,7 @@ from gigabrain_schemas.sensors import PIXEL_BYTES, Image
 OURS: dict[str, Callable[[Any], Any]] = {
     "LaserScan": lambda scan: scan.ranges_m,
     "WorldModel": lambda world: world.points(),
+    "ArmPlan": lambda plan: plan.points(),
     "OccupancyGrid": lambda grid: grid.array(),
     "Image": lambda image: image.array(),
 }
@@ -48,7 +49,7 @@ def test_every_array_says_its_type_its_byte_order_and_its_shape(
 
 @pytest.mark.parametrize(
     "message",
-    [EXAMPLES["LaserScan"], EXAMPLES["WorldModel"], EXAMPLES["OccupancyGrid"], *PIXELS],
+    [*(EXAMPLES[name] for name in OURS if name != "Image"), *PIXELS],
     ids=lambda one: f"{type(one).__name__} {getattr(one, 'encoding', '')}",
 )
 def test_an_array_is_read_by_its_schema(

@@ -35,7 +35,7 @@ NULLABLE = {
 WILL_DO_EMPTY = {
     "EstopRequest", "DescribeRequest", "AuditRequest", "AuditPage", "ParamRequest", "SimRequest",
     "TaskStatus", "Zones", "MapListRequest", "MapListReply", "ObjectMap",
-    "Solids",
+    "Solids", "ArmPlan",
 }  # fmt: skip
 NEEDS_ONE = {"GoalRequest", "ZonesRequest", "ObjectsRequest"}  # of several fields
 REPORT = ("Description.report.distance_m", "Description.report.contacts")  # texts as well

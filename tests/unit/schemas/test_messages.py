@@ -37,6 +37,7 @@ REQUIRED: dict[str, set[str]] = {
     "PoseInMap": {"x", "y", "yaw", "covariance"},
     "OccupancyGrid": {"resolution", "width", "height", "origin_x", "origin_y", "cells"},
     "Intent": {"behaviour", "reason"},
+    "ArmPlan": set(),
     "Twist": {"linear_x"},
     "JointSpeeds": {"name", "velocity"},
     "CmdVel": {"linear_x"},
@@ -110,6 +111,7 @@ def test_the_table_holds_the_keys_and_rates_of_the_design() -> None:
         "robot/map": ("OccupancyGrid", 1),
         "robot/zones": ("Zones", 0.5),
         "robot/intent": ("Intent", 50),
+        "robot/arm_plan": ("ArmPlan", 1),
         "robot/teleop": ("Twist", 20),
         "robot/joint_teleop": ("JointSpeeds", 20),
         "robot/cmd_vel": ("CmdVel", 50),
@@ -152,6 +154,7 @@ def test_a_value_stops_counting_after_so_many_missed_periods() -> None:
         "robot/map": 5_000_000_000,
         "robot/zones": 10_000_000_000,
         "robot/intent": 100_000_000,
+        "robot/arm_plan": 5_000_000_000,
         "robot/teleop": 250_000_000,
         "robot/joint_teleop": 250_000_000,
         "robot/cmd_vel": 100_000_000,
@@ -210,7 +213,7 @@ def test_every_message_is_frozen_and_documented_and_carries_the_header(
 def test_the_golden_folder_holds_the_examples_byte_for_byte() -> None:
     stored = {path.name: path.read_bytes() for path in examples.FOLDER.iterdir()}
     assert stored == examples.files()
-    assert len(stored) == 122
+    assert len(stored) == 124
 
 
 @by_name

@@ -19,6 +19,14 @@ function activity(state) {
   return state.joints.some(({ velocity }) => Math.abs(velocity) > AT_REST_SPEED) ? 'moving' : 'held'
 }
 
+/** Return where the tool is as text: x, y, z in centimetres, and how far it points down. */
+export function toolText(tool) {
+  if (!tool) return ''
+  const [x, y, z, pitch] = tool, down = (pitch * 180) / Math.PI
+  const place = [x, y, z].map((metres) => (100 * metres).toFixed(1)).join(', ')
+  return `tool at ${place} cm, ${Math.abs(down).toFixed(0)}° ${down < 0 ? 'up' : 'down'}`
+}
+
 /** The buttons that hold an arm and let go of it; the second asks a person first. */
 export class ArmHold {
   /** `request(what, more)` sends a request; the rest are the buttons, and the question with its answers. */

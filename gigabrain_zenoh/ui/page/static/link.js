@@ -1,6 +1,6 @@
 // The WebSocket. A frame is a byte for its kind, then its content. Nothing is queued while it is down.
 const ABOUT = 1, STATE = 2, SCAN = 3, MAP = 4, HEALTH = 5, LOG = 6, REPLY = 7, IMAGE = 8, TASK = 9, SCENE = 10, POSES = 11, ZONES = 12
-const CAMERA = 13, FOUND = 14, CONTOURS = 15, PERCEIVED = 16, OBJECTS = 17
+const CAMERA = 13, FOUND = 14, CONTOURS = 15, PERCEIVED = 16, OBJECTS = 17, ARM_PLAN = 18
 const LOGIN = 1, DRIVE = 2, ASK = 3, WATCH = 4, SHOWN = 5, JOG = 6
 const SILENT_AFTER_MS = 1000, RETRY_MS = [300, 600, 1200, 2500], FULL_RETRY_MS = 5000
 const WRONG_TOKEN = 4401, FULL = 4429 // codes of a closed WebSocket
@@ -14,7 +14,7 @@ export class Link {
   #pending = new Map() // by the id of a request: what resolves it
   #receivedMs = 0
 
-  /** `on` has about, robot, scan, map, task, health, log, image, camera, found, contours, perceived, objects, scene, poses, zones, reply, connection(status) and login(). */
+  /** `on` has about, robot, scan, map, task, health, log, image, camera, found, contours, perceived, objects, armPlan, scene, poses, zones, reply, connection(status) and login(). */
   constructor(on, token) {
     this.on = on
     this.token = token
@@ -95,6 +95,7 @@ export class Link {
     else if (kind === CONTOURS) this.on.contours(json())
     else if (kind === PERCEIVED) this.on.perceived(json())
     else if (kind === OBJECTS) this.on.objects(json())
+    else if (kind === ARM_PLAN) this.on.armPlan(json())
     else if (kind === CAMERA) this.on.camera(json())
     else if (kind === ABOUT) this.on.about(json())
   }

@@ -1,5 +1,5 @@
 // Connects the parts of the page: shows the frames that the link receives, and sends the operator's requests.
-import { Arm, ArmHold } from './arm.js'
+import { Arm, ArmHold, toolText } from './arm.js'
 import { Cameras } from './cameras.js'
 import { Drive } from './drive.js'
 import { Link } from './link.js'
@@ -58,6 +58,7 @@ const link = new Link({
     showFigures(now.state, now)
     showSafety(now.safety, about.body)
     arm.setState(now.state)
+    setText($('tool-place'), toolText(now.tool))
     armHold.setState(now.state)
     $('stick').classList.toggle('off', !mayDrive())
   },
@@ -78,6 +79,7 @@ const link = new Link({
   contours: (contours) => objects.setContours(contours),
   perceived: (found) => objects.setPerceived(found),
   objects: (stored) => objects.set(stored),
+  armPlan: (plan) => world.setPlan(plan),
   scene(scene) {
     world.setScene(scene)
     $('show-world').hidden = false
@@ -95,6 +97,7 @@ const link = new Link({
       releaseAll()
       robot = null
       arm.setState(null)
+      setText($('tool-place'), '')
       armHold.setState(null)
       showGate(null, viewOnly())
       showFigures(null, {})

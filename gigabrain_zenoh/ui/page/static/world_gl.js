@@ -4,6 +4,7 @@ const [PLANE, BOX, CYLINDER, SPHERE, CAPSULE, ELLIPSOID, MESH] = [0, 1, 2, 3, 4,
 const SIDES = 20, RINGS = 8 // of round shapes
 const FLOOR_M = 60 // half of what is drawn of an endless floor
 const FLOATS = 7 // of a vertex: position, normal, colour in one
+const SOLID = 126 // alpha of all but the floor; with a higher one a colour could be NaN
 
 const VERTEX = `
 attribute vec3 position, normal; attribute vec4 colour;
@@ -92,6 +93,11 @@ export class Camera {
     const { back, right, up } = this.axes
     return unit([0, 1, 2].map((i) => (x * aspect / 1.6) * right[i] + (y / 1.6) * up[i] - back[i]))
   }
+}
+
+/** Return a colour as four bytes in the place of a float; alpha 0 stands for the floor. */
+function packed([r, g, b], alpha = SOLID) {
+  return new Float32Array(new Uint8Array([r, g, b, alpha]).buffer)[0]
 }
 
 /** Collects the triangles of one body. */
@@ -183,6 +189,7 @@ function shape(kind, size, meshes) {
 
 export class Renderer {
   #bodies = [] // of each its buffer and its count of vertices
+  #marks = null // the same, of what is drawn in the frame of a body
 
   /** Throws where there is no WebGL. */
   constructor(canvas) {
@@ -207,39 +214,47 @@ export class Renderer {
   /** Take the shapes of a scene. */
   load({ bodies, kinds, owners, sizes, places, colours, meshes }) {
     const gl = this.gl, parts = bodies.map(() => new Triangles())
-    const word = new Float32Array(1), bytes = new Uint8Array(word.buffer)
     kinds.forEach((kind, i) => {
-      // a colour is four bytes in the place of a float; alpha 0 stands for the floor, else NaN could be
-      const alpha = kind === PLANE ? 0 : 126
-      bytes.set([colours[4 * i], colours[4 * i + 1], colours[4 * i + 2], alpha])
       const [points, normals] = shape(kind, sizes.subarray(3 * i, 3 * i + 3), meshes)
-      parts[owners[i]].add(points, normals, [...places.subarray(7 * i, 7 * i + 7)], word[0])
+      const colour = packed(colours.subarray(4 * i, 4 * i + 3), kind === PLANE ? 0 : SOLID)
+      parts[owners[i]].add(points, normals, [...places.subarray(7 * i, 7 * i + 7)], colour)
     })
     for (const { buffer } of this.#bodies) gl.deleteBuffer(buffer)
-    this.#bodies = parts.map(({ values }) => {
-      const buffer = gl.createBuffer()
-      gl.bindBuffer(gl.ARRAY_BUFFER, buffer)
-      gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(values), gl.STATIC_DRAW)
-      return { buffer, count: values.length / FLOATS }
-    })
+    this.#bodies = parts.map((part) => this.#stored(part))
   }
 
-  /** Draw all bodies where `matrices` has them; the first stands still. */
-  draw(camera, matrices, background) {
+  /** Mark places in the frame of a body by boxes: each half a size, a pose and a colour from 0 to 255. */
+  mark(boxes) {
+    const triangles = new Triangles()
+    for (const { size, pose, colour } of boxes) triangles.add(...box(size), pose, packed(colour))
+    if (this.#marks) this.gl.deleteBuffer(this.#marks.buffer)
+    this.#marks = this.#stored(triangles)
+  }
+
+  #stored({ values }) {
+    const gl = this.gl, buffer = gl.createBuffer()
+    gl.bindBuffer(gl.ARRAY_BUFFER, buffer)
+    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(values), gl.STATIC_DRAW)
+    return { buffer, count: values.length / FLOATS }
+  }
+
+  /** Draw all bodies where `matrices` has them, and the marks at the body with this number; the first body stands still. */
+  draw(camera, matrices, background, marked) {
     const gl = this.gl, { width, height } = gl.canvas
     gl.viewport(0, 0, width, height)
     gl.clearColor(...background, 1)
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT)
     gl.uniformMatrix4fv(this.uniform.view, false, camera.matrix(width / height))
     gl.uniform3fv(this.uniform.sky, background)
-    this.#bodies.forEach(({ buffer, count }, i) => {
-      if (!count || !matrices[i]) return
-      gl.uniformMatrix4fv(this.uniform.body, false, matrices[i])
+    const marks = this.#marks ? [[this.#marks, matrices[marked]]] : []
+    for (const [{ buffer, count }, matrix] of [...this.#bodies.map((body, i) => [body, matrices[i]]), ...marks]) {
+      if (!count || !matrix) continue
+      gl.uniformMatrix4fv(this.uniform.body, false, matrix)
       gl.bindBuffer(gl.ARRAY_BUFFER, buffer)
       gl.vertexAttribPointer(this.at.position, 3, gl.FLOAT, false, 4 * FLOATS, 0)
       gl.vertexAttribPointer(this.at.normal, 3, gl.FLOAT, false, 4 * FLOATS, 12)
       gl.vertexAttribPointer(this.at.colour, 4, gl.UNSIGNED_BYTE, true, 4 * FLOATS, 24)
       gl.drawArrays(gl.TRIANGLES, 0, count)
-    })
+    }
   }
 }

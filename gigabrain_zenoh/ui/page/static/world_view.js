@@ -1,4 +1,5 @@
 // The simulated world in three dimensions: turn it, and put obstacles and people into it.
+import { planMarks } from './arm_plan.js'
 import { Camera, matrixOf, Renderer } from './world_gl.js'
 
 const STILL = [0, 0, 0, 1, 0, 0, 0]
@@ -8,7 +9,7 @@ const REACH_M = 0.4 // from a thing's middle, within which a click is on it
 const SIZES = { box: [0.3, 0.3, 0.5], cylinder: [0.3, 0.3, 0.5] }
 const CLOSE_ELEVATION = 0.5 // [rad]
 const CLOSE_HEIGHT_M = 0.12 // of what is looked at
-const ROBOT = 'robot/', BASE = 'robot/base' // a simulation has no base of a fixed arm, which does not move
+const ROBOT = 'robot/', BASE = 'robot/base'
 
 const bytesOf = (base64) => Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0))
 const floatsOf = (base64) => new Float32Array(bytesOf(base64).buffer)
@@ -20,6 +21,7 @@ export class WorldView {
   #drag = null
   #drawScheduled = false
   #renderer = null
+  #marks = [] // of the arm's plan
   #height = 0
 
   /** `change(request)` asks the simulation for a change of its world; `say(text, ok)` shows a result. */
@@ -39,7 +41,10 @@ export class WorldView {
   /** Show or hide it; return the reason if it cannot be shown. */
   show(shown) {
     try {
-      if (shown && !this.#renderer) this.#renderer = new Renderer(this.canvas)
+      if (shown && !this.#renderer) {
+        this.#renderer = new Renderer(this.canvas)
+        this.#renderer.mark(this.#marks)
+      }
     } catch (error) {
       return error.message
     }
@@ -57,6 +62,13 @@ export class WorldView {
     }
     this.#matrices = [matrixOf(STILL)]
     if (this.shown) this.#load()
+  }
+
+  /** Show where the arm's tool will go, and the grasps that were found. */
+  setPlan(plan) {
+    this.#marks = planMarks(plan)
+    this.#renderer?.mark(this.#marks)
+    this.draw()
   }
 
   setPoses(version, poses) {
@@ -98,7 +110,7 @@ export class WorldView {
     this.canvas.height = Math.max(1, Math.round(h * ratio))
     const floor = getComputedStyle(this.canvas).getPropertyValue('--floor').trim()
     const background = [1, 3, 5].map((i) => parseInt(floor.slice(i, i + 2), 16) / 255)
-    this.#renderer.draw(this.#camera, this.#matrices, background)
+    this.#renderer.draw(this.#camera, this.#matrices, background, this.scene?.bodies.indexOf(BASE))
   }
 
   /** Return the place on the floor under the pointer, or null. */
