@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import os
 import signal
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from typing import Any
 
 import pytest
@@ -12,7 +12,7 @@ import pytest_asyncio
 
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.topics import STATE
-from gigabrain_zenoh.client.requests import release
+from gigabrain_zenoh.client.requests import press_estop, release
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import BodyLost, Refused
 from gigabrain_zenoh.runtime.connect import connect
@@ -21,6 +21,7 @@ from gigabrain_zenoh.testing.waiting import until
 from tests.ros2.judge import Judge
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
+STAMPED = "geometry_msgs/msg/TwistStamped"
 TRIGGER, SET_BOOL = "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"
 DEFAULT: dict[str, Any] = {}
 SENSOR = {"reliable": False, "depth": 5}
@@ -99,15 +100,29 @@ async def released(robot: Robot) -> None:
         await until(lambda: len(robot.states) > count + 10, "states")  # noqa: B023
 
 
-async def driving(robot: Robot, driver: Any) -> None:
+async def driving(robot: Robot, driver: Any, **how: Any) -> None:
     """Let a program drive; on a busy machine the gate may stop it, and it has to pause."""
     while True:
-        await driver.query("drive", linear=0.15, hz=20.0)
+        await driver.query("drive", linear=0.15, hz=20.0, **how)
         with contextlib.suppress(TimeoutError):
             await until(lambda: robot.now.velocity.linear_x > 0.12, "it drives", 10.0)
             return
         await driver.query("rest")
         await asyncio.sleep(1.0)
+
+
+async def diagnosed(judge: Judge) -> Callable[[str], str]:
+    """Return a function that gives the newest text of a line of /diagnostics, as rclpy has it."""
+    listener = judge.start("listen", node="diagnosed")
+    kind, qos = READ["/diagnostics"]
+    await listener.query("subscribe", topic="/diagnostics", type=kind, qos=qos, stream=True)
+
+    def text(name: str) -> str:
+        heard = listener.seen("message", topic="/diagnostics")
+        lines = heard[-1]["value"]["status"] if heard else []
+        return next((one["message"] for one in lines if one["name"] == f"gigabrain: {name}"), "")
+
+    return text
 
 
 async def test_rclpy_reads_topics_with_values_frames_and_qos(robot: Robot, judge: Judge) -> None:
@@ -149,6 +164,41 @@ async def test_rclpy_drives_by_cmd_vel_and_killed_the_body_stops(
     await until(lambda: abs(robot.now.velocity.linear_x) < 0.01, "it stands")
     await robot.becomes("idle")
     assert robot.now.gate.commander == ""
+
+
+async def test_a_stamped_twist_drives_and_one_with_an_old_stamp_is_refused_by_name(
+    robot: Robot, judge: Judge
+) -> None:
+    await released(robot)
+    driver, text = judge.start("drive"), await diagnosed(judge)
+    await driving(robot, driver, type=STAMPED)
+    assert robot.now.gate.commander == "ros2"
+    await driver.query("drive", linear=0.15, type=STAMPED, late_s=5.0)
+    await until(lambda: "stamp is 5." in text("cmd_vel"), "it is named")
+    await until(lambda: abs(robot.now.velocity.linear_x) < 0.01, "it stands")
+    await driver.query("rest")
+    await robot.becomes("idle")
+
+
+async def test_enable_lets_the_brain_drive_and_ros_is_refused_by_name(
+    robot: Robot, judge: Judge
+) -> None:
+    await released(robot)
+    driver, caller = judge.start("drive"), judge.start("call", node="caller")
+    text = await diagnosed(judge)
+    await caller.available(service="/enable", type=TRIGGER)
+    while robot.now.gate.commander != "control":  # on a busy machine the gate may stop it
+        name = f"enable-{len(caller.seen('response'))}"
+        await caller.query("call", service="/enable", type=TRIGGER, name=name)
+        assert (await caller.hear("response", name=name))["value"]["success"]
+        count = len(robot.states)
+        await until(lambda: len(robot.states) > count + 10, "states")  # noqa: B023
+    await driver.query("drive", linear=0.15)
+    await until(lambda: "control drives; end that first" in text("cmd_vel"), "it is named")
+    assert robot.now.gate.commander in ("control", "")
+    await driver.query("rest")
+    await press_estop(robot.bus, "a test")
+    await robot.becomes("latched")
 
 
 async def test_rclpy_stops_by_service_and_releases_by_another(robot: Robot, judge: Judge) -> None:
