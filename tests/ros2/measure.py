@@ -7,6 +7,7 @@ when the robot's state with the effect has arrived here. A busy machine makes al
 import asyncio
 import contextlib
 import os
+import signal
 import statistics
 import sys
 import tempfile
@@ -49,6 +50,7 @@ SPEED_MPS, COMMAND_HZ, PAUSE_S, TRY_S = 0.15, 20.0, 1.0, 10.0
 SET_BOOL, NAVIGATE = "std_srvs/srv/SetBool", "nav2_msgs/action/NavigateToPose"
 ACTION = {"action": "/navigate_to_pose", "type": NAVIGATE}
 GOAL_S = 300.0
+MAX_RESTARTS = 4  # of five deaths within a minute, the supervisor gives a process up
 READ = {
     "/scan": ("sensor_msgs/msg/LaserScan", {"reliable": False}),
     "/odom": ("nav_msgs/msg/Odometry", {}),
@@ -160,6 +162,35 @@ async def bare_hops(robot: Robot, judge: Judge, count: int) -> list[float]:
         arrived = await arrivals(judge, "/bare_scan", count)
         close()
     return later(arrived, written)
+
+
+async def late_joins(robot: Robot, judge: Judge, count: int) -> list[float]:
+    """Return the times [ms] from the subscription of a node that has just come to a message."""
+    found = []
+    kind, qos = READ["/odom"]
+    for _ in range(count):
+        listen = judge.start("listen")
+        asked = await listen.query("subscribe", topic="/odom", type=kind, qos=qos, stream=True)
+        found.append(((await listen.hear("message"))["at_ns"] - asked["at_ns"]) / 1e6)
+        listen.close()
+    return found
+
+
+async def restarts(robot: Robot, judge: Judge, count: int) -> list[float]:
+    """Return the times [ms] from the gateway's death until rclpy reads its successor."""
+    listen, found = judge.start("listen"), []
+    kind, qos = READ["/odom"]
+    await listen.query("subscribe", topic="/odom", type=kind, qos=qos, stream=True)
+    for _ in range(min(count, MAX_RESTARTS)):
+        await listen.hear("message", nth=len(listen.seen("message")))
+        before = robot.group.pids["ros2"]
+        os.kill(before, signal.SIGKILL)
+        killed_ns = time.monotonic_ns()
+        await until(lambda pid=before: robot.group.pids.get("ros2", pid) != pid, "its successor")
+        first = await listen.hear("message", nth=len(listen.seen("message")))
+        found.append((first["at_ns"] - killed_ns) / 1e6)
+    listen.close()
+    return found
 
 
 async def brakings(robot: Robot, judge: Judge, count: int) -> list[float]:
@@ -287,6 +318,8 @@ async def times(judge: Judge, count: int, seconds: float) -> Table:
             "of that, by DDS and rclpy alone (ms)": bare_hops,
             "publisher killed: from its period to braking (ms)": brakings,
             "/estop called: to zero (ms)": stops,
+            "a node comes: from its subscription to a message (ms)": late_joins,
+            "gateway killed: until rclpy reads the next one (ms)": restarts,
         }
         for name, measure in rows.items():
             say(f"measuring: {name}")

@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import functools
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as xml
@@ -68,11 +68,11 @@ class Client:
         found = await self.program.hear("result", name=name)
         return found["status"], found["value"]["error_code"]
 
-    async def done(self, sent: Any, **goal: Any) -> tuple[str, str, int]:
+    async def done(self, sent: Callable[[], Any], **goal: Any) -> tuple[str, str, int]:
         """Send a goal, again where a busy machine let the gate stop it; return name and result."""
         while True:
             name = f"goal-{len(self.program.seen('accepted'))}"
-            await self.send(name, sent, **goal)
+            await self.send(name, sent(), **goal)
             result = await self.result(name)
             if not self._stopped(name):
                 return name, *result
@@ -134,11 +134,14 @@ async def test_the_urdf_and_the_frames_of_all_links_reach_ros(robot: Robot, judg
 async def test_a_goal_moves_the_arm_with_feedback_and_frees_it(robot: Robot, judge: Judge) -> None:
     client = await following(judge, robot)
     rest = {"velocities": [0.0, 0.0], "accelerations": [0.0, 0.0]}
-    there = trajectory(
-        point(0.0, pan(robot), robot.now.joints[2].position, **rest),
-        point(2.0, 0.6, 1.0, **rest),
-        names=("shoulder_pan", "elbow_flex"),
-    )
+
+    def there() -> Any:
+        return trajectory(
+            point(0.0, pan(robot), robot.now.joints[2].position, **rest),
+            point(2.0, 0.6, 1.0, **rest),
+            names=("shoulder_pan", "elbow_flex"),
+        )
+
     name, *result = await client.done(there)
     assert result == ["succeeded", 0]
     assert pan(robot) == pytest.approx(0.6, abs=NEAR)
@@ -167,6 +170,7 @@ async def test_goals_that_cannot_be_followed_have_codes_and_move_nothing(
         "late": (trajectory(point(2.0**31 - 1, 0.0)), -1),
         "back": (trajectory(point(2.0, 0.1), point(1.0, 0.0)), -1),
         "nobody": (trajectory(point(1.0, 0.0), names=("",)), -2),
+        "elbow": (trajectory(point(1.0, 0.0), names=("elbow",)), -2),
         "old": (trajectory(point(1.0, 0.0)) | {"header": {"stamp": {"sec": 1000}}}, -3),
     }
     for name, (sent, code) in wrong.items():
@@ -189,11 +193,15 @@ async def test_goals_are_cancelled_and_preempted(robot: Robot, judge: Judge) -> 
 
 async def test_a_tolerance_that_cannot_be_kept_ends_a_goal(robot: Robot, judge: Judge) -> None:
     client = await following(judge, robot)
+
+    def away() -> Any:
+        return trajectory(point(3.0, -0.5))
+
     tight = [{"name": "shoulder_pan", "position": 1e-6}]
-    _, *result = await client.done(trajectory(point(3.0, -0.5)), path_tolerance=tight)
+    _, *result = await client.done(away, path_tolerance=tight)
     assert result == ["aborted", -4]
     sharp = [{"name": "shoulder_pan", "position": 1e-9}]
-    _, *result = await client.done(trajectory(point(3.0, -0.5)), goal_tolerance=sharp)
+    _, *result = await client.done(away, goal_tolerance=sharp)
     assert result == ["aborted", -5]
     await robot.becomes("idle")
 

@@ -32,10 +32,13 @@ asyncio.run(main())
 """
 
 
-def robot_file(judge: Judge, folder: Path) -> Path:
-    """The shipped TurtleBot3, in the judge's domain."""
+def robot_file(judge: Judge, folder: Path, *, humble: bool = False) -> Path:
+    """The shipped TurtleBot3, in the judge's domain; or one that takes Twist and has frames."""
     text = catalog.robot_path("turtlebot3_ros2").read_text()
     text = text.replace("domain: 30", f"localhost: true\n  domain: {judge.domain}")
+    if humble:
+        text = text.replace("TwistStamped", "Twist")
+        text = text.replace("  watchdog:", "  mounting: tf_static\n  watchdog:")
     file = folder / "turtlebot3.yaml"
     file.write_text(text)
     return file
@@ -92,16 +95,20 @@ async def standing(robot: Program) -> None:
     await asyncio.to_thread(robot.poll, "truth", lambda now: now["speed_mps"] < 0.005)
 
 
-async def test_it_is_driven_and_measured(judge: Judge, tmp_path: Path) -> None:
-    robot = judge.start("turtlebot3", walls=ROOM, stamped=True)
-    async with Session(robot_file(judge, tmp_path)) as it:
+@pytest.mark.parametrize("humble", [False, True])
+async def test_it_is_driven_and_measured(judge: Judge, tmp_path: Path, humble: bool) -> None:
+    robot = judge.start("turtlebot3", walls=ROOM, stamped=not humble)
+    async with Session(robot_file(judge, tmp_path, humble=humble)) as it:
         await it.found()
         await moving(robot, it)
         await until(lambda: it.state.velocity.linear_x > 0.12, "the measured speed")
         assert it.sent.linear_x == pytest.approx(0.15)
         await until(lambda: it.driver.sensors["scan"], "a scan")
+        await until(lambda: it.state.imu, "its attitude")
+        assert it.state.imu.linear_acceleration[2] == pytest.approx(9.8, abs=0.1)
         assert it.state.battery.percentage == pytest.approx(83.3, abs=0.1)
-        assert it.state.joints[0].velocity == pytest.approx(0.15 / 0.033, rel=0.2)
+        turns = pytest.approx(0.15 / 0.033, rel=0.2)
+        await until(lambda: it.state.joints[0].velocity == turns, "the speed of its wheels")
         it.wanted = 0.0
         await standing(robot)
 
