@@ -54,16 +54,17 @@ STAMP_NS = STAMP["sec"] * 10**9 + STAMP["nanosec"]
 LENS = (-0.5, 0.5, -0.5, 0.5)
 FRONT = Camera(
     name="front",
-    width=16,
-    height=16,
-    intrinsics=(20.0, 21.0, 7.5, 8.5),
+    width=320,
+    height=240,
+    intrinsics=(270.0, 271.0, 160.5, 119.5),
     distortion=(0.1, -0.2, 0.0, 0.0, 0.3),
     depth=True,
     x=0.1,
     z=0.2,
 )
 WAFFLE = replace(BURGER, cameras=(FRONT, Camera(name="rear", width=16, height=16)))
-PIXELS = np.arange(256, dtype=np.uint16).reshape(16, 16) * 10  # [mm]
+PIXELS = np.arange(320 * 240, dtype=np.uint16).reshape(240, 320)  # [mm]
+PICTURE = replace(JPEG, height=240, width=320, data=b"\xff\xd8" + bytes(range(256)) * 160)
 NEAR = samples.open_space(deg_15=0.8, deg_200=2.5)
 NEAR[90] = math.nan
 JOINTS = (
@@ -71,14 +72,14 @@ JOINTS = (
     Joint(name="wheel_right_joint", position=-0.5, velocity=-1.5),
 )
 WAY = TaskStatus(path=((0.0, 0.0), (1.0, 0.0), (1.0, 2.0)), goal=Goal(x=1.0, y=2.0, yaw=math.pi))
-DEPTHS = DepthImage(frame_id="front", height=16, width=16, planes=pack_depth(PIXELS))
+DEPTHS = DepthImage(frame_id="front", height=240, width=320, planes=pack_depth(PIXELS))
 SAID: tuple[tuple[Topic[Any], Message, str], ...] = (
     (BODY, samples.body(WAFFLE), ""),
     (SCAN, samples.scan(NEAR), ""),
     (IMU, READING, ""),
     (MAP, GRID, ""),
     (TASK, WAY, ""),
-    (IMAGE, JPEG, "front"),
+    (IMAGE, PICTURE, "front"),
     (IMAGE, replace(JPEG, frame_id="rear", data=b"\xff\xd8rear"), "rear"),
     (DEPTH, DEPTHS, "front"),
     (SAFETY, SafetyState(verdict="ok"), ""),
@@ -256,28 +257,28 @@ async def test_the_map_and_the_plan_arrive(heard: Heard) -> None:
 
 
 async def test_pictures_arrive_with_the_intrinsics_of_their_camera(heard: Heard) -> None:
-    for at, name, data in (
-        ("/camera", "front", JPEG.data),
-        ("/camera/rear", "rear", b"\xff\xd8rear"),
+    for at, name, data, size in (
+        ("/camera", "front", PICTURE.data, (320, 240)),
+        ("/camera/rear", "rear", b"\xff\xd8rear", (16, 16)),
     ):
         picture, about = heard[f"{at}/image/compressed"], heard[f"{at}/camera_info"]
         assert picture["header"] == about["header"] == head(f"{name}_optical_frame")
         assert (picture["format"], bytes(picture["data"])) == ("jpeg", data)
-        assert (about["width"], about["height"]) == (16, 16)
+        assert (about["width"], about["height"]) == size
     about = heard["/camera/camera_info"]
     assert (about["distortion_model"], about["d"]) == ("plumb_bob", [0.1, -0.2, 0.0, 0.0, 0.3])
-    assert about["k"] == [20.0, 0.0, 7.5, 0.0, 21.0, 8.5, 0.0, 0.0, 1.0]
-    assert about["p"] == [20.0, 0.0, 7.5, 0.0, 0.0, 21.0, 8.5, 0.0, 0.0, 0.0, 1.0, 0.0]
+    assert about["k"] == [270.0, 0.0, 160.5, 0.0, 271.0, 119.5, 0.0, 0.0, 1.0]
+    assert about["p"] == [270.0, 0.0, 160.5, 0.0, 0.0, 271.0, 119.5, 0.0, 0.0, 0.0, 1.0, 0.0]
     assert about["r"] == [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
 
 async def test_depth_arrives_in_millimetres_with_its_camera(heard: Heard) -> None:
     depth, about = heard["/camera/depth/image_raw"], heard["/camera/depth/camera_info"]
     assert depth["header"] == about["header"] == head("front_optical_frame")
-    assert (depth["encoding"], depth["is_bigendian"], depth["step"]) == ("16UC1", 0, 32)
-    pixels = np.frombuffer(bytes(depth["data"]), "<u2").reshape(16, 16)
+    assert (depth["encoding"], depth["is_bigendian"], depth["step"]) == ("16UC1", 0, 640)
+    pixels = np.frombuffer(bytes(depth["data"]), "<u2").reshape(240, 320)
     assert np.array_equal(pixels, PIXELS)
-    assert about["k"][0] == 20.0
+    assert about["k"][0] == 270.0
 
 
 async def test_diagnostics_name_the_parts_of_the_robot(heard: Heard) -> None:
