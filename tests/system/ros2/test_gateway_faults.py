@@ -106,6 +106,6 @@ async def test_a_gateway_killed_while_ros_drives_stops_the_body_and_asks_for_it_
     os.kill(gateway, signal.SIGKILL)
     await stopped(robot)
     await until(lambda: robot.home.processes("ros2") not in ([], [gateway]), "it is restarted")
-    await until(lambda: robot.now.velocity.linear_x > 0.1, "the stream drives it again")
-    assert robot.now.gate.enables > enables
+    await until(lambda: robot.now.gate.enables > enables, "the stream asks for it again")
+    await driving(robot, driver)
     assert others <= set(robot.home.processes())
