@@ -36,6 +36,7 @@ from gigabrain_zenoh.qa.bench.eyes import EyesResult
 from gigabrain_zenoh.qa.bench.fetch import FetchResult
 from gigabrain_zenoh.qa.bench.goals import GoalsResult
 from gigabrain_zenoh.qa.bench.hands import HandsResult
+from gigabrain_zenoh.qa.bench.joints import TrackingResult
 from gigabrain_zenoh.qa.bench.objects import ObjectsResult
 from gigabrain_zenoh.qa.bench.plan import PlanResult
 from gigabrain_zenoh.qa.bench.slam_logs import SlamResult
@@ -55,6 +56,7 @@ DRAWN: dict[str, tuple[type[Struct], Callable[[Any], Any]]] = {  # by the words 
     "fetch": (FetchResult, bench_hands._fetch_table),
     "goals": (GoalsResult, bench_navigation._goals_table),
     "hands": (HandsResult, bench_hands._hands_table),
+    "joints": (TrackingResult, bench_hands._joints_table),
     "objects": (ObjectsResult, bench_eyes._objects_table),
     "plan": (PlanResult, bench._plan_table),
     "slam": (SlamResult, bench_navigation._logs_table),

@@ -126,6 +126,7 @@ COMMANDS = {
     "bench clutter": ("bench_eyes:clutter", "Drive to goals among what a lidar cannot see."),
     "bench objects": ("bench_eyes:objects", "Measure what a robot remembers of things."),
     "bench fetch": ("bench_hands:fetch", "Fetch a can from another room."),
+    "bench joints": ("bench_hands:joints", "Have each joint of an arm follow a sine and a step."),
     "bench hands": ("bench_hands:hands", "Pick things up and put them down with an arm."),
     "bench barn": ("bench_navigation:barn", "Run the BARN and DynaBARN benchmarks."),
     "precompile": ("map:precompile", "Compile mapping and navigation for a quick first start."),

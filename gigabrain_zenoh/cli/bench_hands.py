@@ -1,4 +1,4 @@
-"""`gigabrain bench hands` and `fetch`: what an arm picks up, puts down and brings."""
+"""`gigabrain bench hands`, `fetch` and `joints`: what an arm picks up and brings, and follows."""
 
 from collections import Counter
 from typing import TYPE_CHECKING
@@ -16,8 +16,9 @@ from gigabrain_zenoh.qa.judging import table_of
 if TYPE_CHECKING:
     from gigabrain_zenoh.qa.bench.fetch import FetchResult
     from gigabrain_zenoh.qa.bench.hands import HandsResult, HandsRun
+    from gigabrain_zenoh.qa.bench.joints import TrackingResult
 
-MOST_BACKLASH_DEG = 10.0
+MOST_BACKLASH_DEG, MOST_LOAD_KG = 10.0, 10.0
 
 
 def hands(
@@ -90,6 +91,56 @@ def fetch(
     result = run_async(work)
     finish(_fetch_table(result), result, json)
     return 0
+
+
+def joints(
+    *,
+    body: Body = "so101",
+    load: float = 0.1,
+    backlash: float = 1.0,
+    json: JsonFile = None,
+) -> int:
+    """Have each joint of an arm follow a sine and a step, judged by the physics.
+
+    Example: gigabrain bench joints --body so101
+
+    The arm is stretched out, and carries a load. One joint after the other swings at 0.5 Hz, with
+    half of its greatest speed in the middle, and then goes from one end to the other at once.
+    Control and gate are those of a robot. It needs the extra `arm`.
+
+    Args:
+        load: Mass that it carries at its tool [kg], 0 to 10.
+        backlash: Play of each joint, between motor and joint [degrees], 0 to 10.
+    """
+    from gigabrain_zenoh.qa.bench.joints import measure_joints
+
+    check_names([body])
+    if not 0.0 <= backlash <= MOST_BACKLASH_DEG:
+        raise ConfigError(f"--backlash: expected 0 to {MOST_BACKLASH_DEG:g} degrees")
+    if not 0.0 <= load <= MOST_LOAD_KG:
+        raise ConfigError(f"--load: expected 0 to {MOST_LOAD_KG:g} kg")
+    files.check_result_path(json)
+    result = measure_joints(body, load, backlash, print_progress)
+    finish(_joints_table(result), result, json)
+    return 0
+
+
+def _joints_table(result: "TrackingResult") -> Table:
+    table = table_of(
+        "joint", "swing", "off rms", "off at most", "late", "overshoot", "off at rest",
+        title="Followed",
+    )  # fmt: skip
+    for one in result.joints:
+        table.add_row(
+            one.joint, f"±{one.amplitude_deg:.0f}°", f"{one.rms_deg:.2f}°",
+            f"{one.worst_deg:.2f}°", f"{one.lag_ms:.0f} ms", f"{one.overshoot:.1%}",
+            f"{one.rest_deg:.2f}°",
+        )  # fmt: skip
+    table.caption = (
+        f"{result.body}, stretched out, with {result.load_kg * 1000:.0f} g at its tool and "
+        f"{result.backlash_deg:g}° of backlash."
+    )
+    return table
 
 
 def _fetch_table(result: "FetchResult") -> Table:

@@ -4,6 +4,8 @@ It starts from where the joints were sent, and keeps to speed, acceleration and 
 a joint lags behind is corrected by its gains. A joint that leaves its tolerance stops them all.
 """
 
+from functools import lru_cache
+
 import msgspec
 from msgspec.structs import replace
 
@@ -170,7 +172,21 @@ def _moved(
         goals = {target.name: JointGoal(target.position) for target in targets}
     if not goals and not any(point.velocity or point.acceleration for point in now):
         return now
-    return ramp(now, [goals.get(joint.name, REST) for joint in joints], joints, dt)
+    limits = joints if teleop else [_with_room(joint) for joint in joints]
+    return ramp(now, [goals.get(joint.name, REST) for joint in joints], limits, dt)
+
+
+@lru_cache(maxsize=64)
+def _with_room(joint: JointDescription) -> JointDescription:
+    """Return a joint with less acceleration and jerk, so that it has room for the feed-forward.
+
+    What is sent is ahead by the speed: a + f j of it has to be within the joint's acceleration, or
+    the gate limits it, and the joint runs past its target.
+    """
+    ahead = joint.gains.feed_forward * joint.max_jerk
+    share = joint.max_acceleration / (joint.max_acceleration + ahead)
+    acceleration, jerk = share * joint.max_acceleration, share * joint.max_jerk
+    return replace(joint, max_acceleration=acceleration, max_jerk=jerk)
 
 
 def sample(
@@ -243,6 +259,7 @@ def _corrected(
         grown = max(-most, min(most, grown))
         fixed = gains.p * error + grown + gains.d * (point.velocity - now.velocity)
         fixed = max(-most, min(most, fixed)) + gains.feed_forward * point.velocity
+        fixed += gains.inertia * point.acceleration
         fixed = fixed if memory.active else 0.0
         integral.append(grown)
         sent.append(within(joint, point.position + fixed))

@@ -75,13 +75,15 @@ class JointGains(Record, frozen=True, kw_only=True):
     """How control corrects what it sends to a joint that holds positions by itself.
 
     Sent is the position wanted, and: the error by `p`, its integral while the joint should rest by
-    `i`, the error of speed by `d`, and the speed wanted by `feed_forward`.
+    `i`, the error of speed by `d`, the speed wanted by `feed_forward`, and the acceleration wanted
+    by `inertia`.
     """
 
     p: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
     i: Annotated[float, Meta(ge=0.0, le=20.0)] = 1.0  # [1/s]
     d: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0  # [s]
     feed_forward: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0  # [s], how late the joint follows
+    inertia: Annotated[float, Meta(ge=0.0, le=0.1)] = 0.0  # [s2], over the stiffness of its servo
     max_correction: Annotated[float, Meta(ge=0.0, le=0.5)] = 0.05  # [rad] or [m], of them all
 
 

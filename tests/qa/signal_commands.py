@@ -106,6 +106,7 @@ CALLS = {
     "bench objects": "bench objects --seeds 0",
     "bench fetch": "bench fetch --seeds 0",
     "bench hands": "bench hands --seeds 0",
+    "bench joints": "bench joints",
     "bench eyes": "bench eyes --worlds 1 --seconds 1 --ghosts 1",
     "bench clutter": "bench clutter --seeds 0",
     "faults": "faults --only e-stop-pressed",

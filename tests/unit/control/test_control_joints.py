@@ -209,6 +209,30 @@ def test_feed_forward_leads_a_moving_joint() -> None:
     assert setpoint.velocity == pytest.approx(0.5, abs=0.01)
 
 
+def test_a_heavy_joint_is_sent_ahead_by_its_acceleration() -> None:
+    heavy = replace(PAN, gains=JointGains(i=0.0, inertia=0.01))
+    arm = ArmBench(arm_body(heavy, LIFT))
+    arm.go(ticks=CALM)
+    ahead = []
+    for _ in range(40):
+        arm.go(targets(pan=1.0))
+        setpoint = arm.memory.setpoint[0]
+        ahead.append(arm.places[-1][0] - setpoint.position)
+        assert ahead[-1] == pytest.approx(0.01 * setpoint.acceleration)
+    assert max(ahead) > 0.1  # it speeds up,
+    assert min(ahead) < -0.1  # and brakes
+
+
+def test_what_is_sent_on_the_way_to_a_target_is_within_the_gate_s_limits() -> None:
+    late = replace(PAN, gains=JointGains(i=0.0, feed_forward=0.08))
+    arm = ArmBench(arm_body(late, LIFT))
+    arm.go(ticks=CALM)
+    arm.go(targets(pan=1.2), ticks=100)
+    places = np.array([place[0] for place in arm.places])
+    assert np.abs(np.diff(places, 2)).max() < 1.1 * PAN.max_acceleration * 0.02**2
+    assert places[-1] == pytest.approx(1.2)
+
+
 def test_an_operator_jogs_and_keeps_the_arm_until_the_next_enable() -> None:
     arm = enabled()
     command = arm.go(targets(pan=-1.0), teleop=jog(0.5), ticks=50)
