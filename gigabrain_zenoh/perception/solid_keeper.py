@@ -16,7 +16,7 @@ from gigabrain_zenoh.geometry.pose import PoseHistory
 from gigabrain_zenoh.perception.solid_memory import SolidMemory
 from gigabrain_zenoh.vision.obstacle_contours import OwnPoints, Seen
 from gigabrain_zenoh.vision.solid_fit import SolidFit
-from gigabrain_zenoh.vision.solids import find_solids, is_gone
+from gigabrain_zenoh.vision.solids import EDGE_PX, find_solids, is_gone
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.manipulation.arm_mask import ArmMask
@@ -87,10 +87,13 @@ class SolidKeeper:
         log.warning("%s", text, extra={"data": {"event": "solids"}})
 
     def _on_detections(self, found: Detections) -> None:
-        """Take the classes of what was recognised in a picture."""
+        """Take the classes of what was recognised, and is not cut off by an edge of the picture."""
         pose = self._history.at(found.boot, found.basis)
         if pose is None:
             return
         for one in found.things:
-            if one.position:
-                self._memory.name(one.label, one.position[0], one.position[1], pose)
+            left, top, right, bottom = one.box
+            whole = left >= EDGE_PX and right <= found.width - EDGE_PX
+            whole = whole and top >= EDGE_PX and bottom <= found.height - EDGE_PX
+            if one.position and whole:
+                self._memory.name(one.label, one.confidence, *one.position[:2], pose)

@@ -1,7 +1,7 @@
 """Memory of what stands near an arm: fits of several pictures, tracked in the odometry's frame."""
 
 import math
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -14,6 +14,7 @@ from gigabrain_zenoh.geometry.pose import to_frame, to_parent
 from gigabrain_zenoh.vision.solid_fit import SolidFit
 
 FITS = 9  # newest ones, whose median counts: from near by a thing is seen best
+NAMES = 60  # newest ones, of which the surest counts: from near by little of a thing is seen
 SURE_SEEN = 2  # pictures, from which on a thing counts
 SAME_M, SAME_SHARE = 0.03, 0.5  # how far off the same thing may be: at least, and of its width
 MOVED_M = 0.02  # from its median: it was moved, and what was known of its place is dropped
@@ -35,7 +36,16 @@ class Track:
     seen: int = 0  # pictures
     misses: int = 0
     fits: deque[SolidFit] = field(default_factory=lambda: deque(maxlen=FITS))
-    labels: deque[str] = field(default_factory=lambda: deque(maxlen=FITS))  # newest classes
+    names: deque[tuple[str, float]] = field(default_factory=lambda: deque(maxlen=NAMES))
+    "Newest classes, with confidences."
+
+    @property
+    def label(self) -> str:
+        """The class for which most confidence speaks; empty where it was never recognised."""
+        sums = defaultdict[str, float](float)
+        for label, confidence in self.names:
+            sums[label] += confidence
+        return max(sums, key=lambda label: sums[label], default="")
 
     @property
     def fit(self) -> SolidFit:
@@ -87,11 +97,11 @@ class SolidMemory:
         kept = [one for one in self._tracks if one.misses < MISSES and one.tick >= oldest]
         self._tracks = sorted(kept, key=lambda one: -one.tick)[:MOST]
 
-    def name(self, label: str, x: float, y: float, pose: Pose) -> None:
+    def name(self, label: str, confidence: float, x: float, y: float, pose: Pose) -> None:
         """Record that something was recognised at a place [m] in the frame of a body at `pose`."""
         off, track = _nearest(to_parent(pose, x, y), self._tracks)
         if track and off <= max(LABEL_M, _width(track.fit)):
-            track.labels.append(label)
+            track.names.append((label, confidence))
 
     def solids(self, pose: Pose, tick: int) -> tuple[SeenSolid, ...]:
         """Return what counts, in the frame of a body at `pose` at `tick`, the nearest first."""
@@ -99,10 +109,9 @@ class SolidMemory:
         for track in self._tracks:
             if track.seen >= SURE_SEEN:
                 fit = _moved(track.fit, lambda x, y: to_frame(pose, x, y), -pose.yaw)
-                label = Counter(track.labels).most_common(1)[0][0] if track.labels else ""
                 found.append(SeenSolid(
                     id=track.id, shape=fit.shape, size=fit.size, position=fit.position,
-                    yaw=_turn(fit.yaw), label=label, seen=track.seen,
+                    yaw=_turn(fit.yaw), label=track.label, seen=track.seen,
                     age=max(0, tick - track.tick) * TICK_S,
                 ))  # fmt: skip
         return tuple(sorted(found, key=lambda one: math.hypot(*one.position[:2])))

@@ -31,7 +31,11 @@ CUBE = Box(x=0.2, y=0.12, half_x=0.015, half_y=0.015, top=0.03)
 BESIDE = Box(x=0.12, y=-0.15, half_x=0.02, half_y=0.01, top=0.03)
 ASIDE = (0.15, -0.16)
 BELOW_ITS_HAND = (0.17, 0.0)  # of an arm in its home posture
-NAMED = Detection(label="cube", confidence=0.9, box=(0, 0, 9, 9), position=(0.21, 0.11, 0.015))
+PARTS = tuple(  # of it, at the edges of the picture: what they are taken for does not count
+    Detection(label="can", confidence=1.0, box=box, position=(0.21, 0.11, 0.015))
+    for box in ((0, 50, 90, 99), (50, 0, 90, 99), (50, 50, 320, 99), (50, 50, 90, 240))
+)
+NAMED = Detection(label="cube", confidence=0.9, box=(90, 90, 99, 99), position=(0.21, 0.11, 0.015))
 
 
 class Eyes(NodeBench):
@@ -68,7 +72,7 @@ async def test_perception_publishes_what_stands_on_the_table_of_an_arm() -> None
         assert one.size == pytest.approx((0.03, 0.03, 0.03), abs=0.004)
         assert sorted(other.size) == pytest.approx([0.02, 0.03, 0.04], abs=0.004)
         eyes.send(DETECTIONS, Detections(
-            camera="top", width=320, height=240, things=(NAMED,), boot=BOOT, tick=11, basis=11,
+            camera="top", width=320, height=240, things=(NAMED, *PARTS), boot=BOOT, tick=11, basis=11,
         ))  # fmt: skip
         for tick in (21, 31, 41):
             await eyes.look(tick, CUBE)
