@@ -72,7 +72,8 @@ async def test_perception_publishes_what_stands_on_the_table_of_an_arm() -> None
         assert one.size == pytest.approx((0.03, 0.03, 0.03), abs=0.004)
         assert sorted(other.size) == pytest.approx([0.02, 0.03, 0.04], abs=0.004)
         eyes.send(DETECTIONS, Detections(
-            camera="top", width=320, height=240, things=(NAMED, *PARTS), boot=BOOT, tick=11, basis=11,
+            camera="top", width=320, height=240, things=(NAMED, *PARTS),
+            boot=BOOT, tick=11, basis=11,
         ))  # fmt: skip
         for tick in (21, 31, 41):
             await eyes.look(tick, CUBE)
