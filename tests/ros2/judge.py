@@ -28,6 +28,7 @@ from tests.places import ROOT
 DOMAINS = range(1, 100)  # their ports lie below those that Linux gives to clients
 OF_USER = ("HOME", "LANG", "TMPDIR", "TZ")  # variables that programs keep
 LONGEST_END_S = 10.0  # of a program whose stdin has ended, on a busy machine
+NOT_KNOWN_YET = "_NODE_NAME_UNKNOWN_"  # of an endpoint whose participant is known later
 POLL_S = 0.005
 Event = dict[str, Any]
 
@@ -150,6 +151,15 @@ class Program:
         What is sent before is lost.
         """
         await asyncio.to_thread(self.poll, "available", lambda one: one["available"], **where)
+
+    async def endpoints(self, topic: str) -> Event:
+        """Return who publishes and subscribes, once ROS knows the names of their nodes."""
+
+        def named(found: Event) -> bool:
+            ends = [*found["publishers"], *found["subscribers"]]
+            return all(end["node"] != NOT_KNOWN_YET for end in ends)
+
+        return await asyncio.to_thread(self.poll, "endpoints", named, topic=topic)
 
     def kill(self) -> int:
         """End it at once, as `kill -9` does; returns the monotonic time [ns] of the signal."""

@@ -16,7 +16,7 @@ from tests.system.keys import Site, make_fleet, raw, site
 
 SAYS = {
     "brain": "world perceived/perception detections objects solids pose map zones intent task "
-    "request_log input_log/perception health/perception log estop",
+    "arm_plan request_log input_log/perception health/perception log estop",
     "operator": "teleop joint_teleop cmd_vel joint_cmd button log estop",
     "viewer": "",
 }

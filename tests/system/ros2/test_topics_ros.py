@@ -79,7 +79,7 @@ async def test_ros_reads_our_values_and_sees_type_hash_and_qos(judge: Judge, nod
     assert (scan["angle_increment"], scan["range_max"]) == (0.015625, 3.5)
     assert json.dumps(scan["ranges"]) == "[0.5, 1.25, Infinity, NaN]"
     assert 0 < report["sent_ns"][0] <= report["now_ns"]
-    (seen,) = (await listen.query("endpoints", topic="/red/scan"))["publishers"]
+    (seen,) = (await listen.endpoints("/red/scan"))["publishers"]
     assert (seen["node"], seen["namespace"]) == ("robot", "/red")
     assert (seen["type"], seen["hash"]) == (SCAN, node.types.hash(SCAN))
     assert (seen["reliable"], seen["transient_local"]) == (False, False)
@@ -106,7 +106,7 @@ async def test_we_read_what_ros_publishes(judge: Judge, node: Node) -> None:
     assert (endpoint.kind, endpoint.type) == ("publisher", TWIST)
     assert endpoint.hash == node.types.hash(TWIST)
     assert endpoint.qos.reliable
-    seen = await drive.query("endpoints", topic="/cmd_vel")
+    seen = await drive.endpoints("/cmd_vel")
     assert {one["gid"] for one in seen["publishers"]} == {one.gid.hex() for one in got}
 
 

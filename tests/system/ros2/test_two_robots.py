@@ -107,7 +107,7 @@ async def test_two_robots_are_driven_at_once_and_do_not_mix(pair: Pair, judge: J
             for one in (await value(f"/{name}/{topic}"))["transforms"]
         }
         assert {("odom", "base_footprint"), ("base_footprint", "base_link")} <= frames
-        ends = await listener.query("endpoints", topic=f"/{name}/tf")
+        ends = await listener.endpoints(f"/{name}/tf")
         assert {one["namespace"] for one in ends["publishers"]} == {f"/{name}"}
     nodes = {"/red/gigabrain", "/blue/gigabrain"}
 
