@@ -258,11 +258,11 @@ def hand_over(
     wait: Wait = True,
     at: RobotAddress = LOCAL,
 ) -> None:
-    """Hand what the gripper holds to a person: it lets go once somebody pulls at it.
+    """Hand what the gripper holds to a person: the gripper opens when the person pulls.
 
     Example: gigabrain arm hand-over
 
-    `gigabrain task resume` has it let go as well.
+    `gigabrain task resume` opens it, too.
 
     Args:
         to: Where: forwards, to the left and up from the arm's base [m]. Default: well ahead.

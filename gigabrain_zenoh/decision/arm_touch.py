@@ -1,4 +1,4 @@
-"""What an arm's tool feels: whether it presses against something, and whether somebody pulls."""
+"""Detects contact at an arm's tool: whether it presses against something, or a person pulls."""
 
 import math
 from dataclasses import dataclass
@@ -21,14 +21,14 @@ PULLED_N, PULLED_M, PULLED_TICKS = 2.0, 0.008, 5  # of a person that pulls
 
 @dataclass(frozen=True, kw_only=True)
 class Pressure:
-    """How hard a tool presses along its approach."""
+    """Force and lag of a tool along its approach."""
 
     newtons: float | None  # None where efforts are not measured
     metres: float  # by which it lags
 
     @property
     def touched(self) -> bool:
-        """Whether it presses against something at all."""
+        """True if the tool touches something."""
         return (self.newtons or 0.0) > TOUCHED_N or self.metres > TOUCHED_M
 
     def reaches(self, force: float) -> bool:
@@ -40,7 +40,7 @@ class Pressure:
 
 
 class Touch:
-    """What an arm's tool feels, compared with the first states. To be asked at each state."""
+    """Compares each state with the first ones, in which nothing is touched."""
 
     def __init__(self, planner: ArmPlanner) -> None:
         self._planner, self._sense = planner, ContactSense(planner.arm)
@@ -56,7 +56,7 @@ class Touch:
         return Pressure(newtons=force, metres=float(push.lag @ approach))
 
     def is_pulled(self, body: BodyDescription, state: RobotState) -> bool:
-        """Return whether somebody has pulled at it for a moment."""
+        """Return whether a person has pulled for PULLED_TICKS."""
         push = self._feel(body, state)
         pulls = push is not None and (
             float(np.linalg.norm(push.lag)) > PULLED_M

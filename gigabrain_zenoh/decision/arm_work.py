@@ -1,4 +1,4 @@
-"""What is planned for an action of an arm, and what is told while it moves."""
+"""Plans an action of an arm, and reports its progress while the arm moves."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ Planned = Plan | NoWay
 
 @dataclass(frozen=True, kw_only=True)
 class WorkInputs:
-    """What an action is planned by."""
+    """State, things and grip that an action is planned with."""
 
     state: RobotState
     body: BodyDescription

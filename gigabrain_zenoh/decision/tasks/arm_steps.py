@@ -104,7 +104,7 @@ class Press(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_
 
 
 class HandOver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Bring what is held before a person, and open once that pulls at it or says so."""
+    """Hold a thing out to a person; open the gripper when the person pulls or says so."""
 
     at: Point3 | None = None  # [m], of the tool; None: well ahead, and high
     pitch: Angle | None = None  # [rad] down from level; None: any way
@@ -112,7 +112,7 @@ class HandOver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, om
 
 
 class AwaitTaken(Struct, frozen=True):
-    """Hold still until somebody pulls at what is held, or has taken it."""
+    """Hold still until a person pulls at the thing, or has taken it."""
 
 
 ArmAction = Reach | TakePosture | Gripper | Pick | PlaceThing | Press | HandOver | AwaitTaken
