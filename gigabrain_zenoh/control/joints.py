@@ -4,6 +4,7 @@ It starts from where the joints were sent, and keeps to speed, acceleration and 
 a joint lags behind is corrected by its gains. A joint that leaves its tolerance stops them all.
 """
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import msgspec
@@ -85,13 +86,13 @@ def _step(
             operator=memory.operator and memory.boot == state.boot,
         )
         return memory, _command(body, _places(posture))
-    memory, ticks = _next_tick(body, memory, state, posture)
+    memory, ticks = _next_tick(body, memory, state, here, posture)
     if ticks == 0:
         return memory, _command(body, memory.sent, memory)
     if inputs.teleop:
         memory = replace(memory, operator=True)
     if inputs.intent is None and not (memory.operator or memory.problem):
-        return _resting(body, memory, posture)
+        return _resting(body, memory, here, posture)
     intent = None if memory.operator else inputs.intent
     wants = intent and (intent.joints or intent.joint_trajectory)
     memory = replace(memory, active=bool(memory.active or inputs.teleop or wants))
@@ -104,12 +105,16 @@ def _step(
 
 
 def _next_tick(
-    body: BodyDescription, memory: JointMemory, state: RobotState, posture: tuple[JointPoint, ...]
+    body: BodyDescription,
+    memory: JointMemory,
+    state: RobotState,
+    here: tuple[JointPoint, ...],
+    posture: tuple[JointPoint, ...],
 ) -> tuple[JointMemory, int]:
     """Advance to the tick of `state`; return the ticks since the last step as well.
 
-    The joints start at rest where they were sent: after an enable, and when they did not get what
-    was commanded, for the gate held them.
+    The joints start at rest where they were sent: all after an enable, and each one that did not
+    get what was commanded, for the gate held it.
     """
     opened = not memory.setpoint or memory.boot != state.boot
     handed_over = state.gate.enables != memory.enables
@@ -127,26 +132,48 @@ def _next_tick(
         return memory, 0
     passed = max(0, min(state.tick - memory.tick, MAX_STEP_TICKS))
     calm = state.tick - memory.enabled_tick <= CALM_TICKS
-    if calm or _lost(body, memory, posture):
-        integral = (0.0,) * len(posture)
-        memory = replace(memory, setpoint=posture, sent=_places(posture), integral=integral)
+    lost = [
+        calm or abs(sent - point.position) > LOST_TICKS * TICK_S * joint.max_speed
+        for sent, point, joint in zip(memory.sent, posture, body.joints, strict=True)
+    ]
+    memory = _from_sent(body, memory, here, posture, lost)
     return replace(memory, tick=state.tick), 0 if calm else passed
 
 
 def _resting(
-    body: BodyDescription, memory: JointMemory, posture: tuple[JointPoint, ...]
+    body: BodyDescription,
+    memory: JointMemory,
+    here: tuple[JointPoint, ...],
+    posture: tuple[JointPoint, ...],
 ) -> tuple[JointMemory, JointCommand]:
     """Have the gate brake the joints and hold them, as while decision is silent."""
     names, still = tuple(joint.name for joint in body.joints), (0.0,) * len(posture)
-    memory = replace(memory, active=False, setpoint=posture, sent=_places(posture), integral=still)
+    memory = _from_sent(body, memory, here, posture, [True] * len(posture))
     return memory, JointCommand(name=names, velocity=still)
 
 
-def _lost(body: BodyDescription, memory: JointMemory, posture: tuple[JointPoint, ...]) -> bool:
-    return any(
-        abs(sent - point.position) > LOST_TICKS * TICK_S * joint.max_speed
-        for sent, point, joint in zip(memory.sent, posture, body.joints, strict=True)
-    )
+def _from_sent(
+    body: BodyDescription,
+    memory: JointMemory,
+    here: tuple[JointPoint, ...],
+    posture: tuple[JointPoint, ...],
+    which: Sequence[bool],
+) -> JointMemory:
+    """Have `which` joints go on from where the gate has sent them.
+
+    What is corrected at rest is not part of the setpoint, or each time would add to it.
+    """
+    setpoint, sent = list(memory.setpoint), list(memory.sent)
+    for k, joint in enumerate(body.joints):
+        if which[k]:
+            sent[k] = place = posture[k].position
+            if memory.active:
+                gains, now, old = joint.gains, here[k].position, memory.integral[k]
+                wanted = (place - old + gains.p * now) / (1.0 + gains.p)
+                most = gains.max_correction
+                place -= max(-most, min(most, gains.p * (wanted - now) + old))
+            setpoint[k] = JointPoint(within(joint, place))
+    return replace(memory, setpoint=tuple(setpoint), sent=tuple(sent))
 
 
 def _moved(

@@ -78,10 +78,11 @@ def ramp(
 ) -> tuple[JointPoint, ...]:
     """Return where the joints are `dt` [s] later on the fastest way to their goals.
 
-    All that have a position arrive there at once. Raises ConfigError without Ruckig.
+    All that have a position arrive there at once; the others do not wait for them. Raises
+    ConfigError without Ruckig.
     """
     given = _input(now, limits)
-    interface = _ruckig().ControlInterface
+    interface, synchronization = _ruckig().ControlInterface, _ruckig().Synchronization
     pairs = tuple(zip(goals, limits, now, strict=True))
     given.max_velocity = [
         min(goal.max_speed or one.max_speed, one.max_speed) for goal, one, _ in pairs
@@ -96,6 +97,9 @@ def ramp(
     ]
     given.per_dof_control_interface = [
         interface.Velocity if goal.position is None else interface.Position for goal in goals
+    ]
+    given.per_dof_synchronization = [
+        synchronization.No if goal.position is None else synchronization.Time for goal in goals
     ]
     return tuple(
         msgspec.structs.replace(point, position=within(joint, point.position))
@@ -137,7 +141,7 @@ def along(
     given.max_velocity = [j.max_speed - f.velocity for j, f in zip(limits, frame, strict=True)]
     given.min_velocity = [-j.max_speed - f.velocity for j, f in zip(limits, frame, strict=True)]
     given.target_position = given.target_velocity = [0.0] * len(limits)
-    given.synchronization = _ruckig().Synchronization.No
+    given.per_dof_synchronization = [_ruckig().Synchronization.No] * len(limits)
     return tuple(
         JointPoint(
             within(joint, f.position + f.velocity * dt + p.position),
@@ -176,8 +180,9 @@ def _after(given: Any, dt: float) -> tuple[JointPoint, ...]:
     """
     ruckig = _ruckig()
     path = ruckig.Trajectory(given.degrees_of_freedom)
-    for synchronization in (given.synchronization, ruckig.Synchronization.No):
-        given.synchronization = synchronization
+    alone = [ruckig.Synchronization.No] * given.degrees_of_freedom
+    for synchronization in (given.per_dof_synchronization, alone):
+        given.per_dof_synchronization = synchronization
         try:
             _solver(given.degrees_of_freedom).calculate(given, path)
         except ruckig.RuckigError:  # numerical, where a joint hardly moves

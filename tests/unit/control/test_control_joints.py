@@ -101,6 +101,40 @@ def test_after_a_silence_of_decision_joints_go_on_from_where_they_were_held() ->
     assert arm.sent[0].position == pytest.approx(1.0, abs=0.01)
 
 
+def test_short_silences_of_decision_add_nothing_to_what_an_arm_presses_with() -> None:
+    arm = enabled(sag=0.03)
+    arm.go(targets(pan=0.5), ticks=200)
+    arm.blocked = True
+    arm.here[0] = 0.4  # something pushes it away
+    for _ in range(10):
+        arm.go(None, ticks=2)
+        arm.go(targets(lift=0.5), ticks=10)
+    assert max(place[0] for place in arm.places) < 0.5 + PAN.gains.max_correction + 0.001
+
+
+def test_after_a_short_silence_an_arm_does_not_sag() -> None:
+    arm = enabled(sag=0.03)
+    arm.go(targets(pan=0.5), ticks=200)
+    arm.go(None, ticks=2)
+    arm.go(targets(lift=0.5), ticks=20)
+    assert min(place[0] for place in arm.places[-22:]) == pytest.approx(0.53, abs=0.002)
+    assert arm.here[0] == pytest.approx(0.5, abs=0.002)
+
+
+def test_a_joint_that_the_gate_slows_down_moves_no_other() -> None:
+    arm = enabled(sag=0.03)
+    arm.go(targets(pan=0.5), ticks=200)
+    there = arm.places[-1][0]
+    for _ in range(60):
+        before = arm.sent[1]
+        arm.go(targets(lift=1.4))
+        arm.sent[1] = replace(before, position=before.position + 0.002, velocity=0.1)
+        arm.here[0] = 0.47  # it is pushed away as well
+    assert {round(place[0], 2) for place in arm.places[-60:]} <= {
+        round(there + off, 2) for off in (0.0, 0.01, 0.02)
+    }
+
+
 def test_a_trajectory_is_followed_to_the_tick() -> None:
     arm = enabled()
     wave = [(0.3 * math.sin(0.05 * k) ** 2, 0.001 * k) for k in range(60)]

@@ -55,6 +55,13 @@ def test_a_joint_comes_to_rest_from_any_speed() -> None:
     assert 0.0 < point.position < 0.5
 
 
+def test_a_joint_that_brakes_does_not_wait_for_one_with_a_long_way() -> None:
+    alone = ramp([JointPoint(0.0, 0.3, 1.0)], [REST], [ELBOW], 0.1)[0]
+    moving = [JointPoint(0.0, 0.3, 1.0), JointPoint(-1.5)]
+    beside = ramp(moving, [REST, JointGoal(1.5)], [ELBOW, ELBOW], 0.1)[0]
+    assert (beside.position, beside.velocity) == pytest.approx((alone.position, alone.velocity))
+
+
 @pytest.mark.parametrize("speed", [3.0, -3.0, 99.0])
 def test_a_joint_that_keeps_moving_comes_to_rest_at_the_end_of_its_range(speed: float) -> None:
     points = moved(JointGoal(velocity=speed), 150)
