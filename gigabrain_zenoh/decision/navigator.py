@@ -40,6 +40,7 @@ from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.geometry.pose import compose, inverse
 from gigabrain_zenoh.geometry.se2 import from_pose, transform
+from gigabrain_zenoh.geometry.stopping import brakes
 from gigabrain_zenoh.navigation import global_planner, local_planner
 from gigabrain_zenoh.navigation.contours import placed
 from gigabrain_zenoh.navigation.costmap import inflation
@@ -48,6 +49,7 @@ from gigabrain_zenoh.navigation.local_planner import DEFAULTS, LocalSettings
 from gigabrain_zenoh.navigation.zones import NO_ZONES, SpeedCap, ZoneMap
 
 EXACT_M = 0.05  # from where an arm needs the body
+SLOWLY_M = 0.25  # from there on
 MAX_SCAN_AGE_TICKS = 10  # of a scan to drive by
 MAX_NEAR_OVER_M = 0.25  # beyond, the clearance within reach of the local planner costs alike
 NO_ROUTE = Idle("waiting", "waiting: for a path through the map")
@@ -203,11 +205,12 @@ class Navigator:
     ) -> StepResult:
         """Drive along a route that leads to its goal."""
         assert context.map_from_odom
+        assert context.body
         here = compose(context.map_from_odom, context.pose)
         cap = self._speed_cap(context, here, points)
         request = self._request(context, here, route, goal, points, cap)
         if command.target and command.target.away is not None:
-            request = dataclasses.replace(request, tolerance=EXACT_M)
+            request = close_up(request, context.body)
         plan = self._local_planner(context).plan(request)
         self._routes.report(
             RouteFeedback(
@@ -375,6 +378,22 @@ def _local_settings(config: NavigationConfig, body: BodyDescription) -> LocalSet
 
 def _same_shape(one: BodyDescription, other: BodyDescription) -> bool:
     return (one.footprint, one.lidar) == (other.footprint, other.lidar)
+
+
+def close_up(
+    request: local_planner.PlanRequest, body: BodyDescription
+) -> local_planner.PlanRequest:
+    """Return a request to stand exactly at its goal, which is just before a thing.
+
+    There the body drives so slowly that its stop zone ends well within EXACT_M of the goal: once
+    safety has stopped it, it may not go on until the zone is free again.
+    """
+    off = math.hypot(request.goal.x - request.pose.x, request.goal.y - request.pose.y)
+    slow = request.max_speed
+    if off < SLOWLY_M:
+        stops = brakes(body)["forward"].speed(body.thresholds.stop_margin + EXACT_M / 3)
+        slow = min(stops, slow or math.inf)
+    return dataclasses.replace(request, tolerance=EXACT_M, max_speed=slow)
 
 
 def _errors(command: DriveCommand, here: Pose) -> tuple[float | None, float | None]:

@@ -17,6 +17,7 @@ from gigabrain_schemas.body import Camera
 from gigabrain_schemas.objects import Box, Detections, MapObject
 from gigabrain_zenoh.geometry.se2 import compose, inverse, transform
 from gigabrain_zenoh.perception.camera_view import CameraView
+from gigabrain_zenoh.perception.class_votes import NEAREST_M, ClassVotes
 
 MOVERS = frozenset(("person", "robot", "dog", "cat", "bird"))
 MOVERS_STAY_S = 3.0
@@ -33,7 +34,7 @@ GLIMPSE_S = 1.0  # after which one that does not count is forgotten
 NEAR_M = 2.5  # within which a thing that should be seen is seen
 BEFORE_M = 0.15  # what is so much nearer may hide a thing
 TOGETHER_M = 0.08  # nearer things of one class are one
-MAX_TRACKS, MAX_LABELS = 256, 8
+MAX_TRACKS = 256
 MAX_LABEL_BYTES = 96  # so that all things fit into a message
 
 
@@ -83,13 +84,13 @@ class ObjectTrack:
     seen: int
     last_s: float  # by the robot's time
     last_ns: int
-    votes: dict[str, float] = field(default_factory=dict)  # confidence by class
+    votes: ClassVotes = field(default_factory=ClassVotes)
     anchor: Anchor | None = None
 
     @property
     def label(self) -> str:
         """Its likeliest class."""
-        return max(self.votes, key=self.votes.__getitem__)
+        return self.votes.label
 
     @property
     def moves(self) -> bool:
@@ -194,9 +195,9 @@ class ObjectMemory:
                 seen=1,
                 last_s=glance.time_s,
                 last_ns=glance.unix_ns,
-                votes={sighting.label: max(sighting.confidence, 1e-3)},
             )
         )
+        self._tracks[-1].votes.add(sighting.label, sighting.confidence, sighting.distance)
         self._next_id += 1
 
     def _miss(self, unseen: list[ObjectTrack], sightings: list[Sighting], glance: Glance) -> None:
@@ -294,10 +295,7 @@ def _update(track: ObjectTrack, sighting: Sighting, glance: Glance) -> None:
     track.odds = min(track.odds + SEEN_ODDS + CONFIDENT_ODDS * sighting.confidence, MOST_ODDS)
     track.seen, track.last_s, track.last_ns = track.seen + 1, glance.time_s, glance.unix_ns
     track.anchor = None  # it is fixed anew, to what is mapped round it now
-    votes = track.votes
-    votes[sighting.label] = votes.get(sighting.label, 0.0) + sighting.confidence
-    if len(votes) > MAX_LABELS:
-        del votes[min(votes, key=votes.__getitem__)]
+    track.votes.add(sighting.label, sighting.confidence, sighting.distance)
 
 
 def _before(other: Sighting, pixel: tuple[float, float], depth: float) -> bool:
@@ -309,6 +307,8 @@ def _before(other: Sighting, pixel: tuple[float, float], depth: float) -> bool:
 
 def _restored(one: MapObject, anchor: Anchor | None) -> ObjectTrack:
     sure = min(max(one.confidence, 0.73), 0.982)
+    votes = ClassVotes()
+    votes.add(one.label, 1.0, NEAREST_M)
     return ObjectTrack(
         id=one.id,
         position=np.array((one.x, one.y, one.z)),
@@ -318,7 +318,7 @@ def _restored(one: MapObject, anchor: Anchor | None) -> ObjectTrack:
         seen=max(one.seen, SURE_SEEN),
         last_s=-math.inf,
         last_ns=one.last_seen_ns,
-        votes={one.label: 1.0},
+        votes=votes,
         anchor=anchor,
     )
 

@@ -1,6 +1,7 @@
 """Keeper of what stands near the arm of a body with a depth camera; publishes `robot/solids`."""
 
 import logging
+import math
 from collections import deque
 from collections.abc import Sequence
 from functools import partial
@@ -89,11 +90,14 @@ class SolidKeeper:
     def _on_detections(self, found: Detections) -> None:
         """Take the classes of what was recognised, and is not cut off by an edge of the picture."""
         pose = self._history.at(found.boot, found.basis)
-        if pose is None:
+        camera = next((one for one in self._description.cameras if one.name == found.camera), None)
+        if pose is None or camera is None:
             return
         for one in found.things:
             left, top, right, bottom = one.box
             whole = left >= EDGE_PX and right <= found.width - EDGE_PX
             whole = whole and top >= EDGE_PX and bottom <= found.height - EDGE_PX
             if one.position and whole:
-                self._memory.name(one.label, one.confidence, *one.position[:2], pose)
+                x, y, _ = one.position
+                distance = math.hypot(x - camera.x, y - camera.y)
+                self._memory.name(one.label, one.confidence, (x, y), distance, pose)

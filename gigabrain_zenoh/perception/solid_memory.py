@@ -1,7 +1,7 @@
 """Memory of what stands near an arm: fits of several pictures, tracked in the odometry's frame."""
 
 import math
-from collections import Counter, defaultdict, deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -11,10 +11,10 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_S, Pose
 from gigabrain_schemas.objects import SeenSolid
 from gigabrain_zenoh.geometry.pose import to_frame, to_parent
+from gigabrain_zenoh.perception.class_votes import ClassVotes
 from gigabrain_zenoh.vision.solid_fit import SolidFit
 
 FITS = 9  # newest ones, whose median counts: from near by a thing is seen best
-NAMES = 60  # newest ones, of which the surest counts: from near by little of a thing is seen
 SURE_SEEN = 2  # pictures, from which on a thing counts
 SAME_M, SAME_SHARE = 0.03, 0.5  # how far off the same thing may be: at least, and of its width
 MOVED_M = 0.02  # from its median: it was moved, and what was known of its place is dropped
@@ -36,16 +36,7 @@ class Track:
     seen: int = 0  # pictures
     misses: int = 0
     fits: deque[SolidFit] = field(default_factory=lambda: deque(maxlen=FITS))
-    names: deque[tuple[str, float]] = field(default_factory=lambda: deque(maxlen=NAMES))
-    "Newest classes, with confidences."
-
-    @property
-    def label(self) -> str:
-        """The class for which most confidence speaks; empty where it was never recognised."""
-        sums = defaultdict[str, float](float)
-        for label, confidence in self.names:
-            sums[label] += confidence
-        return max(sums, key=lambda label: sums[label], default="")
+    votes: ClassVotes = field(default_factory=ClassVotes)
 
     @property
     def fit(self) -> SolidFit:
@@ -97,11 +88,16 @@ class SolidMemory:
         kept = [one for one in self._tracks if one.misses < MISSES and one.tick >= oldest]
         self._tracks = sorted(kept, key=lambda one: -one.tick)[:MOST]
 
-    def name(self, label: str, confidence: float, x: float, y: float, pose: Pose) -> None:
-        """Record that something was recognised at a place [m] in the frame of a body at `pose`."""
-        off, track = _nearest(to_parent(pose, x, y), self._tracks)
+    def name(
+        self, label: str, confidence: float, place: Place, distance: float, pose: Pose
+    ) -> None:
+        """Record that something was recognised at a place [m] in the frame of a body at `pose`.
+
+        The camera was at a `distance` of it [m].
+        """
+        off, track = _nearest(to_parent(pose, *place), self._tracks)
         if track and off <= max(LABEL_M, _width(track.fit)):
-            track.names.append((label, confidence))
+            track.votes.add(label, confidence, distance)
 
     def solids(self, pose: Pose, tick: int) -> tuple[SeenSolid, ...]:
         """Return what counts, in the frame of a body at `pose` at `tick`, the nearest first."""
@@ -111,7 +107,7 @@ class SolidMemory:
                 fit = _moved(track.fit, lambda x, y: to_frame(pose, x, y), -pose.yaw)
                 found.append(SeenSolid(
                     id=track.id, shape=fit.shape, size=fit.size, position=fit.position,
-                    yaw=_turn(fit.yaw), label=track.label, seen=track.seen,
+                    yaw=_turn(fit.yaw), label=track.votes.label, seen=track.seen,
                     age=max(0, tick - track.tick) * TICK_S,
                 ))  # fmt: skip
         return tuple(sorted(found, key=lambda one: math.hypot(*one.position[:2])))

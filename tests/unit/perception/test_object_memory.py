@@ -78,6 +78,14 @@ def test_after_ten_pictures_an_object_is_within_5_cm(noise: float, distance: flo
     assert np.percentile(errors, 95) < 0.05
 
 
+def test_its_class_is_the_one_that_was_seen_from_farther_off() -> None:
+    eye = Eye()
+    eye.look(("can", (0.7, 0.0, 0.06)), pictures=10)
+    eye.pose = np.array((0.4, 0.0, 0.0))
+    eye.look(("cylinder", (0.7, 0.0, 0.06)), pictures=100)
+    assert eye.labels == ["can"]
+
+
 def test_a_single_glimpse_is_no_object() -> None:
     eye = Eye()
     eye.look(("can", CAN), pictures=2)

@@ -101,15 +101,27 @@ def test_the_class_for_which_most_confidence_speaks_of_late_is_its_label() -> No
         looked(memory, can(0.3, 0.0), box(0.5, 0.2), tick=tick)
     for label, confidence, pictures in (("cube", 1.0, 90), ("can", 0.9, 25), ("cylinder", 0.5, 35)):
         for _ in range(pictures):
-            memory.name(label, confidence, 0.32, 0.01, ORIGIN)
-    memory.name("cube", 1.0, 0.9, 0.9, ORIGIN)  # stands nowhere near
+            memory.name(label, confidence, (0.32, 0.01), 0.6, ORIGIN)
+    memory.name("cube", 1.0, (0.9, 0.9), 0.6, ORIGIN)  # stands nowhere near
     near, far = memory.solids(ORIGIN, 2)
     assert (near.label, far.label) == ("can", "")
 
 
+def test_a_class_that_was_seen_from_farther_off_stays_however_long_a_thing_is_looked_at() -> None:
+    memory = SolidMemory()
+    for tick in (1, 2):
+        looked(memory, can(0.3, 0.0), tick=tick)
+    memory.name("cube", 1.0, (0.3, 0.0), 0.2, ORIGIN)
+    assert only(memory).label == "cube"  # it was not seen from anywhere else yet
+    memory.name("can", 0.3, (0.3, 0.0), 0.6, ORIGIN)
+    for _ in range(200):
+        memory.name("cylinder", 1.0, (0.3, 0.0), 0.2, ORIGIN)
+    assert only(memory).label == "can"
+
+
 def test_a_memory_without_anything_is_named_in_vain() -> None:
     memory = SolidMemory()
-    memory.name("can", 0.9, 0.3, 0.0, ORIGIN)
+    memory.name("can", 0.9, (0.3, 0.0), 0.6, ORIGIN)
     assert memory.solids(ORIGIN, 1) == ()
 
 
