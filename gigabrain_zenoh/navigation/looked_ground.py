@@ -3,7 +3,9 @@
 A camera sees a wedge ahead. Beside the body, and nearer than it sees the floor, a sill or a step
 down may be that has never been in view. So ground that a body may sweep soon, and that was neither
 in view nor stood on, costs like an obstacle MARGIN_M away: the body turns more in place, and looks.
-It is not closed: a body that may turn nowhere would stand for ever.
+It is not closed: a body that may turn nowhere would stand for ever. So would one that can go aside:
+it stands with the heading that it needs, and does not turn to look. For that one unknown ground is
+so far away that it need not brake.
 """
 
 import math
@@ -14,6 +16,7 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.body import BodyDescription, Camera
+from gigabrain_zenoh.geometry.stopping import brakes
 from gigabrain_zenoh.geometry.sweep import radius
 from gigabrain_zenoh.navigation.footprint import FAR, DistanceGrid
 from gigabrain_zenoh.navigation.local_costmap import (
@@ -46,6 +49,8 @@ class LookedGround:
     def __init__(self, body: BodyDescription, side: int) -> None:
         self._body, self._side = body, side
         self._turning = radius(body.footprint)
+        along, aside = brakes(body)["forward"], body.max_lateral_speed > 0.0
+        self._margin = along.reach if aside else MARGIN_M
         self._looked = np.zeros((side, side), np.uint8)
         self._row = self._column = 0  # of cell (0, 0)
         self._chamfer = Chamfer(side, CELL_M, FAR)
@@ -97,7 +102,7 @@ class LookedGround:
         unseen = (near > 0) & (self._looked == 0)
         if not unseen.any():
             return None
-        return self._chamfer.distance((~unseen).view(np.uint8)) + np.float32(MARGIN_M)
+        return self._chamfer.distance((~unseen).view(np.uint8)) + np.float32(self._margin)
 
     @property
     def _corner(self) -> Floats:

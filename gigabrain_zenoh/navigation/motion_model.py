@@ -57,6 +57,7 @@ def model_of(
     eager = min(1.0, 2.0 * aggressiveness)
     gain = ACCELERATION_RESERVE * (GENTLEST_SHARE + (1.0 - GENTLEST_SHARE) * eager)
     car, limits = body.drive_type == "ackermann", limits_of(body)
+    sees_ahead = any(camera.depth for camera in body.cameras)  # so it had better face its way
     return MotionModel(
         forward=fastest,
         backward=min(MAX_REVERSE_SPEED, 0.5 * fastest),
@@ -71,7 +72,7 @@ def model_of(
         side_margin=body.thresholds.side_margin,
         rim=limits.rim_speed,
         half_track=limits.half_track,
-        strafes=body.drive_type in STRAFING and body.max_lateral_speed > 0.0,
+        strafes=body.drive_type in STRAFING and body.max_lateral_speed > 0.0 and not sees_ahead,
     )
 
 

@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import Camera
 from gigabrain_schemas.tasks import Goal
+from gigabrain_zenoh.decision.navigator import close_up
 from gigabrain_zenoh.geometry.sweep import depth, edges
 from gigabrain_zenoh.navigation.footprint import FAR, DistanceGrid
 from gigabrain_zenoh.navigation.local_costmap import CELL_M, Pose2D
@@ -142,3 +145,21 @@ def test_it_keeps_away_from_ground_that_was_never_in_view() -> None:
     goal = Goal(x=1.2, y=0.9)
     assert deepest_in_unknown((), goal) > 0.0
     assert deepest_in_unknown(("front",), goal) < 0.0
+
+
+@pytest.mark.parametrize("begins", [(-1.0, 0.3, 2.0), (-0.4, -0.9, -1.5), (-0.9, -0.2, 0.1)])
+def test_a_body_that_can_go_aside_gets_before_a_thing_from_wherever_it_looks(
+    begins: tuple[float, float, float],
+) -> None:
+    body = load_robot("lekiwi").description()
+    can = np.array([(0.265 + 0.0345 * math.cos(a), 0.0345 * math.sin(a)) for a in range(7)])
+
+    class SeeingDrive(Drive):
+        def moment(self) -> PlanRequest:
+            seen = dataclasses.replace(super().moment(), cameras=("front",), contours=(can,))
+            return close_up(seen, body)
+
+    drive = SeeingDrive(body, Goal(x=0.0, y=0.0, yaw=0.0), np.empty((0, 2)))
+    x, y, yaw = begins
+    drive.pose = Pose(x=x, y=y, yaw=yaw)
+    assert drive.go(20.0).arrived
