@@ -32,6 +32,7 @@ SENT_TICKS = 25  # local planning uses the commands of the last half second
 OPERATOR_HOLDS = "an operator holds the body; `gigabrain enable` hands it back"
 USUAL_LATENCY_TICKS = 2  # from a scan to the first state after its answer
 LATENCY_MEMORY_TICKS = 100
+STOPPED_TICKS = 75  # ahead, after which another way out is wanted
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,6 +47,7 @@ class NavigationContext:
     delayed_s: float  # [s], by how much scans have lately been answered later than usual
     velocity: Velocity  # measured at the scan
     may_reverse: bool
+    stopped_ahead: bool  # safety has kept it from advancing for a while
     body: BodyDescription | None
     map_from_odom: Pose | None
     lost: WaitReason | None  # why `map_from_odom` is None
@@ -110,6 +112,7 @@ class ContextSource:
         self._commands: PreviousTick[CmdVel] = PreviousTick()
         self._joint_commands: PreviousTick[JointCommand] = PreviousTick()
         self._subscribed_commands = False
+        self._stopped: int | None = None  # tick since which safety has stopped the body ahead
         self._bodies = bus.latest(BODY)
         bus.latest(POSE, self._poses.receive)
         bus.latest(MAP, self._maps.append)
@@ -140,6 +143,10 @@ class ContextSource:
         if pose is None:
             map_from_odom, lost = None, WaitReason.NO_ODOMETRY_OF_SCAN
         sent = self._estimator.sent(tick - SENT_TICKS, tick - 1)
+        if verdict is None or not any(one.code == "zone_ahead" for one in verdict.causes):
+            self._stopped = None
+        elif self._stopped is None or tick < self._stopped:
+            self._stopped = tick
         return NavigationContext(
             tick=tick,
             world=world,
@@ -149,6 +156,7 @@ class ContextSource:
             delayed_s=self._latency.excess_s,
             velocity=self._velocity(state, tick),
             may_reverse=verdict is None or verdict.caps.backward != 0.0,
+            stopped_ahead=self._stopped is not None and tick - self._stopped >= STOPPED_TICKS,
             body=self.body,
             map_from_odom=map_from_odom,
             lost=lost,

@@ -50,6 +50,7 @@ from gigabrain_zenoh.navigation.zones import NO_ZONES, SpeedCap, ZoneMap
 
 EXACT_M = 0.05  # from where an arm needs the body
 SLOWLY_M = 0.25  # from there on
+BAR_STEP_M = 0.02  # between points of a bar: no gap in the planner's cells
 MAX_SCAN_AGE_TICKS = 10  # of a scan to drive by
 MAX_NEAR_OVER_M = 0.25  # beyond, the clearance within reach of the local planner costs alike
 NO_ROUTE = Idle("waiting", "waiting: for a path through the map")
@@ -212,6 +213,8 @@ class Navigator:
         if command.target and command.target.away is not None:
             request = close_up(request, context.body)
         plan = self._local_planner(context).plan(request)
+        if context.stopped_ahead and plan.twist.linear_x > 0.0:
+            plan = self._local_planner(context).plan(barred(request, context.body))
         self._routes.report(
             RouteFeedback(
                 version=route.version,
@@ -394,6 +397,22 @@ def close_up(
         stops = brakes(body)["forward"].speed(body.thresholds.stop_margin + EXACT_M / 3)
         slow = min(stops, slow or math.inf)
     return dataclasses.replace(request, tolerance=EXACT_M, max_speed=slow)
+
+
+def barred(
+    request: local_planner.PlanRequest, body: BodyDescription
+) -> local_planner.PlanRequest:
+    """Return a request with a bar before the body, which it has to back off or turn away from.
+
+    Safety stops it there for something that decision does not know of, such as the place of a thing
+    that an arm has taken away, so near that no camera shows that it is gone.
+    """
+    corners = np.array(body.footprint)
+    x = float(corners[:, 0].max()) + body.thresholds.stop_margin
+    left, right = float(corners[:, 1].max()), float(corners[:, 1].min())
+    aside = np.linspace(right, left, math.ceil((left - right) / BAR_STEP_M) + 1)
+    bar = transform(from_pose(request.pose), np.column_stack((np.full_like(aside, x), aside)))
+    return dataclasses.replace(request, known=np.concatenate((request.known, bar)))
 
 
 def _errors(command: DriveCommand, here: Pose) -> tuple[float | None, float | None]:
