@@ -71,7 +71,7 @@ class Stopped(Drive):
     def stops(self) -> bool:
         ahead, aside = self._here(GHOST)
         self.ghost = self.ghost and ahead < 0.36  # a camera sees the floor from there on
-        return self.ghost and 0.0 < ahead and abs(aside) < 0.18
+        return self.ghost and ahead > 0.0 and abs(aside) < 0.18
 
     def _here(self, point: np.ndarray) -> tuple[float, float]:
         x, y = point - (self.pose.x, self.pose.y)
