@@ -41,6 +41,7 @@ ARRIVED_M = LocalSettings().position_tolerance
 NEAR_GOAL_M = 0.25  # good enough for a goal that was free when it was requested: maps shift
 OCCUPIED_TICKS = 500  # 10 s without progress towards an occupied goal
 
+WAY_OPENS_TICKS = 500  # 10 s, in which somebody may go out of a door, before a search ends
 LOOKING = "looking around"  # what a robot does that searches
 
 Point = tuple[float, float]
@@ -174,7 +175,8 @@ class RoutePlanner:
         self._last_path: Path | None = None  # the last path to this goal that was found
         self._goal: Goal | None = None
         self._settled: tuple[Goal, str] | None = None  # where it stays near its goal, and why
-        self._visited: list[Point] = []
+        self._visited: list[Point] = []  # frontiers where it has been,
+        self._missed: list[Point] = []  # and to which it did not get
         self._doing = ""  # what the local planner did last, for people
         self._progress, self._last_tick = ProgressMonitor(tick), tick
         self._last_frontier_tick = tick
@@ -293,9 +295,9 @@ class RoutePlanner:
         here = request.here.x, request.here.y
         arrived = request.feedback is not None and request.feedback.arrived
         if self._goal and (arrived or self._progress.stuck(request.tick, LEAVE_FRONTIER_TICKS)):
-            self._visited.append((self._goal.x, self._goal.y))
+            (self._visited if arrived else self._missed).append((self._goal.x, self._goal.y))
             self._drop_frontier(request.tick)
-        for _ in range(len(self._visited) + 10):
+        for _ in range(len(self._visited) + len(self._missed) + 10):
             goal = self._frontier(costs, here)
             if goal is None:
                 return self._explored(request, costs)
@@ -309,7 +311,7 @@ class RoutePlanner:
             if isinstance(found, Path):
                 self._progress.measure(float(found.remaining[0]), request.tick)
                 return self._go(goal, found)
-            self._visited.append((goal.x, goal.y))
+            self._missed.append((goal.x, goal.y))
         return self._route(reason="no path to unexplored space")
 
     def _to_target(self, target: Target, request: RouteRequest, costs: Costmap) -> Route:
@@ -345,13 +347,17 @@ class RoutePlanner:
                 return self._go(goal, found, activity=LOOKING)
             looks.give_up()
         route = self._explore(request, costs)
-        if route.state == "running" or looks.settled(request.tick):
-            ended = route.state == "done"
-            reason = "everything reachable was looked at" if ended else route.reason
-            return replace(
-                route, reason=reason, activity=LOOKING if route.points is not None else ""
-            )
-        return self._route(reason="looking at the last places")
+        if route.state == "running":
+            return replace(route, activity=LOOKING if route.points is not None else "")
+        if not looks.settled(request.tick):
+            return self._route(reason="looking at the last places")
+        if looks.ended_tick is None:
+            looks.ended_tick = request.tick
+            looks.try_again()
+            self._missed.clear()
+        if request.tick - looks.ended_tick < WAY_OPENS_TICKS:
+            return self._route(reason="everything reachable was looked at; waiting for other ways")
+        return replace(route, reason="everything reachable was looked at")
 
     def _explored(self, request: RouteRequest, costs: Costmap) -> Route:
         """End the exploration, once the map has been updated without a new frontier."""
@@ -364,7 +370,7 @@ class RoutePlanner:
 
     def _frontier(self, costs: Costmap, here: Point) -> Goal | None:
         """Return the best frontier; the present one, unless another is much better."""
-        found = frontiers(costs, here, self._visited, self._planner.search)
+        found = frontiers(costs, here, (*self._visited, *self._missed), self._planner.search)
         if not found:
             return None
         best = min(found, key=lambda one: one.score)

@@ -109,6 +109,8 @@ class LookAround:
     def __init__(self, seek: int = 0, tick: int = 0) -> None:
         self.seek = seek  # the search that it belongs to
         self._seen: set[tuple[int, int]] = set()
+        self._given_up: set[tuple[int, int]] = set()
+        self.ended_tick: int | None = None  # when nothing was left for the first time
         self._aim: tuple[int, int] | None = None  # the cell that it goes to look at
         self.goal: Goal | None = None  # from where
         self._changed_tick = tick  # when something was seen last
@@ -128,8 +130,14 @@ class LookAround:
         if self._aim:
             i, j = self._aim
             reach = range(-1, 2)
-            self._seen.update((i + di, j + dj) for di in reach for dj in reach)
+            near = {(i + di, j + dj) for di in reach for dj in reach} - self._seen
+            self._given_up |= near
+            self._seen |= near
         self.drop()
+
+    def try_again(self) -> None:
+        """Count what was given up as unseen again."""
+        self._seen -= self._given_up
 
     def drop(self) -> None:
         """Choose another aim next."""

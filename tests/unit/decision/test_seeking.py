@@ -92,12 +92,19 @@ def test_a_thing_shown_by_the_map_does_not_hide_itself() -> None:
     assert off(place, target)[0] >= FRONT_M + 0.15 + 0.25 - 0.01
 
 
-def search(cells: np.ndarray, *, most: int = 400) -> tuple[list[Pose], str]:
-    """Poses that a search of everything goes through, as if it drove at once, and its end."""
+def search(
+    cells: np.ndarray, *, then: np.ndarray | None = None, most: int = 400
+) -> tuple[list[Pose], str]:
+    """Poses that a search of everything goes through, as if it drove at once, and its end.
+
+    The map is `then` once there was nowhere to go for 4 s.
+    """
     planner, here, poses = RoutePlanner(), HERE, []
-    tick, feedback = 0, None
+    tick, feedback, idle = 0, None, 0
     for _ in range(most):
         tick += 25
+        if idle == 8 and then is not None:
+            cells = then
         route = planner.plan(
             RouteRequest(
                 tick=tick,
@@ -111,7 +118,7 @@ def search(cells: np.ndarray, *, most: int = 400) -> tuple[list[Pose], str]:
         )
         if route.state != "running":
             return poses, route.reason
-        feedback = None
+        feedback, idle = None, 0 if route.goal else idle + 1
         if route.goal:
             yaw = here.yaw if route.goal.yaw is None else route.goal.yaw
             here = Pose(x=route.goal.x, y=route.goal.y, yaw=yaw)
@@ -152,6 +159,16 @@ def test_a_room_behind_a_wall_is_not_looked_for_for_ever() -> None:
     poses, reason = search(cells)
     assert reason == "everything reachable was looked at"
     assert max(pose.x for pose in poses) < 4.0
+
+
+def test_a_room_whose_door_somebody_stood_in_is_looked_into_as_well() -> None:
+    cells = empty(8.0, 4.0)
+    cells[:, 40] = 100
+    opened = cells.copy()
+    opened[10:25, 40] = 0
+    poses, reason = search(cells, then=opened)
+    assert reason == "everything reachable was looked at"
+    assert max(pose.x for pose in poses) > 4.5
 
 
 def test_it_turns_on_the_spot_before_it_drives() -> None:
