@@ -118,7 +118,7 @@ class LookAround:
     def look(self, costs: Costmap, body: BodyDescription, here: Pose, tick: int) -> None:
         """Record what the body's cameras see from `here`."""
         before = len(self._seen)
-        for camera in body.cameras:
+        for camera in body.fixed_cameras:
             self._seen.update(map(tuple, _in_view(costs, camera, here).tolist()))
         if len(self._seen) != before:
             self._changed_tick = tick
@@ -244,7 +244,7 @@ def _viewpoint(
 
 def _facing(body: BodyDescription, eye: Floats, aim: Floats, spots: Floats) -> tuple[float, int]:
     """Return the heading from which a camera shows `aim` and most of the `spots`, and how many."""
-    camera = body.cameras[0]
+    camera = body.fixed_cameras[0]
     half = math.atan2(camera.width / 2, camera.pinhole[0]) - RIM_RAD
     off = spots - eye
     bearings = np.arctan2(off[:, 1], off[:, 0])[np.hypot(*off.T) <= LOOK_M]

@@ -207,10 +207,12 @@ class TaskServer:
         return name, at or f"{named(wanted)} is not known yet; looking for it"
 
     def _refuse_blind(self) -> None:
-        """Raise Refused if the body has no cameras."""
+        """Raise Refused if the body has no cameras to look around with."""
         body = self._source.body
         if body and not body.cameras:
             raise Refused("the robot has no cameras; start it with --cameras, or `cameras: on`")
+        if body and not body.fixed_cameras:
+            raise Refused("the robot has no camera but on its arm; finding needs one on its base")
 
     def _seek(self, wanted: Wanted, without: Collection[int], preferred: int | None) -> Sought:
         """Return what is known of a wanted thing at the present step."""

@@ -141,7 +141,7 @@ def _watched(body: BodyDescription, here: Pose, points: Floats) -> NDArray[np.bo
     distance = np.hypot(away[:, 0], away[:, 1])
     bearing = np.arctan2(away[:, 1], away[:, 0]) - here.yaw
     watched = distance <= NEAR_M
-    for camera in body.cameras:
+    for camera in body.fixed_cameras:
         half = math.atan2(camera.width / 2, camera.pinhole[0])
         off = np.abs(np.remainder(bearing - camera.yaw + math.pi, math.tau) - math.pi)
         watched |= (off <= half) & (distance <= camera.depth_max)

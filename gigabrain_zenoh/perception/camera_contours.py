@@ -89,7 +89,7 @@ class _Eye:
 
 
 class CameraContours:
-    """Follows the cameras of one body, on the loop.
+    """Follows the cameras that are fixed to one body, on the loop.
 
     `on_new` is called after each picture, `on_state` with each state.
     """
@@ -103,7 +103,7 @@ class CameraContours:
     ) -> None:
         self._bus, self._description = bus, description
         self._on_new, self._pass_on = on_new, on_state
-        self._eyes = {one.name: _Eye(one) for one in description.cameras}
+        self._eyes = {one.name: _Eye(one) for one in description.fixed_cameras}
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="contours")
         self._contours, self._boot = ObstacleContours(description), 0
         self._busy = False
@@ -114,7 +114,7 @@ class CameraContours:
             bus.subscribe(CAMERA, self._on_info),
             bus.subscribe(STATE, lambda _, state: self._on_state(state)),
         ]
-        depth = [one.depth for one in description.cameras]
+        depth = [eye.camera.depth for eye in self._eyes.values()]
         topics: list[Topic[Any]] = [DEPTH] if any(depth) else []
         topics += [] if all(depth) else [IMAGE]
         self._ends += [bus.subscribe(topic, self._on_picture) for topic in topics]

@@ -136,10 +136,10 @@ class WorldPublisher:
 
     def _on_body(self, body: Body) -> None:
         description = body.description
-        if description.cameras == self._of:
+        if description.fixed_cameras == self._of:
             return
         self.close()
-        self._of, self._newest = description.cameras, None
+        self._of, self._newest = description.fixed_cameras, None
         if self._of:
             from gigabrain_zenoh.perception.camera_contours import CameraContours
 

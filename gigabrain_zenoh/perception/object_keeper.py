@@ -266,6 +266,8 @@ class ObjectKeeper:
     def _take(
         self, picture: Detections, seen: Surroundings, place: Place, moment: OdometrySample
     ) -> None:
+        if any(one.link and one.name == picture.camera for one in seen.body.cameras):
+            return  # it is not known what a camera on an arm looks at
         camera, sample = seen.camera(picture.camera), self._fusion().at(picture.basis)
         again = picture.basis <= self._taken.get(picture.camera, -1)
         if camera is None or sample is None or again or sample.jumps != moment.jumps:

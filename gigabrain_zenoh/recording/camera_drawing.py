@@ -1,7 +1,8 @@
 """Drawings of cameras for viewers: pictures, calibration, what was recognised, and contours.
 
 Foxglove and Rerun join a picture to its calibration by the frame of the lens, by ROS (REP-103): z
-looks ahead, x to the right of the picture and y down. It hangs below `base_link`.
+looks ahead, x to the right of the picture and y down. It hangs below `base_link`, or a link of the
+arm.
 """
 
 import math
@@ -23,6 +24,7 @@ from gigabrain_schemas.objects import (
 )
 from gigabrain_schemas.sensors import Image
 from gigabrain_schemas.vision import CameraInfo, DepthImage
+from gigabrain_zenoh.recording.arm_drawing import LINKS
 from gigabrain_zenoh.recording.drawn import (
     BASE,
     BLUE,
@@ -108,14 +110,15 @@ def calibration(info: CameraInfo, _: str) -> Iterable[Drawn]:
     )  # fmt: skip
     yield as_drawn(f"calibration/{camera.name}", drawn)
     place = fox.FrameTransform(
-        timestamp=stamp(info), parent_frame_id=BASE, child_frame_id=optical_frame(camera.name),
+        timestamp=stamp(info), child_frame_id=optical_frame(camera.name),
+        parent_frame_id=f"{LINKS}{camera.link}" if camera.link else BASE,
         translation=fox.Vector3(x=camera.x, y=camera.y, z=camera.z), rotation=_lens(camera),
     )  # fmt: skip
     yield as_drawn("tf", place)
 
 
 def _lens(camera: Camera) -> fox.Quaternion:
-    """Return the rotation from the frame of the lens to that of the body."""
+    """Return the rotation from the frame of the lens to that in which the camera is mounted."""
     (sr, cr), (sp, cp), (sy, cy) = (
         (math.sin(angle / 2), math.cos(angle / 2))
         for angle in (camera.roll, camera.pitch, camera.yaw)

@@ -3,16 +3,20 @@
 import math
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats, ranges_bytes
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import (
+    Arm,
     Battery,
     Body,
     BodyDescription,
+    Camera,
     GateStatus,
     Joint,
+    JointDescription,
     Lidar,
     RobotState,
 )
@@ -32,6 +36,12 @@ WAFFLE = BodyDescription(
     max_angular_acceleration=3.0,
     lidar=LIDAR,
 )
+ARMED = replace(
+    WAFFLE,
+    joints=(JointDescription(name="lift", lower=-1.0, upper=1.0, max_speed=1.0),),
+    arm=Arm(home=(0.0,)),
+)
+WRIST = Camera(name="wrist", link="hand")  # for ARMED
 DRIVING = GateStatus(mode="enabled", commander="control", enables=1)
 
 

@@ -60,12 +60,13 @@ class CameraHealth:
     """Judges one camera. Times are of any clock [s], the same in all calls.
 
     With `repeats` a still scene may give the same bits twice, as compressed streams do; then the
-    same picture is no fault.
+    same picture is no fault. A camera on an arm may see nothing but what the gripper holds, so only
+    its silence is a fault.
     """
 
     def __init__(self, camera: Camera, *, repeats: bool = False) -> None:
         period_s = 1 / camera.rate_hz
-        self._repeats = repeats
+        self._repeats, self._on_arm = repeats, bool(camera.link)
         self._window_s = max(WINDOW_S, 2.5 * period_s)
         self._sudden_s = max(SUDDEN_S, 1.5 * period_s)
         self._came_s: float | None = None  # the newest exposure, or the first question
@@ -89,7 +90,9 @@ class CameraHealth:
         repeated = not self._repeats and mark in self._prints
         self._prints.append(mark)
         self._came_s = now_s
-        fault = FROZEN if repeated else self._fault(now_s, picture, depth)
+        fault = ""
+        if not self._on_arm:
+            fault = FROZEN if repeated else self._fault(now_s, picture, depth)
         self._judged.append((now_s, fault, mark))
         return not fault
 

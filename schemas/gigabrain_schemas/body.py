@@ -234,7 +234,8 @@ class Camera(Record, frozen=True, kw_only=True):
     depth: bool = False  # measures the depth of each pixel too
     depth_min: Range = 0.25  # [m]; nearer, the depth is unknown
     depth_max: RangeMax = 6.0  # [m]
-    x: Offset = 0.0  # [m], mounting in the body's frame, z from the floor
+    link: Name = ""  # body of the arm's model that it sits on; empty: the robot's own body
+    x: Offset = 0.0  # [m], mounting in the frame of the link; in the robot's, z is from the floor
     y: Offset = 0.0  # [m]
     z: Offset = 0.0  # [m]
     roll: MountingAngle = 0.0  # [rad]
@@ -244,6 +245,8 @@ class Camera(Record, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if self.depth_max <= self.depth_min:
             raise ValueError("depth_max must be larger than depth_min")
+        if self.link and self.depth:
+            raise ValueError("link: a camera on an arm cannot measure depth; set depth: false")
 
     @property
     def pinhole(self) -> tuple[float, float, float, float]:
@@ -366,6 +369,8 @@ class BodyDescription(Record, frozen=True, kw_only=True):
                 )
         if len({camera.name for camera in self.cameras}) < len(self.cameras):
             raise ValueError("cameras: each needs a name of its own")
+        if self.arm is None and any(camera.link for camera in self.cameras):
+            raise ValueError("cameras: link: the body has no arm; leave it out")
         if self.lidar is None:
             return
         needs = self.stopping_distance(self.max_linear_speed)
@@ -404,6 +409,11 @@ class BodyDescription(Record, frozen=True, kw_only=True):
     def has_base(self) -> bool:
         """Whether it can drive; an arm that is fixed cannot."""
         return self.drive_type != "arm"
+
+    @property
+    def fixed_cameras(self) -> tuple[Camera, ...]:
+        """The cameras that do not move with an arm, so that it is known what they look at."""
+        return tuple(camera for camera in self.cameras if not camera.link)
 
     @property
     def turning_radius(self) -> float:

@@ -41,7 +41,7 @@ from gigabrain_zenoh.mapping.object_file import ObjectFile
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.recording.process_replay import with_requests
 from gigabrain_zenoh.runtime.replay import record, replay
-from gigabrain_zenoh.testing.samples import WAFFLE, body, scan, state
+from gigabrain_zenoh.testing.samples import ARMED, WAFFLE, WRIST, body, scan, state
 from tests.node.mapping_robot import SLAM, Robot
 from tests.node.test_zone_keeping import ask, last
 from tests.unit.mapping.houses import CORRIDOR, HOUSE, NICHE, Rooms, at, drawn
@@ -66,7 +66,7 @@ class Seeing(Robot):
         self.rooms = Rooms(walls)
         self.pose = at(3.0, 2.0, 90) if pose is None else pose  # where it is
         self.odometry = np.zeros(3)
-        self.seq = 0
+        self.seq, self.camera = 0, "front"
 
     def say(self) -> None:
         self.send(BODY, body(replace(WAFFLE, cameras=(FRONT,)), boot=self.boot))
@@ -84,7 +84,7 @@ class Seeing(Robot):
     def see(self, *things: Detection, tags: tuple[TagDetection, ...] = ()) -> None:
         self.seq += 1
         picture = Detections(
-            camera="front", width=320, height=240, things=things, tags=tags,
+            camera=self.camera, width=320, height=240, things=things, tags=tags,
             boot=self.boot, tick=self.tick, basis=self.tick, seq=self.seq, stamp_ns=self.seq,
         )  # fmt: skip
         self.send(DETECTIONS, picture)
@@ -149,6 +149,18 @@ async def test_a_robot_without_cameras_has_no_memory_of_things() -> None:
         assert not any(key == OBJECT_MAP.key for key, _ in robot.network.sent)
         assert (await robot.save("house")).ok
     assert not object_file.path_beside(map_file.saved_map_path("house")).exists()
+
+
+async def test_what_a_camera_on_an_arm_sees_has_no_place_and_is_no_miss() -> None:
+    async with Seeing() as robot:
+        robot.send(BODY, body(replace(ARMED, cameras=(FRONT, WRIST)), boot=robot.boot))
+        robot.look(20, can())
+        robot.camera = "wrist"
+        there = tag(at(0, 0), at(2.0, 0.3, 180))
+        robot.look(20, replace(can(1.2, -0.4, "box"), box=(200, 100, 240, 140)), tags=(there,))
+        (one,), tags = robot.known().objects, robot.known().tags
+        assert (one.label, one.seen, tags) == ("can", 20, ())
+        assert not robot.bus.counters["detections_left_out"]
 
 
 async def test_objects_are_published_on_change_and_every_two_seconds() -> None:

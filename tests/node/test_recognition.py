@@ -93,7 +93,7 @@ async def running(*cameras: Camera) -> AsyncIterator[Robot]:
     robot = Robot(bus, clock, recognition, net)
     try:
         robot.be(40)
-        description = replace(samples.WAFFLE, cameras=cameras or (CAMERA,))
+        description = replace(samples.ARMED, cameras=cameras or (CAMERA,))
         bus.publish(BODY, samples.body(description))
         await settle()
         yield robot
@@ -336,6 +336,18 @@ def test_a_picture_of_another_camera_is_not_looked_at():
     picture = Image(frame_id="rear", width=320, height=240, encoding="mono8", data=TAG.tobytes())
     with pytest.raises(ValueError, match="rear"):
         Observer(SeesABall(), TagFinder()).observe(CAMERA, picture, None)
+
+
+async def test_in_a_picture_of_a_camera_on_an_arm_things_have_no_places_and_tags_are_left_out():
+    arm = replace(CAMERA, name="wrist", link="hand", depth=False)
+    async with running(CAMERA, arm) as robot:
+        pose = PoseInMap(x=5.5, y=2.0, yaw=0.0, covariance=(0.01,) * 9)
+        robot.bus.publish(POSE, pose, basis=40)
+        robot.show(basis=38, name="wrist", depth=False)
+        found = await robot.finds(1)
+        (ball,) = found.things
+        assert (found.camera, ball.label, found.tags) == ("wrist", "ball", ())
+        assert (ball.position, ball.in_map, ball.size) == (None, None, None)
 
 
 class Sees(SeesABall):

@@ -11,7 +11,7 @@ from gigabrain_schemas.objects import MapObject, MapTag, ObjectMap
 from gigabrain_schemas.tasks import GoalRequest, MissionRequest
 from gigabrain_schemas.topics import GOAL, MISSION, OBJECT_MAP, ZONES
 from gigabrain_schemas.zones import Place, Zones
-from gigabrain_zenoh.testing.samples import WAFFLE
+from gigabrain_zenoh.testing.samples import ARMED, WAFFLE, WRIST
 from tests.node.plane import CELL, Plane, drawn
 
 FLAT = drawn(
@@ -155,6 +155,15 @@ async def test_without_cameras_things_are_refused_in_one_line() -> None:
         reply = await plane.ask(MISSION, MissionRequest(mission="do: [{goto: {tag: 7}}]"))
         assert reply.text.startswith("the robot has no cameras; ")
         assert OBJECT_MAP.key not in plane.bench.bus.listens
+
+
+async def test_with_a_camera_on_its_arm_alone_it_cannot_look_for_things() -> None:
+    async with Seeing() as plane:
+        plane.description = replace(ARMED, cameras=(WRIST,))
+        await plane.go(0.5)
+        reply = await plane.ask(GOAL, GoalRequest(object="can"))
+        assert not reply.ok
+        assert reply.text.startswith("the robot has no camera but on its arm; ")
 
 
 async def test_a_name_that_only_an_object_has_is_refused_with_the_command_for_it() -> None:

@@ -23,7 +23,7 @@ from tests.node.arm_rig import Rig
 from tests.unit.vision.scenes import Box, depth_of, image, millimetres
 
 SO101 = load_robot("so101").description()
-(TOP,) = SO101.cameras
+(TOP,) = SO101.fixed_cameras
 MODEL = robot_path("so101").with_name("model.xml").read_text()
 assert SO101.arm
 HOME = dict(zip((joint.name for joint in SO101.joints), SO101.arm.home, strict=True))

@@ -109,7 +109,8 @@ def _read_part_of_robot(text: str) -> None:
     part = yaml.safe_load(text)
     with tempfile.TemporaryDirectory(prefix="docs-") as name:
         folder = Path(name) / "robot"
-        shutil.copytree(ARM if {"arm", "joints"} & set(part) else PART_OF, folder)
+        of_arm = {"arm", "joints"} & set(part) or " link: " in text  # as a camera on one has
+        shutil.copytree(ARM if of_arm else PART_OF, folder)
         file = folder / "robot.yaml"
         file.write_text(yaml.safe_dump(_joined(yaml.safe_load(file.read_text()), part)))
         load_link(str(file), Run(folder=folder, link="sim" if "sim" in part else "real"))

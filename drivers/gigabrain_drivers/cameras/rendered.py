@@ -16,6 +16,7 @@ from gigabrain_drivers.cameras.base import (
 )
 from gigabrain_drivers.cameras.depth_noise import NO_ERRORS, SENSOR, DepthSensor
 from gigabrain_drivers.sim.graphics import open_graphics
+from gigabrain_drivers.sim.scene import ROBOT
 from gigabrain_drivers.sim.scene_model import BASE, SceneModel
 from gigabrain_schemas.body import Camera
 from gigabrain_schemas.sim import SimPoses, SimScene
@@ -158,9 +159,8 @@ class Renderer:
         scene, drawn, context = self._scene, self._drawn, self._context
         if scene is None or drawn is None or context is None or not scene.place(poses):
             return {}
-        base = scene.pose_of(BASE)
         if self._rest_height is None:  # the first poses are those of a body at rest
-            self._rest_height = float(base[2])
+            self._rest_height = float(scene.pose_of(BASE)[2])
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(
             scene.model, scene.data, mujoco.MjvOption(), None, mujoco.MjvCamera(), everything, drawn
@@ -169,7 +169,7 @@ class Renderer:
         frames = {}
         for name in names:
             view = self._views[name]
-            self._aim(drawn, view, base)
+            self._aim(drawn, view, scene)
             colours, depth = view.lens.bend(*self._draw(view.lens))
             frames[name] = view.exposure(colours, depth, poses.tick)
         return frames
@@ -184,11 +184,12 @@ class Renderer:
             self._context.free()
         self._scene = self._drawn = self._context = None
 
-    def _aim(self, drawn: mujoco.MjvScene, view: View, base: NDArray[np.float64]) -> None:
+    def _aim(self, drawn: mujoco.MjvScene, view: View, scene: SceneModel) -> None:
         """Put both eyes of MuJoCo's camera where the robot's camera really sits."""
         camera, lens = view.sensor.mounted, view.lens
-        turn, height = rotation(base[3:]), self._rest_height or 0.0
-        place = base[:3] + turn @ np.array([camera.x, camera.y, camera.z - height])
+        body = scene.pose_of(f"{ROBOT}{camera.link}" if camera.link else BASE)
+        turn, height = rotation(body[3:]), 0.0 if camera.link else self._rest_height or 0.0
+        place = body[:3] + turn @ np.array([camera.x, camera.y, camera.z - height])
         axes = turn @ mounting(camera)
         upper, lower = lens.centre[1] + 0.5, lens.height - 0.5 - lens.centre[1]
         middle = lens.width / 2 - 0.5 - lens.centre[0]
@@ -220,7 +221,7 @@ def rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def mounting(camera: Camera) -> NDArray[np.float64]:
-    """Return the axes of a camera in the body's frame (3, 3): by roll, then pitch, then yaw."""
+    """Return the axes of a camera where it is mounted (3, 3): by roll, then pitch, then yaw."""
     (sr, sp, sy), (cr, cp, cy) = (
         function([camera.roll, camera.pitch, camera.yaw]) for function in (np.sin, np.cos)
     )

@@ -42,6 +42,15 @@ def arm_text(path: Path, joints: Collection[str]) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
+def link_names(path: Path, joints: Collection[str]) -> list[str]:
+    """Return the bodies of the model of an arm, without its base. Raises ConfigError."""
+    try:
+        bodies = ElementTree.fromstring(arm_text(path, joints)).iter("body")
+    except ElementTree.ParseError as error:
+        raise _no_xml(path, error) from None
+    return [name for body in bodies if (name := body.get("name", "")) not in ("", BASE)]
+
+
 def _attach(root: Element, above: Element, attach: Element, path: Path) -> None:
     """Put the body of another model in the place of an `attach` element."""
     child, prefix = _parsed(path), attach.get("prefix", "")
@@ -100,4 +109,8 @@ def _parsed(path: Path) -> Element:
     try:
         return ElementTree.fromstring(_text(path))
     except ElementTree.ParseError as error:
-        raise ConfigError(f"{path}: the model of the arm is no XML: {error}") from None
+        raise _no_xml(path, error) from None
+
+
+def _no_xml(path: Path, error: ElementTree.ParseError) -> ConfigError:
+    return ConfigError(f"{path}: the model of the arm is no XML: {error}")

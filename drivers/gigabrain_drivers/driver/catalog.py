@@ -13,6 +13,7 @@ from msgspec import Struct
 
 from gigabrain_drivers import DRIVERS, shipped_hosts
 from gigabrain_drivers.cameras.base import camera_options
+from gigabrain_drivers.driver.arm_model import link_names
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import LINKS, LinkOptions, RobotFile, Run
 from gigabrain_drivers.lidars.base import check_turns, source_class
@@ -162,6 +163,7 @@ def load_layers(
     # read once more, now that it is known what this driver's part looks like: errors name the line
     options = getattr(layers.convert(_exact_type(path, layers, run.link)), section)
     _check_safe(path, layers, robot)
+    _check_links(path, layers, robot)
     if not run.cameras:
         robot = msgspec.structs.replace(robot, cameras=())
     if options.lidar:
@@ -211,6 +213,17 @@ def _check_safe(path: Path, layers: Layers, robot: RobotFile) -> None:
     except ValueError as error:
         key = str(error).partition(":")[0]
         raise ConfigError(f"{layers.source_of(key.split('.'))}: {error}") from None
+
+
+def _check_links(path: Path, layers: Layers, robot: RobotFile) -> None:
+    """Raise ConfigError where a camera sits on a link that the arm's model does not have."""
+    for camera in robot.cameras:
+        if not camera.link:
+            continue
+        known = link_names(path.parent / robot.arm_model, [joint.name for joint in robot.joints])
+        if camera.link not in known:
+            error = unknown("link", camera.link, known)
+            raise ConfigError(f"{layers.source_of(['cameras'])}: camera {camera.name!r}: {error}")
 
 
 def _driver_of(path: Path, layers: Layers, section: LinkName, link: dict[str, Any]) -> type[Driver]:

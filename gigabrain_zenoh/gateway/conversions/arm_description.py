@@ -24,6 +24,9 @@ def add_arm(robot: xml.Element, base: xml.Element, arm: ArmFrames) -> None:
         if frame.link >= 0:
             _fill(link, arm, frame.link, names)
         _join(robot, frame)
+    for placed in arm.cameras:
+        urdf.link(robot, placed.child)
+        urdf.joint(robot, f"{placed.child}_joint", "fixed", placed)
 
 
 def _fill(

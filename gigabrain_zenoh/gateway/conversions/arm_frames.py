@@ -4,7 +4,7 @@ from collections.abc import Collection, Iterator, Mapping
 from typing import NamedTuple
 
 from gigabrain_schemas.body import BodyDescription, JointDescription, RobotState
-from gigabrain_zenoh.gateway.conversions.frames import BASE, Placed
+from gigabrain_zenoh.gateway.conversions.frames import BASE, Placed, camera_frames
 from gigabrain_zenoh.geometry.link_model import (
     Follower,
     Link,
@@ -59,11 +59,20 @@ class ArmFrames:
         self._followers = {one.name: one for one in model.followers}
         self._limits = {joint.name: joint for joint in about.joints}
         self._rests = {one.name: one.rest for link in model.links for one in link.joints}
+        self._names = {0: BASE}  # of the frames of links, by the links' numbers
         self.frames = tuple(self._of_links())
+        names = {model.links[number].name: name for number, name in self._names.items()}
+        self.cameras = tuple(
+            frame
+            for camera in about.cameras
+            if camera.link and camera.link in names
+            for frame in camera_frames(camera, names[camera.link])
+        )
 
     def static(self) -> list[Placed]:
         """Return the frames that do not move in their parent's."""
-        return [_placed(one, one.place) for one in self.frames if one.joint is None]
+        own = [_placed(one, one.place) for one in self.frames if one.joint is None]
+        return [*own, *self.cameras]
 
     def moving(self, state: RobotState) -> list[Placed]:
         """Return the others, by the joints as measured."""
@@ -75,12 +84,16 @@ class ArmFrames:
         ]
 
     def _of_links(self) -> Iterator[ArmFrame]:
-        names = {0: BASE}
+        names = self._names
         parents = {link.parent for link in self.model.links}
         carriers = {shape.link for shape in self.model.every_shape}
+        needed = {
+            one.link for one in self._about.cameras if one.link
+        }  # others are sites of sensors
+        if self._about.arm:
+            needed.add(self._about.arm.tool)
         for number, link in enumerate(self.model.links[1:], 1):
-            tool = self._about.arm is not None and link.name == self._about.arm.tool
-            if number in parents | carriers or link.joints or tool:  # others are sites of sensors
+            if number in parents | carriers or link.joints or link.name in needed:
                 names[number] = self._own_name(link.name)
                 yield from self._of_link(number, link, names[number], names[link.parent])
 

@@ -8,7 +8,15 @@ from gigabrain_schemas.body import Body, BodyDescription
 from gigabrain_zenoh.gateway.conversions import urdf_elements as elements
 from gigabrain_zenoh.gateway.conversions.arm_description import add_arm
 from gigabrain_zenoh.gateway.conversions.arm_frames import ArmFrames
-from gigabrain_zenoh.gateway.conversions.frames import BASE, FOOTPRINT, Make, Placed, static_frames
+from gigabrain_zenoh.gateway.conversions.frames import (
+    BASE,
+    FOOTPRINT,
+    Make,
+    Placed,
+    camera_link,
+    optical_frame,
+    static_frames,
+)
 from gigabrain_zenoh.geometry.link_model import LinkModel
 
 WHEEL_WIDTH = 0.15  # of its diameter; files do not give it
@@ -37,6 +45,8 @@ def wheels(about: BodyDescription) -> tuple[Wheel, ...]:
 def arm_frames(model: LinkModel, body: Body) -> ArmFrames:
     """Return the frames of the arm on a body."""
     taken = {frame.child for frame in static_frames(body)} | {FOOTPRINT}
+    for camera in body.description.cameras:
+        taken |= {camera_link(camera.name), optical_frame(camera.name)}
     taken |= {wheel.link for wheel in wheels(body.description)}
     return ArmFrames(model, body.description, taken)
 

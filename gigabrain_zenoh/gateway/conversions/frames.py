@@ -130,7 +130,7 @@ def optical_frame(camera: str) -> str:
 
 
 def static_frames(body: Body) -> list[Placed]:
-    """Return the frames that do not move on the body: sensors, and the base on the floor.
+    """Return the frames that do not move on the base: its sensors, and itself on the floor.
 
     A file gives no height of its lidar: it counts as the highest part.
     """
@@ -139,15 +139,16 @@ def static_frames(body: Body) -> list[Placed]:
     if about.lidar:
         x, y, yaw = about.lidar.x, about.lidar.y, about.lidar.yaw
         frames.append(Placed(BASE, SCAN_LINK, x, y, about.body_height, turned(yaw)))
-    for camera in about.cameras:
-        frames += _camera_frames(camera)
+    for camera in about.fixed_cameras:
+        frames += camera_frames(camera, BASE)
     return frames
 
 
-def _camera_frames(camera: Camera) -> list[Placed]:
+def camera_frames(camera: Camera, parent: str) -> list[Placed]:
+    """Return the frames of a camera that is mounted on the frame `parent`."""
     link, rotation = camera_link(camera.name), rotated(camera.roll, camera.pitch, camera.yaw)
     return [
-        Placed(BASE, link, camera.x, camera.y, camera.z, rotation),
+        Placed(parent, link, camera.x, camera.y, camera.z, rotation),
         Placed(link, optical_frame(camera.name), 0.0, 0.0, 0.0, LENS),
     ]
 

@@ -13,7 +13,7 @@ from gigabrain_zenoh.decision.route import RouteFeedback, RoutePlanner, RouteReq
 from gigabrain_zenoh.decision.seeking import LookAround, place_before
 from gigabrain_zenoh.navigation.costmap import Costmap, costmap, inflation
 from gigabrain_zenoh.navigation.grid_search import GridSearch
-from gigabrain_zenoh.testing.samples import WAFFLE
+from gigabrain_zenoh.testing.samples import ARMED, WAFFLE, WRIST
 from tests.unit.navigation.grids import empty, grid_of
 
 SEEING = replace(
@@ -142,6 +142,18 @@ def test_it_looks_at_a_whole_room_and_then_says_that_nothing_is_there() -> None:
     assert reason == "everything reachable was looked at"
     assert seen_by(poses, ROOM) > 0.9
     assert len(poses) < 40
+
+
+def test_a_camera_on_an_arm_looks_at_no_room() -> None:
+    before, armed = LookAround(), replace(ARMED, cameras=(replace(WRIST, yaw=2.0),))
+    before.look(costs_of(ROOM), armed, HERE, 1)
+    assert not before._seen
+    both = replace(ARMED, cameras=(*armed.cameras, *SEEING.cameras))
+    goals = [
+        LookAround().next_goal(costs_of(ROOM), one, HERE, GridSearch()) for one in (SEEING, both)
+    ]
+    assert goals[0]
+    assert goals[0] == goals[1]
 
 
 def test_it_looks_into_each_room_of_a_flat() -> None:

@@ -1,5 +1,6 @@
 """Cameras in a robot's file, and where each link has its pictures from."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -130,6 +131,41 @@ def test_a_wrong_camera_is_named_with_its_line(
     tmp_path: Path, old: str, new: str, wanted: str
 ) -> None:
     assert wanted in error_of(file(tmp_path, old, new))
+
+
+@pytest.mark.parametrize(
+    ("link", "wanted"),
+    [
+        (
+            "griper",
+            "robot.yaml:20: camera 'wrist': no link 'griper'; did you mean 'gripper'? known: ",
+        ),
+        ("base", "no link 'base'; known: gripper, jaw, lower_arm, shoulder, upper_arm, wrist"),
+        ("tool", "no link 'tool'; known: "),  # a site of the model
+        ("gripper, depth: true", "robot.yaml:21: cameras[1].link: a camera on an arm cannot "),
+    ],
+)
+def test_a_link_that_can_carry_no_camera_is_named_with_its_line(
+    tmp_path: Path, link: str, wanted: str
+) -> None:
+    folder = Path(shutil.copytree(robot_files()["so101"].parent, tmp_path / "arm"))
+    path = folder / "robot.yaml"
+    path.write_text(path.read_text().replace("link: gripper", f"link: {link}"))
+    assert wanted in error_of(str(path))
+
+
+def test_a_link_without_an_arm_is_refused(tmp_path: Path) -> None:
+    path = file(tmp_path, "name: rear", "name: rear, link: hand")
+    assert error_of(path) == "robot.yaml:9: cameras: link: the body has no arm; leave it out"
+
+
+@pytest.mark.parametrize(("name", "link"), [("so101", "gripper"), ("lekiwi", "arm_gripper")])
+def test_arms_have_a_small_camera_at_the_wrist_behind_the_others(name: str, link: str) -> None:
+    robot, *_ = load_link(name, Run(folder=Path(), cameras=True))
+    *others, wrist = robot.cameras
+    assert (wrist.name, wrist.link, wrist.depth) == ("wrist", link, False)
+    assert robot.fixed_cameras == tuple(others)
+    assert load_link(name, Run(folder=Path()))[0].cameras == ()
 
 
 def test_cameras_are_on_in_a_deployment() -> None:

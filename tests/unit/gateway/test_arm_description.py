@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from gigabrain_schemas.body import Arm, Body, JointDescription
+from gigabrain_schemas.body import Arm, Body, Camera, JointDescription
 from gigabrain_zenoh.gateway.conversions import description
 from gigabrain_zenoh.gateway.conversions.arm_frames import ArmFrames
 from gigabrain_zenoh.gateway.conversions.frames import static_frames
@@ -149,6 +149,29 @@ def compare(body: Body, mjcf: str, count: int, names: dict[str, str] | None = No
 @pytest.mark.parametrize("name", ARMS)
 def test_the_links_of_an_arm_are_where_mujoco_has_them(name: str) -> None:
     compare(*body_of(name), count=100)
+
+
+def test_the_frame_of_a_camera_moves_with_the_link_that_carries_it() -> None:
+    body, mjcf = crane()
+    mjcf = mjcf.replace("second", "lamp_link")  # as the frame of the camera is called
+    lamp = Camera(name="lamp", link="lamp", x=0.3, yaw=math.pi / 2)
+    front = Camera(name="front", x=0.1, z=0.2)
+    body = replace(body, description=replace(body.description, cameras=(lamp, front)))
+    compare(
+        body, mjcf, 5, {"base_link": "arm_base_link", "": "body_3", "lamp_link": "arm_lamp_link"}
+    )
+    arm, robot = made(body, mjcf)
+    quarter = about_axis(np.array((0, 0, 1.0)), math.pi / 2)
+    lens = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # its z looks ahead, its y down
+    seen = []
+    for positions in ({"turn": 0.1, "reach": 0.0}, {"turn": 1.6, "reach": 0.3}):
+        tf = by_tf(body, arm, positions)
+        for name in ("lamp_optical_frame", "front_optical_frame"):
+            np.testing.assert_allclose(forward(robot, positions)[name], tf[name], atol=1e-7)
+        place = tf["lamp"] @ pose(quarter @ lens, np.array((0.3, 0.0, 0.0)))
+        np.testing.assert_allclose(tf["lamp_optical_frame"], place, atol=1e-7)
+        seen.append(tf["lamp_optical_frame"])
+    assert not np.allclose(seen[0], seen[1], atol=0.1)
 
 
 def test_joints_off_their_links_or_at_rest_elsewhere_and_followers_are_described() -> None:

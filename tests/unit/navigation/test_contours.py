@@ -15,6 +15,7 @@ from gigabrain_zenoh.geometry import polygon
 from gigabrain_zenoh.navigation.contours import KEPT_TICKS, ContourMemory, covered, placed
 from gigabrain_zenoh.navigation.dynamic_obstacles import standing
 from gigabrain_zenoh.navigation.local_planner import LocalPlan, PlanRequest
+from gigabrain_zenoh.testing.samples import ARMED, WRIST
 from tests.unit.navigation.drives import WAFFLE, Drive, wall
 
 NOTHING = np.empty((0, 2))
@@ -151,6 +152,13 @@ class TestContourMemory:
         assert memory.version == 1
         memory.update(2 + KEPT_TICKS, away, SEEING, ())
         assert not len(memory.points)
+
+    def test_a_camera_on_an_arm_makes_nothing_gone(self) -> None:
+        memory = ContourMemory()
+        body = replace(ARMED, cameras=(WRIST,))
+        memory.update(1, ORIGIN, body, (box(3.0, 0.0),))
+        memory.update(2, ORIGIN, body, ())
+        assert len(memory.points)
 
     def test_near_by_perception_knows_better(self) -> None:
         memory = ContourMemory()

@@ -24,7 +24,16 @@ from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.perception.camera_contours import SKIPPED
 from gigabrain_zenoh.runtime.replay import Event, record, replay
 from gigabrain_zenoh.testing.in_memory import NodeBench, PatientJournal
-from gigabrain_zenoh.testing.samples import BOOT, WAFFLE, body, open_space, scan, state
+from gigabrain_zenoh.testing.samples import (
+    ARMED,
+    BOOT,
+    WAFFLE,
+    WRIST,
+    body,
+    open_space,
+    scan,
+    state,
+)
 from tests.unit.vision.scenes import HIGH, LOW, Box, depth_of, image, millimetres, near
 from tests.unit.vision.test_floor_colour import picture
 
@@ -262,6 +271,21 @@ async def test_a_body_without_cameras_costs_nothing() -> None:
         bench.send(BODY, body())
         assert not listened & set(bench.bus.listens)
         assert (await bench.world(1)).cameras == ()
+
+
+async def test_a_camera_on_an_arm_gives_no_contours_and_has_no_status() -> None:
+    async with Bench() as bench:
+        await bench.ready()
+        bench.send(BODY, body(replace(ARMED, cameras=(WRIST,))))
+        assert not {IMAGE.at("*"), CAMERA.at("*"), STATE.key} & set(bench.bus.listens)
+        assert (await bench.world(1)).cameras == ()
+        bench.send(BODY, body(replace(ARMED, cameras=(WRIST, LOW), body_height=0.2)))
+        assert IMAGE.at("*") not in bench.bus.listens
+        bench.drive(2)
+        await bench.look(2)
+        world = await bench.world(2)
+        assert status(world) == CameraStatus(name="front", ok=True, exposure=2)
+        assert front_of(world) == pytest.approx(0.95, abs=0.02)
 
 
 class Noting(PatientJournal):

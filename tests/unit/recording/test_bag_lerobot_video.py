@@ -148,6 +148,17 @@ def test_the_dataset_describes_its_videos(tmp_path: Path) -> None:
     assert "observation.images.front" not in data.column_names
 
 
+def test_a_camera_at_the_wrist_is_a_video_beside_the_one_at_the_front(tmp_path: Path) -> None:
+    path, folder = tmp_path / "a.mcap", tmp_path / "dataset"
+    both = [pictures(range(5, 51, 5), f"robot/image/{name}") for name in ("front", "wrist")]
+    write(path, driving(50), *both)
+    convert(path, folder)
+    features = info_of(folder)["features"]
+    for key in ("observation.images.front", "observation.images.wrist"):
+        assert (features[key]["dtype"], features[key]["shape"]) == ("video", [HEIGHT, WIDTH, 3])
+        assert len(frames_of(folder, key, "bgr24")) == 10
+
+
 def test_missing_pictures_are_repeated_and_counted(tmp_path: Path) -> None:
     path, folder = tmp_path / "a.mcap", tmp_path / "dataset"
     slow = pictures(range(25, 76, 25))  # 2 Hz; none for the first four frames and the last five

@@ -67,6 +67,17 @@ def test_a_calibration_has_the_intrinsics_and_hangs_below_the_body() -> None:
     assert found["/viz/tf"] == place.encode()
 
 
+def test_the_lens_of_a_camera_on_an_arm_moves_with_the_link() -> None:
+    arm = replace(FRONT, name="wrist", link="hand")
+    found = {one.topic: one.data for one in camera_drawing.calibration(_info(arm), "wrist")}
+    place = fox.FrameTransform(
+        timestamp=fox.Timestamp(0, 7), parent_frame_id="arm/hand",
+        child_frame_id="wrist_optical_frame", translation=fox.Vector3(x=0.1, y=0.0, z=0.2),
+        rotation=fox.Quaternion(x=-0.5, y=0.5, z=-0.5, w=0.5),
+    )  # fmt: skip
+    assert found["/viz/tf"] == place.encode()
+
+
 def test_a_distortion_of_eight_coefficients_is_the_rational_model() -> None:
     wide = replace(FRONT, distortion=(0.1, 0.2, 0.0, 0.0, 0.3, 0.4, 0.5, 0.6))
     data = next(iter(camera_drawing.calibration(_info(wide), "front"))).data

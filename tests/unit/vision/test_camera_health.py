@@ -160,3 +160,15 @@ def test_a_picture_of_a_few_pixels_can_be_judged() -> None:
     health = CameraHealth(Camera(name="tiny", width=16, height=16))
     picture = np.random.default_rng(0).integers(0, 255, (16, 16), np.uint8)
     assert health.take(0.0, picture, None) in (True, False)
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_only_silence_is_a_fault_of_a_camera_on_an_arm(name: str) -> None:
+    """A still arm gives still pictures, and what the gripper holds may cover the lens."""
+    room = Room(depth=False)
+    health, bad = CameraHealth(Camera(name="wrist", link="hand")), bad_exposures(room, name)
+    for number in range(20):
+        if exposure := bad(number):
+            assert health.take(number / 10, *exposure)
+    assert health.problem(1.9) == ""
+    assert health.problem(2.5) == "no picture"
