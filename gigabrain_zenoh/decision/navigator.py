@@ -399,9 +399,7 @@ def close_up(
     return dataclasses.replace(request, tolerance=EXACT_M, max_speed=slow)
 
 
-def barred(
-    request: local_planner.PlanRequest, body: BodyDescription
-) -> local_planner.PlanRequest:
+def barred(request: local_planner.PlanRequest, body: BodyDescription) -> local_planner.PlanRequest:
     """Return a request with a bar before the body, which it has to back off or turn away from.
 
     Safety stops it there for something that decision does not know of, such as the place of a thing
