@@ -23,7 +23,8 @@ from gigabrain_zenoh.manipulation.inverse_kinematics import (
     ToolGoal,
 )
 
-GAP_M = 0.006  # between each finger and the thing, before they close
+GAP_M = 0.006  # at least, between each finger and the thing, before they close
+WIDE_GAP_M = 0.01  # where the gripper opens so far: a camera errs by 6 mm
 WIDE, ROOM_M = 0.6, 0.01  # of the widest opening; clearance beyond which more does not count
 MARGIN_M = 0.001  # of the open hand from all else
 TILTS_RAD = tuple(math.radians(angle) for angle in (0, 15, 30, 45, 60, 75, 90))
@@ -101,7 +102,7 @@ class GraspPlanner:
             before, posture = grasp
             found.append(Grasp(
                 tool=tool, width=width, tilt=tilt, before=before, posture=posture,
-                opening=self._opening.position(width + 2 * GAP_M),
+                opening=self._opening.position(_opened(width, self._opening)),
                 closed=self._opening.position(width),
                 clearance=checkers[width][1].clearance(posture).distance,
             ))  # fmt: skip
@@ -123,7 +124,7 @@ class GraspPlanner:
         return sorted(found, key=lambda one: (-min(one.clearance, room), one.tilt))
 
     def _checker(self, things: Sequence[Thing], width: float) -> CollisionChecker:
-        opening = self._opening.position(width + 2 * GAP_M)
+        opening = self._opening.position(_opened(width, self._opening))
         return CollisionChecker(self.arm, things, margin=MARGIN_M, gripper=opening)
 
     def _grasp(
@@ -170,7 +171,7 @@ def candidates(thing: Thing, opening: Opening) -> Iterator[tuple[Frame, float, f
             if width + 2 * GAP_M > opening.widest or np.linalg.norm(level) < LEAST_LEVEL:
                 continue  # too wide, or the fingers would close from above
             level /= np.linalg.norm(level)
-            middle = opening.middle(opening.position(width + 2 * GAP_M))
+            middle = opening.middle(opening.position(_opened(width, opening)))
             for side in (1.0, -1.0) if tilt else (1.0,):
                 approach = side * math.sin(tilt) * level
                 approach = approach - math.cos(tilt) * np.cross(across, level)
@@ -179,6 +180,11 @@ def candidates(thing: Thing, opening: Opening) -> Iterator[tuple[Frame, float, f
                 for height in HEIGHTS:
                     place = thing.position - middle * across - height * tall * approach
                     yield Frame(position=place, axes=axes), width, tilt
+
+
+def _opened(width: float, opening: Opening) -> float:
+    """Return how far apart the pads are before they close on a thing [m]."""
+    return max(width + 2 * GAP_M, min(width + 2 * WIDE_GAP_M, opening.widest))
 
 
 def _closing_axes(thing: Thing) -> Iterator[tuple[Floats, float]]:

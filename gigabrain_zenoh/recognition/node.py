@@ -64,7 +64,7 @@ class _Eye:
 
 
 class Recognition:
-    """Follows the cameras of a body, on the loop; `observer` runs in a thread beside it."""
+    """Follows the fixed cameras of a body, on the loop; `observer` runs in a thread beside it."""
 
     def __init__(self, config: RecognitionConfig, bus: Bus, observer: "Observer") -> None:
         self._bus, self._observer = bus, observer
@@ -88,7 +88,7 @@ class Recognition:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def _on_body(self, body: Body) -> None:
-        cameras = {one.name: one for one in body.description.cameras}
+        cameras = {one.name: one for one in body.description.fixed_cameras}
         if cameras != {name: eye.camera for name, eye in self._eyes.items()}:
             self._eyes = {name: _Eye(camera) for name, camera in cameras.items()}
 

@@ -34,7 +34,7 @@ class Observer:
         self._models: dict[Camera, CameraModel] = {}
 
     def observe(self, camera: Camera, image: Image, depth: DepthImage | None) -> Detections:
-        """Return what is in a picture; of a camera on an arm only things, without places.
+        """Return what is in a picture.
 
         Raises ValueError where it is broken, of another size, or of another camera.
         """
@@ -60,7 +60,7 @@ class Observer:
             width=camera.width,
             height=camera.height,
             things=_things(found, model, far, taken) if found else (),
-            tags=() if camera.link else tags,
+            tags=tags,
             took_ms=1e3 * (time.perf_counter() - began),
         )
 
