@@ -22,6 +22,7 @@ LOOKED_AT = 1.6  # of the height of its middle: there it would hide the floor, o
 MISSES = 3  # pictures in which it is seen through
 KEPT_S = 120.0  # without being seen: odometry drifts
 MOST = 64
+NAMED = 150  # things recognised that are not tracked yet: half a minute of one
 LABEL_M = 0.06  # beside the middle of a thing, within which something recognised is this thing
 Place = tuple[float, float]  # x, y [m]
 QUARTER = math.pi / 2  # a box looks the same by each of its sides
@@ -60,6 +61,8 @@ class SolidMemory:
     def __init__(self) -> None:
         self._tracks: list[Track] = []
         self._number = 0  # of the newest track
+        self._named: deque[tuple[Place, str, float, float]] = deque(maxlen=NAMED)
+        "What was recognised where nothing was tracked yet: place, class, confidence, distance."
 
     def look(
         self, fits: Sequence[SolidFit], pose: Pose, tick: int, gone: Callable[[Floats], bool]
@@ -77,6 +80,7 @@ class SolidMemory:
                 self._number += 1
                 track = Track(id=self._number, tick=tick)
                 self._tracks.append(track)
+                self._recall(track, fit)
             else:
                 open_.remove(track)
             _take(track, fit, tick)
@@ -95,9 +99,18 @@ class SolidMemory:
 
         The camera was at a `distance` of it [m].
         """
-        off, track = _nearest(to_parent(pose, *place), self._tracks)
-        if track and off <= max(LABEL_M, _width(track.fit)):
+        there = to_parent(pose, *place)
+        off, track = _nearest(there, self._tracks)
+        if track and off <= _label_gate(track.fit):
             track.votes.add(label, confidence, distance)
+        else:
+            self._named.append((there, label, confidence, distance))
+
+    def _recall(self, track: Track, fit: SolidFit) -> None:
+        """Have a new track know as what it was recognised before, from farther off."""
+        for place, label, confidence, distance in self._named:
+            if math.dist(place, fit.position[:2]) <= _label_gate(fit):
+                track.votes.add(label, confidence, distance)
 
     def solids(self, pose: Pose, tick: int) -> tuple[SeenSolid, ...]:
         """Return what counts, in the frame of a body at `pose` at `tick`, the nearest first."""
@@ -137,6 +150,10 @@ def _moved(
 
 def _width(fit: SolidFit) -> float:
     return max(fit.size[:2]) if fit.shape == "box" else 2 * fit.size[0]
+
+
+def _label_gate(fit: SolidFit) -> float:
+    return max(LABEL_M, _width(fit))
 
 
 def _gate(fit: SolidFit) -> float:

@@ -119,6 +119,17 @@ def test_a_class_that_was_seen_from_farther_off_stays_however_long_a_thing_is_lo
     assert only(memory).label == "can"
 
 
+def test_a_thing_is_known_by_what_was_said_before_it_was_near_enough_to_be_fitted() -> None:
+    memory = SolidMemory()
+    memory.name("can", 0.8, (0.9, 0.0), 0.75, ORIGIN)
+    memory.name("box", 0.8, (0.9, 0.3), 0.75, ORIGIN)
+    nearer = Pose(x=0.5, y=0.0, yaw=0.0)
+    for tick in (1, 2):
+        memory.look([can(0.4, 0.02)], nearer, tick, lambda _: False)
+    memory.name("cylinder", 1.0, (0.4, 0.02), 0.25, nearer)
+    assert only(memory, nearer).label == "can"
+
+
 def test_a_memory_without_anything_is_named_in_vain() -> None:
     memory = SolidMemory()
     memory.name("can", 0.9, (0.3, 0.0), 0.6, ORIGIN)
