@@ -41,7 +41,7 @@ ARRIVED_M = LocalSettings().position_tolerance
 NEAR_GOAL_M = 0.25  # good enough for a goal that was free when it was requested: maps shift
 OCCUPIED_TICKS = 500  # 10 s without progress towards an occupied goal
 
-WAY_OPENS_TICKS = 500  # 10 s, in which somebody may go out of a door, before a search ends
+WAY_OPENS_TICKS = 500  # 10 s, in which somebody may go out of a door, before it gives up
 LOOKING = "looking around"  # what a robot does that searches
 
 Point = tuple[float, float]
@@ -237,8 +237,8 @@ class RoutePlanner:
             around = self._zones, self._bare, request.body, request.here
             why = explained(found, *around, goal)
             closed = self._rezoned and why is not found
-            final = first and not len(self._contours.points)  # what cameras see may go away
-            if final or closed or self._progress.stuck(request.tick, GIVE_UP_TICKS):
+            opens = found.fault == NO_WAY or len(self._contours.points) > 0  # or may go away
+            if (first and not opens) or closed or self._progress.stuck(request.tick, GIVE_UP_TICKS):
                 return self._route(state="failed", reason=why.reason)
             if self._last_path:  # noise closes narrow ways in the map; the scan shows them
                 return self._go(goal, self._last_path)
@@ -320,7 +320,8 @@ class RoutePlanner:
         goal = self._goal or place_before(*around, target, self._planner.search)
         if goal is None:
             reason = f"no free and reachable place before {target.name}"
-            return self._route(state="failed", reason=reason)
+            ended = self._progress.stuck(request.tick, WAY_OPENS_TICKS)
+            return self._route(state="failed" if ended else "running", reason=reason)
         route = self._to_goal(goal, request, costs)
         before = f"before {target.name}"
         return replace(route, reason=f"{before}, {route.reason}" if route.reason else before)

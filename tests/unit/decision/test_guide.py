@@ -72,6 +72,20 @@ def test_a_way_that_the_map_loses_is_kept_to_for_thirty_seconds() -> None:
     assert lost.reason.startswith("no way leads to the goal; nearest reachable point is ")
 
 
+def test_a_way_that_somebody_bars_at_first_has_thirty_seconds_to_open() -> None:
+    guide = RoutePlanner()
+    barred = think(guide, SHUT, tick=1)
+    assert barred.state == "running"
+    assert barred.activity == "checking whether the goal is free"
+    assert barred.goal
+    assert barred.goal.x < 3.0
+    opened = think(guide, OPEN, tick=900, x=2.5)
+    assert opened.goal == AHEAD
+    guide = RoutePlanner()
+    ends = [think(guide, SHUT, tick=tick, x=2.5).state for tick in (1, 1400, 1502)]
+    assert ends == ["running", "running", "failed"]
+
+
 def test_a_way_that_opens_again_is_planned_anew() -> None:
     guide = RoutePlanner()
     think(guide, OPEN, tick=1)
@@ -183,8 +197,8 @@ def test_a_goal_within_the_arrival_tolerance_of_a_reachable_place_is_driven_to()
     assert route.reason.startswith("0.08 m from the requested goal: the goal is too close to ")
 
 
-def test_what_no_way_has_ever_led_to_is_refused_at_once() -> None:
-    assert think(RoutePlanner(), SHUT, tick=1).state == "failed"
+def test_what_is_inside_something_from_the_first_is_refused_at_once() -> None:
+    assert think(RoutePlanner(), SHUT, tick=1, goal=Goal(x=3.0, y=1.0)).state == "failed"
 
 
 def test_it_makes_room_when_somebody_stays_where_it_is_to_go() -> None:

@@ -186,3 +186,27 @@ def test_a_room_whose_door_somebody_stood_in_is_looked_into_as_well() -> None:
 def test_it_turns_on_the_spot_before_it_drives() -> None:
     poses, _ = search(ROOM)
     assert (poses[0].x, poses[0].y) == (1.0, 1.0)
+
+
+def test_somebody_before_a_thing_has_ten_seconds_to_go_away() -> None:
+    cells = ROOM.copy()
+    target = Target(name="can 1", x=3.0, y=2.0, radius=0.03)
+    cells[10:31, 20:41] = 100  # round it
+    planner = RoutePlanner()
+
+    def state(cells: np.ndarray, tick: int) -> str:
+        return planner.plan(
+            RouteRequest(
+                tick=tick,
+                command=DriveCommand(1, "approach", target=target),
+                here=HERE,
+                grid=grid_of(cells),
+                body=SEEING,
+                feedback=None,
+                seen=np.empty((0, 2)),
+            )
+        ).state
+
+    assert [state(cells, 1), state(cells, 499), state(cells, 502)] == ["running"] * 2 + ["failed"]
+    planner = RoutePlanner()
+    assert [state(cells, 1), state(ROOM, 499), state(ROOM, 600)] == ["running"] * 3
