@@ -63,7 +63,7 @@ def _poses(arm: ArmKinematics, grasps: Sequence[Grasp]) -> Iterator[GraspPose]:
     opening = arm.opening() if grasps else None
     for grasp in grasps:
         assert opening
-        between = np.array([0.0, 0.0, opening.middle(grasp.closed)])
+        between = np.array([0.0, 0.0, opening.middle(grasp.opening)])
         x, y, z = grasp.tool.place(between).tolist()
         w, i, j, k = grasp.tool.quaternion.tolist()
         yield GraspPose(position=(x, y, z), orientation=(i, j, k, w), opening=grasp.width)
