@@ -15,7 +15,7 @@ from gigabrain_zenoh.vision.nets import Net
 from gigabrain_zenoh.vision.pictures import decoded
 from gigabrain_zenoh.vision.recognizer import Found
 from gigabrain_zenoh.vision.tags import TagFinder
-from gigabrain_zenoh.vision.thing_places import thing_place
+from gigabrain_zenoh.vision.thing_places import fits, thing_place
 
 MAX_THINGS = 128
 MIN_BOX_PX = 1.0
@@ -112,7 +112,8 @@ def _things(
 ) -> tuple[Detection, ...]:
     """Return what a net found, the surest first, placed by depth.
 
-    A thing has one class, the surest; boxes of `taken` are of tags, which are no things.
+    A thing has one class, the surest of those that are not larger than it is; boxes of `taken` are
+    of tags, which are no things.
     """
     things, taken = [], list(taken)
     for label, sure, corners in zip(
@@ -124,8 +125,10 @@ def _things(
             continue
         if any(overlap(box, other) > SAME_BOX for other in taken):
             continue
-        taken.append(box)
         place = None if depth is None else thing_place(label, box, model, depth)
+        if place and not fits(label, place):
+            continue
+        taken.append(box)
         things.append(Detection(
             label=label,
             confidence=min(max(sure, 0.0), 1.0),

@@ -25,6 +25,8 @@ BEHIND = {
     "robot": 0.42,
 }
 ROUND = {"ball"}
+# [m], what is less wide is something else: a can that looks like a small robot
+NARROWEST_M = {"charger": 0.12, "door": 0.4, "person": 0.12, "robot": 0.1}
 USUAL, MOST_M = 0.35, 0.35  # of other things, and of all
 INNER = (0.2, 0.15, 0.8, 0.75)  # left, top, right, bottom of the part that is looked at
 MIN_PIXELS, MIN_SHARE = 8, 0.15  # with depth, of that part
@@ -67,6 +69,11 @@ def thing_place(
     whole = top >= EDGE_PX and bottom <= height - EDGE_PX
     tall = high * (middle if label in ROUND else front)  # the upper edge of others is in front
     return ThingPlace((x, y, z), (wide * middle, tall) if whole else None)
+
+
+def fits(label: str, place: ThingPlace) -> bool:
+    """Return whether a thing of that class may be as narrow as the one at a place."""
+    return place.size is None or place.size[0] >= NARROWEST_M.get(label, 0.0)
 
 
 def _inside(box: Box, depth: NDArray[np.uint16]) -> NDArray[np.float64]:

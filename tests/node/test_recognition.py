@@ -28,6 +28,7 @@ from gigabrain_zenoh.recognition.observer import Observer
 from gigabrain_zenoh.testing import samples
 from gigabrain_zenoh.testing.waiting import settle, until
 from gigabrain_zenoh.vision.camera_model import CameraModel
+from gigabrain_zenoh.vision.labels import CLASSES
 from gigabrain_zenoh.vision.recognizer import Found
 from gigabrain_zenoh.vision.tags import TagFinder
 from tests.unit.vision.tag_scenes import CAMERA, draw, facing
@@ -376,6 +377,22 @@ def test_a_tag_is_no_thing_but_what_stands_before_it_is():
     before = (min(columns), min(rows) + 20, min(columns) + 15, max(rows) + 30)
     found = looked_at(Sees(plate, before))
     assert [thing.label for thing in found.things] == ["ball"]
+
+
+@pytest.mark.parametrize(("metres", "label"), [(0.8, "can"), (2.0, "robot")])
+def test_a_thing_that_is_too_narrow_for_the_surest_class_is_the_next_one(metres, label):
+    class Net(SeesABall):
+        def find(self, picture: np.ndarray) -> Found:
+            boxes = np.array([(150, 110, 175, 150)] * 2, np.float32)
+            classes = np.array([CLASSES.index(one) for one in ("robot", "can")])
+            return Found(boxes, classes, np.array((0.8, 0.5), np.float32))
+
+    data = cv2.imencode(".jpg", TAG)[1].tobytes()
+    picture = Image(frame_id="front", width=320, height=240, encoding="jpeg", data=data)
+    pixels = np.full((240, 320), 1000 * metres, np.uint16)
+    depth = DepthImage(frame_id="front", width=320, height=240, planes=pack_depth(pixels))
+    (thing,) = Observer(Net(), TagFinder()).observe(CAMERA, picture, depth).things
+    assert thing.label == label
 
 
 def test_the_net_gets_red_green_blue():
