@@ -346,8 +346,15 @@ class Manipulator:
             if not (closed and holds(planner, plan.hold, state)):
                 return self._missed(planner, body, state)
             self._grip(planner, run, plan.hold, state)
-        if over and over.name == "ease" and hold and not holds(planner, hold, state):
-            return self._missed(planner, body, state)
+        if over and over.name == "ease" and hold:
+            if not holds(planner, hold, state):
+                return self._missed(planner, body, state)
+            place = gripper_place(planner, state, hold.grip)
+            if planner.overloads(hold, place):
+                ease = planner.eased(hold, place)
+                assert ease.gripper is not None
+                run.insert(ease)
+                self._achieve(dataclasses.replace(hold, grip=ease.gripper))
         if over and over.name == "open" and hold:
             self._achieve(
                 None, placed=placed(planner, measured_posture(planner, state), command.do, hold)

@@ -230,6 +230,10 @@ class ArmPlanner:
         """Return the phase in which the gripper, measured there, squeezes what it holds less."""
         return self._picker().eased(measured, hold.grip)
 
+    def overloads(self, hold: Hold, measured: float) -> bool:
+        """Return whether the gripper, measured there, squeezes harder than it can for long."""
+        return self._picker().overloads(measured, hold.grip)
+
     def gripped(self, hold: Hold, thing: Thing, measured: Floats) -> Hold:
         """Return what is held by fingers that have just closed on a thing.
 

@@ -36,6 +36,7 @@ SLOW = 0.35  # of the joints' speeds, with a thing in the gripper
 CREEP = 0.1  # the same straight to a thing or its place: safety slows single joints near the table
 SQUEEZE = 0.12  # of the gripper's range, beyond the thing's width
 EASED = 0.035  # the same, once it is held: what servos can do for long
+SPRUNG = 1.4  # times as much is too much
 HELD_SHARE = 0.01  # of the gripper's range, short of its target: something is between the fingers
 LIFT_M = 0.05  # straight up
 PLACE_GAP_M = 0.003  # above what it is put on, when it is let go of
@@ -267,6 +268,14 @@ class PickPlacePlanner:
         most = EASED * span if self._gripper.max_effort else span
         less = max(-most, min(most, wanted - measured))
         return Phase(name="ease", gripper=measured + less)
+
+    def overloads(self, measured: float, wanted: float) -> bool:
+        """Return whether a gripper that was sent to `wanted` squeezes harder than it can for long.
+
+        What was gripped askew may spring back when the grip is eased.
+        """
+        span = self._gripper.upper - self._gripper.lower
+        return bool(self._gripper.max_effort) and abs(measured - wanted) > SPRUNG * EASED * span
 
     def holds(self, measured: float, wanted: float) -> bool:
         """Return whether the gripper has stopped short of where it was sent."""

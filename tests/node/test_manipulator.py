@@ -15,6 +15,8 @@ from gigabrain_schemas.brain import Intent, JointTarget
 from gigabrain_schemas.objects import SeenSolid
 from gigabrain_schemas.safety import JointCap
 from gigabrain_zenoh.decision.behaviours import ArmCommand
+from gigabrain_zenoh.manipulation.phases import Phase
+from gigabrain_zenoh.manipulation.pick_place import PickPlacePlanner
 from gigabrain_zenoh.safety.arm_shape import MujocoArm
 from gigabrain_zenoh.safety.step import SafetyInputs, SafetyMemory, step
 from tests.node.arm_rig import ELSEWHERE, THERE, THINGS, Rig
@@ -226,6 +228,26 @@ def test_what_is_lost_while_the_grip_eases_is_tried_again(rig: Rig) -> None:
     task = rig.carry_on()
     assert (task.state, task.reason) == ("succeeded", "it holds cube")
     assert rig.phases.count("close") == 2
+
+
+def test_a_grip_that_squeezes_too_hard_still_is_eased_again(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    eased, squeezes = PickPlacePlanner.eased, list[float]()
+
+    def eases(self: PickPlacePlanner, measured: float, wanted: float) -> Phase:
+        squeezes.append(abs(measured - wanted))
+        if len(squeezes) == 1:  # it does not, at first
+            return Phase(name="ease", gripper=wanted)
+        return eased(self, measured, wanted)
+
+    monkeypatch.setattr(PickPlacePlanner, "eased", eases)
+    task = rig.carry_out(THINGS + "do: [{pick: cube}]")
+    assert (task.state, task.reason) == ("succeeded", "it holds cube")
+    assert len(squeezes) == 2
+    state = rig.arm.state()
+    sent, measured = state.joints_sent[-1], state.joints[-1].position
+    assert abs(sent - measured) < squeezes[1] / 2
 
 
 def test_a_joint_that_does_not_follow_ends_the_command_after_a_few_tries(rig: Rig) -> None:
