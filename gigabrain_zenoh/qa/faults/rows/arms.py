@@ -9,9 +9,11 @@ import math
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from gigabrain_drivers.driver.catalog import load_robot, robot_path
+from gigabrain_drivers.sim.worlds import mission_file
 from gigabrain_schemas.body import Joint
 from gigabrain_zenoh.client.tasks import Tasks
 from gigabrain_zenoh.qa.faults.rig import RESTED_TICKS, Rig, deployment_of
@@ -221,8 +223,8 @@ async def _carrying(robot: RobotUnderTest) -> AsyncIterator[None]:
     await robot.release()
     tasks = Tasks(probe.bus)
     if not (await tasks.status()).current:
-        path = robot_path(robot.deployment.body).with_name(body.demo.mission)
-        await tasks.carry_out(path)
+        folder = robot_path(robot.deployment.body).parent
+        await tasks.carry_out(Path(mission_file(body.demo.mission, folder)))
     enabling = asyncio.create_task(enable())
     try:
         await until(fast, "it carries something fast")
