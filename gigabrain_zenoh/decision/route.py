@@ -41,7 +41,7 @@ ARRIVED_M = LocalSettings().position_tolerance
 NEAR_GOAL_M = 0.25  # good enough for a goal that was free when it was requested: maps shift
 OCCUPIED_TICKS = 500  # 10 s without progress towards an occupied goal
 
-WAY_OPENS_TICKS = 500  # 10 s, in which somebody may go out of a door, before it gives up
+WAY_OPENS_TICKS = 500  # wait 10 s for people to clear the way before giving up
 LOOKING = "looking around"  # what a robot does that searches
 
 Point = tuple[float, float]

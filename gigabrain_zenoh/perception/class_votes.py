@@ -1,4 +1,4 @@
-"""Which class a thing has, by all that was said of it."""
+"""Chooses the class of one thing from the classes that a net gave it in many pictures."""
 
 from collections import defaultdict, deque
 
@@ -9,8 +9,8 @@ NEWEST = 60  # pictures that count
 class ClassVotes:
     """Confidences of the newest pictures of one thing, by class.
 
-    From near by only a part of a thing is seen, and a can looks like a cylinder: what is said from
-    there counts only as long as nothing was said from farther off.
+    From near by a net takes a can for a cylinder, so pictures from nearer than NEAREST_M count only
+    until there is one from farther off.
     """
 
     def __init__(self) -> None:
@@ -18,7 +18,7 @@ class ClassVotes:
         self._near = True  # they are all from near by
 
     def add(self, label: str, confidence: float, distance: float) -> None:
-        """Count what was said from a `distance` [m]."""
+        """Add the class of a picture that was taken from a `distance` [m]."""
         near = distance < NEAREST_M
         if near and not self._near:
             return
@@ -29,7 +29,7 @@ class ClassVotes:
 
     @property
     def label(self) -> str:
-        """The class for which most confidence speaks; empty where nothing was said."""
+        """The class with the largest sum of confidences; empty before the first picture."""
         sums = defaultdict[str, float](float)
         for label, confidence in self._votes:
             sums[label] += confidence

@@ -136,6 +136,26 @@ async def test_it_rests_while_the_battery_is_nearly_empty() -> None:
         assert plane.intent.twist == STANDS
 
 
+async def test_where_safety_keeps_stopping_it_ahead_it_no_longer_wants_to_advance() -> None:
+    ahead = Cause(code="zone_ahead", text="obstacle 0.10 m ahead of the body, seen by a camera")
+    async with Plane(CELLS) as plane:
+        await plane.go(0.2)
+        await plane.ask(GOAL, GoalRequest(x=4.0, y=0.8))
+        while not plane.intent.trajectory:
+            await plane.go(0.1)
+        await plane.go(1.0)
+        wanted = []
+        for _ in range(25):
+            verdict = SafetyState(verdict="slow", causes=(ahead,), boot=BOOT, tick=plane.tick)
+            plane.bench.send(SAFETY, verdict)
+            await plane.go(0.1)
+            assert plane.intent.twist, plane.intent.reason
+            wanted.append(plane.intent.twist.linear_x)
+        assert min(wanted[:12]) > 0.05
+        assert max(wanted[18:]) < 0.02
+        await plane.until("succeeded", seconds=60)
+
+
 async def test_something_new_in_the_way_is_gone_round() -> None:
     wide = drawn("####################\n" + "#..................#\n" * 12 + "####################")
     async with Plane(wide, at=(1.0, 1.6, 0.0)) as plane:
