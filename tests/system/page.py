@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 import pytest
-from playwright.async_api import BrowserContext, Page, async_playwright
+from playwright.async_api import BrowserContext, Page, async_playwright, expect
 from websockets.asyncio.client import ClientConnection, connect
 
 from gigabrain_zenoh.config.settings import Endpoint
@@ -25,6 +25,7 @@ FLAGS = [
 ]  # fmt: skip
 OPERATOR, VIEWER = "operator-token-of-the-tests", "viewer-token-of-the-tests"
 TIMEOUT_MS = 60_000
+expect.set_options(timeout=TIMEOUT_MS)
 
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
 

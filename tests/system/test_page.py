@@ -175,7 +175,8 @@ async def test_tables_and_log_show_every_process(chromium: Browser) -> None:
         await told(page, "processes", name)
     await page.click("#tab-topics")
     await told(page, "topics", "robot/cmd_vel")
-    assert re.search(r"robot/scan\s+\d+\.\d Hz\s+driver", await text(page, "topics"))
+    rate = re.compile(r"robot/scan\s+\d+\.\d Hz\s+driver")
+    await expect(page.locator("#topics")).to_have_text(rate, use_inner_text=True)
     await page.keyboard.press("ArrowRight")
     assert await page.get_attribute("#tab-log", "aria-selected") == "true"
 

@@ -4,6 +4,7 @@ from collections.abc import AsyncIterator
 
 import pytest
 import pytest_asyncio
+from playwright.async_api import expect
 
 from gigabrain_schemas.requests import MapReply, MapRequest
 from gigabrain_schemas.topics import MAP_LIST, MAP_LOAD, MAP_SAVE, ZONES, ZONES_CHANGE
@@ -149,7 +150,7 @@ async def test_maps_are_saved_and_loaded(chromium: Browser, fake: Mapped) -> Non
     page.on("dialog", lambda dialog: dialog.accept())
     await page.click("#edit-zones")
     await page.wait_for_selector('#map-name:has-text("map: house")')
-    assert await page.locator("#maps option:not([disabled])").all_inner_texts() == ["house"]
+    await expect(page.locator("#maps option:not([disabled])")).to_have_text("house")
     await page.fill("#map-save-name", "attic")
     await page.click("#map-save")
     await page.wait_for_selector('#zone-note:has-text("saved attic")')
