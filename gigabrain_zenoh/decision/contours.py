@@ -3,7 +3,6 @@
 import logging
 import math
 from collections import Counter
-from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
@@ -11,9 +10,6 @@ from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import Contour, WorldModel
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.logs import Fault
-
-if TYPE_CHECKING:
-    from gigabrain_schemas.arrays import Floats
 
 FARTHEST_M = 100.0  # of a corner from the body: no camera measures farther
 POINT_M = 0.05  # between the points of an edge that are looked at
@@ -55,10 +51,12 @@ def with_contours(world: WorldModel, body: BodyDescription | None) -> WorldModel
         return world
     import numpy as np  # not needed without cameras
 
+    from gigabrain_zenoh.geometry.polygon import points_on_edges
+
     front = max(x for x, _ in body.footprint)
     radius = max(math.hypot(x, y) for x, y in body.footprint)
-    points = np.concatenate([_outline(one) for one in world.contours])
-    x, y = points.T
+    polygons = [np.array(one.polygon) for one in world.contours]
+    x, y = points_on_edges(polygons, POINT_M, MAX_EDGE_POINTS).T
     distance, bearing = np.hypot(x, y), np.arctan2(y, x)
     cone = (np.abs(bearing) <= math.radians(AHEAD.sector_deg) / 2) & (distance <= AHEAD.ahead)
     strip = (x > 0) & (x <= front + AHEAD.corridor)
@@ -80,16 +78,3 @@ def with_contours(world: WorldModel, body: BodyDescription | None) -> WorldModel
         distance_ahead=nearest,
         sectors=tuple(sectors),
     )
-
-
-def _outline(contour: Contour) -> "Floats":
-    """Return points (n, 2) [m] along the edges of a contour."""
-    import numpy as np
-
-    corners = np.array(contour.polygon)
-    ends = np.roll(corners, -1, axis=0)
-    found = []
-    for begin, end in zip(corners, ends, strict=True):
-        count = min(MAX_EDGE_POINTS, 1 + math.ceil(math.dist(begin, end) / POINT_M))
-        found.append(begin + np.linspace(0.0, 1.0, count, endpoint=False)[:, None] * (end - begin))
-    return np.concatenate(found)

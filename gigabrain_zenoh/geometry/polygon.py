@@ -1,5 +1,7 @@
 """Polygons in the plane: corners (n, 2) [m], closed from the last to the first."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -69,3 +71,33 @@ def distance(corners: Floats, points: Floats) -> Floats:
     nearest = np.hypot(away[..., 0], away[..., 1]).min(axis=1)
     found: Floats = np.where(contains(corners, points), 0.0, nearest)
     return found
+
+
+def edges(polygons: Sequence[Floats]) -> tuple[Floats, Floats, NDArray[np.intp]]:
+    """Return where all edges of `polygons` begin and end, (n, 2) each, and the first of each."""
+    begin = np.concatenate(polygons)
+    counts = np.array([len(one) for one in polygons])
+    first = np.cumsum(counts) - counts
+    following = np.arange(1, len(begin) + 1)
+    following[first + counts - 1] = first
+    return begin, begin[following], first
+
+
+def points_on_edges(polygons: Sequence[Floats], step: float, most: int) -> Floats:
+    """Return points (n, 2) on the edges of all `polygons`, corners included.
+
+    They are at most `step` [m] apart, but on no edge are more than `most`.
+    """
+    begin, end, _ = edges(polygons)
+    length = np.hypot(*(end - begin).T)
+    counts = np.clip(np.ceil(length / step), 1, most).astype(np.intp)
+    edge, number = spread(counts)
+    share = number / counts[edge]
+    points: Floats = begin[edge] + share[:, None] * (end - begin)[edge]
+    return points
+
+
+def spread(counts: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return each index as often as `counts` (n,) says, and how often it has come before."""
+    index = np.repeat(np.arange(len(counts)), counts)
+    return index, np.arange(len(index)) - np.repeat(np.cumsum(counts) - counts, counts)

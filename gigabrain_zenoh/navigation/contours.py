@@ -10,8 +10,9 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_NS, Pose
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import Contour
+from gigabrain_zenoh.geometry.polygon import edges, spread
 from gigabrain_zenoh.geometry.se2 import from_pose, transform
-from gigabrain_zenoh.navigation.zones import EDGE_STEP, spread
+from gigabrain_zenoh.navigation.zones import EDGE_STEP
 
 CELL_M = 0.05  # of remembered points
 NEAR_M = 1.5  # of the body, within which perception itself remembers what is there
@@ -32,15 +33,10 @@ def covered(polygons: Sequence[Floats], side: int) -> NDArray[np.bool_]:
     """
     if not polygons:
         return np.zeros((side, side), np.bool_)
-    corners = np.concatenate(polygons)
-    counts = np.array([len(one) for one in polygons])
-    first = np.cumsum(counts) - counts
-    following = np.arange(1, len(corners) + 1)
-    following[first + counts - 1] = first
-    ends = corners[following]
+    corners, ends, first = edges(polygons)
     doubled = corners[:, 0] * ends[:, 1] - ends[:, 0] * corners[:, 1]
     sign = np.where(np.add.reduceat(doubled, first) < 0, -1, 1).astype(np.int16)
-    mask = _inside(corners, ends, np.repeat(sign, counts), side)
+    mask = _inside(corners, ends, np.repeat(sign, np.diff(first, append=len(corners))), side)
     begin, along = _within(corners, ends, side)
     edge, step = spread(np.ceil(np.abs(along).max(axis=1) / EDGE_STEP).astype(np.intp) + 1)
     share = step * EDGE_STEP / np.maximum(np.abs(along).max(axis=1), EDGE_STEP)[edge]

@@ -262,7 +262,7 @@ def _covered(corners: Floats, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     crossings = np.zeros((height, width + 1), np.uint8)  # before a cell's middle, modulo 256
     both = np.ceil(np.stack((corners[:, 1], ends[:, 1])) - 0.5).clip(0, height).astype(np.intp)
     first, last = both.min(axis=0), both.max(axis=0)
-    edge, rows = spread(last - first)
+    edge, rows = polygon.spread(last - first)
     rows += first[edge]
     (x, y), (to_x, to_y) = corners[edge].T, ends[edge].T
     at = x + (rows + 0.5 - y) / np.where(to_y == y, 1.0, to_y - y) * (to_x - x)
@@ -270,19 +270,13 @@ def _covered(corners: Floats, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     np.add.at(crossings, (rows, columns), np.uint8(1))
     covered: NDArray[np.bool_] = np.cumsum(crossings[:, :-1], axis=1, dtype=np.uint8) & 1 == 1
     counts = np.ceil(np.abs(ends - corners).max(axis=1) / EDGE_STEP).astype(np.intp) + 1
-    edge, step = spread(counts)
+    edge, step = polygon.spread(counts)
     share = step / counts[edge]
     points = corners[edge] + share[:, None] * (ends - corners)[edge]
     points = points[((points >= 0) & (points < (width, height))).all(axis=1)]
     columns, rows = points.astype(np.intp).T
     covered[rows, columns] = True
     return covered
-
-
-def spread(counts: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return each index as often as `counts` (n,) says, and how often it has come before."""
-    index = np.repeat(np.arange(len(counts)), counts)
-    return index, np.arange(len(index)) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
 def clipped(corners: Floats, box: Box) -> Floats:

@@ -6,9 +6,11 @@ import numpy as np
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.body import BodyDescription, Camera
-from gigabrain_schemas.brain import Contour, WorldModel
+from gigabrain_schemas.brain import WorldModel
+from gigabrain_zenoh.geometry.polygon import points_on_edges
 
 STEP_M = 0.05  # between points on the rim of a contour
+MAX_EDGE_POINTS = 64
 
 
 @dataclass(frozen=True)
@@ -31,18 +33,7 @@ class Surroundings:
 
     def hiding(self, height: float) -> Floats:
         """Return points (n, 2) [m] of what may hide a thing from a camera of that `height` [m]."""
-        rims = [_rim(one) for one in self.world.contours if one.top >= height]
-        return np.concatenate((self.points, *rims))
-
-
-def _rim(contour: Contour) -> Floats:
-    """Return points (n, 2) on the rim of a contour [m]."""
-    corners = np.array(contour.polygon)
-    sides = np.roll(corners, -1, axis=0) - corners
-    counts = np.clip(np.ceil(np.hypot(*sides.T) / STEP_M), 1, 64).astype(int)
-    return np.concatenate(
-        [
-            corner + np.outer(np.arange(count) / count, side)
-            for corner, side, count in zip(corners, sides, counts, strict=True)
-        ]
-    )
+        high = [np.array(one.polygon) for one in self.world.contours if one.top >= height]
+        if not high:
+            return self.points
+        return np.concatenate((self.points, points_on_edges(high, STEP_M, MAX_EDGE_POINTS)))
