@@ -1,66 +1,113 @@
-"""Giving way at an occupied goal, to somebody who waits for the robot to leave."""
+"""Giving way to somebody at the goal, or in the way, who waits for the robot to leave."""
 
 import math
 
 import numpy as np
 
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.brain import Obstacle
 from gigabrain_schemas.tasks import Goal
-from gigabrain_zenoh.navigation.costmap import LETHAL, Costmap
+from gigabrain_zenoh.geometry.se2 import from_pose, rotation, transform
+from gigabrain_zenoh.navigation.costmap import Costmap
+from gigabrain_zenoh.navigation.dynamic_obstacles import discs_of
 from gigabrain_zenoh.navigation.grid_search import GridSearch
 
-OCCUPIED_NEAR_M = 2.0  # from the goal; a robot farther away blocks no one
+NEAR_M = 2.0  # from the goal or from somebody; a robot farther away blocks no one
 GIVE_WAY_TICKS = 750  # 15 s; an obstacle that is still there does not wait for the robot
 MAX_GIVE_WAYS = 2  # per goal
 MAX_WAITING_COST = 2.0  # of a place to wait at
 MAX_WAITING_PATH_M = 6.0
-MIN_OFFSET_M = 1.0  # from the line that leads from the goal through the robot
+MIN_OFFSET_M = 1.0  # from the line on which the other is likely to go on
+WALKED_TICKS = 3000  # 60 s, for which it is remembered where somebody has walked
+STANDS_M = 0.4  # from where somebody was, to a hit of the scan
+SAME_M = 1.0  # what walks so near to where somebody was is the same one
 
 Point = tuple[float, float]
+Way = tuple[float, float, float]  # x, y [m] of somebody, and the direction in which they go [rad]
+
+
+class Walkers:
+    """Where everybody who walks was last seen to, and which way they went: they may stand now."""
+
+    def __init__(self) -> None:
+        self.ways: Floats = np.empty((0, 3))  # (n, 3) x, y [m] in the map, direction [rad]
+        self._ticks = np.empty(0, np.int64)
+
+    def update(self, tick: int, obstacles: tuple[Obstacle, ...], map_from_odom: Pose) -> None:
+        """Take in the obstacles of a scan, in the frame of the odometry."""
+        if not obstacles and not len(self.ways):
+            return
+        moving = discs_of(obstacles)
+        places = transform(from_pose(map_from_odom), moving[:, :2])
+        turns = np.arctan2(moving[:, 3], moving[:, 2]) + map_from_odom.yaw
+        away = np.hypot(*(self.ways[:, None, :2] - places).transpose(2, 0, 1))
+        kept = (away > SAME_M).all(axis=1) & (np.abs(tick - self._ticks) <= WALKED_TICKS)
+        self.ways = np.concatenate((self.ways[kept], np.column_stack((places, turns))))
+        self._ticks = np.concatenate((self._ticks[kept], np.full(len(moving), tick)))
+
+
+def nearest(ways: Floats, place: Point, reach: float) -> Way | None:
+    """Return the one of `ways` (n, 3) that is nearest to `place`, within `reach` [m]."""
+    away = np.hypot(*(ways[:, :2] - place).T)
+    if away.min(initial=math.inf) > reach:
+        return None
+    x, y, turn = ways[int(away.argmin())].tolist()
+    return x, y, turn
+
+
+def standing(ways: Floats, seen: Floats) -> Floats:
+    """Return those of `ways` (n, 3) who are still where they were, by the hits `seen` (m, 2)."""
+    away = np.hypot(*(ways[:, None, :2] - seen).transpose(2, 0, 1))
+    return ways[(away <= STANDS_M).any(axis=1)]
 
 
 class GiveWay:
-    """Decides when to leave an occupied goal, for an obstacle that waits for the robot to go."""
+    """Decides when to go aside, for somebody who waits for the robot to go."""
 
     def __init__(self) -> None:
         self._count = self._since_tick = 0
-        self.place: Goal | None = None  # where the robot waits now
+        self.place: Goal | None = None  # where the robot waits now,
+        self.left: Point | None = None  # and for whom
 
     def update(
-        self, goal: Goal, here: Point, tick: int, stuck: bool, costs: Costmap, search: GridSearch
-    ) -> bool:
-        """Begin, continue or stop giving way; return whether that has changed."""
-        before, cell = self.place, costs.cell(goal.x, goal.y)
-        occupied = cell is not None and costs.cost[cell] > LETHAL
-        near = math.dist(here, (goal.x, goal.y)) < OCCUPIED_NEAR_M
+        self, other: Way | None, here: Point, tick: int, stuck: bool, costs: Costmap,
+        search: GridSearch,
+    ) -> bool:  # fmt: skip
+        """Begin, continue or stop giving way to `other`; return whether that has changed."""
+        before = self.place
         if before:
             waiting = tick - self._since_tick < GIVE_WAY_TICKS
-            self.place = before if occupied and waiting else None
-        elif occupied and stuck and self._count < MAX_GIVE_WAYS and near:
-            self.place = waiting_place(costs, search, here, goal, far=self._count > 0)
-            self._count, self._since_tick = self._count + 1, tick
+            self.place = before if other and waiting else None
+        elif (
+            other and stuck and self._count < MAX_GIVE_WAYS and math.dist(here, other[:2]) < NEAR_M
+        ):
+            self.place = waiting_place(costs, search, here, other, far=self._count > 0)
+            self._count, self._since_tick, self.left = self._count + 1, tick, other[:2]
         return self.place is not before
 
 
 def waiting_place(
-    costs: Costmap, search: GridSearch, here: Point, goal: Goal, *, far: bool
+    costs: Costmap, search: GridSearch, here: Point, other: Way, *, far: bool
 ) -> Goal | None:
-    """Return the nearest place away from the line goal-`here`, or the one farthest from the goal.
+    """Return the nearest place beside the line on which `other` goes, or the farthest from there.
 
-    An obstacle at the goal probably moves on along that line. The farthest place is for one that
-    went another way, and for a robot without room to the side. None if no place is reachable.
+    The farthest place is for somebody who went another way, and for a robot without room to the
+    side. None if no place is reachable.
     """
     start = costs.cell(*here)
     if start is None:
         return None
     way = search.field(costs.cost, start, "from") * costs.resolution
-    rows, columns = np.nonzero((costs.cost < MAX_WAITING_COST) & (way < MAX_WAITING_PATH_M))
+    free = (costs.cost < MAX_WAITING_COST) & (costs.cells >= 0)
+    rows, columns = np.nonzero(free & (way < MAX_WAITING_PATH_M))
     if not len(rows):
         return None
-    off = costs.points(rows, columns) - (goal.x, goal.y)
-    ahead = math.atan2(here[1] - goal.y, here[0] - goal.x)
-    offset = np.abs(off[:, 1] * math.cos(ahead) - off[:, 0] * math.sin(ahead))
+    x, y, ahead = other
+    off = costs.points(rows, columns) - (x, y)
+    offset = np.abs((off @ rotation(ahead)[:2, :2])[:, 1])
     score = np.where(offset >= MIN_OFFSET_M, -way[rows, columns], -math.inf)
     if far or not np.isfinite(score).any():
         score = np.hypot(*off.T)
-    x, y = (off[int(score.argmax())] + (goal.x, goal.y)).tolist()
-    return Goal(x=x, y=y)
+    dx, dy = off[int(score.argmax())].tolist()
+    return Goal(x=x + dx, y=y + dy)

@@ -1,7 +1,7 @@
 """Route planning for drive commands: the next place, the path to it, and when to give up."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -13,11 +13,12 @@ from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.decision.behaviours import DriveCommand, Target
 from gigabrain_zenoh.decision.enlarging import enlarged
-from gigabrain_zenoh.decision.give_way import GiveWay
+from gigabrain_zenoh.decision.give_way import NEAR_M, SAME_M, GiveWay, nearest, standing
 from gigabrain_zenoh.decision.progress import AT_GOAL_M, ProgressMonitor
 from gigabrain_zenoh.decision.seeking import LookAround, place_before, random_place
 from gigabrain_zenoh.navigation.contours import ContourMemory
 from gigabrain_zenoh.navigation.costmap import (
+    LETHAL,
     Costmap,
     Unknown,
     ZoneOverlay,
@@ -39,7 +40,8 @@ SAME_FRONTIER_M = 0.6  # a frontier moves as the map grows
 FRONTIER_CONFIRM_TICKS = 125  # 2.5 s: the map is published once a second
 ARRIVED_M = LocalSettings().position_tolerance
 NEAR_GOAL_M = 0.25  # good enough for a goal that was free when it was requested: maps shift
-OCCUPIED_TICKS = 500  # 10 s without progress towards an occupied goal
+OCCUPIED_TICKS = 500  # 10 s without progress towards an occupied goal,
+STANDING_TICKS = 250  # and 5 s where somebody stands who has walked
 
 WAY_OPENS_TICKS = 500  # wait 10 s for people to clear the way before giving up
 LOOKING = "looking around"  # what a robot does that searches
@@ -83,6 +85,7 @@ class RouteRequest:
     feedback: RouteFeedback | None  # of the last route
     seen: Floats  # (n, 2) [m], hits of the newest scan, in the map
     contours: tuple[Floats, ...] = ()  # polygons (n, 2) [m] in the map, seen by cameras
+    walkers: Floats = field(default_factory=lambda: np.empty((0, 3)))  # see give_way.Walkers
     zones: ZoneMap = NO_ZONES
     inflation: float | None = None  # [m], see NavigationConfig
     held_ticks: int = 0  # since the last route, in which the body could not follow it
@@ -270,17 +273,27 @@ class RoutePlanner:
         return f" ({why})" if why else ""
 
     def _giving_way(self, goal: Goal, request: RouteRequest, costs: Costmap) -> Route | None:
-        """Return a route away from an occupied goal, if the robot gives way there."""
-        here = (request.here.x, request.here.y)
-        stuck = self._progress.stuck(request.tick, OCCUPIED_TICKS)
-        if self._give_way.update(goal, here, request.tick, stuck, costs, self._planner.search):
+        """Return a route away from who is at the goal or in the way, if the robot gives way."""
+        here, cell = (request.here.x, request.here.y), costs.cell(goal.x, goal.y)
+        give_way, search = self._give_way, self._planner.search
+        if give_way.place and give_way.left:
+            other = nearest(request.walkers, give_way.left, SAME_M)
+        else:
+            other = nearest(standing(request.walkers, request.seen), here, NEAR_M)
+        why = "somebody is in the way"
+        stuck = self._progress.stuck(request.tick, STANDING_TICKS)
+        if cell is not None and costs.cost[cell] > LETHAL:
+            ahead = math.atan2(here[1] - goal.y, here[0] - goal.x)
+            other, why = (goal.x, goal.y, ahead), "the goal is occupied"
+            stuck = self._progress.stuck(request.tick, OCCUPIED_TICKS)
+        if give_way.update(other, here, request.tick, stuck, costs, search):
             self._progress, self._last_path = ProgressMonitor(request.tick), None
             self._version += 1
-        place = self._give_way.place
+        place = give_way.place
         way = self._planner.plan(costs, request.body, request.here, place) if place else None
         if place is None or not isinstance(way, Path):
             return None
-        return self._go(place, way, "the goal is occupied", "giving way")
+        return self._go(place, way, why, "giving way")
 
     def _approach(self, found: Unreachable, request: RouteRequest, costs: Costmap) -> Route:
         """Return a route to the nearest reachable place, to see whether the goal is free again."""

@@ -7,6 +7,7 @@ from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.decision.behaviours import DriveCommand, NavigationConfig
 from gigabrain_zenoh.decision.context import NavigationContext
+from gigabrain_zenoh.decision.give_way import Walkers
 from gigabrain_zenoh.decision.route import Route, RouteFeedback, RoutePlanner, RouteRequest
 from gigabrain_zenoh.geometry.se2 import from_pose, transform
 from gigabrain_zenoh.host.threads import ScheduledWorker, Take
@@ -33,6 +34,7 @@ class RouteSchedule:
         self._planned: tuple[int, OccupancyGrid, ZoneMap] | None = None  # tick, map and zones of
         # the last plan
         self._feedback: RouteFeedback | None = None
+        self._walkers = Walkers()
         self._stands = False  # the route was not followed in the last step
         self._counted = (0, 0)  # boot and tick until which `_held_ticks` has counted
         self._held_ticks = 0  # since the last request
@@ -65,6 +67,11 @@ class RouteSchedule:
         zones: ZoneMap,
     ) -> None:
         """Plan a route if one is due; in a large map it becomes `route` at a later scan."""
+        assert context.world
+        assert context.body
+        assert context.map_from_odom
+        obstacles = context.world.obstacles
+        self._walkers.update(context.tick, obstacles, context.map_from_odom)
         cells = grid.width * grid.height
         scans = MIN_DUE_SCANS + cells // CELLS_PER_SCAN
         if not self._worker.idle:  # maybe with a larger map, which this one has replaced
@@ -72,8 +79,6 @@ class RouteSchedule:
             return
         if not self._due(command, context.tick, grid, zones):
             return
-        assert context.world
-        assert context.body
         self._planned = context.tick, grid, zones
         feedback, self._feedback = self._feedback, None
         request = RouteRequest(
@@ -85,6 +90,7 @@ class RouteSchedule:
             feedback=feedback,
             seen=transform(from_pose(here), context.world.points().astype(np.float64)),
             contours=placed(context.world.contours, here),
+            walkers=self._walkers.ways,
             zones=zones,
             inflation=self.inflation,
             held_ticks=self._held_ticks,

@@ -9,8 +9,10 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.base import Pose
+from gigabrain_schemas.brain import Obstacle
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.decision.behaviours import DriveCommand
+from gigabrain_zenoh.decision.give_way import Walkers
 from gigabrain_zenoh.decision.route import (
     PathCheck,
     Route,
@@ -29,6 +31,7 @@ ROOM = empty(8.0, 6.0)
 TAKEN = ROOM.copy()
 TAKEN[28:32, 48:52] = 100  # somebody, round (5, 3)
 AHEAD = Goal(x=5.0, y=1.0)
+NOBODY, NOTHING = np.empty((0, 3)), np.empty((0, 2))
 
 
 def think(
@@ -42,6 +45,8 @@ def think(
     held_ticks: int = 0,
     slowed_by: str = "",
     feedback: RouteFeedback | None = None,
+    walkers: np.ndarray = NOBODY,
+    seen: np.ndarray = NOTHING,
 ) -> Route:
     return guide.plan(
         RouteRequest(
@@ -51,9 +56,10 @@ def think(
             grid=grid_of(cells),
             body=WAFFLE,
             feedback=feedback,
-            seen=np.empty((0, 2)),
+            seen=seen,
             held_ticks=held_ticks,
             slowed_by=slowed_by,
+            walkers=walkers,
         )
     )
 
@@ -284,3 +290,77 @@ def test_a_robot_between_walls_goes_far_from_who_stands_at_its_goal() -> None:
     assert leaves.activity
     assert leaves.goal
     assert leaves.goal.x < 1.0
+
+
+OPENED = ROOM.copy()
+OPENED[:, 40:42] = 100  # a wall at x = 4 m, with a door
+OPENED[24:36, 40:42] = 0
+BARRED = OPENED.copy()
+BARRED[28:32, 38:43] = 100  # somebody stands in it
+THERE = np.array([[4.05, 3.0, math.pi]])  # they came through it towards -x
+
+
+HITS = np.array([[3.8, 3.1], [3.8, 2.9]])  # of their front
+
+
+def goes_aside(cells: np.ndarray, walkers: np.ndarray, seen: np.ndarray) -> list[Route]:
+    """Return the routes of a robot that stands before the door."""
+    guide = RoutePlanner()
+    ask = functools.partial(think, guide, goal=Goal(x=6.0, y=3.0), x=3.2, y=3.2)
+    ask(OPENED, tick=1)
+    ticks = (50, 251, 252, 900)
+    return [ask(cells, tick=tick, walkers=walkers, seen=seen) for tick in ticks]
+
+
+@pytest.mark.parametrize("cells", [BARRED, OPENED])  # the map knows them sooner or later
+def test_it_goes_aside_for_somebody_in_the_only_door(cells: np.ndarray) -> None:
+    *waits, leaves, stays = goes_aside(cells, THERE, HITS)
+    assert [one.activity for one in waits] == ["", ""]
+    assert (leaves.activity, leaves.reason) == ("giving way", "somebody is in the way")
+    assert leaves.goal
+    assert abs(leaves.goal.y - 3.0) >= 1.0  # beside their line, not beside its own to them
+    assert math.dist((leaves.goal.x, leaves.goal.y), (3.2, 3.2)) < 1.2
+    assert (stays.goal, stays.activity) == (leaves.goal, leaves.activity)
+
+
+def test_it_goes_on_as_soon_as_they_have_walked_on() -> None:
+    guide = RoutePlanner()
+    ask = functools.partial(think, guide, goal=Goal(x=6.0, y=3.0), x=3.2, y=3.2)
+    ask(OPENED, tick=1)
+    aside = ask(BARRED, tick=252, walkers=THERE, seen=HITS)
+    assert aside.activity
+    near = ask(OPENED, tick=300, walkers=THERE - np.array((0.9, 0.0, 0.0)))
+    assert near.activity == "giving way"  # they have not passed yet
+    passed = ask(OPENED, tick=350, walkers=THERE - np.array((1.2, 0.0, 0.0)))
+    assert (passed.goal, passed.activity) == (Goal(x=6.0, y=3.0), "")
+
+
+@pytest.mark.parametrize(
+    ("walkers", "seen"),
+    [
+        (NOBODY, HITS),  # a thing
+        (THERE + np.array((0.0, 2.5, 0.0)), HITS),  # somebody elsewhere
+        (THERE, NOTHING),  # they have gone
+    ],
+)
+def test_it_does_not_go_aside_for_things_nor_for_who_is_not_there(
+    walkers: np.ndarray, seen: np.ndarray
+) -> None:
+    assert not any(one.activity for one in goes_aside(BARRED, walkers, seen))
+
+
+def walking(x: float, y: float, speed: float) -> Obstacle:
+    return Obstacle(id=1, x=x, y=y, velocity_x=speed, radius=0.2)
+
+
+def test_who_has_walked_is_remembered_where_they_stand() -> None:
+    walkers = Walkers()
+    moved = Pose(x=1.0, y=2.0, yaw=math.pi / 2)
+    walkers.update(10, (walking(1.0, 0.0, 0.5),), moved)
+    walkers.update(15, (walking(1.3, 0.0, 0.5),), moved)
+    walkers.update(20, (walking(1.3, 0.0, 0.0),), moved)
+    assert walkers.ways == pytest.approx(np.array([[1.0, 3.3, math.pi / 2]]))
+    walkers.update(3015, (), moved)
+    assert len(walkers.ways) == 1
+    walkers.update(3016, (), moved)
+    assert len(walkers.ways) == 0
