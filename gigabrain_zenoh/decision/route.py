@@ -272,9 +272,9 @@ class RoutePlanner:
         why = request.slowed_by or self._doing
         return f" ({why})" if why else ""
 
-    def _giving_way(self, goal: Goal, request: RouteRequest, costs: Costmap) -> Route | None:
+    def _giving_way(self, goal: Goal | None, request: RouteRequest, costs: Costmap) -> Route | None:
         """Return a route away from who is at the goal or in the way, if the robot gives way."""
-        here, cell = (request.here.x, request.here.y), costs.cell(goal.x, goal.y)
+        here = request.here.x, request.here.y
         give_way, search = self._give_way, self._planner.search
         if give_way.place and give_way.left:
             other = nearest(request.walkers, give_way.left, SAME_M)
@@ -282,7 +282,8 @@ class RoutePlanner:
             other = nearest(standing(request.walkers, request.seen), here, NEAR_M)
         why = "somebody is in the way"
         stuck = self._progress.stuck(request.tick, STANDING_TICKS)
-        if cell is not None and costs.cost[cell] > LETHAL:
+        cell = costs.cell(goal.x, goal.y) if goal else None
+        if goal and cell is not None and costs.cost[cell] > LETHAL:
             ahead = math.atan2(here[1] - goal.y, here[0] - goal.x)
             other, why = (goal.x, goal.y, ahead), "the goal is occupied"
             stuck = self._progress.stuck(request.tick, OCCUPIED_TICKS)
@@ -332,6 +333,8 @@ class RoutePlanner:
         around = costs, request.body, request.here
         goal = self._goal or place_before(*around, target, self._planner.search)
         if goal is None:
+            if away := self._giving_way(None, request, costs):
+                return away
             reason = f"no free and reachable place before {target.name}"
             ended = self._progress.stuck(request.tick, WAY_OPENS_TICKS)
             return self._route(state="failed" if ended else "running", reason=reason)
@@ -369,6 +372,9 @@ class RoutePlanner:
             looks.ended_tick = request.tick
             looks.try_again()
             self._missed.clear()
+        if away := self._giving_way(None, request, costs):
+            looks.ended_tick = request.tick
+            return away
         if request.tick - looks.ended_tick < WAY_OPENS_TICKS:
             return self._route(reason="everything reachable was looked at; waiting for other ways")
         return replace(route, reason="everything reachable was looked at")

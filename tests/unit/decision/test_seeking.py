@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import Camera
 from gigabrain_zenoh.decision.behaviours import DriveCommand, Target
-from gigabrain_zenoh.decision.route import RouteFeedback, RoutePlanner, RouteRequest
+from gigabrain_zenoh.decision.route import Route, RouteFeedback, RoutePlanner, RouteRequest
 from gigabrain_zenoh.decision.seeking import LookAround, place_before
 from gigabrain_zenoh.navigation.costmap import Costmap, costmap, inflation
 from gigabrain_zenoh.navigation.grid_search import GridSearch
@@ -186,6 +186,51 @@ def test_a_room_whose_door_somebody_stood_in_is_looked_into_as_well() -> None:
 def test_it_turns_on_the_spot_before_it_drives() -> None:
     poses, _ = search(ROOM)
     assert (poses[0].x, poses[0].y) == (1.0, 1.0)
+
+
+STANDS = np.array([[1.6, 2.2, -math.pi / 2]])  # somebody who came towards the robot,
+FRONT = np.array([[1.6, 2.0]])  # and a hit on them
+
+
+def ask(planner: RoutePlanner, command: DriveCommand, cells: np.ndarray, tick: int) -> Route:
+    return planner.plan(
+        RouteRequest(
+            tick=tick,
+            command=command,
+            here=HERE,
+            grid=grid_of(cells),
+            body=SEEING,
+            feedback=None,
+            seen=FRONT,
+            walkers=STANDS,
+        )
+    )
+
+
+def test_a_search_that_somebody_ends_goes_aside_for_them() -> None:
+    cells = np.full_like(empty(4.0, 3.0), 100)
+    cells[1:-1, 1:-1] = 0
+    planner, command = RoutePlanner(), DriveCommand(5, "look", seek=5)
+    planner._looks = LookAround(5)
+    planner._looks._seen = {(i, j) for i in range(20) for j in range(15)}
+    routes = [ask(planner, command, cells, tick) for tick in range(1, 3000, 25)]
+    told = [one.activity for one in routes if one.state == "running"]
+    assert "giving way" not in told[:8]
+    away = next(one for one in routes if one.activity == "giving way")
+    assert away.goal
+    assert abs(away.goal.x - 1.6) >= 1.0
+    assert told.count("giving way") >= 30  # 15 s, and once more
+    assert routes[-1].reason == "everything reachable was looked at"
+
+
+def test_a_place_before_a_thing_that_somebody_stands_in_is_waited_for_aside() -> None:
+    cells = ROOM.copy()
+    cells[30:51, 20:41] = 100  # round the thing
+    command = DriveCommand(1, "approach", target=Target(name="can 1", x=1.6, y=2.3, radius=0.03))
+    planner = RoutePlanner()
+    told = [ask(planner, command, cells, tick) for tick in (1, 200, 300, 1000, 1060)]
+    assert [one.activity == "giving way" for one in told] == [False, False, True, True, False]
+    assert ask(planner, command, ROOM, 1100).state == "running"
 
 
 def test_somebody_before_a_thing_has_ten_seconds_to_go_away() -> None:
