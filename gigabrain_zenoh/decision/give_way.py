@@ -21,6 +21,7 @@ MAX_WAITING_PATH_M = 6.0
 MIN_OFFSET_M = 1.0  # from the line on which the other is likely to go on
 WALKED_TICKS = 3000  # 60 s, for which it is remembered where somebody has walked
 STANDS_M = 0.4  # from where somebody was, to a hit of the scan
+BODY_M = 0.5  # from where somebody was, to the middle of their contour
 SAME_M = 1.0  # what walks so near to where somebody was is the same one
 
 Point = tuple[float, float]
@@ -59,7 +60,13 @@ def nearest(ways: Floats, place: Point, reach: float) -> Way | None:
 def standing(ways: Floats, seen: Floats) -> Floats:
     """Return those of `ways` (n, 3) who are still where they were, by the hits `seen` (m, 2)."""
     away = np.hypot(*(ways[:, None, :2] - seen).transpose(2, 0, 1))
-    return ways[(away <= STANDS_M).any(axis=1)]
+    found: Floats = ways[(away <= STANDS_M).any(axis=1)]
+    return found
+
+
+def things(polygons: tuple[Floats, ...], ways: Floats) -> tuple[Floats, ...]:
+    """Return the `polygons` (k, 2) [m] that are none of the people of `ways` (n, 3)."""
+    return tuple(one for one in polygons if nearest(ways, tuple(one.mean(axis=0)), BODY_M) is None)
 
 
 class GiveWay:

@@ -7,7 +7,7 @@ from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.decision.behaviours import DriveCommand, NavigationConfig
 from gigabrain_zenoh.decision.context import NavigationContext
-from gigabrain_zenoh.decision.give_way import Walkers
+from gigabrain_zenoh.decision.give_way import Walkers, standing, things
 from gigabrain_zenoh.decision.route import Route, RouteFeedback, RoutePlanner, RouteRequest
 from gigabrain_zenoh.geometry.se2 import from_pose, transform
 from gigabrain_zenoh.host.threads import ScheduledWorker, Take
@@ -81,6 +81,8 @@ class RouteSchedule:
             return
         self._planned = context.tick, grid, zones
         feedback, self._feedback = self._feedback, None
+        seen = transform(from_pose(here), context.world.points().astype(np.float64))
+        people = standing(self._walkers.ways, seen)
         request = RouteRequest(
             tick=context.tick,
             command=command,
@@ -88,8 +90,8 @@ class RouteSchedule:
             grid=grid,
             body=context.body,
             feedback=feedback,
-            seen=transform(from_pose(here), context.world.points().astype(np.float64)),
-            contours=placed(context.world.contours, here),
+            seen=seen,
+            contours=things(placed(context.world.contours, here), people),
             walkers=self._walkers.ways,
             zones=zones,
             inflation=self.inflation,

@@ -12,7 +12,7 @@ from gigabrain_schemas.base import Pose
 from gigabrain_schemas.brain import Obstacle
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.decision.behaviours import DriveCommand
-from gigabrain_zenoh.decision.give_way import Walkers
+from gigabrain_zenoh.decision.give_way import Walkers, standing, things
 from gigabrain_zenoh.decision.route import (
     PathCheck,
     Route,
@@ -364,3 +364,12 @@ def test_who_has_walked_is_remembered_where_they_stand() -> None:
     assert len(walkers.ways) == 1
     walkers.update(3016, (), moved)
     assert len(walkers.ways) == 0
+
+
+def test_people_are_no_things_that_a_route_remembers() -> None:
+    person = np.array([[3.9, 2.8], [4.2, 2.8], [4.2, 3.2]])
+    box = person + np.array((0.0, 1.0))
+    ways = standing(THERE, HITS)
+    assert [one is box for one in things((person, box), ways)] == [True]
+    gone = things((person, box), standing(THERE, HITS + 1.0))
+    assert len(gone) == 2
