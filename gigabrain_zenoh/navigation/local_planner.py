@@ -306,6 +306,8 @@ class LocalPlanner:
         seen = dynamic_obstacles.standing(moment.contours, discs)
         grid = self._window.grid(moment.tick, moment.known, discs, moment.keepouts, body, seen)
         place = Pose2D(moment.pose.x, moment.pose.y, moment.pose.yaw)
+        if self._stuck(moment):
+            self._ground.fill_gaps(place)
         looked = self._ground.limited(grid, place, moment.cameras, moment.contours)
         ways = self._traffic.ways((goal.x, goal.y)) if self._traffic else None
         to, aside = (goal.x, goal.y), self._half_width

@@ -5,7 +5,8 @@ down may be that has never been in view. So ground that a body may sweep soon, a
 in view nor stood on, costs like an obstacle MARGIN_M away: the body turns more in place, and looks.
 It is not closed: a body that may turn nowhere would stand for ever. So would one that can go aside:
 it stands with the heading that it needs, and does not turn to look. For that one unknown ground is
-so far away that it need not brake.
+so far away that it need not brake. A body that gets no farther, with a gap before it that it is too
+near to look at, has the gap filled.
 """
 
 import math
@@ -33,6 +34,7 @@ EDGE_RAD = math.radians(1.5)  # at the sides of a picture that is not trusted
 SOON_M = 0.25  # beyond the circle of a turning body, which it may sweep before it has looked
 PLACED_M = 0.1  # beyond that circle, clear where a person puts the body down
 MARGIN_M = 0.06  # as far as an obstacle whose cost unknown ground has
+GAP_M = 0.12  # narrower than this, between looked ground: what stands low shows beside it
 BIN_RAD = math.radians(3.0)  # of the bearings round a camera
 SHADE_STEP_M = 0.015  # between points of an outline that hides what is behind it
 BEHIND_M = 0.05  # of what is behind an outline's nearest point that is seen nevertheless
@@ -92,14 +94,26 @@ class LookedGround:
             eye = np.array((camera.x, camera.y)) @ turn + (place.x, place.y)
             self._see(camera, eye, place.yaw + camera.yaw, outlines)
 
+    def fill_gaps(self, place: Pose2D) -> None:
+        """Count unseen ground near `place` that is narrower than GAP_M as looked at."""
+        if not self._began:
+            return
+        deep = self._chamfer.distance((self._looked == 0).view(np.uint8)) > GAP_M / 2
+        beyond = self._chamfer.distance((~deep).view(np.uint8)) > GAP_M / 2
+        self._looked[self._near(place) & beyond] = 1
+
+    def _near(self, place: Pose2D) -> Mask:
+        """Return the cells that a body at `place` may sweep soon."""
+        near = np.zeros((self._side, self._side), np.uint8)
+        reach = math.ceil((self._turning + SOON_M) / CELL_M)
+        fill_disc(near, *self._cell(place.x, place.y), reach)
+        return near > 0
+
     def _unseen(self, place: Pose2D) -> Singles | None:
         """Return distances (side, side) to unseen ground near `place`; None where all was seen."""
         if not self._began:
             return None
-        near = np.zeros((self._side, self._side), np.uint8)
-        reach = math.ceil((self._turning + SOON_M) / CELL_M)
-        fill_disc(near, *self._cell(place.x, place.y), reach)
-        unseen = (near > 0) & (self._looked == 0)
+        unseen = self._near(place) & (self._looked == 0)
         if not unseen.any():
             return None
         return self._chamfer.distance((~unseen).view(np.uint8)) + np.float32(self._margin)

@@ -163,3 +163,39 @@ def test_a_body_that_can_go_aside_gets_before_a_thing_from_wherever_it_looks(
     x, y, yaw = begins
     drive.pose = Pose(x=x, y=y, yaw=yaw)
     assert drive.go(20.0).arrived
+
+
+def with_gap(wide: float) -> LookedGround:
+    """Return ground that was looked at, but for a gap 0.2 m ahead."""
+    ground = LookedGround(BODY, SIDE)
+    looked(ground)
+    ground._looked[:] = 1
+    rows = slice(SIDE // 2 - 12, SIDE // 2 + 12)
+    begin = SIDE // 2 + round(0.2 / CELL_M)
+    ground._looked[rows, begin : begin + round(wide / CELL_M)] = 0
+    return ground
+
+
+@pytest.mark.parametrize(("wide", "filled"), [(0.1, True), (0.2, False)])
+def test_a_narrow_gap_is_filled_and_a_wide_one_stays(wide: float, filled: bool) -> None:
+    ground, place = with_gap(wide), (0.2 + wide / 2, 0.0)
+    assert at(ground.limited(open_ground(), HERE, (), ()), *place) == pytest.approx(MARGIN_M)
+    ground.fill_gaps(Pose2D(2.0, 2.0, 0.0))
+    assert at(ground.limited(open_ground(), HERE, (), ()), *place) == pytest.approx(MARGIN_M)
+    ground.fill_gaps(HERE)
+    found = at(ground.limited(open_ground(), HERE, (), ()), *place)
+    assert found == FAR if filled else found == pytest.approx(MARGIN_M)
+
+
+def test_a_body_that_gets_no_farther_fills_the_gap_before_it() -> None:
+    class StandingDrive(Drive):
+        def moment(self) -> PlanRequest:
+            return dataclasses.replace(super().moment(), pose=Pose(x=0.0, y=0.0, yaw=0.0))
+
+    drive = StandingDrive(BODY, Goal(x=1.2, y=0.0), np.empty((0, 2)))
+    ground = drive.planner._ground = with_gap(0.1)
+    unseen = int((ground._looked == 0).sum())
+    drive.go(4.9)
+    assert (ground._looked == 0).sum() == unseen
+    drive.go(0.4)
+    assert (ground._looked == 0).sum() == 0
