@@ -23,6 +23,7 @@ WALKED_TICKS = 3000  # 60 s, for which it is remembered where somebody has walke
 STANDS_M = 0.4  # from where somebody was, to a hit of the scan
 BODY_M = 0.5  # from where somebody was, to the middle of their contour
 SAME_M = 1.0  # what walks so near to where somebody was is the same one
+MOST = 64  # that are remembered
 
 Point = tuple[float, float]
 Way = tuple[float, float, float]  # x, y [m] of somebody, and the direction in which they go [rad]
@@ -44,8 +45,9 @@ class Walkers:
         turns = np.arctan2(moving[:, 3], moving[:, 2]) + map_from_odom.yaw
         away = np.hypot(*(self.ways[:, None, :2] - places).transpose(2, 0, 1))
         kept = (away > SAME_M).all(axis=1) & (np.abs(tick - self._ticks) <= WALKED_TICKS)
-        self.ways = np.concatenate((self.ways[kept], np.column_stack((places, turns))))
-        self._ticks = np.concatenate((self._ticks[kept], np.full(len(moving), tick)))
+        ways = np.concatenate((self.ways[kept], np.column_stack((places, turns))))
+        ticks = np.concatenate((self._ticks[kept], np.full(len(moving), tick)))
+        self.ways, self._ticks = ways[-MOST:], ticks[-MOST:]
 
 
 def nearest(ways: Floats, place: Point, reach: float) -> Way | None:

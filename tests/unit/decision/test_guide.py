@@ -366,6 +366,15 @@ def test_who_has_walked_is_remembered_where_they_stand() -> None:
     assert len(walkers.ways) == 0
 
 
+def test_no_crowd_is_remembered_without_end() -> None:
+    walkers = Walkers()
+    for k in range(8):
+        crowd = tuple(walking(2.0 * x, 20.0 * k, 0.5) for x in range(20))
+        walkers.update(5 * k, crowd, Pose(x=0.0, y=0.0, yaw=0.0))
+    assert len(walkers.ways) == 64
+    assert walkers.ways[-1].tolist() == [38.0, 140.0, 0.0]
+
+
 def test_people_are_no_things_that_a_route_remembers() -> None:
     person = np.array([[3.9, 2.8], [4.2, 2.8], [4.2, 3.2]])
     box = person + np.array((0.0, 1.0))
