@@ -218,7 +218,7 @@ def _name(pid: int) -> str:
 def _problem(trial: Trial, ready: bool, errors: str, left: Sequence[str], own: set[int]) -> str:
     wanted = signal.Signals[trial.signal]
     if trial.took_s - trial.waited_s > LIMIT_S:
-        return "did not end in time"
+        return f"did not end in time, {'ready' if ready else 'not ready'}: {errors[-800:]}"
     if left:
         return f"left behind: {left}"
     # before its first line a command is Python's: the signal kills, or breaks off Python's start
