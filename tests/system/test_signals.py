@@ -30,4 +30,5 @@ def test_a_signal_at_any_moment_ends_a_command(stage: Stage, command: str, name:
         at_s = random.Random(f"{command} {number} {name}").random() * FIRST_S
         trial = attempt(stage, command, number, name, at_s, {0})
         assert trial.took_s < PATIENCE_S
-        assert trial.problem in ("", "did not end in time"), trial  # how long is for `make qa`
+        late = trial.problem.startswith("did not end in time")  # how long is for `make qa`
+        assert late or not trial.problem, trial
