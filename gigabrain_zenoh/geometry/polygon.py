@@ -83,10 +83,10 @@ def edges(polygons: Sequence[Floats]) -> tuple[Floats, Floats, NDArray[np.intp]]
     return begin, begin[following], first
 
 
-def points_on_edges(polygons: Sequence[Floats], step: float, most: int) -> Floats:
+def points_on_edges(polygons: Sequence[Floats], step: float, most: int | None = None) -> Floats:
     """Return points (n, 2) on the edges of all `polygons`, corners included.
 
-    They are at most `step` [m] apart, but on no edge are more than `most`.
+    They are at most `step` [m] apart, unless an edge would need more than `most`.
     """
     begin, end, _ = edges(polygons)
     length = np.hypot(*(end - begin).T)

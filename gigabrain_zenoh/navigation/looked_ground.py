@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.body import BodyDescription, Camera
+from gigabrain_zenoh.geometry.polygon import points_on_edges
 from gigabrain_zenoh.geometry.stopping import brakes
 from gigabrain_zenoh.geometry.sweep import radius
 from gigabrain_zenoh.navigation.footprint import FAR, DistanceGrid
@@ -186,12 +187,7 @@ def _shades(eye: Floats, yaw: float, outlines: Sequence[Floats]) -> Floats:
     """Return the distance of the nearest outline in each bin of bearings (n,) [m]."""
     free = np.full(round(math.tau / BIN_RAD), np.inf)
     if outlines:
-        begin = np.concatenate(outlines)
-        along = np.concatenate([np.roll(one, -1, axis=0) - one for one in outlines])
-        steps = np.ceil(np.hypot(along[:, 0], along[:, 1]) / SHADE_STEP_M).astype(np.intp) + 1
-        edge = np.repeat(np.arange(len(steps)), steps)
-        step = np.arange(len(edge)) - np.repeat(np.cumsum(steps) - steps, steps)
-        points = begin[edge] + (step / steps[edge])[:, None] * along[edge] - eye
+        points = points_on_edges(outlines, SHADE_STEP_M) - eye
         bearing, away = _polar(points[:, 0], points[:, 1], yaw)
         np.minimum.at(free, _bin(bearing, len(free)), away)
     return free
