@@ -1,4 +1,4 @@
-"""Giving way to somebody at the goal, or in the way, who waits for the robot to leave."""
+"""Gives way to a person at the goal or on the route who waits for the robot to leave."""
 
 import math
 
@@ -13,24 +13,24 @@ from gigabrain_zenoh.navigation.costmap import Costmap
 from gigabrain_zenoh.navigation.dynamic_obstacles import discs_of
 from gigabrain_zenoh.navigation.grid_search import GridSearch
 
-NEAR_M = 2.0  # from the goal or from somebody; a robot farther away blocks no one
+NEAR_M = 2.0  # from the goal or the person; a robot farther away blocks nobody
 GIVE_WAY_TICKS = 750  # 15 s; an obstacle that is still there does not wait for the robot
 MAX_GIVE_WAYS = 2  # per goal
 MAX_WAITING_COST = 2.0  # of a place to wait at
 MAX_WAITING_PATH_M = 6.0
 MIN_OFFSET_M = 1.0  # from the line on which the other is likely to go on
-WALKED_TICKS = 3000  # 60 s, for which it is remembered where somebody has walked
-STANDS_M = 0.4  # from where somebody was, to a hit of the scan
-BODY_M = 0.5  # from where somebody was, to the middle of their contour
-SAME_M = 1.0  # what walks so near to where somebody was is the same one
+WALKED_TICKS = 3000  # 60 s, how long a walking person is remembered
+STANDS_M = 0.4  # from a person's last place to a hit of the scan: still there
+BODY_M = 0.5  # from a person's last place to the middle of a contour: their own
+SAME_M = 1.0  # between two places of the same person
 MOST = 64  # that are remembered
 
 Point = tuple[float, float]
-Way = tuple[float, float, float]  # x, y [m] of somebody, and the direction in which they go [rad]
+Way = tuple[float, float, float]  # x, y [m] of a person, and their direction [rad]
 
 
 class Walkers:
-    """Where everybody who walks was last seen to, and which way they went: they may stand now."""
+    """Remembers where people were last seen walking, and in which direction."""
 
     def __init__(self) -> None:
         self.ways: Floats = np.empty((0, 3))  # (n, 3) x, y [m] in the map, direction [rad]
@@ -72,7 +72,7 @@ def things(polygons: tuple[Floats, ...], ways: Floats) -> tuple[Floats, ...]:
 
 
 class GiveWay:
-    """Decides when to go aside, for somebody who waits for the robot to go."""
+    """Decides when to move aside for a person who waits for the robot."""
 
     def __init__(self) -> None:
         self._count = self._since_tick = 0
@@ -101,8 +101,8 @@ def waiting_place(
 ) -> Goal | None:
     """Return the nearest place beside the line on which `other` goes, or the farthest from there.
 
-    The farthest place is for somebody who went another way, and for a robot without room to the
-    side. None if no place is reachable.
+    Take the farthest place for a person who went another way, or where there is no room to the
+    side. Return None if no place is reachable.
     """
     start = costs.cell(*here)
     if start is None:
