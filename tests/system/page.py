@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 import pytest
-from playwright.async_api import BrowserContext, Page, async_playwright, expect
+from playwright.async_api import BrowserContext, Page, TimeoutError, async_playwright, expect
 from websockets.asyncio.client import ClientConnection, connect
 
 from gigabrain_zenoh.config.settings import Endpoint
@@ -81,9 +81,19 @@ class Browser:
         await page.set_viewport_size({"width": width, "height": height})
         page.on("pageerror", lambda error: self.faults.append(str(error)))
         page.on("request", lambda request: self._check(request.url))
+        lost: list[str] = []
+        page.on("requestfailed", lambda request: lost.append(f"{request.url} {request.failure}"))
         await page.goto(f"{self._robot.origin}/#{token}")
-        await page.wait_for_selector("#link.live")
+        try:
+            await page.wait_for_selector("#link.live")
+        except TimeoutError as error:
+            error.add_note(f"{self.faults=}, {lost=}, {await page.inner_text('#doing')!r}")
+            raise
         return page
+
+    async def lose(self, file: str) -> None:
+        """Let the next request for one of the page's files fail."""
+        await self._context.route(f"**/{file}", lambda route: route.abort(), times=1)
 
     async def close_pages(self) -> None:
         """Close what a test has opened; the browser stays."""

@@ -5,7 +5,7 @@ from collections.abc import AsyncIterator, Callable
 
 import pytest
 import pytest_asyncio
-from playwright.async_api import Page
+from playwright.async_api import Page, expect
 
 from gigabrain_zenoh.testing.waiting import until
 from tests.system.fake_page import Fake, serving
@@ -146,3 +146,13 @@ async def test_a_gamepad_drives_while_a_shoulder_button_is_held(
     await page.wait_for_selector('#confirmed:has-text("CONFIRMED by")')
     await page.wait_for_timeout(200)
     assert fake.presses == ["page"]  # once, for as long as the button is held
+
+
+@pytest.mark.parametrize("file", ["main.js", "link.js", "style.css"])
+async def test_a_page_of_which_a_file_did_not_arrive_is_loaded_again(
+    chromium: Browser, file: str
+) -> None:
+    await chromium.lose(file)
+    page = await chromium.open()
+    await expect(page.locator("header")).to_have_css("display", "flex")
+    await expect(page.locator("#link")).to_have_class("badge live")

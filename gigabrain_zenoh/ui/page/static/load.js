@@ -1,0 +1,11 @@
+// Loads the page again when one of its files did not arrive: without it, nothing of the page runs.
+const RELOAD_AFTER_MS = 1000
+let reloads = false
+
+addEventListener('error', (event) => {
+  if (reloads || !['SCRIPT', 'LINK'].includes(event.target.tagName)) return
+  reloads = true
+  const doing = document.getElementById('doing')
+  if (doing) doing.textContent = 'a part of this page did not arrive; loading it again'
+  setTimeout(() => location.reload(), RELOAD_AFTER_MS)
+}, true)
