@@ -9,6 +9,7 @@ import msgspec
 from gigabrain_schemas.body import JointDescription
 
 AT_REST_JOINT_SPEED = 0.05  # [rad/s] or [m/s], of a joint that stands still
+BRAKING = 2.0  # times its greatest planned acceleration, by which a joint is stopped
 OVERRUN = 0.6  # of the way that a joint lags behind, which it runs on if nothing takes it back
 
 
@@ -39,11 +40,11 @@ def stopped(now: JointMotion, limits: JointDescription) -> JointMotion:
 
 
 def braked(now: JointMotion, limits: JointDescription, dt: float) -> JointMotion:
-    """Return where a joint is sent after `dt` [s] of braking at its greatest acceleration.
+    """Return where a joint is sent after `dt` [s] of braking harder than any plan would.
 
     As `stopped`, it takes back what was sent ahead for the speed that is lost.
     """
-    slower = max(0.0, abs(now.velocity) - limits.max_acceleration * dt)
+    slower = max(0.0, abs(now.velocity) - BRAKING * limits.max_acceleration * dt)
     after = _moved(now, math.copysign(slower, now.velocity), limits, dt)
     taken_back = OVERRUN * limits.gains.feed_forward * (now.velocity - after.velocity)
     return JointMotion(after.position - taken_back, after.velocity)
