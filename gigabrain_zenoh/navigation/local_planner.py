@@ -43,6 +43,11 @@ DETOUR_M = 0.15  # [m], so far off the straight way is round something
 TURN_COST_SHARE = 1.0  # of time, at full turn, where a strafing body has a heading to keep
 STUCK_RADIUS_M = 0.3  # [m], who gets no farther than this is in one place
 SLOW_PATIENCE = 2.0  # times as long as a speed zone makes it take to get out of one place
+LOOK_AFTER_S, LOOK_UNTIL_S = 2.0, 8.0  # in one place, when it tries to see the ground on its way
+WAY_ON_M = 0.4  # [m], so far away it looks for the way on
+FACES_RAD = 0.35  # [rad], so nearly ahead ground is in view
+BACK_M = 0.3  # [m], from where a camera sees the ground that was right before the body
+LOOKING = "looking: it has not seen the ground on its way"
 MAKING_WAY = "making way: it looks round for what moves"
 STANDARD = Weights()
 ARRIVED_SPEED_SHARE = 0.05  # share of the largest speeds at which a body has arrived
@@ -260,13 +265,18 @@ class LocalPlanner:
         discs = self._window.moving(moment.tick, discs)
         model = slowed_model(self._model, moment.max_speed)
         weights = self._look_out(moment.tick, place, discs, model)
-        if self._arrived(moment):
+        if self._at_goal(moment) and not self._turns(moment.velocity):
             return _standing("arrived: at the goal", arrived=True)
+        if self._at_goal(moment) and goal.yaw is None:
+            return _standing("waiting: at the goal")
         looks_round = self._looks_round(moment.tick)
         if looks_round:
             if weights is self._weights or dynamic_obstacles.stay_clear(discs, place.x, place.y):
                 return _standing("waiting: it looks round for what moves")
             moment = replace(moment, goal=Goal(x=place.x, y=place.y), path=None, headings=None)
+        lookout = self._lookout(moment, place)
+        if lookout:
+            moment = replace(moment, goal=lookout, path=None, headings=None)
         if self._model.strafes and moment.goal.yaw is not None:
             weights = weights._replace(turning=TURN_COST_SHARE * SECOND / self._model.turning**2)
         scene = self._scene(moment, discs)
@@ -279,6 +289,8 @@ class LocalPlanner:
             self._start(moment, place),
         )
         answer = self._answer(moment, scene, planned)
+        if lookout:
+            return replace(answer, reason=LOOKING)
         return replace(answer, reason=MAKING_WAY) if looks_round else answer
 
     def _look_out(self, tick: int, place: Pose2D, discs: Floats, model: MotionModel) -> Weights:
@@ -299,6 +311,26 @@ class LocalPlanner:
             return False
         traffic, alone = dynamic_obstacles.LOOK_AROUND_IN_TRAFFIC_S, dynamic_obstacles.LOOK_AROUND_S
         return (tick - self._began) * TICK_S < (traffic if self._traffic.any else alone)
+
+    def _lookout(self, moment: PlanRequest, place: Pose2D) -> Goal | None:
+        """Return where a body that gets no farther sees the ground on its way; None if it need not.
+
+        It turns there first; if the ground is too near to be in view, it backs off. A plan that
+        leads over such ground costs less the later it begins, so without this it is put off.
+        """
+        model, waits_s = self._model, self._waits_s(moment)
+        if model.lateral > 0.0 or model.radius > 0.0 or not LOOK_AFTER_S < waits_s < LOOK_UNTIL_S:
+            return None
+        path = moment.path if moment.path is not None else no_points()
+        ahead = path[np.hypot(path[:, 0] - place.x, path[:, 1] - place.y) > WAY_ON_M]
+        x, y = ahead[0].tolist() if len(ahead) else (moment.goal.x, moment.goal.y)
+        bearing = math.atan2(y - place.y, x - place.x)
+        if not self._ground.hides(place, bearing, self._half_width):
+            return None
+        faces = abs(math.remainder(bearing - place.yaw, math.tau)) < FACES_RAD
+        back = BACK_M if faces else 0.0
+        x, y = place.x - back * math.cos(bearing), place.y - back * math.sin(bearing)
+        return Goal(x=x, y=y, yaw=bearing)
 
     def _scene(self, moment: PlanRequest, discs: Floats) -> Scene:
         goal = moment.goal
@@ -362,28 +394,35 @@ class LocalPlanner:
             self._sampler.shift((moment.tick - self._tick) * TICK_S)
         self._tick = moment.tick
 
-    def _arrived(self, moment: PlanRequest) -> bool:
+    def _at_goal(self, moment: PlanRequest) -> bool:
+        """Return whether the body is at its goal, and moves no farther; it may turn there still."""
         goal, pose, v = moment.goal, moment.pose, moment.velocity
         off = math.hypot(goal.x - pose.x, goal.y - pose.y)
         turn = 0.0 if goal.yaw is None else abs(math.remainder(goal.yaw - pose.yaw, math.tau))
-        settings, model = self._settings, self._model
-        slow = math.hypot(v.linear_x, v.linear_y) <= max(0.02, ARRIVED_SPEED_SHARE * model.forward)
-        near = off <= self._tolerance(moment) and turn <= settings.yaw_tolerance
-        return near and slow and abs(v.angular_z) <= max(0.05, ARRIVED_SPEED_SHARE * model.turning)
+        slow = max(0.02, ARRIVED_SPEED_SHARE * self._model.forward)
+        near = off <= self._tolerance(moment) and turn <= self._settings.yaw_tolerance
+        return near and math.hypot(v.linear_x, v.linear_y) <= slow
+
+    def _turns(self, velocity: Velocity) -> bool:
+        return abs(velocity.angular_z) > max(0.05, ARRIVED_SPEED_SHARE * self._model.turning)
 
     def _tolerance(self, moment: PlanRequest) -> float:
         given = moment.tolerance
         return self._settings.position_tolerance if given is None else given
 
     def _stuck(self, moment: PlanRequest) -> bool:
+        patience = self._settings.stuck_after
+        if moment.max_speed:
+            patience = max(patience, SLOW_PATIENCE * STUCK_RADIUS_M / moment.max_speed)
+        return self._waits_s(moment) > patience
+
+    def _waits_s(self, moment: PlanRequest) -> float:
+        """Return for how long the body has been in one place [s]."""
         here, then = moment.pose, self._anchor
         gone = math.hypot(here.x - then.x, here.y - then.y) > STUCK_RADIUS_M
         if gone or not self._anchor_tick:
             self._anchor, self._anchor_tick = here, moment.tick
-        patience = self._settings.stuck_after
-        if moment.max_speed:
-            patience = max(patience, SLOW_PATIENCE * STUCK_RADIUS_M / moment.max_speed)
-        return (moment.tick - self._anchor_tick) * TICK_S > patience
+        return (moment.tick - self._anchor_tick) * TICK_S
 
 
 def _standing(reason: str, *, arrived: bool = False, blocked: bool = False) -> LocalPlan:

@@ -5,8 +5,8 @@ down may be that has never been in view. So ground that a body may sweep soon, a
 in view nor stood on, costs like an obstacle MARGIN_M away: the body turns more in place, and looks.
 It is not closed: a body that may turn nowhere would stand for ever. So would one that can go aside:
 it stands with the heading that it needs, and does not turn to look. For that one unknown ground is
-so far away that it need not brake. A body that gets no farther, with a gap before it that it is too
-near to look at, has the gap filled.
+so far away that it need not brake. A body that gets no farther turns to look where its way leads,
+or backs off to see it; a narrow gap before it is filled.
 """
 
 import math
@@ -102,6 +102,23 @@ class LookedGround:
         deep = self._chamfer.distance((self._looked == 0).view(np.uint8)) > GAP_M / 2
         beyond = self._chamfer.distance((~deep).view(np.uint8)) > GAP_M / 2
         self._looked[self._near(place) & beyond] = 1
+
+    def hides(self, place: Pose2D, bearing: float, half_width: float) -> bool:
+        """Return whether ground was not looked at that a body at `place` may sweep soon.
+
+        Only a strip of `half_width` [m] to both sides of a `bearing` [rad] counts, from beyond the
+        circle of a turning body on.
+        """
+        if not self._began:
+            return False
+        along = np.arange(self._turning, self._turning + SOON_M, CELL_M)
+        across = np.arange(-half_width, half_width + CELL_M, CELL_M)
+        right, up = (one.ravel() for one in np.meshgrid(along, across))
+        cos, sin = math.cos(bearing), math.sin(bearing)
+        x, y = place.x + cos * right - sin * up, place.y + sin * right + cos * up
+        rows = np.floor(y / CELL_M).astype(np.intp) - self._row
+        columns = np.floor(x / CELL_M).astype(np.intp) - self._column
+        return not self._looked[rows, columns].all()
 
     def _near(self, place: Pose2D) -> Mask:
         """Return the cells that a body at `place` may sweep soon."""

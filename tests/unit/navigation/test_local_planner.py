@@ -39,6 +39,18 @@ def test_who_is_there_and_looks_elsewhere_turns_at_once(body: BodyDescription, y
     assert "turning in place: at the goal" in {plan.reason for plan in drive.plans}
 
 
+def test_who_is_there_and_wants_no_yaw_stops_turning() -> None:
+    moment = PlanRequest(
+        tick=1,
+        pose=Pose(x=0.05, y=0.0, yaw=2.0),
+        velocity=Velocity(angular_z=0.8),
+        goal=Goal(x=0.0, y=0.0),
+        hits=wall((0.3, -0.5), (0.3, 0.5)),
+    )
+    plan = LocalPlanner(WAFFLE).plan(moment)
+    assert (plan.twist, plan.reason, plan.arrived) == (Velocity(), "waiting: at the goal", False)
+
+
 def test_an_omnidirectional_body_goes_sideways_through_a_gap_too_narrow_for_its_front() -> None:
     gap = np.concatenate([wall((0.2, 0.9), (1.6, 0.9)), wall((-0.2, 0.9), (-1.6, 0.9))])
     drive = Drive(OMNI, Goal(x=0.0, y=1.8, yaw=0.0), gap, response=LATE)

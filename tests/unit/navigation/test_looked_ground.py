@@ -10,15 +10,15 @@ from msgspec.structs import replace
 from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import Pose
-from gigabrain_schemas.body import Camera
+from gigabrain_schemas.body import BodyDescription, Camera
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.decision.navigator import close_up
 from gigabrain_zenoh.geometry.sweep import depth, edges
 from gigabrain_zenoh.navigation.footprint import FAR, DistanceGrid
 from gigabrain_zenoh.navigation.local_costmap import CELL_M, Pose2D
-from gigabrain_zenoh.navigation.local_planner import PlanRequest
+from gigabrain_zenoh.navigation.local_planner import LOOKING, LocalPlan, PlanRequest
 from gigabrain_zenoh.navigation.looked_ground import MARGIN_M, LookedGround, floor_in_view
-from tests.unit.navigation.drives import WAFFLE, Drive
+from tests.unit.navigation.drives import OMNI, WAFFLE, Drive
 
 FRONT = Camera(
     name="front", width=320, height=240, rate_hz=10, field_of_view=1.047, depth=True, x=0.064,
@@ -187,11 +187,49 @@ def test_a_narrow_gap_is_filled_and_a_wide_one_stays(wide: float, filled: bool) 
     assert found == FAR if filled else found == pytest.approx(MARGIN_M)
 
 
-def test_a_body_that_gets_no_farther_fills_the_gap_before_it() -> None:
-    class StandingDrive(Drive):
-        def moment(self) -> PlanRequest:
-            return dataclasses.replace(super().moment(), pose=Pose(x=0.0, y=0.0, yaw=0.0))
+class StandingDrive(Drive):
+    """A body that stays where it is, whatever is planned."""
 
+    def moment(self) -> PlanRequest:
+        return dataclasses.replace(super().moment(), pose=Pose(x=0.0, y=0.0, yaw=0.0))
+
+
+def plan_after(
+    seconds: float, goal: Goal, *, body: BodyDescription = BODY, gap: float = 0.2
+) -> LocalPlan:
+    """Return the plan of a body that has stood for some seconds with a gap before it."""
+    drive = StandingDrive(body, goal, np.empty((0, 2)))
+    drive.planner._ground = with_gap(gap)
+    return drive.go(seconds)
+
+
+def test_a_body_that_gets_no_farther_turns_to_look_at_the_ground_on_its_way() -> None:
+    aside = Goal(x=0.5, y=0.5)
+    assert plan_after(1.9, aside).reason != LOOKING
+    plan = plan_after(2.3, aside)
+    assert plan.reason == LOOKING
+    assert plan.trajectory[-1].yaw > 0.5
+    assert max(abs(point.x) for point in plan.trajectory) < 0.1
+
+
+def test_it_backs_off_from_ground_that_is_too_near_to_be_in_view() -> None:
+    plan = plan_after(2.3, Goal(x=1.2, y=0.0))
+    assert plan.reason == LOOKING
+    assert plan.trajectory[-1].x < -0.1
+
+
+def test_it_looks_for_a_few_seconds_and_only_at_what_was_not_seen() -> None:
+    assert plan_after(8.3, Goal(x=1.2, y=0.0)).reason != LOOKING
+    assert plan_after(2.3, Goal(x=1.2, y=0.0), gap=0.0).reason != LOOKING
+
+
+def test_who_goes_aside_need_not_look() -> None:
+    assert (
+        plan_after(2.3, Goal(x=1.2, y=0.0), body=replace(OMNI, cameras=(FRONT,))).reason != LOOKING
+    )
+
+
+def test_a_body_that_gets_no_farther_fills_the_gap_before_it() -> None:
     drive = StandingDrive(BODY, Goal(x=1.2, y=0.0), np.empty((0, 2)))
     ground = drive.planner._ground = with_gap(0.1)
     unseen = int((ground._looked == 0).sum())
