@@ -136,6 +136,7 @@ async def test_a_leader_that_is_unplugged_leaves_the_follower_where_it_is(
     async with leader_at(tmp_path / "leader") as leader:
         command = leader.start(shared_home)
         await until(lambda: "following" in command.out or not command.running)
+        assert command.running, command.err
         moving = asyncio.ensure_future(leader.move(shoulder_pan=1.5))
         await until(lambda: sent(arm, "shoulder_pan") > 0.5, "on its way")
         moving.cancel()
@@ -155,6 +156,7 @@ async def test_an_estop_ends_it_and_the_arm_is_held(
     async with leader_at(tmp_path / "leader") as leader:
         command = leader.start(shared_home)
         await until(lambda: "following" in command.out or not command.running)
+        assert command.running, command.err
         moving = asyncio.ensure_future(leader.swing("shoulder_pan", -1.2, -0.4))
         await until(lambda: sent(arm, "shoulder_pan") < -0.3, "on its way")
         assert await (await shared_home.run("estop")).ended() == 0

@@ -122,9 +122,11 @@ class Robot:
         return set(self.home.processes()) - set(self.home.processes(name))
 
     @property
-    def never_stopped(self) -> bool:
-        """Whether the gate let it drive all the time."""
-        return {state.gate.mode for state in self.states} == {"enabled"}
+    def stops(self) -> set[str]:
+        """Why the gate did not let it drive all the time."""
+        assert self.states
+        shut = [state.gate for state in self.states if state.gate.mode != "enabled"]
+        return {f"{gate.mode}: {[cause.text for cause in gate.causes]}" for gate in shut}
 
     @property
     def moves(self) -> bool:
@@ -197,7 +199,7 @@ async def test_one_that_raises_is_named_and_restarted_and_the_robot_drives_on(
     robot.how.unlink()
     await until(lambda: robot.home.processes(name) not in ([], before), "it is restarted")
     assert robot.others(name) == others
-    assert robot.never_stopped
+    assert robot.stops == set()
 
 
 @pytest.mark.parametrize("name", ["mine", "bad"])
@@ -214,7 +216,7 @@ async def test_one_that_hangs_is_named_shows_where_and_the_robot_drives_on(
     await until(lambda: robot.home.processes(name) not in ([], before), "it is restarted")
     await until(lambda: not robot.problems, "it is well again")
     assert robot.others(name) == others
-    assert robot.never_stopped
+    assert robot.stops == set()
     log = await robot.home.run("log", "--process", name)
     assert f"{name} has made no progress for 5 s" in log.out
 
@@ -225,7 +227,7 @@ async def test_one_that_always_raises_is_given_up_and_the_robot_drives_on(start:
     robot.how.write_text("raise")
     await until(lambda: "is given up: 5 deaths" in robot.up.out, "it is given up")
     await until(lambda: "mine died of ValueError: as asked" in robot.problems, "it is named")
-    assert robot.never_stopped
+    assert robot.stops == set()
     why = await robot.home.run("why")
     assert "mine died of ValueError: as asked, in bad_company.py:19" in why.out
 
