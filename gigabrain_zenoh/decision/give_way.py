@@ -13,7 +13,7 @@ from gigabrain_zenoh.navigation.costmap import Costmap
 from gigabrain_zenoh.navigation.dynamic_obstacles import discs_of
 from gigabrain_zenoh.navigation.grid_search import GridSearch
 
-NEAR_M = 2.0  # from the goal or the person; a robot farther away blocks nobody
+NEAR_M = 2.0  # from the goal or the person, within which the robot is in the way
 GIVE_WAY_TICKS = 750  # 15 s; an obstacle that is still there does not wait for the robot
 MAX_GIVE_WAYS = 2  # per goal
 MAX_WAITING_COST = 2.0  # of a place to wait at

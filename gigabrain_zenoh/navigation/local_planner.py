@@ -43,10 +43,11 @@ DETOUR_M = 0.15  # [m], so far off the straight way is round something
 TURN_COST_SHARE = 1.0  # of time, at full turn, where a strafing body has a heading to keep
 STUCK_RADIUS_M = 0.3  # [m], who gets no farther than this is in one place
 SLOW_PATIENCE = 2.0  # times as long as a speed zone makes it take to get out of one place
-LOOK_AFTER_S, LOOK_UNTIL_S = 2.0, 8.0  # in one place, when it tries to see the ground on its way
-WAY_ON_M = 0.4  # [m], so far away it looks for the way on
-FACES_RAD = 0.35  # [rad], so nearly ahead ground is in view
-BACK_M = 0.3  # [m], from where a camera sees the ground that was right before the body
+LOOK_AFTER_S, LOOK_UNTIL_S = 2.0, 8.0  # in one place: it tries to see the ground on its way,
+LOOK_EVERY_S = 12.0  # again and again
+WAY_ON_M = 0.4  # [m], distance of the point of its path that it turns to
+FACES_RAD = 0.35  # [rad], off its heading by which that point is in view
+BACK_M = 0.3  # [m], by which it backs off from ground that is too near to be in view
 LOOKING = "looking: it has not seen the ground on its way"
 MAKING_WAY = "making way: it looks round for what moves"
 STANDARD = Weights()
@@ -265,10 +266,11 @@ class LocalPlanner:
         discs = self._window.moving(moment.tick, discs)
         model = slowed_model(self._model, moment.max_speed)
         weights = self._look_out(moment.tick, place, discs, model)
-        if self._at_goal(moment) and not self._turns(moment.velocity):
-            return _standing("arrived: at the goal", arrived=True)
-        if self._at_goal(moment) and goal.yaw is None:
-            return _standing("waiting: at the goal")
+        if self._at_goal(moment):
+            if not self._turns(moment.velocity):
+                return _standing("arrived: at the goal", arrived=True)
+            if goal.yaw is None:
+                return _standing("waiting: at the goal")
         looks_round = self._looks_round(moment.tick)
         if looks_round:
             if weights is self._weights or dynamic_obstacles.stay_clear(discs, place.x, place.y):
@@ -318,8 +320,9 @@ class LocalPlanner:
         It turns there first; if the ground is too near to be in view, it backs off. A plan that
         leads over such ground costs less the later it begins, so without this it is put off.
         """
-        model, waits_s = self._model, self._waits_s(moment)
-        if model.lateral > 0.0 or model.radius > 0.0 or not LOOK_AFTER_S < waits_s < LOOK_UNTIL_S:
+        waits_s = self._waits_s(moment) % LOOK_EVERY_S
+        differential = self._model.lateral == 0.0 and self._model.radius == 0.0
+        if not differential or not LOOK_AFTER_S < waits_s < LOOK_UNTIL_S:
             return None
         path = moment.path if moment.path is not None else no_points()
         ahead = path[np.hypot(path[:, 0] - place.x, path[:, 1] - place.y) > WAY_ON_M]

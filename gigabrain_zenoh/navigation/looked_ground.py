@@ -104,21 +104,18 @@ class LookedGround:
         self._looked[self._near(place) & beyond] = 1
 
     def hides(self, place: Pose2D, bearing: float, half_width: float) -> bool:
-        """Return whether ground was not looked at that a body at `place` may sweep soon.
+        """Return whether there is unseen ground near `place` on the way at a `bearing` [rad].
 
-        Only a strip of `half_width` [m] to both sides of a `bearing` [rad] counts, from beyond the
-        circle of a turning body on.
+        The way is `half_width` [m] wide to both sides, and begins where a turning body ends.
         """
         if not self._began:
             return False
-        along = np.arange(self._turning, self._turning + SOON_M, CELL_M)
-        across = np.arange(-half_width, half_width + CELL_M, CELL_M)
-        right, up = (one.ravel() for one in np.meshgrid(along, across))
+        rows, columns = np.nonzero(self._near(place) & (self._looked == 0))
+        x = (columns + self._column + 0.5) * CELL_M - place.x
+        y = (rows + self._row + 0.5) * CELL_M - place.y
         cos, sin = math.cos(bearing), math.sin(bearing)
-        x, y = place.x + cos * right - sin * up, place.y + sin * right + cos * up
-        rows = np.floor(y / CELL_M).astype(np.intp) - self._row
-        columns = np.floor(x / CELL_M).astype(np.intp) - self._column
-        return not self._looked[rows, columns].all()
+        ahead, aside = cos * x + sin * y, cos * y - sin * x
+        return bool(np.any((ahead > self._turning) & (np.abs(aside) <= half_width)))
 
     def _near(self, place: Pose2D) -> Mask:
         """Return the cells that a body at `place` may sweep soon."""

@@ -220,7 +220,14 @@ def test_it_backs_off_from_ground_that_is_too_near_to_be_in_view() -> None:
 
 def test_it_looks_for_a_few_seconds_and_only_at_what_was_not_seen() -> None:
     assert plan_after(8.3, Goal(x=1.2, y=0.0)).reason != LOOKING
+    assert plan_after(14.3, Goal(x=1.2, y=0.0)).reason == LOOKING  # and again
     assert plan_after(2.3, Goal(x=1.2, y=0.0), gap=0.0).reason != LOOKING
+
+
+def test_a_body_larger_than_its_window_has_no_unseen_ground_beyond_it() -> None:
+    ground = LookedGround(BODY, 8)  # 0.2 m to each side
+    ground.look(HERE, ("front",), (), -4 * CELL_M, -4 * CELL_M)
+    assert not any(ground.hides(HERE, turn, 0.15) for turn in np.linspace(-3, 3, 7))
 
 
 def test_who_goes_aside_need_not_look() -> None:
