@@ -3,7 +3,7 @@ const RELOAD_AFTER_MS = 1000
 let reloads = false
 
 addEventListener('error', (event) => {
-  if (reloads || !['SCRIPT', 'LINK'].includes(event.target.tagName)) return
+  if (reloads || !event.target.matches?.('script, link[rel=stylesheet]')) return
   reloads = true
   const doing = document.getElementById('doing')
   if (doing) doing.textContent = 'a part of this page did not arrive; loading it again'
