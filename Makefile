@@ -97,7 +97,8 @@ qa: setup
 # where it was stopped, with what failed or was not reached
 PASSED ?= .qa/passed_tests
 qa-tests: setup
-	$(PYTEST) -q -m 'qa or slow or hypothesis' --hypothesis-profile=qa --passed $(PASSED) $(ARGS)
+	$(PYTEST) -q -m 'qa or slow or hypothesis' -o faulthandler_timeout=7200 --hypothesis-profile=qa \
+	  --passed $(PASSED) $(ARGS)
 
 # every extreme value in every message
 extremes: setup

@@ -19,6 +19,27 @@ settings.register_profile("qa", deadline=None, max_examples=1000)
 settings.load_profile("quick")  # `make qa` loads the other
 
 
+class FailuresAtOnce:
+    """Prints why a test failed when it did; a run that is stopped prints no summary."""
+
+    def __init__(self, terminal: pytest.TerminalReporter) -> None:
+        self._terminal = terminal
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Print a failure."""
+        if report.failed:
+            self._terminal.ensure_newline()
+            self._terminal.write_line(f"{report.nodeid}, at once:\n{report.longreprtext}")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_configure(config: pytest.Config) -> None:
+    """Print failures where there is a terminal, which workers of pytest-xdist have not."""
+    if terminal := config.pluginmanager.get_plugin("terminalreporter"):
+        config.pluginmanager.register(FailuresAtOnce(terminal), "failures_at_once")
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark each test by the folder that it lies in."""
     for item in items:
