@@ -15,7 +15,7 @@ from gigabrain_zenoh.vision.nets import Net
 from gigabrain_zenoh.vision.pictures import decoded
 from gigabrain_zenoh.vision.recognizer import Found
 from gigabrain_zenoh.vision.tags import TagFinder
-from gigabrain_zenoh.vision.thing_places import fits, thing_place
+from gigabrain_zenoh.vision.thing_places import fits, part_of_wall, thing_place
 
 MAX_THINGS = 128
 MIN_BOX_PX = 1.0
@@ -112,8 +112,8 @@ def _things(
 ) -> tuple[Detection, ...]:
     """Return what a net found, the surest first, placed by depth.
 
-    A thing has one class, the surest of those that are not larger than it is; boxes of `taken` are
-    of tags, which are no things.
+    A thing has one class, the surest of those that are not larger than it is. Parts of walls and
+    boxes of tags, in `taken`, are no things.
     """
     things, taken = [], list(taken)
     for label, sure, corners in zip(
@@ -124,6 +124,8 @@ def _things(
         if right - left < MIN_BOX_PX or bottom - top < MIN_BOX_PX:
             continue
         if any(overlap(box, other) > SAME_BOX for other in taken):
+            continue
+        if depth is not None and part_of_wall(label, box, model, depth):
             continue
         place = None if depth is None else thing_place(label, box, model, depth)
         if place and not fits(label, place):

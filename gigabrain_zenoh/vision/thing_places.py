@@ -4,6 +4,7 @@ A camera measures the nearest face of a thing. Its middle is half its thickness 
 taken from its width: round things are as thick as wide.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +34,10 @@ MIN_PIXELS, MIN_SHARE = 8, 0.15  # with depth, of that part
 LAYER_SHARE = 0.3  # of the depths that make a layer: nearer ones are something else's edge
 THIN_M, THICKNESS = 0.06, 0.7  # least, and of the width, that a layer may be thick
 EDGE_PX = 2.0  # a box that is so near to an edge may go on behind it
+IN_WALLS = {"door"}
+BESIDE = (0.1, 0.35)  # where a strip beside a box begins and ends, of the box's width
+NARROW_M = 0.15  # less wide things stand out too little from a wall
+FLAT_M, BENT_M = 0.02, 0.05  # off a plane, inside a box in the mean, and beside it
 
 
 class ThingPlace(NamedTuple):
@@ -74,6 +79,61 @@ def thing_place(
 def fits(label: str, place: ThingPlace) -> bool:
     """Return whether a thing of that class may be as narrow as the one at a place."""
     return place.size is None or place.size[0] >= NARROWEST_M.get(label, 0.0)
+
+
+def part_of_wall(label: str, box: Box, model: CameraModel, depth: NDArray[np.uint16]) -> bool:
+    """Return whether the plane that is seen in a box goes on beyond both of its sides.
+
+    A side at the edge of the picture, or with unknown depth beside it, tells nothing.
+    """
+    left, _, right, _ = np.clip(box, 0, (*depth.shape[::-1],) * 2)
+    wide, middle, fx = right - left, (left + right) / 2, model.camera.pinhole[0]
+    if label in IN_WALLS:
+        return False
+    near, far = BESIDE[0] * wide, BESIDE[1] * wide
+    profile = _profile(box, depth)
+    inner = profile[math.floor(left) : math.ceil(right)]
+    known = inner[np.isfinite(inner)]
+    if len(known) < MIN_PIXELS or wide / fx < NARROW_M * np.median(known):
+        return False
+    goes_on = [
+        _one_plane(profile, (left, middle), (left - far, left - near)),
+        _one_plane(profile, (middle, right), (right + near, right + far)),
+    ]
+    told = [one for one in goes_on if one is not None]
+    return bool(told) and all(told)
+
+
+def _profile(box: Box, depth: NDArray[np.uint16]) -> NDArray[np.float64]:
+    """Return the inverse of the median depth [1/m] in each column, nan where it is unknown.
+
+    Along a row of pixels, that of a plane is a straight line.
+    """
+    _, top, _, bottom = box
+    high = bottom - top
+    inner = slice(max(0, round(top + INNER[1] * high)), max(0, round(top + INNER[3] * high)) + 1)
+    columns = np.sort(depth[inner].T.copy())  # unknown ones first
+    known = np.count_nonzero(columns, axis=1)
+    enough = known * 2 > columns.shape[1]
+    profile = np.full(len(columns), np.nan)
+    median = columns[np.arange(len(columns)), columns.shape[1] - 1 - known // 2]
+    profile[enough] = 1e3 / median[enough]
+    return profile
+
+
+def _one_plane(
+    profile: NDArray[np.float64], inside: tuple[float, float], beside: tuple[float, float]
+) -> bool | None:
+    """Return whether columns `beside` lie in the plane of those `inside`; None if unknown."""
+    columns = np.arange(len(profile))
+    known = np.isfinite(profile)
+    within = columns[known & (columns >= inside[0]) & (columns < inside[1])]
+    beyond = columns[known & (columns >= beside[0]) & (columns < beside[1])]
+    if len(within) < MIN_PIXELS // 2 or not len(beyond):
+        return None
+    slope, offset = np.polyfit(within, profile[within], 1)
+    off = np.abs(slope * columns + offset - profile) / profile**2  # [m], to first order
+    return bool(off[within].mean() < FLAT_M and np.median(off[beyond]) < BENT_M)
 
 
 def _inside(box: Box, depth: NDArray[np.uint16]) -> NDArray[np.float64]:

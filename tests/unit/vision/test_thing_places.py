@@ -6,7 +6,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.body import Camera
 from gigabrain_zenoh.vision.camera_model import CameraModel, rotation
-from gigabrain_zenoh.vision.thing_places import thing_place
+from gigabrain_zenoh.vision.thing_places import part_of_wall, thing_place
 
 CAMERA = Camera(name="front", width=320, height=240, depth=True, x=0.1, z=0.2)
 MODEL = CameraModel(CAMERA)
@@ -136,9 +136,70 @@ def test_a_thing_that_is_cut_off_at_a_side_has_no_place_and_above_or_below_no_si
     assert place.size is None
 
 
+def wall(distance, yaw, y=0.0):
+    """A wall that goes on to all sides, through the point (distance, y)."""
+    normal = np.array((np.cos(yaw), np.sin(yaw), 0.0))
+
+    def surface(origin, rays):
+        depth = ((distance, y, 0.0) - origin) @ normal / (rays @ normal)
+        return np.where(depth > 0, depth, np.nan)
+
+    return surface
+
+
+def nearest(*surfaces):
+    return lambda origin, rays: np.fmin.reduce([one(origin, rays) for one in surfaces])
+
+
+WALLS = {
+    "across": wall(2.0, 0.0),
+    "aslant": wall(2.0, 0.9),
+    "far": wall(3.5, -0.4),
+    "corner": nearest(wall(2.5, 0.7), wall(2.5, -0.7)),
+}
+
+
+@pytest.mark.parametrize("name", WALLS)
+@pytest.mark.parametrize(
+    "box",
+    [
+        (120.0, 60.0, 200.0, 140.0),
+        (100.0, 40.0, 140.0, 200.0),
+        (0.0, 30.0, 110.0, 180.0),
+        (230.0, 80.0, 320.0, 150.0),
+    ],
+)
+def test_a_part_of_a_wall_is_no_thing_but_a_door_may_be(name, box):
+    depth, _ = seen(MODEL, WALLS[name], np.random.default_rng(0))
+    assert part_of_wall("box", box, MODEL, depth)
+    assert not part_of_wall("door", box, MODEL, depth)
+
+
+@pytest.mark.parametrize(("label", "shape", "size"), THINGS)
+@pytest.mark.parametrize("ahead", [0.7, 1.5, 2.5])
+@pytest.mark.parametrize("gap", [0.0, 0.3])
+def test_a_thing_before_a_wall_is_no_part_of_it(label, shape, size, ahead, gap):
+    thing = shape((ahead, 0.1 * ahead, 0.2))
+    behind = wall(ahead + size[0] / 2 + gap, 0.3, 0.1 * ahead)
+    depth, _ = seen(MODEL, nearest(thing, behind), np.random.default_rng(0))
+    _, (left, top, right, bottom) = seen(MODEL, thing)
+    for off in (0.0, 0.08):  # a net's box is not exact
+        less = off * (right - left)
+        assert not part_of_wall(label, (left + less, top, right - less, bottom), MODEL, depth)
+        assert not part_of_wall(label, (left - less, top, right + less, bottom), MODEL, depth)
+
+
+def test_a_box_that_spans_the_picture_or_unknown_depth_tells_nothing_of_walls():
+    depth, _ = seen(MODEL, WALLS["across"])
+    assert not part_of_wall("box", (0.0, 40.0, 320.0, 200.0), MODEL, depth)
+    assert not part_of_wall("box", (100.0, 40.0, 200.0, 200.0), MODEL, np.zeros_like(depth))
+
+
 @pytest.mark.parametrize("box", [(-50, -50, 400, 300), (100, 100, 100, 100), (319, 239, 320, 240),
                                  (5, -1e5, 50, 1e5)])  # fmt: skip
 def test_boxes_of_any_kind_give_a_finite_place_or_none(box):
     for value in (0, 1, 800, 65535):
-        place = thing_place("x", box, MODEL, np.full((240, 320), value, np.uint16))
+        depth = np.full((240, 320), value, np.uint16)
+        place = thing_place("x", box, MODEL, depth)
+        assert part_of_wall("x", box, MODEL, depth) in (True, False)
         assert place is None or np.isfinite(place.position).all()
