@@ -162,11 +162,10 @@ class ObstacleContours:
         """Return the contours of some cells, with their distance, and mark the cells with them."""
         cells = self._memory.cells[at]
         labels = connected((cells["low"] + cells["high"]) / 2)
-        at = at[_believed(cells, labels)[labels]]
+        believed = _believed(cells, labels)[labels]
+        at, cells, labels = at[believed], cells[believed], labels[believed]
         if not len(at):
             return []
-        cells = self._memory.cells[at]
-        labels = connected((cells["low"] + cells["high"]) / 2)
         labels = split(cells["low"], cells["high"], labels, self._memory.place)
         order = np.argsort(labels, kind="stable")
         at, cells, labels = at[order], cells[order], labels[order]
