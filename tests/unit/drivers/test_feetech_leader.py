@@ -49,11 +49,12 @@ class Led(Rig):
     async def read(self) -> dict[str, float]:
         return dict(await self.during(self.leader.read()))
 
-    async def read_on(self) -> None:
-        """Read for 200 ms."""
-        for _ in range(10):
+    async def read_on(self, times: int = 40) -> dict[str, float]:
+        """Read every 20 ms; return the last posture."""
+        for _ in range(times):
             await self.wait(20)
-            await self.read()
+            found = await self.read()
+        return found
 
 
 @asynccontextmanager
@@ -113,6 +114,16 @@ async def test_one_lost_answer_does_not_end_it_and_silence_does() -> None:
         assert await rig.read() == before
         with pytest.raises(ConfigError, match=r"the leader at memory: servo 1 \(shoulder_pan\) an"):
             await rig.read_on()
+
+
+async def test_silence_of_a_third_of_a_second_leaves_its_last_posture() -> None:
+    async with leading() as rig:
+        before = await rig.read()
+        heard, rig.link.disturb = rig.link.disturb, lambda _: b""
+        assert await rig.read_on(8) == before  # each takes 38 ms
+        rig.link.disturb = heard
+        rig.joint("wrist_roll").position = 0.2
+        assert (await rig.read_on(10))["wrist_roll"] == pytest.approx(0.2, abs=TICK)
 
 
 async def test_one_servo_that_falls_silent_is_named() -> None:

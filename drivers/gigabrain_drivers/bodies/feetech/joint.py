@@ -42,6 +42,7 @@ class ServoJoint:
     """A joint, its servo and its calibration. Positions are radians, places are ticks."""
 
     pushed_factor, pushed_acceleration = PUSHED_FACTOR, MAX_ACCELERATION
+    lost_after_ns = LOST_NS
 
     def __init__(
         self,
@@ -181,7 +182,7 @@ class ServoJoint:
 
     def lost(self, now_ns: int) -> str:
         """Return that it answers no more, or an empty text."""
-        silent = now_ns - self.heard_ns > LOST_NS
+        silent = now_ns - self.heard_ns > self.lost_after_ns
         return f"{self} answers no more: cable, power?" if silent else ""
 
     def measured(self) -> Joint | None:

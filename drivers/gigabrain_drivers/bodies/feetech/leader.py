@@ -30,6 +30,7 @@ class LeaderJoint(ServoJoint):
     """A joint that a hand moves, faster than a motor would."""
 
     pushed_factor, pushed_acceleration = 8.0, 1000.0  # [rad/s2]
+    lost_after_ns = 500_000_000  # it moves nothing, and the other arm waits where it is
 
     @property
     def leads_to(self) -> float:
