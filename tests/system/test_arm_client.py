@@ -190,6 +190,7 @@ async def test_a_wrong_command_is_one_clear_line(
     assert posture(arm) == pytest.approx(before, abs=0.01)
 
 
+@pytest.mark.slow
 async def test_decision_reaches_a_point_and_says_what_it_cannot(arm: Probe) -> None:
     async with connect(source="tasks") as robot:
         task = await robot.tasks.carry_out("do: [{reach: [0.22, 0.05, 0.12]}]")

@@ -71,6 +71,7 @@ async def test_a_demo_with_cameras_gives_picture_depth_and_info_also_after_a_dea
     assert await demo.ended() == 0
 
 
+@pytest.mark.slow
 async def test_without_opengl_one_line_says_so_and_the_robot_drives_as_without_cameras(
     home: Home, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -48,6 +48,7 @@ async def square(script: Robot) -> None:
         await script.drive(angular_z=1.0, seconds=math.pi / 2)
 
 
+@pytest.mark.slow
 async def test_a_script_drives_a_square_and_the_brain_goes_on_afterwards(robot: Probe) -> None:
     async with gigabrain_zenoh.connect(take=True, source="square") as script:
         for _ in range(4):  # where a busy machine holds up the script or the gate, once more
@@ -189,6 +190,7 @@ async def test_what_there_is_not_is_said_in_words(robot: Probe) -> None:
             await script.set_joint_position("arm", 1.0)
 
 
+@pytest.mark.slow
 async def test_several_robots_are_listed(
     robot: Probe, shared_home: Home, demo: CommandProcess, home: Home
 ) -> None:

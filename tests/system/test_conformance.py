@@ -23,6 +23,7 @@ NEEDS_A_PEER = {
 
 
 @pytest.mark.parametrize("name", BODIES)
+@pytest.mark.slow
 async def test_every_robot_passes_the_kit(
     name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

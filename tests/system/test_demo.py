@@ -92,6 +92,7 @@ async def test_a_robot_roams_without_touching_anything(home: Home, world: str, b
     assert home.processes() == []
 
 
+@pytest.mark.slow
 async def test_the_same_seed_gives_the_same_decisions_at_any_speed(home: Home) -> None:
     options = ("--world", "warehouse", "--seconds", "12", "--seed", "4", "--lockstep-timeout", "30")
     _, slow = await run(home, *options, "--speed", "4")
@@ -103,6 +104,7 @@ async def test_the_same_seed_gives_the_same_decisions_at_any_speed(home: Home) -
     assert (slow["contacts"], fast["contacts"]) == (0, 0)
 
 
+@pytest.mark.slow
 async def test_a_robot_that_touches_something_fails_the_run(home: Home) -> None:
     """Its file says that its lidar looks backwards, so it sees no wall ahead."""
     waffle = BODIES / "turtlebot3_waffle"

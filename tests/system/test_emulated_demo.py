@@ -40,6 +40,7 @@ def test_other_links_have_no_emulator(tmp_path: Path, link: str) -> None:
     assert found["driver"][0] == ("router",)
 
 
+@pytest.mark.slow
 async def test_a_robot_roams_by_bytes_on_two_serial_lines(home: Home) -> None:
     path = home.folder / "report.json"
     for seconds in ("8", "30", "60"):  # longer where a busy machine stops it again and again

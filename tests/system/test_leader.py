@@ -24,6 +24,7 @@ from tests.system.servos import emulated_arm
 from tests.system.test_feetech_link import arm_on
 from tests.unit.drivers.feetech import FreeArm
 
+pytestmark = pytest.mark.slow
 JOINTS = load_robot("so101").joints
 NAMES = [joint.name for joint in JOINTS]
 TEN_MS = 0.01

@@ -99,6 +99,7 @@ def terminal(home: Home) -> Iterator[Terminal]:
     place.close()
 
 
+@pytest.mark.slow
 async def test_the_page_shows_the_whole_robot_and_ctrl_c_ends_it(
     home: Home, terminal: Terminal
 ) -> None:

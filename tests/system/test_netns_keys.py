@@ -72,6 +72,7 @@ async def test_three_hosts_with_keys_drive_and_each_may_do_what_it_is_there_for(
         assert list((homes["operator"].folder / "state").rglob("*.mcap"))
 
 
+@pytest.mark.slow
 async def test_a_stranger_on_the_network_gets_nothing_and_is_written_down(tmp_path: Path) -> None:
     with network("robot", "stranger", subnet=81) as net:
         address = net.address["robot"]

@@ -203,6 +203,7 @@ async def test_one_that_raises_is_named_and_restarted_and_the_robot_drives_on(
 
 
 @pytest.mark.parametrize("name", ["mine", "bad"])
+@pytest.mark.slow
 async def test_one_that_hangs_is_named_shows_where_and_the_robot_drives_on(
     name: str, start: object
 ) -> None:

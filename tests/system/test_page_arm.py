@@ -323,6 +323,7 @@ async def test_the_arm_is_drawn_in_three_dimensions(chromium: Browser) -> None:
     await drawn(page, "r > 2 * b && r > 80", 500)  # yellow
 
 
+@pytest.mark.slow
 async def test_the_way_of_the_tool_and_the_grasps_are_drawn_for_those_who_look(
     chromium: Browser, fake: FakeArm
 ) -> None:

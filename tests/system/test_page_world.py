@@ -89,6 +89,7 @@ async def click_beside(
     await page.mouse.up()
 
 
+@pytest.mark.slow
 async def test_what_is_clicked_into_the_world_is_there_and_drawn(
     chromium: Browser, seen: Probe
 ) -> None:

@@ -38,6 +38,7 @@ print("\\n".join(failed))
 """
 
 
+@pytest.mark.slow
 def test_every_module_imports_without_posix_modules() -> None:
     done = subprocess.run(
         (sys.executable, "-W", "ignore", "-c", IMPORT_ALL),

@@ -72,6 +72,7 @@ def test_a_bad_name_is_refused_and_nothing_is_overwritten(tmp_path: Path) -> Non
     assert (folder / "README.md").read_text() == "mine"
 
 
+@pytest.mark.slow
 async def test_a_new_process_runs_on_a_robot_as_its_readme_says(tmp_path: Path) -> None:
     site = tmp_path / "site"
     install(write_package("process", "lamp", tmp_path), site)

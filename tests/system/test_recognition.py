@@ -23,6 +23,7 @@ tags: [{id: 7, at: [1.49, 0.1], yaw: 3.1416, z: 0.25, size: 0.2}]
 
 
 @pytest.mark.skipif(not can_draw(), reason="there is no OpenGL here")
+@pytest.mark.slow
 async def test_tags_are_seen_also_after_the_process_died_or_hung_and_the_robot_drives_on(
     home: Home,
 ) -> None:

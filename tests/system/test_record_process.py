@@ -4,6 +4,8 @@ import os
 import signal
 from pathlib import Path
 
+import pytest
+
 from gigabrain_zenoh.qa.probe import probing
 from gigabrain_zenoh.recording.bag_reader import faults, read_info
 from gigabrain_zenoh.testing.processes import Home, endpoint_of
@@ -16,6 +18,7 @@ def sizes(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_size for path in folder.glob("*.mcap")}
 
 
+@pytest.mark.slow
 async def test_a_recorder_that_is_killed_costs_the_robot_nothing_and_its_file_is_mended(
     home: Home,
 ) -> None:

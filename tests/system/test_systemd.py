@@ -72,6 +72,7 @@ def bare(tmp_path: Path) -> Iterator[Home]:
     home.close()
 
 
+@pytest.mark.slow
 async def test_it_runs_without_capabilities_on_a_read_only_system(bare: Home) -> None:
     file = bare.deployment(resume="auto")
     up = bare.start("up", str(file))

@@ -244,6 +244,7 @@ async def test_why_and_doctor_say_that_no_robot_runs(home: Home) -> None:
     assert (await doctor.ended(), "Nothing listens on that port." in doctor.out) == (1, True)
 
 
+@pytest.mark.slow
 async def test_a_body_that_obeys_a_key_of_its_own_is_driven_and_explained_all_the_same(
     home: Home,
 ) -> None:

@@ -67,6 +67,7 @@ def view(home: Home, endpoint: str, display: str = "") -> subprocess.Popen[str]:
 
 
 @needs_xvfb
+@pytest.mark.slow
 async def test_a_window_shows_the_running_simulation_which_never_waits_for_it(
     shared_home: Home, display: Display
 ) -> None:

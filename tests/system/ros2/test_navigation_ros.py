@@ -84,6 +84,7 @@ async def test_goals_are_followed_cancelled_and_preempted(robot: Robot, judge: J
     assert await result(client, "home") == ("succeeded", 0)
 
 
+@pytest.mark.slow
 async def test_a_goal_through_poses_is_followed_and_keeps_the_other_action_out(
     robot: Robot, judge: Judge
 ) -> None:
@@ -117,6 +118,7 @@ async def published(
             await asyncio.sleep(0.5)
 
 
+@pytest.mark.slow
 async def test_a_goal_pose_of_rviz_has_a_plan_and_a_wrong_one_is_named(
     robot: Robot, judge: Judge
 ) -> None:
@@ -138,6 +140,7 @@ async def test_a_goal_pose_of_rviz_has_a_plan_and_a_wrong_one_is_named(
     await published(judge, "/goal_pose", POSE, wrong, lambda: "'base_link'" in text("goal_pose"))
 
 
+@pytest.mark.slow
 async def test_an_initialpose_of_rviz_reaches_the_map_maker(robot: Robot, judge: Judge) -> None:
     await mapped(judge.start("navigate"))
     accepted: list[AcceptedRequest] = []

@@ -108,6 +108,7 @@ async def sent(rmf: Adapter, begin: list[float], x: float, y: float) -> None:
         assert status == ABORTED
 
 
+@pytest.mark.slow
 async def test_open_rmf_sends_follows_and_cancels_goals_and_reads_battery_and_pose(
     home: Home, interpreter: Path, tmp_path: Path
 ) -> None:

@@ -38,6 +38,7 @@ async def listed(home: Home, judge: Judge, *options: str) -> dict[str, Any]:
     return {row["name"]: row for row in map(json.loads, command.out.splitlines())}
 
 
+@pytest.mark.slow
 async def test_topics_of_rclpy_are_listed_with_types_qos_and_nodes(
     home: Home, judge: Judge
 ) -> None:
@@ -68,6 +69,7 @@ async def test_where_no_node_is_found_it_says_what_to_check(home: Home, judge: J
     assert command.err.count("\n") == 1
 
 
+@pytest.mark.slow
 async def test_a_robots_keys_are_listed_and_doctor_finds_what_does_not_match(
     home: Home, judge: Judge, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -84,6 +84,7 @@ def namespaces(graph: dict[str, Any]) -> set[str]:
     return {topic.split("/")[1] for topic in graph["topics"].keys() - OF_ROS}
 
 
+@pytest.mark.slow
 async def test_two_robots_are_driven_at_once_and_do_not_mix(pair: Pair, judge: Judge) -> None:
     await asyncio.gather(released(pair.red), released(pair.blue))
     driver, listener = judge.start("drive", node="hands"), judge.start("listen")
