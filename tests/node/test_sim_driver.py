@@ -8,9 +8,8 @@ import pytest
 
 from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.robot import RobotFile, Run
-from gigabrain_drivers.sim import driver as sim_driver
 from gigabrain_drivers.sim.driver import MujocoDriver
-from gigabrain_drivers.sim.physics import Simulation, run_report
+from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
 
@@ -28,13 +27,13 @@ def make(speed: float = 100.0, seconds: float | None = None, **options: float) -
 async def test_a_report_reads_nothing_that_the_physics_is_at_work_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    readers = set[str]()
+    readers, report = set[str](), Simulation.report
 
     def account(simulation: Simulation, robot: RobotFile, run: Run) -> dict[str, object]:
         readers.add(threading.current_thread().name)
-        return run_report(simulation, robot, run)
+        return report(simulation, robot, run)
 
-    monkeypatch.setattr(sim_driver, "run_report", account)
+    monkeypatch.setattr(Simulation, "report", account)
     driver = make(seconds=1.0)
     readers.clear()  # before there is a thread
     async with driver:

@@ -23,7 +23,7 @@ from gigabrain_drivers.sim import STEP_S, Pace
 from gigabrain_drivers.sim.arm_truth import ArmTruth
 from gigabrain_drivers.sim.body import SimLidar
 from gigabrain_drivers.sim.locomotion import Charge, Motor, OdometryReading
-from gigabrain_drivers.sim.physics import Simulation, run_report
+from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.scene import ROBOT
 from gigabrain_drivers.sim.sensors import ImuSample, Lidar
 from gigabrain_drivers.sim.world import Stream, generator
@@ -83,7 +83,7 @@ class EmulatedBody:
         arm = simulation.arm
         self._arm_truth = ArmTruth(simulation.model, simulation.data, arm) if arm else None
         self.snapshot = self._measure_all()
-        self._account = run_report(self._simulation, robot, run)  # as of the newest step
+        self._account = self._simulation.report(robot, run)  # as of the newest step
         self._untaken: deque[Snapshot] = deque(maxlen=MAX_SNAPSHOTS)
 
     def start(self) -> None:
@@ -203,7 +203,7 @@ class EmulatedBody:
         self._drive_arm()
         self._simulation.advance()
         snapshot = self._measure_all()
-        self._account = run_report(self._simulation, self.robot, self.run)
+        self._account = self._simulation.report(self.robot, self.run)
         if self._arm_truth:
             self._arm_truth.update(self._simulation.time_ns)
         if not broken.frozen_values:

@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,6 @@ from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.sim import STEP_NS, STEP_S, Pace
 from gigabrain_drivers.sim.body import MujocoOptions, sim_body
-from gigabrain_drivers.sim.live_world import LiveWorld
-from gigabrain_drivers.sim.physics import Simulation, run_report
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.arrays import ranges_bytes
 from gigabrain_schemas.base import TICK_NS, Message, Pose, Velocity
@@ -28,13 +26,16 @@ from gigabrain_zenoh.bus.bridge import Bridge
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 
+if TYPE_CHECKING:
+    from gigabrain_drivers.sim.physics import Simulation
+
 T = TypeVar("T")
 STEPS_PER_TICK = TICK_NS // STEP_NS  # physics steps per tick of the robot's clock
 COMMAND_TIMEOUT_NS = 150_000_000  # of simulated time: as long as a firmware would wait
 SPEED_RANGE = (0.1, 100.0)
 
 
-def state_message(simulation: Simulation, robot_type: str) -> RobotState:
+def state_message(simulation: "Simulation", robot_type: str) -> RobotState:
     """Return the body's state by its own sensors."""
     arm = simulation.arm
     odometry, charge, imu = simulation.odometry(), simulation.battery(), simulation.imu()
@@ -77,6 +78,10 @@ class MujocoDriver(Driver):
     Options = MujocoOptions
 
     def __init__(self, robot: RobotFile, options: MujocoOptions, run: Run) -> None:
+        # they import MuJoCo, which takes 0.2 s; to read its options is quick
+        from gigabrain_drivers.sim.live_world import LiveWorld
+        from gigabrain_drivers.sim.physics import Simulation
+
         super().__init__(robot, options, run)
         if not SPEED_RANGE[0] <= run.speed <= SPEED_RANGE[1]:
             raise ConfigError(
@@ -98,7 +103,7 @@ class MujocoDriver(Driver):
         self._thread: threading.Thread | None = None
         self._bridge: Bridge | None = None
         self._readings: asyncio.Queue[Reading | Exception | None] = asyncio.Queue()
-        self._account = run_report(self._simulation, robot, run)  # as of the newest tick
+        self._account = self._simulation.report(robot, run)  # as of the newest tick
         self._state: RobotState | None = None
         self.sensors = dict.fromkeys(("imu", "scan") if robot.lidar else ("imu",))
 
@@ -229,7 +234,7 @@ class MujocoDriver(Driver):
             raise BodyLost(f"fell over after {self._simulation.time_ns / 1e9:.2f} s")
         news = self._world.step()
         if last:
-            self._account = run_report(self._simulation, self.robot, self.run)
+            self._account = self._simulation.report(self.robot, self.run)
             return Reading(self._imu(), state=self._read_state(), news=news)
         # a lidar is not synchronous with the states; between two of them the cores are idle
         due = self._ticks >= self._next_scan

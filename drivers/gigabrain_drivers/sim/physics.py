@@ -176,6 +176,26 @@ class Simulation:
         """Return whether the robot, but for its hand, touches anything but the floor right now."""
         return self.truth.touching
 
+    def report(self, robot: RobotFile, run: Run) -> dict[str, Any]:
+        """Return the truth of the run so far."""
+        truth = self.truth
+        pose = truth.pose()
+        return {
+            "body": robot.robot_type,
+            "world": run.world,
+            "seed": run.seed,
+            "sim_seconds": round(self.time_ns / 1e9, 2),
+            "distance_m": round(truth.distance_m, 3),
+            "contacts": truth.contacts,
+            "falls": truth.falls,
+            "min_clearance_m": round(truth.min_clearance_m, 3),
+            "person_stood": self.person_stood,
+            "true_speed": round(truth.speed()[0], 4),
+            "true_x": round(pose.x, 4),
+            "true_y": round(pose.y, 4),
+            "true_yaw": round(pose.yaw, 4),
+        }
+
     def _set_walking(self, body: int, person: Person | None) -> None:
         """Have a spare body walk, or no longer."""
         if person:
@@ -221,24 +241,3 @@ def make_locomotion(body: SimModel, model: mujoco.MjModel, data: mujoco.MjData) 
     if body.fixed:
         return Fixed()
     raise ConfigError(f"{type(body).__name__} has neither wheels nor legs")
-
-
-def run_report(simulation: Simulation, robot: RobotFile, run: Run) -> dict[str, Any]:
-    """The truth of the run so far, by the physics itself."""
-    truth = simulation.truth
-    pose = truth.pose()
-    return {
-        "body": robot.robot_type,
-        "world": run.world,
-        "seed": run.seed,
-        "sim_seconds": round(simulation.time_ns / 1e9, 2),
-        "distance_m": round(truth.distance_m, 3),
-        "contacts": truth.contacts,
-        "falls": truth.falls,
-        "min_clearance_m": round(truth.min_clearance_m, 3),
-        "person_stood": simulation.person_stood,
-        "true_speed": round(truth.speed()[0], 4),
-        "true_x": round(pose.x, 4),
-        "true_y": round(pose.y, 4),
-        "true_yaw": round(pose.yaw, 4),
-    }
