@@ -205,8 +205,10 @@ def main() -> None:
         from contextlib import suppress
 
         from gigabrain_zenoh.host.signals import interrupts
+        from gigabrain_zenoh.host.this_process import multiply_in_one_thread
 
         interrupts.install()
+        multiply_in_one_thread()
     except KeyboardInterrupt:
         os._exit(130)
     try:

@@ -164,6 +164,16 @@ def _waited_ns(schedstat: Path) -> int:
         return 0
 
 
+def multiply_in_one_thread() -> None:
+    """Have numpy multiply matrices in the calling thread; before it is imported.
+
+    By default OpenBLAS shares each product with a thread for every other core, and all of them spin
+    for a while afterwards. Our matrices are too small for that: contours of a picture took twice
+    the CPU time. OPENBLAS_NUM_THREADS in the environment is respected.
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
 M_MMAP_THRESHOLD = -3  # mallopt(3)
 LARGE_BYTES = 4 << 20  # the costs of a map of 50 x 50 m, and less, stay in the heap
 

@@ -400,6 +400,7 @@ def main() -> None:
     """Run a supervised process, configured by its first argument, and exit."""
     this_process.die_with_supervisor()
     this_process.map_large_blocks()
+    this_process.multiply_in_one_thread()
     this_process.show_stack_on_request()
     interrupts.install()
     code = run_process(msgspec.json.decode(sys.argv[1], type=ProcessConfig))

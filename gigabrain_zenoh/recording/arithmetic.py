@@ -1,13 +1,16 @@
 """Makes numpy round the same on every x86-64 processor with AVX2. Import it before numpy.
 
-By default OpenBLAS and numpy choose code by the processor's instructions (AVX-512 or not). That
-code rounds differently, and a recorded drive is not repeated to the last bit. Child processes
-inherit the choice, unless their environment sets another.
+By default OpenBLAS and numpy choose code by the processor's instructions (AVX-512 or not), and
+OpenBLAS shares its work by the number of cores. That code rounds differently, and a recorded drive
+is not repeated to the last bit. Child processes inherit the choice, unless their environment sets
+another.
 """
 
 import os
 import platform
 from importlib import metadata
+
+from gigabrain_zenoh.host.this_process import multiply_in_one_thread
 
 X86_64 = ("x86_64", "AMD64")
 AVX512_FEATURES = {  # names of the disabled instructions, by whether numpy is 2.4 or newer
@@ -27,3 +30,4 @@ def _disable_avx512() -> None:
 
 
 _disable_avx512()
+multiply_in_one_thread()
