@@ -34,7 +34,8 @@ MIN_PIXELS, MIN_SHARE = 8, 0.15  # with depth, of that part
 LAYER_SHARE = 0.3  # of the depths that make a layer: nearer ones are something else's edge
 THIN_M, THICKNESS = 0.06, 0.7  # least, and of the width, that a layer may be thick
 EDGE_PX = 2.0  # a box that is so near to an edge may go on behind it
-IN_WALLS = {"door"}
+# what stands free; others, as doors and pictures, may be in a wall or on it
+STANDING = {"ball", "box", "can", "charger", "cube", "cylinder", "person", "robot"}
 BESIDE = (0.1, 0.35)  # where a strip beside a box begins and ends, of the box's width
 NARROW_M = 0.15  # less wide things stand out too little from a wall
 FLAT_M, BENT_M = 0.02, 0.05  # off a plane, inside a box in the mean, and beside it
@@ -84,11 +85,12 @@ def fits(label: str, place: ThingPlace) -> bool:
 def part_of_wall(label: str, box: Box, model: CameraModel, depth: NDArray[np.uint16]) -> bool:
     """Return whether the plane that is seen in a box goes on beyond both of its sides.
 
-    A side at the edge of the picture, or with unknown depth beside it, tells nothing.
+    It may be a floor as well. A side at the edge of the picture, or with unknown depth beside it,
+    tells nothing.
     """
     left, _, right, _ = np.clip(box, 0, (*depth.shape[::-1],) * 2)
     wide, middle, fx = right - left, (left + right) / 2, model.camera.pinhole[0]
-    if label in IN_WALLS:
+    if label not in STANDING:
         return False
     near, far = BESIDE[0] * wide, BESIDE[1] * wide
     profile = _profile(box, depth)

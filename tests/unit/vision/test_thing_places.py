@@ -169,10 +169,11 @@ WALLS = {
         (230.0, 80.0, 320.0, 150.0),
     ],
 )
-def test_a_part_of_a_wall_is_no_thing_but_a_door_may_be(name, box):
+def test_a_part_of_a_wall_is_no_thing_but_doors_and_pictures_may_be(name, box):
     depth, _ = seen(MODEL, WALLS[name], np.random.default_rng(0))
     assert part_of_wall("box", box, MODEL, depth)
     assert not part_of_wall("door", box, MODEL, depth)
+    assert not part_of_wall("picture", box, MODEL, depth)
 
 
 @pytest.mark.parametrize(("label", "shape", "size"), THINGS)
@@ -201,5 +202,5 @@ def test_boxes_of_any_kind_give_a_finite_place_or_none(box):
     for value in (0, 1, 800, 65535):
         depth = np.full((240, 320), value, np.uint16)
         place = thing_place("x", box, MODEL, depth)
-        assert part_of_wall("x", box, MODEL, depth) in (True, False)
+        assert part_of_wall("box", box, MODEL, depth) in (True, False)
         assert place is None or np.isfinite(place.position).all()
