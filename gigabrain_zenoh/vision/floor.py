@@ -31,10 +31,14 @@ class FloorPlane:
 
     def sigma(self, x: NDArray[np.floating], y: NDArray[np.floating]) -> NDArray[np.floating]:
         """Return the standard deviation of its height at points [m]."""
+        return np.asarray(np.sqrt(self.variance(x, y)))
+
+    def variance(self, x: NDArray[np.floating], y: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Return the variance of its height at points [m2]."""
         c = self.covariance
-        variance = c[0, 0] + 2 * (c[0, 1] * x + c[0, 2] * y + c[1, 2] * x * y)
-        variance = variance + c[1, 1] * x * x + c[2, 2] * y * y
-        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+        along = x * (2 * c[0, 1] + c[1, 1] * x)
+        across = y * (2 * c[0, 2] + c[2, 2] * y + 2 * c[1, 2] * x)
+        return np.asarray(np.maximum(c[0, 0] + along + across, 0.0))
 
 
 def unseen_floor() -> FloorPlane:
@@ -51,26 +55,28 @@ def fit_floor(before: FloorPlane, points: Floats, sigma: Floats) -> FloorPlane:
     """
     walk = np.diag((WALK_OFFSET_M, WALK_SLOPE, WALK_SLOPE)) ** 2
     predicted = FloorPlane(before.coefficients, _bounded(before.covariance + walk))
-    x, y, z = points.T
-    distance = np.hypot(x, y)
+    distance = np.hypot(points[:, 0], points[:, 1])
+    outwards = np.argsort(distance)
+    distance, (x, y, z) = distance[outwards], points[outwards].T
     design = np.stack((np.ones_like(x), x, y))
-    noise = sigma * sigma + ROUGH_M * ROUGH_M
+    noise = sigma[outwards] ** 2 + ROUGH_M * ROUGH_M
     spread = np.square(np.clip(distance, 0.3, 1.6))  # near ones are many
     information = np.linalg.inv(predicted.covariance)
     now = predicted
-    for reach in REACHES_M:
-        off = z - now.coefficients @ design
-        gate = GATE * np.sqrt(now.sigma(x, y) ** 2 + noise)
-        inlying = np.maximum(1.0 - np.square(off / gate), 0.0) * (distance < reach)  # Tukey
-        weight = np.square(inlying) * spread
+    for count in np.searchsorted(distance, REACHES_M):
+        near = np.s_[:count]
+        off = z[near] - now.coefficients @ design[:, near]
+        gate = GATE * GATE * (now.variance(x[near], y[near]) + noise[near])
+        inlying = np.maximum(1.0 - off * off / gate, 0.0)  # Tukey
+        weight = inlying * inlying * spread[near]
         total = float(weight.sum())
         if np.count_nonzero(inlying) < LEAST_POINTS or total <= 0.0:
             continue
-        weight *= INDEPENDENT / total / noise
-        weighed = design * weight
-        precision = information + weighed @ design.T
+        weight *= INDEPENDENT / total / noise[near]
+        weighed = design[:, near] * weight
+        precision = information + weighed @ design[:, near].T
         covariance = np.linalg.inv(precision)
-        solved = covariance @ (information @ predicted.coefficients + weighed @ z)
+        solved = covariance @ (information @ predicted.coefficients + weighed @ z[near])
         limits = np.array((MAX_OFFSET_M, MAX_SLOPE, MAX_SLOPE))
         now = FloorPlane(np.clip(solved, -limits, limits), covariance, seen=True)
     return now
