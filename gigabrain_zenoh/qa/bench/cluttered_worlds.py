@@ -12,6 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import Pose
@@ -121,9 +122,16 @@ def _fits(outline: Floats, others: Sequence[Floats], start: Pose) -> bool:
         return False
     rim = _along(outline)
     return all(
-        min(distance(other, rim).min(), distance(outline, _along(other)).min()) >= GAP_M
+        _boxes_gap(outline, other) >= GAP_M
+        or min(distance(other, rim).min(), distance(outline, _along(other)).min()) >= GAP_M
         for other in others
     )
+
+
+def _boxes_gap(one: Floats, other: Floats) -> float:
+    """Return how far apart the upright boxes round two outlines are at least [m]."""
+    beyond = np.maximum(one.min(axis=0) - other.max(axis=0), other.min(axis=0) - one.max(axis=0))
+    return float(beyond.max())
 
 
 def _along(outline: Floats) -> Floats:
@@ -186,7 +194,8 @@ class FreeSpace:
         middles = np.arange(-HALF_M + CELL_M / 2, HALF_M, CELL_M)
         x, y = np.meshgrid(middles, middles)
         points = np.column_stack((x.ravel(), y.ravel()))
-        room = np.minimum(distances(self._bars, points), HALF_M - np.abs(points).max(axis=1))
+        self._away = distances(self._bars, points)
+        room = np.minimum(self._away, HALF_M - np.abs(points).max(axis=1))
         self._points, self._room = points, room
         self._side, self._turning = len(middles), radius(body.footprint)
         free = (room >= self._turning + WAY_SPARE_M).reshape(x.shape)
@@ -204,8 +213,12 @@ class FreeSpace:
         return float(self.ways_from(begin)[self._cell(end)])
 
     def _cell(self, place: Point) -> int:
-        column, row = (min(int((one + HALF_M) / CELL_M), self._side - 1) for one in place)
-        return row * self._side + column
+        return int(self._cells(np.array(place)))
+
+    def _cells(self, places: Floats) -> NDArray[np.intp]:
+        """Return the numbers of the cells in which places (..., 2) [m] are."""
+        at = np.clip((places + HALF_M) / CELL_M, 0, self._side - 1).astype(np.intp)
+        return np.asarray(at[..., 1] * self._side + at[..., 0])
 
     def goals(
         self, random: np.random.Generator, start: Point
@@ -236,7 +249,10 @@ class FreeSpace:
         """Return whether the body cannot go straight to a cell."""
         share = np.linspace(0.0, 1.0, 40)[:, None]
         line = np.array(here) + share * (self._points[cell] - here)
-        return bool(distances(self._bars, line).min() < self._turning / 2)
+        away = float(self._away[self._cells(line)].min())
+        if abs(away - self._turning / 2) < CELL_M:  # the cells' middles do not tell
+            away = float(distances(self._bars, line).min())
+        return away < self._turning / 2
 
 
 def write_world(world: ClutteredWorld, folder: Path) -> Path:
