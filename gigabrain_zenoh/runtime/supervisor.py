@@ -88,9 +88,10 @@ class Supervisor:
         halted = asyncio.create_task(self._shared.halt.wait())
         watching = asyncio.create_task(self._watch())
         try:
-            # a keeper ends only when all are stopped, or with an exception
+            # a keeper ends only when all are stopped, or with an exception; one whose process the
+            # kernel does not let go may never end
             ends = [halted, watching, *self._tasks.values()]
-            await asyncio.wait(ends, return_when="FIRST_EXCEPTION")
+            await asyncio.wait(ends, return_when="FIRST_COMPLETED")
         finally:
             try:
                 await self.stop()
@@ -138,9 +139,10 @@ class Supervisor:
 
     def _abandon(self) -> None:
         """Kill every process that still runs, without waiting for it."""
-        for keeper in self._keepers.values():
+        for name, keeper in self._keepers.items():
             if keeper.child:
                 keeper.child.abandon()
+                self._tasks[name].cancel()
 
     async def _end(self, keepers: Sequence[ManagedProcess], kill_s: float, leave_s: float) -> None:
         """Request the end, kill at `kill_s`, and stop waiting at `leave_s` (both loop times)."""

@@ -1,6 +1,7 @@
 import asyncio
 import os
 import signal
+import subprocess
 import sys
 
 import pytest
@@ -112,6 +113,36 @@ async def test_a_run_that_is_cancelled_again_before_its_stop_has_begun_ends_all(
         each.cancel()
     await asyncio.gather(*left, return_exceptions=True)
     await until(lambda: not any(alive(pid) for pid in pids))
+
+
+TRACER = """
+import ctypes, sys, time
+print(ctypes.CDLL(None).ptrace(16, int(sys.argv[1]), None, None), flush=True)  # PTRACE_ATTACH
+time.sleep(60)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="by ptrace(2)")
+async def test_a_process_that_the_kernel_does_not_let_go_holds_up_no_end() -> None:
+    """As one that waits for a broken device: a killed one that is traced is not reaped either."""
+    supervisor = Supervisor([spec("one"), spec("two")], Records(), QUICK)
+    task = asyncio.create_task(supervisor.run())
+    await until(lambda: all(s.state == "ready" for s in supervisor.statuses.values()))
+    held = str(supervisor.statuses["one"].pid)
+    tracer = await asyncio.create_subprocess_exec(
+        sys.executable, "-c", TRACER, held, stdout=subprocess.PIPE
+    )
+    assert tracer.stdout
+    try:
+        if await tracer.stdout.readline() != b"0\n":
+            pytest.skip("this host lets no process trace another one")
+        await supervisor.stop(within_s=1.0)
+        await asyncio.wait_for(task, 5.0)
+        assert supervisor.statuses["two"].state == "stopped"
+    finally:
+        tracer.kill()
+        await tracer.wait()
+    await until(lambda: not state(int(held)))
 
 
 async def test_a_terminals_ctrl_c_does_not_reach_the_processes() -> None:
