@@ -24,7 +24,6 @@ from tests.system.servos import emulated_arm
 from tests.system.test_feetech_link import arm_on
 from tests.unit.drivers.feetech import FreeArm
 
-pytestmark = pytest.mark.slow
 JOINTS = load_robot("so101").joints
 NAMES = [joint.name for joint in JOINTS]
 TEN_MS = 0.01
@@ -100,6 +99,7 @@ def fastest(ways: dict[int, Floats]) -> float:
     return max(speeds)
 
 
+@pytest.mark.slow
 async def test_an_arm_goes_slowly_to_the_leader_s_posture_then_follows_it_and_is_recorded(
     shared_home: Home, arm: Probe, tmp_path: Path
 ) -> None:
@@ -163,6 +163,7 @@ async def test_a_leader_that_is_unplugged_leaves_the_follower_where_it_is(
     assert there < 1.4
 
 
+@pytest.mark.slow
 async def test_an_estop_ends_it_and_the_arm_is_held(
     shared_home: Home, arm: Probe, tmp_path: Path
 ) -> None:
@@ -185,6 +186,7 @@ async def test_an_estop_ends_it_and_the_arm_is_held(
         assert await (await shared_home.run(again)).ended() == 0
 
 
+@pytest.mark.slow
 async def test_a_leader_of_which_a_servo_is_missing_moves_nothing(
     shared_home: Home, arm: Probe, tmp_path: Path
 ) -> None:
@@ -198,6 +200,7 @@ async def test_a_leader_of_which_a_servo_is_missing_moves_nothing(
     assert arm.state.joints_sent == pytest.approx(before, abs=0.001)
 
 
+@pytest.mark.slow
 async def test_the_port_of_the_follower_is_none_for_a_leader(
     shared_home: Home, tmp_path: Path
 ) -> None:
