@@ -26,8 +26,18 @@ BEHIND = {
     "robot": 0.42,
 }
 ROUND = {"ball"}
-# [m], what is less wide is something else: a can that looks like a small robot
-NARROWEST_M = {"charger": 0.12, "door": 0.4, "person": 0.12, "robot": 0.1}
+# [m], least and most width; others are something else: a can that looks like a small robot, a wall
+WIDTHS_M = {
+    "ball": (0.0, 0.6),
+    "box": (0.0, 1.2),
+    "can": (0.0, 0.3),
+    "charger": (0.12, 1.0),
+    "cube": (0.0, 0.8),
+    "cylinder": (0.0, 0.8),
+    "door": (0.4, 2.5),
+    "person": (0.12, 1.5),
+    "robot": (0.1, 1.2),
+}
 USUAL, MOST_M = 0.35, 0.35  # of other things, and of all
 INNER = (0.2, 0.15, 0.8, 0.75)  # left, top, right, bottom of the part that is looked at
 MIN_PIXELS, MIN_SHARE = 8, 0.15  # with depth, of that part
@@ -36,9 +46,9 @@ THIN_M, THICKNESS = 0.06, 0.7  # least, and of the width, that a layer may be th
 EDGE_PX = 2.0  # a box that is so near to an edge may go on behind it
 # what stands free; others, as doors and pictures, may be in a wall or on it
 STANDING = {"ball", "box", "can", "charger", "cube", "cylinder", "person", "robot"}
-BESIDE = (0.1, 0.35)  # where a strip beside a box begins and ends, of the box's width
+STRIP = (0.1, 0.4)  # where it begins and ends, from a side of a box, of the box's width
 NARROW_M = 0.15  # less wide things stand out too little from a wall
-FLAT_M, BENT_M = 0.02, 0.05  # off a plane, inside a box in the mean, and beside it
+FLAT_M, BENT_M = 0.02, 0.05  # off a plane, inside a box in the mean, and farther beside it
 
 
 class ThingPlace(NamedTuple):
@@ -78,29 +88,30 @@ def thing_place(
 
 
 def fits(label: str, place: ThingPlace) -> bool:
-    """Return whether a thing of that class may be as narrow as the one at a place."""
-    return place.size is None or place.size[0] >= NARROWEST_M.get(label, 0.0)
+    """Return whether a thing of that class may be as wide as the one at a place."""
+    least, most = WIDTHS_M.get(label, (0.0, math.inf))
+    return place.size is None or least <= place.size[0] <= most
 
 
 def part_of_wall(label: str, box: Box, model: CameraModel, depth: NDArray[np.uint16]) -> bool:
-    """Return whether the plane that is seen in a box goes on beyond both of its sides.
+    """Return whether what is seen in a box ends at neither side, as a wall between two pillars.
 
     It may be a floor as well. A side at the edge of the picture, or with unknown depth beside it,
     tells nothing.
     """
     left, _, right, _ = np.clip(box, 0, (*depth.shape[::-1],) * 2)
-    wide, middle, fx = right - left, (left + right) / 2, model.camera.pinhole[0]
+    wide, fx = right - left, model.camera.pinhole[0]
     if label not in STANDING:
         return False
-    near, far = BESIDE[0] * wide, BESIDE[1] * wide
+    near, far = STRIP[0] * wide, STRIP[1] * wide
     profile = _profile(box, depth)
     inner = profile[math.floor(left) : math.ceil(right)]
     known = inner[np.isfinite(inner)]
     if len(known) < MIN_PIXELS or wide / fx < NARROW_M * np.median(known):
         return False
     goes_on = [
-        _one_plane(profile, (left, middle), (left - far, left - near)),
-        _one_plane(profile, (middle, right), (right + near, right + far)),
+        _goes_on(profile, (left + near, left + far), (left - far, left - near)),
+        _goes_on(profile, (right - far, right - near), (right + near, right + far)),
     ]
     told = [one for one in goes_on if one is not None]
     return bool(told) and all(told)
@@ -123,10 +134,13 @@ def _profile(box: Box, depth: NDArray[np.uint16]) -> NDArray[np.float64]:
     return profile
 
 
-def _one_plane(
+def _goes_on(
     profile: NDArray[np.float64], inside: tuple[float, float], beside: tuple[float, float]
 ) -> bool | None:
-    """Return whether columns `beside` lie in the plane of those `inside`; None if unknown."""
+    """Return whether columns `inside` are a plane that may go on `beside`; None if unknown.
+
+    It may where what is seen there is no farther: the plane itself, or something before it.
+    """
     columns = np.arange(len(profile))
     known = np.isfinite(profile)
     within = columns[known & (columns >= inside[0]) & (columns < inside[1])]
@@ -134,8 +148,9 @@ def _one_plane(
     if len(within) < MIN_PIXELS // 2 or not len(beyond):
         return None
     slope, offset = np.polyfit(within, profile[within], 1)
-    off = np.abs(slope * columns + offset - profile) / profile**2  # [m], to first order
-    return bool(off[within].mean() < FLAT_M and np.median(off[beyond]) < BENT_M)
+    farther = (slope * columns + offset - profile) / profile**2  # [m], to first order
+    flat = np.abs(farther[within]).mean() < FLAT_M
+    return bool(flat and np.median(farther[beyond]) < BENT_M)
 
 
 def _inside(box: Box, depth: NDArray[np.uint16]) -> NDArray[np.float64]:

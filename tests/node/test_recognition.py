@@ -36,6 +36,9 @@ from tests.unit.vision.tag_scenes import CAMERA, draw, facing
 TAG, DEPTH_PICTURE = draw(
     facing(7, 0.16, (1.0, 0.2, 0.1), 0.3, 0.0, 0.0), CameraModel(CAMERA), np.random.default_rng(0)
 )
+BALL = (120, 60, 160, 100)  # [px]
+DEPTH_PICTURE[60:90, :120] += 1500  # what is beside the ball is behind it
+DEPTH_PICTURE[60:90, 160:] += 1500
 REAR = Camera(name="rear", width=320, height=240, x=-0.2, z=0.1, yaw=math.pi)
 STAMP_NS = 1_795_580_000_000_000_000
 
@@ -50,7 +53,7 @@ class SeesABall:
     def find(self, picture: np.ndarray) -> Found:
         self.seen += 1
         assert self.go_on.wait(30)
-        box = np.array([[120, 60, 160, 100]], np.float32)
+        box = np.array([BALL], np.float32)
         return Found(box, np.array([1]), np.array([0.9], np.float32))
 
 
@@ -389,7 +392,8 @@ def test_a_thing_that_is_too_narrow_for_the_surest_class_is_the_next_one(metres,
 
     data = cv2.imencode(".jpg", TAG)[1].tobytes()
     picture = Image(frame_id="front", width=320, height=240, encoding="jpeg", data=data)
-    pixels = np.full((240, 320), 1000 * metres, np.uint16)
+    pixels = np.full((240, 320), 1000 * metres + 500, np.uint16)
+    pixels[110:150, 150:175] -= 500
     depth = DepthImage(frame_id="front", width=320, height=240, planes=pack_depth(pixels))
     (thing,) = Observer(Net(), TagFinder()).observe(CAMERA, picture, depth).things
     assert thing.label == label

@@ -190,6 +190,21 @@ def test_a_thing_before_a_wall_is_no_part_of_it(label, shape, size, ahead, gap):
         assert not part_of_wall(label, (left - less, top, right + less, bottom), MODEL, depth)
 
 
+PILLARS = upright((1.8, 0.5, 0.3), 0.15, 0.8), upright((1.8, -0.5, 0.3), 0.15, 0.8)
+
+
+def test_a_wall_between_pillars_is_no_thing_and_what_stands_behind_one_of_them_is():
+    depth, _ = seen(MODEL, nearest(wall(3.5, 0.2), *PILLARS), np.random.default_rng(0))
+    assert part_of_wall("box", (105.0, 60.0, 215.0, 150.0), MODEL, depth)
+    cube = cuboid((2.6, 0.35, 0.3), (0.2, 0.2, 0.2), 0.3)
+    scene = nearest(cube, wall(3.5, 0.2), PILLARS[0])
+    depth, _ = seen(MODEL, scene, np.random.default_rng(0))
+    _, (_, top, right, bottom) = seen(MODEL, cube)
+    _, (_, _, left, _) = seen(MODEL, PILLARS[0])
+    assert left < right - 20
+    assert not part_of_wall("cube", (left, top, right, bottom), MODEL, depth)
+
+
 def test_a_box_that_spans_the_picture_or_unknown_depth_tells_nothing_of_walls():
     depth, _ = seen(MODEL, WALLS["across"])
     assert not part_of_wall("box", (0.0, 40.0, 320.0, 200.0), MODEL, depth)
