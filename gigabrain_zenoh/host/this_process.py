@@ -168,8 +168,8 @@ def multiply_in_one_thread() -> None:
     """Have numpy multiply matrices in the calling thread; before it is imported.
 
     By default OpenBLAS shares each product with a thread for every other core, and all of them spin
-    for a while afterwards. Our matrices are too small for that: contours of a picture took twice
-    the CPU time. OPENBLAS_NUM_THREADS in the environment is respected.
+    for a while afterwards. Our matrices are too small for that: in a loop over pictures, contours
+    took 1.6 times the CPU time. OPENBLAS_NUM_THREADS in the environment is respected.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 

@@ -79,7 +79,8 @@ def _compiled(function: F, *, lean: bool) -> F:
 def cache_folder() -> Path | None:
     """Return the cache folder for kernels of exactly these sources; None for a user without a home.
 
-    Numba notices changes in a kernel's own file only, not in those of the kernels it calls.
+    Numba notices changes in a kernel's own file only, not in those of the kernels it calls. It
+    finds nothing for the same file at another place, as in a second checkout, or of another time.
     """
     try:
         return user_cache_path("gigabrain") / f"kernels-{_digest()}"
@@ -108,6 +109,7 @@ def _digest() -> str:
     for holder in HOLDERS:
         for source in sorted((PACKAGE / holder).rglob("*.py")):
             digest.update(source.read_bytes())
+            digest.update(f"{source} {source.stat().st_mtime_ns}".encode(errors="replace"))
     return digest.hexdigest()[:16]
 
 

@@ -1,4 +1,4 @@
-"""Recorded drives are replayed with the same arithmetic on every x86-64 processor."""
+"""How numpy computes: the same on every x86-64 processor for recorded drives, and in one thread."""
 
 import os
 import platform
@@ -26,3 +26,37 @@ def test_numpy_leaves_out_what_not_every_processor_has() -> None:
         (sys.executable, "-W", "error", "-c", SHOW), capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "[]"
+
+
+# what comes before `multiply_in_one_thread` must not import numpy; nor is MuJoCo needed for options
+QUICK = """
+import sys
+import gigabrain_zenoh.cli.app, gigabrain_zenoh.launch.processes
+print([name for name in ("numpy", "mujoco") if name in sys.modules])
+import gigabrain_drivers.sim.driver
+print("mujoco" in sys.modules)
+"""
+THREADS = """
+import os
+from gigabrain_zenoh.host.this_process import multiply_in_one_thread
+multiply_in_one_thread()
+import numpy
+print(os.environ["OPENBLAS_NUM_THREADS"], len(os.listdir("/proc/self/task")))
+"""
+
+
+def printed(code: str, **env: str) -> str:
+    """What a program prints that starts with numpy's own settings, but for `env`."""
+    own = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    command = (sys.executable, "-W", "error", "-c", code)
+    return subprocess.run(command, capture_output=True, text=True, check=True, env=own | env).stdout
+
+
+def test_commands_and_processes_begin_without_numpy_and_mujoco() -> None:
+    assert printed(QUICK).split("\n") == ["[]", "False", ""]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="threads are counted in /proc")
+def test_matrices_are_multiplied_in_one_thread_unless_the_environment_says_otherwise() -> None:
+    assert printed(THREADS).split() == ["1", "1"]
+    assert printed(THREADS, OPENBLAS_NUM_THREADS="2").split()[0] == "2"

@@ -1,5 +1,6 @@
 """Where compiled functions are kept."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -26,6 +27,22 @@ def test_a_change_in_any_source_with_kernels_asks_for_a_folder_of_its_own(
     assert kernels.cache_folder() == first
     (tmp_path / "mapping" / "one.py").write_text("x = 2")
     assert kernels.cache_folder() != first
+
+
+def test_a_second_checkout_is_not_taken_for_compiled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    folders = []
+    for name in ("one", "other"):
+        monkeypatch.setattr(kernels, "PACKAGE", tmp_path / name)
+        source = tmp_path / name / "mapping" / "one.py"
+        source.parent.mkdir(parents=True)
+        source.write_text("x = 1")
+        os.utime(source, (1, 1))
+        folders.append(kernels.cache_folder())
+    os.utime(source, (2, 2))  # numba takes it for another file
+    assert len({*folders, kernels.cache_folder()}) == 3
 
 
 def test_where_nothing_can_be_written_it_is_compiled_all_the_same(tmp_path: Path) -> None:
