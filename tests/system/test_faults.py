@@ -41,4 +41,8 @@ def test_the_robot_stops_whatever_breaks(fault: FaultRow, results: dict[int, Fau
     result = results[fault.number]
     if result.verdict == "skipped":
         pytest.skip(result.reason)
-    assert result.verdict == "passed", result.tries
+    if all(run.disturbed and run.measured for run in result.tries) and result.reason:
+        pytest.skip(
+            f"a thread waited for a core in every run, so limits say nothing: {result.reason}"
+        )
+    assert result.verdict == "passed", f"{result.reason}, in {result.tries}"
