@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("tensorflow")
+pytest.importorskip("gigabrain_zenoh.qa.train.net", reason="needs the extra train")
 pytest.importorskip("onnx")
 
 import cv2
