@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 EVERY_NS = 500_000_000  # from one word about it to the next
 MAX_WAITING = MAX_ENTRIES // 2  # entries; more may be added while they are published
-MOST_KEYS = 512  # of which the newest number is known
+MAX_KEYS = 512  # of which the newest number is known
 HIGHEST = 2**63 - 1
 
 
@@ -81,7 +81,7 @@ class PublishedInputLogger(InputLogger):
         """Record that a message is used; several uses in a row count as one."""
         if seq and self._last.get(key) == seq:
             return
-        put_newest(self._last, key, seq, MOST_KEYS)
+        put_newest(self._last, key, seq, MAX_KEYS)
         self._add(key, seq)
 
     def in_time(self, job: Job, patience_s: float) -> bool:

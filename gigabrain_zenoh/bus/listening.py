@@ -14,7 +14,7 @@ from gigabrain_zenoh.errors import unknown
 
 M = TypeVar("M", bound=Message)
 TOPIC_BY_KEY: dict[str, Topic[Any]] = {topic.key: topic for topic in TOPICS}
-ROOM = 64  # messages that wait for a slow `async for`; the oldest give way
+MAX_WAITING = 64  # messages that wait for a slow `async for`; the oldest give way
 
 
 def topic_named(name: str) -> Topic[Any]:
@@ -36,7 +36,7 @@ def topic_of(key: str) -> Topic[Any] | None:
 
 async def listen(bus: Bus, topic: Topic[M]) -> AsyncIterator[M]:
     """Yield every message on `topic` from the first `anext` on."""
-    waiting: deque[M] = deque(maxlen=ROOM)
+    waiting: deque[M] = deque(maxlen=MAX_WAITING)
     arrived = asyncio.Event()
 
     def take(_key: str, message: M) -> None:

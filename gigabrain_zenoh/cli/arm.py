@@ -25,9 +25,9 @@ Metres = Annotated[float, Parameter(allow_leading_hyphen=True)]
 Distance = Annotated[float, Parameter(allow_leading_hyphen=True)]
 BAR = 20  # characters of a joint's range
 WATCH_S = 0.2
-MOST_LABEL = 64
+MAX_LABEL_CHARS = 64
 SLOW = math.radians(45)  # [rad/s], of an arm that a person sends somewhere
-SURE = "all joints are let go of, and the arm may fall; hold it, and type yes: "
+LIMP_PROMPT = "all joints are let go of, and the arm may fall; hold it, and type yes: "
 
 
 def state(*, watch: bool = False, at: RobotAddress = LOCAL) -> None:
@@ -184,8 +184,10 @@ def pick_seen(
     from gigabrain_zenoh.decision.tasks.arm_steps import Solid
     from gigabrain_zenoh.decision.tasks.mission import Mission, Step
 
-    if not 0 < len(label) <= MOST_LABEL:
-        raise ConfigError(f"pick: expected a class of at most {MOST_LABEL} characters, such as can")
+    if not 0 < len(label) <= MAX_LABEL_CHARS:
+        raise ConfigError(
+            f"pick: expected a class of at most {MAX_LABEL_CHARS} characters, such as can"
+        )
     mission = Mission(things={label: Solid(label=label)}, do=(Step(pick=label),))
     _carry_out(at, mission, mode, wait)
 
@@ -290,7 +292,7 @@ def limp(*, yes: bool = False, at: RobotAddress = LOCAL) -> None:
     if not yes:
         if not sys.stdin.isatty():
             raise ConfigError("arm limp asks a person first; give --yes where nobody can answer")
-        if input(SURE).strip().lower() != "yes":
+        if input(LIMP_PROMPT).strip().lower() != "yes":
             print_line("nothing is done")
             return
     _ask(at, lambda robot: robot.limp())

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from gigabrain_zenoh.qa.bench.hands import HandsResult, HandsRun
     from gigabrain_zenoh.qa.bench.joints import TrackingResult
 
-MOST_BACKLASH_DEG, MOST_LOAD_KG = 10.0, 10.0
+MAX_BACKLASH_DEG, MAX_LOAD_KG = 10.0, 10.0
 
 
 def hands(
@@ -47,8 +47,8 @@ def hands(
     from gigabrain_zenoh.qa.bench.hands import measure_hands
 
     check_names([body])
-    if not 0.0 <= backlash <= MOST_BACKLASH_DEG:
-        raise ConfigError(f"--backlash: expected 0 to {MOST_BACKLASH_DEG:g} degrees")
+    if not 0.0 <= backlash <= MAX_BACKLASH_DEG:
+        raise ConfigError(f"--backlash: expected 0 to {MAX_BACKLASH_DEG:g} degrees")
     files.check_result_path(json)
     result = measure_hands(
         seeds_of(seeds), body, print_progress, backlash_deg=backlash, camera=camera
@@ -115,10 +115,10 @@ def joints(
     from gigabrain_zenoh.qa.bench.joints import measure_joints
 
     check_names([body])
-    if not 0.0 <= backlash <= MOST_BACKLASH_DEG:
-        raise ConfigError(f"--backlash: expected 0 to {MOST_BACKLASH_DEG:g} degrees")
-    if not 0.0 <= load <= MOST_LOAD_KG:
-        raise ConfigError(f"--load: expected 0 to {MOST_LOAD_KG:g} kg")
+    if not 0.0 <= backlash <= MAX_BACKLASH_DEG:
+        raise ConfigError(f"--backlash: expected 0 to {MAX_BACKLASH_DEG:g} degrees")
+    if not 0.0 <= load <= MAX_LOAD_KG:
+        raise ConfigError(f"--load: expected 0 to {MAX_LOAD_KG:g} kg")
     files.check_result_path(json)
     result = measure_joints(body, load, backlash, print_progress)
     finish(_joints_table(result), result, json)

@@ -287,7 +287,7 @@ def _at(path: str, text: str) -> str:
 
 
 T = TypeVar("T")
-MOST_BYTES = 256 * 1024  # a hundred times what a large robot's file holds
+MAX_BYTES = 256 * 1024  # a hundred times what a large robot's file holds
 
 
 def load(path: Path, type: type[T]) -> T:
@@ -314,7 +314,7 @@ def beside(name: str, folder: Path) -> str:
 def read(path: Path) -> str:
     """Return the text of a YAML file. Raises ConfigError."""
     try:
-        data = read_bounded(path, MOST_BYTES)
+        data = read_bounded(path, MAX_BYTES)
         return data.decode()
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file{_nearest(path)}") from None

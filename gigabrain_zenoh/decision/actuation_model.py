@@ -24,7 +24,7 @@ LAGS_S = TICK_S * np.arange(26)  # candidates: 0 to 0.5 s
 LATE_TICKS = 5  # how late a tick's messages may arrive without affecting the result
 SILENT_TICKS = 5  # after this long without a command, the gate stops the body
 EXCITED_TICKS = 30  # how long a change of the command is informative
-LEAST_CHANGE = (0.04, 0.15)  # [m/s], [rad/s], within EXCITED_TICKS; smaller changes drown in noise
+MIN_CHANGE = (0.04, 0.15)  # [m/s], [rad/s], within EXCITED_TICKS; smaller changes drown in noise
 NOISE = (0.004, 0.01)  # [m/s], [rad/s], minimum; prevents overconfidence in an exact model
 MEMORY_TICKS = 1000  # excited ticks; time constant with which squared errors are forgotten
 ENOUGH_TICKS = 40  # excited ticks before the estimate is used
@@ -142,7 +142,7 @@ class ActuationEstimator:
         self._past: dict[int, CmdVel] = {}  # the commander's, already evaluated
         self._states: dict[int, RobotState] = {}
         self._command: CmdVel | None = None
-        self._axes = tuple(Axis(*each) for each in zip(LEAST_CHANGE, NOISE, strict=True))
+        self._axes = tuple(Axis(*each) for each in zip(MIN_CHANGE, NOISE, strict=True))
         self._response = self._prior
 
     def _process(self, state: RobotState) -> None:

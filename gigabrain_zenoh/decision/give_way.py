@@ -23,7 +23,7 @@ WALKED_TICKS = 3000  # 60 s, how long a walking person is remembered
 STANDS_M = 0.4  # from a person's last place to a hit of the scan: still there
 BODY_M = 0.5  # from a person's last place to the middle of a contour: their own
 SAME_M = 1.0  # between two places of the same person
-MOST = 64  # that are remembered
+MAX_WAYS = 64  # that are remembered
 
 Point = tuple[float, float]
 Way = tuple[float, float, float]  # x, y [m] of a person, and their direction [rad]
@@ -47,7 +47,7 @@ class Walkers:
         kept = (away > SAME_M).all(axis=1) & (np.abs(tick - self._ticks) <= WALKED_TICKS)
         ways = np.concatenate((self.ways[kept], np.column_stack((places, turns))))
         ticks = np.concatenate((self._ticks[kept], np.full(len(moving), tick)))
-        self.ways, self._ticks = ways[-MOST:], ticks[-MOST:]
+        self.ways, self._ticks = ways[-MAX_WAYS:], ticks[-MAX_WAYS:]
 
 
 def nearest(ways: Floats, place: Point, reach: float) -> Way | None:

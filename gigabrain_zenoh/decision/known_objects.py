@@ -13,7 +13,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.decision.behaviours import Target
 
 TAG_RADIUS_M = 0.02
-LEAST_RADIUS_M, MOST_RADIUS_M = 0.02, 1.0
+MIN_RADIUS_M, MAX_RADIUS_M = 0.02, 1.0
 NO_OBJECTS = ObjectMap()
 Wanted = str | int  # a class, or the number of a tag
 
@@ -80,7 +80,7 @@ def sought(
 def _target(one: MapObject | MapTag) -> Target:
     if isinstance(one, MapTag):
         return Target(name=f"tag {one.id}", x=one.x, y=one.y, radius=TAG_RADIUS_M, yaw=one.yaw)
-    radius = min(max(one.size[0] / 2, LEAST_RADIUS_M), MOST_RADIUS_M)
+    radius = min(max(one.size[0] / 2, MIN_RADIUS_M), MAX_RADIUS_M)
     return Target(name=f"{one.label} {one.id}", x=one.x, y=one.y, radius=radius)
 
 

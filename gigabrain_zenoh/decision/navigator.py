@@ -15,7 +15,7 @@ from gigabrain_schemas.base import TICK_S, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import Intent, WorldModel
 from gigabrain_schemas.safety import SafetyState
-from gigabrain_schemas.tasks import MOST_POINTS, Goal
+from gigabrain_schemas.tasks import MAX_POINTS, Goal
 from gigabrain_schemas.zones import Zone
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.decision.behaviours import (
@@ -431,7 +431,7 @@ def _rest_of(points: Floats, here: Pose) -> Floats:
 
 def _thinned(points: Floats) -> tuple[tuple[float, float], ...]:
     """Return few enough points to be drawn, with the first and the last."""
-    count = min(len(points), MOST_POINTS)
+    count = min(len(points), MAX_POINTS)
     chosen = np.linspace(0, len(points) - 1, count).round().astype(int)
     return tuple((round(x, 3), round(y, 3)) for x, y in points[chosen].tolist())
 

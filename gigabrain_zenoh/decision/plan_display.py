@@ -13,7 +13,7 @@ from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Plan
 from gigabrain_zenoh.manipulation.grasps import Grasp
 
 STEP_M = 0.01  # between points of the path
-MOST_POINTS, MOST_GRASPS = 400, 8
+MAX_POINTS, MAX_GRASPS = 400, 8
 
 
 class PlanDisplay:
@@ -45,7 +45,7 @@ def described(arm: ArmKinematics, plan: Plan) -> ArmPlan:
     postures = [phase.arm.positions for phase in plan.phases if phase.arm]
     return ArmPlan(
         path=_path(arm, np.concatenate(postures)).astype("<f4").tobytes() if postures else b"",
-        grasps=tuple(_poses(arm, plan.grasps[:MOST_GRASPS])),
+        grasps=tuple(_poses(arm, plan.grasps[:MAX_GRASPS])),
     )
 
 
@@ -56,7 +56,7 @@ def _path(arm: ArmKinematics, postures: Floats) -> Floats:
         place = arm.forward(posture).position
         if not kept or np.linalg.norm(place - kept[-1]) >= STEP_M:
             kept.append(place)
-    return np.array(kept[:MOST_POINTS])
+    return np.array(kept[:MAX_POINTS])
 
 
 def _poses(arm: ArmKinematics, grasps: Sequence[Grasp]) -> Iterator[GraspPose]:

@@ -28,7 +28,7 @@ RIM_RAD = math.radians(4)  # at the picture's edge, where a thing may be cut off
 SAMPLE_M = 0.05  # along a line of sight
 STAND_M = (0.5, 1.8)  # from what is looked at, where there is a choice
 NEIGHBOURS, AROUND_M = 4, 0.45  # unseen cells so near together are worth a look
-SURE_TICKS = 75  # 1.5 s, until all counts as seen: what was seen last is still being recognised
+SETTLED_TICKS = 75  # 1.5 s, until all counts as seen: what was seen last is still being recognised
 VIEWPOINTS = 16  # round what is to be looked at, that are tried
 LOOK_PRICE_M = 1.0  # of way, that one look costs
 
@@ -145,7 +145,7 @@ class LookAround:
 
     def settled(self, tick: int) -> bool:
         """Return whether nothing new was seen for a while."""
-        return tick - self._changed_tick >= SURE_TICKS
+        return tick - self._changed_tick >= SETTLED_TICKS
 
     def next_goal(
         self, costs: Costmap, body: BodyDescription, here: Pose, search: GridSearch

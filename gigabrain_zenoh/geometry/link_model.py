@@ -11,7 +11,7 @@ from xml.etree import ElementTree as xml
 
 import numpy as np
 
-from gigabrain_schemas.body import MOST_MODEL_CHARACTERS
+from gigabrain_schemas.body import MAX_MODEL_CHARACTERS
 from gigabrain_schemas.sim import ShapeKind
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.link_inertia import (
@@ -300,8 +300,8 @@ class _Reader:
 
 
 def _parsed(mjcf: str) -> xml.Element:
-    if len(mjcf) > MOST_MODEL_CHARACTERS:
-        raise ValueError(f"expected at most {MOST_MODEL_CHARACTERS} characters")
+    if len(mjcf) > MAX_MODEL_CHARACTERS:
+        raise ValueError(f"expected at most {MAX_MODEL_CHARACTERS} characters")
     if "<!DOCTYPE" in mjcf or "<!ENTITY" in mjcf:  # its entities may grow without end
         raise ValueError("it declares entities")
     root = xml.fromstring(mjcf)

@@ -7,14 +7,14 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
 
-LEAST_AREA_M2 = 1e-4
+MIN_AREA_M2 = 1e-4
 
 
 def problem(corners: Floats) -> str:
     """Return why corners make no simple polygon, or an empty text."""
     if edges_cross(corners):
         return "its edges cross"
-    return "it has no area" if abs(area(corners)) < LEAST_AREA_M2 else ""
+    return "it has no area" if abs(area(corners)) < MIN_AREA_M2 else ""
 
 
 def area(corners: Floats) -> float:

@@ -14,7 +14,7 @@ from gigabrain_schemas.arrays import Floats
 Corners = tuple[tuple[float, float], ...]
 
 STEP = 0.02  # [m], how far any part of the body moves between two checks
-MOST_STEPS = 1000  # checks along one path; longer paths use longer steps
+MAX_STEPS = 1000  # checks along one path; longer paths use longer steps
 AT_ONCE = 1_000_000  # distances from points to edges that are computed in one batch
 NEARER = 0.005  # [m], how much closer a point already within the margin may come
 
@@ -160,7 +160,7 @@ def arc(
 
 
 def _steps(reach: float, step: float) -> Floats:
-    step = max(step, reach / MOST_STEPS)
+    step = max(step, reach / MAX_STEPS)
     return np.arange(0.0, reach + step, step)
 
 

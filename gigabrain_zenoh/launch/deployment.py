@@ -49,7 +49,7 @@ from gigabrain_zenoh.security.identity_files import (
     identity_folder,
 )
 
-MOST_HOSTS = 64
+MAX_HOSTS = 64
 NET_FILES = ("onnx", "labels")  # in the part `recognizer`
 ROBOT = tuple(name for name, one in PROCESSES.items() if one.default)
 
@@ -90,8 +90,8 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         if not self.hosts:
             raise ValueError("hosts: expected at least one, with the processes that it runs")
-        if len(self.hosts) > MOST_HOSTS:
-            raise ValueError(f"hosts: {len(self.hosts)} of them; expected at most {MOST_HOSTS}")
+        if len(self.hosts) > MAX_HOSTS:
+            raise ValueError(f"hosts: {len(self.hosts)} of them; expected at most {MAX_HOSTS}")
         self._place_own()
         placed = Counter(name for names in self.hosts.values() for name in names)
         twice = sorted(name for name, times in placed.items() if times > 1)

@@ -26,7 +26,7 @@ from gigabrain_zenoh.security.acl import check_write
 if TYPE_CHECKING:
     from gigabrain_zenoh.launch.deployment import Deployment
 
-MOST_OWN = 32  # of one robot
+MAX_OWN = 32  # of one robot
 MODULES, PERCEPTORS = "processes", "perceptors"  # parts of a deployment file
 OWN = ProcessType("")
 
@@ -38,8 +38,8 @@ def check_entries(
 ) -> None:
     """Raise ValueError, which begins with the place in the file, for entries that do not fit."""
     names = [*processes, *perceptors]
-    if len(names) > MOST_OWN:
-        raise ValueError(f"processes: {len(names)} of one's own; expected at most {MOST_OWN}")
+    if len(names) > MAX_OWN:
+        raise ValueError(f"processes: {len(names)} of one's own; expected at most {MAX_OWN}")
     for part, entries in ((MODULES, processes), (PERCEPTORS, perceptors)):
         for name in entries:
             if name in known or names.count(name) > 1:

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from gigabrain_schemas.arrays import Floats
-from gigabrain_schemas.body import MOST_MODEL_CHARACTERS, JointDescription
+from gigabrain_schemas.body import MAX_MODEL_CHARACTERS, JointDescription
 from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.manipulation.descent import Chain
 
@@ -302,9 +302,9 @@ def _read(
     mjcf: str, joints: Sequence[str], tool: str
 ) -> tuple[mujoco.MjSpec, tuple[Follower, ...]]:
     """Return the model with the given joints alone, its base at the origin, and followers."""
-    if len(mjcf) > MOST_MODEL_CHARACTERS:
+    if len(mjcf) > MAX_MODEL_CHARACTERS:
         raise ConfigError(
-            f"the arm's model has {len(mjcf)} characters; at most {MOST_MODEL_CHARACTERS} are read"
+            f"the arm's model has {len(mjcf)} characters; at most {MAX_MODEL_CHARACTERS} are read"
         )
     if found := FORBIDDEN.search(mjcf):
         raise ConfigError(

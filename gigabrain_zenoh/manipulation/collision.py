@@ -19,13 +19,13 @@ from gigabrain_zenoh.manipulation.arm_kinematics import (
 
 MARGIN_M = 0.005
 DISTANCE_CUTOFF_M = 0.1
-ROOM_CUTOFF_M = 0.012
-LEAST_SWEEP_M = 0.001  # of a line of postures, by which the margin may be undercut
+CLEARANCE_CUTOFF_M = 0.012
+MIN_SWEEP_M = 0.001  # of a line of postures, by which the margin may be undercut
 LINK_RADIUS_M = 0.03  # by which links and tools stick out, beyond the line from joint to joint
 HELD = "held"  # the body of what the tool holds
 SIZES = {"box": 3, "cylinder": 2, "sphere": 1, "floor": 0}
 BASE_FRAME = Frame(position=np.zeros(3), axes=np.eye(3))
-LEAST_M, MOST_M = 1e-4, 100.0
+MIN_SIZE_M, MAX_SIZE_M = 1e-4, 100.0
 GEOMS = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
@@ -54,8 +54,8 @@ class Thing:
             raise ConfigError(f"{self.name}: size and place have to be finite")
         if len(self.size) != SIZES[self.kind]:
             raise ConfigError(f"{self.name}: a {self.kind} has {SIZES[self.kind]} sizes")
-        if not all(LEAST_M <= size <= MOST_M for size in self.size):
-            raise ConfigError(f"{self.name}: expected sizes of {LEAST_M} to {MOST_M:g} m")
+        if not all(MIN_SIZE_M <= size <= MAX_SIZE_M for size in self.size):
+            raise ConfigError(f"{self.name}: expected sizes of {MIN_SIZE_M} to {MAX_SIZE_M:g} m")
 
     @property
     def half(self) -> Floats:
@@ -136,7 +136,7 @@ class CollisionChecker:
         """Return whether nothing touches anything within the margin."""
         return not self.touches(posture)
 
-    def room(self, posture: Floats, cutoff: float = ROOM_CUTOFF_M) -> float:
+    def room(self, posture: Floats, cutoff: float = CLEARANCE_CUTOFF_M) -> float:
         """Return a distance [m] that all parts keep; their smallest one may be a bit larger.
 
         It is exact where it is no more than the margin.
@@ -165,7 +165,7 @@ class CollisionChecker:
             room = self.room(start + (goal - start) * middle) - share * self.margin
             if room <= 0.0:
                 return False
-            if half > max(room, LEAST_SWEEP_M):
+            if half > max(room, MIN_SWEEP_M):
                 parts += [(begin, middle), (middle, end)]
         return True
 

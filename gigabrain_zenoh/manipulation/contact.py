@@ -13,7 +13,7 @@ from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics
 
 SKIPPED_TICKS = 10  # at first: friction and speed have to settle
 REFERENCE_TICKS = 10  # after them, with whose mean is compared
-LEAST_SHARE = 0.1  # of the greatest lever; where levers are shorter, a force is not known
+MIN_SHARE = 0.1  # of the greatest lever; where levers are shorter, a force is not known
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,5 +54,5 @@ class ContactSense:
         if loads is None:
             return Push(force=None, lag=lag)
         change = self._loads - loads
-        force = np.linalg.lstsq(jacobian[:3].T, change, rcond=LEAST_SHARE)[0]
+        force = np.linalg.lstsq(jacobian[:3].T, change, rcond=MIN_SHARE)[0]
         return Push(force=np.asarray(force, np.float64), lag=lag)

@@ -18,10 +18,10 @@ Flags = NDArray[np.bool_]
 PLACE, APPROACH, AXES = 0, 1, 2  # which part of a goal counts
 MAX_ITERATIONS = 60
 MAX_STEP = 0.6  # [rad] or [m] of a joint
-LEAST_STEP = 1e-6
+MIN_STEP = 1e-6
 SLOW_STEP, SLOW_GAIN = 1e-3, 1e-4  # steps that bring so little end the descent
 FINE_M, FINE_RAD = 1e-6, 1e-5  # errors at which a posture is improved no more
-DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-9, 1e3
+DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-4, 1e-9, 1e3
 EASE, STIFFEN = 0.2, 6.0  # factors of the damping after a step that helped, and one that did not
 
 
@@ -220,7 +220,7 @@ def descend(
             low, high = posture[k] <= limits[0, k], posture[k] >= limits[1, k]
             held[k] = (low and slope[k] < 0.0) or (high and slope[k] > 0.0)
         new_cost, moved = math.inf, 0.0
-        while damping < MOST_DAMPING:
+        while damping < MAX_DAMPING:
             _solved(square, slope, damping, held, step)
             scale = min(1.0, MAX_STEP / max(np.abs(step).max(), 1e-12))
             moved = 0.0
@@ -236,9 +236,9 @@ def descend(
             damping *= STIFFEN
         if new_cost >= cost:
             return
-        slow = moved < LEAST_STEP or (cost - new_cost < SLOW_GAIN * cost and moved < SLOW_STEP)
+        slow = moved < MIN_STEP or (cost - new_cost < SLOW_GAIN * cost and moved < SLOW_STEP)
         posture[:], error[:], cost = tried, new_error, new_cost
-        damping = max(LEAST_DAMPING, damping * EASE)
+        damping = max(MIN_DAMPING, damping * EASE)
         _normal_equations(frame, joints, chain, error, weight, square, slope)
         if slow or _is_fine(error):
             return

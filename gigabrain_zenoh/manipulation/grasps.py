@@ -34,8 +34,8 @@ HEIGHTS = (0.0, 0.3, 0.6)  # of half the thing's height, above its middle
 TOLERANCE_RAD = math.radians(4)  # of the tool's orientation at the thing
 DRIFT_RAD = math.radians(35)  # the same where the approach begins
 TRIES = 5  # of inverse kinematics, for each
-ENOUGH = 8  # grasps
-LEAST_LEVEL = 0.3  # sine between the vertical and the axis along which fingers close
+ENOUGH_GRASPS = 8  # grasps
+MIN_LEVEL = 0.3  # sine between the vertical and the axis along which fingers close
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -72,7 +72,7 @@ class GraspPlanner:
         thing: Thing,
         others: Sequence[Thing],
         start: Floats | None = None,
-        enough: int = ENOUGH,
+        enough: int = ENOUGH_GRASPS,
     ) -> list[Grasp] | NoGrasp:
         """Return the ways to grasp a thing, those with the largest clearance first.
 
@@ -168,7 +168,7 @@ def candidates(thing: Thing, opening: Opening) -> Iterator[tuple[Frame, float, f
     for tilt in TILTS_RAD:
         for across, width in _closing_axes(thing):
             level = np.cross(UP, across)
-            if width + 2 * GAP_M > opening.widest or np.linalg.norm(level) < LEAST_LEVEL:
+            if width + 2 * GAP_M > opening.widest or np.linalg.norm(level) < MIN_LEVEL:
                 continue  # too wide, or the fingers would close from above
             level /= np.linalg.norm(level)
             middle = opening.middle(opening.position(_opened(width, opening)))

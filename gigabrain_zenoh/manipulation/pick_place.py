@@ -36,7 +36,7 @@ SLOW = 0.35  # of the joints' speeds, with a thing in the gripper
 CREEP = 0.1  # the same straight to a thing or its place: safety slows single joints near the table
 SQUEEZE = 0.12  # of the gripper's range, beyond the thing's width
 EASED = 0.035  # the same, once it is held: what servos can do for long
-MOST_EASED = 1.4  # times EASED; a grip that squeezes harder is eased again
+MAX_EASED = 1.4  # times EASED; a grip that squeezes harder is eased again
 HELD_SHARE = 0.01  # of the gripper's range, short of its target: something is between the fingers
 LIFT_M = 0.05  # straight up
 PLACE_GAP_M = 0.003  # above what it is put on, when it is let go of
@@ -275,7 +275,7 @@ class PickPlacePlanner:
         What was gripped askew may spring back when the grip is eased.
         """
         span = self._gripper.upper - self._gripper.lower
-        return bool(self._gripper.max_effort) and abs(measured - wanted) > MOST_EASED * EASED * span
+        return bool(self._gripper.max_effort) and abs(measured - wanted) > MAX_EASED * EASED * span
 
     def holds(self, measured: float, wanted: float) -> bool:
         """Return whether the gripper has stopped short of where it was sent."""

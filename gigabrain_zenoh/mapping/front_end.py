@@ -28,8 +28,8 @@ POINTS = 360  # of a scan are enough for ICP
 INLIERS = 0.35  # share of the points, below it ICP has failed
 MOVED = 0.4  # [m], ICP that went farther from where it began has slid away
 SCORE = 0.35  # a search below it has failed
-LEAST_SCORE = 0.2  # of a search that ICP may begin from
-SURE_SCORE, SURE_INLIERS = 0.55, 0.6  # what it takes to believe a wide search
+MIN_SCORE = 0.2  # of a search that ICP may begin from
+WIDE_SCORE, WIDE_INLIERS = 0.55, 0.6  # what it takes to believe a wide search
 WIDE = Window(1.0, 0.6)  # where to look when the scan does not fit where it should
 WIDELY = 45  # points of a scan are enough for that, as ICP and what is seen have to agree
 CLEAR = 0.85  # score, from here on nothing is doubted
@@ -37,11 +37,11 @@ WRONG = 0.2  # share of what should be in view that is looked through: not the p
 CLEARER = 0.1  # so much less of it
 BETTER = 0.1  # score: so much more, for a place that odometry does not lead to
 SLID = 0.3  # [m], a match so far from where odometry leads may have slid over what is known
-ENOUGH = 0.5  # of its inliers, for what odometry leads to instead
-LEAST_INLIERS = 0.15  # share of the points, to go by odometry and them
+ENOUGH_INLIERS = 0.5  # of its inliers, for what odometry leads to instead
+MIN_INLIERS = 0.15  # share of the points, to go by odometry and them
 TURNS = (-1.5, -0.75, 0.75, 1.5)  # standard deviations of odometry's turn, to begin ICP from
-LEAST_TURNED = 0.05  # share of the points, of the same after a turn
-FEW = 20  # points, with fewer there is nothing to match
+MIN_TURNED_INLIERS = 0.05  # share of the points, of the same after a turn
+MIN_POINTS = 20  # points, with fewer there is nothing to match
 CONTRADICTED = 0.6  # squared deviations: a match that pulls odometry farther speaks against it
 SETTLED, SETTLED_INLIERS = (0.1, 0.03), 0.8  # [m] and [rad]; share of the points
 SETTLED_RMS = 0.06  # [m]
@@ -140,7 +140,7 @@ class FrontEnd:
         `noise` is the covariance of `delta` in its own frame, if it is known.
         """
         guess = compose(self.pose, delta)
-        self._adrift = self._adrift.moved(delta, len(scan.points) < FEW)
+        self._adrift = self._adrift.moved(delta, len(scan.points) < MIN_POINTS)
         self._noise = self._summed(noise, delta)
         if self._local is None:
             match = ScanMatch(guess, self._adrift.covariance, "matched", 1.0, 1.0)
@@ -195,7 +195,7 @@ class FrontEnd:
         return self._scans, self._poses
 
     def _match(self, local: LocalMap, scan: Scan, guess: Floats) -> ScanMatch:
-        if len(scan.points) < FEW:
+        if len(scan.points) < MIN_POINTS:
             return ScanMatch(guess, self._adrift.covariance, "odometry", 0.0, 0.0)
         covariance = self._adrift.covariance
         found = search(local.image, scan.points, guess, self._adrift.window)
@@ -231,7 +231,7 @@ class FrontEnd:
             return match
         near = self._led(local, scan, guess, found)
         if match and believed:
-            return near if near and near.inliers > ENOUGH * match.inliers else match
+            return near if near and near.inliers > ENOUGH_INLIERS * match.inliers else match
         if near:
             return near
         if not match:
@@ -260,7 +260,7 @@ class FrontEnd:
             if not through < WRONG or _apart(fit.pose, guess) > MOVED:
                 continue
             least = min(through, least)
-            if fit.inliers >= max(best.inliers if best else 0.0, LEAST_TURNED):
+            if fit.inliers >= max(best.inliers if best else 0.0, MIN_TURNED_INLIERS):
                 best = fit
         return (_matched(best, found, covariance, "matched") if best else None), least
 
@@ -270,7 +270,7 @@ class FrontEnd:
         """Match where odometry leads; None if the scan contradicts it or shows little known."""
         covariance = self._adrift.covariance
         fit = _fit(local, scan, guess, guess, covariance)
-        if fit.inliers < LEAST_INLIERS or _apart(fit.pose, guess) > MOVED:
+        if fit.inliers < MIN_INLIERS or _apart(fit.pose, guess) > MOVED:
             return None
         if not seen_through(local.buckets.points, scan.points, fit.pose) < WRONG:
             return None
@@ -283,14 +283,14 @@ class FrontEnd:
 
         It must score at least `least`, and look through less than `wrong`, if that is known.
         """
-        least = max(least, SURE_SCORE)
+        least = max(least, WIDE_SCORE)
         points = thinned(scan.points, WIDELY)
         places = [search(local.image, points, at, WIDE, least) for at in (guess, self.pose)]
         found = max(places, key=lambda place: place.score)
         if found.score < least:
             return None
         fit = _fit(local, scan, found.pose, found.pose, UNKNOWN)
-        if fit.inliers < SURE_INLIERS or _apart(fit.pose, found.pose) > MOVED:
+        if fit.inliers < WIDE_INLIERS or _apart(fit.pose, found.pose) > MOVED:
             return None
         if seen_through(local.buckets.points, scan.points, fit.pose) > wrong - CLEARER:
             return None
@@ -312,7 +312,7 @@ class FrontEnd:
         local = build([before], pose[None], pose, CELL, SIGMA)
         found = search(local.image, scan.points, guess, self._adrift.window)
         fit = _fit(local, scan, found.pose, guess, self._adrift.covariance)
-        return fit.inliers >= SURE_INLIERS
+        return fit.inliers >= WIDE_INLIERS
 
     def _summed(self, noise: Floats | None, delta: Floats) -> Floats | None:
         """Return the covariance of odometry since the last match, in the present pose's axes."""
@@ -345,7 +345,7 @@ def _fit(
 
 def _plain(fit: IcpResult, found: SearchResult, covariance: Floats) -> ScanMatch | None:
     """Return the match by search and ICP, or None if both have failed."""
-    near = found.score > LEAST_SCORE and _apart(fit.pose, found.pose) <= MOVED
+    near = found.score > MIN_SCORE and _apart(fit.pose, found.pose) <= MOVED
     if near and fit.inliers >= INLIERS:
         return _matched(fit, found, covariance, "matched")
     if found.score > SCORE:

@@ -25,19 +25,19 @@ from gigabrain_zenoh.mapping.likelihood_field import (
 )
 
 POINTS = 90  # of a scan, evenly chosen
-FEWEST_POINTS = 20
+MIN_POINTS = 20
 SIGMA = 0.15  # [m], wide enough for the steps between headings
 BLOCK = 8  # cells
 STEP_M, FINEST_RAD, COARSEST_RAD = 0.15, math.radians(1.0), math.radians(3.0)
-LEAST = 0.5  # a worse fit does not count
+MIN_SCORE = 0.5  # a worse fit does not count
 UNKNOWN = 191  # of 255, what a hit on what the map does not show counts: neither for nor against
 BAND = 0.2  # candidates that much worse than the best are not looked at
-LEAST_SHOWN = 0.9  # and that good where next to nothing is shown
+MIN_SCORE_HIDDEN = 0.9  # and that good where next to nothing is shown
 SHOWN = 0.2  # of the hits, at least, to make out a place
 CLEAR_SHOWN, CLEAR_SCORE, CLEAR_WRONG = 0.8, 0.8, 0.03  # a place beyond doubt, but for its likes
 AGAINST = 0.1  # beams that the map rules out, more than elsewhere: it is not there
 BEYOND_M = 3.0  # past the edge of what is known to be free
-MOST_BLOCKS, MOST_TRIED, MOST_FOUND = 40_000, 192, 24
+MAX_BLOCKS, MAX_TRIED, MAX_FOUND = 40_000, 192, 24
 APART_M, APART_RAD = 0.3, math.radians(20)  # nearer ones are the same
 SLID_M = 0.25  # a fit that went farther from where it began has become another place
 WEAK = np.diag((1.0, 1.0, 1.0))  # information that holds a candidate where it was found
@@ -59,7 +59,7 @@ def search(field: LikelihoodField, beams: Beams, last: Floats | None = None) -> 
     thread in the background.
     """
     hits = beams.hits
-    if len(hits) < FEWEST_POINTS or not field.free.any():
+    if len(hits) < MIN_POINTS or not field.free.any():
         return []
     tried = _likely(field, hits)
     fits = [fit(field, beams, pose, WEAK) for pose in tried]
@@ -68,7 +68,7 @@ def search(field: LikelihoodField, beams: Beams, last: Floats | None = None) -> 
     if last is None:
         return found
     here = fit(field, beams, last, WEAK)
-    if here.score < LEAST or not apart(here.pose, (one.pose for one in found)):
+    if here.score < MIN_SCORE or not apart(here.pose, (one.pose for one in found)):
         return found
     return [*found, Candidate(here.pose, here.score)]
 
@@ -85,8 +85,8 @@ def _likely(field: LikelihoodField, hits: Points) -> list[Floats]:
     offsets = _turned(chosen, headings, field.cell)
     scores, cells = _inside(image, standing, offsets, places, bounds)
     tried: list[Floats] = []
-    for k in np.argsort(-scores, kind="stable")[: 50 * MOST_TRIED]:
-        if scores[k] < max(LEAST, scores.max() - BAND) or len(tried) == MOST_TRIED:
+    for k in np.argsort(-scores, kind="stable")[: 50 * MAX_TRIED]:
+        if scores[k] < max(MIN_SCORE, scores.max() - BAND) or len(tried) == MAX_TRIED:
             break
         xy = field.origin + (cells[k] + 0.5) * field.cell
         pose = np.array((*xy, headings[places[k, 0]]))
@@ -120,8 +120,8 @@ def _turned(points: Points, headings: Floats, cell: float) -> NDArray[np.int64]:
 def _best_blocks(bounds: Bytes) -> NDArray[np.int64]:
     """Return the promising blocks (n, 3) as heading, row and column, the best first."""
     flat = bounds.ravel()
-    worth = np.flatnonzero(flat >= round(255 * LEAST))
-    order = np.argsort(-flat[worth].astype(np.int16), kind="stable")[:MOST_BLOCKS]
+    worth = np.flatnonzero(flat >= round(255 * MIN_SCORE))
+    order = np.argsort(-flat[worth].astype(np.int16), kind="stable")[:MAX_BLOCKS]
     return np.stack(np.unravel_index(worth[order], bounds.shape), axis=-1).astype(np.int64)
 
 
@@ -146,7 +146,7 @@ def _distinct(field: LikelihoodField, fits: list[FieldFit]) -> list[FieldFit]:
     found: list[FieldFit] = []
     for one in sorted(possible, key=lambda one: -one.score):
         new = one.wrong <= most and apart(one.pose, (other.pose for other in found))
-        if new and len(found) < MOST_FOUND and not _outdone(field, one, found):
+        if new and len(found) < MAX_FOUND and not _outdone(field, one, found):
             found.append(one)
     return found
 
@@ -165,7 +165,7 @@ def _outdone(field: LikelihoodField, one: FieldFit, found: list[FieldFit]) -> bo
 
 def _least(shown: float) -> float:
     """Return the least score of what is shown: the less is shown, the higher."""
-    return LEAST + (LEAST_SHOWN - LEAST) * max(0.0, 1.0 - shown / JUDGED)
+    return MIN_SCORE + (MIN_SCORE_HIDDEN - MIN_SCORE) * max(0.0, 1.0 - shown / JUDGED)
 
 
 def _standing(field: LikelihoodField) -> NDArray[np.bool_]:
@@ -215,7 +215,7 @@ def _inside(
     scores, cells = np.zeros(len(places)), np.zeros((len(places), 2), np.int64)
     for place in range(len(places)):
         heading, row, column = places[place]
-        enough = max(LEAST, best - BAND) * 255.0 * count
+        enough = max(MIN_SCORE, best - BAND) * 255.0 * count
         if (bounds[heading, row, column] + 1) * count < enough:
             break  # those that follow are no better
         for y in range(row * BLOCK, min((row + 1) * BLOCK, height)):

@@ -15,12 +15,12 @@ Points = NDArray[np.float32]
 NEIGHBOUR = 0.4  # [m], a point farther away lies on something else
 SPREAD, FARTHEST = 2.5, 1.2  # unless beams are so many times farther apart there; and [m]
 SPAN = 0.12  # [m], a normal rests on neighbours at least so far to either side, where there are any
-LEAST, MOST = 3, 10  # neighbours on either side
-FEWEST = 3  # points under a normal
+MIN_NEIGHBOURS, MAX_NEIGHBOURS = 3, 10  # neighbours on either side
+MIN_POINTS = 3  # points under a normal
 
 BINS = 360  # of bearing
 MARGIN = 0.3  # [m], what lies nearer than a beam's end by less was hit by it
-FEW = 20  # points in view; fewer prove nothing
+MIN_SEEN_POINTS = 20  # points in view; fewer prove nothing
 
 Arrays = Mapping[str, NDArray[np.generic]]
 REACH_M = 200.0  # of a beam: what it passes is drawn cell by cell
@@ -102,7 +102,7 @@ def _evenly(count: int, most: int) -> NDArray[np.intp]:
 
 def normals(points: Points) -> Points:
     """Return the normal at each point, of the line through its neighbours in beam order."""
-    if len(points) < FEWEST:
+    if len(points) < MIN_POINTS:
         return np.zeros_like(points)
     bearings = np.arctan2(points[:, 1], points[:, 0])
     apart = np.sort(np.abs(np.diff(bearings)))
@@ -120,7 +120,7 @@ def _normals(points: Points, between: float) -> Points:
         range_ = np.sqrt(points[k, 0] ** 2 + points[k, 1] ** 2)
         most_away = min(max(NEIGHBOUR, SPREAD * between * range_), FARTHEST)
         for side in (-1, 1):
-            for step in range(1, min(MOST, count - 1) + 1):
+            for step in range(1, min(MAX_NEIGHBOURS, count - 1) + 1):
                 j = (k + side * step) % count
                 dx, dy = points[j, 0] - points[k, 0], points[j, 1] - points[k, 1]
                 away = np.sqrt(dx * dx + dy * dy)
@@ -128,9 +128,9 @@ def _normals(points: Points, between: float) -> Points:
                     n += 1
                     sx, sy = sx + dx, sy + dy
                     sxx, syy, sxy = sxx + dx * dx, syy + dy * dy, sxy + dx * dy
-                if step >= LEAST and away >= SPAN:
+                if step >= MIN_NEIGHBOURS and away >= SPAN:
                     break
-        if n >= FEWEST:
+        if n >= MIN_POINTS:
             xx, yy, xy = sxx - sx * sx / n, syy - sy * sy / n, sxy - sx * sy / n
             along = 0.5 * np.arctan2(2 * xy, xx - yy)  # the principal axis
             found[k, 0], found[k, 1] = -np.sin(along), np.cos(along)
@@ -145,7 +145,7 @@ def seen_through(shown: Points, scan: Points, pose: Floats) -> float:
     """
     nearest, farthest = _ends(scan)
     through, hit = _look(shown, nearest, farthest, pose)
-    return through / (through + hit) if through + hit >= FEW else np.nan
+    return through / (through + hit) if through + hit >= MIN_SEEN_POINTS else np.nan
 
 
 def share_hit(shown: Points, scan: Points, pose: Floats) -> float:

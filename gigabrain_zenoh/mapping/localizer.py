@@ -12,7 +12,7 @@ import numpy as np
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.geometry.se2 import IDENTITY, between, compose, inverse, turned
 from gigabrain_zenoh.host.threads import ScheduledWorker, Take
-from gigabrain_zenoh.mapping.global_localization import FEWEST_POINTS, Candidate, apart, search
+from gigabrain_zenoh.mapping.global_localization import MIN_POINTS, Candidate, apart, search
 from gigabrain_zenoh.mapping.keyframes import View
 from gigabrain_zenoh.mapping.likelihood_field import (
     LikelihoodField,
@@ -26,13 +26,14 @@ from gigabrain_zenoh.mapping.occupancy_grid import CELL, LogOddsGrid
 from gigabrain_zenoh.mapping.pose_hint import PoseHint, better, explained, far_from
 
 LOST_SCORE, LOST_SCANS = 0.45, 5  # so bad a fit for so long: the robot is somewhere else
-SURE_SCORE, SURE_SCANS = 0.65, 3  # so good a fit for so long, and the only one: it is here
+# so good a fit for so many scans, and the only one: it is here
+CONFIRMED_SCORE, CONFIRMED_SCANS = 0.65, 3
 TOLERANCE = 0.03  # of all beams ruled out, more than elsewhere, say nothing against a place,
 STILL_TOLERANCE, STILL_SCANS = 0.05, 5  # and while the robot stands, it takes more, and some scans
 AGAINST = 0.2  # that much in all speaks against it,
 AGAINST_ODOMETRY = 0.6  # and that much at odometry's place: a person may stand in the view
 BUMPED_M, BUMPED_RAD = 0.6, math.radians(45)  # so far off odometry, it may have slipped or been hit
-MOST_WRONG = 0.15  # of all beams ruled out, or it is not sure to be here
+MAX_WRONG = 0.15  # of all beams ruled out, or it is not sure to be here
 DOUBTED_WRONG = 0.1  # ruled out, where the fit is bad as well, are enough against a place
 WALL_M = 0.08  # so near to a wall there is no body
 SHOWN = 0.1  # of the hits: a place that the map shows less of cannot be judged
@@ -147,7 +148,7 @@ class Localizer:
         sole = len(alike) == 1
         for one in alike:
             near = [k for k, h in enumerate(self._places) if not apart(h.pose, (one.pose,))]
-            good = int(one.score >= SURE_SCORE)
+            good = int(one.score >= CONFIRMED_SCORE)
             there = Hypothesis(one.pose, SPREAD, one.score, good=good)
             if near:
                 there = self._places.pop(near[0])
@@ -158,7 +159,7 @@ class Localizer:
         """Process one scan after a `motion` (3,) of covariance `noise` (3, 3), in its own frame."""
         self._unsearched += 1
         self._moved = compose(self._moved, motion)
-        seen = len(view.scan.points) >= FEWEST_POINTS
+        seen = len(view.scan.points) >= MIN_POINTS
         self._places = [
             _followed(self.map, _predicted(one, motion, noise), view if seen else None)
             for one in self._places
@@ -208,7 +209,7 @@ class Localizer:
         Earlier contradictions of the latter do not count: a person may have stood in the view.
         """
         for one in self._places:
-            if one.good >= SURE_SCANS and (one.continues or len(self._places) == 1):
+            if one.good >= CONFIRMED_SCANS and (one.continues or len(self._places) == 1):
                 return one
         return None
 
@@ -266,7 +267,7 @@ def _followed(into: LikelihoodField, one: Hypothesis, view: View | None) -> Hypo
         seen,
         pose=found.pose,
         covariance=_inverse(prior + found.information),
-        good=one.good + 1 if found.score >= SURE_SCORE and found.wrong < MOST_WRONG else 0,
+        good=one.good + 1 if found.score >= CONFIRMED_SCORE and found.wrong < MAX_WRONG else 0,
         bad=0 if found.score >= LOST_SCORE else seen.bad,
     )
 

@@ -34,7 +34,7 @@ from gigabrain_zenoh.host.run_folders import state_dir
 
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # grey values, as ROS's map_server writes them
 OCCUPIED_PERCENT, FREE_PERCENT = 65, 40  # from here on, and up to here
-LEAST_FREE_M2, LEAST_WALL_M = 1.0, 1.0  # less than that is no map
+MIN_FREE_M2, MIN_WALL_M = 1.0, 1.0  # less than that is no map
 GRAPH = ".graph.npz"
 ZONES = ".zones.yaml"  # see zone_file
 OBJECTS = ".objects.json"  # see object_file
@@ -136,10 +136,10 @@ def save(
 def map_problem(found: SavedMap) -> str:
     """Return why a map is not worth saving, or an empty text."""
     area = np.count_nonzero(_free(found)) * found.resolution**2
-    if area < LEAST_FREE_M2:
+    if area < MIN_FREE_M2:
         return f"the map is empty: {area:.2f} m² of it are free"
     length = np.count_nonzero(found.cells >= OCCUPIED_PERCENT) * found.resolution
-    if length < LEAST_WALL_M:
+    if length < MIN_WALL_M:
         return f"the map has no walls: {length:.2f} m of them"
     return ""
 

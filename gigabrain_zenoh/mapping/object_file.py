@@ -14,15 +14,15 @@ from gigabrain_zenoh.mapping import map_file
 
 VERSION = 1
 MAX_BYTES = 200_000
-MOST = 256
+MAX_OBJECTS = 256
 
 
 class ObjectFile(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What stands and hangs in a map, in its frame."""
 
     version: Annotated[int, Meta(ge=1, le=VERSION)] = VERSION
-    objects: Annotated[tuple[MapObject, ...], Meta(max_length=MOST)] = ()
-    tags: Annotated[tuple[MapTag, ...], Meta(max_length=MOST)] = ()
+    objects: Annotated[tuple[MapObject, ...], Meta(max_length=MAX_OBJECTS)] = ()
+    tags: Annotated[tuple[MapTag, ...], Meta(max_length=MAX_OBJECTS)] = ()
 
     def __post_init__(self) -> None:
         for name, ids in (

@@ -22,9 +22,9 @@ from gigabrain_zenoh.mapping.keyframes import REACH_M, Points, View, split
 
 CELL = 0.05  # [m]
 HIT, PASS = 9, -5  # tenths of log-odds: one hit is 0.71, one beam that goes on is 0.38
-SURE, CLEAR = 35, -25  # no surer than 0.97 and 0.08
+MAX_LOG_ODDS, MIN_LOG_ODDS = 35, -25  # no surer than 0.97 and 0.08
 GROWTH = 64  # cells; the grid grows by so many at least
-MOST_CELLS = 2800  # along one side: a message of 8 MB holds no more
+MAX_CELLS = 2800  # along one side: a message of 8 MB holds no more
 Cells = NDArray[np.int8]
 Stamps = NDArray[np.int32]
 ODDS = np.arange(-128, 128) / 10
@@ -120,7 +120,7 @@ class LogOddsGrid:
         below, above = _missing(float(low[1]), float(high[1]), self.origin_y, height)
         if not (left or right or below or above):
             return
-        if max(width + left + right, height + below + above) > MOST_CELLS:
+        if max(width + left + right, height + below + above) > MAX_CELLS:
             self.full = True
             return
         room = ((below, above), (left, right))
@@ -159,7 +159,7 @@ def _draw(
     for x, y in hits:
         if 0 <= x < width and 0 <= y < height and stamps[y, x] != stamp:
             stamps[y, x] = stamp
-            log_odds[y, x] = min(log_odds[y, x] + HIT, SURE)
+            log_odds[y, x] = min(log_odds[y, x] + HIT, MAX_LOG_ODDS)
     for ends in (hits, free):
         for x, y in ends:
             _pass(log_odds, stamps, stamp, (start[0], start[1]), (x, y))
@@ -177,7 +177,7 @@ def _pass(
     while x != end_x or y != end_y:
         if 0 <= x < width and 0 <= y < height and stamps[y, x] != stamp:
             stamps[y, x] = stamp
-            log_odds[y, x] = max(log_odds[y, x] + PASS, CLEAR)
+            log_odds[y, x] = max(log_odds[y, x] + PASS, MIN_LOG_ODDS)
         twice = 2 * off
         if twice >= up:
             off += up

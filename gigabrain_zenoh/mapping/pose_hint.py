@@ -12,22 +12,22 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.geometry.se2 import inverse_of
-from gigabrain_zenoh.mapping.global_localization import FEWEST_POINTS, Candidate, apart
+from gigabrain_zenoh.mapping.global_localization import MIN_POINTS, Candidate, apart
 from gigabrain_zenoh.mapping.keyframes import Beams, Points
 from gigabrain_zenoh.mapping.likelihood_field import LikelihoodField, fit
 
 SIGMAS = 2.0  # of the hint's ellipsoid that are sampled
 STEP_M = 0.12  # between samples
 REACH_M = 1.5  # turns count as the way of a wall at this distance
-MOST_SAMPLES, AT_ONCE = 20_000, 1000
+MAX_SAMPLES, AT_ONCE = 20_000, 1000
 POINTS = 90  # of a scan, evenly chosen
 SIGMA_M = 0.15  # how near a hit of a sample should be to a wall
 UNKNOWN = 0.75  # likelihood of a hit that the map cannot judge, as in the global search
-TRIED, MOST_FOUND = 12, 4
-LEAST_SCORE, LEAST_SHOWN = 0.5, 0.2
+TRIED, MAX_FOUND = 12, 4
+MIN_SCORE, MIN_SHOWN = 0.5, 0.2
 WEAK = np.diag((1.0, 1.0, 1.0))  # information that holds a fit at its sample
 FAR_SIGMAS = 4.0  # off the hint: the robot is not where it thinks to be, or the tag was moved
-SURE_SCORE, BETTER = 0.65, 0.15  # of a place that a localized robot leaves its own for
+LEAVING_SCORE, LEAVING_GAIN = 0.65, 0.15  # of a place that a localized robot leaves its own for
 OFF_COST = 0.02  # of the score, for one standard deviation off the hint
 
 
@@ -40,7 +40,7 @@ class PoseHint(NamedTuple):
 
 def explained(field: LikelihoodField, beams: Beams, hint: PoseHint) -> list[Candidate]:
     """Return the poses within the hint that explain a scan, the best first."""
-    if len(beams.hits) < FEWEST_POINTS:
+    if len(beams.hits) < MIN_POINTS:
         return []
     samples = _samples(hint)
     likely = _likelihoods(field, beams.hits, samples)
@@ -52,12 +52,12 @@ def explained(field: LikelihoodField, beams: Beams, hint: PoseHint) -> list[Cand
     good = [
         (Candidate(one.pose, one.score), _squared_deviation(hint, one.pose))
         for one in fits
-        if one.score >= LEAST_SCORE and one.shown >= LEAST_SHOWN
+        if one.score >= MIN_SCORE and one.shown >= MIN_SHOWN
     ]
     good = [one for one in good if one[1] <= (SIGMAS + 1.0) ** 2]
     found: list[Candidate] = []
     for one, _ in sorted(good, key=lambda pair: OFF_COST * pair[1] - pair[0].score):
-        if len(found) < MOST_FOUND and apart(one.pose, (other.pose for other in found)):
+        if len(found) < MAX_FOUND and apart(one.pose, (other.pose for other in found)):
             found.append(one)
     return found
 
@@ -73,9 +73,9 @@ def better(field: LikelihoodField, beams: Beams, hint: PoseHint, pose: Floats) -
     So a tag that was moved throws no robot off, whose scan fits where it thinks to be.
     """
     found = explained(field, beams, hint)
-    if not found or found[0].score < SURE_SCORE:
+    if not found or found[0].score < LEAVING_SCORE:
         return []
-    return found if found[0].score > fit(field, beams, pose, WEAK).score + BETTER else []
+    return found if found[0].score > fit(field, beams, pose, WEAK).score + LEAVING_GAIN else []
 
 
 def _samples(hint: PoseHint) -> Floats:
@@ -85,7 +85,7 @@ def _samples(hint: PoseHint) -> Floats:
     reaches = SIGMAS * np.sqrt(np.maximum(values, 1e-12))
     reaches = np.minimum(reaches, math.pi * REACH_M)
     step = STEP_M
-    while np.prod(2 * np.ceil(reaches / step) + 1) > MOST_SAMPLES:
+    while np.prod(2 * np.ceil(reaches / step) + 1) > MAX_SAMPLES:
         step *= 1.2
     counts = np.ceil(reaches / step).astype(int)
     lines = [np.linspace(-far, far, 2 * n + 1) for far, n in zip(reaches, counts, strict=True)]

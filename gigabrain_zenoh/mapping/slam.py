@@ -42,7 +42,7 @@ PASSES = 2  # over a place, from then on it is known
 REACH = 3.0  # [m], keyframes farther off show other places
 SQUARE, SECTOR = 0.4, np.pi / 2  # [m] and [rad]: of keyframes seen from one place one is enough
 TURNED = 0.5  # [m] that a keyframe may be farther off, for each rad that it is less turned away
-MOST = 16  # keyframes
+MAX_CANDIDATES = 16  # keyframes
 
 
 @dataclass(frozen=True, slots=True)
@@ -373,11 +373,11 @@ class KnownGround:
 
 
 def _chosen(ids: NDArray[np.intp], poses: Floats, pose: Floats) -> list[int]:
-    """Return the newest keyframe of each place and direction, of those the nearest MOST."""
+    """Return the newest keyframe of each place and direction; of those the nearest ones."""
     places = np.floor(poses / (SQUARE, SQUARE, SECTOR))
     _, newest = np.unique(places[::-1], axis=0, return_index=True)
     ids, poses = ids[::-1][newest], poses[::-1][newest]
     off = poses - pose
     far = np.hypot(off[:, 0], off[:, 1]) + TURNED * np.abs(wrap(off[:, 2]))
-    order = np.lexsort((ids, far))[:MOST]
+    order = np.lexsort((ids, far))[:MAX_CANDIDATES]
     return [int(k) for k in ids[order[::-1]]]

@@ -25,7 +25,7 @@ from gigabrain_zenoh.mapping.localizer import (
 from gigabrain_zenoh.mapping.map_file import Arrays
 from gigabrain_zenoh.mapping.occupancy_grid import (
     CELL,
-    MOST_CELLS,
+    MAX_CELLS,
     GridScan,
     GridScans,
     LogOddsGrid,
@@ -47,7 +47,7 @@ LOOKING = "looking for the robot in the map"
 SAVE_AND_GO_ON = "save the map, and start perception with it (map: NAME)"
 FULL = Cause(
     code="map_full",
-    text=f"the map is full: {MOST_CELLS * CELL:g} m long; what lies beyond is left out",
+    text=f"the map is full: {MAX_CELLS * CELL:g} m long; what lies beyond is left out",
     remedy="map a large site in parts",
 )
 
@@ -149,7 +149,7 @@ class SlamMap:
     def _thaw_grid(self, arrays: Arrays) -> None:
         """Restore the grid; KeyError or ValueError if the arrays do not belong together."""
         odds, known = arrays["grid_odds"], arrays["grid_known"]
-        if odds.ndim != 2 or odds.shape != known.shape or max(odds.shape) > MOST_CELLS:
+        if odds.ndim != 2 or odds.shape != known.shape or max(odds.shape) > MAX_CELLS:
             raise ValueError(f"a grid of shape {odds.shape}")
         x, y = shaped(arrays, "grid_origin", 2).tolist()
         self._grid = LogOddsGrid.of(odds, known.astype(np.bool_), (x, y))

@@ -61,8 +61,8 @@ def save(map_path: Path, zones: ZoneFile) -> None:
 def encoded(zones: ZoneFile) -> bytes:
     """Return the content of a file. Raises Refused if it could not be read again."""
     data = "".join((HEAD, f"version: {VERSION}\n", *_lines(zones))).encode()
-    if len(data) > loading.MOST_BYTES:
-        raise Refused(f"not saved: {len(data)} bytes of zones; at most {loading.MOST_BYTES} do")
+    if len(data) > loading.MAX_BYTES:
+        raise Refused(f"not saved: {len(data)} bytes of zones; at most {loading.MAX_BYTES} do")
     return data
 
 

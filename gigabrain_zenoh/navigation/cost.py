@@ -10,7 +10,7 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import NONE, lean_kernel
 from gigabrain_zenoh.navigation.car_track import way_left
 from gigabrain_zenoh.navigation.footprint import (
-    ROOM,
+    MAX_CLEARANCE_M,
     STRETCH,
     UNSURE,
     DistanceGrid,
@@ -72,7 +72,7 @@ def place_cost(
 ) -> float:
     """Return the cost of a second here, `room` [m] from obstacles and `away` [m] from discs."""
     cost = 0.0
-    if room < ROOM:
+    if room < MAX_CLEARANCE_M:
         cost += weights.near * exponential((weights.margin - room) / weights.near_over)
     if away < NO_DISC and weights.trust == 0.0:
         cost += weights.disc * math.exp(-away / weights.disc_over)
@@ -297,7 +297,7 @@ def evaluate_surroundings(problem: Problem, states: Floats) -> None:
             state[MIDDLE + lane] = between(grid.distance, column, row)
         for lane in range(LANES):
             room = state[MIDDLE + lane] - outline.inner  # it is no more than that
-            room = room if room < AT_EASE else ROOM
+            room = room if room < AT_EASE else MAX_CLEARANCE_M
             near = weights.near * exponential((weights.margin - room) / weights.near_over)
             motion = motion_cost(weights, room, state[VX + lane], state[VY + lane], state[W + lane])
             time = time_cost(scene, state[X + lane], state[Y + lane], state[YAW + lane])
@@ -333,7 +333,7 @@ def price(problem: Problem, rooms: Floats, states: Floats, lane: int, limit: flo
         if min(touching, passing + end) >= limit:
             return math.inf
     cost: float = 0.0
-    room, slack, touches, looked = ROOM, 0.0, int(NONE), False
+    room, slack, touches, looked = MAX_CLEARANCE_M, 0.0, int(NONE), False
     steps = states.shape[0] - 1
     for t in range(1, steps + 1):
         if cost + to_come >= limit:

@@ -10,11 +10,11 @@ from gigabrain_zenoh.geometry.sweep import Corners, box
 from gigabrain_zenoh.kernels.jit import NONE, lean_kernel
 
 SPACING = 0.05  # [m], between points on the outline at most,
-MOST_POINTS = 500  # unless there were more than so many: those of a long outline are farther apart
+MAX_POINTS = 500  # unless there were more than so many: those of a long outline are farther apart
 GROUP = 3  # neighbouring points that are left out together: two and one in the middle
 STRETCH = 1.02  # a distance in the grid differs by no more than so many times the way,
 UNSURE = 0.87  # and so many cells, between one that is looked up in the nearest cell and any other
-ROOM = 0.4  # [m], more than that round the body makes no difference
+MAX_CLEARANCE_M = 0.4  # [m], more than that round the body makes no difference
 FAR = 3.0  # [m], what is farther away, or beyond the window, does not matter
 
 
@@ -59,7 +59,7 @@ def outline_of(footprint: Corners) -> Outline:
     """Return the outline of any polygon."""
     corners = np.array(footprint, dtype=np.float64)
     sides = np.roll(corners, -1, axis=0) - corners
-    spacing = max(SPACING, float(np.hypot(*sides.T).sum()) / MOST_POINTS)
+    spacing = max(SPACING, float(np.hypot(*sides.T).sum()) / MAX_POINTS)
     pieces = []
     for start, side in zip(corners, sides, strict=True):
         count = max(1, math.ceil(float(np.hypot(*side)) / spacing))
@@ -104,7 +104,7 @@ def between(distance: Singles, u: float, v: float) -> float:
 def clearance(grid: DistanceGrid, outline: Outline, at: Placement) -> float:
     """Return the distance of the outline to the nearest obstacle [m]; below 0 with one inside.
 
-    More than ROOM counts as ROOM.
+    More than MAX_CLEARANCE_M counts as MAX_CLEARANCE_M.
     """
     return clearance_of(grid, outline, at, middle_of(grid, outline, at), int(NONE))[0]
 
@@ -118,9 +118,11 @@ def clearance_of(
     Groups are compared from `first` on, so that a good guess spares others. `middle` is the result
     of `middle_of`.
     """
-    if middle >= outline.outer + ROOM:
-        return ROOM, first
-    nearest = min(ROOM, middle - outline.inner) if middle < outline.inner else ROOM
+    if middle >= outline.outer + MAX_CLEARANCE_M:
+        return MAX_CLEARANCE_M, first
+    nearest = MAX_CLEARANCE_M
+    if middle < outline.inner:
+        nearest = min(nearest, middle - outline.inner)
     found, group = _nearest(grid, outline, at, np.float32(nearest), first)
     return min(nearest, found), group
 

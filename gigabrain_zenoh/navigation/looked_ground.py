@@ -30,7 +30,7 @@ from gigabrain_zenoh.navigation.local_costmap import (
 )
 from gigabrain_zenoh.navigation.zones import fill
 
-SURE_M = 1.5  # from a camera: so far it shows what is 3 cm high
+RELIABLE_M = 1.5  # from a camera: so far it shows what is 3 cm high
 EDGE_RAD = math.radians(1.5)  # at the sides of a picture that is not trusted
 SOON_M = 0.25  # beyond the circle of a turning body, which it may sweep before it has looked
 PLACED_M = 0.1  # beyond that circle, clear where a person puts the body down
@@ -178,7 +178,7 @@ def floor_in_view(camera: Camera) -> tuple[float, float, float]:
     near = camera.z / math.tan(lowest) if 0.0 < lowest < math.pi / 2 else math.inf
     far = camera.z / math.tan(highest) if highest > 0.0 else math.inf
     half = math.atan2(camera.width / 2, fx) - EDGE_RAD
-    return max(near, camera.depth_min), min(far, camera.depth_max, SURE_M), half
+    return max(near, camera.depth_min), min(far, camera.depth_max, RELIABLE_M), half
 
 
 def _overlap(shift: int, side: int) -> tuple[slice, slice]:

@@ -13,7 +13,7 @@ from gigabrain_zenoh.kernels.jit import lean_kernel
 
 ACCELERATION_RESERVE = 0.9  # of the body's accelerations: plans must work on a bad floor too
 GENTLEST_SHARE = 0.4  # of that reserve, at an aggressiveness of 0
-LEAST_SPEED = 0.01  # [m/s]; a body that may drive at all may drive so fast
+MIN_SPEED = 0.01  # [m/s]; a body that may drive at all may drive so fast
 MAX_REVERSE_SPEED = 0.4  # [m/s], no faster backwards: the lidar may not see there
 SLOWEST = 0.001  # [m/s], where it must not reverse
 STRAFING = ("mecanum", "omni")  # drive types
@@ -80,7 +80,7 @@ def slowed_model(model: MotionModel, speed: float | None) -> MotionModel:
     """Return the model of a body that must not drive faster than `speed` [m/s]."""
     if speed is None or speed >= model.forward:
         return model
-    slow = max(speed, LEAST_SPEED)
+    slow = max(speed, MIN_SPEED)
     return model._replace(
         forward=slow, backward=min(model.backward, slow), lateral=min(model.lateral, slow)
     )

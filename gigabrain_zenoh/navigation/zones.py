@@ -31,12 +31,12 @@ from gigabrain_zenoh.navigation.grid_search import COLUMN_STEPS, ROW_STEPS
 EDGE_STEP = 0.5  # cells between the points of an edge, whose cells are filled too
 AGAINST_COSINE = -0.2  # of the angle between a way and a lane, from where on it goes against it
 MAX_NAMED = 3  # lanes, in a text
-LEAST_USE_M = 0.5  # [m] along a lane, from where on a path uses it
+MIN_USE_M = 0.5  # [m] along a lane, from where on a path uses it
 OCCUPIED = 100  # of a cell to keep out of
 
 REACTION_S = 0.3  # before the body slows down for a speed zone
 BRAKING_SHARE = 0.5  # of its deceleration, with which it slows down
-LEAST_LOOK_M = 1.0  # [m] of the path that are looked at for speed zones
+MIN_LOOK_M = 1.0  # [m] of the path that are looked at for speed zones
 
 Mask = NDArray[np.uint8]
 Box = tuple[float, float, float, float]  # least x and y [m], greatest x and y
@@ -59,7 +59,7 @@ class LanePart(NamedTuple):
         along, aside = off @ self.ahead, np.abs(off @ np.array((-y, x)))
         inside = (along >= 0) & (along <= self.length) & (aside <= self.half_width)
         both = inside[1:] & inside[:-1]
-        return bool(both.any()) and float(np.diff(along)[both].sum()) > LEAST_USE_M
+        return bool(both.any()) and float(np.diff(along)[both].sum()) > MIN_USE_M
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -171,7 +171,7 @@ class ZoneMap:
             return None
         brake = BRAKING_SHARE * deceleration
         reach = float(np.hypot(*np.array(footprint).T).max())
-        look = LEAST_LOOK_M + reach + speed * REACTION_S + speed**2 / (2 * brake)
+        look = MIN_LOOK_M + reach + speed * REACTION_S + speed**2 / (2 * brake)
         gone = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))))
         ahead, gone = path[gone <= look], gone[gone <= look]
         caps = []

@@ -10,7 +10,7 @@ from gigabrain_schemas.body import Camera
 from gigabrain_zenoh.vision.camera_model import rotation
 
 EDGE = 0.08  # of the picture's width and height, at its rim: what is there may be cut off
-LEAST_PX = 10.0  # a smaller thing is not surely recognised
+MIN_PX = 10.0  # a smaller thing is not surely recognised
 NEAREST_M = 0.35
 BEAM_RAD = math.radians(1.5)  # beside a line of sight, in which a hit hides what is behind
 
@@ -44,7 +44,7 @@ class CameraView:
         half = fx * extent / 2 / depth
         rim_u, rim_v = EDGE * camera.width + half, EDGE * camera.height + half
         inside = rim_u <= u <= camera.width - rim_u and rim_v <= v <= camera.height - rim_v
-        return Spot((u, v), depth) if inside and 2 * half >= LEAST_PX else None
+        return Spot((u, v), depth) if inside and 2 * half >= MIN_PX else None
 
     def hidden(self, hits: Floats, place: tuple[float, float], before: float) -> bool:
         """Return whether a hit of the scan (n, 2) lies on the way to a place, and `before` it [m].

@@ -206,8 +206,8 @@ class ObjectKeeper:
             return
         seen = self._seen_tick
         now = ObjectMap(
-            objects=self.memory.objects()[: object_file.MOST],
-            tags=self.tags.tags()[: object_file.MOST],
+            objects=self.memory.objects()[: object_file.MAX_OBJECTS],
+            tags=self.tags.tags()[: object_file.MAX_OBJECTS],
             map=self._map,
             recognizing=seen is not None and 0 <= tick - seen <= RECOGNIZING_TICKS,
         )
@@ -225,8 +225,8 @@ class ObjectKeeper:
     def present(self) -> ObjectFile:
         """What stays, in the map as it is now."""
         return ObjectFile(
-            objects=tuple(one for one, _ in self.memory.anchored())[: object_file.MOST],
-            tags=self.tags.tags()[: object_file.MOST],
+            objects=tuple(one for one, _ in self.memory.anchored())[: object_file.MAX_OBJECTS],
+            tags=self.tags.tags()[: object_file.MAX_OBJECTS],
         )
 
     def problems(self) -> tuple[Cause, ...]:

@@ -23,13 +23,13 @@ MOVERS = frozenset(("person", "robot", "dog", "cat", "bird"))
 MOVERS_STAY_S = 3.0
 FARTHEST_M, HIGHEST_M = 8.0, 3.0  # what claims to stand beyond is not believed
 NOISE_M, NOISE_PER_M = 0.03, 0.01  # standard deviation of a position, and of that per metre off
-LEAST_GAIN = 0.06  # of a sighting: what was moved a little is followed
+MIN_GAIN = 0.06  # of a sighting: what was moved a little is followed
 GATE_M, GATE_SIGMAS, MOVER_GATE_M = 0.25, 3.0, 1.0  # how far off the same thing may be seen
 GATE_HEIGHT_M = 0.4
 OTHER_GATE_M = 0.15  # the same for another class: a thing is taken for a can, then for a cylinder
-SEEN_ODDS, CONFIDENT_ODDS, MISSED_ODDS, MOST_ODDS = 0.4, 0.8, 0.6, 4.0
+SEEN_ODDS, CONFIDENCE_ODDS, MISSED_ODDS, MAX_ODDS = 0.4, 0.8, 0.6, 4.0
 BEGIN_ODDS = -0.8
-SURE_SEEN, SURE_ODDS = 3, 1.0  # pictures and log-odds, from which on a thing counts
+CONFIRMED_PICTURES, CONFIRMED_ODDS = 3, 1.0  # pictures and log-odds, from which on a thing counts
 GLIMPSE_S = 1.0  # after which one that does not count is forgotten
 NEAR_M = 2.5  # within which a thing that should be seen is seen
 BEFORE_M = 0.15  # what is so much nearer may hide a thing
@@ -100,7 +100,7 @@ class ObjectTrack:
     @property
     def sure(self) -> bool:
         """Whether it counts."""
-        return self.seen >= SURE_SEEN and self.odds >= SURE_ODDS
+        return self.seen >= CONFIRMED_PICTURES and self.odds >= CONFIRMED_ODDS
 
     def message(self) -> MapObject:
         """Return it as it is published and saved."""
@@ -191,7 +191,7 @@ class ObjectMemory:
                 position=sighting.position,
                 variance=sighting.variance,
                 size=sighting.size or (0.1, 0.1),
-                odds=BEGIN_ODDS + CONFIDENT_ODDS * sighting.confidence,
+                odds=BEGIN_ODDS + CONFIDENCE_ODDS * sighting.confidence,
                 seen=1,
                 last_s=glance.time_s,
                 last_ns=glance.unix_ns,
@@ -285,14 +285,14 @@ def _matched(
 
 
 def _update(track: ObjectTrack, sighting: Sighting, glance: Glance) -> None:
-    gain = max(track.variance / (track.variance + sighting.variance), LEAST_GAIN)
+    gain = max(track.variance / (track.variance + sighting.variance), MIN_GAIN)
     gain = 0.6 if track.moves else gain
     track.position = track.position + gain * (sighting.position - track.position)
     track.variance = gain * sighting.variance
     if sighting.size:
         old, new = track.size, sighting.size
         track.size = old[0] + gain * (new[0] - old[0]), old[1] + gain * (new[1] - old[1])
-    track.odds = min(track.odds + SEEN_ODDS + CONFIDENT_ODDS * sighting.confidence, MOST_ODDS)
+    track.odds = min(track.odds + SEEN_ODDS + CONFIDENCE_ODDS * sighting.confidence, MAX_ODDS)
     track.seen, track.last_s, track.last_ns = track.seen + 1, glance.time_s, glance.unix_ns
     track.anchor = None  # it is fixed anew, to what is mapped round it now
     track.votes.add(sighting.label, sighting.confidence, sighting.distance)
@@ -315,7 +315,7 @@ def _restored(one: MapObject, anchor: Anchor | None) -> ObjectTrack:
         variance=NOISE_M**2,
         size=one.size,
         odds=math.log(sure / (1 - sure)) + 0.01,
-        seen=max(one.seen, SURE_SEEN),
+        seen=max(one.seen, CONFIRMED_PICTURES),
         last_s=-math.inf,
         last_ns=one.last_seen_ns,
         votes=votes,

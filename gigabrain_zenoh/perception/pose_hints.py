@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 COUNTS_TICKS = round(2e9 / TICK_NS)  # for how long a hint counts while the robot is not found
 PERSON_M, PERSON_RAD = 0.3, 0.25  # deviation of what a person says
-LEAST_VARIANCE = 1e-6  # [m2], [rad2]
+MIN_VARIANCE = 1e-6  # [m2], [rad2]
 SAID = "a person has said where it is"
 
 
@@ -88,9 +88,9 @@ def _spread(request: PoseRequest) -> Floats | None:
         return np.diag((PERSON_M, PERSON_M, turn)) ** 2
     given = np.array(request.covariance).reshape(3, 3)
     spread = (given + given.T) / 2
-    if np.linalg.eigvalsh(spread).min() < -LEAST_VARIANCE:
+    if np.linalg.eigvalsh(spread).min() < -MIN_VARIANCE:
         return None
     if request.yaw is None:
         spread[2], spread[:, 2] = 0.0, 0.0
         spread[2, 2] = turn**2
-    return np.asarray(spread + LEAST_VARIANCE * np.eye(3), np.float64)
+    return np.asarray(spread + MIN_VARIANCE * np.eye(3), np.float64)

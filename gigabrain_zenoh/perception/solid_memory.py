@@ -15,13 +15,13 @@ from gigabrain_zenoh.perception.class_votes import ClassVotes
 from gigabrain_zenoh.vision.solid_fit import SolidFit
 
 FITS = 9  # newest ones, whose median counts: from near by a thing is seen best
-SURE_SEEN = 2  # pictures, from which on a thing counts
+CONFIRMED_PICTURES = 2  # pictures, from which on a thing counts
 SAME_M, SAME_SHARE = 0.03, 0.5  # how far off the same thing may be: at least, and of its width
 MOVED_M = 0.02  # from its median: it was moved, and what was known of its place is dropped
 LOOKED_AT = 1.6  # of the height of its middle: there it would hide the floor, or what is behind
 MISSES = 3  # pictures in which it is seen through
 KEPT_S = 120.0  # without being seen: odometry drifts
-MOST = 64
+MAX_SOLIDS = 64
 NAMED = 150  # things recognised that are not tracked yet: half a minute of one
 LABEL_M = 0.06  # beside the middle of a thing, within which something recognised is this thing
 Place = tuple[float, float]  # x, y [m]
@@ -90,7 +90,7 @@ class SolidMemory:
             track.misses = track.misses + 1 if missed else 0
         oldest = tick - KEPT_S / TICK_S
         kept = [one for one in self._tracks if one.misses < MISSES and one.tick >= oldest]
-        self._tracks = sorted(kept, key=lambda one: -one.tick)[:MOST]
+        self._tracks = sorted(kept, key=lambda one: -one.tick)[:MAX_SOLIDS]
 
     def name(
         self, label: str, confidence: float, place: Place, distance: float, pose: Pose
@@ -116,7 +116,7 @@ class SolidMemory:
         """Return what counts, in the frame of a body at `pose` at `tick`, the nearest first."""
         found = []
         for track in self._tracks:
-            if track.seen >= SURE_SEEN:
+            if track.seen >= CONFIRMED_PICTURES:
                 fit = _moved(track.fit, lambda x, y: to_frame(pose, x, y), -pose.yaw)
                 found.append(SeenSolid(
                     id=track.id, shape=fit.shape, size=fit.size, position=fit.position,

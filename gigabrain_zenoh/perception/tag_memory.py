@@ -17,10 +17,10 @@ from gigabrain_zenoh.mapping.pose_hint import PoseHint
 from gigabrain_zenoh.perception.camera_view import CameraView
 from gigabrain_zenoh.perception.object_memory import Anchor, Glance, carried
 
-MOST_TILT = 0.5  # of the face's axis, upwards or downwards: a tag on the floor has no yaw
+MAX_TILT = 0.5  # of the face's axis, upwards or downwards: a tag on the floor has no yaw
 FARTHEST_M = 6.0
-SURE_SEEN = 3  # pictures, from which on a tag counts
-LEAST_GAIN = 0.05  # of a sighting
+CONFIRMED_PICTURES = 3  # pictures, from which on a tag counts
+MIN_GAIN = 0.05  # of a sighting
 SAME_M, SAME_RAD = 0.3, 0.5  # a tag that is seen farther off has been moved, or the robot has
 MOVED_S, MOVED_SEEN = 3.0, 10  # for so long and so often
 GAP_S = 5.0  # between two sightings of a moved tag
@@ -28,7 +28,7 @@ WELL_M, WELL_RAD = 0.15, 0.1  # deviations of a robot that is well localized
 POSITION_M, POSITION_PER_M = 0.03, 0.04  # deviation of a tag's position, and that per metre off
 YAW_RAD = 0.15  # deviation of where its face looks: it is the least certain
 KNOWN_M = 0.05  # deviation of its place in the map
-MISSED, MOST_PATIENCE = 1, 8  # pictures that should show a tag, until it is forgotten
+MISSED, MAX_PATIENCE = 1, 8  # pictures that should show a tag, until it is forgotten
 NEAR_M, FACING = 2.0, 0.5  # within which, and cosine from which on, it should be seen
 MAX_TAGS = 256
 
@@ -43,7 +43,7 @@ class TagTrack:
     seen: int
     last_s: float
     last_ns: int
-    patience: int = MOST_PATIENCE
+    patience: int = MAX_PATIENCE
     anchor: Anchor | None = None
     elsewhere: "TagTrack | None" = None  # where it is seen now, if not here
     since_s: float = 0.0
@@ -51,7 +51,7 @@ class TagTrack:
     @property
     def sure(self) -> bool:
         """Whether it counts."""
-        return self.seen >= SURE_SEEN
+        return self.seen >= CONFIRMED_PICTURES
 
     def message(self) -> MapTag:
         """Return it as it is published and saved."""
@@ -114,7 +114,7 @@ class TagMemory:
         self._tracks = {
             one.id: TagTrack(
                 one.id, np.array((one.x, one.y, one.z, one.yaw)), one.size,
-                max(one.seen, SURE_SEEN), -math.inf, one.last_seen_ns, anchor=anchor,
+                max(one.seen, CONFIRMED_PICTURES), -math.inf, one.last_seen_ns, anchor=anchor,
             )
             for one, anchor in found[:MAX_TAGS]
         }  # fmt: skip
@@ -197,7 +197,7 @@ def face_yaw(tag: TagDetection) -> float | None:
     out_x, out_y = 1 - 2 * (y * y + z * z), 2 * (x * y + z * w)
     out_z = 2 * (x * z - y * w)
     length = math.sqrt(out_x**2 + out_y**2 + out_z**2)
-    if length < 1e-6 or abs(out_z) > MOST_TILT * length:
+    if length < 1e-6 or abs(out_z) > MAX_TILT * length:
         return None
     return math.atan2(out_y, out_x)
 
@@ -224,13 +224,13 @@ def _new(one: TagDetection, place: Floats, glance: Glance) -> TagTrack:
 
 
 def _average(known: TagTrack, one: TagDetection, place: Floats, glance: Glance) -> None:
-    gain = max(1.0 / (known.seen + 1), LEAST_GAIN)
+    gain = max(1.0 / (known.seen + 1), MIN_GAIN)
     off = place - known.place
     off[3] = math.remainder(off[3], math.tau)
     known.place = known.place + gain * off
     known.size += gain * (min(one.size, 5.0) - known.size)
     known.seen, known.last_s, known.last_ns = known.seen + 1, glance.time_s, glance.unix_ns
-    known.patience, known.anchor = MOST_PATIENCE, None
+    known.patience, known.anchor = MAX_PATIENCE, None
 
 
 def _same(one: Floats, other: Floats) -> bool:

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 EARLY = 0.25  # of a period: a picture that comes so much earlier is not left out
 DEPTH_WAIT_NS = 60_000_000  # that a picture waits for its depth
-SURE_TIMES = 5  # pictures in a row that show a tag in another size
+CONFIRMED_PICTURES = 5  # pictures in a row that show a tag in another size
 KEPT_DEPTHS = 4  # of a camera, for the picture of the same exposure
 INSTALL = "recognition needs OpenCV; install it with: pip install 'gigabrain-zenoh[eyes]'"
 
@@ -157,7 +157,7 @@ class Recognition:
                 self._misread.pop(tag.id, None)
                 continue
             times = self._misread[tag.id] = self._misread.get(tag.id, 0) + 1
-            if times == SURE_TIMES:
+            if times == CONFIRMED_PICTURES:
                 log.warning(
                     "tag %d measures %.2f m by depth, but its size is set to %.2f m; "
                     "set `tags: size`, or its own in `sizes`",

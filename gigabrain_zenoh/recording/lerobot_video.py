@@ -18,7 +18,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from gigabrain_schemas.base import Message
-from gigabrain_schemas.body import MOST_CAMERAS
+from gigabrain_schemas.body import MAX_CAMERAS
 from gigabrain_schemas.sensors import Image
 from gigabrain_schemas.topics import DEPTH, IMAGE, STATE
 from gigabrain_schemas.vision import DepthImage
@@ -75,7 +75,7 @@ def write_videos(
     for key, message, boot, tick in _exposures(path):
         if not find_spec("av"):
             raise ConfigError("videos need PyAV: pip install 'gigabrain-zenoh[lerobot]'")
-        if key not in tracks and len(tracks) >= 2 * MOST_CAMERAS:
+        if key not in tracks and len(tracks) >= 2 * MAX_CAMERAS:
             continue
         if key not in tracks:
             tracks[key] = _Track(key, places, folder / _file_of(key), hz)

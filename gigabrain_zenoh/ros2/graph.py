@@ -13,7 +13,7 @@ CLOCK_S = 1.0  # by which clocks may differ
 SYNCHRONISE = "synchronise both machines by chrony or NTP"
 POLL_S = 0.1
 STILL_S = 1.0  # without a change, after which discovery is over
-LEAST_S = 2.0  # for nodes of other hosts to answer
+MIN_WAIT_S = 2.0  # for nodes of other hosts to answer
 ALONE_S = 5.0  # while there is no other node, or one without a name: names come later
 LIMIT_S = 10.0  # of a graph that does not come to rest
 ENDS: tuple[tuple[EndpointKind, EndpointKind], ...] = (
@@ -44,7 +44,7 @@ async def discovered(
         if newest != found:
             found, changed_s = newest, now_s
         known = found and all(one.node for one in found)
-        if now_s - changed_s >= STILL_S and now_s - began_s >= (LEAST_S if known else ALONE_S):
+        if now_s - changed_s >= STILL_S and now_s - began_s >= (MIN_WAIT_S if known else ALONE_S):
             break
         await asyncio.sleep(POLL_S)
     return tuple(sorted(found, key=lambda one: (one.topic, one.type, one.kind, one.node)))

@@ -169,7 +169,7 @@ LASTING_NS = 60_000_000_000  # the same for refusals that go on
 LASTING: tuple[What, ...] = ("refused", "stranger")
 MAX_SOURCES = 100  # entries counted apart within that time, of granted and of refused requests
 MAX_CODES = 20  # that one entry counts apart
-ROOM = 1000  # entries that may wait for the disk
+MAX_WAITING = 1000  # entries that may wait for the disk
 OTHERS, OTHER = "others", "other"
 Key = tuple[What, str, str]  # what, source, code; no code where all codes of a source are one entry
 
@@ -197,7 +197,9 @@ class AuditTrail:
     def __init__(self, bus: Bus, folder: Path) -> None:
         self._bus = bus
         self._file = AuditFile(folder, bus.process)
-        self._scribe: BackgroundWriter[AuditRecord] = BackgroundWriter(self._file.append, ROOM)
+        self._scribe: BackgroundWriter[AuditRecord] = BackgroundWriter(
+            self._file.append, MAX_WAITING
+        )
         self._recent: dict[bool, dict[Key, _Recent]] = {True: {}, False: {}}  # by `ok`
         self._unwritable = Fault(log)
         self._reading = asyncio.Lock()  # many threads that decode would hold up the loop

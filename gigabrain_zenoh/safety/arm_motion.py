@@ -31,7 +31,7 @@ MOVING = 1e-3  # [rad/s] or [m/s], of a joint that is sent elsewhere
 SEEN_M = 0.2  # of free distance; joints that stand still cannot take more before they are seen
 NO_LEVER = 1e-4  # [m] per [rad] or [m]; a joint with less does not count
 HELD_M = 0.003  # of free distance, below which a person is told what holds the arm
-STEP_M, MOST_STEPS = 0.08, 10  # on the way until the joints rest, so that they pass no shape unseen
+STEP_M, MAX_STEPS = 0.08, 10  # on the way until the joints rest, so that they pass no shape unseen
 
 Kind = Literal["self", "floor", "keep_out"]
 KINDS: tuple[Kind, ...] = ("self", "floor", "keep_out")
@@ -120,7 +120,7 @@ def limits(
     ways = np.where(moving > 0, brakes.way(rising), -brakes.way(falling))
     ways[np.abs(moving) < MOVING] = 0.0
     longest = float((shape.levers @ np.abs(ways)).max(initial=0.0))
-    steps = min(MOST_STEPS, math.ceil(longest / STEP_M))
+    steps = min(MAX_STEPS, math.ceil(longest / STEP_M))
     ends = np.arange(1, steps + 1) / max(1, steps)
     ahead = np.clip(np.array(sent) + ends[:, None] * ways, brakes.lower, brakes.upper)
     within = np.full((2 + steps, len(reach)), clearance)

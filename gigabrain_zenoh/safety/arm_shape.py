@@ -11,7 +11,7 @@ import numpy as np
 from mujoco import mj_geomDistance
 from numpy.typing import NDArray
 
-from gigabrain_schemas.body import MOST_MODEL_CHARACTERS, BodyDescription
+from gigabrain_schemas.body import MAX_MODEL_CHARACTERS, BodyDescription
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.safety.arm_motion import Kind, Near
 
@@ -174,8 +174,8 @@ class MujocoArm:
 
 def _compiled(mjcf: str, body: BodyDescription) -> mujoco.MjModel:
     """Return the model with the boxes of the description."""
-    if len(mjcf.encode()) > MOST_MODEL_CHARACTERS:
-        raise ConfigError(f"the arm's model is larger than {MOST_MODEL_CHARACTERS // 1024} kB")
+    if len(mjcf.encode()) > MAX_MODEL_CHARACTERS:
+        raise ConfigError(f"the arm's model is larger than {MAX_MODEL_CHARACTERS // 1024} kB")
     if found := REFUSED.search(mjcf) or FILES.search(mjcf):
         raise ConfigError(
             f"the arm's model has {found[1]!r}; safety takes primitive shapes only, in one file"

@@ -39,7 +39,7 @@ MIN_PERIOD_SHARE = 0.5  # of its period: pictures that come faster are skipped
 FROZEN_M, FROZEN_RAD = 0.02, math.radians(2)  # moved while the picture stays exactly the same
 UP_STEP = 0.01  # of the vertical's x and y: 0.6 deg, to which a tilt counts
 WAYS = {"forward": 0.0, "left": math.pi / 2, "backward": math.pi, "right": -math.pi / 2}
-LEAST_SIDE = math.radians(45)  # from its axis, to which a camera must see at least
+MIN_SIDE = math.radians(45)  # from its axis, to which a camera must see at least
 CELL_M = 0.03  # of points nearer than this one is kept
 NEAR_M = 0.04  # within which two sightings of a doubtful point confirm each other
 PENDING, BELIEVED = 1, 3  # levels; from 2 on a point counts, and each look through it takes one
@@ -47,7 +47,7 @@ PENDING_PERIODS = 2.5  # after which a doubtful point that was not seen again is
 DRIFT_M = 0.02  # inside the footprint: what stands there can be no thing
 JUMP_M = 0.5  # between two pictures: the odometry has restarted
 MAX_POINTS = 1500
-LEAST_KNOWN = 0.8  # share of the pixels whose rays follow from the intrinsics
+MIN_KNOWN = 0.8  # share of the pixels whose rays follow from the intrinsics
 CHECK_TICKS = 5  # without pictures, between two looks at what is remembered
 
 
@@ -215,7 +215,7 @@ def _overdue(
 def directions(camera: Camera) -> set[str]:
     """Return the directions of motion that a camera should see."""
     fx, *_ = camera.pinhole
-    side = max(math.atan2(camera.width / 2, fx), LEAST_SIDE) + 1e-6
+    side = max(math.atan2(camera.width / 2, fx), MIN_SIDE) + 1e-6
     return {
         way for way, yaw in WAYS.items() if abs(math.remainder(yaw - camera.yaw, math.tau)) <= side
     }
@@ -246,7 +246,7 @@ def _look(
         return marks, "camera_wrong", f"sends what is no picture: {error}"[:300]
     pose, up = place
     view = view_of(body, camera, up)
-    if view.known < LEAST_KNOWN:
+    if view.known < MIN_KNOWN:
         return marks, "camera_wrong", "has a distortion in its file that no lens has"
     dark = blind(camera, view, picture)
     wanted = view._replace(sure=np.zeros_like(view.sure)) if dark else view

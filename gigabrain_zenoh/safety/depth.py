@@ -24,10 +24,11 @@ MEMORY_M = 0.3  # beyond the stopping distance, what is seen is remembered
 UNDISTORT_STEPS, UNDISTORTED = 20, 1e-3  # and how far off a ray may be then, 1 m ahead
 WIDEST = 20.0  # [m] aside of what is 1 m ahead: no lens sees that
 NEVER = 65535  # [mm], a depth that no pixel has
-SURE_NEAR_M, SURE_SHARE = 0.05, 0.8  # beyond depth_min, of depth_max: the floor must be seen there
+# beyond depth_min, of depth_max: the floor must be seen there
+JUDGED_NEAR_M, JUDGED_SHARE = 0.05, 0.8
 ALIKE_M, ALIKE_SHARE = 0.015, 0.02  # by which depths on one surface differ from pixel to pixel
-BESIDE, SURELY_BESIDE = 2, 4  # of 8 neighbours alike: to be believed if confirmed, at once
-HOLE_BESIDE, SURE_HOLE_BESIDE = 3, 6  # the same of holes
+BESIDE, CERTAIN_BESIDE = 2, 4  # of 8 neighbours alike: to be believed if confirmed, at once
+HOLE_BESIDE, CERTAIN_HOLE_BESIDE = 3, 6  # the same of holes
 BLIND_FLOOR, BLIND = 0.8, 0.95  # share of unknown pixels
 GAP_PX = 5  # side of a square without any floor that is no flaw of the picture
 
@@ -96,8 +97,8 @@ def view_of(body: BodyDescription, camera: Camera, up: Up = (0.0, 0.0)) -> View:
     crossing = mount[:2] + np.minimum(floor, 1e6)[..., None] * rays[..., :2]
     away = np.hypot(crossing[..., 0], crossing[..., 1])
     near = known & (away <= reach_of(body)) & (outside(edges(body.footprint), crossing) > 0)
-    sure = near & (floor >= camera.depth_min + SURE_NEAR_M)
-    sure &= floor <= SURE_SHARE * camera.depth_max
+    sure = near & (floor >= camera.depth_min + JUDGED_NEAR_M)
+    sure &= floor <= JUDGED_SHARE * camera.depth_max
     return View(
         mount=mount,
         rays=rays.astype(np.float32),
@@ -246,7 +247,7 @@ def sight(body: BodyDescription, camera: Camera, view: View, picture: Pixels) ->
     found: list[tuple[Floats, bool, bool]] = []
     if stands.any():
         beside, metres = _alike(stands, picture), picture * np.float32(0.001)
-        sure, doubtful = beside >= SURELY_BESIDE, stands & (beside >= BESIDE)
+        sure, doubtful = beside >= CERTAIN_BESIDE, stands & (beside >= BESIDE)
         for points, known in _nearest(view, stands & sure, doubtful, metres):
             found.append((points[outside(hull, points[:, :2]) > 0], False, known))
     hole = (picture > view.below) & ~dark
@@ -255,7 +256,7 @@ def sight(body: BodyDescription, camera: Camera, view: View, picture: Pixels) ->
     doubtful = (hole & (holes >= HOLE_BESIDE)) | gap
     if doubtful.any():
         for points, known in _nearest(
-            view, hole & (holes >= SURE_HOLE_BESIDE), doubtful, view.floor
+            view, hole & (holes >= CERTAIN_HOLE_BESIDE), doubtful, view.floor
         ):
             found.append((points, True, known))
     if not found:

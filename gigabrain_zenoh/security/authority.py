@@ -240,7 +240,7 @@ def write_list(folder: Path, generations: Mapping[str, int]) -> None:
 
 
 EXPIRES_SOON_DAYS = 30
-MOST_BYTES = 100_000  # of a key or a certificate
+MAX_BYTES = 100_000  # of a key or a certificate
 
 
 class Identity(Struct, frozen=True, kw_only=True):
@@ -332,7 +332,7 @@ def read_key(path: Path) -> ec.EllipticCurvePrivateKey:
 
 def _bytes(path: Path) -> bytes:
     try:
-        return read_bounded(path, MOST_BYTES)
+        return read_bounded(path, MAX_BYTES)
     except PermissionError:
         raise unreadable(path) from None
     except OSError as error:

@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import Any
 
 from gigabrain_schemas.base import Message
-from gigabrain_schemas.body import MOST_CAMERAS
+from gigabrain_schemas.body import MAX_CAMERAS
 from gigabrain_schemas.objects import Detections
 from gigabrain_schemas.sensors import Image
 from gigabrain_schemas.topics import DETECTIONS, IMAGE, Topic
@@ -24,7 +24,7 @@ _decode_image = Codec(IMAGE.type, IMAGE.max_bytes).decode
 class CameraFeed:
     """Newest message of each camera or perceptor; decoded when it is read.
 
-    Of topics with a key for each camera, the first MOST_CAMERAS keys are kept.
+    Of topics with a key for each camera, the first MAX_CAMERAS keys are kept.
     """
 
     def __init__(self, bus: Bus, *topics: Topic[Any]) -> None:
@@ -77,10 +77,10 @@ class CameraFeed:
     def _receive(self, topic: Topic[Any], key: str, encoding: str, payload: bytes) -> None:
         """Keep an encoded payload. In any thread."""
         held, name = self._sampled.get(topic), key.removeprefix(f"{topic.key}/")
-        if held is not None and (name in held or len(held) < MOST_CAMERAS):
+        if held is not None and (name in held or len(held) < MAX_CAMERAS):
             held.setdefault(name, Sampled(self._bus, topic)).receive(key, encoding, payload)
             if topic is IMAGE and DETECTIONS in self._topics:
                 self._recent.setdefault(name, deque(maxlen=RECENT)).append(payload)
 
     def _add_detections(self, _key: str, found: Detections) -> None:
-        put_newest(self._detections, found.camera, found, MOST_CAMERAS)
+        put_newest(self._detections, found.camera, found, MAX_CAMERAS)

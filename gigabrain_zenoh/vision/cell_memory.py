@@ -25,12 +25,12 @@ KEPT_REACH_M = 5.0  # farther from the robot, nobody needs it
 GONE_STRIKES = 3.0  # pictures that see through it; new ones need one
 BESIDE_STRIKES = 0.05  # a picture that sees something there, but not quite in this cell
 STEADY_POINTS = 3.0  # pixels of a cell that counts in its first picture
-SURE_SEEN = 4.0  # pictures, after which a cell is sure
+CONFIRMED_PICTURES = 4.0  # pictures, after which a cell is sure
 SHARES = (0.2, 0.45, 0.7)  # of its height, where a cell is looked at
 THROUGH_M = 0.02  # beyond noise
 NEIGHBOURS = tuple((row, column) for row in (-1, 0, 1) for column in (-1, 0, 1))
 MAX_CELLS = 8000  # the newest; a picture has at most some thousand
-LEAST_HALF_M = 0.004  # of a cell's box
+MIN_HALF_M = 0.004  # of a cell's box
 KEY_SPAN = 1 << 20
 CELLS = np.dtype(
     [
@@ -139,7 +139,7 @@ class CellMemory:
             cells[name][at] += 0.5 * (new[name] - cells[name][at])
         cells["bottom"][at] = np.minimum(cells["bottom"][at], new["bottom"])
         cells["top"][at] = np.maximum(cells["top"][at], new["top"])
-        cells["seen"][at] = np.minimum(cells["seen"][at] + 1, SURE_SEEN)
+        cells["seen"][at] = np.minimum(cells["seen"][at] + 1, CONFIRMED_PICTURES)
         cells["strikes"][at] = 0.0
         for name in ("points", "stamp", "driven", "turned"):
             cells[name][at] = new[name]
@@ -161,8 +161,8 @@ class CellMemory:
         spread = np.add.reduceat(places * places, first) / count[:, None] - mean * mean
         half = np.sqrt(3 * np.maximum(spread, 0.0))  # of a box evenly filled
         corner = ((key[first] // 4)[:, None] // (KEY_SPAN, 1) % KEY_SPAN - KEY_SPAN // 2) * CELL_M
-        cells["low"] = np.minimum(np.maximum(mean - half, corner), mean - LEAST_HALF_M)
-        cells["high"] = np.maximum(np.minimum(mean + half, corner + CELL_M), mean + LEAST_HALF_M)
+        cells["low"] = np.minimum(np.maximum(mean - half, corner), mean - MIN_HALF_M)
+        cells["high"] = np.maximum(np.minimum(mean + half, corner + CELL_M), mean + MIN_HALF_M)
         cells["key"], cells["kind"], cells["points"] = key[first], kind, count
         cells["bottom"] = np.minimum.reduceat(height, first)
         cells["top"] = np.maximum.reduceat(height, first)

@@ -18,7 +18,7 @@ ROUGH_M = 0.003  # standard deviation of a real floor from its plane
 REACHES_M = (0.6, 1.0, 1.6, 2.4, 3.2, 3.2)  # outwards from what is sure to what is not
 GATE = 3.0  # standard deviations from the plane, beyond which a point is not floor
 INDEPENDENT = 60.0  # a picture counts as no more than this many independent points
-LEAST_POINTS = 60  # with fewer the floor is not in view
+MIN_POINTS = 60  # with fewer the floor is not in view
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ def fit_floor(before: FloorPlane, points: Floats, sigma: Floats) -> FloorPlane:
         inlying = np.maximum(1.0 - off * off / gate, 0.0)  # Tukey
         weight = inlying * inlying * spread[near]
         total = float(weight.sum())
-        if np.count_nonzero(inlying) < LEAST_POINTS or total <= 0.0:
+        if np.count_nonzero(inlying) < MIN_POINTS or total <= 0.0:
             continue
         weight *= INDEPENDENT / total / noise[near]
         weighed = design[:, near] * weight

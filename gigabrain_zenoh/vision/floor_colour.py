@@ -24,7 +24,7 @@ UNLIKE = 5.0  # standard deviations from the colour of the floor
 GAIN = 0.1  # of a new picture in the remembered colour
 RUN_PX = 3  # rows in sequence that are no floor; fewer are joints and specks
 DEEP_M = (0.0, 0.02)  # behind the boundary something stands, at least this deep
-LEAST_PX = 40  # of a patch
+MIN_PX = 40  # of a patch
 DARK = 40.0  # added to the brightness that chromaticity is divided by: dark pixels have no colour
 
 
@@ -78,7 +78,7 @@ class ColourCamera:
 
     def _learn(self, patch: Floats) -> None:
         """Take the colour of the patch before the robot, if floor is all that it shows."""
-        if len(patch) < LEAST_PX:
+        if len(patch) < MIN_PX:
             return
         mean, spread = np.median(patch, axis=0), np.maximum(patch.std(axis=0), SPREAD)
         if spread[0] > EVEN:

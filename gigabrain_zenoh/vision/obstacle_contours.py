@@ -17,11 +17,11 @@ from gigabrain_zenoh.geometry.polygon import contains
 from gigabrain_zenoh.vision.camera_model import CameraModel
 from gigabrain_zenoh.vision.cell_memory import (
     COLOUR,
+    CONFIRMED_PICTURES,
     HOLE,
     KEPT_S,
     MISSING,
     OBSTACLE,
-    SURE_SEEN,
     CellMemory,
     Cells,
     Picture,
@@ -33,11 +33,11 @@ from gigabrain_zenoh.vision.outlines import Labels, connected, distinct, split, 
 ENOUGH_PIXELS = 320 * 240  # of larger pictures every second row and column is taken, or fewer
 MAX_CONTOURS = 128  # the nearest
 BOTTOMLESS_M = -1.0  # of a hole that returns nothing
-ROOM_ABOVE_M = 0.01  # what hangs no higher than this above the body bars the way too
+CLEARANCE_ABOVE_M = 0.01  # what hangs no higher than this above the body bars the way too
 AT_ONCE_POINTS = 12.0  # pixels of something that is believed in its first picture
 LATER_POINTS = 2.0  # ... in its second
 GROUPS = ((OBSTACLE,), (HOLE, MISSING), (COLOUR,))  # kinds of cells that make a contour together
-LEAST_SEEN = {OBSTACLE: 2.0, HOLE: 2.0, MISSING: 3.0, COLOUR: 3.0}  # pictures
+MIN_SEEN = {OBSTACLE: 2.0, HOLE: 2.0, MISSING: 3.0, COLOUR: 3.0}  # pictures
 UNSURE = {MISSING: 0.5, COLOUR: 0.5}  # confidence of kinds that other things look like
 OwnPoints = Callable[[Floats], NDArray[np.bool_]]  # which points (n, 3) are on the body's own arm
 
@@ -59,7 +59,7 @@ class ObstacleContours:
 
     def __init__(self, description: BodyDescription) -> None:
         self._footprint: Floats = np.array(description.footprint)
-        self._height = description.body_height + ROOM_ABOVE_M
+        self._height = description.body_height + CLEARANCE_ABOVE_M
         self._cameras: dict[str, Camera] = {one.name: one for one in description.cameras}
         self._steps = {one.name: step_of(one) for one in description.cameras}
         self._depth: dict[str, DepthCamera] = {}
@@ -218,7 +218,7 @@ def _believed(cells: Cells, labels: Labels) -> NDArray[np.bool_]:
     groups = int(labels.max()) + 1
     points = np.bincount(labels, cells["points"], groups)
     enough = np.zeros(groups, np.bool_)
-    for kind, least in LEAST_SEEN.items():
+    for kind, least in MIN_SEEN.items():
         of_kind = cells["kind"] == kind
         enough[labels[of_kind & (cells["seen"] >= least)]] = True
         if kind == OBSTACLE:
@@ -233,7 +233,7 @@ def _believed(cells: Cells, labels: Labels) -> NDArray[np.bool_]:
 def _contour(part: Cells, corners: Floats, track: int, now: float) -> Contour:
     age = max(0.0, now - float(part["stamp"].max()))
     kind = int(part["kind"].max())
-    surety = min(1.0, (1.0 + float(part["seen"].max())) / (1.0 + SURE_SEEN))
+    surety = min(1.0, (1.0 + float(part["seen"].max())) / (1.0 + CONFIRMED_PICTURES))
     return Contour(
         polygon=tuple(distinct(corners)),
         bottom=float(np.clip(part["bottom"].min(), -10.0, 10.0)),

@@ -14,7 +14,7 @@ import numpy as np
 from gigabrain_schemas.arrays import Floats
 
 ShapeName = Literal["box", "cylinder", "sphere"]
-LEAST_POINTS = 12
+MIN_POINTS = 12
 FROM_ABOVE = math.tan(math.radians(20))  # slope of the line of sight from which a top is whole
 TOP_SHARE = 0.97  # of the heights lie below the top
 LID_M = 0.004  # below its top, where its rim is
@@ -23,8 +23,8 @@ ANGLES = np.radians(np.arange(0.0, 90.0, 2.0))
 FINE_RAD = np.radians(np.arange(-2.0, 2.1, 0.25))
 CLOSE_M = 0.001  # nearer to a side is no better
 FLAT_M = 0.008  # of a box of which one side is seen, at most
-LEAST_ARC = 1.2  # of its radius, that is seen of a round thing
-MOST_RADIUS_M = 0.2
+MIN_ARC = 1.2  # of its radius, that is seen of a round thing
+MAX_RADIUS_M = 0.2
 ROUNDS = 8  # of Gauss-Newton
 UNDECIDED = 0.9  # a thing is round where a circle fits better than sides do by this factor
 RESTS = 0.35  # of its radius, by which the middle of a ball may seem too high or too low
@@ -58,7 +58,7 @@ def fit_solid(points: Floats, eye: Floats, spacing: float) -> SolidFit | None:
         eye: (3,) of the camera, in the same frame.
         spacing: Distance of neighbouring points across the line of sight [m].
     """
-    if len(points) < LEAST_POINTS:
+    if len(points) < MIN_POINTS:
         return None
     top = float(np.quantile(points[:, 2], TOP_SHARE))
     flat = points[:, :2]
@@ -168,7 +168,7 @@ def _circle(outline: Floats, *, whole: bool, spacing: float) -> _Outline | None:
         step, *_ = np.linalg.lstsq(slope, radius - far, rcond=None)
         x, y, radius = x + step[0], y + step[1], radius + float(step[2])
     span = float(np.hypot(*(off.max(axis=0) - off.min(axis=0))))
-    if not 0.0 < radius < MOST_RADIUS_M or span < LEAST_ARC * radius:
+    if not 0.0 < radius < MAX_RADIUS_M or span < MIN_ARC * radius:
         return None
     error = float(np.abs(np.hypot(*(off - (x, y)).T) - radius).mean())
     radius += spacing / 2 if whole else 0.0  # its rim lies between two points

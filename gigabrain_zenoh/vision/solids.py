@@ -15,13 +15,13 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.vision.camera_model import CameraModel
 from gigabrain_zenoh.vision.depth_picture import DepthView
 from gigabrain_zenoh.vision.outlines import connected
-from gigabrain_zenoh.vision.solid_fit import LEAST_POINTS, SolidFit, fit_solid
+from gigabrain_zenoh.vision.solid_fit import MIN_POINTS, SolidFit, fit_solid
 
 REACH_M = 1.2  # from the camera
 LARGEST_M = 0.35  # across; what is larger is furniture
 LINK_M = 0.006  # least gap between two things
 NEARER_M = 0.02  # than a thing: what is so may hide a part of it
-RING_PX, MOST_HIDDEN = 2, 0.08  # round a thing, and the share of that which may be nearer
+RING_PX, MAX_HIDDEN = 2, 0.08  # round a thing, and the share of that which may be nearer
 EDGE_PX = 2  # at the edges of a picture
 BLIND_M = 0.01  # beyond the least depth: a part that is nearer may not be seen
 TOUCH_M = 0.01  # from a thing, within which the arm hides a part of it, or holds it
@@ -82,7 +82,7 @@ def _groups(flat: Floats) -> Iterator[NDArray[np.intp]]:
     labels = connected(flat, LINK_M)
     order = np.argsort(labels, kind="stable")
     for group in np.split(order, np.flatnonzero(np.diff(labels[order])) + 1):
-        if len(group) >= LEAST_POINTS and float(np.ptp(flat[group], axis=0).max()) < LARGEST_M:
+        if len(group) >= MIN_POINTS and float(np.ptp(flat[group], axis=0).max()) < LARGEST_M:
             yield group
 
 
@@ -99,7 +99,7 @@ def _is_cut(view: DepthView, pixels: NDArray[np.intp], far: float) -> bool:
     ring = (cv2.dilate(mask, kernel) > 0) & (mask == 0)
     around = view.depth[ring]
     hiding = (around > 0) & (around < far - NEARER_M)
-    return bool(hiding.mean() > MOST_HIDDEN)
+    return bool(hiding.mean() > MAX_HIDDEN)
 
 
 def _near(points: Floats, others: Floats) -> bool:

@@ -13,7 +13,7 @@ from gigabrain_schemas.arrays import Floats
 POINTS = 16  # of an edge
 ENDS = 0.12  # share of an edge left out at each end
 CELLS = 8.0  # of the smallest family, across its black square
-REACH_CELLS, MOST_PX, LEAST_PX = 0.7, 3.0, 1.0  # how far from an edge its step is looked for
+REACH_CELLS, MAX_PX, MIN_PX = 0.7, 3.0, 1.0  # how far from an edge its step is looked for
 STEP_PX = 0.25
 MAX_MOVE_PX = 2.5  # farther, the first guess is kept
 
@@ -27,7 +27,7 @@ def refined(grey: NDArray[np.uint8], corners: Floats) -> Floats:
     if (outward * (corners - corners.mean(axis=0))).sum() < 0:
         outward = -outward
     shares = np.linspace(ENDS, 1 - ENDS, POINTS)
-    reach = float(np.clip(REACH_CELLS * length.min() / CELLS, LEAST_PX, MOST_PX))
+    reach = float(np.clip(REACH_CELLS * length.min() / CELLS, MIN_PX, MAX_PX))
     offsets = np.arange(-reach, reach + STEP_PX, STEP_PX)
     on_edge = corners[:, None] + shares[:, None] * along[:, None]  # (4, POINTS, 2)
     sampled = on_edge[:, :, None] + offsets[:, None] * outward[:, None, None]

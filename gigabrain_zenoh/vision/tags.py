@@ -27,7 +27,7 @@ FAMILIES = {
 MIN_SIDE_PX = 12.0  # of the shortest side
 FROM_LOWER_LEFT = (1, 0, 3, 2)  # OpenCV draws these families upside down, from the upper left
 TURNED_RAD = 0.35  # between two poses that are two answers
-SURE = 1.5  # by which the error of the other pose must be greater, without depth
+MIN_ERROR_RATIO = 1.5  # by which the error of the other pose must be greater, without depth
 INNER = 0.85  # share of a tag's sides within which depth is taken: its edges mix with behind it
 MIN_POINTS = 20  # with depth
 MAX_TILT_ERROR = 0.06  # [rad], of a plane by depth that is believed
@@ -112,7 +112,7 @@ def place(corners: Floats, size: float, model: CameraModel, plane: Plane | None)
     (best, error), *others = poses
     for other, other_error in others:
         turned = math.acos(np.clip(best.axes[:, 0] @ other.axes[:, 0], -1.0, 1.0))
-        if turned > TURNED_RAD and other_error < SURE * error:
+        if turned > TURNED_RAD and other_error < MIN_ERROR_RATIO * error:
             return None
     return best if plane is None else _at_depth(best, model, plane)
 

@@ -38,7 +38,7 @@ WIDTHS_M = {
     "person": (0.12, 1.5),
     "robot": (0.1, 1.2),
 }
-USUAL, MOST_M = 0.35, 0.35  # of other things, and of all
+OTHERS_BEHIND, MAX_BEHIND_M = 0.35, 0.35  # of other things, and of all
 INNER = (0.2, 0.15, 0.8, 0.75)  # left, top, right, bottom of the part that is looked at
 MIN_PIXELS, MIN_SHARE = 8, 0.15  # with depth, of that part
 LAYER_SHARE = 0.3  # of the depths that make a layer: nearer ones are something else's edge
@@ -74,8 +74,8 @@ def thing_place(
     front = _front(_inside(box, depth), wide)
     if front is None:
         return None
-    behind = BEHIND.get(label, USUAL)
-    farther = min(front * behind * wide / (1 - behind * min(wide, 1.0)), MOST_M)
+    behind = BEHIND.get(label, OTHERS_BEHIND)
+    farther = min(front * behind * wide / (1 - behind * min(wide, 1.0)), MAX_BEHIND_M)
     middle = front + farther
     row = round(min(max((top + bottom) / 2, 0), height - 1))
     ray = model.rays[:, row, round((left + right) / 2)].astype(np.float64)

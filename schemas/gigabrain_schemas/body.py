@@ -51,13 +51,13 @@ Clearance = Annotated[float, Meta(ge=0.002, le=0.5)]  # [m]
 Key = Annotated[str, Meta(pattern=r"^\w+(/\w+)*$", max_length=128)]
 
 
-MOST_JOINTS = 128
-MOST_ARM_JOINTS = 32
-MOST_MODEL_CHARACTERS = 262_144
-MOST_KEEP_OUT = 16
+MAX_JOINTS = 128
+MAX_ARM_JOINTS = 32
+MAX_MODEL_CHARACTERS = 262_144
+MAX_KEEP_OUT = 16
 FOLLOW_SHARE = 0.06  # of a joint's range, by which it may be off what was sent
-LEAST_AREA = 1e-4  # [m2]
-LEAST_SPEED = 0.001  # [m/s], [rad/s]
+MIN_AREA = 1e-4  # [m2]
+MIN_SPEED = 0.001  # [m/s], [rad/s]
 
 
 class Joint(Record, frozen=True, kw_only=True):
@@ -134,15 +134,15 @@ class Arm(Record, frozen=True, kw_only=True):
     """What the brain has to know of an arm besides its joints and its model."""
 
     tool: Name = "tool"  # site of the model that reaches for things, along its x axis
-    home: Annotated[tuple[JointPosition, ...], Meta(min_length=1, max_length=MOST_ARM_JOINTS)]
+    home: Annotated[tuple[JointPosition, ...], Meta(min_length=1, max_length=MAX_ARM_JOINTS)]
     # [rad] or [m], a posture in which it is out of the way; one number for each joint
-    carry: Annotated[tuple[JointPosition, ...], Meta(max_length=MOST_ARM_JOINTS)] = ()
+    carry: Annotated[tuple[JointPosition, ...], Meta(max_length=MAX_ARM_JOINTS)] = ()
     # the same, in which it holds a thing above its base while that drives; none: it has no such
     rate_hz: Annotated[float, Meta(ge=50.0, le=200.0)] = 50.0  # of control's commands to its joints
     goal_time: Sustain = 1.0  # [s] after the end of a trajectory until its joints are there
     floor: Annotated[float, Meta(ge=-10.0, le=10.0)] | None = None
     # [m], height of the floor or table in the frame of its model; None: it cannot reach one
-    keep_out: Annotated[tuple[KeepOut, ...], Meta(max_length=MOST_KEEP_OUT)] = ()
+    keep_out: Annotated[tuple[KeepOut, ...], Meta(max_length=MAX_KEEP_OUT)] = ()
     voltage: tuple[Volts, Volts] | None = None  # [V], least and greatest of its supply
 
     def __post_init__(self) -> None:
@@ -187,8 +187,8 @@ class RobotState(Message, frozen=True, kw_only=True):
     pose: Pose  # odometry, since the driver's start
     velocity: Velocity  # as measured
     sent: Velocity = Velocity()  # last command to the body, as its protocol encodes it
-    joints: Annotated[tuple[Joint, ...], Meta(max_length=MOST_JOINTS)] = ()
-    joints_sent: Annotated[tuple[JointPosition, ...], Meta(max_length=MOST_ARM_JOINTS)] = ()
+    joints: Annotated[tuple[Joint, ...], Meta(max_length=MAX_JOINTS)] = ()
+    joints_sent: Annotated[tuple[JointPosition, ...], Meta(max_length=MAX_ARM_JOINTS)] = ()
     # [rad] or [m], last positions to the body, in the order of its description
     limp: bool = False  # its joints are let go of: a person can move them
     battery: Battery | None = None
@@ -217,7 +217,7 @@ FocalLength = Annotated[float, Meta(ge=1.0, le=1e5)]  # [px]
 FieldOfView = Annotated[float, Meta(ge=0.1, le=3.0)]  # [rad]
 Coefficient = Annotated[float, Meta(ge=-100.0, le=100.0)]  # of distortion
 CameraName = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]*$(?!\n)", max_length=32)]
-MOST_CAMERAS = 8
+MAX_CAMERAS = 8
 
 
 class Camera(Record, frozen=True, kw_only=True):
@@ -340,22 +340,22 @@ class BodyDescription(Record, frozen=True, kw_only=True):
     min_turning_radius: Annotated[float, Meta(ge=0.0, le=100.0)] = 0.0
     # [m], of an Ackermann base; 0: max_linear_speed / max_angular_speed
     body_height: Annotated[float, Meta(ge=0.01, le=10.0)] = 0.5  # [m], of its highest part
-    joints: Annotated[tuple[JointDescription, ...], Meta(max_length=MOST_ARM_JOINTS)] = ()
+    joints: Annotated[tuple[JointDescription, ...], Meta(max_length=MAX_ARM_JOINTS)] = ()
     # that can be commanded, from the base to the tool
     arm: Arm | None = None
     lidar: Lidar | None = None
-    cameras: Annotated[tuple[Camera, ...], Meta(max_length=MOST_CAMERAS)] = ()
+    cameras: Annotated[tuple[Camera, ...], Meta(max_length=MAX_CAMERAS)] = ()
     thresholds: Thresholds = DEFAULT
     control: ControlGains = ControlGains()
     safe_state: SafeState = "stop"  # what the driver brings it to when it ends
     control_topic: Key = "robot/cmd_vel"  # the key that its driver obeys
 
     def __post_init__(self) -> None:
-        if _area(self.footprint) < LEAST_AREA:
+        if _area(self.footprint) < MIN_AREA:
             raise ValueError("footprint: it must enclose an area, its corners in order")
         for name in ("max_linear_speed", "max_angular_speed"):
-            if self.drive_type != "arm" and getattr(self, name) < LEAST_SPEED:
-                raise ValueError(f"{name}: expected at least {LEAST_SPEED:g}")
+            if self.drive_type != "arm" and getattr(self, name) < MIN_SPEED:
+                raise ValueError(f"{name}: expected at least {MIN_SPEED:g}")
         self._check_joints()
         for name, speed in (
             ("follow_linear", self.max_linear_speed),
@@ -446,5 +446,5 @@ class Body(Message, frozen=True, kw_only=True):
 class ArmModel(Message, frozen=True, kw_only=True):
     """The model of a body with an arm. The last value is kept for those who join late."""
 
-    mjcf: Annotated[str, Meta(max_length=MOST_MODEL_CHARACTERS)]
+    mjcf: Annotated[str, Meta(max_length=MAX_MODEL_CHARACTERS)]
     # MuJoCo's XML, of primitives only; its joints have the names of the description

@@ -22,7 +22,7 @@ from gigabrain_schemas.base import (
     Velocity,
     array_meta,
 )
-from gigabrain_schemas.body import MOST_ARM_JOINTS, MOST_CAMERAS, JointPosition, JointSpeed
+from gigabrain_schemas.body import MAX_ARM_JOINTS, MAX_CAMERAS, JointPosition, JointSpeed
 from gigabrain_schemas.sensors import Quaternion
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ class WorldModel(Message, frozen=True, kw_only=True):
     # [m], nearest hit per equal sector, counter-clockwise, the first centred ahead; None for none
     obstacles: Annotated[tuple[Obstacle, ...], Meta(max_length=256)] = ()
     contours: Annotated[tuple[Contour, ...], Meta(max_length=128)] = ()
-    cameras: Annotated[tuple[CameraStatus, ...], Meta(max_length=MOST_CAMERAS)] = ()
+    cameras: Annotated[tuple[CameraStatus, ...], Meta(max_length=MAX_CAMERAS)] = ()
     hits: Annotated[bytes, array_meta(64 * 1024, "float32", ("n", 2), "m")] = b""
     # float32 little-endian [m], (n, 2): where beams hit; only for navigation
 
@@ -205,7 +205,7 @@ class JointTrajectory(Record, frozen=True, kw_only=True):
     Between the points positions are interpolated; after the last one the joints stay there.
     """
 
-    name: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MOST_ARM_JOINTS)]
+    name: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MAX_ARM_JOINTS)]
     start: Tick  # of the first point, by the robot's clock
     period: Annotated[float, Meta(ge=0.001, le=1.0)]  # [s] from point to point
     positions: Annotated[bytes, array_meta(12 * 1024, "float32", ("n", "joints"), "rad")]
@@ -236,7 +236,7 @@ class Intent(Message, frozen=True, kw_only=True):
     """Decision's wish, the motion that it expects, and its reason."""
 
     twist: Velocity | None = None
-    joints: Annotated[tuple[JointTarget, ...], Meta(max_length=MOST_ARM_JOINTS)] = ()
+    joints: Annotated[tuple[JointTarget, ...], Meta(max_length=MAX_ARM_JOINTS)] = ()
     joint_trajectory: JointTrajectory | None = None  # instead of `joints`
     trajectory: Annotated[tuple[TrajectoryPoint, ...], Meta(max_length=256)] = ()
     follow: bool = False  # control keeps to the trajectory; without, it gives the body the twist
@@ -284,10 +284,8 @@ class Twist(Message, frozen=True, kw_only=True):
 class JointSpeeds(Message, frozen=True, kw_only=True):
     """Velocities of joints that an operator asks for; other joints are held."""
 
-    name: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MOST_ARM_JOINTS)]
-    velocity: Annotated[
-        tuple[JointSpeed, ...], Meta(max_length=MOST_ARM_JOINTS)
-    ]  # [rad/s] or [m/s]
+    name: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MAX_ARM_JOINTS)]
+    velocity: Annotated[tuple[JointSpeed, ...], Meta(max_length=MAX_ARM_JOINTS)]  # [rad/s] or [m/s]
 
     def __post_init__(self) -> None:
         if len(self.velocity) != len(self.name):
@@ -312,11 +310,11 @@ class JointCommand(Message, frozen=True, kw_only=True):
     Positions alone are to be reached and kept; velocities alone are kept up.
     """
 
-    name: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MOST_ARM_JOINTS)]
-    position: Annotated[tuple[JointPosition, ...], Meta(max_length=MOST_ARM_JOINTS)] = ()
+    name: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MAX_ARM_JOINTS)]
+    position: Annotated[tuple[JointPosition, ...], Meta(max_length=MAX_ARM_JOINTS)] = ()
     # [rad] or [m]
     velocity: Annotated[
-        tuple[JointSpeed, ...], Meta(max_length=MOST_ARM_JOINTS)
+        tuple[JointSpeed, ...], Meta(max_length=MAX_ARM_JOINTS)
     ] = ()  # [rad/s] or [m/s]
     source: Name = ""  # who commands
     operator: bool = False  # control follows an operator's stream, not decision's intent

@@ -7,7 +7,7 @@ from msgspec import Meta, Struct
 from gigabrain_schemas.base import Count, Key, Message, Name, Text
 from gigabrain_schemas.tasks import MAX_REQUEST_BYTES
 
-MOST_RECORDS = 1000
+MAX_RECORDS = 1000
 What = Literal[
     "boot",  # the driver has started
     "end",  # the driver ends, and leaves the body in its safe state
@@ -40,13 +40,13 @@ class AuditRecord(Message, frozen=True, kw_only=True):
 class AuditRequest(Message, frozen=True, kw_only=True):
     """Asks for the newest entries. An empty request will do."""
 
-    newest: Annotated[int, Meta(ge=1, le=MOST_RECORDS)] = 100
+    newest: Annotated[int, Meta(ge=1, le=MAX_RECORDS)] = 100
 
 
 class AuditPage(Message, frozen=True, kw_only=True):
     """The newest entries, oldest first."""
 
-    records: Annotated[tuple[AuditRecord, ...], Meta(max_length=MOST_RECORDS)] = ()
+    records: Annotated[tuple[AuditRecord, ...], Meta(max_length=MAX_RECORDS)] = ()
 
 
 MAX_ENTRIES = 4096  # entries in one message

@@ -16,7 +16,7 @@ from gigabrain_schemas.base import (
     SpeedCap,
     Text,
 )
-from gigabrain_schemas.body import MOST_ARM_JOINTS
+from gigabrain_schemas.body import MAX_ARM_JOINTS
 
 Figures = Annotated[dict[Key, NonNegative], Meta(max_length=256)]
 Data = Annotated[str, Meta(max_length=4096)]
@@ -48,7 +48,7 @@ class SafetyState(Message, frozen=True, kw_only=True):
 
     verdict: Literal["ok", "slow", "stop"]
     caps: SpeedCaps = SpeedCaps()
-    joints: Annotated[tuple[JointCap, ...], Meta(max_length=MOST_ARM_JOINTS)] = ()
+    joints: Annotated[tuple[JointCap, ...], Meta(max_length=MAX_ARM_JOINTS)] = ()
     # of those that have a limit
     causes: Causes = ()  # why the verdict is what it is
     warnings: Causes = ()  # become causes if no one acts

@@ -20,7 +20,7 @@ Accelerations = tuple[Acceleration, Acceleration, Acceleration]
 Part = Annotated[float, Meta(ge=-2.0, le=2.0)]  # of a quaternion of about unit length
 Quaternion = tuple[Part, Part, Part, Part]
 Pixels = Annotated[int, Meta(ge=0, le=16_384)]
-LEAST_STEP = 1e-6  # [rad], from beam to beam
+MIN_STEP = 1e-6  # [rad], from beam to beam
 
 
 class LaserScan(Message, frozen=True, kw_only=True):
@@ -38,7 +38,7 @@ class LaserScan(Message, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if not self.ranges or len(self.ranges) % 4:
             raise ValueError(f"ranges must be float32 values, got {len(self.ranges)} bytes")
-        if abs(self.angle_increment) < LEAST_STEP:
+        if abs(self.angle_increment) < MIN_STEP:
             raise ValueError("angle_increment must not be 0")
         if self.range_max <= self.range_min:
             raise ValueError("range_max must be larger than range_min")

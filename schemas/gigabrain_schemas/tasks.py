@@ -21,7 +21,7 @@ How = Literal["replace", "queue", "preempt"]
 # in place of all that there is to do; after it; or before it, which goes on afterwards
 TaskState = Literal["queued", "active", "paused", "succeeded", "failed", "cancelled"]
 MAX_REQUEST_BYTES = 96 * 1024  # of a request as text: a mission of the longest, quoted
-MOST_POINTS = 256  # of a path that is only drawn
+MAX_POINTS = 256  # of a path that is only drawn
 
 
 class Goal(Record, frozen=True, kw_only=True):
@@ -114,7 +114,7 @@ class TaskStatus(Message, frozen=True, kw_only=True):
     distance_remaining: Distance | None = None  # [m] along the path; None while none is known
     eta: NonNegative | None = None  # [s] until the step is done
     goal: Goal | None = None  # where it drives to now
-    path: Annotated[tuple[tuple[Coordinate, Coordinate], ...], Meta(max_length=MOST_POINTS)] = ()
+    path: Annotated[tuple[tuple[Coordinate, Coordinate], ...], Meta(max_length=MAX_POINTS)] = ()
     # [m] in the map, from here to the goal, for drawing
     queue: Annotated[tuple[Task, ...], Meta(max_length=32)] = ()
     done: Annotated[tuple[Task, ...], Meta(max_length=16)] = ()  # the last ones, newest first

@@ -29,7 +29,7 @@ from tests.fuzz.harness import split
 CODECS = {message.__name__: codec_of(message) for message in messages()}
 NAMES = sorted(CODECS)
 HERE = Pose(x=0.0, y=0.0, yaw=0.0)
-MOST_PIXELS = 400  # of a side
+MAX_PIXELS = 400  # of a side
 
 
 def check(data: bytes) -> None:
@@ -85,7 +85,7 @@ def looked_at(picture: DepthImage) -> None:
             told(str(error))
         else:
             assert shape == (picture.height // shrunk, picture.width // shrunk)
-    if max(picture.width, picture.height) > MOST_PIXELS:
+    if max(picture.width, picture.height) > MAX_PIXELS:
         return  # such a camera takes as long as it takes
     camera = Camera(name="front", depth=True, width=picture.width, height=picture.height, z=0.1)
     pictures = {"front": Picture(image=replace(picture, basis=1))}

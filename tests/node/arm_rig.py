@@ -32,7 +32,7 @@ CUBE = """<mujoco><worldbody>
 THERE, ELSEWHERE = (0.2388, 0.0), (0.1388, 0.15)
 THINGS = "things: {cube: {box: [0.03, 0.03, 0.03], at: [0.2388, 0.0, 0.015]}}\n"
 IDLE = Intent(behaviour="test", reason="still")
-MOST_TICKS = 4000
+MAX_TICKS = 4000
 
 
 def waits(job: Future[Any], _patience_s: float) -> bool:
@@ -121,7 +121,7 @@ class Rig:
 
     def carry_on(self) -> Task:
         """Return what becomes of the present task."""
-        for _ in range(MOST_TICKS):
+        for _ in range(MAX_TICKS):
             self.tick()
             if not self.queue.status.current:
                 return self.queue.status.done[0]

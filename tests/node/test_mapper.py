@@ -165,7 +165,7 @@ async def test_after_a_new_start_of_the_driver_the_map_stays_and_the_robot_is_fo
 async def test_a_map_that_may_grow_no_more_is_told_once_and_in_the_health(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(occupancy_grid, "MOST_CELLS", 100)
+    monkeypatch.setattr(occupancy_grid, "MAX_CELLS", 100)
     async with Robot() as robot:
         robot.say()
         robot.drive(30)

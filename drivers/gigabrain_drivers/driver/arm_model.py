@@ -9,7 +9,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
-from gigabrain_schemas.body import MOST_MODEL_CHARACTERS
+from gigabrain_schemas.body import MAX_MODEL_CHARACTERS
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import read_bounded
 
@@ -100,7 +100,7 @@ def _section(root: Element, name: str) -> Element:
 
 def _text(path: Path) -> str:
     try:
-        return read_bounded(path, MOST_MODEL_CHARACTERS).decode()
+        return read_bounded(path, MAX_MODEL_CHARACTERS).decode()
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: the model of the arm: {error}") from None
 

@@ -29,15 +29,15 @@ from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.config.loading import nearest
 from gigabrain_zenoh.errors import ConfigError
 
-MOST_M = 400.0  # from the origin to anything in a world
+MAX_DISTANCE_M = 400.0  # from the origin to anything in a world
 MAX_THINGS, MAX_TAGS = 200, 50
 MAX_SHAPES, MAX_PEOPLE, MAX_LIGHTS, MAX_CORNERS = 4000, 16, 8, 100
 MIN_PATH_M = 0.5
 LEAF_HALF = 0.02  # [m], of a closed door
 FLOOR = "floor"  # name of the floor's geom, material and texture
 
-Place = Annotated[float, Meta(ge=-MOST_M, le=MOST_M)]  # [m]
-Size = Annotated[float, Meta(ge=0.005, le=2 * MOST_M)]  # [m]
+Place = Annotated[float, Meta(ge=-MAX_DISTANCE_M, le=MAX_DISTANCE_M)]  # [m]
+Size = Annotated[float, Meta(ge=0.005, le=2 * MAX_DISTANCE_M)]  # [m]
 Height = Annotated[float, Meta(ge=0.0, le=20.0)]  # [m], above the floor
 WallHeight = Annotated[float, Meta(ge=0.05, le=20.0)]  # [m]
 Angle = Annotated[float, Meta(ge=-10.0, le=10.0)]  # [rad]
@@ -73,7 +73,9 @@ class _Part(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class DoorPart(_Part, frozen=True, kw_only=True):
     """An opening in a wall, with a leaf of wood in it if it is closed."""
 
-    at: Annotated[float, Meta(ge=0.0, le=2 * MOST_M)]  # its middle, from the wall's begin [m]
+    at: Annotated[
+        float, Meta(ge=0.0, le=2 * MAX_DISTANCE_M)
+    ]  # its middle, from the wall's begin [m]
     width: Annotated[float, Meta(ge=0.1, le=100.0)] = 1.0  # [m]
     closed: bool = False
 

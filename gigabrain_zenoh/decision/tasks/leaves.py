@@ -36,7 +36,7 @@ from gigabrain_zenoh.decision.tasks.scripts import Run
 
 StartScript = Callable[[Script], Run]
 MOVED_M = 0.15  # that a target may be off where the robot drives to
-MOST_WAYS = 4  # to a thing that is to be picked up
+MAX_WAYS = 4  # to a thing that is to be picked up
 NOBODY_LOOKS = "waiting: nothing is recognised in pictures; run the process `recognition`"
 
 
@@ -289,7 +289,7 @@ class PickNode(ArmNode):
     def _next_way(self) -> DriveNode | SeekNode | None:
         outcome, command = self.context.outcome, self._command
         assert command
-        if outcome is None or outcome.number != command.number or self._ways == MOST_WAYS:
+        if outcome is None or outcome.number != command.number or self._ways == MAX_WAYS:
             return None
         if outcome.approach:
             return DriveNode("approach", self.context, target=outcome.approach)

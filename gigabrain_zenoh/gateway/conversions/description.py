@@ -21,7 +21,7 @@ from gigabrain_zenoh.geometry.link_model import LinkModel
 
 WHEEL_WIDTH = 0.15  # of its diameter; files do not give it
 ROUND_CORNERS, ROUND_SHARE = 8, 0.03  # a footprint of so many corners, so equally far, is round
-LEAST_HEIGHT = 0.02  # [m] of the hull that is drawn
+MIN_HEIGHT = 0.02  # [m] of the hull that is drawn
 
 
 class Wheel(NamedTuple):
@@ -81,7 +81,7 @@ def _hull(link: xml.Element, about: BodyDescription) -> None:
     xs, ys = zip(*about.footprint, strict=True)
     middle = (max(xs) + min(xs)) / 2, (max(ys) + min(ys)) / 2
     lift = about.wheel_radius if wheels(about) else 0.0
-    height = max(about.body_height - lift, LEAST_HEIGHT)
+    height = max(about.body_height - lift, MIN_HEIGHT)
     reaches = [math.hypot(x - middle[0], y - middle[1]) for x, y in about.footprint]
     is_round = max(reaches) - min(reaches) <= ROUND_SHARE * max(reaches)
     for part in ("visual", "collision"):

@@ -41,7 +41,7 @@ WAIT_S = 3.0  # that a tick may wait for the brain: less than a stuck process ma
 MAX_SILENCE_S = 120.0  # of the tasks, and of the driver
 SETTLED_S = 3.0  # after the first goal was sent
 REACHED_M = 0.3  # from a goal at rest, by the physics
-LEAST_REACHED = 8  # goals of a world
+MIN_REACHED = 8  # goals of a world
 POLLS_PER_LOOK = 5  # at the truth
 
 Progress = Callable[[str], None]
@@ -100,7 +100,7 @@ class ClutterRun(Struct, frozen=True, kw_only=True):
     @property
     def ok(self) -> bool:
         """True if it also reached most goals."""
-        return self.unharmed and self.reached >= LEAST_REACHED
+        return self.unharmed and self.reached >= MIN_REACHED
 
 
 class ClutterResult(Struct, frozen=True, kw_only=True):

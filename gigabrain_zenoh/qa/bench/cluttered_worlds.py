@@ -36,7 +36,7 @@ START_M = 0.55  # from the robot's origin to anything, where it starts
 CELL_M = 0.05
 WAY_SPARE_M, GOAL_SPARE_M = 0.08, 0.17  # beside the circle in which the body turns
 LOW_ROOF_M = 0.08  # above the body: the ways that were searched do not lead under lower roofs
-LEG_M, MOST_LEG_M = 0.9, 1.6  # way from goal to goal
+LEG_M, MAX_LEG_M = 0.9, 1.6  # way from goal to goal
 CANDIDATES = 30  # for a goal: the one farthest from those before is taken
 SPREAD_M = 2.0  # of all goals, along x or y
 BARRED_SHARE = 0.8  # of the goals, where the straight way is barred
@@ -227,7 +227,7 @@ class FreeSpace:
         here, goals, legs = start, list[Point](), list[float]()
         while len(goals) < GOALS:
             ways = self.ways_from(here)
-            good = (ways >= LEG_M) & (ways <= MOST_LEG_M)
+            good = (ways >= LEG_M) & (ways <= MAX_LEG_M)
             good &= self._room >= self._turning + GOAL_SPARE_M
             chosen = np.flatnonzero(good)
             if not len(chosen):

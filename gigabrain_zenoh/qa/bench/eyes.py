@@ -36,7 +36,7 @@ SPEED, TURN = 0.2, 0.2  # [m/s], [rad/s]
 ERROR_REACH_M, RECALL_REACH_M = 3.0, 2.0
 STEP_M, EDGE_STEP_M = 0.02, 0.004  # between points of outlines
 BEARING_STEP = math.radians(0.5)
-LEAST_M = 0.028  # of what is seen of a thing, for recall: 3 cm less what a pixel may hide
+MIN_SEEN_M = 0.028  # of what is seen of a thing, for recall: 3 cm less what a pixel may hide
 FOUND_M, FOUND_SHARE = 0.05, 0.5  # distance to a contour, and share of a thing's points within it
 PIT_SEEN_M = 0.03  # below the floor
 FALSE_M = 0.10  # a contour that is nowhere nearer to a thing is none
@@ -263,8 +263,8 @@ def _found(truth: _Truth, contours: Sequence[Contour]) -> list[bool]:
         near = truth.away[truth.thing == number]
         if (
             near.max() > RECALL_REACH_M
-            or np.ptp(mine[:, 2]) < LEAST_M
-            or _width(mine, truth.pose) < LEAST_M
+            or np.ptp(mine[:, 2]) < MIN_SEEN_M
+            or _width(mine, truth.pose) < MIN_SEEN_M
         ):
             continue
         covered = distances(outlines, mine[:, :2]) < FOUND_M

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from gigabrain_schemas import topics
 from gigabrain_schemas.base import Count, Finite, Message, Name, Pose, Text, Velocity
 from gigabrain_schemas.body import (
-    MOST_ARM_JOINTS,
+    MAX_ARM_JOINTS,
     ArmModel,
     Body,
     BodyDescription,
@@ -82,7 +82,7 @@ class Login(Struct, frozen=True, forbid_unknown_fields=True):
 class Jog(Struct, frozen=True, forbid_unknown_fields=True):
     """Frame of an operator: speeds of joints while their buttons are held."""
 
-    speeds: Annotated[dict[Name, JointSpeed], Meta(max_length=MOST_ARM_JOINTS)] = {}
+    speeds: Annotated[dict[Name, JointSpeed], Meta(max_length=MAX_ARM_JOINTS)] = {}
     # [rad/s or m/s]
     tool: tuple[ToolSpeed, ToolSpeed, ToolSpeed] | None = None
     # [m/s], of the arm's tool, along x, y and z of the base

@@ -21,7 +21,7 @@ from tests.unit.gate.rig import BLIND, BOOT, CRASHED, HOT, LIMITS, LOST, ZONE
 MS = 1_000_000
 GAIN = (0.02, 0.02, 0.06)  # of speed in a tick, by axis, as LIMITS say
 LOSS = (0.04, 0.04, 0.06)
-MOST = (0.26, 0.2, 1.8)
+MAX_SPEEDS = (0.26, 0.2, 1.8)
 RIM, HALF_TRACK = 0.266, 0.1435  # [m/s], [m], of a base whose wheels are not as fast as that
 ROUNDING = 1e-9
 MOVES = {
@@ -274,7 +274,7 @@ class GateMachine(RuleBasedStateMachine):
             told = self.told[axis]
             braking = max(0.0, abs(told) - LOSS[axis])
             bound = forward[axis] if value > 0 else backward[axis]
-            assert abs(value) <= MOST[axis]
+            assert abs(value) <= MAX_SPEEDS[axis]
             assert value * told >= 0  # it never goes through zero
             assert abs(value) >= braking - ROUNDING
             assert abs(value) <= (abs(told) + GAIN[axis] if driven else braking) + ROUNDING

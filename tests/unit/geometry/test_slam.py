@@ -8,7 +8,7 @@ import pytest
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.geometry.se2 import IDENTITY, between, compose
-from gigabrain_zenoh.mapping.front_end import FEW
+from gigabrain_zenoh.mapping.front_end import MIN_POINTS
 from gigabrain_zenoh.mapping.keyframes import Scan
 from gigabrain_zenoh.mapping.slam import Estimate, Slam
 from tests.unit.mapping.rooms import Lidar, Walls, box, dead_reckoned, drifting, line
@@ -259,7 +259,7 @@ def test_with_nothing_in_sight_odometry_carries_on_and_the_doubt_grows() -> None
     lidar = Lidar(180)
     slam = Slam()
     feed(slam, look(BLOCK, poses[:5], lidar), stepped(poses[:5], 0.0, 1.0))
-    few = Scan.of(np.ones((FEW - 1, 2)))
+    few = Scan.of(np.ones((MIN_POINTS - 1, 2)))
     blind = feed(slam, [few] * 30, np.tile((0.1, 0.0, 0.0), (30, 1)))
     assert {estimate.kind for estimate in blind} == {"odometry"}
     assert blind[-1].pose == pytest.approx((3.4, 0.0, 0.0), abs=0.02)

@@ -5,7 +5,7 @@ from msgspec.structs import replace
 from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import BODY, HEALTH
-from gigabrain_zenoh.bus.input_log import MOST_KEYS, PublishedInputLogger
+from gigabrain_zenoh.bus.input_log import MAX_KEYS, PublishedInputLogger
 from gigabrain_zenoh.host.bounded import put_newest
 from gigabrain_zenoh.safety.health import Host
 from gigabrain_zenoh.safety.node import InputCollector
@@ -33,7 +33,7 @@ def test_an_input_log_keeps_the_newest_number_of_so_many_keys() -> None:
     input_log = PublishedInputLogger(lambda _: None, lambda: 0)
     for n in range(10_000):
         input_log.note(f"robot/health/{n}", 1)
-    assert len(input_log._last) == MOST_KEYS == 512
+    assert len(input_log._last) == MAX_KEYS == 512
 
 
 async def test_who_watches_keeps_the_health_of_64_processes() -> None:

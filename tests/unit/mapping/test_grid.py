@@ -109,7 +109,7 @@ def test_a_grid_as_it_was_saved_goes_on() -> None:
     for grid in (first, again):
         grid.draw(at(0.025, 0.025), points((1.5, 0.0)), NONE)
     assert np.array_equal(first.percent(), again.percent())
-    assert grids.MOST_CELLS**2 <= 8 * 1024 * 1024
+    assert grids.MAX_CELLS**2 <= 8 * 1024 * 1024
 
 
 def test_a_part_of_it_is_what_the_whole_shows_there() -> None:

@@ -7,7 +7,7 @@ import pytest
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.objects import SeenSolid
 from gigabrain_zenoh.geometry.pose import ORIGIN
-from gigabrain_zenoh.perception.solid_memory import KEPT_S, MISSES, MOST, SolidMemory
+from gigabrain_zenoh.perception.solid_memory import KEPT_S, MAX_SOLIDS, MISSES, SolidMemory
 from gigabrain_zenoh.vision.solid_fit import SolidFit
 
 
@@ -71,8 +71,8 @@ def test_a_thing_that_is_seen_through_goes_and_one_that_is_hidden_stays() -> Non
 def test_what_was_not_seen_for_long_is_forgotten_and_there_are_not_too_many() -> None:
     memory = SolidMemory()
     for tick in (1, 2):
-        looked(memory, *(can(0.1 * k, 1.0) for k in range(MOST + 20)), tick=tick)
-    assert len(memory.solids(ORIGIN, 2)) == MOST
+        looked(memory, *(can(0.1 * k, 1.0) for k in range(MAX_SOLIDS + 20)), tick=tick)
+    assert len(memory.solids(ORIGIN, 2)) == MAX_SOLIDS
     looked(memory, tick=3 + round(KEPT_S * 50))
     assert memory.solids(ORIGIN, 3) == ()
 

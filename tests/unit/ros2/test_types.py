@@ -272,7 +272,7 @@ def test_a_million_payloads_of_nonsense_raise_nothing_else(types: Types) -> None
     assert storm(types, rounds)[0] >= 1_000_000
 
 
-MOST_BYTES = 60  # of Python's objects, for each byte of a payload
+MAX_BYTES = 60  # of Python's objects, for each byte of a payload
 SIZE = 8000  # bytes
 
 
@@ -293,7 +293,7 @@ def test_a_payload_allocates_no_more_than_its_length_allows(types: Types) -> Non
                 worst[name] = max(worst.get(name, 0.0), peak / SIZE)
     finally:
         tracemalloc.stop()
-    assert {name: most for name, most in worst.items() if most > MOST_BYTES} == {}
+    assert {name: most for name, most in worst.items() if most > MAX_BYTES} == {}
 
 
 def hostile() -> Iterator[bytes]:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gigabrain_schemas.arrays import Floats
-from gigabrain_zenoh.vision.solid_fit import LEAST_POINTS, SolidFit, fit_solid
+from gigabrain_zenoh.vision.solid_fit import MIN_POINTS, SolidFit, fit_solid
 
 ABOVE, BESIDE = np.array([0.17, 0.0, 0.55]), np.array([0.0, 0.0, 0.1])  # [m], of cameras
 STEP_M = 0.002  # between points
@@ -110,10 +110,10 @@ def test_a_box_that_shows_two_sides_has_both_lengths() -> None:
 
 
 def test_too_few_points_fit_nothing() -> None:
-    assert fit_solid(np.zeros((LEAST_POINTS - 1, 3)), ABOVE, STEP_M) is None
+    assert fit_solid(np.zeros((MIN_POINTS - 1, 3)), ABOVE, STEP_M) is None
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(LEAST_POINTS, 60))
+@given(st.integers(0, 2**32 - 1), st.integers(MIN_POINTS, 60))
 def test_any_points_give_finite_sizes_or_nothing(seed: int, count: int) -> None:
     points = np.random.default_rng(seed).uniform(0.0, 0.3, (count, 3))
     for eye in (ABOVE, BESIDE):
