@@ -113,7 +113,7 @@ class Memory(Struct, frozen=True, kw_only=True):
     asked_ns: int = -ASK_NS
     blocked: str = ""  # why the sender has to pause first
     velocity: Velocity = ZERO
-    heard_ns: int = -RELEASE_NS  # when any command came, also one that was refused
+    received_ns: int = -RELEASE_NS  # when any command came, also one that was refused
     last_ns: int = -RELEASE_NS  # when the newest good one was sent, as far as it is known
     period_ns: int = TIMEOUT_NS  # of its sender
     senders: tuple[Sender, ...] = ()  # the newest last
@@ -144,8 +144,8 @@ Step = tuple[Memory, tuple[Action, ...]]
 
 def arrive(config: Config, limits: Limits, memory: Memory, wanted: Wanted, now: Now) -> Step:
     """Process a command of ROS."""
-    paused = now.ns - memory.heard_ns >= RELEASE_NS
-    memory = replace(memory, heard_ns=now.ns)
+    paused = now.ns - memory.received_ns >= RELEASE_NS
+    memory = replace(memory, received_ns=now.ns)
     code, text = _fault(config, wanted, now)
     if code == "not_finite":  # its sender is out of order: brake
         memory = replace(memory, velocity=ZERO, refusal=text)
@@ -178,7 +178,7 @@ def observe(config: Config, memory: Memory, state: RobotState, now: Now) -> Step
     if state.gate.mode == "latched" and not _is_old(memory):
         memory = replace(memory, blocked=f"the robot was latched; {PAUSE}")
     since_ns = now.ns - memory.last_ns
-    if now.ns - memory.heard_ns >= RELEASE_NS:
+    if now.ns - memory.received_ns >= RELEASE_NS:
         blocked = memory.blocked if state.gate.mode == "latched" else ""
         memory = replace(memory, refusal="", blocked=blocked)
     if since_ns >= RELEASE_NS:
@@ -212,7 +212,7 @@ def silent(memory: Memory, now: Now) -> Step:
     """Process a command of ROS while the robot is silent: a lease is over."""
     blocked = f"the robot was silent; {PAUSE}" if memory.holds else memory.blocked
     memory = replace(
-        memory, gate=None, holds=False, velocity=ZERO, heard_ns=now.ns,
+        memory, gate=None, holds=False, velocity=ZERO, received_ns=now.ns,
         blocked=blocked, refusal=NO_ROBOT,
     )  # fmt: skip
     return memory, (Refuse("no_robot"),)

@@ -128,7 +128,7 @@ class JointRequests:
         self._requests = TopicRequests(scene.bus, ros, types, work)
         self._commander: JointCommander | None = None
         self._server: ActionServer | None = None
-        self._heard_ns = -RELEASE_NS  # when the newest trajectory came by the topic
+        self._received_ns = -RELEASE_NS  # when the newest trajectory came by the topic
         scene.on_body.append(self._offer)
 
     def forget(self, why: str) -> None:
@@ -169,7 +169,7 @@ class JointRequests:
         assert commander
         assert body
         now_ns = self._scene.bus.clock.now_ns()
-        paused, self._heard_ns = now_ns - self._heard_ns >= RELEASE_NS, now_ns
+        paused, self._received_ns = now_ns - self._received_ns >= RELEASE_NS, now_ns
         if paused:
             commander.blocked = ""
         if commander.blocked:

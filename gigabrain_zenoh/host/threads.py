@@ -98,7 +98,7 @@ class BackgroundWriter(Generic[T]):
         done: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         self._waiting.append(done)
         if self._task is None or self._task.done():
-            self._task = asyncio.create_task(self._work(), name="scribe")
+            self._task = asyncio.create_task(self._work(), name="background_writer")
         return done
 
     async def close(self) -> None:

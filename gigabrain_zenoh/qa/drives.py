@@ -18,7 +18,7 @@ from gigabrain_zenoh.launch.processes import node_of
 from gigabrain_zenoh.recording.process_replay import OUTPUTS, replay_process, settings_for
 
 AVOIDS = ("state", "body", "scan", "world", "intent", "cmd_vel", "safety")
-NAVIGATES = (*AVOIDS, "pose", "map", "task", "granted", "heard")
+NAVIGATES = (*AVOIDS, "pose", "map", "task", "request_log", "input_log")
 ATTEMPTS = 5
 
 

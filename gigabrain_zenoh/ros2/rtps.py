@@ -310,7 +310,7 @@ class _Client:
             repliers = {guid[:12]: one for guid, one in self._reader.writers.items()}
             askers = self._writer.readers
             found = {guid: one for guid, one in askers.items() if guid[:12] in repliers}
-            ready = [g for g, one in found.items() if one.heard and repliers[g[:12]].heard]
+            ready = [g for g, one in found.items() if one.answered and repliers[g[:12]].answered]
             late = time.monotonic() - started > min(READY_S, timeout_s / 2)
             if ready or (found and late):
                 return ready or list(found)

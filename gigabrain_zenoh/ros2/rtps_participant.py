@@ -62,7 +62,7 @@ class Remote:
     payload: bytes  # of its newest announcement
     builtin: Address
     user: Address
-    heard_s: float
+    received_s: float
     endpoints: dict[bytes, EndpointData] = field(default_factory=dict)
 
 
@@ -142,7 +142,7 @@ class Participant:
             remote = self.remotes.get(message.prefix)
             if remote is None or not self._believed(remote.data, source):
                 return
-            remote.heard_s = now
+            remote.received_s = now
             self._dispatch(message.prefix, one)
 
     def tick(self, now: float) -> float:
@@ -150,7 +150,7 @@ class Participant:
         self._now = now
         for prefix, remote in list(self.remotes.items()):
             lease = min(max(remote.data.lease_s, MIN_LEASE_S), MAX_LEASE_S)
-            if now - remote.heard_s > lease:
+            if now - remote.received_s > lease:
                 self._forget(prefix)
         if now >= self._next_s:
             self._announced += 1
@@ -195,7 +195,7 @@ class Participant:
                 self._forget(prefix)
             return
         if remote and remote.payload == one.payload and self._believed(remote.data, source):
-            remote.heard_s = self._now
+            remote.received_s = self._now
             return
         try:
             data = decode_participant(one.payload, vendor)
@@ -206,7 +206,7 @@ class Participant:
         if data.prefix != prefix or builtin is None or user is None:
             return
         if remote:
-            remote.data, remote.payload, remote.heard_s = data, one.payload, self._now
+            remote.data, remote.payload, remote.received_s = data, one.payload, self._now
             if remote.builtin not in data.builtin or remote.user not in data.user:
                 remote.builtin, remote.user = builtin, user
                 self._match_builtin(prefix, remote)

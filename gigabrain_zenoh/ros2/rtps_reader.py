@@ -57,7 +57,7 @@ class _Writer:
     next: int = 1  # the sample to deliver next
     early: dict[int, Data | None] = field(default_factory=dict)  # None: it does not concern us
     assemblies: dict[int, _Assembly] = field(default_factory=dict)
-    heard: bool = False
+    answered: bool = False
     wait_s: float = GREET_S
     due_s: float = 0.0
     asked_s: float = -1.0
@@ -79,9 +79,9 @@ class ReliableReader:
         if known := self.writers.get(guid):
             known.address = address
             return
-        heard = guid in self._strangers
+        answered = guid in self._strangers
         self._strangers.pop(guid, None)
-        self.writers[guid] = writer = _Writer(guid, address, heard=heard)
+        self.writers[guid] = writer = _Writer(guid, address, answered=answered)
         self._greet(writer, now)
 
     def unmatch(self, guid: bytes) -> None:
@@ -141,7 +141,7 @@ class ReliableReader:
             if len(self._strangers) < MAX_STRANGERS:
                 self._strangers[guid] = None
             return
-        writer.heard = True
+        writer.answered = True
         self._skip(writer, beat.first)  # what the writer no longer has will never come
         if not beat.final or writer.next <= beat.last:
             self._ask(writer, beat.last, now)
@@ -159,7 +159,7 @@ class ReliableReader:
         writer = self.writers.get(guid)
         if writer is None:
             return
-        writer.heard = True
+        writer.answered = True
         if gap.start <= writer.next:
             self._skip(writer, gap.base)
         window = range(max(gap.start, writer.next), min(gap.base, writer.next + MAX_EARLY))
@@ -177,7 +177,7 @@ class ReliableReader:
             if writer.assemblies:
                 kept = ((s, a) for s, a in writer.assemblies.items() if now - a.at_s <= ASSEMBLY_S)
                 writer.assemblies = dict(kept)
-            if not writer.heard:
+            if not writer.answered:
                 if now >= writer.due_s:
                     self._greet(writer, now)
                 due = min(due, writer.due_s)

@@ -53,14 +53,14 @@ class _Reader:
     told: int  # it knows about all samples up to this one
     acked: int = 0  # it has all samples below this one
     last: int = 0  # the newest sample for it
-    heard: bool = False  # it has sent an ACKNACK
+    answered: bool = False  # it has sent an ACKNACK
     wait_s: float = FIRST_HEARTBEAT_S
     due_s: float = 0.0
     sent_s: dict[int, float] = field(default_factory=dict)
 
     @property
     def waits(self) -> bool:
-        return self.acked <= self.last or not self.heard
+        return self.acked <= self.last or not self.answered
 
 
 class ReliableWriter:
@@ -125,7 +125,7 @@ class ReliableWriter:
         reader = self.readers.get(guid)
         if reader is None:
             return
-        reader.heard = True
+        reader.answered = True
         base = min(ack.base, self._last + 1)
         reader.acked = max(reader.acked, base)
         if not self._transient_local:

@@ -197,7 +197,7 @@ class AuditTrail:
     def __init__(self, bus: Bus, folder: Path) -> None:
         self._bus = bus
         self._file = AuditFile(folder, bus.process)
-        self._scribe: BackgroundWriter[AuditRecord] = BackgroundWriter(
+        self._writer: BackgroundWriter[AuditRecord] = BackgroundWriter(
             self._file.append, MAX_WAITING
         )
         self._recent: dict[bool, dict[Key, _Recent]] = {True: {}, False: {}}  # by `ok`
@@ -244,7 +244,7 @@ class AuditTrail:
                 if recent.codes:
                     self._write_entry(key, recent, ok)
             known.clear()
-        await self._scribe.close()
+        await self._writer.close()
 
     def _write_entry(self, key: Key, recent: _Recent, ok: bool) -> None:
         what, source, _ = key
@@ -260,11 +260,11 @@ class AuditTrail:
             times=recent.codes.total(),
         )
         recent.told_ns, recent.codes = self._bus.clock.now_ns(), Counter()
-        written = self._scribe.put(self._bus.publish(AUDIT, record))
+        written = self._writer.put(self._bus.publish(AUDIT, record))
         written.add_done_callback(self._written)
 
     def _written(self, written: asyncio.Future[str]) -> None:
-        self._bus.counters["audit_lost"] = self._scribe.lost
+        self._bus.counters["audit_lost"] = self._writer.lost
         if problem := written.result():
             self._unwritable.begin(problem)
         else:

@@ -212,16 +212,16 @@ class ServiceManager:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(address)
         self._socket.setblocking(False)
-        self._heard: list[str] = []
+        self._received: list[str] = []
 
     @property
-    def heard(self) -> list[str]:
+    def received(self) -> list[str]:
         """All messages so far."""
         while True:
             try:
-                self._heard.append(self._socket.recv(4096).decode())
+                self._received.append(self._socket.recv(4096).decode())
             except BlockingIOError:
-                return list(self._heard)
+                return list(self._received)
 
     def close(self) -> None:
         """Close the socket."""

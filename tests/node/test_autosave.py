@@ -207,11 +207,11 @@ async def test_a_replay_neither_reads_nor_writes(tmp_path: Path) -> None:
         robot.drive(60)
     then = [(key, data) for _, key, data in events if key in (WORLD.key, POSE.key)]
     before = [path.read_bytes() for path in files(tmp_path)]
-    heard = with_requests(
+    received = with_requests(
         [event for event in events if event[1] in (STATE.key, SCAN.key, "robot/body")]
     )
     config = PerceptionConfig(mapping="slam", state_dir=str(tmp_path))
-    now = await replay(functools.partial(perception.run, config), heard, "perception")
+    now = await replay(functools.partial(perception.run, config), received, "perception")
     assert [one for one in now if one[0] in (WORLD.key, POSE.key)] == then
     assert [path.read_bytes() for path in files(tmp_path)] == before
 

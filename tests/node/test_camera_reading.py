@@ -78,17 +78,17 @@ async def running(tmp_path: Path) -> AsyncIterator[tuple[Bus, dict[str, list[Any
     (tmp_path / "robot.yaml").write_text(ROBOT)
     network = LocalNetwork()
     bus, robot = (Bus(network.transport(), Clock(), name) for name in ("camera", "driver"))
-    heard: dict[str, list[Any]] = {"image": [], "camera": []}
-    robot.subscribe(IMAGE, lambda _, message: heard["image"].append(message))
-    robot.subscribe(CAMERA, lambda _, message: heard["camera"].append(message))
+    received: dict[str, list[Any]] = {"image": [], "camera": []}
+    robot.subscribe(IMAGE, lambda _, message: received["image"].append(message))
+    robot.subscribe(CAMERA, lambda _, message: received["camera"].append(message))
     robot.time.boot, robot.time.tick = samples.BOOT, 40
     config = CameraConfig(body=str(tmp_path / "robot.yaml"))
     task = asyncio.ensure_future(functools.partial(camera_process.run, config)(bus, lambda: None))
     try:
         await asyncio.sleep(0)
         robot.publish(STATE, samples.state(40))
-        await until(lambda: heard["image"] or task.done(), "a picture")
-        yield bus, heard
+        await until(lambda: received["image"] or task.done(), "a picture")
+        yield bus, received
         assert not task.done()
     finally:
         task.cancel()
@@ -97,59 +97,59 @@ async def running(tmp_path: Path) -> AsyncIterator[tuple[Bus, dict[str, list[Any
         await robot.close()
 
 
-def problem(heard: dict[str, list[Any]]) -> str:
-    return heard["camera"][-1].problem if heard["camera"] else ""
+def problem(received: dict[str, list[Any]]) -> str:
+    return received["camera"][-1].problem if received["camera"] else ""
 
 
 async def test_a_picture_has_the_newest_tick_and_a_new_stamp(tmp_path: Path) -> None:
-    async with running(tmp_path) as (bus, heard):
-        await until(lambda: heard["image"][-1].tick == 40, "the robot's tick")
-        newest = heard["image"][-1]
+    async with running(tmp_path) as (bus, received):
+        await until(lambda: received["image"][-1].tick == 40, "the robot's tick")
+        newest = received["image"][-1]
         assert (newest.basis, newest.boot, newest.encoding) == (40, samples.BOOT, "jpeg")
         assert 0 <= bus.clock.unix_ns() - newest.stamp_ns < 10**9
 
 
 async def test_a_source_that_hangs_is_named_and_the_process_goes_on(tmp_path: Path) -> None:
-    async with running(tmp_path) as (bus, heard):
+    async with running(tmp_path) as (bus, received):
         Scripted.hangs.set()
-        await until(lambda: problem(heard) == "no picture", "the silence")
+        await until(lambda: problem(received) == "no picture", "the silence")
         assert bus.progress()
         Scripted.hangs.clear()
-        await until(lambda: problem(heard) == "", "the end of it")
+        await until(lambda: problem(received) == "", "the end of it")
 
 
 async def test_a_source_that_is_lost_is_opened_again(tmp_path: Path) -> None:
-    async with running(tmp_path) as (_, heard):
+    async with running(tmp_path) as (_, received):
         Scripted.lost = "the cable is out"
-        await until(lambda: problem(heard) == "no picture: the cable is out", "the loss")
+        await until(lambda: problem(received) == "no picture: the cable is out", "the loss")
         await until(lambda: Scripted.opened >= 3, "more tries")
         Scripted.lost = ""
-        before = len(heard["image"])
-        await until(lambda: len(heard["image"]) > before + 3, "pictures")
-        assert problem(heard) == ""
+        before = len(received["image"])
+        await until(lambda: len(received["image"]) > before + 3, "pictures")
+        assert problem(received) == ""
 
 
 async def test_a_picture_of_another_size_is_withheld_and_said(tmp_path: Path) -> None:
-    async with running(tmp_path) as (_, heard):
+    async with running(tmp_path) as (_, received):
         Scripted.size = (200, 320, 3)
-        await until(lambda: "320 x 200" in problem(heard), "the size")
-        assert problem(heard) == "pictures of 320 x 200 pixels; the body's file says 320 x 240"
-        before = len(heard["image"])
+        await until(lambda: "320 x 200" in problem(received), "the size")
+        assert problem(received) == "pictures of 320 x 200 pixels; the body's file says 320 x 240"
+        before = len(received["image"])
         await asyncio.sleep(0.2)
-        assert len(heard["image"]) == before
+        assert len(received["image"]) == before
         Scripted.size = SIZE
-        await until(lambda: problem(heard) == "", "the end of it")
+        await until(lambda: problem(received) == "", "the end of it")
 
 
 async def test_a_picture_that_nobody_would_take_is_withheld_and_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async with running(tmp_path) as (_, heard):
+    async with running(tmp_path) as (_, received):
         monkeypatch.setattr("gigabrain_drivers.cameras.output.HEADER_BYTES", 2**20)
-        await until(lambda: "at most 1.0 MB are sent" in problem(heard), "the size")
-        before = len(heard["image"])
+        await until(lambda: "at most 1.0 MB are sent" in problem(received), "the size")
+        before = len(received["image"])
         await asyncio.sleep(0.2)
-        assert len(heard["image"]) == before
+        assert len(received["image"]) == before
 
 
 async def test_a_source_that_breaks_ends_the_process_with_its_own_error(

@@ -49,11 +49,11 @@ def said(plane: Plane, topic: object) -> Message | None:
 
 
 async def test_no_extreme_stops_decision_and_it_reaches_its_goal_afterwards() -> None:
-    heard = (BODY, topics.MAP, topics.STATE, topics.WORLD, topics.POSE, CMD_VEL, topics.SAFETY)
+    received = (BODY, topics.MAP, topics.STATE, topics.WORLD, topics.POSE, CMD_VEL, topics.SAFETY)
     async with Plane(drawn(ROOM)) as plane:
         await plane.go(0.2)
         await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
-        for case in (one for one in chosen_extremes() if one.to in heard):
+        for case in (one for one in chosen_extremes() if one.to in received):
             own = said(plane, case.to)
             base = msgspec.msgpack.decode(codec.encode(own)) if own else None
             header = {"boot": plane.boot, "tick": plane.tick, "basis": plane.tick}

@@ -98,9 +98,9 @@ async def test_a_replay_of_a_drive_with_a_save_says_the_same_and_saves_nothing(
         robot.drive(20)
     (own_maps / "house.yaml").unlink()
     own = (WORLD.key, POSE.key, MAP.key)
-    heard = with_requests([event for event in events if event[1] not in own])
-    assert sum(key == MAP_SAVE.key for _, key, _ in heard) == 1
-    now = await replay(functools.partial(perception.run, SLAM), heard, "perception")
+    received = with_requests([event for event in events if event[1] not in own])
+    assert sum(key == MAP_SAVE.key for _, key, _ in received) == 1
+    now = await replay(functools.partial(perception.run, SLAM), received, "perception")
     then = [(key, data) for _, key, data in events if key in own]
     assert [one for one in now if one[0] in own] == then
     assert len(then) > 160

@@ -421,8 +421,8 @@ async def test_a_replay_remembers_the_same(tmp_path: Path) -> None:
         await ask(robot, POSE_SET, PoseRequest(x=0.1, y=0.0, yaw=0.1))
         robot.look(20, can(1.0, 0.0))
         was = list(robot.network.sent)
-    heard = with_requests([event for event in events if event[1] not in keys])
-    now = await replay(functools.partial(perception.run, config), heard, "node")
+    received = with_requests([event for event in events if event[1] not in keys])
+    now = await replay(functools.partial(perception.run, config), received, "node")
     assert objects_of(now) == objects_of(was)
     assert len(objects_of(was)) > 3
 

@@ -62,8 +62,8 @@ class Robot:
 
     def __init__(self, bus: Bus, clock: FakeClock, recognition: Recognition, net: SeesABall):
         self.bus, self.clock, self.recognition, self.net = bus, clock, recognition, net
-        self.heard: list[Detections] = []
-        bus.subscribe(DETECTIONS, lambda _, message: self.heard.append(message))
+        self.received: list[Detections] = []
+        bus.subscribe(DETECTIONS, lambda _, message: self.received.append(message))
         self.own = recognition._bus
 
     def be(self, tick: int, pose: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
@@ -82,8 +82,8 @@ class Robot:
         self.bus.publish(IMAGE, Image(**about, encoding="jpeg", data=data), **header)
 
     async def finds(self, count: int) -> Detections:
-        await until(lambda: len(self.heard) >= count, f"{count} detections")
-        return self.heard[-1]
+        await until(lambda: len(self.received) >= count, f"{count} detections")
+        return self.received[-1]
 
     async def pass_s(self, seconds: float) -> None:
         await self.clock.advance(round(seconds * 1e9))
@@ -162,7 +162,7 @@ async def test_broken_pictures_are_counted_and_the_next_one_is_looked_at(caplog)
                 "a broken picture",
             )
             await robot.pass_s(1)
-        assert robot.heard == []
+        assert robot.received == []
         faults = [one for one in caplog.records if one.levelno >= logging.WARNING]
         assert len(faults) == 1
         robot.show(40)
@@ -197,7 +197,7 @@ async def test_the_newest_picture_is_looked_at_when_the_worker_is_free():
         await settle()
         robot.net.go_on.set()
         await robot.finds(2)
-        assert [one.basis for one in robot.heard] == [40, 43]
+        assert [one.basis for one in robot.received] == [40, 43]
 
 
 async def test_cameras_take_turns():
@@ -209,9 +209,9 @@ async def test_cameras_take_turns():
             await settle()
             await until(lambda: not robot.recognition._busy, "an idle worker")
             await robot.pass_s(0.2)
-        await until(lambda: len(robot.heard) == 8, "eight pictures")
-        assert [one.camera for one in robot.heard].count("rear") == 4
-        assert all(thing.position is None for one in robot.heard if one.camera == "rear"
+        await until(lambda: len(robot.received) == 8, "eight pictures")
+        assert [one.camera for one in robot.received].count("rear") == 4
+        assert all(thing.position is None for one in robot.received if one.camera == "rear"
                    for thing in one.things)  # fmt: skip
 
 
@@ -299,7 +299,7 @@ async def test_work_that_ends_after_the_process_closed_starts_no_more(caplog):
         robot.net.go_on.set()
         await until(lambda: not robot.recognition._busy, "its end")
         await settle()
-    assert robot.heard == []
+    assert robot.received == []
     assert robot.net.seen == 1
     assert caplog.records == []
 

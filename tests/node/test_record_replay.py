@@ -145,7 +145,7 @@ def said(topic: Topic[Any], tick: int, boot: int = 7) -> Event:
 
 
 def test_a_request_is_fed_where_it_counted_and_not_where_its_record_came() -> None:
-    heard = [
+    received = [
         said(STATE, 90, boot=6),  # of an earlier start of the driver, which counted further
         said(STATE, 5),
         said(WORLD, 5),
@@ -154,7 +154,7 @@ def test_a_request_is_fed_where_it_counted_and_not_where_its_record_came() -> No
         (150, REQUEST_LOG.key, granted("robot/goal", tick=6, basis=0)),
         (151, REQUEST_LOG.key, granted("robot/mission", tick=6, basis=5)),
     ]
-    order = [(at, key) for at, key, _ in with_requests(heard)]
+    order = [(at, key) for at, key, _ in with_requests(received)]
     assert order == [
         (1800, "robot/state"),
         (100, "robot/state"),
@@ -210,10 +210,10 @@ async def test_a_decision_that_was_sent_to_a_place_does_the_same_again() -> None
         await plane.go(1.5)
     own = (INTENT.key, TASK.key)
     then = [(key, data) for _, key, data in events if key in own]
-    heard = with_requests([event for event in events if event[1] not in own])
-    assert [key for _, key, _ in heard if key in ASKED] == [GOAL.key, *2 * (TASK_CHANGE.key,)]
+    received = with_requests([event for event in events if event[1] not in own])
+    assert [key for _, key, _ in received if key in ASKED] == [GOAL.key, *2 * (TASK_CHANGE.key,)]
     node = functools.partial(decision.run, DecisionConfig(behaviour="navigate"))
-    now = [(key, data) for key, data in await replay(node, heard) if key in own]
+    now = [(key, data) for key, data in await replay(node, received) if key in own]
     assert plane.travelled > 0.3
     said_now = [unstamped(*one) for one in now]
     getting_ready = [one for one in said_now if not one["boot"]]  # this was not recorded
@@ -231,10 +231,10 @@ async def test_a_parameter_that_was_changed_meanwhile_is_changed_again(tmp_path:
         speeds = await robot.go(100)
     assert (round(speeds[0], 2), round(speeds[-1], 2)) == (0.26, 0.1)
     then = [(key, data) for _, key, data in events if key == INTENT.key]
-    heard = with_requests([event for event in events if event[1] != INTENT.key])
-    assert [key for _, key, _ in heard if key.startswith(PARAM.key)] == [PARAM.at("decision")]
+    received = with_requests([event for event in events if event[1] != INTENT.key])
+    assert [key for _, key, _ in received if key.startswith(PARAM.key)] == [PARAM.at("decision")]
     now = [
-        one for one in await replay(BRAIN["decision"], heard, "decision") if one[0] == INTENT.key
+        one for one in await replay(BRAIN["decision"], received, "decision") if one[0] == INTENT.key
     ]
     assert [unstamped(*one) for one in now] == [unstamped(*one) for one in then]
 
@@ -254,8 +254,8 @@ async def test_a_limit_of_the_body_that_was_changed_meanwhile_is_in_the_recordin
             speeds = await robot.go(100)
     assert speeds[-1] == 0.0
     then = [(key, data) for _, key, data in events if key in topics]
-    heard = with_requests([event for event in events if event[1] not in topics])
-    now = [one for one in await replay(BRAIN[process], heard, process) if one[0] in topics]
+    received = with_requests([event for event in events if event[1] not in topics])
+    now = [one for one in await replay(BRAIN[process], received, process) if one[0] in topics]
     assert len(now) > 100
     assert [unstamped(*one) for one in now] == [unstamped(*one) for one in then]
 

@@ -115,11 +115,11 @@ class Simulated:
     def __init__(self, driver: MujocoDriver) -> None:
         self.network = LocalNetwork()
         self.bus = Bus(self.network.transport(), Clock(), "driver")
-        self.heard: dict[str, list[Message]] = {"depth": [], "image": [], "camera": []}
+        self.received: dict[str, list[Message]] = {"depth": [], "image": [], "camera": []}
         for topic in (DEPTH, IMAGE, CAMERA):
             name = topic.key.partition("/")[2]
             self.bus.subscribe(
-                topic, lambda _, message, name=name: self.heard[name].append(message)
+                topic, lambda _, message, name=name: self.received[name].append(message)
             )  # type: ignore[misc]
         self.scene, self.poses = sent(driver)
         self.bus.time.boot = BOOT
@@ -133,11 +133,11 @@ class Simulated:
     async def drive(self, first: int, last: int, *, poses: bool = True) -> None:
         """Let ticks go by; after each with an exposure wait for it."""
         for tick in range(first, last + 1):
-            before = len(self.heard["image"]) + len(self.heard["camera"])
+            before = len(self.received["image"]) + len(self.received["camera"])
             self.tick(tick, poses=poses)
             if poses and tick % 5 == 0:
                 await until(
-                    lambda: len(self.heard["image"]) + len(self.heard["camera"]) > before,  # noqa: B023
+                    lambda: len(self.received["image"]) + len(self.received["camera"]) > before,  # noqa: B023
                     f"tick {tick}",
                 )
             await asyncio.sleep(0)
@@ -159,7 +159,7 @@ async def running(driver: MujocoDriver) -> AsyncIterator[tuple[Simulated, Bus]]:
             world.tick(1)
             world.bus.publish(SIM_SCENE, world.scene)
             world.tick(2)
-            await until(lambda: world.heard["image"] or task.done(), "the first picture")
+            await until(lambda: world.received["image"] or task.done(), "the first picture")
         yield world, bus
     finally:
         task.cancel()
@@ -173,7 +173,7 @@ async def test_picture_depth_and_info_carry_stamp_tick_and_basis_of_the_exposure
 ) -> None:
     async with running(driver) as (world, _):
         await world.drive(3, 15)
-        images, depths = world.heard["image"], world.heard["depth"]
+        images, depths = world.received["image"], world.received["depth"]
         assert [one.tick for one in images[-3:]] == [5, 10, 15]
         assert [(one.tick, one.basis, one.boot) for one in images] == [
             (one.tick, one.basis, one.boot) for one in depths
@@ -181,7 +181,7 @@ async def test_picture_depth_and_info_carry_stamp_tick_and_basis_of_the_exposure
         assert {one.boot for one in images} == {BOOT}
         sent_at = dict(world_stamps(world))
         assert [one.stamp_ns for one in depths[-3:]] == [sent_at[tick] for tick in (5, 10, 15)]
-        info = world.heard["camera"][-1]
+        info = world.received["camera"][-1]
         assert (info.camera, info.source, info.problem) == (FRONT, "mujoco", "")  # type: ignore[attr-defined]
         assert (depths[-1].array() > 0).mean() > 0.3  # type: ignore[attr-defined]
 
@@ -209,17 +209,17 @@ async def test_a_fault_is_named_and_its_pictures_are_withheld(
         await world.drive(3, 30)
         bus.params.change("front_fault", fault)
         await world.drive(31, 55)  # 0.5 s
-        assert world.heard["camera"][-1].problem == problem  # type: ignore[attr-defined]
+        assert world.received["camera"][-1].problem == problem  # type: ignore[attr-defined]
         await until(lambda: bus.problems, "the health's problem")
         assert problem in bus.problems[0].text
-        before = len(world.heard["image"])
+        before = len(world.received["image"])
         await world.drive(56, 70)
-        assert len(world.heard["image"]) == before
+        assert len(world.received["image"]) == before
         assert bus.counters["front_withheld"] >= 5
         bus.params.change("front_fault", "none")
         await world.drive(71, 110)
-        assert world.heard["camera"][-1].problem == ""  # type: ignore[attr-defined]
-        assert len(world.heard["image"]) > before
+        assert world.received["camera"][-1].problem == ""  # type: ignore[attr-defined]
+        assert len(world.received["image"]) > before
 
 
 async def test_a_cable_that_is_out_is_known_by_the_robot_s_clock(driver: MujocoDriver) -> None:
@@ -229,7 +229,7 @@ async def test_a_cable_that_is_out_is_known_by_the_robot_s_clock(driver: MujocoD
         for tick in range(31, 56):
             world.tick(tick)
         await until(lambda: bus.problems, "the health's problem")
-        assert world.heard["camera"][-1].problem == "no picture"  # type: ignore[attr-defined]
+        assert world.received["camera"][-1].problem == "no picture"  # type: ignore[attr-defined]
 
 
 async def test_time_that_stands_still_is_no_fault_of_a_camera(driver: MujocoDriver) -> None:
@@ -249,7 +249,7 @@ async def test_a_driver_that_starts_again_is_seen_at_once(driver: MujocoDriver) 
         await until(lambda: bus.time.boot == BOOT + 1, "the new start")
         world.bus.publish(SIM_SCENE, world.scene)
         world.bus.publish(SIM_POSES, world.poses)
-        await until(lambda: world.heard["image"][-1].boot == BOOT + 1, "its picture")
+        await until(lambda: world.received["image"][-1].boot == BOOT + 1, "its picture")
 
 
 async def test_a_robot_without_cameras_is_refused() -> None:
@@ -277,8 +277,8 @@ async def test_a_scene_that_cannot_be_drawn_is_said_and_a_good_one_is_drawn_agai
         assert bus.progress()  # it is no process that hangs
         world.bus.publish(SIM_SCENE, world.scene)
         await world.drive(16, 30)
-        assert world.heard["image"][-1].tick == 30
+        assert world.received["image"][-1].tick == 30
 
 
 def infos(world: Simulated) -> list[str]:
-    return [one.problem for one in world.heard["camera"]]  # type: ignore[attr-defined]
+    return [one.problem for one in world.received["camera"]]  # type: ignore[attr-defined]

@@ -9,7 +9,7 @@ class Server:
     """Takes what comes, and has a writer for each caller."""
 
     def __init__(self) -> None:
-        self.heard = bytearray()
+        self.received = bytearray()
         self.ends: list[str] = []
         self.writers: list[asyncio.StreamWriter] = []
 
@@ -17,7 +17,7 @@ class Server:
         self.writers.append(writer)
         try:
             while data := await reader.read(65536):
-                self.heard += data
+                self.received += data
             self.ends.append("fin")
         except ConnectionResetError:
             self.ends.append("rst")

@@ -141,10 +141,10 @@ async def test_open_rmfs_adapter_reads_and_asks_what_free_fleet_offers_and_nothi
     net: Site, who: str
 ) -> None:
     robot, gateway = [await net.client(one, "red") for one in ("robot@red", "process.ros2@red")]
-    rmf, heard = net.raw(who), set[str]()
+    rmf, received = net.raw(who), set[str]()
     wanted = {f"red/{key}" for key in FLEET_READ}
     for key in ("**", *wanted):
-        rmf.declare_subscriber(key, lambda sample: heard.add(str(sample.key_expr)))
+        rmf.declare_subscriber(key, lambda sample: received.add(str(sample.key_expr)))
     for key in ASKED:
         robot.serve(key, answer)
     for key in FLEET_ASKED:
@@ -156,11 +156,11 @@ async def test_open_rmfs_adapter_reads_and_asks_what_free_fleet_offers_and_nothi
         for key in FLEET_READ:
             gateway.publish(TELEOP, key, b"x", "")
 
-    await repeat(send, lambda: heard >= wanted)
+    await repeat(send, lambda: received >= wanted)
     for key in FLEET_ASKED:
         await asked_until_answered(rmf, f"red/{key}")
     assert [key for key in ASKED if await ask(rmf, f"red/{key}")] == []
-    assert heard == wanted
+    assert received == wanted
     ears = [SampleCollector(robot, key) for key in ("tf", "robot/teleop")]
     await repeat(send, lambda: all(ear.samples for ear in ears))
     for key in ("tf", "robot/teleop"):
@@ -192,10 +192,10 @@ async def test_nobody_but_the_robot_answers_for_its_gate(net: Site) -> None:
 
 async def test_everybody_sees_all_of_a_robot_and_nothing_of_its_neighbour(net: Site) -> None:
     red, blue = await net.client("robot@red", "red"), await net.client("robot@blue", "blue")
-    heard: list[str] = []
+    received: list[str] = []
     viewer, fleet = net.raw("viewer@red"), net.raw("operator")
     for key in ("red/robot/**", "blue/robot/**", "**"):
-        viewer.declare_subscriber(key, lambda sample: heard.append(str(sample.key_expr)))
+        viewer.declare_subscriber(key, lambda sample: received.append(str(sample.key_expr)))
     of_all: list[str] = []
     fleet.declare_subscriber("*/robot/scan", lambda sample: of_all.append(str(sample.key_expr)))
     sends = [red.publish, blue.publish]
@@ -206,8 +206,8 @@ async def test_everybody_sees_all_of_a_robot_and_nothing_of_its_neighbour(net: S
                 publish(topic, topic.at("driver"), b"x", "")
 
     wanted = {f"red/{topic.at('driver')}" for topic in TOPICS}
-    await repeat(send, lambda: set(heard) >= wanted and len(set(of_all)) == 2)
-    assert set(heard) == wanted
+    await repeat(send, lambda: set(received) >= wanted and len(set(of_all)) == 2)
+    assert set(received) == wanted
     assert set(of_all) == {"red/robot/scan", "blue/robot/scan"}
 
 
@@ -240,11 +240,14 @@ async def test_a_hostile_robot_with_keys_of_its_own_cannot_touch_its_neighbour(n
 async def test_who_is_unknown_hears_nothing_and_is_not_heard(net: Site) -> None:
     red = await net.client("robot@red", "red")
     red.serve("robot/describe/driver", answer)
-    ear, heard = SampleCollector(await net.client("operator@red", "red"), "robot/**"), list[str]()
+    ear, received = (
+        SampleCollector(await net.client("operator@red", "red"), "robot/**"),
+        list[str](),
+    )
     green = net.raw("robot@green")
     green.declare_subscriber(
         "**",
-        lambda sample: heard.append(str(sample.key_expr)),
+        lambda sample: received.append(str(sample.key_expr)),
         allowed_origin=zenoh.Locality.REMOTE,  # it hears itself, as everybody does
     )
     green.put("red/robot/cmd_vel", b"x")
@@ -253,7 +256,7 @@ async def test_who_is_unknown_hears_nothing_and_is_not_heard(net: Site) -> None:
     topic = TOPICS[0]
     await repeat(lambda: red.publish(topic, "robot/scan", b"x", ""), lambda: ear.samples)
     assert {key for key, _ in ear.samples} == {"robot/scan"}
-    assert heard == []
+    assert received == []
 
 
 async def test_the_admin_space_is_closed_to_all(net: Site) -> None:

@@ -39,15 +39,15 @@ async def test_nothing_is_dropped(drive: Path, rate: float) -> None:
     async with robot() as network:
         await network.router()
         ear, mouth = await network.client(), await network.client()
-        heard: list[tuple[str, str, bytes]] = []
-        ear.tap("robot/**", lambda *sample: heard.append(sample))
-        await repeat(lambda: mouth.publish(TELEOP, TELEOP.key, b"", ""), lambda: heard)
+        received: list[tuple[str, str, bytes]] = []
+        ear.tap("robot/**", lambda *sample: received.append(sample))
+        await repeat(lambda: mouth.publish(TELEOP, TELEOP.key, b"", ""), lambda: received)
         player = Player(drive, PlayOptions(rate=rate), mouth)
         await player.play()
-        await until(lambda: sum(key != TELEOP.key for key, _, _ in heard) == 121)
+        await until(lambda: sum(key != TELEOP.key for key, _, _ in received) == 121)
     assert player.sent == 121
     others = (TELEOP.key, "robot/map")
-    assert [(key, encoding, data) for key, encoding, data in heard if key not in others] == [
+    assert [(key, encoding, data) for key, encoding, data in received if key not in others] == [
         (s.key, s.encoding, s.payload) for s in Bag(drive) if s.key not in others
     ]
 

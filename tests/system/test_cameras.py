@@ -35,19 +35,19 @@ async def test_a_demo_with_cameras_gives_picture_depth_and_info_also_after_a_dea
     demo = home.start(*AVOID, "--cameras", "--headless")
     endpoint = await robot_of(home, demo)
     async with connect(endpoint, "looker", timeout_s=None) as bus, probing(endpoint) as robot:
-        heard: dict[str, list[Any]] = {}
+        received: dict[str, list[Any]] = {}
 
         def listen(topic: Topic[Any]) -> None:
-            bus.subscribe(topic, lambda key, message: heard.setdefault(key, []).append(message))
+            bus.subscribe(topic, lambda key, message: received.setdefault(key, []).append(message))
 
         for topic in (IMAGE, DEPTH, CAMERA):
             listen(topic)
 
         def newest(topic: Topic[Any]) -> Any:
-            return heard.get(topic.at("front"), [None])[-1]
+            return received.get(topic.at("front"), [None])[-1]
 
         def pictures() -> int:
-            return len(heard.get(IMAGE.at("front"), []))
+            return len(received.get(IMAGE.at("front"), []))
 
         await until(lambda: pictures() >= 10 and newest(CAMERA), "ten pictures")
         assert decoded(newest(IMAGE)).shape == (240, 320, 3)
@@ -55,7 +55,7 @@ async def test_a_demo_with_cameras_gives_picture_depth_and_info_also_after_a_dea
         assert depth.shape == (240, 320)
         assert 0.2 < (depth > 0).mean() < 0.99  # the floor at least, and holes
         assert newest(CAMERA).camera == load_robot("turtlebot3_waffle").cameras[0]
-        ticks: list[Message] = heard[DEPTH.at("front")][-5:]
+        ticks: list[Message] = received[DEPTH.at("front")][-5:]
         assert all(one.tick == one.basis and one.tick % 5 == 0 for one in ticks)
         body = robot.bodies.current
         assert body

@@ -40,7 +40,7 @@ async def test_a_calm_proxy_changes_nothing_either_way(
 ) -> None:
     reader, writer = await call(proxy)
     writer.write(LONG)
-    await until(lambda: server[0].heard == LONG, "all of it")
+    await until(lambda: server[0].received == LONG, "all of it")
     server[0].writers[0].write(LONG)
     assert await reader.readexactly(len(LONG)) == LONG
     assert (proxy.figures["up"].taken, proxy.figures["up"].handed_on) == (102400, 102400)
@@ -60,7 +60,7 @@ async def test_who_has_said_all_may_still_listen(
     writer.write(b"last")
     writer.write_eof()
     assert await reader.read() == b"late"
-    assert (bytes(server[0].heard), server[0].ends) == (b"last", ["fin"])
+    assert (bytes(server[0].received), server[0].ends) == (b"last", ["fin"])
     writer.close()
 
 
@@ -69,16 +69,16 @@ async def test_a_hole_takes_nothing_and_hands_all_on_when_it_ends(
 ) -> None:
     _, writer = await call(proxy)
     writer.write(b"before")
-    await until(lambda: server[0].heard, "before")
+    await until(lambda: server[0].received, "before")
     proxy.set(Chaos(hole=True))
     writer.write(b" during")
     _, second = await call(proxy)  # is taken, and hears nothing
     second.write(b" another")
     await asyncio.sleep(0.1)
-    assert (bytes(server[0].heard), len(server[0].writers)) == (b"before", 1)
+    assert (bytes(server[0].received), len(server[0].writers)) == (b"before", 1)
     proxy.set()
-    await until(lambda: len(server[0].heard) == 21, "all of it")
-    assert server[0].heard[:13] == b"before during"
+    await until(lambda: len(server[0].received) == 21, "all of it")
+    assert server[0].received[:13] == b"before during"
     writer.close()
     second.close()
 
@@ -91,7 +91,7 @@ async def test_a_hole_of_one_way_leaves_the_other(
     proxy.set(Chaos(hole=True), "down")
     server[0].writers[0].write(b"answer")
     writer.write(b"question")
-    await until(lambda: server[0].heard == b"question", "the question")
+    await until(lambda: server[0].received == b"question", "the question")
     with pytest.raises(TimeoutError):
         await asyncio.wait_for(reader.read(1), 0.1)
     proxy.set(CALM, "down")
@@ -142,7 +142,7 @@ async def test_an_unplugged_proxy_refuses_callers_and_is_back_at_the_same_port(
     await proxy.plug()
     _, second = await call(proxy)
     second.write(b"back")
-    await until(lambda: server[0].heard == b"back", "it is back")
+    await until(lambda: server[0].received == b"back", "it is back")
     first.close()
     second.close()
 
@@ -163,9 +163,9 @@ async def test_delay_and_jitter_keep_the_order(server: tuple[Server, int], proxy
     for number in range(20):
         writer.write(bytes([number]))
         await asyncio.sleep(0.002)
-    await until(lambda: len(server[0].heard) == 20, "all of it")
+    await until(lambda: len(server[0].received) == 20, "all of it")
     assert loop.time() - began_s >= 0.02
-    assert bytes(server[0].heard) == bytes(range(20))
+    assert bytes(server[0].received) == bytes(range(20))
     writer.close()
 
 

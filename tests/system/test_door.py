@@ -95,10 +95,10 @@ async def test_denials_and_strangers_are_in_the_audit_log(gate: Gate, tmp_path: 
 async def test_what_is_allowed_is_not_audited(gate: Gate) -> None:
     before = set(gate.audited)
     with raw(gate.as_("robot@red")) as robot, raw(gate.as_("operator@red")) as operator:
-        heard: list[bytes] = []
-        operator.declare_subscriber("red/robot/**", lambda s: heard.append(s.payload.to_bytes()))
+        received: list[bytes] = []
+        operator.declare_subscriber("red/robot/**", lambda s: received.append(s.payload.to_bytes()))
         async with asyncio.timeout(30):
-            while not heard:
+            while not received:
                 robot.put("red/robot/state", b"x")
                 await asyncio.sleep(0.02)
         operator.put("red/robot/teleop", b"x")
@@ -140,14 +140,16 @@ async def test_1100_connections_that_fail_keep_nobody_out_who_comes_by_the_socke
     near = await robot_of(shared_home, gate.command)
     local = Endpoint(connect=near.connect[:1])
     with raw(gate.as_("operator@red")) as operator:
-        heard: list[bytes] = []
-        operator.declare_subscriber("red/robot/state", lambda s: heard.append(s.payload.to_bytes()))
+        received: list[bytes] = []
+        operator.declare_subscriber(
+            "red/robot/state", lambda s: received.append(s.payload.to_bytes())
+        )
 
         async def is_heard() -> None:
-            heard.clear()
+            received.clear()
             with raw(local) as robot:  # refused at once where there is no room
                 async with asyncio.timeout(30):
-                    while not heard:
+                    while not received:
                         robot.put("red/robot/state", b"x")
                         await asyncio.sleep(0.02)
 

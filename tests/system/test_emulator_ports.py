@@ -44,24 +44,24 @@ async def test_a_port_appears_disappears_and_comes_back_empty(tmp_path: Path) ->
 
 
 async def test_a_host_that_goes_and_comes_back_finds_the_same_port(tmp_path: Path) -> None:
-    pty, heard = Pty(tmp_path / "port"), list[bytes]()
-    pty.on_bytes = heard.append
+    pty, received = Pty(tmp_path / "port"), list[bytes]()
+    pty.on_bytes = received.append
     pty.plug()
     for word in (b"one", b"two"):
         fd = opened(pty.path)
         os.write(fd, word)
-        await until(lambda word=word: word in heard)
+        await until(lambda word=word: word in received)
         os.close(fd)
     pty.unplug()
 
 
 async def test_bytes_are_raw_both_ways(tmp_path: Path) -> None:
-    pty, heard, every = Pty(tmp_path / "port"), list[bytes](), bytes(range(256))
-    pty.on_bytes = heard.append
+    pty, received, every = Pty(tmp_path / "port"), list[bytes](), bytes(range(256))
+    pty.on_bytes = received.append
     pty.plug()
     fd = opened(pty.path)
     os.write(fd, every)
-    await until(lambda: b"".join(heard) == every)
+    await until(lambda: b"".join(received) == every)
     pty.write(every)
     assert select.select([fd], [], [], 60.0)[0]
     assert os.read(fd, 1000) == every

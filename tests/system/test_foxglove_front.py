@@ -107,8 +107,8 @@ async def test_of_200_viewers_that_do_not_read_16_are_admitted_and_cut_off(
     talker: tuple[Talker, int, Front],
 ) -> None:
     made, port, stands = talker
-    heard = [await first(port) for _ in range(200)]
-    starts = [data[:12] for data, _ in heard]
+    received = [await first(port) for _ in range(200)]
+    starts = [data[:12] for data, _ in received]
     assert set(starts) == {bytes(12), b"HTTP/1.1 503"}
     assert starts[:16] == [bytes(12)] * 16
     assert made.there <= 16
@@ -117,7 +117,7 @@ async def test_of_200_viewers_that_do_not_read_16_are_admitted_and_cut_off(
             await asyncio.sleep(0.01)
     data, writer = await first(port)  # a newcomer has a place
     assert data == bytes(20)
-    for _, each in (*heard, (b"", writer)):
+    for _, each in (*received, (b"", writer)):
         each.transport.abort()
 
 

@@ -84,8 +84,8 @@ async def test_every_port_of_an_emulator_has_its_proxy(tmp_path: Path) -> None:
     serial, tcp = Pty(tmp_path / "ports" / "scan"), TcpPort(tmp_path / "ports" / "base", 0)
     (tmp_path / "ports").mkdir()
     (tmp_path / "ports" / "faults.json").write_text("{}")
-    heard = bytearray()
-    tcp.on_bytes = heard.extend
+    received = bytearray()
+    tcp.on_bytes = received.extend
     serial.plug()
     tcp.plug()
     async with in_front_of(tmp_path / "ports", tmp_path / "spoiled") as proxies:
@@ -95,7 +95,7 @@ async def test_every_port_of_an_emulator_has_its_proxy(tmp_path: Path) -> None:
         link.open()
         await until(lambda: link.connected, "it is open")
         link.write(b"to a body behind TCP")
-        await until(lambda: heard == b"to a body behind TCP", "it arrives")
+        await until(lambda: received == b"to a body behind TCP", "it arrives")
         await link.close()
     serial.unplug()
     tcp.unplug()

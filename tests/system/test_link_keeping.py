@@ -109,11 +109,11 @@ async def test_a_connection_that_cannot_be_watched_is_made_again(
 async def test_an_owner_that_chokes_on_bytes_gets_those_of_another_connection(
     gather_s: float,
 ) -> None:
-    link, heard = Flaky(), list[bytes]()
+    link, received = Flaky(), list[bytes]()
     link.gather_s = gather_s
 
     def on_bytes(data: bytes) -> None:
-        heard.append(data)
+        received.append(data)
         if data == b"bad":
             raise IndexError("frame")
 
@@ -124,7 +124,7 @@ async def test_an_owner_that_chokes_on_bytes_gets_those_of_another_connection(
     os.write(link.far, b"bad")
     await until(lambda: link.connected and link.reconnects == 1)
     os.write(link.far, b"good")
-    await until(lambda: heard == [b"bad", b"good"])
+    await until(lambda: received == [b"bad", b"good"])
     await link.close()
 
 
@@ -170,13 +170,13 @@ async def test_an_adapter_that_bounces_between_open_and_its_settings_is_opened_a
     monkeypatch.setattr(serial_link, "open_port", opening)
     monkeypatch.setattr(termios, "tcgetattr", bouncing)
     link = SerialLink(str(pty.path), 115200, Clock())
-    heard = Heard(link)
+    received = Heard(link)
     link.open()
     await until(lambda: link.connected)
     assert bounced
     assert not opened[0].is_open  # nothing leaks
     pty.write(b"hello")
-    await until(lambda: heard.data == b"hello")
+    await until(lambda: received.data == b"hello")
     await link.close()
 
 

@@ -31,15 +31,15 @@ async def link(pty: Pty) -> AsyncIterator[SerialLink]:
 
 
 async def test_bytes_go_both_ways(pty: Pty, link: SerialLink) -> None:
-    heard, back = Heard(link), list[bytes]()
+    received, back = Heard(link), list[bytes]()
     pty.on_bytes = back.append
     link.open()
     await until(lambda: link.connected)
     assert link.write(b"V,0.100,0.500\n")
     pty.write(b"\x00\n\r\xff")  # a raw line changes nothing
-    await until(lambda: back and heard.data)
-    assert (b"".join(back), heard.data) == (b"V,0.100,0.500\n", b"\x00\n\r\xff")
-    assert (heard.opened, heard.lost, link.problem) == (1, [], "")
+    await until(lambda: back and received.data)
+    assert (b"".join(back), received.data) == (b"V,0.100,0.500\n", b"\x00\n\r\xff")
+    assert (received.opened, received.lost, link.problem) == (1, [], "")
 
 
 async def test_a_port_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> None:
@@ -55,17 +55,17 @@ async def test_a_port_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> Non
 
 
 async def test_an_unplugged_port_is_noticed_and_reopened(pty: Pty, link: SerialLink) -> None:
-    heard, back = Heard(link), list[bytes]()
+    received, back = Heard(link), list[bytes]()
     pty.on_bytes = back.append
     link.open()
     await until(lambda: link.connected)
     pty.unplug()
-    await until(lambda: heard.lost)
+    await until(lambda: received.lost)
     assert not link.connected
     assert not link.write(b"lost")
     pty.plug()
     await until(lambda: link.connected)
-    assert (heard.opened, link.reconnects, link.health.reconnects) == (2, 1, 1)
+    assert (received.opened, link.reconnects, link.health.reconnects) == (2, 1, 1)
     assert link.write(b"new")
     await until(lambda: back)
     assert back == [b"new"]  # and nothing from before
@@ -153,10 +153,10 @@ async def test_the_age_is_that_of_the_newest_bytes(pty: Pty, link: SerialLink) -
     await until(lambda: link.connected)
     await asyncio.sleep(0.05)
     assert link.health.age_ms >= 45
-    heard, loop = Heard(link), asyncio.get_running_loop()
+    received, loop = Heard(link), asyncio.get_running_loop()
     wrote_s = loop.time()
     pty.write(b"x")
-    await until(lambda: heard.data)
+    await until(lambda: received.data)
     assert link.health.age_ms <= 1e3 * (loop.time() - wrote_s)
 
 

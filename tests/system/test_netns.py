@@ -126,8 +126,8 @@ async def test_a_brain_that_is_cut_off_stops_the_robot_and_holds_up_nobody_else(
     assert all(speed < 0.2 for speed in late)  # slower than it drove, from the first one on
     standing = [s for s in robot.states if last + STOP_TICKS + REST_TICKS <= s.tick <= back]
     assert all(at_rest(state) for state in standing)
-    heard = [s.tick for s in robot.states if start <= s.tick <= back]
-    assert max(b - a for a, b in pairwise(heard)) <= 25  # nobody else is held up
+    received = [s.tick for s in robot.states if start <= s.tick <= back]
+    assert max(b - a for a, b in pairwise(received)) <= 25  # nobody else is held up
     await nothing_stale_or_touched(robot)
 
 

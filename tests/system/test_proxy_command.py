@@ -26,7 +26,7 @@ async def test_the_command_spoils_a_line_as_it_is_told(
     reader, writer = await asyncio.open_connection(host, int(port))
     writer.write(b"question")
     await asyncio.sleep(0.1)
-    assert server[0].heard == b""  # no connection comes about through a hole
+    assert server[0].received == b""  # no connection comes about through a hole
     command.send(signal.SIGINT)
     assert await command.ended() == 130
     with pytest.raises(ConnectionResetError):

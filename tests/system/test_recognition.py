@@ -33,16 +33,16 @@ async def test_tags_are_seen_also_after_the_process_died_or_hung_and_the_robot_d
     demo = home.start(*AVOID, *options)
     endpoint = await robot_of(home, demo)
     async with connect(endpoint, "looker", timeout_s=None) as bus, probing(endpoint) as robot:
-        heard: list[Detections] = []
-        bus.subscribe(DETECTIONS, lambda _, message: heard.append(message))
+        received: list[Detections] = []
+        bus.subscribe(DETECTIONS, lambda _, message: received.append(message))
 
         async def seen(what: str) -> Any:
-            heard.clear()
-            await until(lambda: len(heard) >= 3, what)
-            return heard[-1]
+            received.clear()
+            await until(lambda: len(received) >= 3, what)
+            return received[-1]
 
-        await until(lambda: any(one.tags for one in heard), "the tag")
-        first = next(one for one in heard if one.tags)
+        await until(lambda: any(one.tags for one in received), "the tag")
+        first = next(one for one in received if one.tags)
         assert (first.camera, first.width, first.height) == ("front", 320, 240)
         assert first.tags[0].id == 7
         boot = first.boot

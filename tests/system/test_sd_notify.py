@@ -25,25 +25,25 @@ async def test_up_tells_its_service_manager_how_all_are_doing(
     monkeypatch.setenv("WATCHDOG_USEC", "1000000")
     file = home.deployment()
     up = home.start("up", str(file), "--keep-stuck")
-    await until(lambda: "READY=1" in service_manager.heard, "all are ready")
-    assert [word for word in service_manager.heard if word.startswith("STATUS")][-1] == ALL_READY
-    assert service_manager.heard[0].startswith("STATUS=not ready: router, driver")
-    await until(lambda: service_manager.heard[-1] == "WATCHDOG=1", "the watchdog is fed")
+    await until(lambda: "READY=1" in service_manager.received, "all are ready")
+    assert [word for word in service_manager.received if word.startswith("STATUS")][-1] == ALL_READY
+    assert service_manager.received[0].startswith("STATUS=not ready: router, driver")
+    await until(lambda: service_manager.received[-1] == "WATCHDOG=1", "the watchdog is fed")
     async with probing(endpoint_of(file)) as robot:
         pid = await robot.pid("decision")
         assert not knows_of_the_manager(pid)
         os.kill(pid, signal.SIGSTOP)
         await until(
-            lambda: "STATUS=stuck: decision" in service_manager.heard, "it is seen to be stuck"
+            lambda: "STATUS=stuck: decision" in service_manager.received, "it is seen to be stuck"
         )
         await robot.ticks(100)  # twice the watchdog's time
-        assert service_manager.heard[-1] == "STATUS=stuck: decision"
+        assert service_manager.received[-1] == "STATUS=stuck: decision"
         os.kill(pid, signal.SIGCONT)
-        await until(lambda: service_manager.heard[-1] == "WATCHDOG=1", "it gets on again")
-        since = service_manager.heard.index("STATUS=stuck: decision")
-        assert service_manager.heard[since + 1 : since + 3] == [ALL_READY, "WATCHDOG=1"]
-    assert service_manager.heard.count("READY=1") == 1
+        await until(lambda: service_manager.received[-1] == "WATCHDOG=1", "it gets on again")
+        since = service_manager.received.index("STATUS=stuck: decision")
+        assert service_manager.received[since + 1 : since + 3] == [ALL_READY, "WATCHDOG=1"]
+    assert service_manager.received.count("READY=1") == 1
     up.send(signal.SIGTERM)
     assert await up.ended() == 0
-    assert service_manager.heard[-1] == "STOPPING=1"
+    assert service_manager.received[-1] == "STOPPING=1"
     assert up.out.count("progress") == 1  # that there was none; beats are not shown

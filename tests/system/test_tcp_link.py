@@ -20,14 +20,14 @@ def server() -> socket.socket:
 async def test_tcp_there_and_back_and_again_after_the_peer_is_gone() -> None:
     with server() as listening:
         link = TcpLink("127.0.0.1", listening.getsockname()[1], Clock(), quiet_ns=None)
-        heard = Heard(link)
+        received = Heard(link)
         link.open()
         peer, _ = await asyncio.to_thread(listening.accept)
         await until(lambda: link.connected)
         assert link.write(b"hello")
         assert await asyncio.to_thread(peer.recv, 100) == b"hello"
         peer.close()
-        await until(lambda: heard.lost)
+        await until(lambda: received.lost)
         peer, _ = await asyncio.to_thread(listening.accept)
         await until(lambda: link.connected)
         assert link.reconnects == 1
@@ -38,17 +38,17 @@ async def test_tcp_there_and_back_and_again_after_the_peer_is_gone() -> None:
 async def test_a_tcp_peer_that_falls_silent_is_dropped_and_gets_nothing_old() -> None:
     with server() as listening:
         link = TcpLink("127.0.0.1", listening.getsockname()[1], Clock(), quiet_ns=100_000_000)
-        heard = Heard(link)
+        received = Heard(link)
         link.open()
         frozen, _ = await asyncio.to_thread(listening.accept)
         await until(lambda: link.connected)
-        while not heard.lost:
+        while not received.lost:
             link.write(b"old")
             await asyncio.sleep(0.01)
-        assert "no data for" in heard.lost[0]
+        assert "no data for" in received.lost[0]
         peer, _ = await asyncio.to_thread(listening.accept)
         peer.sendall(b"alive")
-        await until(lambda: heard.data)
+        await until(lambda: received.data)
         link.write(b"new")
         assert await asyncio.to_thread(peer.recv, 100) == b"new"
         await link.close()
@@ -59,13 +59,13 @@ async def test_a_tcp_peer_that_falls_silent_is_dropped_and_gets_nothing_old() ->
 async def test_a_tcp_peer_that_takes_nothing_is_dropped_in_the_middle_of_a_frame() -> None:
     with server() as listening:
         link = TcpLink("127.0.0.1", listening.getsockname()[1], Clock(), quiet_ns=None)
-        heard = Heard(link)
+        received = Heard(link)
         link.open()
         peer, _ = await asyncio.to_thread(listening.accept)
         await until(lambda: link.connected)
         while link.write(b"x" * 65536):
             pass
-        assert heard.lost == ["it does not read what is sent to it"]
+        assert received.lost == ["it does not read what is sent to it"]
         await link.close()
         peer.close()
 

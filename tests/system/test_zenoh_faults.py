@@ -194,10 +194,10 @@ async def test_a_client_joins_again_with_a_session_of_which_its_router_knows_not
         assert second
         assert str(first.session.zid()) != str(second.session.zid())
         ear.close()  # ends what was declared on the second
-        heard = len(ear.samples)
+        received = len(ear.samples)
         other = SampleCollector(client, "robot/teleop")
         await repeat(lambda: client.publish(TELEOP, "robot/teleop", b"", ""), lambda: other.samples)
-        assert len(ear.samples) == heard
+        assert len(ear.samples) == received
         await client.close()
 
 

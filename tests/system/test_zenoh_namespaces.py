@@ -63,14 +63,14 @@ async def test_a_router_in_a_namespace_is_one_of_the_robots_processes(net: Zenoh
     """It answers and reports there, and still joins those of any other namespace."""
     router = Bus(await net.router("red"), Clock(), "router")
     red, fleet = Bus(await net.client("red"), Clock()), await net.client()
-    heard: list[tuple[str, Health]] = []
-    red.subscribe(HEALTH, lambda key, health: heard.append((key, health)))
+    received: list[tuple[str, Health]] = []
+    red.subscribe(HEALTH, lambda key, health: received.append((key, health)))
     of_fleet = SampleCollector(fleet, "red/robot/health/*")
     await repeat(
         lambda: router.publish(HEALTH, example(Health), name="router"),
-        lambda: heard and of_fleet.samples,
+        lambda: received and of_fleet.samples,
     )
-    assert heard[0][0] == "robot/health/router"
+    assert received[0][0] == "robot/health/router"
     assert of_fleet.samples[0][0] == "red/robot/health/router"
     router.serve(DESCRIBE, describe, name="router")
     while not await red.ask(DESCRIBE, DescribeRequest(), name="router", timeout_s=20):

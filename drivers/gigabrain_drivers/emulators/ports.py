@@ -128,7 +128,7 @@ class TcpPort:
         self._usual, self._clock = port, Clock()
         self._server: socket.socket | None = None
         self._client: socket.socket | None = None
-        self._heard_ns = 0
+        self._received_ns = 0
 
     @property
     def address(self) -> tuple[str, int] | None:
@@ -178,14 +178,14 @@ class TcpPort:
         except OSError:
             return
         now_ns = self._clock.now_ns()
-        if self._client and now_ns - self._heard_ns < CLIENT_TIMEOUT_NS:
+        if self._client and now_ns - self._received_ns < CLIENT_TIMEOUT_NS:
             self.refused += 1
             client.close()
             return
         self._drop()
         client.setblocking(False)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._client, self._heard_ns = client, now_ns
+        self._client, self._received_ns = client, now_ns
         asyncio.get_running_loop().add_reader(client, self._readable)
 
     def _readable(self) -> None:
@@ -200,7 +200,7 @@ class TcpPort:
         if not data:
             self._drop()
             return
-        self._heard_ns = self._clock.now_ns()
+        self._received_ns = self._clock.now_ns()
         self.on_bytes(data)
 
     def _drop(self) -> None:

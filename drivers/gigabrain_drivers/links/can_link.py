@@ -194,7 +194,7 @@ class CanLink(Link):
         self.lost_frames += wrong
         if not frames:
             return False
-        self._heard_ns = self._clock.now_ns()
+        self._received_ns = self._clock.now_ns()
         data = records(frames)
         self._trace("rx", data)
         self._call(self.on_bytes, data)

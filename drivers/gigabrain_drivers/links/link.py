@@ -49,13 +49,13 @@ class Link(abc.ABC):
         self.errors = 0  # frames that the owner threw away
         self.reconnects = 0
         self._clock = clock
-        self._heard_ns = clock.now_ns()
+        self._received_ns = clock.now_ns()
         self._fd: int | None = None
         self._gathering: asyncio.TimerHandle | None = None
         self._opened_once = False
         self._reported: set[str] = set()
         self._ended = asyncio.Event()
-        self._keeper: asyncio.Task[None] | None = None
+        self._task: asyncio.Task[None] | None = None
 
     @property
     def connected(self) -> bool:
@@ -70,7 +70,7 @@ class Link(abc.ABC):
     @property
     def age_ns(self) -> int:
         """Time since the newest bytes, or since the link was opened [ns]."""
-        return self._clock.now_ns() - self._heard_ns
+        return self._clock.now_ns() - self._received_ns
 
     @property
     def health(self) -> LinkHealth:
@@ -84,9 +84,9 @@ class Link(abc.ABC):
 
     def open(self) -> None:
         """Connect in the background, and again after every loss. Return at once."""
-        if self._keeper is None:
-            self.problem, self._heard_ns = "connecting", self._clock.now_ns()
-            self._keeper = asyncio.create_task(self._keep_open(), name=f"link {self}")
+        if self._task is None:
+            self.problem, self._received_ns = "connecting", self._clock.now_ns()
+            self._task = asyncio.create_task(self._keep_open(), name=f"link {self}")
 
     def write(self, data: bytes) -> bool:
         """Send now or not at all. Return whether all was sent. Never block or raise."""
@@ -119,11 +119,11 @@ class Link(abc.ABC):
 
     async def close(self) -> None:
         """Close the port. May be called any number of times."""
-        keeper, self._keeper = self._keeper, None
-        if keeper:
-            keeper.cancel()
+        task, self._task = self._task, None
+        if task:
+            task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
-                await keeper
+                await task
         self.drop("closed")
         self.problem = "closed"
 
@@ -182,7 +182,7 @@ class Link(abc.ABC):
             log.error("%s: %s", self, text, exc_info=error)
 
     def _attach(self, fd: int) -> None:
-        self._fd, self.problem, self._heard_ns = fd, "", self._clock.now_ns()
+        self._fd, self.problem, self._received_ns = fd, "", self._clock.now_ns()
         self._ended.clear()
         self.reconnects += self._opened_once
         self._opened_once = True
@@ -233,7 +233,7 @@ class Link(abc.ABC):
         if not data:  # the other end is gone; left in the loop, this would spin
             self.drop("the other end is gone: unplugged?")
             return False
-        self._heard_ns = self._clock.now_ns()
+        self._received_ns = self._clock.now_ns()
         self._trace("rx", data)
         self._call(self.on_bytes, data)
         return True
@@ -266,29 +266,29 @@ class Liveness:
     ) -> None:
         self._link, self._clock = link, clock
         self._silent_ns, self._senseless = silent_ns, senseless
-        self._heard_ns: int | None = None  # None since the line was opened or lost
+        self._received_ns: int | None = None  # None since the line was opened or lost
         self._hoping_ns = clock.now_ns()  # since when there is nothing
         self._fault = Fault(log)
 
     @property
     def received(self) -> bool:
         """True if a message has come since the line was opened."""
-        return self._heard_ns is not None
+        return self._received_ns is not None
 
     def mark_received(self) -> bool:
         """Note a message; return whether it is the first on this line."""
-        first, self._heard_ns = self._heard_ns is None, self._clock.now_ns()
+        first, self._received_ns = self._received_ns is None, self._clock.now_ns()
         return first
 
     def reset(self) -> None:
         """Forget all messages: the line is lost or new."""
-        if self._heard_ns is not None:
-            self._heard_ns, self._hoping_ns = None, self._clock.now_ns()
+        if self._received_ns is not None:
+            self._received_ns, self._hoping_ns = None, self._clock.now_ns()
 
     def alive(self) -> bool:
         """Return whether the newest message is recent enough."""
-        silent_ns = self._clock.now_ns() - (self._heard_ns or self._hoping_ns)
-        alive = self._heard_ns is not None and silent_ns <= self._silent_ns
+        silent_ns = self._clock.now_ns() - (self._received_ns or self._hoping_ns)
+        alive = self._received_ns is not None and silent_ns <= self._silent_ns
         if alive:
             self._fault.end(f"{self._link}: reports again")
         elif silent_ns > LOG_AFTER_NS:

@@ -130,8 +130,8 @@ async def test_rclpys_goals_are_followed_preempted_and_cancelled(
     for name in ("first", "second"):
         await client.query("send", **action, name=name, goal={"pose": pose})
         await client.hear("accepted", name=name)
-        heard = await client.hear("feedback", name=name)
-        assert heard["value"]["distance_remaining"] > 0
+        received = await client.hear("feedback", name=name)
+        assert received["value"]["distance_remaining"] > 0
     assert (await client.hear("result", name="first"))["status"] == "aborted"
     await client.query("cancel", name="second")
     assert (await client.hear("cancelled", name="second"))["goals"] == 1

@@ -118,8 +118,8 @@ async def diagnosed(judge: Judge) -> Callable[[str], str]:
     await listener.query("subscribe", topic="/diagnostics", type=kind, qos=qos, stream=True)
 
     def text(name: str) -> str:
-        heard = listener.seen("message", topic="/diagnostics")
-        lines = heard[-1]["value"]["status"] if heard else []
+        received = listener.seen("message", topic="/diagnostics")
+        lines = received[-1]["value"]["status"] if received else []
         return next((one["message"] for one in lines if one["name"] == f"gigabrain: {name}"), "")
 
     return text

@@ -26,8 +26,8 @@ async def test_a_robot_without_a_brain_leaves_nav2_its_names(home: Home, judge: 
         )
         parents = {one["header"]["frame_id"] for one in report["values"][-1]["transforms"]}
         assert parents == {"odom", "base_link"}
-        heard = (await listener.endpoints("/cmd_vel"))["subscribers"]
-        assert {one["node"] for one in heard} == {"gigabrain"}
+        received = (await listener.endpoints("/cmd_vel"))["subscribers"]
+        assert {one["node"] for one in received} == {"gigabrain"}
         for topic in OF_NAV2:
             found = await listener.endpoints(topic)
             assert (topic, found["publishers"], found["subscribers"]) == (topic, [], [])

@@ -127,8 +127,8 @@ async def test_a_goal_pose_of_rviz_has_a_plan_and_a_wrong_one_is_named(
     await listener.query("subscribe", topic="/plan", type=PATH, qos={}, stream=True)
 
     def planned() -> bool:
-        heard = [one["value"] for one in listener.seen("message", topic="/plan")]
-        ends = [path["poses"][-1] for path in heard if path["poses"]]
+        received = [one["value"] for one in listener.seen("message", topic="/plan")]
+        ends = [path["poses"][-1] for path in received if path["poses"]]
         places = [(one["header"]["frame_id"], one["pose"]["position"]) for one in ends]
         return any(
             frame == "map" and abs(at["x"] - 0.5) < 0.1 and abs(at["y"] - 0.1) < 0.1

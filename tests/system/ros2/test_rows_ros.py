@@ -144,7 +144,7 @@ def is_whole(topic: str, report: dict[str, Any]) -> bool:
 
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
-async def heard(gateway: None, shared_judge: Judge) -> AsyncIterator[Heard]:
+async def received(gateway: None, shared_judge: Judge) -> AsyncIterator[Heard]:
     """The newest message of each topic, as rclpy has it."""
     listener = shared_judge.start("listen")
     for topic, (kind, qos) in TABLE.items():
@@ -174,7 +174,7 @@ def about_z(half: float) -> dict[str, float]:
 
 
 async def test_ros_knows_type_hash_and_qos_of_every_topic(
-    gateway: None, heard: Heard, judge: Judge
+    gateway: None, received: Heard, judge: Judge
 ) -> None:
     listener = judge.start("listen", node="looker")
 
@@ -188,8 +188,8 @@ async def test_ros_knows_type_hash_and_qos_of_every_topic(
         assert (one["reliable"], one["transient_local"]) == (qos.reliable, qos.transient_local)
 
 
-async def test_scans_have_ranges_angles_and_what_was_not_hit(heard: Heard) -> None:
-    scan = heard["/scan"]
+async def test_scans_have_ranges_angles_and_what_was_not_hit(received: Heard) -> None:
+    scan = received["/scan"]
     assert scan["header"] == head("base_scan")
     assert np.array_equal(scan["ranges"], NEAR.astype(float), equal_nan=True)
     assert scan["angle_increment"] == pytest.approx(math.radians(1.0))
@@ -197,27 +197,27 @@ async def test_scans_have_ranges_angles_and_what_was_not_hit(heard: Heard) -> No
     assert (scan["scan_time"], scan["intensities"]) == (pytest.approx(0.1), [])
 
 
-async def test_odometry_frames_and_joints_are_those_of_the_state(heard: Heard) -> None:
-    odom = heard["/odom"]
+async def test_odometry_frames_and_joints_are_those_of_the_state(received: Heard) -> None:
+    odom = received["/odom"]
     assert (odom["header"], odom["child_frame_id"]) == (head("odom"), "base_footprint")
     assert odom["pose"]["pose"]["position"] == {"x": 1.0, "y": 0.0, "z": 0.0}
     twist = odom["twist"]["twist"]
     assert (twist["linear"]["x"], twist["angular"]["z"]) == (0.2, -0.3)
-    joints = heard["/joint_states"]
+    joints = received["/joint_states"]
     assert joints["name"] == ["wheel_left_joint", "wheel_right_joint"]
     assert (joints["position"], joints["velocity"]) == ([0.5, -0.5], [1.5, -1.5])
-    assert heard["/clock"]["clock"] == STAMP
+    assert received["/clock"]["clock"] == STAMP
 
 
-async def test_the_frames_lead_from_the_map_to_each_sensor(heard: Heard) -> None:
-    moving = {one["child_frame_id"]: one for one in heard["/tf"]["transforms"]}
+async def test_the_frames_lead_from_the_map_to_each_sensor(received: Heard) -> None:
+    moving = {one["child_frame_id"]: one for one in received["/tf"]["transforms"]}
     assert [one["header"]["frame_id"] for one in moving.values()] == [
         "map", "odom", "base_link", "base_link",
     ]  # fmt: skip
     odom = moving["odom"]["transform"]
     assert odom["translation"] == {"x": pytest.approx(5.0), "y": pytest.approx(4.0), "z": 0.0}
     assert odom["rotation"] == about_z(math.pi / 4)
-    static = {one["child_frame_id"]: one for one in heard["/tf_static"]["transforms"]}
+    static = {one["child_frame_id"]: one for one in received["/tf_static"]["transforms"]}
     parents = {name: one["header"]["frame_id"] for name, one in static.items()}
     assert parents == {
         "base_link": "base_footprint", "imu_link": "base_link", "base_scan": "base_link",
@@ -228,26 +228,26 @@ async def test_the_frames_lead_from_the_map_to_each_sensor(heard: Heard) -> None
     assert tuple(lens[axis] for axis in "xyzw") == LENS
 
 
-async def test_the_imu_the_battery_and_the_description_arrive(heard: Heard) -> None:
-    imu = heard["/imu"]
+async def test_the_imu_the_battery_and_the_description_arrive(received: Heard) -> None:
+    imu = received["/imu"]
     assert imu["header"] == head("imu_link")
     assert imu["linear_acceleration"] == {"x": 1.0, "y": 0.0, "z": 9.8}
     assert imu["angular_velocity"]["z"] == 0.1
     assert imu["orientation"] == about_z(0.0)
-    battery = heard["/battery_state"]
+    battery = received["/battery_state"]
     assert (battery["percentage"], battery["voltage"]) == (pytest.approx(0.4), 12.0)
     assert battery["present"]
     assert math.isnan(battery["charge"])
-    assert 'link name="front_optical_frame"' in heard["/robot_description"]["data"]
+    assert 'link name="front_optical_frame"' in received["/robot_description"]["data"]
 
 
-async def test_the_map_and_the_plan_arrive(heard: Heard) -> None:
-    grid = heard["/map"]
+async def test_the_map_and_the_plan_arrive(received: Heard) -> None:
+    grid = received["/map"]
     assert (grid["header"], grid["data"]) == (head("map"), [100, -1])
     info = grid["info"]
     assert (info["width"], info["height"]) == (2, 1)
     assert info["resolution"] == pytest.approx(0.1)
-    plan = heard["/plan"]
+    plan = received["/plan"]
     assert plan["header"] == head("map")
     assert [one["header"] for one in plan["poses"]] == [head("map")] * 3
     places = [one["pose"]["position"] for one in plan["poses"]]
@@ -256,24 +256,24 @@ async def test_the_map_and_the_plan_arrive(heard: Heard) -> None:
     assert plan["poses"][2]["pose"]["orientation"] == about_z(math.pi / 2)
 
 
-async def test_pictures_arrive_with_the_intrinsics_of_their_camera(heard: Heard) -> None:
+async def test_pictures_arrive_with_the_intrinsics_of_their_camera(received: Heard) -> None:
     for at, name, data, size in (
         ("/camera", "front", PICTURE.data, (320, 240)),
         ("/camera/rear", "rear", b"\xff\xd8rear", (16, 16)),
     ):
-        picture, about = heard[f"{at}/image/compressed"], heard[f"{at}/camera_info"]
+        picture, about = received[f"{at}/image/compressed"], received[f"{at}/camera_info"]
         assert picture["header"] == about["header"] == head(f"{name}_optical_frame")
         assert (picture["format"], bytes(picture["data"])) == ("jpeg", data)
         assert (about["width"], about["height"]) == size
-    about = heard["/camera/camera_info"]
+    about = received["/camera/camera_info"]
     assert (about["distortion_model"], about["d"]) == ("plumb_bob", [0.1, -0.2, 0.0, 0.0, 0.3])
     assert about["k"] == [270.0, 0.0, 160.5, 0.0, 271.0, 119.5, 0.0, 0.0, 1.0]
     assert about["p"] == [270.0, 0.0, 160.5, 0.0, 0.0, 271.0, 119.5, 0.0, 0.0, 0.0, 1.0, 0.0]
     assert about["r"] == [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
 
-async def test_depth_arrives_in_millimetres_with_its_camera(heard: Heard) -> None:
-    depth, about = heard["/camera/depth/image_raw"], heard["/camera/depth/camera_info"]
+async def test_depth_arrives_in_millimetres_with_its_camera(received: Heard) -> None:
+    depth, about = received["/camera/depth/image_raw"], received["/camera/depth/camera_info"]
     assert depth["header"] == about["header"] == head("front_optical_frame")
     assert (depth["encoding"], depth["is_bigendian"], depth["step"]) == ("16UC1", 0, 640)
     pixels = np.frombuffer(bytes(depth["data"]), "<u2").reshape(240, 320)
@@ -281,8 +281,8 @@ async def test_depth_arrives_in_millimetres_with_its_camera(heard: Heard) -> Non
     assert about["k"][0] == 270.0
 
 
-async def test_diagnostics_name_the_parts_of_the_robot(heard: Heard) -> None:
-    found = {one["name"]: one for one in heard["/diagnostics"]["status"]}
+async def test_diagnostics_name_the_parts_of_the_robot(received: Heard) -> None:
+    found = {one["name"]: one for one in received["/diagnostics"]["status"]}
     assert {"gigabrain: gate", "gigabrain: safety"} <= found.keys()
     assert found[BATTERY]["message"] == "40 %, 12.0 V"
     assert found["gigabrain: cmd_vel"]["message"] == "no commands"

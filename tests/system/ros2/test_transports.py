@@ -160,11 +160,11 @@ async def test_nothing_is_called_after_the_end(nodes: Nodes) -> None:
         listener.subscribe("/chatter", STRING, Qos(), got.append)
         publisher = talker.publisher("/chatter", STRING)
         await repeat(lambda: publisher.publish(nodes.string("hi")), lambda: got)
-    heard = len(got)
+    received = len(got)
     for _ in range(10):
         publisher.publish(nodes.string("hi"))
         await asyncio.sleep(0.01)
-    assert len(got) == heard
+    assert len(got) == received
 
 
 async def test_what_is_closed_after_the_end_was_closed_by_it(nodes: Nodes) -> None:

@@ -139,12 +139,12 @@ async def test_a_lie_now_and_then_ends_nobody() -> None:
 
 async def test_a_lie_reaches_no_reader_and_is_counted() -> None:
     net = Net()
-    heard = list[int]()
-    net.one.latest(STATE, lambda state: heard.append(state.tick))
+    received = list[int]()
+    net.one.latest(STATE, lambda state: received.append(state.tick))
     for tick in (100, FAR, 101):
         say(net, state(tick))
     await asyncio.sleep(0)
-    assert heard == [100, 101]
+    assert received == [100, 101]
     assert net.one.counters["refused_ticks"] == 1
 
 

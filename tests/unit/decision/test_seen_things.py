@@ -90,16 +90,16 @@ class Heard:
 
 
 def watching(body: BodyDescription) -> tuple[Heard, SeenThings]:
-    heard = Heard()
-    seen = SeenThings(heard.bus)
+    received = Heard()
+    seen = SeenThings(received.bus)
     seen.observe(body, state(1))
-    return heard, seen
+    return received, seen
 
 
 def test_things_are_where_they_are_after_the_body_has_driven_on() -> None:
-    heard, seen = watching(load_robot("lekiwi").description())
-    assert heard.subscribed
-    heard.subscribed(Solids(solids=(CAN,), boot=BOOT, tick=1, basis=1))
+    received, seen = watching(load_robot("lekiwi").description())
+    assert received.subscribed
+    received.subscribed(Solids(solids=(CAN,), boot=BOOT, tick=1, basis=1))
     assert seen.at(state(1)) == ()  # it was not there before that state
     there = state(2, pose=(0.1, 0.0, math.pi / 2))
     seen.observe(None, there)
@@ -110,15 +110,15 @@ def test_things_are_where_they_are_after_the_body_has_driven_on() -> None:
 
 
 def test_things_of_another_start_of_the_driver_do_not_count() -> None:
-    heard, seen = watching(ARM)
-    assert heard.subscribed
-    heard.subscribed(Solids(solids=(CAN,), boot=BOOT + 1, tick=1, basis=1))
+    received, seen = watching(ARM)
+    assert received.subscribed
+    received.subscribed(Solids(solids=(CAN,), boot=BOOT + 1, tick=1, basis=1))
     assert seen.at(state(2)) == ()
 
 
 def test_a_body_without_a_camera_is_not_watched() -> None:
-    heard, seen = watching(load_robot("piper").description())
-    assert heard.subscribed is None
+    received, seen = watching(load_robot("piper").description())
+    assert received.subscribed is None
     assert seen.at(state(2)) == ()
 
 

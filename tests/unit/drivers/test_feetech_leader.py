@@ -119,9 +119,9 @@ async def test_one_lost_answer_does_not_end_it_and_silence_does() -> None:
 async def test_silence_of_a_third_of_a_second_leaves_its_last_posture() -> None:
     async with leading() as rig:
         before = await rig.read()
-        heard, rig.link.disturb = rig.link.disturb, lambda _: b""
+        received, rig.link.disturb = rig.link.disturb, lambda _: b""
         assert await rig.read_on(8) == before  # each takes 38 ms
-        rig.link.disturb = heard
+        rig.link.disturb = received
         rig.joint("wrist_roll").position = 0.2
         assert (await rig.read_on(10))["wrist_roll"] == pytest.approx(0.2, abs=TICK)
 

@@ -82,7 +82,7 @@ def test_no_wrong_position_is_believed(hit: Hit, frames: int) -> None:
         for packet in decoder.feed(line.carry(answer)):
             if packet.id == 1:
                 joint.take(feetech.decode_readings(packet.params), now_ns)
-        if joint.heard_ns == now_ns:
+        if joint.received_ns == now_ns:
             believed += 1
             assert joint.newest
             assert joint.newest.position == ticks

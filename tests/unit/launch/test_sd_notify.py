@@ -18,7 +18,7 @@ def test_the_watchdog_is_fed_in_good_time_and_not_at_every_turn(
     for _ in range(100):
         notifier.alive()
         now[0] += 0.1
-    assert service_manager.heard == ["WATCHDOG=1"] * 3  # at 0, 4 and 8 s
+    assert service_manager.received == ["WATCHDOG=1"] * 3  # at 0, 4 and 8 s
 
 
 def test_ready_is_said_once_and_a_status_when_it_changes(service_manager: ServiceManager) -> None:
@@ -27,7 +27,7 @@ def test_ready_is_said_once_and_a_status_when_it_changes(service_manager: Servic
         notifier.status(text)
         notifier.ready()
         notifier.alive()
-    assert service_manager.heard == ["STATUS=a", "READY=1", "STATUS=b"]
+    assert service_manager.received == ["STATUS=a", "READY=1", "STATUS=b"]
 
 
 def test_an_abstract_address_and_a_missing_manager_are_fine(
@@ -39,7 +39,7 @@ def test_an_abstract_address_and_a_missing_manager_are_fine(
     notifier = Notifier.from_environment()
     assert "NOTIFY_SOCKET" not in os.environ
     notifier.stopping()
-    assert service_manager.heard == ["STOPPING=1"]
+    assert service_manager.received == ["STOPPING=1"]
     service_manager.close()
     notifier.stopping()
     Notifier.from_environment().stopping()
@@ -48,12 +48,12 @@ def test_an_abstract_address_and_a_missing_manager_are_fine(
 def test_a_watchdog_that_is_meant_for_another_process_is_not_fed(
     service_manager: ServiceManager, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for pid, heard in (("1", []), (str(os.getpid()), ["WATCHDOG=1"])):
+    for pid, received in (("1", []), (str(os.getpid()), ["WATCHDOG=1"])):
         monkeypatch.setenv("NOTIFY_SOCKET", service_manager.address)
         monkeypatch.setenv("WATCHDOG_USEC", "5000000")
         monkeypatch.setenv("WATCHDOG_PID", pid)
         Notifier.from_environment().alive()
-        assert service_manager.heard == heard
+        assert service_manager.received == received
 
 
 class TurningClock(Clock):

@@ -312,9 +312,9 @@ async def test_a_replay_gives_the_same_worlds() -> None:
     worlds = [data for _, key, data in events if key == WORLD.key]
     assert sum(bool(contours_of(data)) for data in worlds) > 15
     inputs = {BODY.key, STATE.key, SCAN.key, DEPTH.at("front"), FINISHED}
-    heard = [event for event in events if event[1] in inputs]
+    received = [event for event in events if event[1] in inputs]
     config = PerceptionConfig(mapping="slam")
-    now = await replay(functools.partial(perception.run, config), heard, "perception")
+    now = await replay(functools.partial(perception.run, config), received, "perception")
     assert [data for key, data in now if key == WORLD.key] == worlds
 
 

@@ -82,13 +82,13 @@ def test_work_is_timed_by_name_and_its_result_handed_on() -> None:
 
 
 def test_a_hop_lasts_from_its_first_message_of_a_tick_to_the_next_ones() -> None:
-    heard = ChainMonitor()
+    received = ChainMonitor()
     for tick, left_ms in ((5, 100), (10, 200), (15, 300)):
-        heard.add("robot/scan", CmdVel(linear_x=0.0, basis=tick, stamp_ns=left_ms * MS))
+        received.add("robot/scan", CmdVel(linear_x=0.0, basis=tick, stamp_ns=left_ms * MS))
     for tick, left_ms in ((5, 101), (10, 203), (10, 220)):  # the last repeats what it rests on
-        heard.add("robot/cmd_vel", CmdVel(linear_x=0.0, basis=tick, stamp_ns=left_ms * MS))
-    assert heard.between(SCAN, CMD_VEL) == 2.0
-    assert not heard.complete
+        received.add("robot/cmd_vel", CmdVel(linear_x=0.0, basis=tick, stamp_ns=left_ms * MS))
+    assert received.between(SCAN, CMD_VEL) == 2.0
+    assert not received.complete
     assert median_ms({1: 0, 2: 0, 3: 0}, {2: 4 * MS, 3: 8 * MS, 4: MS}) == 6.0
 
 

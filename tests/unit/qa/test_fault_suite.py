@@ -324,12 +324,12 @@ async def test_a_part_that_hangs_leaves_the_rest_of_its_process_running() -> Non
     network, hangs = LocalNetwork(), threading.Event()
     bus = HangingBus(WORLD, hangs, network.transport(), FakeClock(), "decision")
     speaker = Bus(network.transport(), FakeClock(), "perception")
-    heard: list[str] = []
-    bus.latest(WORLD, lambda _: heard.append("world"))
-    bus.latest(INTENT, lambda _: heard.append("intent"))
+    received: list[str] = []
+    bus.latest(WORLD, lambda _: received.append("world"))
+    bus.latest(INTENT, lambda _: received.append("intent"))
     for _ in range(2):
         speaker.publish(WORLD, WorldModel(scan_ok=True, obstacle_ahead=False))
         speaker.publish(INTENT, Intent(behaviour="avoid", reason="free"))
         await settle()
         hangs.set()
-    assert heard == ["world", "intent", "intent"]
+    assert received == ["world", "intent", "intent"]

@@ -33,8 +33,8 @@ class Rig:
         self.clock, self.network = FakeClock(), LocalNetwork()
         self.bus = Bus(self.network.transport(), self.clock, "driver")
         self.other = Bus(self.network.transport(), self.clock, "other")
-        self.heard: list[AuditRecord] = []
-        self.other.subscribe(AUDIT, lambda _key, record: self.heard.append(record))
+        self.received: list[AuditRecord] = []
+        self.other.subscribe(AUDIT, lambda _key, record: self.received.append(record))
         self.trail = AuditTrail(self.bus, folder)
 
     async def after(self, seconds: float) -> None:
@@ -89,7 +89,7 @@ async def test_an_entry_is_told_at_once_written_and_can_be_asked_for(tmp_path: P
     rig = Rig(tmp_path)
     rig.bus.time.boot, rig.bus.time.tick = 7, 205
     rig.trail.note("take", "ann", "ann drives, taken over from control")
-    assert rig.heard == [
+    assert rig.received == [
         AuditRecord(
             stamp_ns=1_000_000_000_000_000_000, seq=1, boot=7, tick=205,
             process="driver", what="take", source="ann",
@@ -97,8 +97,10 @@ async def test_an_entry_is_told_at_once_written_and_can_be_asked_for(tmp_path: P
         )
     ]  # fmt: skip
     await rig.trail.close()
-    assert read_audit(tmp_path, 10) == tuple(rig.heard)
-    assert await rig.other.ask(AUDIT_LOG, AuditRequest()) == [AuditPage(records=tuple(rig.heard))]
+    assert read_audit(tmp_path, 10) == tuple(rig.received)
+    assert await rig.other.ask(AUDIT_LOG, AuditRequest()) == [
+        AuditPage(records=tuple(rig.received))
+    ]
 
 
 async def test_what_happens_again_within_a_second_is_counted(tmp_path: Path) -> None:
@@ -106,14 +108,14 @@ async def test_what_happens_again_within_a_second_is_counted(tmp_path: Path) -> 
     for _ in range(21):
         rig.trail.note("estop", "ann", "stopped")
     rig.trail.note("estop", "bob", "stopped")
-    assert [(r.source, r.times) for r in rig.heard] == [("ann", 1), ("bob", 1)]
+    assert [(r.source, r.times) for r in rig.received] == [("ann", 1), ("bob", 1)]
     await rig.after(0.9)
-    assert len(rig.heard) == 2
+    assert len(rig.received) == 2
     await rig.after(0.1)
-    assert [(r.source, r.times) for r in rig.heard[2:]] == [("ann", 20)]
+    assert [(r.source, r.times) for r in rig.received[2:]] == [("ann", 20)]
     await rig.after(1.0)
     rig.trail.note("estop", "bob", "stopped")
-    assert [(r.source, r.times) for r in rig.heard[3:]] == [("bob", 1)]
+    assert [(r.source, r.times) for r in rig.received[3:]] == [("bob", 1)]
     await rig.trail.close()
 
 
@@ -122,9 +124,9 @@ async def test_who_keeps_trying_is_told_once_a_minute(tmp_path: Path) -> None:
     for _ in range(59):
         rig.trail.note("refused", "script", "control drives", code="commander", ok=False)
         await rig.after(1.0)
-    assert [(r.what, r.times) for r in rig.heard] == [("refused", 1)]
+    assert [(r.what, r.times) for r in rig.received] == [("refused", 1)]
     await rig.after(1.0)
-    assert [(r.what, r.times) for r in rig.heard] == [("refused", 1), ("refused", 58)]
+    assert [(r.what, r.times) for r in rig.received] == [("refused", 1), ("refused", 58)]
     await rig.trail.close()
 
 
@@ -132,10 +134,10 @@ async def test_a_crowd_is_told_as_others(tmp_path: Path) -> None:
     rig = Rig(tmp_path)
     for number in range(10_000):
         rig.trail.note("refused", f"source-{number}", ok=False)
-    assert len(rig.heard) == 101
-    assert rig.heard[-1].source == "others"
+    assert len(rig.received) == 101
+    assert rig.received[-1].source == "others"
     await rig.trail.close()
-    assert (rig.heard[-1].source, rig.heard[-1].times) == ("others", 9899)
+    assert (rig.received[-1].source, rig.received[-1].times) == ("others", 9899)
 
 
 async def test_a_crowd_of_sources_takes_the_place_of_nobody_who_was_obeyed(tmp_path: Path) -> None:
@@ -144,9 +146,9 @@ async def test_a_crowd_of_sources_takes_the_place_of_nobody_who_was_obeyed(tmp_p
         for number in range(1000):
             rig.trail.note("refused", f"source-{second}-{number}", code=str(number), ok=False)
         await rig.after(1.0)
-    assert len(rig.heard) == 100 + 99 + 3  # the others are told at once and after each minute
+    assert len(rig.received) == 100 + 99 + 3  # the others are told at once and after each minute
     rig.trail.note("estop", "ann", "stopped")
-    assert rig.heard[-1].source == "ann"
+    assert rig.received[-1].source == "ann"
     assert sum(map(len, rig.trail._recent.values())) <= 102
     await rig.trail.close()
 
@@ -171,14 +173,14 @@ async def test_a_disk_that_hangs_holds_nobody_up_and_the_oldest_give_way() -> No
         batches.append(items)
         return "the disk is full" if 5 in items else ""
 
-    scribe = BackgroundWriter(write, room=3)
-    first = scribe.put(1)
+    writer = BackgroundWriter(write, room=3)
+    first = writer.put(1)
     await asyncio.sleep(0)  # the first batch is on its way
-    others = [scribe.put(number) for number in (2, 3, 4, 5)]
+    others = [writer.put(number) for number in (2, 3, 4, 5)]
     assert not first.done()
     goes_on.set()
     assert await first == ""
     assert [await other for other in others] == ["the disk is full"] * 4
     assert batches == [(1,), (3, 4, 5)]
-    assert scribe.lost == 1
-    await scribe.close()
+    assert writer.lost == 1
+    await writer.close()

@@ -49,9 +49,9 @@ class Rig:
     def __init__(self, folder: Path) -> None:
         self.clock, network = FakeClock(), LocalNetwork()
         self.folder, self.bus = folder, Bus(network.transport(), self.clock, "router")
-        self.heard: list[AuditRecord] = []
+        self.received: list[AuditRecord] = []
         other = Bus(network.transport(), self.clock, "other")
-        other.subscribe(AUDIT, lambda _key, record: self.heard.append(record))
+        other.subscribe(AUDIT, lambda _key, record: self.received.append(record))
         self.trail = AuditTrail(self.bus, folder)
         self.door = AccessAudit(self.trail, {"viewer@red"})
         self.door.note_link(Link(ZID, "viewer@red", "tls/127.0.0.1:5", there=True))
@@ -67,7 +67,7 @@ async def test_40000_denials_are_one_record_a_minute_and_push_out_no_estop(tmp_p
             await rig.clock.advance(20_000_000_000)
             rig.trail.flush()
     rig.door.note_denial(Denied(ZID, "Query", "red/robot/release/x"))
-    refused = [record for record in rig.heard if record.what == "refused"]
+    refused = [record for record in rig.received if record.what == "refused"]
     assert [(r.source, r.code, r.times) for r in refused] == [
         ("viewer@red", "put other", 1),
         ("viewer@red", "put other", 29_999),
@@ -80,7 +80,7 @@ async def test_40000_denials_are_one_record_a_minute_and_push_out_no_estop(tmp_p
         ("release", "before the flood"),
         ("enable", "before the flood"),
     ]
-    last = rig.heard[-1]
+    last = rig.received[-1]
     assert (last.code, last.times) == ("put other", 10_001)
     assert last.text == (
         "viewer@red at tls/127.0.0.1:5 may not query red/robot/release/x; "
@@ -94,7 +94,7 @@ async def test_why_strangers_are_turned_away_is_told_without_what_they_choose(
     rig = Rig(tmp_path)
     for port in range(40_000):
         rig.door.note_denial(TurnedAway(f"invalid peer at 10.0.0.1:{port} says {port:x}1"))
-    assert [(r.source, r.code) for r in rig.heard] == [("unknown", "invalid peer at … says …")]
+    assert [(r.source, r.code) for r in rig.received] == [("unknown", "invalid peer at … says …")]
     await rig.trail.close()
 
 

@@ -115,18 +115,18 @@ def test_the_recorded_drive_has_something_of_everything() -> None:
 async def test_a_system_replayed_on_its_own_sends_the_same_bytes(name: str) -> None:
     node, key = SYSTEMS[name]
     events = await asyncio.to_thread(drive)
-    heard = [event for event in events if event[1] != key]
+    received = [event for event in events if event[1] != key]
     sent = [(k, payload) for _, k, payload in events if k == key]
     assert len(sent) >= 120
-    assert await replay(node, heard) == sent
+    assert await replay(node, received) == sent
 
 
 async def test_a_system_that_was_changed_sends_something_else() -> None:
     events = await asyncio.to_thread(drive)
-    heard = [event for event in events if event[1] != "robot/intent"]
+    received = [event for event in events if event[1] != "robot/intent"]
     slower = functools.partial(decision.run, DecisionConfig(settings={"max_linear_speed": 0.15}))
     same = [(key, payload) for _, key, payload in events if key == "robot/intent"]
-    assert await replay(slower, heard) != same
+    assert await replay(slower, received) != same
 
 
 async def test_what_ends_a_node_ends_its_replay() -> None:

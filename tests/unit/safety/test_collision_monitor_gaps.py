@@ -141,9 +141,9 @@ async def test_h_nobody_can_switch_it_off() -> None:
         answers = [
             await stranger.query(service.at("safety"), b"", "", 0.1, "data") for service in SERVICES
         ]
-        heard = set(bench.bus.listens)
+        received = set(bench.bus.listens)
     assert answers == [[]] * len(SERVICES)
-    assert heard == {topic.at("*") for topic in MONITORED}  # what is measured, and no orders
+    assert received == {topic.at("*") for topic in MONITORED}  # what is measured, and no orders
 
 
 @pytest.mark.parametrize("degrees", range(-20, 21, 5))

@@ -66,13 +66,13 @@ def test_what_is_not_heard_says_neither_that_a_body_is_stuck_nor_that_it_is_froz
 
 
 def test_a_body_that_runs_away_on_a_line_that_comes_and_goes_is_still_found() -> None:
-    patrol, heard = under_way(REST), 0
+    patrol, received = under_way(REST), 0
     while "runaway" not in patrol.codes:
         connected = patrol.tick % 10 < 5
-        heard += connected
+        received += connected
         patrol.go(moves=AHEAD, connected=connected)
-        assert heard <= 15
-    assert heard == 15
+        assert received <= 15
+    assert received == 15
 
 
 def test_one_wheel_that_is_stuck_turns_the_body_and_is_found() -> None:

@@ -261,12 +261,12 @@ class FeetechDriver(Driver):
         return sum(servo.refused for servo in self._servos())
 
     def _health(self) -> LinkHealth:
-        heard_ns = min((servo.heard_ns for servo in self._servos()), default=0)
+        received_ns = min((servo.received_ns for servo in self._servos()), default=0)
         self.link.errors = self._bus.errors + self._refused()
         return replace(
             self.link.health,
             connected=not self.problem,
-            age_ms=max(0, self._clock.now_ns() - heard_ns) / 1e6,
+            age_ms=max(0, self._clock.now_ns() - received_ns) / 1e6,
         )
 
     async def _run(self) -> None:

@@ -59,7 +59,7 @@ class ServoJoint:
         self.refused = 0  # readings that were not believed
         self.position = 0.0  # [rad], the newest that is believed
         self.newest: ServoReadings | None = None
-        self.heard_ns = 0  # when the newest one was asked for
+        self.received_ns = 0  # when the newest one was asked for
         self._stall_torque = stall_torque
         self._full, self._gentle = round(torque_limit * 1000), round(grip_torque * 1000)
         self._last: ServoReadings | None = None  # believed or not
@@ -92,7 +92,7 @@ class ServoJoint:
         A servo that holds already keeps what it holds: any other goal would move it.
         """
         self.newest = self._last = now
-        self.heard_ns, self._speed = asked_ns, 0.0
+        self.received_ns, self._speed = asked_ns, 0.0
         self.position = self.calibration.to_radians(now.position)
         self._contact_ns = None
         holds = now.torque and abs(self.velocity) < AT_REST
@@ -105,7 +105,7 @@ class ServoJoint:
         settings and status, has to be read twice.
         """
         position = self.calibration.to_radians(now.position)
-        passed_s = (asked_ns - self.heard_ns) / 1e9
+        passed_s = (asked_ns - self.received_ns) / 1e9
         moved = position - self.position
         furthest = self.pushed_factor * self.description.max_speed * passed_s + JUMP_SLACK
         change = abs(moved - self._speed * passed_s)
@@ -115,7 +115,7 @@ class ServoJoint:
             self.refused += 1
             return
         self._speed = moved / passed_s if passed_s > 0.0 else 0.0
-        self.newest, self.position, self.heard_ns = now, position, asked_ns
+        self.newest, self.position, self.received_ns = now, position, asked_ns
 
     def command(self, position: float) -> float:
         """Go to a position [rad] within its limits; return the one that a tick stands for.
@@ -182,7 +182,7 @@ class ServoJoint:
 
     def lost(self, now_ns: int) -> str:
         """Return that it answers no more, or an empty text."""
-        silent = now_ns - self.heard_ns > self.lost_after_ns
+        silent = now_ns - self.received_ns > self.lost_after_ns
         return f"{self} answers no more: cable, power?" if silent else ""
 
     def measured(self) -> Joint | None:

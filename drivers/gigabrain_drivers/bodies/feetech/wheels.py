@@ -51,7 +51,7 @@ class ServoWheel:
         self.goal = 0  # ticks/s, as the servo counts them
         self.turned = 0  # ticks forward since the start
         self.refused = 0  # readings that were not believed
-        self.heard_ns = 0  # when the newest one was asked for
+        self.received_ns = 0  # when the newest one was asked for
         self.newest: ServoReadings | None = None
         self._direction, self._torque_limit = direction, round(torque_limit * 1000)
         self._last: ServoReadings | None = None  # believed or not
@@ -86,7 +86,7 @@ class ServoWheel:
     def begin(self, now: ServoReadings, asked_ns: int) -> None:
         """Believe a reading whatever was before."""
         self.newest = self._last = now
-        self.heard_ns, self.goal = asked_ns, 0
+        self.received_ns, self.goal = asked_ns, 0
         self._past.clear()
         self._past.append((asked_ns, self.turned))
 
@@ -97,11 +97,11 @@ class ServoWheel:
         """
         before, last, self._last = self.newest or now, self._last or now, now
         moved = (now.position - before.position + TICKS // 2) % TICKS - TICKS // 2
-        furthest = FASTEST * (asked_ns - self.heard_ns) / 1e9 + SLACK
+        furthest = FASTEST * (asked_ns - self.received_ns) / 1e9 + SLACK
         if abs(moved) > furthest or _seldom(now) != _seldom(last):
             self.refused += 1
             return 0
-        self.newest, self.heard_ns = now, asked_ns
+        self.newest, self.received_ns = now, asked_ns
         forward = self._direction * moved
         self.turned += forward
         self._past.append((asked_ns, self.turned))
@@ -128,7 +128,7 @@ class ServoWheel:
 
     def problem(self, now_ns: int) -> str:
         """Return what is wrong with it in one line, or an empty text."""
-        if now_ns - self.heard_ns > LOST_NS:
+        if now_ns - self.received_ns > LOST_NS:
             return f"{self} answers no more: cable, power?"
         if status := feetech.faults_of(self.status):
             return f"{self} protects itself: {status}"

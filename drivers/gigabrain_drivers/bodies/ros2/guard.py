@@ -40,16 +40,16 @@ class Guard:
         """`reached` tells whether the driver itself reaches the robot."""
         self._options, self._clock, self._reached = options, clock, reached
         self._process: asyncio.subprocess.Process | None = None
-        self._heard_ns: int | None = None
+        self._received_ns: int | None = None
         self._readers = 0
-        self._keeper: asyncio.Task[None] | None = None
+        self._task: asyncio.Task[None] | None = None
 
     @property
     def problem(self) -> str:
         """Why it could not stop the robot; empty while it could."""
-        if self._heard_ns is None:
+        if self._received_ns is None:
             return "the guard, which stops the robot if this driver dies, is starting"
-        if self._clock.now_ns() - self._heard_ns > LOST_NS:
+        if self._clock.now_ns() - self._received_ns > LOST_NS:
             return "the guard, which stops the robot if this driver dies, does not answer"
         if not self._readers:
             return "the guard, which stops the robot if this driver dies, does not reach it yet"
@@ -57,8 +57,8 @@ class Guard:
 
     def open(self) -> None:
         """Start it in the background."""
-        if self._keeper is None:
-            self._keeper = asyncio.create_task(self._keep(), name="guard")
+        if self._task is None:
+            self._task = asyncio.create_task(self._keep(), name="guard")
 
     def tell(self, *, moving: bool) -> None:
         """Tell it of a command that was sent."""
@@ -66,12 +66,12 @@ class Guard:
 
     async def close(self) -> None:
         """End it; nothing is left to guard."""
-        keeper, self._keeper = self._keeper, None
-        if keeper:
+        task, self._task = self._task, None
+        if task:
             self._write(QUIT)
-            keeper.cancel()
+            task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
-                await keeper
+                await task
 
     def _write(self, word: bytes) -> None:
         process = self._process
@@ -84,7 +84,7 @@ class Guard:
             try:
                 await self._run()
             finally:
-                self._process, self._heard_ns = None, None
+                self._process, self._received_ns = None, None
             await self._clock.sleep_ns(RESTART_NS)
 
     async def _run(self) -> None:
@@ -103,18 +103,18 @@ class Guard:
         alone_ns: int | None = None  # from its first word on
         try:
             while alone_ns is None or self._clock.now_ns() - alone_ns < LOST_NS:  # else: not joined
-                async with asyncio.timeout(START_S if self._heard_ns is None else LOST_NS / 1e9):
+                async with asyncio.timeout(START_S if self._received_ns is None else LOST_NS / 1e9):
                     line = await process.stdout.readline()
                 if not line:
                     return
-                self._heard_ns, self._readers = self._clock.now_ns(), int(line)
+                self._received_ns, self._readers = self._clock.now_ns(), int(line)
                 if alone_ns is None or self._readers or not self._reached():
-                    alone_ns = self._heard_ns
+                    alone_ns = self._received_ns
         except TimeoutError:
             return
         finally:
             process.stdin.close()  # it ends by that
-            if self._keeper:  # it is replaced, and may hang
+            if self._task:  # it is replaced, and may hang
                 with contextlib.suppress(ProcessLookupError):
                     process.kill()
 

@@ -58,7 +58,7 @@ class RosLink:
         self._topics: list[tuple[str, str, Qos, Take]] = []
         self._faults: dict[str, Fault] = {}
         self._command: RosPublisher | None = None
-        self._keeper: asyncio.Task[None] | None = None
+        self._task: asyncio.Task[None] | None = None
         self._types: Types | None = None
 
     def __str__(self) -> str:
@@ -81,16 +81,16 @@ class RosLink:
 
     def open(self) -> None:
         """Join in the background. Return at once."""
-        if self._keeper is None:
+        if self._task is None:
             self.problem = "joining ROS 2"
-            self._keeper = asyncio.create_task(self._keep_open(), name=f"link {self}")
+            self._task = asyncio.create_task(self._keep_open(), name=f"link {self}")
 
     async def close(self) -> None:
         """Leave ROS 2. May be called any number of times."""
-        keeper, self._keeper = self._keeper, None
-        if keeper:
-            keeper.cancel()
-            _, late = await asyncio.wait((keeper,), timeout=CLOSE_S)
+        task, self._task = self._task, None
+        if task:
+            task.cancel()
+            _, late = await asyncio.wait((task,), timeout=CLOSE_S)
             if late:
                 log.warning("%s: it has not been left within %g s", self, CLOSE_S)
         self.problem = "closed"

@@ -60,20 +60,20 @@ class Lds03Device(Device):
 
     def reset(self) -> None:
         """Come to rest."""
-        self._heard = b""
+        self._received = b""
         self._waiting: list[Sample] = []
         self._begins = False
         self._sweep.stop()
 
     def feed(self, data: bytes) -> None:
         """Obey the newest command."""
-        self._heard += data
-        start, stop = self._heard.rfind(lds03.START), self._heard.rfind(lds03.STOP)
+        self._received += data
+        start, stop = self._received.rfind(lds03.START), self._received.rfind(lds03.STOP)
         if start > stop:
             self._sweep.start(LDS03_SAMPLES_HZ, LDS03_HZ)
         elif stop >= 0:
             self._sweep.stop()
-        self._heard = b"" if max(start, stop) >= 0 else self._heard[-COMMAND_BYTES:]
+        self._received = b"" if max(start, stop) >= 0 else self._received[-COMMAND_BYTES:]
 
     def step(self, now_ns: int) -> None:
         """Send all whole packets that were measured; none crosses 0 degrees."""

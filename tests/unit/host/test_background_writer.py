@@ -14,8 +14,8 @@ async def test_who_waits_hears_of_any_exception_and_the_next_is_written() -> Non
         written.append(items)
         return ""
 
-    scribe = BackgroundWriter(write, room=4)
-    assert await scribe.put(1) == "ValueError: cannot encode that"
-    assert await scribe.put(2) == ""
+    writer = BackgroundWriter(write, room=4)
+    assert await writer.put(1) == "ValueError: cannot encode that"
+    assert await writer.put(2) == ""
     assert written == [(2,)]
-    await scribe.close()
+    await writer.close()
