@@ -1,4 +1,4 @@
-"""What each kind of device sends when all is well."""
+"""Valid sample bytes of each device's protocol."""
 
 from typing import Any
 
@@ -26,7 +26,7 @@ def state_of_alpha(**changes: Any) -> alpha.State:
 
 
 def samples(template: Template) -> dict[str, bytes]:
-    """What each kind of device sends when all is well."""
+    """Return valid bytes of each protocol, by its name."""
     ranges = tuple(range(500, 512))
     five = tuple(lds03.Lds03Sample(float(n), 500 + n, 80, False) for n in range(5))
     nodes = [encode_node(n * 10.0, 500.0, quality=20, begins=n % 36 == 0) for n in range(80)]

@@ -1,4 +1,4 @@
-"""What must hold for whatever comes in on a body's or a lidar's line, serial or TCP."""
+"""Fuzz checks of the bytes on a body's or a lidar's line, serial or TCP."""
 
 import functools
 import math
@@ -153,7 +153,7 @@ def said(driver: Any) -> Message:
 
 
 def valid(message: Message) -> None:
-    """What the bus would carry, the others would take."""
+    """Assert that a receiver could decode the message, and that its numbers are finite."""
     finite(codec_of(type(message)).decode(encode(clipped(message))))
 
 

@@ -1,4 +1,4 @@
-"""What must hold for every payload that the bus may be handed."""
+"""Fuzz checks of the payloads of the bus, for every type of message."""
 
 import itertools
 import math
@@ -95,7 +95,7 @@ def looked_at(picture: DepthImage) -> None:
 
 
 def planned_by(world: WorldModel) -> None:
-    """What its contours mean can be told and planned by."""
+    """Assert that its contours can be merged and remembered, and that all points are finite."""
     merged = ContourFilter(Counter()).merged(world, WAFFLE)
     assert len(merged.contours) <= len(world.contours)
     memory = ContourMemory()

@@ -1,4 +1,4 @@
-"""What must hold for small files that are read back, and for words that people type."""
+"""Fuzz checks of small files that are read back, and of words that people type."""
 
 import contextlib
 import fcntl
@@ -62,7 +62,7 @@ def record(data: bytes) -> None:
 
 
 def typed(data: bytes) -> None:
-    """What cannot be understood is refused in one line."""
+    """Assert that typed text is parsed, or refused with ConfigError or ValueError."""
     text = data.decode(errors="replace")
     for parse in PARSERS:
         with contextlib.suppress(ConfigError, ValueError):

@@ -1,4 +1,4 @@
-"""What must hold for whatever stands in the file of a robot, a deployment or a world."""
+"""Fuzz checks of the files of robots, deployments and worlds."""
 
 import math
 from collections.abc import Callable, Iterator
