@@ -48,7 +48,7 @@ class Robot(NodeBench):
             self.send(SCAN, self.scan(y=0.0 if still else None))
 
     async def save(self, name: str, *, replace: bool = False) -> MapReply:
-        """What perception answers."""
+        """Ask perception to save the map, and return its reply. Time advances meanwhile."""
         bus = Bus(self.network.transport(), self.clock, "test")
         request = MapRequest(name=name, replace=replace)
         patient = bus.ask(MAP_SAVE, request, timeout_s=600.0)  # by the clock below, which runs fast

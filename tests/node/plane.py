@@ -116,7 +116,7 @@ class Plane:
         raise AssertionError(f"at ({self.x:.2f}, {self.y:.2f}): {self.intent.reason}")
 
     async def ask(self, service: Service[Q, R], request: Q) -> R:
-        """What the node answers, while time goes on."""
+        """Ask the node, and return its reply. Time advances meanwhile."""
         asking = asyncio.ensure_future(self.operator.ask(service, request, timeout_s=30.0))
         while not asking.done():
             await self._tick()
@@ -191,7 +191,7 @@ class Plane:
         return msgspec.structs.replace(seen, boot=self.boot, tick=self.tick, basis=self.tick)
 
     def _ranges(self) -> NDArray[np.float64]:
-        """What 360 beams find, in steps of half a cell."""
+        """Return the ranges [m] of 360 beams, in steps of half a cell; inf without a hit."""
         reach = np.arange(0.0, 3.5, CELL / 2)
         angles = self.yaw + np.radians(np.arange(360.0))
         columns = ((self.x + np.outer(np.cos(angles), reach)) / CELL).astype(int)
@@ -211,7 +211,7 @@ class Plane:
         inside: NDArray[np.bool_],
         there: NDArray[np.bool_],
     ) -> None:
-        """What a beam has passed or hit is known from now on."""
+        """Mark the cells that the beams have passed or hit as known."""
         passed = inside & (np.cumsum(there, axis=1) - there == 0)
         r, c = rows[passed], columns[passed]
         self.known[r, c] = self.cells[r, c]

@@ -1,4 +1,4 @@
-"""What viewers are shown of an arm's plan, and that nothing is made while nobody looks."""
+"""Arm plans for viewers: the tool's path and its grasps. Without a viewer none is made."""
 
 from pathlib import Path
 from typing import Any

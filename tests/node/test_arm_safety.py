@@ -109,12 +109,12 @@ class Rig:
 
     @property
     def posture(self) -> NDArray[np.float64]:
-        """Where the joints are by the physics, not by their encoders."""
+        """Return the joint angles of the physics, not of their encoders [rad]."""
         return np.array([self._joint(name).qpos[0] for name in self.names])
 
     @property
     def speeds(self) -> NDArray[np.float64]:
-        """How fast the joints are by the physics [rad/s]."""
+        """Return the joint speeds of the physics [rad/s]."""
         return np.array([self._joint(name).qvel[0] for name in self.names])
 
     def _joint(self, name: str) -> Any:
@@ -170,7 +170,7 @@ def test_a_hostile_commander_brings_the_arm_to_touch_nothing(seed: int) -> None:
 
 
 def rests_for(rig: Rig, code: str, posture: tuple[float, ...]) -> bool:
-    """Whether the arm rests for this cause, a tick later on its way to a posture."""
+    """Command a posture for one tick, and return whether the arm rests for this cause."""
     rig.tick(position=posture)
     causes = rig.gate.safety.causes if rig.gate.safety else ()
     return code in [cause.code for cause in causes] and bool(np.abs(rig.speeds).max() < REST)

@@ -1,4 +1,4 @@
-"""What decision makes of messages that nobody would send."""
+"""Extreme messages to decision: speeds are limited, and it still reaches its goal."""
 
 import msgspec
 
@@ -36,7 +36,7 @@ async def test_the_brains_own_commands_count_as_the_gate_lets_them_through() -> 
 
 
 def said(plane: Plane, topic: object) -> Message | None:
-    """What the robot itself says on `topic` now."""
+    """Return the robot's own map, state or body at this tick; None for other topics."""
     match topic:
         case topics.MAP:
             return as_map(plane.known, plane.tick, plane.boot)

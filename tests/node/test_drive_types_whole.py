@@ -1,4 +1,4 @@
-"""What only some drive types can do, by a whole robot with its body in MuJoCo."""
+"""Manoeuvres that only some drive types can do, by a whole robot with its body in MuJoCo."""
 
 import itertools
 import math

@@ -81,7 +81,7 @@ there = foreign_behaviours:There
 
 @pytest.fixture(autouse=True)
 def package(site: Path) -> None:
-    """What pip makes of such a package."""
+    """Write the package's module and metadata into `site`, as pip does."""
     info = site / "foreign_behaviours-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text(

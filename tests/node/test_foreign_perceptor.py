@@ -64,7 +64,7 @@ class People:
 
 @pytest.fixture
 def package(site: Path) -> None:
-    """What pip makes of such a package, and of a broken one."""
+    """Write two modules and their metadata into `site`, as pip does; `ghost_node` is broken."""
     info = site / "people-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: people\nVersion: 1.0\n")

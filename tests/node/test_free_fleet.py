@@ -1,4 +1,4 @@
-"""What Open-RMF's free_fleet adapter asks and reads, in memory: each request, each answer."""
+"""Open-RMF's free_fleet adapter, in memory: its requests, our answers and our topics."""
 
 import math
 import random

@@ -19,7 +19,7 @@ PER_TICK = 100  # 20000 payloads in all
 
 
 async def speeds(folder: Path, resume: Resume, per_tick: int) -> list[float]:
-    """What the body did in each tick while so many payloads came in each."""
+    """Return the body's speed in each tick [m/s], with `per_tick` payloads delivered before it."""
     payloads = flood(seed=3)
     async with RobotInMemory(folder, resume=resume) as robot:
         for _ in range(TICKS):

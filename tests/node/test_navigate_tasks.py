@@ -1,4 +1,4 @@
-"""What there is to do, and the node that does it: pauses, exploring, roaming, restarts."""
+"""Tasks, and the node that carries them out: pauses, exploring, roaming, restarts."""
 
 import asyncio
 import math

@@ -47,7 +47,7 @@ class ShuffledEnd(LocalTransport):
 
     @property
     def states_pending(self) -> int:
-        """How many ticks this process is behind."""
+        """Return the number of ticks that this process is behind."""
         return sum(key == STATE.key for key, _, _ in self.pending)
 
     def deliver_one(self, draw: random.Random) -> None:
@@ -110,7 +110,10 @@ async def drive(folder: Path, seed: int, ticks: int) -> Story:
 
 
 def story(network: LocalNetwork) -> Story:
-    """What the states say; the first tick is announced until the brain is there, so only once."""
+    """Return tick, mode, velocity and pose of each state, once for each tick.
+
+    The first tick is published again and again until the brain is there.
+    """
     decode = msgspec.msgpack.Decoder(RobotState).decode
     states = {(s := decode(data)).tick: s for key, data in network.sent if key == STATE.key}
     return [(s.tick, s.gate.mode, s.velocity, s.pose) for s in states.values()]

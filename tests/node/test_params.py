@@ -44,7 +44,7 @@ def root_level() -> Iterator[None]:
 
 
 async def wants(name: str, value: str, *, ahead: bool) -> list[Velocity | None]:
-    """What the behaviour `avoid` wants before a parameter is set, and after."""
+    """Return the velocities that `avoid` wants, before and after a parameter is set."""
     wanted, world = [], WorldModel(scan_ok=True, obstacle_ahead=False, sectors=MORE_ROOM_LEFT)
     async with NodeBench(functools.partial(decision.run, DecisionConfig())) as bench:
         for tick in (10, 20):

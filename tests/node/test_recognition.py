@@ -58,7 +58,7 @@ class SeesABall:
 
 
 class Robot:
-    """What the driver, the cameras and perception publish, and what recognition says."""
+    """A stand-in for a robot's driver and cameras, with the detections received."""
 
     def __init__(self, bus: Bus, clock: FakeClock, recognition: Recognition, net: SeesABall):
         self.bus, self.clock, self.recognition, self.net = bus, clock, recognition, net

@@ -1,4 +1,4 @@
-"""What the gateway tells of the ROS graph: our keys, what does not match, and clocks."""
+"""The gateway's report on the ROS graph: our keys, QoS mismatches, and clocks."""
 
 from gigabrain_zenoh.config.settings import Ros2Config
 from gigabrain_zenoh.gateway.topic_list import rows

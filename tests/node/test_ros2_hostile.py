@@ -1,4 +1,4 @@
-"""What other nodes of ROS may send at random: the gateway bears it, and works afterwards."""
+"""Mutated messages and requests of other ROS nodes: the gateway works on afterwards."""
 
 import random
 

@@ -78,7 +78,7 @@ TABLE = {
 
 
 class Driver:
-    """What a robot's processes publish, by hand."""
+    """A stand-in for a robot's processes, which publishes their messages."""
 
     def __init__(self, bus, gateway_bus, node, clock):
         self.bus, self.gateway_bus, self.node, self.clock, self.tick = (

@@ -1,4 +1,4 @@
-"""What raises in a thread, or in a handler of messages, ends its process."""
+"""An exception in a thread, or in a handler of messages, ends its process."""
 
 import asyncio
 from collections.abc import Callable
