@@ -39,19 +39,19 @@ def stages() -> list[list[Step]]:
 
 
 def only(steps: list[Step], word: str) -> str:
-    """What follows the one instruction of that kind."""
+    """Return the text after the one instruction of that kind."""
     (rest,) = (rest for each, rest in steps if each == word)
     return rest
 
 
 def extras() -> set[str]:
-    """What the image installs beside the base."""
+    """Return the names of the extras that the image installs."""
     (named,) = re.findall(r"pip install .*'\.\[(.*)\]'", only(stages()[0], "RUN"))
     return set(named.split(","))
 
 
 def command() -> list[str]:
-    """What the image starts unless it is told otherwise."""
+    """Return the default command of the image: its ENTRYPOINT and CMD."""
     final = stages()[-1]
     return [*json.loads(only(final, "ENTRYPOINT")), *json.loads(only(final, "CMD"))]
 
@@ -89,7 +89,7 @@ class Image:
         return subprocess.Popen(command(), cwd=work, env=self._env(), start_new_session=True)
 
     def healthy(self) -> bool:
-        """Whether the HEALTHCHECK is content."""
+        """Run the HEALTHCHECK, and return whether it succeeds."""
         check = only(stages()[-1], "HEALTHCHECK").partition("CMD ")[2]
         return not subprocess.run(
             ("sh", "-c", self._here(check)), stdout=subprocess.DEVNULL
@@ -119,7 +119,7 @@ class Image:
 
 
 def fault_of(image: Image, started: subprocess.Popen[bytes]) -> str:
-    """Why it did not become healthy, or not end; nothing where it did both."""
+    """Wait until it is healthy, then stop it. Return the fault; an empty text without one."""
     end_s = time.monotonic() + HEALTHY_S
     while not image.healthy():
         if started.poll() is not None:

@@ -1,7 +1,7 @@
-"""How long the sentences of README.md and docs/ are: `python -m tests.qa.sentences`.
+"""Measure the sentences of README.md and docs/: `python -m tests.qa.sentences`.
 
-Code, tables, headings, links' targets and comments are no sentences. An item of a list is one by
-itself; a colon before a list or a block ends one. Prints each page's mean and the longest.
+Code, tables, headings, links' targets and comments are left out. An item of a list is a sentence
+by itself; a colon before a list or a block ends one. Prints each page's mean and the longest.
 """
 
 import re

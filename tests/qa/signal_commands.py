@@ -1,4 +1,4 @@
-"""How each command is called when signals are sent to it, and the exit codes it may end with."""
+"""Command lines for the signal sweep, and the exit codes that each command may end with."""
 
 # `{robot}`: the router of a robot that runs; `{router}`: a router without a robot; `{port}`: a free
 # port; `{file}`: a name for a new file; the rest are files of `tests.qa.signal_sweep.Stage`

@@ -47,9 +47,9 @@ class Trial(Struct, frozen=True, kw_only=True):
 
 
 class Stage:
-    """What the commands need: a robot, a router without one, files; and folders of their own.
+    """The surroundings of the commands: a robot, a bare router, files, and folders of their own.
 
-    Without `robot` there is only a router, which tools take for one.
+    Without `robot` there is only a router, which tools take for a robot.
     """
 
     def __init__(self, folder: Path, *, robot: bool = True) -> None:
@@ -79,7 +79,7 @@ class Stage:
             raise RuntimeError(done.stderr.decode())
 
     def words(self, command: str) -> list[str]:
-        """What to type."""
+        """Return the words of its command line, with a new name and a free port."""
         name = f"new_{next(self._names)}"
         places = {
             "robot": self.robot,
@@ -121,7 +121,7 @@ class Stage:
 
 
 def handled(pid: int, number: int) -> bool:
-    """Whether a process has a handler for a signal (proc(5): SigCgt)."""
+    """Return whether a process has a handler for a signal (proc(5): SigCgt)."""
     with contextlib.suppress(OSError):
         for line in Path(f"/proc/{pid}/status").read_text().splitlines():
             if line.startswith("SigCgt:"):
@@ -130,7 +130,7 @@ def handled(pid: int, number: int) -> bool:
 
 
 def without_processor_s(pid: int) -> float:
-    """How long the threads of a process have waited for a processor (schedstat)."""
+    """Return the time that a process's threads have waited for a processor [s] (schedstat)."""
     waited_ns = 0
     for path in Path(f"/proc/{pid}/task").glob("*/schedstat"):
         with contextlib.suppress(OSError):
@@ -149,7 +149,10 @@ def left_behind(mark: str) -> list[int]:
 
 
 def life_s(stage: Stage, command: str) -> tuple[float, int | None]:
-    """How long a command lives without a signal, and its exit code; None where it goes on."""
+    """Run a command without a signal. Return the time it ran [s], and its exit code.
+
+    A command that runs for LONGEST_S is killed; its exit code is None.
+    """
     began_s, mark = time.monotonic(), uuid.uuid4().hex
     process = stage.start(command, mark)
     try:
@@ -255,7 +258,7 @@ def sweep(commands: Sequence[str], moments: range, seed: int, results: Path) -> 
 
 
 def read(results: Path) -> list[Trial]:
-    """What was tried before."""
+    """Return the trials of earlier calls; none where the file is missing."""
     lines = results.read_bytes().splitlines() if results.exists() else []
     return [msgspec.json.decode(line, type=Trial) for line in lines]
 
