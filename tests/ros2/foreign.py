@@ -74,7 +74,7 @@ def javascript() -> Path:
 
 
 class JavaScriptNode(NamedTuple):
-    """What a program needs that is a node by rclnodejs."""
+    """The modules and the environment that a program needs for a node of rclnodejs."""
 
     modules: Path  # its folder node_modules
     environment: dict[str, str]

@@ -79,7 +79,7 @@ class Program:
 
     @property
     def errors(self) -> str:
-        """What it has written to standard error."""
+        """Return the text that it has written to standard error."""
         return self._errors.read_text()
 
     def send(self, do: str, **fields: Any) -> int:

@@ -137,7 +137,7 @@ class BatteryState(IdlStruct):
 
 
 class Adapter:
-    """What Open-RMF knows of one robot, and asks it."""
+    """Open-RMF's side of one robot: keeps its frames, battery and feedback, and asks it."""
 
     def __init__(self, session: zenoh.Session, robot: str) -> None:
         self.session, self.robot = session, robot

@@ -1,7 +1,7 @@
-"""What the rclpy programs have in common: commands in on stdin, events out on stdout, as JSON.
+"""Common parts of the rclpy programs: commands in on stdin, events out on stdout, as JSON.
 
 A command is a line `{"do": name, "id": number, ...}`; the answer is an event with the same name and
-id. A program ends when its stdin does, and by the exception of a command that cannot be obeyed.
+id. A program ends when its stdin ends, or with the exception of a command that fails.
 Times are of the monotonic clock, which all processes of a machine share.
 """
 

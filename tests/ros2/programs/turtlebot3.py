@@ -38,7 +38,7 @@ VOLTS = 12.0
 
 @dataclass(frozen=True)
 class Lidar:
-    """What one model publishes."""
+    """The scan properties of one lidar model."""
 
     hz: float
     samples_per_s: float
