@@ -74,7 +74,7 @@ def state(pid: int) -> str:
 
 
 def alive(pid: int) -> bool:
-    """Whether a process runs; a zombie, which its new parent may not have reaped yet, does not."""
+    """Return whether a process runs. A zombie that is not reaped yet does not."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

@@ -151,7 +151,7 @@ class Fake:
         self.robot.publish(INTENT, intent)
 
     def say_once(self) -> None:
-        """What is kept for those who come late."""
+        """Publish the kept topics once: body, map, objects and task."""
         body = load_robot("turtlebot3_waffle").description()
         self.robot.publish(BODY, Body(description=body, link="sim"))
         cells = np.zeros((SIDE, SIDE), np.int8)

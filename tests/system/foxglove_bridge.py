@@ -36,7 +36,7 @@ class Bridge:
 
     @property
     def patterns(self) -> list[str]:
-        """What is subscribed on the bus."""
+        """Return the keys that are subscribed on the bus."""
         return [key for key, _ in self._network._listeners]
 
     @property

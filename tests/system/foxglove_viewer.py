@@ -61,7 +61,7 @@ class Viewer:
         await self._socket.send(SAY.pack(1, channel) + data)
 
     async def call(self, service: str, content: object = None) -> dict[str, Any]:
-        """What a service answers."""
+        """Call a service once it is advertised, and return its answer."""
         while service not in self.services:
             await self._hear()
         self._calls += 1

@@ -56,7 +56,7 @@ class Site:
         await self._join(at)
 
     def as_(self, name: str, namespace: str = "") -> Endpoint:
-        """Where somebody finds the router."""
+        """Return the endpoint for a client of the router with the keys `name`."""
         keys = str(self.fleet / name)
         return Endpoint(connect=(self.address,), namespace=namespace, keys=keys)
 

@@ -39,7 +39,7 @@ def waffle(world: str = "arena") -> EmulatedBody:
 
 @functools.cache
 def truth() -> NDArray[np.float32]:
-    """What the simulation's own lidar sees from where the body stands, (360,) [m]."""
+    """Return the scan of the simulation's own lidar, from the body's place, (360,) [m]."""
     return waffle().simulation.scan()
 
 

@@ -4,7 +4,7 @@ from gigabrain_drivers.links.link import Link
 
 
 class Heard:
-    """What a link told its owner."""
+    """The bytes, openings and losses that a link has reported."""
 
     def __init__(self, link: Link) -> None:
         self.data, self.opened, self.lost = b"", 0, list[str]()

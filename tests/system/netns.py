@@ -34,7 +34,7 @@ class Namespace:
 
     @property
     def inside(self) -> tuple[str, ...]:
-        """What to put before a command so that it runs in here."""
+        """Return the words before a command that make it run in this namespace."""
         return ("nsenter", f"--net=/proc/{self.pid}/ns/net", "--")
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""What each role may say, ask and answer: on a real router, over TLS, key by key."""
+"""Rights of each role to publish, ask and answer: on a real router, over TLS, key by key."""
 
 import asyncio
 from collections.abc import AsyncIterator

@@ -48,7 +48,7 @@ class Rig:
         return self.station.device
 
     async def commanding(self) -> None:
-        """What the driver's process does every 20 ms."""
+        """Read the state and send the velocity every 20 ms, as the driver's process does."""
         while True:
             self.connected.append((await self.driver.read_state()).link.connected)
             if self.streaming:

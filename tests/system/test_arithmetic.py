@@ -1,4 +1,4 @@
-"""How numpy computes: the same on every x86-64 processor for recorded drives, and in one thread."""
+"""Arithmetic of numpy: the same on every x86-64 processor for recorded drives, in one thread."""
 
 import os
 import platform
@@ -46,7 +46,7 @@ print(os.environ["OPENBLAS_NUM_THREADS"], len(os.listdir("/proc/self/task")))
 
 
 def printed(code: str, **env: str) -> str:
-    """What a program prints that starts with numpy's own settings, but for `env`."""
+    """Return the output of a program that starts with numpy's own settings, except for `env`."""
     own = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
     command = (sys.executable, "-W", "error", "-c", code)
     return subprocess.run(command, capture_output=True, text=True, check=True, env=own | env).stdout

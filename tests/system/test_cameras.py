@@ -91,7 +91,7 @@ async def test_without_opengl_one_line_says_so_and_the_robot_drives_as_without_c
 
 
 def told(path: Path) -> dict[str, Any]:
-    """What a run did, without how fast this machine was."""
+    """Return the results of a run that do not depend on how fast this machine is."""
     report = json.loads(path.read_bytes())
     names = ("sim_seconds", "distance_m", "turns", "min_clearance_m", "contacts", "true_x")
     return {name: report.get(name) for name in names}

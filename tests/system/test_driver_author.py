@@ -1,4 +1,4 @@
-"""What `gigabrain driver new` writes is a package that passes the kit; what breaks it does not."""
+"""Packages of `gigabrain driver new`: they pass the kit as written, and fail with a mistake."""
 
 import tomllib
 from pathlib import Path
@@ -13,7 +13,7 @@ from gigabrain_zenoh.qa.conformance.driver_checks import CheckedRobot
 
 
 def installed(folder: Path, site: Path) -> Path:
-    """What pip makes of a package: its modules, and beside them what says so; the folder."""
+    """Move a package into `site` and write its metadata, as pip does; return its new folder."""
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
     lines = [
         f"[{group}]\n" + "\n".join(f"{name} = {where}" for name, where in points.items())

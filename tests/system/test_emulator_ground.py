@@ -1,4 +1,4 @@
-"""What emulators stand on: ptys that can be unplugged, faults, stations, and their process."""
+"""The base of the emulators: ptys that can be unplugged, faults, stations, and their process."""
 
 import asyncio
 import os

@@ -24,7 +24,7 @@ LONGEST_S = 300.0
 
 
 class Example(NamedTuple):
-    """How a program is run, and what it leaves."""
+    """The arguments of a program, a part of its output, and the files that it makes."""
 
     arguments: tuple[str, ...] = ()  # ENDPOINT and DRIVE stand for those of the robot
     prints: str = ""

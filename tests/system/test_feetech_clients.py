@@ -23,7 +23,7 @@ PATIENCE = [3.0, 20.0]  # [s] that the arm gets to move; the longer where the ma
 
 
 async def told(package: str, program: str, port: Path, seconds: float) -> dict[str, Any]:
-    """What a client has seen."""
+    """Run a client, and return the JSON that it prints."""
     uv = [sys.executable, "-m", "uv", "run", "-q", "--isolated", "--no-project"]
     command = [*uv, "--with", package, "python", str(PROGRAMS / program), str(port), str(seconds)]
     client = await asyncio.create_subprocess_exec(
@@ -36,7 +36,10 @@ async def told(package: str, program: str, port: Path, seconds: float) -> dict[s
 
 
 async def moved(package: str, program: str, port: Path) -> dict[str, Any]:
-    """What a client has seen of an arm that had the time to move."""
+    """Run a client that moves the arm, and return the JSON that it prints.
+
+    Where the arm misses its goals, the client runs again, for longer.
+    """
     for seconds in PATIENCE:
         async with emulated_arm(port) as (arm, body):
             for joint, servo, at in zip(body.free.values(), arm.servos.values(), HOME, strict=True):

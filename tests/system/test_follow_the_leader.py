@@ -38,7 +38,7 @@ class HomeWithExample(Home):
 
 
 def install(site: Path) -> None:
-    """What pip makes of the example."""
+    """Copy the example into `site` and write its metadata, as pip does."""
     project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text())["project"]
     info = site / "follow_the_leader-0.1.0.dist-info"
     info.mkdir(parents=True)

@@ -37,7 +37,7 @@ ENTRY_POINTS = f"""[gigabrain.drivers]
 
 @pytest.fixture
 def package(site: Path) -> Path:
-    """What pip makes of such a package; its folder."""
+    """Write the package and its metadata into `site`, as pip does; return the package's folder."""
     folder = site / f"{NAME}_driver"
     info = site / f"{NAME}-1.0.dist-info"
     folder.mkdir()

@@ -60,7 +60,7 @@ real:
 
 @pytest.fixture(autouse=True)
 def package(site: Path) -> None:
-    """What pip makes of such a package."""
+    """Write the package's module and metadata into `site`, as pip does."""
     info = site / f"{NAME}-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {NAME}\nVersion: 1.0\n")

@@ -55,7 +55,7 @@ async def run(config, bus, ready):
 
 @pytest.fixture(autouse=True)
 def package(site: Path) -> Path:
-    """What pip makes of such a package."""
+    """Write the package's modules and metadata into `site`, as pip does; return `site`."""
     info = site / "lamp-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: lamp\nVersion: 1.0\n")

@@ -1,4 +1,4 @@
-"""Who may connect to the Foxglove bridge, how many, and what becomes of those who do not read."""
+"""Connections to the Foxglove bridge: origins, the limit of 16, and viewers that do not read."""
 
 import asyncio
 import contextlib
@@ -96,7 +96,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 async def first(port: int) -> tuple[bytes, asyncio.StreamWriter]:
-    """What somebody who connects hears first."""
+    """Connect as a viewer. Return the first bytes received (at most 20), and the writer."""
     reader, writer = await asyncio.open_connection("127.0.0.1", port)
     writer.write(HEAD.format("X: y").encode())
     return await reader.read(20), writer

@@ -1,4 +1,4 @@
-"""Who steers from Foxglove, who may not, and who only disturbs."""
+"""Steering from Foxglove: the secret topic, two viewers, invalid velocities, and noise."""
 
 import asyncio
 import contextlib

@@ -1,4 +1,4 @@
-"""Where compiled functions are kept."""
+"""Cache folders of compiled functions."""
 
 import os
 import subprocess

@@ -39,7 +39,7 @@ def options(folder: Path = Path()) -> ScanOptions:
 
 
 def scans_of(source: SerialSource, clock: FakeClock, pieces: list[bytes]) -> list[LaserScan]:
-    """What a source makes of pieces that come 10 ms apart."""
+    """Feed pieces to a source, 10 ms apart, and return its scans."""
     found: list[LaserScan] = []
     source.emit = found.append
     for piece in pieces:

@@ -53,7 +53,7 @@ class Terminal:
 
     @property
     def running(self) -> bool:
-        """Whether the command still runs; reads what it has shown meanwhile."""
+        """Return whether the command still runs. Also reads its new output."""
         try:
             while data := os.read(self._screen, 65536):
                 self.shown += data.decode()
@@ -64,7 +64,7 @@ class Terminal:
         return self._process.poll() is None
 
     def shows(self, text: str) -> bool:
-        """Whether the newest page says `text`."""
+        """True while the command runs and its newest page contains `text`."""
         return self.running and any(text in line for line in self.page())
 
     def page(self) -> list[str]:

@@ -53,7 +53,7 @@ class Site:
         self.homes[host].start("up", str(file), "--host", host)
 
     def records(self, process: str, event: str) -> list[dict[str, Any]]:
-        """What a process on the robot has logged of one kind."""
+        """Return the log records of one event, by a process on the robot."""
         (path,) = self.homes["robot"].folder.glob(f"state/gigabrain/runs/*/{process}.jsonl")
         records = [json.loads(line) for line in path.read_text().splitlines()]
         return [record for record in records if record["event"] == event]

@@ -26,7 +26,7 @@ MS = 1_000_000
 
 
 class Wire:
-    """What the board answers."""
+    """A wire that keeps the answers of the board."""
 
     def __init__(self) -> None:
         self._decoder = DynamixelDecoder()
@@ -271,7 +271,7 @@ def _until(true: Callable[[], bool]) -> None:
 
 
 def _told(answer: tuple[Any, ...]) -> list[Any]:
-    """What the SDK read, once it says that all went well."""
+    """Assert that the SDK reports success. Return the first value that it read, as a list."""
     *values, result, error = answer
     assert (result, error) == (dynamixel_sdk.COMM_SUCCESS, 0)
     return values[:1]

@@ -123,20 +123,20 @@ class Robot:
 
     @property
     def stops(self) -> set[str]:
-        """Why the gate did not let it drive all the time."""
+        """Return the gate's modes and causes of all states in which it was not enabled."""
         assert self.states
         shut = [state.gate for state in self.states if state.gate.mode != "enabled"]
         return {f"{gate.mode}: {[cause.text for cause in gate.causes]}" for gate in shut}
 
     @property
     def moves(self) -> bool:
-        """Whether it moves now, and may."""
+        """True while the gate is enabled and the robot turns."""
         now = self.states[-1]
         return now.gate.mode == "enabled" and now.velocity.angular_z > 0.25
 
     @property
     def problems(self) -> str:
-        """What the router says of silent processes."""
+        """Return the problems in the router's health as one text."""
         router = self.health.get("router")
         return "; ".join(one.text for one in router.problems) if router else ""
 

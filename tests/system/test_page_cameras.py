@@ -1,4 +1,4 @@
-"""What the page shows of cameras: pictures with what is recognised, contours, and things."""
+"""Cameras on the page: pictures with what is recognised, contours, and things."""
 
 import asyncio
 from collections.abc import AsyncIterator

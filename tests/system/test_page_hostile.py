@@ -1,4 +1,4 @@
-"""What a WebSocket client may send to the page's server, and what becomes of it."""
+"""Hostile WebSocket clients of the page's server: they are cut off and move nothing."""
 
 import asyncio
 import contextlib

@@ -1,4 +1,4 @@
-"""What the page draws of a robot that says all there is to say."""
+"""The page's map of a robot that publishes on all topics."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
@@ -34,7 +34,7 @@ async def chromium(fake: Fake, tmp_path_factory: pytest.TempPathFactory) -> Asyn
 
 
 async def colour(page: Page, x: float, y: float) -> tuple[int, ...]:
-    """What is drawn at a place of the map [m]; the robot, at (0.5, 0), is in the middle."""
+    """Return the RGBA pixel at a place of the map [m]; the robot, at (0.5, 0), is in the middle."""
     pixel = await page.evaluate(
         """([x, y]) => {
           const canvas = document.getElementById('map'), ratio = devicePixelRatio

@@ -1,4 +1,4 @@
-"""What `gigabrain process new` writes runs, and its test passes, as it is."""
+"""Packages of `gigabrain process new`: they run, and their test passes, as written."""
 
 import asyncio
 import os
@@ -22,7 +22,7 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 
 
 def install(folder: Path, site: Path) -> None:
-    """What pip makes of a package: its modules, and beside them what says so."""
+    """Move a package into `site` and write its metadata, as pip does."""
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
     info = site / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
     info.mkdir(parents=True)

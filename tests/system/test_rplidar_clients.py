@@ -50,7 +50,7 @@ async def booted(its: RplidarOptions) -> AsyncIterator[None]:
 
 
 def wrong(points: Iterable[Point]) -> tuple[int, int]:
-    """How many of the points that saw something are not where the simulation sees something."""
+    """Return the number of points with a range, and of those that the simulation contradicts."""
     expected, seen, off = truth(), 0, 0
     for angle, distance in points:
         if not 0 < distance < 3450:

@@ -1,4 +1,4 @@
-"""Which robots run here: the notes that supervisors leave, and who reads them."""
+"""Notes of running robots, which supervisors leave on this machine."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""What the robot stops by goes before others, and those who only look on push nobody aside."""
+"""Process priorities: driver, control and safety, which stop the robot, go first."""
 
 import os
 import subprocess
@@ -35,7 +35,7 @@ def going_first(*words: str, of_its_own: bool = True) -> tuple[int, str]:
 
 
 def told_of(session: str, nice: int) -> bool:
-    """Whether a session has so much niceness, where there is such a thing."""
+    """Return whether a session has this niceness; True where sessions have none."""
     return not session or session.endswith(f" nice {nice}")
 
 

@@ -1,4 +1,4 @@
-"""What a service manager hears of `gigabrain up`, on a real datagram socket."""
+"""Notifications of `gigabrain up` to a service manager, on a real datagram socket."""
 
 import os
 import signal
@@ -14,7 +14,7 @@ ALL_READY = "STATUS=all ready: router, driver, perception, decision, control, sa
 
 
 def knows_of_the_manager(pid: int) -> bool:
-    """Whether a process could speak in the service's name."""
+    """Return whether a process could notify the service manager."""
     return b"NOTIFY_SOCKET" in Path(f"/proc/{pid}/environ").read_bytes()
 
 

@@ -84,7 +84,7 @@ class Recogniser:
         )  # fmt: skip
 
     def off(self, x: float, y: float) -> tuple[float, float]:
-        """How far the robot is from a place [m], and how far it looks past it [rad]."""
+        """Return the distance of the robot to a place [m], and its angle off the heading [rad]."""
         ahead, left = to_frame(self.place, x, y)
         return math.hypot(ahead, left), abs(math.atan2(left, ahead))
 

@@ -57,7 +57,7 @@ async def until_driving(home: Home) -> None:
 
 
 async def printed(home: Home, *arguments: str) -> str:
-    """What a command prints that has to succeed."""
+    """Run a command that has to succeed, and return its output."""
     command = await home.run(*arguments)
     assert await command.ended() == 0, command.err
     return command.out

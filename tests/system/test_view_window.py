@@ -40,7 +40,7 @@ class Display:
         self._file = folder / "Xvfb_screen0"
 
     def colours(self) -> int:
-        """How many colours are on the screen."""
+        """Return the number of colours on the screen."""
         pixels = np.frombuffer(self._file.read_bytes()[HEADER_BYTES:][: 4 * 900 * 590], "<u4")
         return len(np.unique(pixels))
 

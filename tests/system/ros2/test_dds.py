@@ -1,4 +1,4 @@
-"""What DDS alone does, with participants of ours in this process."""
+"""Tests of the DDS transport alone, with our participants in this process."""
 
 import contextlib
 import socket

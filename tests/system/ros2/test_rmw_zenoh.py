@@ -1,4 +1,4 @@
-"""What `rmw_zenoh` alone does: nodes of ours, and bare Zenoh sessions in place of others."""
+"""Tests of `rmw_zenoh` alone: our nodes, and bare Zenoh sessions in place of others."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable

@@ -87,7 +87,7 @@ SAID: tuple[tuple[Topic[Any], Message, str], ...] = (
 
 
 class Played:
-    """What the processes of a robot publish."""
+    """A stand-in for a robot's processes, which publishes their messages."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus, self._tick = bus, 0

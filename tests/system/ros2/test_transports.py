@@ -1,4 +1,4 @@
-"""What both transports promise, with nodes of ours on both sides."""
+"""Tests of both transports, with our nodes on both sides."""
 
 import asyncio
 from collections.abc import AsyncIterator
