@@ -1,4 +1,4 @@
-"""What `import gigabrain_zenoh` shows."""
+"""The public names of `gigabrain_zenoh`, which are imported only when they are used."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""What a process has looked at is said in its own order, and a replay goes by just that."""
+"""The input log of a process: published in order, and replayed in the same order."""
 
 import asyncio
 import threading
@@ -158,7 +158,7 @@ def test_a_bus_with_a_journal_notes_what_is_valid() -> None:
 
 
 def life(*entries: tuple[str, int], at_ms: int, seq: int, process: str = "decision") -> Sample:
-    """What a process says it has looked at, a millisecond apart from `at_ms` on."""
+    """Return the sample of an input log: these entries, a millisecond apart, from `at_ms` on."""
     said = Said()
     said.now_ns += at_ms * MS
     for key, number in entries:

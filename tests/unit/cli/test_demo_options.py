@@ -1,4 +1,4 @@
-"""Which mission `gigabrain demo` begins with."""
+"""The mission with which `gigabrain demo` begins."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Whether a script still has the body, from state to state."""
+"""The control lease of a script, updated with each robot state."""
 
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import GateMode, GateStatus, RobotState

@@ -1,4 +1,4 @@
-"""What is wrong between the fields of a file is said with the line of the field that is wrong."""
+"""Errors between the fields of a deployment file, reported with the line of the wrong field."""
 
 from pathlib import Path
 

@@ -20,7 +20,7 @@ STEPS = 4  # in which a tick passes
 async def sent_while_moving(
     rate_hz: float, link: Literal["sim", "emulated"], silent_from: int = 100
 ) -> list[list[JointCommand]]:
-    """What is sent in each of 40 ticks, with a target; decision may fall silent."""
+    """Return the commands of each of 40 ticks. From tick `silent_from` on, no intent is sent."""
     description = arm_body()
     assert description.arm
     description = replace(description, arm=replace(description.arm, rate_hz=rate_hz))

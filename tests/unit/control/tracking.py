@@ -38,7 +38,7 @@ class Course:
         return self.poses[min(round(t * 1000), len(self.poses) - 1)], self._velocity(t)
 
     def intent(self, tick: int, response: ActuationModel, *, follow: bool = True) -> Intent:
-        """What decision would say in this tick: the next 2 s, as seen from where it should be."""
+        """Return the intent of a tick: the next 2 s of the course, relative to its pose now."""
         here, now = self.at(tick * 0.02)
         points = []
         for i in range(21):
@@ -112,9 +112,9 @@ def errors(
     response: ActuationModel = SLOW,
     late: int = 1,
 ) -> list[float]:
-    """How far the body is from where it should be, tick by tick [m]; ten intents a second.
+    """Return the distance of the body from its place on the course, tick by tick [m].
 
-    Decision takes its time: each intent is of `late` ticks before.
+    Ten intents a second are sent. Each was made `late` ticks before, as decision takes time.
     """
     found = []
     intent = None

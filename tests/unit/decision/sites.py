@@ -1,4 +1,4 @@
-"""Who carries out tasks, in memory: the executive on time that the test counts, the service."""
+"""Task execution in memory: an executive on time that the test counts, and the task service."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -66,11 +66,11 @@ class Robot:
         return _short(self.command)
 
     def reached(self) -> float | str | None:
-        """What comes once it has got there."""
+        """Report that the robot has arrived, and return the result of the next step."""
         return self._became("done", "it is there")
 
     def failed(self, why: str = "no way") -> float | str | None:
-        """What comes when it cannot get there."""
+        """Report that the robot cannot arrive, and return the result of the next step."""
         return self._became("failed", why)
 
     @property
@@ -79,7 +79,7 @@ class Robot:
 
     @property
     def last(self) -> tuple[str, str]:
-        """How the last task ended."""
+        """Return the state and the reason of the task that ended last."""
         return self.status.done[0].state, self.status.done[0].reason
 
     def _became(self, state: Any, reason: str) -> float | str | None:

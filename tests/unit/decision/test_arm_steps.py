@@ -1,4 +1,4 @@
-"""What missions may ask of an arm, and what is refused before anything moves."""
+"""Steps of missions for an arm, and refusals before anything moves."""
 
 import pytest
 from msgspec.structs import replace

@@ -71,7 +71,7 @@ def world(tick: int, *contours: Contour) -> WorldModel:
 
 
 async def decided(*contours: Contour) -> tuple[str, int]:
-    """What avoid does about them, and how many were refused."""
+    """Return the action of `avoid` for these contours, and the number of refused contours."""
     async with bench() as node:
         node.send(BODY, body(SEEING))
         node.send(STATE, state(10))

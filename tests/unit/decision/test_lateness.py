@@ -1,4 +1,4 @@
-"""How late scans are answered, in ticks of the robot."""
+"""Latency of the answers to scans, counted in ticks of the robot."""
 
 from gigabrain_zenoh.decision.context import ScanLatency
 

@@ -29,7 +29,7 @@ class Seeker(Robot):
         self.known = ObjectMap(objects=objects, tags=tags, recognizing=True)
 
     def wanted(self) -> tuple[str, str] | None:
-        """What is commanded, and the name of its target."""
+        """Step once. Return the command's kind and its target's name, or None without a command."""
         self.step()
         if self.command is None:
             return None

@@ -33,7 +33,7 @@ def can(x: float, y: float) -> Target:
 
 
 def off(place: object, target: Target) -> tuple[float, float]:
-    """How far it stands from a target [m], and how far it looks past it [rad]."""
+    """Return the distance of a target [m], and the absolute angle from the heading to it [rad]."""
     x, y, yaw = place.x, place.y, place.yaw  # type: ignore[attr-defined]
     turn = math.atan2(target.y - y, target.x - x) - yaw
     return math.hypot(target.x - x, target.y - y), abs(math.remainder(turn, math.tau))

@@ -1,4 +1,4 @@
-"""Which of the things that a camera sees a mission means, and where the arm looks from."""
+"""Matching of a mission's things with those that a camera sees, and postures to look from."""
 
 import math
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""What waits, what goes first, what is cancelled, and what a restart leaves of it all."""
+"""The task queue: order, cancellation and restarts."""
 
 from collections.abc import Iterator
 

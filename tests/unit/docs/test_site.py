@@ -1,4 +1,4 @@
-"""What the documentation site is made of: pages, navigation, and tables from the code."""
+"""The documentation site: pages, navigation, and tables from the code."""
 
 import re
 from pathlib import Path

@@ -79,7 +79,7 @@ class Cable(Link):
         raise NotImplementedError
 
     def velocities(self) -> list[tuple[int, int]]:
-        """What was sent to address 150, in hundredths."""
+        """Return linear x [0.01 m/s] and angular z [0.01 rad/s] of each write to address 150."""
         goals = [struct.unpack("<6i", p.params[2:]) for p in self.sent if p.params[:2] == b"\x96\0"]
         return [(goal[0], goal[5]) for goal in goals]
 

@@ -74,7 +74,7 @@ class Cable(Link):
 
 
 class Body:
-    """What carries the arm: servos that are where they should be, and gravity where none hold."""
+    """The body of the arm: servos reach their targets at once, and gravity acts where none hold."""
 
     def __init__(self, *angles: float) -> None:
         self.places = dict.fromkeys((*ARM, "gripper"), 0.0) | dict(zip(ARM, angles, strict=False))

@@ -1,4 +1,4 @@
-"""What a faulty body reports is kept within the bounds of its messages."""
+"""Clipping of a faulty body's state to the bounds of its message."""
 
 import math
 

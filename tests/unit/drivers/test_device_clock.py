@@ -1,4 +1,4 @@
-"""How late a device's data come, by its own stamps: on a fake clock, frame by frame."""
+"""Lateness of a device's data by its own stamps, on a fake clock, frame by frame."""
 
 import random
 from collections.abc import Callable

@@ -23,7 +23,7 @@ def furthest(before: dict[str, float], after: dict[str, float]) -> float:
 
 
 async def problem_of(rig: Rig) -> str:
-    """Why the arm is not moved, once the driver has tried for long enough."""
+    """Wait 40 ms, and return the driver's reason for not moving the arm."""
     await rig.wait(40)
     assert not (await rig.driver.read_state()).link.connected
     return rig.driver.problem

@@ -1,4 +1,4 @@
-"""Who drives, who is told, and what is written down: a whole robot in memory."""
+"""The gatekeeper in a whole robot in memory: commanders, e-stops, causes and the audit log."""
 
 import asyncio
 import itertools

@@ -1,4 +1,4 @@
-"""What lines say of a body, put together: pose, velocity, battery, wheels, restarts."""
+"""Robot states from the lines of a body: pose, velocity, battery, wheels, restarts."""
 
 import math
 from pathlib import Path

@@ -124,7 +124,7 @@ async def test_a_driver_that_lacks_it_is_refused_at_the_start(
 
 
 class Ready:
-    """Whether the driver has said that it is ready."""
+    """A `ready` callback that records whether it was called."""
 
     called = False
 

@@ -1,4 +1,4 @@
-"""What the gate lets out is what the body is told, but for the units of its protocol."""
+"""Commands sent to the body: the gate's output, rounded to the units of the body's protocol."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What goes over a line, in words: each frame beside its own bytes, whatever the pieces."""
+"""Frames on a line as text, each beside its own bytes, received in pieces of any size."""
 
 import logging
 import math

@@ -110,7 +110,7 @@ class Rig:
             self.send(linear_x, angular_z=angular_z)
 
     def until(self, mode: str, go_on: Callable[[], None]) -> int:
-        """How often `go_on` is called until the gate is in `mode`."""
+        """Call `go_on` until the gate is in `mode`, and return the number of calls."""
         for count in range(1, 1000):
             go_on()
             if self.state.mode == mode:

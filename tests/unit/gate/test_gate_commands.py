@@ -1,4 +1,4 @@
-"""Which commands the gate lets through, and what is left of them."""
+"""Velocity commands at the gate: acceptance, limits and refusals."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Who may open the gate, and when."""
+"""Enabling the gate: rights, refusals and timing."""
 
 from collections.abc import Callable
 

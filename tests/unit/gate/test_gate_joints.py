@@ -1,4 +1,4 @@
-"""Which commands for joints the gate lets through, and how it holds an arm in all other cases."""
+"""Joint commands at the gate: acceptance, limits and refusals; and the holding of an arm."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""What the gate makes of speeds that are not numbers."""
+"""Speeds at the gate that are not finite numbers: refusals, stops and latching."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""When the gate opens again by itself, where a deployment allows it."""
+"""Automatic enabling of the gate after a stop, where a deployment allows it."""
 
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.gate import gate

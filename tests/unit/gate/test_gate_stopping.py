@@ -1,4 +1,4 @@
-"""How the gate stops, what it remembers of it, and the e-stop."""
+"""Stopping of the gate: duration, remembered causes, latching and the e-stop."""
 
 from collections.abc import Callable
 from typing import Literal

@@ -1,4 +1,4 @@
-"""What makes the gate stop a body that it has let go: silence, old data, safety, the driver."""
+"""Reasons for the gate to stop an enabled body: silence, old data, safety, the driver."""
 
 from typing import Literal
 

@@ -1,4 +1,4 @@
-"""Where the gateway to ROS runs, with which settings and rights."""
+"""Deployment of the gateway to ROS: its host, settings and rights."""
 
 import json
 

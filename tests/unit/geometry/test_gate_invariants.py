@@ -1,6 +1,6 @@
-"""What holds of the gate whatever happens, in whatever order; hypothesis tries to break it.
+"""Invariants of the gate, tested by hypothesis with events in any order.
 
-The machine keeps books of its own, from the events alone, and holds the gate to them.
+The test keeps a record of its own, from the events alone, and compares the gate with it.
 """
 
 import math
@@ -283,7 +283,7 @@ class GateMachine(RuleBasedStateMachine):
         assert self.state.output == ZERO or self.state.mode in ("enabled", "stopping")
 
     def check_last_clamp(self) -> None:
-        """What a driver clamps once more is left as it is, so the steps above are the body's."""
+        """Check that a driver's second clamp changes nothing, so the steps above are the body's."""
         clamped = clamp(self.state.output, self.limits)
         for value, kept in zip(axes(self.state.output), axes(clamped), strict=True):
             assert abs(value - kept) <= ROUNDING

@@ -1,4 +1,4 @@
-"""How fast a body may go, and how fast it may change that."""
+"""Speed and acceleration limits of a body."""
 
 import math
 

@@ -145,7 +145,7 @@ def test_an_aisle_is_not_taken_for_the_next_one_like_it(reach: float, uprights: 
 
 
 def passed_by(noise: Floats | None) -> float:
-    """How far ahead a robot ends up in a bare aisle that a crate goes through beside it [m]."""
+    """Return the error along a bare aisle while a crate moves beside the robot [m], + ahead."""
     poses = line(np.array((0.0, 0.0, 0.0)), np.array((2.0, 0.0, 0.0)), 0.025)
     lidar, slam = Lidar(180, reach=4.0), Slam()
     steps = stepped(poses, 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""How far a footprint can go: straight, turning and along arcs."""
+"""Free motion of a footprint: straight, turning and along arcs."""
 
 import math
 import tracemalloc

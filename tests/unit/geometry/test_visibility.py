@@ -1,4 +1,4 @@
-"""Where a scan may have been taken, by what its beams would have passed through."""
+"""Plausible poses of a scan, judged by the walls that its beams would have passed through."""
 
 import numpy as np
 import pytest

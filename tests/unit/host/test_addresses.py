@@ -1,4 +1,4 @@
-"""Which addresses only this machine reaches, and what is no address at all."""
+"""Loopback addresses, endpoints of Zenoh, and names of hosts."""
 
 import pytest
 

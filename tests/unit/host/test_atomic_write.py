@@ -1,4 +1,4 @@
-"""What was reported as written is there after a power cut, and never half of it."""
+"""Atomic writes: a file that was reported as written survives a power cut, always whole."""
 
 import os
 import stat
@@ -19,7 +19,7 @@ from gigabrain_zenoh.security.identity_files import LIST
 
 
 class Disk:
-    """What a power cut would leave: only what was synced, contents and names apart."""
+    """A disk as a power cut would leave it: only synced contents and synced names remain."""
 
     def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self._contents: dict[int, bytes] = {}

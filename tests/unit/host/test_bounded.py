@@ -1,4 +1,4 @@
-"""What strangers name is not kept without end."""
+"""Bounded memory for names that other processes choose."""
 
 from msgspec.structs import replace
 

@@ -1,4 +1,4 @@
-"""What the robot stops by goes before others, and those who only look on push nobody aside."""
+"""Priorities of processes: those that can stop the robot go first, and observers step aside."""
 
 import os
 

@@ -32,7 +32,7 @@ MINE = HEAD + "processes:\n  mine:\n    module: my_lamp.node\n"
 
 @pytest.fixture(autouse=True)
 def lamp(site: Path) -> None:
-    """What pip makes of the package."""
+    """Write the modules into `site`, as pip would install them."""
     (site / "my_lamp").mkdir()
     (site / "my_lamp" / "__init__.py").write_text("raise RuntimeError('nobody may import this')\n")
     (site / "my_lamp" / "node.py").write_text(MODULE)
@@ -112,7 +112,7 @@ def test_a_perceptor_that_no_package_offers_is_found_before_anything_starts(
 
 
 def config_of(path: Path) -> ProcessConfig:
-    """What the supervisor hands to `mine`."""
+    """Return the configuration that the supervisor passes to `mine`."""
     entry = load_deployment(path).processes["mine"]
     return ProcessConfig(
         name="mine",

@@ -1,4 +1,4 @@
-"""What a service manager hears of `gigabrain up`, on a real datagram socket."""
+"""Notifications of `gigabrain up` to a service manager, on a real datagram socket."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""What is logged goes over the bus as well, and never in the way of what it is about."""
+"""Log records on the bus. A failure to publish costs the record and nothing else."""
 
 import asyncio
 import logging

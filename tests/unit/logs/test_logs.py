@@ -1,4 +1,4 @@
-"""What a process logs: a JSON line each in the run folder, and on the console."""
+"""Logs of a process: a JSON line for each record in the run folder, and on the console."""
 
 import contextlib
 import io
@@ -34,7 +34,7 @@ def root_as_it_was() -> Iterator[None]:
 
 
 class Said:
-    """What went to stderr since the test began."""
+    """The text written to stderr since the test began."""
 
     def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
         self._capsys, self._text = capsys, ""

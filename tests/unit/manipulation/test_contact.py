@@ -1,4 +1,4 @@
-"""What an arm feels of a push, by efforts and by what lags, and where something is pressed."""
+"""Detection of pushes on an arm by effort and lag, and the side on which to press a thing."""
 
 import math
 

@@ -55,7 +55,7 @@ class Rooms:
         self._random = np.random.default_rng(seed)
 
     def ranges(self, pose: Floats, extra: Sequence[Wall] = ()) -> Floats:
-        """What 360 beams measure from `pose` (3,) [m]; inf where there is nothing in range."""
+        """Return the ranges of 360 beams from `pose` (3,) [m]; inf where nothing is in range."""
         walls = np.vstack((self._walls, np.array(extra, np.float64).reshape(-1, 4)))
         angles = pose[2] + np.radians(np.arange(0, 360, 360 / BEAMS))
         dx, dy = np.cos(angles)[:, None], np.sin(angles)[:, None]
@@ -112,7 +112,7 @@ class Walker:
 
 
 def error(place: Place, pose: Floats) -> float:
-    """How far a place is from where the robot is [m]."""
+    """Return the distance between an estimated place and the robot's pose [m]."""
     return math.hypot(*(place.pose - pose)[:2].tolist())
 
 

@@ -60,7 +60,7 @@ def line(start: Floats, end: Floats, step: float) -> Floats:
 
 
 def dead_reckoned(start: Floats, steps: NDArray[np.float64]) -> Floats:
-    """Where odometry alone ends."""
+    """Return the pose after all steps, by odometry alone."""
     for step in steps:
         start = compose(start, step)
     return start

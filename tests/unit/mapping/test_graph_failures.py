@@ -63,7 +63,7 @@ def links() -> list[Edge]:
 
 
 def true_pose(keyframe: int) -> Floats:
-    """Where a keyframe of the square really is."""
+    """Return the exact pose (3,) of a keyframe of the square."""
     pose = np.zeros(3)
     for k in range(1, keyframe + 1):
         pose = compose(pose, np.array((1.0, 0.0, 0.0 if k % SIDE else math.pi / 2)))

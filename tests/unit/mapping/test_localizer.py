@@ -118,7 +118,7 @@ def hall(reach: int) -> SavedMap:
 
 
 def ends(found: list[Candidate]) -> list[float]:
-    """Where along the hall [m], to 10 cm."""
+    """Return the places along the hall [m], rounded to 10 cm."""
     return [round(float(one.pose[0]), 1) for one in found]
 
 

@@ -99,7 +99,7 @@ class Drive:
         return self.plans[-1]
 
     def moment(self) -> PlanRequest:
-        """What it sees now."""
+        """Return the planner's request for the present tick."""
         cosine, sine = math.cos(self.pose.yaw), math.sin(self.pose.yaw)
         off = self.walls - (self.pose.x, self.pose.y)
         hits = off @ np.array(((cosine, -sine), (sine, cosine)))
@@ -133,7 +133,7 @@ class Drive:
         self.least = min(self.least, self._room())
 
     def _room(self) -> float:
-        """How far the exact footprint is from everything [m]; negative inside it."""
+        """Return the footprint's distance to the nearest obstacle [m]; negative if they overlap."""
         rows = [(o.x, o.y, o.radius) for o in self.someone(self.tick * TICK_S)]
         discs = np.array([*rows, *((x, y, 0.0) for x, y in self.walls.tolist())])
         if not len(discs):

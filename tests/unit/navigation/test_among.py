@@ -34,7 +34,7 @@ LOOKED = round(dynamic_obstacles.LOOK_AROUND_S / 0.02) + 1  # ticks
 
 
 def plans(body: BodyDescription, speed: float, cycles: int = 3) -> list[LocalPlan]:
-    """What is planned once it has looked round, somebody 1.5 m ahead crossing so fast [m/s]."""
+    """Return the plans after looking round, while somebody 1.5 m ahead crosses at `speed` [m/s]."""
     planner, made = LocalPlanner(body, FEW), []
     for tick in (1, *range(LOOKED, LOOKED + 4 * cycles, 4)):
         y = -1.0 + speed * 0.02 * tick
@@ -97,7 +97,7 @@ def test_a_quick_body_looks_round_before_it_first_drives_off() -> None:
 
 
 def near(discs: list[tuple[float, ...]], seconds: float) -> tuple[float, float]:
-    """What a Jackal in its origin has near it, and what that costs."""
+    """Return the distance [m] of the nearest disc from a Jackal at (0, 0), and the cost of all."""
     weights = Weights(disc=9.0, disc_over=0.3, disc_lead=0.1, trust=0.7)
     state = np.zeros(STATE)
     state[COSINE : COSINE + LANES] = 1.0

@@ -127,7 +127,7 @@ def test_no_polygons_cover_nothing() -> None:
 
 
 class TestContourMemory:
-    """What routes remember."""
+    """Contours that the route planner remembers."""
 
     def test_it_covers_the_polygons(self) -> None:
         memory = ContourMemory()

@@ -1,4 +1,4 @@
-"""What cells cost a body: its footprint, unknown space, extra obstacles, maps that change."""
+"""Costs of cells for a body: footprint, unknown space, extra obstacles, maps that change."""
 
 import tracemalloc
 

@@ -1,4 +1,4 @@
-"""Where to explore next, and when all is mapped."""
+"""Choice of the next frontier to explore, and the end of exploration."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What a plan costs: it may be left unlooked at only where it would cost as much as it may not."""
+"""Costs of plans under a limit: only a plan that costs at least the limit may be given up."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Where quick things pass: ways beside are better, if they are not much longer."""
+"""The traffic map: ways that avoid quick things are preferred, if they are not much longer."""
 
 import math
 from typing import Any
@@ -30,7 +30,10 @@ GOAL = (12.0, 0.0)
 
 
 def crossing(seconds: float, speed: float) -> TrafficMap:
-    """What a body of 2 m/s sees of discs that go along x = 5 from y = -4 to 4 m, 2 m apart."""
+    """Return the traffic map of a body of 2 m/s that sees discs cross at `speed` [m/s].
+
+    They go along x = 5 from y = -4 to 4 m, 2 m apart.
+    """
     traffic = TrafficMap(0.4, 2.0, 10.0)
     for tick in range(1, round(seconds * 50), 2):
         ys = [(speed * 0.02 * tick + k * 2.0) % 8.0 - 4.0 for k in range(4)]
@@ -124,7 +127,7 @@ def test_the_local_field_leads_round_what_it_cannot_see_the_end_of() -> None:
 
 
 def looks(discs: tuple[Obstacle, ...], seconds: float) -> LocalPlan:
-    """What a Jackal plans so long after it was sent somewhere."""
+    """Return the plan of a Jackal `seconds` after it was given a goal."""
     planner = LocalPlanner(JACKAL, LocalSettings(samples=128, window=6.0))
     for tick in (1, 1 + round(seconds / 0.02)):
         moment = PlanRequest(

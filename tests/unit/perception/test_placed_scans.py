@@ -18,7 +18,7 @@ MAPPING = PerceptionConfig(mapping="slam")
 
 
 class Handed:
-    """What was handed on: the scan's tick, and x of its pose."""
+    """A receiver of placed scans. It keeps the tick of each scan and the x of its pose."""
 
     def __init__(self) -> None:
         self.placed = PlacedScans(self._take, lambda scan: self.missed.append(scan.basis))

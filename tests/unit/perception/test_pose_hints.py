@@ -1,4 +1,4 @@
-"""What a person or RViz says of the robot's place, as a hint with its covariance."""
+"""Pose hints from a person or RViz, and their covariance."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""How figures come about: percentiles, rounds, hops and scans that are timed."""
+"""Calculation of figures: percentiles, rounds, hops and timed scans."""
 
 import pytest
 from hypothesis import given

@@ -1,4 +1,4 @@
-"""What `gigabrain bench goals` makes of its figures."""
+"""Results of `gigabrain bench goals`: goals, limits and the table."""
 
 import asyncio
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What the benchmarks say of a map's memory over hours."""
+"""Growth of a map and of memory over hours, as the benchmarks report it."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What cameras cost: the difference of two robots, without what drawing takes."""
+"""Costs of cameras: the difference between two robots, without rendering."""
 
 import os
 from collections.abc import Iterator

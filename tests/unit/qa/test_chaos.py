@@ -1,4 +1,4 @@
-"""What a bad line does to bytes, and the words that ask for it."""
+"""Damage to bytes by a bad line, and the commands that set it."""
 
 import random
 

@@ -1,4 +1,4 @@
-"""What the kit says on a machine that has no time for it."""
+"""Results of the conformance kit on a machine that is too busy."""
 
 import itertools
 import os

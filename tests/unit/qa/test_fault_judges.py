@@ -1,4 +1,4 @@
-"""What the fault suite judges by: that it tells a robot that is well from one that is not."""
+"""Judgements of the fault suite: a healthy robot passes, and a faulty one does not."""
 
 import asyncio
 import contextlib
@@ -62,7 +62,7 @@ async def test_a_host_whose_clock_runs_twice_as_fast_does_not() -> None:
 
 async def test_a_host_that_goes_by_the_stamps_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
     class ByStamp(Latest[Any]):
-        """What the bus must not do."""
+        """A `Latest` that takes the age from the publisher's stamp, which the bus must not do."""
 
         def __init__(self, topic: Any, clocks: Clock, time: Any) -> None:
             super().__init__(topic, clocks, time)
@@ -84,7 +84,7 @@ def test_memory_growth_is_the_slope_over_all_samples() -> None:
 
 
 def drive(modes: Sequence[str], commanded: Sequence[int]) -> Probe:
-    """Who has looked on while the gate was in these modes, and commands came in these ticks."""
+    """Return a probe that recorded these gate modes, one a tick, and commands in these ticks."""
     probe = Probe(Bus(LocalNetwork().transport(), Clock(), "suite"))
     for tick, mode in enumerate(modes, start=1):
         gate = replace(DRIVING, mode=mode) if mode == "enabled" else GateStatus(mode="stopping")

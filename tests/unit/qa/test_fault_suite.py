@@ -163,7 +163,7 @@ async def result_of(
     fault: FaultRow = FAULT,
     options: Options = SHORT,
 ) -> FaultResult:
-    """What the suite makes of runs that do this, and wait for a core for so long [ms] meanwhile."""
+    """Return the suite's result of these runs, each with its longest wait for a core [ms]."""
     left, waits = iter(run for run, _ in runs), iter(wait for _, wait in runs)
 
     async def test(_: Rig) -> dict[Figure, float]:

@@ -1,4 +1,4 @@
-"""What the fault suite breaks a robot with does what it says."""
+"""Tools with which the fault suite breaks a robot."""
 
 import time
 

@@ -1,4 +1,4 @@
-"""What noise on the wire gets past a line's form and its checksum."""
+"""Errors on the wire that a line's form and its checksum do not detect."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What makes classes different holds for every draw, and the textures of tests are apart."""
+"""Looks for training: classes differ in every draw, and the textures of tests are separate."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What the net is to answer, and how pictures of the training set are changed."""
+"""Training targets of the net, and augmentation of the training pictures."""
 
 import cv2
 import numpy as np
@@ -22,7 +22,7 @@ def labelled(*things, ignored=()):
 
 
 def answer(one):
-    """What a perfect net would answer: logits by the heat, distances to the box's sides."""
+    """Return a perfect net's answer: logits by the heat, distances to the box's sides."""
     heat, _, boxes, weights = targets(one, 240, 320)
     rows, columns = np.indices(weights.shape) * 8 + 4
     middle = np.stack([columns, rows], -1)

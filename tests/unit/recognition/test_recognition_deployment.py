@@ -1,4 +1,4 @@
-"""Where recognition runs, and what a deployment file says of its net and tags."""
+"""Deployment of recognition: its host, net and tags."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What viewers get of an arm: its shapes, and frames that lead to where MuJoCo has the tool."""
+"""Drawing of an arm for viewers: its shapes, and frames that agree with the kinematics."""
 
 import logging
 from functools import partial

@@ -1,4 +1,4 @@
-"""What viewers get of cameras: frames of lenses, calibration, boxes, contours and objects."""
+"""Drawing of cameras for viewers: frames of lenses, calibration, boxes, contours and objects."""
 
 import re
 import struct

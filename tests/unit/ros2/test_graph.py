@@ -1,4 +1,4 @@
-"""What keeps the ends of a topic apart, from the graph alone."""
+"""Reasons why the ends of a topic exchange nothing, found in the graph alone."""
 
 from typing import Any
 

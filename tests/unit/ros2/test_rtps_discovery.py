@@ -1,4 +1,4 @@
-"""What participants and endpoints announce, compared with what Fast DDS 2.14.5 sends."""
+"""Discovery data of participants and endpoints, compared with those of Fast DDS 2.14.5."""
 
 import pytest
 

@@ -29,7 +29,7 @@ SECOND_TICKS = 50
 
 
 def judged(*looks: tuple[tuple[object, ...], object]) -> list[bool]:
-    """What is made of these pairs of `came` and `done`, from the second on."""
+    """Return whether each pair of `came` and `done` is progress, from the second on."""
     came, done = iter([look[0] for look in looks]), iter([look[1] for look in looks])
     progress = Progress(came.__next__, done.__next__)
     return [progress() for _ in looks[1:]]

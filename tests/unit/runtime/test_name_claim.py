@@ -84,7 +84,7 @@ async def life(network: SlowNetwork, begin_ns: int, stay: asyncio.Event) -> None
 
 
 async def stayed(begins_ns: list[int], delays_ns: Iterable[int]) -> int:
-    """How many of the processes that begin at these times have stayed after 20 s."""
+    """Return the number of processes, begun at these times [ns], that still run after 20 s."""
     network, stay = SlowNetwork(delays_ns), asyncio.Event()
     lives = [asyncio.ensure_future(life(network, begin, stay)) for begin in begins_ns]
     await network.clock.advance(20 * SECOND_NS)

@@ -1,4 +1,4 @@
-"""Which robots run here: the notes that supervisors leave, and who reads them."""
+"""Notes of running robots: left by supervisors, and read by clients on the same machine."""
 
 import contextlib
 import fcntl

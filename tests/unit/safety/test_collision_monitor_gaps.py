@@ -1,4 +1,4 @@
-"""What a collision monitor in wide use leaves open (facts of Nav2's, a to k), one test for each."""
+"""Gaps that Nav2's collision monitor leaves open (facts a to k), one test for each."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""What safety takes from depth: low things, steps, overhangs, memory, and cameras that fail."""
+"""Depth images in safety: low things, steps, overhangs, memory, and cameras that fail."""
 
 import math
 from collections.abc import Callable
@@ -82,7 +82,7 @@ class Drive:
 
     @property
     def marks(self) -> int:
-        """How many points are believed."""
+        """Return the number of points that count as obstacles."""
         return int((self.memory.field.cameras.marks.level > 1).sum())
 
 

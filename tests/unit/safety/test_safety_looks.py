@@ -82,7 +82,7 @@ class Walker:
 
     @property
     def behind(self) -> float | None:
-        """How far is free behind [m]."""
+        """Return the free distance behind the body [m]; None where nothing is in the way."""
         return self.field.free["backward"]
 
 

@@ -21,7 +21,7 @@ ANGLES = np.radians(np.arange(360.0))
 
 
 def room(pose: Pose) -> NDArray[np.float64]:
-    """What 360 beams measure in a room of 6 m by 4 m, its middle in (0.5, 0.3)."""
+    """Return the ranges of 360 beams [m] in a room of 6 m by 4 m. Its middle is (0.5, 0.3)."""
     angles = ANGLES + pose.yaw
     across, along = np.cos(angles), np.sin(angles)
     x = np.where(across > 0, 3.5 - pose.x, -2.5 - pose.x) / np.where(across == 0, 1e-9, across)

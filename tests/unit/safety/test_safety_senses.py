@@ -95,7 +95,7 @@ SECONDS = itertools.count(1000)
 
 
 def disk_mb(watch: HostMonitor) -> float:
-    """What it says a second later."""
+    """Return the free disk space at the next reading [MB]; 0 before the disk has answered."""
     return watch.read(next(SECONDS) * 1_100_000_000).disk_mb or 0.0
 
 

@@ -10,7 +10,7 @@ from gigabrain_zenoh.qa.faults.hostile import Path, codec_of, leaves
 
 
 def codec(name: str) -> Codec[Any]:
-    """What the bus would decode message `name` with."""
+    """Return the codec with which the bus would decode message `name`."""
     return codec_of(type(EXAMPLES[name]))
 
 
@@ -40,12 +40,12 @@ def numbers(name: str) -> list[Path]:
 
 
 def at(plain: Any, path: Path) -> Any:
-    """What is at `path`."""
+    """Return the value at `path`."""
     return at(plain[path[0]], path[1:]) if path else plain
 
 
 def refuses(name: str, payload: bytes) -> bool:
-    """Whether `payload` is no valid message `name`."""
+    """Return whether `payload` is not a valid message `name`."""
     try:
         codec(name).decode(payload)
     except ValueError:

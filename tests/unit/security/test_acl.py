@@ -1,4 +1,4 @@
-"""What each role may say, ask and answer: on a real router, over TLS, key by key."""
+"""Access rights of the roles: topics, services, and rules for the router."""
 
 from gigabrain_schemas.safety import ButtonState
 from gigabrain_schemas.topics import SERVICES, TOPICS, Topic

@@ -1,4 +1,4 @@
-"""What a deployment does with keys: TLS for all, whose identity may run what, and where."""
+"""Keys in a deployment: TLS on all links, and the identities that a host or process may use."""
 
 import shutil
 from pathlib import Path

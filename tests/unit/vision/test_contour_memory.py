@@ -1,4 +1,4 @@
-"""What was seen is remembered out of view, and gone once it is seen through."""
+"""Memory of contours: kept while out of view, and removed once a camera sees through them."""
 
 import math
 

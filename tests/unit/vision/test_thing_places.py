@@ -1,4 +1,4 @@
-"""Where a thing is by the depth inside its box: its middle, whatever its face."""
+"""Places of things from the depth inside their boxes: the middle, for any face."""
 
 import numpy as np
 import pytest
