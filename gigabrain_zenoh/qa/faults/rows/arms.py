@@ -5,7 +5,6 @@ It rests from when on no joint is more than 2 deg from where it ends.
 
 import asyncio
 import inspect
-import math
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from functools import partial
@@ -27,6 +26,7 @@ FAST_RAD_S = 0.8
 MIDDLE_RAD = 0.7  # round which it has room to go on
 TURN_RAD = 1.2  # from the middle, where the operator turns back
 JOG_S = 0.05  # between two messages of the operator
+LOOK_S = 0.5  # between two looks at whether it goes on
 CARRIES_RAD_S = 0.5  # of the fastest joint, while it carries something
 ALL = ("router", "driver", "perception", "decision", "control", "safety")
 REST_S = 1.5  # of simulated time, in which every arm has come to rest
@@ -215,21 +215,23 @@ async def _carrying(robot: RobotUnderTest) -> AsyncIterator[None]:
             return False
         return max(abs(joint.velocity) for joint in probe.state.joints) > CARRIES_RAD_S
 
-    async def enable() -> None:
-        while True:
-            await until(lambda: probe.state.gate.mode == "idle", "idle", math.inf)
-            await probe.enable_brain()
+    tasks, folder = Tasks(probe.bus), robot_path(robot.deployment.body).parent
+    mission = Path(mission_file(body.demo.mission, folder))
+
+    async def go_on() -> None:
+        while True:  # a fault may have ended the mission
+            if not (await tasks.status()).current:
+                await tasks.carry_out(mission)
+            if probe.state.gate.mode == "idle":
+                await probe.enable_brain()
+            await asyncio.sleep(LOOK_S)
 
     await robot.release()
-    tasks = Tasks(probe.bus)
-    if not (await tasks.status()).current:
-        folder = robot_path(robot.deployment.body).parent
-        await tasks.carry_out(Path(mission_file(body.demo.mission, folder)))
-    enabling = asyncio.create_task(enable())
+    going_on = asyncio.create_task(go_on())
     try:
         await until(fast, "it carries something fast")
     finally:
-        enabling.cancel()
+        going_on.cancel()
     yield
 
 
