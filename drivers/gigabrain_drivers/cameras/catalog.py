@@ -1,4 +1,4 @@
-"""Which cameras a robot has on a link, each with its source, by its file."""
+"""Cameras of a robot on a link, each with its source, by the robot's file."""
 
 import importlib.util
 from collections.abc import Mapping

@@ -19,7 +19,7 @@ LONGEST_WAIT_S = 1.0  # between two pictures of a recording
 
 
 class ReplayOptions(CameraOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where the recording is."""
+    """The file of the recording, and the camera in it."""
 
     file: str  # beside the robot's file
     camera: str = ""  # of the recording; empty: the one of this name

@@ -95,7 +95,7 @@ class JointServos(SimServo, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class PartNames(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a moving part is called in a model: its joint, and what else is not found by it."""
+    """The names of a moving part in a model. Empty ones are found by its joint."""
 
     joint: str
     actuator: str = ""

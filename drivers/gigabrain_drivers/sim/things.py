@@ -1,4 +1,4 @@
-"""What people put into a simulated world while it runs, in bodies that its model keeps spare."""
+"""Things and people put into a simulated world while it runs, in spare bodies of its model."""
 
 import math
 from collections.abc import Callable

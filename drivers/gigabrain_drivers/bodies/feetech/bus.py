@@ -44,7 +44,7 @@ class HostBus:
 
     @property
     def busy(self) -> bool:
-        """Whether a question waits for its answers."""
+        """Return whether a request waits for its answers."""
         return self._line.locked()
 
     async def send(self, frame: bytes) -> bool:

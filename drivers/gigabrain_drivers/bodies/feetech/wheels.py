@@ -111,7 +111,7 @@ class ServoWheel:
 
     @property
     def has_settings(self) -> bool:
-        """Whether its servo has the settings of `frame_part`, by its newest reading."""
+        """Return whether its servo has the settings of `frame_part`, by its newest reading."""
         now = self.newest
         wanted = feetech.MAX_ACCELERATION, self._torque_limit
         return now is not None and (now.acceleration, now.torque_limit) == wanted
@@ -280,7 +280,7 @@ class ServoBase:
 
     @property
     def overloaded(self) -> bool:
-        """Whether a servo protects itself from overload."""
+        """Return whether a servo protects itself from overload."""
         return any(wheel.status & feetech.OVERLOAD for wheel in self.wheels)
 
     async def end_overload(self) -> None:

@@ -56,7 +56,7 @@ class Feedback:
 
     @property
     def motors_on(self) -> tuple[bool, ...]:
-        """Which motors hold: six of the arm, and the gripper's."""
+        """Return whether each motor holds: six of the arm, and the gripper's."""
         bits = [drive.status for drive in self._drives]
         bits += [self._gripper.status] if self._hand else []
         return tuple(bool(status & piper.ENABLED) for status in bits)

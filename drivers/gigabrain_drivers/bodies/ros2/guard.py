@@ -46,7 +46,7 @@ class Guard:
 
     @property
     def problem(self) -> str:
-        """Why it could not stop the robot; empty while it could."""
+        """Return why the guard could not stop the robot now; empty if it could."""
         if self._received_ns is None:
             return "the guard, which stops the robot if this driver dies, is starting"
         if self._clock.now_ns() - self._received_ns > LOST_NS:
