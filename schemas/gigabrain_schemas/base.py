@@ -88,7 +88,7 @@ class Velocity(Record, frozen=True, kw_only=True):
 
 
 class Cause(Record, frozen=True, kw_only=True):
-    """Why the robot is held back."""
+    """A reason why the robot is held back."""
 
     code: Name  # see gigabrain_zenoh.gate.causes
     text: Text  # a sentence for people

@@ -72,11 +72,11 @@ class Joint(Record, frozen=True, kw_only=True):
 
 
 class JointGains(Record, frozen=True, kw_only=True):
-    """How control corrects what it sends to a joint that holds positions by itself.
+    """The gains by which control corrects the commands to a joint that holds positions by itself.
 
-    Sent is the position wanted, and: the error by `p`, its integral while the joint should rest by
-    `i`, the error of speed by `d`, the speed wanted by `feed_forward`, and the acceleration wanted
-    by `inertia`.
+    The command is the wanted position plus five terms: `p` times the error, `i` times its integral
+    while the joint should rest, `d` times the error of speed, `feed_forward` times the wanted
+    speed, and `inertia` times the wanted acceleration.
     """
 
     p: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
@@ -117,7 +117,7 @@ class JointDescription(Record, frozen=True, kw_only=True):
 
     @property
     def follow_error(self) -> float:
-        """How far it may be off what was sent before safety speaks up [rad] or [m]."""
+        """Return the distance from the command that safety tolerates [rad] or [m]."""
         return self.follow or FOLLOW_SHARE * (self.upper - self.lower)
 
 
@@ -131,7 +131,7 @@ class KeepOut(Record, frozen=True, kw_only=True):
 
 
 class Arm(Record, frozen=True, kw_only=True):
-    """What the brain has to know of an arm besides its joints and its model."""
+    """The data of an arm that the brain needs besides its joints and its model."""
 
     tool: Name = "tool"  # site of the model that reaches for things, along its x axis
     home: Annotated[tuple[JointPosition, ...], Meta(min_length=1, max_length=MAX_ARM_JOINTS)]
@@ -272,7 +272,7 @@ class ControlGains(Record, frozen=True, kw_only=True):
 
 
 class Thresholds(Record, frozen=True, kw_only=True):
-    """When safety speaks up. None of them can be switched off."""
+    """The thresholds of safety. None of them can be switched off."""
 
     battery_warn: PerCent = 15.0  # [%], charge it soon
     battery_return: PerCent = 7.0  # [%], decision comes to rest
@@ -407,7 +407,7 @@ class BodyDescription(Record, frozen=True, kw_only=True):
 
     @property
     def has_base(self) -> bool:
-        """Whether it can drive; an arm that is fixed cannot."""
+        """Return whether it can drive; an arm that is fixed cannot."""
         return self.drive_type != "arm"
 
     @property

@@ -61,7 +61,7 @@ class DetectedObject(Obstacle, frozen=True, kw_only=True):
 
 
 class Objects(Message, frozen=True, kw_only=True):
-    """What a perceptor finds in one scan. Its basis is the tick of that scan."""
+    """The objects that a perceptor finds in one scan. The basis is the tick of that scan."""
 
     objects: Annotated[tuple[DetectedObject, ...], Meta(max_length=256)]
 
@@ -91,7 +91,7 @@ class Contour(Record, frozen=True, kw_only=True):
 
 
 class CameraStatus(Record, frozen=True, kw_only=True):
-    """Whether a camera can be believed."""
+    """The health of a camera. It is `ok` while its pictures can be believed."""
 
     name: Name
     ok: bool
@@ -131,7 +131,7 @@ class WorldModel(Message, frozen=True, kw_only=True):
 
 
 class PoseInMap(Message, frozen=True, kw_only=True):
-    """Where the robot is in the map."""
+    """The robot's pose in the map, with its covariance."""
 
     x: Coordinate  # [m]
     y: Coordinate  # [m]
@@ -190,7 +190,7 @@ class ActuationModel(Record, frozen=True, kw_only=True):
 
 
 class JointTarget(Record, frozen=True, kw_only=True):
-    """Where one joint should go."""
+    """The wanted position of one joint."""
 
     name: Name
     position: JointPosition  # [rad] or [m]
@@ -200,7 +200,7 @@ LONGEST_WINDOW_S = 3.0  # of a joint trajectory in an intent
 
 
 class JointTrajectory(Record, frozen=True, kw_only=True):
-    """Where joints should be from tick to tick: a window that decision renews as it goes on.
+    """The wanted positions of joints from tick to tick: a window that decision keeps renewing.
 
     Between the points positions are interpolated; after the last one the joints stay there.
     """
@@ -247,7 +247,7 @@ class Intent(Message, frozen=True, kw_only=True):
 
 
 class GraspPose(Record, frozen=True, kw_only=True):
-    """Where fingers may hold a thing: x is the approach, and they close along z."""
+    """A pose of fingers that may hold a thing: x is the approach, and they close along z."""
 
     position: tuple[Coordinate, Coordinate, Coordinate]  # [m], between them, in the body's frame
     orientation: Quaternion  # x, y, z, w
@@ -255,7 +255,7 @@ class GraspPose(Record, frozen=True, kw_only=True):
 
 
 class ArmPlan(Message, frozen=True, kw_only=True):
-    """Where an arm's tool will go, for viewers. It is empty once the arm is there."""
+    """The planned path of an arm's tool, for viewers. It is empty once the arm is there."""
 
     path: Annotated[bytes, array_meta(12 * 1024, "float32", ("n", 3), "m")] = b""
     # float32 little-endian [m], (n, 3) in the body's frame
@@ -305,7 +305,7 @@ class CmdVel(Message, frozen=True, kw_only=True):
 
 
 class JointCommand(Message, frozen=True, kw_only=True):
-    """Where the joints should be a tick later, and how fast they move then.
+    """The wanted positions and velocities of joints, a tick later.
 
     Positions alone are to be reached and kept; velocities alone are kept up.
     """

@@ -1,4 +1,4 @@
-"""What cameras found: things and tags in one picture, what stands where, what an arm may grasp."""
+"""Objects found by cameras: in one picture, in the map, and near an arm."""
 
 from typing import Annotated, Literal
 
@@ -118,7 +118,7 @@ class SeenSolid(Record, frozen=True, kw_only=True):
 
 
 class Solids(Message, frozen=True, kw_only=True):
-    """What stands near an arm, in the body's frame at the basis, the nearest first."""
+    """The solids near an arm, in the body's frame at the basis, the nearest first."""
 
     solids: Annotated[tuple[SeenSolid, ...], Meta(max_length=64)] = ()
 

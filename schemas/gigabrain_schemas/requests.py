@@ -92,7 +92,7 @@ class PoseRequest(Message, frozen=True, kw_only=True):
 
 
 class PoseReply(Message, frozen=True, kw_only=True):
-    """Whether the robot is looked for there."""
+    """The answer to a PoseRequest. It is `ok` if the robot is looked for there."""
 
     ok: bool
     text: Text  # a sentence for people

@@ -67,7 +67,7 @@ class SimScene(Message, frozen=True, kw_only=True):
 
 
 class SimPoses(Message, frozen=True, kw_only=True):
-    """Where the bodies of a SimScene are, by the physics. The robot itself does not look at it."""
+    """The poses of the bodies of a SimScene, by the physics. The robot itself does not use them."""
 
     version: Count  # of the scene
     poses: Annotated[bytes, array(28 * MAX_BODIES, "float32", ("n", 7), "m")]

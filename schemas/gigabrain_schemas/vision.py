@@ -1,4 +1,4 @@
-"""What cameras see: depth pictures, and how a camera sees. Pictures are `sensors.Image`."""
+"""Data of cameras: depth pictures, models and mounting poses. Pictures are `sensors.Image`."""
 
 import zlib
 from typing import TYPE_CHECKING, Annotated
@@ -69,7 +69,7 @@ def _unpacked(data: bytes, height: int, width: int) -> "NDArray[np.uint16]":
 
 
 class CameraInfo(Message, frozen=True, kw_only=True):
-    """How a camera sees and where it sits. The last value is kept for those who join late."""
+    """The model and mounting pose of a camera. The last value is kept for those who join late."""
 
     camera: Camera
     source: CameraName = "mujoco"  # what its pictures come from
