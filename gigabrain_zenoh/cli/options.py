@@ -45,7 +45,7 @@ UNIT = re.compile("_(s|mb)$")  # part of a setting's name, but not of its option
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class RobotAddress:
-    """Which robot a command is for."""
+    """The robot that a command is for."""
 
     connect: str | None = None
     "Zenoh endpoint of the robot's router. Default: the only robot on this machine."

@@ -81,7 +81,7 @@ class JointPath:
 
     @property
     def seconds(self) -> float:
-        """How long it lasts [s]."""
+        """Return the duration [s]."""
         return self._times[-1]
 
     def at(self, t: float) -> dict[str, float]:
@@ -121,7 +121,7 @@ class JointStream:
 
     @property
     def posture(self) -> dict[str, float]:
-        """Where the joints should be by now [rad] or [m]."""
+        """Return the positions that the joints should have by now [rad] or [m]."""
         names = (joint.name for joint in self._body.joints)
         return dict(zip(names, (point.position for point in self._now), strict=True))
 
@@ -182,7 +182,7 @@ class JointStream:
 
     @property
     def arrived(self) -> bool:
-        """Whether all joints have been sent to where they should get."""
+        """Return whether all joints have been sent to their goals."""
         over = self._path is None or (self._tick - self._path_tick) * TICK_S >= self._path.seconds
         return over and all(
             abs(self.posture[name] - place) < ARRIVED for name, place in self._ends.items()

@@ -1,4 +1,4 @@
-"""Which commander has the body."""
+"""The lease by which one commander has the body."""
 
 from gigabrain_schemas.body import GateStatus, RobotState
 

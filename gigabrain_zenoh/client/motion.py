@@ -71,7 +71,7 @@ class OdometryMotion:
 
     @property
     def done(self) -> bool:
-        """Whether the motion has ended and the body is at rest."""
+        """Return whether the motion has ended and the body is at rest."""
         if not self._end_tick:
             return False
         return at_rest(self._last.velocity) or self._last.tick > self._end_tick + REST_TICKS

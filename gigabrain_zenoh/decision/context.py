@@ -175,7 +175,7 @@ class ContextSource:
 
     @property
     def lost(self) -> WaitReason | None:
-        """Why the robot's pose in the map is unknown now; None if it is known."""
+        """Return why the robot's pose in the map is unknown now; None if it is known."""
         return self._map_from_odom(self._bus.time.boot, self._bus.time.tick)[1]
 
     def here(self, boot: int, tick: int) -> Pose | None:

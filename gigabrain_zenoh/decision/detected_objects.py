@@ -1,4 +1,4 @@
-"""What perceptors have found: given to behaviours, and kept clear of where it is to be avoided."""
+"""Objects found by perceptors: input of behaviours, and obstacles if marked `avoid`."""
 
 import math
 from collections.abc import Mapping

@@ -242,7 +242,7 @@ class GoalServer(InputSource):
 
     @property
     def hung(self) -> bool:
-        """Whether the plan in the worker thread will never finish."""
+        """Return whether the plan in the worker thread will never finish."""
         return self._navigator is not None and self._navigator.hung
 
     async def close(self) -> None:

@@ -20,7 +20,7 @@ Wanted = str | int  # a class, or the number of a tag
 
 @dataclass(frozen=True, kw_only=True)
 class Sought:
-    """What is known of a wanted thing now."""
+    """The result of a search: the target, or None while there is none."""
 
     target: Target | None = None
     id: int = 0  # of the target

@@ -130,17 +130,17 @@ class Navigator:
 
     @property
     def hung(self) -> bool:
-        """Whether the plan in the worker thread will never finish."""
+        """Return whether the plan in the worker thread will never finish."""
         return self._routes.hung
 
     @property
     def located(self) -> bool:
-        """Whether the robot's pose in the map was known at the last scan."""
+        """Return whether the robot's pose in the map was known at the last scan."""
         return self._context is not None and self._context.here is not None
 
     @property
     def waits(self) -> WaitReason | None:
-        """What start-up waits for; None once pose and map were known."""
+        """Return what start-up waits for; None once pose and map were known."""
         if self._oriented:
             return None
         if not self._seen:
@@ -150,7 +150,7 @@ class Navigator:
 
     @property
     def lost(self) -> WaitReason:
-        """Why the robot's pose in the map is unknown, or that there is no map."""
+        """Return why the robot's pose in the map is unknown, or that there is no map."""
         return self._source.lost or WaitReason.NO_MAP
 
     async def check(self, goal: Goal) -> PathCheck:

@@ -65,7 +65,7 @@ class InputSource:
 
     @property
     def hung(self) -> bool:
-        """Whether a part of it will never finish, while the rest continues."""
+        """Return whether a part of it will never finish, while the rest continues."""
         return False
 
     async def close(self) -> None:

@@ -65,7 +65,7 @@ class Route:
 
 @dataclass(frozen=True, kw_only=True)
 class RouteFeedback:
-    """How a route was driven within one scan."""
+    """The local planner's feedback on a route after one scan."""
 
     version: int
     arrived: bool = False

@@ -111,7 +111,7 @@ class RouteSchedule:
 
     @property
     def hung(self) -> bool:
-        """Whether the plan in the worker thread will never finish."""
+        """Return whether the plan in the worker thread will never finish."""
         return self._worker.overdue > HUNG_SCANS
 
     def _plan(self, request: RouteRequest) -> Take:

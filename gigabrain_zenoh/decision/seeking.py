@@ -104,7 +104,7 @@ def in_sight(costs: Costmap, eye: Floats, points: Floats, short: float) -> NDArr
 
 
 class LookAround:
-    """Where cameras have looked in one search, and where to look next. Not thread-safe."""
+    """The cells seen by cameras in one search, and the next one to look at. Not thread-safe."""
 
     def __init__(self, seek: int = 0, tick: int = 0) -> None:
         self.seek = seek  # the search that it belongs to

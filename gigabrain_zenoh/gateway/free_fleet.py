@@ -1,4 +1,4 @@
-"""What Open-RMF's adapter free_fleet reads and asks of a robot, on plain Zenoh keys.
+"""ROS topics and services for Open-RMF's adapter free_fleet, on plain Zenoh keys.
 
 The keys and payloads are those that zenoh-bridge-ros2dds makes of a robot with Nav2, as the source
 of open-rmf/free_fleet at 002505f uses them: below the robot's name, CDR, no type and no attachment.

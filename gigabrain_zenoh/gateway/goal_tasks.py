@@ -15,7 +15,7 @@ class GoalTasks:
 
     @property
     def busy(self) -> bool:
-        """Whether a goal is carried out."""
+        """Return whether a goal is being carried out."""
         return bool(self._works)
 
     def cancel(self, goal: Goal) -> bool:

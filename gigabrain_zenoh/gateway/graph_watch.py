@@ -1,4 +1,4 @@
-"""What keeps ROS and the gateway apart: types, QoS, type hashes and clocks, for health."""
+"""Mismatches between ROS and the gateway, for health: types, QoS, type hashes and clocks."""
 
 from collections.abc import Callable, Iterable, Mapping
 

@@ -84,7 +84,7 @@ class JointPath:
 
     @property
     def seconds(self) -> float:
-        """How long it takes [s]."""
+        """Return the duration [s]."""
         return float(self._times[-1])
 
     def at(self, t: float) -> tuple[Floats, Floats]:
@@ -257,7 +257,7 @@ def _started(
 
 
 class Tolerances(NamedTuple):
-    """What a goal allows: the body's joints with their tolerances [rad] or [m], and speeds."""
+    """The tolerances of a goal: of the body's joints [rad] or [m], and of speeds."""
 
     body: BodyDescription
     path_speeds: Mapping[str, float]  # [rad/s] or [m/s], of joints whose speed is checked

@@ -1,4 +1,4 @@
-"""What ROS moves joints by: the topic joint_trajectory and the action follow_joint_trajectory.
+"""ROS interfaces that move joints: topic joint_trajectory, action follow_joint_trajectory.
 
 Both are offered once the robot has shown that it has joints.
 """

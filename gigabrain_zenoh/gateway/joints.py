@@ -35,7 +35,7 @@ PAUSE = "pause for 0.5 s before it may move joints again"
 
 
 class Ended(NamedTuple):
-    """How a trajectory has ended."""
+    """The result of a trajectory."""
 
     code: Code
     text: str = ""

@@ -34,13 +34,13 @@ _decode_map = Codec(MAP.type, MAP.max_bytes).decode
 
 
 class EndState(IntEnum):
-    """How a goal ends, by action_msgs/GoalStatus."""
+    """Final states of a goal, by action_msgs/GoalStatus."""
 
     SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
 
 
 class Outcome(NamedTuple):
-    """How a goal has ended."""
+    """The final state of a goal, with its result code and a text for people."""
 
     state: EndState
     code: int = result_codes.NONE
@@ -48,7 +48,7 @@ class Outcome(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """What feedback tells."""
+    """The progress of a goal, for its feedback."""
 
     here: Pose | None
     passed_ns: int

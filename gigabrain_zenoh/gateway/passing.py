@@ -45,7 +45,7 @@ ROBOT_KEYS = frozenset({one.key for one in TOPICS} | {one.key for one in SERVICE
 
 
 class Route(NamedTuple):
-    """What is passed where, and how."""
+    """A route between a Zenoh key and a ROS topic: its direction, type and form."""
 
     key: str
     topic: str  # with a leading slash

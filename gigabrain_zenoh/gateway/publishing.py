@@ -1,4 +1,4 @@
-"""What the gateway publishes: a table, and publishers that work only while ROS reads them."""
+"""Publishing to ROS: a table of topics, and publishers that work only while ROS reads them."""
 
 import functools
 import logging

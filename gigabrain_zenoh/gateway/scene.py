@@ -1,4 +1,4 @@
-"""What the gateway knows of the robot, each message decoded once for all that use it."""
+"""The gateway's data of the robot. Each message is decoded once for all that use it."""
 
 import logging
 from collections.abc import Callable
@@ -104,7 +104,7 @@ class Scene:
 
     @property
     def simulated(self) -> bool:
-        """Whether the body is simulated, so that ROS takes its time from /clock."""
+        """Return whether the body is simulated, so that ROS takes its time from /clock."""
         return self.body is not None and self.body.link == "sim"
 
     @property

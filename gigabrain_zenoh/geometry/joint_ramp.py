@@ -21,7 +21,7 @@ SLACK = 1e-3  # [rad/s] or [m/s], the same for joints that barely move
 
 
 class JointPoint(msgspec.Struct, frozen=True):
-    """Where a joint should be, and how it moves then."""
+    """The position, velocity and acceleration of a joint at one time."""
 
     position: float  # [rad] or [m]
     velocity: float = 0.0  # [rad/s] or [m/s]
@@ -29,7 +29,7 @@ class JointPoint(msgspec.Struct, frozen=True):
 
 
 class JointGoal(msgspec.Struct, frozen=True):
-    """Where a joint should get, or how fast it should move."""
+    """The goal of a joint: a position, or a velocity."""
 
     position: float | None = None  # [rad] or [m]; None: nowhere, it moves at `velocity`
     velocity: float = 0.0  # [rad/s] or [m/s], without a position

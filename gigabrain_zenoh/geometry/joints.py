@@ -1,4 +1,4 @@
-"""How far joints may move from tick to tick. Pure functions."""
+"""Joint motion within limits, from tick to tick. Pure functions."""
 
 import math
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ OVERRUN = 0.6  # of the way that a joint lags behind, which it runs on if nothin
 
 
 class JointMotion(msgspec.Struct, frozen=True):
-    """Where a joint is, and how fast it moves."""
+    """The position and velocity of a joint."""
 
     position: float  # [rad] or [m]
     velocity: float = 0.0  # [rad/s] or [m/s]

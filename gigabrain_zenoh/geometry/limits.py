@@ -1,4 +1,4 @@
-"""How fast a body may go, and how fast it may change that. Pure functions."""
+"""Speed and acceleration limits of a body. Pure functions."""
 
 import math
 

@@ -38,7 +38,7 @@ log = logging.getLogger("gigabrain")
 
 @dataclass(frozen=True)
 class ProcessPlace:
-    """Where one process of a deployment runs."""
+    """The endpoint, folders and time limit of one process of a deployment."""
 
     endpoint: Endpoint
     run_dir: Path  # folder of this run's logs
@@ -84,7 +84,7 @@ class ProcessType:
 
     @property
     def own(self) -> bool:
-        """Whether it is a process of one's own, with an identity of its own."""
+        """Return whether the process has an identity of its own."""
         return "process" in self.roles
 
     def node(self, settings: Mapping[str, Any]) -> Node:

@@ -18,7 +18,7 @@ MIN_SHARE = 0.1  # of the greatest lever; where levers are shorter, a force is n
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Push:
-    """What pushes the tool, in the frame of the base."""
+    """The force on the tool and the tool's lag, in the frame of the base."""
 
     force: Floats | None  # (3,) [N]; None where efforts are not measured
     lag: Floats  # (3,) [m], from where the tool is to where it was sent

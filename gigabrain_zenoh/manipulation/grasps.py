@@ -55,7 +55,7 @@ class Grasp:
 
 @dataclass(frozen=True, kw_only=True)
 class NoGrasp:
-    """Why a thing cannot be grasped."""
+    """The reason why a thing cannot be grasped."""
 
     reason: str  # for people
 

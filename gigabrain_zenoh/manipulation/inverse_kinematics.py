@@ -29,7 +29,7 @@ Collides = Callable[[Floats], str]  # of a posture: what touches what, empty for
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ToolGoal:
-    """Where the tool should be, in the frame of the arm's base.
+    """The wanted pose of the tool, in the frame of the arm's base.
 
     With `axes` its whole orientation counts, with `approach` alone only the direction of its
     x axis, with neither its place only.
@@ -42,7 +42,7 @@ class ToolGoal:
 
     @property
     def fault(self) -> str:
-        """Why this is no goal; empty for a good one."""
+        """Return why the goal is invalid; empty for a valid one."""
         given = [self.position, self.axes, self.approach]
         if not all(np.all(np.isfinite(one)) for one in given if one is not None):
             return "the goal has to be finite"
@@ -76,7 +76,7 @@ class OutOfReach:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Found:
-    """Where a descent has ended."""
+    """The posture in which a descent has ended, and its errors."""
 
     posture: Floats
     position_error: float

@@ -35,7 +35,7 @@ MARGIN_SHARE = 0.5  # of the checker's margin, that is kept where corners are cu
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JointTrajectory:
-    """Where the joints are at which time. It begins with the present state and ends at rest."""
+    """The motion of joints over time. It begins with the present state and ends at rest."""
 
     names: tuple[str, ...]
     times: Floats  # (k,) [s] from the start, rising
@@ -45,7 +45,7 @@ class JointTrajectory:
 
     @property
     def duration(self) -> float:
-        """How long it takes [s]."""
+        """Return the duration [s]."""
         return float(self.times[-1])
 
 

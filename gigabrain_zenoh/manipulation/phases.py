@@ -38,7 +38,7 @@ class Phase:
 
     @property
     def ticks(self) -> int:
-        """How long it takes."""
+        """Return the duration [ticks]."""
         if self.arm is None:
             return GRIP_TICKS
         return math.ceil(self.arm.duration / TICK_S) + 1 + SETTLE_TICKS

@@ -47,7 +47,7 @@ TRIES = 3  # grasps whose ways are planned
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pick:
-    """How a thing is picked up."""
+    """A plan to pick up a thing."""
 
     grasp: Grasp
     phases: tuple[Phase, ...]
@@ -57,14 +57,14 @@ class Pick:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Place:
-    """How a thing that is held is put down."""
+    """A plan to put down a thing that is held."""
 
     phases: tuple[Phase, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
 class NoWay:
-    """Why something cannot be picked up or put down."""
+    """The reason why something cannot be picked up or put down."""
 
     reason: str  # for people
     stand_off: float | None = None  # [m], how far ahead of its base a thing can be picked up

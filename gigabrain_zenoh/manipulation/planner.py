@@ -29,7 +29,7 @@ class JointPath:
 
 @dataclass(frozen=True, kw_only=True)
 class NoPath:
-    """Why there is no path."""
+    """The reason why there is no path."""
 
     cause: NoPathCause
     reason: str  # for people

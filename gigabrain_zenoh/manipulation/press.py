@@ -40,7 +40,7 @@ JUMP_RAD = 0.3  # [rad] or [m] from step to step: that is another posture
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PressWay:
-    """How something is pressed."""
+    """A plan to press something, and the posture to return to."""
 
     phases: tuple[Phase, ...]
     before: Floats  # (n,) posture to which the arm goes back

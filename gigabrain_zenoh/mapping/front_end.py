@@ -97,7 +97,7 @@ class DriftSinceMatch:
 
     @property
     def broken(self) -> bool:
-        """Whether the robot was carried off, so that nothing joins the two parts.
+        """Return whether the robot was carried off, so that nothing joins the two parts.
 
         Scans that fit neither the map nor one another prove nothing, such as leaves in the wind or
         a slope.
@@ -106,7 +106,7 @@ class DriftSinceMatch:
 
     @property
     def far(self) -> bool:
-        """Whether the last matched scan may be out of sight by now."""
+        """Return whether the last matched scan may be out of sight by now."""
         return self.travel > MISSED_TRAVEL or self.turn > MISSED_TURN
 
     def after_break(self) -> Floats:

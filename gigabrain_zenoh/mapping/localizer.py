@@ -95,7 +95,7 @@ class Localizer:
 
     @property
     def wants_search(self) -> bool:
-        """Whether the whole map should be searched now."""
+        """Return whether the whole map should be searched now."""
         return not self._places and self._unsearched >= SEARCH_INTERVAL_SCANS
 
     @property
@@ -361,7 +361,7 @@ class KidnapDetector:
 
     @property
     def certain(self) -> bool:
-        """Whether the robot is certainly somewhere else."""
+        """Return whether the robot is certainly somewhere else."""
         return self.scans >= KIDNAPPED_SCANS
 
     def look(self, grid: LogOddsGrid, view: View, pose: Floats) -> bool:

@@ -18,7 +18,7 @@ MAX_OBJECTS = 256
 
 
 class ObjectFile(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What stands and hangs in a map, in its frame."""
+    """The objects and tags of a map, in its frame."""
 
     version: Annotated[int, Meta(ge=1, le=VERSION)] = VERSION
     objects: Annotated[tuple[MapObject, ...], Meta(max_length=MAX_OBJECTS)] = ()

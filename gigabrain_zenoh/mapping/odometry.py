@@ -85,7 +85,7 @@ class OdometryFusion:
 
     @property
     def slipping(self) -> bool:
-        """Whether wheels and gyro disagree."""
+        """Return whether wheels and gyro disagree."""
         return abs(self._slip) > SLIP_RATE
 
     def at(self, tick: int) -> OdometrySample | None:

@@ -126,7 +126,7 @@ def _score(likelihood: float, down: int, right: int, t: int, lattice: Lattice) -
 def _total(
     cells: Bytes, flat: NDArray[np.uint8], hits: LatticeHits, t: int, row: int, column: int
 ) -> int:
-    """How likely all points of heading `t` are together, so many rows and columns on."""
+    """Return the summed likelihood of all points of heading `t`, shifted by `row` and `column`."""
     total = 0
     on = np.uint32(row * cells.shape[1] + column)
     for k in range(hits.inside_count[t]):

@@ -104,7 +104,7 @@ class TrafficMap:
 
     @property
     def any(self) -> bool:
-        """Whether there is traffic."""
+        """Return whether there is traffic."""
         return self._any
 
     def see(self, tick: int, x: float, y: float, discs: Floats) -> None:

@@ -37,7 +37,7 @@ Pose = tuple[float, float, float]  # x, y [m], yaw [rad]
 
 
 class Car(NamedTuple):
-    """What a car needs: discs along its middle line that cover it, and its tightest turn."""
+    """The shape of a car: discs along its middle line that cover it, and its tightest turn."""
 
     radius: float  # [m], of the tightest turn
     first: float  # [m], from the origin to the middle of the first disc
@@ -48,7 +48,7 @@ class Car(NamedTuple):
 
 
 class Terrain(NamedTuple):
-    """Where a car may be, by cells of a map."""
+    """A map for a car: clearance, cost and distance to the goal of each cell."""
 
     distance: Singles  # (h, w) [m], to the nearest obstacle
     cost: Costs  # (h, w), of a metre

@@ -1,4 +1,4 @@
-"""What the cost of a plan depends on: the body, its surroundings, the goal, and the weights."""
+"""Inputs of a plan's cost: the body, its surroundings, the goal, and the weights."""
 
 from typing import NamedTuple
 

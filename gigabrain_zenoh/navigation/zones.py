@@ -96,7 +96,7 @@ class ZoneMap:
 
     @property
     def empty(self) -> bool:
-        """Whether no zone restricts where the body may drive."""
+        """Return whether no zone restricts where the body may drive."""
         return not self.keepouts and not self.lanes
 
     def overlay(self, grid: OccupancyGrid, rules: Inflation) -> ZoneOverlay | None:

@@ -1,4 +1,4 @@
-"""Where a thing would be in a camera's picture, and whether something is in the way."""
+"""The place of a thing in a camera's picture, and hits of the scan that may hide it."""
 
 import math
 from typing import NamedTuple
@@ -16,7 +16,7 @@ BEAM_RAD = math.radians(1.5)  # beside a line of sight, in which a hit hides wha
 
 
 class Spot(NamedTuple):
-    """Where a thing is in a picture."""
+    """The place of a thing in a picture."""
 
     pixel: tuple[float, float]
     depth: float  # [m], along the camera's axis

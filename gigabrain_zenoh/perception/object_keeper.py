@@ -84,7 +84,7 @@ class KeptTag(Struct, frozen=True):
 
 
 class ObjectState(Struct, frozen=True, kw_only=True):
-    """What the next perception process needs."""
+    """The state for the next perception process."""
 
     boot: Count  # start of the driver for which it counts
     map: Name = ""
@@ -223,7 +223,7 @@ class ObjectKeeper:
 
     @property
     def present(self) -> ObjectFile:
-        """What stays, in the map as it is now."""
+        """Return the objects and tags that stay, in the map as it is now."""
         return ObjectFile(
             objects=tuple(one for one, _ in self.memory.anchored())[: object_file.MAX_OBJECTS],
             tags=self.tags.tags()[: object_file.MAX_OBJECTS],

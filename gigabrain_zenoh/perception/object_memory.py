@@ -94,12 +94,12 @@ class ObjectTrack:
 
     @property
     def moves(self) -> bool:
-        """Whether it moves by itself."""
+        """Return whether things of its class move by themselves."""
         return self.label in MOVERS
 
     @property
     def sure(self) -> bool:
-        """Whether it counts."""
+        """Return whether it has been seen often and surely enough to count."""
         return self.seen >= CONFIRMED_PICTURES and self.odds >= CONFIRMED_ODDS
 
     def message(self) -> MapObject:

@@ -126,13 +126,13 @@ class ObstacleTrack:
 
     @property
     def may_be_off(self) -> float:
-        """How far it may be from the predicted position if it has turned round [m]."""
+        """Return how far it may be from the predicted position if it has turned round [m]."""
         speed = math.hypot(self.velocity_x, self.velocity_y)
         return 2 * speed * min(self.unseen_s, TURNS_S) if self.moving else 0.0
 
     @property
     def moves_quickly(self) -> bool:
-        """Whether it moves faster than QUICK_SPEED."""
+        """Return whether it moves faster than QUICK_SPEED."""
         return self.moving and math.hypot(self.velocity_x, self.velocity_y) > QUICK_SPEED
 
     def seems_to_move(self) -> bool:

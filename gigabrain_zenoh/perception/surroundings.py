@@ -1,4 +1,4 @@
-"""What one scan says of the place: what may hide things, and which cameras can be believed."""
+"""Surroundings by one scan: points that may hide things, and cameras that can be believed."""
 
 from dataclasses import dataclass
 

@@ -50,7 +50,7 @@ class TagTrack:
 
     @property
     def sure(self) -> bool:
-        """Whether it counts."""
+        """Return whether it has been seen often enough to count."""
         return self.seen >= CONFIRMED_PICTURES
 
     def message(self) -> MapTag:

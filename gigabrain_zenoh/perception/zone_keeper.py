@@ -61,7 +61,7 @@ class Anchored(Struct, frozen=True, kw_only=True):
 
 
 class ZoneState(Struct, frozen=True, kw_only=True):
-    """What the next perception process needs: the map in use, and its zones."""
+    """The state for the next perception process: the map in use, and its zones."""
 
     boot: Count  # start of the driver for which it counts
     map: Name = ""

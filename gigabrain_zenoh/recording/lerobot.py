@@ -46,7 +46,7 @@ Floats = NDArray[np.float32]
 
 
 class Layout(Struct, frozen=True, kw_only=True):
-    """What a dataset holds of a body."""
+    """The parts of a body that a dataset holds."""
 
     robot_type: str | None = None
     base: bool = True

@@ -72,7 +72,7 @@ class Goal:
 
 
 class Outcome(NamedTuple):
-    """How a goal ended."""
+    """The final state of a goal, and its result."""
 
     state: GoalState  # SUCCEEDED, CANCELED or ABORTED
     result: Any = None  # message or mapping of the action's result; None: its defaults
@@ -139,7 +139,7 @@ class Goals:
 
 
 class ActionHandler(Protocol):
-    """What an action does."""
+    """The callbacks of an action: they accept, cancel and run its goals."""
 
     def accept(self, message: Any) -> bool:
         """Return whether to accept a goal."""

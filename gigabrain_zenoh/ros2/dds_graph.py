@@ -100,7 +100,7 @@ class DiscoveryInfo:
 
 
 class DdsGraph:
-    """What is known of the others, and of ourselves."""
+    """The known endpoints and nodes: those of others, and our own."""
 
     def __init__(self, info: DiscoveryInfo, ours: frozenset[bytes]) -> None:
         """Create an empty graph; `ours` are the GUIDs' first 12 bytes of our participants."""

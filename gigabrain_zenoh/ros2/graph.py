@@ -24,7 +24,7 @@ Owner = tuple[str, EndpointKind]  # a node, and its endpoints of a kind
 
 
 class Trouble(NamedTuple):
-    """Why two endpoints of a topic or service exchange nothing."""
+    """The reason why two endpoints of a topic or service exchange nothing."""
 
     kind: str  # type, qos, hash or name
     topic: str

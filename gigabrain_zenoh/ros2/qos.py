@@ -7,7 +7,7 @@ MAX_DEPTH = 1000  # messages that a publisher keeps for late readers, or a reade
 
 @dataclass(frozen=True)
 class Qos:
-    """What a publisher offers, or what a subscriber requests."""
+    """The QoS that a publisher offers, or that a subscriber requests."""
 
     reliable: bool = True
     transient_local: bool = False  # a late reader gets the last `depth` messages

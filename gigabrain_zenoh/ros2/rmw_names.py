@@ -123,7 +123,7 @@ NAMES = (b"\x0fsequence_number", b"\x10source_timestamp", b"\x0asource_gid\x10")
 
 
 class Attachment(NamedTuple):
-    """What goes with every message, request and response."""
+    """The attachment of a message, request or response: its number, time and sender."""
 
     sequence: int  # from 1
     source_ns: int  # [ns], Unix time

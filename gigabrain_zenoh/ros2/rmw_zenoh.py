@@ -59,7 +59,7 @@ RETRY_S = 0.1  # until a service is asked again that no node serves yet
 
 
 class _Entity:
-    """What an endpoint of ours is called: its key, and its token in a session."""
+    """The key of an endpoint of ours, and its token in a session."""
 
     def __init__(
         self, home: "RmwZenohTransport", kind: EndpointKind, topic: str, type: str, qos: Qos

@@ -1,4 +1,4 @@
-"""How fast each joint may move towards what the arm must not touch. Pure functions.
+"""Speed limits of joints towards what the arm must not touch. Pure functions.
 
 A pair of shapes at the distance d comes nearer by Σ |g| s, where s are the ways of the joints that
 bring them together and g the distance that a joint takes per [rad] or [m]. Until the next verdict
@@ -66,7 +66,7 @@ class ArmShape(Protocol):
 
 
 class ArmLimits(Struct, frozen=True, kw_only=True):
-    """How the arm may move now, and why not faster."""
+    """The present speed limits of the arm's joints, and the causes that hold it back."""
 
     caps: tuple[JointCap, ...] = ()
     causes: tuple[Cause, ...] = ()

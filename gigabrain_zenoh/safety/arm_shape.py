@@ -34,7 +34,7 @@ Indices = NDArray[np.int64]
 
 
 class _Poses(NamedTuple):
-    """Where shapes and joints are in some postures."""
+    """The poses of shapes and joints in some postures."""
 
     positions: Floats  # (postures, movable joints) [rad] or [m]
     middles: Floats  # (postures, shapes, 3) [m]

@@ -81,7 +81,7 @@ NO_MARKS = Marks(np.empty((0, 3)), np.empty(0, bool), np.empty(0, np.int8), np.e
 
 
 class CameraState(Struct, frozen=True, kw_only=True):
-    """What is known of one camera."""
+    """The state of one camera and of its newest picture."""
 
     basis: int = 0  # tick of the newest picture; 0 before the first
     code: str = ""  # of the cause for which that one cannot be believed

@@ -176,7 +176,7 @@ class Attitude(Struct, frozen=True, kw_only=True):
 
     @property
     def causes(self) -> tuple[Cause, ...]:
-        """Why the body must stop, until a person releases it."""
+        """Return the causes for which the body must stop, until a person releases it."""
         found = [("tilted", self.tilted_ticks >= TILT_TICKS), ("collision", self.hit)]
         return tuple(cause(code) for code, wrong in found if wrong)
 

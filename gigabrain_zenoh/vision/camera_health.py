@@ -1,4 +1,4 @@
-"""Whether a camera can be believed: pure, and fed with one exposure after the other.
+"""Checks of a camera's pictures, one exposure after the other. Pure.
 
 A camera that shows nothing new or nothing at all counts as blind. A sensor has noise, so two
 exposures never have the same bits. A surface that is nearer than the camera can measure takes all
@@ -31,7 +31,7 @@ STEP_PX, BLOCK = 4, 5  # every fourth pixel is looked at, in blocks of 5 x 5
 
 
 class PictureFigures(NamedTuple):
-    """What a picture looks like as a whole."""
+    """Figures of a picture as a whole."""
 
     dark: float  # share of pixels
     bright: float  # share of pixels

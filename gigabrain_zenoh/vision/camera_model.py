@@ -1,4 +1,4 @@
-"""How the pixels of a camera and points in the body's frame belong together.
+"""Conversion between the pixels of a camera and points in the body's frame.
 
 Brown's model of distortion (k1, k2, p1, p2, k3), as in OpenCV and ROS.
 """

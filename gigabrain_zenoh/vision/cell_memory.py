@@ -1,4 +1,4 @@
-"""What cameras saw, in cells of the plane of the odometry: where, how high, how long ago.
+"""Memory of what cameras saw: cells in the plane of the odometry, with height and age.
 
 A cell is emptied when it is seen through: when a picture shows what is behind it, or the floor
 under it. What is out of view stays, until the odometry has drifted too far since it was seen.
@@ -54,7 +54,7 @@ Cells = NDArray[np.void]
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """What a picture says of the places in view, to see what is gone."""
+    """The depth and the floor in a picture, to find cells whose thing is gone."""
 
     model: CameraModel
     depth: Singles  # (height, width) [m]; 0 is unknown
@@ -191,7 +191,7 @@ class CellMemory:
 
     @property
     def place(self) -> Floats:
-        """Where the robot is (2,), in the odometry frame [m]."""
+        """Return the robot's position (2,), in the odometry frame [m]."""
         return np.array(self._placed()[:2])
 
     def _placed(self) -> tuple[float, float, float, float]:

@@ -1,4 +1,4 @@
-"""What a depth picture shows: points above the floor, floor, holes in it, and what is unknown."""
+"""Contents of a depth picture: points above the floor, floor, holes in it, and unknown parts."""
 
 import math
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ SUB_ROWS = (-0.375, -0.125, 0.125, 0.375)
 
 @dataclass(frozen=True, slots=True)
 class DepthView:
-    """What one picture shows. Points are in the body's frame [m], heights above the floor [m]."""
+    """The content of a picture. Points are in the body's frame [m], heights above the floor [m]."""
 
     obstacles: Singles  # (n, 3): x, y, height
     holes: Singles  # (m, 3): where the floor should be, and how high what was seen instead is

@@ -30,7 +30,7 @@ DARK = 40.0  # added to the brightness that chromaticity is divided by: dark pix
 
 @dataclass(frozen=True, slots=True)
 class ColourView:
-    """What one picture shows, in the body's frame."""
+    """The floor and its boundary in one picture, in the body's frame."""
 
     boundary: Floats  # (n, 2) [m], where the floor ends
     is_floor: Mask  # (height, width)

@@ -52,7 +52,7 @@ FLAT_M, BENT_M = 0.02, 0.05  # off a plane, inside a box in the mean, and farthe
 
 
 class ThingPlace(NamedTuple):
-    """Where a thing is, in the body's frame."""
+    """The position and size of a thing, in the body's frame."""
 
     position: Point  # [m], of its middle
     size: Extent | None  # [m], width and height; None where it is not all in the picture

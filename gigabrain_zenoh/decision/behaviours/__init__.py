@@ -92,14 +92,14 @@ class StepOutcome(Struct, frozen=True, kw_only=True):
 
 
 class Idle(NamedTuple):
-    """Why the robot stands: a short name, whose changes are logged, and a text for people."""
+    """The reason to stand: a short name, whose changes are logged, and a text for people."""
 
     activity: str
     reason: str
 
 
 class WaitReason(StrEnum):
-    """Why the robot cannot drive by its map yet; the value is the text for people."""
+    """Reasons why the robot cannot drive by its map yet; the value is the text for people."""
 
     STARTING = "starting up"
     PERCEPTION_STARTING = "perception is starting up"

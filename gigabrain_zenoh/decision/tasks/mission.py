@@ -201,7 +201,7 @@ class Mission(Part, frozen=True, kw_only=True):
 
     @property
     def drives(self) -> bool:
-        """Whether any step drives."""
+        """Return whether any step drives."""
         return any(step.kind in DRIVING for _, step in _steps(self))
 
     @property
@@ -211,7 +211,7 @@ class Mission(Part, frozen=True, kw_only=True):
 
     @property
     def looks(self) -> bool:
-        """Whether any step needs a camera that recognises things or tags."""
+        """Return whether any step needs a camera that recognises things or tags."""
         return any(
             step.find is not None or any(isinstance(place, AtTag) for _, place in _places(step))
             for _, step in _steps(self)

@@ -49,7 +49,7 @@ T = TypeVar("T")
 
 
 class ClutterCourse(Struct, frozen=True, kw_only=True):
-    """How worlds are driven."""
+    """The settings of a run through cluttered worlds."""
 
     body: str = "turtlebot3_waffle"
     cameras: bool = True

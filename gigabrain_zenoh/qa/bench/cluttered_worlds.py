@@ -186,7 +186,7 @@ def _thing(random: np.random.Generator, thing: int, kind: str, height: float) ->
 
 
 class FreeSpace:
-    """Where a body may be by the true shapes of a world, in cells of CELL_M."""
+    """The free space of a body by the true shapes of a world, in cells of CELL_M."""
 
     def __init__(self, parts: Sequence[Part], pits: Sequence[Pit], body: BodyDescription) -> None:
         bars = [one.outline for one in parts if one.bottom < body.body_height + LOW_ROOF_M]

@@ -46,7 +46,7 @@ SEEN_S, GHOST_WAIT_S = 1.0, 3.0
 
 
 class EyesFigures(Struct, frozen=True, kw_only=True):
-    """What was measured with one kind of sensor."""
+    """The figures measured with one kind of sensor."""
 
     sensor: str
     camera: str
@@ -113,7 +113,7 @@ class Eyes:
 
 @dataclass
 class ClutterScores:
-    """What cluttered worlds add up to."""
+    """The scores of all cluttered worlds together."""
 
     front: list[float] = field(default_factory=list)
     beyond: list[float] = field(default_factory=list)
@@ -218,7 +218,7 @@ def _clutter(eyes: Eyes, world: EyesWorld, scores: ClutterScores) -> None:
 
 
 class _Truth:
-    """What a camera really sees, without errors, in the world's frame."""
+    """The true view of a camera, without errors, in the world's frame."""
 
     def __init__(self, eyes: Eyes, renderer: Renderer, world: EyesWorld, pose: Pose) -> None:
         self.world, self.pose, self.height = world, pose, eyes.body.body_height

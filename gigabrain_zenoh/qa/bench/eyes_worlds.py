@@ -72,7 +72,7 @@ class Pit(NamedTuple):
 
 
 class EyesWorld(NamedTuple):
-    """What stands on the floor, and what gapes in it."""
+    """A floor with things on it, and with at most one pit."""
 
     parts: tuple[Part, ...] = ()
     pit: Pit | None = None

@@ -308,7 +308,7 @@ def in_words(run: HandsRun) -> str:
 
 @dataclass
 class Attempt:
-    """What came of one thing."""
+    """The outcome of picking up one thing and putting it down."""
 
     outcome: str = ""
     reason: str = ""

@@ -39,7 +39,7 @@ Progress = Callable[[str], None]
 
 
 class JointTracking(Struct, frozen=True, kw_only=True):
-    """How one joint followed, by the physics."""
+    """The errors of one joint that follows a sine and a step, by the physics."""
 
     joint: str
     amplitude_deg: float  # of the sine

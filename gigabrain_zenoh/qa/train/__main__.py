@@ -19,7 +19,7 @@ FOLDER = Path("things")
 @cyclopts.Parameter(name="*")
 @dataclass(frozen=True)
 class Plan:
-    """How much is rendered and learned, and where it is kept."""
+    """The amount of rendering and learning, and the folder for it."""
 
     folder: Path = FOLDER
     "Where the sets and the checkpoint are; what is there is not made again."

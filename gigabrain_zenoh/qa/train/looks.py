@@ -1,4 +1,4 @@
-"""What each class looks like: parts of random proportions, standing on the floor, facing +x.
+"""Shapes of each class: parts of random proportions, standing on the floor, facing +x.
 
 `wide` is 0 within the proportions of training and 1 for those beyond, which only tests draw.
 """

@@ -21,7 +21,7 @@ Params = dict[str, dict[str, Any]]
 
 
 class Ops(Protocol[T]):
-    """What the net is built of; a tensor is T."""
+    """The operations of the net; a tensor is T."""
 
     def conv(
         self,

@@ -50,7 +50,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Split:
-    """What may be drawn: textures, proportions, and lights."""
+    """The textures, proportions and lights that may be drawn."""
 
     families: tuple[textures.Family, ...]
     wide: int

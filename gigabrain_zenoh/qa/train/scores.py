@@ -20,7 +20,7 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is in a picture: boxes (n, 4) [px], labels (n,), and which of them may be missed."""
+    """The things in a picture: boxes (n, 4) [px], labels (n,), and those that may be missed."""
 
     boxes: Floats
     labels: NDArray[np.int64]

@@ -1,4 +1,4 @@
-"""What the net is to answer for a picture, and the pictures as training changes them."""
+"""Targets of the net for a picture, and random changes of pictures in training."""
 
 import cv2
 import numpy as np

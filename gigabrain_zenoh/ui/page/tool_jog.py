@@ -1,4 +1,4 @@
-"""Where an arm's tool is, and the speeds of joints that move it along a line.
+"""The place of an arm's tool, and the speeds of joints that move it along a line.
 
 The speeds are found by damped least squares.
 """
