@@ -218,7 +218,7 @@ class Passage:
         self.counts: Counter[str] = Counter()
         self._route, self._bus, self._ros, self._link = route, bus, ros, link
         self._converter, self._fault = Converter(types, route), Fault(log)
-        self._topic, self._told = topic, frozenset[str]()
+        self._topic, self._reported = topic, frozenset[str]()
         self._ends: Close | None = None
         self._qos = self._listens = Qos(reliable=False, depth=DEPTH)
         self._read = self._looked = False
@@ -269,9 +269,9 @@ class Passage:
         )
         found = troubles(self._link, (*theirs, ours), ours_only=True)
         wrong = frozenset(f"{one.text}; {one.do}" for one in found)
-        for text in sorted(wrong - self._told):
+        for text in sorted(wrong - self._reported):
             log.warning("%s: %s", route.topic, text)
-        self._told = wrong
+        self._reported = wrong
 
     def _count(self, readers: int) -> None:
         """Listen to the key while ROS reads the topic."""

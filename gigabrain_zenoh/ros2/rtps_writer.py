@@ -50,7 +50,7 @@ class _Reader:
     guid: bytes
     address: Address
     start: int  # first sample that concerns it, except those for it alone
-    told: int  # it knows about all samples up to this one
+    announced: int  # it knows about all samples up to this one
     acked: int = 0  # it has all samples below this one
     last: int = 0  # the newest sample for it
     answered: bool = False  # it has sent an ACKNACK
@@ -84,7 +84,7 @@ class ReliableWriter:
             known.address = address
             return
         start = 1 if self._transient_local else self._last + 1
-        reader = _Reader(guid, address, start, told=0, due_s=now + FIRST_HEARTBEAT_S)
+        reader = _Reader(guid, address, start, announced=0, due_s=now + FIRST_HEARTBEAT_S)
         self.readers[guid] = reader
         mine = [one for one in self._history.values() if self._concerns(one, reader)]
         reader.last = mine[-1].data.seq if mine else 0
@@ -144,7 +144,7 @@ class ReliableWriter:
         if wanted:
             self._deliver(reader, wanted, now)
         elif not asked and not ack.final:
-            has_all = base > max(reader.last, reader.told)
+            has_all = base > max(reader.last, reader.announced)
             self._to(reader, [self._heartbeat(reader, final=has_all)])
 
     def on_nack_fragments(self, guid: bytes, nack: NackFragments, now: float) -> None:
@@ -212,9 +212,9 @@ class ReliableWriter:
         size, entity = 0, reader.guid[12:]
         for one in samples:
             data = one.data._replace(reader=entity)
-            if data.seq > reader.told + 1 and not self._transient_local:
-                batch.append(Gap(entity, self.entity, reader.told + 1, data.seq))
-            reader.told = max(reader.told, data.seq)
+            if data.seq > reader.announced + 1 and not self._transient_local:
+                batch.append(Gap(entity, self.entity, reader.announced + 1, data.seq))
+            reader.announced = max(reader.announced, data.seq)
             reader.sent_s[data.seq] = now
             if len(data.payload) > MAX_WHOLE_BYTES:
                 for part in _fragments(data, entity):
@@ -229,7 +229,7 @@ class ReliableWriter:
 
     def _heartbeat(self, reader: _Reader, *, final: bool = False) -> Heartbeat:
         self._serial += 1
-        last = max(reader.last, reader.told)
+        last = max(reader.last, reader.announced)
         mine = (s for s, one in self._history.items() if s <= last and self._concerns(one, reader))
         first = min(mine, default=last + 1)
         return Heartbeat(reader.guid[12:], self.entity, first, last, self._serial, final)

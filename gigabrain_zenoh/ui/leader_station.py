@@ -14,7 +14,7 @@ from gigabrain_zenoh.ui.teleop_station import keys_of, typed_keys
 
 SLOW = math.radians(45)  # [rad/s], at which the follower goes to the leader's posture
 FAR, NEAR = math.radians(60), math.radians(3)  # off that posture, where this begins and ends
-TOLD_TICKS = 50  # between two lines about it
+PROGRESS_TICKS = 50  # between two lines about it
 PREFIX = "arm_"  # of the joints of an arm on a base
 HELP = "hold the leader and move it; space: e-stop; x or Ctrl-C: end"
 Posture = Mapping[str, float]  # [rad] by joint
@@ -34,7 +34,7 @@ class LeaderStation:
         self._robot, self._leader, self._say = robot, leader, say
         self._ended, self._pressed = asyncio.Event(), False
         self._speed: float | None = SLOW
-        self._told = 0  # ticks that it has been slow for
+        self._slow_ticks = 0  # ticks that it has been slow for
 
     async def drive(self, take: bool) -> None:
         """Lead until a key or a signal ends it; then the robot holds where it is.
@@ -82,12 +82,12 @@ class LeaderStation:
         off = abs(wanted[name] - sent[name])
         if self._speed and off < NEAR:
             self._say("following")
-            self._speed, self._told = None, 0
+            self._speed, self._slow_ticks = None, 0
         elif self._speed or off > FAR:
-            if self._told % TOLD_TICKS == 0:
+            if self._slow_ticks % PROGRESS_TICKS == 0:
                 degrees = math.degrees(off)
                 self._say(f"slowly to the leader's posture: {name} has {degrees:.0f} deg to go")
-            self._speed, self._told = SLOW, self._told + 1
+            self._speed, self._slow_ticks = SLOW, self._slow_ticks + 1
 
 
 def follower_posture(body: BodyDescription, posture: Posture) -> dict[str, float]:

@@ -113,8 +113,8 @@ def part_of_wall(label: str, box: Box, model: CameraModel, depth: NDArray[np.uin
         _goes_on(profile, (left + near, left + far), (left - far, left - near)),
         _goes_on(profile, (right - far, right - near), (right + near, right + far)),
     ]
-    told = [one for one in goes_on if one is not None]
-    return bool(told) and all(told)
+    answers = [one for one in goes_on if one is not None]
+    return bool(answers) and all(answers)
 
 
 def _profile(box: Box, depth: NDArray[np.uint16]) -> NDArray[np.float64]:

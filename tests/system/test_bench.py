@@ -40,7 +40,7 @@ async def test_a_whole_robot_is_measured(home: Home, tmp_path: Path) -> None:
     assert result["ready_s"] > 0
     assert result["physics_cpu"] > 0
     goal = result["first_goal"]
-    assert goal["told"].startswith("goal-1: ")
+    assert goal["answer"].startswith("goal-1: ")
     assert 0 < goal["accepted_s"] < goal["drives_s"]
     assert 0 < goal["accepted_cpu_s"] <= goal["drives_cpu_s"]
     assert "physics and lidar" in command.out

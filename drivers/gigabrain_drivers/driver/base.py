@@ -83,11 +83,11 @@ class Driver(abc.ABC):
 
     async def ticks(self, clock: Clock) -> AsyncIterator[int]:
         """Yield whenever time has gone on, and by how many ticks of 20 ms of the body's time."""
-        start, told = clock.now_ns(), 0
+        start, yielded = clock.now_ns(), 0
         async for now_ns in clock.every(TICK_NS):
-            passed = (now_ns - start + TIMER_SLACK_NS) // TICK_NS + 1 - told
+            passed = (now_ns - start + TIMER_SLACK_NS) // TICK_NS + 1 - yielded
             if passed > 0:
-                told += passed
+                yielded += passed
                 yield passed
 
     async def hold(self) -> None:

@@ -106,16 +106,16 @@ class Spelling:
 
     def spell(self, data: bytes) -> list[str]:
         """Return a line of text for each frame that `data` completes."""
-        told = []
+        printed = []
         for value in data:
             self._held.append(value)
             for frame in self._feed(bytes((value,))):
-                told.append(_line(self._held, self._describe(frame)))
+                printed.append(_line(self._held, self._describe(frame)))
                 self._held.clear()
         if len(self._held) > MAX_UNFRAMED_BYTES:
-            told.append(_line(self._held, "no frame"))
+            printed.append(_line(self._held, "no frame"))
             self._held.clear()
-        return told
+        return printed
 
 
 class Wording:

@@ -138,9 +138,9 @@ def mismatches(spec: mujoco.MjSpec, body: SimModel) -> Iterator[str]:
         x, y = zip(*body.footprint, strict=True)
         edges = ("front", max(x)), ("rear", min(x)), ("left side", max(y)), ("right side", min(y))
         outline = measures.outline([joint.name for joint in body.joints])
-        for (edge, told), is_in_model in zip(edges, outline, strict=True):
-            if abs(is_in_model) > abs(told) + MAX_OFF_M:  # a wider footprint is only careful
-                yield _differs(f"the {edge} of the footprint", is_in_model, told)
+        for (edge, stated), is_in_model in zip(edges, outline, strict=True):
+            if abs(is_in_model) > abs(stated) + MAX_OFF_M:  # a wider footprint is only careful
+                yield _differs(f"the {edge} of the footprint", is_in_model, stated)
 
 
 def _wheels(measures: ModelMeasures, body: SimBody) -> Iterator[str]:
@@ -153,9 +153,9 @@ def _wheels(measures: ModelMeasures, body: SimBody) -> Iterator[str]:
     if body.wheel_base:
         along = [measures.body(name)[0] for name in body.wheels]
         lengths.append(("wheel_base", body.wheel_base, max(along) - min(along)))
-    for name, told, is_in_model in lengths:
-        if abs(told / is_in_model - 1.0) > MAX_SHARE:
-            yield _differs(name, is_in_model, told)
+    for name, stated, is_in_model in lengths:
+        if abs(stated / is_in_model - 1.0) > MAX_SHARE:
+            yield _differs(name, is_in_model, stated)
     middle = float(np.mean([place[0] for place in places.values()]))
     if abs(middle) > MAX_OFF_M:
         yield f"the wheels are {middle:.3f} m ahead of the base's origin; expected them at 0 m"
@@ -171,12 +171,12 @@ def _wheels(measures: ModelMeasures, body: SimBody) -> Iterator[str]:
 
 def _lidar(measures: ModelMeasures, mount: tuple[float, float, float]) -> Iterator[str]:
     x, y, yaw = measures.site("lidar")
-    for name, told, is_in_model in (("lidar: x", mount[0], x), ("lidar: y", mount[1], y)):
-        if abs(told - is_in_model) > MAX_OFF_M:
-            yield _differs(name, is_in_model, told)
+    for name, stated, is_in_model in (("lidar: x", mount[0], x), ("lidar: y", mount[1], y)):
+        if abs(stated - is_in_model) > MAX_OFF_M:
+            yield _differs(name, is_in_model, stated)
     if abs(math.remainder(mount[2] - yaw, math.tau)) > MAX_OFF_RAD:
         yield _differs("lidar: yaw", yaw, mount[2], "rad")
 
 
-def _differs(what: str, is_in_model: float, told: float, unit: str = "m") -> str:
-    return f"{what} is {is_in_model:.3f} {unit} here, and {told:.3f} {unit} in the robot's file"
+def _differs(what: str, is_in_model: float, stated: float, unit: str = "m") -> str:
+    return f"{what} is {is_in_model:.3f} {unit} here, and {stated:.3f} {unit} in the robot's file"

@@ -105,14 +105,14 @@ async def _window(
         with viewer.lock():
             made.aim(viewer.cam)
         loop = asyncio.get_running_loop()
-        newest, moved_s, told = poses.newest, loop.time(), False
+        newest, moved_s, warned = poses.newest, loop.time(), False
         while viewer.is_running():
             scene = scenes.newest
             if poses.newest is not newest:
-                newest, moved_s, told = poses.newest, loop.time(), False
-            elif loop.time() - moved_s > SILENT_S and not told:
+                newest, moved_s, warned = poses.newest, loop.time(), False
+            elif loop.time() - moved_s > SILENT_S and not warned:
                 say("the simulation is silent; the window shows its last state")
-                told = True
+                warned = True
             if scene and scene is not made.scene and not made.update(scene):
                 return SceneModel(scene)
             with viewer.lock():

@@ -100,12 +100,12 @@ class ZenohTransport:
     def watch_readers(self, key: str, on_readers: OnReaders) -> Close:
         """Call `on_readers` with whether `key` has subscribers: in each session, at each change."""
 
-        def told(status: zenoh.MatchingStatus) -> None:
+        def matched(status: zenoh.MatchingStatus) -> None:
             self._bridge.post(on_readers, status.matching)
 
         def declare(line: OpenSession) -> Bundle:
             publisher = line.session.declare_publisher(key)
-            listener = publisher.declare_matching_listener(line.guard(told))
+            listener = publisher.declare_matching_listener(line.guard(matched))
             on_readers(has_subscriber(publisher))
             return Bundle(publisher, listener)
 

@@ -68,7 +68,7 @@ class MissionContext:
     given: Mapping[str, Solid] = field(default_factory=dict)  # things of the mission's file
     things: dict[str, Solid] = field(default_factory=dict)  # what stands round the arm by now
     offers: bool = False  # the active step waits for a person to take something
-    told: bool = False  # a person has said that it may let go
+    may_let_go: bool = False  # a person has said that it may let go
     doing: str = ""  # the active step, for people
     problem: str = ""  # the last failure, for people
     progress: float | None = None  # of a step that does not drive
@@ -178,7 +178,7 @@ class OfferNode(ArmNode):
     def initialise(self) -> None:
         """Start the node, or start it again."""
         super().initialise()
-        self.context.told = False
+        self.context.may_let_go = False
         self._until_s = self.context.free_s + self._seconds
 
     def update(self) -> Status:
@@ -186,7 +186,7 @@ class OfferNode(ArmNode):
         status = super().update()
         if status is not Status.RUNNING:
             return status
-        if self.context.told:
+        if self.context.may_let_go:
             self.context.command = None
             return Status.SUCCESS
         if self.context.free_s > self._until_s:

@@ -173,7 +173,7 @@ class TaskQueue:
         """
         job = self._job(name)
         if not job.held and job is self._jobs[0] and job.context.offers:
-            job.context.told = True
+            job.context.may_let_go = True
             return f"{job.id} lets go of it"
         if not job.held:
             raise Refused(f"{job.id} is not paused")

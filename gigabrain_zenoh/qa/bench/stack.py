@@ -56,7 +56,7 @@ class FirstGoal(Struct, frozen=True, kw_only=True):
 
     accepted_s: float
     accepted_cpu_s: float
-    told: str  # text of the reply
+    answer: str  # text of the reply
     drives_s: float  # until it followed its first path
     drives_cpu_s: float
 
@@ -171,7 +171,7 @@ async def measure_first_goal(body: str, world: str, show: Callable[[str], None])
         return FirstGoal(
             accepted_s=accepted_s,
             accepted_cpu_s=accepted_cpu_s,
-            told=text,
+            answer=text,
             drives_s=group.seconds,
             drives_cpu_s=group.cpu_s,
         )
@@ -207,9 +207,9 @@ def stack_page(result: StackResult) -> "Group":
     )  # fmt: skip
     if goal := result.first_goal:
         text = (
-            f"The first goal was accepted after {goal.accepted_cpu_s:.2f} s of CPU ({goal.told}). "
-            f"The robot drove to it after {goal.drives_s:.2f} s with {goal.drives_cpu_s:.2f} s of "
-            "CPU."
+            f"The first goal was accepted after {goal.accepted_cpu_s:.2f} s of CPU "
+            f"({goal.answer}). The robot drove to it after {goal.drives_s:.2f} s with "
+            f"{goal.drives_cpu_s:.2f} s of CPU."
         )
         page.renderables.append(Text(text, style="dim"))
     return page

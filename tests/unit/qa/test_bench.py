@@ -63,7 +63,11 @@ def test_targets_are_held_against_the_figures() -> None:
     slow = targets(stack(ready_s=1.6, physics_cpu=0.06))
     assert [limit.allows(value) for limit, value in slow.items()] == [False, True, False, True]
     goal = FirstGoal(
-        accepted_s=1.9, accepted_cpu_s=1.7, told="goal-1: accepted", drives_s=4.0, drives_cpu_s=5.1
+        accepted_s=1.9,
+        accepted_cpu_s=1.7,
+        answer="goal-1: accepted",
+        drives_s=4.0,
+        drives_cpu_s=5.1,
     )
     held = {limit.figure.name: limit for limit in targets(stack(first_goal=goal))}
     assert held["first goal accepted after"].allows(1.9)
@@ -94,7 +98,7 @@ def test_the_pages_say_it_all() -> None:
         assert text in page
     assert "first goal" not in page
     goal = FirstGoal(
-        accepted_s=1.95, accepted_cpu_s=1.7, told="goal-1: ok", drives_s=4.0, drives_cpu_s=5.1
+        accepted_s=1.95, accepted_cpu_s=1.7, answer="goal-1: ok", drives_s=4.0, drives_cpu_s=5.1
     )
     page = shown(stack_page(stack(first_goal=goal)))
     for text in ("1.95 s", "after 1.70 s of CPU (goal-1: ok)", "4.00 s with 5.10 s of CPU"):

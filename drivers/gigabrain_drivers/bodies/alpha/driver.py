@@ -71,7 +71,7 @@ class AlphaDriver(Driver):
         self._state: State | None = None
         self._liveness = Liveness(self.link, self._clock, STATE_TIMEOUT_NS, NO_VALID_FRAME, log)
         self._stamps, self._echoes = DeviceClock(MILLISECONDS), EchoClock(USUAL_ROUND_TRIP_MS)
-        self._untold = False  # whether a loss has not been reported yet
+        self._unreported = False  # whether a loss has not been reported yet
         self._open = self._parked = False
         self._fall = Fault(log)
         self.sensors = dict.fromkeys(("imu", "scan") if options.scan else ("imu",))
@@ -116,7 +116,7 @@ class AlphaDriver(Driver):
         if not self._liveness.received:  # it may still be starting
             return ZERO
         to = self.bounded(linear_x, linear_y, angular_z)
-        if self._untold or self._fallen:
+        if self._unreported or self._fallen:
             to = ZERO
         if self._parked and to == ZERO:
             self.link.write(alpha.encode_park(self._next()))
@@ -155,7 +155,7 @@ class AlphaDriver(Driver):
         self._last = None
 
     def _lost(self, why: str) -> None:
-        self._untold = self._untold or self._liveness.received
+        self._unreported = self._unreported or self._liveness.received
         self._liveness.reset()
 
     def _received(self, data: bytes) -> None:
@@ -202,9 +202,9 @@ class AlphaDriver(Driver):
         A loss is reported at least once, however soon the body is back.
         """
         alive = self._liveness.alive()
-        told, self._untold = not self._untold, False
+        reported, self._unreported = not self._unreported, False
         late_ms = max(self._stamps.late_ms, self._echoes.late_ms)
-        return replace(self.link.health, connected=alive and told, late_ms=late_ms)
+        return replace(self.link.health, connected=alive and reported, late_ms=late_ms)
 
 
 def _with(state: RobotState, now: State) -> RobotState:

@@ -44,8 +44,8 @@ class LineCommand:
         twist = Twist(*(values.get(name, 0.0) for name in Twist._fields))
         if self._base and self._by_wheels:
             wheels = zip(self._base.wheels, self._base.to_wheels(twist), strict=True)
-            told = tuple(values.get(WHEEL + name, speed) for name, speed in wheels)
-            twist = self._base.to_body(told)
+            wheel_speeds = tuple(values.get(WHEEL + name, speed) for name, speed in wheels)
+            twist = self._base.to_body(wheel_speeds)
         return Velocity(**{name: value + 0.0 for name, value in twist._asdict().items()})  # no -0
 
     def _values(self, velocity: Velocity) -> dict[str, float]:

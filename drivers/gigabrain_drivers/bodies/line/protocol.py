@@ -326,13 +326,13 @@ def _check_text(text: str) -> None:
 
 def describe(values: Mapping[str, float]) -> str:
     """The numbers of a line in words, in SI units, volts, degrees C and percent."""
-    told = []
+    words = []
     for name, value in values.items():
         quantity = {**STATE, **COMMAND}[name]
         unit = next(iter(UNITS[quantity]))
         number = f"{round(value):#x}" if quantity == "flags" else f"{value:.4g}"
-        told.append(f"{name} {number} {unit}".strip())
-    return ", ".join(told)
+        words.append(f"{name} {number} {unit}".strip())
+    return ", ".join(words)
 
 
 class LineDecoder:

@@ -84,7 +84,7 @@ class PiperDriver(Driver):
         self._were_on = False
         self._enabling_ns: int | None = None  # since when they are being switched on
         self._asked_ns = 0
-        self._untold = False  # whether a loss has not been reported yet
+        self._unreported = False  # whether a loss has not been reported yet
         self._unplaced = True  # the gate does not know yet where a new connection has found it
         self._open = False
         self._well_ns = self._clock.now_ns()
@@ -221,7 +221,7 @@ class PiperDriver(Driver):
         self._targets, self._enabling_ns, self._unplaced = None, None, True
 
     def _lost(self, _why: str) -> None:
-        self._untold = self._untold or self._feedback.complete
+        self._unreported = self._unreported or self._feedback.complete
 
     def _received(self, data: bytes) -> None:
         now_ns = self._clock.now_ns()
@@ -246,7 +246,7 @@ class PiperDriver(Driver):
         if self._were_on:
             log.warning("motor %d has switched itself off; enable the robot again", _off(on))
             self._were_on = self._hold_on = False
-            self._targets, self._untold = None, True
+            self._targets, self._unreported = None, True
         if self._hold_on and not self._feedback.problem():
             self._switch_on(now_ns)
 
@@ -269,12 +269,12 @@ class PiperDriver(Driver):
 
     def _health(self) -> LinkHealth:
         """Return the link's health: connected if the arm reports and has no fault."""
-        told, self._untold = not self._untold, False
+        reported, self._unreported = not self._unreported, False
         stamp_ns = self._feedback.stamp_ns()
         age_ns = self._clock.now_ns() - stamp_ns if stamp_ns is not None else self.link.age_ns
         return replace(
             self.link.health,
-            connected=self._fresh() and told and not self._feedback.problem(),
+            connected=self._fresh() and reported and not self._feedback.problem(),
             age_ms=age_ns / 1e6,
         )
 
