@@ -85,7 +85,7 @@ BAD_MISSIONS = {
 }
 GATEWAY = {  # as the process ros2 reports it
     "transport": "dds", "domain": 0, "node": "/gigabrain", "distro": "jazzy", "localhost": 1,
-    "other_nodes": 0, "to_check": "is the others' ROS_DOMAIN_ID 0?",
+    "other_nodes": 0, "to_check": "check on the other nodes: ROS_DOMAIN_ID=0",
 }  # fmt: skip
 ROS_SHELL = {
     "ROS_DISTRO": "humble", "ROS_DOMAIN_ID": "7", "RMW_IMPLEMENTATION": "rmw_zenoh_cpp",

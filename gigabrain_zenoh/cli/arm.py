@@ -58,13 +58,13 @@ def state(*, watch: bool = False, at: RobotAddress = LOCAL) -> None:
 
 
 def jog(joint: str, distance: Distance, /, *, take: Take = False, at: RobotAddress = LOCAL) -> None:
-    """Move one joint by some degrees, or millimetres if it slides, slowly.
+    """Move one joint slowly, in degrees, or in mm if it is prismatic.
 
     Example: gigabrain arm jog shoulder_pan 10 --take
 
     Args:
         joint: Name of the joint; see `gigabrain arm state`.
-        distance: How far, from where it was sent; negative for the other way.
+        distance: Distance from the last commanded position; may be negative.
     """
     check_finite("distance", distance)
 
@@ -112,7 +112,7 @@ def goto(
     wait: Wait = True,
     at: RobotAddress = LOCAL,
 ) -> None:
-    """Bring the tool to a point, round what is in the way.
+    """Move the tool to a point, around obstacles.
 
     Example: gigabrain arm goto 0.22 0.05 0.12 --pitch 60
 
@@ -239,7 +239,7 @@ def press(
         y: To the left [m].
         z: Up [m].
         pitch: How far the tool points down [degrees], 0 for level. Default: any way.
-        depth: How far it goes on behind that place at most [m].
+        depth: Maximum travel beyond the point [m].
         force: With which it presses [N].
         seconds: How long.
     """
@@ -280,7 +280,7 @@ def hand_over(
 
 
 def limp(*, yes: bool = False, at: RobotAddress = LOCAL) -> None:
-    """Let go of all joints, so that a person can move them. The arm may fall: hold it.
+    """Switch joint torque off, to move the joints by hand. The arm may fall: hold it.
 
     Example: gigabrain arm limp --yes
 

@@ -146,8 +146,8 @@ def play(
         start: Start this long after its first message [s].
         loop: Repeat until Ctrl-C.
         remap: Publish a key on another: robot/scan=old/scan.
-        beside_robot: Also while a driver runs. Its gate refuses recorded commands; its brain
-            is confused.
+        beside_robot: Also if a driver runs. Its gate drops recorded commands; its brain
+            gets mixed data.
     """
     from gigabrain_zenoh.recording.player import PlayOptions
     from gigabrain_zenoh.recording.player import play as run

@@ -104,9 +104,9 @@ def joints(
 
     Example: gigabrain bench joints --body so101
 
-    The arm is stretched out, and carries a load. One joint after the other swings at 0.5 Hz, with
-    half of its greatest speed in the middle, and then goes from one end to the other at once.
-    Control and gate are those of a robot. It needs the extra `arm`.
+    The arm is stretched out, and carries a load. Each joint in turn follows a sine of 0.5 Hz, up to
+    half its maximum speed, then a step over the same range. Control and gate are those of a robot.
+    It needs the extra `arm`.
 
     Args:
         load: Mass that it carries at its tool [kg], 0 to 10.

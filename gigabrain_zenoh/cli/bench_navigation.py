@@ -280,7 +280,7 @@ class GoalsOptions:
     seed: int = 0
     "Random seed of the start pose, the sensor noise and the goals."
     headings: bool = False
-    "All goals have a heading, and the body's own motions reach them in the true world."
+    "Give each goal a heading, and use only poses that the robot can reach."
 
 
 GOALS = GoalsOptions()

@@ -53,19 +53,19 @@ class RobotOptions:
     "End after this much simulated time [s]."
     seed: Seed = 0
     speed: float = 1.0
-    "Simulated over real time. At any speed but 1, time waits for the brain."
+    "Real-time factor. If it is not 1, simulated time waits for the brain."
     lockstep_timeout: float = 0.15
-    "How long time waits for the brain [s]; longer for a slow machine."
+    "Longest wait for the brain [s]; increase it on a slow machine."
     behaviour: str = "navigate"
     "Behaviour: `navigate`, or `avoid`, which makes no map."
     map: str = ""
-    "Saved map to find the robot in, instead of making one; see `gigabrain map list`."
+    "Saved map to localize in, instead of mapping; see `gigabrain map list`."
     set: Sets = ()
     settings: SettingsFiles = ()
     cameras: bool = False
     "Use the robot's cameras; see docs/how-to/cameras.md."
     resume: Resume | None = None
-    "Drive on after a stop whose cause has passed. Default: auto; manual with --link real."
+    "Resume after a stop once its cause is gone. Default: auto; manual with --link real."
 
     def check(self) -> None:
         """Raise ConfigError or UnknownName for a value that does not fit."""
@@ -192,7 +192,7 @@ def up(
     Args:
         deployment: Deployment file, or the name of a known one.
         host: Which of the file's hosts this is; required if it has several.
-        map: Saved map to localize in, instead of what the file says of maps.
+        map: Saved map to localize in; replaces the file's map settings.
         keys: Folder of this host's identity, instead of the one in the file.
         level: Lowest level to log.
         cameras: Use the robot's cameras, as `cameras: on` in the file does.

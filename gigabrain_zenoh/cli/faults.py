@@ -52,9 +52,9 @@ class SuiteOptions:
     behaviour: str = "avoid"
     "Behaviour. `navigate` makes a map (tried with tests 1 to 9, 18, 19, 43 and 45)."
     cameras: Annotated[bool, Parameter(negative=())] = False
-    "Use the cameras of simulated robots in all tests, not in those of cameras alone."
+    "Use simulated cameras in all tests, not only in the camera tests."
     long: Annotated[bool, Parameter(negative=())] = False
-    "Run the long forms, as before a release: soak, load, all orders of deaths."
+    "Run the long variants, as before a release: soak, load, all kill orders."
 
     def check(self) -> None:
         """Raise ConfigError if the suite cannot run with these."""

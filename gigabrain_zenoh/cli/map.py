@@ -49,8 +49,7 @@ def load(name: str, /, *, proceed: bool = False, at: RobotAddress = LOCAL) -> No
 
     Example: gigabrain map load office
 
-    All tasks are cancelled, as their coordinates mean other places. The robot searches itself in
-    the map.
+    All tasks are cancelled: their coordinates are of the old map. The robot then localizes itself.
 
     Args:
         name: Name of the map.

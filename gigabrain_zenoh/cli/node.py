@@ -205,7 +205,7 @@ def save_params(file: Path, /, *, at: RobotAddress = LOCAL) -> None:
     Example: gigabrain param save slow.yaml
 
     Args:
-        file: File to write. What it holds already stays, unless the same was changed again.
+        file: File to write. Its other values are kept.
     """
     from gigabrain_zenoh.cli.config import with_values
 

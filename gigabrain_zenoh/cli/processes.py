@@ -224,11 +224,11 @@ def driver(
     Args:
         name: Name of the robot, or path of its YAML file; see `gigabrain robots`.
         link: How to reach the robot: simulated, emulated or real.
-        speed: Simulated over real time. At any speed but 1, time waits for the brain.
+        speed: Real-time factor. If it is not 1, simulated time waits for the brain.
         resume: Drive on after a stop whose cause has passed: by itself, or when enabled.
-        cameras: Count the robot's cameras as its own; `gigabrain node run camera` runs them.
+        cameras: Use the robot's cameras; run them with `gigabrain node run camera`.
         ports: Folder of the emulator's ports, for `--link emulated`.
-        state_dir: Folder for the cause of a latch, which survives a restart.
+        state_dir: Folder that keeps the cause of a latch across restarts.
     """
     from gigabrain_drivers.driver.catalog import load_link
     from gigabrain_drivers.driver.robot import Run

@@ -32,7 +32,7 @@ class RosLinkOptions:
     """Settings with which a node joins ROS 2."""
 
     transport: Literal["rmw_zenoh", "dds"] = "rmw_zenoh"
-    "How the other nodes talk: by rmw_zenoh over a router, or by DDS."
+    "RMW of the other nodes: rmw_zenoh over a router, or DDS."
     domain: int = 0
     "ROS_DOMAIN_ID of the other nodes."
     ros_namespace: str = "/"
@@ -63,7 +63,7 @@ class RosOptions(RosLinkOptions):
     take: bool = False
     "Take the body from another commander with the first /cmd_vel."
     cmd_vel_timeout: float = 0.2
-    "Longest time in seconds that a /cmd_vel counts."
+    "Time in seconds that a /cmd_vel stays valid."
     leave_out: tuple[str, ...] = ()
     "ROS topic or service not to offer; may be given again."
     free_fleet: bool = False
@@ -79,7 +79,7 @@ def ros2(*, options: RosOptions = LOCAL_ROS, at: RobotAddress = LOCAL) -> int:
     Example: gigabrain ros2 --transport dds
 
     ROS sees the robot's topics, and may drive it, send it goals and stop it.
-    If the gateway ends, nothing else of the robot notices. In a deployment
+    If it ends, the robot's other processes keep running. In a deployment
     file, a part `ros2:` starts it with the robot.
     """
     endpoint = _endpoint(at)
@@ -161,7 +161,7 @@ def pass_(
         source: Key or ROS topic to read.
         target: ROS topic or key to write.
         type: ROS type of the topic, such as std_msgs/String.
-        as_: Fields of the same names; JSON in the type's only text; or CDR, unchanged.
+        as_: Equal field names, JSON in the type's one string field, or unchanged CDR.
     """
     from gigabrain_zenoh import logs
     from gigabrain_zenoh.gateway.passing import pass_on, route

@@ -244,4 +244,4 @@ def _notice(where: str, old: str, new: str) -> None:
 def _notice_text(old: str, new: str) -> str:
     if not new:
         return f"'{old}' has no effect here; remove it before {REMOVED_IN}"
-    return f"'{old}' is now '{new}'; the old word works until {REMOVED_IN}"
+    return f"'{old}' is now '{new}'; the old form works until {REMOVED_IN}"

@@ -62,7 +62,7 @@ class PerceptionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     def __post_init__(self) -> None:
         if self.map and self.mapping == "off":
-            raise ValueError("map: a map is for mapping: slam or localize; expected one of them")
+            raise ValueError("map: needs mapping; set `mapping` to slam or localize")
 
 
 class DecisionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

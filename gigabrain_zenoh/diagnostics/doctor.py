@@ -215,7 +215,7 @@ def _serial(machine: MachineFacts) -> Iterator[Diagnosis]:
 
 def _multicast(machine: MachineFacts) -> Iterator[Diagnosis]:
     if machine.multicast:
-        yield _bad("multicast", "on: sessions search for others", "reinstall the package")
+        yield _bad("multicast", "Zenoh multicast scouting is on", "reinstall the package")
     else:
         yield _ok("multicast", "off: a process joins only by the router's address")
 
@@ -285,7 +285,7 @@ def _rates(robot: RobotFacts) -> Iterator[Diagnosis]:
         hz, promised = health.sent_hz.get(key, 0.0), topic.hz * pace
         if hz < MIN_RATE * promised and topic.key != BODY.key:
             cure = f"reduce the load here, or read its log: gigabrain log --process {process}"
-            yield _bad(key, f"{hz:g} Hz from {process}, promised {promised:g}", cure)
+            yield _bad(key, f"{hz:g} Hz from {process}, expected {promised:g}", cure)
     for process, health in robot.health.items():
         for key, count in health.rejected.items():
             cure = f"find the sender: gigabrain topic info {key.removeprefix('robot/')}"

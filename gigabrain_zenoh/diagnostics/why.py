@@ -50,8 +50,8 @@ READ_SAFETY_LOG = "read its log with `gigabrain log --process safety`"
 GOES_ON = "remove the cause; decision then goes on by itself"
 BY_HAND = "move it with `gigabrain teleop` or `gigabrain arm jog`"
 FIND_IT = (
-    "drive it a turn with `gigabrain teleop`, show its camera a tag that it knows, "
-    "or tell it where it is with `gigabrain pose X Y`"
+    "turn the robot with `gigabrain teleop`, show its camera a known tag, "
+    "or set its pose with `gigabrain pose X Y`"
 )
 CHECK_LIDAR = "check the lidar's power and cable"
 
@@ -221,7 +221,7 @@ def _intent(facts: ChainFacts) -> LinkStatus:
             link="intent",
             ok=False,
             waits=True,
-            text=f"decision wants to stand: {intent.reason}",
+            text=f"decision does not drive: {intent.reason}",
             remedy=FIND_IT if WaitReason.NOT_LOCALIZED in intent.reason else GOES_ON,
         )
     return _ok("intent", f"{intent.reason}{_after(facts, INTENT.key, 'the world')}")
@@ -262,14 +262,14 @@ def _control(facts: ChainFacts) -> LinkStatus:
         text = "an operator holds the robot still"
         remedy = "let the brain drive with `gigabrain enable`"
         if _wants_to_move(facts):
-            return _broken("control", f"{text}, while decision wants to move", remedy)
+            return _broken("control", f"{text}, but decision sends motion", remedy)
         return _waits("control", text, remedy)
     free = facts.safety is not None and facts.safety.verdict != "stop"
     caps = facts.safety.caps if facts.safety else NO_CAPS
     wanted = intent.twist if intent and intent.twist else ZERO
     if still and free and not at_rest(wanted) and not _capped_to_rest(wanted, caps):
         remedy = "read its log with `gigabrain log --process control`"
-        return _broken("control", "control sends zero, while decision wants to move", remedy)
+        return _broken("control", "control sends zero, but decision sends motion", remedy)
     operator = "an operator drives: " if command.operator else ""
     return _ok(
         "control",
@@ -288,7 +288,7 @@ def _safety(facts: ChainFacts) -> LinkStatus:
         return _broken("safety", text, remedy or READ_SAFETY_LOG)
     wanted = facts.intent.twist if facts.intent else None
     if wanted and not _other_commander(facts) and _capped_to_rest(wanted, safety.caps):
-        text = f"safety allows no speed in that direction: {text}"
+        text = f"safety blocks that direction: {text}"
         return _broken("safety", text, remedy or READ_SAFETY_LOG)
     return _ok("safety", f"{safety.verdict}{': ' if text else ''}{text}")
 
@@ -306,7 +306,7 @@ def _gate(facts: ChainFacts) -> LinkStatus:
         return _broken("gate", text, f"{remedy}; {act}" if remedy else act)
     if at_rest(facts.fastest) and gate.commander != BRAIN:
         remedy = "let it drive, or take the robot back with `gigabrain enable --take`"
-        return _broken("gate", f"{gate.commander} has control, and stands still", remedy)
+        return _broken("gate", f"{gate.commander} drives, but sends no motion", remedy)
     return _ok("gate", f"open for {gate.commander}")
 
 
@@ -319,7 +319,7 @@ def _body(facts: ChainFacts) -> LinkStatus:
     if at_rest(now) and not at_rest(commanded):
         wanted = f"{commanded.linear_x:+.2f} m/s {commanded.angular_z:+.2f} rad/s"
         remedy = "check whether it is blocked, its motors, and their power"
-        return _broken("body", f"it stands, while the command is {wanted}", remedy)
+        return _broken("body", f"no motion, but the command is {wanted}", remedy)
     if at_rest(now):
         return _waits("body", "it stands, as commanded", "send it a command or a goal")
     return _ok("body", f"it moves: {speed}")

@@ -14,7 +14,7 @@ SILENCE = Cause(
 )
 STALE = Cause(
     code="stale",
-    text="commands rest on sensor data that is too old",
+    text="commands use sensor data that is too old",
     remedy="check that lidar, perception and decision keep up, then enable it again",
 )
 SAFETY_SILENT = Cause(

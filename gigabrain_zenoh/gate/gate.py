@@ -65,13 +65,13 @@ def release(state: GateState, event: Release) -> tuple[GateState, Outcome]:
     if event.estop_generation != state.estop_generation:
         newest = state.estop_generation
         return rejected(
-            state, f"e-stop number {newest} is the newest; look at it before you release"
+            state, f"wrong e-stop number, newest {newest}; check its cause, then release"
         )
     if state.still_ticks < STILL_TICKS:
         return rejected(state, "the body is not at rest yet; wait half a second")
     held = why.latching(state.faults + (state.safety.causes if state.safety else ()))
     if held:
-        return rejected(state, f"what latched it still holds: {why.in_words(held)}")
+        return rejected(state, f"the cause is still present: {why.in_words(held)}")
     by_hand = bool(why.latching(state.causes))
     state = replace(state, mode="idle", causes=(), by_hand=by_hand)
     return state, Outcome(text="released; enable it to move")
@@ -302,7 +302,7 @@ def _enable(config: GateConfig, state: GateState, event: Enable) -> tuple[GateSt
         if not event.take:
             return rejected(state, f"{state.commander} drives; take it over with take=true")
         if event.source == BRAIN and event.by in ("", BRAIN):
-            return rejected(state, f"{state.commander} drives; only a person hands it to the brain")
+            return rejected(state, f"{state.commander} drives; only a person can enable the brain")
     found = stop_reasons(config, state, event.source)
     if found:
         return rejected(state, f"not now: {why.in_words(found)}")

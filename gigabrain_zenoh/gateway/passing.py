@@ -101,8 +101,8 @@ def check_writer(keys: str, key: str) -> None:
 def robots_own(key: str) -> Refused:
     """Return the error for a key on which the robot acts."""
     return Refused(
-        f"{key} is the robot's own: ROS moves and asks it through the gateway, `gigabrain ros2`, "
-        "which has the rights for it"
+        f"{key} is the robot's own: not writable here; command the robot through the gateway, "
+        "`gigabrain ros2`"
     )
 
 
@@ -112,8 +112,8 @@ def text_field(types: Types, type: str) -> str:
         return text
     names = ", ".join(name for name, _ in types.fields(type))
     raise ConfigError(
-        f"{type} has {names}; JSON needs a type with one text alone, such as std_msgs/msg/String, "
-        "or leave out --as json"
+        f"{type} has {names}; JSON needs a type with one string field, such as "
+        "std_msgs/msg/String; or omit --as json"
     )
 
 

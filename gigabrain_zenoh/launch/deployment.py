@@ -96,17 +96,17 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         placed = Counter(name for names in self.hosts.values() for name in names)
         twice = sorted(name for name, times in placed.items() if times > 1)
         if twice:
-            raise ValueError(f"hosts: {', '.join(twice)} must run once, on one host")
+            raise ValueError(f"hosts: {', '.join(twice)} repeated; list each once")
         for name in placed:
             if getattr(self, name, self) is None:
                 raise ValueError(f"hosts: {name} needs settings; add a part `{name}:` to this file")
         if self.button and self.speed != 1.0:
-            raise ValueError("button: a person presses it in real time, so leave out `speed`")
+            raise ValueError("button: works in real time only; remove `speed`")
         self._check_router()
         if self.fleet and not self.namespace:
-            raise ValueError("fleet: this robot needs a namespace of its own as well")
+            raise ValueError("fleet: this robot has no namespace; set `namespace`")
         if self.resume == "auto" and self.link == "real":
-            raise ValueError("resume: auto is for simulation; a real body is enabled by a person")
+            raise ValueError("resume: auto is not allowed with link real; use manual")
         if self.speed != 1.0 and self.link != "sim":
             raise ValueError("speed is for the simulation; other links run in real time")
 
@@ -133,7 +133,7 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         except ValueError as error:
             raise ValueError(f"router: {error}") from None
         if len(self.hosts) > 1 and host and not port:
-            raise ValueError(f"router: {self.router}: several hosts must know its port")
+            raise ValueError(f"router: {self.router}: several hosts need a fixed port")
         if exposed((self.router,)) and not (self.insecure or self.keys):
             raise ValueError(
                 f"router: {self.router} can be reached by anybody on the network; "

@@ -71,8 +71,8 @@ ROS_WRITES = tuple(
     )
 ) + FLEET_KEYS  # fmt: skip
 NAME_FOR_FLEET = (
-    "ros2: Open-RMF calls a robot by its namespace, and this one has none; set `namespace:` in the "
-    "deployment file, or leave free_fleet off"
+    "ros2: free_fleet needs the robot's namespace; set `namespace:` in the deployment file, "
+    "or leave free_fleet off"
 )
 ROUTER_FOR_ROS = (
     "ros2: nodes of ROS have no identity at a router with keys; name another one as "

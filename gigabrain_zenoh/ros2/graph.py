@@ -58,8 +58,8 @@ def unreached(transport: str, domain: int, router: str = "") -> str:
             f"RMW_IMPLEMENTATION=rmw_zenoh_cpp and ROS_DOMAIN_ID={domain}?"
         )
     return (
-        f"is the others' ROS_DOMAIN_ID {domain}, are they on this network with multicast, or do "
-        "they talk to their own machine only (ROS_LOCALHOST_ONLY)?"
+        f"check on the other nodes: ROS_DOMAIN_ID={domain}, same network with multicast, "
+        "ROS_LOCALHOST_ONLY not set"
     )
 
 

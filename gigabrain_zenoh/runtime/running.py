@@ -154,7 +154,7 @@ def find_running(namespace: str = "") -> Running:
     """Return the only robot on this machine. Raises BusError for none, Ambiguous for several."""
     robots = [r for r in running() if not namespace or r.endpoint.namespace == namespace]
     if not robots:
-        raise BusError("no robot runs here; start one with `gigabrain demo`, or name its router")
+        raise BusError("no robot runs here; start one with `gigabrain demo`, or set `connect`")
     nearest = {_place(robot): robot for robot in sorted(robots, key=_ways)}
     if len(nearest) > 1:
         where = ", ".join(f"{r.endpoint.connect[-1]} ({r.label})" for r in nearest.values())

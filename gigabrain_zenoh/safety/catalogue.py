@@ -22,8 +22,7 @@ _MAKE_ROOM = "turn or back away, or clear the way"
 _MOVE_AWAY = "move the arm away from it, or clear the way"
 _LOOK_AT_SERVO = "check that servo and its cable, then release the robot"
 _FREE_ARM = (
-    "find what holds it and free it; `gigabrain arm limp` lets go of the joints; "
-    "then release the robot"
+    "remove what blocks it (`gigabrain arm limp` switches torque off), then release the robot"
 )
 _CLOSE_PROGRAMS = "close programs that need not run on it"
 
@@ -67,7 +66,7 @@ CAUSES = _causes(
     (
         "round_trip",
         "commands take too long; half speed",
-        "move the operator nearer, or relieve the network or the computer",
+        "move the operator nearer, or reduce network or computer load",
     ),
     (
         "body_late",
@@ -81,23 +80,23 @@ CAUSES = _causes(
     ),
     (
         "camera_lost",
-        "no picture of a camera for too long; the body does not go where it should look",
+        "no image from a camera for too long; no motion in its direction",
         "check that the camera process runs, its log, and the camera's cable",
     ),
     (
         "camera_blind",
-        "a camera sees nothing; the body does not go where it should look",
-        "uncover and clean it, light the room, or back away from what is before it",
+        "a camera sees nothing; no motion in its direction",
+        "uncover and clean it, light the room, or back away from the obstacle",
     ),
     (
         "camera_frozen",
-        "a camera repeats one picture; the body does not go where it should look",
+        "a camera repeats one image; no motion in its direction",
         "start the camera process again, or plug the camera in again",
     ),
     (
         "camera_wrong",
-        "a camera's pictures are not those that the body's file describes",
-        "correct the camera in the body's file, or what sends its pictures",
+        "a camera's images do not match the body's file",
+        "correct the camera in the body's file, or its image source",
     ),
     ("zone_ahead", "obstacle ahead of the body", _MAKE_ROOM),
     ("zone_behind", "obstacle behind the body", _MAKE_ROOM),
@@ -117,11 +116,11 @@ CAUSES = _causes(
     ),
     ("arm_self", "parts of the arm are too near each other", "move them apart"),
     ("arm_floor", "the arm is too near the floor", _MOVE_AWAY),
-    ("arm_keep_out", "the arm is too near a box to keep out of", _MOVE_AWAY),
+    ("arm_keep_out", "the arm is too near a keep-out box", _MOVE_AWAY),
 ) | _causes(
     ("joint_lost", "a joint is no longer reported", _LOOK_AT_SERVO),
     ("joint_jump", "a joint jumped farther than it can move", _LOOK_AT_SERVO),
-    ("joint_off", "a joint is not where it was sent", _FREE_ARM),
+    ("joint_off", "a joint is not at its setpoint", _FREE_ARM),
     ("joint_overload", "a joint has been at its greatest effort for too long", _FREE_ARM),
     (
         "voltage_low",
@@ -151,8 +150,8 @@ CAUSES = _causes(
 
 WARNINGS = _causes(
     ("battery_low", "the battery is low", "charge it soon"),
-    ("battery_return", "the battery is nearly empty; the robot comes to rest", "charge it now"),
-    ("motor_warm", "a motor is warm", "drive more gently, or let it rest"),
+    ("battery_return", "the battery is nearly empty; the robot stops", "charge it now"),
+    ("motor_warm", "a motor is warm", "drive slower, or let it cool"),
     ("disk_low", "the disk is nearly full", "delete old recordings and logs"),
     ("cpu_busy", "the computer is overloaded", _CLOSE_PROGRAMS),
     ("memory_low", "the computer's memory is nearly full", _CLOSE_PROGRAMS),

@@ -181,7 +181,9 @@ async def test_a_map_that_may_grow_no_more_is_told_once_and_in_the_health(
 
 
 def test_a_map_for_nothing_is_refused_with_its_line() -> None:
-    with pytest.raises(ConfigError, match="f:2: map: a map is for mapping: slam or localize;"):
+    with pytest.raises(
+        ConfigError, match="f:2: map: needs mapping; set `mapping` to slam or localize"
+    ):
         config.loads("sectors: 8\nmap: house\n", PerceptionConfig, "f")
     assert config.loads('mapping: "off"', PerceptionConfig, "f") == PerceptionConfig()
 

@@ -67,4 +67,4 @@ async def test_a_real_body_starts_neither_released_nor_enabled(home: Home) -> No
         *AVOID, "--body", "mycustombot", "--link", "real", "--resume", "auto", "--headless"
     )
     assert await refused.ended() == 2
-    assert "resume: auto is for simulation" in refused.err
+    assert "resume: auto is not allowed" in refused.err

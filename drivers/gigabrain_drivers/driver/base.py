@@ -99,7 +99,7 @@ class Driver(abc.ABC):
         raise Unsupported(f"{type(self).__name__} cannot park its body")
 
     async def limp(self) -> None:
-        """Let go of all joints, so that a person can move them. Raises BodyLost.
+        """Switch joint torque off, to move the joints by hand. Raises BodyLost.
 
         `read_state` says so until the next positions are sent.
         """

@@ -383,7 +383,7 @@ async def run(config: DriverConfig, bus: Bus, ready: Callable[[], None]) -> None
     if config.link != "sim" and config.speed != 1.0:
         raise ConfigError(f"link {config.link!r} runs in real time; --speed is for simulation")
     if config.link == "real" and config.resume == "auto":
-        raise ConfigError("resume: auto is for simulation; a real body is enabled by a person")
+        raise ConfigError("resume: auto is not allowed with link real; use manual")
     if config.link != "real":
         load_world(config.world, config.seed)  # a mock takes any, and would hide a wrong one
     where = Run(

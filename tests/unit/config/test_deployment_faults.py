@@ -29,11 +29,11 @@ PORT = "expected a path, or usb:VID:PID[:SERIAL], got"
         ("body: mock\nrouter: localhost", "f:2: router: 'localhost' is not a Zenoh endpoint"),
         (
             "hosts:\n  a: [router]\n  b: [driver]\nrouter: tcp/127.0.0.1:0",
-            "f:4: router: tcp/127.0.0.1:0: several hosts must know its port",
+            "f:4: router: tcp/127.0.0.1:0: several hosts need a fixed port",
         ),
         (
             "body: mock\nhosts:\n  a: [driver]\n  b: [driver]",
-            "f:2: hosts: driver must run once, on one host",
+            "f:2: hosts: driver repeated; list each once",
         ),
         ("link: emulated\nspeed: 2", "f:2: speed is for the simulation"),
         ("body: mock\nbutton:\n  port: ''", f"f:3: button.port: {PORT} ''"),

@@ -50,8 +50,8 @@ def test_the_notice_is_one_line_with_the_place_and_comes_once(
     for _ in range(2):
         values("decision:\n  begin: roam\n  unknown: avoid\n")
     assert capsys.readouterr().err.splitlines() == [
-        "robot.yaml:2: 'begin: roam' is now 'start: explore'; the old word works until 0.3",
-        "robot.yaml:3: 'unknown' is now 'unknown_space'; the old word works until 0.3",
+        "robot.yaml:2: 'begin: roam' is now 'start: explore'; the old form works until 0.3",
+        "robot.yaml:3: 'unknown' is now 'unknown_space'; the old form works until 0.3",
     ]
 
 
@@ -123,7 +123,7 @@ def test_settings_in_an_old_recording_get_the_current_words() -> None:
     ],
 )
 def test_old_commands_and_options_are_read_as_the_new_ones(old: str, new: str, notice: str) -> None:
-    expected = [f"{notice}; the old word works until 0.3"] if notice else []
+    expected = [f"{notice}; the old form works until 0.3"] if notice else []
     assert renamed_arguments(old.split(), CLI) == (new.split(), expected)
 
 

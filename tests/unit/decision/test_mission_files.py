@@ -21,7 +21,7 @@ from gigabrain_zenoh.errors import ConfigError
         ),
         ("do:\n- goto: [1, .nan]", "m:2: .nan is not allowed; expected a finite number"),
         ("do:\n- goto: [1]", "m:2: do[0].goto: expected "),
-        ("do:\n- wait: 1\n  goto: [1, 2]", "m:2: do[0].wait: a step has one kind"),
+        ("do:\n- wait: 1\n  goto: [1, 2]", "m:2: do[0].wait: this step is"),
         ("do:\n- explore:", "m:2: do[0]: an empty step; expected one of goto, "),
         ("do:\n- tree: b", "m:2: do[0].tree: no tree 'b'; known: none"),
         (

@@ -126,7 +126,7 @@ def test_a_process_that_is_gone_is_found(name: str) -> None:
         ({"described": {**ROBOT.described, "safety": replace(example(Description), version="9")}},
          "versions", "the processes differ: 0.1.0, 9"),
         ({"health": {**ROBOT.health, "driver": health("driver", sent_hz={"robot/scan": 10.0})}},
-         "robot/state", "0 Hz from driver, promised 50"),
+         "robot/state", "0 Hz from driver, expected 50"),
         ({"health": {k: v for k, v in ROBOT.health.items() if k != "control"}},
          "control", "reports no health"),
         ({"lead_ms": {"waffle": 1800.0}}, "clock", "waffle is 1.8 s behind this one"),

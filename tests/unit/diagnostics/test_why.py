@@ -373,7 +373,7 @@ def test_a_brain_that_stands_with_a_goal_gives_its_reason(moving: ChainFacts) ->
     verdict = judge(standing(moving, DRIVES, reason=reason))
     assert verdict.broken
     assert (verdict.broken.link, verdict.exit_code) == ("intent", 15)
-    assert verdict.broken.text == f"decision wants to stand: {reason}"
+    assert verdict.broken.text == f"decision does not drive: {reason}"
 
 
 def test_an_operator_that_keeps_the_body_from_a_goal_is_named(moving: ChainFacts) -> None:

@@ -71,12 +71,12 @@ async def test_a_second_commander_is_told_who_drives_and_a_take_over_names_both(
         assert (reply.ok, reply.text) == (False, "control drives; take it over with take=true")
         assert (await enable(robot, "ann", take=True)).ok
         reply = await enable(robot, "control", take=True)
-        assert (reply.ok, reply.text) == (False, "ann drives; only a person hands it to the brain")
+        assert (reply.ok, reply.text) == (False, "ann drives; only a person can enable the brain")
         assert (await enable(robot, "control", take=True, by="bob")).ok
         assert log.of("enable", "take") == [
             ("enable", "ann", False, "control drives; take it over with take=true"),
             ("take", "ann", True, "ann drives, taken over from control"),
-            ("enable", "control", False, "ann drives; only a person hands it to the brain"),
+            ("enable", "control", False, "ann drives; only a person can enable the brain"),
             ("take", "bob", True, "control drives, taken over from ann"),
         ]
 

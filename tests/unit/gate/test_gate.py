@@ -76,7 +76,7 @@ def test_a_release_must_name_the_newest_estop(generation: int) -> None:
     rig.feed(gate.Estop("alice"))
     rig.tick(30)
     assert rig.feed(gate.Release(generation)) == gate.Outcome(
-        ok=False, text="e-stop number 2 is the newest; look at it before you release"
+        ok=False, text="wrong e-stop number, newest 2; check its cause, then release"
     )
     assert rig.mode == "latched"
     assert rig.feed(gate.Release(2)).ok
@@ -124,7 +124,7 @@ def test_a_release_waits_until_what_latched_it_is_over(verdict: Literal["ok", "s
     rig.tick(25)
     rig.safety(HOT, BLIND, verdict=verdict)
     assert rig.feed(gate.Release(0)) == gate.Outcome(
-        ok=False, text="what latched it still holds: a motor is hot"
+        ok=False, text="the cause is still present: a motor is hot"
     )
     rig.safety(BLIND, verdict="stop")
     assert rig.feed(gate.Release(0)).ok
@@ -135,7 +135,7 @@ def test_what_the_driver_itself_finds_wrong_holds_a_release_back_as_well() -> No
     rig.tick(25, faults=(CRASHED, LOST))
     rig.safety(HOT)
     assert rig.feed(gate.Release(0)) == gate.Outcome(
-        ok=False, text="what latched it still holds: it has hit something; a motor is hot"
+        ok=False, text="the cause is still present: it has hit something; a motor is hot"
     )
     rig.safety()
     assert not rig.feed(gate.Release(0)).ok

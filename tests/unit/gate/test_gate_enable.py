@@ -51,7 +51,7 @@ def _brain_stares(rig: Rig) -> None:
         (lambda rig: rig.tick(8), "the safety process is silent", False),
         (lambda rig: rig.safety(BLIND, verdict="stop"), "the lidar is blind", False),
         (_brain_quiet, "no valid command for 100 ms", True),
-        (_brain_stares, "commands rest on sensor data that is too old", True),
+        (_brain_stares, "commands use sensor data that is too old", True),
     ],
 )
 def test_it_is_enabled_only_when_nothing_speaks_against_it(
@@ -140,7 +140,7 @@ def test_the_brain_takes_the_body_from_nobody_unless_a_person_hands_it_over() ->
     rig.live(3)
     for by in ("", "control"):
         assert rig.feed(gate.Enable("control", take=True, by=by)) == gate.Outcome(
-            ok=False, text="alice drives; only a person hands it to the brain"
+            ok=False, text="alice drives; only a person can enable the brain"
         )
     assert rig.state.commander == "alice"
     assert rig.feed(gate.Enable("control", take=True, by="bob")) == gate.Outcome(

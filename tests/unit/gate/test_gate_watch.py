@@ -58,7 +58,7 @@ def test_sensor_data_may_be_so_old_and_no_older(limit_ms: int, borne: int) -> No
         assert rig.send(0.2, basis=rig.state.tick - looked) == gate.Outcome()
     assert rig.mode == "enabled"
     rig.tick()
-    assert plain(rig.state.causes) == [("stale", "commands rest on sensor data that is too old")]
+    assert plain(rig.state.causes) == [("stale", "commands use sensor data that is too old")]
     assert rig.mode == "stopping"
 
 

@@ -46,7 +46,7 @@ LINK = Ros2Link(transport="dds", node="pass")
         ("robot/world", "/w", "std_msgs/Strin", "json", "did you mean 'std_msgs/msg/String'"),
         ("robot/world", "/w", "std_srvs/srv/SetBool", "json", "no ROS message type"),
         ("robot/world", "/a b", "std_msgs/String", "json", "is no ROS name"),
-        ("robot/world", "/w", "sensor_msgs/LaserScan", "json", "a type with one text alone"),
+        ("robot/world", "/w", "sensor_msgs/LaserScan", "json", "a type with one string field"),
         ("/a", "notes", "std_msgs/String", "fields", "a key below robot/"),
         ("/a", "robot/*", "std_msgs/String", "fields", "one key"),
         ("/a", "robot/Big/x", "std_msgs/String", "fields", "a name after robot/"),
