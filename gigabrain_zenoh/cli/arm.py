@@ -87,7 +87,7 @@ def jog(joint: str, distance: Distance, /, *, take: Take = False, at: RobotAddre
 
 
 def home(*, take: Take = False, at: RobotAddress = LOCAL) -> None:
-    """Move the arm, slowly, to the posture in which it is out of the way.
+    """Move the arm slowly to its home posture, out of the way.
 
     Example: gigabrain arm home --take
     """

@@ -64,7 +64,7 @@ def chain(
     rates: Annotated[tuple[float, ...], Parameter(consume_multiple=True)] = (10.0, 50.0),
     json: JsonFile = None,
 ) -> int:
-    """Time the way from scan to command, in turns with a bare Zenoh relay.
+    """Measure scan-to-command latency, in turns with a bare Zenoh relay.
 
     Example: gigabrain bench chain --seconds 10 --rounds 3 --rates 10 50
 
@@ -152,7 +152,7 @@ def bodies(
     Args:
         names: Robots. Default: all that have the link.
         link: How to reach them.
-        seconds: Time that each drives [s of its own time].
+        seconds: Time that each drives [s of robot time].
     """
     from gigabrain_drivers.driver.catalog import simulated
     from gigabrain_zenoh.launch.deployment import Deployment

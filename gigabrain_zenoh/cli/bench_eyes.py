@@ -141,8 +141,8 @@ def clutter(
 
     Args:
         seeds: Seeds of the worlds, such as 0-99 or 3,5,20-22.
-        speed: Simulated over real time.
-        seconds: Time in each world, from the first goal [s of its own time].
+        speed: Real-time factor.
+        seconds: Time in each world, from the first goal [s of robot time].
         lidar_only: Leave the cameras off.
         logs: Keep the worlds and the logs of all processes in this folder.
     """
@@ -183,8 +183,8 @@ def objects(
 
     Args:
         seeds: Seeds of the worlds, such as 0-9 or 3,5,20-22.
-        speed: Simulated over real time.
-        seconds: Time in each world, from the first place on [s of its own time].
+        speed: Real-time factor.
+        seconds: Time in each world, from the first place on [s of robot time].
     """
     from gigabrain_zenoh.qa.bench.clutter import seeds_of
     from gigabrain_zenoh.qa.bench.objects import measure_objects

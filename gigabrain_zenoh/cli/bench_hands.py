@@ -77,8 +77,8 @@ def fetch(
 
     Args:
         seeds: Seeds of the worlds, such as 0-9 or 3,5,20-22.
-        speed: Simulated over real time, at most.
-        seconds: Time in each world [s of its own time].
+        speed: Real-time factor, at most.
+        seconds: Time in each world [s of robot time].
         people: A person walks through the door and back, all the time.
     """
     from gigabrain_zenoh.qa.bench.clutter import seeds_of

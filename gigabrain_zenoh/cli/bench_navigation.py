@@ -53,7 +53,7 @@ def slam(
     Args:
         log: Log files.
         world: Simulated worlds to explore instead; see `gigabrain worlds`.
-        minutes: Time in each world [min of its own time].
+        minutes: Time in each world [min of robot time].
         seed: Random seed of the start pose and the sensor noise in a world.
         png: Draw the maps to this file.
     """
@@ -272,11 +272,11 @@ class GoalsOptions:
     meetings: int = 0
     "Continue until the person of the world has stopped for the robot this many times."
     hours: float = 0.0
-    "Continue for this time [h of its own time], and report the memory of perception."
+    "Continue for this time [h of robot time], and report the memory of perception."
     link: Literal["sim", "emulated"] = "sim"
     "How to reach the robots."
     speed: float = 5.0
-    "Simulated over real time; emulated robots run at 1."
+    "Real-time factor; emulated robots run at 1."
     seed: int = 0
     "Random seed of the start pose, the sensor noise and the goals."
     headings: bool = False

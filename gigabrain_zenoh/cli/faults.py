@@ -89,7 +89,7 @@ def faults(
     into: Path | None = None,
     json: JsonFile = None,
 ) -> int:
-    """Break a running robot in every way of the table, and check that it stops.
+    """Inject every fault of the table into a running robot, and check that it stops.
 
     Example: gigabrain faults --only decision-killed 12 --repeat 3
 

@@ -50,7 +50,7 @@ def objects(
 
 
 def pose(x: Number, y: Number, yaw: Number | None = None, /, *, at: RobotAddress = LOCAL) -> None:
-    """Tell the robot where it is in its map; its scan confirms and refines it.
+    """Set the robot's pose in its map; its scan confirms and refines it.
 
     Example: gigabrain pose 3.0 1.5 1.57
 

@@ -225,7 +225,7 @@ def driver(
         name: Name of the robot, or path of its YAML file; see `gigabrain robots`.
         link: How to reach the robot: simulated, emulated or real.
         speed: Real-time factor. If it is not 1, simulated time waits for the brain.
-        resume: Drive on after a stop whose cause has passed: by itself, or when enabled.
+        resume: Resume after a stop once its cause is gone: by itself, or when enabled.
         cameras: Use the robot's cameras; run them with `gigabrain node run camera`.
         ports: Folder of the emulator's ports, for `--link emulated`.
         state_dir: Folder that keeps the cause of a latch across restarts.

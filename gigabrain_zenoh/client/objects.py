@@ -45,7 +45,7 @@ async def forget_objects(bus: Bus, **fields: Any) -> str:
 
 
 async def set_pose(bus: Bus, x: float, y: float, yaw: float | None = None) -> PoseInMap:
-    """Tell the robot where it is [m, m, rad]; return its pose once its scan has confirmed it.
+    """Set the robot's pose [m, m, rad]; return it once the robot's scan has confirmed it.
 
     Raises ConfigError for numbers that are not valid, BodyLost, and Refused if the scan does not
     fit there.

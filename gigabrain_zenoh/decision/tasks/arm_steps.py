@@ -63,7 +63,7 @@ class HeldThing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Reach(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Bring the tool to a point."""
+    """Move the tool to a point."""
 
     at: Point3
     pitch: Angle | None = None  # [rad] down from level; None: any way

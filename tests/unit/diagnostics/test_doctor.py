@@ -87,7 +87,7 @@ def test_a_healthy_machine_and_robot_have_only_good_results() -> None:
         ),
         ({"ports": (PORT,)}, "serial", "/dev/ttyACM0", 'ATTRS{idVendor}=="0483"'),
         ({"ports": (PORT,)}, "serial", "0483:5740", "usermod -aG dialout"),
-        ({"multicast": True}, "multicast", "search for others", "reinstall"),
+        ({"multicast": True}, "multicast", "scouting is on", "reinstall"),
         ({"certificate": EXPIRED}, "keys", "expired on 2026-01-01", "gigabrain keys issue"),
         (
             {"certificate": Certificate(folder="keys/red", name="robot@red", days_left=12.0)},

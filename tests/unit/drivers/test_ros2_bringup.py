@@ -66,7 +66,7 @@ def test_an_empty_graph_asks_for_domain_and_network() -> None:
     ours = end("/cmd_vel", STAMPED, ours=True)
     (found,) = graph_findings(options(), [ours])
     assert (found.what, found.verdict) == ("graph", "error")
-    assert "ROS_DOMAIN_ID 7" in found.do
+    assert "ROS_DOMAIN_ID=7" in found.do
     zenoh = options(transport="rmw_zenoh", router="tcp/robot:7447")
     (found,) = graph_findings(zenoh, [])
     assert "tcp/robot:7447" in found.do

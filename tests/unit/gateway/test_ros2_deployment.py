@@ -78,7 +78,7 @@ def test_its_own_identity_may_command_and_ask_and_nothing_else():
 
 def test_open_rmf_needs_a_name_of_the_robot(tmp_path):
     fleet = Ros2Config(free_fleet=True)
-    with pytest.raises(ConfigError, match="calls a robot by its namespace, and this one has none"):
+    with pytest.raises(ConfigError, match="free_fleet needs the robot's namespace"):
         specs(Deployment(ros2=fleet), tmp_path)
     _, started = specs(Deployment(ros2=fleet, namespace="red"), tmp_path)["ros2"]
     assert started["settings"]["free_fleet"]

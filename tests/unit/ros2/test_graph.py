@@ -103,7 +103,7 @@ def test_over_dds_nodes_of_humble_have_neither_name_nor_hash() -> None:
 
 
 def test_where_nothing_is_found_the_usual_reasons_are_named() -> None:
-    assert "ROS_DOMAIN_ID 7" in unreached("dds", 7)
+    assert "ROS_DOMAIN_ID=7" in unreached("dds", 7)
     over_zenoh = unreached("rmw_zenoh", 7, "tcp/127.0.0.1:7447")
     assert "the router tcp/127.0.0.1:7447" in over_zenoh
     assert "RMW_IMPLEMENTATION=rmw_zenoh_cpp and ROS_DOMAIN_ID=7" in over_zenoh
