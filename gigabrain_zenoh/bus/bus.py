@@ -61,6 +61,7 @@ R = TypeVar("R", bound=Message)
 LOST_NS = 3_000_000_000  # without a state that can be believed, while others come
 PAUSE_NS = 1_000_000_000  # between two of them, and the count begins again
 FETCH_S = 1.0  # how long the one who keeps a value may take to hand it over
+FETCH_AGAIN_NS, MAX_FETCH_AGAIN_NS = 1_000_000_000, 8_000_000_000  # while none has come
 
 
 class Bus:
@@ -167,7 +168,7 @@ class Bus:
         guarded = self._guard(receive)
         if not topic.keep or topic.many:
             return self._listening(pattern, self.transport.subscribe(pattern, guarded, topic.depth))
-        live = False
+        live = known = False
 
         def receive_live(key: str, payload: bytes) -> bool | None:
             nonlocal live
@@ -175,10 +176,20 @@ class Bus:
             live = live or taken is True
             return taken
 
+        def receive_kept(key: str, payload: bytes) -> bool | None:
+            nonlocal known
+            if not live:  # a live message counts more than a kept one
+                known = guarded(key, payload) is True or known
+            return known
+
         ends = self.transport.subscribe(pattern, receive_live, topic.depth)
-        # a live message counts more than a kept one
-        self._fetch(topic, lambda key, payload: None if live else guarded(key, payload))
-        return self._listening(pattern, ends)
+        fetching = self._fetch(topic, receive_kept, lambda: live or known)
+
+        def end() -> None:
+            fetching.cancel()
+            ends()
+
+        return self._listening(pattern, end)
 
     def tap(self, pattern: str, on_raw: OnRaw) -> Close:
         """Call `on_raw(key, encoding, payload)` for all on `pattern`, valid or not, in any thread.
@@ -312,16 +323,28 @@ class Bus:
         if first:
             self.transport.serve(key, answer)
 
-    def _fetch(self, topic: Topic[Any], receive: OnSample) -> None:
-        """Ask for the kept value, for a subscriber that comes after it was sent."""
+    def _fetch(
+        self, topic: Topic[Any], receive: OnSample, known: Callable[[], bool]
+    ) -> "asyncio.Task[None]":
+        """Ask for the kept value until one is known.
+
+        It was sent before the subscriber came, or its only message was lost.
+        """
 
         async def fetch() -> None:
+            again_ns = FETCH_AGAIN_NS
             try:
-                for payload in await self.kept(topic):
-                    receive(topic.key, payload)
+                while True:
+                    for payload in await self.kept(topic):
+                        receive(topic.key, payload)
+                    if known():
+                        return
+                    await self.clock.sleep_ns(again_ns)
+                    again_ns = min(2 * again_ns, MAX_FETCH_AGAIN_NS)
             except Exception as error:  # noqa: BLE001 - as in `_guard`: no code awaits this task
                 self._fail(error)
 
         task = asyncio.get_running_loop().create_task(fetch())
         self._fetching.add(task)
         task.add_done_callback(self._fetching.discard)
+        return task

@@ -6,8 +6,9 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import msgspec
+import pytest
 
-from gigabrain_drivers.driver import catalog
+from gigabrain_drivers.driver import catalog, process
 from gigabrain_drivers.driver.process import DriverProcess
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.sim.driver import MujocoDriver
@@ -27,8 +28,10 @@ WAFFLE = "turtlebot3_waffle"
 Node = Callable[[Bus, Callable[[], None]], Awaitable[None]]
 
 
-def make(speed: float = 100.0, seconds: float | None = None, **options: float) -> MujocoDriver:
-    run = Run(folder=Path(), world="arena", seed=0, speed=speed, seconds=seconds)
+def make(
+    speed: float = 100.0, seconds: float | None = None, cameras: bool = False, **options: float
+) -> MujocoDriver:
+    run = Run(folder=Path(), world="arena", seed=0, speed=speed, seconds=seconds, cameras=cameras)
     robot, driver = catalog.make_driver(WAFFLE, run)
     assert isinstance(driver, MujocoDriver)
     changed = msgspec.structs.replace(driver.options, **options)
@@ -59,11 +62,11 @@ async def drive(driver: MujocoDriver, folder: Path) -> tuple[LocalNetwork, list[
     watcher = bus()
     watcher.subscribe(STATE, lambda key, state: speeds.append(float(driver.report()["true_speed"])))  # type: ignore[arg-type]
     body = bus()
-    process = DriverProcess(config, driver.robot, driver, body)
-    tasks.append(asyncio.ensure_future(process.run(lambda: None)))
+    gated = DriverProcess(config, driver.robot, driver, body)
+    tasks.append(asyncio.ensure_future(gated.run(lambda: None)))
     while not driver.finished:
         await asyncio.sleep(0.01)
-        assert process.report()["lockstep_timeouts"] == 0  # each tick was answered
+        assert gated.report()["lockstep_timeouts"] == 0  # each tick was answered
         for task in tasks:
             if task.done():
                 task.result()
@@ -104,6 +107,15 @@ def ticks_of(network: LocalNetwork, key: str) -> list[int]:
     ticks = [header_of(payload).tick for sent, payload in network.sent if sent == key]
     announced = len(list(itertools.takewhile(lambda tick: tick == ticks[0], ticks)))
     return ticks[announced - 1 :]
+
+
+async def test_a_camera_that_never_answers_does_not_hold_the_first_tick_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(process, "CAMERAS_S", 0.3)
+    async with asyncio.timeout(60):
+        network, _ = await drive(make(seconds=0.06, cameras=True), tmp_path)
+    assert ticks_of(network, STATE.key) == [1, 2, 3]
 
 
 async def test_two_runs_with_the_same_seed_decide_alike(tmp_path: Path) -> None:

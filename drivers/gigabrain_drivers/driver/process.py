@@ -271,10 +271,10 @@ class DriverProcess:
             if self._poses and self._robot.cameras:  # not kept for those that come late
                 self._sensors.append((SIM_POSES, self._poses))
             self._begin(lockstep, state)
+            if cameras_s <= 0:
+                lockstep.forget_pictures()
             answered = await lockstep.wait(REPEAT_S)
             cameras_s -= REPEAT_S
-            if cameras_s < 0:
-                lockstep.forget_pictures()
 
     def _begin(self, lockstep: Lockstep, state: RobotState) -> None:
         """Announce the tick; on a network in memory the answers come before this returns."""

@@ -154,6 +154,36 @@ async def test_a_late_joiner_gets_the_last_of_the_kept_values(net: Net) -> None:
     assert sent.seq == 2
 
 
+async def test_a_kept_value_whose_message_was_lost_is_asked_for_again(
+    net: Net, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    maps = net.two.latest(MAP)
+    await settle()
+    with monkeypatch.context() as lost:
+        lost.setattr(net.one.transport, "publish", lambda *_: None)
+        sent = net.one.publish(MAP, GRID)
+    await net.clock.advance(SECOND_NS - 1)
+    assert maps.newest is None
+    await net.clock.advance(1)
+    await settle()
+    assert maps.newest == sent
+
+
+async def test_a_subscription_that_has_ended_asks_for_no_kept_value(net: Net) -> None:
+    asked: list[bytes] = []
+
+    async def answer(payload: bytes) -> tuple[bytes, str]:
+        asked.append(payload)
+        return b"", ""
+
+    close = net.two.subscribe(MAP, lambda _, __: None)
+    await settle()
+    close()
+    net.network.transport().serve("robot/map", answer)
+    await net.clock.advance(60 * SECOND_NS)
+    assert asked == []
+
+
 async def test_a_stream_is_not_kept(net: Net) -> None:
     net.one.publish(TELEOP, Twist(linear_x=0.2))
     twists = net.two.latest(TELEOP)
