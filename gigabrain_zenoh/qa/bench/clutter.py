@@ -328,12 +328,16 @@ class CourseDriver:
 
     async def _accepted(self, x: float, y: float) -> str:
         """Return the name of the task; a robot that has just started may not know its pose yet."""
+        loop = asyncio.get_running_loop()
+        end_s = loop.time() + MAX_SILENCE_S
         while True:
             try:
                 return await self._while_running(self._tasks.go_to(x, y))
             except Refused:
                 if self.seconds > SETTLED_S:
                     raise
+            if loop.time() > end_s:
+                raise Failed("the robot's time stands still")
 
     async def _while_running(self, work: Awaitable[T]) -> T:
         """Wait for `work`. Raises Over, and GigabrainError when a process dies."""
