@@ -68,7 +68,7 @@ async def test_the_gateway_reports_how_it_has_joined() -> None:
         assert (report["transport"], report["domain"]) == ("dds", 7)
         assert (report["node"], report["localhost"]) == ("/red/gigabrain", 0)
         assert report["other_nodes"] == 0
-        assert "ROS_DOMAIN_ID 7" in report["to_check"]
+        assert "ROS_DOMAIN_ID=7" in report["to_check"]
         robot.node.read("/red/scan", LASER, DEFAULT)
         assert (robot.gateway_bus.report()["other_nodes"]) == 1
         assert robot.gateway_bus.report()["to_check"] == ""
