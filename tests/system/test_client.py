@@ -1,6 +1,7 @@
 """`gigabrain_zenoh.connect()`: a script beside a robot that drives itself."""
 
 import asyncio
+import contextlib
 import itertools
 import math
 import re
@@ -21,6 +22,7 @@ from gigabrain_zenoh.errors import (
     UnknownName,
     Unsupported,
 )
+from gigabrain_zenoh.gate.causes import LATE
 from gigabrain_zenoh.qa.probe import Probe, probing
 from gigabrain_zenoh.testing.processes import AVOID, CommandProcess, Home, free_port, robot_of
 from gigabrain_zenoh.testing.waiting import until
@@ -101,12 +103,22 @@ async def test_a_script_without_asyncio_has_the_same_robot(robot: Probe) -> None
 
 
 async def test_a_script_keeps_the_body_while_it_thinks(robot: Probe) -> None:
-    async with connect(take=True, source="thinker") as script:
-        await script.drive(angular_z=0.5, seconds=0.4)
-        await robot.ticks(75)
-        assert robot.state.gate.commander == "thinker"
-        assert robot.state.velocity.angular_z < 0.05
-        await script.drive(angular_z=-0.5, seconds=0.4)
+    kept = ""
+    for _ in range(4):  # where a busy machine holds up the script or the gate, once more
+        begin = robot.state.tick
+        with contextlib.suppress(Refused):
+            async with connect(take=True, source="thinker") as script:
+                await script.drive(angular_z=0.5, seconds=0.4)
+                await robot.ticks(75)
+                kept, turning = robot.state.gate.commander, robot.state.velocity.angular_z
+                await script.drive(angular_z=-0.5, seconds=0.4)
+        if kept == "thinker":
+            break
+        gates = (state.gate for state in robot.states if state.tick >= begin)
+        stops = {cause.code for gate in gates for cause in gate.causes}
+        assert stops & LATE, stops
+    assert kept == "thinker"
+    assert turning < 0.05
     await until(lambda: robot.state.gate.commander == "control", "the brain goes on")
 
 

@@ -65,7 +65,7 @@ async def test_topics_of_rclpy_are_listed_with_types_qos_and_nodes(
 async def test_where_no_node_is_found_it_says_what_to_check(home: Home, judge: Judge) -> None:
     command = await home.run("ros2", "topics", *join(judge))
     assert await command.ended() == 1
-    assert command.err.startswith(f"gigabrain: no node of ROS in domain {judge.domain}: is the")
+    assert command.err.startswith(f"gigabrain: no node of ROS in domain {judge.domain}: check on")
     assert command.err.count("\n") == 1
 
 
