@@ -17,7 +17,7 @@ SIDE_BY_SIDE := -n 2 --dist loadfile --max-worker-restart 0
 MAKEFLAGS += --no-print-directory
 
 .PHONY: setup demo lint style rooms types site unit node system check test qa qa-tests extremes dockerfile signals \
-  ci-extra slow first-starts train-tests ros2-environment bench faults soak mutation fuzz golden recordings pictures clean
+  ci-extra slow first-starts page-commands train-tests ros2-environment bench faults soak mutation fuzz golden recordings pictures clean
 
 setup: $(WARM)
 
@@ -137,7 +137,10 @@ fuzz: setup
 
 # what CI runs behind `make test`: slow tests, first starts in empty environments, and what the pages
 # say to run
-ci-extra: setup slow first-starts train-tests
+ci-extra: slow train-tests first-starts page-commands
+
+# every command that the pages show
+page-commands: setup
 	$(BIN)/python -m tests.qa.documentation
 
 # tests of some 12 s and more; those of faults by themselves, as a busy machine delays robots
