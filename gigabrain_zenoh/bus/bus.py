@@ -168,28 +168,7 @@ class Bus:
         guarded = self._guard(receive)
         if not topic.keep or topic.many:
             return self._listening(pattern, self.transport.subscribe(pattern, guarded, topic.depth))
-        live = known = False
-
-        def receive_live(key: str, payload: bytes) -> bool | None:
-            nonlocal live
-            taken = guarded(key, payload)
-            live = live or taken is True
-            return taken
-
-        def receive_kept(key: str, payload: bytes) -> bool | None:
-            nonlocal known
-            if not live:  # a live message counts more than a kept one
-                known = guarded(key, payload) is True or known
-            return known
-
-        ends = self.transport.subscribe(pattern, receive_live, topic.depth)
-        fetching = self._fetch(topic, receive_kept, lambda: live or known)
-
-        def end() -> None:
-            fetching.cancel()
-            ends()
-
-        return self._listening(pattern, end)
+        return self._listening(pattern, self._subscribe_kept(topic, guarded))
 
     def tap(self, pattern: str, on_raw: OnRaw) -> Close:
         """Call `on_raw(key, encoding, payload)` for all on `pattern`, valid or not, in any thread.
@@ -322,6 +301,31 @@ class Bus:
 
         if first:
             self.transport.serve(key, answer)
+
+    def _subscribe_kept(self, topic: Topic[Any], receive: OnSample) -> Close:
+        """Receive live messages, and the kept value until either has come."""
+        live = known = False
+
+        def receive_live(key: str, payload: bytes) -> bool | None:
+            nonlocal live
+            taken = receive(key, payload)
+            live = live or taken is True
+            return taken
+
+        def receive_kept(key: str, payload: bytes) -> bool | None:
+            nonlocal known
+            if not live:  # a live message counts more than a kept one
+                known = receive(key, payload) is True or known
+            return known
+
+        ends = self.transport.subscribe(topic.key, receive_live, topic.depth)
+        fetching = self._fetch(topic, receive_kept, lambda: live or known)
+
+        def end() -> None:
+            fetching.cancel()
+            ends()
+
+        return end
 
     def _fetch(
         self, topic: Topic[Any], receive: OnSample, known: Callable[[], bool]
