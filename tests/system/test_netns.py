@@ -127,7 +127,7 @@ async def test_a_brain_that_is_cut_off_stops_the_robot_and_holds_up_nobody_else(
     standing = [s for s in robot.states if last + STOP_TICKS + REST_TICKS <= s.tick <= back]
     assert all(at_rest(state) for state in standing)
     received = [s.tick for s in robot.states if start <= s.tick <= back]
-    assert max(b - a for a, b in pairwise(received)) <= 25  # nobody else is held up
+    assert max(b - a for a, b in pairwise(received)) <= 25  # no other client is delayed
     await nothing_stale_or_touched(robot)
 
 

@@ -34,7 +34,7 @@ LOOKED = round(dynamic_obstacles.LOOK_AROUND_S / 0.02) + 1  # ticks
 
 
 def plans(body: BodyDescription, speed: float, cycles: int = 3) -> list[LocalPlan]:
-    """Return the plans after looking round, while somebody 1.5 m ahead crosses at `speed` [m/s]."""
+    """Return the plans made while a person 1.5 m ahead crosses at `speed` [m/s]."""
     planner, made = LocalPlanner(body, FEW), []
     for tick in (1, *range(LOOKED, LOOKED + 4 * cycles, 4)):
         y = -1.0 + speed * 0.02 * tick
