@@ -80,8 +80,8 @@ async def test_without_opengl_one_line_says_so_and_the_robot_drives_as_without_c
         monkeypatch.setenv("MUJOCO_GL", "egl")
         monkeypatch.setenv("PYOPENGL_PLATFORM", "glx")  # which EGL refuses
         path = home.folder / f"report{len(cameras)}.json"
-        options = ("--headless", "--seconds", "6", "--speed", "10", "--report", str(path))
-        demo = await home.run(*AVOID, *options, *cameras)
+        options = ("--headless", "--seconds", "6", "--speed", "10", "--lockstep-timeout", "30")
+        demo = await home.run(*AVOID, *options, "--report", str(path), *cameras)
         assert await demo.ended() == 0
         assert ("apt-get install" in demo.err) is bool(cameras)
         assert len(demo.err.splitlines()) == len(cameras)
