@@ -51,7 +51,7 @@ async def joints_obey(checked: CheckedRobot) -> Finding:
 
             ticks = await it.until(lambda off=off, span=span: off() <= SLACK * span, TRAVEL_TICKS)  # type: ignore[misc]
             if ticks is None:
-                return Finding(False, f"{joint.name} stays {off():.3f} off {goal:.3f}")
+                raise Failed(f"{joint.name} stays {off():.3f} off {goal:.3f}")
             worst = max(worst, (joint.name, off() / span), key=lambda one: one[1])
     return Finding(True, f"at most {worst[1]:.1%} of its range off: {worst[0]}")
 

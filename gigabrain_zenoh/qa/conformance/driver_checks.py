@@ -269,7 +269,7 @@ async def obeys(checked: CheckedRobot) -> Finding:
             ticks = await it.until(there, RAMP_TICKS)
             measured = getattr(it.state.velocity, axis) if it.state else math.nan
             if ticks is None:
-                return Finding(False, f"{axis} {measured:.3f} instead of {wanted:.3f}")
+                raise Failed(f"{axis} {measured:.3f} instead of {wanted:.3f}")
             measured_texts.append(f"{axis} {measured:.3f} of {wanted:.3f} after {ticks} ticks")
     return Finding(True, "; ".join(measured_texts))
 
@@ -334,9 +334,10 @@ async def returns(checked: CheckedRobot) -> Finding:
     within = _axes(clamp(asked, limits_of(robot)))
     honest = all(abs(a - b) <= UNIT for a, b in zip(_axes(sent), within, strict=True) if b)
     speeds = ", ".join(f"{speed:.4f}" for speed in _axes(sent))
-    return Finding(
-        honest and ticks is not None, f"returned {speeds}; commanded differs by {worst:.4f}"
-    )
+    text = f"returned {speeds}; commanded differs by {worst:.4f}"
+    if ticks is None:
+        raise Failed(text)
+    return Finding(honest, text)
 
 
 def _axes(velocity: Velocity) -> tuple[float, float, float]:

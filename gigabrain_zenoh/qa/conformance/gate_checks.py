@@ -259,7 +259,7 @@ async def reconnects(gated: GatedDriver) -> Finding:
         gated.checked.break_peer("")
     back = await gated.until(lambda: gated.state and gated.state.link.connected, BACK_TICKS)
     if back is None:
-        return Finding(False, f"not back after {BACK_TICKS} ticks")
+        raise Failed(f"not back after {BACK_TICKS} ticks")
     if gated.checked.goes_on:
         await _until_stopped(gated)
     moved = await gated.until(lambda: any(gated.checked.commanded(gated.state)), QUIET_TICKS)

@@ -1,5 +1,6 @@
 """Results of the conformance kit on a machine that is too busy."""
 
+import functools
 import itertools
 import os
 from collections.abc import Awaitable, Callable
@@ -8,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from gigabrain_zenoh.host import this_process
-from gigabrain_zenoh.qa.conformance import kit
+from gigabrain_zenoh.qa.conformance import driver_checks, kit
 from gigabrain_zenoh.qa.judging import Failed, Finding, Skipped
 
 
@@ -16,6 +17,7 @@ def waiting(monkeypatch: pytest.MonkeyPatch, each_ms: float) -> None:
     """A machine that has the kit wait so long between two looks."""
     steps = itertools.count()
     monkeypatch.setattr(this_process, "waited_ms", lambda: each_ms * next(steps))
+    monkeypatch.setattr(this_process, "stolen_ns_by_core", dict)
 
 
 def finds(*findings: Finding) -> Callable[[], Awaitable[Finding]]:
@@ -55,6 +57,15 @@ async def test_late_by_more_than_the_machine_is_the_drivers_fault(
     assert await kit._found(finds(LATE)) == LATE
 
 
+async def test_what_a_host_withholds_from_a_virtual_machine_counts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    waiting(monkeypatch, 0.0)
+    steps = itertools.count()
+    monkeypatch.setattr(this_process, "stolen_ns_by_core", lambda: {"cpu0": next(steps) * 10**9})
+    assert await kit._found(finds(LATE, LATE, GOOD)) == GOOD
+
+
 async def test_what_is_wrong_is_wrong_on_any_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     waiting(monkeypatch, 1e6)
     assert await kit._found(finds(WRONG)) == WRONG
@@ -71,6 +82,23 @@ async def test_a_driver_that_does_not_come_as_far_fails_on_a_machine_with_time(
     waiting(monkeypatch, 1e6)
     with pytest.raises(Skipped, match="did not move; gate idle; this machine is too busy"):
         await kit._found(stuck)
+
+
+@pytest.mark.parametrize("check", [driver_checks.obeys, driver_checks.returns])
+async def test_a_speed_that_is_not_reached_counts_on_a_machine_with_time(
+    check: Callable[[driver_checks.CheckedRobot], Awaitable[Finding]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(driver_checks, "RAMP_TICKS", 5)
+    monkeypatch.setattr(driver_checks, "UNIT", -1.0)  # nothing comes as near as that
+    async with driver_checks.CheckedRobot("mock", "sim", tmp_path) as robot:
+        call = functools.partial(check, robot)
+        waiting(monkeypatch, 0.0)
+        assert not (await kit._found(call)).ok
+        waiting(monkeypatch, 1e6)
+        with pytest.raises(Skipped, match="this machine is too busy"):
+            await kit._found(call)
 
 
 def test_waiting_for_a_core_is_summed_over_all_threads(
