@@ -174,7 +174,7 @@ def multiply_in_one_thread() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
-M_MMAP_THRESHOLD = -3  # mallopt(3)
+M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = -3, -1  # mallopt(3)
 LARGE_BYTES = 4 << 20  # the costs of a map of 50 x 50 m, and less, stay in the heap
 
 
@@ -182,10 +182,14 @@ def map_large_blocks() -> None:
     """Have blocks of LARGE_BYTES and more go back to the system as soon as they are free.
 
     By itself glibc raises that limit to 32 MiB as blocks are freed, and then keeps those of each
-    thread: 119 MB after planning in a few maps of 140 x 140 m, and 1 MB with this.
+    thread: 119 MB after planning in a few maps of 140 x 140 m, and 1 MB with this. With a limit
+    that is set, glibc returns all but 128 KiB at the end of a heap at once, and the process that
+    renders pictures asked for 300 pages again for each of them; so that limit is set, too.
     """
     with contextlib.suppress(AttributeError, OSError):
-        ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, LARGE_BYTES)
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(M_MMAP_THRESHOLD, LARGE_BYTES)
+        mallopt(M_TRIM_THRESHOLD, LARGE_BYTES)
 
 
 def trim_heap() -> None:
