@@ -143,12 +143,9 @@ ci-extra: slow train-tests first-starts page-commands
 page-commands: setup
 	$(BIN)/python -m tests.qa.documentation
 
-# tests of some 12 s and more; those of faults by themselves, as a busy machine delays robots
-SLOW := -q -m 'slow and not qa'
-FAULTS := tests/system/test_faults.py
+# tests of some 12 s and more, one after the other: robots side by side delay each other
 slow: setup
-	$(PYTEST) $(SIDE_BY_SIDE) $(SLOW) --ignore=$(FAULTS) $(or $(ARGS),tests)
-	$(if $(ARGS),,$(PYTEST) $(SLOW) $(FAULTS))
+	$(PYTEST) -q -m 'slow and not qa' $(or $(ARGS),tests)
 
 # from the sdist, from the wheel by each Python that is found, for one command, and `make demo`
 first-starts: setup
