@@ -125,10 +125,14 @@ class CellMemory:
         if len(self.cells):
             self._refresh(place[known], new[known])
             new = new[~known]
-        cells = np.concatenate((self.cells, new))
+        cells = self.cells
         gone = cells["strikes"] >= np.where(cells["seen"] > 1, GONE_STRIKES, 1.0)
         gone &= cells["stamp"] < self._now
-        cells = cells[~gone]
+        if gone.any():
+            cells = self.cells = cells[~gone]
+        if not len(new):
+            return
+        cells = np.concatenate((cells, new))
         if len(cells) > MAX_CELLS:
             cells = cells[np.argsort(-cells["stamp"], kind="stable")[:MAX_CELLS]]
         self.cells = cells[np.argsort(cells["key"], kind="stable")]

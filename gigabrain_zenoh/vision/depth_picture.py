@@ -157,7 +157,9 @@ class DepthCamera:
         absent = looked_for & ~known
         if np.count_nonzero(absent) < MISSING_SHARE * MISSING_PX**2:
             return np.empty((0, 2), np.float32)
-        absent &= window_sum(absent) >= MISSING_SHARE * MISSING_PX**2
+        lines = np.flatnonzero(absent.any(axis=1))
+        part = np.s_[lines[0] : lines[-1] + 1]  # mostly the lower half of the picture
+        absent[part] &= window_sum(absent[part]) >= MISSING_SHARE * MISSING_PX**2
         return self._places(rays[:, absent], expected[absent], expected[absent])[:, :2]
 
 
