@@ -24,7 +24,7 @@ GYRO_TICKS = 5  # and no turn from the gyro
 REST_TICKS = 25  # without a turn of a wheel, then what the gyro says is its bias
 REST_RATE = 0.02  # [rad/s], faster is no bias: the robot is being turned
 FIRST_RATE = 0.1  # [rad/s], the bias of a gyro that was never at rest before
-BIAS_SHARE = 0.02  # of a new reading at 50 Hz: over about a second
+BIAS_SHARE = 0.02  # of a new reading at 50 Hz: over about a second; the first ones are averaged
 
 SLIP_RATE = 0.15  # [rad/s] between wheels and gyro, smoothed
 SLIP_SHARE = 0.1  # of a new difference: over about 0.2 s
@@ -51,9 +51,10 @@ class OdometryFusion:
     def __init__(self) -> None:
         self._moments: deque[OdometrySample] = deque(maxlen=KEPT)
         self.bias = 0.0  # [rad/s], of the gyro
-        self._calibrated = False
+        self._readings = 0  # that it is the mean of; 0: it is not known
         self._rate: float | None = None  # [rad/s], the gyro's last reading without its bias
         self._rest = 0  # ticks
+        self._quiet, self._mean = 0, 0.0  # readings at this rest, and their mean [rad/s]
         self._slip = 0.0  # [rad/s], smoothed
 
     @property
@@ -130,12 +131,22 @@ class OdometryFusion:
 
     def _learn_bias(self, step: Floats, rate: float) -> bool:
         """Learn the gyro's bias at rest; return whether the body is at rest."""
-        self._rest = self._rest + 1 if not step.any() else 0
-        if self._rest < REST_TICKS or abs(rate) > (REST_RATE if self._calibrated else FIRST_RATE):
+        if step.any():
+            self._rest = self._quiet = 0
             return False
-        share = BIAS_SHARE if self._calibrated else 1.0
-        self.bias += share * rate
-        self._calibrated, self._slip = True, 0.0
+        self._rest += 1
+        if abs(rate) > (REST_RATE if self._readings else FIRST_RATE):
+            return False
+        self._quiet += 1
+        self._mean += (rate - self._mean) / self._quiet
+        if self._rest < REST_TICKS:
+            return False
+        if self._readings:
+            self._readings += 1
+            self.bias += max(BIAS_SHARE, 1 / self._readings) * rate
+        else:
+            self.bias, self._readings = self._mean, self._quiet
+        self._slip = 0.0
         return True
 
 

@@ -80,6 +80,14 @@ def test_at_rest_the_bias_of_the_gyro_is_learnt_and_the_heading_stays() -> None:
     assert after.fused[2] == pytest.approx(moment.fused[2], abs=1e-6)
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_of_a_noisy_gyro_the_bias_is_the_mean_of_what_it_said_at_rest(seed: int) -> None:
+    """A heading that drifts by 0.2 degrees a second turns the map with it."""
+    readings = np.random.default_rng(seed).normal(0.01, 0.002, 35).tolist()
+    fusion = fused(*(seen(1 + k, (0, 0, 0), rate) for k, rate in enumerate(readings)))
+    assert fusion.bias == pytest.approx(0.01, abs=4 * 0.002 / math.sqrt(len(readings)))
+
+
 def test_a_robot_that_somebody_turns_by_hand_has_turned() -> None:
     still = [seen(1 + k, (0, 0, 0), 0.0) for k in range(50)]
     fusion = fused(*still, *(seen(51 + k, (0, 0, 0), 0.5) for k in range(100)))
