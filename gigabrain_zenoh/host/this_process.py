@@ -182,9 +182,10 @@ def map_large_blocks() -> None:
     """Have blocks of LARGE_BYTES and more go back to the system as soon as they are free.
 
     By itself glibc raises that limit to 32 MiB as blocks are freed, and then keeps those of each
-    thread: 119 MB after planning in a few maps of 140 x 140 m, and 1 MB with this. With a limit
-    that is set, glibc returns all but 128 KiB at the end of a heap at once, and the process that
-    renders pictures asked for 300 pages again for each of them; so that limit is set, too.
+    thread: 119 MB after planning in a few maps of 140 x 140 m, and 1 MB with this.
+
+    Once that limit is set, glibc keeps only 128 KiB free at the end of a heap. The camera process
+    then asked for 300 pages again with each picture, so LARGE_BYTES are kept free there as well.
     """
     with contextlib.suppress(AttributeError, OSError):
         mallopt = ctypes.CDLL(None).mallopt

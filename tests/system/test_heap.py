@@ -35,6 +35,25 @@ for _ in range(3):
 print(held_mb() - before)
 """
 LEFT_MB = 5.0
+PICTURES = """
+import resource, sys
+import numpy as np
+from gigabrain_zenoh.host import this_process as heap
+
+heap.map_large_blocks()
+
+
+def draw():
+    parts = [np.ones(75_000, np.float32) for _ in range(4)]
+    del parts
+
+
+draw()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(100):
+    draw()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
 
 
 def grown_mb(*words: str) -> float:
@@ -48,3 +67,11 @@ def grown_mb(*words: str) -> float:
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_large_blocks_go_back_to_the_system() -> None:
     assert grown_mb("mapped") < LEFT_MB
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc's heap")
+def test_what_each_picture_needs_stays_in_the_heap() -> None:
+    done = subprocess.run(
+        (sys.executable, "-c", PICTURES), capture_output=True, text=True, check=True
+    )
+    assert int(done.stdout) < 1000
