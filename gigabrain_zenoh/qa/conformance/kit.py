@@ -171,23 +171,15 @@ async def _found(call: Callable[[], Awaitable[Finding]]) -> Finding:
     Raises Skipped where that is so each time.
     """
     for _ in range(ATTEMPTS):
-        waited_ms = _waited_ms()
+        waited_ms = this_process.waited_ms()
         finding = await _tried(call)
-        waited_ms = _waited_ms() - waited_ms
+        waited_ms = this_process.waited_ms() - waited_ms
         if finding.ok or not 0 < finding.late_ms <= waited_ms:
             return finding
     raise Skipped(
         f"{finding.measured}; this machine is too busy to judge it: the kit waited "
         f"{waited_ms:.0f} ms for a core"
     )
-
-
-def _waited_ms() -> float:
-    """Return how long this process was without a core that it wanted, at most, in total [ms].
-
-    What the host of a virtual machine withheld may have been withheld from others.
-    """
-    return this_process.waited_ms() + sum(this_process.stolen_ns_by_core().values()) / 1e6
 
 
 async def _tried(call: Callable[[], Awaitable[Finding]]) -> Finding:

@@ -17,7 +17,6 @@ def waiting(monkeypatch: pytest.MonkeyPatch, each_ms: float) -> None:
     """A machine that has the kit wait so long between two looks."""
     steps = itertools.count()
     monkeypatch.setattr(this_process, "waited_ms", lambda: each_ms * next(steps))
-    monkeypatch.setattr(this_process, "stolen_ns_by_core", dict)
 
 
 def finds(*findings: Finding) -> Callable[[], Awaitable[Finding]]:
@@ -55,15 +54,6 @@ async def test_late_by_more_than_the_machine_is_the_drivers_fault(
 ) -> None:
     waiting(monkeypatch, 100.0)
     assert await kit._found(finds(LATE)) == LATE
-
-
-async def test_what_a_host_withholds_from_a_virtual_machine_counts(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    waiting(monkeypatch, 0.0)
-    steps = itertools.count()
-    monkeypatch.setattr(this_process, "stolen_ns_by_core", lambda: {"cpu0": next(steps) * 10**9})
-    assert await kit._found(finds(LATE, LATE, GOOD)) == GOOD
 
 
 async def test_what_is_wrong_is_wrong_on_any_machine(monkeypatch: pytest.MonkeyPatch) -> None:
