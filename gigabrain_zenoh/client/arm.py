@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import BodyDescription, JointDescription, RobotState
 from gigabrain_schemas.brain import JointCommand
-from gigabrain_zenoh.errors import ConfigError, Unsupported, unknown
+from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported, unknown
 from gigabrain_zenoh.geometry.joint_ramp import (
     REST,
     JointGoal,
@@ -22,6 +22,7 @@ from gigabrain_zenoh.geometry.joint_ramp import (
 Positions = Mapping[str, float]  # [rad] or [m] by joint
 LOST_TICKS = 3  # by whose motion the joints may be away from where they were sent
 ARRIVED = 1e-4  # [rad] or [m], off a goal
+SENT = 2e-3  # [rad] or [m], off a goal, as servos round what they are sent
 LONGEST_S = 600.0  # of a trajectory
 
 
@@ -110,10 +111,18 @@ class JointStream:
     """
 
     def __init__(self, body: BodyDescription, state: RobotState, source: str) -> None:
-        """Start where the joints are. Nothing moves before `go` or `follow`."""
+        """Start where the joints are. Nothing moves before `go` or `follow`.
+
+        Raises BodyLost where one is not measured.
+        """
         self._body, self._source = body, source
         self._now = held(body, state)
+        if not self._now:
+            raise BodyLost(
+                f"{body.robot_type}: not all of its joints are measured; see `arm state`"
+            )
         self._tick, self._sent = state.tick, self._now
+        self._postures = (self._now, self._now)  # where the gate held the joints, newest last
         self._ends: dict[str, float] = {}
         self._speed: float | None = None
         self._path: JointPath | None = None
@@ -144,7 +153,8 @@ class JointStream:
         posture = held(self._body, state)
         if not posture:
             return None
-        if not self._now or self._lost(posture):
+        self._postures = (self._postures[1], posture)
+        if self._lost(posture):
             self._now = posture
         ticks = max(0, min(state.tick - self._tick, LOST_TICKS))
         self._tick = state.tick
@@ -189,10 +199,19 @@ class JointStream:
         )
 
     def reached(self, state: RobotState) -> bool:
-        """Return whether all joints are where they should get, as measured."""
+        """Return whether all joints are where they should get, as sent and as measured.
+
+        They were sent there twice: in passing, they would go on when the commands end.
+        """
         here = measured(self._body, state)
-        return self.arrived and all(
-            abs(point.position - self._ends[joint.name]) <= (joint.goal_tolerance or math.inf)
-            for joint, point in zip(self._body.joints, here, strict=False)
-            if joint.name in self._ends
+        if not (here and self.arrived):
+            return False
+        return all(
+            abs(before.position - end) <= SENT
+            and abs(now.position - end) <= SENT
+            and abs(point.position - end) <= (joint.goal_tolerance or math.inf)
+            for joint, before, now, point in zip(
+                self._body.joints, *self._postures, here, strict=True
+            )
+            if (end := self._ends.get(joint.name)) is not None
         )

@@ -8,7 +8,9 @@ from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import Joint, RobotState
 from gigabrain_schemas.brain import JointCommand
 from gigabrain_schemas.examples import example
-from gigabrain_zenoh.client.arm import JointStream
+from gigabrain_zenoh.client.arm import JointPath, JointStream
+from gigabrain_zenoh.errors import BodyLost
+from gigabrain_zenoh.geometry.joints import JointMotion, approach, braked
 
 ARM = load_robot("so101").description()
 PAN, LIFT = 0, 1
@@ -62,3 +64,58 @@ def test_a_jump_is_followed_within_speed_and_acceleration() -> None:
     assert max(map(abs, gains)) <= pan.max_acceleration * TICK_S * 1.01
     assert places[-1] == pytest.approx(1.0, abs=1e-4)
     assert max(places) < 1.0 + 1e-6
+
+
+class LateArm(Arm):
+    """A gate that misses some commands, and servos that follow 80 ms late."""
+
+    def __init__(self) -> None:
+        self.sent = [JointMotion(0.0) for _ in ARM.joints]
+        self.before = (0.0,) * len(ARM.joints)
+        super().__init__()
+
+    def state(self) -> RobotState:
+        rows = zip(ARM.joints, self.at, self.before, strict=True)
+        joints = tuple(
+            Joint(name=joint.name, position=place, velocity=(place - before) / TICK_S)
+            for joint, place, before in rows
+        )
+        sent = tuple(motion.position for motion in self.sent)
+        return replace(super().state(), joints=joints, joints_sent=sent)
+
+    def pass_tick(self, *, lost: bool) -> None:
+        """Send the joints on by one command, or brake them where it is `lost`."""
+        command, self.tick = self.stream.step(self.state()), self.tick + 1
+        assert command
+        rows = zip(self.sent, command.position, command.velocity, ARM.joints, strict=True)
+        self.sent = [
+            braked(now, joint, TICK_S)
+            if lost
+            else approach(now, JointMotion(place, velocity), joint, TICK_S)
+            for now, place, velocity, joint in rows
+        ]
+        pairs = zip(self.at, self.sent, strict=True)
+        self.before = self.at
+        self.at = tuple(at + 0.22 * (motion.position - at) for at, motion in pairs)
+
+
+@pytest.mark.parametrize("gap", range(1, 10))  # ticks without a command
+@pytest.mark.parametrize("back", range(12))  # ticks of commands between it and the end
+def test_joints_that_have_arrived_stay_there_without_commands(gap: int, back: int) -> None:
+    arm = LateArm()
+    arm.stream.follow(JointPath(ARM, [(0.5, {"shoulder_pan": -1.2})], arm.stream.posture))
+    missed, ticks = range(25 - back - gap, 25 - back), 0
+    while not arm.stream.reached(arm.state()):
+        arm.pass_tick(lost=ticks in missed)
+        ticks += 1
+        assert ticks < 75
+    for _ in range(25):
+        arm.pass_tick(lost=True)
+    assert arm.sent[PAN].position == pytest.approx(-1.2, abs=0.003)
+    assert arm.at[PAN] == pytest.approx(-1.2, abs=0.01)
+
+
+def test_joints_that_are_not_measured_are_not_commanded() -> None:
+    state = replace(example(RobotState), joints=(Joint(name="shoulder_pan", position=0.0),))
+    with pytest.raises(BodyLost, match="not all of its joints are measured"):
+        JointStream(ARM, state, "script")
