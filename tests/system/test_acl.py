@@ -11,7 +11,6 @@ from gigabrain_schemas.topics import ESTOP_SAID, SERVICES, TELEOP, TOPICS
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.security.authority import issue
 from gigabrain_zenoh.testing.processes import SampleCollector, repeat
-from gigabrain_zenoh.testing.waiting import until
 from tests.system.keys import Site, make_fleet, raw, site
 
 SAYS = {
@@ -54,6 +53,30 @@ async def asked_until_answered(session: zenoh.Session, key: str) -> None:
             pass
 
 
+async def heard(
+    net: Site, ear: SampleCollector, session: zenoh.Session, keys: list[str], known: set[str]
+) -> set[str]:
+    """Have a session write each key; return those that arrive, once the `known` ones do.
+
+    What another session writes afterwards arrives last.
+    """
+    says, ends = str(session.zid()).encode(), f"after {session.zid()}".encode()
+
+    def say_all() -> None:
+        for key in keys:
+            session.put(f"red/{key}", says)
+
+    def arrived() -> set[str]:
+        return {key for key, payload in ear.samples if payload == says}
+
+    await repeat(say_all, lambda: arrived() >= known)
+    say_all()
+    await asked_until_answered(session, "red/robot/describe/driver")
+    last = net.raw("brain@red")
+    await repeat(lambda: last.put("red/robot/world", ends), lambda: ends in ear.payloads)
+    return arrived()
+
+
 async def test_a_robot_hears_of_each_role_what_it_may_say_and_no_more(net: Site) -> None:
     robot = await net.client("robot@red", "red")
     robot.serve("robot/describe/driver", answer)
@@ -61,17 +84,8 @@ async def test_a_robot_hears_of_each_role_what_it_may_say_and_no_more(net: Site)
     for role, expected in SAYS.items():
         session = net.raw(f"{role}@red")
         may = {f"robot/{name}" for name in expected.split()}
-        ear.samples.clear()
-
-        def say_all(session: zenoh.Session = session) -> None:
-            for key in SAID:
-                session.put(f"red/{key}", b"x")
-
         await asked_until_answered(session, "red/robot/describe/driver")
-        await repeat(say_all, lambda may=may: {key for key, _ in ear.samples} >= may)
-        say_all()
-        await asked_until_answered(session, "red/robot/describe/driver")  # after all it has said
-        await until(lambda may=may: {key for key, _ in ear.samples} == may)
+        assert await heard(net, ear, session, SAID, may) == may
 
 
 async def test_each_role_may_ask_its_own_questions_and_no_others(net: Site) -> None:
@@ -96,15 +110,8 @@ async def test_a_process_of_ones_own_writes_and_asks_what_it_declares_and_no_mor
     for key in [*ASKED, "robot/lamp/ask"]:
         robot.serve(key, answer)
 
-    def say_all() -> None:
-        for key in said:
-            mine.put(f"red/{key}", b"x")
-
     await asked_until_answered(mine, "red/robot/lamp/ask")  # declared last of all
-    await repeat(say_all, lambda: {key for key, _ in ear.samples} >= declared)
-    say_all()
-    await asked_until_answered(mine, "red/robot/lamp/ask")  # after all it has said
-    await until(lambda: {key for key, _ in ear.samples} == declared)
+    assert await heard(net, ear, mine, said, declared) == declared
     answered = {key for key in ASKED if await ask(mine, f"red/{key}")}
     assert answered == {"robot/goal", "robot/describe/driver"}
 
