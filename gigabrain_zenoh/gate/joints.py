@@ -66,7 +66,7 @@ def output(config: GateConfig, state: GateState, calm: bool) -> tuple[JointMotio
     """
     now = state.joints_before
     if state.mode == "latched":
-        return tuple(map(stopped, now, config.joints))
+        return tuple(map(stopped, now))
     command = state.joint_command
     live = command and state.tick - state.joint_tick < LIVE_TICKS
     safety = state.safety

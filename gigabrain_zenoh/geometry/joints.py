@@ -14,10 +14,11 @@ OVERRUN = 0.6  # of the way that a joint lags behind, which it runs on if nothin
 
 
 class JointMotion(msgspec.Struct, frozen=True):
-    """The position and velocity of a joint."""
+    """The position and velocity of a joint; of one that is sent there, its servo's lag as well."""
 
     position: float  # [rad] or [m]
     velocity: float = 0.0  # [rad/s] or [m/s]
+    lag: float = 0.0  # [rad] or [m], how far the joint is still from there
 
 
 def joints_at_rest(measured: Sequence[JointMotion]) -> bool:
@@ -30,13 +31,12 @@ def frozen(now: JointMotion) -> JointMotion:
     return JointMotion(now.position)
 
 
-def stopped(now: JointMotion, limits: JointDescription) -> JointMotion:
+def stopped(now: JointMotion) -> JointMotion:
     """Return a joint that comes to rest as soon as its servo can make it.
 
     The servo is still on its way to `now`. It stops on the rest of that way.
     """
-    taken_back = OVERRUN * limits.gains.feed_forward * now.velocity
-    return JointMotion(now.position - taken_back)
+    return JointMotion(now.position - OVERRUN * now.lag)
 
 
 def braked(now: JointMotion, limits: JointDescription, dt: float) -> JointMotion:
@@ -46,8 +46,10 @@ def braked(now: JointMotion, limits: JointDescription, dt: float) -> JointMotion
     """
     slower = max(0.0, abs(now.velocity) - BRAKING * limits.max_acceleration * dt)
     after = _moved(now, math.copysign(slower, now.velocity), limits, dt)
-    taken_back = OVERRUN * limits.gains.feed_forward * (now.velocity - after.velocity)
-    return JointMotion(after.position - taken_back, after.velocity)
+    ahead = limits.gains.feed_forward * (now.velocity - after.velocity)
+    lost = min(now.lag, ahead, key=abs)  # a joint that has just set off lags behind by less
+    lag = min(now.lag - lost, after.lag, key=abs)
+    return JointMotion(after.position - OVERRUN * lost, after.velocity, lag)
 
 
 class SpeedBand(NamedTuple):
@@ -115,4 +117,14 @@ def _moved(now: JointMotion, velocity: float, limits: JointDescription, dt: floa
     position = now.position + velocity * dt
     if limits.lower <= now.position <= limits.upper:
         position = max(limits.lower, min(limits.upper, position))
-    return JointMotion(position, velocity)
+    return JointMotion(position, velocity, _lag(now, position, limits, dt))
+
+
+def _lag(now: JointMotion, position: float, limits: JointDescription, dt: float) -> float:
+    """Return how far a servo is behind `position`, to which it was sent on within `dt` [s].
+
+    It follows with the time constant that its feed-forward makes up for.
+    """
+    late = limits.gains.feed_forward
+    kept = math.exp(-dt / late) if late else 0.0
+    return now.lag * kept + (position - now.position) / dt * late * (1.0 - kept)

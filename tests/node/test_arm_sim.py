@@ -185,7 +185,7 @@ async def test_a_joint_at_its_greatest_speed_is_at_rest_120_ms_after_it_is_stopp
             sent = accelerated(sent, joint.max_speed, joint, 0.02)
             state = await run(driver, ticks, 1, aim)
         assert state.joints[index].velocity > 0.9 * joint.max_speed
-        sent = stopped(sent, joint)
+        sent = stopped(sent)
         await run(driver, ticks, 6, aim)
         for _ in range(25):
             state = await run(driver, ticks, 1, aim)

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Callable
 
 import pytest
 from hypothesis import given
@@ -21,6 +22,7 @@ from gigabrain_zenoh.geometry.joints import (
 
 DT = 0.02
 JOINT = JointDescription(name="elbow", lower=-1.5, upper=1.5, max_speed=3.0, max_acceleration=20.0)
+LATE = replace(JOINT, gains=JointGains(feed_forward=0.08))  # a servo that follows so late [s]
 positions = st.floats(-1.5, 1.5)
 speeds = st.floats(-100.0, 100.0)
 
@@ -69,14 +71,12 @@ def test_a_braked_joint_comes_to_rest_within_its_range(start: float, velocity: f
     assert JOINT.lower <= now.position <= JOINT.upper
 
 
-def test_a_braked_joint_takes_back_what_it_was_sent_ahead() -> None:
-    ahead = replace(JOINT, gains=JointGains(feed_forward=0.08))
-    now = JointMotion(0.5, 1.0)
+def test_a_braked_joint_takes_back_most_of_what_its_servo_lags_behind() -> None:
+    now = before = JointMotion(0.5, 1.0, lag=LATE.gains.feed_forward)
     for _ in range(2):
-        now = braked(now, ahead, DT)
-    on_its_way, taken_back = 0.2 * DT, 0.6 * 0.08 * 1.0
+        now = braked(now, LATE, DT)
     assert now.velocity == 0.0
-    assert now.position == pytest.approx(0.5 + on_its_way - taken_back)
+    assert 0.5 - 0.6 * before.lag < now.position < 0.5 - 0.4 * before.lag
 
 
 def test_a_stream_within_the_limits_is_followed_exactly() -> None:
@@ -105,8 +105,23 @@ def test_rest_is_judged_by_all_joints_and_nan_is_no_rest() -> None:
 
 
 def test_a_joint_that_stops_takes_back_most_of_what_its_servo_lags_behind() -> None:
-    moving = JointMotion(0.5, 2.0)
-    assert stopped(moving, JOINT) == JointMotion(0.5)
-    late = replace(JOINT, gains=JointGains(feed_forward=0.1))
-    assert 0.3 < stopped(moving, late).position < 0.5
-    assert stopped(JointMotion(0.5), late) == JointMotion(0.5)
+    late, prompt = JointMotion(-1.0), JointMotion(-1.0)
+    for _ in range(40):
+        late, prompt = accelerated(late, 2.0, LATE, DT), accelerated(prompt, 2.0, JOINT, DT)
+    assert late.lag == pytest.approx(2.0 * LATE.gains.feed_forward, rel=1e-2)
+    assert stopped(late) == JointMotion(late.position - 0.6 * late.lag)
+    assert stopped(prompt) == JointMotion(prompt.position)
+    assert stopped(stopped(late)) == stopped(late)
+
+
+@pytest.mark.parametrize("stop", [lambda now: stopped(now), lambda now: braked(now, LATE, DT)])
+@given(speed=st.floats(-3.0, 3.0), ticks=st.integers(1, 12))
+def test_a_joint_that_has_just_set_off_is_not_sent_back_behind_its_start(
+    stop: Callable[[JointMotion], JointMotion], speed: float, ticks: int
+) -> None:
+    now = JointMotion(0.0)
+    for _ in range(ticks):
+        now = accelerated(now, speed, LATE, DT)
+    for _ in range(5):
+        now = stop(now)
+        assert now.position * speed >= -1e-9
