@@ -49,8 +49,10 @@ class JointTrajectory:
         return float(self.times[-1])
 
 
-def eased(joints: Sequence[JointDescription], speed: float) -> list[JointDescription]:
-    """Return joints with a share `speed` of what they can, and less acceleration and jerk.
+def eased(
+    joints: Sequence[JointDescription], speed: float, acceleration: float = ACCELERATION_SHARE
+) -> list[JointDescription]:
+    """Return joints with shares of the speed, and of the acceleration and jerk, that they can.
 
     What is left is for control: a joint that lags is sent ahead by its speed, and corrected.
     """
@@ -58,8 +60,8 @@ def eased(joints: Sequence[JointDescription], speed: float) -> list[JointDescrip
         replace(
             joint,
             max_speed=speed * joint.max_speed,
-            max_acceleration=ACCELERATION_SHARE * joint.max_acceleration,
-            max_jerk=ACCELERATION_SHARE * joint.max_jerk,
+            max_acceleration=acceleration * joint.max_acceleration,
+            max_jerk=acceleration * joint.max_jerk,
         )
         for joint in joints
     ]

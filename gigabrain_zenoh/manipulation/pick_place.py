@@ -33,6 +33,7 @@ from gigabrain_zenoh.manipulation.planner import NoPath, plan
 
 LIMIT_SPARE = 0.006  # of a joint's range, at its ends: servos swing a bit too far
 SLOW = 0.35  # of the joints' speeds, with a thing in the gripper
+GENTLE = 0.25  # of their accelerations then: servos go on to where they were sent last
 CREEP = 0.1  # the same straight to a thing or its place: safety slows single joints near the table
 SQUEEZE = 0.12  # of the gripper's range, beyond the thing's width
 EASED = 0.035  # the same, once it is held: what servos can do for long
@@ -79,7 +80,7 @@ class PickPlacePlanner:
         self._inverse = inverse or InverseKinematics(arm, LIMIT_SPARE)
         self._grasps = GraspPlanner(arm, self._inverse)
         self._fast = TimeParametrization(eased(arm.joints, FAST))
-        self._slow = TimeParametrization(eased(arm.joints, SLOW))
+        self._slow = TimeParametrization(eased(arm.joints, SLOW, GENTLE))
         self._creep = TimeParametrization(eased(arm.joints, CREEP))
         self._opening = arm.opening()
         assert arm.gripper
