@@ -360,18 +360,22 @@ class RoutePlanner:
                 self._drop_frontier(request.tick)
             found = self._find(goal, request, costs)
             if isinstance(found, Path):
+                looks.ended_tick = None
                 self._progress.measure(float(found.remaining[0]), request.tick)
                 return self._go(goal, found, activity=LOOKING)
             looks.give_up()
         route = self._explore(request, costs)
+        if route.points is not None:
+            looks.ended_tick = None
+            return replace(route, activity=LOOKING)
         if route.state == "running":
-            return replace(route, activity=LOOKING if route.points is not None else "")
+            return route
         if not looks.settled(request.tick):
             return self._route(reason="looking at the last places")
+        if looks.try_again():
+            self._missed.clear()
         if looks.ended_tick is None:
             looks.ended_tick = request.tick
-            looks.try_again()
-            self._missed.clear()
         if away := self._giving_way(None, request, costs):
             looks.ended_tick = request.tick
             return away

@@ -92,19 +92,18 @@ def test_a_thing_shown_by_the_map_does_not_hide_itself() -> None:
     assert off(place, target)[0] >= FRONT_M + 0.15 + 0.25 - 0.01
 
 
-def search(
-    cells: np.ndarray, *, then: np.ndarray | None = None, most: int = 400
-) -> tuple[list[Pose], str]:
+def search(cells: np.ndarray, *then: np.ndarray, most: int = 400) -> tuple[list[Pose], str]:
     """Poses that a search of everything goes through, as if it drove at once, and its end.
 
-    The map is `then` once there was nowhere to go for 4 s.
+    The map is the next one of `then` each time there was nowhere to go for 4 s.
     """
+    maps = iter(then)
     planner, here, poses = RoutePlanner(), HERE, []
     tick, feedback, idle = 0, None, 0
     for _ in range(most):
         tick += 25
-        if idle == 8 and then is not None:
-            cells = then
+        if idle == 8:
+            cells = next(maps, cells)
         route = planner.plan(
             RouteRequest(
                 tick=tick,
@@ -178,9 +177,19 @@ def test_a_room_whose_door_somebody_stood_in_is_looked_into_as_well() -> None:
     cells[:, 40] = 100
     opened = cells.copy()
     opened[10:25, 40] = 0
-    poses, reason = search(cells, then=opened)
+    poses, reason = search(cells, opened)
     assert reason == "everything reachable was looked at"
     assert max(pose.x for pose in poses) > 4.5
+
+
+def test_a_second_door_that_somebody_stands_in_is_waited_for_as_well() -> None:
+    cells = empty(8.0, 4.0)
+    cells[:, 40] = cells[:, 60] = 100
+    first, second = cells.copy(), cells.copy()
+    first[10:25, 40] = second[10:25, 40] = second[10:25, 60] = 0
+    poses, reason = search(cells, first, second)
+    assert reason == "everything reachable was looked at"
+    assert max(pose.x for pose in poses) > 6.5
 
 
 def test_it_turns_on_the_spot_before_it_drives() -> None:
