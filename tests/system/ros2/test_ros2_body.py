@@ -196,7 +196,7 @@ async def test_a_guard_that_starts_slowly_is_not_started_again(
     process = guard._process
     assert process
     await guard.close()
-    await process.communicate()
+    assert process.returncode == 0  # waited for
 
 
 async def test_bringup_finds_it_whole_or_names_the_wrong_type(judge: Judge, tmp_path: Path) -> None:

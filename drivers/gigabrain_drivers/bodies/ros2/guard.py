@@ -29,7 +29,8 @@ PERIOD_NS = 20_000_000
 WORD_NS = 500_000_000  # between two words to the driver
 LOST_NS = 3_000_000_000  # without a word of the guard, after which the driver counts it as lost
 RESTART_NS = 500_000_000
-CLOSE_S = 1.0
+CLOSE_S = 1.0  # for its own link,
+END_S = 2.0  # and for the whole process
 START_S = 60.0  # for its first word, on a busy machine; to start it again would make that slower
 
 
@@ -114,9 +115,18 @@ class Guard:
             return
         finally:
             process.stdin.close()  # it ends by that
-            if self._task:  # it is replaced, and may hang
-                with contextlib.suppress(ProcessLookupError):
-                    process.kill()
+            await _ended(process, 0.0 if self._task else END_S)  # one that is replaced may hang
+
+
+async def _ended(process: asyncio.subprocess.Process, within_s: float) -> None:
+    """Wait until a process has ended; kill it after `within_s`."""
+    try:
+        async with asyncio.timeout(within_s):
+            await process.wait()
+    except TimeoutError:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        await process.wait()
 
 
 async def guard(options: Ros2Options) -> None:
