@@ -33,8 +33,8 @@ from gigabrain_zenoh.manipulation.planner import NoPath, plan
 
 LIMIT_SPARE = 0.006  # of a joint's range, at its ends: servos swing a bit too far
 SLOW = 0.35  # of the joints' speeds, with a thing in the gripper
-GENTLE = 0.25  # of their accelerations then: servos go on to where they were sent last
 CREEP = 0.1  # the same straight to a thing or its place: safety slows single joints near the table
+GENTLE = 0.25  # of their accelerations on the way: servos go on to where they were sent last
 SQUEEZE = 0.12  # of the gripper's range, beyond the thing's width
 EASED = 0.035  # the same, once it is held: what servos can do for long
 MAX_EASED = 1.4  # times EASED; a grip that squeezes harder is eased again
@@ -80,7 +80,8 @@ class PickPlacePlanner:
         self._inverse = inverse or InverseKinematics(arm, LIMIT_SPARE)
         self._grasps = GraspPlanner(arm, self._inverse)
         self._fast = TimeParametrization(eased(arm.joints, FAST))
-        self._slow = TimeParametrization(eased(arm.joints, SLOW, GENTLE))
+        self._slow = TimeParametrization(eased(arm.joints, SLOW))
+        self._gentle = TimeParametrization(eased(arm.joints, SLOW, GENTLE))
         self._creep = TimeParametrization(eased(arm.joints, CREEP))
         self._opening = arm.opening()
         assert arm.gripper
@@ -202,7 +203,7 @@ class PickPlacePlanner:
             return NoWay(reason=f"{held.name}: {way.reason}")
         return Place(
             phases=(
-                Phase(name="traverse", arm=self._slow.trajectory(way.postures, checker=checker)),
+                Phase(name="traverse", arm=self._gentle.trajectory(way.postures, checker=checker)),
                 Phase(name="lower", arm=self._straight(above.posture, down.posture)),
                 Phase(name="open", gripper=opening),
                 Phase(name="retreat", arm=self._retreat(tool, down, held, others, opening)),
