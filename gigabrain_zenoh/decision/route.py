@@ -372,7 +372,8 @@ class RoutePlanner:
             return route
         if not looks.settled(request.tick):
             return self._route(reason="looking at the last places")
-        if looks.try_again():
+        if not looks.tried_again:
+            looks.try_again()
             self._missed.clear()
         if looks.ended_tick is None:
             looks.ended_tick = request.tick

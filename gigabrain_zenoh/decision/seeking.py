@@ -110,7 +110,7 @@ class LookAround:
         self.seek = seek  # the search that it belongs to
         self._seen: set[tuple[int, int]] = set()
         self._given_up: set[tuple[int, int]] = set()
-        self._tried_again = False
+        self.tried_again = False
         self.ended_tick: int | None = None  # since when nothing is left
         self._aim: tuple[int, int] | None = None  # the cell that it goes to look at
         self.goal: Goal | None = None  # from where
@@ -136,13 +136,10 @@ class LookAround:
             self._seen |= near
         self.drop()
 
-    def try_again(self) -> bool:
-        """Count what was given up as unseen again, once; return whether this is the time."""
-        first = not self._tried_again
-        if first:
-            self._tried_again = True
-            self._seen -= self._given_up
-        return first
+    def try_again(self) -> None:
+        """Count what was given up as unseen again."""
+        self._seen -= self._given_up
+        self.tried_again = True
 
     def drop(self) -> None:
         """Choose another aim next."""
