@@ -1,12 +1,17 @@
 """An arm on the operator page: its joints are shown, and move only while a button is held."""
 
-from collections.abc import AsyncIterator
+import asyncio
+import sys
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import pytest_asyncio
 from msgspec.structs import replace
+from numpy.typing import NDArray
 from playwright.async_api import Page
 
 from gigabrain_drivers.driver.catalog import load_robot
@@ -34,6 +39,8 @@ DRIVES = replace(
 )  # fmt: skip
 READY = GateStatus(mode="enabled", commander="control", enables=1)
 LATCHED = GateStatus(mode="latched", estop_generation=1, enables=1)
+LOOKS = 300
+Colour = NDArray[np.float64]  # of each pixel, 0 to 255
 PAN = "shoulder_pan up: hold to move it"
 
 
@@ -320,7 +327,7 @@ async def test_a_viewer_sees_joints_without_buttons(chromium: Browser) -> None:
 async def test_the_arm_is_drawn_in_three_dimensions(chromium: Browser) -> None:
     page = await opened(chromium)
     await page.wait_for_selector("#world", state="visible")
-    await drawn(page, "r > 2 * b && r > 80", 500)  # yellow
+    await drawn(page, lambda r, g, b: (r > 2 * b) & (r > 80), 500)  # yellow
 
 
 @pytest.mark.slow
@@ -336,31 +343,36 @@ async def test_the_way_of_the_tool_and_the_grasps_are_drawn_for_those_who_look(
         for place in ((0.25, -0.15, 0.02), (0.2, -0.25, 0.02))
     ]
     fake.robot.publish(ARM_PLAN, ArmPlan(path=way.tobytes(), grasps=tuple(grasps)))
-    await drawn(page, "b > 2.5 * r && b > 1.4 * g", 60)  # the way is blue
-    await drawn(page, "g > 2 * r && g > 1.6 * b", 20)  # the grasp that is chosen is green
+    await drawn(page, is_blue, 60)  # the way is blue
+    await drawn(page, is_green, 20)  # the grasp that is chosen is green
     late = await opened(chromium)  # what is kept is shown to those who come later
-    await drawn(late, "b > 2.5 * r && b > 1.4 * g", 60)
+    await drawn(late, is_blue, 60)
     fake.robot.publish(ARM_PLAN, ArmPlan())
-    await drawn(page, "b > 2.5 * r && b > 1.4 * g", 0, most=0)
+    await drawn(page, is_blue, 0, most=0)
 
 
-async def drawn(page: Page, colour: str, least: int, most: int = 10**9) -> None:
-    """Wait until so many pixels of the world have a colour: a condition on r, g and b."""
-    count = """() => new Promise((resolve) => requestAnimationFrame(() => {
-      const canvas = document.getElementById('world'), copy = document.createElement('canvas')
-      copy.width = canvas.width; copy.height = canvas.height
-      const pen = copy.getContext('2d')
-      pen.drawImage(canvas, 0, 0)
-      const { data } = pen.getImageData(0, 0, copy.width, copy.height)
-      let count = 0
-      for (let i = 0; i < data.length; i += 4) {
-        const [r, g, b] = data.subarray(i, i + 3)
-        count += COLOUR
-      }
-      resolve(count)
-    }))""".replace("COLOUR", colour)
-    for _ in range(300):
-        if least <= await page.evaluate(count) <= most:
+def is_blue(r: Colour, g: Colour, b: Colour) -> Any:
+    return (b > 2.5 * r) & (b > 1.4 * g)
+
+
+def is_green(r: Colour, g: Colour, b: Colour) -> Any:
+    return (g > 2 * r) & (g > 1.6 * b)
+
+
+async def drawn(
+    page: Page, colour: Callable[..., Any], least: int, most: int = sys.maxsize
+) -> None:
+    """Wait until so many pixels of the world have a colour: a condition on r, g and b.
+
+    It looks at screenshots: the canvas itself is empty again once the browser has shown it.
+    """
+    count = -1
+    for _ in range(LOOKS):
+        data = await page.locator("#world").screenshot()
+        shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).astype(float)
+        b, g, r = np.moveaxis(shown, -1, 0)
+        count = np.count_nonzero(colour(r, g, b))
+        if least <= count <= most:
             return
-        await page.wait_for_timeout(100)
-    raise AssertionError(f"expected {least} to {most} pixels with {colour}")
+        await asyncio.sleep(0.1)
+    raise AssertionError(f"{count} pixels have the colour, not {least} to {most}")
