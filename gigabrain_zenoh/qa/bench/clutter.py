@@ -252,7 +252,7 @@ class CourseDriver:
         self, bus: Bus, group: ProcessGroup, world: ClutteredWorld, seconds: float
     ) -> None:
         self._bus, self._group, self._world, self._longest_s = bus, group, world, seconds
-        self._tasks = Tasks(bus, starting_s=MAX_SILENCE_S, silent_s=MAX_SILENCE_S)
+        self.tasks = Tasks(bus, starting_s=MAX_SILENCE_S, silent_s=MAX_SILENCE_S)
         self._maps, self._poses, self._bodies = bus.latest(MAP), bus.latest(POSE), bus.latest(BODY)
         self._states = bus.latest(STATE)
         self._began_s = 0.0
@@ -320,26 +320,26 @@ class CourseDriver:
     async def _go(self, x: float, y: float) -> str:
         """Drive to a goal in the map; return why it was not reached, empty if it was."""
         try:
-            task = await self._accepted(x, y)
-            ended = await self._while_running(self._tasks.result(task))
+            task = await self.accepted(lambda: self.tasks.go_to(x, y))
+            ended = await self.while_running(self.tasks.result(task))
         except (Refused, BodyLost) as refusal:
             return f"refused: {refusal}"
         return "" if ended.state == "succeeded" else f"{ended.state}: {ended.reason}"
 
-    async def _accepted(self, x: float, y: float) -> str:
+    async def accepted(self, ask: Callable[[], Awaitable[str]]) -> str:
         """Return the name of the task; a robot that has just started may not know its pose yet."""
         loop = asyncio.get_running_loop()
         end_s = loop.time() + MAX_SILENCE_S
         while True:
             try:
-                return await self._while_running(self._tasks.go_to(x, y))
+                return await self.while_running(ask())
             except Refused:
                 if self.seconds > SETTLED_S:
                     raise
             if loop.time() > end_s:
                 raise Failed("the robot's time stands still")
 
-    async def _while_running(self, work: Awaitable[T]) -> T:
+    async def while_running(self, work: Awaitable[T]) -> T:
         """Wait for `work`. Raises Over, and GigabrainError when a process dies."""
         waiting, polls = asyncio.ensure_future(work), 0
         try:
@@ -364,7 +364,7 @@ class CourseDriver:
             raise Over(f"it has latched: {', '.join(latching)}")
 
     def _doing(self) -> str:
-        newest = self._tasks.newest
+        newest = self.tasks.newest
         return newest.current.reason if newest and newest.current else "no task"
 
     def _is_localized(self) -> bool:

@@ -195,10 +195,9 @@ class FetchDriver(CourseDriver):
         await self.begin()
         there = compose(inverse(self.world_from_map), drop)
         try:
-            task = await self._while_running(
-                self._tasks.carry_out(fetch_mission(there), label="fetch")
-            )
-            ended = await self._while_running(self._tasks.result(task))
+            mission = fetch_mission(there)
+            task = await self.accepted(lambda: self.tasks.carry_out(mission, label="fetch"))
+            ended = await self.while_running(self.tasks.result(task))
         except (Refused, BodyLost) as refusal:
             return f"refused: {refusal}"
         except Over as end:
