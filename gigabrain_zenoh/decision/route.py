@@ -372,9 +372,9 @@ class RoutePlanner:
             return route
         if not looks.settled(request.tick):
             return self._route(reason="looking at the last places")
-        if not looks.tried_again:
-            looks.try_again()
+        if looks.look_closer():
             self._missed.clear()
+            return self._route(reason="looking at all again, from nearer by")
         if looks.ended_tick is None:
             looks.ended_tick = request.tick
         if away := self._giving_way(None, request, costs):

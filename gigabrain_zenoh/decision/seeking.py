@@ -22,11 +22,12 @@ OWN_M = 0.25  # round a thing, what is occupied is the thing itself or what it s
 OCCUPIED_PERCENT = 65
 
 CELL_M = 0.2  # of what has been looked at
-LOOK_M = 2.2  # a thing is recognised within 2.5 m, and may stand 0.3 m behind, at a wall
+LOOKS_M = 1.9, 1.2  # from how far at most it looks everywhere, and again where it found nothing:
+# within 2 m nine of ten pictures of a can show it to the net, and farther off fewer than half
 OWN_GROUND_M = 0.5  # round the body: it would stand in a thing there
 RIM_RAD = math.radians(4)  # at the picture's edge, where a thing may be cut off
 SAMPLE_M = 0.05  # along a line of sight
-STAND_M = (0.5, 1.8)  # from what is looked at, where there is a choice
+STAND_M, SHORT_M = 0.5, 0.1  # least, from what is looked at, and how much less than the most
 NEIGHBOURS, AROUND_M = 4, 0.45  # unseen cells so near together are worth a look
 SETTLED_TICKS = 75  # 1.5 s, until all counts as seen: what was seen last is still being recognised
 VIEWPOINTS = 16  # round what is to be looked at, that are tried
@@ -108,9 +109,8 @@ class LookAround:
 
     def __init__(self, seek: int = 0, tick: int = 0) -> None:
         self.seek = seek  # the search that it belongs to
+        self._round = 0
         self._seen: set[tuple[int, int]] = set()
-        self._given_up: set[tuple[int, int]] = set()
-        self.tried_again = False
         self.ended_tick: int | None = None  # since when nothing is left
         self._aim: tuple[int, int] | None = None  # the cell that it goes to look at
         self.goal: Goal | None = None  # from where
@@ -120,7 +120,7 @@ class LookAround:
         """Record what the body's cameras see from `here`."""
         before = len(self._seen)
         for camera in body.fixed_cameras:
-            self._seen.update(map(tuple, _in_view(costs, camera, here).tolist()))
+            self._seen.update(map(tuple, _in_view(costs, camera, here, self._reach).tolist()))
         if len(self._seen) != before:
             self._changed_tick = tick
         if self._aim in self._seen:
@@ -131,15 +131,20 @@ class LookAround:
         if self._aim:
             i, j = self._aim
             reach = range(-1, 2)
-            near = {(i + di, j + dj) for di in reach for dj in reach} - self._seen
-            self._given_up |= near
-            self._seen |= near
+            self._seen |= {(i + di, j + dj) for di in reach for dj in reach}
         self.drop()
 
-    def try_again(self) -> None:
-        """Count what was given up as unseen again."""
-        self._seen -= self._given_up
-        self.tried_again = True
+    def look_closer(self) -> bool:
+        """Begin to look at everything again, from nearer by; return False after the last time."""
+        if self._round + 1 == len(LOOKS_M):
+            return False
+        self._round += 1
+        self._seen.clear()
+        return True
+
+    @property
+    def _reach(self) -> float:
+        return LOOKS_M[self._round]
 
     def drop(self) -> None:
         """Choose another aim next."""
@@ -167,7 +172,7 @@ class LookAround:
         turn = np.abs(np.remainder(bearing - here.yaw + np.pi, 2 * np.pi) - np.pi)
         best = int(np.argmin(far + 0.3 * turn))
         self._aim = tuple(unseen[best].tolist())
-        self.goal = _viewpoint(costs, body, here, spots[best], spots, way)
+        self.goal = _viewpoint(costs, body, here, spots[best], spots, way, self._reach)
         return self.goal
 
     def _unseen(self, costs: Costmap, way: Floats) -> tuple[Cells, Floats]:
@@ -197,15 +202,15 @@ def _crowded(cells: Cells) -> NDArray[np.bool_]:
     return np.asarray(counts > NEIGHBOURS)
 
 
-def _in_view(costs: Costmap, camera: Camera, here: Pose) -> Cells:
-    """Return the cells (n, 2) that a camera sees well from a body at `here`."""
+def _in_view(costs: Costmap, camera: Camera, here: Pose, reach: float) -> Cells:
+    """Return the cells (n, 2) that a camera sees well, within `reach` [m] of a body at `here`."""
     cos, sin = math.cos(here.yaw), math.sin(here.yaw)
     eye = np.array(
         (here.x + cos * camera.x - sin * camera.y, here.y + sin * camera.x + cos * camera.y)
     )
-    reach = math.ceil(LOOK_M / CELL_M)
+    count = math.ceil(reach / CELL_M)
     middle = np.floor(eye / CELL_M).astype(np.int64)
-    steps = np.arange(-reach, reach + 1)
+    steps = np.arange(-count, count + 1)
     cells = (np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) + middle).astype(np.int64)
     off = (cells + 0.5) * CELL_M - eye
     far = np.hypot(*off.T)
@@ -213,23 +218,35 @@ def _in_view(costs: Costmap, camera: Camera, here: Pose) -> Cells:
     half = math.atan2(camera.width / 2, fx) - RIM_RAD
     axis = here.yaw + camera.yaw
     turn = np.abs(np.remainder(np.arctan2(off[:, 1], off[:, 0]) - axis + np.pi, 2 * np.pi) - np.pi)
-    cells = cells[(far <= LOOK_M) & ((turn <= half) | (far < OWN_GROUND_M))]
+    cells = cells[(far <= reach) & ((turn <= half) | (far < OWN_GROUND_M))]
     found: Cells = cells[in_sight(costs, eye, (cells + 0.5) * CELL_M, CELL_M)]
     return found
 
 
 def _viewpoint(
-    costs: Costmap, body: BodyDescription, here: Pose, aim: Floats, spots: Floats, way: Floats
+    costs: Costmap,
+    body: BodyDescription,
+    here: Pose,
+    aim: Floats,
+    spots: Floats,
+    way: Floats,
+    reach: float,
 ) -> Goal:
-    """Return the place that sees `aim` (2,), and many of the `spots` (n, 2) for its way."""
+    """Return the place that sees `aim` (2,), and many of the `spots` (n, 2) for its way.
+
+    They are seen from within `reach` [m].
+    """
     eye = np.array((here.x, here.y))
     off = math.hypot(*(aim - eye).tolist())
     turns = body.turning_radius == 0.0
-    if turns and STAND_M[0] <= off <= LOOK_M and in_sight(costs, eye, aim[None], CELL_M)[0]:
-        return Goal(x=here.x, y=here.y, yaw=_facing(body, eye, aim, spots)[0])
+    if turns and STAND_M <= off <= reach and in_sight(costs, eye, aim[None], CELL_M)[0]:
+        return Goal(x=here.x, y=here.y, yaw=_facing(body, eye, aim, spots, reach)[0])
     angles = np.linspace(0.0, math.tau, VIEWPOINTS, endpoint=False)
     ring = np.column_stack((np.cos(angles), np.sin(angles)))
-    places = [aim, *(aim + far * one for far in np.linspace(*STAND_M, 4) for one in ring)]
+    places = [
+        aim,
+        *(aim + far * one for far in np.linspace(STAND_M, reach - SHORT_M, 4) for one in ring),
+    ]
     best, least = aim, math.inf
     for k, place in enumerate(places):
         cell = costs.cell(*place.tolist())
@@ -237,19 +254,21 @@ def _viewpoint(
             continue
         if k and not in_sight(costs, place, aim[None], CELL_M)[0]:
             continue
-        price = (float(way[cell]) + LOOK_PRICE_M) / (_facing(body, place, aim, spots)[1] + 1)
+        price = (float(way[cell]) + LOOK_PRICE_M) / (_facing(body, place, aim, spots, reach)[1] + 1)
         if price < least:
             best, least = place, price
     x, y = best.tolist()
-    return Goal(x=x, y=y, yaw=_facing(body, best, aim, spots)[0] if turns else None)
+    return Goal(x=x, y=y, yaw=_facing(body, best, aim, spots, reach)[0] if turns else None)
 
 
-def _facing(body: BodyDescription, eye: Floats, aim: Floats, spots: Floats) -> tuple[float, int]:
+def _facing(
+    body: BodyDescription, eye: Floats, aim: Floats, spots: Floats, reach: float
+) -> tuple[float, int]:
     """Return the heading from which a camera shows `aim` and most of the `spots`, and how many."""
     camera = body.fixed_cameras[0]
     half = math.atan2(camera.width / 2, camera.pinhole[0]) - RIM_RAD
     off = spots - eye
-    bearings = np.arctan2(off[:, 1], off[:, 0])[np.hypot(*off.T) <= LOOK_M]
+    bearings = np.arctan2(off[:, 1], off[:, 0])[np.hypot(*off.T) <= reach]
     ahead = math.atan2(*(aim - eye)[::-1].tolist())
     options = ahead + half * np.array((0.0, 0.4, -0.4, 0.8, -0.8))
     turns = np.abs(np.remainder(bearings[None, :] - options[:, None] + np.pi, 2 * np.pi) - np.pi)

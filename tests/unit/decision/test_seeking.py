@@ -126,9 +126,10 @@ def search(cells: np.ndarray, *then: np.ndarray, most: int = 400) -> tuple[list[
     raise AssertionError("it looks for ever")
 
 
-def seen_by(poses: list[Pose], cells: np.ndarray) -> float:
+def seen_by(poses: list[Pose], cells: np.ndarray, *, close: bool = False) -> float:
     """The share of the free cells that a camera has seen from one of these poses."""
     looks, costs = LookAround(), costs_of(cells)
+    assert not close or looks.look_closer()
     for pose in poses:
         looks.look(costs, SEEING, pose, 1)
     rows, columns = np.nonzero(cells == 0)
@@ -140,7 +141,15 @@ def test_it_looks_at_a_whole_room_and_then_says_that_nothing_is_there() -> None:
     poses, reason = search(ROOM)
     assert reason == "everything reachable was looked at"
     assert seen_by(poses, ROOM) > 0.9
-    assert len(poses) < 40
+    assert len(poses) < 110  # places to look from, also those at the edges of the map
+
+
+def test_what_was_not_found_is_looked_for_again_from_nearer_by() -> None:
+    poses, _ = search(ROOM)
+    assert seen_by(poses, ROOM, close=True) > 0.9
+    looks = LookAround()
+    assert looks.look_closer()
+    assert not looks.look_closer()
 
 
 def test_a_camera_on_an_arm_looks_at_no_room() -> None:
@@ -221,6 +230,7 @@ def test_a_search_that_somebody_ends_goes_aside_for_them() -> None:
     cells[1:-1, 1:-1] = 0
     planner, command = RoutePlanner(), DriveCommand(5, "look", seek=5)
     planner._looks = LookAround(5)
+    assert planner._looks.look_closer()
     planner._looks._seen = {(i, j) for i in range(20) for j in range(15)}
     routes = [ask(planner, command, cells, tick) for tick in range(1, 3000, 25)]
     told = [one.activity for one in routes if one.state == "running"]
