@@ -2,35 +2,34 @@
 
 from collections import defaultdict, deque
 
-NEAREST_M = 0.5  # from the camera; nets are trained on what stands farther off
-NEWEST = 60  # pictures that count
+NEAREST_M, FARTHEST_M = 0.5, 2.0  # from the camera, between which a net is surest
+NEARER, FARTHER = 0.05, 0.25  # what a picture from elsewhere counts, beside one from there
+NEWEST = 60  # pictures that count, from near by and from farther off
 
 
 class ClassVotes:
     """Confidences of the newest pictures of one thing, by class.
 
-    From near by a net takes a can for a cylinder, so pictures from nearer than NEAREST_M count only
-    until there is one from farther off.
+    From near by a net may take a can for a cylinder, in as many pictures as the robot stands there.
+    From far off it may take one for a robot now and then.
     """
 
     def __init__(self) -> None:
+        self._near: deque[tuple[str, float]] = deque(maxlen=NEWEST)
         self._votes: deque[tuple[str, float]] = deque(maxlen=NEWEST)
-        self._near = True  # they are all from near by
 
     def add(self, label: str, confidence: float, distance: float) -> None:
         """Add the class of a picture that was taken from a `distance` [m]."""
-        near = distance < NEAREST_M
-        if near and not self._near:
-            return
-        if self._near and not near:
-            self._votes.clear()
-        self._near = near
-        self._votes.append((label, confidence))
+        if distance < NEAREST_M:
+            self._near.append((label, NEARER * confidence))
+        else:
+            share = FARTHER if distance > FARTHEST_M else 1.0
+            self._votes.append((label, share * confidence))
 
     @property
     def label(self) -> str:
         """The class with the largest sum of confidences; empty before the first picture."""
         sums = defaultdict[str, float](float)
-        for label, confidence in self._votes:
+        for label, confidence in (*self._near, *self._votes):
             sums[label] += confidence
         return max(sums, key=sums.__getitem__, default="")

@@ -90,10 +90,19 @@ def test_a_single_glimpse_is_no_object() -> None:
     eye = Eye()
     eye.look(("can", CAN), pictures=2)
     assert eye.labels == []
-    eye.look(pictures=12)
+    eye.look(pictures=22)
     eye.look(("can", CAN), pictures=2)
     assert eye.labels == []
     eye.look(("can", CAN), pictures=1)
+    assert eye.labels == ["can"]
+
+
+def test_what_one_in_ten_pictures_shows_is_an_object() -> None:
+    eye = Eye()
+    for _ in range(3):
+        assert eye.labels == []
+        eye.look(pictures=9)
+        eye.look(("can", (2.4, 0.1, 0.06)))
     assert eye.labels == ["can"]
 
 

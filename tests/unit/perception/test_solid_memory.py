@@ -113,7 +113,8 @@ def test_a_class_that_was_seen_from_farther_off_stays_however_long_a_thing_is_lo
         looked(memory, can(0.3, 0.0), tick=tick)
     memory.name("cube", 1.0, (0.3, 0.0), 0.2, ORIGIN)
     assert only(memory).label == "cube"  # it was not seen from anywhere else yet
-    memory.name("can", 0.3, (0.3, 0.0), 0.6, ORIGIN)
+    for _ in range(6):
+        memory.name("can", 0.6, (0.3, 0.0), 0.6, ORIGIN)
     for _ in range(200):
         memory.name("cylinder", 1.0, (0.3, 0.0), 0.2, ORIGIN)
     assert only(memory).label == "can"
