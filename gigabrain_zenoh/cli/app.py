@@ -116,6 +116,7 @@ COMMANDS = {
     "proxy": ("faults:proxy", "Emulate a bad network in front of a router or a robot's port."),
     "bench chain": ("bench:chain", "Measure scan-to-command latency."),
     "bench stack": ("bench:stack", "Measure CPU, memory and start-up time."),
+    "bench robots": ("bench:robots", "Have several robots explore at once on this machine."),
     "bench estop": ("bench:estop", "Time the e-stop."),
     "bench bodies": ("bench:bodies", "Drive all robots in turn with one brain."),
     "bench plan": ("bench:plan", "Time and check global planning."),

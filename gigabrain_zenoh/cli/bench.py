@@ -1,4 +1,4 @@
-"""`gigabrain bench chain`, `stack`, `estop`, `bodies` and `plan`: what this machine achieves."""
+"""`gigabrain bench chain`, `stack`, `robots`, `estop`, `bodies`, `plan`: what this machine does."""
 
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -109,6 +109,34 @@ def stack(
     result = run_async(measure_stack(body, world, seconds, print_progress, goal=goal))
     finish(stack_page(result), result, json)
     return 0
+
+
+def robots(
+    *,
+    count: int = 4,
+    seconds: float = 60.0,
+    body: Body = "turtlebot3_waffle",
+    world: World = "house",
+    json: JsonFile = None,
+) -> int:
+    """Have several robots explore at once, each in a world of its own, at real time.
+
+    Example: gigabrain bench robots --count 4 --seconds 60
+
+    Exit code 1 after a contact, or if this machine is too small for so many.
+
+    Args:
+        count: Number of robots.
+        seconds: Duration, once all have started [s].
+    """
+    from gigabrain_zenoh.qa.bench.robots import measure_robots, robots_page
+
+    files.check_result_path(json)
+    check_positive(count=count, seconds=seconds)
+    check_names([body], [world])
+    result = run_async(measure_robots(body, world, count, seconds, print_progress))
+    finish(robots_page(result), result, json)
+    return 0 if result.ok else 1
 
 
 def estop(

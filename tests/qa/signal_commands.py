@@ -102,6 +102,7 @@ CALLS = {
     "render": "render {file}.png",
     "bench chain": "bench chain --seconds 3 --rounds 1",
     "bench stack": "bench stack --seconds 3",
+    "bench robots": "bench robots --count 1 --seconds 3",
     "bench cameras": "bench cameras --seconds 3",
     "bench objects": "bench objects --seeds 0",
     "bench fetch": "bench fetch --seeds 0",

@@ -1,0 +1,64 @@
+"""The verdict of `gigabrain bench robots`, and for how long a gate was shut."""
+
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_zenoh.qa.bench.robots import FleetRobot, RobotsResult, shut_share
+
+FAST = FleetRobot(
+    number=1, distance_m=9.0, real_time=1.0, stood=0.0, p50_ms=8.0, p99_ms=30.0, cpu=0.3,
+    physics_cpu=0.05, pss_bytes=400_000_000,
+)  # fmt: skip
+
+
+def gate(tick: int, mode: str) -> dict[str, object]:
+    return {"event": "gate", "tick": tick, "mode": mode}
+
+
+def result(*robots: FleetRobot) -> RobotsResult:
+    return RobotsResult(body="b", world="w", seconds=60.0, cores=2, busy=0.8, robots=robots)
+
+
+@pytest.mark.parametrize(
+    ("records", "share"),
+    [
+        ([gate(10, "enabled")], 0.0),
+        ([], 1.0),
+        ([gate(10, "enabled"), gate(600, "stopping"), gate(650, "enabled")], 0.1),
+        ([gate(10, "enabled"), gate(950, "latched"), {"event": "ready"}], 0.1),
+        ([gate(10, "enabled"), gate(400, "idle"), gate(550, "enabled")], 0.1),
+        ([gate(10, "enabled"), gate(1200, "idle")], 0.0),
+    ],
+)
+def test_a_gate_counts_as_shut_within_the_measured_time_only(
+    records: list[dict[str, object]], share: float
+) -> None:
+    assert shut_share(records, 10.0, 20.0) == pytest.approx(share)  # ticks 500 to 1000
+
+
+@pytest.mark.parametrize(
+    ("slow", "why"),
+    [
+        (replace(FAST, number=2, p99_ms=83.0), "scan to command took 83 ms (p99)"),
+        (replace(FAST, number=2, p99_ms=None), "no scan was answered"),
+        (replace(FAST, number=2, real_time=0.8), "its time ran at 80% of real time"),
+        (replace(FAST, number=2, stood=0.2), "it stood for 20% of the time"),
+        (FleetRobot(number=2, problem="driver cannot be started"), "driver cannot be started"),
+    ],
+)
+def test_it_says_for_which_robot_the_machine_is_too_small(slow: FleetRobot, why: str) -> None:
+    found = result(FAST, slow)
+    assert found.verdict.startswith("this machine is too small for 2 of these robots: robot 2: ")
+    assert why in found.verdict
+    assert not found.ok
+
+
+def test_a_contact_is_no_matter_of_size() -> None:
+    found = result(FAST, replace(FAST, number=2, contacts=3))
+    assert found.verdict == "this machine carries 2 of these robots, but they had 3 contacts"
+    assert not found.ok
+
+
+def test_it_says_that_the_machine_carries_them() -> None:
+    assert result(FAST).verdict == "this machine carries 1 of these robots"
+    assert result(FAST).ok
