@@ -39,8 +39,9 @@ $(DEMO) $(INSTALLED): pyproject.toml
 	@PATH="$$PATH:$(BIN)" uv pip install --quiet --python $(BIN)/python -e '.[$(EXTRAS)]' pip
 	@touch $(DEMO) $@
 
-# the kernels, compiled once
-$(WARM): $(INSTALLED)
+# the kernels, compiled once, and again after a change of a package that has some (kernels/jit.py)
+HOLDERS := kernels manipulation mapping navigation qa/bench
+$(WARM): $(INSTALLED) $(shell find $(HOLDERS:%=gigabrain_zenoh/%) -name '*.py')
 	@$(BIN)/gigabrain precompile
 	@touch $@
 
