@@ -61,7 +61,7 @@ def test_patterned_textures_of_tests_are_none_of_those_of_training():
     assert set(textures.TRAIN) & set(textures.TEST) == {textures.plain}
 
 
-@pytest.mark.parametrize("family", {*textures.TRAIN, *textures.TEST})
+@pytest.mark.parametrize("family", dict.fromkeys((*textures.TRAIN, *textures.TEST)))
 def test_a_texture_is_a_share_of_two_colours(family):
     share = family(np.random.default_rng(2), 48)
     assert share.shape == (48, 48)
