@@ -39,7 +39,14 @@ from gigabrain_zenoh.decision.held_things import (
     thing_of,
 )
 from gigabrain_zenoh.decision.plan_display import PlanDisplay
-from gigabrain_zenoh.decision.seen_things import Lookout, approach, located, still_stands, unseen
+from gigabrain_zenoh.decision.seen_things import (
+    Lookout,
+    PutDown,
+    approach,
+    located,
+    still_stands,
+    unseen,
+)
 from gigabrain_zenoh.decision.tasks.arm_steps import (
     ArmAction,
     AwaitTaken,
@@ -94,6 +101,7 @@ class Manipulator:
         self._seen_as: int | None = None  # number by which a camera knew what is held
         self._gripped = 0  # tick since which it is held
         self._target: Thing | None = None  # to be picked up, where it stands
+        self._put: PutDown | None = None  # what a camera knew, and has not seen since
 
     def step(
         self,
@@ -214,6 +222,10 @@ class Manipulator:
             if self._planning is None:
                 held = self._seen_as if self._hold else None
                 things, numbers = located(command.things, seen, held)
+                if self._put and (solid := self._put.at(state, seen)):
+                    things[f"{self._put.name} put down"] = solid
+                else:
+                    self._put = None
                 if isinstance(command.do, Pick) and not self._hold:
                     self._seen_as = numbers.get(command.do.thing)
                 missing = None if self._hold else unseen(command.do, command.things, things)
@@ -356,9 +368,10 @@ class Manipulator:
                 run.insert(ease)
                 self._achieve(dataclasses.replace(hold, grip=ease.gripper))
         if over and over.name == "open" and hold:
-            self._achieve(
-                None, placed=placed(planner, measured_posture(planner, state), command.do, hold)
-            )
+            name, solid = placed(planner, measured_posture(planner, state), command.do, hold)
+            self._achieve(None, placed=(name, solid))
+            if self._seen_as is not None:  # others have a place by their mission
+                self._put = PutDown(name=name, solid=solid, state=state)
         if over and over.name == "grip":
             self._set_hold(None)
         if run.phase is None:

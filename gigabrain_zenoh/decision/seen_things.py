@@ -3,6 +3,7 @@
 import math
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
@@ -24,6 +25,7 @@ SAME_M = 0.03  # beside where a thing stands by its mission: it is the same, see
 SEEN_AFTER_TICKS = 50  # since a thing is held: a camera that still sees it stand is right
 NEAR_M = 1.0  # of the body, within which what is seen may be in the arm's way
 LOOK_TICKS = 75  # at rest, until a thing in sight is known: pictures come five times a second
+PUT_M, PUT_TICKS = 0.06, 500  # beside where a thing was put down, and until a camera has seen it
 ASIDE = 0.7  # of the first joint's range, to either side, where the arm hides nothing
 Lengths = tuple[float, float, float]
 
@@ -62,6 +64,30 @@ class SeenThings:
             place, yaw = (x, y, one.position[2]), one.yaw + here.yaw
             moved.append(replace(one, position=place, yaw=yaw, age=one.age + older))
         return tuple(sorted(moved, key=lambda one: math.hypot(*one.position[:2])))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PutDown:
+    """A thing that the arm has put down: it is in the way, even if the arm hides it."""
+
+    name: str
+    solid: Solid  # with its place in the body's frame then
+    state: RobotState
+
+    def at(self, state: RobotState, seen: tuple[SeenSolid, ...]) -> Solid | None:
+        """Return it in the body's frame now, until something is seen there or the body drives off.
+
+        It is also forgotten after ten seconds: somebody may have taken it before it was seen.
+        """
+        assert self.solid.at
+        here = relative(state.pose, self.state.pose)
+        x, y = to_parent(here, *self.solid.at[:2])
+        old = not 0 <= state.tick - self.state.tick < PUT_TICKS or state.boot != self.state.boot
+        if old or math.hypot(x, y) > NEAR_M:
+            return None
+        if any(math.dist((x, y), one.position[:2]) < PUT_M for one in seen):
+            return None
+        return replace(self.solid, at=(x, y, self.solid.at[2]), yaw=self.solid.yaw + here.yaw)
 
 
 class Lookout:

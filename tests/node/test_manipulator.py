@@ -281,6 +281,32 @@ def test_what_safety_holds_back_for_long_ends_the_command_after_a_few_tries(rig:
     assert rig.phases.count("move") == 6
 
 
+def test_what_was_put_down_is_in_the_way_while_the_arm_hides_it(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cube = SeenSolid(id=7, shape="box", size=(0.03, 0.03, 0.03), position=(*THERE, 0.015))
+    rig.seen = (cube,)
+    plan, known = rig.manipulator._work, list[dict[str, Any]]()
+
+    def work(*given: Any) -> Any:
+        known.append(dict(given[-1]))
+        return plan(*given)
+
+    monkeypatch.setattr(rig.manipulator, "_work", work)
+    rig.give(
+        "things: {cube: {box: [0.03, 0.03, 0.03]}}\n"
+        "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]}, {posture: home}]"
+    )
+    while rig.queue.status.current:
+        rig.tick()
+        rig.seen = () if rig.phases[-1] == "lift" else rig.seen  # the camera sees it no more
+    assert rig.queue.status.done[0].state == "succeeded"
+    pick, _, home = known
+    assert list(pick) == ["cube"]
+    assert list(home) == ["cube put down"]
+    assert home["cube put down"].at == pytest.approx((*ELSEWHERE, 0.015), abs=0.01)
+
+
 FAR = "{box: [0.03, 0.03, 0.03]%s}"
 
 

@@ -6,11 +6,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from gigabrain_drivers.driver.catalog import load_robot
-from gigabrain_schemas.body import BodyDescription
+from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.objects import SeenSolid, Solids
-from gigabrain_zenoh.decision.seen_things import LOOK_TICKS, Lookout, SeenThings, located
+from gigabrain_zenoh.decision.seen_things import LOOK_TICKS, Lookout, PutDown, SeenThings, located
 from gigabrain_zenoh.decision.tasks.arm_steps import Solid
 from gigabrain_zenoh.testing.samples import BOOT, state
 
@@ -107,6 +108,30 @@ def test_things_are_where_they_are_after_the_body_has_driven_on() -> None:
     assert one.position == pytest.approx((0.0, -0.2, 0.057))
     assert one.yaw == pytest.approx(-math.pi / 2)
     assert one.age == pytest.approx(CAN.age + 0.02)
+
+
+PUT = PutDown(name="can", solid=Solid(cylinder=(0.033, 0.12), at=(0.3, 0.0, 0.06)), state=state(2))
+TURNED = state(3, pose=(0.1, 0.0, math.pi / 2))
+
+
+@pytest.mark.parametrize(
+    ("now", "seen", "place"),
+    [
+        (state(2), (), (0.3, 0.0, 0.06)),
+        (TURNED, (CUBE,), (0.0, -0.2, 0.06)),
+        (state(2), (CUBE,), (0.3, 0.0, 0.06)),
+        (state(2), (CAN,), None),  # it is seen there
+        (state(1000), (), None),  # taken since, maybe
+        (state(3, pose=(1.5, 0.0, 0.0)), (), None),  # the body has driven off
+        (replace(state(3), boot=BOOT + 1), (), None),
+        (state(1), (), None),  # the driver has begun again
+    ],
+)
+def test_what_was_put_down_stands_there_until_it_is_seen_or_left(
+    now: RobotState, seen: tuple[SeenSolid, ...], place: tuple[float, float, float] | None
+) -> None:
+    found = PUT.at(now, seen)
+    assert (found and found.at) == (place and pytest.approx(place))
 
 
 def test_things_of_another_start_of_the_driver_do_not_count() -> None:
