@@ -37,13 +37,13 @@ def solid_of(thing: Thing, at: Floats, yaw: float) -> Solid:
 
 
 def placed(
-    planner: ArmPlanner, measured: Floats, action: ArmAction, hold: Hold
+    planner: ArmPlanner, measured: Floats, action: ArmAction, hold: Hold, body: BodyDescription
 ) -> tuple[str, Solid]:
     """Return a thing that was let go of by an arm at `measured` (n,), and where it stands now."""
     tool, thing = planner.arm.forward(measured), hold.thing
     at, ahead = tool.place(thing.position), tool.axes @ thing.axes[:, 0]
-    if isinstance(action, PlaceThing):  # it stands on something there
-        at = np.array([at[0], at[1], action.at[2] if len(action.at) == 3 else at[2]])
+    if isinstance(action, PlaceThing):  # it stands on something there, or on the floor
+        at[2] = action.at[2] if len(action.at) == 3 else standing_height(hold, body)
     return thing.name, solid_of(thing, at, math.atan2(ahead[1], ahead[0]))
 
 

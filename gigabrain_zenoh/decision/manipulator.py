@@ -240,8 +240,8 @@ class Manipulator:
             planning, self._planning = self._planning, None
             found = planning.result()
             if isinstance(found, NoWay):
-                if self._interim:  # it cannot get out of sight that way
-                    self._interim = False
+                if self._interim or self._put:  # it stays in sight, or less is in its way
+                    self._interim, self._put = False, None
                     return self._still(PLANNING)
                 return self._fail(found.reason, approach(self._target, found.stand_off))
             if not begins_at(found, sent_posture(planner, body, state)):
@@ -368,7 +368,8 @@ class Manipulator:
                 run.insert(ease)
                 self._achieve(dataclasses.replace(hold, grip=ease.gripper))
         if over and over.name == "open" and hold:
-            name, solid = placed(planner, measured_posture(planner, state), command.do, hold)
+            posture = measured_posture(planner, state)
+            name, solid = placed(planner, posture, command.do, hold, body)
             self._achieve(None, placed=(name, solid))
             if self._seen_as is not None:  # others have a place by their mission
                 self._put = PutDown(name=name, solid=solid, state=state)
