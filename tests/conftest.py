@@ -1,6 +1,7 @@
 """Marks tests by their folders; fixtures and settings that all folders share."""
 
 import gc
+import signal
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,11 @@ MARKS = {"unit": "unit", "fuzz": "unit", "node": "node", "system": "system"}
 settings.register_profile("quick", deadline=None, max_examples=20)
 settings.register_profile("qa", deadline=None, max_examples=1000)
 settings.load_profile("quick")  # `make qa` loads the other
+
+
+# of a shell that runs this in the background, commands would have SIGINT ignored from birth
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 class FailuresAtOnce:
