@@ -77,7 +77,7 @@ class PutDown:
     def at(self, state: RobotState, seen: tuple[SeenSolid, ...]) -> Solid | None:
         """Return it in the body's frame now, until something is seen there or the body drives off.
 
-        It is also forgotten after ten seconds: somebody may have taken it before it was seen.
+        Forget it after ten seconds as well, in case someone took it before the camera saw it.
         """
         assert self.solid.at
         here = relative(state.pose, self.state.pose)

@@ -8,16 +8,18 @@ from typing import TYPE_CHECKING, Any
 import psutil
 from msgspec import Struct
 
+from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.base import TICK_S
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
 from gigabrain_zenoh.decision.drive_kernels import DRIVE_KERNELS
-from gigabrain_zenoh.errors import GigabrainError
+from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.kernels.precompile import ensure_compiled
+from gigabrain_zenoh.launch.demo import KEPT
 from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.perception.node import MAP_KERNELS
 from gigabrain_zenoh.qa.bench.stack import physics_share
-from gigabrain_zenoh.qa.judging import table_of
+from gigabrain_zenoh.qa.judging import Failed, table_of
 from gigabrain_zenoh.qa.robot_under_test import (
     LOOPBACK,
     START_S,
@@ -32,7 +34,6 @@ if TYPE_CHECKING:
 SETTLE_S = 5.0  # the first plan and the first map are no part of what a running robot costs
 ANSWER_S = 20.0  # for a report, on a machine that is too small
 MAX_P99_MS = 60.0  # of scan to command
-KEPT = 0.97  # share of real time
 MAX_STOOD = 0.05  # share of the time that a robot may stand because the gate is shut
 MB = 1e6
 
@@ -56,7 +57,7 @@ class FleetRobot(Struct, frozen=True, kw_only=True):
     def too_slow(self) -> str:
         """Return in what the machine is too small for it; empty if it is not."""
         if self.problem:
-            return self.problem
+            return ""
         if self.real_time < KEPT:
             return f"its time ran at {self.real_time:.0%} of real time"
         if self.p99_ms is None:
@@ -83,8 +84,12 @@ class RobotsResult(Struct, frozen=True, kw_only=True):
         """Return whether the machine carries them, in a line."""
         count = len(self.robots)
         slow = [f"robot {one.number}: {one.too_slow}" for one in self.robots if one.too_slow]
+        failed = [f"robot {one.number}: {one.problem}" for one in self.robots if one.problem]
+        why = "; ".join((*slow, *failed))
         if slow:
-            return f"this machine is too small for {count} of these robots: {'; '.join(slow)}"
+            return f"this machine is too small for {count} of these robots: {why}"
+        if failed:
+            return f"{len(failed)} of these {count} robots failed: {why}"
         if contacts := sum(one.contacts for one in self.robots):
             return f"this machine carries {count} of these robots, but they had {contacts} contacts"
         return f"this machine carries {count} of these robots"
@@ -92,7 +97,7 @@ class RobotsResult(Struct, frozen=True, kw_only=True):
     @property
     def ok(self) -> bool:
         """True if the machine carries them, and none touched anything."""
-        return not any(one.too_slow or one.contacts for one in self.robots)
+        return not any(one.too_slow or one.problem or one.contacts for one in self.robots)
 
 
 class _Start:
@@ -108,14 +113,20 @@ class _Start:
             self.all.set()
 
     async def wait(self, group: ProcessGroup) -> None:
-        """Wait for the others. Raises GigabrainError when a process of `group` dies."""
+        """Wait for the others. Raises Failed when a process of `group` dies."""
         await group.until(self.all.is_set, "the other robots are ready", 2 * START_S)
 
 
 async def measure_robots(
     body: str, world: str, count: int, seconds: float, show: Callable[[str], None]
 ) -> RobotsResult:
-    """Have robots explore worlds of their own, and measure them all at once."""
+    """Have robots explore worlds of their own, and measure them all at once.
+
+    Raises ConfigError for a body without a base or a lidar.
+    """
+    description = load_robot(body).description()
+    if not description.has_base or description.lidar is None:
+        raise ConfigError(f"{body} cannot explore: it needs a base and a lidar")
     for warm_up in (MAP_KERNELS, DRIVE_KERNELS):
         await ensure_compiled(warm_up)
     show(f"starting {count} x {body} in {world}")
@@ -157,14 +168,14 @@ async def _robot(number: int, deployment: Deployment, seconds: float, start: _St
         try:
             robot = measured_robot(deployment, ready_s=START_S)
             group, bus = await stack.enter_async_context(robot)
-        except GigabrainError as error:
+        except Failed as error:
             return FleetRobot(number=number, problem=str(error))
         finally:
             start.settled()
         try:
             await start.wait(group)
             return await _measured(number, group, bus, seconds)
-        except GigabrainError as error:
+        except Failed as error:
             return FleetRobot(number=number, problem=str(error))
 
 

@@ -43,7 +43,6 @@ def test_a_gate_counts_as_shut_within_the_measured_time_only(
         (replace(FAST, number=2, p99_ms=None), "no scan was answered"),
         (replace(FAST, number=2, real_time=0.8), "its time ran at 80% of real time"),
         (replace(FAST, number=2, stood=0.2), "it stood for 20% of the time"),
-        (FleetRobot(number=2, problem="driver cannot be started"), "driver cannot be started"),
     ],
 )
 def test_it_says_for_which_robot_the_machine_is_too_small(slow: FleetRobot, why: str) -> None:
@@ -51,6 +50,16 @@ def test_it_says_for_which_robot_the_machine_is_too_small(slow: FleetRobot, why:
     assert found.verdict.startswith("this machine is too small for 2 of these robots: robot 2: ")
     assert why in found.verdict
     assert not found.ok
+
+
+def test_a_robot_that_fails_is_told_and_alone_says_nothing_of_the_machine() -> None:
+    failed = FleetRobot(number=2, problem="a process died")
+    found = result(FAST, failed)
+    assert found.verdict == "1 of these 2 robots failed: robot 2: a process died"
+    assert not found.ok
+    slow = result(replace(FAST, p99_ms=83.0), failed)
+    assert slow.verdict.endswith("(p99); robot 2: a process died")
+    assert slow.verdict.startswith("this machine is too small")
 
 
 def test_a_contact_is_no_matter_of_size() -> None:
