@@ -187,8 +187,8 @@ class ArmKinematics:
 
     @property
     def hand(self) -> tuple[str, ...]:
-        """The bodies whose pads touch what is held."""
-        return tuple(geom.parent.name for geom in self._spec.geoms if geom.name in PADS)
+        """The bodies whose pads touch what is held. Raises ConfigError for a model without pads."""
+        return tuple(self._spec.geom(pad).parent.name for pad in self._pads())
 
     def opening(self) -> "Opening":
         """Return how far the gripper opens. Raises ConfigError for a model without pads."""

@@ -134,16 +134,16 @@ class PickPlacePlanner:
             posture: Where the arm is (n,).
             opening: Where the gripper's joint goes to let go [rad] or [m].
         """
-        fault = NoWay(reason=f"{held.name} cannot be put there")
         checker = CollisionChecker(
             self.arm, others, held=held, margin=0.001, ignore=may_touch(held, others)
         )
+        faults = []
         for tool in self._tools_at(held, target, posture):
             one = self._place(checker, tool, held, others, posture, opening)
             if isinstance(one, Place):
                 return one
-            fault = one
-        return fault
+            faults.append(one)
+        return faults[0]  # of the least turn
 
     def _pick(
         self, grasp: Grasp, thing: Thing, others: Sequence[Thing], posture: Floats

@@ -3,6 +3,7 @@
 import itertools
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -183,3 +184,36 @@ def test_it_goes_so_near_that_it_can_grasp_a_can_from_above(far: float) -> None:
         assert isinstance(found, NoWay)
         assert found.stand_off
         assert 0.2 < found.stand_off < 0.29
+
+
+@pytest.mark.parametrize("place", [(0.3, 0.0), (0.26, 0.05), (0.32, -0.03)])
+def test_it_goes_back_up_from_a_can_that_it_put_down(place: tuple[float, float]) -> None:
+    robot = catalog.load_robot("lekiwi")
+    assert robot.arm
+    planner = ArmPlanner(text(), robot.description())
+    home, carry = np.array(robot.arm.home[:-1]), np.array(robot.arm.carry[:-1])
+    can = Thing(
+        name="can", kind="cylinder", size=(0.0335, 0.12), position=np.array((0.26, 0, 0.06))
+    )
+    picked = planner.pick(can, [], home, 0)
+    assert isinstance(picked, Plan)
+    assert picked.hold
+    put = planner.place(picked.hold, np.array((*place, 0.06)), [], carry)
+    assert isinstance(put, Plan)
+    retreat = next(phase.arm for phase in put.phases if phase.name == "retreat")
+    assert retreat
+    first, last = retreat.positions[0], retreat.positions[-1]
+    raised = planner.arm.forward(last).position - planner.arm.forward(first).position
+    assert raised[2] > 0.05
+    left = replace(can, position=np.array((*place, 0.06)))
+    back = planner.take_posture(dict(zip(planner.arm.names, home, strict=True)), [left], last, None)
+    assert isinstance(back, Plan)
+
+
+def test_it_presses_a_thing_with_the_tip_of_its_gripper() -> None:
+    robot = catalog.load_robot("lekiwi")
+    assert robot.arm
+    planner = ArmPlanner(text(), robot.description())
+    box = Thing(name="box", kind="box", size=(0.06, 0.06, 0.1), position=np.array((0.28, 0, 0.05)))
+    pressed = planner.press(box, None, 0.02, [], np.array(robot.arm.home[:-1]))
+    assert isinstance(pressed, Plan), pressed.reason
