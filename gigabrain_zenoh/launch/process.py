@@ -67,6 +67,7 @@ class ProcessType:
     joins: Callable[["Deployment", set[str]], bool] | None = None  # added to such a host by itself
     after: tuple[str, ...] = ("router", "relay")  # which of these must be ready before it starts
     compiles: Callable[["Deployment"], bool] | None = None  # its first start takes minutes
+    forks: bool = False  # its module leaves no thread running, so a fork server may import it
     stop_last: bool = False  # the others need it in order to end well
     stops: bool = False  # carries commands and stops: gets a higher priority where permitted
     repeats: bool = False  # can be replayed, so it publishes which input it used

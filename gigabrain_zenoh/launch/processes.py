@@ -230,6 +230,7 @@ PROCESSES: Mapping[str, ProcessType] = {
         stops=True,
         stop_last=True,
         roles=("robot", "router"),
+        forks=True,
     ),
     "emulator": ProcessType(
         "gigabrain_drivers.emulators.process:run",
@@ -249,6 +250,7 @@ PROCESSES: Mapping[str, ProcessType] = {
         after=("router", "emulator"),
         stops=True,
         roles=("robot",),
+        forks=True,
     ),
     "camera": ProcessType(
         "gigabrain_drivers.cameras.process:run",
@@ -265,6 +267,7 @@ PROCESSES: Mapping[str, ProcessType] = {
         compiles=_maps,
         repeats=True,
         roles=("robot", "brain"),
+        forks=True,
     ),
     "recognition": ProcessType(
         "gigabrain_zenoh.recognition.node:run",
@@ -281,6 +284,7 @@ PROCESSES: Mapping[str, ProcessType] = {
         compiles=_navigates,
         repeats=True,
         roles=("robot", "brain"),
+        forks=True,
     ),
     "relay": ProcessType(
         "gigabrain_zenoh.runtime.router:run_relay",
@@ -292,12 +296,23 @@ PROCESSES: Mapping[str, ProcessType] = {
         stops=True,
         stop_last=True,
         roles=("robot", "brain"),
+        forks=True,
     ),
     "control": ProcessType(
-        "gigabrain_zenoh.control.node:run", default=True, stops=True, repeats=True, roles=("robot",)
+        "gigabrain_zenoh.control.node:run",
+        default=True,
+        stops=True,
+        repeats=True,
+        forks=True,
+        roles=("robot",),
     ),
     "safety": ProcessType(
-        "gigabrain_zenoh.safety.node:run", default=True, stops=True, repeats=True, roles=("robot",)
+        "gigabrain_zenoh.safety.node:run",
+        default=True,
+        stops=True,
+        repeats=True,
+        forks=True,
+        roles=("robot",),
     ),
     "page": ProcessType(
         "gigabrain_zenoh.ui.page.node:run", PageConfig, looks_on=True, roles=OPERATED
@@ -398,14 +413,17 @@ def run_process(config: ProcessConfig, make_bus: MakeBus = Bus) -> int:
 
 def main() -> None:
     """Run a supervised process, configured by its first argument, and exit."""
-    this_process.die_with_supervisor()
-    this_process.map_large_blocks()
-    this_process.multiply_in_one_thread()
-    this_process.show_stack_on_request()
-    interrupts.install()
-    code = run_process(msgspec.json.decode(sys.argv[1], type=ProcessConfig))
+    this_process.set_up()
+    code = run_supervised(sys.argv[1])
     sys.stdout.flush()
     os._exit(code)  # Zenoh's threads must not keep a finished process alive
+
+
+def run_supervised(config: str) -> int:
+    """Run the process with a ProcessConfig in JSON, and return its exit code."""
+    this_process.show_stack_on_request()
+    interrupts.install()
+    return run_process(msgspec.json.decode(config, type=ProcessConfig))
 
 
 if __name__ == "__main__":

@@ -17,11 +17,14 @@ from gigabrain_zenoh.launch.processes import (
     names_by_role,
     process_types,
 )
+from gigabrain_zenoh.runtime.fork_server import ForkRequest
 from gigabrain_zenoh.runtime.managed_process import ProcessSpec
 from gigabrain_zenoh.runtime.running import local_socket
 
 # -P: a package in the current folder must not shadow an installed one
 COMMAND = (sys.executable, "-P", "-m", "gigabrain_zenoh.launch.processes")
+SHARED, KERNELS = "gigabrain_zenoh.launch.shared", "gigabrain_zenoh.kernels.shared"
+FORKED = "gigabrain_zenoh.launch.processes:run_supervised"
 LATER_S, SOON_S = 3600.0, 30.0  # a router on another host may start later
 COMPILING_S = 600.0  # mapping and navigation compile their kernels at the first start
 
@@ -54,20 +57,35 @@ def process_specs(
             level=level,
         )
         process = structs.replace(process, **own_config(deployment, name, file))
-        soon_s = COMPILING_S if row.compiles and row.compiles(deployment) else SOON_S
+        compiles = row.compiles is not None and row.compiles(deployment)
         specs.append(
             ProcessSpec(
                 name=name,
                 argv=(*COMMAND, msgspec.json.encode(process).decode()),
+                fork=_fork(row, process, compiles=compiles),
                 after=after,
                 beats=True,
                 shows_stack=True,
                 stop_last=row.stop_last,
                 optional=row.own or row.optional,
-                ready_timeout_s=soon_s if after else LATER_S,
+                ready_timeout_s=(COMPILING_S if compiles else SOON_S) if after else LATER_S,
             )
         )
     return specs
+
+
+def _fork(row: ProcessType, process: ProcessConfig, *, compiles: bool) -> ForkRequest | None:
+    """Return how a fork server starts a process; None for one that none may start."""
+    if not row.forks:
+        return None
+    brief = msgspec.json.encode({"name": process.name, "run_dir": process.run_dir}).decode()
+    light = SHARED, row.run.partition(":")[0]
+    return ForkRequest(
+        run=FORKED,
+        argument=msgspec.json.encode(process).decode(),
+        title=f"{FORKED} {brief}",
+        imports=(light, (KERNELS,)) if compiles else (light,),
+    )
 
 
 def _names(deployment: Deployment, host: str) -> list[str]:

@@ -1,22 +1,19 @@
-"""One supervised process: its child process, its restarts after failures, and its end."""
+"""One supervised process: its starts, its restarts after failures, and its end."""
 
 import asyncio
 import contextlib
-import os
 import signal
-import subprocess
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, cast
-
-import msgspec
+from typing import Any, Literal
 
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host import this_process
-from gigabrain_zenoh.host.terminal import LineSplitter
 from gigabrain_zenoh.runtime import heartbeat
+from gigabrain_zenoh.runtime.child import Child, supervised_environment
+from gigabrain_zenoh.runtime.fork_server import ForkRequest
+from gigabrain_zenoh.runtime.forking import ForkServers
 
 
 @dataclass(frozen=True)
@@ -53,107 +50,7 @@ class RestartPolicy:
         return delay_s
 
 
-_DRAIN_S = 0.2  # what a dead child has written arrives at once; someone else may hold its pipe
 _STACK_S = 0.2  # how long a stuck process has to print where it is
-_REAP_S = 0.2  # a killed process ends at once, unless the kernel waits for a device
-
-
-def as_record(line: bytes, process: str) -> dict[str, Any]:
-    """Return the log record in a line of output; other lines become the text of a record."""
-    known = {"t": time.time_ns(), "level": "info", "process": process, "event": "output"}
-    with contextlib.suppress(msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        found = msgspec.json.decode(line)
-        if isinstance(found, dict) and isinstance(found.get("event"), str):
-            fit = {k: v for k, v in found.items() if type(v) is type(known.get(k, v))}
-            return known | fit
-    return known | {"level": "error", "text": line.decode(errors="replace").rstrip()}
-
-
-class Child(asyncio.SubprocessProtocol):
-    """A running process. Its pipes are always drained, whatever comes out of them."""
-
-    def __init__(self, name: str, on_record: Callable[[dict[str, Any]], None]) -> None:
-        self._name, self._on_record = name, on_record
-        self._lines = {1: LineSplitter(), 2: LineSplitter()}
-        self._ended, self._drained = asyncio.Event(), asyncio.Event()
-        self._transport: asyncio.SubprocessTransport | None = None
-        self.pid = 0
-
-    @classmethod
-    async def start(
-        cls,
-        name: str,
-        argv: Sequence[str],
-        env: Mapping[str, str],
-        on_record: Callable[[dict[str, Any]], None],
-    ) -> "Child":
-        """Start a process; raises OSError when that cannot be done."""
-        _, child = await asyncio.get_running_loop().subprocess_exec(
-            lambda: cls(name, on_record),
-            *argv,
-            stdin=subprocess.DEVNULL,
-            env=dict(env),
-            start_new_session=True,  # a terminal's Ctrl-C is for the supervisor alone
-        )
-        return child
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Note that the process runs and its pipes are open (asyncio calls this)."""
-        self._transport = cast(asyncio.SubprocessTransport, transport)
-        self.pid = self._transport.get_pid()
-
-    def pipe_data_received(self, fd: int, data: bytes) -> None:
-        """Split output into records (asyncio calls this)."""
-        for line in self._lines[fd].feed(data):
-            self._on_record(as_record(line, self._name))
-
-    def pipe_connection_lost(self, fd: int, exc: Exception | None) -> None:
-        """Handle the end of output on `fd` (asyncio calls this)."""
-        if rest := self._lines.pop(fd).end():
-            self._on_record(as_record(rest, self._name))
-        if not self._lines:
-            self._drained.set()
-
-    def process_exited(self) -> None:
-        """Kill what the process has started, once it is reaped (asyncio calls this)."""
-        self._signal_group(signal.SIGKILL)  # and all that it has started
-        self._ended.set()
-
-    def send_signal(self, number: int) -> None:
-        """Send a signal to the process and all that it has started, unless it has ended."""
-        if not self._ended.is_set():
-            self._signal_group(number)
-
-    def show_stack(self) -> None:
-        """Have the process print where it is; see `this_process.show_stack_on_request`."""
-        if this_process.STACK_SIGNAL and not self._ended.is_set():
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.kill(self.pid, this_process.STACK_SIGNAL)
-
-    def _signal_group(self, number: int) -> None:
-        # macOS answers EPERM where Linux answers ESRCH for a group that is gone
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(self.pid, number)
-
-    async def wait(self) -> int:
-        """Wait for its end and last output; return the exit code, or minus the signal's number."""
-        await self._ended.wait()
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(_DRAIN_S):
-                await self._drained.wait()
-        transport = cast(asyncio.SubprocessTransport, self._transport)
-        transport.close()
-        return cast(int, transport.get_returncode())
-
-    def abandon(self) -> None:
-        """Kill and reap it without the event loop, which is being torn down."""
-        self.send_signal(signal.SIGKILL)
-        if self._transport:
-            if process := self._transport.get_extra_info("subprocess"):  # uvloop has none
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    process.wait(_REAP_S)
-            self._transport.close()
-
 
 State = Literal["waiting", "starting", "ready", "backing off", "given up", "stopped"]
 OnRecord = Callable[[str, Mapping[str, Any]], None]
@@ -171,6 +68,7 @@ class ProcessSpec:
     optional: bool = False  # the robot goes on without it, also where its settings are wrong
     shows_stack: bool = False  # prints where it is on `this_process.STACK_SIGNAL`
     beats: bool = False  # reports progress once a second, and is killed without it
+    fork: ForkRequest | None = None  # the same as `argv`, for a fork server
 
 
 @dataclass
@@ -192,6 +90,7 @@ class Shared:
     on_record: OnRecord
     backoff: Backoff
     keep_stuck: bool = False  # processes without progress are left alone, for a debugger
+    fork_servers: ForkServers | None = None
     halt: asyncio.Event = field(default_factory=asyncio.Event)
     # held while a process is being started, so that a stop misses none
     starting: asyncio.Lock = field(default_factory=asyncio.Lock)
@@ -267,15 +166,21 @@ class ManagedProcess:
         return Death(f"ended with {_in_words(code)}", code, up_s, bad)
 
     async def _start(self) -> Child | None:
-        ours = {this_process.SUPERVISOR_VARIABLE: str(os.getpid()), "PYTHONUNBUFFERED": "1"}
-        async with self._shared.starting:
-            if self._shared.halt.is_set():
+        spec, shared = self.spec, self._shared
+        if spec.fork and shared.fork_servers:
+            await shared.fork_servers.imported(spec.fork)
+        async with shared.starting:
+            if shared.halt.is_set():
                 return None
-            self.child = await Child.start(
-                self.spec.name, self.spec.argv, os.environ | ours, self._handle_record
-            )
-            self.status.pid = self.child.pid
-            return self.child
+            child = None
+            if spec.fork and shared.fork_servers:
+                child = await shared.fork_servers.start(spec.name, spec.fork, self._handle_record)
+            if child is None:
+                child = await Child.start(
+                    spec.name, spec.argv, supervised_environment(), self._handle_record
+                )
+            self.child, self.status.pid = child, child.pid
+            return child
 
     def check_progress(self, passed_s: float) -> None:
         """Kill a process without progress; called every `heartbeat.LOOK_S`, or later."""

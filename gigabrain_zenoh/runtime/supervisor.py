@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import graphlib
+import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Self
@@ -10,6 +11,7 @@ from typing import Self
 from gigabrain_zenoh import errors
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.runtime import heartbeat
+from gigabrain_zenoh.runtime.forking import ForkServers
 from gigabrain_zenoh.runtime.managed_process import (
     Backoff,
     ManagedProcess,
@@ -40,6 +42,9 @@ class Supervisor:
     ) -> None:
         _check(specs)
         self._shared = Shared(on_record, backoff or Backoff(), keep_stuck)
+        forks = {spec.name: spec.fork for spec in specs if spec.fork}
+        if len(forks) > 1 and ForkServers.works_here():  # a single one would share with none
+            self._shared.fork_servers = ForkServers(forks, self._on_fork_failure)
         self._keepers = {spec.name: ManagedProcess(spec, self._shared) for spec in specs}
         self.statuses: Mapping[str, ProcessStatus] = {
             name: keeper.status for name, keeper in self._keepers.items()
@@ -81,6 +86,8 @@ class Supervisor:
 
     async def run(self) -> None:
         """Keep all processes running until `stop()` or cancellation; either stops them all."""
+        if self._shared.fork_servers:
+            self._shared.fork_servers.open()
         self._tasks = {
             name: asyncio.create_task(keeper.run([self._keepers[n] for n in keeper.spec.after]))
             for name, keeper in self._keepers.items()
@@ -99,6 +106,10 @@ class Supervisor:
                 await watching
             finally:  # a second Ctrl-C may cancel the stop before it starts
                 self._abandon()
+
+    def _on_fork_failure(self, text: str) -> None:
+        about = {"level": "warning", "process": "supervisor", "event": "fork server", "text": text}
+        self._shared.on_record("supervisor", {"t": time.time_ns(), **about})
 
     async def _watch(self) -> None:
         """Check for processes without progress, until all are stopped."""
@@ -139,6 +150,8 @@ class Supervisor:
 
     def _abandon(self) -> None:
         """Kill every process that still runs, without waiting for it."""
+        if self._shared.fork_servers:
+            self._shared.fork_servers.close()
         for name, keeper in self._keepers.items():
             if keeper.child:
                 keeper.child.abandon()

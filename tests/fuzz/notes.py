@@ -20,7 +20,7 @@ from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.geometry.limits import limits_of
 from gigabrain_zenoh.host.terminal import LineSplitter
 from gigabrain_zenoh.qa.proxy.chaos import parse_command
-from gigabrain_zenoh.runtime.managed_process import as_record
+from gigabrain_zenoh.runtime.child import as_record
 from gigabrain_zenoh.runtime.running import folder, running
 from tests.fuzz.harness import split
 

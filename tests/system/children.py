@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from gigabrain_zenoh.runtime.fork_server import ForkRequest
 from gigabrain_zenoh.runtime.supervisor import Backoff, ProcessSpec, Supervisor
 from gigabrain_zenoh.testing.waiting import until
 from tests.places import ROOT
@@ -34,6 +35,18 @@ HANG = "signal.signal(signal.SIGTERM, signal.SIG_IGN); say('ready'); wait()"
 
 def spec(name: str, code: str = SERVE, *after: str, **more: Any) -> ProcessSpec:
     return ProcessSpec(name, (sys.executable, "-c", CHILD + code), after, **more)
+
+
+def forked(name: str, code: str = SERVE, *after: str, **more: Any) -> ProcessSpec:
+    """The same, which a fork server may start; needs ROOT in PYTHONPATH."""
+    imports = more.pop("imports", ((__name__,),))
+    request = ForkRequest("tests.system.children:run", CHILD + code, f"forked {name}", imports)
+    return spec(name, code, *after, fork=request, **more)
+
+
+def run(code: str) -> int:
+    exec(code, {"__name__": "forked"})
+    return 0
 
 
 class Records:
@@ -106,10 +119,10 @@ asyncio.run(supervisor.run())
 
 @contextmanager
 def another_supervisor(
-    **codes: str,
+    parent_code: str = PARENT, /, **codes: str
 ) -> Iterator[tuple[subprocess.Popen[str], dict[str, int]]]:
     """A supervisor in a process of its own, with the pids of its processes, all ready."""
-    argv = [sys.executable, "-c", PARENT, json.dumps(codes)]
+    argv = [sys.executable, "-c", parent_code, json.dumps(codes)]
     pids: dict[str, int] = {}
     with subprocess.Popen(
         argv, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True

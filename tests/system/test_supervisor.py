@@ -12,7 +12,7 @@ import pytest
 
 from gigabrain_zenoh.errors import ConfigError, UnknownName
 from gigabrain_zenoh.launch.specs import COMMAND
-from gigabrain_zenoh.runtime.managed_process import Child
+from gigabrain_zenoh.runtime.child import Child
 from gigabrain_zenoh.runtime.supervisor import Backoff, ProcessSpec, Supervisor
 from gigabrain_zenoh.testing.waiting import until
 from tests.system.children import HANG, QUICK, SERVE, Records, freeze, running, spec

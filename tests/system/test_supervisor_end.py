@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from gigabrain_zenoh.runtime.managed_process import Child
+from gigabrain_zenoh.runtime.child import Child
 from gigabrain_zenoh.runtime.supervisor import Backoff, Supervisor
 from gigabrain_zenoh.testing.waiting import until
 from tests.system.children import (

@@ -1,5 +1,5 @@
 from gigabrain_zenoh.host.terminal import LineSplitter
-from gigabrain_zenoh.runtime.managed_process import as_record
+from gigabrain_zenoh.runtime.child import as_record
 
 
 def test_lines_of_any_cut_are_put_together() -> None:

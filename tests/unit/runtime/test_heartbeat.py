@@ -15,10 +15,10 @@ from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.decision.node import InputSource
 from gigabrain_zenoh.host.threads import ScheduledWorker
 from gigabrain_zenoh.qa.faults.broken_process import HANGING_TOPICS, HangingBus
+from gigabrain_zenoh.runtime.child import Child
 from gigabrain_zenoh.runtime.heartbeat import LOOK_S, Progress, Silence
 from gigabrain_zenoh.runtime.managed_process import (
     Backoff,
-    Child,
     ManagedProcess,
     ProcessSpec,
     Shared,

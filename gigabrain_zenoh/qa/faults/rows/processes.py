@@ -1,10 +1,13 @@
 """Processes that are killed, frozen, or have a part that hangs."""
 
 import asyncio
+import contextlib
 import itertools
 import random
 import signal
 import time
+
+import psutil
 
 from gigabrain_schemas.base import TICK_MS
 from gigabrain_schemas.topics import CMD_VEL
@@ -32,6 +35,8 @@ from gigabrain_zenoh.qa.faults.rig import (
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, Skipped, Stage, fault_row, worse_of
 from gigabrain_zenoh.qa.probe import moving, until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
+from gigabrain_zenoh.runtime import fork_server
+from gigabrain_zenoh.runtime.forking import ForkServers
 from gigabrain_zenoh.runtime.managed_process import Backoff
 
 FROZEN_TICKS, LONG_FROZEN_TICKS = 250, 3000  # 5 s, 60 s
@@ -57,6 +62,8 @@ NOT_LATCHED = Figure("not latched at start")
 ENABLED_LATCHED = Figure("enabled while latched")
 OLD_OBEYED = Figure("commands of the old boot obeyed")
 STARTS = Figure("starts")
+READY_AFTER = Figure("ready after", "s", wall=True)
+NOT_TOLD = Figure("faults not told")
 WAIT_TOO_SHORT = Figure("wait too short", "s")
 CPU_ADDED = Figure("cpu added", "%")
 IDLE = Figure("idle after", "s")
@@ -383,3 +390,32 @@ async def _recovery_s(robot: RobotUnderTest, victim: str) -> float:
     await until(drives_on, "it drives on")
     since = back.tick if back.boot == probe.state.boot else 0
     return (probe.state.tick - since) * TICK_MS / 1e3
+
+
+@fault_row(63, "", READY_AFTER.at_most(30), NOT_TOLD.at_most(0))
+async def fork_server_lost(rig: Rig) -> Measured:
+    """Kill and freeze the fork server while a robot starts: its processes start by themselves."""
+    if not ForkServers.works_here():
+        raise Skipped("processes are not forked on this system")
+    longest_s, not_told = 0.0, 0
+    for fault in (signal.SIGKILL, signal.SIGSTOP):
+        await rig.end_robot()
+        attack = asyncio.create_task(_break_fork_server(fault))
+        deployment = deployment_of(rig.options, "sim")
+        async with rig.own_robot(deployment) as robot:
+            await attack
+            await robot.until_driving()
+            longest_s = max(longest_s, robot.ready_s)
+            not_told += all(record.get("event") != "fork server" for record in robot.records)
+    return {READY_AFTER: longest_s, NOT_TOLD: not_told}
+
+
+async def _break_fork_server(fault: signal.Signals) -> None:
+    """Send a signal to the fork server that this process starts next, once it is there."""
+    while True:
+        for child in psutil.Process().children():
+            with contextlib.suppress(psutil.Error):
+                if fork_server.__name__ in child.cmdline():
+                    child.send_signal(fault)
+                    return
+        await asyncio.sleep(0.005)

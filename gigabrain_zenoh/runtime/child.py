@@ -1,0 +1,125 @@
+"""A running process: its output as log records, its signals and its end."""
+
+import asyncio
+import contextlib
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, cast
+
+import msgspec
+
+from gigabrain_zenoh.host import this_process
+from gigabrain_zenoh.host.terminal import LineSplitter
+
+_DRAIN_S = 0.2  # what a dead child has written arrives at once; someone else may hold its pipe
+REAP_S = 0.2  # a killed process ends at once, unless the kernel waits for a device
+
+
+def supervised_environment() -> dict[str, str]:
+    """Return the environment of a process that this one starts and supervises."""
+    ours = {this_process.SUPERVISOR_VARIABLE: str(os.getpid()), "PYTHONUNBUFFERED": "1"}
+    return os.environ | ours
+
+
+def as_record(line: bytes, process: str) -> dict[str, Any]:
+    """Return the log record in a line of output; other lines become the text of a record."""
+    known = {"t": time.time_ns(), "level": "info", "process": process, "event": "output"}
+    with contextlib.suppress(msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        found = msgspec.json.decode(line)
+        if isinstance(found, dict) and isinstance(found.get("event"), str):
+            fit = {k: v for k, v in found.items() if type(v) is type(known.get(k, v))}
+            return known | fit
+    return known | {"level": "error", "text": line.decode(errors="replace").rstrip()}
+
+
+class Child(asyncio.SubprocessProtocol):
+    """A running process. Its pipes are always drained, whatever comes out of them."""
+
+    def __init__(self, name: str, on_record: Callable[[dict[str, Any]], None]) -> None:
+        self._name, self._on_record = name, on_record
+        self._lines = {1: LineSplitter(), 2: LineSplitter()}
+        self._ended, self._drained = asyncio.Event(), asyncio.Event()
+        self._transport: asyncio.SubprocessTransport | None = None
+        self.pid = 0
+
+    @classmethod
+    async def start(
+        cls,
+        name: str,
+        argv: Sequence[str],
+        env: Mapping[str, str],
+        on_record: Callable[[dict[str, Any]], None],
+    ) -> "Child":
+        """Start a process; raises OSError when that cannot be done."""
+        _, child = await asyncio.get_running_loop().subprocess_exec(
+            lambda: cls(name, on_record),
+            *argv,
+            stdin=subprocess.DEVNULL,
+            env=dict(env),
+            start_new_session=True,  # a terminal's Ctrl-C is for the supervisor alone
+        )
+        return child
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Note that the process runs and its pipes are open (asyncio calls this)."""
+        self._transport = cast(asyncio.SubprocessTransport, transport)
+        self.pid = self._transport.get_pid()
+
+    def pipe_data_received(self, fd: int, data: bytes) -> None:
+        """Split output into records (asyncio calls this)."""
+        for line in self._lines[fd].feed(data):
+            self._on_record(as_record(line, self._name))
+
+    def pipe_connection_lost(self, fd: int, exc: Exception | None) -> None:
+        """Handle the end of output on `fd` (asyncio calls this)."""
+        if rest := self._lines.pop(fd).end():
+            self._on_record(as_record(rest, self._name))
+        if not self._lines:
+            self._drained.set()
+
+    def process_exited(self) -> None:
+        """Kill what the process has started, once it is reaped (asyncio calls this)."""
+        self._signal_group(signal.SIGKILL)  # and all that it has started
+        self._ended.set()
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal to the process and all that it has started, unless it has ended."""
+        if not self._ended.is_set():
+            self._signal_group(number)
+
+    def show_stack(self) -> None:
+        """Have the process print where it is; see `this_process.show_stack_on_request`."""
+        if this_process.STACK_SIGNAL and not self._ended.is_set():
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.kill(self.pid, this_process.STACK_SIGNAL)
+
+    def _signal_group(self, number: int) -> None:
+        # macOS answers EPERM where Linux answers ESRCH for a group that is gone
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.pid, number)
+
+    async def wait(self) -> int:
+        """Wait for its end and last output; return the exit code, or minus the signal's number."""
+        await self._ended.wait()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_DRAIN_S):
+                await self._drained.wait()
+        return self._close()
+
+    def _close(self) -> int:
+        """Close the pipes; return the exit code, or minus the signal's number."""
+        transport = cast(asyncio.SubprocessTransport, self._transport)
+        transport.close()
+        return cast(int, transport.get_returncode())
+
+    def abandon(self) -> None:
+        """Kill and reap it without the event loop, which is being torn down."""
+        self.send_signal(signal.SIGKILL)
+        if self._transport:
+            if process := self._transport.get_extra_info("subprocess"):  # uvloop has none
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(REAP_S)
+            self._transport.close()

@@ -1,0 +1,119 @@
+"""Processes that import what others need, and fork them: they share its memory.
+
+A fork server holds no session and no keys, and runs no thread. A fork ends up as a child of the
+supervisor, not of the server, so it goes on when the server ends:
+
+    fork server  its pid, once it has imported                          -> supervisor
+    supervisor   a request, with the ends of its output and of a pipe   -> fork server
+    fork server  forks, and the fork forks: the first one ends          -> the fork
+    the fork     its pid, once the supervisor is its parent             -> supervisor
+    supervisor   a byte in the pipe; if it has given up, it closes it   -> the fork, which runs
+
+The servers end when all is started: what starts later does so by itself, as after a failure.
+A server that goes on to import copies the pages that it writes to, and shares less with those that
+it has forked before. So there is one for each level of imports, a fork of the one before.
+"""
+
+import contextlib
+import gc
+import importlib
+import os
+import socket
+import sys
+import time
+from collections.abc import Sequence
+from typing import NoReturn
+
+import msgspec
+from msgspec import Struct
+
+from gigabrain_zenoh.host import this_process
+from gigabrain_zenoh.plugins import find
+
+MAX_BYTES = 128 * 1024  # of a request
+ADOPTION_S = 5.0  # until a fork has become a child of the supervisor
+ADOPTION_LOOK_S = 0.0002
+
+
+class Level(Struct, frozen=True):
+    """One fork server."""
+
+    connection: int  # file descriptor of the socket to the supervisor
+    modules: tuple[str, ...]  # that it imports, after those of the levels before
+
+
+class ForkRequest(Struct, frozen=True):
+    """One process to start."""
+
+    run: str  # "module:function" that runs in it with `argument`, and returns its exit code
+    argument: str
+    title: str  # for ps(1)
+    imports: tuple[tuple[str, ...], ...]  # modules that the server of each level imports for it
+
+
+def main() -> NoReturn:
+    """Serve the requests of a supervisor, until it ends or closes the connections.
+
+    The argument is a list of levels in JSON.
+    """
+    supervisor = os.getppid()
+    this_process.set_up()
+    levels = msgspec.json.decode(sys.argv[1], type=list[Level])
+    for level in levels:
+        for module in level.modules:
+            with contextlib.suppress(ImportError):  # the process that needs it reports it
+                importlib.import_module(module)
+        gc.collect()
+        gc.freeze()  # a later collection in a fork writes to none of what it shares
+        this = os.getpid()
+        if level is levels[-1] or os.fork():
+            break
+        this_process.die_with_parent(this)
+        os.close(level.connection)
+    _serve(socket.socket(fileno=level.connection), supervisor)
+
+
+def _serve(connection: socket.socket, supervisor: int) -> NoReturn:
+    connection.send(str(os.getpid()).encode())
+    while True:
+        data, ends, _, _ = socket.recv_fds(connection, MAX_BYTES, 3)
+        if not data:
+            os._exit(0)
+        if first := os.fork():
+            os.waitpid(first, 0)
+        elif os.fork():
+            os._exit(0)
+        else:
+            _become(msgspec.json.decode(data, type=ForkRequest), ends, connection, supervisor)
+        for end in ends:
+            os.close(end)
+
+
+def _become(
+    request: ForkRequest, ends: Sequence[int], connection: socket.socket, supervisor: int
+) -> NoReturn:
+    """Become a process of the supervisor, and run until its end."""
+    from setproctitle import setproctitle  # installed on Linux only
+
+    os.setsid()
+    deadline_s = time.monotonic() + ADOPTION_S
+    while os.getppid() != supervisor:
+        if time.monotonic() > deadline_s:
+            os._exit(1)
+        time.sleep(ADOPTION_LOOK_S)
+    this_process.die_with_parent(supervisor)
+    out, err, go = ends
+    connection.send(str(os.getpid()).encode())
+    if not os.read(go, 1):
+        os._exit(1)
+    os.dup2(out, 1)
+    os.dup2(err, 2)
+    os.closerange(3, max(*ends, connection.detach()) + 1)
+    setproctitle(request.title)
+    code: int = find(request.run)(request.argument)
+    sys.stdout.flush()
+    os._exit(code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,227 @@
+"""The supervisor's side of fork servers, and the processes that they have forked (Linux)."""
+
+import asyncio
+import contextlib
+import ctypes
+import functools
+import itertools
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import msgspec
+
+from gigabrain_zenoh.runtime.child import REAP_S, Child, supervised_environment
+from gigabrain_zenoh.runtime.fork_server import MAX_BYTES, ForkRequest, Level
+
+COMMAND = (sys.executable, "-P", "-m", "gigabrain_zenoh.runtime.fork_server")
+LONGEST_S = 15.0  # until a fork runs: the first one waits for all that it imports
+LOOK_S = 0.5  # between looks whether a fork server is stopped
+PR_SET_CHILD_SUBREAPER = 36  # prctl(2)
+FAILED = "the fork server {}; processes start without it, with more memory"
+
+
+class ForkServers:
+    """Fork the processes of a supervisor once; then they end, as they hold memory of their own.
+
+    When one of them fails they end as well.
+    """
+
+    def __init__(self, forks: Mapping[str, ForkRequest], on_failure: Callable[[str], None]) -> None:
+        """Take all processes by name; `on_failure` is told why a server has failed."""
+        self._missing = {*forks}
+        levels = itertools.zip_longest(*(fork.imports for fork in forks.values()), fillvalue=())
+        self._levels = [tuple(dict.fromkeys(itertools.chain(*level))) for level in levels]
+        self._on_failure = on_failure
+        self._first: subprocess.Popen[bytes] | None = None
+        self._connections: list[socket.socket] = []
+        self._imported: list[asyncio.Task[int]] = []  # of each level
+
+    @staticmethod
+    def works_here() -> bool:
+        """Return whether this system can do it."""
+        return sys.platform == "linux" and hasattr(os, "pidfd_open")
+
+    def open(self) -> None:
+        """Start the servers, in a running event loop."""
+        try:
+            self._open()
+        except OSError as error:
+            self._fail(f"cannot be started ({error})")
+
+    def _open(self) -> None:
+        pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in self._levels]
+        self._connections = [ours for ours, _ in pairs]
+        ends = [theirs.fileno() for _, theirs in pairs]
+        levels = [Level(*one) for one in zip(ends, self._levels, strict=True)]
+        try:
+            self._first = subprocess.Popen(
+                (*COMMAND, msgspec.json.encode(levels).decode()),
+                stdin=subprocess.DEVNULL,
+                pass_fds=ends,
+                env=supervised_environment(),
+                start_new_session=True,
+            )
+        finally:
+            for _, theirs in pairs:
+                theirs.close()
+        self._imported = [asyncio.create_task(self._answer(one)) for one in self._connections]
+
+    def close(self) -> None:
+        """End the servers. What they have forked goes on."""
+        if self._first:
+            self._first.kill()  # the others die with it
+            self._first.wait()
+        for task, connection in zip(self._imported, self._connections, strict=True):
+            task.cancel()
+            connection.close()
+        self._first, self._connections, self._imported = None, [], []
+
+    async def imported(self, request: ForkRequest) -> None:
+        """Wait until the server that forks a process can do so, or has failed."""
+        if self._imported:
+            await asyncio.wait([self._imported[len(request.imports) - 1]])
+
+    async def start(
+        self, name: str, request: ForkRequest, on_record: Callable[[dict[str, Any]], None]
+    ) -> Child | None:
+        """Have a process started; return None where the servers have ended."""
+        data = msgspec.json.encode(request)
+        if not self._connections or len(data) > MAX_BYTES:
+            return None
+        level = len(request.imports) - 1
+        connection = self._connections[level]
+        with contextlib.ExitStack() as closing:
+            out, err, go = (_pipe(closing) for _ in range(3))
+            try:
+                with _adopting():
+                    await self._imported[level]
+                    socket.send_fds(connection, [data], [out[1], err[1], go[0]])
+                    child = ForkedChild(name, on_record, await self._answer(connection))
+            except (OSError, TimeoutError) as error:
+                self._fail(str(error) or "does not answer")
+                return None
+            await child.attend(os.dup(out[0]), os.dup(err[0]))
+            os.write(go[1], b"1")
+        self._missing.discard(name)
+        if not self._missing:
+            self.close()
+        return child
+
+    def _fail(self, why: str) -> None:
+        self.close()
+        self._on_failure(FAILED.format(why))
+
+    async def _answer(self, connection: socket.socket) -> int:
+        """Return the pid of a server, or of a fork. Raises TimeoutError and ConnectionError."""
+        loop, answered = asyncio.get_running_loop(), asyncio.Event()
+        deadline_s = loop.time() + LONGEST_S
+        loop.add_reader(connection, answered.set)
+        try:
+            while not answered.is_set():
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(LOOK_S):
+                        await answered.wait()
+                if self._any_stopped() or loop.time() > deadline_s:
+                    raise TimeoutError
+        finally:
+            loop.remove_reader(connection)
+        pid = connection.recv(64)
+        if not pid:
+            raise ConnectionError("has ended")
+        return int(pid)
+
+    def _any_stopped(self) -> bool:
+        """Return whether somebody has stopped a server with a signal."""
+        import psutil  # costs 20 ms; most answers come before the first look
+
+        assert self._first
+        try:
+            first = psutil.Process(self._first.pid)
+            states = [one.status() for one in (first, *first.children())]
+        except psutil.Error:  # it ends, which the connection tells
+            return False
+        return psutil.STATUS_STOPPED in states
+
+
+class ForkedChild(Child):
+    """A process that a fork server has started: a child of this one all the same."""
+
+    def __init__(self, name: str, on_record: Callable[[dict[str, Any]], None], pid: int) -> None:
+        """Take the pid of a child. Raises OSError for one that is gone."""
+        super().__init__(name, on_record)
+        self.pid, self._code = pid, 0
+        self._pidfd = os.pidfd_open(pid)
+        self._pipes: list[asyncio.ReadTransport] = []
+
+    async def attend(self, out: int, err: int) -> None:
+        """Read its output from these ends of pipes, and wait for its end."""
+        loop = asyncio.get_running_loop()
+        for number, end in enumerate((out, err), 1):
+            pipe, _ = await loop.connect_read_pipe(
+                functools.partial(_Output, self, number), os.fdopen(end, "rb", 0)
+            )
+            self._pipes.append(pipe)
+        loop.add_reader(self._pidfd, self._reap)
+
+    def _reap(self) -> None:
+        asyncio.get_running_loop().remove_reader(self._pidfd)
+        self._wait()
+        self.process_exited()
+
+    def _wait(self) -> None:
+        ended = os.waitid(os.P_PIDFD, self._pidfd, os.WEXITED | os.WNOHANG)
+        os.close(self._pidfd)
+        if ended:
+            exited = ended.si_code == os.CLD_EXITED
+            self._code = ended.si_status if exited else -ended.si_status
+
+    def _close(self) -> int:
+        for pipe in self._pipes:
+            pipe.close()
+        return self._code
+
+    def abandon(self) -> None:
+        """Kill and reap it without the event loop, which is being torn down."""
+        if not self._ended.is_set():
+            self.send_signal(signal.SIGKILL)
+            select.select([self._pidfd], [], [], REAP_S)
+            self._reap()
+        self._close()
+
+
+class _Output(asyncio.Protocol):
+    """The output of a child on one of its pipes."""
+
+    def __init__(self, child: Child, number: int) -> None:
+        self._child, self._number = child, number
+
+    def data_received(self, data: bytes) -> None:
+        self._child.pipe_data_received(self._number, data)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._child.pipe_connection_lost(self._number, exc)
+
+
+def _pipe(closing: contextlib.ExitStack) -> tuple[int, int]:
+    """Return the ends of a pipe, to read and to write, which `closing` closes."""
+    ends = os.pipe()
+    for end in ends:
+        closing.callback(os.close, end)
+    return ends
+
+
+@contextlib.contextmanager
+def _adopting() -> Iterator[None]:
+    """Have this process become the parent of descendants whose parents end meanwhile."""
+    prctl = ctypes.CDLL(None, use_errno=True).prctl
+    prctl(PR_SET_CHILD_SUBREAPER, ctypes.c_ulong(1), *(ctypes.c_ulong(0),) * 3)
+    try:
+        yield
+    finally:
+        prctl(PR_SET_CHILD_SUBREAPER, ctypes.c_ulong(0), *(ctypes.c_ulong(0),) * 3)

@@ -1,0 +1,177 @@
+"""Processes that a fork server starts behave as those that are started by themselves."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pytest
+
+from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
+from gigabrain_zenoh.launch.deployment import Deployment
+from gigabrain_zenoh.launch.processes import PROCESSES
+from gigabrain_zenoh.launch.specs import process_specs
+from gigabrain_zenoh.runtime import forking
+from gigabrain_zenoh.runtime.forking import ForkServers
+from gigabrain_zenoh.runtime.supervisor import Supervisor
+from gigabrain_zenoh.testing.waiting import until
+from tests.places import ROOT
+from tests.system.children import (
+    PARENT,
+    SERVE,
+    alive,
+    another_supervisor,
+    forked,
+    freeze,
+    running,
+    spec,
+)
+
+pytestmark = pytest.mark.skipif(not ForkServers.works_here(), reason="Linux alone has pidfds")
+NEVER = (("tests.system.never_imported",),)
+
+
+@pytest.fixture(autouse=True)
+def path(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+
+
+def servers() -> list[psutil.Process]:
+    """The fork server of the first level that this process has started."""
+    return [one for one in psutil.Process().children() if "fork_server" in " ".join(one.cmdline())]
+
+
+async def until_ready(supervisor: Supervisor) -> None:
+    await until(lambda: all(one.state == "ready" for one in supervisor.statuses.values()))
+
+
+async def test_a_fork_is_a_child_of_its_supervisor_and_the_servers_end() -> None:
+    async with running(forked("one"), forked("two"), spec("three")) as (supervisor, records):
+        await until_ready(supervisor)
+        one, two, three = (psutil.Process(s.pid) for s in supervisor.statuses.values())
+        assert [one.cmdline()[0], two.cmdline()[0]] == ["forked one", "forked two"]
+        assert {one.ppid(), two.ppid(), three.ppid()} == {os.getpid()}
+        assert os.getsid(one.pid) == os.getpgid(one.pid) == one.pid
+        assert not servers()
+        assert not records.texts("fork server")
+        own = one.memory_full_info().uss
+        assert own < 0.5 * one.memory_info().rss  # the rest is shared with the other one
+
+
+async def test_a_fork_that_dies_is_started_again_by_itself() -> None:
+    async with running(forked("one"), forked("two")) as (supervisor, records):
+        status = supervisor.statuses["one"]
+        await until_ready(supervisor)
+        first = status.pid
+        os.kill(first or 0, signal.SIGKILL)
+        await until(lambda: status.restarts == 1 and status.state == "ready")
+        assert (status.last_exit, supervisor.deaths) == (-9, 1)
+        assert psutil.Process(status.pid).cmdline()[0] == sys.executable
+        assert records.texts("died") == ["one ended with signal 9 (Killed); next start in 0.01 s"]
+
+
+@pytest.mark.parametrize(
+    ("code", "text"),
+    [
+        ("sys.exit(7)", "one ended with exit code 7; next start in 0.01 s"),
+        ("print('x' * 99_999); raise ValueError", "one ended with exit code 1; next start in"),
+        ("pass", "one ended with exit code 0; next start in 0.01 s"),
+    ],
+)
+async def test_how_a_fork_ends_is_told_with_its_output(code: str, text: str) -> None:
+    async with running(forked("one", code), forked("two")) as (_, records):
+        await until(lambda: records.texts("died"))
+        assert records.texts("died")[0].startswith(text)
+        said = "".join(records.texts("output"))
+        assert said.count("x") >= 99_999 * ("print" in code)
+        assert ("ValueError" in said) == ("raise" in code)
+
+
+async def test_a_fork_starts_after_those_that_it_needs() -> None:
+    async with running(forked("one", SERVE, "two"), forked("two"), forked("three")) as running_now:
+        supervisor, records = running_now
+        await until_ready(supervisor)
+        order = records.events()
+        assert order.index(("two", "ready")) < order.index(("one", "ready"))
+
+
+async def killed(server: psutil.Process) -> None:
+    server.kill()
+
+
+async def frozen(server: psutil.Process) -> None:
+    await freeze(server.pid)
+
+
+async def left_alone(server: psutil.Process) -> None:
+    del server
+
+
+@pytest.mark.parametrize(
+    ("fault", "why"),
+    [(killed, "has ended"), (frozen, "does not answer"), (left_alone, "does not answer")],
+)
+async def test_without_a_server_processes_start_by_themselves(
+    fault: Callable[[psutil.Process], object], why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its import never ends; one that is only slow is given up after a while."""
+    if fault is left_alone:
+        monkeypatch.setattr(forking, "LONGEST_S", 0.2)
+        monkeypatch.setattr(forking, "LOOK_S", 0.1)
+    specs = forked("one", imports=NEVER), forked("two", imports=NEVER)
+    async with running(*specs) as (supervisor, records):
+        await until(servers)
+        await fault(servers()[0])  # type: ignore[misc]
+        await until_ready(supervisor)
+        told = [f"the fork server {why}; processes start without it, with more memory"]
+        assert records.texts("fork server") == told
+        assert supervisor.deaths == 0
+        assert not servers()
+
+
+async def test_a_stop_does_not_wait_for_a_server_that_imports() -> None:
+    specs = forked("one", imports=NEVER), forked("two", imports=NEVER)
+    async with running(*specs):
+        await until(servers)
+    assert not servers()
+
+
+def all_forked(parent: str) -> str:
+    """The same supervisor, whose processes a fork server starts."""
+    made = parent.replace("specs = [", "from tests.system.children import forked\nspecs = [")
+    made = made.replace('ProcessSpec(n, (sys.executable, "-c", code))', "forked(n)")
+    assert made.count("forked") == 2
+    return made
+
+
+async def test_forks_die_with_their_supervisor() -> None:
+    with another_supervisor(all_forked(PARENT), one="", two="") as (parent, pids):
+        assert all(psutil.Process(pid).cmdline()[0] == f"forked {n}" for n, pid in pids.items())
+        parent.kill()
+        await until(lambda: not any(alive(pid) for pid in pids.values()))
+
+
+def test_what_servers_import_leaves_no_thread(tmp_path: Path) -> None:
+    """A fork has only the thread that forks, while locks of others stay held."""
+    rows = [name for name, row in PROCESSES.items() if row.forks and row.named]
+    deployment = Deployment(
+        hosts={"robot": tuple(rows)},
+        perception=PerceptionConfig(mapping="slam"),
+        decision=DecisionConfig(behaviour="navigate"),
+    )
+    specs = process_specs(deployment, "robot", tmp_path, tmp_path)
+    modules = [
+        module for one in specs if one.fork for level in one.fork.imports for module in level
+    ]
+    assert "gigabrain_zenoh.kernels.shared" in modules
+    code = (
+        "import importlib, os, sys; [importlib.import_module(one) for one in sys.argv[1:]];"
+        "print(os.listdir('/proc/self/task'), os.getpid())"
+    )
+    env = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    argv = [sys.executable, "-c", code, *modules]
+    threads, _, pid = subprocess.check_output(argv, text=True, env=env).rpartition(" ")
+    assert threads == f"['{pid.strip()}']"
