@@ -382,6 +382,9 @@ class RoutePlanner:
             return away
         if request.tick - looks.ended_tick < WAY_OPENS_TICKS:
             return self._route(reason="everything reachable was looked at; waiting for other ways")
+        if self._missed and looks.try_again():
+            self._missed.clear()
+            return self._route(reason="trying again to get to unexplored space")
         return replace(route, reason="everything reachable was looked at")
 
     def _explored(self, request: RouteRequest, costs: Costmap) -> Route:

@@ -24,6 +24,7 @@ OCCUPIED_PERCENT = 65
 CELL_M = 0.2  # of what has been looked at
 LOOKS_M = 1.9, 1.2  # from how far at most it looks everywhere, and again where it found nothing:
 # within 2 m nine of ten pictures of a can show it to the net, and farther off fewer than half
+AGAIN = 2  # times that it tries again to get to where it did not get, as people go away
 OWN_GROUND_M = 0.5  # round the body: it would stand in a thing there
 RIM_RAD = math.radians(4)  # at the picture's edge, where a thing may be cut off
 SAMPLE_M = 0.05  # along a line of sight
@@ -109,7 +110,7 @@ class LookAround:
 
     def __init__(self, seek: int = 0, tick: int = 0) -> None:
         self.seek = seek  # the search that it belongs to
-        self._round = 0
+        self._round = self._again = 0
         self._seen: set[tuple[int, int]] = set()
         self.ended_tick: int | None = None  # since when nothing is left
         self._aim: tuple[int, int] | None = None  # the cell that it goes to look at
@@ -140,6 +141,13 @@ class LookAround:
             return False
         self._round += 1
         self._seen.clear()
+        return True
+
+    def try_again(self) -> bool:
+        """Count one more try to get to unexplored space; return False after the last one."""
+        if self._again == AGAIN:
+            return False
+        self._again, self.ended_tick = self._again + 1, None
         return True
 
     @property

@@ -36,6 +36,7 @@ from gigabrain_zenoh.decision.tasks.scripts import Run
 
 StartScript = Callable[[Script], Run]
 MOVED_M = 0.15  # that a target may be off where the robot drives to
+LEFT_M = 0.4  # round where a thing was not known any more: it does not go there again without it
 MAX_WAYS = 4  # to a thing that is to be picked up
 NOBODY_LOOKS = "waiting: nothing is recognised in pictures; run the process `recognition`"
 
@@ -201,7 +202,10 @@ class OfferNode(ArmNode):
 
 
 class SeekNode(Leaf):
-    """Drives before the nearest wanted thing or tag, and looks for one while none is known."""
+    """Drives before the nearest wanted thing or tag, and looks for one while none is known.
+
+    One that is no longer known on the way may be hidden, or hard to recognise: it goes there once.
+    """
 
     def __init__(self, wanted: Wanted, context: MissionContext) -> None:
         super().__init__(f"looking for {named(wanted)}", context)
@@ -210,24 +214,27 @@ class SeekNode(Leaf):
         self._id: int | None = None  # of the target
         self._seek = 0
         self._missed: dict[int, str] = {}  # ids that it cannot get to, and why
+        self._left: list[Target] = []  # where it was, and did not know the thing any more
 
     def initialise(self) -> None:
         """Start the node, or start it again."""
         self._seek = next(self.context.numbers)
         self._command, self._id = DriveCommand(self._seek, "look", seek=self._seek), None
-        self._missed = {}
+        self._missed, self._left = {}, []
 
     def update(self) -> Status:
         """Advance the node by one tick, and return its status."""
         outcome = self.context.outcome
-        if outcome and outcome.number == self._command.number and outcome.state != "running":
-            if self._command.kind == "look":
-                return self.failed(self._why(outcome.reason))
-            if outcome.state == "done":
-                return Status.SUCCESS
-            if self._id is not None:
-                self._missed[self._id] = outcome.reason
+        ended = outcome and outcome.number == self._command.number and outcome.state != "running"
+        if outcome and ended and self._command.kind == "look":
+            return self.failed(self._why(outcome.reason))
+        if outcome and ended and outcome.state != "done" and self._id is not None:
+            self._missed[self._id] = outcome.reason
         found = self.context.seek(self._wanted, self._missed, self._id)
+        if outcome and ended and outcome.state == "done" and found.id == self._id:
+            return Status.SUCCESS
+        if ended and self._command.target:
+            self._left.append(self._command.target)
         self._choose(found)
         target = self._command.target
         self.context.doing = f"going before {target.name}" if target else self.name
@@ -241,12 +248,12 @@ class SeekNode(Leaf):
         """Give another command if there is another target, or if it is somewhere else."""
         target, before = found.target, self._command.target
         if target is None:
-            if before or self._command.kind != "look":
+            gone = before and any(_apart(before, one) <= LEFT_M for one in self._left)
+            if gone or (before is None and self._command.kind != "look"):
                 number = next(self.context.numbers)
                 self._command, self._id = DriveCommand(number, "look", seek=self._seek), None
             return
-        off = math.hypot(target.x - before.x, target.y - before.y) if before else math.inf
-        if found.id != self._id or off > MOVED_M:
+        if found.id != self._id or before is None or _apart(target, before) > MOVED_M:
             number = next(self.context.numbers)
             self._command = DriveCommand(number, "approach", target=target)
             self._id = found.id
@@ -359,3 +366,7 @@ class ScriptNode(Leaf):
         if self._running:
             self._running.stop()
             self._running = None
+
+
+def _apart(one: Target, other: Target) -> float:
+    return math.hypot(one.x - other.x, one.y - other.y)

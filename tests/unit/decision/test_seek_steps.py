@@ -60,20 +60,41 @@ def test_it_looks_for_a_thing_and_drives_before_the_nearest_once_it_is_known() -
     assert (robot.status.done[0].kind, robot.status.done[0].label) == ("goal", "find a can")
 
 
-def test_a_thing_that_is_carried_away_under_way_is_looked_for_again() -> None:
+def test_what_is_not_known_any_more_under_way_is_looked_for_where_it_was() -> None:
+    robot = Seeker()
+    robot.tasks.add_find("can", "replace", "ann")
+    assert robot.wanted() == ("look", "")
+    seek = robot.command.seek if robot.command else 0
+    robot.knows(can(1, 2.0))
+    assert robot.wanted() == ("approach", "can 1")
+    robot.knows()
+    assert robot.wanted() == ("approach", "can 1")
+    robot.reached()
+    assert robot.wanted() == ("look", "")
+    assert robot.command
+    assert robot.command.seek == seek  # what has been looked at counts on
+    robot.knows(can(2, 2.1))
+    assert robot.wanted() == ("approach", "can 2")
+    robot.knows()
+    assert robot.wanted() == ("look", "")  # it was there once
+    robot.knows(can(3, 3.0))
+    assert robot.wanted() == ("approach", "can 3")
+    robot.knows()
+    robot.failed("no free and reachable place before can 3")
+    assert robot.wanted() == ("look", "")
+
+
+def test_what_is_known_again_on_the_way_to_where_it_was_is_found() -> None:
     robot = Seeker()
     robot.tasks.add_find("can", "replace", "ann")
     robot.knows(can(1, 2.0))
     assert robot.wanted() == ("approach", "can 1")
     robot.knows()
-    assert robot.wanted() == ("look", "")
-    seek = robot.command.seek if robot.command else 0
-    robot.knows(can(2, 3.0))
+    assert robot.wanted() == ("approach", "can 1")
+    robot.knows(can(2, 2.05))
     assert robot.wanted() == ("approach", "can 2")
-    robot.knows()
-    assert robot.wanted() == ("look", "")
-    assert robot.command
-    assert robot.command.seek == seek  # what has been looked at counts on
+    robot.reached()
+    assert robot.last == ("succeeded", "it is there")
 
 
 def test_when_all_was_looked_at_it_fails_in_words() -> None:

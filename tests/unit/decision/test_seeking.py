@@ -201,6 +201,29 @@ def test_a_second_door_that_somebody_stands_in_is_waited_for_as_well() -> None:
     assert max(pose.x for pose in poses) > 6.5
 
 
+def test_it_tries_again_to_get_to_unexplored_space_and_then_ends() -> None:
+    cells = np.full_like(empty(6.0, 4.0), 100)
+    cells[1:-1, 1:-1] = 0
+    cells[:, 40:] = -1
+    planner, command = RoutePlanner(), DriveCommand(5, "look", seek=5)
+    ask(planner, command, cells, 1)
+    planner._looks._seen = {(i, j) for i in range(30) for j in range(20)}
+    assert planner._looks.look_closer()
+    planner._looks._seen = {(i, j) for i in range(30) for j in range(20)}
+    told = []
+    for tick in range(26, 6000, 25):
+        route = ask(planner, command, cells, tick)
+        told.append("way" if route.goal else route.reason)
+        if route.goal:  # somebody stood there each time
+            planner._missed.append((route.goal.x, route.goal.y))
+            planner._drop_frontier(tick)
+        if route.state != "running":
+            break
+    assert told.count(again := "trying again to get to unexplored space") == 2
+    assert all(told[k + 1] == "way" for k, one in enumerate(told) if one == again)
+    assert route.reason == "everything reachable was looked at"
+
+
 def test_it_turns_on_the_spot_before_it_drives() -> None:
     poses, _ = search(ROOM)
     assert (poses[0].x, poses[0].y) == (1.0, 1.0)
