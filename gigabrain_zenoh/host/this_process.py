@@ -23,7 +23,6 @@ def set_up() -> None:
     die_with_supervisor()
     map_large_blocks()
     multiply_in_one_thread()
-    open_no_window()
 
 
 def die_with_supervisor() -> None:
@@ -182,12 +181,20 @@ def multiply_in_one_thread() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
+NO_WINDOW = "MUJOCO_GL", "disable"
+
+
 def open_no_window() -> None:
     """Have MuJoCo import nothing for windows, which takes 0.2 s and 6 MB; before it is imported.
 
     What draws pictures chooses its own graphics. MUJOCO_GL in the environment is respected.
     """
-    os.environ.setdefault("MUJOCO_GL", "disable")
+    os.environ.setdefault(*NO_WINDOW)
+
+
+def environment_for_others() -> dict[str, str]:
+    """Return the environment for programs of others, which may open windows."""
+    return dict(os.environ.items() - {NO_WINDOW})
 
 
 M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = -3, -1  # mallopt(3)

@@ -403,7 +403,10 @@ def load_process(config: ProcessConfig) -> tuple[ProcessType, Node]:
     """Return the row of a process, and its node. Raises ValidationError and ConfigError."""
     if config.module or config.perceptor:
         return load_own(config)
-    return process_type(config.name), node_of(config)
+    row = process_type(config.name)
+    if not row.own:
+        this_process.open_no_window()
+    return row, node_of(config)
 
 
 def run_process(config: ProcessConfig, make_bus: MakeBus = Bus) -> int:

@@ -103,8 +103,12 @@ def _become(
         time.sleep(ADOPTION_LOOK_S)
     this_process.die_with_parent(supervisor)
     out, err, go = ends
-    connection.send(str(os.getpid()).encode())
-    if not os.read(go, 1):
+    try:
+        connection.send(str(os.getpid()).encode())
+        wanted = os.read(go, 1)
+    except OSError:
+        wanted = b""
+    if not wanted:
         os._exit(1)
     os.dup2(out, 1)
     os.dup2(err, 2)

@@ -76,7 +76,8 @@ class ForkServers:
         """End the servers. What they have forked goes on."""
         if self._first:
             self._first.kill()  # the others die with it
-            self._first.wait()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._first.wait(REAP_S)
         for task, connection in zip(self._imported, self._connections, strict=True):
             task.cancel()
             connection.close()

@@ -13,6 +13,7 @@ from gigabrain_zenoh.decision.tasks.mission import Script
 from gigabrain_zenoh.decision.tasks.scripts import LEASHED, Run, Scripts
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile
 from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.testing.waiting import until
 
 
@@ -39,6 +40,31 @@ async def test_a_program_of_the_folder_is_run_there_with_its_arguments(tmp_path:
     folder = program(tmp_path, 'echo "$1 in $(pwd)"')
     run = Scripts(folder).start(Script(run="beep", arguments=("twice",)))
     assert await ended(run) == (True, f"ended well: twice in {tmp_path}")
+
+
+@pytest.mark.parametrize(("before", "then"), [(None, "any"), ("egl", "egl")])
+async def test_a_program_may_open_windows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str | None, then: str
+) -> None:
+    monkeypatch.setenv("MUJOCO_GL", before or "")
+    if before is None:
+        monkeypatch.delenv("MUJOCO_GL")
+    this_process.open_no_window()
+    folder = program(tmp_path, 'echo "${MUJOCO_GL:-any}"')
+    assert await ended(Scripts(folder).start(Script(run="beep"))) == (True, f"ended well: {then}")
+
+
+def test_a_process_of_ours_imports_nothing_for_windows() -> None:
+    code = """
+import sys
+from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
+from gigabrain_zenoh.launch.processes import load_process
+load_process(ProcessConfig(name="safety", endpoint=Endpoint()))
+import mujoco
+print("glfw" in sys.modules)
+"""
+    env = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
+    assert subprocess.check_output([sys.executable, "-c", code], text=True, env=env) == "False\n"
 
 
 async def test_a_program_that_fails_says_why(tmp_path: Path) -> None:

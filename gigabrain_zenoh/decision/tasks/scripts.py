@@ -9,6 +9,7 @@ from pathlib import Path
 
 from gigabrain_zenoh.decision.tasks.mission import Script
 from gigabrain_zenoh.errors import GigabrainError, Refused, unknown
+from gigabrain_zenoh.host import this_process
 
 MAX_OUTPUT = 200  # bytes of a program's output that its result shows, the last ones
 LINGER_S = 1.0  # for the rest of its output, once it has ended
@@ -62,6 +63,7 @@ class Run:
                 program, output = await asyncio.get_running_loop().subprocess_exec(
                     _Output, "/bin/sh", "-c", LEASHED, "sh", path, *script.arguments,
                     cwd=path.parent, start_new_session=True, stdin=end,
+                    env=this_process.environment_for_others(),
                     stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
                 )  # fmt: skip
                 with contextlib.closing(program):
