@@ -11,7 +11,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import msgspec
@@ -20,7 +20,8 @@ from gigabrain_zenoh.runtime.child import REAP_S, Child, supervised_environment
 from gigabrain_zenoh.runtime.fork_server import MAX_BYTES, ForkRequest, Level
 
 COMMAND = (sys.executable, "-P", "-m", "gigabrain_zenoh.runtime.fork_server")
-LONGEST_S = 15.0  # until a fork runs: the first one waits for all that it imports
+IMPORT_S = 15.0  # until a fork server has imported
+FORK_S = 5.0  # until a fork answers
 LOOK_S = 0.5  # between looks whether a fork server is stopped
 PR_SET_CHILD_SUBREAPER = 36  # prctl(2)
 FAILED = "the fork server {}; processes start without it, with more memory"
@@ -70,7 +71,9 @@ class ForkServers:
         finally:
             for _, theirs in pairs:
                 theirs.close()
-        self._imported = [asyncio.create_task(self._answer(one)) for one in self._connections]
+        self._imported = [
+            asyncio.create_task(self._answer(one, IMPORT_S)) for one in self._connections
+        ]
 
     def close(self) -> None:
         """End the servers. What they have forked goes on."""
@@ -100,10 +103,10 @@ class ForkServers:
         with contextlib.ExitStack() as closing:
             out, err, go = (_pipe(closing) for _ in range(3))
             try:
-                with _adopting():
+                with _adoption:
                     await self._imported[level]
                     socket.send_fds(connection, [data], [out[1], err[1], go[0]])
-                    child = ForkedChild(name, on_record, await self._answer(connection))
+                    child = ForkedChild(name, on_record, await self._answer(connection, FORK_S))
             except (OSError, TimeoutError) as error:
                 self._fail(str(error) or "does not answer")
                 return None
@@ -118,10 +121,10 @@ class ForkServers:
         self.close()
         self._on_failure(FAILED.format(why))
 
-    async def _answer(self, connection: socket.socket) -> int:
+    async def _answer(self, connection: socket.socket, within_s: float) -> int:
         """Return the pid of a server, or of a fork. Raises TimeoutError and ConnectionError."""
         loop, answered = asyncio.get_running_loop(), asyncio.Event()
-        deadline_s = loop.time() + LONGEST_S
+        deadline_s = loop.time() + within_s
         loop.add_reader(connection, answered.set)
         try:
             while not answered.is_set():
@@ -217,12 +220,27 @@ def _pipe(closing: contextlib.ExitStack) -> tuple[int, int]:
     return ends
 
 
-@contextlib.contextmanager
-def _adopting() -> Iterator[None]:
-    """Have this process become the parent of descendants whose parents end meanwhile."""
-    prctl = ctypes.CDLL(None, use_errno=True).prctl
-    prctl(PR_SET_CHILD_SUBREAPER, ctypes.c_ulong(1), *(ctypes.c_ulong(0),) * 3)
-    try:
-        yield
-    finally:
-        prctl(PR_SET_CHILD_SUBREAPER, ctypes.c_ulong(0), *(ctypes.c_ulong(0),) * 3)
+class _Adoption:
+    """While it is entered, this process becomes the parent of descendants that lose theirs.
+
+    Several supervisors of one process may have entered it at once.
+    """
+
+    def __init__(self) -> None:
+        self._entered = 0
+
+    def __enter__(self) -> None:
+        self._entered += 1
+        self._set()
+
+    def __exit__(self, *_: object) -> None:
+        self._entered -= 1
+        self._set()
+
+    def _set(self) -> None:
+        zero = ctypes.c_ulong(0)
+        adopts = ctypes.c_ulong(int(self._entered > 0))
+        ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, adopts, zero, zero, zero)
+
+
+_adoption = _Adoption()

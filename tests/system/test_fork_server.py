@@ -1,5 +1,6 @@
 """Processes that a fork server starts behave as those that are started by themselves."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -61,6 +62,15 @@ async def test_a_fork_is_a_child_of_its_supervisor_and_the_servers_end() -> None
         assert own < 0.5 * one.memory_info().rss  # the rest is shared with the other one
 
 
+async def test_several_supervisors_of_one_process_fork_at_once() -> None:
+    specs = [(forked("one"), forked("two"), forked("three")) for _ in range(4)]
+    async with contextlib.AsyncExitStack() as stack:
+        robots = [await stack.enter_async_context(running(*one)) for one in specs]
+        for supervisor, records in robots:
+            await until_ready(supervisor)
+            assert not records.texts("fork server")
+
+
 async def test_a_fork_that_dies_is_started_again_by_itself() -> None:
     async with running(forked("one"), forked("two")) as (supervisor, records):
         status = supervisor.statuses["one"]
@@ -119,7 +129,7 @@ async def test_without_a_server_processes_start_by_themselves(
 ) -> None:
     """Its import never ends; one that is only slow is given up after a while."""
     if fault is left_alone:
-        monkeypatch.setattr(forking, "LONGEST_S", 0.2)
+        monkeypatch.setattr(forking, "IMPORT_S", 0.2)
         monkeypatch.setattr(forking, "LOOK_S", 0.1)
     specs = forked("one", imports=NEVER), forked("two", imports=NEVER)
     async with running(*specs) as (supervisor, records):
