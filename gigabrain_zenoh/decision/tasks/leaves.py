@@ -231,7 +231,7 @@ class SeekNode(Leaf):
         if outcome and ended and outcome.state != "done" and self._id is not None:
             self._missed[self._id] = outcome.reason
         found = self.context.seek(self._wanted, self._missed, self._id)
-        if outcome and ended and outcome.state == "done" and found.id == self._id:
+        if outcome and ended and outcome.state == "done" and found.target and found.id == self._id:
             return Status.SUCCESS
         if ended and self._command.target:
             self._left.append(self._command.target)

@@ -84,6 +84,16 @@ def test_what_is_not_known_any_more_under_way_is_looked_for_where_it_was() -> No
     assert robot.wanted() == ("look", "")
 
 
+def test_a_tag_that_is_not_known_any_more_on_arrival_is_not_found() -> None:
+    robot = Seeker()
+    robot.carry_out("do: [{find: {tag: 0}}]")
+    robot.knows(tags=(MapTag(id=0, x=2.0, y=0.0, z=0.4, yaw=3.0, size=0.16),))
+    assert robot.wanted() == ("approach", "tag 0")
+    robot.knows()
+    robot.reached()
+    assert robot.wanted() == ("look", "")
+
+
 def test_what_is_known_again_on_the_way_to_where_it_was_is_found() -> None:
     robot = Seeker()
     robot.tasks.add_find("can", "replace", "ann")

@@ -214,7 +214,7 @@ def test_it_tries_again_to_get_to_unexplored_space_and_then_ends() -> None:
     for tick in range(26, 6000, 25):
         route = ask(planner, command, cells, tick)
         told.append("way" if route.goal else route.reason)
-        if route.goal:  # somebody stood there each time
+        if route.goal:  # a person blocks each way
             planner._missed.append((route.goal.x, route.goal.y))
             planner._drop_frontier(tick)
         if route.state != "running":
