@@ -34,7 +34,7 @@ class ForkServers:
     """
 
     def __init__(self, forks: Mapping[str, ForkRequest], on_failure: Callable[[str], None]) -> None:
-        """Take all processes by name; `on_failure` is told why a server has failed."""
+        """Take all processes by name; call `on_failure` with the reason if a server fails."""
         self._missing = {*forks}
         levels = itertools.zip_longest(*(fork.imports for fork in forks.values()), fillvalue=())
         self._levels = [tuple(dict.fromkeys(itertools.chain(*level))) for level in levels]
@@ -81,8 +81,10 @@ class ForkServers:
             self._first.kill()  # the others die with it
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._first.wait(REAP_S)
-        for task, connection in zip(self._imported, self._connections, strict=True):
-            task.cancel()
+        for task in self._imported:
+            if not task.cancel() and not task.cancelled():
+                task.exception()  # retrieved, so that asyncio does not log it
+        for connection in self._connections:
             connection.close()
         self._first, self._connections, self._imported = None, [], []
 
@@ -127,10 +129,12 @@ class ForkServers:
         deadline_s = loop.time() + within_s
         loop.add_reader(connection, answered.set)
         try:
-            while not answered.is_set():
+            while True:
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(LOOK_S):
                         await answered.wait()
+                if answered.is_set():
+                    break
                 if self._any_stopped() or loop.time() > deadline_s:
                     raise TimeoutError
         finally:
@@ -141,7 +145,7 @@ class ForkServers:
         return int(pid)
 
     def _any_stopped(self) -> bool:
-        """Return whether somebody has stopped a server with a signal."""
+        """Return whether a signal has stopped a server."""
         import psutil  # costs 20 ms; most answers come before the first look
 
         assert self._first

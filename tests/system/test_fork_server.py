@@ -142,6 +142,17 @@ async def test_without_a_server_processes_start_by_themselves(
         assert not servers()
 
 
+async def test_where_no_server_can_start_processes_start_by_themselves(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(forking, "COMMAND", ("/nowhere/python",))
+    async with running(forked("one"), forked("two")) as (supervisor, records):
+        await until_ready(supervisor)
+        (told,) = records.texts("fork server")
+        assert told.startswith("the fork server cannot be started ([Errno 2] No such file")
+        assert supervisor.deaths == 0
+
+
 async def test_a_stop_does_not_wait_for_a_server_that_imports() -> None:
     specs = forked("one", imports=NEVER), forked("two", imports=NEVER)
     async with running(*specs):
