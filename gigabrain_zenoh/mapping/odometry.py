@@ -30,6 +30,7 @@ SLIP_RATE = 0.15  # [rad/s] between wheels and gyro, smoothed
 SLIP_SHARE = 0.1  # of a new difference: over about 0.2 s
 GYRO = 0.3  # of the yaw's deviation by wheels alone
 SLIPPING = 5.0  # so much more uncertain is what the wheels say then
+LAG_S = 0.05  # by which odometry may be older, or newer, than a scan of its tick
 
 JUMP_FACTOR, JUMP_M, JUMP_RAD = 2.0, 0.2, 0.5  # more than the body can do is no motion
 
@@ -43,6 +44,7 @@ class OdometrySample(NamedTuple):
     slipping: bool
     jumps: int  # how often the odometry has jumped since the start
     unaided: int = 0  # how many of the steps since then turned by what the wheels say alone
+    rate: float = 0.0  # [rad/s], of the turn
 
 
 class OdometryFusion:
@@ -74,15 +76,18 @@ class OdometryFusion:
             return
         ticks = state.tick - last.tick
         step = between(last.odometry, pose)
-        fused, jumps, unaided = last.fused, last.jumps, last.unaided
+        fused, jumps, unaided, rate = last.fused, last.jumps, last.unaided, 0.0
         if jumped(step, ticks * TICK_NS / 1e9, body):
             self._rate, self._rest = self._turn_rate(state), 0
             jumps += 1
         else:
             turn = self._turn(state, step, ticks)
             unaided += turn is None
-            fused = advanced(fused, step, float(step[2]) if turn is None else turn)
-        self._moments.append(OdometrySample(state.tick, pose, fused, self.slipping, jumps, unaided))
+            turn = float(step[2]) if turn is None else turn
+            fused, rate = advanced(fused, step, turn), turn / (ticks * TICK_NS / 1e9)
+        self._moments.append(
+            OdometrySample(state.tick, pose, fused, self.slipping, jumps, unaided, rate)
+        )
 
     @property
     def slipping(self) -> bool:
@@ -112,6 +117,7 @@ class OdometryFusion:
             after.slipping,
             after.jumps,
             after.unaided,
+            after.rate,
         )
 
     def _turn_rate(self, state: RobotState) -> float | None:
@@ -151,10 +157,15 @@ class OdometryFusion:
 
 
 def way(last: OdometrySample, moment: OdometrySample) -> tuple[Floats, Floats]:
-    """Return the motion (3,) between two samples, and its covariance (3, 3) in its own frame."""
+    """Return the motion (3,) between two scans, and its covariance (3, 3) in its own frame.
+
+    While the body turns faster and faster, scans that are a little newer show a larger turn.
+    """
     step = between(last.fused, moment.fused)
     aided = moment.unaided == last.unaided
-    return step, uncertainty(step, slipping=moment.slipping, gyro=aided)
+    noise = uncertainty(step, slipping=moment.slipping, gyro=aided)
+    noise[2, 2] += (LAG_S * (moment.rate - last.rate)) ** 2
+    return step, noise
 
 
 def jumped(step: Floats, seconds: float, body: BodyDescription) -> bool:

@@ -8,8 +8,10 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import ImuData
-from gigabrain_zenoh.mapping.odometry import OdometryFusion, uncertainty, way
+from gigabrain_zenoh.mapping.odometry import LAG_S, OdometryFusion, uncertainty, way
+from gigabrain_zenoh.mapping.slam import Slam
 from gigabrain_zenoh.testing.samples import WAFFLE, state
+from tests.unit.mapping.rooms import Lidar, box
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 
@@ -63,8 +65,11 @@ def test_over_missing_states_the_wheels_say_how_much_it_turned() -> None:
     assert moment.fused == pytest.approx((0.1, 0, 0.5))
     assert after.fused == pytest.approx((0.1, 0, 0.5))
     by_wheels, by_gyro = way(last, moment)[1], way(moment, after)[1]
-    assert by_wheels == pytest.approx(uncertainty(way(last, moment)[0], slipping=False))
-    assert by_gyro[2, 2] == pytest.approx(uncertainty(np.zeros(3), slipping=False)[2, 2] * 0.3**2)
+    lag = np.diag((0.0, 0.0, LAG_S)) ** 2
+    expected = uncertainty(way(last, moment)[0], slipping=False) + lag * (0.3 / 0.8 - 1.0) ** 2
+    assert by_wheels == pytest.approx(expected)
+    still = uncertainty(np.zeros(3), slipping=False, gyro=True)
+    assert by_gyro == pytest.approx(still + lag * (0.3 / 0.8) ** 2)
 
 
 def test_at_rest_the_bias_of_the_gyro_is_learnt_and_the_heading_stays() -> None:
@@ -131,3 +136,23 @@ def test_an_older_state_changes_nothing() -> None:
     fusion = fused(seen(10, (0, 0, 0)), seen(11, (0.01, 0, 0)), seen(10, (5.0, 0, 0)))
     assert fusion.newest
     assert fusion.newest.fused == pytest.approx((0.01, 0, 0))
+
+
+@pytest.mark.parametrize("lag", [0, 2, 4])
+def test_where_odometry_is_older_than_scans_turns_do_not_bend_the_map(lag: int) -> None:
+    """A node of ROS 2 sends odometry at 20 Hz, so states show turns up to 80 ms late."""
+    walls = np.array([*box(-2, -2, 6, 4), (1, -2, 1, 0.6), (2.5, 2, 2.5, -0.4)])
+    lidar, fusion, slam, last = Lidar(220, reach=8.0, noise=0.0), OdometryFusion(), Slam(), None
+    turns = 1.9 * np.sin(np.arange(280) * 0.02 * 2.5)  # [rad/s], faster and slower within 1.3 s
+    rates = np.concatenate([np.zeros(20), turns])
+    yaws = np.cumsum(rates) * 0.02
+    for tick in range(5, 300):
+        old = max(tick - lag, 0)
+        fusion.add(seen(tick, (0, 0, float(yaws[old])), float(rates[old])), WAFFLE)
+        if tick % 5 == 0:
+            moment = fusion.at(tick)
+            assert moment
+            true = np.array((0.0, 0.0, yaws[tick]))
+            found = slam.add(lidar.scan(walls, true), *way(last or moment, moment))
+            assert math.remainder(found.pose[2] - true[2], math.tau) == pytest.approx(0, abs=0.02)
+            last = moment
