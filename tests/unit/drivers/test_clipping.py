@@ -4,7 +4,7 @@ import math
 
 from msgspec.structs import replace
 
-from gigabrain_drivers.driver.process import clipped
+from gigabrain_drivers.driver.clipping import clipped
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import Battery, Joint, RobotState
 from gigabrain_schemas.sensors import ImuData
