@@ -62,25 +62,33 @@ def chain(
     seconds: float = 10.0,
     rounds: int = 3,
     rates: Annotated[tuple[float, ...], Parameter(consume_multiple=True)] = (10.0, 50.0),
+    peers: bool = False,
     json: JsonFile = None,
 ) -> int:
     """Measure scan-to-command latency, in turns with a bare Zenoh relay.
 
     Example: gigabrain bench chain --seconds 10 --rounds 3 --rates 10 50
+    Example: gigabrain bench chain --peers
 
     Args:
         seconds: Length of each run [s].
         rounds: Number of turns of chain and relay.
         rates: Scans per second [Hz].
+        peers: Also run the relay with dora and rospy, where they are installed.
     """
     from gigabrain_zenoh.qa.bench.chain import chain_page, measure_chain
+    from gigabrain_zenoh.qa.bench.peer_frameworks import COMMANDS, installed
 
     files.check_result_path(json)
     check_positive(seconds=seconds, rounds=rounds)
     for rate in rates:
         if not 0 < rate <= MAX_SCAN_HZ:
             raise ConfigError(f"--rates: expected above 0, at most {MAX_SCAN_HZ:g}, got {rate:g}")
-    result = run_async(measure_chain(seconds, rounds, rates, print_progress))
+    frameworks = installed() if peers else ()
+    missing = set(COMMANDS) - {one.name for one in frameworks} if peers else set()
+    for name in sorted(missing):
+        print_progress(f"{name} is left out: there is no command {COMMANDS[name]!r}")
+    result = run_async(measure_chain(seconds, rounds, rates, print_progress, frameworks))
     finish(chain_page(result), result, json)
     return 0
 

@@ -5,18 +5,24 @@ from pathlib import Path
 
 import pytest
 
+from gigabrain_zenoh.qa.bench.peer_frameworks import COMMANDS, installed
 from gigabrain_zenoh.testing.processes import Home
 
 
 @pytest.mark.slow
-async def test_the_chain_is_timed_beside_a_bare_relay(home: Home, tmp_path: Path) -> None:
+async def test_the_chain_is_timed_beside_relays(home: Home, tmp_path: Path) -> None:
+    """Those of dora and rospy run where they are; CI has rospy."""
     report = tmp_path / "chain.json"
-    options = ("--seconds", "1", "--rounds", "1", "--rates", "50", "--json", str(report))
+    options = ("--seconds", "1", "--rounds", "1", "--rates", "50", "--peers", "--json", str(report))
     command = await home.run("bench", "chain", *options)
     assert await command.ended() == 0, command.err
     result = json.loads(report.read_bytes())
     (rate,) = result["rates"]
-    for runs in (rate["chain"], rate["relay"], [rate["peers"]]):
+    there = [framework.name for framework in installed()]
+    assert list(rate["frameworks"]) == there
+    for name in COMMANDS.keys() - {*there}:
+        assert f"{name} is left out: there is no command" in command.out + command.err
+    for runs in (rate["chain"], rate["relay"], [rate["peers"]], *rate["frameworks"].values()):
         assert runs[0]["n"] >= 10
         assert 0 < runs[0]["p50_ms"] <= runs[0]["p99_ms"]
     assert [hop["name"] for hop in result["hops"]] == [

@@ -32,6 +32,7 @@ from gigabrain_zenoh.launch.deployment import Deployment, client_endpoint, with_
 from gigabrain_zenoh.launch.processes import PROCESSES
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.perception import node as perception
+from gigabrain_zenoh.qa.bench.peer_frameworks import Framework, time_framework
 from gigabrain_zenoh.qa.bench.relay import RelayRole
 from gigabrain_zenoh.qa.judging import Latencies, limited, over_rounds, table_of
 from gigabrain_zenoh.qa.robot_under_test import (
@@ -64,12 +65,13 @@ PAUSE_S = TICK_NS / 1e9
 
 
 class RateComparison(Struct, frozen=True, kw_only=True):
-    """Rounds of chain and relay in turns at one rate, and one run without a router."""
+    """Rounds of chain, relays and frameworks in turns at one rate, and one without a router."""
 
     rate_hz: float
     chain: tuple[Latencies, ...]
     relay: tuple[Latencies, ...]
     peers: Latencies
+    frameworks: dict[str, tuple[Latencies, ...]] = {}  # by name
 
     @property
     def ratio_p50(self) -> float:
@@ -109,15 +111,22 @@ class ChainResult(Struct, frozen=True, kw_only=True):
 
 
 async def measure_chain(
-    seconds: float, rounds: int, rates_hz: Sequence[float], show: Progress
+    seconds: float,
+    rounds: int,
+    rates_hz: Sequence[float],
+    show: Progress,
+    frameworks: Sequence[Framework] = (),
 ) -> ChainResult:
-    """Run the benchmark. Raises GigabrainError when a process dies."""
+    """Run the benchmark, with relays of other frameworks. Raises GigabrainError if one dies."""
     with tempfile.TemporaryDirectory(prefix="gigabrain-bench-") as name:
         folder = Path(name)
         show(f"listening to the chain at {rates_hz[0]:g} Hz")
         monitor, monitored = await listen_to_chain(rates_hz[0], min(seconds, LISTEN_S), folder)
         sizes = monitor.sizes()
-        compared = [await _compare(rate, seconds, rounds, sizes, folder, show) for rate in rates_hz]
+        compared = [
+            await _compare(rate, seconds, rounds, sizes, folder, show, frameworks)
+            for rate in rates_hz
+        ]
         show("timing what each hop does")
         hops = await measure_hops(monitor, monitored)
     return ChainResult(
@@ -136,16 +145,27 @@ async def _compare(
     sizes: Sequence[int],
     folder: Path,
     show: Progress,
+    frameworks: Sequence[Framework],
 ) -> RateComparison:
     chain, relay = [], []
+    others: dict[str, list[Latencies]] = {one.name: [] for one in frameworks}
     for i in range(1, rounds + 1):
         show(f"{rate_hz:g} Hz, round {i} of {rounds}: chain")
         chain.append(await time_chain(rate_hz, seconds, folder))
         show(f"{rate_hz:g} Hz, round {i} of {rounds}: bare relay")
         relay.append(await time_relay(rate_hz, seconds, sizes, folder))
+        for one in frameworks:
+            show(f"{rate_hz:g} Hz, round {i} of {rounds}: {one.name}")
+            others[one.name].append(await time_framework(one, rate_hz, seconds, SETTLE_S, sizes))
     show(f"{rate_hz:g} Hz: bare relay without a router")
     peers = await time_peers(rate_hz, seconds, sizes)
-    return RateComparison(rate_hz=rate_hz, chain=tuple(chain), relay=tuple(relay), peers=peers)
+    return RateComparison(
+        rate_hz=rate_hz,
+        chain=tuple(chain),
+        relay=tuple(relay),
+        peers=peers,
+        frameworks={name: tuple(times) for name, times in others.items()},
+    )
 
 
 @asynccontextmanager
@@ -373,6 +393,8 @@ def chain_page(result: ChainResult) -> "Group":
         )  # fmt: skip
         row("", "gigabrain", over_rounds(one.chain), *ratios)
         row("", "no router", one.peers)
+        for name, times in one.frameworks.items():
+            row("", name, over_rounds(times))
         compared.add_section()
     hops = table_of("hop", "took", "encode, put", "bridge", "decode", "step", "rest")
     for hop in result.hops:
