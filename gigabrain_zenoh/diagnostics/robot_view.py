@@ -22,6 +22,7 @@ from gigabrain_schemas.topics import (
 )
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.freshness import Latest
+from gigabrain_zenoh.bus.listening import Sampled
 from gigabrain_zenoh.host.bounded import put_newest
 
 M = TypeVar("M", bound=Message)
@@ -73,3 +74,16 @@ class RobotView:
 
     def on_rare(self, topic: Topic[Any], message: Message) -> None:
         """Act on a message of a rare topic, such as TASK or HEALTH, as it arrives."""
+
+
+class SampledView(RobotView):
+    """The same, but messages of busy topics are decoded when they are read."""
+
+    def __init__(self, bus: Bus) -> None:
+        self.sampled: dict[Topic[Any], Sampled[Any]] = {}
+        super().__init__(bus)
+
+    def newest_of(self, topic: Topic[M]) -> Latest[M]:
+        """Subscribe to a busy topic; decode only the messages that are read."""
+        sampled = self.sampled[topic] = Sampled(self.bus, topic)
+        return sampled

@@ -14,6 +14,7 @@ from msgspec import Struct, structs
 from gigabrain_schemas.base import TICK_S
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
+from gigabrain_zenoh.bus.zenoh.workarounds import NAP_S
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.layers import Row
 from gigabrain_zenoh.config.settings import PageConfig
@@ -172,7 +173,8 @@ class Demo:
 
     async def _join(self, stop: asyncio.Event) -> Bus | None:
         """Open a session; return None if the run ends before there is a router."""
-        opening = asyncio.ensure_future(ZenohTransport.open(client_endpoint(self._deployment)))
+        endpoint = structs.replace(client_endpoint(self._deployment), nap_s=NAP_S)
+        opening = asyncio.ensure_future(ZenohTransport.open(endpoint))
         while not opening.done() and not stop.is_set() and not self._supervisor.given_up:
             await asyncio.wait((opening,), timeout=LOOK_S)
         if not opening.done():
@@ -187,8 +189,8 @@ class Demo:
         moved_s, seconds = loop.time(), watch.seconds
         with view:
             while not (stop.is_set() or self._supervisor.given_up or self._over(watch)):
+                watch.look()
                 view.show()
-                watch.note_start_times()
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(stop.wait(), LOOK_S)
                 self._look_at_capacity(watch, view)
@@ -200,6 +202,7 @@ class Demo:
                 elif loop.time() - moved_s > STALLED_S:
                     self._failures.append(f"the robot's clock stood still for {STALLED_S:.0f} s")
                     break
+            watch.look()
             view.show()
         self._last_fault = newest_fault(text for _, text in self._faults)
         return await self._ask_for_truth(watch, HASTY_S if stop.is_set() else ANSWER_S)

@@ -3,13 +3,13 @@
 import asyncio
 import contextlib
 import time
-from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from collections.abc import Mapping
+from typing import Any
 
 import psutil
 from msgspec import Struct, structs
 
-from gigabrain_schemas.base import TICK_S, Message
+from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import Intent
 from gigabrain_schemas.requests import DescribeRequest, Description
@@ -17,18 +17,12 @@ from gigabrain_schemas.safety import Health
 from gigabrain_schemas.tasks import TaskStatus
 from gigabrain_schemas.topics import (
     DESCRIBE,
-    INTENT,
     MAP,
-    STATE,
-    Topic,
 )
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.bus.freshness import Latest
-from gigabrain_zenoh.diagnostics.robot_view import RobotView
+from gigabrain_zenoh.diagnostics.robot_view import SampledView
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate.causes import LATE
-
-M = TypeVar("M", bound=Message)
 
 UNKNOWN_CELL = b"\xff"
 ASK_S, ASK_PAUSE_S = 1.0, 0.1  # timeout of one query, and pause before the next
@@ -45,7 +39,7 @@ class StartTimes(Struct, frozen=True, kw_only=True):
     path_s: float | None = None  # first path planned in the robot's own map
 
 
-class RunMonitor(RobotView):
+class RunMonitor(SampledView):
     """Newest messages of a robot, and the distance that it has driven."""
 
     def __init__(self, bus: Bus) -> None:
@@ -57,13 +51,13 @@ class RunMonitor(RobotView):
         super().__init__(bus)
         self.map = bus.latest(MAP)
 
-    def newest_of(self, topic: Topic[M]) -> Latest[M]:
-        """Subscribe to a busy topic; every state and every intent is counted."""
-        counters: dict[str, Callable[[Any], None]] = {
-            STATE.key: self._add_distance,
-            INTENT.key: self._count_turn,
-        }
-        return self.bus.latest(topic, counters.get(topic.key))
+    def look(self) -> None:
+        """Decode the newest messages, and count. Called ten times a second."""
+        for topic in self.sampled.values():
+            topic.poll()
+        self._add_distance(self.state.newest)
+        self._count_turn(self.intent.newest)
+        self._note_start_times()
 
     @property
     def problem(self) -> str:
@@ -89,8 +83,8 @@ class RunMonitor(RobotView):
             return None
         return (len(grid.cells) - grid.cells.count(UNKNOWN_CELL)) * grid.resolution**2
 
-    def note_start_times(self) -> None:
-        """Note what has happened since the last call."""
+    def _note_start_times(self) -> None:
+        """Note what has happened since the last look."""
         task = self.task.current
         happened = {
             "state_s": self.state.newest is not None,
@@ -130,15 +124,15 @@ class RunMonitor(RobotView):
             await asyncio.sleep(min(left_s, ASK_PAUSE_S))
         return None
 
-    def _count_turn(self, intent: Intent) -> None:
-        twist = intent.twist
+    def _count_turn(self, intent: Intent | None) -> None:
+        twist = intent.twist if intent else None
         turning = twist is not None and twist.angular_z != 0.0 and twist.linear_x == 0.0
         self.turns += turning and not self._turning
         self._turning = turning
 
-    def _add_distance(self, state: RobotState) -> None:
+    def _add_distance(self, state: RobotState | None) -> None:
         last, self._last = self._last, state
-        if last and last.boot == state.boot:
+        if last and state and last.boot == state.boot:
             dx, dy = state.pose.x - last.pose.x, state.pose.y - last.pose.y
             self.distance_m += (dx * dx + dy * dy) ** 0.5
 

@@ -3,15 +3,13 @@
 import functools
 from collections import Counter
 from collections.abc import Mapping
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 from gigabrain_schemas.base import Message, Velocity
-from gigabrain_schemas.topics import LOG, MAP, STATE, Topic
+from gigabrain_schemas.topics import LOG, MAP, STATE
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.bus.freshness import Latest
-from gigabrain_zenoh.bus.listening import Sampled
 from gigabrain_zenoh.client.requests import jog, steer
-from gigabrain_zenoh.diagnostics.robot_view import RobotView
+from gigabrain_zenoh.diagnostics.robot_view import SampledView
 from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of
 
 M = TypeVar("M", bound=Message)
@@ -23,19 +21,13 @@ MAX_RECEIVED_HZ = 120  # messages of one viewer that are processed; held keys ta
 SETTLE_S = 0.1  # start of a new stream that is ignored: commands the network had buffered
 
 
-class ViewerScene(RobotView):
-    """Messages for viewers: also map and log. Busy topics are decoded when read."""
+class ViewerScene(SampledView):
+    """Messages for viewers: also map and log."""
 
     def __init__(self, bus: Bus) -> None:
-        self.sampled: dict[Topic[Any], Sampled[Any]] = {}
         super().__init__(bus)
         bus.latest(MAP, functools.partial(self.on_rare, MAP))
         bus.subscribe(LOG, lambda _key, record: self.on_rare(LOG, record))
-
-    def newest_of(self, topic: Topic[M]) -> Latest[M]:
-        """Subscribe to a busy topic; decode only the messages that are read."""
-        sampled = self.sampled[topic] = Sampled(self.bus, topic)
-        return sampled
 
     @property
     def enables(self) -> int | None:

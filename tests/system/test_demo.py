@@ -316,6 +316,7 @@ async def test_where_the_page_is_is_said_once_and_not_before_it_is_there(
     net = Net()
     watch = RunMonitor(net.one)
     net.two.publish(STATE, EXAMPLES["RobotState"])
+    watch.look()
     hosts = {"robot": (*ROBOT, "page")}
     where = DemoOptions(headless=True, page="http://127.0.0.1:8080")
     demo = Demo(Deployment(router="tcp/127.0.0.1:0", hosts=hosts), where)
