@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import logging
-import os
 import socket
 import threading
 from collections.abc import AsyncIterator, Callable, Iterable
@@ -14,7 +13,7 @@ from msgspec import Struct, structs
 
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import Transport
-from gigabrain_zenoh.bus.zenoh.config import ZENOH_RUNTIME, session_config
+from gigabrain_zenoh.bus.zenoh.config import session_config
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.bus.zenoh.workarounds import NAP_S
 from gigabrain_zenoh.clock import Clock
@@ -61,7 +60,6 @@ async def connect(
     if looks_on:
         step_aside()
         endpoint = structs.replace(endpoint, nap_s=NAP_S)
-    os.environ.setdefault("ZENOH_RUNTIME", ZENOH_RUNTIME)
     try:
         opening = ZenohTransport.open(endpoint) if timeout_s else open_session(endpoint)
         transport = await asyncio.wait_for(opening, timeout_s)

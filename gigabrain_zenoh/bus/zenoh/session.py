@@ -21,7 +21,7 @@ import zenoh
 
 from gigabrain_zenoh.bus.bridge import Bridge
 from gigabrain_zenoh.bus.transport import Close
-from gigabrain_zenoh.bus.zenoh.config import explain, plain, session_config
+from gigabrain_zenoh.bus.zenoh.config import ZENOH_RUNTIME, explain, plain, session_config
 from gigabrain_zenoh.bus.zenoh.workarounds import (
     CLOSING_THREAD,
     await_zenoh_threads,
@@ -68,6 +68,7 @@ async def open_session(endpoint: Endpoint) -> zenoh.Session:
     Raises BusError when a router cannot listen, ConfigError for an endpoint that is not valid.
     """
     _close_at_exit()
+    os.environ.setdefault("ZENOH_RUNTIME", ZENOH_RUNTIME)  # read when Zenoh starts its threads
     config = _config(endpoint)
     loop = asyncio.get_running_loop()
     opened: asyncio.Future[zenoh.Session] = loop.create_future()
