@@ -110,6 +110,15 @@ def test_driven_again_by_its_nodes_a_trial_is_the_same() -> None:
     assert barn.drive_nodes(field(posts), 1, HARD, QUICK) == one
 
 
+def test_fake_time_does_not_pass_while_kernels_compile() -> None:
+    """On a new installation the robot would not be localized in time, and the bench would end."""
+    course = barn.JudgedCourse(field(NONE), 0, HARD)
+    nodes = barn._nodes(course, QUICK, "nowhere")
+    for name in ("perception", "decision"):
+        settings = nodes[name].args[0]  # type: ignore[attr-defined]
+        assert settings.compile_first
+
+
 def jackal(*posts: tuple[float, float, float]) -> MujocoJackal:
     calm = Conditions(delay=0.1, drift=0.0, noise=0.0, dropouts=0.0, physics=True)
     return MujocoJackal(calm, (0.0, 0.0, 0.0), np.array(posts).reshape(-1, 3), 1)

@@ -109,9 +109,13 @@ def measure_barn(
             for world in worlds
             for trial in range(trials)
         ]
-        for one in as_completed(waiting):
-            done.append(one.result())
-            progress(done[-1])
+        try:
+            for one in as_completed(waiting):
+                done.append(one.result())
+                progress(done[-1])
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)  # else it first drives all the others
+            raise
     done.sort(key=lambda one: (one.world, one.trial))
     return BarnResult(plant=PLANTS[plant], samples=samples, trials=tuple(done))
 
@@ -162,11 +166,14 @@ async def _drive(course: JudgedCourse, samples: int, folder: str) -> BarnTrial:
 
 def _nodes(course: JudgedCourse, samples: int, folder: str) -> dict[str, Node]:
     """Return the nodes of a robot that may drive through unknown space."""
+    mapping = PerceptionConfig(mapping="slam", compile_first=True)  # fake time waits for nothing
     anywhere = DecisionConfig(
-        behaviour="navigate", settings={"unknown_space": "allow", "samples": samples}
+        behaviour="navigate",
+        settings={"unknown_space": "allow", "samples": samples},
+        compile_first=True,
     )
     return {
-        "perception": functools.partial(perception.run, PerceptionConfig(mapping="slam")),
+        "perception": functools.partial(perception.run, mapping),
         "decision": functools.partial(decision.run, anywhere),
         "control": control.run,
         "safety": _safety,
