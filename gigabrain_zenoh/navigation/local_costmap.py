@@ -1,8 +1,8 @@
 """Local costmap: a window around the robot that remembers recent lidar hits.
 
 A hit marks a cell; two beams that pass it clear it. What no beam can check expires, as odometry
-drifts. Distances are a 5 x 5 chamfer (Borgefors 1986). cv2.distanceTransform took 0.51 ms where
-this took 0.20 ms (320 x 320 cells), and differs in the last bits.
+drifts. Distances are a 5 x 5 chamfer (Borgefors 1986), in a third of the time that
+cv2.distanceTransform takes; it differs in the last bits.
 """
 
 import itertools
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_NS
 from gigabrain_zenoh.kernels.images import connected_parts
-from gigabrain_zenoh.kernels.jit import kernel
+from gigabrain_zenoh.kernels.jit import kernel, lean_kernel
 from gigabrain_zenoh.navigation.contours import covered
 from gigabrain_zenoh.navigation.footprint import FAR, DistanceGrid
 from gigabrain_zenoh.navigation.zones import fill
@@ -25,9 +25,11 @@ RIM_CELLS = 2  # cells round the window, from which nothing is near
 UNIT = 1 << 20  # of a cell
 STRAIGHT, SLANT, KNIGHT = UNIT, round(1.4 * UNIT), round(2.1969 * UNIT)
 UNREACHED = np.int32(1 << 29)
+WORD, ALL_FREE = 8, np.uint64(0x0101010101010101)  # cells that are looked at together
 FreeCells = NDArray[np.uint8]
 Steps = NDArray[np.int32]
 Singles = NDArray[np.float32]
+Words = NDArray[np.uint64]
 
 CELL_M = 0.025
 BEARING_BINS = 720  # of the bearings round the lidar
@@ -62,30 +64,56 @@ class Chamfer:
 def _chamfer(
     free: FreeCells, steps: Steps, cell: np.float32, most: np.float32, distance: Singles
 ) -> None:
+    """Fill `distance` by steps along rows first, then from row to row: their order is free."""
     rows, columns = free.shape
     for row in range(rows):
         here, cells = steps[row + RIM_CELLS, RIM_CELLS : RIM_CELLS + columns], free[row]
-        for column in range(columns):
-            here[column] = UNREACHED if cells[column] else np.int32(0)
+        words = cells[: columns // WORD * WORD].view(np.uint64)
+        _along(cells, words, here)
         _from_beside(steps[row + 1], steps[row], here)
-        now = UNREACHED
-        for column in range(columns):
-            now = min(np.int32(now + STRAIGHT), here[column])
-            here[column] = now
     unit = np.float32(1.0 / UNIT)
     for row in range(rows - 1, -1, -1):
         here, out = steps[row + RIM_CELLS, RIM_CELLS : RIM_CELLS + columns], distance[row]
         _from_beside(steps[row + RIM_CELLS + 1], steps[row + RIM_CELLS + 2], here)
-        now = UNREACHED
-        for column in range(columns - 1, -1, -1):
-            now = min(np.int32(now + STRAIGHT), here[column])
-            here[column] = now
         for column in range(columns):
             away = np.float32(here[column]) * unit * cell
             out[column] = away if away < most else most
 
 
-@kernel
+@lean_kernel
+def _along(cells: FreeCells, words: Words, here: Steps) -> None:
+    """Fill `here` with the steps within a row to the nearest 0 in `cells`, also in `words`."""
+    n, last = len(cells), -1
+    for word in range(len(words) + 1):
+        if word < len(words) and words[word] == ALL_FREE:
+            continue
+        for j in range(word * WORD, min(n, (word + 1) * WORD)):
+            if not cells[j]:
+                middle = (last + j + 1) // 2 if last >= 0 else 0
+                if last >= 0:
+                    _rise(here[last:middle])
+                _fall(here[middle : j + 1])
+                last = j
+    if last >= 0:
+        _rise(here[last:])
+    else:
+        here[:] = UNREACHED
+
+
+@lean_kernel
+def _rise(here: Steps) -> None:
+    for k in range(len(here)):
+        here[k] = np.int32(np.int32(k) * STRAIGHT)
+
+
+@lean_kernel
+def _fall(here: Steps) -> None:
+    last = np.int32(len(here) - 1)
+    for k in range(len(here)):
+        here[k] = np.int32(np.int32(last - np.int32(k)) * STRAIGHT)
+
+
+@lean_kernel
 def _from_beside(beside: Steps, beyond: Steps, here: Steps) -> None:
     """Lower `here` by steps from the two rows on one side. Slices, and 32 bits: vectorised."""
     n = len(here)

@@ -1,5 +1,6 @@
 """The parts of the local planner, each against what is known without it."""
 
+import itertools
 import math
 import threading
 
@@ -120,9 +121,9 @@ def _exact(points: np.ndarray, x: float, y: float, yaw: float) -> float:
 
 def test_distances_are_those_of_opencv_and_no_more_than_asked_for() -> None:
     random = np.random.default_rng(4)
-    chamfer = Chamfer(90, 0.025, 0.8)
-    for share in (0.5, 0.01, 0.001, 0.0):
-        free = (random.random((90, 90)) >= share).astype(np.uint8)
+    for share, side in itertools.product((1.0, 0.5, 0.01, 0.001, 0.0), (90, 64)):
+        chamfer = Chamfer(side, 0.025, 0.8)
+        free = (random.random((side, side)) >= share).astype(np.uint8)
         want = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5) * 0.025
         np.testing.assert_allclose(chamfer.distance(free), np.minimum(want, 0.8), atol=1e-5)
 
