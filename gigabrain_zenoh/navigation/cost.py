@@ -353,7 +353,7 @@ def price(problem: Problem, rooms: Floats, states: Floats, lane: int, limit: flo
             slack = room - AT_EASE
         away = one[AWAY + lane]
         if room < least:
-            cost += _contact_cost(t / steps) + rest(model, scene, x, y, motion.yaw)
+            cost += contact_cost(t / steps) + rest(model, scene, x, y, motion.yaw)
             return cost + IMPACT * math.hypot(vx, vy)
         if away < least_disc:
             left = rest(model, scene, x, y, motion.yaw)
@@ -368,7 +368,7 @@ def price(problem: Problem, rooms: Floats, states: Floats, lane: int, limit: flo
 
 
 @lean_kernel
-def _contact_cost(share: float) -> float:
+def contact_cost(share: float) -> float:
     """Return the cost of a contact after that share of the plan."""
     return TOUCHED * (1.0 - 0.7 * share)
 
@@ -393,7 +393,7 @@ def _lower_bounds(
         if middle < may or struck:
             left = spent + rest(model, scene, one[X + lane], one[Y + lane], one[YAW + lane])
             if middle < may:
-                touching = min(touching, left + _contact_cost(t / steps))
+                touching = min(touching, left + contact_cost(t / steps))
             if struck:
                 touching = min(touching, left + disc_contact_cost(weights, t * dt, t / steps))
         if middle < must or struck:

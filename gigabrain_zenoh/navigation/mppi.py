@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import NONE, kernel, lean_kernel
 from gigabrain_zenoh.navigation.cost import evaluate_surroundings, fill_clearances, price
+from gigabrain_zenoh.navigation.cost_bound import bounds_of, may_cost_less
 from gigabrain_zenoh.navigation.footprint import Outline
 from gigabrain_zenoh.navigation.motion_model import (
     LANES,
@@ -21,7 +22,7 @@ from gigabrain_zenoh.navigation.motion_model import (
     make_feasible,
     simulate,
 )
-from gigabrain_zenoh.navigation.planning_problem import Problem, Scene, Weights
+from gigabrain_zenoh.navigation.planning_problem import Problem, Scene, Weights, motion_of
 
 NOISE_KEPT, NOISE_FRESH = 0.85, 0.53  # of the noise from step to step
 NOISE_SHARE, TURN_NOISE_SHARE = 0.175, 0.3  # of the noise, as a share of the largest speeds
@@ -84,21 +85,20 @@ def _twists(random: np.random.Generator, shape: tuple[int, ...], model: MotionMo
 
 
 @lean_kernel
-def fill_plans(plans: Floats, last: Floats, noise: NDArray[np.float32], simple: Floats) -> None:
-    """Fill `plans` (blocks, T, 3, LANES)."""
-    blocks, steps, axes, _ = plans.shape
-    for block in range(blocks):
-        for t in range(steps):
-            for axis in range(axes):
-                plan, disturbed = plans[block, t, axis], noise[block, t, axis]
-                for lane in range(LANES):
-                    plan[lane] = last[t, axis] + disturbed[lane]
-                for lane in range(0, LANES, SIMPLE_EVERY):
-                    one = simple[block * LANES + lane]
-                    plan[lane] = one[axis] if t < one[6] else one[axes + axis]
-    for t in range(steps):
-        for axis in range(axes):
-            plans[0, t, axis, 0], plans[0, t, axis, BRAKING_LANE] = last[t, axis], 0.0
+def fill_plans(
+    plans: Floats, last: Floats, noise: NDArray[np.float32], simple: Floats, first: bool
+) -> None:
+    """Fill the `plans` (T, 3, LANES) of a block; the `first` holds the last plan, and braking."""
+    for t in range(plans.shape[0]):
+        for axis in range(3):
+            plan, disturbed = plans[t, axis], noise[t, axis]
+            for lane in range(LANES):
+                plan[lane] = last[t, axis] + disturbed[lane]
+            for lane in range(0, LANES, SIMPLE_EVERY):
+                one = simple[lane]
+                plan[lane] = one[axis] if t < one[6] else one[3 + axis]
+            if first:
+                plan[0], plan[BRAKING_LANE] = last[t, axis], 0.0
 
 
 class SampledPlan(NamedTuple):
@@ -121,9 +121,10 @@ class Samples(NamedTuple):
 class SamplerBuffers(NamedTuple):
     """Arrays that are used again, plans in lanes."""
 
-    plans: Floats  # (blocks + 1, T, 3, LANES); the last block is for what comes of the others
+    plans: Floats  # (blocks + 1, T, 3, LANES): those kept, one after the other; the last is a draft
     states: Floats  # (T + 1, STATE), of one block
-    costs: Floats  # (blocks, LANES)
+    costs: Floats  # (blocks, LANES), of those kept
+    origins: NDArray[np.int64]  # (samples,), the lanes that they were drafted in
 
 
 class Sampler:
@@ -144,6 +145,7 @@ class Sampler:
             np.zeros((blocks + 1, steps, 3, LANES)),
             np.empty((steps + 1, STATE)),
             np.empty((blocks, LANES)),
+            np.empty(blocks * LANES, dtype=np.int64),
         )
         self.last = np.zeros((steps, 3))
 
@@ -194,33 +196,53 @@ def _search(
 ) -> tuple[Floats, Floats, float, float]:
     """Return the best commands (T, 3), their track (T + 1, 6), their cost, and that of standing.
 
-    The cost is inf for plans that are worthless beside an earlier one. The last block holds the
-    weighted mean of all others, and the best.
+    Plans whose last pose alone makes them worthless beside an earlier one are dropped. The others
+    are kept together, and priced when they fill a block. In the end the draft becomes the weighted
+    mean of all, and the best.
     """
-    (plans, states, costs), (last, noise, simple) = work, samples
-    model, outline, dt = problem.model, problem.outline, problem.dt
-    blocks, mean, best = len(costs), 0, 1
-    rooms = np.empty(min(len(states), len(start.past)))
-    found = np.full(LANES, math.inf)
-    fill_plans(plans[:blocks], last, noise, simple)
-    least = math.inf
-    for block in range(blocks + 1):
-        if block == blocks:
-            _gather(plans, costs, found, mean, best)
-        make_feasible(model, start, dt, plans[block])
-        simulate(model, outline.far, start, dt, plans[block], states)
-        evaluate_surroundings(problem, states)
-        if block == 0:
-            fill_clearances(problem.scene, outline, states, rooms)
-        of = found if block == blocks else costs[block]
-        for lane in range(LANES if block < blocks else 2):
-            free = block == blocks or (block == 0 and lane == BRAKING_LANE)
-            limit = math.inf if free else least + WORTHLESS_MARGIN
-            of[lane] = price(problem, rooms, states, lane, limit)
-            least = min(least, of[lane])
+    (plans, states, costs, origins), (last, noise, simple) = work, samples
+    draft, blocks, mean, best = plans[-1], len(costs), 0, 1
+    rooms, found = np.empty(min(len(states), len(start.past))), np.empty(LANES)
+    bounds, least, kept, priced = bounds_of(problem, start, len(last)), math.inf, 0, 0
+    for block in range(blocks):
+        fill_plans(draft, last, noise[block], simple[block * LANES :], block == 0)
+        make_feasible(problem.model, start, problem.dt, draft)
+        simulate(problem.model, problem.outline.far, start, problem.dt, draft, states)
+        limit = least + WORTHLESS_MARGIN
+        for lane in range(LANES):
+            if may_cost_less(problem, bounds, motion_of(states[-1], lane), limit):
+                _copy_lane(draft, lane, plans[kept // LANES], kept % LANES)
+                origins[kept], kept = lane, kept + 1
+        while kept - priced >= (LANES if block < blocks - 1 else 1):
+            now = costs[priced // LANES, : kept - priced]
+            _evaluate(problem, start, plans[priced // LANES], limit, states, rooms, now)
+            least, priced = min(least, now.min()), priced + LANES
+    _gather(plans, costs, origins[:kept], mean, best)
+    make_feasible(problem.model, start, problem.dt, draft)
+    _evaluate(problem, start, draft, math.inf, states, rooms, found[:2])
     taken = best if found[mean] > found[best] + MEAN_MARGIN else mean
-    commands, track = _lane_result(plans[blocks], states, taken)
+    commands, track = _lane_result(draft, states, taken)
     return commands, track, found[taken], costs[0, BRAKING_LANE]
+
+
+@kernel
+def _evaluate(
+    problem: Problem, start: InitialState, plans: Floats, limit: float,
+    states: Floats, rooms: Floats, costs: Floats,
+) -> None:  # fmt: skip
+    """Fill `states`, and `costs` (n,) of the first lanes of feasible `plans` (T, 3, LANES).
+
+    A cost is inf where it must reach `limit`, or is worthless beside one before. With a limit of
+    inf none is, and `rooms` are filled as well.
+    """
+    simulate(problem.model, problem.outline.far, start, problem.dt, plans, states)
+    evaluate_surroundings(problem, states)
+    if limit == math.inf:
+        fill_clearances(problem.scene, problem.outline, states, rooms)
+    for lane in range(len(costs)):
+        costs[lane] = price(problem, rooms, states, lane, limit)
+        if limit < math.inf:
+            limit = min(limit, costs[lane] + WORTHLESS_MARGIN)
 
 
 @kernel
@@ -238,35 +260,40 @@ def _lane_result(plans: Floats, states: Floats, lane: int) -> tuple[Floats, Floa
 
 
 @lean_kernel
-def _gather(plans: Floats, costs: Floats, shares: Floats, mean: int, best: int) -> None:
+def _copy_lane(plans: Floats, lane: int, to: Floats, to_lane: int) -> None:
+    for t in range(plans.shape[0]):
+        for axis in range(plans.shape[1]):
+            to[t, axis, to_lane] = plans[t, axis, lane]
+
+
+@lean_kernel
+def _gather(plans: Floats, costs: Floats, origins: NDArray[np.int64], mean: int, best: int) -> None:
     """Put the weighted mean of the `plans`, and the best of them, into lanes of the last block.
 
-    The `shares` (LANES,) are scribbled on.
+    They are summed up by the lanes that they came from, `origins` (n,).
     """
-    gathered, top, (steps, axes, _) = plans[-1], int(NONE), plans[-1].shape
-    for n in range(costs.size):
+    gathered, top, total = plans[-1], int(NONE), 0.0
+    for n in range(len(origins)):
         if costs[n // LANES, n % LANES] < costs[top // LANES, top % LANES]:
             top = n
-    least, first, total = costs[top // LANES, top % LANES], True, 0.0
-    for block in range(len(costs)):
-        counts = False
-        for lane in range(LANES):
-            worse = costs[block, lane] - least
-            shares[lane] = math.exp(-worse / TEMPERATURE) if worse < WORTHLESS_MARGIN else 0.0
-            total += shares[lane]
-            counts |= worse < WORTHLESS_MARGIN
-        if counts:
-            for n in range(steps * axes):
-                one, sums = plans[block, n // axes, n % axes], gathered[n // axes, n % axes]
-                for lane in range(LANES):
-                    sums[lane] = (0.0 if first else sums[lane]) + shares[lane] * one[lane]
-            first = False
-    for n in range(steps * axes):
-        sums, amount = gathered[n // axes, n % axes], 0.0
-        for lane in range(LANES):
-            amount += sums[lane]
-        sums[mean] = amount / total
-        sums[best] = plans[top // LANES, n // axes, n % axes, top % LANES]
+    least = costs[top // LANES, top % LANES]
+    gathered[:] = 0.0
+    for n in range(len(origins)):
+        worse = costs[n // LANES, n % LANES] - least
+        if worse < WORTHLESS_MARGIN:
+            share = math.exp(-worse / TEMPERATURE)
+            total += share
+            for t in range(plans.shape[1]):
+                for axis in range(plans.shape[2]):
+                    one = plans[n // LANES, t, axis, n % LANES]
+                    gathered[t, axis, origins[n]] += share * one
+    for t in range(plans.shape[1]):
+        for axis in range(plans.shape[2]):
+            sums, amount = gathered[t, axis], 0.0
+            for lane in range(LANES):
+                amount += sums[lane]
+            sums[mean] = amount / total
+            sums[best] = plans[top // LANES, t, axis, top % LANES]
 
 
 def step_duration(model: MotionModel) -> float:

@@ -9,6 +9,7 @@ import pytest
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import kernel
 from gigabrain_zenoh.navigation.cost import evaluate_surroundings, fill_clearances, price
+from gigabrain_zenoh.navigation.cost_bound import bounds_of, may_cost_less
 from gigabrain_zenoh.navigation.dynamic_obstacles import WEIGHTS
 from gigabrain_zenoh.navigation.footprint import DistanceGrid, Outline, outline_of
 from gigabrain_zenoh.navigation.motion_model import (
@@ -21,10 +22,19 @@ from gigabrain_zenoh.navigation.motion_model import (
     model_of,
     simulate,
 )
-from gigabrain_zenoh.navigation.planning_problem import Problem, Scene, Weights
+from gigabrain_zenoh.navigation.planning_problem import (
+    Problem,
+    Scene,
+    Weights,
+    motion_of,
+)
 from gigabrain_zenoh.qa.bench.barn_course import JACKAL
 
 STEPS, DT, BLOCKS = 30, 0.05, 25
+START = InitialState(
+    0.0, 0.0, 0.2, 0.8, 0.0, 0.3, (0.8, 0.0, 0.3), np.tile((0.8, 0.0, 0.3), (3, 1)), 0.4,
+    first_order_lag(0.15, DT), 1.0,
+)  # fmt: skip
 NOBODY = np.empty((0, 6))
 SOMEBODY = np.array([(1.2, 0.6, 0.0, -0.8, 0.3, 0.05), (1.0, -1.5, 0.5, 1.0, 0.3, 0.05)])
 
@@ -65,20 +75,22 @@ def scene(discs: Floats) -> Scene:
     )
 
 
+def random_plans() -> Floats:
+    """Return plans (BLOCKS, STEPS, 3, LANES), many of which run into posts."""
+    random = np.random.default_rng(1)
+    plans: Floats = np.cumsum(random.normal(0.0, 0.5, (BLOCKS, STEPS, 3, LANES)), axis=1)
+    plans[:, :, 0] += random.uniform(-0.5, 2.0, (BLOCKS, 1, LANES))
+    return plans
+
+
 @pytest.mark.parametrize(("weights", "discs"), [(Weights(), NOBODY), (WEIGHTS, SOMEBODY)])
 def test_a_plan_is_given_up_only_where_it_costs_as_much_as_the_limit(
     weights: Weights, discs: Floats
 ) -> None:
-    random = np.random.default_rng(1)
-    plans = np.cumsum(random.normal(0.0, 0.5, (BLOCKS, STEPS, 3, LANES)), axis=1)
-    plans[:, :, 0] += random.uniform(-0.5, 2.0, (BLOCKS, 1, LANES))
-    start = InitialState(
-        0.0, 0.0, 0.2, 0.8, 0.0, 0.3, (0.8, 0.0, 0.3), np.tile((0.8, 0.0, 0.3), (3, 1)), 0.4,
-        first_order_lag(0.15, DT), 1.0,
-    )  # fmt: skip
+    plans = random_plans()
     limits = np.array([math.inf, 40.0, 60.0, 100.0, 150.0])
     costs = np.empty((len(limits), BLOCKS, LANES))
-    given = model_of(JACKAL), outline_of(JACKAL.footprint), weights, scene(discs), start, DT
+    given = model_of(JACKAL), outline_of(JACKAL.footprint), weights, scene(discs), START, DT
     prices(*given, plans, np.empty((STEPS + 1, STATE)), limits, costs)
     whole = costs[0]
     assert np.isfinite(whole).all()
@@ -87,3 +99,34 @@ def test_a_plan_is_given_up_only_where_it_costs_as_much_as_the_limit(
         assert 0 < matters.sum() < whole.size
         assert found[matters].tolist() == whole[matters].tolist()
         assert np.isinf(found[~matters]).any()
+
+
+@kernel
+def not_worth_pricing(
+    problem: Problem, start: InitialState, plans: Floats, states: Floats, limits: Floats,
+    dropped: Floats,
+) -> None:  # fmt: skip
+    """Fill `dropped` (blocks, LANES): 1 where a plan cannot cost less than its limit."""
+    bounds = bounds_of(problem, start, plans.shape[1])
+    for block in range(len(plans)):
+        simulate(problem.model, problem.outline.far, start, problem.dt, plans[block], states)
+        for lane in range(LANES):
+            limit, end = limits[block, lane], motion_of(states[-1], lane)
+            dropped[block, lane] = not may_cost_less(problem, bounds, end, limit)
+
+
+@pytest.mark.parametrize("goal", [(3.0, 0.0), (0.4, 0.1)])
+@pytest.mark.parametrize(("weights", "discs"), [(Weights(), NOBODY), (WEIGHTS, SOMEBODY)])
+def test_a_plan_is_dropped_by_its_end_only_where_it_costs_as_much_as_the_limit(
+    weights: Weights, discs: Floats, goal: tuple[float, float]
+) -> None:
+    plans, states = random_plans(), np.empty((STEPS + 1, STATE))
+    around = scene(discs)._replace(goal_x=goal[0], goal_y=goal[1])
+    given = model_of(JACKAL), outline_of(JACKAL.footprint), weights, around
+    costs, dropped = np.empty((1, BLOCKS, LANES)), np.empty((BLOCKS, LANES))
+    prices(*given, START, DT, plans, states, np.array([math.inf]), costs)
+    arguments = Problem(*given, DT), START, plans, states
+    not_worth_pricing(*arguments, np.nextafter(costs[0], math.inf), dropped)
+    assert not dropped.any()
+    not_worth_pricing(*arguments, np.full_like(costs[0], costs.min() + 4.0), dropped)
+    assert 0.0 < dropped.mean() < 1.0
