@@ -91,11 +91,9 @@ def seed(
     """
     side = len(known)
     points = np.array([goal]) if path is None else path
-    cells = np.floor((points - corner) / cell).astype(np.int64)
-    inside = np.asarray(((cells >= 1) & (cells < side - 1)).all(axis=1))
-    if inside.any():
-        last = _way_out(points, inside, np.add(corner, side * cell / 2))
-        column, row = cells[last]
+    last = _way_out(points, cell, corner, side)
+    if last >= 0:
+        column, row = np.floor((points[last] - corner) / cell).astype(np.int64)
         known[row, column] = 0
         return True
     x, y = (np.add.outer(corner, (np.arange(side) + 0.5) * cell).T - points[-1]).T
@@ -105,12 +103,26 @@ def seed(
     return False
 
 
-def _way_out(points: Floats, inside: NDArray[np.bool_], robot: Floats) -> int:
-    """Return the index of the path's last point before it leaves the window."""
-    near = np.hypot(*(points - robot).T)
-    nearest = int(np.argmin(np.where(inside, near, np.inf)))
-    outside = np.flatnonzero(~inside[nearest:])
-    return nearest + int(outside[0]) - 1 if len(outside) else len(points) - 1
+@kernel
+def _way_out(points: Floats, cell: float, corner: tuple[float, float], side: int) -> int:
+    """Return the index of the last of `points` (n, 2) before they leave the window; -1 if all have.
+
+    It counts from the one that is nearest to the robot, in the middle.
+    """
+    middle_x, middle_y = corner[0] + side * cell / 2, corner[1] + side * cell / 2
+    last, nearest, leads_on = -1, math.inf, False
+    for n in range(len(points)):
+        x, y = points[n, 0], points[n, 1]
+        column, row = math.floor((x - corner[0]) / cell), math.floor((y - corner[1]) / cell)
+        inside = 1 <= column < side - 1 and 1 <= row < side - 1
+        away = math.hypot(x - middle_x, y - middle_y)
+        if inside and away < nearest:
+            last, nearest, leads_on = n, away, True
+        elif inside and leads_on:
+            last = n
+        else:
+            leads_on = False
+    return last
 
 
 @kernel

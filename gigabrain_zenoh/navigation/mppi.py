@@ -181,12 +181,16 @@ class Sampler:
         return SampledPlan(commands, track, cost, standing)
 
 
+@kernel
 def _resampled(plan: Floats, steps: NDArray[np.floating]) -> Floats:
     """Interpolate `plan` (T, 3) at `steps` (T,); beyond its ends it is constant."""
-    inside = np.minimum(np.maximum(steps, 0.0), len(plan) - 1.0)
-    before = np.minimum(inside.astype(np.int64), len(plan) - 2)
-    first, second = plan[before], plan[before + 1]
-    found: Floats = first + (inside - before)[:, None] * (second - first)
+    found = np.empty_like(plan)
+    for n in range(len(plan)):
+        inside = min(max(steps[n], 0.0), len(plan) - 1.0)
+        before = min(int(inside), len(plan) - 2)
+        for axis in range(plan.shape[1]):
+            first, second = plan[before, axis], plan[before + 1, axis]
+            found[n, axis] = first + (inside - before) * (second - first)
     return found
 
 
