@@ -38,9 +38,9 @@ class Walkers:
 
     def update(self, tick: int, obstacles: tuple[Obstacle, ...], map_from_odom: Pose) -> None:
         """Take in the obstacles of a scan, in the frame of the odometry."""
-        if not obstacles and not len(self.ways):
-            return
         moving = discs_of(obstacles)
+        if not len(moving) and not len(self.ways):
+            return
         places = transform(from_pose(map_from_odom), moving[:, :2])
         turns = np.arctan2(moving[:, 3], moving[:, 2]) + map_from_odom.yaw
         away = np.hypot(*(self.ways[:, None, :2] - places).transpose(2, 0, 1))

@@ -208,8 +208,9 @@ class Navigator:
         assert context.map_from_odom
         assert context.body
         here = compose(context.map_from_odom, context.pose)
-        cap = self._speed_cap(context, here, points)
-        request = self._request(context, here, route, goal, points, cap)
+        left = _rest_of(points, here)
+        cap = self._speed_cap(context, here, left)
+        request = self._request(context, here, route, goal, points, left, cap)
         if command.target and command.target.away is not None:
             request = close_up(request, context.body)
         plan = self._local_planner(context).plan(request)
@@ -223,7 +224,7 @@ class Navigator:
                 reason=plan.reason,
             )
         )
-        outcome = self._outcome(context, command, route, plan)
+        outcome = self._outcome(context, command, route, plan, left)
         headline = ": ".join(filter(None, (route.activity, route.reason))) or outcome.activity
         intent = self._intent(
             twist=plan.twist,
@@ -242,16 +243,20 @@ class Navigator:
         route: Route,
         goal: Goal,
         points: Floats,
+        left: Floats,
         cap: SpeedCap | None,
     ) -> local_planner.PlanRequest:
-        """Return what the local planner needs, in the odometry's frame; `here` is in the map's."""
+        """Return what the local planner needs, in the odometry's frame.
+
+        `here`, and the `points` of a path and those `left` of it (k, 2), are in the map's.
+        """
         assert context.map_from_odom
         assert context.world
         to_odom = inverse(context.map_from_odom)
         move = from_pose(to_odom)
         around = here.x, here.y, DEFAULTS.window
         keepouts = self._zone_map.keepouts_near(*around)
-        lanes = self._zone_map.lanes_beside(*around, _rest_of(points, here)[1:])
+        lanes = self._zone_map.lanes_beside(*around, left[1:])
         there = compose(to_odom, Pose(x=goal.x, y=goal.y, yaw=goal.yaw or 0.0))
         headings = route.headings
         return local_planner.PlanRequest(
@@ -288,14 +293,12 @@ class Navigator:
         command: DriveCommand,
         route: Route,
         plan: local_planner.LocalPlan,
+        left: Floats,
     ) -> StepOutcome:
         assert context.map_from_odom
-        assert context.body
         assert route.goal
-        assert route.points is not None
         here = compose(context.map_from_odom, context.pose)
         position_error, heading_error = _errors(command, here)
-        left = _rest_of(route.points, here)
         distance_m = float(np.hypot(*np.diff(left, axis=0).T).sum())
         self._longest_m = max(self._longest_m, distance_m, 1e-6)
         arrived = plan.arrived and command.kind != "explore" and not route.activity
@@ -322,13 +325,13 @@ class Navigator:
         assert context.body
         return min(self._config.max_linear_speed or math.inf, context.body.max_linear_speed)
 
-    def _speed_cap(self, context: NavigationContext, here: Pose, points: Floats) -> SpeedCap | None:
+    def _speed_cap(self, context: NavigationContext, here: Pose, left: Floats) -> SpeedCap | None:
         assert context.body
         v, body = context.velocity, context.body
         return self._zone_map.speed_cap(
             here,
             body.footprint,
-            _rest_of(points, here),
+            left,
             math.hypot(v.linear_x, v.linear_y),
             body.max_linear_deceleration,
         )
@@ -433,7 +436,7 @@ def _thinned(points: Floats) -> tuple[tuple[float, float], ...]:
     """Return few enough points to be drawn, with the first and the last."""
     count = min(len(points), MAX_POINTS)
     chosen = np.linspace(0, len(points) - 1, count).round().astype(int)
-    return tuple((round(x, 3), round(y, 3)) for x, y in points[chosen].tolist())
+    return tuple((x, y) for x, y in points[chosen].round(3).tolist())
 
 
 def warm_up() -> None:
