@@ -30,7 +30,7 @@ SLIP_RATE = 0.15  # [rad/s] between wheels and gyro, smoothed
 SLIP_SHARE = 0.1  # of a new difference: over about 0.2 s
 GYRO = 0.3  # of the yaw's deviation by wheels alone
 SLIPPING = 5.0  # so much more uncertain is what the wheels say then
-LAG_S = 0.05  # by which odometry may be older, or newer, than a scan of its tick
+LAG_S = 0.02  # standard deviation of the time between odometry and a scan of its tick
 
 JUMP_FACTOR, JUMP_M, JUMP_RAD = 2.0, 0.2, 0.5  # more than the body can do is no motion
 
