@@ -2,39 +2,45 @@
 
 A step costs its length in cells times the mean cost of both cells. Corners are not cut. From cells
 of cost LETHAL or more a path may lead to lower cost only, so that a body too close to something
-can leave. One-way lanes forbid some of the eight ways in their cells. Open cells lie in buckets by
-total cost, in half the time of a heap. Smoothing keeps straight lines that cost no more than the
-cells.
+can leave. One-way lanes forbid some of the eight ways in their cells. A* is guided by the bounds of
+`block_bounds`. Open cells lie in buckets by total cost, in half the time of a heap. Smoothing keeps
+straight lines that cost no more than the cells.
 """
 
 import math
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
-from gigabrain_zenoh.kernels.jit import NONE, kernel
+from gigabrain_zenoh.kernels.jit import NONE, kernel, lean_kernel
+from gigabrain_zenoh.navigation.block_bounds import (
+    COLUMN_STEPS,
+    DIAGONAL,
+    NOWHERE,
+    ROW_STEPS,
+    Cell,
+    CostBound,
+    Ints,
+    bound_at,
+    block_bounds,
+    still_holds,
+    towards,
+)
 from gigabrain_zenoh.navigation.costmap import LETHAL, NO_LANES, Costs, WayBits
 
-DIAGONAL = math.sqrt(2.0)
-ROW_STEPS = (0, -1, -1, -1, 0, 1, 1, 1)  # by way: round the compass, the odd ones are diagonal
-COLUMN_STEPS = (1, 1, 0, -1, -1, -1, 0, 1)
 HALF_LENGTHS = (0.5, DIAGONAL / 2) * 4  # half its length
 MAX_BEND = 2  # ways to either side of that by which a cell was reached: behind, nothing is cheaper
-BUCKETS_PER_COST = 12.0  # buckets for a cost of 1
-BUCKETS = 4096  # in a ring: they hold more than any one step can add
+BUCKETS_PER_COST = 24.0  # buckets for a cost of 1
+BUCKETS = 8192  # in a ring: they hold more than any one step can add
 SUM_TOLERANCE = 1e-10  # sums of the same numbers in another order differ by less
 SPARE_ENTRIES = 1024
 ROOT_MARK = 8  # the way came from nowhere: it began here
 SETTLED_MARK = 16  # and more: the cell was settled
 RUN_STRIDE = 32  # and more: of this search
 LAST_RUN = np.iinfo(np.int32).max // RUN_STRIDE - 1  # the marks hold no greater one
-NOWHERE = -1
 OUT_OF_ENTRIES = -1  # no room for more entries
 NO_TARGET = (NOWHERE, NOWHERE)
-Ints = NDArray[np.int32]
-Cell = tuple[int, int]  # row, column
 Direction = Literal["from", "to"]
 
 CORNER = 1e-6  # cells of a line within a cell: so little only touches its corner
@@ -59,6 +65,7 @@ class GridSearch:
         self._turn = 0
         none, first = np.empty(0, np.int32), np.empty(BUCKETS, np.int32)
         self._memory = SearchMemory(np.empty(0), none, first, np.empty((3, 0), np.int32))
+        self._bound = block_bounds(self._shape)
 
     def path(
         self, cost: Costs, start: Cell, goal: Cell, against: WayBits = NO_LANES
@@ -85,6 +92,15 @@ class GridSearch:
         )
         return field.reshape(cost.shape)
 
+    def bound(self, cost: Costs, start: Cell, goal: Cell) -> float:
+        """Return what the cheapest path costs at least, much faster than the path is found."""
+        if cost.shape != self._shape:
+            self._make_room(cost.shape)
+        cost = np.ascontiguousarray(cost)
+        if self._bound.goal != goal or not still_holds(self._bound, cost, start):
+            self._bound = towards(goal, start, cost, self._bound)
+        return bound_at(self._bound, cost, *start)
+
     def reach(self, cost: Costs, start: Cell, against: WayBits = NO_LANES) -> None:
         """Go wherever a way leads from `start`, for `nearest` to be asked."""
         self._run(cost, start, NO_TARGET, against, reverse=False)
@@ -107,12 +123,14 @@ class GridSearch:
         if cost.shape != self._shape:
             self._make_room(cost.shape)
         cost = np.ascontiguousarray(cost)
+        if target != NO_TARGET:
+            self._bound = towards(target, start, cost, self._bound)
         while True:
             if self._turn >= LAST_RUN:
                 self._memory.mark[:] = self._turn = 0
             self._turn += 1
             turn = RUN_STRIDE * self._turn
-            found = _search(cost, against, start, target, reverse, turn, self._memory)
+            found = _search(cost, against, start, target, reverse, turn, self._memory, self._bound)
             if found != OUT_OF_ENTRIES:
                 return
             more = np.empty((3, 2 * self._memory.entries.shape[1]), np.int32)
@@ -122,6 +140,7 @@ class GridSearch:
         """Memory for a grid. What no search comes to is never touched, and costs nothing."""
         size = shape[0] * shape[1]
         self._shape, self._turn = (shape[0], shape[1]), 0
+        self._bound = block_bounds(shape)
         entries = np.empty((3, size + SPARE_ENTRIES), np.int32)
         self._memory = SearchMemory(
             np.empty(size), np.zeros(size, np.int32), self._memory.first, entries
@@ -131,7 +150,7 @@ class GridSearch:
 @kernel
 def _search(
     cost: Costs, against: WayBits, start: Cell, target: Cell, reverse: bool, turn: int,
-    held: SearchMemory,
+    held: SearchMemory, bound: CostBound,
 ) -> int:  # fmt: skip
     """Settle cells until no way to `target` is cheaper; return how many, or OUT_OF_ENTRIES."""
     (height, width), flat, (g, mark, first, entries) = cost.shape, cost.ravel(), held
@@ -139,7 +158,7 @@ def _search(
     first[:] = NOWHERE
     at, best = start[0] * width + start[1], np.inf  # what the way to `target` costs, so far
     g[at], mark[at] = 0.0, turn + ROOT_MARK
-    now = int(_bound(start[0], start[1], target) * BUCKETS_PER_COST)
+    now = int(_bound(bound, cost, start[0], start[1], target) * BUCKETS_PER_COST)
     _put(first, entries, int(NONE), now, start[0], start[1])
     free, used, count, settled = NOWHERE, 1, 1, 0
     while count:
@@ -152,7 +171,10 @@ def _search(
         base, here, way = g[cell], flat[cell], mark[cell] - turn
         if way >= SETTLED_MARK:
             continue  # a duplicate: it was reached at less meanwhile
-        if base + _bound(row, column, target) >= best - SUM_TOLERANCE and (row, column) != target:
+        if (
+            base + _bound(bound, cost, row, column, target) >= best - SUM_TOLERANCE
+            and (row, column) != target
+        ):
             continue
         mark[cell], settled = mark[cell] + SETTLED_MARK, settled + 1
         begin, end = (0, 8) if way == ROOT_MARK else (way - MAX_BEND, way + MAX_BEND + 1)
@@ -172,15 +194,18 @@ def _search(
             ):
                 continue
             g[other], mark[other] = found, turn + to
+            total = found + _bound(bound, cost, down, right, target)
             if (down, right) == target:
                 best = found
+            elif total >= best - SUM_TOLERANCE:
+                continue
             if free != NOWHERE:
                 entry, free = free, entries[2, free]
             elif used < entries.shape[1]:
                 entry, used = used, used + 1
             else:
                 return OUT_OF_ENTRIES
-            key = int((found + _bound(down, right, target)) * BUCKETS_PER_COST)
+            key = min(int(total * BUCKETS_PER_COST), now + BUCKETS - 1)
             _put(first, entries, entry, max(now, key), down, right)
             count += 1
     return settled
@@ -210,13 +235,10 @@ def _may_enter(source: float, into: float) -> bool:
     return into < LETHAL or into <= source
 
 
-@kernel
-def _bound(row: int, column: int, target: Cell) -> float:
-    """Return a lower bound of the cost to `target`: no cell costs less than 1."""
-    if target[0] == NOWHERE:
-        return 0.0
-    down, right = abs(row - target[0]), abs(column - target[1])
-    return down + (DIAGONAL - 1) * right if down > right else right + (DIAGONAL - 1) * down
+@lean_kernel
+def _bound(bound: CostBound, cost: Costs, row: int, column: int, target: Cell) -> float:
+    """Return a lower bound of the cost to `target`."""
+    return 0.0 if target[0] == NOWHERE else bound_at(bound, cost, row, column)
 
 
 @kernel

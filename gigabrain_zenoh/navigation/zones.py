@@ -19,6 +19,7 @@ from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.zones import Zone
 from gigabrain_zenoh.geometry import polygon
 from gigabrain_zenoh.geometry.sweep import Corners
+from gigabrain_zenoh.navigation.block_bounds import COLUMN_STEPS, ROW_STEPS
 from gigabrain_zenoh.navigation.costmap import (
     NO_LANES,
     Inflation,
@@ -26,7 +27,6 @@ from gigabrain_zenoh.navigation.costmap import (
     ZoneOverlay,
     clearance_costs,
 )
-from gigabrain_zenoh.navigation.grid_search import COLUMN_STEPS, ROW_STEPS
 
 EDGE_STEP = 0.5  # cells between the points of an edge, whose cells are filled too
 AGAINST_COSINE = -0.2  # of the angle between a way and a lane, from where on it goes against it

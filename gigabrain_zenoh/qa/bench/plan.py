@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_zenoh.host.bounded import percentile
+from gigabrain_zenoh.navigation.block_bounds import Ints
 from gigabrain_zenoh.navigation.costmap import LETHAL, Costmap, Costs, Inflation, costmap
 from gigabrain_zenoh.navigation.global_planner import GlobalPlanner, Path, Point, warm_up
-from gigabrain_zenoh.navigation.grid_search import GridSearch, Ints
+from gigabrain_zenoh.navigation.grid_search import GridSearch
 from gigabrain_zenoh.qa.bench.slam_logs import draw_side_by_side
 
 if TYPE_CHECKING:

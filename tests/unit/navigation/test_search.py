@@ -110,6 +110,18 @@ def test_nobody_leaves_through_what_is_closer_still() -> None:
     assert GridSearch().path(cost, (3, 4), (8, 4)) is None
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_no_path_costs_less_than_the_bound_however_costs_change(seed: int) -> None:
+    cost, rng, search = random_costs(seed, (60, 50)), np.random.default_rng(seed), GridSearch()
+    for _ in range(30):
+        row, column = (int(value) for value in rng.integers(0, 45, 2))
+        cost[row : row + 6, column : column + 6] = rng.choice([1.0, 5.0, 150.0])
+        start = (int(rng.integers(0, 60)), 3)
+        cells = GridSearch().path(cost, start, (30, 45))
+        if cells is not None:
+            assert search.bound(cost, start, (30, 45)) <= spent(cost, cells)
+
+
 def test_the_same_memory_serves_many_searches_and_sizes() -> None:
     search = GridSearch()
     for size in (9, 30, 9, 12):

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.zones import Zone
 from gigabrain_zenoh.geometry import polygon
+from gigabrain_zenoh.navigation.block_bounds import COLUMN_STEPS, ROW_STEPS
 from gigabrain_zenoh.navigation.costmap import LETHAL, Inflation, costmap, with_zones
 from gigabrain_zenoh.navigation.global_planner import GlobalPlanner, Path, Unreachable, is_valid
-from gigabrain_zenoh.navigation.grid_search import COLUMN_STEPS, ROW_STEPS
 from gigabrain_zenoh.navigation.local_costmap import LocalCostmap, Pose2D
 from gigabrain_zenoh.navigation.zones import ZoneMap, fill
 from tests.unit.navigation.grids import empty, grid_of

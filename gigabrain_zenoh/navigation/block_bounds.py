@@ -1,0 +1,257 @@
+"""Lower bounds of the cost to a goal, from a search over blocks of cells. They guide A*.
+
+Corners of blocks of 4 x 4 cells are the vertices of a coarse grid, and a block costs what the
+cheapest of its 5 x 5 cells costs, those of its edges included. A step along an edge costs its
+length times the cheaper of the two blocks beside it; a diagonal step, its length times its block.
+The cheapest ways over that grid give the bounds at the vertices.
+
+Between the vertices: on the edges of a block, the middle gets the mean of its ends. The middle of
+the block gets the least value that differs from its eight neighbours by no more than a step in this
+block costs. That such a value exists follows from the differences of the four corners. So four
+blocks of half the size are bounded in the same way, down to cells. No step between cells costs less
+than the bound falls by it (A* calls this consistent), so no way costs less than the bound.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.kernels.images import Bytes
+from gigabrain_zenoh.kernels.jit import kernel, lean_kernel
+from gigabrain_zenoh.navigation.costmap import LETHAL, Costs
+
+DIAGONAL = math.sqrt(2.0)
+ROW_STEPS = (0, -1, -1, -1, 0, 1, 1, 1)  # by way: round the compass, the odd ones are diagonal
+COLUMN_STEPS = (1, 1, 0, -1, -1, -1, 0, 1)
+BLOCK = 4  # cells a side
+SHIFT, WITHIN = 2, BLOCK - 1  # cell >> SHIFT is its block, cell & WITHIN its place in it
+BUCKETS = 4096  # in a ring: they hold more than any one step can add
+BUCKETS_PER_COST = 6.0
+ENTRIES_PER_VERTEX = 4
+BEYOND_RATIO, BEYOND = 1.06, 4.0  # how far beyond the start is searched: bounds are a bit low
+ROUNDED_DOWN = 1 - 2.0**-22  # of bounds in single precision
+UNSEEN, PRICED, BOUNDED = 0, 1, 2  # what is known of a block: nothing, its cost, its bounds
+NOWHERE = -1
+Ints = np.ndarray[tuple[int, ...], np.dtype[np.int32]]
+Cell = tuple[int, int]  # row, column
+
+
+class CostBound(NamedTuple):
+    """Bounds of the cost to a goal, and the buffers to find them."""
+
+    vertex: Floats  # (rows, columns) of vertices, the bound there; inf where none is known
+    settled: Bytes  # likewise, 1 where it is final
+    price: Costs  # by block
+    known: Bytes  # by block, see UNSEEN
+    bounds: Costs  # (block, cell in it)
+    corners: Floats  # (5, 5), of the block at work
+    first: Ints  # by bucket, the entry on top
+    entries: Ints  # row, column, and the entry below
+    goal: Cell = (NOWHERE, NOWHERE)
+    limit: float = 0.0  # vertices that are not settled have at least this bound, less the distance
+    start: Cell = (0, 0)  # from here
+
+
+def block_bounds(shape: tuple[int, ...]) -> CostBound:
+    """Return memory for a grid. What no search comes to is never touched, and costs nothing."""
+    rows, columns = ((max(side, 1) - 1) // BLOCK + 1 for side in shape)
+    vertices = rows + 1, columns + 1
+    entries = ENTRIES_PER_VERTEX * vertices[0] * vertices[1]
+    return CostBound(
+        vertex=np.empty(vertices),
+        settled=np.empty(vertices, np.uint8),
+        price=np.empty((rows, columns), np.float32),
+        known=np.empty((rows, columns), np.uint8),
+        bounds=np.empty((rows * columns, BLOCK * BLOCK), np.float32),
+        corners=np.empty((BLOCK + 1, BLOCK + 1)),
+        first=np.empty(BUCKETS, np.int32),
+        entries=np.empty((3, entries), np.int32),
+    )
+
+
+def towards(goal: Cell, start: Cell, cost: Costs, memory: CostBound) -> CostBound:
+    """Return bounds of the cost to `goal`, close ones where ways from `start` may lead."""
+    limit = _spread(cost, start, goal, memory)
+    return memory._replace(goal=goal, limit=limit, start=start)
+
+
+@kernel
+def still_holds(bound: CostBound, cost: Costs, start: Cell) -> bool:
+    """Return whether bounds hold at other costs, as no block is cheaper, and are close at `start`.
+
+    Then they are still no higher than the cost of any way, whatever has become dearer.
+    """
+    known, price = bound.known, bound.price
+    if not _around(bound.settled, start):
+        return False
+    for row in range(known.shape[0]):
+        for column in range(known.shape[1]):
+            if known[row, column] != UNSEEN and _least(cost, row, column) < price[row, column]:
+                return False
+    return True
+
+
+@lean_kernel
+def bound_at(bound: CostBound, cost: Costs, row: int, column: int) -> float:
+    """Return the bound of the cost from a cell."""
+    down, right = row >> SHIFT, column >> SHIFT
+    block = down * bound.known.shape[1] + right
+    if bound.known[down, right] != BOUNDED:
+        _fill(bound, cost, down, right, block)
+    return float(bound.bounds[block, (row & WITHIN) * BLOCK + (column & WITHIN)])
+
+
+@lean_kernel
+def octile(down: float, right: float) -> float:
+    """Return the length of the shortest way over cells."""
+    down, right = abs(down), abs(right)
+    return down + (DIAGONAL - 1) * right if down > right else right + (DIAGONAL - 1) * down
+
+
+@lean_kernel
+def _price(cost: Costs, bound: CostBound, row: int, column: int) -> float:
+    """Return the cost of a block; inf outside the grid."""
+    price, known = bound.price, bound.known
+    if not (0 <= row < price.shape[0] and 0 <= column < price.shape[1]):
+        return np.inf
+    if known[row, column] == UNSEEN:
+        price[row, column], known[row, column] = _least(cost, row, column), PRICED
+    return float(price[row, column])
+
+
+@lean_kernel
+def _least(cost: Costs, row: int, column: int) -> np.float32:
+    """Return the cost of the cheapest cell of a block and its edges, LETHAL at most."""
+    least, top, left = np.float32(LETHAL), row * BLOCK, column * BLOCK
+    for y in range(top, min(top + BLOCK + 1, cost.shape[0])):
+        for x in range(left, min(left + BLOCK + 1, cost.shape[1])):
+            least = min(least, cost[y, x])
+    return least
+
+
+@kernel
+def _spread(cost: Costs, start: Cell, goal: Cell, bound: CostBound) -> float:
+    """Settle vertices from `goal` to a bit beyond `start`; return the `limit` of the bound."""
+    vertex, settled, first, entries = bound.vertex, bound.settled, bound.first, bound.entries
+    vertex[:], settled[:], bound.known[:], first[:] = np.inf, 0, UNSEEN, NOWHERE
+    y, x = start[0] / BLOCK, start[1] / BLOCK
+    free, used, count, limit = NOWHERE, 4, 4, np.inf
+    now = int(max(octile(start[0] - goal[0], start[1] - goal[1]) - 4 * BLOCK, 0) * BUCKETS_PER_COST)
+    for entry in range(4):
+        row, column = (goal[0] >> SHIFT) + entry // 2, (goal[1] >> SHIFT) + entry % 2
+        vertex[row, column] = 0.0
+        key = int(BLOCK * octile(row - y, column - x) * BUCKETS_PER_COST)
+        _put(first, entries, entry, max(now, key), row, column)
+    while count and now < limit:
+        top = first[now % BUCKETS]
+        if top == NOWHERE:
+            now += 1
+            continue
+        row, column, first[now % BUCKETS] = entries[0, top], entries[1, top], entries[2, top]
+        entries[2, top], free, count = free, top, count - 1
+        if settled[row, column]:
+            continue
+        settled[row, column], base = 1, vertex[row, column]
+        if limit == np.inf and _around(settled, start):
+            limit = now * BEYOND_RATIO + BEYOND * BUCKETS_PER_COST
+        steps = _steps(cost, bound, row, column)
+        for way in range(8):
+            down, right = row + ROW_STEPS[way], column + COLUMN_STEPS[way]
+            found = base + steps[way]
+            if found == np.inf or found >= vertex[down, right]:
+                continue
+            vertex[down, right], settled[down, right] = found, 0
+            if free != NOWHERE:
+                entry, free = free, entries[2, free]
+            elif used < entries.shape[1]:
+                entry, used = used, used + 1
+            else:
+                return now / BUCKETS_PER_COST
+            key = int((found + BLOCK * octile(down - y, right - x)) * BUCKETS_PER_COST)
+            _put(first, entries, entry, max(now, key), down, right)
+            count += 1
+    return now / BUCKETS_PER_COST if count else np.inf
+
+
+@lean_kernel
+def _put(first: Ints, entries: Ints, entry: int, bucket: int, row: int, column: int) -> None:
+    """Put `entry`, for a vertex, on top of a bucket."""
+    entries[0, entry], entries[1, entry] = row, column
+    entries[2, entry], first[bucket % BUCKETS] = first[bucket % BUCKETS], entry
+
+
+@lean_kernel
+def _around(settled: Bytes, cell: Cell) -> bool:
+    """Return whether all corners of the block of a cell are settled."""
+    row, column = cell[0] >> SHIFT, cell[1] >> SHIFT
+    return bool(
+        settled[row, column]
+        & settled[row, column + 1]
+        & settled[row + 1, column]
+        & settled[row + 1, column + 1]
+    )
+
+
+@lean_kernel
+def _steps(
+    cost: Costs, bound: CostBound, row: int, column: int
+) -> tuple[float, float, float, float, float, float, float, float]:
+    """Return what steps from a vertex cost, by way; inf out of the grid."""
+    one, across = float(BLOCK), BLOCK * DIAGONAL
+    before, behind = _price(cost, bound, row - 1, column - 1), _price(cost, bound, row - 1, column)
+    left, right = _price(cost, bound, row, column - 1), _price(cost, bound, row, column)
+    return (
+        one * min(behind, right),
+        across * behind,
+        one * min(before, behind),
+        across * before,
+        one * min(before, left),
+        across * left,
+        one * min(left, right),
+        across * right,
+    )
+
+
+@lean_kernel
+def _fill(bound: CostBound, cost: Costs, row: int, column: int, block: int) -> None:
+    """Compute the bounds of the cells of a block from those of its corners."""
+    at, price = bound.corners, _price(cost, bound, row, column)
+    for i in range(2):
+        for j in range(2):
+            at[i * BLOCK, j * BLOCK] = _at_vertex(bound, row + i, column + j)
+    side = BLOCK
+    while side > 1:
+        half = side // 2
+        for i in range(0, BLOCK, side):
+            for j in range(0, BLOCK, side):
+                _halve(at, i, j, half, price)
+        side = half
+    for i in range(BLOCK):
+        for j in range(BLOCK):
+            value = np.float32(max(at[i, j], 0.0) * ROUNDED_DOWN)
+            bound.bounds[block, i * BLOCK + j] = value
+    bound.known[row, column] = BOUNDED
+
+
+@lean_kernel
+def _at_vertex(bound: CostBound, row: int, column: int) -> float:
+    """Return the bound at a vertex; beyond those that are settled, by the way from the start."""
+    away = octile(row * BLOCK - bound.start[0], column * BLOCK - bound.start[1])
+    found = min(bound.vertex[row, column], bound.limit - away)
+    top, left = bound.goal[0] >> SHIFT, bound.goal[1] >> SHIFT
+    down = max(top - row, row - top - 1, 0)  # blocks between here and that of the goal
+    right = max(left - column, column - left - 1, 0)
+    return float(max(found, BLOCK * octile(down, right)))
+
+
+@lean_kernel
+def _halve(at: Floats, top: int, left: int, half: int, price: float) -> None:
+    """Fill the middles of the edges of a block, and its middle, from its corners."""
+    y, x, bottom, right = top + half, left + half, top + 2 * half, left + 2 * half
+    a, b, c, d = at[top, left], at[top, right], at[bottom, left], at[bottom, right]
+    at[top, x], at[bottom, x] = (a + b) / 2, (c + d) / 2
+    at[y, left], at[y, right] = (a + c) / 2, (b + d) / 2
+    straight = max(max(a + b, c + d), max(a + c, b + d)) / 2 - half * price
+    at[y, x] = max(straight, max(max(a, b), max(c, d)) - half * DIAGONAL * price)

@@ -1,0 +1,72 @@
+"""Bounds of the cost to a goal: never above the cost itself, and close to it."""
+
+import numpy as np
+import pytest
+
+from gigabrain_zenoh.navigation.block_bounds import bound_at, block_bounds, still_holds, towards
+from gigabrain_zenoh.navigation.grid_search import GridSearch
+from tests.unit.navigation.grids import Cell
+
+
+def bounds_of(cost: np.ndarray, start: Cell, goal: Cell) -> np.ndarray:
+    bound = towards(goal, start, cost, block_bounds(cost.shape))
+    return np.array([bound_at(bound, cost, *cell) for cell in np.ndindex(cost.shape)]).reshape(
+        cost.shape
+    )
+
+
+def rooms(seed: int, shape: tuple[int, int]) -> np.ndarray:
+    """Patches of any cost, some of them lethal, with noise of single cells."""
+    rng = np.random.default_rng(seed)
+    cost = rng.uniform(1, 6, shape)
+    for _ in range(12):
+        row, column = (int(rng.integers(0, side)) for side in shape)
+        height, width = rng.integers(2, 12, 2)
+        cost[row : row + height, column : column + width] = rng.choice([1, 3, 13, 150])
+    return cost.astype(np.float32)
+
+
+@pytest.mark.parametrize("shape", [(40, 33), (1, 30), (37, 4), (32, 32)])
+@pytest.mark.parametrize("seed", range(4))
+def test_no_way_costs_less_than_its_bound(seed: int, shape: tuple[int, int]) -> None:
+    cost, rng = rooms(seed, shape), np.random.default_rng(seed)
+    for _ in range(4):
+        start, goal = (tuple(int(rng.integers(0, side)) for side in shape) for _ in range(2))
+        cheapest = GridSearch().field(cost, goal, "to")
+        assert (bounds_of(cost, start, goal) <= cheapest).all()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_no_step_costs_less_than_the_bound_falls_by_it(seed: int) -> None:
+    cost = rooms(seed, (40, 33))
+    bounds = bounds_of(cost, (2, 3), (35, 28))
+    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        rows, columns = np.mgrid[0 : 40 - down, max(-right, 0) : 33 - max(right, 0)]
+        one, other = (rows, columns), (rows + down, columns + right)
+        step = np.hypot(down, right) * (cost[one].astype(float) + cost[other]) / 2
+        assert (np.abs(bounds[one] - bounds[other]) <= step * (1 + 1e-5)).all()
+
+
+def test_round_a_wall_the_bound_is_close() -> None:
+    cost = np.ones((80, 80), np.float32)
+    cost[30:40, :70] = 200.0
+    cheapest = GridSearch().field(cost, (10, 10), "to")
+    bound = bounds_of(cost, (70, 10), (10, 10))[70, 10]
+    assert 0.9 * cheapest[70, 10] < bound <= cheapest[70, 10]
+
+
+def test_bounds_hold_while_no_block_becomes_cheaper() -> None:
+    cost = np.full((40, 40), 2.0, np.float32)
+    bound = towards((35, 35), (4, 4), cost, block_bounds(cost.shape))
+    assert still_holds(bound, cost, (6, 6))
+    cost[18:22, 18:22] = 150.0
+    assert still_holds(bound, cost, (6, 6))
+    cost[20, 21] = 1.9
+    assert not still_holds(bound, cost, (6, 6))
+
+
+def test_bounds_are_computed_again_for_a_start_that_they_are_not_close_at() -> None:
+    cost = np.ones((200, 200), np.float32)
+    bound = towards((90, 100), (90, 60), cost, block_bounds(cost.shape))
+    assert still_holds(bound, cost, (90, 61))
+    assert not still_holds(bound, cost, (90, 195))
