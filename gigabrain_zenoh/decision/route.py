@@ -209,7 +209,7 @@ class RoutePlanner:
         if self._costmap is None or not same:
             rules = inflation(request.body, self._unknown_space, request.inflation)
             points = np.concatenate((self._blocking, self._contours.points))
-            self._bare = costmap(request.grid, rules, points, self._bare)
+            self._bare = costmap(request.grid, rules, points, self._bare, reuse=True)
             self._costmap = with_zones(self._bare, self._zone_overlay(request, self._bare))
             self._costmap_key = key
         return self._costmap

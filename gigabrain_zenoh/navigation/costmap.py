@@ -120,10 +120,13 @@ def costmap(
     rules: Inflation,
     points: NDArray[np.floating] | None = None,
     before: Costmap | None = None,
+    *,
+    reuse: bool = False,
 ) -> Costmap:
     """Return the costs of `grid`; `points` [m], (n, 2) in the map's frame, are obstacles too.
 
-    With the costmap `before` only changed parts are computed; the result is the same.
+    With the costmap `before` only changed parts are computed; the result is the same. With `reuse`
+    they are written into the costs of `before`, which must not be used any more.
     """
     cells = _with_points(grid, points)
     box = _box_to_renew(before, grid, rules, cells)
@@ -133,7 +136,7 @@ def costmap(
     else:
         cost = before.cost
         if box[0] < box[1]:
-            cost = cost.copy()
+            cost = cost if reuse else cost.copy()
             _fill(cost, cells, rules, grid.resolution, box)
     return Costmap(
         resolution=grid.resolution,
@@ -256,8 +259,13 @@ def _changed(before: Cells, now: Cells) -> Box:
     height, width = now.shape
     top, bottom, left, right = height, 0, width, 0
     for row in range(height):
+        one, other, differs = before[row], now[row], np.uint8(0)
+        for column in range(width):  # without a branch it is vectorised
+            differs = np.uint8(differs | np.uint8(one[column] ^ other[column]))
+        if not differs:
+            continue
+        top, bottom = min(top, row), row + 1
         for column in range(width):
-            if before[row, column] != now[row, column]:
-                top, bottom = min(top, row), row + 1
+            if one[column] != other[column]:
                 left, right = min(left, column), max(right, column + 1)
     return (top, bottom, left, right) if bottom else (0, 0, 0, 0)

@@ -129,6 +129,15 @@ def test_what_is_computed_after_a_change_is_what_all_anew_would_be(seed: int) ->
     np.testing.assert_array_equal(before.cost, kept)
 
 
+def test_reused_costs_are_renewed_in_place() -> None:
+    cells = empty(8.0, 8.0)
+    before = costmap(grid_of(cells), RULES)
+    cells[10, 20] = 100
+    after = costmap(grid_of(cells), RULES, None, before, reuse=True)
+    assert after.cost is before.cost
+    np.testing.assert_array_equal(after.cost, costmap(grid_of(cells), RULES).cost)
+
+
 def test_a_map_that_has_not_changed_costs_nothing_new() -> None:
     grid = grid_of(wall())
     before = costmap(grid, RULES)
