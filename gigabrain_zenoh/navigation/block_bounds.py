@@ -78,19 +78,25 @@ def towards(goal: Cell, start: Cell, cost: Costs, memory: CostBound) -> CostBoun
 
 
 @kernel
-def still_holds(bound: CostBound, cost: Costs, start: Cell) -> bool:
-    """Return whether bounds hold at other costs, as no block is cheaper, and are close at `start`.
+def bound_after_changes(bound: CostBound, cost: Costs, start: Cell) -> float:
+    """Return the bound at `start`, if costs are not those any more from which bounds were computed.
 
-    Then they are still no higher than the cost of any way, whatever has become dearer.
+    A way through blocks that have become cheaper costs at least its length to the last of them and
+    the bound where it leaves that. On all other ways the bounds hold.
     """
-    known, price = bound.known, bound.price
-    if not _around(bound.settled, start):
-        return False
+    least, known, price = bound_at(bound, cost, *start), bound.known, bound.price
     for row in range(known.shape[0]):
         for column in range(known.shape[1]):
-            if known[row, column] != UNSEEN and _least(cost, row, column) < price[row, column]:
-                return False
-    return True
+            if known[row, column] == UNSEEN or _least(cost, row, column) >= price[row, column]:
+                continue
+            down = max(row * BLOCK - start[0], start[0] - (row + 1) * BLOCK, 0)
+            right = max(column * BLOCK - start[1], start[1] - (column + 1) * BLOCK, 0)
+            beyond = min(
+                min(_at_vertex(bound, row, column), _at_vertex(bound, row, column + 1)),
+                min(_at_vertex(bound, row + 1, column), _at_vertex(bound, row + 1, column + 1)),
+            )
+            least = min(least, octile(down, right) + beyond)
+    return least
 
 
 @lean_kernel

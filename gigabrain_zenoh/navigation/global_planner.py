@@ -23,6 +23,7 @@ from gigabrain_zenoh.navigation.grid_search import (
 POINT_SPACING_M = 0.1  # [m] between the points of a path, at most
 MAX_STRAY_M = 0.5  # [m] off its path, beyond which it is planned again
 SWITCH_COST_RATIO = 0.85  # of the present path's cost, above which a new path is not taken
+MAX_DETOUR_OF_CELLS = math.sqrt(4 - 2 * math.sqrt(2))  # of steps between cells, over straight lines
 Point = tuple[float, float]  # [m], in the map's frame
 NO_WAY = "no way leads to the goal"
 
@@ -88,13 +89,14 @@ class GlobalPlanner:
 
     def replan(self, costmap: Costmap, start: Point, goal: Point, path: Path) -> Path | Unreachable:
         """Return the rest of `path` if it is free and no path is much cheaper; or a new one."""
-        found = self.plan(costmap, start, goal)
         rest = remaining_path(path, costmap, start)
         if rest is None or tuple(path.points[-1]) != goal or not is_valid(rest, costmap):
-            return found
-        if isinstance(found, Path) and found.cost[0] < SWITCH_COST_RATIO * rest.cost[0]:
-            return found
-        return rest
+            return self.plan(costmap, start, goal)
+        worthwhile = SWITCH_COST_RATIO * rest.cost[0]
+        if self._costs_at_least(worthwhile, costmap, start, goal):
+            return rest
+        found = self.plan(costmap, start, goal)
+        return found if isinstance(found, Path) and found.cost[0] < worthwhile else rest
 
     def field(self, costmap: Costmap, goal: Point) -> Floats | None:
         """Return the cost from each cell to `goal`, (height, width) [m in the open].
@@ -105,6 +107,15 @@ class GlobalPlanner:
         if cell is None:
             return None
         return self.search.field(costmap.cost, cell, "to", costmap.against) * costmap.resolution
+
+    def _costs_at_least(self, least: float, costmap: Costmap, start: Point, goal: Point) -> bool:
+        """Return whether it is sure that no path is cheaper [m in the open]."""
+        begin, end = costmap.cell(*start), costmap.cell(*goal)
+        if begin is None or end is None:
+            return False
+        ends = float(costmap.cost[begin] + costmap.cost[end])  # searched are ways between centres
+        cells = least / costmap.resolution * MAX_DETOUR_OF_CELLS + ends
+        return self.search.costs_at_least(cells, costmap.cost, begin, end)
 
     def _nearest(self, costmap: Costmap, goal: Point, why: str) -> Unreachable:
         """Return the place nearest to `goal` among the cells of the last search."""

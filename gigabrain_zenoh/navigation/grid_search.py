@@ -22,9 +22,9 @@ from gigabrain_zenoh.navigation.block_bounds import (
     Cell,
     CostBound,
     Ints,
+    bound_after_changes,
     bound_at,
     block_bounds,
-    still_holds,
     towards,
 )
 from gigabrain_zenoh.navigation.costmap import LETHAL, NO_LANES, Costs, WayBits
@@ -92,14 +92,15 @@ class GridSearch:
         )
         return field.reshape(cost.shape)
 
-    def bound(self, cost: Costs, start: Cell, goal: Cell) -> float:
-        """Return what the cheapest path costs at least, much faster than the path is found."""
+    def costs_at_least(self, least: float, cost: Costs, start: Cell, goal: Cell) -> bool:
+        """Return whether it is sure, without a search over cells, that a path costs `least`."""
         if cost.shape != self._shape:
             self._make_room(cost.shape)
         cost = np.ascontiguousarray(cost)
-        if self._bound.goal != goal or not still_holds(self._bound, cost, start):
-            self._bound = towards(goal, start, cost, self._bound)
-        return bound_at(self._bound, cost, *start)
+        if self._bound.goal == goal and bound_after_changes(self._bound, cost, start) >= least:
+            return True
+        self._bound = towards(goal, start, cost, self._bound)
+        return bound_at(self._bound, cost, *start) >= least
 
     def reach(self, cost: Costs, start: Cell, against: WayBits = NO_LANES) -> None:
         """Go wherever a way leads from `start`, for `nearest` to be asked."""

@@ -3,6 +3,7 @@
 import itertools
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path as File
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -31,6 +32,8 @@ RESOLUTION = 0.05  # [m]
 DENSITY = 0.2  # of the random map
 PITCH, ROOM, WALL, DOOR = 240, 96, 2, 20  # cells: four rooms and two corridors repeat
 FURNITURE = 3  # pieces a room
+OBJECT = 10  # cells a side
+METRE = 10  # points of a path
 Cells = NDArray[np.int8]
 
 
@@ -151,11 +154,49 @@ def _measure(
         first.timing("costs after a change, and a plan"),
         searching.timing("optimal path, office"),
         planning.timing("the same, pulled tight"),
+        *_replanned(made, cells, paths, rng),
         *_corner_to_corner(size, rng, ratios),
     )
     length = float(np.mean([one.remaining[0] for one in paths]))
     worst = max(ratios, key=lambda ratio: abs(ratio - 1))
     return SizeFigures(size=size, path_m=length, timings=timings, ratio=worst), made, paths
+
+
+def _replanned(
+    made: Costmap, cells: Cells, paths: list[Path], rng: np.random.Generator
+) -> tuple[Timing, Timing]:
+    """Time from a new map to the path, as decision plans: after a change somewhere, and on it.
+
+    The robot has come a metre along its path. An object appears, and disappears again.
+    """
+    planner, elsewhere, ahead = GlobalPlanner(), OperationTimer(), OperationTimer()
+    costs = replace(made, cost=made.cost.copy())  # they are renewed in place
+    for old in paths:
+        here, goal = _point(old, METRE), _point(old, -1)
+        planner.replan(costs, _point(old, 0), goal, old)
+        for timer, changed in (
+            (elsewhere, with_new_furniture(cells, rng)),
+            (ahead, _blocked(made, cells, old, rng)),
+        ):
+            for cells_now, timed in ((changed, timer), (cells, elsewhere)):
+                grid = grid_of(cells_now)
+                with timed:
+                    costs = costmap(grid, RULES, None, costs, reuse=True)
+                    planner.replan(costs, here, goal, old)
+    return elsewhere.timing("replanned after a change"), ahead.timing("the same, on its path")
+
+
+def _point(path: Path, number: int) -> Point:
+    x, y = path.points[number].tolist()
+    return x, y
+
+
+def _blocked(made: Costmap, cells: Cells, path: Path, rng: np.random.Generator) -> Cells:
+    """Return the map with an object of 0.5 m in the middle half of a path."""
+    count = len(path.points)
+    at = made.cell(*_point(path, int(rng.integers(count // 4, 3 * count // 4))))
+    assert at
+    return _with_object(cells, max(at[0] - OBJECT // 2, 0), max(at[1] - OBJECT // 2, 0))
 
 
 def _queries(made: Costmap, search: GridSearch, rng: np.random.Generator) -> Iterator[Query]:
@@ -252,9 +293,13 @@ def scattered(size: int, rng: np.random.Generator) -> Costs:
 
 def with_new_furniture(cells: Cells, rng: np.random.Generator) -> Cells:
     """Return the map with one more piece of furniture."""
-    row, column = rng.integers(0, len(cells) - 10, 2)
+    row, column = rng.integers(0, len(cells) - OBJECT, 2)
+    return _with_object(cells, int(row), int(column))
+
+
+def _with_object(cells: Cells, row: int, column: int) -> Cells:
     now = cells.copy()
-    now[row : row + 10, column : column + 10] = 100
+    now[row : row + OBJECT, column : column + OBJECT] = 100
     return now
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gigabrain_zenoh.navigation.block_bounds import bound_at, block_bounds, still_holds, towards
+from gigabrain_zenoh.navigation.block_bounds import bound_after_changes, bound_at, block_bounds, towards
 from gigabrain_zenoh.navigation.grid_search import GridSearch
 from tests.unit.navigation.grids import Cell
 
@@ -55,18 +55,23 @@ def test_round_a_wall_the_bound_is_close() -> None:
     assert 0.9 * cheapest[70, 10] < bound <= cheapest[70, 10]
 
 
-def test_bounds_hold_while_no_block_becomes_cheaper() -> None:
-    cost = np.full((40, 40), 2.0, np.float32)
-    bound = towards((35, 35), (4, 4), cost, block_bounds(cost.shape))
-    assert still_holds(bound, cost, (6, 6))
-    cost[18:22, 18:22] = 150.0
-    assert still_holds(bound, cost, (6, 6))
-    cost[20, 21] = 1.9
-    assert not still_holds(bound, cost, (6, 6))
+@pytest.mark.parametrize("seed", range(6))
+def test_no_way_costs_less_than_its_bound_after_changes(seed: int) -> None:
+    cost, rng, goal = rooms(seed, (60, 50)), np.random.default_rng(seed), (55, 40)
+    bound = towards(goal, (5, 5), cost, block_bounds(cost.shape))
+    for _ in range(20):
+        row, column = (int(value) for value in rng.integers(0, 45, 2))
+        cost[row : row + 5, column : column + 5] = rng.choice([1.0, 2.0, 150.0])
+        cheapest = GridSearch().field(cost, goal, "to")
+        for start in ((5, 5), (20, 10), (40, 45)):
+            assert bound_after_changes(bound, cost, start) <= cheapest[start]
 
 
-def test_bounds_are_computed_again_for_a_start_that_they_are_not_close_at() -> None:
-    cost = np.ones((200, 200), np.float32)
-    bound = towards((90, 100), (90, 60), cost, block_bounds(cost.shape))
-    assert still_holds(bound, cost, (90, 61))
-    assert not still_holds(bound, cost, (90, 195))
+def test_a_cheaper_block_far_aside_leaves_the_bound_as_it_is() -> None:
+    cost = np.full((100, 100), 2.0, np.float32)
+    bound = towards((10, 90), (10, 10), cost, block_bounds(cost.shape))
+    before = bound_after_changes(bound, cost, (10, 10))
+    cost[90:, 50:60] = 1.0
+    assert bound_after_changes(bound, cost, (10, 10)) == before > 150
+    cost[10, 50:60] = 1.0  # the straight way to there may cost 1 a cell as well, for all it knows
+    assert 100 < bound_after_changes(bound, cost, (10, 10)) < 120

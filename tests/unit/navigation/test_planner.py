@@ -227,6 +227,43 @@ def test_a_much_better_way_is_taken_and_a_slightly_better_one_is_not() -> None:
     np.testing.assert_allclose(kept.points[-20:], over.points[-20:])
 
 
+def test_a_change_elsewhere_keeps_the_path_without_a_search(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    cells, planner, goal = empty(18.0, 4.0), GlobalPlanner(), (17.55, 0.55)
+    cells[12:30, 40] = 100
+    old = path(seen(cells), (0.55, 0.55), goal)
+    cells[32:35, 10:14] = 100
+    monkeypatch.setattr(planner, "plan", None)
+    kept = planner.replan(seen(cells), (1.05, 0.55), goal, old)
+    assert isinstance(kept, Path)
+    assert kept.remaining[0] == pytest.approx(16.5)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_kept_path_is_the_one_that_a_search_would_keep(seed: int) -> None:
+    rng, planner, goal = np.random.default_rng(seed), GlobalPlanner(), (7.55, 7.55)
+    cells = empty(8.1, 8.1)
+    old = path(seen(cells, fits=0.1), (0.55, 0.55), goal)
+    for _ in range(25):
+        row, column = rng.integers(10, 65, 2)
+        height, width = rng.integers(1, 20, 2)
+        cells[row : row + height, column : column + width] = rng.choice([0, 100])
+        made = seen(cells, fits=0.1)
+        found = GlobalPlanner().plan(made, (0.6, 0.6), goal)
+        again = planner.replan(made, (0.6, 0.6), goal, old)
+        rest = remaining_path(old, made, (0.6, 0.6))
+        assert rest is not None
+        cheaper = isinstance(found, Path) and found.cost[0] < 0.85 * rest.cost[0]
+        expected = found if cheaper or not is_valid(rest, made) else rest
+        if not isinstance(expected, Path):
+            assert again == expected
+            continue
+        assert isinstance(again, Path)
+        np.testing.assert_array_equal(again.points, expected.points)
+        old = again
+
+
 def test_who_has_strayed_or_has_another_goal_gets_a_new_path() -> None:
     made = seen(empty(6, 6))
     old = path(made, (0.5, 0.5), (5.5, 0.5))

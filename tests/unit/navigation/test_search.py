@@ -111,7 +111,7 @@ def test_nobody_leaves_through_what_is_closer_still() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_no_path_costs_less_than_the_bound_however_costs_change(seed: int) -> None:
+def test_a_path_is_never_thought_dearer_than_it_is_however_costs_change(seed: int) -> None:
     cost, rng, search = random_costs(seed, (60, 50)), np.random.default_rng(seed), GridSearch()
     for _ in range(30):
         row, column = (int(value) for value in rng.integers(0, 45, 2))
@@ -119,7 +119,9 @@ def test_no_path_costs_less_than_the_bound_however_costs_change(seed: int) -> No
         start = (int(rng.integers(0, 60)), 3)
         cells = GridSearch().path(cost, start, (30, 45))
         if cells is not None:
-            assert search.bound(cost, start, (30, 45)) <= spent(cost, cells)
+            paid = spent(cost, cells)
+            assert not search.costs_at_least(1.001 * paid, cost, start, (30, 45))
+            assert search.costs_at_least(36.0, cost, start, (30, 45))
 
 
 def test_the_same_memory_serves_many_searches_and_sizes() -> None:
