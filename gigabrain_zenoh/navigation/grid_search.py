@@ -172,10 +172,8 @@ def _search(
         base, here, way = g[cell], flat[cell], mark[cell] - turn
         if way >= SETTLED_MARK:
             continue  # a duplicate: it was reached at less meanwhile
-        if (
-            base + _bound(bound, cost, row, column, target) >= best - SUM_TOLERANCE
-            and (row, column) != target
-        ):
+        total = base + _bound(bound, cost, row, column, target)
+        if total >= best - SUM_TOLERANCE and (row, column) != target:
             continue
         mark[cell], settled = mark[cell] + SETTLED_MARK, settled + 1
         begin, end = (0, 8) if way == ROOT_MARK else (way - MAX_BEND, way + MAX_BEND + 1)

@@ -32,8 +32,8 @@ RESOLUTION = 0.05  # [m]
 DENSITY = 0.2  # of the random map
 PITCH, ROOM, WALL, DOOR = 240, 96, 2, 20  # cells: four rooms and two corridors repeat
 FURNITURE = 3  # pieces a room
-OBJECT = 10  # cells a side
-METRE = 10  # points of a path
+OBJECT_CELLS = 10  # a side
+POINTS_PER_M = 10  # of a path
 Cells = NDArray[np.int8]
 
 
@@ -154,7 +154,7 @@ def _measure(
         first.timing("costs after a change, and a plan"),
         searching.timing("optimal path, office"),
         planning.timing("the same, pulled tight"),
-        *_replanned(made, cells, paths, rng),
+        *_replanned(made, cells, paths, rng.spawn(1)[0]),
         *_corner_to_corner(size, rng, ratios),
     )
     length = float(np.mean([one.remaining[0] for one in paths]))
@@ -172,7 +172,7 @@ def _replanned(
     planner, elsewhere, ahead = GlobalPlanner(), OperationTimer(), OperationTimer()
     costs = replace(made, cost=made.cost.copy())  # they are renewed in place
     for old in paths:
-        here, goal = _point(old, METRE), _point(old, -1)
+        here, goal = _point(old, POINTS_PER_M), _point(old, -1)
         planner.replan(costs, _point(old, 0), goal, old)
         for timer, changed in (
             (elsewhere, with_new_furniture(cells, rng)),
@@ -196,7 +196,7 @@ def _blocked(made: Costmap, cells: Cells, path: Path, rng: np.random.Generator) 
     count = len(path.points)
     at = made.cell(*_point(path, int(rng.integers(count // 4, 3 * count // 4))))
     assert at
-    return _with_object(cells, max(at[0] - OBJECT // 2, 0), max(at[1] - OBJECT // 2, 0))
+    return _with_object(cells, max(at[0] - OBJECT_CELLS // 2, 0), max(at[1] - OBJECT_CELLS // 2, 0))
 
 
 def _queries(made: Costmap, search: GridSearch, rng: np.random.Generator) -> Iterator[Query]:
@@ -293,13 +293,13 @@ def scattered(size: int, rng: np.random.Generator) -> Costs:
 
 def with_new_furniture(cells: Cells, rng: np.random.Generator) -> Cells:
     """Return the map with one more piece of furniture."""
-    row, column = rng.integers(0, len(cells) - OBJECT, 2)
+    row, column = rng.integers(0, len(cells) - OBJECT_CELLS, 2)
     return _with_object(cells, int(row), int(column))
 
 
 def _with_object(cells: Cells, row: int, column: int) -> Cells:
     now = cells.copy()
-    now[row : row + OBJECT, column : column + OBJECT] = 100
+    now[row : row + OBJECT_CELLS, column : column + OBJECT_CELLS] = 100
     return now
 
 
