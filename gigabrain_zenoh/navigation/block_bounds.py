@@ -38,7 +38,7 @@ Ints = np.ndarray[tuple[int, ...], np.dtype[np.int32]]
 Cell = tuple[int, int]  # row, column
 
 
-class CostBound(NamedTuple):
+class BlockBounds(NamedTuple):
     """Bounds of the cost to a goal, and the buffers to find them."""
 
     vertex: Floats  # (rows, columns) of vertices, the bound there; inf where none is known
@@ -54,12 +54,12 @@ class CostBound(NamedTuple):
     start: Cell = (0, 0)  # from here
 
 
-def block_bounds(shape: tuple[int, ...]) -> CostBound:
+def block_bounds(shape: tuple[int, ...]) -> BlockBounds:
     """Return memory for a grid. What no search comes to is never touched, and costs nothing."""
     rows, columns = ((max(side, 1) - 1) // BLOCK + 1 for side in shape)
     vertices = rows + 1, columns + 1
     entries = ENTRIES_PER_VERTEX * vertices[0] * vertices[1]
-    return CostBound(
+    return BlockBounds(
         vertex=np.empty(vertices),
         settled=np.empty(vertices, np.uint8),
         price=np.empty((rows, columns), np.float32),
@@ -71,14 +71,14 @@ def block_bounds(shape: tuple[int, ...]) -> CostBound:
     )
 
 
-def towards(goal: Cell, start: Cell, cost: Costs, memory: CostBound) -> CostBound:
+def towards(goal: Cell, start: Cell, cost: Costs, memory: BlockBounds) -> BlockBounds:
     """Return bounds of the cost to `goal`, close ones where ways from `start` may lead."""
     limit = _spread(cost, start, goal, memory)
     return memory._replace(goal=goal, limit=limit, start=start)
 
 
 @kernel
-def bound_after_changes(bound: CostBound, cost: Costs, start: Cell) -> float:
+def bound_after_changes(bound: BlockBounds, cost: Costs, start: Cell) -> float:
     """Return the bound at `start`, if costs are not those any more from which bounds were computed.
 
     A way through blocks that have become cheaper costs at least its length to the last of them and
@@ -100,7 +100,7 @@ def bound_after_changes(bound: CostBound, cost: Costs, start: Cell) -> float:
 
 
 @lean_kernel
-def bound_at(bound: CostBound, cost: Costs, row: int, column: int) -> float:
+def bound_at(bound: BlockBounds, cost: Costs, row: int, column: int) -> float:
     """Return the bound of the cost from a cell."""
     down, right = row >> SHIFT, column >> SHIFT
     block = down * bound.known.shape[1] + right
@@ -117,7 +117,7 @@ def octile(down: float, right: float) -> float:
 
 
 @lean_kernel
-def _price(cost: Costs, bound: CostBound, row: int, column: int) -> float:
+def _price(cost: Costs, bound: BlockBounds, row: int, column: int) -> float:
     """Return the cost of a block; inf outside the grid."""
     price, known = bound.price, bound.known
     if not (0 <= row < price.shape[0] and 0 <= column < price.shape[1]):
@@ -138,7 +138,7 @@ def _least(cost: Costs, row: int, column: int) -> np.float32:
 
 
 @kernel
-def _spread(cost: Costs, start: Cell, goal: Cell, bound: CostBound) -> float:
+def _spread(cost: Costs, start: Cell, goal: Cell, bound: BlockBounds) -> float:
     """Settle vertices from `goal` to a bit beyond `start`; return the `limit` of the bound."""
     vertex, settled, first, entries = bound.vertex, bound.settled, bound.first, bound.entries
     vertex[:], settled[:], bound.known[:], first[:] = np.inf, 0, UNSEEN, NOWHERE
@@ -202,7 +202,7 @@ def _around(settled: Bytes, cell: Cell) -> bool:
 
 @lean_kernel
 def _steps(
-    cost: Costs, bound: CostBound, row: int, column: int
+    cost: Costs, bound: BlockBounds, row: int, column: int
 ) -> tuple[float, float, float, float, float, float, float, float]:
     """Return what steps from a vertex cost, by way; inf out of the grid."""
     one, across = float(BLOCK), BLOCK * DIAGONAL
@@ -221,7 +221,7 @@ def _steps(
 
 
 @lean_kernel
-def _fill(bound: CostBound, cost: Costs, row: int, column: int, block: int) -> None:
+def _fill(bound: BlockBounds, cost: Costs, row: int, column: int, block: int) -> None:
     """Compute the bounds of the cells of a block from those of its corners."""
     at, price = bound.corners, _price(cost, bound, row, column)
     for i in range(2):
@@ -242,7 +242,7 @@ def _fill(bound: CostBound, cost: Costs, row: int, column: int, block: int) -> N
 
 
 @lean_kernel
-def _at_vertex(bound: CostBound, row: int, column: int) -> float:
+def _at_vertex(bound: BlockBounds, row: int, column: int) -> float:
     """Return the bound at a vertex; beyond those that are settled, by the way from the start."""
     away = octile(row * BLOCK - bound.start[0], column * BLOCK - bound.start[1])
     found = min(bound.vertex[row, column], bound.limit - away)

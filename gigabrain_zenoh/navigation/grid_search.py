@@ -19,12 +19,12 @@ from gigabrain_zenoh.navigation.block_bounds import (
     DIAGONAL,
     NOWHERE,
     ROW_STEPS,
+    BlockBounds,
     Cell,
-    CostBound,
     Ints,
+    block_bounds,
     bound_after_changes,
     bound_at,
-    block_bounds,
     towards,
 )
 from gigabrain_zenoh.navigation.costmap import LETHAL, NO_LANES, Costs, WayBits
@@ -151,7 +151,7 @@ class GridSearch:
 @kernel
 def _search(
     cost: Costs, against: WayBits, start: Cell, target: Cell, reverse: bool, turn: int,
-    held: SearchMemory, bound: CostBound,
+    held: SearchMemory, bound: BlockBounds,
 ) -> int:  # fmt: skip
     """Settle cells until no way to `target` is cheaper; return how many, or OUT_OF_ENTRIES."""
     (height, width), flat, (g, mark, first, entries) = cost.shape, cost.ravel(), held
@@ -235,7 +235,7 @@ def _may_enter(source: float, into: float) -> bool:
 
 
 @lean_kernel
-def _bound(bound: CostBound, cost: Costs, row: int, column: int, target: Cell) -> float:
+def _bound(bound: BlockBounds, cost: Costs, row: int, column: int, target: Cell) -> float:
     """Return a lower bound of the cost to `target`."""
     return 0.0 if target[0] == NOWHERE else bound_at(bound, cost, row, column)
 

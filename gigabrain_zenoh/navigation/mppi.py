@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import NONE, kernel, lean_kernel
 from gigabrain_zenoh.navigation.cost import evaluate_surroundings, fill_clearances, price
-from gigabrain_zenoh.navigation.cost_bound import bounds_of, may_cost_less
 from gigabrain_zenoh.navigation.footprint import Outline
 from gigabrain_zenoh.navigation.motion_model import (
     LANES,
@@ -22,6 +21,7 @@ from gigabrain_zenoh.navigation.motion_model import (
     make_feasible,
     simulate,
 )
+from gigabrain_zenoh.navigation.plan_bounds import bounds_of, may_cost_less
 from gigabrain_zenoh.navigation.planning_problem import Problem, Scene, Weights, motion_of
 
 NOISE_KEPT, NOISE_FRESH = 0.85, 0.53  # of the noise from step to step

@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from gigabrain_zenoh.navigation.block_bounds import bound_after_changes, bound_at, block_bounds, towards
+from gigabrain_zenoh.navigation.block_bounds import (
+    block_bounds,
+    bound_after_changes,
+    bound_at,
+    towards,
+)
 from gigabrain_zenoh.navigation.grid_search import GridSearch
 from tests.unit.navigation.grids import Cell
 

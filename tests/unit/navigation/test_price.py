@@ -9,7 +9,6 @@ import pytest
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import kernel
 from gigabrain_zenoh.navigation.cost import evaluate_surroundings, fill_clearances, price
-from gigabrain_zenoh.navigation.cost_bound import bounds_of, may_cost_less
 from gigabrain_zenoh.navigation.dynamic_obstacles import WEIGHTS
 from gigabrain_zenoh.navigation.footprint import DistanceGrid, Outline, outline_of
 from gigabrain_zenoh.navigation.motion_model import (
@@ -22,6 +21,7 @@ from gigabrain_zenoh.navigation.motion_model import (
     model_of,
     simulate,
 )
+from gigabrain_zenoh.navigation.plan_bounds import bounds_of, may_cost_less
 from gigabrain_zenoh.navigation.planning_problem import (
     Problem,
     Scene,

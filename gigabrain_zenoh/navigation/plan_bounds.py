@@ -21,7 +21,7 @@ from gigabrain_zenoh.navigation.planning_problem import MotionState, Problem
 SLACK = 0.01  # of costs, more than rounding errors
 
 
-class CostBounds(NamedTuple):
+class PlanBounds(NamedTuple):
     """Lower bounds that hold for all plans of a cycle."""
 
     touching: float  # the cost of a plan with a contact
@@ -29,7 +29,7 @@ class CostBounds(NamedTuple):
 
 
 @lean_kernel
-def bounds_of(problem: Problem, start: InitialState, steps: int) -> CostBounds:
+def bounds_of(problem: Problem, start: InitialState, steps: int) -> PlanBounds:
     """Return the bounds of plans of so many `steps`.
 
     In each step a body may be anywhere that its speed allows, and that costs time alone.
@@ -54,11 +54,11 @@ def bounds_of(problem: Problem, start: InitialState, steps: int) -> CostBounds:
             contact = min(contact, disc_contact_cost(weights, t * dt, t / steps))
         touching = min(touching, spent + SECOND * left / model.forward + contact)
         spent += 0.5 * SECOND * dt if away - reach > scene.tolerance else 0.0
-    return CostBounds(touching - SLACK, spent - SLACK)
+    return PlanBounds(touching - SLACK, spent - SLACK)
 
 
 @lean_kernel
-def may_cost_less(problem: Problem, bounds: CostBounds, end: MotionState, limit: float) -> bool:
+def may_cost_less(problem: Problem, bounds: PlanBounds, end: MotionState, limit: float) -> bool:
     """Return whether a plan that leads to `end` may cost less than `limit`."""
     if bounds.touching < limit:
         return True
