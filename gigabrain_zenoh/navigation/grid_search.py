@@ -155,12 +155,12 @@ def _search(
 ) -> int:  # fmt: skip
     """Settle cells until no way to `target` is cheaper; return how many, or OUT_OF_ENTRIES."""
     (height, width), flat, (g, mark, first, entries) = cost.shape, cost.ravel(), held
-    lanes, opposite = against.ravel(), 4 if reverse else 0
+    lanes = against.ravel()
     first[:] = NOWHERE
     at, best = start[0] * width + start[1], np.inf  # what the way to `target` costs, so far
     g[at], mark[at] = 0.0, turn + ROOT_MARK
     now = int(_bound(bound, cost, start[0], start[1], target) * BUCKETS_PER_COST)
-    _put(first, entries, int(NONE), now, start[0], start[1])
+    _put(first, entries, int(NONE), now, 0.0, start[0], start[1])
     free, used, count, settled = NOWHERE, 1, 1, 0
     while count:
         top = first[now % BUCKETS]
@@ -172,8 +172,8 @@ def _search(
         base, here, way = g[cell], flat[cell], mark[cell] - turn
         if way >= SETTLED_MARK:
             continue  # a duplicate: it was reached at less meanwhile
-        total = base + _bound(bound, cost, row, column, target)
-        if total >= best - SUM_TOLERANCE and (row, column) != target:
+        least = base + _bound(bound, cost, row, column, target)
+        if least >= best - SUM_TOLERANCE and (row, column) != target:
             continue
         mark[cell], settled = mark[cell] + SETTLED_MARK, settled + 1
         begin, end = (0, 8) if way == ROOT_MARK else (way - MAX_BEND, way + MAX_BEND + 1)
@@ -186,17 +186,14 @@ def _search(
             found = base + HALF_LENGTHS[to] * here + HALF_LENGTHS[to] * flat[other]
             if mark[other] >= turn and found >= g[other] - SUM_TOLERANCE:
                 continue
-            if lanes.size and (lanes[cell] | lanes[other]) >> (to + opposite & 7) & 1:
-                continue
-            if not _may_step(
-                flat, cell, other, row * width + right, down * width + column, reverse
-            ):
+            aside, above = row * width + right, down * width + column
+            if not _may_step(flat, lanes, cell, other, aside, above, to, reverse):
                 continue
             g[other], mark[other] = found, turn + to
-            total = found + _bound(bound, cost, down, right, target)
+            least = found + _bound(bound, cost, down, right, target)
             if (down, right) == target:
                 best = found
-            elif total >= best - SUM_TOLERANCE:
+            elif least >= best - SUM_TOLERANCE:
                 continue
             if free != NOWHERE:
                 entry, free = free, entries[2, free]
@@ -204,22 +201,30 @@ def _search(
                 entry, used = used, used + 1
             else:
                 return OUT_OF_ENTRIES
-            key = min(int(total * BUCKETS_PER_COST), now + BUCKETS - 1)
-            _put(first, entries, entry, max(now, key), down, right)
+            _put(first, entries, entry, now, least, down, right)
             count += 1
     return settled
 
 
 @kernel
-def _put(first: Ints, entries: Ints, entry: int, bucket: int, row: int, column: int) -> None:
-    """Put `entry`, for a cell, on top of a bucket."""
+def _put(
+    first: Ints, entries: Ints, entry: int, now: int, least: float, row: int, column: int
+) -> None:
+    """Put `entry`, for a cell, on top of the bucket of its `least` cost: from `now` on."""
+    bucket = max(now, min(int(least * BUCKETS_PER_COST), now + BUCKETS - 1))
     entries[0, entry], entries[1, entry] = row, column
     entries[2, entry], first[bucket % BUCKETS] = first[bucket % BUCKETS], entry
 
 
 @kernel
-def _may_step(flat: Costs, cell: int, other: int, aside: int, above: int, reverse: bool) -> bool:
+def _may_step(
+    flat: Costs, lanes: WayBits, cell: int, other: int, aside: int, above: int, to: int,
+    reverse: bool,
+) -> bool:  # fmt: skip
     """Return whether a step may be taken; a diagonal one needs both cells beside it free."""
+    ahead = to + 4 & 7 if reverse else to
+    if lanes.size and (lanes[cell] | lanes[other]) >> ahead & 1:
+        return False
     source, into = (flat[other], flat[cell]) if reverse else (flat[cell], flat[other])
     return (
         _may_enter(source, into)
