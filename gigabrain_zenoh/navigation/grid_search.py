@@ -206,7 +206,7 @@ def _search(
     return settled
 
 
-@kernel
+@lean_kernel
 def _put(
     first: Ints, entries: Ints, entry: int, now: int, least: float, row: int, column: int
 ) -> None:
@@ -216,7 +216,7 @@ def _put(
     entries[2, entry], first[bucket % BUCKETS] = first[bucket % BUCKETS], entry
 
 
-@kernel
+@lean_kernel
 def _may_step(
     flat: Costs, lanes: WayBits, cell: int, other: int, aside: int, above: int, to: int,
     reverse: bool,
@@ -233,7 +233,7 @@ def _may_step(
     )
 
 
-@kernel
+@lean_kernel
 def _may_enter(source: float, into: float) -> bool:
     """Return whether a body may go from a cell of cost `source` into one of cost `into`."""
     return into < LETHAL or into <= source
