@@ -113,9 +113,8 @@ def measure_barn(
             for one in as_completed(waiting):
                 done.append(one.result())
                 progress(done[-1])
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)  # else it first drives all the others
-            raise
+        finally:
+            pool.shutdown(cancel_futures=True)  # a failure does not wait for the others
     done.sort(key=lambda one: (one.world, one.trial))
     return BarnResult(plant=PLANTS[plant], samples=samples, trials=tuple(done))
 
