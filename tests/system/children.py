@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import AsyncIterator, Iterator, Mapping
 from contextlib import asynccontextmanager, contextmanager, suppress
 from pathlib import Path
@@ -15,7 +16,7 @@ import pytest
 
 from gigabrain_zenoh.runtime.fork_server import ForkRequest
 from gigabrain_zenoh.runtime.supervisor import Backoff, ProcessSpec, Supervisor
-from gigabrain_zenoh.testing.waiting import until
+from gigabrain_zenoh.testing.waiting import settle, until
 from tests.places import ROOT
 
 QUICK = Backoff(first_s=0.01, factor=2.0, longest_s=0.04)
@@ -93,6 +94,13 @@ def alive(pid: int) -> bool:
     except ProcessLookupError:
         return False
     return state(pid) not in ("Z", "X")
+
+
+async def reaped(pid: int) -> None:
+    """Wait until a process is gone, and a thread of asyncio has told the event loop so."""
+    await until(lambda: not state(pid))
+    await until(lambda: not any("waitpid" in each.name for each in threading.enumerate()))
+    await settle()
 
 
 async def freeze(pid: int | None) -> None:

@@ -18,6 +18,7 @@ from tests.system.children import (
     alive,
     another_supervisor,
     freeze,
+    reaped,
     running,
     spec,
     state,
@@ -142,7 +143,7 @@ async def test_a_process_that_the_kernel_does_not_let_go_holds_up_no_end() -> No
     finally:
         tracer.kill()
         await tracer.wait()
-    await until(lambda: not state(int(held)))
+    await reaped(int(held))
 
 
 async def test_a_terminals_ctrl_c_does_not_reach_the_processes() -> None:
