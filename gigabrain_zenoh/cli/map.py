@@ -7,6 +7,10 @@ from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, on_bus, print_line
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.signals import run_async
 
+NOT_LINKED = (
+    "not linked: that needs a C++ compiler, Python.h, and pip install 'gigabrain-zenoh[fast]'"
+)
+
 
 def save(name: str, /, *, at: RobotAddress = LOCAL, replace: bool = False) -> None:
     """Save the map that the robot makes, on the host where perception runs.
@@ -98,29 +102,38 @@ def precompile() -> None:
     The compiled code is kept in the user's cache folder, or in NUMBA_CACHE_DIR.
     After an update it is compiled again, at the latest at the first start, while
     the robot drives.
+
+    With a C++ compiler and the extra `fast` it is linked as well: robots then
+    start faster and take 100 MB less. Only this command does that.
     """
     run_async(_compile_all())
 
 
 async def _compile_all() -> None:
     from gigabrain_zenoh.decision.drive_kernels import ARM_KERNELS, CAR_KERNELS, DRIVE_KERNELS
+    from gigabrain_zenoh.kernels.precompile import can_link
     from gigabrain_zenoh.perception.node import LOCALIZE_KERNELS, MAP_KERNELS
 
-    print_line("compiling, which takes up to a minute")
+    print_line("compiling, which takes up to two minutes")
+    links = can_link()
     await asyncio.gather(  # they share no kernel
-        _compile("mapping", MAP_KERNELS, LOCALIZE_KERNELS),
-        _compile("planning and driving", DRIVE_KERNELS, CAR_KERNELS, ARM_KERNELS),
+        _compile("mapping", MAP_KERNELS, LOCALIZE_KERNELS, links=links),
+        _compile("driving", DRIVE_KERNELS, CAR_KERNELS, ARM_KERNELS, links=links),
     )
+    if not links:
+        print_line(NOT_LINKED)
 
 
-async def _compile(name: str, *warm_ups: str) -> None:
-    from gigabrain_zenoh.kernels.precompile import compile_all, compile_in_child, missing_package
+async def _compile(name: str, *warm_ups: str, links: bool) -> None:
+    from gigabrain_zenoh.kernels import precompile as kernels
 
     start_s = time.monotonic()
     for warm_up in warm_ups:
-        if await compile_in_child(warm_up):
+        if await kernels.compile_in_child(warm_up):
             try:
-                compile_all(warm_up)  # raises the reason of the failure
+                kernels.compile_all(warm_up)  # raises the reason of the failure
             except ModuleNotFoundError as error:
-                raise missing_package(error) from None
+                raise kernels.missing_package(error) from None
+    if links:
+        await kernels.link_in_child(name, *warm_ups)
     print_line(f"{name}: {time.monotonic() - start_s:.1f} s")

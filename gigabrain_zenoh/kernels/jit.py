@@ -1,36 +1,41 @@
-"""Compiles functions with numba, and keeps the result on disk.
+"""Functions that run compiled: from a linked library, or else by numba.
 
-Numba is imported without optional packages that are not used here (scipy's BLAS, coverage, cffi):
-importing those takes as long as loading all kernels.
+Numba is imported where a kernel is not in a library. It is imported without optional packages that
+are not used here (scipy's BLAS, coverage, cffi): importing those takes as long as loading all
+kernels.
 """
 
-import hashlib
+import functools
 import importlib
 import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy as np
-from platformdirs import user_cache_path
+
+from gigabrain_zenoh.kernels import cache, linked
 
 UNUSED = ("scipy.linalg", "coverage", "cffi")
 # the submodules look for BLAS and cffi; unless imported here, they do so at the first call
 PARTS = ("numba", "numba.np.arraymath", "numba.core.typing.cffi_utils")
 
 F = TypeVar("F", bound=Callable[..., object])
-PACKAGE = Path(__file__).parents[1]
 NONE, ONE, TWO = np.int64(0), np.int64(1), np.int64(2)  # as literals they are compiled for apart
-HOLDERS = ("kernels", "manipulation", "mapping", "navigation", "qa/bench")  # packages with kernels
 
 
-def _import_numba() -> Any:
+@functools.cache
+def import_numba() -> Any:
+    """Import numba, to keep what it compiles in `cache.kernel_folder`."""
+    if folder := cache.cache_folder():
+        os.environ.setdefault(cache.FOLDER, str(folder))
     with _as_if_missing(*UNUSED):
         for part in PARTS:
             importlib.import_module(part)
-    return sys.modules["numba"]
+    numba: Any = sys.modules["numba"]
+    numba.core.config.reload_config()
+    return numba
 
 
 @contextmanager
@@ -46,73 +51,62 @@ def _as_if_missing(*names: str) -> Iterator[None]:
             del modules[name]
 
 
-numba = _import_numba()
+class Kernel:
+    """A compiled function. Other kernels may call it as well."""
+
+    def __init__(self, function: Callable[..., Any], *, lean: bool) -> None:
+        functools.update_wrapper(self, function)
+        self.function, self._lean = function, lean
+        self.name = f"{function.__module__}:{function.__qualname__}"
+        self.called = False  # by numba, and not from another kernel only
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call it; it runs without the GIL."""
+        for takes, function in self._linked:
+            if takes(arguments):
+                return function(*arguments)
+        self.called = True
+        return self.dispatcher(*arguments)
+
+    @property
+    def overloads(self) -> int:
+        """Number of lists of types that it has been compiled for, in a library or here."""
+        here = len(self.dispatcher.signatures) if "dispatcher" in vars(self) else 0
+        return len(self._linked) + here
+
+    @functools.cached_property
+    def _linked(self) -> tuple[tuple[linked.Takes, Callable[..., Any]], ...]:
+        return linked.overloads_of(self.name)
+
+    @functools.cached_property
+    def dispatcher(self) -> Any:
+        """The function as numba has it: it is compiled at its first call with other types.
+
+        The result is kept in NUMBA_CACHE_DIR, or in the user's cache folder. If neither can be
+        written, each process compiles again.
+        """
+        numba, lean = import_numba(), self._lean
+        options = {"nogil": True, "error_model": "numpy", "_nrt": not lean, "forceinline": lean}
+        try:
+            return numba.njit(cache=True, **options)(self.function)
+        except RuntimeError:  # numba: no locator available
+            return numba.njit(**options)(self.function)
+
+    @property
+    def _numba_type_(self) -> Any:
+        """The type of this function for numba, where a kernel that it compiles calls it."""
+        return self.dispatcher._numba_type_
 
 
 def kernel(function: F) -> F:
-    """Compile `function` at its first call; it runs without the GIL.
-
-    The result is kept in NUMBA_CACHE_DIR, or in the user's cache folder. If neither can be written,
-    each process compiles again.
-    """
-    return _compiled(function, lean=False)
+    """Have `function` run compiled."""
+    return cast("F", Kernel(function, lean=False))
 
 
 def lean_kernel(function: F) -> F:
-    """Compile a `function` that makes no arrays and is called very often by kernels.
+    """Have a `function` run compiled that makes no arrays and is called very often by kernels.
 
     It is inlined into its callers, and does not count references to its arrays: counting took
     longer than the work. Numba refuses one that makes arrays.
     """
-    return _compiled(function, lean=True)
-
-
-def _compiled(function: F, *, lean: bool) -> F:
-    options = {"nogil": True, "error_model": "numpy", "_nrt": not lean, "forceinline": lean}
-    try:
-        compiled = numba.njit(cache=True, **options)(function)
-    except RuntimeError:  # numba: no locator available
-        compiled = numba.njit(**options)(function)
-    return cast("F", compiled)
-
-
-def cache_folder() -> Path | None:
-    """Return the cache folder for kernels of exactly these sources; None for a user without a home.
-
-    Numba notices changes in a kernel's own file only, not in those of the kernels it calls. It
-    finds nothing for the same file at another place, as in a second checkout, or of another time.
-    """
-    try:
-        return user_cache_path("gigabrain") / f"kernels-{_digest()}"
-    except RuntimeError:
-        return None
-
-
-def mark_of(warm_up: str) -> Path | None:
-    """Return the file that marks all of `warm_up` as compiled for this processor.
-
-    None if nothing can be kept.
-    """
-    from llvmlite.binding import get_host_cpu_name
-
-    folder = Path(os.environ.get("NUMBA_CACHE_DIR", os.devnull))
-    machine = f"{numba.__version__}-{get_host_cpu_name()}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return None
-    return folder / f"{warm_up.replace(':', '.')}-{_digest()}-{machine}"
-
-
-def _digest() -> str:
-    digest = hashlib.sha256()
-    for holder in HOLDERS:
-        for source in sorted((PACKAGE / holder).rglob("*.py")):
-            digest.update(source.read_bytes())
-            digest.update(f"{source} {source.stat().st_mtime_ns}".encode(errors="replace"))
-    return digest.hexdigest()[:16]
-
-
-if folder := cache_folder():
-    os.environ.setdefault("NUMBA_CACHE_DIR", str(folder))
-    numba.core.config.reload_config()
+    return cast("F", Kernel(function, lean=True))

@@ -8,19 +8,26 @@ import contextlib
 import gc
 import logging
 import os
+import shutil
 import sys
+import sysconfig
 from collections.abc import Awaitable
+from importlib.util import find_spec
+from pathlib import Path
 
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.host.this_process import join_in
 from gigabrain_zenoh.host.threads import InTime, Job
+from gigabrain_zenoh.kernels import cache
 from gigabrain_zenoh.plugins import find
 
 log = logging.getLogger(__name__)
 QUIET_S = 5.0  # of compiling, before it is logged
 COLLECT_AFTER = 100_000  # new objects; by the standard 700 compiling takes a tenth longer
 TRIES = 2  # to compile, if the child is killed
+LANGUAGES = "CC", "CXX"  # whose compilers linking needs
+LINKING = "gigabrain_zenoh.kernels.linking"  # a module that imports a compiler
 LAST_NICE = 19  # gets what the robot leaves of the processors
 
 
@@ -120,9 +127,7 @@ def missing_package(error: ModuleNotFoundError) -> ConfigError:
 
 def _is_missing(warm_up: str) -> bool:
     """Return whether a kernel is still to be compiled, and can be kept."""
-    from gigabrain_zenoh.kernels.jit import mark_of  # numba: only who drives by kernels pays
-
-    mark = mark_of(warm_up)
+    mark = cache.mark_of(warm_up)
     return mark is not None and not mark.exists()
 
 
@@ -145,13 +150,21 @@ async def _log_if_slow(work: Awaitable[object]) -> None:
 
 async def compile_in_child(warm_up: str, *, step_aside: bool = False) -> int:
     """Compile in a child process, and return its exit code; with `step_aside` others go first."""
+    aside = ("aside",) if step_aside else ()
+    return await _in_child(f"compiling {warm_up}", __name__, warm_up, str(os.getpid()), *aside)
+
+
+async def link_in_child(library: str, *warm_ups: str) -> int:
+    """Link the compiled kernels of `warm_ups` in a child process, and return its exit code."""
+    about = f"linking {library}"
+    return await _in_child(about, LINKING, library, str(os.getpid()), *warm_ups)
+
+
+async def _in_child(doing: str, module: str, *arguments: str) -> int:
     paths = os.pathsep.join(path for path in sys.path if path)
     child = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-P", "-m"),  # -P: nothing is imported from the current folder
-        __name__,
-        warm_up,
-        str(os.getpid()),
-        *(("aside",) if step_aside else ()),
+        *(sys.executable, "-P", "-m", module),  # -P: nothing is imported from the current folder
+        *arguments,
         env={**os.environ, "PYTHONPATH": paths},
         stdin=asyncio.subprocess.DEVNULL,
         stdout=asyncio.subprocess.DEVNULL,
@@ -160,7 +173,7 @@ async def compile_in_child(warm_up: str, *, step_aside: bool = False) -> int:
     try:
         _, errors = await child.communicate()
         if child.returncode and (said := errors.decode(errors="replace").strip()):
-            log.warning("compiling %s beforehand failed: %s", warm_up, said.splitlines()[-1])
+            log.warning("%s beforehand failed: %s", doing, said.splitlines()[-1])
             log.debug("%s", said)
         return child.returncode or 0
     finally:
@@ -169,12 +182,18 @@ async def compile_in_child(warm_up: str, *, step_aside: bool = False) -> int:
             await child.wait()
 
 
+def can_link() -> bool:
+    """Return whether this machine has what linking takes: compilers, Python.h and setuptools."""
+    compilers = (os.environ.get(one) or sysconfig.get_config_var(one) for one in LANGUAGES)
+    headers = Path(sysconfig.get_path("include"), "Python.h")
+    there = headers.exists() and find_spec("setuptools")
+    return bool(there) and all(one and shutil.which(one.split()[0]) for one in compilers)
+
+
 def compile_all(warm_up: str) -> None:
     """Compile here, and mark it as done where it can be kept. Raises ModuleNotFoundError."""
-    from gigabrain_zenoh.kernels.jit import mark_of
-
     find(warm_up)()
-    mark = mark_of(warm_up)
+    mark = cache.mark_of(warm_up)
     if mark:
         with contextlib.suppress(OSError):  # a folder that can be read only: as if nothing was kept
             mark.touch()

@@ -1,5 +1,7 @@
-"""Imported by a fork server: its forks share what numba makes at the first call of a kernel."""
+"""Imported by a fork server: its forks share the linked kernels, or what numba makes at first."""
 
-from gigabrain_zenoh.kernels.jit import numba
+from gigabrain_zenoh.kernels.jit import import_numba
+from gigabrain_zenoh.kernels.linked import load_all
 
-numba.core.registry.cpu_target.typing_context.refresh()
+if not load_all():
+    import_numba().core.registry.cpu_target.typing_context.refresh()

@@ -14,8 +14,8 @@ pytest.importorskip("numba")
 
 from gigabrain_zenoh.cli import map as map_commands
 from gigabrain_zenoh.decision.drive_kernels import ARM_KERNELS, CAR_KERNELS, DRIVE_KERNELS
+from gigabrain_zenoh.kernels import cache as kernels
 from gigabrain_zenoh.kernels import jit, precompile
-from gigabrain_zenoh.kernels import jit as kernels
 from gigabrain_zenoh.perception.node import LOCALIZE_KERNELS, MAP_KERNELS
 from gigabrain_zenoh.plugins import find
 
@@ -95,10 +95,34 @@ def test_what_is_compiled_beforehand_is_what_each_process_calls(
 
     monkeypatch.setattr(precompile, "compile_in_child", in_child)
     monkeypatch.setattr(precompile, "compile_all", done.append)
+    monkeypatch.setattr(precompile, "can_link", lambda: False)
     map_commands.precompile()
     assert sorted(tried) == sorted(WARM_UPS)
     assert done == (tried if code else [])  # what a child cannot do
-    assert capsys.readouterr().out.count(" s\n") == 2
+    out = capsys.readouterr().out
+    assert out.count(" s\n") == 2
+    assert map_commands.NOT_LINKED in out
+
+
+async def test_precompile_links_what_each_process_calls(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    linked = dict[str, tuple[str, ...]]()
+
+    async def in_child(*_: str) -> int:
+        return 0
+
+    async def link(library: str, *warm_ups: str) -> int:
+        linked[library] = warm_ups
+        return 0
+
+    monkeypatch.setattr(precompile, "can_link", lambda: True)
+    monkeypatch.setattr(precompile, "compile_in_child", in_child)
+    monkeypatch.setattr(precompile, "link_in_child", link)
+    await map_commands._compile_all()
+    assert set(linked) == {"mapping", "driving"}
+    assert sorted(one for some in linked.values() for one in some) == sorted(WARM_UPS)
+    assert "not linked" not in capsys.readouterr().out
 
 
 def test_a_child_that_fails_says_so(calls: Path) -> None:

@@ -9,9 +9,9 @@ import pytest
 
 from gigabrain_zenoh.testing.processes import SOURCES
 
-numba = pytest.importorskip("numba")
+pytest.importorskip("numba")
 
-from gigabrain_zenoh.kernels import jit as kernels  # noqa: E402
+from gigabrain_zenoh.kernels import cache as kernels
 
 
 def test_a_change_in_any_source_with_kernels_asks_for_a_folder_of_its_own(
@@ -53,7 +53,7 @@ def test_where_nothing_can_be_written_it_is_compiled_all_the_same(tmp_path: Path
         "NUMBA_CACHE_DIR": str(no_folder / "below"),
     }
     code = (
-        "import numba; from gigabrain_zenoh.kernels.jit import kernel\n"
+        "from gigabrain_zenoh.kernels.jit import kernel\n"
         "@kernel\ndef double(x: int) -> int:\n    return 2 * x\n"
         "print(double(21))"
     )

@@ -3,7 +3,7 @@ import sys
 
 DRIVE = """
 import importlib, pkgutil
-from numba.core.registry import CPUDispatcher
+from gigabrain_zenoh.kernels.jit import Kernel
 from gigabrain_zenoh import mapping
 from gigabrain_zenoh.qa.bench.slam_world import map_world
 from gigabrain_zenoh.mapping.slam_map import warm_up
@@ -12,11 +12,10 @@ def compiled():
     inside = pkgutil.iter_modules(mapping.__path__, mapping.__name__ + ".")
     names = [module.name for module in inside]
     return {
-        (name, function.__name__, str(signature))
+        (function.name, function.overloads)
         for name in names
         for function in vars(importlib.import_module(name)).values()
-        if isinstance(function, CPUDispatcher)
-        for signature in function.signatures
+        if isinstance(function, Kernel) and function.overloads
     }
 
 warm_up()

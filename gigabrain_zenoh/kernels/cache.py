@@ -1,0 +1,76 @@
+"""Where compiled kernels are kept: in NUMBA_CACHE_DIR, or in the user's cache folder."""
+
+import functools
+import hashlib
+import os
+import platform
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+from platformdirs import user_cache_path
+
+PACKAGE = Path(__file__).parents[1]
+HOLDERS = ("kernels", "manipulation", "mapping", "navigation", "qa/bench")  # packages with kernels
+FOLDER = "NUMBA_CACHE_DIR"  # environment variable
+CPU_INFO = Path("/proc/cpuinfo")
+FEATURES = ("flags", "Features")  # of a processor in CPU_INFO: on x86, and on ARM
+
+
+def kernel_folder() -> Path | None:
+    """Return the folder in use; None for a user without a home."""
+    chosen = os.environ.get(FOLDER)
+    return Path(chosen) if chosen else cache_folder()
+
+
+def cache_folder() -> Path | None:
+    """Return the cache folder for kernels of exactly these sources; None for a user without a home.
+
+    Numba notices changes in a kernel's own file only, not in those of the kernels it calls. It
+    finds nothing for the same file at another place, as in a second checkout, or of another time.
+    """
+    try:
+        return user_cache_path("gigabrain") / f"kernels-{_digest()}"
+    except RuntimeError:
+        return None
+
+
+def mark_of(warm_up: str) -> Path | None:
+    """Return the file that marks all of `warm_up` as compiled for this processor.
+
+    None if nothing can be kept.
+    """
+    folder = kernel_folder()
+    if folder is None:
+        return None
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return folder / f"{warm_up.replace(':', '.')}{suffix()}"
+
+
+def suffix() -> str:
+    """Return the end of the names of files for these sources and this processor."""
+    return f"-{_digest()}-{_machine()}"
+
+
+def _digest() -> str:
+    digest = hashlib.sha256()
+    for holder in HOLDERS:
+        for source in sorted((PACKAGE / holder).rglob("*.py")):
+            digest.update(source.read_bytes())
+            digest.update(f"{source} {source.stat().st_mtime_ns}".encode(errors="replace"))
+    return digest.hexdigest()[:16]
+
+
+@functools.cache
+def _machine() -> str:
+    """Return a digest of the processor, and of what compiles for it."""
+    parts = [sys.version, version("numba"), version("numpy"), platform.machine()]
+    try:
+        lines = CPU_INFO.read_text().splitlines()
+        parts += [next(line for line in lines if line.startswith(FEATURES))]
+    except (OSError, StopIteration):
+        parts += [platform.processor()]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]

@@ -1,0 +1,105 @@
+"""Links compiled kernels into a shared library that runs without numba; see `linked`.
+
+It needs a C++ compiler and the header files of Python. Run it in a process of its own: a compiler
+leaves some 200 MB behind.
+"""
+
+import gc
+import importlib
+import sys
+import tempfile
+import warnings
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from gigabrain_zenoh.host import this_process
+from gigabrain_zenoh.kernels import cache
+from gigabrain_zenoh.kernels.jit import Kernel, import_numba
+from gigabrain_zenoh.kernels.linked import (
+    INDEX,
+    LIBRARY,
+    MODULE,
+    SCALARS,
+    ArrayType,
+    Overload,
+    ScalarType,
+    TupleType,
+)
+from gigabrain_zenoh.plugins import find
+
+numba = import_numba()
+
+
+def link(name: str, warm_ups: Iterable[str]) -> None:
+    """Write a library of all kernels that `warm_ups` call, and its index; nothing if it is there.
+
+    A warm-up is the "module:name" of a function. No kernel may have been called before.
+    """
+    folder = cache.kernel_folder()
+    place = folder and folder / f"{name}{cache.suffix()}"
+    if not folder or not place or Path(f"{place}{INDEX}").exists():
+        return
+    for warm_up in warm_ups:
+        find(warm_up)()
+    with tempfile.TemporaryDirectory(dir=folder) as made:
+        library = _library()
+        library.output_dir = made
+        overloads = list(_export(library))
+        library.compile()
+        Path(made, library.output_file).replace(f"{place}{LIBRARY}")
+        index = Path(made, "index")
+        index.write_bytes(msgspec.json.encode(overloads))
+        index.replace(f"{place}{INDEX}")
+
+
+def _library() -> Any:
+    """Return an empty library, whose functions are compiled as `kernel` has them compiled."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", numba.core.errors.NumbaPendingDeprecationWarning)
+        pycc: Any = importlib.import_module("numba.pycc")
+    plain = pycc.compiler.Flags
+
+    def flags_of_kernels() -> Any:
+        flags = plain()
+        flags.release_gil, flags.error_model = True, "numpy"
+        return flags
+
+    pycc.compiler.Flags = flags_of_kernels  # a library has no parameter for them
+    library = pycc.CC(MODULE)
+    library.target_cpu = "host"
+    return library
+
+
+def _export(library: Any) -> Iterator[Overload]:
+    """Add the kernels to a library, for each list of types with which they were compiled."""
+    called = [one for one in gc.get_objects() if isinstance(one, Kernel) and one.called]
+    for kernel in sorted(called, key=lambda one: one.name):
+        signatures = [one.signature for one in kernel.dispatcher.overloads.values()]
+        for signature in sorted(signatures, key=lambda one: "A)" in str(one)):
+            takes = type_of(numba.types.Tuple(signature.args))
+            if isinstance(takes, TupleType):
+                symbol = f"kernel_{len(library._exported_functions)}"
+                library.export(symbol, signature)(kernel.function)
+                yield Overload(kernel.name, symbol, takes)
+
+
+def type_of(known: Any) -> ScalarType | ArrayType | TupleType | None:
+    """Return numba's type as one of ours; None for another, which stays with numba."""
+    types = numba.types
+    if isinstance(known, types.Array):
+        if known.layout == "F" or not (known.mutable and known.aligned):
+            return None
+        return ArrayType(str(known.dtype), known.ndim, known.layout == "C")
+    if isinstance(known, types.BaseTuple):
+        items = tuple(type_of(item) for item in known)
+        return None if None in items else TupleType(tuple(item for item in items if item))
+    return ScalarType(str(known)) if str(known) in SCALARS else None
+
+
+if __name__ == "__main__":
+    library, parent = sys.argv[1:3]
+    this_process.die_with_parent(int(parent))
+    link(library, sys.argv[3:])
