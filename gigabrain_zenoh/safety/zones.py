@@ -185,9 +185,25 @@ def _free(body: BodyDescription, points: Floats, motion: Motion) -> Free:
         for direction, along in ways:
             known = free[direction]
             if along >= MIN_ARC_LINEAR:
-                part = way * along / speed
+                part = way * along / speed + _margin_on_curve(body, twist)
                 free[direction] = part if known is None else min(part, known)
     return free
+
+
+def _margin_on_curve(body: BodyDescription, twist: Axes) -> float:
+    """Return by how much less than straight on may be free along a curve [m].
+
+    The stop margin is room for the part of the body that moves farthest: on a curve, a corner. The
+    tighter the curve, the less of that way the body's middle goes, and none in a turn on the spot.
+    If the turn takes longer to brake than the speed, the way in that time counts as well.
+    """
+    vx, vy, w = twist
+    speed = math.hypot(vx, vy)
+    fastest = max(speed, *(math.hypot(vx - w * y, vy + w * x) for x, y in body.footprint))
+    brakes_s = speed / body.max_linear_deceleration
+    longer_s = max(0.0, abs(w) / body.max_angular_acceleration - brakes_s)
+    room = body.thresholds.stop_margin * (1.0 - speed / fastest)
+    return max(0.0, room - speed * longer_s / 2.0)
 
 
 def _arc(body: BodyDescription, points: Floats, twist: Axes) -> float | None:

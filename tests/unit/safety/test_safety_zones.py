@@ -1,14 +1,20 @@
 """The protective field: every direction, curves, what is unknown, and no flicker."""
 
+import math
+
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from gigabrain_schemas.base import Velocity
-from gigabrain_schemas.body import Thresholds
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.body import BodyDescription, Thresholds
 from gigabrain_schemas.safety import SpeedCaps
+from gigabrain_zenoh.geometry.pose import PoseHistory, to_frame
+from gigabrain_zenoh.geometry.sweep import depth, edges
 from gigabrain_zenoh.safety.blind_spots import SECTORS
-from gigabrain_zenoh.testing.samples import LIDAR, WAFFLE, open_space
+from gigabrain_zenoh.safety.zones import Motion, ProtectiveField
+from gigabrain_zenoh.testing.samples import LIDAR, WAFFLE, open_space, scan, state
 from tests.unit.safety.patrol import BODY, Patrol
 
 AHEAD = Velocity(linear_x=0.2)
@@ -82,6 +88,56 @@ def test_a_curve_is_capped_by_what_it_leads_to() -> None:
     curving.go(60, told=curve)
     assert straight.go(5, told=AHEAD, values=values) == []
     assert curving.go(5, told=curve, values=values) == ["zone_ahead"]
+
+
+def test_the_tighter_a_curve_the_less_of_it_must_be_free() -> None:
+    """The margin of 0.08 m is for the corner that moves farthest: 3.6 times as far as the middle.
+
+    At 0.05 m/s a curve of 6 cm needs 0.040 m, not 0.097 m. The posts are 0.071 and 0.036 m away.
+    """
+    curve = Velocity(linear_x=0.05, angular_z=0.8)
+    patrol = Patrol()
+    patrol.go(60, told=curve)
+    assert patrol.go(5, told=curve, values=near(30, 0.21)) == []
+    assert patrol.go(5, told=curve, values=near(-20, 0.23)) == ["zone_ahead"]
+
+
+@pytest.mark.parametrize("angular_acceleration", [0.6, 3.0])
+def test_on_whatever_curve_it_may_go_on_it_stops_before_a_post(angular_acceleration: float) -> None:
+    """It obeys for the reaction time, and then brakes speed and turn as quickly as it can."""
+    body = replace(BODY, max_angular_acceleration=angular_acceleration)
+    posts, ways_on = np.random.default_rng(1), 0
+    for _ in range(400):
+        degrees, distance = int(posts.integers(360)), float(posts.uniform(0.15, 0.5))
+        twist = Velocity(
+            linear_x=float(posts.uniform(0.03, 0.26)), angular_z=float(posts.uniform(-1.8, 1.8))
+        )
+        bearing = math.radians(degrees)
+        post = distance * np.array((math.cos(bearing), math.sin(bearing)))
+        motion = Motion(measured=twist, commanded=twist, requested=twist)
+        now = state(5)
+        seen = scan(near(degrees, distance), 5)
+        field = ProtectiveField().then(body, seen, now, PoseHistory().then(now), motion)
+        if room(body, post) > 0.03 and not field.stopped:
+            ways_on += 1
+            assert least_room(body, twist, post) > 0.0, (twist, degrees, distance)
+    assert ways_on > 100
+
+
+def least_room(body: BodyDescription, twist: Velocity, post: Floats) -> float:
+    """How near to `post` (2,) the body comes [m] until it rests."""
+    v, w, x, y, yaw, nearest, dt = twist.linear_x, twist.angular_z, 0.0, 0.0, 0.0, math.inf, 0.01
+    for tick in range(600):
+        if tick * dt >= body.thresholds.reaction_time:
+            v = max(0.0, v - body.max_linear_deceleration * dt)
+            w -= math.copysign(min(abs(w), body.max_angular_acceleration * dt), w)
+        x, y, yaw = x + v * math.cos(yaw) * dt, y + v * math.sin(yaw) * dt, yaw + w * dt
+        nearest = min(nearest, room(body, np.array(to_frame(Pose(x=x, y=y, yaw=yaw), *post))))
+    return nearest
+
+
+def room(body: BodyDescription, post: Floats) -> float:
+    return float(depth(edges(body.footprint), post))
 
 
 def test_the_zone_goes_by_the_larger_of_measured_and_told() -> None:
