@@ -57,6 +57,9 @@ KEPT_SCANS = 32
 BEYOND_MARGIN_M = 0.12  # how far beyond a free point a beam must go; more than noise
 HIT_MARGIN_M = 0.1  # around a disc, in which its hits lie
 MIN_FREE_SHARE = 0.35  # of hits in free space, to confirm motion
+ODOMETRY_ERROR = 0.06  # of the way and of the turn between two scans, also by a late stamp
+NOISE_GATE_M = 0.03  # between hits of two scans on the same surface
+MIN_STATIC_SHARE = 0.2  # by how much more of the hits must be known, to refute motion
 FIELD_EDGE_BEAMS = 3  # ignored at the ends of the field of view
 
 
@@ -287,6 +290,27 @@ class PastScan:
             passed &= ~beside | (far[beam] > ranges + BEYOND_MARGIN_M)
         return passed
 
+    def hit(self, points: Floats, within: float) -> Bools:
+        """Return which `points` (n, 2) have a hit of this scan `within` so many metres."""
+        if not len(self.points):
+            return np.zeros(len(points), dtype=np.bool_)
+        dx, dy = (points[:, k, None] - self.points[:, k] for k in (0, 1))
+        near: Bools = (dx * dx + dy * dy).min(axis=1) <= within * within
+        return near
+
+    def tolerance(self, other: "PastScan", x: float, y: float) -> float:
+        """Return how far hits of a standing thing at (x, y) may differ in two scans [m].
+
+        Odometry errs with the way and the turn between them, and noise along a beam lies aside when
+        seen from elsewhere.
+        """
+        here, there = self._place, other._place
+        turn = abs(math.remainder(here.yaw - there.yaw, math.tau))
+        way = math.hypot(here.x - there.x, here.y - there.y)
+        away = math.hypot(x - here.x, y - here.y)
+        parallax = min(1.0, way / away) if away else 1.0
+        return ODOMETRY_ERROR * (turn * away + way) + BEYOND_MARGIN_M * parallax
+
     def _polar(self, points: Floats) -> tuple[Floats, Floats]:
         dx, dy = points[:, 0] - self._place.x, points[:, 1] - self._place.y
         bearings = np.arctan2(dy, dx) - self._place.yaw
@@ -315,17 +339,37 @@ class FreeSpace:
         self, x: float, y: float, velocity_x: float, velocity_y: float, radius: float
     ) -> bool:
         """Return whether free space confirms the velocity [m/s] of a disc at (x, y) [m]."""
-        now = self._scans[-1]
-        speed = math.hypot(velocity_x, velocity_y)
-        long_ago = COMPARED_S if speed * COMPARED_S < MOTION_M else MOTION_M / speed
-        old = [scan for scan in self._scans if (now.tick - scan.tick) * TICK_S >= long_ago]
-        before = old[-1] if old else self._scans[0]
+        now, before = self._scans[-1], self._compared(math.hypot(velocity_x, velocity_y))
         if before is now:
             return False
-        dt = (now.tick - before.tick) * TICK_S
+        dt, within = (now.tick - before.tick) * TICK_S, now.tolerance(before, x, y)
         mine = _near(now.points, x, y, radius)
         was = _near(before.points, x - velocity_x * dt, y - velocity_y * dt, radius)
-        return _share(before.free(mine)) > MIN_FREE_SHARE or _share(now.free(was)) > MIN_FREE_SHARE
+        return any(
+            _share(scan.free(points) & ~scan.hit(points, within)) > MIN_FREE_SHARE
+            for scan, points in ((before, mine), (now, was))
+        )
+
+    def shows_rest(
+        self, x: float, y: float, velocity_x: float, velocity_y: float, radius: float
+    ) -> bool:
+        """Return whether the hits of a disc at (x, y) [m] were there before, and not behind it.
+
+        Behind it is where they were if it has that velocity [m/s].
+        """
+        now, before = self._scans[-1], self._compared(math.hypot(velocity_x, velocity_y))
+        dt, within = (now.tick - before.tick) * TICK_S, now.tolerance(before, x, y)
+        mine = _near(now.points, x, y, radius)
+        behind = mine - np.array((velocity_x, velocity_y)) * dt
+        stood, moved = (before.hit(points, within + NOISE_GATE_M) for points in (mine, behind))
+        return before is not now and _share(stood) > _share(moved) + MIN_STATIC_SHARE
+
+    def _compared(self, speed: float) -> PastScan:
+        """Return the scan with which a thing of this speed [m/s] is compared."""
+        now = self._scans[-1]
+        long_ago = COMPARED_S if speed * COMPARED_S < MOTION_M else MOTION_M / speed
+        old = [scan for scan in self._scans if (now.tick - scan.tick) * TICK_S >= long_ago]
+        return old[-1] if old else self._scans[0]
 
 
 def _near(points: Floats, x: float, y: float, radius: float) -> Floats:

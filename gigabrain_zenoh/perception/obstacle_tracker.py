@@ -38,6 +38,7 @@ MOVING_M, MOVING_SPEED = 0.15, 0.15  # [m], [m/s]: less is no motion
 QUICK_SPEED = 0.5  # [m/s]
 MOVING_SIGMAS = 2.5  # standard deviations of a speed above zero
 STANDING_SPEED, STANDING_S = 0.12, 0.6  # slower for this long, it stands
+REFUTED_S = 0.2  # its hits were there before for this long: it has never moved
 
 GATE_SIGMAS = 4.0  # standard deviations from the prediction; a farther cluster is another
 MAX_JUMP_M = 0.6
@@ -68,6 +69,7 @@ class ObstacleTrack:
     moving: bool = False
     partly: bool = False  # when it was first seen, only a part of it was
     standing_s: float = 0.0
+    refuted_s: float = 0.0
     anchor_x: float = 0.0  # [m], last place where it stood
     anchor_y: float = 0.0
 
@@ -149,7 +151,17 @@ class ObstacleTrack:
         speed = math.hypot(self.velocity_x, self.velocity_y)
         self.standing_s = self.standing_s + dt if speed < STANDING_SPEED else 0.0
         if self.moving and self.standing_s >= STANDING_S:
-            self.moving, self.anchor_x, self.anchor_y = False, self.x, self.y
+            self._rest()
+
+    def refute(self, dt: float) -> None:
+        """Record for `dt` [s] that its hits show no motion; after REFUTED_S it stands."""
+        self.refuted_s += dt
+        if self.refuted_s >= REFUTED_S:
+            self.velocity_x = self.velocity_y = 0.0
+            self._rest()
+
+    def _rest(self) -> None:
+        self.moving, self.anchor_x, self.anchor_y = False, self.x, self.y
 
     def obstacle(self) -> Obstacle:
         """Return it as a message; without a velocity while it stands."""
@@ -206,7 +218,7 @@ class ObstacleTracker:
         points = _placed(hits, pose)
         parts = self._correct_all(clusters, taken, points, lidar, pose)
         self._space.add(PastScan(tick, points, lidar, abs(spacing), pose))
-        self._judge()
+        self._judge(dt)
         self._tracks = [track for track in self._tracks if self._lives(track)]
         self._begin_parts(points, lidar, pose)
         for j in set(range(len(clusters))) - set(taken.values()):
@@ -270,11 +282,17 @@ class ObstacleTracker:
         else:  # a hidden part does not make it smaller
             track.correct(x, y, track.radius, PARTIAL_NOISE_FACTOR * cluster.noise)
 
-    def _judge(self) -> None:
+    def _judge(self, dt: float) -> None:
         """Let free space decide which tracks move, rather than only show another side."""
         for t in self._tracks:
+            moves = t.x, t.y, t.velocity_x, t.velocity_y, t.radius
             if t.seems_to_move():
-                t.moving = self._space.shows_motion(t.x, t.y, t.velocity_x, t.velocity_y, t.radius)
+                t.moving, t.refuted_s = self._space.shows_motion(*moves), 0.0
+            elif t.moving and t.unseen_s == 0.0:
+                if self._space.shows_rest(*moves):
+                    t.refute(dt)
+                else:
+                    t.refuted_s = 0.0
 
     def _lives(self, track: ObstacleTrack) -> bool:
         limit = FORGET_S if track.seen > CONFIRMED_SCANS else FORGET_NEW_S

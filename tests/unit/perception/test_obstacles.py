@@ -66,8 +66,10 @@ class Watch:
         self.tracker, self.tick, self.t = ObstacleTracker(), 0, 0.0
         self._random = np.random.default_rng(seed)
 
-    def scan(self, *discs: Disc, pose: Pose = HERE) -> tuple[Obstacle, ...]:
-        """One scan more."""
+    def scan(
+        self, *discs: Disc, pose: Pose = HERE, believed: Pose | None = None
+    ) -> tuple[Obstacle, ...]:
+        """One scan more, from `pose`, where the odometry has `believed` instead."""
         self.tick += round(50 / self.hz)
         self.t = self.tick * 0.02
         ranges, angles = measured(self.lidar, pose, self.walls, discs, self.fov)
@@ -80,7 +82,7 @@ class Watch:
         y = self.lidar.y + ranges[hit] * np.sin(angles[hit])
         spacing = self.fov / self.lidar.beams
         hits = np.column_stack((x, y))
-        return self.tracker.update(hits, self.lidar, spacing, pose, 7, self.tick)
+        return self.tracker.update(hits, self.lidar, spacing, believed or pose, 7, self.tick)
 
     def walk(
         self, path: Callable[[float], tuple[float, float]], scans: int, radius: float = 0.25
@@ -177,6 +179,21 @@ def test_what_comes_into_view_as_the_robot_turns_does_not_move() -> None:
         pose = Pose(x=0.0, y=0.0, yaw=0.1 * i)
         obstacles = watch.scan((1.5, 0.4, 0.4), (-1.5, 1.0, 0.3), (0.4, -2.0, 0.4), pose=pose)
         assert all(speed(one) == 0.0 for one in obstacles), (i, obstacles)
+
+
+@pytest.mark.parametrize("drift", [-0.03, 0.03])
+def test_posts_stand_though_the_odometry_of_a_turning_robot_drifts(drift: float) -> None:
+    posts = [(1.2 * i + 0.3 * (j % 2), 0.7 * j, 0.08) for i in range(-2, 4) for j in range(-4, 5)]
+    watch = Watch(JACKAL, (), fov=math.radians(270), hz=25.0, noise=0.03, lost=0.1)
+    told = moving = 0
+    for i in range(200):
+        yaw, x = 1.2 * math.sin(0.1 * i), -0.6 + 0.005 * i
+        believed = Pose(x=(1 + drift) * x, y=0.35, yaw=(1 + drift) * yaw)
+        obstacles = watch.scan(*posts, pose=Pose(x=x, y=0.35, yaw=yaw), believed=believed)
+        told += len(obstacles)
+        moving += sum(speed(one) > 0.0 for one in obstacles)
+    assert told > 1000
+    assert moving < 0.01 * told
 
 
 def test_a_wall_is_no_obstacle_but_a_person_in_front_of_it_is() -> None:
