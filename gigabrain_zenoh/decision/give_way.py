@@ -24,6 +24,7 @@ STANDS_M = 0.4  # from a person's last place to a hit of the scan: still there
 BODY_M = 0.5  # from a person's last place to the middle of a contour: their own
 SAME_M = 1.0  # between two places of the same person
 MAX_WAYS = 64  # that are remembered
+WALKED_M = 0.5  # from where it was first seen: the shadows of a robot that turns do not get so far
 
 Point = tuple[float, float]
 Way = tuple[float, float, float]  # x, y [m] of a person, and their direction [rad]
@@ -35,10 +36,13 @@ class Walkers:
     def __init__(self) -> None:
         self.ways: Floats = np.empty((0, 3))  # (n, 3) x, y [m] in the map, direction [rad]
         self._ticks = np.empty(0, np.int64)
+        self._first: dict[int, Point] = {}  # place of each obstacle when it was first seen
 
     def update(self, tick: int, obstacles: tuple[Obstacle, ...], map_from_odom: Pose) -> None:
         """Take in the obstacles of a scan, in the frame of the odometry."""
-        moving = discs_of(obstacles)
+        self._first = {one.id: self._first.get(one.id, (one.x, one.y)) for one in obstacles}
+        walked = (one for one in obstacles if self._walked(one))
+        moving = discs_of(tuple(walked))
         if not len(moving) and not len(self.ways):
             return
         places = transform(from_pose(map_from_odom), moving[:, :2])
@@ -48,6 +52,9 @@ class Walkers:
         ways = np.concatenate((self.ways[kept], np.column_stack((places, turns))))
         ticks = np.concatenate((self._ticks[kept], np.full(len(moving), tick)))
         self.ways, self._ticks = ways[-MAX_WAYS:], ticks[-MAX_WAYS:]
+
+    def _walked(self, one: Obstacle) -> bool:
+        return math.dist(self._first[one.id], (one.x, one.y)) >= WALKED_M
 
 
 def nearest(ways: Floats, place: Point, reach: float) -> Way | None:
