@@ -7,6 +7,7 @@ no more room than at full speed otherwise; later data stop it.
 """
 
 import math
+from functools import lru_cache
 from typing import Self
 
 import numpy as np
@@ -34,7 +35,7 @@ REST_TICKS = 50  # without motion commands, after which nothing is known
 SPEED_TICKS, MIN_SPEED_TICKS = 40, 20  # of measured speeds
 SPEED_DELAYS = 31  # candidates, a tick apart: 0 to 0.6 s
 MIN_SPEED_DELAYS = 15  # while there are fewer commands than the longest delay needs
-SPEED_SCALE = np.array([0.05, 0.05, 0.3])  # [m/s, m/s, rad/s], as tolerances of tracking_error
+SPEED_SCALE = (0.05, 0.05, 0.3)  # [m/s, m/s, rad/s], as tolerances of tracking_error
 MIN_SPEED_CHANGE = 2.0  # in units of that; smaller changes are noise
 SPEED_PERIOD_TICKS = 4  # between estimates
 
@@ -105,10 +106,11 @@ class SpeedDelay(DelayEstimate, frozen=True, kw_only=True):
             return None
         if len(self.commanded) < len(self.measured) + MIN_SPEED_DELAYS - 1:
             return None
+        changes = zip(zip(*self.measured, strict=True), SPEED_SCALE, strict=True)
+        if max(max(axis) / unit - min(axis) / unit for axis, unit in changes) < MIN_SPEED_CHANGE:
+            return None
         commanded = np.array(self.commanded) / SPEED_SCALE
         measured = np.array(self.measured) / SPEED_SCALE
-        if float(np.ptp(measured, axis=0).max()) < MIN_SPEED_CHANGE:
-            return None
         left, whole = _unexplained(commanded, measured)
         best = int(np.argmin(left))
         sure = left[best] <= MAX_UNEXPLAINED * whole and _refutes_shorter(left, best)
@@ -160,17 +162,19 @@ def _turn(before: LaserScan, now: LaserScan) -> float | None:
     """Return the lidar's turn between two scans [rad]; None if they do not show it."""
     if before.angle_increment != now.angle_increment or len(before.ranges) != len(now.ranges):
         return None
-    then, newest = _profile(before), _profile(now)
+    then, newest = _profile(before.ranges), _profile(now.ranges)
     step, beams = abs(now.angle_increment), len(newest)
     if not math.isclose(step * beams, math.tau, rel_tol=0.01):
         return None
     most = min(math.ceil(MAX_TURN / step), beams // 2 - 1)
     around = np.concatenate([then[beams - most :], then, then[:most]])
     apart = np.lib.stride_tricks.sliding_window_view(around, beams) - newest  # (shifts, beams)
-    limit = MAX_RANGE_DIFFERENCE_M * MAX_RANGE_DIFFERENCE_M
-    unlike = np.minimum(apart * apart, limit).mean(axis=1)
-    best = int(np.argmin(unlike))
-    if best in (0, 2 * most) or unlike[best] > DISTINCT * float(np.median(unlike)):
+    np.multiply(apart, apart, out=apart)
+    np.minimum(apart, MAX_RANGE_DIFFERENCE_M * MAX_RANGE_DIFFERENCE_M, out=apart)
+    unlike = np.add.reduce(apart, axis=1) / beams
+    best = int(unlike.argmin())
+    # the number of turns is odd, so that the median is one of them
+    if best in (0, 2 * most) or unlike[best] > DISTINCT * np.partition(unlike, most)[most]:
         return None
     left, middle, right = unlike[best - 1 : best + 2]
     bend = left - 2 * middle + right
@@ -178,10 +182,11 @@ def _turn(before: LaserScan, now: LaserScan) -> float | None:
     return float((best - most + between) * now.angle_increment)
 
 
-def _profile(scan: LaserScan) -> Floats:
-    """Return the ranges (n,) [m], clipped to MAX_RANGE_M."""
-    values = scan.ranges_m.astype(np.float64)
-    return np.clip(np.nan_to_num(values, nan=MAX_RANGE_M, posinf=MAX_RANGE_M), 0.0, MAX_RANGE_M)
+@lru_cache(maxsize=2)  # each scan is compared with the one before and the one after
+def _profile(ranges: bytes) -> Floats:
+    """Return the ranges of a scan (n,) [m], clipped to MAX_RANGE_M; that is what nan counts as."""
+    values = np.frombuffer(ranges, "<f4").astype(np.float64)
+    return np.maximum(np.fmin(values, MAX_RANGE_M), 0.0)
 
 
 def _turn_delay(turns: tuple[tuple[int, int, float], ...], history: PoseHistory) -> int | None:

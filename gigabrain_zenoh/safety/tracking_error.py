@@ -125,11 +125,10 @@ def _bands(body: BodyDescription, recent: tuple[Velocity, ...]) -> Bands:
     Control corrects a body that is too slow or too fast, so a share of the speed is no fault.
     """
     share = body.control.max_correction
+    ranges = ((min(values), max(values)) for values in zip(*map(axes, recent), strict=True))
     return tuple(
-        (min(values), max(values), tolerance + share * max(abs(min(values)), abs(max(values))))
-        for values, tolerance in zip(
-            zip(*map(axes, recent), strict=True), _tolerances(body), strict=True
-        )
+        (least, most, tolerance + share * max(abs(least), abs(most)))
+        for (least, most), tolerance in zip(ranges, _tolerances(body), strict=True)
     )
 
 

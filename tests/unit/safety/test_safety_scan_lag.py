@@ -2,6 +2,7 @@
 
 import math
 import random
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from gigabrain_schemas.base import TICK_S, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState, Thresholds
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.geometry.pose import PoseHistory
-from gigabrain_zenoh.safety.latency import DataLatency
+from gigabrain_zenoh.safety.latency import DataLatency, TurnDelay
 from gigabrain_zenoh.testing.samples import LIDAR, WAFFLE, scan, state
 
 BODY = replace(WAFFLE, thresholds=Thresholds(reaction_time=0.25))
@@ -118,3 +119,44 @@ def test_who_drives_straight_on_learns_nothing() -> None:
     robot = Robot(5)
     assert robot.drive(200, 0.0, 0.2) == []
     assert robot.late.turns.ticks is None
+
+
+Change = Callable[[NDArray[np.float64]], None]
+
+
+def turned(change: Change, yaw: float) -> float | None:
+    """The turn that two scans of a room show, one of each changed like that; None without one."""
+    delay, history = TurnDelay(), PoseHistory()
+    for tick, seen in (
+        (5, room(Pose(x=0.0, y=0.0, yaw=0.0))),
+        (10, room(Pose(x=0.0, y=0.0, yaw=yaw))),
+    ):
+        change(seen)
+        now = replace(state(tick), basis=tick)
+        delay = delay.then(now, replace(scan(seen, tick), basis=tick), history, 5)
+    return delay.turns[-1][2] if delay.turns else None
+
+
+def unchanged(_: NDArray[np.float64]) -> None:
+    pass
+
+
+def gaps(seen: NDArray[np.float64]) -> None:
+    seen[40:60], seen[100:110], seen[200:215] = np.nan, np.inf, -np.inf
+
+
+@pytest.mark.parametrize(
+    ("change", "yaw", "turn"),
+    [
+        (unchanged, 0.0, 0.0),
+        (unchanged, 0.1, 0.09998960632440314),
+        (unchanged, -0.3, -0.29999356532962007),
+        (unchanged, 0.5, 0.49996078370780606),
+        (unchanged, 0.7, None),  # farther than is searched
+        (gaps, 0.1, 0.05676318957283547),
+        (gaps, -0.3, -0.2839689727870426),
+        (gaps, 0.5, None),
+    ],
+)
+def test_the_turn_between_two_scans(change: Change, yaw: float, turn: float | None) -> None:
+    assert turned(change, yaw) == turn
