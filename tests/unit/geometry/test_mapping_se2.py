@@ -18,6 +18,15 @@ def test_there_and_back_is_where_it_began() -> None:
     assert np.abs(compose(a, between(a, b)) - wrapped(b)).max() < 1e-12
 
 
+@pytest.mark.parametrize("yaw", [0.0, np.pi, -np.pi, 3 * np.pi, 2.5])
+def test_a_single_pose_moves_as_one_of_many(yaw: float) -> None:
+    for a, b in np.random.default_rng(4).uniform(-7, 7, (50, 2, 3)):
+        b[2] = yaw
+        for move in (compose, between):
+            assert move(a, b) == pytest.approx(move(a[None], b[None])[0], abs=1e-12)
+        assert inverse(b) == pytest.approx(inverse(b[None])[0], abs=1e-12)
+
+
 def test_angles_are_told_within_a_half_turn() -> None:
     assert wrap(np.array((3 * np.pi / 2, -3 * np.pi / 2, 0.5))) == pytest.approx(
         (-np.pi / 2, np.pi / 2, 0.5)
