@@ -22,7 +22,13 @@ from gigabrain_zenoh.bus.input_log import PublishedInputLogger
 from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
 from gigabrain_zenoh.errors import ConfigError, GigabrainError
 from gigabrain_zenoh.host.signals import interrupts, stop_signals
-from gigabrain_zenoh.host.this_process import go_first, join_in, start_first, step_aside
+from gigabrain_zenoh.host.this_process import (
+    go_first,
+    join_in,
+    start_first,
+    step_aside,
+    unmap_code,
+)
 from gigabrain_zenoh.plugins import find
 from gigabrain_zenoh.runtime.connect import MakeBus, connect
 from gigabrain_zenoh.runtime.heartbeat import STDOUT, beat
@@ -222,8 +228,9 @@ async def _node(bus: Bus, node: Node, process_type: ProcessType) -> None:
 
 
 def _ready(process_type: ProcessType) -> None:
-    if not process_type.stops:
+    if not process_type.stops:  # what stops the robot waits for no disk
         join_in()
+        unmap_code()
     gc.collect()
     gc.freeze()  # objects from set-up stay; later collections check new objects only
     gc.enable()

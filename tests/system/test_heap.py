@@ -75,3 +75,34 @@ def test_what_each_picture_needs_stays_in_the_heap() -> None:
         (sys.executable, "-c", PICTURES), capture_output=True, text=True, check=True
     )
     assert int(done.stdout) < 1000
+
+
+CODE = """
+from gigabrain_zenoh.host import this_process
+from gigabrain_zenoh.mapping.slam_map import warm_up
+
+def code_kb():
+    mapped = 0
+    for line in open("/proc/self/smaps"):
+        words = line.split()
+        if len(words) >= 5 and "-" in words[0]:
+            of_file = words[1] == "r-xp" and words[4] != "0"
+        elif words[0] == "Rss:" and of_file:
+            mapped += int(words[1])
+    return mapped
+
+warm_up()
+before = code_kb()
+this_process.unmap_code()
+warm_up()
+print(before, code_kb())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux tells what is mapped")
+def test_code_that_only_the_start_has_run_is_unmapped() -> None:
+    pytest.importorskip("gtsam")
+    done = subprocess.run((sys.executable, "-c", CODE), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    before, after = map(int, done.stdout.split())
+    assert after < before - 15_000
