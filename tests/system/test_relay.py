@@ -64,14 +64,14 @@ def test_its_processes_meet_at_a_socket_and_it_alone_connects_to_the_router(
 
 async def relay_lost(robot: Probe, *, killed: bool) -> None:
     """With it the brain is lost, which stops the robot; and it comes back by itself."""
-    (told,) = await robot.bus.ask(DESCRIBE, DescribeRequest(), name="relay", timeout_s=20)
+    relay = await robot.pid("relay")
     ears = Ears(robot)
     await robot.driving_straight(0.19)
     start = robot.state
-    os.kill(told.pid, signal.SIGKILL if killed else signal.SIGSTOP)
+    os.kill(relay, signal.SIGKILL if killed else signal.SIGSTOP)
     await robot.ticks(REST_TICKS)
     if not killed:
-        os.kill(told.pid, signal.SIGCONT)
+        os.kill(relay, signal.SIGCONT)
     await robot.driving_straight(0.15, room=0.0)
     last, first = ears.silence(start.tick)
     assert first - last > STOP_TICKS
