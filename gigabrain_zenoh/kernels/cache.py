@@ -1,4 +1,4 @@
-"""Where compiled kernels are kept: in NUMBA_CACHE_DIR, or in the user's cache folder."""
+"""Names the files of compiled kernels, in NUMBA_CACHE_DIR or in the user's cache folder."""
 
 import functools
 import hashlib
@@ -30,7 +30,7 @@ def cache_folder() -> Path | None:
     finds nothing for the same file at another place, as in a second checkout, or of another time.
     """
     try:
-        return user_cache_path("gigabrain") / f"kernels-{_digest()}"
+        return user_cache_path("gigabrain") / f"kernels-{digest(PACKAGE)}"
     except RuntimeError:
         return None
 
@@ -52,16 +52,18 @@ def mark_of(warm_up: str) -> Path | None:
 
 def suffix() -> str:
     """Return the end of the names of files for these sources and this processor."""
-    return f"-{_digest()}-{_machine()}"
+    return f"-{digest(PACKAGE)}-{_machine()}"
 
 
-def _digest() -> str:
-    digest = hashlib.sha256()
+@functools.cache
+def digest(package: Path) -> str:
+    """Return a digest of the sources with kernels, as they are at the first call."""
+    sources = hashlib.sha256()
     for holder in HOLDERS:
-        for source in sorted((PACKAGE / holder).rglob("*.py")):
-            digest.update(source.read_bytes())
-            digest.update(f"{source} {source.stat().st_mtime_ns}".encode(errors="replace"))
-    return digest.hexdigest()[:16]
+        for source in sorted((package / holder).rglob("*.py")):
+            sources.update(source.read_bytes())
+            sources.update(f"{source} {source.stat().st_mtime_ns}".encode(errors="replace"))
+    return sources.hexdigest()[:16]
 
 
 @functools.cache

@@ -58,7 +58,7 @@ class Kernel:
         functools.update_wrapper(self, function)
         self.function, self._lean = function, lean
         self.name = f"{function.__module__}:{function.__qualname__}"
-        self.called = False  # by numba, and not from another kernel only
+        self.called = False  # from Python, and run by numba
 
     def __call__(self, *arguments: Any) -> Any:
         """Call it; it runs without the GIL."""

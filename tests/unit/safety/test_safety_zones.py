@@ -125,7 +125,7 @@ def test_on_whatever_curve_it_may_go_on_it_stops_before_a_post(angular_accelerat
 
 
 def least_room(body: BodyDescription, twist: Velocity, post: Floats) -> float:
-    """How near to `post` (2,) the body comes [m] until it rests."""
+    """Return the least distance of the body from `post` (2,) [m] until it rests."""
     v, w, x, y, yaw, nearest, dt = twist.linear_x, twist.angular_z, 0.0, 0.0, 0.0, math.inf, 0.01
     for tick in range(600):
         if tick * dt >= body.thresholds.reaction_time:
