@@ -151,6 +151,7 @@ GROUPS = {
     "bench": "Run benchmarks.",
     "schema": "Export message definitions.",
 }
+SUPERVISING = {"demo", "up"}  # these start a robot's processes
 # commands that have others below them
 PARENTS = COMMANDS.keys() & {command.rpartition(" ")[0] for command in COMMANDS}
 
@@ -235,6 +236,10 @@ def _call(words: "Sequence[str]") -> object:
     from gigabrain_zenoh.errors import ConfigError, GigabrainError
     from gigabrain_zenoh.host.signals import interrupts
 
+    if {*words[:1]} & SUPERVISING and not {*words} & {"--help", "-h"}:
+        from gigabrain_zenoh.runtime.forking import start_early
+
+        start_early("gigabrain_zenoh.launch.shared")
     try:
         words, notices = renamed_arguments(words)
         app = make_app(words)

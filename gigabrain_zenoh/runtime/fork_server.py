@@ -3,13 +3,15 @@
 A fork server holds no session and no keys, and runs no thread. A fork ends up as a child of the
 supervisor, not of the server, so it goes on when the server ends:
 
+    supervisor   the levels of imports, with a connection for each      -> fork server
     fork server  its pid, once it has imported                          -> supervisor
     supervisor   a request, with the ends of its output and of a pipe   -> fork server
     fork server  forks, and the fork forks: the first one ends          -> the fork
     the fork     its pid, once the supervisor is its parent             -> supervisor
     supervisor   a byte in the pipe; if it has given up, it closes it   -> the fork, which runs
 
-The servers end when all is started: what starts later does so by itself, as after a failure.
+`gigabrain up` starts the server first, which imports while the command reads what to run. The
+servers end when all is started: what starts later does so by itself, as after a failure.
 A server that goes on to import copies the pages that it writes to, and shares less with those that
 it has forked before. So there is one for each level of imports, a fork of the one before.
 """
@@ -31,15 +33,9 @@ from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.plugins import find
 
 MAX_BYTES = 128 * 1024  # of a request
+MAX_LEVELS = 8
 ADOPTION_S = 5.0  # until a fork has become a child of the supervisor
 ADOPTION_LOOK_S = 0.0002
-
-
-class Level(Struct, frozen=True):
-    """One fork server."""
-
-    connection: int  # file descriptor of the socket to the supervisor
-    modules: tuple[str, ...]  # that it imports, after those of the levels before
 
 
 class ForkRequest(Struct, frozen=True):
@@ -54,23 +50,35 @@ class ForkRequest(Struct, frozen=True):
 def main() -> NoReturn:
     """Serve the requests of a supervisor, until it ends or closes the connections.
 
-    The argument is a list of levels in JSON.
+    The arguments are the file descriptor of the first connection, and what to import at once.
     """
     supervisor = os.getppid()
     this_process.set_up()
-    levels = msgspec.json.decode(sys.argv[1], type=list[Level])
-    for level in levels:
-        for module in level.modules:
-            with contextlib.suppress(ImportError):  # the process that needs it reports it
-                importlib.import_module(module)
+    first = socket.socket(fileno=int(sys.argv[1]))
+    _import(sys.argv[2:])
+    data, ends, _, _ = socket.recv_fds(first, MAX_BYTES, MAX_LEVELS)
+    if not data:
+        os._exit(0)
+    levels = msgspec.json.decode(data, type=list[tuple[str, ...]])
+    connections = [first, *(socket.socket(fileno=end) for end in ends)]
+    for modules in levels:
+        _import(modules)
         gc.collect()
         gc.freeze()  # a later collection in a fork writes to none of what it shares
         this = os.getpid()
-        if level is levels[-1] or os.fork():
+        if len(connections) == 1 or os.fork():
             break
         this_process.die_with_parent(this)
-        os.close(level.connection)
-    _serve(socket.socket(fileno=level.connection), supervisor)
+        connections.pop(0).close()
+    for connection in connections[1:]:
+        connection.close()
+    _serve(connections[0], supervisor)
+
+
+def _import(modules: Sequence[str]) -> None:
+    for module in modules:
+        with contextlib.suppress(ImportError):  # the process that needs it reports it
+            importlib.import_module(module)
 
 
 def _serve(connection: socket.socket, supervisor: int) -> NoReturn:

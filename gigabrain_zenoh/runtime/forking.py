@@ -11,13 +11,13 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import msgspec
 
 from gigabrain_zenoh.runtime.child import REAP_S, Child, supervised_environment
-from gigabrain_zenoh.runtime.fork_server import MAX_BYTES, ForkRequest, Level
+from gigabrain_zenoh.runtime.fork_server import MAX_BYTES, ForkRequest
 
 COMMAND = (sys.executable, "-P", "-m", "gigabrain_zenoh.runtime.fork_server")
 IMPORT_S = 15.0  # until a fork server has imported
@@ -25,6 +25,54 @@ FORK_S = 5.0  # until a fork answers
 LOOK_S = 0.5  # between looks whether a fork server is stopped
 PR_SET_CHILD_SUBREAPER = 36  # prctl(2)
 FAILED = "the fork server {}; processes start without it, with more memory"
+
+
+def works_here() -> bool:
+    """Return whether this system has what fork servers need."""
+    return sys.platform == "linux" and hasattr(os, "pidfd_open")
+
+
+Server = tuple[subprocess.Popen[bytes], socket.socket]
+_early: list[Server] = []
+
+
+def start_early(*modules: str) -> None:
+    """Start a fork server that the next supervisor takes over, and have it import `modules`.
+
+    It imports while this process reads what to run.
+    """
+    if works_here():
+        with contextlib.suppress(OSError):  # the supervisor tries again, and reports it
+            _early.append(_start(modules))
+
+
+def end_early() -> None:
+    """End the server of `start_early` if it is not needed."""
+    while _early:
+        server, connection = _early.pop()
+        connection.close()
+        _end(server)
+
+
+def _start(modules: Sequence[str] = ()) -> Server:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with theirs, contextlib.ExitStack() as closing:
+        closing.callback(ours.close)
+        server = subprocess.Popen(
+            (*COMMAND, str(theirs.fileno()), *modules),
+            stdin=subprocess.DEVNULL,
+            pass_fds=[theirs.fileno()],
+            env=supervised_environment(),
+            start_new_session=True,
+        )
+        closing.pop_all()
+    return server, ours
+
+
+def _end(server: subprocess.Popen[bytes]) -> None:
+    server.kill()
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        server.wait(REAP_S)
 
 
 class ForkServers:
@@ -43,11 +91,6 @@ class ForkServers:
         self._connections: list[socket.socket] = []
         self._imported: list[asyncio.Task[int]] = []  # of each level
 
-    @staticmethod
-    def works_here() -> bool:
-        """Return whether this system can do it."""
-        return sys.platform == "linux" and hasattr(os, "pidfd_open")
-
     def open(self) -> None:
         """Start the servers, in a running event loop."""
         try:
@@ -56,21 +99,15 @@ class ForkServers:
             self._fail(f"cannot be started ({error})")
 
     def _open(self) -> None:
-        pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in self._levels]
-        self._connections = [ours for ours, _ in pairs]
-        ends = [theirs.fileno() for _, theirs in pairs]
-        levels = [Level(*one) for one in zip(ends, self._levels, strict=True)]
-        try:
-            self._first = subprocess.Popen(
-                (*COMMAND, msgspec.json.encode(levels).decode()),
-                stdin=subprocess.DEVNULL,
-                pass_fds=ends,
-                env=supervised_environment(),
-                start_new_session=True,
-            )
-        finally:
-            for _, theirs in pairs:
-                theirs.close()
+        self._first, first = _early.pop() if _early else _start()
+        self._connections = [first]
+        with contextlib.ExitStack() as closing:
+            ends = []
+            for _ in self._levels[1:]:
+                ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+                self._connections.append(ours)
+                ends.append(closing.enter_context(theirs).fileno())
+            socket.send_fds(first, [msgspec.json.encode(self._levels)], ends)
         self._imported = [
             asyncio.create_task(self._answer(one, IMPORT_S)) for one in self._connections
         ]
@@ -78,9 +115,7 @@ class ForkServers:
     def close(self) -> None:
         """End the servers. What they have forked goes on."""
         if self._first:
-            self._first.kill()  # the others die with it
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self._first.wait(REAP_S)
+            _end(self._first)  # the others die with it
         for task in self._imported:
             if not task.cancel() and not task.cancelled():
                 task.exception()  # retrieved, so that asyncio does not log it
@@ -139,7 +174,9 @@ class ForkServers:
                     raise TimeoutError
         finally:
             loop.remove_reader(connection)
-        pid = connection.recv(64)
+        pid = b""
+        with contextlib.suppress(ConnectionResetError):  # it has not read all
+            pid = connection.recv(64)
         if not pid:
             raise ConnectionError("has ended")
         return int(pid)

@@ -10,8 +10,7 @@ from typing import Self
 
 from gigabrain_zenoh import errors
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.runtime import heartbeat
-from gigabrain_zenoh.runtime.forking import ForkServers
+from gigabrain_zenoh.runtime import forking, heartbeat
 from gigabrain_zenoh.runtime.managed_process import (
     Backoff,
     ManagedProcess,
@@ -43,8 +42,10 @@ class Supervisor:
         _check(specs)
         self._shared = Shared(on_record, backoff or Backoff(), keep_stuck)
         forks = {spec.name: spec.fork for spec in specs if spec.fork}
-        if len(forks) > 1 and ForkServers.works_here():  # a single one would share with none
-            self._shared.fork_servers = ForkServers(forks, self._on_fork_failure)
+        if len(forks) > 1 and forking.works_here():  # a single one would share with none
+            self._shared.fork_servers = forking.ForkServers(forks, self._on_fork_failure)
+        else:
+            forking.end_early()
         self._keepers = {spec.name: ManagedProcess(spec, self._shared) for spec in specs}
         self.statuses: Mapping[str, ProcessStatus] = {
             name: keeper.status for name, keeper in self._keepers.items()

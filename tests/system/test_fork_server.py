@@ -11,12 +11,12 @@ from pathlib import Path
 import psutil
 import pytest
 
+from gigabrain_zenoh.cli import app
 from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
 from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.launch.processes import PROCESSES
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.runtime import forking
-from gigabrain_zenoh.runtime.forking import ForkServers
 from gigabrain_zenoh.runtime.supervisor import Supervisor
 from gigabrain_zenoh.testing.waiting import until
 from tests.places import ROOT
@@ -31,7 +31,7 @@ from tests.system.children import (
     spec,
 )
 
-pytestmark = pytest.mark.skipif(not ForkServers.works_here(), reason="Linux alone has pidfds")
+pytestmark = pytest.mark.skipif(not forking.works_here(), reason="Linux alone has pidfds")
 NEVER = (("tests.system.never_imported",),)
 
 
@@ -158,6 +158,68 @@ async def test_a_stop_does_not_wait_for_a_server_that_imports() -> None:
     async with running(*specs):
         await until(servers)
     assert not servers()
+
+
+async def test_a_supervisor_takes_over_a_server_that_was_started_early() -> None:
+    forking.start_early("tests.system.children")
+    (early,) = servers()
+    async with running(forked("one"), forked("two")) as (supervisor, records):
+        await until_ready(supervisor)
+        assert psutil.Process(supervisor.statuses["one"].pid).cmdline()[0] == "forked one"
+        assert not servers()
+        assert not records.texts("fork server")
+    assert not early.is_running()
+
+
+async def test_an_early_server_that_no_process_needs_is_ended() -> None:
+    forking.start_early()
+    assert servers()
+    async with running(forked("one"), spec("two")) as (supervisor, _):
+        assert not servers()
+        await until_ready(supervisor)
+
+
+async def test_without_the_early_server_processes_start_by_themselves() -> None:
+    forking.start_early()
+    (early,) = servers()
+    early.kill()
+    early.wait()
+    async with running(forked("one"), forked("two")) as (supervisor, records):
+        await until_ready(supervisor)
+        assert len(records.texts("fork server")) == 1
+        assert supervisor.deaths == 0
+
+
+ABANDONS = """
+from gigabrain_zenoh.runtime import forking
+forking.start_early("time")
+print(forking._early[0][0].pid)
+"""
+
+
+def test_an_early_server_ends_with_the_command_that_started_it() -> None:
+    said = subprocess.check_output((sys.executable, "-c", ABANDONS), text=True)
+    with contextlib.suppress(psutil.NoSuchProcess):
+        psutil.Process(int(said)).wait(timeout=10)
+
+
+@pytest.mark.parametrize(
+    ("words", "started"),
+    [
+        (["up", "nowhere.yaml"], ["gigabrain_zenoh.launch.shared"]),
+        (["demo", "--seconds", "-1"], ["gigabrain_zenoh.launch.shared"]),
+        (["up", "--help"], []),
+        (["robots", "--nothing"], []),
+        ([], []),
+    ],
+)
+def test_commands_that_run_a_robot_start_a_server_early(
+    words: list[str], started: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    early: list[str] = []
+    monkeypatch.setattr(forking, "start_early", early.append)
+    app._call(words)
+    assert early == started
 
 
 def all_forked(parent: str) -> str:

@@ -35,8 +35,7 @@ from gigabrain_zenoh.qa.faults.rig import (
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, Skipped, Stage, fault_row, worse_of
 from gigabrain_zenoh.qa.probe import moving, until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
-from gigabrain_zenoh.runtime import fork_server
-from gigabrain_zenoh.runtime.forking import ForkServers
+from gigabrain_zenoh.runtime import fork_server, forking
 from gigabrain_zenoh.runtime.managed_process import Backoff
 
 FROZEN_TICKS, LONG_FROZEN_TICKS = 250, 3000  # 5 s, 60 s
@@ -395,7 +394,7 @@ async def _recovery_s(robot: RobotUnderTest, victim: str) -> float:
 @fault_row(63, "", READY_AFTER.at_most(30), NOT_TOLD.at_most(0))
 async def fork_server_lost(rig: Rig) -> Measured:
     """Kill and freeze the fork server while a robot starts: its processes start by themselves."""
-    if not ForkServers.works_here():
+    if not forking.works_here():
         raise Skipped("processes are not forked on this system")
     longest_s, not_told = 0.0, 0
     for fault in (signal.SIGKILL, signal.SIGSTOP):
