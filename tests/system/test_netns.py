@@ -17,6 +17,7 @@ import pytest
 from gigabrain_schemas.brain import CmdVel, Intent
 from gigabrain_schemas.topics import CMD_VEL, INTENT
 from gigabrain_zenoh.client.robot import Robot
+from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.qa.probe import Probe, at_rest, probing
 from gigabrain_zenoh.qa.proxy.chaos import CALM, Chaos
@@ -60,12 +61,13 @@ class Site:
 
 
 class Ears:
-    """Keeps the intents and commands that a probe receives."""
+    """Keeps all intents and commands that a probe receives, also while the test's loop stalls."""
 
     def __init__(self, robot: Probe) -> None:
         self.commands, self.intents = deque[CmdVel](maxlen=10_000), deque[Intent](maxlen=10_000)
-        robot.bus.subscribe(CMD_VEL, lambda _key, command: self.commands.append(command))
-        robot.bus.subscribe(INTENT, lambda _key, intent: self.intents.append(intent))
+        command, intent = Codec(CmdVel, CMD_VEL.max_bytes), Codec(Intent, INTENT.max_bytes)
+        robot.bus.tap(CMD_VEL.key, lambda *said: self.commands.append(command.decode(said[2])))
+        robot.bus.tap(INTENT.key, lambda *said: self.intents.append(intent.decode(said[2])))
 
     def silence(self, after: int) -> tuple[int, int]:
         """Return the ticks of the last intent before a silence, and of the first one after it.
