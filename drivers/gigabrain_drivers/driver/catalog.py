@@ -4,7 +4,6 @@ import difflib
 import importlib.util
 from collections.abc import Mapping
 from importlib import resources
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -25,7 +24,7 @@ from gigabrain_zenoh.config.settings import LinkName
 from gigabrain_zenoh.errors import ConfigError, UnknownName, unknown
 from gigabrain_zenoh.geometry.body_settings import check_safe
 from gigabrain_zenoh.host.run_folders import state_dir
-from gigabrain_zenoh.plugins import load_plugin, plugin_names
+from gigabrain_zenoh.plugins import load_plugin, offered, plugin_names
 
 GROUP = "gigabrain.drivers"  # of entry points
 EMULATOR = "{emulator}"  # in a robot's file: the folder of the emulator's ports
@@ -43,7 +42,7 @@ def robot_files() -> dict[str, Path]:
 def _robots_of_packages() -> dict[str, Path]:
     """A package that offers a driver may have a robot.yaml of the driver's name in its folder."""
     found = {}
-    for point in entry_points(group=GROUP):
+    for point in offered(GROUP):
         spec = importlib.util.find_spec(point.module.partition(".")[0])
         for folder in (spec.submodule_search_locations or ()) if spec else ():
             if (path := Path(folder) / "robot.yaml").is_file():
