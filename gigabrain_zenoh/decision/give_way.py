@@ -31,30 +31,39 @@ Way = tuple[float, float, float]  # x, y [m] of a person, and their direction [r
 
 
 class Walkers:
-    """Remembers where people were last seen walking, and in which direction."""
+    """Remembers people who have walked: where they were last seen, and where they were going."""
 
     def __init__(self) -> None:
         self.ways: Floats = np.empty((0, 3))  # (n, 3) x, y [m] in the map, direction [rad]
-        self._ticks = np.empty(0, np.int64)
+        self._ticks = np.empty(0, np.int64)  # of their last step
+        self._ids = np.empty(0, np.int64)
         self._first: dict[int, Point] = {}  # place of each obstacle when it was first seen
+        self._walked: set[int] = set()  # those that have been far from there
 
     def update(self, tick: int, obstacles: tuple[Obstacle, ...], map_from_odom: Pose) -> None:
         """Take in the obstacles of a scan, in the frame of the odometry."""
-        self._first = {one.id: self._first.get(one.id, (one.x, one.y)) for one in obstacles}
-        walked = (one for one in obstacles if self._walked(one))
-        moving = discs_of(tuple(walked))
-        if not len(moving) and not len(self.ways):
+        first = {one.id: self._first.get(one.id, (one.x, one.y)) for one in obstacles}
+        self._walked &= first.keys()
+        for one in obstacles:
+            if math.dist(first[one.id], (one.x, one.y)) >= WALKED_M:
+                self._walked.add(one.id)  # also when they come back
+        self._first = first
+        walked = [one for one in obstacles if one.id in self._walked]
+        if not walked and not len(self.ways):
             return
-        places = transform(from_pose(map_from_odom), moving[:, :2])
+        frame = from_pose(map_from_odom)
+        for one in walked:  # they may go on too slowly to be seen moving
+            self.ways[self._ids == one.id, :2] = transform(frame, np.array([[one.x, one.y]]))
+        stepped = [one for one in walked if len(discs_of((one,)))]
+        moving = discs_of(tuple(stepped))
+        places = transform(frame, moving[:, :2])
         turns = np.arctan2(moving[:, 3], moving[:, 2]) + map_from_odom.yaw
         away = np.hypot(*(self.ways[:, None, :2] - places).transpose(2, 0, 1))
         kept = (away > SAME_M).all(axis=1) & (np.abs(tick - self._ticks) <= WALKED_TICKS)
         ways = np.concatenate((self.ways[kept], np.column_stack((places, turns))))
         ticks = np.concatenate((self._ticks[kept], np.full(len(moving), tick)))
-        self.ways, self._ticks = ways[-MAX_WAYS:], ticks[-MAX_WAYS:]
-
-    def _walked(self, one: Obstacle) -> bool:
-        return math.dist(self._first[one.id], (one.x, one.y)) >= WALKED_M
+        ids = np.concatenate((self._ids[kept], np.array([one.id for one in stepped], np.int64)))
+        self.ways, self._ticks, self._ids = ways[-MAX_WAYS:], ticks[-MAX_WAYS:], ids[-MAX_WAYS:]
 
 
 def nearest(ways: Floats, place: Point, reach: float) -> Way | None:

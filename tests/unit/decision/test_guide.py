@@ -349,8 +349,8 @@ def test_it_does_not_go_aside_for_things_nor_for_who_is_not_there(
     assert not any(one.activity for one in goes_aside(BARRED, walkers, seen))
 
 
-def walking(x: float, y: float, speed: float) -> Obstacle:
-    return Obstacle(id=1, x=x, y=y, velocity_x=speed, radius=0.2)
+def walking(x: float, y: float, speed: float, number: int = 1) -> Obstacle:
+    return Obstacle(id=number, x=x, y=y, velocity_x=speed, radius=0.2)
 
 
 def test_who_has_walked_is_remembered_where_they_stand() -> None:
@@ -368,10 +368,31 @@ def test_who_has_walked_is_remembered_where_they_stand() -> None:
     assert len(walkers.ways) == 0
 
 
+def test_who_comes_back_is_remembered_where_they_stand() -> None:
+    walkers, here = Walkers(), Pose(x=0.0, y=0.0, yaw=0.0)
+    for tick, x in enumerate((0.0, 0.3, 0.6, 0.3)):
+        walkers.update(5 * tick, (walking(x, 0.0, 0.5 if x < 0.6 else -0.5),), here)
+    walkers.update(20, (walking(0.1, 0.0, -0.5),), here)
+    walkers.update(25, (walking(0.1, 0.0, 0.0),), here)
+    assert len(standing(walkers.ways, np.array([[-0.1, 0.0]]))) == 1
+
+
+def test_who_creeps_on_is_remembered_where_they_stand() -> None:
+    walkers, here = Walkers(), Pose(x=1.0, y=0.0, yaw=0.0)
+    for tick, x in enumerate((0.0, 0.3, 0.6)):
+        walkers.update(5 * tick, (walking(x, 0.0, 0.5),), here)
+    for tick in range(3, 20):  # a centimetre from scan to scan, as if standing
+        walkers.update(5 * tick, (walking(0.6 + 0.01 * (tick - 2), 0.0, 0.0),), here)
+    assert walkers.ways == pytest.approx(np.array([[1.77, 0.0, 0.0]]))
+    walkers.update(3011, (walking(0.77, 0.0, 0.0),), here)
+    assert len(walkers.ways) == 0  # a minute after their last step
+
+
 def test_no_crowd_is_remembered_without_end() -> None:
     walkers = Walkers()
-    for k in range(8):
-        crowd = tuple(walking(2.0 * x, 20.0 * k, 0.5) for x in range(20))
+    for k in range(16):
+        x, y = -0.6 * (1 - k % 2), 20.0 * (k // 2)
+        crowd = tuple(walking(x + 2.0 * i, y, 0.5, 20 * (k // 2) + i) for i in range(20))
         walkers.update(5 * k, crowd, Pose(x=0.0, y=0.0, yaw=0.0))
     assert len(walkers.ways) == 64
     assert walkers.ways[-1].tolist() == [38.0, 140.0, 0.0]
