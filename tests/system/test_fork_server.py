@@ -5,7 +5,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import psutil
@@ -15,7 +15,7 @@ from gigabrain_zenoh.cli import app
 from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
 from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.launch.processes import PROCESSES
-from gigabrain_zenoh.launch.specs import process_specs
+from gigabrain_zenoh.launch.specs import SHARED, process_specs
 from gigabrain_zenoh.runtime import forking
 from gigabrain_zenoh.runtime.supervisor import Supervisor
 from gigabrain_zenoh.testing.waiting import until
@@ -36,8 +36,10 @@ NEVER = (("tests.system.never_imported",),)
 
 
 @pytest.fixture(autouse=True)
-def path(monkeypatch: pytest.MonkeyPatch) -> None:
+def path(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    yield
+    forking.end_early()  # where a test has failed
 
 
 def servers() -> list[psutil.Process]:
@@ -206,8 +208,8 @@ def test_an_early_server_ends_with_the_command_that_started_it() -> None:
 @pytest.mark.parametrize(
     ("words", "started"),
     [
-        (["up", "nowhere.yaml"], ["gigabrain_zenoh.launch.shared"]),
-        (["demo", "--seconds", "-1"], ["gigabrain_zenoh.launch.shared"]),
+        (["up", "nowhere.yaml"], [SHARED]),
+        (["demo", "--seconds", "-1"], [SHARED]),
         (["up", "--help"], []),
         (["robots", "--nothing"], []),
         ([], []),
