@@ -2,8 +2,9 @@
 
 A block of `sh` or `python` is run in a folder of its page, a line of `sh` at a time; `blocks.py`
 says what a comment before a block changes. A line that ends in `&` runs until the end of its block.
-All pages share one robot. Other blocks are checked. Pages may be named behind the command. Prints
-how many blocks were run, and which need hardware; ends with 1 where something fails.
+Pages share a robot, which is ended before a block that starts one: robots side by side delay each
+other. Other blocks are checked. Pages may be named behind the command. Prints how many blocks were
+run, and which need hardware; ends with 1 where something fails.
 """
 
 import contextlib
@@ -28,16 +29,17 @@ JUDGES = ("gigabrain why", "gigabrain doctor")  # their exit code says what is w
 USAGE, INTERRUPTED = 2, 130
 MODE = "gigabrain topic echo state -n 1 --fields gate.mode"
 BODIES = {"robot": "turtlebot3_waffle", "arm": "so101"}  # what a block is run beside
+STARTS_ROBOT = re.compile(r"^gigabrain (bench|demo|faults|up)\b", re.MULTILINE)
 Words = str | Sequence[str]
 
 
 class Home:
-    """The folders of a user, and a robot in them once one is asked for; each body alone."""
+    """The folders of a user, and a robot in them once one is asked for."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._robots: dict[str, subprocess.Popen[bytes]] = {}  # by body
-        self._driven: set[str] = set()  # which have been enabled
+        self._body = ""
+        self._robot: subprocess.Popen[bytes] | None = None
 
     def environment(self, place: Path, body: str) -> dict[str, str]:
         """Return the environment of a page in `place`; with a `body` it sees that robot."""
@@ -53,19 +55,22 @@ class Home:
         }
 
     def robot(self, body: str) -> None:
-        """Start a robot, unless it runs, and wait until it may drive."""
+        """Start a robot in place of another one, unless it runs, and wait until it may drive."""
         environment = self.environment(self.folder, body)
-        if body not in self._robots:
+        running = self._robot is not None and self._body == body
+        if not running:
+            self.close()
             words = f"exec gigabrain demo --headless --no-page --world arena --body {body}"
-            self._robots[body] = start(words, self.folder, environment, subprocess.DEVNULL)
-        until_enabled(self.folder, environment, driven=body in self._driven)
-        self._driven.add(body)
+            self._robot = start(words, self.folder, environment, subprocess.DEVNULL)
+            self._body = body
+        until_enabled(self.folder, environment, driven=running)
 
     def close(self) -> None:
-        """End the robots."""
-        for robot in self._robots.values():
-            robot.send_signal(signal.SIGINT)
-            robot.wait(60)
+        """End the robot, if there is one."""
+        if self._robot is not None:
+            self._robot.send_signal(signal.SIGINT)
+            self._robot.wait(60)
+            self._robot = None
 
 
 def start(
@@ -149,6 +154,8 @@ def run_block(home: Home, folder: Path, block: Block, page: contextlib.ExitStack
     body = next((known for word, known in BODIES.items() if word in block.value), "")
     if body:
         home.robot(body)
+    elif STARTS_ROBOT.search(block.text):
+        home.close()
     environment = home.environment(folder, body)
     ended = re.search(r"(\d+) s", block.value)
     after_s = float(ended[1]) if ended else 0.0
