@@ -59,13 +59,14 @@ from gigabrain_zenoh.decision.tasks.arm_steps import (
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold, Plan
 from gigabrain_zenoh.manipulation.collision import Thing
-from gigabrain_zenoh.manipulation.phases import PhaseRun
+from gigabrain_zenoh.manipulation.phases import Phase, PhaseRun
 from gigabrain_zenoh.manipulation.pick_place import NoWay
 
 TRIES = 3  # to pick a thing up, each with another grasp
 HOLD_UPS = 5  # of one command, after which it fails
 WAIT_TICKS = 100  # for a joint that the gate holds back, before another way is planned
 MISSED = f"it was not caught, {TRIES} times"
+SQUEEZES = ("close", "ease", "lift", "relax", "grip")  # after which a gripper may do so too hard
 CARRYING = ("lift", "traverse", "lower", "move")  # phases in which a thing has to be held
 NO_MODEL = Idle("waiting", "waiting: for the arm's model, robot/arm_model")
 NOT_MEASURED = Idle("waiting", "waiting: for all joints to be measured")
@@ -357,24 +358,20 @@ class Manipulator:
             closed = sent_to(planner, body, state, plan.hold.grip)  # unless safety holds it back
             if not (closed and holds(planner, plan.hold, state)):
                 return self._missed(planner, body, state)
-            self._grip(planner, run, plan.hold, state)
-        if over and over.name == "ease" and hold:
-            if not holds(planner, hold, state):
+            hold = self._grip(planner, plan.hold, state)
+        if over and over.name == "grip":
+            hold = None
+            self._set_hold(None)
+        if over and over.name in SQUEEZES:
+            if hold and not holds(planner, hold, state):
                 return self._missed(planner, body, state)
-            place = gripper_place(planner, state, hold.grip)
-            if planner.overloads(hold, place):
-                ease = planner.eased(hold, place)
-                assert ease.gripper is not None
-                run.insert(ease)
-                self._achieve(dataclasses.replace(hold, grip=ease.gripper))
+            self._ease(planner, run, hold, state, over)
         if over and over.name == "open" and hold:
             posture = measured_posture(planner, state)
             name, solid = placed(planner, posture, command.do, hold, body)
             self._achieve(None, placed=(name, solid))
             if self._seen_as is not None:  # others have a place by their mission
                 self._put = PutDown(name=name, solid=solid, state=state)
-        if over and over.name == "grip":
-            self._set_hold(None)
         if run.phase is None:
             return self._end(body, state, run)
         return self._moving(state)
@@ -387,15 +384,27 @@ class Manipulator:
         self._back_off(planner, body, state, self._plan)
         return self._moving(state)
 
-    def _grip(self, planner: ArmPlanner, run: PhaseRun, hold: Hold, state: RobotState) -> None:
-        """Record that the gripper holds a thing, and have it squeeze less from now on."""
+    def _grip(self, planner: ArmPlanner, hold: Hold, state: RobotState) -> Hold:
+        """Record and return what the gripper holds from now on."""
         assert self._target
-        self._gripped = state.tick
-        ease = planner.eased(hold, gripper_place(planner, state, hold.grip))
-        assert ease.gripper is not None
-        run.insert(ease)
         held = planner.gripped(hold, self._target, measured_posture(planner, state))
-        self._achieve(dataclasses.replace(held, grip=ease.gripper))
+        self._achieve(held)
+        return held
+
+    def _ease(
+        self, planner: ArmPlanner, run: PhaseRun, hold: Hold | None, state: RobotState, over: Phase
+    ) -> None:
+        """Have a gripper that squeezes too hard after a phase squeeze less."""
+        self._gripped = state.tick
+        wanted = hold.grip if hold else over.gripper
+        assert wanted is not None
+        measured = gripper_place(planner, state, wanted)
+        ease = planner.eased(measured, wanted, lifted=over.name not in ("close", "ease"))
+        if ease:
+            run.insert(ease)
+        if ease and hold:
+            assert ease.gripper is not None
+            self._achieve(dataclasses.replace(hold, grip=ease.gripper))
 
     def _held_up(self, why: str) -> StepResult:
         """Plan again from where the joints are, as something held them up."""

@@ -226,13 +226,9 @@ class ArmPlanner:
             return self.after_press(left, posture, 0.0)
         return Plan(phases=self._picker().back_off(left.grasp, posture), grasp=left.grasp)
 
-    def eased(self, hold: Hold, measured: float) -> Phase:
-        """Return the phase in which the gripper, measured there, squeezes what it holds less."""
-        return self._picker().eased(measured, hold.grip)
-
-    def overloads(self, hold: Hold, measured: float) -> bool:
-        """Return whether the gripper, measured there, squeezes harder than it can for long."""
-        return self._picker().overloads(measured, hold.grip)
+    def eased(self, measured: float, wanted: float, *, lifted: bool) -> Phase | None:
+        """Return the phase in which the gripper squeezes less; None where it need not."""
+        return self._picker().eased(measured, wanted, lifted=lifted)
 
     def gripped(self, hold: Hold, thing: Thing, measured: Floats) -> Hold:
         """Return what is held by fingers that have just closed on a thing.

@@ -36,8 +36,11 @@ SLOW = 0.35  # of the joints' speeds, with a thing in the gripper
 CREEP = 0.1  # the same straight to a thing or its place: safety slows single joints near the table
 GENTLE = 0.25  # of their accelerations on the way: servos go on to where they were sent last
 SQUEEZE = 0.12  # of the gripper's range, beyond the thing's width
-EASED = 0.035  # the same, once it is held: what servos can do for long
-MAX_EASED = 1.4  # times EASED; a grip that squeezes harder is eased again
+EASED = 0.035  # the same, once it is held
+RELAXED = (
+    0.0185  # the same, once it is lifted: servos stay below 60 °C however long they hold it so
+)
+TOO_HARD = 1.2  # times these; a grip that squeezes harder is eased again
 HELD_SHARE = 0.01  # of the gripper's range, short of its target: something is between the fingers
 LIFT_M = 0.05  # straight up
 PLACE_GAP_M = 0.003  # above what it is put on, when it is let go of
@@ -261,23 +264,18 @@ class PickPlacePlanner:
         aim = grasp.closed + closing * SQUEEZE * span
         return max(self._gripper.lower, min(self._gripper.upper, aim))
 
-    def eased(self, measured: float, wanted: float) -> Phase:
+    def eased(self, measured: float, wanted: float, *, lifted: bool) -> Phase | None:
         """Return the phase in which a gripper that was sent to `wanted` squeezes less.
 
-        One whose greatest effort is not known goes on squeezing.
+        None where it need not, or its greatest effort is not known. What was gripped askew may
+        spring back when the grip is eased.
         """
-        span = self._gripper.upper - self._gripper.lower
-        most = EASED * span if self._gripper.max_effort else span
-        less = max(-most, min(most, wanted - measured))
-        return Phase(name="ease", gripper=measured + less)
-
-    def overloads(self, measured: float, wanted: float) -> bool:
-        """Return whether a gripper that was sent to `wanted` squeezes harder than it can for long.
-
-        What was gripped askew may spring back when the grip is eased.
-        """
-        span = self._gripper.upper - self._gripper.lower
-        return bool(self._gripper.max_effort) and abs(measured - wanted) > MAX_EASED * EASED * span
+        span, lag = self._gripper.upper - self._gripper.lower, wanted - measured
+        most = (RELAXED if lifted else EASED) * span
+        if not self._gripper.max_effort or abs(lag) <= TOO_HARD * most:
+            return None
+        less = math.copysign(most, lag)
+        return Phase(name="relax" if lifted else "ease", gripper=measured + less)
 
     def holds(self, measured: float, wanted: float) -> bool:
         """Return whether the gripper has stopped short of where it was sent."""

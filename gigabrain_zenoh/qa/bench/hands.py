@@ -31,7 +31,7 @@ from gigabrain_schemas.brain import Intent
 from gigabrain_schemas.safety import JointCap, SafetyState
 from gigabrain_zenoh.control.joints import JointInputs, JointMemory, step_joints
 from gigabrain_zenoh.decision.held_things import thing_of
-from gigabrain_zenoh.decision.manipulator import TRIES
+from gigabrain_zenoh.decision.manipulator import SQUEEZES, TRIES
 from gigabrain_zenoh.decision.seen_things import Lookout, located
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate import gate
@@ -427,12 +427,17 @@ def _gripped(arm: ArmInMemory, planner: ArmPlanner, pick: Plan, thing: Thing) ->
     for phase in pick.phases:
         arm.carry_out(phase)
         if phase.name == "close":
-            closed = arm.measured(gripper)
-            if not planner.holds(closed, hold.grip):
-                return None
             posture = np.array([arm.measured(name) for name in planner.arm.names])
             hold = planner.gripped(hold, thing, posture)
-            arm.carry_out(planner.eased(hold, closed))
+        if phase.name not in SQUEEZES:
+            continue
+        lifted = phase.name == "lift"
+        while ease := planner.eased(arm.measured(gripper), hold.grip, lifted=lifted):
+            assert ease.gripper is not None
+            arm.carry_out(ease)
+            hold = dataclasses.replace(hold, grip=ease.gripper)
+        if not planner.holds(arm.measured(gripper), hold.grip):
+            return None
     return hold
 
 
