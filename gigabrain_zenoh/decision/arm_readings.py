@@ -82,9 +82,17 @@ def sent_to(planner: ArmPlanner, body: BodyDescription, state: RobotState, place
     """Return whether the gripper was sent to a place [rad] or [m], or where that is not known."""
     gripper = planner.arm.gripper
     assert gripper
-    sent = dict(zip((joint.name for joint in body.joints), state.joints_sent, strict=False))
     slack = gripper.gains.max_correction + SENT * (gripper.upper - gripper.lower)
-    return abs(sent.get(gripper.name, place) - place) <= slack
+    return abs(sent_place(planner, body, state, place) - place) <= slack
+
+
+def sent_place(
+    planner: ArmPlanner, body: BodyDescription, state: RobotState, unknown: float
+) -> float:
+    """Return where the gripper was sent [rad] or [m]."""
+    assert planner.arm.gripper
+    sent = dict(zip((joint.name for joint in body.joints), state.joints_sent, strict=False))
+    return sent.get(planner.arm.gripper.name, unknown)
 
 
 def gripper_place(planner: ArmPlanner, state: RobotState, unknown: float) -> float:

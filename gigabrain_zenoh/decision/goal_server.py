@@ -147,6 +147,8 @@ class GoalServer(InputSource):
             if isinstance(command, ArmCommand):
                 outcome = done
                 intent = replace(moved, twist=intent.twist, response=intent.response)
+            else:
+                intent = replace(intent, joints=moved.joints)
         self._outcome = outcome if command else None
         return intent, outcome
 

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import BodyDescription, RobotState
-from gigabrain_schemas.brain import Intent
+from gigabrain_schemas.brain import Intent, JointTarget
 from gigabrain_schemas.objects import SeenSolid
 from gigabrain_schemas.topics import ARM_MODEL
 from gigabrain_zenoh.bus.bus import Bus
@@ -32,6 +32,7 @@ from gigabrain_zenoh.decision.behaviours import (
     StepResult,
     Target,
 )
+from gigabrain_zenoh.decision.grip import Grip
 from gigabrain_zenoh.decision.held_things import (
     held_thing,
     hold_of,
@@ -59,14 +60,13 @@ from gigabrain_zenoh.decision.tasks.arm_steps import (
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold, Plan
 from gigabrain_zenoh.manipulation.collision import Thing
-from gigabrain_zenoh.manipulation.phases import Phase, PhaseRun
+from gigabrain_zenoh.manipulation.phases import PhaseRun
 from gigabrain_zenoh.manipulation.pick_place import NoWay
 
 TRIES = 3  # to pick a thing up, each with another grasp
 HOLD_UPS = 5  # of one command, after which it fails
 WAIT_TICKS = 100  # for a joint that the gate holds back, before another way is planned
 MISSED = f"it was not caught, {TRIES} times"
-SQUEEZES = ("close", "ease", "lift", "relax", "grip")  # after which a gripper may do so too hard
 CARRYING = ("lift", "traverse", "lower", "move")  # phases in which a thing has to be held
 NO_MODEL = Idle("waiting", "waiting: for the arm's model, robot/arm_model")
 NOT_MEASURED = Idle("waiting", "waiting: for all joints to be measured")
@@ -89,6 +89,7 @@ class Manipulator:
         self._run: PhaseRun | None = None
         self._hold: Hold | None = None
         self._held: HeldThing | None = None  # the same, for the file of tasks
+        self._grip = Grip()
         self._recalls = True  # it does not know yet what the gripper holds
         self._number = 0  # of the present command
         self._misses = 0  # grasps of it that caught nothing
@@ -119,6 +120,8 @@ class Manipulator:
         Things without a place are where they are `seen`, in the body's frame.
         """
         intent, outcome = self._step(state, body, command, idle, held, seen)
+        if self._planner and not self._run and not held:
+            intent = replace(intent, joints=self._keep_grip(self._planner, body, state))
         self._display.show(self._planner, self._plan if self._run else None)
         known = command.held if command and self._recalls else self._held
         return intent, replace(outcome, holds=known)
@@ -197,7 +200,19 @@ class Manipulator:
 
     def _set_hold(self, hold: Hold | None) -> None:
         """Record what the gripper holds."""
+        if hold or self._hold:
+            self._grip.hold_by(hold.grip if hold else None)
         self._hold, self._held = hold, held_thing(hold) if hold else None
+
+    def _keep_grip(
+        self, planner: ArmPlanner, body: BodyDescription, state: RobotState
+    ) -> tuple[JointTarget, ...]:
+        """Return what keeps the grip of an arm that is still."""
+        targets = self._grip.keep(planner, body, state)
+        if self._hold and self._grip.place not in (None, self._hold.grip):
+            self._hold = dataclasses.replace(self._hold, grip=self._grip.place)
+            self._held = held_thing(self._hold)
+        return targets
 
     def _carry_out(
         self,
@@ -236,7 +251,7 @@ class Manipulator:
                 if isinstance(work, str):
                     return self._fail(work)
                 self._planning = self._pool.submit(work)
-            if not self._in_time(self._planning, 0.0):
+            if not self._in_time(self._planning, 0.0) or self._grip.moves:
                 return self._still(PLANNING)
             planning, self._planning = self._planning, None
             found = planning.result()
@@ -358,20 +373,20 @@ class Manipulator:
             closed = sent_to(planner, body, state, plan.hold.grip)  # unless safety holds it back
             if not (closed and holds(planner, plan.hold, state)):
                 return self._missed(planner, body, state)
-            hold = self._grip(planner, plan.hold, state)
-        if over and over.name == "grip":
-            hold = None
-            self._set_hold(None)
-        if over and over.name in SQUEEZES:
-            if hold and not holds(planner, hold, state):
+            hold = self._caught(planner, plan.hold, state)
+        if over and over.name in ("close", "ease") and hold:
+            if not holds(planner, hold, state):
                 return self._missed(planner, body, state)
-            self._ease(planner, run, hold, state, over)
+            self._ease(planner, run, hold, state)
         if over and over.name == "open" and hold:
             posture = measured_posture(planner, state)
             name, solid = placed(planner, posture, command.do, hold, body)
             self._achieve(None, placed=(name, solid))
             if self._seen_as is not None:  # others have a place by their mission
                 self._put = PutDown(name=name, solid=solid, state=state)
+        if over and over.name == "grip":
+            self._set_hold(None)
+            self._grip.hold_by(over.gripper)
         if run.phase is None:
             return self._end(body, state, run)
         return self._moving(state)
@@ -384,26 +399,20 @@ class Manipulator:
         self._back_off(planner, body, state, self._plan)
         return self._moving(state)
 
-    def _grip(self, planner: ArmPlanner, hold: Hold, state: RobotState) -> Hold:
+    def _caught(self, planner: ArmPlanner, hold: Hold, state: RobotState) -> Hold:
         """Record and return what the gripper holds from now on."""
         assert self._target
         held = planner.gripped(hold, self._target, measured_posture(planner, state))
         self._achieve(held)
         return held
 
-    def _ease(
-        self, planner: ArmPlanner, run: PhaseRun, hold: Hold | None, state: RobotState, over: Phase
-    ) -> None:
-        """Have a gripper that squeezes too hard after a phase squeeze less."""
+    def _ease(self, planner: ArmPlanner, run: PhaseRun, hold: Hold, state: RobotState) -> None:
+        """Have a gripper that squeezes a thing too hard squeeze less."""
         self._gripped = state.tick
-        wanted = hold.grip if hold else over.gripper
-        assert wanted is not None
-        measured = gripper_place(planner, state, wanted)
-        ease = planner.eased(measured, wanted, lifted=over.name not in ("close", "ease"))
+        ease = planner.eased(gripper_place(planner, state, hold.grip), hold.grip)
         if ease:
-            run.insert(ease)
-        if ease and hold:
             assert ease.gripper is not None
+            run.insert(ease)
             self._achieve(dataclasses.replace(hold, grip=ease.gripper))
 
     def _held_up(self, why: str) -> StepResult:

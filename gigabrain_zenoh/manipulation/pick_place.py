@@ -36,11 +36,9 @@ SLOW = 0.35  # of the joints' speeds, with a thing in the gripper
 CREEP = 0.1  # the same straight to a thing or its place: safety slows single joints near the table
 GENTLE = 0.25  # of their accelerations on the way: servos go on to where they were sent last
 SQUEEZE = 0.12  # of the gripper's range, beyond the thing's width
-EASED = 0.035  # the same, once it is held
-RELAXED = (
-    0.0185  # the same, once it is lifted: servos stay below 60 °C however long they hold it so
-)
-TOO_HARD = 1.2  # times these; a grip that squeezes harder is eased again
+EASED, MAX_EASED = 0.035, 0.049  # the same, once it is held; what squeezes harder is eased again
+KEPT = 0.02  # the same, once it is lifted: servos hold it for hours and stay below 60 °C
+TOO_LOOSE, TOO_HARD = 0.9, 1.12  # times that: a grip beyond is set again
 HELD_SHARE = 0.01  # of the gripper's range, short of its target: something is between the fingers
 LIFT_M = 0.05  # straight up
 PLACE_GAP_M = 0.003  # above what it is put on, when it is let go of
@@ -264,18 +262,27 @@ class PickPlacePlanner:
         aim = grasp.closed + closing * SQUEEZE * span
         return max(self._gripper.lower, min(self._gripper.upper, aim))
 
-    def eased(self, measured: float, wanted: float, *, lifted: bool) -> Phase | None:
+    def eased(self, measured: float, wanted: float) -> Phase | None:
         """Return the phase in which a gripper that was sent to `wanted` squeezes less.
 
-        None where it need not, or its greatest effort is not known. What was gripped askew may
-        spring back when the grip is eased.
+        None where it need not. What was gripped askew may spring back when the grip is eased.
         """
         span, lag = self._gripper.upper - self._gripper.lower, wanted - measured
-        most = (RELAXED if lifted else EASED) * span
-        if not self._gripper.max_effort or abs(lag) <= TOO_HARD * most:
+        if not self._gripper.max_effort or abs(lag) <= MAX_EASED * span:
             return None
-        less = math.copysign(most, lag)
-        return Phase(name="relax" if lifted else "ease", gripper=measured + less)
+        return Phase(name="ease", gripper=measured + math.copysign(EASED * span, lag))
+
+    def kept(self, measured: float, wanted: float) -> float:
+        """Return where a gripper goes that was sent to `wanted`, and is to hold on for long.
+
+        One whose greatest effort is not known stays.
+        """
+        lower, upper = self._gripper.lower, self._gripper.upper
+        lag, squeeze = wanted - measured, KEPT * (upper - lower)
+        fits = TOO_LOOSE * squeeze <= abs(lag) <= TOO_HARD * squeeze
+        if not self._gripper.max_effort or fits:
+            return wanted
+        return max(lower, min(upper, measured + math.copysign(squeeze, lag)))
 
     def holds(self, measured: float, wanted: float) -> bool:
         """Return whether the gripper has stopped short of where it was sent."""

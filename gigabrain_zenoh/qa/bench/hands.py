@@ -31,7 +31,7 @@ from gigabrain_schemas.brain import Intent
 from gigabrain_schemas.safety import JointCap, SafetyState
 from gigabrain_zenoh.control.joints import JointInputs, JointMemory, step_joints
 from gigabrain_zenoh.decision.held_things import thing_of
-from gigabrain_zenoh.decision.manipulator import SQUEEZES, TRIES
+from gigabrain_zenoh.decision.manipulator import TRIES
 from gigabrain_zenoh.decision.seen_things import Lookout, located
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate import gate
@@ -429,14 +429,15 @@ def _gripped(arm: ArmInMemory, planner: ArmPlanner, pick: Plan, thing: Thing) ->
         if phase.name == "close":
             posture = np.array([arm.measured(name) for name in planner.arm.names])
             hold = planner.gripped(hold, thing, posture)
-        if phase.name not in SQUEEZES:
-            continue
-        lifted = phase.name == "lift"
-        while ease := planner.eased(arm.measured(gripper), hold.grip, lifted=lifted):
-            assert ease.gripper is not None
-            arm.carry_out(ease)
-            hold = dataclasses.replace(hold, grip=ease.gripper)
-        if not planner.holds(arm.measured(gripper), hold.grip):
+            while ease := planner.eased(arm.measured(gripper), hold.grip):
+                assert ease.gripper is not None
+                arm.carry_out(ease)
+                hold = dataclasses.replace(hold, grip=ease.gripper)
+        if phase.name == "lift":
+            kept = planner.kept(arm.measured(gripper), hold.grip)
+            arm.carry_out(Phase(name="grip", gripper=kept))
+            hold = dataclasses.replace(hold, grip=kept)
+        if phase.name in {"close", "lift"} and not planner.holds(arm.measured(gripper), hold.grip):
             return None
     return hold
 
