@@ -39,7 +39,7 @@ class Grip:
         elif not 0 <= passed < REST_TICKS and sent_to(planner, body, state, place):
             measured = gripper_place(planner, state, place)
             if planner.holds(measured, place):
-                place = planner.kept(measured, place)
+                place = planner.squeeze(measured, place, moving=False)
                 self.moves, self._since = place != self.place, state.tick
         self.place = place
         return (JointTarget(name=gripper.name, position=place),) if self.moves else ()

@@ -60,7 +60,7 @@ from gigabrain_zenoh.decision.tasks.arm_steps import (
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold, Plan
 from gigabrain_zenoh.manipulation.collision import Thing
-from gigabrain_zenoh.manipulation.phases import PhaseRun
+from gigabrain_zenoh.manipulation.phases import Phase, PhaseRun
 from gigabrain_zenoh.manipulation.pick_place import NoWay
 
 TRIES = 3  # to pick a thing up, each with another grasp
@@ -264,6 +264,8 @@ class Manipulator:
                 self._interim = False
                 return self._still(PLANNING)
             self._begin(planner, found, state)
+            if self._run and self._hold:
+                self._squeeze(planner, self._run, self._hold, state)
         return self._follow(planner, state, body, command)
 
     def _look_for(
@@ -374,10 +376,10 @@ class Manipulator:
             if not (closed and holds(planner, plan.hold, state)):
                 return self._missed(planner, body, state)
             hold = self._caught(planner, plan.hold, state)
-        if over and over.name in ("close", "ease") and hold:
+        if over and over.name in ("close", "squeeze") and hold:
             if not holds(planner, hold, state):
                 return self._missed(planner, body, state)
-            self._ease(planner, run, hold, state)
+            self._squeeze(planner, run, hold, state)
         if over and over.name == "open" and hold:
             posture = measured_posture(planner, state)
             name, solid = placed(planner, posture, command.do, hold, body)
@@ -406,14 +408,13 @@ class Manipulator:
         self._achieve(held)
         return held
 
-    def _ease(self, planner: ArmPlanner, run: PhaseRun, hold: Hold, state: RobotState) -> None:
-        """Have a gripper that squeezes a thing too hard squeeze less."""
+    def _squeeze(self, planner: ArmPlanner, run: PhaseRun, hold: Hold, state: RobotState) -> None:
+        """Have the gripper squeeze as hard as it should while the arm moves; it may spring back."""
         self._gripped = state.tick
-        ease = planner.eased(gripper_place(planner, state, hold.grip), hold.grip)
-        if ease:
-            assert ease.gripper is not None
-            run.insert(ease)
-            self._achieve(dataclasses.replace(hold, grip=ease.gripper))
+        place = planner.squeeze(gripper_place(planner, state, hold.grip), hold.grip, moving=True)
+        if place != hold.grip:
+            run.insert(Phase(name="squeeze", gripper=place))
+            self._set_hold(dataclasses.replace(hold, grip=place))
 
     def _held_up(self, why: str) -> StepResult:
         """Plan again from where the joints are, as something held them up."""

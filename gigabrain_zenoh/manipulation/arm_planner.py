@@ -226,13 +226,9 @@ class ArmPlanner:
             return self.after_press(left, posture, 0.0)
         return Plan(phases=self._picker().back_off(left.grasp, posture), grasp=left.grasp)
 
-    def eased(self, measured: float, wanted: float) -> Phase | None:
-        """Return the phase in which the gripper squeezes less; None where it need not."""
-        return self._picker().eased(measured, wanted)
-
-    def kept(self, measured: float, wanted: float) -> float:
-        """Return where the gripper goes to hold on for long, which was sent to `wanted`."""
-        return self._picker().kept(measured, wanted)
+    def squeeze(self, measured: float, wanted: float, *, moving: bool) -> float:
+        """Return where the gripper goes to squeeze as hard as it should, which goes to `wanted`."""
+        return self._picker().squeeze(measured, wanted, moving=moving)
 
     def gripped(self, hold: Hold, thing: Thing, measured: Floats) -> Hold:
         """Return what is held by fingers that have just closed on a thing.

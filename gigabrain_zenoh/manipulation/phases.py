@@ -15,8 +15,8 @@ from gigabrain_schemas.brain import JointTrajectory as JointWindow
 from gigabrain_zenoh.manipulation.joint_trajectory import JointTrajectory
 
 PhaseName = Literal[
-    "hover", "descend", "close", "ease", "lift", "traverse", "lower", "open", "retreat", "move",
-    "grip", "press", "hold",
+    "hover", "descend", "close", "squeeze", "lift", "traverse", "lower", "open", "retreat",
+    "move", "grip", "press", "hold",
 ]  # fmt: skip
 GRIP_TICKS = 40  # until a gripper has closed, or has stopped at what is between its fingers
 LATE_TICKS = 250  # by which that may last longer, where safety slows it down

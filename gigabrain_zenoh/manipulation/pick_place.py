@@ -36,9 +36,8 @@ SLOW = 0.35  # of the joints' speeds, with a thing in the gripper
 CREEP = 0.1  # the same straight to a thing or its place: safety slows single joints near the table
 GENTLE = 0.25  # of their accelerations on the way: servos go on to where they were sent last
 SQUEEZE = 0.12  # of the gripper's range, beyond the thing's width
-EASED, MAX_EASED = 0.035, 0.049  # the same, once it is held; what squeezes harder is eased again
-KEPT = 0.02  # the same, once it is lifted: servos hold it for hours and stay below 60 °C
-TOO_LOOSE, TOO_HARD = 0.9, 1.12  # times that: a grip beyond is set again
+MOVING = (0.0315, 0.035, 0.049)  # the same while the arm moves what it holds: least, set, and most
+STILL = (0.018, 0.02, 0.0224)  # while it is still: servos hold on for hours and stay below 60 °C
 HELD_SHARE = 0.01  # of the gripper's range, short of its target: something is between the fingers
 LIFT_M = 0.05  # straight up
 PLACE_GAP_M = 0.003  # above what it is put on, when it is let go of
@@ -262,27 +261,22 @@ class PickPlacePlanner:
         aim = grasp.closed + closing * SQUEEZE * span
         return max(self._gripper.lower, min(self._gripper.upper, aim))
 
-    def eased(self, measured: float, wanted: float) -> Phase | None:
-        """Return the phase in which a gripper that was sent to `wanted` squeezes less.
-
-        None where it need not. What was gripped askew may spring back when the grip is eased.
-        """
-        span, lag = self._gripper.upper - self._gripper.lower, wanted - measured
-        if not self._gripper.max_effort or abs(lag) <= MAX_EASED * span:
-            return None
-        return Phase(name="ease", gripper=measured + math.copysign(EASED * span, lag))
-
-    def kept(self, measured: float, wanted: float) -> float:
-        """Return where a gripper goes that was sent to `wanted`, and is to hold on for long.
+    def squeeze(self, measured: float, wanted: float, *, moving: bool) -> float:
+        """Return where a gripper goes that was sent to `wanted`, to squeeze as hard as it should.
 
         One whose greatest effort is not known stays.
+
+        Args:
+            measured: Where it is [rad] or [m].
+            wanted: Where it was sent [rad] or [m].
+            moving: Whether the arm moves meanwhile.
         """
         lower, upper = self._gripper.lower, self._gripper.upper
-        lag, squeeze = wanted - measured, KEPT * (upper - lower)
-        fits = TOO_LOOSE * squeeze <= abs(lag) <= TOO_HARD * squeeze
-        if not self._gripper.max_effort or fits:
+        least, aim, most = (share * (upper - lower) for share in (MOVING if moving else STILL))
+        lag = wanted - measured
+        if not self._gripper.max_effort or least <= abs(lag) <= most:
             return wanted
-        return max(lower, min(upper, measured + math.copysign(squeeze, lag)))
+        return max(lower, min(upper, measured + math.copysign(aim, lag)))
 
     def holds(self, measured: float, wanted: float) -> bool:
         """Return whether the gripper has stopped short of where it was sent."""

@@ -12,7 +12,7 @@ from gigabrain_drivers.driver.robot import Run
 from gigabrain_schemas.body import Joint
 from gigabrain_schemas.tasks import MissionRequest
 from gigabrain_schemas.topics import ARM_MODEL, BODY, MISSION, STATE, Topic
-from gigabrain_zenoh.manipulation.pick_place import KEPT, TOO_HARD, TOO_LOOSE
+from gigabrain_zenoh.manipulation.pick_place import STILL
 from tests.node.plane import ROOM, Plane, drawn
 
 LEKIWI = load_robot("lekiwi")
@@ -55,11 +55,11 @@ async def test_a_grip_follows_what_creeps_while_the_base_drives(creeps: float) -
         mission = MissionRequest(mission="do: [{gripper: close}, {goto: [4.0, 0.8]}]")
         assert (await plane.ask(MISSION, mission)).ok
         await drive(plane, 0.3)
-        assert TOO_LOOSE * KEPT < plane.lag < TOO_HARD * KEPT
+        assert STILL[0] < plane.lag < STILL[-1]
         plane.width += creeps
-        assert not TOO_LOOSE * KEPT < plane.lag < TOO_HARD * KEPT
+        assert not STILL[0] < plane.lag < STILL[-1]
         await drive(plane, 1.0)
-        assert TOO_LOOSE * KEPT < plane.lag < TOO_HARD * KEPT
+        assert STILL[0] < plane.lag < STILL[-1]
 
 
 async def drive(plane: Carrier, way: float) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from gigabrain_drivers.driver.catalog import make_driver, robot_path
+from gigabrain_drivers.driver.catalog import load_robot, make_driver, robot_path
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.sim import STEP_S
 from gigabrain_drivers.sim.worlds import mission_file
@@ -18,17 +18,13 @@ from gigabrain_schemas.objects import SeenSolid
 from gigabrain_schemas.safety import JointCap
 from gigabrain_zenoh.decision.behaviours import ArmCommand, Idle
 from gigabrain_zenoh.decision.grip import REST_TICKS
-from gigabrain_zenoh.manipulation.phases import Phase
-from gigabrain_zenoh.manipulation.pick_place import (
-    KEPT,
-    MAX_EASED,
-    PickPlacePlanner,
-)
+from gigabrain_zenoh.manipulation.pick_place import MOVING, STILL, PickPlacePlanner
 from gigabrain_zenoh.safety.arm_shape import MujocoArm
 from gigabrain_zenoh.safety.step import SafetyInputs, SafetyMemory, step
 from tests.node.arm_rig import ELSEWHERE, THERE, THINGS, Rig
 
-STILL = Idle("idle", "no task")
+NO_TASK = Idle("idle", "no task")
+GRIPPER = load_robot("so101").joints[-1]
 SOON = 150  # ticks, within which a grip has been set again
 
 
@@ -89,23 +85,31 @@ def test_a_grip_follows_what_creeps_while_the_arm_is_still(rig: Rig, way: float)
     assert rig.carry_out(THINGS + "do: [{pick: cube}]").state == "succeeded"
     for _ in range(SOON):
         rig.tick()
-    state, gripper = rig.arm.state(), rig.arm.description.joints[-1]
+    state = rig.arm.state()
     crept = state.joints[-1].position + way
     joints = (*state.joints[:-1], replace(state.joints[-1], position=crept))
     now = replace(state, joints=joints, tick=state.tick + REST_TICKS)
-    intent, outcome = rig.manipulator.step(now, rig.arm.description, None, STILL, "")
+    intent, outcome = rig.manipulator.step(now, rig.arm.description, None, NO_TASK, "")
     (target,) = intent.joints
     assert target.name == "gripper"
-    assert abs(target.position - crept) == pytest.approx(KEPT * (gripper.upper - gripper.lower))
+    assert abs(target.position - crept) == pytest.approx(STILL[1] * (GRIPPER.upper - GRIPPER.lower))
     assert outcome.holds
     assert outcome.holds.grip == target.position
 
 
-def lag_of_gripper(rig: Rig) -> float:
-    """Return how far the gripper is from where it was sent, as a share of its range."""
-    state, gripper = rig.arm.state(), rig.arm.description.joints[-1]
-    lag = abs(state.joints_sent[-1] - state.joints[-1].position)
-    return lag / (gripper.upper - gripper.lower)
+def test_a_grip_is_firmer_while_the_arm_moves(rig: Rig) -> None:
+    assert rig.carry_out(THINGS + "do: [{pick: cube}]").state == "succeeded"
+    for _ in range(SOON):
+        rig.tick()
+    rig.give("do: [{place: [0.1388, 0.15, 0.015]}]")
+    lags = dict[str, float]()  # by phases, at their ends
+    while rig.queue.status.current:
+        rig.tick()
+        state = rig.arm.state()
+        lag = abs(state.joints_sent[-1] - state.joints[-1].position)
+        lags[rig.phases[-1]] = lag / (GRIPPER.upper - GRIPPER.lower)
+    assert MOVING[0] < lags["traverse"] < MOVING[-1]
+    assert MOVING[0] < lags["lower"] < MOVING[-1]
 
 
 def test_safety_near_the_table_bends_no_way_of_the_piper_to_a_block(tmp_path: Path) -> None:
@@ -270,7 +274,7 @@ def test_a_gripper_that_safety_holds_back_is_not_taken_for_one_that_holds_someth
 
 def test_what_is_lost_while_the_grip_eases_is_tried_again(rig: Rig) -> None:
     rig.give(THINGS + "do: [{pick: cube}]")
-    while rig.outcome is None or rig.outcome.reason != "ease":
+    while rig.outcome is None or rig.outcome.reason != "squeeze":
         rig.tick()
     rig.take_away()
     while rig.outcome.reason != "retreat":
@@ -284,19 +288,19 @@ def test_what_is_lost_while_the_grip_eases_is_tried_again(rig: Rig) -> None:
 def test_a_grip_that_squeezes_too_hard_still_is_eased_again(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    eased, squeezes = PickPlacePlanner.eased, list[float]()
+    squeeze, lags = PickPlacePlanner.squeeze, list[float]()
 
-    def eases(self: PickPlacePlanner, measured: float, wanted: float) -> Phase | None:
-        squeezes.append(abs(measured - wanted))
-        if len(squeezes) == 1:  # it does not, at first
-            return Phase(name="ease", gripper=wanted)
-        return eased(self, measured, wanted)
+    def squeezes(self: PickPlacePlanner, measured: float, wanted: float, *, moving: bool) -> float:
+        place = squeeze(self, measured, wanted, moving=moving)
+        if moving:
+            lags.append(abs(measured - wanted))
+        return wanted + 0.001 if moving and len(lags) == 1 else place  # it does not, at first
 
-    monkeypatch.setattr(PickPlacePlanner, "eased", eases)
+    monkeypatch.setattr(PickPlacePlanner, "squeeze", squeezes)
     task = rig.carry_out(THINGS + "do: [{pick: cube}]")
     assert (task.state, task.reason) == ("succeeded", "it holds cube")
-    assert len(squeezes) > 1
-    assert lag_of_gripper(rig) < MAX_EASED
+    assert lags[1] == pytest.approx(lags[0], abs=0.01)
+    assert lags[-1] < MOVING[-1] * (GRIPPER.upper - GRIPPER.lower)
 
 
 def test_a_joint_that_does_not_follow_ends_the_command_after_a_few_tries(rig: Rig) -> None:

@@ -429,17 +429,24 @@ def _gripped(arm: ArmInMemory, planner: ArmPlanner, pick: Plan, thing: Thing) ->
         if phase.name == "close":
             posture = np.array([arm.measured(name) for name in planner.arm.names])
             hold = planner.gripped(hold, thing, posture)
-            while ease := planner.eased(arm.measured(gripper), hold.grip):
-                assert ease.gripper is not None
-                arm.carry_out(ease)
-                hold = dataclasses.replace(hold, grip=ease.gripper)
+            hold = _squeezed(arm, planner, hold, gripper)
         if phase.name == "lift":
-            kept = planner.kept(arm.measured(gripper), hold.grip)
-            arm.carry_out(Phase(name="grip", gripper=kept))
-            hold = dataclasses.replace(hold, grip=kept)
+            place = planner.squeeze(arm.measured(gripper), hold.grip, moving=False)
+            arm.carry_out(Phase(name="grip", gripper=place))
+            hold = _squeezed(arm, planner, dataclasses.replace(hold, grip=place), gripper)
         if phase.name in {"close", "lift"} and not planner.holds(arm.measured(gripper), hold.grip):
             return None
     return hold
+
+
+def _squeezed(arm: ArmInMemory, planner: ArmPlanner, hold: Hold, gripper: str) -> Hold:
+    """Have a gripper squeeze as it should while the arm moves, as decision does."""
+    while True:
+        place = planner.squeeze(arm.measured(gripper), hold.grip, moving=True)
+        if place == hold.grip:
+            return hold
+        arm.carry_out(Phase(name="squeeze", gripper=place))
+        hold = dataclasses.replace(hold, grip=place)
 
 
 def _targets(rng: np.random.Generator, height: float, pan: float) -> Iterator[Floats]:
