@@ -28,6 +28,7 @@ from gigabrain_zenoh.manipulation.pick_place import (
 )
 from gigabrain_zenoh.manipulation.planner import NoPath, plan
 from gigabrain_zenoh.manipulation.press import PressPlanner
+from gigabrain_zenoh.manipulation.squeeze import is_holding, squeezing_place
 
 TABLE = "the table"
 SUNK_M = 0.001  # of the floor below its place, as things stand on it
@@ -228,7 +229,8 @@ class ArmPlanner:
 
     def squeeze(self, measured: float, wanted: float, *, moving: bool) -> float:
         """Return where the gripper goes to squeeze as hard as it should, which goes to `wanted`."""
-        return self._picker().squeeze(measured, wanted, moving=moving)
+        assert self.arm.gripper
+        return squeezing_place(self.arm.gripper, measured, wanted, moving=moving)
 
     def gripped(self, hold: Hold, thing: Thing, measured: Floats) -> Hold:
         """Return what is held by fingers that have just closed on a thing.
@@ -249,7 +251,8 @@ class ArmPlanner:
 
     def holds(self, measured: float, wanted: float) -> bool:
         """Return whether the gripper has stopped short of where it was sent."""
-        return self._picker().holds(measured, wanted)
+        assert self.arm.gripper
+        return is_holding(self.arm.gripper, measured, wanted)
 
     def _stand_off(self, thing: Thing, posture: Floats) -> float | None:
         """Return how far ahead of the base a thing is grasped well [m]; None for nowhere."""

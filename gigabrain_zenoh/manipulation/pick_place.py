@@ -36,9 +36,6 @@ SLOW = 0.35  # of the joints' speeds, with a thing in the gripper
 CREEP = 0.1  # the same straight to a thing or its place: safety slows single joints near the table
 GENTLE = 0.25  # of their accelerations on the way: servos go on to where they were sent last
 SQUEEZE = 0.12  # of the gripper's range, beyond the thing's width
-MOVING = (0.0315, 0.035, 0.049)  # the same while the arm moves what it holds: least, set, and most
-STILL = (0.018, 0.02, 0.0224)  # while it is still: servos hold on for hours and stay below 60 °C
-HELD_SHARE = 0.01  # of the gripper's range, short of its target: something is between the fingers
 LIFT_M = 0.05  # straight up
 PLACE_GAP_M = 0.003  # above what it is put on, when it is let go of
 PLACE_YAWS = 16  # turns of what is put down that are tried
@@ -260,27 +257,6 @@ class PickPlacePlanner:
         span = self._gripper.upper - self._gripper.lower
         aim = grasp.closed + closing * SQUEEZE * span
         return max(self._gripper.lower, min(self._gripper.upper, aim))
-
-    def squeeze(self, measured: float, wanted: float, *, moving: bool) -> float:
-        """Return where a gripper goes that was sent to `wanted`, to squeeze as hard as it should.
-
-        One whose greatest effort is not known stays.
-
-        Args:
-            measured: Where it is [rad] or [m].
-            wanted: Where it was sent [rad] or [m].
-            moving: Whether the arm moves meanwhile.
-        """
-        lower, upper = self._gripper.lower, self._gripper.upper
-        least, aim, most = (share * (upper - lower) for share in (MOVING if moving else STILL))
-        lag = wanted - measured
-        if not self._gripper.max_effort or least <= abs(lag) <= most:
-            return wanted
-        return max(lower, min(upper, measured + math.copysign(aim, lag)))
-
-    def holds(self, measured: float, wanted: float) -> bool:
-        """Return whether the gripper has stopped short of where it was sent."""
-        return abs(measured - wanted) > HELD_SHARE * (self._gripper.upper - self._gripper.lower)
 
 
 def may_touch(held: Thing, others: Sequence[Thing]) -> list[tuple[str, str]]:

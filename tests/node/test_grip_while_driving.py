@@ -12,7 +12,7 @@ from gigabrain_drivers.driver.robot import Run
 from gigabrain_schemas.body import Joint
 from gigabrain_schemas.tasks import MissionRequest
 from gigabrain_schemas.topics import ARM_MODEL, BODY, MISSION, STATE, Topic
-from gigabrain_zenoh.manipulation.pick_place import STILL
+from gigabrain_zenoh.manipulation.squeeze import STILL
 from tests.node.plane import ROOM, Plane, drawn
 
 LEKIWI = load_robot("lekiwi")

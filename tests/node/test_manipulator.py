@@ -18,7 +18,8 @@ from gigabrain_schemas.objects import SeenSolid
 from gigabrain_schemas.safety import JointCap
 from gigabrain_zenoh.decision.behaviours import ArmCommand, Idle
 from gigabrain_zenoh.decision.grip import REST_TICKS
-from gigabrain_zenoh.manipulation.pick_place import MOVING, STILL, PickPlacePlanner
+from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner
+from gigabrain_zenoh.manipulation.squeeze import MOVING, STILL
 from gigabrain_zenoh.safety.arm_shape import MujocoArm
 from gigabrain_zenoh.safety.step import SafetyInputs, SafetyMemory, step
 from tests.node.arm_rig import ELSEWHERE, THERE, THINGS, Rig
@@ -288,15 +289,15 @@ def test_what_is_lost_while_the_grip_eases_is_tried_again(rig: Rig) -> None:
 def test_a_grip_that_squeezes_too_hard_still_is_eased_again(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    squeeze, lags = PickPlacePlanner.squeeze, list[float]()
+    squeeze, lags = ArmPlanner.squeeze, list[float]()
 
-    def squeezes(self: PickPlacePlanner, measured: float, wanted: float, *, moving: bool) -> float:
+    def squeezes(self: ArmPlanner, measured: float, wanted: float, *, moving: bool) -> float:
         place = squeeze(self, measured, wanted, moving=moving)
         if moving:
             lags.append(abs(measured - wanted))
         return wanted + 0.001 if moving and len(lags) == 1 else place  # it does not, at first
 
-    monkeypatch.setattr(PickPlacePlanner, "squeeze", squeezes)
+    monkeypatch.setattr(ArmPlanner, "squeeze", squeezes)
     task = rig.carry_out(THINGS + "do: [{pick: cube}]")
     assert (task.state, task.reason) == ("succeeded", "it holds cube")
     assert lags[1] == pytest.approx(lags[0], abs=0.01)
