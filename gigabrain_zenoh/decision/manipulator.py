@@ -254,18 +254,27 @@ class Manipulator:
             if not self._in_time(self._planning, 0.0) or self._grip.moves:
                 return self._still(PLANNING)
             planning, self._planning = self._planning, None
-            found = planning.result()
-            if isinstance(found, NoWay):
-                if self._interim or self._put:  # it stays in sight, or less is in its way
-                    self._interim, self._put = False, None
-                    return self._still(PLANNING)
-                return self._fail(found.reason, approach(self._target, found.stand_off))
-            if not begins_at(found, sent_posture(planner, body, state)):
-                self._interim = False
+            return self._take_up(planning.result(), planner, state, body, command)
+        return self._follow(planner, state, body, command)
+
+    def _take_up(
+        self,
+        found: Planned,
+        planner: ArmPlanner,
+        state: RobotState,
+        body: BodyDescription,
+        command: ArmCommand,
+    ) -> StepResult:
+        """Begin to carry out what was planned, unless it has to be planned again, or cannot be."""
+        if isinstance(found, NoWay):
+            if self._interim or self._put:  # it stays in sight, or less is in its way
+                self._interim, self._put = False, None
                 return self._still(PLANNING)
-            self._begin(planner, found, state)
-            if self._run and self._hold:
-                self._squeeze(planner, self._run, self._hold, state)
+            return self._fail(found.reason, approach(self._target, found.stand_off))
+        if not begins_at(found, sent_posture(planner, body, state)):
+            self._interim = False
+            return self._still(PLANNING)
+        self._begin(planner, found, state)
         return self._follow(planner, state, body, command)
 
     def _look_for(
@@ -349,6 +358,8 @@ class Manipulator:
         gripper = planner.arm.gripper
         self._plan = plan
         self._run = PhaseRun(plan.phases, gripper.name if gripper else "", state.tick)
+        if self._hold:
+            self._squeeze(planner, self._run, self._hold, state)
 
     def _follow(
         self, planner: ArmPlanner, state: RobotState, body: BodyDescription, command: ArmCommand
