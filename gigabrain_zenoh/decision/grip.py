@@ -1,8 +1,8 @@
-"""How hard a gripper holds on while the arm is still, so while the body drives, too."""
+"""Keeps the grip of an arm that is still, also while the body drives."""
 
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import JointTarget
-from gigabrain_zenoh.decision.arm_readings import gripper_place, sent_place, sent_to
+from gigabrain_zenoh.decision.arm_readings import gripper_place, sent_place
 from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner
 
 LONG_TICKS = 50  # to move on, after which it stays where it was sent
@@ -30,13 +30,11 @@ class Grip:
         gripper, place = planner.arm.gripper, self.place
         if gripper is None or place is None:
             return ()
-        passed = state.tick - self._since
-        if self.moves:
-            sent = sent_place(planner, body, state, place)
-            there = abs(sent - place) <= THERE * (gripper.upper - gripper.lower)
-            if there or not 0 <= passed < LONG_TICKS:
-                place, self.moves, self._since = sent, False, state.tick
-        elif not 0 <= passed < REST_TICKS and sent_to(planner, body, state, place):
+        passed, sent = state.tick - self._since, sent_place(planner, body, state, place)
+        there = abs(sent - place) <= THERE * (gripper.upper - gripper.lower)
+        if self.moves and (there or not 0 <= passed < LONG_TICKS):
+            place, self.moves, self._since = sent, False, state.tick
+        elif there and not self.moves and not 0 <= passed < REST_TICKS:
             measured = gripper_place(planner, state, place)
             if planner.holds(measured, place):
                 place = planner.squeeze(measured, place, moving=False)

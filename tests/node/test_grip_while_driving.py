@@ -1,4 +1,4 @@
-"""What the gripper of a base holds while it drives: neither too loosely, nor too hard."""
+"""A base that drives keeps the grip of its arm."""
 
 import asyncio
 from pathlib import Path
@@ -12,7 +12,7 @@ from gigabrain_drivers.driver.robot import Run
 from gigabrain_schemas.body import Joint
 from gigabrain_schemas.tasks import MissionRequest
 from gigabrain_schemas.topics import ARM_MODEL, BODY, MISSION, STATE, Topic
-from gigabrain_zenoh.manipulation.squeeze import STILL
+from gigabrain_zenoh.manipulation.arm_planner import STILL
 from tests.node.plane import ROOM, Plane, drawn
 
 LEKIWI = load_robot("lekiwi")
@@ -34,7 +34,7 @@ class Carrier(Plane):
 
     @property
     def lag(self) -> float:
-        """How far the gripper is from where it was sent, as a share of its range."""
+        """The distance of the gripper from where it was sent, as a share of its range."""
         return (self.width - self.sent[GRIPPER.name]) / (GRIPPER.upper - GRIPPER.lower)
 
     def _with_joints(self, topic: Topic[Any], message: Any) -> None:

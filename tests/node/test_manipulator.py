@@ -18,8 +18,7 @@ from gigabrain_schemas.objects import SeenSolid
 from gigabrain_schemas.safety import JointCap
 from gigabrain_zenoh.decision.behaviours import ArmCommand, Idle
 from gigabrain_zenoh.decision.grip import REST_TICKS
-from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner
-from gigabrain_zenoh.manipulation.squeeze import MOVING, STILL
+from gigabrain_zenoh.manipulation.arm_planner import MOVING, STILL, ArmPlanner
 from gigabrain_zenoh.safety.arm_shape import MujocoArm
 from gigabrain_zenoh.safety.step import SafetyInputs, SafetyMemory, step
 from tests.node.arm_rig import ELSEWHERE, THERE, THINGS, Rig
@@ -96,6 +95,17 @@ def test_a_grip_follows_what_creeps_while_the_arm_is_still(rig: Rig, way: float)
     assert abs(target.position - crept) == pytest.approx(STILL[1] * (GRIPPER.upper - GRIPPER.lower))
     assert outcome.holds
     assert outcome.holds.grip == target.position
+
+
+def test_a_gripper_that_an_operator_has_moved_stays_there(rig: Rig) -> None:
+    assert rig.carry_out(THINGS + "do: [{pick: cube}]").state == "succeeded"
+    for _ in range(SOON):
+        rig.tick()
+    opened = JointTarget(name="gripper", position=rig.arm.measured("gripper") + 0.01)
+    for _ in range(SOON):
+        rig.arm.step(Intent(joints=(opened,), behaviour="test", reason="open"))
+    intent, _ = rig.manipulator.step(rig.arm.state(), rig.arm.description, None, NO_TASK, "")
+    assert intent.joints == ()
 
 
 def test_a_grip_is_firmer_while_the_arm_moves(rig: Rig) -> None:
