@@ -15,7 +15,8 @@ from gigabrain_zenoh.navigation.grid_search import GridSearch
 
 NEAR_M = 2.0  # from the goal or the person, within which the robot is in the way
 GIVE_WAY_TICKS = 750  # 15 s; an obstacle that is still there does not wait for the robot
-MAX_GIVE_WAYS = 2  # per goal
+MAX_IN_VAIN = 2  # per goal, after which the other was still there,
+MAX_GIVE_WAYS = 10  # and in all
 MAX_WAITING_COST = 2.0  # of a place to wait at
 MAX_WAITING_PATH_M = 6.0
 MIN_OFFSET_M = 1.0  # from the line on which the other is likely to go on
@@ -91,7 +92,7 @@ class GiveWay:
     """Decides when to move aside for a person who waits for the robot."""
 
     def __init__(self) -> None:
-        self._count = self._since_tick = 0
+        self._count = self._in_vain = self._since_tick = 0
         self.place: Goal | None = None  # where the robot waits now,
         self.left: Point | None = None  # and for whom
 
@@ -102,14 +103,18 @@ class GiveWay:
         """Begin, continue or stop giving way to `other`; return whether that has changed."""
         before = self.place
         if before:
-            waiting = tick - self._since_tick < GIVE_WAY_TICKS
-            self.place = before if other and waiting else None
-        elif (
-            other and stuck and self._count < MAX_GIVE_WAYS and math.dist(here, other[:2]) < NEAR_M
-        ):
-            self.place = waiting_place(costs, search, here, other, far=self._count > 0)
-            self._count, self._since_tick, self.left = self._count + 1, tick, other[:2]
+            late = tick - self._since_tick >= GIVE_WAY_TICKS
+            self._in_vain += late and other is not None
+            self.place = None if late or other is None else before
+        elif other and stuck and self._may_again and math.dist(here, other[:2]) < NEAR_M:
+            self.place = waiting_place(costs, search, here, other, far=self._in_vain > 0)
+            self._count += self.place is not None
+            self._since_tick, self.left = tick, other[:2]
         return self.place is not before
+
+    @property
+    def _may_again(self) -> bool:
+        return self._in_vain < MAX_IN_VAIN and self._count < MAX_GIVE_WAYS
 
 
 def waiting_place(

@@ -335,6 +335,19 @@ def test_it_goes_on_as_soon_as_they_have_walked_on() -> None:
     assert (passed.goal, passed.activity) == (Goal(x=6.0, y=3.0), "")
 
 
+@pytest.mark.parametrize(("meetings", "told"), [(10, ["giving way"] * 10), (11, [""])])
+def test_it_goes_aside_whenever_they_come_back(meetings: int, told: list[str]) -> None:
+    guide = RoutePlanner()
+    ask = functools.partial(think, guide, goal=Goal(x=6.0, y=3.0), x=3.2, y=3.2)
+    ask(OPENED, tick=1)
+    routes = []
+    for number in range(meetings):
+        routes.append(ask(BARRED, tick=252 + 600 * number, walkers=THERE, seen=HITS))
+        gone = ask(OPENED, tick=300 + 600 * number)
+        assert (gone.activity, gone.state) == ("", "running")
+    assert [one.activity for one in routes][-len(told) :] == told
+
+
 @pytest.mark.parametrize(
     ("walkers", "seen"),
     [
