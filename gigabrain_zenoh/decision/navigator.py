@@ -171,6 +171,7 @@ class Navigator:
         self, context: NavigationContext, command: DriveCommand | None
     ) -> Route | None:
         here, world = context.here, context.world
+        self._routes.watch(context)
         if here and world:
             grid = self._source.grid(world.boot, world.basis)
             self._oriented = self._oriented or grid is not None

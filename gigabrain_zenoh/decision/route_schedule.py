@@ -58,6 +58,11 @@ class RouteSchedule:
         route = self.route
         self._stands = feedback is None and route is not None and route.points is not None
 
+    def watch(self, context: NavigationContext) -> None:
+        """Take in who walks, at each scan, whether the robot drives or not."""
+        if context.world and context.map_from_odom:
+            self._walkers.update(context.tick, context.world.obstacles, context.map_from_odom)
+
     def request(
         self,
         context: NavigationContext,
@@ -69,9 +74,6 @@ class RouteSchedule:
         """Plan a route if one is due; in a large map it becomes `route` at a later scan."""
         assert context.world
         assert context.body
-        assert context.map_from_odom
-        obstacles = context.world.obstacles
-        self._walkers.update(context.tick, obstacles, context.map_from_odom)
         cells = grid.width * grid.height
         scans = MIN_DUE_SCANS + cells // CELLS_PER_SCAN
         if not self._worker.idle:  # maybe with a larger map, which this one has replaced

@@ -3,10 +3,12 @@
 import math
 from typing import Literal
 
+import msgspec
 import numpy as np
 import pytest
 
 from gigabrain_schemas.base import Cause, Velocity
+from gigabrain_schemas.brain import Obstacle, WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import GoalRequest, MissionRequest
 from gigabrain_schemas.topics import GOAL, MISSION, SAFETY
@@ -192,3 +194,33 @@ async def test_the_same_world_gives_the_same_drive() -> None:
             await plane.go(5.0)
             places.append((plane.x, plane.y, plane.yaw))
     assert places[0] == places[1]
+
+
+class Walked(Plane):
+    """A plane on which somebody has walked in the gap beside the wall, and stands there."""
+
+    person = 3.8  # [m], along x
+
+    def _world(self) -> WorldModel:
+        walks = self.person > 2.7
+        self.person -= 0.05 * walks
+        self.cells = CELLS.copy()
+        middle = round(self.person / 0.05)
+        self.cells[27:33, middle - 3 : middle + 3] = 100
+        there = Obstacle(
+            id=3, x=self.person - self.start[0], y=1.5 - self.start[1], radius=0.15,
+            velocity_x=-0.5 * walks,
+        )  # fmt: skip
+        world = super()._world()
+        self.known = CELLS.copy()  # perception leaves out of the map who walks
+        return msgspec.structs.replace(world, obstacles=(there,))
+
+
+async def test_it_gives_way_to_who_has_walked_up_before_it_had_a_goal() -> None:
+    async with Walked(CELLS, (1.9, 1.5, 0.0)) as plane:
+        await plane.go(0.2)
+        assert (await plane.ask(MISSION, MissionRequest(mission="do: [{wait: 1}]"))).ok
+        await plane.go(4.0)  # they stand
+        assert (await plane.ask(GOAL, GoalRequest(x=4.0, y=0.8))).ok
+        await plane.go(14.0)
+        assert "somebody is in the way" in "\n".join(one.reason for one in plane.intents)
