@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -15,6 +16,7 @@ from gigabrain_zenoh.manipulation.phases import Phase
 GRIPS = 0.1  # of the gripper's greatest speed, above which it moves: an encoder's steps are less
 MOVED = 0.02  # [rad] or [m] off the beginning of a plan: it was made for another posture
 SENT = 0.01  # of the gripper's range, within which it was sent to its target
+REGRIP = 0.12  # of its range, by which a grip changes at most while something is held
 
 
 def sent_posture(planner: ArmPlanner, body: BodyDescription, state: RobotState) -> Floats:
@@ -62,6 +64,21 @@ def begins_at(plan: Plan, posture: Floats) -> bool:
 def holds(planner: ArmPlanner, hold: Hold, state: RobotState) -> bool:
     """Return whether the gripper has stopped short of where it was sent."""
     return planner.holds(gripper_place(planner, state, hold.grip), hold.grip)
+
+
+def still_held(
+    planner: ArmPlanner, body: BodyDescription, state: RobotState, hold: Hold
+) -> Hold | None:
+    """Return `hold` by where the gripper was sent meanwhile; None if it holds nothing any more."""
+    gripper = planner.arm.gripper
+    assert gripper
+    grip = hold.grip
+    if not sent_to(planner, body, state, grip):
+        grip = sent_place(planner, body, state, grip)
+    squeezes = (grip - gripper_place(planner, state, grip)) * (hold.grip - hold.opening) > 0.0
+    near = abs(grip - hold.grip) <= REGRIP * (gripper.upper - gripper.lower)
+    now = replace(hold, grip=grip)
+    return now if squeezes and near and holds(planner, now, state) else None
 
 
 def gripper_moves(

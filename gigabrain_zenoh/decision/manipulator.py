@@ -22,6 +22,7 @@ from gigabrain_zenoh.decision.arm_readings import (
     pace,
     sent_posture,
     sent_to,
+    still_held,
 )
 from gigabrain_zenoh.decision.arm_touch import Touch
 from gigabrain_zenoh.decision.arm_work import Planned, WorkInputs, moving, work_for
@@ -194,8 +195,7 @@ class Manipulator:
     ) -> None:
         """Believe that something is held since before a restart, if the gripper agrees."""
         self._recalls = False
-        hold = hold_of(held) if held else None
-        if hold and sent_to(planner, body, state, hold.grip) and holds(planner, hold, state):
+        if held and (hold := still_held(planner, body, state, hold_of(held))):
             self._set_hold(hold)
 
     def _set_hold(self, hold: Hold | None) -> None:

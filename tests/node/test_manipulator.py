@@ -193,7 +193,7 @@ def test_after_an_interruption_it_goes_on_from_where_it_is(rig: Rig, phase: str)
     assert rig.arm.thing()[:2] == pytest.approx(ELSEWHERE, abs=0.012)
 
 
-@pytest.mark.parametrize("phase", ["descend", "lift", "traverse", "lower", "retreat"])
+@pytest.mark.parametrize("phase", ["descend", "squeeze", "lift", "traverse", "lower", "retreat"])
 def test_after_a_restart_of_decision_it_goes_on_with_what_it_holds(rig: Rig, phase: str) -> None:
     rig.give(THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]}]")
     while rig.outcome is None or rig.outcome.reason != phase:
