@@ -396,5 +396,5 @@ def is_free(cost: Costs, points: Floats, against: WayBits) -> bool:
         worst = line_cost(cost, x, y, to_x, to_y, against)[1]
         if worst == np.inf or (worst >= LETHAL and worst > limit):
             return False
-        limit = cost[int(to_y), int(to_x)]
+        limit = min(limit, cost[int(to_y), int(to_x)])  # a line ends before the cell at its end
     return True

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from gigabrain_zenoh.navigation.costmap import Costmap, Inflation, Unknown, costmap
+from gigabrain_zenoh.navigation.costmap import NO_LANES, Costmap, Inflation, Unknown, costmap
 from gigabrain_zenoh.navigation.global_planner import (
     GlobalPlanner,
     Path,
@@ -13,6 +13,7 @@ from gigabrain_zenoh.navigation.global_planner import (
     is_valid,
     remaining_path,
 )
+from gigabrain_zenoh.navigation.grid_search import is_free
 from tests.unit.navigation.grids import drawn, empty, grid_of
 
 NAN, INF = float("nan"), float("inf")
@@ -188,6 +189,14 @@ def test_a_path_is_valid_until_something_stands_on_it() -> None:
     assert is_valid(found, seen(cells))
     cells[5:13, 30] = 100
     assert not is_valid(found, seen(cells))
+
+
+def test_a_path_whose_points_are_at_the_edges_of_cells_is_blocked_as_well() -> None:
+    points = np.column_stack((np.arange(5.0, 56.0), np.full(51, 30.0)))
+    cells = empty(6.0, 6.0)
+    assert is_free(seen(cells).cost, points, NO_LANES)
+    cells[28:33, 30:35] = 100
+    assert not is_free(seen(cells).cost, points, NO_LANES)
 
 
 def test_a_path_beyond_a_map_that_shrank_is_not_valid() -> None:
