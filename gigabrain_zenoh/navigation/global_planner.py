@@ -23,6 +23,9 @@ from gigabrain_zenoh.navigation.grid_search import (
 POINT_SPACING_M = 0.1  # [m] between the points of a path, at most
 MAX_STRAY_M = 0.5  # [m] off its path, beyond which it is planned again
 SWITCH_COST_RATIO = 0.85  # of the present path's cost, above which a new path is not taken
+LONG_PATH_M = 20.0  # [m], from which a path is led round what blocks it: a search takes longer
+DETOUR_M = 3.0  # [m] of the path before and behind that, which are searched anew, and to the sides
+MAX_DETOUR_M = 15.0  # [m] of the path that are
 MAX_DETOUR_OF_CELLS = math.sqrt(4 - 2 * math.sqrt(2))  # of steps between cells, over straight lines
 Point = tuple[float, float]  # [m], in the map's frame
 NO_WAY = "no way leads to the goal"
@@ -65,6 +68,7 @@ class GlobalPlanner:
 
     def __init__(self) -> None:
         self.search = GridSearch()
+        self._nearby = GridSearch()  # in a part of the map
 
     def plan(self, costmap: Costmap, start: Point, goal: Point) -> Path | Unreachable:
         """Return the cheapest path from `start` to `goal`, or why there is none."""
@@ -80,23 +84,26 @@ class GlobalPlanner:
         cells = self.search.path(costmap.cost, begin, end, costmap.against)
         if cells is None:
             return self._nearest(costmap, goal, NO_WAY)
-        places = np.column_stack((cells[:, 1] + 0.5, cells[:, 0] + 0.5))
-        places = np.vstack((places[:1], places)) if len(places) == 1 else places
-        places[0], places[-1] = _in_cells(costmap, np.array((start, goal)))
-        corners = _in_metres(costmap, smooth_path(costmap.cost, places, costmap.against))
-        corners[0], corners[-1] = start, goal  # exactly
-        return _path(costmap, corners)
+        return _path(costmap, _pulled_tight(costmap, cells, np.array((start, goal))))
 
     def replan(self, costmap: Costmap, start: Point, goal: Point, path: Path) -> Path | Unreachable:
-        """Return the rest of `path` if it is free and no path is much cheaper; or a new one."""
+        """Return the rest of `path` if it is free and no path is much cheaper; or a new one.
+
+        A long path that is blocked is led round what blocks it, if no path is much cheaper.
+        """
         rest = remaining_path(path, costmap, start)
-        if rest is None or tuple(path.points[-1]) != goal or not is_valid(rest, costmap):
+        if rest is None or tuple(path.points[-1]) != goal:
             return self.plan(costmap, start, goal)
-        worthwhile = SWITCH_COST_RATIO * rest.cost[0]
+        free = is_valid(rest, costmap)
+        kept = rest if free else self._detour(costmap, rest)
+        if kept is None:
+            return self.plan(costmap, start, goal)
+        worthwhile = SWITCH_COST_RATIO * kept.cost[0]
         if self._costs_at_least(worthwhile, costmap, start, goal):
-            return rest
+            return kept
         found = self.plan(costmap, start, goal)
-        return found if isinstance(found, Path) and found.cost[0] < worthwhile else rest
+        better = isinstance(found, Path) and found.cost[0] < worthwhile
+        return found if better or not free else kept
 
     def field(self, costmap: Costmap, goal: Point) -> Floats | None:
         """Return the cost from each cell to `goal`, (height, width) [m in the open].
@@ -107,6 +114,26 @@ class GlobalPlanner:
         if cell is None:
             return None
         return self.search.field(costmap.cost, cell, "to", costmap.against) * costmap.resolution
+
+    def _detour(self, costmap: Costmap, path: Path) -> Path | None:
+        """Return a long path led round what blocks it; None if that does not work nearby."""
+        stretch = _blocked_stretch(costmap, path)
+        if stretch is None:
+            return None
+        begin, end = stretch
+        margin = math.ceil(DETOUR_M / costmap.resolution)
+        along = _cells_of(costmap, path.points[begin : end + 1])
+        low, high = (along.min(axis=0) - margin).clip(0), along.max(axis=0) + margin
+        part = slice(low[0], high[0]), slice(low[1], high[1])
+        against = np.ascontiguousarray(costmap.against[part])
+        (row, column), (to_row, to_column) = (along[[0, -1]] - low).tolist()
+        cells = self._nearby.path(costmap.cost[part], (row, column), (to_row, to_column), against)
+        if cells is None:
+            return None
+        corners = _pulled_tight(costmap, cells + low, path.points[[begin, end]])
+        led = np.vstack((path.points[:begin], corners, path.points[end + 1 :]))
+        detour = _path(costmap, led)
+        return detour if is_valid(detour, costmap) else None
 
     def _costs_at_least(self, least: float, costmap: Costmap, start: Point, goal: Point) -> bool:
         """Return whether it is sure that no path is cheaper [m in the open]."""
@@ -126,6 +153,37 @@ class GlobalPlanner:
         x, y = costmap.points(np.array(cell[:1]), np.array(cell[1:]))[0]
         away = math.hypot(x - goal[0], y - goal[1])
         return Unreachable(fault=why, nearest=(float(x), float(y)), distance=away)
+
+
+def _blocked_stretch(costmap: Costmap, path: Path) -> tuple[int, int] | None:
+    """Return the points of a long path between which it has to lead elsewhere, if they are near."""
+    if path.remaining[0] < LONG_PATH_M:
+        return None
+    rows, columns = _cells_of(costmap, path.points).T
+    blocked = path.remaining[costmap.cost[rows, columns] >= LETHAL]
+    if not len(blocked):  # but between two points
+        return None
+    before = int(np.count_nonzero(path.remaining >= blocked[0] + DETOUR_M))
+    until = int(np.count_nonzero(path.remaining > blocked[-1] - DETOUR_M))
+    begin, end = max(before - 1, 0), min(until, len(rows) - 1)
+    far = path.remaining[begin] - path.remaining[end] > MAX_DETOUR_M
+    return None if far else (begin, end)
+
+
+def _cells_of(costmap: Costmap, points: Floats) -> NDArray[np.intp]:
+    """Return the rows and columns (n, 2) of points (n, 2) [m]; of the nearest cells, if outside."""
+    inside = np.array(costmap.cost.shape) - 1
+    return _in_cells(costmap, points)[:, ::-1].astype(np.intp).clip(0, inside)
+
+
+def _pulled_tight(costmap: Costmap, cells: NDArray[np.integer], ends: Floats) -> Floats:
+    """Return the corners (n, 2) [m] of a path over `cells` (m, 2), between two `ends` (2, 2)."""
+    places = np.column_stack((cells[:, 1] + 0.5, cells[:, 0] + 0.5))
+    places = np.vstack((places[:1], places)) if len(places) == 1 else places
+    places[[0, -1]] = _in_cells(costmap, ends)
+    corners = _in_metres(costmap, smooth_path(costmap.cost, places, costmap.against))
+    corners[[0, -1]] = ends  # exactly
+    return corners
 
 
 def is_valid(path: Path, costmap: Costmap) -> bool:

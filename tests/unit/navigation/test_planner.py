@@ -273,6 +273,55 @@ def test_a_kept_path_is_the_one_that_a_search_would_keep(seed: int) -> None:
         old = again
 
 
+def test_a_long_path_is_led_round_what_blocks_it_without_a_search_of_all(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    cells, planner, goal = empty(100.0, 6.0), GlobalPlanner(), (99.5, 3.0)
+    old = path(seen(cells), (0.5, 3.0), goal)
+    cells[28:33, 180:185] = 100
+    best = path(seen(cells), (1.5, 3.0), goal)
+    monkeypatch.setattr(planner, "plan", None)
+    led = planner.replan(seen(cells), (1.5, 3.0), goal, old)
+    assert isinstance(led, Path)
+    assert is_valid(led, seen(cells))
+    assert led.cost[0] < 1.02 * best.cost[0]
+    np.testing.assert_allclose(led.points[led.points[:, 0] > 22.0, 1], 3.0)
+
+
+def test_a_long_path_whose_corridor_is_closed_leads_elsewhere() -> None:
+    cells, goal = empty(36.0, 8.0), (35.5, 2.0)
+    cells[39:41, 20:340] = 100
+    old = path(seen(cells), (0.5, 2.0), goal)
+    assert old.points[:, 1].max() < 4.0
+    cells[:40, 180] = 100
+    led = GlobalPlanner().replan(seen(cells), (0.5, 2.0), goal, old)
+    assert isinstance(led, Path)
+    assert led.points[:, 1].max() > 4.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_path_that_is_led_round_costs_little_more_than_the_cheapest(seed: int) -> None:
+    rng, planner, goal = np.random.default_rng(seed), GlobalPlanner(), (35.5, 35.5)
+    cells = empty(36.0, 36.0)
+    for row, column in rng.integers(20, 330, (60, 2)):
+        cells[row : row + 12, column : column + 12] = 100
+    cells[:20, :20] = cells[-20:, -20:] = 0
+    old, blocked = path(seen(cells), (0.5, 0.5), goal), 0
+    for _ in range(12):
+        x, y = old.points[rng.integers(40, len(old.points) - 40)]
+        cells[int(y * 10) : int(y * 10) + 5, int(x * 10) : int(x * 10) + 5] = 100
+        made = seen(cells)
+        blocked += not is_valid(old, made)
+        led, best = planner.replan(made, (0.5, 0.5), goal, old), path(made, (0.5, 0.5), goal)
+        assert isinstance(led, Path)
+        assert is_valid(led, made)
+        assert tuple(led.points[0]) == (0.5, 0.5)
+        assert tuple(led.points[-1]) == goal
+        assert led.cost[0] <= best.cost[0] / 0.85
+        old = led
+    assert blocked >= 6
+
+
 def test_who_has_strayed_or_has_another_goal_gets_a_new_path() -> None:
     made = seen(empty(6, 6))
     old = path(made, (0.5, 0.5), (5.5, 0.5))
