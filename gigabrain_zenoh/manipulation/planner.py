@@ -15,6 +15,10 @@ from gigabrain_zenoh.manipulation.collision import CollisionChecker
 
 BRANCH = 0.5  # [rad] or [m] of the joint that moves most, of a branch of a tree
 SHORTCUTS = 40
+MAX_OVERLAP_M = 0.005  # of the start with what it touches: from deeper in it does not leave
+LEAVING = (0.02, 0.05, 0.1)  # [rad] or [m] of the joint that moves most, to leave a tight start
+LEAVING_TRIES = 40  # directions of each
+LEAVING_PARTS = 4  # of the way, in which it must not come nearer to anything
 TIME_LIMIT_S = 2.0
 
 NoPathCause = Literal["limits", "start", "goal", "time"]
@@ -80,27 +84,43 @@ def plan(
 ) -> JointPath | NoPath:
     """Return a path of postures from `start` to `goal` (n,), or why there is none.
 
-    The same `seed` gives the same path, unless the `time_limit` [s] cuts the search off.
+    The same `seed` gives the same path, unless the `time_limit` [s] cuts the search off. A start
+    that is too near to something is left first: servos do not stop exactly where they should.
     """
-    if fault := _fault(checker, start, goal):
-        return fault
-    if checker.is_line_free(start, goal):
-        return JointPath(postures=np.stack((start, goal)))
-    random, until = np.random.default_rng(seed), time.monotonic() + time_limit
-    found = _connect(checker, start, goal, random, until)
-    if found is None:
-        return NoPath(cause="time", reason=f"no way round was found within {time_limit:g} s")
-    return JointPath(postures=np.array(_shortened(checker, found, random)))
-
-
-def _fault(checker: CollisionChecker, start: Floats, goal: Floats) -> NoPath | None:
     for name, posture in (("start", start), ("goal", goal)):
         if not checker.arm.inside(posture):
             return NoPath(cause="limits", reason=f"the {name} is outside the limits of the joints")
-    if touches := checker.touches(start):
-        return NoPath(cause="start", reason=f"the start collides: {touches}")
     if touches := checker.touches(goal):
         return NoPath(cause="goal", reason=f"the goal collides: {touches}")
+    random, until, begin = np.random.default_rng(seed), time.monotonic() + time_limit, start
+    if touches := checker.touches(start):
+        freed = _freed(checker, start, random)
+        if freed is None:
+            return NoPath(cause="start", reason=f"the start collides: {touches}")
+        begin = freed
+    way = [begin, goal]
+    if not checker.is_line_free(begin, goal):
+        found = _connect(checker, begin, goal, random, until)
+        if found is None:
+            return NoPath(cause="time", reason=f"no way round was found within {time_limit:g} s")
+        way = _shortened(checker, found, random)
+    return JointPath(postures=np.array(way if begin is start else [start, *way]))
+
+
+def _freed(checker: CollisionChecker, start: Floats, random: np.random.Generator) -> Floats | None:
+    """Return a free posture beside a start that is not, to which nothing comes nearer."""
+    nearest = checker.clearance(start).distance
+    if nearest < -MAX_OVERLAP_M:
+        return None
+    for far in LEAVING:
+        for _ in range(LEAVING_TRIES):
+            way = random.uniform(-1.0, 1.0, len(start))
+            way *= far / np.abs(way).max()
+            if not (checker.arm.inside(start + way) and checker.is_free(start + way)):
+                continue
+            parts = (start + way * k / LEAVING_PARTS for k in range(1, LEAVING_PARTS))
+            if all(checker.clearance(part).distance >= nearest for part in parts):
+                return np.asarray(start + way)
     return None
 
 

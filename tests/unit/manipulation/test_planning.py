@@ -157,6 +157,42 @@ def test_a_plan_that_cannot_be_says_why() -> None:
     assert "floor" in causes["goal"].reason  # type: ignore[union-attr]
 
 
+def near_the_shelf(checker: CollisionChecker, posture: Floats, gap: float) -> Floats:
+    """Return where the shoulder has lifted an arm from below the shelf up to a gap [m] from it."""
+    low, high = posture, posture.copy()
+    while checker.clearance(high).distance > gap:
+        high = high - np.array([0.0, 0.02, 0.0, 0.0, 0.0])
+    for _ in range(30):
+        middle = (low + high) / 2
+        far = checker.clearance(middle).distance > gap
+        low, high = (middle, high) if far else (low, middle)
+    return low
+
+
+@pytest.mark.parametrize("gap", [0.0012, -0.003])
+def test_a_start_that_is_a_bit_too_near_is_left_without_coming_nearer(gap: float) -> None:
+    checker = CollisionChecker(arm(), [FLOOR, SHELF], margin=0.002)
+    for below, above in below_and_above(checker, 3):
+        start = near_the_shelf(checker, below, gap)
+        assert checker.touches(start)
+        found = plan(checker, start, above)
+        assert isinstance(found, JointPath)
+        assert np.array_equal(found.postures[0], start)
+        first, second = found.postures[:2]
+        on_the_way = [first + share * (second - first) for share in np.linspace(0.0, 1.0, 20)]
+        rooms = [checker.clearance(one).distance for one in on_the_way]
+        assert min(rooms) > gap - 1e-4
+        assert checker.is_free(second)
+
+
+def test_a_start_that_is_deep_in_something_is_not_left() -> None:
+    checker = CollisionChecker(arm(), [FLOOR, SHELF], margin=0.002)
+    ((below, above),) = below_and_above(checker, 1)
+    found = plan(checker, near_the_shelf(checker, below, -0.008), above)
+    assert isinstance(found, NoPath)
+    assert found.cause == "start"
+
+
 def test_a_start_in_motion_goes_on_smoothly() -> None:
     timing = TimeParametrization(arm().joints)
     speed = np.array([1.0, 0.0, -0.5, 0.0, 0.0])
