@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from gigabrain_schemas.arrays import Floats
-from gigabrain_schemas.body import Arm, BodyDescription
+from gigabrain_schemas.body import BodyDescription
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics
 from gigabrain_zenoh.manipulation.collision import CollisionChecker, Thing, turned
@@ -30,10 +30,12 @@ from gigabrain_zenoh.manipulation.planner import NoPath, plan
 from gigabrain_zenoh.manipulation.press import PressPlanner
 
 TABLE = "the table"
+SPARE_M = 0.004  # from boxes beyond safety's clearance: it holds an arm that comes to that
 SUNK_M = 0.001  # of the floor below its place, as things stand on it
 SHARES = (0.57, 0.62, 0.7, 0.5, 0.78)  # of its reach, at which a thing is best grasped
 NEARER_M = 0.065  # farther than there, it goes nearer before it grasps: it stops 5 cm off at most
 BEFORE_M = 0.08  # between the body and a thing that it picks up
+MARGIN_M = 0.002  # from all that is around, of an arm that holds nothing
 ORIENTATION_RAD = math.radians(2)  # by which the approach of a tool that reaches may be off
 OFFERS = ((0.7, 0.5), (0.6, 0.55), (0.6, 0.4), (0.5, 0.5), (0.5, 0.3))  # ahead and up, of its reach
 OFFER_PITCHES = (0.0, math.radians(30), None)
@@ -74,7 +76,7 @@ class ArmPlanner:
         self.arm = ArmKinematics(mjcf, body.joints, body.arm.tool)
         self._inverse = InverseKinematics(self.arm, LIMIT_SPARE)
         self._times = TimeParametrization(eased(self.arm.joints, FAST))
-        self._around = surroundings(body.arm)
+        self._around = surroundings(body)
         self._pick_place: PickPlacePlanner | None = None
         self._press_planner: PressPlanner | None = None
         self._front = max(x for x, _ in body.footprint)  # [m]
@@ -99,15 +101,18 @@ class ArmPlanner:
             hold: What it holds.
         """
         checker = self._checker(things, hold)
-        goal = ToolGoal(
+        found = self._inverse.solve(self.tool_goal(point, pitch), posture, checker.touches)
+        if isinstance(found, OutOfReach):
+            return NoWay(reason=self._explained(found))
+        return self._move(checker, posture, found.posture)
+
+    def tool_goal(self, point: Floats, pitch: float | None) -> ToolGoal:
+        """Return a goal at a point (3,) [m]; `pitch` as in `reach`."""
+        return ToolGoal(
             position=point,
             approach=None if pitch is None else self._approach(point, pitch),
             orientation_tolerance=ORIENTATION_RAD,
         )
-        found = self._inverse.solve(goal, posture, checker.touches)
-        if isinstance(found, OutOfReach):
-            return NoWay(reason=self._explained(found))
-        return self._move(checker, posture, found.posture)
 
     def take_posture(
         self,
@@ -299,7 +304,7 @@ class ArmPlanner:
     def _checker(self, things: Sequence[Thing], hold: Hold | None) -> CollisionChecker:
         around = self._all(things)
         if hold is None:
-            return CollisionChecker(self.arm, around, margin=0.002)
+            return CollisionChecker(self.arm, around, margin=MARGIN_M)
         ignore = may_touch(hold.thing, around)
         return CollisionChecker(self.arm, around, held=hold.thing, margin=0.001, ignore=ignore)
 
@@ -324,15 +329,18 @@ class ArmPlanner:
         return f"not reachable: {found.reason}; the nearest is ({x:.3f}, {y:.3f}, {z:.3f})"
 
 
-def surroundings(arm: Arm) -> list[Thing]:
-    """Return the floor and the boxes that no part of an arm may enter."""
+def surroundings(body: BodyDescription) -> list[Thing]:
+    """Return the floor, and the boxes that no part of an arm may enter with what safety keeps."""
+    assert body.arm
     found = []
-    if arm.floor is not None:
-        place = np.array([0.0, 0.0, arm.floor - SUNK_M])
+    if body.arm.floor is not None:
+        place = np.array([0.0, 0.0, body.arm.floor - SUNK_M])
         found.append(Thing(name=TABLE, kind="floor", position=place))
-    for box in arm.keep_out:
+    kept = 2 * (body.thresholds.arm_clearance + SPARE_M)
+    for box in body.arm.keep_out:
+        length, width, height = (side + kept for side in box.size)
         found.append(Thing(
-            name=box.name, kind="box", size=box.size, position=np.array(box.center),
-            axes=turned(box.yaw),
+            name=box.name, kind="box", size=(length, width, height),
+            position=np.array(box.center), axes=turned(box.yaw),
         ))  # fmt: skip
     return found

@@ -5,9 +5,13 @@ import math
 import mujoco
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
+from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.body import KeepOut
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.manipulation.arm_planner import surroundings
 from gigabrain_zenoh.manipulation.collision import CollisionChecker, Thing
 from gigabrain_zenoh.manipulation.grasps import ROOM_M, Grasp, GraspPlanner, NoGrasp
 from gigabrain_zenoh.manipulation.inverse_kinematics import Reachable, ToolGoal
@@ -261,3 +265,12 @@ def test_what_cannot_be_grasped_says_why() -> None:
 def test_joints_of_another_arm_are_refused() -> None:
     with pytest.raises(ConfigError):
         type(arm())(MODEL.read_text(), JOINTS[5:])
+
+
+def test_ways_keep_off_boxes_by_more_than_safety_does() -> None:
+    body = load_robot("so101").description()
+    assert body.arm
+    shelf = KeepOut(name="shelf", center=(0.3, 0.0, 0.2), size=(0.2, 0.4, 0.02))
+    _, kept = surroundings(replace(body, arm=replace(body.arm, floor=0.0, keep_out=(shelf,))))
+    for side, given in zip(kept.size, shelf.size, strict=True):
+        assert side / 2 > given / 2 + body.thresholds.arm_clearance + 0.002
