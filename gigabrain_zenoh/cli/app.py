@@ -127,6 +127,7 @@ COMMANDS = {
     "bench clutter": ("bench_eyes:clutter", "Drive to goals past obstacles a lidar misses."),
     "bench objects": ("bench_eyes:objects", "Measure what a robot remembers of things."),
     "bench fetch": ("bench_hands:fetch", "Fetch a can from another room."),
+    "bench reach": ("bench_hands:reach", "Have an arm go to random goals near its body."),
     "bench joints": ("bench_hands:joints", "Have each joint of an arm follow a sine and a step."),
     "bench hands": ("bench_hands:hands", "Pick things up and put them down with an arm."),
     "bench barn": ("bench_navigation:barn", "Run the BARN and DynaBARN benchmarks."),

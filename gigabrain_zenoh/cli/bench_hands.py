@@ -1,4 +1,4 @@
-"""`gigabrain bench hands`, `fetch` and `joints`: what an arm picks up and brings, and follows."""
+"""`gigabrain bench hands`, `fetch`, `reach` and `joints`: where arms go, and what they bring."""
 
 from collections import Counter
 from typing import TYPE_CHECKING
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from gigabrain_zenoh.qa.bench.fetch import FetchResult
     from gigabrain_zenoh.qa.bench.hands import HandsResult, HandsRun
     from gigabrain_zenoh.qa.bench.joints import TrackingResult
+    from gigabrain_zenoh.qa.bench.reach import ReachResult
 
 MAX_BACKLASH_DEG, MAX_LOAD_KG = 10.0, 10.0
 
@@ -91,6 +92,57 @@ def fetch(
     result = run_async(work)
     finish(_fetch_table(result), result, json)
     return 0
+
+
+def reach(
+    *,
+    body: Body = "so101",
+    goals: int = 1000,
+    seed: int = 0,
+    json: JsonFile = None,
+) -> int:
+    """Have an arm go to random goals near its body, judged by the physics.
+
+    Example: gigabrain bench reach --goals 1000
+
+    Goals are drawn all around the arm, over and under a shelf, and beyond its reach; every other
+    one with a pitch of the tool. It times inverse kinematics and planning, and counts on how many
+    ways the arm touched anything. Planner, control, safety and gate are those of a robot. It
+    needs the extra `arm`.
+
+    Args:
+        goals: How many are drawn.
+        seed: Seed of the goals.
+    """
+    from gigabrain_zenoh.qa.bench.reach import measure_reach
+
+    check_names([body])
+    check_positive(goals=goals)
+    files.check_result_path(json)
+    result = measure_reach(body, goals, seed, print_progress)
+    finish(_reach_table(result), result, json)
+    return 1 if result.touched else 0
+
+
+def _reach_table(result: "ReachResult") -> Table:
+    table = table_of("what", "n", "p50 [ms]", "p95 [ms]", "p99 [ms]", title="Reached")
+    for what, times in (
+        ("a posture, found", result.solved),
+        ("no posture, and why", result.unsolved),
+        ("a plan", result.planned),
+    ):
+        figures = (f"{one:.1f}" for one in (times.p50_ms, times.p95_ms, times.p99_ms))
+        table.add_row(what, str(times.n), *figures)
+    refused = ", ".join(f"{n} {cause}" for cause, n in sorted(result.refused.items()))
+    table.caption = "\n".join((
+        f"{result.body}, {result.goals} goals: {result.reached} reached, off p95 "
+        f"{result.off_p95_m * 100:.1f} cm; no posture: {refused or 'none'}; no way: "
+        f"{sum(result.no_way.values())}; held back by safety: {result.held}. "
+        f"On {len(result.touched)} ways it touched something.",
+        *(f"{n} times no way: {why}" for why, n in sorted(result.no_way.items())),
+        *result.touched[:10],
+    ))  # fmt: skip
+    return table
 
 
 def joints(

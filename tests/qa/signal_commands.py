@@ -108,6 +108,7 @@ CALLS = {
     "bench fetch": "bench fetch --seeds 0",
     "bench hands": "bench hands --seeds 0",
     "bench joints": "bench joints",
+    "bench reach": "bench reach",
     "bench eyes": "bench eyes --worlds 1 --seconds 1 --ghosts 1",
     "bench clutter": "bench clutter --seeds 0",
     "faults": "faults --only e-stop-pressed",
