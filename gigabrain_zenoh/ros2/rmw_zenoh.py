@@ -113,8 +113,13 @@ class RmwZenohPublisher:
 
     def lost(self) -> None:
         """Forget the readers, as the session is lost."""
-        self._put, self._matched = None, False
+        self.release()
+        self._matched = False
         self.count()
+
+    def release(self) -> None:
+        """Send no more: what is declared on the session is about to be dropped."""
+        self._put = None
 
     def count(self) -> None:
         """Count the readers: those with a token, and one at least if Zenoh knows of any.
@@ -186,6 +191,8 @@ class RmwZenohTransport:
     ) -> None:
         self.bridge.close()
         self._questions.close()
+        for publisher in self.publishers:
+            publisher.release()
         await self.lines.close()
 
     def publisher(

@@ -120,16 +120,19 @@ def _close(session: zenoh.Session) -> None:
         log.debug("closing the session: %s", error)
 
 
-async def close_session(session: zenoh.Session) -> None:
+async def close_session(session: zenoh.Session, declared: list[Any]) -> None:
     """Close the session, waiting half a second at most.
 
-    After that, closing continues until the process ends.
+    After that, closing continues until the process ends. What was `declared` on it is dropped in
+    the closing thread. An advanced publisher waits there for Zenoh's threads, and these may wait
+    for a callback: garbage collection in that callback's thread would wait for ever.
     """
     loop = asyncio.get_running_loop()
     done = asyncio.Event()
 
     def work() -> None:
         _close(session)
+        declared.clear()
         with contextlib.suppress(RuntimeError):  # the loop is closed
             loop.call_soon_threadsafe(done.set)
 
@@ -247,7 +250,7 @@ class ReconnectingSession:
         line, self.now = self.now, None
         self._joined.set()  # release callers that wait for a new line
         if line:
-            await close_session(line.session)
+            await close_session(line.session, self._withdraw())
 
     def _join(self, session: zenoh.Session) -> None:
         """Repeat all declarations on a new session, then make it the current line."""
@@ -275,11 +278,16 @@ class ReconnectingSession:
             return
         self.now = None
         self._joined.clear()
+        self._on_lost()
+        self._start(close_session(line.session, self._withdraw()))
+        self._start(self._renew())
+
+    def _withdraw(self) -> list[Any]:
+        """Return what was declared on the last line, and forget it."""
+        made = [declared.made for declared in self._declared]
         for declared in self._declared:
             declared.made = None
-        self._start(close_session(line.session))
-        self._on_lost()
-        self._start(self._renew())
+        return made
 
     async def _renew(self) -> None:
         while True:
@@ -291,7 +299,7 @@ class ReconnectingSession:
             except Exception as error:  # noqa: BLE001 - without a line the process is deaf for good
                 log.warning("the router cannot be joined again: %s", error)
                 if session:  # some declarations failed on it
-                    self._start(close_session(session))
+                    self._start(close_session(session, []))
                 await asyncio.sleep(AGAIN_S)
 
     def _start(self, work: Coroutine[Any, Any, None]) -> None:

@@ -254,3 +254,12 @@ async def test_all_is_found_again_after_the_routers_restart() -> None:
 async def test_without_a_router_the_error_names_the_option() -> None:
     with pytest.raises(ConfigError, match="router: tcp"):
         RmwZenohTransport(Ros2Link(), types())
+
+
+async def test_a_closed_node_keeps_no_publisher_that_a_callback_could_drop(
+    nodes: ZenohNodes,
+) -> None:
+    async with nodes.opened("talker") as node:
+        publisher = node.publisher("/map", STRING, LATCHED)
+        assert publisher._put
+    assert publisher._put is None

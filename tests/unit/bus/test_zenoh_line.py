@@ -1,6 +1,7 @@
 """A line to the router: renewed whole, whatever goes wrong meanwhile."""
 
 import asyncio
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +12,7 @@ from gigabrain_zenoh.bus.bridge import Bridge
 from gigabrain_zenoh.bus.zenoh import session as zenoh_line
 from gigabrain_zenoh.bus.zenoh.session import ReconnectingSession
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
+from gigabrain_zenoh.bus.zenoh.workarounds import CLOSING_THREAD
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.testing.waiting import until
 
@@ -76,8 +78,9 @@ class World:
     async def _open(self, _: Endpoint) -> Session:
         return self._later.pop(0)
 
-    async def _close(self, session: Session) -> None:
+    async def _close(self, session: Session, declared: list[str]) -> None:
         session.closed = True
+        declared.clear()
 
     def _count(self) -> None:
         self.lost += 1
@@ -118,6 +121,35 @@ async def test_a_link_that_was_lost_before_anybody_listened_is_noticed(
     assert first.closed
     await world.lines.close()
     await asyncio.sleep(0)
+
+
+class Declared:
+    """Something declared on a session, which notes in which thread it is dropped."""
+
+    def __init__(self, dropped: list[str]) -> None:
+        self._dropped = dropped
+
+    def __del__(self) -> None:
+        self._dropped.append(threading.current_thread().name)
+
+
+@pytest.mark.parametrize("lost", [False, True])
+async def test_what_was_declared_is_dropped_by_the_thread_that_closes(
+    lost: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not by garbage collection: in the thread of a callback it may wait for that callback."""
+    first, dropped = Session(), list[str]()
+    monkeypatch.setattr(zenoh_line, "open_session", lambda _: asyncio.sleep(60))
+    session: Any = first
+    lines = ReconnectingSession(session, Endpoint(connect=("tcp/127.0.0.1:1",)), Bridge(), list)
+    lines.declare(lambda _: Declared(dropped))
+    if lost:
+        first.lose()
+    else:
+        await lines.close()
+    await until(lambda: dropped)
+    assert dropped == [CLOSING_THREAD]
+    await lines.close()
 
 
 async def test_who_asks_on_a_session_that_was_just_closed_is_answered_by_nobody() -> None:
