@@ -15,7 +15,7 @@ from gigabrain_zenoh.manipulation.collision import CollisionChecker
 
 BRANCH = 0.5  # [rad] or [m] of the joint that moves most, of a branch of a tree
 SHORTCUTS = 40
-MAX_OVERLAP_M = 0.005  # of the start with what it touches: from deeper in it does not leave
+MAX_OVERLAP_M = 0.01  # of the start with what it touches: from deeper in it does not leave
 LEAVING = (0.02, 0.05, 0.1)  # [rad] or [m] of the joint that moves most, to leave a tight start
 LEAVING_TRIES = 40  # directions of each
 LEAVING_PARTS = 4  # of the way, in which it must not come nearer to anything
