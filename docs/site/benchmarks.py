@@ -39,6 +39,7 @@ from gigabrain_zenoh.qa.bench.hands import HandsResult
 from gigabrain_zenoh.qa.bench.joints import TrackingResult
 from gigabrain_zenoh.qa.bench.objects import ObjectsResult
 from gigabrain_zenoh.qa.bench.plan import PlanResult
+from gigabrain_zenoh.qa.bench.reach import ReachResult
 from gigabrain_zenoh.qa.bench.robots import RobotsResult, robots_page
 from gigabrain_zenoh.qa.bench.slam_logs import SlamResult
 from gigabrain_zenoh.qa.bench.stack import StackResult, stack_page
@@ -60,6 +61,7 @@ DRAWN: dict[str, tuple[type[Struct], Callable[[Any], Any]]] = {  # by the words 
     "joints": (TrackingResult, bench_hands._joints_table),
     "objects": (ObjectsResult, bench_eyes._objects_table),
     "plan": (PlanResult, bench._plan_table),
+    "reach": (ReachResult, bench_hands._reach_table),
     "robots": (RobotsResult, robots_page),
     "slam": (SlamResult, bench_navigation._logs_table),
     "stack": (StackResult, stack_page),
