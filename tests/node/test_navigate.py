@@ -197,7 +197,7 @@ async def test_the_same_world_gives_the_same_drive() -> None:
 
 
 class Walked(Plane):
-    """A plane on which somebody has walked in the gap beside the wall, and stands there."""
+    """A plane with a person who walks up to the gap beside the wall and stands there."""
 
     person = 3.8  # [m], along x
 
