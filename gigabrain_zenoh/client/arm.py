@@ -172,9 +172,9 @@ class JointStream:
         joints, dt = self._body.joints, ticks * TICK_S
         if self._path:
             t = (self._tick - self._path_tick) * TICK_S
-            rows = (self._path.at(t - dt + TICK_S), self._path.at(t + TICK_S))
-            before, after = ([row[joint.name] for joint in joints] for row in rows)
-            return along(self._now, before, after, joints, dt)
+            rows = [self._path.at(t + TICK_S + k * dt) for k in (-1, 0, 1)]
+            path = [[row[joint.name] for joint in joints] for row in rows]
+            return along(self._now, path, joints, dt)
         goals = [
             JointGoal(self._ends[joint.name], max_speed=self._speed)
             if joint.name in self._ends

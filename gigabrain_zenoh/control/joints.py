@@ -28,6 +28,7 @@ from gigabrain_zenoh.geometry.joint_ramp import (
 
 MAX_STEP_TICKS = 5  # longest step, also after a gap
 LOST_TICKS = 3  # by whose motion the joints may be away from where they were sent
+FASTEST = 1.1  # of a joint's greatest speed: the gate moves none faster, but for rounding
 SLOW = 0.01  # [rad/s] or [m/s], below which a joint should rest
 Places = tuple[float, ...]
 
@@ -51,6 +52,7 @@ class JointMemory(msgspec.Struct, frozen=True, kw_only=True):
     active: bool = False  # something was wanted since then: gains correct what joints lag behind
     setpoint: tuple[JointPoint, ...] = ()  # for the tick after this one; none while closed
     sent: Places = ()  # the last command
+    obeyed: Places = ()  # where the gate has sent the joints at that tick
     integral: Places = ()  # [rad] or [m], part of the correction
     problem: str = ""  # code of the tolerance that was broken
     detail: str = ""  # which joint broke it, and by how much
@@ -113,8 +115,8 @@ def _next_tick(
 ) -> tuple[JointMemory, int]:
     """Advance to the tick of `state`; return the ticks since the last step as well.
 
-    The joints start at rest where they were sent: all after an enable, and each one that did not
-    get what was commanded, for the gate held it.
+    The joints start where they were sent: all after an enable, and each one that did not get what
+    was commanded, for the gate slowed it down. That one goes on at the speed at which it was sent.
     """
     opened = not memory.setpoint or memory.boot != state.boot
     handed_over = state.gate.enables != memory.enables
@@ -127,6 +129,7 @@ def _next_tick(
             operator=memory.operator and not handed_over,
             setpoint=posture,
             sent=_places(posture),
+            obeyed=_places(posture),
             integral=(0.0,) * len(posture),
         )
         return memory, 0
@@ -136,8 +139,14 @@ def _next_tick(
         calm or abs(sent - point.position) > LOST_TICKS * TICK_S * joint.max_speed
         for sent, point, joint in zip(memory.sent, posture, body.joints, strict=True)
     ]
-    memory = _from_sent(body, memory, here, posture, lost)
-    return replace(memory, tick=state.tick), 0 if calm else passed
+    speeds = [0.0] * len(posture)
+    for k, joint in enumerate(body.joints):
+        moved = (posture[k].position - memory.obeyed[k]) / (max(1, passed) * TICK_S)
+        if abs(moved) <= FASTEST * joint.max_speed:  # else it was turned by hand
+            speeds[k] = moved
+    memory = _from_sent(body, memory, here, posture, lost, speeds)
+    memory = replace(memory, tick=state.tick, obeyed=_places(posture))
+    return memory, 0 if calm else passed
 
 
 def _resting(
@@ -148,7 +157,7 @@ def _resting(
 ) -> tuple[JointMemory, JointCommand]:
     """Have the gate brake the joints and hold them, as while decision is silent."""
     names, still = tuple(joint.name for joint in body.joints), (0.0,) * len(posture)
-    memory = _from_sent(body, memory, here, posture, [True] * len(posture))
+    memory = _from_sent(body, memory, here, posture, [True] * len(posture), still)
     return memory, JointCommand(name=names, velocity=still)
 
 
@@ -158,8 +167,9 @@ def _from_sent(
     here: tuple[JointPoint, ...],
     posture: tuple[JointPoint, ...],
     which: Sequence[bool],
+    speeds: Sequence[float],
 ) -> JointMemory:
-    """Have `which` joints go on from where the gate has sent them.
+    """Have `which` joints go on at `speeds` from where the gate has sent them.
 
     What is corrected at rest is not part of the setpoint, or each time would add to it.
     """
@@ -172,7 +182,7 @@ def _from_sent(
                 wanted = (place - old + gains.p * now) / (1.0 + gains.p)
                 most = gains.max_correction
                 place -= max(-most, min(most, gains.p * (wanted - now) + old))
-            setpoint[k] = JointPoint(within(joint, place))
+            setpoint[k] = JointPoint(within(joint, place), speeds[k])
     return replace(memory, setpoint=tuple(setpoint), sent=tuple(sent))
 
 
@@ -189,8 +199,9 @@ def _moved(
     if memory.problem:
         return ramp(now, [JointGoal(place) for place in memory.hold], joints, dt)
     if trajectory:
-        before, after = (sample(body, trajectory, now, t) for t in (memory.tick, memory.tick + 1))
-        return along(now, before, after, joints, dt)
+        at = [memory.tick + 1 + k * ticks for k in (-1, 0, 1)]
+        path = [sample(body, trajectory, now, tick) for tick in at]
+        return along(now, path, joints, dt)
     if teleop:
         speeds = dict(zip(teleop.name, teleop.velocity, strict=True))
         goals = {name: JointGoal(velocity=speed) for name, speed in speeds.items()}
@@ -299,10 +310,20 @@ def between(
 ) -> JointCommand:
     """Return the command `after_s` after that of a state: how the joints go on by then."""
     places = tuple(
-        within(joint, place + point.velocity * after_s)
-        for joint, place, point in zip(body.joints, command.position, memory.setpoint, strict=True)
+        within(joint, place + speed * after_s)
+        for joint, place, speed in zip(body.joints, command.position, command.velocity, strict=True)
     )
     return replace(command, position=places)
+
+
+def _speeds(body: BodyDescription, memory: JointMemory) -> Places:
+    """Return how fast what is sent moves: the feed-forward of a joint that brakes goes back."""
+    ahead = [joint.gains.feed_forward if memory.active else 0.0 for joint in body.joints]
+    speeds = [p.velocity + f * p.acceleration for p, f in zip(memory.setpoint, ahead, strict=True)]
+    return tuple(
+        max(-joint.max_speed, min(joint.max_speed, speed))
+        for joint, speed in zip(body.joints, speeds, strict=True)
+    )
 
 
 def _places(points: tuple[JointPoint, ...]) -> Places:
@@ -312,7 +333,7 @@ def _places(points: tuple[JointPoint, ...]) -> Places:
 def _command(
     body: BodyDescription, places: Places, memory: JointMemory | None = None
 ) -> JointCommand:
-    speeds = tuple(point.velocity for point in memory.setpoint) if memory else (0.0,) * len(places)
+    speeds = _speeds(body, memory) if memory else (0.0,) * len(places)
     return JointCommand(
         name=tuple(joint.name for joint in body.joints),
         position=places,

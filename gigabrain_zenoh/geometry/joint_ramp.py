@@ -16,6 +16,7 @@ from gigabrain_zenoh.errors import ConfigError
 
 OVER = 1.02  # by which a step along a path may be beyond the limits: rounding, float32
 CATCH_UP = 0.95  # of a joint's greatest speed, at which a path may run away from it
+PATHS = 0.5  # of its acceleration, that a path may have while a joint gets onto it
 NOTHING = 1e-9  # speed and acceleration that are rounding, for which Ruckig may find no way
 SLACK = 1e-3  # [rad/s] or [m/s], the same for joints that barely move
 
@@ -109,16 +110,22 @@ def ramp(
 
 def along(
     now: Sequence[JointPoint],
-    before: Sequence[float],
-    after: Sequence[float],
+    path: Sequence[Sequence[float]],
     limits: Sequence[JointDescription],
     dt: float,
 ) -> tuple[JointPoint, ...]:
-    """Return where joints are `dt` [s] later that follow a path, from `before` to `after`.
+    """Return where joints are `dt` [s] later that follow a path.
 
-    One that cannot be there by then gets onto the path as fast as it may: seen from a frame that
-    goes on at the path's speed, it comes to rest. Raises ConfigError without Ruckig.
+    One that cannot be on it by then gets there as fast as it may: seen from a frame that goes along
+    the path, it comes to rest. Raises ConfigError without Ruckig.
+
+    Args:
+        now: Where the joints are.
+        path: Where each should be now, `dt` later, and twice as late.
+        limits: What they can.
+        dt: Time step [s].
     """
+    before, after, _ = path
     steps = tuple(
         JointPoint(place, speed := (place - point.position) / dt, (speed - point.velocity) / dt)
         for point, place in zip(now, after, strict=True)
@@ -129,27 +136,39 @@ def along(
     )  # from then on at the path's speed
     if all(map(_possible, (*steps, *nexts), (*limits, *limits))):
         return steps
-    frame = [
-        JointPoint(a, max(-most, min(most, (b - a) / dt)))
-        for a, b, most in zip(before, after, [CATCH_UP * j.max_speed for j in limits], strict=True)
-    ]
+    frame = [_frame(joint, places, dt) for joint, *places in zip(limits, *path, strict=True)]
     off = [
-        JointPoint(p.position - f.position, p.velocity - f.velocity, p.acceleration)
+        JointPoint(
+            p.position - f.position, p.velocity - f.velocity, p.acceleration - f.acceleration
+        )
         for p, f in zip(now, frame, strict=True)
     ]
     given = _input(off, limits)
-    given.max_velocity = [j.max_speed - f.velocity for j, f in zip(limits, frame, strict=True)]
-    given.min_velocity = [-j.max_speed - f.velocity for j, f in zip(limits, frame, strict=True)]
+    pairs = list(zip(limits, frame, strict=True))
+    given.max_acceleration = [j.max_acceleration - f.acceleration for j, f in pairs]
+    given.min_acceleration = [-j.max_acceleration - f.acceleration for j, f in pairs]
+    given.max_velocity = [j.max_speed - f.velocity for j, f in pairs]
+    given.min_velocity = [-j.max_speed - f.velocity for j, f in pairs]
     given.target_position = given.target_velocity = [0.0] * len(limits)
     given.per_dof_synchronization = [_ruckig().Synchronization.No] * len(limits)
     return tuple(
         JointPoint(
-            within(joint, f.position + f.velocity * dt + p.position),
-            f.velocity + p.velocity,
-            p.acceleration,
+            within(joint, f.position + speed * dt + p.position),
+            speed + p.velocity,
+            f.acceleration + p.acceleration,
         )
         for joint, f, p in zip(limits, frame, _after(given, dt), strict=True)
+        for speed in (f.velocity + f.acceleration * dt,)
     )
+
+
+def _frame(joint: JointDescription, path: Sequence[float], dt: float) -> JointPoint:
+    """Return a frame that goes along a path, as fast as the joint can follow it."""
+    before, after, later = path
+    most, fastest = PATHS * joint.max_acceleration, CATCH_UP * joint.max_speed
+    acceleration = max(-most, min(most, (later - 2.0 * after + before) / dt**2))
+    velocity = max(-fastest, min(fastest, (after - before) / dt))
+    return JointPoint(before, velocity - acceleration * dt, acceleration)
 
 
 def _braking_in_time(velocity: float, now: JointPoint, joint: JointDescription) -> float:

@@ -17,7 +17,7 @@ from gigabrain_schemas.body import (
 )
 from gigabrain_schemas.brain import Intent, JointCommand, JointSpeeds, JointTarget, JointTrajectory
 from gigabrain_zenoh.control.joints import JointInputs, JointMemory, step_joints
-from gigabrain_zenoh.geometry.joints import JointMotion, approach, braked
+from gigabrain_zenoh.geometry.joints import ANY_SPEED, JointMotion, approach, braked
 from gigabrain_zenoh.testing.samples import DRIVING
 
 PAN, LIFT = (
@@ -69,6 +69,7 @@ class ArmBench:
         self.here = [-sag] * len(self.sent)
         self.places: list[tuple[float, ...]] = []  # commanded
         self.missing = False
+        self.band = ANY_SPEED  # safety's
 
     def go(
         self, intent: Intent | None = None, *, teleop: JointSpeeds | None = None, ticks: int = 1
@@ -104,7 +105,7 @@ class ArmBench:
         if self.gate.mode == "enabled" and self.gate.commander == "control":
             wanted = map(JointMotion, command.position, command.velocity)
             self.sent = [
-                approach(now, to, joint, 0.02) if to else braked(now, joint, 0.02)
+                approach(now, to, joint, 0.02, self.band) if to else braked(now, joint, 0.02)
                 for now, to, joint in zip_longest(self.sent, wanted, self.body.joints)
             ]
         if not self.blocked:

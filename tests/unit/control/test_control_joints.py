@@ -8,6 +8,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.body import JointGains
 from gigabrain_schemas.brain import JointSpeeds
+from gigabrain_zenoh.geometry.joints import ANY_SPEED, SpeedBand
 from gigabrain_zenoh.testing.samples import DRIVING
 from tests.unit.control.arm import CLOSED, LIFT, PAN, ArmBench, arm_body, path, targets
 
@@ -296,6 +297,33 @@ def test_an_arm_that_the_gate_held_goes_on_from_where_it_was_sent() -> None:
     command = arm.go(targets(pan=1.0))
     assert command
     assert command.position[0] == pytest.approx(-0.5, abs=0.02)
+
+
+def test_an_arm_that_the_gate_slows_down_moves_evenly_and_does_not_run_past_the_end() -> None:
+    arm, speeds = ArmBench(arm_body(replace(PAN, path_tolerance=0.0), LIFT)), []
+    arm.go(ticks=CALM)
+    rows = ramp_to(1.2, 40)  # 1.5 rad/s
+    arm.band = SpeedBand(-0.6, 0.6)
+    for tick in range(120):
+        if tick == 60:
+            arm.band = ANY_SPEED
+        arm.go(path(rows, start=CALM))
+        speeds.append(arm.sent[0].velocity)
+    assert min(speeds[12:60]) > 0.5
+    assert max(place[0] for place in arm.places) < 1.25
+    assert arm.sent[0].position == pytest.approx(1.2, abs=0.01)
+
+
+def test_a_command_says_how_fast_what_is_sent_moves() -> None:
+    ahead = replace(PAN, gains=JointGains(i=0.0, feed_forward=0.1))
+    arm = ArmBench(arm_body(ahead, LIFT))
+    arm.go(ticks=CALM)
+    for _ in range(60):
+        before = arm.places[-1][0]
+        command = arm.go(targets(pan=0.5))
+        assert command
+        moved = (command.position[0] - before) / 0.02
+        assert command.velocity[0] == pytest.approx(moved, abs=0.35)
 
 
 def test_an_unknown_joint_in_an_intent_moves_nothing() -> None:

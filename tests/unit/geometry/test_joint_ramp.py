@@ -77,19 +77,30 @@ def test_a_posture_out_of_range_ends_at_the_limit() -> None:
 def test_a_joint_gets_onto_a_moving_path_and_stays_on_it() -> None:
     point, off = JointPoint(0.3), []
     for step in range(60):
-        before, after = (0.8 * math.sin(math.pi * DT * k) for k in (step, step + 1))
-        new = along([point], [before], [after], [ELBOW], DT)[0]
+        path = [[0.8 * math.sin(math.pi * DT * (step + k))] for k in range(3)]
+        new = along([point], path, [ELBOW], DT)[0]
         assert abs(new.velocity - point.velocity) <= STEP_CHANGE
         point = new
-        off.append(abs(point.position - after))
+        off.append(abs(point.position - path[1][0]))
     assert max(off[20:]) < 1e-9
+
+
+def test_a_joint_that_is_behind_does_not_run_past_the_end_of_a_path_that_brakes() -> None:
+    braking = 0.5 * ELBOW.max_acceleration
+    point, end_s = JointPoint(-0.15, 1.5), 1.5 / braking
+    for step in range(40):
+        times = [min(end_s, (step + k) * DT) for k in range(3)]
+        path = [[1.5 * t - 0.5 * braking * t * t] for t in times]
+        point = along([point], path, [ELBOW], DT)[0]
+        assert point.position < path[2][0] + 0.002
+    assert point.position == pytest.approx(path[2][0], abs=1e-6)
 
 
 def test_a_path_that_is_too_fast_is_followed_as_fast_as_the_joint_can() -> None:
     point = JointPoint(-1.9)
     for step in range(40):
-        at = -1.9 + step * DT * 6.0
-        point = along([point], [at], [at + DT * 6.0], [ELBOW], DT)[0]
+        path = [[-1.9 + (step + k) * DT * 6.0] for k in range(3)]
+        point = along([point], path, [ELBOW], DT)[0]
         assert point.velocity <= 3.0 * 1.03
     assert point.position > -0.5
 
@@ -120,7 +131,8 @@ def test_a_way_is_found_however_small_speeds_and_ways_are(
     goals = [JointGoal(0.5 + way) for _, _, way in joints]
     found = ramp(now, goals, [ELBOW] * len(joints), DT)
     assert [point.position for point in found] == pytest.approx([0.5] * len(joints), abs=0.01)
-    along(now, [0.5] * 6, [0.5 + way for _, _, way in joints], [ELBOW] * len(joints), DT)
+    path = [[0.5 + k * way for _, _, way in joints] for k in range(3)]
+    along(now, path, [ELBOW] * len(joints), DT)
 
 
 def test_where_ruckig_finds_no_way_at_all_the_joints_brake(
