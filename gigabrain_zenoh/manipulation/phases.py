@@ -112,18 +112,19 @@ class PhaseRun:
         self._total += phase.ticks
 
     def wish(self, tick: int) -> tuple[tuple[JointTarget, ...], JointWindow | None]:
-        """Return the targets, or the part of a trajectory, for the intent of a state of `tick`."""
-        phase = self.phase
-        if phase is None:
-            return (), None
+        """Return the targets, or the part of a trajectory, for the intent of a state of `tick`.
+
+        Once all phases are over it is the end of the last one, where the joints may not be yet.
+        """
+        phase = self.phase or self._phases[-1]
         if phase.arm is None:
             assert phase.gripper is not None
             return (JointTarget(name=self._gripper, position=phase.gripper),), None
-        first = max(0, tick - self._begun)
+        first = max(0, tick - self._begun) if self.phase else phase.ticks
         rows = _rows(phase.arm, first + np.arange(WINDOW_TICKS))
         return (), JointWindow(
             name=phase.arm.names,
-            start=self._begun + first + AHEAD_TICKS,
+            start=max(tick, self._begun) + AHEAD_TICKS,
             period=TICK_S,
             positions=rows.astype("<f4").tobytes(),
         )
