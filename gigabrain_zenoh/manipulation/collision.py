@@ -129,7 +129,7 @@ class CollisionChecker:
     def touches(self, posture: Floats) -> str:
         """Return what touches what within the margin, as text; empty for nothing."""
         self._place(posture, self.margin)
-        distance, pair = self._nearest(self.margin)
+        distance, pair = self._overlap() or self._nearest(self.margin)
         return " and ".join(pair) if pair and distance < self.margin else ""
 
     def is_free(self, posture: Floats) -> bool:
@@ -174,6 +174,15 @@ class CollisionChecker:
         self._place(posture, cutoff)
         distance, pair = self._nearest(cutoff)
         return Clearance(distance=distance, pair=pair)
+
+    def _overlap(self) -> tuple[float, tuple[str, str]] | None:
+        """Return the deepest contact of two that overlap."""
+        contacts = self._data.contact
+        if not self._data.ncon or contacts.dist.min() >= 0.0:
+            return None
+        deepest = contacts.dist.argmin()
+        one, other = contacts.geom[deepest]
+        return float(contacts.dist[deepest]), (self._names[one], self._names[other])
 
     def _nearest(self, cutoff: float) -> tuple[float, tuple[str, str] | None]:
         """Return the smallest distance [m] among contacts that may be nearer than `cutoff`.

@@ -16,7 +16,6 @@ from gigabrain_zenoh.kernels.jit import kernel
 
 Flags = NDArray[np.bool_]
 PLACE, APPROACH, AXES = 0, 1, 2  # which part of a goal counts
-MAX_ITERATIONS = 60
 MAX_STEP = 0.6  # [rad] or [m] of a joint
 MIN_STEP = 1e-6
 SLOW_STEP, SLOW_GAIN = 1e-3, 1e-4  # steps that bring so little end the descent
@@ -198,15 +197,17 @@ def _cost(error: Floats, weight: float) -> float:
 
 
 @kernel
-def descend(
-    chain: Chain, limits: Floats, goal: Floats, part: int, weight: float,
+def _is_fine(error: Floats) -> bool:
+    place, turn = math.sqrt(_cost(error, 0.0)), np.abs(error[3:]).max()
+    return place < FINE_M and turn < FINE_RAD
+
+
+@kernel
+def _descend(
+    chain: Chain, limits: Floats, goal: Floats, part: int, weight: float, steps: int,
     posture: Floats, held: Flags, error: Floats,
 ) -> None:  # fmt: skip
-    """Improve `posture` (n,) until the squared errors are least, a radian counting as `weight` [m].
-
-    `limits` are (2, n). Fills in `held` (n,), the joints that would go on, were they not at their
-    limits, and the `error` (6,) that is left [m], [rad]. Steps are Levenberg and Marquardt's.
-    """
+    """Improve one posture (n,), by the steps of Levenberg and Marquardt."""
     count = len(posture)
     frame, joints = np.empty((3, 4)), np.empty((count, 2, 3))
     square, slope, step = np.empty((count, count)), np.empty(count), np.empty(count)
@@ -215,7 +216,7 @@ def descend(
     _goal_error(frame, goal, part, error)
     cost = _cost(error, weight)
     _normal_equations(frame, joints, chain, error, weight, square, slope)
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(steps):
         for k in range(count):
             low, high = posture[k] <= limits[0, k], posture[k] >= limits[1, k]
             held[k] = (low and slope[k] < 0.0) or (high and slope[k] > 0.0)
@@ -245,9 +246,20 @@ def descend(
 
 
 @kernel
-def _is_fine(error: Floats) -> bool:
-    place, turn = math.sqrt(_cost(error, 0.0)), np.abs(error[3:]).max()
-    return place < FINE_M and turn < FINE_RAD
+def descend(
+    chain: Chain, limits: Floats, goal: Floats, part: int, weight: float, steps: int,
+    postures: Floats, held: Flags, errors: Floats,
+) -> None:  # fmt: skip
+    """Improve `postures` (k, n), each until its squared errors are least, or for so many steps.
+
+    A radian counts as `weight` [m]; `limits` are (2, n). Fills in `held` (k, n), the joints that
+    would go on, were they not at their limits, and the `errors` (k, 2) that are left [m], [rad].
+    """
+    error = np.empty(6)
+    for k in range(len(postures)):
+        _descend(chain, limits, goal, part, weight, steps, postures[k], held[k], error)
+        errors[k, 0] = math.sqrt(_cost(error, 0.0))
+        errors[k, 1] = math.sqrt(error[3] ** 2 + error[4] ** 2 + error[5] ** 2)
 
 
 def warm_up() -> None:
@@ -256,5 +268,5 @@ def warm_up() -> None:
     chain = Chain(
         fixed=frame[None].copy(), axes=np.eye(3)[2:], slides=np.zeros(1, np.bool_), tool=frame
     )
-    limits, posture = np.array([[-1.0], [1.0]]), np.zeros(1)
-    descend(chain, limits, frame, PLACE, 1.0, posture, np.zeros(1, np.bool_), np.zeros(6))
+    limits, held, errors = np.array([[-1.0], [1.0]]), np.zeros((1, 1), np.bool_), np.zeros((1, 2))
+    descend(chain, limits, frame, PLACE, 1.0, 1, np.zeros((1, 1)), held, errors)

@@ -5,8 +5,9 @@ before the orientation: an arm with five joints has few of the orientations, but
 places. It starts from the given posture, then from those of a table that come nearest to the goal.
 """
 
+import functools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,13 +15,17 @@ import numpy as np
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.manipulation.arm_kinematics import ArmKinematics
-from gigabrain_zenoh.manipulation.descent import APPROACH, AXES, PLACE, descend
+from gigabrain_zenoh.manipulation.descent import APPROACH, AXES, PLACE, Flags, descend
 
 POSITION_TOLERANCE_M = 1e-4
 ORIENTATION_TOLERANCE_RAD = 0.01
 ARMS_LENGTH_M = 0.05  # a radian of orientation counts as much as this distance
 FIRST_M = 0.001  # the same, where orientation has to stand back
 TABLE_POSTURES = 3000
+FIRST_STEPS, STEPS = 15, 60  # of a descent: from each start, and from where it comes near
+NEAR_M = 0.002  # both errors together
+AT_ONCE = 4  # descents from postures of the table
+NEAREST = 6  # where no posture reaches the goal: those from which it is tried in earnest
 NEAR_TRIES, TRIES = 16, 60  # postures of the table: those nearest to the goal, then any others
 
 Cause = Literal["too_far", "joint_limit", "orientation", "collision", "invalid"]
@@ -39,6 +44,24 @@ class ToolGoal:
     axes: Floats | None = None  # (3, 3), a rotation
     approach: Floats | None = None  # (3,), of length 1
     orientation_tolerance: float = ORIENTATION_TOLERANCE_RAD  # [rad]
+
+    @functools.cached_property
+    def frame(self) -> Floats:
+        """Its axes and place (3, 4); zeros for what does not count."""
+        frame = np.zeros((3, 4))
+        frame[:, 3] = self.position
+        if self.axes is not None:
+            frame[:, :3] = self.axes
+        elif self.approach is not None:
+            frame[:, 0] = self.approach
+        return frame
+
+    @property
+    def part(self) -> int:
+        """Which part of the frame counts."""
+        if self.axes is not None:
+            return AXES
+        return PLACE if self.approach is None else APPROACH
 
     @property
     def fault(self) -> str:
@@ -74,20 +97,24 @@ class OutOfReach:
     orientation_error: float = math.inf  # [rad]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class _Found:
     """The posture in which a descent has ended, and its errors."""
 
     posture: Floats
+    held: Flags  # (n,) joints that would go on, were they not at their limits
     position_error: float
     orientation_error: float
-    held: tuple[int, ...]  # joints that would go on, were they not at their limits
 
     def reaches(self, goal: ToolGoal) -> bool:
         near = self.position_error < POSITION_TOLERANCE_M
         return near and self.orientation_error <= goal.orientation_tolerance
 
     @property
+    def cost(self) -> float:
+        """Both errors together, as the descent weighs them [m]."""
+        return math.hypot(self.position_error, ARMS_LENGTH_M * self.orientation_error)
+
     def rank(self) -> tuple[float, float]:
         """The place first, in steps within which the orientation decides."""
         steps = round(self.position_error / (10 * POSITION_TOLERANCE_M))
@@ -132,8 +159,8 @@ class InverseKinematics:
             return OutOfReach(cause="invalid", reason=fault, posture=None)
         found: list[_Found] = []
         touching: OutOfReach | None = None
-        for begin in self._starts(goal, start, tries):
-            found.append(now := self._descend(goal, begin))
+        for now in self._found(goal, start, tries):
+            found.append(now)
             if now.reaches(goal):
                 touches = collides(now.posture) if collides else ""
                 if not touches:
@@ -143,11 +170,31 @@ class InverseKinematics:
                         orientation_error=now.orientation_error,
                     )
                 touching = touching or now.out_of_reach("collision", f"collides: {touches}")
-        return touching or self._explain(min(found, key=lambda one: one.rank))
+        return touching or self._explain(self._nearest(goal, found))
 
-    def _starts(self, goal: ToolGoal, start: Floats | None, tries: int) -> Iterator[Floats]:
+    def _found(self, goal: ToolGoal, start: Floats | None, tries: int) -> Iterator[_Found]:
+        """Yield the ends of all descents, few at a time: an early one often reaches the goal."""
         if start is not None:
-            yield np.clip(start, *self._limits)
+            yield from self._ends(goal, np.clip(start, *self._limits)[None])
+        starts = self._starts(goal, tries)
+        for at in range(0, len(starts), AT_ONCE):
+            yield from self._ends(goal, starts[at : at + AT_ONCE])
+
+    def _ends(self, goal: ToolGoal, starts: Floats) -> Iterator[_Found]:
+        for now in self._descend(goal, starts, FIRST_STEPS):
+            yield self._refined(goal, now) if now.cost < NEAR_M else now
+
+    def _nearest(self, goal: ToolGoal, found: Sequence[_Found]) -> _Found:
+        """Return what comes nearest to a goal that is out of reach, the place before the rest."""
+        best = sorted(found, key=lambda one: one.cost)[:NEAREST]
+        refined = [self._refined(goal, one) for one in best]
+        if goal.part != PLACE:
+            starts = self._starts(ToolGoal(position=goal.position), NEAREST)[:NEAREST]
+            refined += self._descend(goal, starts, STEPS, FIRST_M)
+        return min(refined, key=_Found.rank)
+
+    def _starts(self, goal: ToolGoal, tries: int) -> Floats:
+        """Return the postures of the table (k, n) to begin with."""
         off = ((self._places - goal.position) ** 2).sum(axis=1)
         if goal.axes is not None:
             off += ARMS_LENGTH_M**2 * ((self._axes - goal.axes) ** 2).sum(axis=(1, 2))
@@ -155,32 +202,33 @@ class InverseKinematics:
             off += ARMS_LENGTH_M**2 * ((self._axes[:, :, 0] - goal.approach) ** 2).sum(axis=1)
         near = min(tries, NEAR_TRIES)
         nearest = np.argpartition(off, near)[:near]
-        yield from self._table[nearest[np.argsort(off[nearest], kind="stable")]]
-        yield from self._table[: tries - near]
+        nearest = nearest[np.argsort(off[nearest], kind="stable")]
+        return np.concatenate((self._table[nearest], self._table[: tries - near]))
 
-    def _descend(self, goal: ToolGoal, posture: Floats) -> _Found:
-        frame, part = np.zeros((3, 4)), PLACE
-        frame[:, 3] = goal.position
-        if goal.axes is not None:
-            frame[:, :3], part = goal.axes, AXES
-        elif goal.approach is not None:
-            frame[:, 0], part = goal.approach, APPROACH
-        posture, held, error = posture.copy(), np.zeros(len(posture), np.bool_), np.zeros(6)
-        for weight in (ARMS_LENGTH_M, FIRST_M, 0.0):
-            descend(self.arm.chain, self._limits, frame, part, weight, posture, held, error)
-            place, turn = math.hypot(*error[:3]), math.hypot(*error[3:])
-            if place < POSITION_TOLERANCE_M:
-                break  # else the orientation has pulled it away
-        return _Found(
-            posture=posture, position_error=place, orientation_error=turn,
-            held=tuple(np.flatnonzero(held).tolist()),
-        )  # fmt: skip
+    def _refined(self, goal: ToolGoal, found: _Found) -> _Found:
+        """Descend as far as it goes; where the orientation pulls the tool away, it stands back."""
+        for weight in (FIRST_M, 0.0):
+            if found.position_error >= POSITION_TOLERANCE_M:
+                (found,) = self._descend(goal, found.posture[None], STEPS, weight)
+        return found
+
+    def _descend(
+        self, goal: ToolGoal, starts: Floats, steps: int, weight: float = ARMS_LENGTH_M
+    ) -> list[_Found]:
+        """Return the ends of descents from postures (k, n)."""
+        postures, held = starts.copy(), np.zeros(starts.shape, np.bool_)
+        errors = np.empty((len(starts), 2))
+        frame, part = goal.frame, goal.part
+        weight = 0.0 if part == PLACE else weight
+        descend(self.arm.chain, self._limits, frame, part, weight, steps, postures, held, errors)
+        ends = zip(postures, held, errors.tolist(), strict=True)
+        return [_Found(posture, stuck, *off) for posture, stuck, off in ends]
 
     def _explain(self, found: _Found) -> OutOfReach:
         arm = self.arm
         held = " and ".join(
             f"{arm.names[joint]} is at its limit of {arm.show(joint, found.posture[joint])}"
-            for joint in found.held
+            for joint in np.flatnonzero(found.held).tolist()
         )
         because = f": {held}" if held else ""
         if found.position_error < POSITION_TOLERANCE_M:

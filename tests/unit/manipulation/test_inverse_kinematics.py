@@ -87,6 +87,18 @@ def test_an_orientation_that_is_not_possible_says_by_how_much_and_keeps_the_plac
     assert f"off by {math.degrees(off):.0f}°" in found.reason
 
 
+def test_where_the_orientation_is_not_possible_the_place_is_reached() -> None:
+    random = np.random.default_rng(2)
+    for posture in postures(100):
+        approach = random.normal(size=3)
+        place = arm().forward(posture).position
+        found = inverse().solve(
+            ToolGoal(position=place, approach=approach / np.linalg.norm(approach))
+        )
+        assert found.posture is not None
+        assert np.linalg.norm(arm().forward(found.posture).position - place) < 1e-3
+
+
 def test_a_posture_that_collides_is_not_taken() -> None:
     goal = ToolGoal(position=np.array([0.2, 0.0, 0.1]))
     found = inverse().solve(goal, collides=lambda posture: "palm and shelf")
