@@ -20,6 +20,12 @@ from tests.system.page import VIEWER, Browser, Robot, browser, needs_browser
 pytestmark = [needs_browser, pytest.mark.asyncio(loop_scope="module")]
 
 ENABLED, LIVE = "#gate[data-mode=enabled]", "#link.live"
+SHOWN = """() => ({
+  link: document.querySelector('#link').textContent,
+  doing: document.querySelector('#doing').textContent,
+  stick: document.querySelector('#stick').outerHTML,
+  focus: document.hasFocus(), hidden: document.hidden,
+})"""  # of what steers, should it not
 
 
 @pytest.fixture(scope="module")
@@ -68,9 +74,12 @@ async def ready_to_drive(page: Page) -> None:
     await page.wait_for_selector(ENABLED)
 
 
-async def turning(seen: Probe) -> None:
+async def turning(seen: Probe, page: Page) -> None:
     """Turning left, which this robot's own brain never does."""
-    await until(lambda: seen.state.velocity.angular_z > 0.3, "turning as told")
+    try:
+        await until(lambda: seen.state.velocity.angular_z > 0.3, "turning as told")
+    except TimeoutError as error:
+        raise AssertionError(f"{await page.evaluate(SHOWN)}; {seen.state.gate}") from error
 
 
 async def hold_left(page: Page) -> None:
@@ -87,7 +96,7 @@ async def test_a_held_key_drives_and_letting_go_stops(chromium: Browser, seen: P
     page = await chromium.open()
     await ready_to_drive(page)
     await page.keyboard.down("a")
-    await turning(seen)
+    await turning(seen, page)
     await told(page, "wanted", "0.00 m/s · 0.91 rad/s")
     await page.keyboard.up("a")
     await seen.at_rest()
@@ -130,7 +139,7 @@ async def test_a_window_that_loses_the_focus_lets_all_keys_go(
     page = await chromium.open()
     await ready_to_drive(page)
     await page.keyboard.down("a")
-    await turning(seen)
+    await turning(seen, page)
     await page.evaluate("window.dispatchEvent(new Event('blur'))")
     await seen.at_rest()
     await page.keyboard.up("a")
@@ -142,7 +151,7 @@ async def test_the_e_stop_stops_a_driving_robot_and_names_the_confirming_body(
     page = await chromium.open()
     await ready_to_drive(page)
     await page.keyboard.down("a")
-    await turning(seen)
+    await turning(seen, page)
     before = seen.state.gate.estop_generation
     await page.keyboard.press("Space")
     await told(page, "confirmed", "CONFIRMED by turtlebot3_waffle in ")
@@ -186,7 +195,7 @@ async def test_of_two_viewers_one_steers_and_both_see_it(chromium: Browser, seen
     await told(two, "link", "2 viewers")
     await ready_to_drive(one)
     await one.keyboard.down("a")
-    await turning(seen)
+    await turning(seen, one)
     await told(two, "doing", "steered by viewer")
     await two.keyboard.down("d")
     await told(two, "reply", "another page steers")
@@ -223,7 +232,7 @@ async def test_on_a_phone_nothing_is_cut_off_and_the_joystick_drives(
     await page.locator("#stick").scroll_into_view_if_needed()
     await page.evaluate("scrollBy(0, 150)")
     await hold_left(page)
-    await turning(seen)
+    await turning(seen, page)
     await page.mouse.up()
     await seen.at_rest()
 
@@ -240,9 +249,33 @@ async def test_a_joystick_pressed_while_the_robot_stops_for_a_moment_steers_when
         await hold_left(page)
     finally:
         os.kill(pid, signal.SIGCONT)
-    await turning(seen)
+    await turning(seen, page)
     await page.mouse.up()
     await seen.at_rest()
+
+
+async def test_what_can_be_pressed_stays_where_it_is_when_the_robot_stops(
+    chromium: Browser, seen: Probe
+) -> None:
+    page = await chromium.open()
+    await ready_to_drive(page)
+    names = "#estop", "#stick", "#release", "#take", "#enable"
+
+    async def places() -> list[object]:
+        return [await page.locator(name).bounding_box() for name in names]
+
+    before = await places()
+    pid = await seen.pid("control")
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        await told(page, "causes", "control is silent")
+        assert await places() == before
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    await page.click("#estop")
+    await told(page, "confirmed", "CONFIRMED by")
+    await told(page, "causes", "find out why it was pressed")
+    assert await places() == before
 
 
 @pytest.mark.slow
@@ -270,7 +303,7 @@ async def test_a_key_held_while_the_robot_was_latched_must_be_pressed_again(
         await page.wait_for_selector("#gate[data-mode=latched]")
     await ready_to_drive(page)
     await hold_left(page)
-    await turning(seen)
+    await turning(seen, page)
     await page.mouse.up()
     await seen.at_rest()
 
@@ -281,7 +314,7 @@ async def test_the_page_comes_back_by_itself_after_its_server_and_drives_again(
     page = await chromium.open()
     await ready_to_drive(page)
     await page.keyboard.down("a")
-    await turning(seen)
+    await turning(seen, page)
     os.kill(await seen.pid("page"), signal.SIGKILL)
     await page.wait_for_selector("#link:not(.live)")
     assert await page.inner_text("#mode") == "Silent"
@@ -292,6 +325,6 @@ async def test_the_page_comes_back_by_itself_after_its_server_and_drives_again(
     await page.keyboard.up("a")
     await ready_to_drive(page)
     await page.keyboard.down("a")
-    await turning(seen)
+    await turning(seen, page)
     await page.keyboard.up("a")
     await seen.at_rest()

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from playwright.async_api import Page
 
 from gigabrain_drivers.driver.catalog import load_robot
-from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.base import Cause, Pose, Velocity
 from gigabrain_schemas.body import ArmModel, Body, BodyDescription, GateStatus, Joint, RobotState
 from gigabrain_schemas.brain import ArmPlan, GraspPose, JointSpeeds
 from gigabrain_schemas.examples import example
@@ -249,6 +249,19 @@ async def test_whatever_ends_a_hold_stops_the_joint(
         assert not fake.jogged
     if end != "closed":
         await page.mouse.up()
+
+
+async def test_its_buttons_stay_where_they_are_when_it_stops(
+    chromium: Browser, fake: FakeArm
+) -> None:
+    page = await opened(chromium)
+    button = page.get_by_label(PAN)
+    before = await button.bounding_box()
+    remedy = "check that the commander runs and reaches the robot, then enable it again"
+    cause = Cause(code="silence", text="no valid command for 100 ms", remedy=remedy)
+    fake.gate = replace(LATCHED, causes=(cause, replace(cause, code="stale", text="old data")))
+    await page.wait_for_selector("#causes:has-text('old data')")
+    assert await button.bounding_box() == before
 
 
 async def test_an_arm_that_is_limp_says_so(chromium: Browser, fake: FakeArm) -> None:
