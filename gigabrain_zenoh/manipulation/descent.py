@@ -18,6 +18,7 @@ Flags = NDArray[np.bool_]
 PLACE, APPROACH, AXES = 0, 1, 2  # which part of a goal counts
 MAX_STEP = 0.6  # [rad] or [m] of a joint
 MIN_STEP = 1e-6
+NO_STEP = 1e-5  # as small as this it is not tried any smaller
 SLOW_STEP, SLOW_GAIN = 1e-3, 1e-4  # steps that bring so little end the descent
 FINE_M, FINE_RAD = 1e-6, 1e-5  # errors at which a posture is improved no more
 DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-4, 1e-9, 1e3
@@ -138,10 +139,14 @@ def _goal_error(frame: Floats, goal: Floats, part: int, error: Floats) -> None:
 
 
 @kernel
-def _solved(square: Floats, right: Floats, damping: float, held: Flags, step: Floats) -> None:
-    """Fill in `step` of (square + damping) step = right; joints that are held stay (Cholesky)."""
+def _solved(
+    square: Floats, right: Floats, damping: float, held: Flags, lower: Floats, step: Floats
+) -> None:
+    """Fill in `step` of (square + damping) step = right; joints that are held stay (Cholesky).
+
+    `lower` (n, n) is for its own use.
+    """
     count = len(right)
-    lower = np.zeros((count, count))
     for i in range(count):
         for j in range(i + 1):
             total = 0.0 if held[i] or held[j] else square[i, j]
@@ -164,15 +169,15 @@ def _solved(square: Floats, right: Floats, damping: float, held: Flags, step: Fl
 @kernel
 def _normal_equations(
     frame: Floats, joints: Floats, chain: Chain, error: Floats, weight: float,
-    square: Floats, slope: Floats,
+    jacobian: Floats, square: Floats, slope: Floats,
 ) -> None:  # fmt: skip
-    """Fill in J'J (n, n) and J'e (n,) of the weighted errors."""
+    """Fill in J (6, n), J'J (n, n) and J'e (n,) of the weighted errors."""
     count = len(slope)
-    jacobian = np.zeros((6, count))
     for k in range(count):
         a, b, c = joints[k, 1, 0], joints[k, 1, 1], joints[k, 1, 2]
         if chain.slides[k]:
             jacobian[0, k], jacobian[1, k], jacobian[2, k] = a, b, c
+            jacobian[3, k], jacobian[4, k], jacobian[5, k] = 0.0, 0.0, 0.0
             continue
         x, y = frame[0, 3] - joints[k, 0, 0], frame[1, 3] - joints[k, 0, 1]
         z = frame[2, 3] - joints[k, 0, 2]
@@ -211,20 +216,23 @@ def _descend(
     count = len(posture)
     frame, joints = np.empty((3, 4)), np.empty((count, 2, 3))
     square, slope, step = np.empty((count, count)), np.empty(count), np.empty(count)
+    lower, jacobian = np.empty((count, count)), np.empty((6, count))
     tried, new_error, damping = np.empty(count), np.empty(6), DAMPING
     tool_pose(chain, posture, frame, joints)
     _goal_error(frame, goal, part, error)
     cost = _cost(error, weight)
-    _normal_equations(frame, joints, chain, error, weight, square, slope)
+    _normal_equations(frame, joints, chain, error, weight, jacobian, square, slope)
     for _ in range(steps):
         for k in range(count):
             low, high = posture[k] <= limits[0, k], posture[k] >= limits[1, k]
             held[k] = (low and slope[k] < 0.0) or (high and slope[k] > 0.0)
         new_cost, moved = math.inf, 0.0
         while damping < MAX_DAMPING:
-            _solved(square, slope, damping, held, step)
-            scale = min(1.0, MAX_STEP / max(np.abs(step).max(), 1e-12))
-            moved = 0.0
+            _solved(square, slope, damping, held, lower, step)
+            moved, longest = 0.0, 1e-12
+            for k in range(count):
+                longest = max(longest, abs(step[k]))
+            scale = min(1.0, MAX_STEP / longest)
             for k in range(count):
                 aim = posture[k] + scale * step[k]
                 tried[k] = min(max(aim, limits[0, k]), limits[1, k])
@@ -232,7 +240,7 @@ def _descend(
             tool_pose(chain, tried, frame, joints)
             _goal_error(frame, goal, part, new_error)
             new_cost = _cost(new_error, weight)
-            if new_cost < cost:
+            if new_cost < cost or moved < NO_STEP:
                 break
             damping *= STIFFEN
         if new_cost >= cost:
@@ -240,7 +248,7 @@ def _descend(
         slow = moved < MIN_STEP or (cost - new_cost < SLOW_GAIN * cost and moved < SLOW_STEP)
         posture[:], error[:], cost = tried, new_error, new_cost
         damping = max(MIN_DAMPING, damping * EASE)
-        _normal_equations(frame, joints, chain, error, weight, square, slope)
+        _normal_equations(frame, joints, chain, error, weight, jacobian, square, slope)
         if slow or _is_fine(error):
             return
 

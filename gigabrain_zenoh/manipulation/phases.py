@@ -1,5 +1,6 @@
 """Phases of a plan, and how they are carried out: one wish for the joints in each tick."""
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -36,12 +37,23 @@ class Phase:
     arm: JointTrajectory | None = None
     gripper: float | None = None  # [rad] or [m], where its joint goes
 
-    @property
+    @functools.cached_property
     def ticks(self) -> int:
-        """Return the duration [ticks]."""
+        """The duration [ticks]."""
         if self.arm is None:
             return GRIP_TICKS
         return math.ceil(self.arm.duration / TICK_S) + 1 + SETTLE_TICKS
+
+    def at(self, ticks: NDArray[np.int64]) -> Floats:
+        """Return the postures (k, n) of the arm some ticks after the start."""
+        return self._postures[np.clip(ticks, 0, len(self._postures) - 1)]
+
+    @functools.cached_property
+    def _postures(self) -> Floats:
+        assert self.arm
+        times = np.arange(self.ticks) * TICK_S
+        columns = [np.interp(times, self.arm.times, column) for column in self.arm.positions.T]
+        return np.stack(columns, axis=1)
 
 
 class PhaseRun:
@@ -92,7 +104,7 @@ class PhaseRun:
         if phase is None or phase.arm is None:
             return ""
         names, late = phase.arm.names, AHEAD_TICKS + LAG_TICKS
-        rows = _rows(phase.arm, np.arange(before, tick - self._begun + 1) - late)
+        rows = phase.at(np.arange(before, tick - self._begun + 1) - late)
         ways = np.diff(rows, axis=0)
         off = np.sign(ways) * (rows[1:] - [sent[name] for name in names])
         behind = (off > [spare[name] for name in names]) & (np.abs(ways) > NO_WAY)
@@ -121,7 +133,7 @@ class PhaseRun:
             assert phase.gripper is not None
             return (JointTarget(name=self._gripper, position=phase.gripper),), None
         first = max(0, tick - self._begun) if self.phase else phase.ticks
-        rows = _rows(phase.arm, first + np.arange(WINDOW_TICKS))
+        rows = phase.at(first + np.arange(WINDOW_TICKS))
         return (), JointWindow(
             name=phase.arm.names,
             start=max(tick, self._begun) + AHEAD_TICKS,
@@ -134,7 +146,7 @@ class PhaseRun:
         phase = self.phase
         if phase is None or phase.arm is None:
             return {}
-        row = _rows(phase.arm, np.array([tick - self._begun - AHEAD_TICKS]))[0]
+        (row,) = phase.at(np.array([tick - self._begun - AHEAD_TICKS]))
         return dict(zip(phase.arm.names, row.tolist(), strict=True))
 
     def over_for(self, tick: int) -> int:
@@ -149,10 +161,3 @@ class PhaseRun:
     def progress(self, tick: int) -> float:
         """Return the share that is done."""
         return 1.0 - self.left_ticks(tick) / self._total if self._total else 1.0
-
-
-def _rows(trajectory: JointTrajectory, ticks: NDArray[np.int64]) -> Floats:
-    """Return the postures (k, n) some ticks after the start."""
-    times = ticks * TICK_S
-    columns = trajectory.positions.T
-    return np.stack([np.interp(times, trajectory.times, column) for column in columns], axis=1)
