@@ -97,7 +97,8 @@ def stack(
     *,
     seconds: float = 20.0,
     body: Body = "turtlebot3_waffle",
-    world: World = "arena",
+    link: Literal["sim", "emulated"] = "sim",
+    world: World | None = None,
     goal: bool = False,
     json: JsonFile = None,
 ) -> int:
@@ -105,16 +106,20 @@ def stack(
 
     Example: gigabrain bench stack --seconds 20 --world house --goal
 
+    A robot that drives avoids obstacles; an arm carries out the mission of its demo.
+
     Args:
         seconds: Duration [s].
+        link: How to reach the robot; the CPU of an emulator does not count.
+        world: World, or path of a world file. Default: arena; for an arm, that of its demo.
         goal: Also time a second start with a map, until it accepts a goal.
     """
     from gigabrain_zenoh.qa.bench.stack import measure_stack, stack_page
 
     files.check_result_path(json)
     check_positive(seconds=seconds)
-    check_names([body], [world])
-    result = run_async(measure_stack(body, world, seconds, print_progress, goal=goal))
+    check_names([body], [world] if world else [])
+    result = run_async(measure_stack(body, link, world, seconds, print_progress, goal=goal))
     finish(stack_page(result), result, json)
     return 0
 

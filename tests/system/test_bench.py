@@ -52,6 +52,19 @@ async def test_a_whole_robot_is_measured(home: Home, tmp_path: Path) -> None:
     assert "physics and lidar" in command.out
 
 
+@pytest.mark.slow
+async def test_an_arm_s_stack_is_measured_while_it_moves_things(home: Home, tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    report = tmp_path / "arm.json"
+    options = ("--body", "so101", "--link", "emulated", "--seconds", "5", "--json", str(report))
+    command = home.start("bench", "stack", *options)
+    assert await command.ended(600.0) == 0, command.err
+    result = json.loads(report.read_bytes())
+    assert (result["world"], result["arm_hz"]) == ("table", 100.0)
+    assert "emulator" in [process["name"] for process in result["processes"]]
+    assert "100 commands a second to its arm" in command.out
+
+
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [

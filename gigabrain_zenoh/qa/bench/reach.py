@@ -41,6 +41,7 @@ LOW, HIGH = (-0.3, -1.0, -0.1), (1.0, 1.0, 0.9)  # where goals are, in lengths o
 SHELF_AT, SHELF_SIZE = (0.7, 0.0, 0.36), (0.45, 0.9, 0.04)  # likewise
 PITCHES_RAD = -math.pi / 6, math.pi / 2  # of every other goal: how far the tool points down
 SHOW_EVERY = 100
+REST_TICKS = 100  # after a goal is reached, in which control corrects what its weight pulls it down
 REASON = "going to a goal"
 Progress = Callable[[str], None]
 
@@ -65,7 +66,7 @@ class ReachResult(Struct, frozen=True, kw_only=True):
     no_way: dict[str, int]  # goals with a posture, by why there is no path to it
     held: int  # goals to which safety did not let it come
     touched: tuple[str, ...]  # a line for each goal on whose way the arm touched something
-    off_p95_m: float  # of the tool from its goal, at rest
+    off_p95_m: float  # of the tool from its goal, 2 s after it was reached
     solved: Times  # inverse kinematics of goals with a posture,
     unsolved: Times  # and of the others, until it is known why
     planned: Times  # posture, path and trajectory
@@ -160,7 +161,8 @@ class Course:
             return
         self._arm.touched.clear()
         arrived = self._follow(point, pitch)
-        self._arm.settle()
+        for _ in range(REST_TICKS):
+            self._arm.step(Intent(behaviour="reach", reason="done"))
         if self._arm.touched:
             where = ", ".join(f"{one:.3f}" for one in point)
             self._touched.append(f"to ({where}): {'; '.join(sorted(self._arm.touched))}")

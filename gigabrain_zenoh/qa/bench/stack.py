@@ -4,20 +4,26 @@ import asyncio
 import statistics
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AsyncExitStack
 from typing import TYPE_CHECKING
 
 from msgspec import Struct
+from msgspec.structs import replace
 
+from gigabrain_drivers.driver.catalog import load_robot
+from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import Intent
 from gigabrain_schemas.safety import Health
 from gigabrain_schemas.tasks import GoalRequest
-from gigabrain_schemas.topics import GOAL, HEALTH, INTENT
+from gigabrain_schemas.topics import GOAL, HEALTH, INTENT, STATE
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
+from gigabrain_zenoh.config.settings import DecisionConfig, LinkName, PerceptionConfig
 from gigabrain_zenoh.decision.drive_kernels import DRIVE_KERNELS
+from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.kernels.precompile import ensure_compiled
 from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.perception.node import MAP_KERNELS
+from gigabrain_zenoh.qa.arm_mission import repeated_mission
 from gigabrain_zenoh.qa.judging import Figure, Limit, table_of
 from gigabrain_zenoh.qa.robot_under_test import (
     LOOPBACK,
@@ -31,13 +37,17 @@ if TYPE_CHECKING:
     from rich.console import Group
 
 SETTLE_S = 2.0  # imports and first calls are no part of what a running robot costs
+MOVES_RAD_S = 0.2  # of a joint, or [m/s]
 PERIOD_S = 1.0  # of the health messages
 SIMULATOR = "driver"  # the process that holds MuJoCo
+EMULATOR = "emulator"  # another one that does, and is the other end of a body's line
 AHEAD = GoalRequest(x=0.5, y=0.0, source="bench")
 ASK_S, AGAIN_S = 1.0, 0.02
 MB = 1e6
 READY = Figure("all ready after", "s").at_most(1.5)
 CPU = Figure("CPU without physics", "%").at_most(30)
+ARM_CPU = Figure("CPU without physics", "%").at_most(35)
+ARM_HZ = 100.0  # of control's commands to an arm on its own bus; simulated, it takes 50
 PHYSICS = Figure("physics and lidar", "%").at_most(5)
 FIRST_GOAL = Figure("first goal accepted after", "s").at_most(2)
 MAX_RSS_MB = 70.0
@@ -65,22 +75,28 @@ class StackResult(Struct, frozen=True, kw_only=True):
     """Cost of a whole robot."""
 
     body: str
+    link: LinkName
     world: str
     seconds: float
     ready_s: float  # from the start of the first process until the last was ready
     physics_cpu: float | None  # of one core, with the lidar's rays; None for a body without physics
+    arm_hz: float = 0.0  # of commands to an arm that moves meanwhile; 0 for a robot that drives
     processes: tuple[ProcessCost, ...]
     first_goal: FirstGoal | None = None  # of the same robot, restarted with a map
 
     @property
     def cpu_without_physics(self) -> float:
-        """CPU of all processes together, of one core."""
-        return sum(process.cpu for process in self.processes) - (self.physics_cpu or 0.0)
+        """CPU of all processes but an emulator together, of one core."""
+        own = [process.cpu for process in self.processes if process.name != EMULATOR]
+        return sum(own) - (self.physics_cpu or 0.0)
 
 
 def targets(result: StackResult) -> dict[Limit, float]:
     """Return the figures that have a limit. Memory counts in processes without MuJoCo."""
-    found = {READY: result.ready_s, CPU: 100 * result.cpu_without_physics}
+    used = 100 * result.cpu_without_physics
+    if result.arm_hz:  # decision and safety hold MuJoCo, too
+        return {READY: result.ready_s, ARM_CPU: used}
+    found = {READY: result.ready_s, CPU: used}
     if result.physics_cpu is not None:
         found[PHYSICS] = 100 * result.physics_cpu
     if goal := result.first_goal:
@@ -92,15 +108,28 @@ def targets(result: StackResult) -> dict[Limit, float]:
 
 
 async def measure_stack(
-    body: str, world: str, seconds: float, show: Callable[[str], None], *, goal: bool = False
-) -> StackResult:
-    """Run a robot that avoids obstacles; with `goal` also one that navigates, for its first goal.
+    body: str, link: LinkName, world: str | None, seconds: float, show: Callable[[str], None],
+    *, goal: bool = False,
+) -> StackResult:  # fmt: skip
+    """Run a robot that avoids obstacles, or an arm that carries out the mission of its demo.
 
-    Raises GigabrainError when a process dies.
+    With `goal`, also run one that navigates, for its first goal. Raises ConfigError for an arm that
+    should, and GigabrainError when a process dies.
     """
-    deployment = Deployment(body=body, world=world, resume="auto", router=LOOPBACK)
+    robot = load_robot(body)
+    is_arm = not robot.description().has_base
+    if goal and is_arm:
+        raise ConfigError(f"--goal: {body} does not drive")
+    world = world or (robot.demo.world if is_arm else Deployment().world)
+    deployment = Deployment(body=body, link=link, world=world, resume="auto", router=LOOPBACK)
+    if is_arm:
+        rate, decision = {"arm": {"rate_hz": ARM_HZ}}, DecisionConfig(behaviour="navigate")
+        deployment = replace(deployment, robot=rate, decision=decision)
     show(f"starting {body} in {world}")
-    async with measured_robot(deployment) as (group, bus):
+    async with measured_robot(deployment) as (group, bus), AsyncExitStack() as stack:
+        if is_arm:
+            await stack.enter_async_context(repeated_mission(bus, body))
+            await _until_it_moves(group, bus)
         await group.run_for(SETTLE_S)
         show(f"ready after {group.ready_s:.2f} s; measuring for {seconds:g} s")
         names = list(group.supervisor.statuses)
@@ -114,13 +143,28 @@ async def measure_stack(
     first_goal = await measure_first_goal(body, world, show) if goal else None
     return StackResult(
         body=body,
+        link=link,
         world=world,
         seconds=seconds,
         ready_s=group.ready_s,
         physics_cpu=physics_share(before, after, (ended_ns - began_ns) / 1e9),
         processes=tuple(_cost(name, healths[name]) for name in names),
+        arm_hz=ARM_HZ if is_arm else 0.0,
         first_goal=first_goal,
     )
+
+
+async def _until_it_moves(group: ProcessGroup, bus: Bus) -> None:
+    """Wait until a joint moves: the first plan may take long."""
+    moves = asyncio.Event()
+
+    def on_state(_key: str, state: RobotState) -> None:
+        if any(abs(joint.velocity) > MOVES_RAD_S for joint in state.joints):
+            moves.set()
+
+    close = bus.subscribe(STATE, on_state)
+    await group.until(moves.is_set, "the arm moves", START_S)
+    close()
 
 
 def physics_share(
@@ -200,7 +244,8 @@ def stack_page(result: StackResult) -> "Group":
         verdict = Text("ok", style="green") if limit.allows(value) else Text("over", style="yellow")
         value_text, limit_text = f"{value:.2f} {figure.unit}", f"{at_most:g} {figure.unit}"
         limits.add_row(figure.name, value_text, limit_text, verdict)
-    title = f"\n{result.body} in {result.world} at real time, {result.seconds:g} s"
+    rate = f", {result.arm_hz:g} commands a second to its arm" if result.arm_hz else ""
+    title = f"\n{result.body} ({result.link}) in {result.world}, {result.seconds:g} s{rate}"
     page = Group(
         Text(title, style="bold"), costs,
         Text("\nTargets (CPU of one core)", style="bold"), limits,

@@ -22,6 +22,7 @@ from tests.unit.qa.figures import compared, one
 def stack(**changes: object) -> StackResult:
     values = {
         "body": "turtlebot3_waffle",
+        "link": "sim",
         "world": "arena",
         "seconds": 20.0,
         "ready_s": 1.2,
@@ -47,6 +48,21 @@ def test_what_the_whole_robot_costs_leaves_its_physics_out() -> None:
     assert stack(physics_cpu=None).cpu_without_physics == pytest.approx(0.2125)
     assert physics_share({"physics_cpu_s": 1.5}, {"physics_cpu_s": 2.5}, 20.0) == 0.05
     assert physics_share({}, {"physics_cpu_s": 2.5}, 20.0) is None
+
+
+def test_the_emulator_of_an_arm_does_not_count_and_its_limit_is_another() -> None:
+    emulator = ProcessCost(name="emulator", cpu=0.25, rss_bytes=95_000_000)
+    arm = stack(link="emulated", physics_cpu=None, arm_hz=100.0, processes=(
+        emulator, ProcessCost(name="safety", cpu=0.36, rss_bytes=90_000_000),
+    ))  # fmt: skip
+    held = {
+        limit.figure.name: (value, limit.allows(value)) for limit, value in targets(arm).items()
+    }
+    assert held == {
+        "all ready after": (1.2, True),
+        "CPU without physics": (pytest.approx(36.0), False),
+    }
+    assert "100 commands a second to its arm" in shown(stack_page(arm))
 
 
 def test_targets_are_held_against_the_figures() -> None:

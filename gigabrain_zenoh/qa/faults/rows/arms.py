@@ -8,13 +8,11 @@ import inspect
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-from gigabrain_drivers.driver.catalog import load_robot, robot_path
-from gigabrain_drivers.sim.worlds import mission_file
+from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.body import Joint
-from gigabrain_zenoh.client.tasks import Tasks
+from gigabrain_zenoh.qa.arm_mission import LOOK_S, repeated_mission
 from gigabrain_zenoh.qa.faults.rig import RESTED_TICKS, Rig, deployment_of
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, Skipped, fault_row, worse_of
 from gigabrain_zenoh.qa.probe import until
@@ -26,7 +24,6 @@ FAST_RAD_S = 0.8
 MIDDLE_RAD = 0.7  # round which it has room to go on
 TURN_RAD = 1.2  # from the middle, where the operator turns back
 JOG_S = 0.05  # between two messages of the operator
-LOOK_S = 0.5  # between two looks at whether it goes on
 CARRIES_RAD_S = 0.5  # of the fastest joint, while it carries something
 ALL = ("router", "driver", "perception", "decision", "control", "safety")
 REST_S = 1.5  # of simulated time, in which every arm has come to rest
@@ -205,9 +202,9 @@ async def _done(action: Action) -> None:
 @asynccontextmanager
 async def _carrying(robot: RobotUnderTest) -> AsyncIterator[None]:
     """Have the mission of the body's demo move things; begins while it carries one fast."""
-    probe, body = robot.probe, load_robot(robot.deployment.body)
-    if not body.demo.mission:
-        raise Skipped(f"{body.robot_type} has no mission")
+    probe, body = robot.probe, robot.deployment.body
+    if not load_robot(body).demo.mission:
+        raise Skipped(f"{body} has no mission")
 
     def fast() -> bool:
         intent = probe.intent.fresh()
@@ -215,23 +212,19 @@ async def _carrying(robot: RobotUnderTest) -> AsyncIterator[None]:
             return False
         return max(abs(joint.velocity) for joint in probe.state.joints) > CARRIES_RAD_S
 
-    tasks, folder = Tasks(probe.bus), robot_path(robot.deployment.body).parent
-    mission = Path(mission_file(body.demo.mission, folder))
-
-    async def go_on() -> None:
-        while True:  # a fault may have ended the mission
-            if not (await tasks.status()).current:
-                await tasks.carry_out(mission)
+    async def enable() -> None:
+        while True:
             if probe.state.gate.mode == "idle":
                 await probe.enable_brain()
             await asyncio.sleep(LOOK_S)
 
     await robot.release()
-    going_on = asyncio.create_task(go_on())
+    enabling = asyncio.create_task(enable())
     try:
-        await until(fast, "it carries something fast")
+        async with repeated_mission(probe.bus, body):
+            await until(fast, "it carries something fast")
     finally:
-        going_on.cancel()
+        enabling.cancel()
     yield
 
 
