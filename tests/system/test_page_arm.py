@@ -257,6 +257,9 @@ async def test_its_buttons_stay_where_they_are_when_it_stops(
     page = await opened(chromium)
     button = page.get_by_label(PAN)
     before = await button.bounding_box()
+    await page.click("#enable")
+    await page.wait_for_selector("#reply:not(:empty)")
+    assert await button.bounding_box() == before
     remedy = "check that the commander runs and reaches the robot, then enable it again"
     cause = Cause(code="silence", text="no valid command for 100 ms", remedy=remedy)
     fake.gate = replace(LATCHED, causes=(cause, replace(cause, code="stale", text="old data")))
