@@ -106,12 +106,12 @@ def stack(
 
     Example: gigabrain bench stack --seconds 20 --world house --goal
 
-    A robot that drives avoids obstacles; an arm carries out the mission of its demo.
+    A robot that drives avoids obstacles, by default in the arena. An arm carries out the mission of
+    its demo, by default in the world of that.
 
     Args:
         seconds: Duration [s].
         link: How to reach the robot; the CPU of an emulator does not count.
-        world: World, or path of a world file. Default: arena; for an arm, that of its demo.
         goal: Also time a second start with a map, until it accepts a goal.
     """
     from gigabrain_zenoh.qa.bench.stack import measure_stack, stack_page
