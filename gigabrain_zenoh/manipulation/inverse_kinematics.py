@@ -23,7 +23,7 @@ ARMS_LENGTH_M = 0.05  # a radian of orientation counts as much as this distance
 FIRST_M = 0.001  # the same, where orientation has to stand back
 TABLE_POSTURES = 3000
 FIRST_STEPS, STEPS = 15, 60  # of a descent: from each start, and from where it comes near
-NEAR_M = 0.002  # both errors together
+NEAR_M = 0.001  # of both errors together, beyond those that the goal allows
 AT_ONCE = 4  # descents from postures of the table
 NEAREST = 6  # where no posture reaches the goal: those from which it is tried in earnest
 NEAR_TRIES, TRIES = 16, 60  # postures of the table: those nearest to the goal, then any others
@@ -181,8 +181,9 @@ class InverseKinematics:
             yield from self._ends(goal, starts[at : at + AT_ONCE])
 
     def _ends(self, goal: ToolGoal, starts: Floats) -> Iterator[_Found]:
+        near = NEAR_M + ARMS_LENGTH_M * goal.orientation_tolerance
         for now in self._descend(goal, starts, FIRST_STEPS):
-            yield self._refined(goal, now) if now.cost < NEAR_M else now
+            yield self._refined(goal, now) if now.cost < near else now
 
     def _nearest(self, goal: ToolGoal, found: Sequence[_Found]) -> _Found:
         """Return what comes nearest to a goal that is out of reach, the place before the rest."""

@@ -99,6 +99,26 @@ def test_where_the_orientation_is_not_possible_the_place_is_reached() -> None:
         assert np.linalg.norm(arm().forward(found.posture).position - place) < 1e-3
 
 
+@pytest.mark.parametrize("tolerance", [0.2, math.pi])
+def test_a_goal_is_reached_with_any_turn_that_it_allows(tolerance: float) -> None:
+    random, turned, found = np.random.default_rng(3), 0, 0
+    for posture in postures(60):
+        frame = arm().forward(posture)
+        off = random.normal(size=3)
+        off -= off @ frame.axes[:, 0] * frame.axes[:, 0]
+        approach = frame.axes[:, 0] + 0.9 * min(1.0, tolerance) * off / np.linalg.norm(off)
+        goal = ToolGoal(
+            position=frame.position,
+            approach=approach / np.linalg.norm(approach),
+            orientation_tolerance=tolerance,
+        )
+        one = inverse().solve(goal, posture)
+        found += isinstance(one, Reachable)
+        turned += isinstance(one, Reachable) and one.orientation_error > 0.05
+    assert found == 60
+    assert turned > 10  # most are not possible as they were asked for
+
+
 def test_a_posture_that_collides_is_not_taken() -> None:
     goal = ToolGoal(position=np.array([0.2, 0.0, 0.1]))
     found = inverse().solve(goal, collides=lambda posture: "palm and shelf")
