@@ -29,7 +29,7 @@ from gigabrain_zenoh.manipulation.pick_place import (
 from gigabrain_zenoh.manipulation.planner import NoPath, plan
 from gigabrain_zenoh.manipulation.press import PressPlanner
 
-TABLE = "the table"
+TABLE, ABOVE_TABLE = "the table", "just above the table"
 SPARE_M = 0.004  # from boxes beyond safety's clearance: it holds an arm that comes to that
 SUNK_M = 0.001  # of the floor below its place, as things stand on it
 SHARES = (0.57, 0.62, 0.7, 0.5, 0.78)  # of its reach, at which a thing is best grasped
@@ -77,6 +77,12 @@ class ArmPlanner:
         self._inverse = InverseKinematics(self.arm, LIMIT_SPARE)
         self._times = TimeParametrization(eased(self.arm.joints, FAST))
         self._around = surroundings(body)
+        higher = np.array([0.0, 0.0, SUNK_M + kept(body)])
+        self._above_floor = [
+            replace(one, name=ABOVE_TABLE, position=one.position + higher)
+            for one in self._around
+            if one.kind == "floor"
+        ]
         self._pick_place: PickPlacePlanner | None = None
         self._press_planner: PressPlanner | None = None
         self._front = max(x for x, _ in body.footprint)  # [m]
@@ -100,8 +106,15 @@ class ArmPlanner:
             posture: Where the arm is (n,).
             hold: What it holds.
         """
-        checker = self._checker(things, hold)
-        found = self._inverse.solve(self.tool_goal(point, pitch), posture, checker.touches)
+        goal = self.tool_goal(point, pitch)
+        if hold is None:  # a way that safety does not hold up near the floor, if there is one
+            way = self._way_to(self._checker([*things, *self._above_floor], None), goal, posture)
+            if isinstance(way, Plan):
+                return way
+        return self._way_to(self._checker(things, hold), goal, posture)
+
+    def _way_to(self, checker: CollisionChecker, goal: ToolGoal, posture: Floats) -> Plan | NoWay:
+        found = self._inverse.solve(goal, posture, checker.touches)
         if isinstance(found, OutOfReach):
             return NoWay(reason=self._explained(found))
         return self._move(checker, posture, found.posture)
@@ -329,6 +342,11 @@ class ArmPlanner:
         return f"not reachable: {found.reason}; the nearest is ({x:.3f}, {y:.3f}, {z:.3f})"
 
 
+def kept(body: BodyDescription) -> float:
+    """Return how far plans keep off what safety holds an arm at [m]."""
+    return body.thresholds.arm_clearance + SPARE_M
+
+
 def surroundings(body: BodyDescription) -> list[Thing]:
     """Return the floor, and the boxes that no part of an arm may enter with what safety keeps."""
     assert body.arm
@@ -336,9 +354,8 @@ def surroundings(body: BodyDescription) -> list[Thing]:
     if body.arm.floor is not None:
         place = np.array([0.0, 0.0, body.arm.floor - SUNK_M])
         found.append(Thing(name=TABLE, kind="floor", position=place))
-    kept = 2 * (body.thresholds.arm_clearance + SPARE_M)
     for box in body.arm.keep_out:
-        length, width, height = (side + kept for side in box.size)
+        length, width, height = (side + 2 * kept(body) for side in box.size)
         found.append(Thing(
             name=box.name, kind="box", size=(length, width, height),
             position=np.array(box.center), axes=turned(box.yaw),

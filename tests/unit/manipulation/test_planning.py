@@ -11,7 +11,7 @@ from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.body import KeepOut
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.manipulation.arm_planner import surroundings
+from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Plan, surroundings
 from gigabrain_zenoh.manipulation.collision import CollisionChecker, Thing
 from gigabrain_zenoh.manipulation.grasps import ROOM_M, Grasp, GraspPlanner, NoGrasp
 from gigabrain_zenoh.manipulation.inverse_kinematics import Reachable, ToolGoal
@@ -268,3 +268,24 @@ def test_ways_keep_off_boxes_by_more_than_safety_does() -> None:
     _, kept = surroundings(replace(body, arm=replace(body.arm, floor=0.0, keep_out=(shelf,))))
     for side, given in zip(kept.size, shelf.size, strict=True):
         assert side / 2 > given / 2 + body.thresholds.arm_clearance + 0.002
+
+
+def test_ways_keep_off_the_floor_by_more_than_safety_does_where_they_can() -> None:
+    body = load_robot("so101").description()
+    planner, random = ArmPlanner(MODEL.read_text(), body), np.random.default_rng(0)
+    floor = CollisionChecker(planner.arm, [Thing(name="floor", kind="floor")], margin=0.0)
+    assert body.arm
+    posture = np.array(body.arm.home[:-1])
+    lowest = []
+    for _ in range(12):
+        point = random.uniform((0.15, -0.2, 0.02), (0.3, 0.2, 0.05))
+        found = planner.reach(point, None, [], posture, None)
+        if isinstance(found, Plan):
+            (move,) = found.phases
+            assert move.arm
+            for one in move.arm.positions[5:]:
+                near = floor.clearance(one)
+                if near.pair and "floor" in near.pair:
+                    lowest.append(near.distance)
+            posture = move.arm.positions[-1]
+    assert min(lowest) > body.thresholds.arm_clearance
