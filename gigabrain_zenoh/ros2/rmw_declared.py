@@ -8,12 +8,15 @@ import zenoh.ext
 
 from gigabrain_zenoh.ros2.qos import Qos
 
-HEARTBEAT_S = 0.5  # of publishers whose late readers notice what they missed
 REMOTE = zenoh.Locality.REMOTE
 
 
 def advanced_publisher(session: zenoh.Session, key: str, qos: Qos) -> Any:
-    """Declare a publisher that keeps its last messages for late readers."""
+    """Declare a publisher that keeps its last messages for late readers.
+
+    It has no heartbeat, by which readers notice that they missed the last message: Zenoh 1.10 ends
+    its task while it holds the GIL, and hangs where a callback waits for that.
+    """
     return zenoh.ext.declare_advanced_publisher(
         session,
         key,
@@ -21,11 +24,7 @@ def advanced_publisher(session: zenoh.Session, key: str, qos: Qos) -> Any:
         allowed_destination=REMOTE,
         cache=zenoh.ext.CacheConfig(qos.depth),
         publisher_detection=True,
-        sample_miss_detection=zenoh.ext.MissDetectionConfig(
-            heartbeat=None, sporadic_heartbeat=HEARTBEAT_S
-        )
-        if qos.reliable
-        else None,
+        sample_miss_detection=zenoh.ext.MissDetectionConfig() if qos.reliable else None,
     )
 
 
