@@ -15,10 +15,11 @@ LOOK_S = 0.5  # between two looks at whether it goes on
 
 
 @asynccontextmanager
-async def repeated_mission(bus: Bus, body: str) -> AsyncIterator[None]:
+async def repeated_mission(bus: Bus, body: str) -> AsyncIterator[asyncio.Task[None]]:
     """Have an arm carry out the mission of its demo, from the beginning when it has ended.
 
-    Raises ConfigError for a body that has none.
+    The task that sees to it ends where the robot refuses. Raises ConfigError for a body that has no
+    mission.
     """
     mission = load_robot(body).demo.mission
     if not mission:
@@ -33,6 +34,6 @@ async def repeated_mission(bus: Bus, body: str) -> AsyncIterator[None]:
 
     repeating = asyncio.create_task(repeat())
     try:
-        yield
+        yield repeating
     finally:
         repeating.cancel()

@@ -108,7 +108,8 @@ def table_of(*columns: str, title: str | None = None, left: int = 1) -> "Table":
 
     table = Table(title=title)
     for number, name in enumerate(columns):
-        table.add_column(Text(name), justify="left" if number < left else "right", no_wrap=True)
+        is_text = number < left  # the heads of figures may take two lines
+        table.add_column(Text(name), justify="left" if is_text else "right", no_wrap=is_text)
     return table
 
 

@@ -128,8 +128,8 @@ async def measure_stack(
     show(f"starting {body} in {world}")
     async with measured_robot(deployment) as (group, bus), AsyncExitStack() as stack:
         if is_arm:
-            await stack.enter_async_context(repeated_mission(bus, body))
-            await _until_it_moves(group, bus)
+            mission = await stack.enter_async_context(repeated_mission(bus, body))
+            await _until_it_moves(group, bus, mission)
         await group.run_for(SETTLE_S)
         show(f"ready after {group.ready_s:.2f} s; measuring for {seconds:g} s")
         names = list(group.supervisor.statuses)
@@ -154,8 +154,8 @@ async def measure_stack(
     )
 
 
-async def _until_it_moves(group: ProcessGroup, bus: Bus) -> None:
-    """Wait until a joint moves: the first plan may take long."""
+async def _until_it_moves(group: ProcessGroup, bus: Bus, mission: asyncio.Task[None]) -> None:
+    """Wait until a joint moves: the first plan may take long. Raises what ends the mission."""
     moves = asyncio.Event()
 
     def on_state(_key: str, state: RobotState) -> None:
@@ -163,8 +163,10 @@ async def _until_it_moves(group: ProcessGroup, bus: Bus) -> None:
             moves.set()
 
     close = bus.subscribe(STATE, on_state)
-    await group.until(moves.is_set, "the arm moves", START_S)
+    await group.until(lambda: moves.is_set() or mission.done(), "the arm moves", START_S)
     close()
+    if mission.done():
+        mission.result()
 
 
 def physics_share(

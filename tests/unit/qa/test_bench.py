@@ -16,6 +16,7 @@ from gigabrain_zenoh.qa.bench.stack import (
     stack_page,
     targets,
 )
+from gigabrain_zenoh.qa.judging import table_of
 from tests.unit.qa.figures import compared, one
 
 
@@ -41,6 +42,15 @@ def shown(page: RenderableType) -> str:
     with console.capture() as capture:
         console.print(page)
     return capture.get()
+
+
+def test_a_table_that_is_too_wide_for_a_terminal_breaks_heads_and_cuts_nothing() -> None:
+    table = table_of("joint", "swing", "off rms", "off at most", "late", "overshoot", "off at rest")
+    table.add_row("shoulder_pan", "±27°", "0.54°", "0.90°", "-1 ms", "0.2%", "0.12°")
+    console = Console(width=80, no_color=True)
+    with console.capture() as capture:
+        console.print(table)
+    assert "…" not in capture.get()
 
 
 def test_what_the_whole_robot_costs_leaves_its_physics_out() -> None:
