@@ -24,7 +24,9 @@ def advanced_publisher(session: zenoh.Session, key: str, qos: Qos) -> Any:
         allowed_destination=REMOTE,
         cache=zenoh.ext.CacheConfig(qos.depth),
         publisher_detection=True,
-        sample_miss_detection=zenoh.ext.MissDetectionConfig() if qos.reliable else None,
+        sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None)
+        if qos.reliable
+        else None,
     )
 
 
