@@ -77,7 +77,7 @@ class ArmPlanner:
         self._inverse = InverseKinematics(self.arm, LIMIT_SPARE)
         self._times = TimeParametrization(eased(self.arm.joints, FAST))
         self._around = surroundings(body)
-        higher = np.array([0.0, 0.0, SUNK_M + kept(body)])
+        higher = np.array([0.0, 0.0, SUNK_M + body.thresholds.arm_clearance])
         self._above_floor = [
             replace(one, name=ABOVE_TABLE, position=one.position + higher)
             for one in self._around
@@ -342,11 +342,6 @@ class ArmPlanner:
         return f"not reachable: {found.reason}; the nearest is ({x:.3f}, {y:.3f}, {z:.3f})"
 
 
-def kept(body: BodyDescription) -> float:
-    """Return how far plans keep off what safety holds an arm at [m]."""
-    return body.thresholds.arm_clearance + SPARE_M
-
-
 def surroundings(body: BodyDescription) -> list[Thing]:
     """Return the floor, and the boxes that no part of an arm may enter with what safety keeps."""
     assert body.arm
@@ -354,8 +349,9 @@ def surroundings(body: BodyDescription) -> list[Thing]:
     if body.arm.floor is not None:
         place = np.array([0.0, 0.0, body.arm.floor - SUNK_M])
         found.append(Thing(name=TABLE, kind="floor", position=place))
+    kept = 2 * (body.thresholds.arm_clearance + SPARE_M)
     for box in body.arm.keep_out:
-        length, width, height = (side + 2 * kept(body) for side in box.size)
+        length, width, height = (side + kept for side in box.size)
         found.append(Thing(
             name=box.name, kind="box", size=(length, width, height),
             position=np.array(box.center), axes=turned(box.yaw),
