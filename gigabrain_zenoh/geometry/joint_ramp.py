@@ -136,6 +136,16 @@ def along(
     )  # from then on at the path's speed
     if all(map(_possible, (*steps, *nexts), (*limits, *limits))):
         return steps
+    return _onto(now, path, limits, dt)
+
+
+def _onto(
+    now: Sequence[JointPoint],
+    path: Sequence[Sequence[float]],
+    limits: Sequence[JointDescription],
+    dt: float,
+) -> tuple[JointPoint, ...]:
+    """Return where joints are `dt` [s] later that get onto a path as fast as they may."""
     frame = [_frame(joint, places, dt) for joint, *places in zip(limits, *path, strict=True)]
     off = [
         JointPoint(
