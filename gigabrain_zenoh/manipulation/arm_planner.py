@@ -107,7 +107,7 @@ class ArmPlanner:
             hold: What it holds.
         """
         goal = self.tool_goal(point, pitch)
-        if hold is None:  # a way that safety does not hold up near the floor, if there is one
+        if self._above_floor and hold is None:  # first a way that safety does not hold up there
             way = self._way_to(self._checker([*things, *self._above_floor], None), goal, posture)
             if isinstance(way, Plan):
                 return way
