@@ -21,6 +21,7 @@ MS = 1_000_000
 TIMEOUT_NS = 200 * MS  # longest period of a sender
 BRAKE_NS = 60 * MS  # silence after the period before zero is sent; the gate bears 100 ms
 RELEASE_NS = 500 * MS  # after the last command
+AWAKE_NS = 100 * MS  # longest time between two states that counts as silence of a sender
 AHEAD_NS = 100 * MS  # by which the clock of a stamp may be ahead of ours
 ASK_NS = 500 * MS  # from one request for the body to the next
 INTERVALS = 9  # of a sender, for their median
@@ -102,6 +103,27 @@ class Sender(Struct, frozen=True):
     lateness: Lateness = Lateness()
 
 
+class Silence(Struct, frozen=True):
+    """Time without a command, as far as this process was awake to hear one."""
+
+    heard_ns: int = RELEASE_NS
+    until_ns: int = 0
+
+    @property
+    def is_pause(self) -> bool:
+        """Whether the sender has paused, after which it may ask for a lost body again."""
+        return self.heard_ns >= RELEASE_NS
+
+    def then(self, now_ns: int) -> "Silence":
+        """Return the silence at a later time; a freeze of this process is none of the sender."""
+        return Silence(self.heard_ns + min(now_ns - self.until_ns, AWAKE_NS), now_ns)
+
+    @staticmethod
+    def broken(now_ns: int) -> "Silence":
+        """Return the silence after a command that comes now."""
+        return Silence(0, now_ns)
+
+
 class Memory(Struct, frozen=True, kw_only=True):
     """State of the commander."""
 
@@ -113,7 +135,7 @@ class Memory(Struct, frozen=True, kw_only=True):
     asked_ns: int = -ASK_NS
     blocked: str = ""  # why the sender has to pause first
     velocity: Velocity = ZERO
-    received_ns: int = -RELEASE_NS  # when any command came, also one that was refused
+    silence: Silence = Silence()  # since any command, also one that was refused
     last_ns: int = -RELEASE_NS  # when the newest good one was sent, as far as it is known
     period_ns: int = TIMEOUT_NS  # of its sender
     senders: tuple[Sender, ...] = ()  # the newest last
@@ -144,8 +166,8 @@ Step = tuple[Memory, tuple[Action, ...]]
 
 def arrive(config: Config, limits: Limits, memory: Memory, wanted: Wanted, now: Now) -> Step:
     """Process a command of ROS."""
-    paused = now.ns - memory.received_ns >= RELEASE_NS
-    memory = replace(memory, received_ns=now.ns)
+    paused = memory.silence.then(now.ns).is_pause
+    memory = replace(memory, silence=Silence.broken(now.ns))
     code, text = _fault(config, wanted, now)
     if code == "not_finite":  # its sender is out of order: brake
         memory = replace(memory, velocity=ZERO, refusal=text)
@@ -174,19 +196,20 @@ def arrive(config: Config, limits: Limits, memory: Memory, wanted: Wanted, now: 
 
 def observe(config: Config, memory: Memory, state: RobotState, now: Now) -> Step:
     """Process a state of the robot: repeat the command, brake, or give the body back."""
-    memory = replace(memory, gate=state.gate, boot=state.boot)
+    silence = memory.silence.then(now.ns)
+    memory = replace(memory, gate=state.gate, boot=state.boot, silence=silence)
     if state.gate.mode == "latched" and not _is_old(memory):
         memory = replace(memory, blocked=f"the robot was latched; {PAUSE}")
     since_ns = now.ns - memory.last_ns
-    if now.ns - memory.received_ns >= RELEASE_NS:
+    if memory.holds and not _mine(config, memory):
+        return _lost(config, memory), ()
+    if memory.silence.is_pause:
         blocked = memory.blocked if state.gate.mode == "latched" else ""
         memory = replace(memory, refusal="", blocked=blocked)
     if since_ns >= RELEASE_NS:
         return replace(memory, holds=False, velocity=ZERO), ()
     if not memory.holds:
         return memory, ()
-    if not _mine(config, memory):
-        return _lost(config, memory), ()
     if since_ns <= memory.period_ns:
         return memory, (Send(memory.velocity),)
     return memory, ((Send(ZERO),) if since_ns > memory.period_ns + BRAKE_NS else ())
@@ -212,7 +235,7 @@ def silent(memory: Memory, now: Now) -> Step:
     """Process a command of ROS while the robot is silent: a lease is over."""
     blocked = f"the robot was silent; {PAUSE}" if memory.holds else memory.blocked
     memory = replace(
-        memory, gate=None, holds=False, velocity=ZERO, received_ns=now.ns,
+        memory, gate=None, holds=False, velocity=ZERO, silence=Silence.broken(now.ns),
         blocked=blocked, refusal=NO_ROBOT,
     )  # fmt: skip
     return memory, (Refuse("no_robot"),)

@@ -13,7 +13,7 @@ from gigabrain_schemas.body import Body
 from gigabrain_zenoh.config.settings import Ros2Config
 from gigabrain_zenoh.errors import GigabrainError, Refused
 from gigabrain_zenoh.gateway.background import Background
-from gigabrain_zenoh.gateway.commander import RELEASE_NS
+from gigabrain_zenoh.gateway.commander import Silence
 from gigabrain_zenoh.gateway.conversions.diagnostics import Status
 from gigabrain_zenoh.gateway.conversions.frames import Make, header
 from gigabrain_zenoh.gateway.goal_tasks import GoalTasks
@@ -128,8 +128,9 @@ class JointRequests:
         self._requests = TopicRequests(scene.bus, ros, types, work)
         self._commander: JointCommander | None = None
         self._server: ActionServer | None = None
-        self._received_ns = -RELEASE_NS  # when the newest trajectory came by the topic
+        self._silence = Silence()  # since any trajectory by the topic
         scene.on_body.append(self._offer)
+        scene.on_state.append(lambda _: self._listen())
 
     def forget(self, why: str) -> None:
         """Stop commanding joints at once."""
@@ -163,15 +164,18 @@ class JointRequests:
                 now_ns=self._scene.bus.clock.unix_ns,
             )
 
+    def _listen(self) -> None:
+        self._silence = self._silence.then(self._scene.bus.clock.now_ns())
+
     async def _obey(self, message: Any) -> str:
         """Begin to follow a trajectory of the topic, in place of any other."""
         commander, body = self._commander, self._scene.description
         assert commander
         assert body
-        now_ns = self._scene.bus.clock.now_ns()
-        paused, self._received_ns = now_ns - self._received_ns >= RELEASE_NS, now_ns
-        if paused:
+        self._listen()
+        if self._silence.is_pause:
             commander.blocked = ""
+        self._silence = Silence.broken(self._silence.until_ns)
         if commander.blocked:
             raise Refused(commander.blocked)
         path, waits_s = commander.judge(message)

@@ -61,12 +61,28 @@ class MockArm(MockBody):
         return replace(await super().read_state(), joints=joints, limp=self.let_go)
 
 
+class Hearing:
+    """A network on which one process can be frozen: it hears nothing, and that is lost."""
+
+    def __init__(self, network):
+        self._network, self.frozen = network, False
+
+    def transport(self):
+        made = self._network.transport()
+        subscribe = made.subscribe
+        made.subscribe = lambda key, heard, depth: subscribe(
+            key, lambda *sample: self.frozen or heard(*sample), depth
+        )
+        return made
+
+
 class ArmRobot:
     """A robot that is an arm: `async with ArmRobot(folder) as robot:`."""
 
     def __init__(self, folder, config=None, mjcf=None):
         self._folder, self._config, self._mjcf = folder, config, mjcf
         self.network, self.clock = LocalNetwork(), FakeClock()
+        self.gateway_network = Hearing(self.network)
         self.state, self.safe = None, True
 
     async def __aenter__(self):
@@ -81,7 +97,7 @@ class ArmRobot:
         self.operator.subscribe(STATE, self._see)
         self._stack = AsyncExitStack()
         self.gateway_bus, self.ros = await self._stack.enter_async_context(
-            gateway_on(self.network, self.clock, self._config)
+            gateway_on(self.gateway_network, self.clock, self._config)
         )
         self.node = RosNode(self.ros, self.clock)
         await self.go(60)

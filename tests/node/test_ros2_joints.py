@@ -237,27 +237,44 @@ async def test_an_estop_ends_a_goal_and_what_follows_is_refused(tmp_path):
         assert "gigabrain: joint_trajectory" not in robot.diagnostics()
 
 
+async def stream(robot, ticks):
+    """Publish a trajectory that goes on a little from what was sent, every second tick."""
+    for _ in range(ticks // 2):
+        robot.publish(robot.trajectory((0.1, robot.state.joints_sent[0] + 0.01)))
+        await robot.go(2)
+
+
 async def test_a_stream_of_trajectories_does_not_go_on_after_a_stop_until_it_pauses(tmp_path):
     async with ready(tmp_path) as (robot, _):
-
-        async def stream(ticks):
-            for _ in range(ticks // 2):
-                ahead = robot.state.joints_sent[0] + 0.01
-                robot.publish(robot.trajectory((0.1, ahead)))
-                await robot.go(2)
-
-        await stream(40)
+        await stream(robot, 40)
         assert robot.state.gate.commander == "ros2"
         assert robot.at("shoulder_pan") > 0.02
         robot.safe = False  # safety's process dies
-        await stream(30)
+        await stream(robot, 30)
         robot.safe = True
         stays = robot.at("shoulder_pan")
-        await stream(40)
+        await stream(robot, 40)
         assert robot.state.gate.mode == "idle"
         assert robot.at("shoulder_pan") == pytest.approx(stays, abs=0.01)
         await robot.go(30)
-        await stream(40)
+        await stream(robot, 40)
+        assert robot.at("shoulder_pan") > stays + 0.02
+
+
+async def test_a_frozen_gateway_counts_its_freeze_as_no_pause_of_a_stream(tmp_path):
+    async with ready(tmp_path) as (robot, _):
+        await stream(robot, 40)
+        assert robot.at("shoulder_pan") > 0.02
+        robot.gateway_network.frozen = True  # and its transport to ROS keeps only the newest
+        await robot.go(60)
+        robot.gateway_network.frozen = False
+        await robot.go(3)
+        stays = robot.at("shoulder_pan")
+        await stream(robot, 40)
+        assert robot.at("shoulder_pan") == pytest.approx(stays, abs=0.01)
+        assert robot.state.gate.mode == "idle"
+        await robot.go(30)
+        await stream(robot, 40)
         assert robot.at("shoulder_pan") > stays + 0.02
 
 

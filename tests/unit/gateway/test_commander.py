@@ -256,10 +256,27 @@ def test_a_lost_body_is_asked_for_after_a_pause_of_half_a_second():
     machine = Machine()
     machine.drives()
     machine.state(LATCHED)
-    machine.ms += 480
     machine.state(replace(IDLE, enables=4))
+    machine.sends(480)
     assert machine.command() == [Refuse("commander")]
-    machine.ms += 500
+    machine.sends(500)
+    assert machine.command() == [Ask(False)]
+
+
+@pytest.mark.parametrize("first", ["state", "command"])
+def test_a_commander_that_was_frozen_counts_its_freeze_as_no_pause_of_the_sender(first):
+    machine = Machine()
+    machine.drives()
+    machine.ms += 1500
+    machine.gate = replace(IDLE, enables=machine.gate.enables)
+    if first == "command":  # the gate refuses what it sends
+        machine.command()
+    for _ in range(20):
+        machine.state()
+        assert machine.command() == [Refuse("commander")]
+        machine.ms += 50
+    assert "the gate has stopped" in machine.memory.refusal
+    machine.sends(500)
     assert machine.command() == [Ask(False)]
 
 
