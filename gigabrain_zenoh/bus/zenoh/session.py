@@ -18,6 +18,7 @@ from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
 import zenoh
+from zenoh.handlers import Callback
 
 from gigabrain_zenoh.bus.bridge import Bridge
 from gigabrain_zenoh.bus.transport import Close
@@ -26,6 +27,7 @@ from gigabrain_zenoh.bus.zenoh.workarounds import (
     CLOSING_THREAD,
     await_zenoh_threads,
     disable_linger,
+    keep_thread_state,
 )
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import BusError, ConfigError
@@ -182,6 +184,19 @@ class OpenSession:
                 deliver(what)
 
         return delivered
+
+    def direct(self, deliver: Callable[[T], object]) -> Any:
+        """Return the same as a handler in Zenoh's receiving thread, where `deliver` must be short.
+
+        Any other callback of Zenoh's wakes a thread of its own for each message.
+        """
+
+        def delivered(what: T) -> None:
+            keep_thread_state()
+            if not self.cut:
+                deliver(what)
+
+        return Callback(delivered, indirect=False)
 
 
 Make = Callable[[OpenSession], Any]

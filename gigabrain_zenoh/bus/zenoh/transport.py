@@ -18,7 +18,7 @@ from gigabrain_zenoh.bus.zenoh.session import (
     has_subscriber,
     open_session,
 )
-from gigabrain_zenoh.bus.zenoh.workarounds import ReceiveThrottle, keep_thread_state
+from gigabrain_zenoh.bus.zenoh.workarounds import ReceiveThrottle
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import GigabrainError
 
@@ -77,24 +77,18 @@ class ZenohTransport:
 
         mailbox = Mailbox(self._bridge, deliver, depth)
         return self._lines.declare(
-            lambda line: line.session.declare_subscriber(key, line.guard(mailbox.put))
+            lambda line: line.session.declare_subscriber(key, line.direct(mailbox.put))
         )
 
     def tap(self, pattern: str, on_raw: OnRaw) -> Close:
-        """Subscribe with a callback in Zenoh's own thread; no sample is dropped here.
-
-        The callback is direct, because an indirect one wakes a separate thread for each message.
-        """
+        """Subscribe with a callback in Zenoh's own thread; no sample is dropped here."""
 
         def deliver(sample: zenoh.Sample) -> None:
-            keep_thread_state()
             on_raw(str(sample.key_expr), str(sample.encoding), sample.payload.to_bytes())
 
         take = self._nap.after_each(deliver) if self._nap else deliver
         return self._lines.declare(
-            lambda line: line.session.declare_subscriber(
-                pattern, Callback(line.guard(take), indirect=False)
-            )
+            lambda line: line.session.declare_subscriber(pattern, line.direct(take))
         )
 
     def watch_readers(self, key: str, on_readers: OnReaders) -> Close:

@@ -1,5 +1,6 @@
 """At the end of a process Zenoh's threads have ended: one that has not may abort it."""
 
+import asyncio
 import json
 import subprocess
 import sys
@@ -9,7 +10,10 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
+from gigabrain_schemas.topics import STATE
 from gigabrain_zenoh.bus.zenoh import workarounds
+from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
+from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.testing.processes import free_endpoint
 
 PROGRAM = """
@@ -66,6 +70,21 @@ def test_a_program_may_end_at_once(flood: str, way: str) -> None:
         command = (sys.executable, "-c", PROGRAM, flood, way)
         done = subprocess.run(command, capture_output=True, text=True, timeout=30)
         assert (done.returncode, done.stderr) == (0, "")
+
+
+async def test_a_subscription_starts_no_thread() -> None:
+    endpoint = free_endpoint()
+    with open_router(endpoint):
+        transport = await ZenohTransport.open(Endpoint(connect=(endpoint,)))
+        before, arrived = threading.active_count(), asyncio.Event()
+        for key in ("one", "two", "one"):
+            transport.subscribe(key, lambda _key, _payload: arrived.set(), 1)
+        transport.tap("**", lambda _key, _encoding, _payload: None)
+        assert threading.active_count() == before
+        transport.publish(STATE, "one", b"data", "")
+        await asyncio.wait_for(arrived.wait(), 10.0)
+        assert threading.active_count() == before
+        await transport.close()
 
 
 @pytest.mark.parametrize("name", ["Thread-1 (pyo3-closure)", workarounds.CLOSING_THREAD])
