@@ -1,5 +1,6 @@
 """Encodes messages to bytes and decodes them. A decoded message is valid."""
 
+import functools
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
@@ -16,6 +17,7 @@ MAX_ERROR_CHARS = 200  # an error quotes the message, which may have 60 kB
 encode = msgspec.msgpack.Encoder().encode
 
 
+@functools.cache
 def encoding_of(message: type[Message]) -> str:
     """Return the Zenoh encoding of a message type."""
     return f"application/msgpack;gigabrain.{message.__name__}"

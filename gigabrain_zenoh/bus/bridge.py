@@ -20,11 +20,11 @@ class Waker(Protocol):
         ...
 
     def signal(self) -> None:
-        """Make it readable. Raises BlockingIOError where it is more than readable already."""
+        """Make it readable."""
         ...
 
     def clear(self) -> None:
-        """Make it unreadable. Raises BlockingIOError where it was so already."""
+        """Make it unreadable, also where it was so already."""
         ...
 
     def close(self) -> None:
@@ -47,8 +47,11 @@ class EventFd:
         os.eventfd_write(self._fd, 1)
 
     def clear(self) -> None:
-        """Make it unreadable."""
-        os.eventfd_read(self._fd)
+        """Make it unreadable, also where it was so already."""
+        try:
+            os.eventfd_read(self._fd)
+        except BlockingIOError:
+            return
 
     def close(self) -> None:
         """Free the descriptor."""
@@ -69,11 +72,13 @@ class SocketPair:
 
     def signal(self) -> None:
         """Make it readable."""
-        self._write.send(b"\1")
+        with contextlib.suppress(BlockingIOError):  # full: it is more than readable
+            self._write.send(b"\1")
 
     def clear(self) -> None:
-        """Make it unreadable."""
-        self._read.recv(4096)
+        """Make it unreadable, also where it was so already."""
+        with contextlib.suppress(BlockingIOError):
+            self._read.recv(4096)
 
     def close(self) -> None:
         """Close both ends."""
@@ -99,11 +104,10 @@ class Bridge:
 
     def post(self, function: Callable[[Any], object], argument: Any) -> None:
         """Have the loop call `function(argument)`. From any thread; never blocks."""
-        if not self._open:
-            return
-        self._queue.append((function, argument))
-        if not self._signalled:
-            self._wake()
+        if self._open:
+            self._queue.append((function, argument))
+            if not self._signalled:
+                self._wake()
 
     def close(self) -> None:
         """Stop calling. What is still queued, or posted later, is dropped."""
@@ -116,14 +120,13 @@ class Bridge:
         self._queue.clear()
 
     def _wake(self) -> None:
-        with self._closing, contextlib.suppress(BlockingIOError):  # full: it is readable already
+        with self._closing:
             if self._open:
                 self._signalled = True
                 self._waker.signal()
 
     def _drain(self) -> None:
-        with contextlib.suppress(BlockingIOError):
-            self._waker.clear()
+        self._waker.clear()
         self._signalled = False  # before emptying: what comes now signals again
         try:
             for _ in range(len(self._queue)):  # bounded: what comes meanwhile waits its turn
@@ -163,14 +166,15 @@ class Mailbox(Generic[T]):
 
     def _deliver(self) -> None:
         self._posted = False  # before emptying, so that samples arriving from now on post again
-        if self._newest_only:
-            self._deliver_newest()
+        count = len(self._samples)
+        if self._newest_only and count > 1:
+            self._deliver_newest(count)
             return
-        for _ in range(len(self._samples)):
+        for _ in range(count):
             self._on_sample(self._samples.popleft())
 
-    def _deliver_newest(self) -> None:
-        waiting = [self._samples.popleft() for _ in range(len(self._samples))]
+    def _deliver_newest(self, count: int) -> None:
+        waiting = [self._samples.popleft() for _ in range(count)]
         for sample in reversed(waiting):
             if self._on_sample(sample) is not False:
                 break

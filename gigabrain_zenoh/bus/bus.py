@@ -30,14 +30,14 @@ class Rejections:
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
-        self._faults: dict[str, tuple[Fault, int]] = {}  # and the time of the last invalid message
+        self.faults: dict[str, tuple[Fault, int]] = {}  # and the time of the last invalid message
         self.counts: Counter[str] = Counter()
 
     def reject(self, key: str, error: ValueError) -> None:
         """Count an invalid message on `key`, and log the fault if it is new."""
         self.counts[key] += 1
-        fault, _ = self._faults.get(key, (Fault(log), 0))
-        self._faults[key] = fault, self._clock.now_ns()
+        fault, _ = self.faults.get(key, (Fault(log), 0))
+        self.faults[key] = fault, self._clock.now_ns()
         about = {"event": "rejected", "key": key}
         fault.begin(f"dropped a message on {key}: {error}", about)
 
@@ -46,11 +46,11 @@ class Rejections:
 
         While a valid and an invalid sender share the key, the fault stays.
         """
-        if key not in self._faults:
+        if key not in self.faults:
             return
-        fault, last_ns = self._faults[key]
+        fault, last_ns = self.faults[key]
         if self._clock.now_ns() - last_ns >= QUIET_NS:
-            del self._faults[key]
+            del self.faults[key]
             fault.end(f"{key} is valid again")
 
 
@@ -146,29 +146,36 @@ class Bus:
         Returns the function that ends it.
         """
         decode, pattern = Codec(topic.type, topic.max_bytes).decode, topic.at(name)
-        moves_time = topic.key in CLOCK_KEYS
+        moves_time, rejections, known = topic.key in CLOCK_KEYS, self._rejections, False
 
-        def receive(key: str, payload: bytes) -> bool:
+        def receive(key: str, payload: bytes) -> bool | None:
+            nonlocal known
             self.received[pattern] += 1
             try:
-                message = decode(payload)
-            except ValueError as error:
-                self._rejections.reject(pattern, error)
-                if on_bad:
-                    on_bad(payload)
-                return False
-            self._rejections.accept(pattern)
-            self.arrived[pattern] = message.boot, message.tick
-            self.input_log.note(key, message.seq)
-            if moves_time and not self._in_time(topic, message):
-                return False
-            on_message(key, message)
+                try:
+                    message = decode(payload)
+                except ValueError as error:
+                    rejections.reject(pattern, error)
+                    if on_bad:
+                        on_bad(payload)
+                    return False
+                if rejections.faults:
+                    rejections.accept(pattern)
+                self.arrived[pattern] = message.boot, message.tick
+                self.input_log.note(key, message.seq)
+                if moves_time and not self._in_time(topic, message):
+                    return False
+                on_message(key, message)
+            except Exception as error:  # noqa: BLE001 - ends the process: the runner raises it
+                self._fail(error)
+                return None
+            known = True
             return True
 
-        guarded = self._guard(receive)
-        if not topic.keep or topic.many:
-            return self._listening(pattern, self.transport.subscribe(pattern, guarded, topic.depth))
-        return self._listening(pattern, self._subscribe_kept(topic, guarded))
+        ends = self.transport.subscribe(pattern, receive, topic.depth)
+        if topic.keep and not topic.many:
+            ends = self._fetching_too(ends, topic, receive, lambda: known)
+        return self._listening(pattern, ends)
 
     def tap(self, pattern: str, on_raw: OnRaw) -> Close:
         """Call `on_raw(key, encoding, payload)` for all on `pattern`, valid or not, in any thread.
@@ -269,18 +276,6 @@ class Bus:
             ))  # fmt: skip
         return believed
 
-    def _guard(self, receive: OnSample) -> OnSample:
-        """Pass an exception of `receive` to `failed`, which ends the process."""
-
-        def guarded(key: str, payload: bytes) -> bool | None:
-            try:
-                return receive(key, payload)
-            except Exception as error:  # noqa: BLE001 - handed on whole, to be raised by the runner
-                self._fail(error)
-                return None
-
-        return guarded
-
     def _fail(self, error: Exception) -> None:
         if not self.failed.done():
             self.failed.set_exception(error)
@@ -302,53 +297,37 @@ class Bus:
         if first:
             self.transport.serve(key, answer)
 
-    def _subscribe_kept(self, topic: Topic[Any], receive: OnSample) -> Close:
-        """Receive live messages, and the kept value until either has come."""
-        live = known = False
+    def _fetching_too(
+        self, ends: Close, topic: Topic[Any], receive: OnSample, known: Callable[[], bool]
+    ) -> Close:
+        """Ask for the kept value until one is known, unless a live message has come.
 
-        def receive_live(key: str, payload: bytes) -> bool | None:
-            nonlocal live
-            taken = receive(key, payload)
-            live = live or taken is True
-            return taken
-
-        def receive_kept(key: str, payload: bytes) -> bool | None:
-            nonlocal known
-            if not live:  # a live message counts more than a kept one
-                known = receive(key, payload) is True or known
-            return known
-
-        ends = self.transport.subscribe(topic.key, receive_live, topic.depth)
-        fetching = self._fetch(topic, receive_kept, lambda: live or known)
-
-        def end() -> None:
-            fetching.cancel()
-            ends()
-
-        return end
-
-    def _fetch(
-        self, topic: Topic[Any], receive: OnSample, known: Callable[[], bool]
-    ) -> "asyncio.Task[None]":
-        """Ask for the kept value until one is known.
-
-        It was sent before the subscriber came, or its only message was lost.
+        It was sent before the subscriber came, or its only message was lost. Returns `ends`, which
+        ends this as well.
         """
 
         async def fetch() -> None:
             again_ns = FETCH_AGAIN_NS
-            try:
-                while True:
-                    for payload in await self.kept(topic):
-                        receive(topic.key, payload)
-                    if known():
-                        return
-                    await self.clock.sleep_ns(again_ns)
-                    again_ns = min(2 * again_ns, MAX_FETCH_AGAIN_NS)
-            except Exception as error:  # noqa: BLE001 - as in `_guard`: no code awaits this task
-                self._fail(error)
+            while True:
+                kept = await self.kept(topic)
+                for payload in () if known() else kept:
+                    receive(topic.key, payload)
+                if known():
+                    return
+                await self.clock.sleep_ns(again_ns)
+                again_ns = min(2 * again_ns, MAX_FETCH_AGAIN_NS)
+
+        def finished(task: "asyncio.Task[None]") -> None:
+            self._fetching.discard(task)
+            if not task.cancelled() and isinstance(error := task.exception(), Exception):
+                self._fail(error)  # no code awaits this task
 
         task = asyncio.get_running_loop().create_task(fetch())
         self._fetching.add(task)
-        task.add_done_callback(self._fetching.discard)
-        return task
+        task.add_done_callback(finished)
+
+        def end() -> None:
+            task.cancel()
+            ends()
+
+        return end
