@@ -26,6 +26,7 @@ ITERATIONS, CONVERGED = 20, 1e-4
 BESIDE_M = 0.3  # [m] round a wall a hit is judged by it, even where nothing else is known
 JUDGED = 0.5  # of the hits, at least; a place that the map shows less of scores lower
 BLUR_M = 0.25  # [m], a beam that ends so much behind a wall has passed through it
+CONTRADICTED_M = 2 * BLUR_M  # longer distances only make its steps along a beam longer
 Distances = NDArray[np.float32]
 
 ON_WALL_M = 0.15  # a wall that comes to lie this near another matches it
@@ -56,12 +57,20 @@ class FieldFit(NamedTuple):
     wrong: float  # 0 to 1, the share of beams that the map rules out, see `contradiction`
 
 
-def field_of(cells: NDArray[np.int8], cell: float, origin: tuple[float, float]) -> LikelihoodField:
-    """Make the field of an occupancy grid (height, width): 0 to 100 occupied, -1 unknown."""
-    reach = math.ceil(MAX_DISTANCE_M / cell) + 1
+def field_of(
+    cells: NDArray[np.int8],
+    cell: float,
+    origin: tuple[float, float],
+    farthest: float = MAX_DISTANCE_M,
+) -> LikelihoodField:
+    """Make the field of an occupancy grid (height, width): 0 to 100 occupied, -1 unknown.
+
+    Distances are capped at `farthest` [m]; for a `contradiction` alone, CONTRADICTED_M is enough.
+    """
+    reach = math.ceil(farthest / cell) + 1
     walls = np.where(cells >= OCCUPIED, np.int8(100), np.int8(0))
     distance = np.sqrt(squared_distance(walls, reach)) * np.float32(cell)
-    metres = np.minimum(distance, np.float32(MAX_DISTANCE_M))
+    metres = np.minimum(distance, np.float32(farthest))
     free = (cells >= 0) & (cells <= FREE)
     shown = (cells >= 0) | (metres <= BESIDE_M)
     return LikelihoodField(metres, free, shown, np.array(origin, np.float64), cell)

@@ -15,6 +15,7 @@ from gigabrain_zenoh.host.threads import ScheduledWorker, Take
 from gigabrain_zenoh.mapping.global_localization import MIN_POINTS, Candidate, apart, search
 from gigabrain_zenoh.mapping.keyframes import View
 from gigabrain_zenoh.mapping.likelihood_field import (
+    CONTRADICTED_M,
     LikelihoodField,
     clearance,
     contradiction,
@@ -369,7 +370,7 @@ class KidnapDetector:
         cells, corner = grid.around(float(pose[0]), float(pose[1]), JUDGED_RADIUS_M)
         if not cells.size:
             return False
-        field = field_of(cells, CELL, corner)
+        field = field_of(cells, CELL, corner, CONTRADICTED_M)
         share = contradiction(field, view.beams, pose)
         if share > self._usual + SUDDEN_INCREASE:
             self.scans += 1
