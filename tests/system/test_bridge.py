@@ -235,7 +235,8 @@ async def test_a_full_socket_pair_is_readable_and_that_is_enough() -> None:
     bridge = Bridge(lambda: pair)
     with contextlib.suppress(BlockingIOError):
         while True:
-            pair.signal()
+            pair._write.send(b"\1")
+    pair.signal()
     got: list[int] = []
     bridge.post(got.append, 1)
     await until(lambda: got)
