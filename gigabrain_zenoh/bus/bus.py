@@ -174,7 +174,7 @@ class Bus:
 
         ends = self.transport.subscribe(pattern, receive, topic.depth)
         if topic.keep and not topic.many:
-            ends = self._fetching_too(ends, topic, receive, lambda: known)
+            ends = self._fetch_kept(topic, receive, lambda: known, ends)
         return self._listening(pattern, ends)
 
     def tap(self, pattern: str, on_raw: OnRaw) -> Close:
@@ -297,13 +297,13 @@ class Bus:
         if first:
             self.transport.serve(key, answer)
 
-    def _fetching_too(
-        self, ends: Close, topic: Topic[Any], receive: OnSample, known: Callable[[], bool]
+    def _fetch_kept(
+        self, topic: Topic[Any], receive: OnSample, known: Callable[[], bool], ends: Close
     ) -> Close:
-        """Ask for the kept value until one is known, unless a live message has come.
+        """Ask for the kept value until that or a live message is known.
 
-        It was sent before the subscriber came, or its only message was lost. Returns `ends`, which
-        ends this as well.
+        It was sent before the subscriber came, or its only message was lost. The returned function
+        ends this, and calls `ends`.
         """
 
         async def fetch() -> None:
