@@ -1,6 +1,5 @@
 """Encodes messages to bytes and decodes them. A decoded message is valid."""
 
-import functools
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
@@ -17,7 +16,6 @@ MAX_ERROR_CHARS = 200  # an error quotes the message, which may have 60 kB
 encode = msgspec.msgpack.Encoder().encode
 
 
-@functools.cache
 def encoding_of(message: type[Message]) -> str:
     """Return the Zenoh encoding of a message type."""
     return f"application/msgpack;gigabrain.{message.__name__}"
