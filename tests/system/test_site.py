@@ -50,13 +50,16 @@ async def test_the_search_works_on_files_without_a_request_to_any_host(
 ) -> None:
     asked: list[str] = []
     page.on("request", lambda request: asked.append(request.url))
-    await page.goto((site / "index.html").as_uri())
-    await page.get_by_role("button", name="Search").click()
-    await page.keyboard.insert_text("safe_state")
-    for _ in range(300):  # the results are in a closed shadow root
-        await page.keyboard.press("Enter")
-        await page.wait_for_timeout(100)
-        if "/index.html" not in page.url:
+    for _ in range(5):  # Enter opens the first result, also before all pages have been read
+        await page.goto((site / "index.html").as_uri())
+        await page.get_by_role("button", name="Search").click()
+        await page.keyboard.insert_text("safe_state")
+        for _ in range(300):  # the results are in a closed shadow root
+            await page.wait_for_timeout(100)
+            await page.keyboard.press("Enter")
+            if "/index.html" not in page.url:
+                break
+        if "safe_state" in await page.inner_text("article"):
             break
     assert "safe_state" in await page.inner_text("article")
     assert [url for url in asked if not url.startswith("file:")] == []
