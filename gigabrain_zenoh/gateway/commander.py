@@ -21,7 +21,7 @@ MS = 1_000_000
 TIMEOUT_NS = 200 * MS  # longest period of a sender
 BRAKE_NS = 60 * MS  # silence after the period before zero is sent; the gate bears 100 ms
 RELEASE_NS = 500 * MS  # after the last command
-AWAKE_NS = 100 * MS  # longest time between two states that counts as silence of a sender
+AWAKE_NS = 100 * MS  # longest silence between two events; more is a freeze of this process
 AHEAD_NS = 100 * MS  # by which the clock of a stamp may be ahead of ours
 ASK_NS = 500 * MS  # from one request for the body to the next
 INTERVALS = 9  # of a sender, for their median
@@ -111,7 +111,7 @@ class Silence(Struct, frozen=True):
 
     @property
     def is_pause(self) -> bool:
-        """Whether the sender has paused, after which it may ask for a lost body again."""
+        """Return whether the sender has paused, and may ask for a lost body again."""
         return self.heard_ns >= RELEASE_NS
 
     def then(self, now_ns: int) -> "Silence":

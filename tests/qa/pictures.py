@@ -73,7 +73,7 @@ PLACES = (Place(name="kitchen", x=2.0, y=-2.2), Place(name="bed", x=-2.3, y=1.0)
 
 
 class Scene(NamedTuple):
-    """Who watches a robot, and its page in a browser."""
+    """A client that watches a robot, and the page in a browser."""
 
     seen: Probe
     page: Page
