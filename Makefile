@@ -146,9 +146,11 @@ ci-extra: slow train-tests first-starts page-commands
 page-commands: setup
 	$(BIN)/python -m tests.qa.documentation
 
-# tests of some 12 s and more, one after the other: robots side by side delay each other
+# tests of some 2 s (unit), 3 s (node) and 5 s (system) and more; the last ones one after the
+# other, as robots side by side delay each other
 slow: setup
-	$(PYTEST) -q -m 'slow and not qa' $(or $(ARGS),tests)
+	$(PYTEST) $(SIDE_BY_SIDE) -q -m 'slow and not qa' tests/unit tests/fuzz tests/node
+	$(PYTEST) -q -m 'slow and not qa' tests/system
 
 # from the sdist, from the wheel by each Python that is found, for one command, and `make demo`
 first-starts: setup

@@ -96,6 +96,7 @@ def simulation_of(body: str, backlash: float = 0.0) -> Simulation:
     return Simulation(model, load_world("table", 0), 0)
 
 
+@pytest.mark.slow
 def test_an_outstretched_piper_holds_its_payload_for_ever_and_warms_no_motor_beyond_its_limit() -> (
     None
 ):

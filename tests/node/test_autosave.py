@@ -216,6 +216,7 @@ async def test_a_replay_neither_reads_nor_writes(tmp_path: Path) -> None:
     assert [path.read_bytes() for path in files(tmp_path)] == before
 
 
+@pytest.mark.slow
 async def test_a_robot_that_stands_writes_no_more(tmp_path: Path) -> None:
     async with Walking(tmp_path) as robot:
         robot.say()

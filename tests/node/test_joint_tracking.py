@@ -6,7 +6,7 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.qa.bench.joints import measure_joints
 
 
-@pytest.mark.parametrize("body", ["so101", "piper"])
+@pytest.mark.parametrize("body", ["so101", pytest.param("piper", marks=pytest.mark.slow)])
 def test_joints_follow_a_sine_within_a_degree_and_hardly_overshoot_a_step(body: str) -> None:
     result = measure_joints(body, 0.1, 1.0, lambda _: None)
     assert len(result.joints) == {"so101": 5, "piper": 6}[body]

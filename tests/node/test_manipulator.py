@@ -63,6 +63,7 @@ def test_the_demo_of_any_arm_moves_blocks_and_heats_no_motor(tmp_path: Path, bod
     rig.manipulator.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", ["{pick: cube}", "{pick: cube}, {gripper: close}"])
 @pytest.mark.parametrize("body", ["so101", "piper"])
 def test_what_an_arm_holds_heats_no_motor_however_long(
@@ -123,6 +124,7 @@ def test_a_grip_is_firmer_while_the_arm_moves(rig: Rig) -> None:
     assert MOVING[0] < lags["lower"] < MOVING[-1]
 
 
+@pytest.mark.slow
 def test_safety_near_the_table_bends_no_way_of_the_piper_to_a_block(tmp_path: Path) -> None:
     rig = Rig(tmp_path, body="piper", world=Path("table"))
     rig.give(Path(mission_file("blocks", tmp_path)).read_text())
@@ -274,6 +276,7 @@ def test_what_slips_out_of_the_gripper_is_told(rig: Rig) -> None:
     assert "cube has slipped out of the gripper" in task.reason
 
 
+@pytest.mark.slow
 def test_a_gripper_that_safety_holds_back_is_not_taken_for_one_that_holds_something(
     rig: Rig,
 ) -> None:

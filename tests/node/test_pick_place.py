@@ -31,6 +31,7 @@ def home(planner: PickPlacePlanner) -> np.ndarray:
     return np.array(robot.arm.home[: len(planner.arm.joints)])
 
 
+@pytest.mark.slow
 def test_things_of_all_kinds_are_picked_up_and_put_down() -> None:
     result = measure_hands(SEEDS, "so101", lambda _: None)
     assert {run.kind for run in result.runs} == {"cube", "cylinder", "sphere"}

@@ -102,6 +102,7 @@ async def test_it_looks_for_a_can_in_the_next_room() -> None:
         assert plane.off(7.2, 0.6)[0] < 0.6
 
 
+@pytest.mark.slow
 async def test_where_there_is_none_it_says_so_after_it_has_looked_everywhere() -> None:
     async with Seeing(thing(3, 2.8, 1.2, "ball")) as plane:
         await plane.go(0.5)

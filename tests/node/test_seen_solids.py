@@ -132,6 +132,7 @@ def test_a_mission_picks_up_what_is_seen_and_puts_it_down(rig: SeeingRig) -> Non
     assert (x, y) == pytest.approx((0.14, 0.15), abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rig", [BELOW_ITS_HAND], indirect=True)
 def test_a_thing_below_its_own_hand_is_seen_once_the_arm_is_out_of_the_way(rig: SeeingRig) -> None:
     rig.look()

@@ -55,6 +55,7 @@ def rms(values: NDArray[np.float64]) -> list[float]:
     return np.sqrt((values**2).mean(axis=0)).tolist()  # type: ignore[no-any-return]
 
 
+@pytest.mark.slow
 def test_a_minute_at_03_metres_a_second_within_002_rms_and_without_a_fall() -> None:
     simulation = Simulation(alpha(), room(), 0)
     errors = walk(simulation, 60, lambda _: Twist(0.3, 0.0, 0.0))

@@ -114,6 +114,7 @@ async def test_a_zone_ahead_is_avoided_although_the_old_path_leads_through_it() 
         assert least > 0.0
 
 
+@pytest.mark.slow
 async def test_a_robot_inside_a_zone_leaves_it_by_the_shortest_way() -> None:
     lab = box("lab", 1.0, 1.0, 6.0, 5.0)
     async with Plane(HALL, at=(2.0, 3.0, 0.0)) as plane:
@@ -134,6 +135,7 @@ async def test_a_robot_inside_a_zone_leaves_it_by_the_shortest_way() -> None:
         assert least > 0.0
 
 
+@pytest.mark.slow
 async def test_a_robot_leaving_a_zone_sees_the_obstacles_in_it() -> None:
     cells = HALL.copy()
     cells[40:80, 30:32] = 100  # a wall between the robot and the nearest edge
@@ -156,6 +158,7 @@ async def test_zones_over_the_whole_map_leave_no_goal() -> None:
         assert (await plane.ask(GOAL, GoalRequest(x=7.0, y=3.0))).ok
 
 
+@pytest.mark.slow
 async def test_the_body_is_slow_in_a_speed_zone_and_before_it() -> None:
     ramp = box("ramp", 3.0, 0.0, 5.0, 6.0, max_speed=0.1)
     async with Plane(HALL, at=(1.0, 3.0, 0.0)) as plane:
@@ -169,6 +172,7 @@ async def test_the_body_is_slow_in_a_speed_zone_and_before_it() -> None:
         assert any("at most 0.10 m/s: speed zone 'ramp'" in reason for reason in reasons)
 
 
+@pytest.mark.slow
 async def test_a_one_way_lane_is_driven_along_and_gone_round_against() -> None:
     lane = Zone(name="lane", kind="one_way", points=((2.0, 3.0), (6.0, 3.0)), lane_width=2.0)
 

@@ -215,6 +215,7 @@ def test_the_robot_has_all_three_links() -> None:
     assert catalog.load_link("alpha", run)[2].port == "/ports/base"  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow
 async def test_parked_it_lies_and_a_new_driver_leaves_it_lying(rig: Rig) -> None:
     rig.driver.robot = replace(rig.driver.robot, safe_state="park")
     rig.streaming = (0.3, 0.0, 0.0)

@@ -133,6 +133,7 @@ async def test_a_limp_arm_falls_by_a_persons_word_and_holds_again(arm: Probe) ->
         await script.enable(take=True)
 
 
+@pytest.mark.slow
 async def test_an_operator_jogs_through_control(arm: Probe) -> None:
     async with connect(source="operator") as script:
         await until(lambda: arm.state.gate.commander == "control", "the brain goes on")
@@ -150,6 +151,7 @@ async def test_an_operator_jogs_through_control(arm: Probe) -> None:
         assert arm.state.gate.commander == "control"
 
 
+@pytest.mark.slow
 async def test_commands_show_and_move_the_arm(shared_home: Home, arm: Probe) -> None:
     shown = await shared_home.run("arm", "state")
     assert (await shown.ended(), len(shown.out.splitlines())) == (0, 8), shown.err
@@ -160,6 +162,7 @@ async def test_commands_show_and_move_the_arm(shared_home: Home, arm: Probe) -> 
     assert posture(arm) == pytest.approx(HOME, abs=NEAR)
 
 
+@pytest.mark.slow
 async def test_the_tools_miss_no_scans_worlds_or_wheels(shared_home: Home, arm: Probe) -> None:
     await until(lambda: arm.state.gate.commander == "control", "the brain goes on")
     why = await shared_home.run("why")

@@ -28,6 +28,7 @@ def can_draw() -> bool:
     return True
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not can_draw(), reason="there is no OpenGL here")
 async def test_a_demo_with_cameras_gives_picture_depth_and_info_also_after_a_death(
     home: Home,

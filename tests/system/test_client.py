@@ -220,6 +220,7 @@ async def test_several_robots_are_listed(
         assert (await script.read_state()).boot == robot.state.boot
 
 
+@pytest.mark.slow
 async def test_no_robot_no_router_and_no_driver_are_told_apart(
     tmp_path_factory: pytest.TempPathFactory, home: Home, monkeypatch: pytest.MonkeyPatch
 ) -> None:

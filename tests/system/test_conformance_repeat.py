@@ -32,6 +32,7 @@ def test_a_single_try_says_what_it_measured() -> None:
     )
 
 
+@pytest.mark.slow
 async def test_only_the_stops_are_repeated(tmp_path: Path) -> None:
     told: list[str] = []
     results = await kit.check("mock", "sim", tmp_path, told.append, repeat=2)

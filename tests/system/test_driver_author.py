@@ -29,6 +29,7 @@ def installed(folder: Path, site: Path) -> Path:
     return package.rename(site / package.name)
 
 
+@pytest.mark.slow
 async def test_a_new_driver_passes_the_kit_by_its_name(tmp_path: Path, site: Path) -> None:
     folder = authoring.write_package("kit_probe", tmp_path)
     assert folder == tmp_path / "gigabrain-kit-probe"

@@ -125,6 +125,7 @@ def test_it_writes_what_its_row_declares_and_what_tells_of_itself() -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 async def test_up_starts_it_and_restarts_it_when_it_hangs(tmp_path: Path, package: Path) -> None:
     home, hang = HomeWithLamp(tmp_path / "home", package), tmp_path / "hang"
     router = f"tcp/127.0.0.1:{free_port()}"

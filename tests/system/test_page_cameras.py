@@ -101,6 +101,7 @@ async def test_a_broken_picture_is_named_and_the_next_one_shown(
     await page.wait_for_selector(f"{figure}:not(.blind)")
 
 
+@pytest.mark.slow
 async def test_boxes_are_drawn_over_the_picture_and_can_be_switched_off(
     chromium: Browser, fake: Fake
 ) -> None:

@@ -117,7 +117,13 @@ async def test_a_flood_is_cut_off_and_others_go_on(robot: Robot) -> None:
 
 
 @pytest.mark.usefixtures("served")
-@pytest.mark.parametrize("begun", [b"", b"GET / HTTP/1.1\r\nHost: "], ids=["silent", "half"])
+@pytest.mark.parametrize(
+    "begun",
+    [
+        pytest.param(b"", id="silent"),
+        pytest.param(b"GET / HTTP/1.1\r\nHost: ", id="half", marks=pytest.mark.slow),
+    ],
+)
 async def test_silent_connections_keep_no_browser_out(robot: Robot, begun: bytes) -> None:
     with contextlib.ExitStack() as stack:
         for _ in range(100):
@@ -151,6 +157,7 @@ async def test_a_page_asked_for_by_another_name_is_not_given(robot: Robot) -> No
     await writer.wait_closed()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("served")
 async def test_a_viewer_that_never_reads_slows_neither_robot_nor_others(robot: Robot) -> None:
     reader, writer = await asyncio.open_connection("127.0.0.1", robot.port, limit=1024)

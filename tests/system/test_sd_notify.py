@@ -18,6 +18,7 @@ def knows_of_the_manager(pid: int) -> bool:
     return b"NOTIFY_SOCKET" in Path(f"/proc/{pid}/environ").read_bytes()
 
 
+@pytest.mark.slow
 async def test_up_tells_its_service_manager_how_all_are_doing(
     home: Home, service_manager: ServiceManager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,6 +2,8 @@
 
 import signal
 
+import pytest
+
 from gigabrain_schemas.requests import DescribeRequest
 from gigabrain_schemas.topics import DESCRIBE
 from gigabrain_zenoh.config.settings import Endpoint
@@ -61,6 +63,7 @@ async def test_a_second_driver_for_the_same_body_is_refused_in_one_line(home: Ho
     await until(lambda: "ready" in namesake.err, "a driver in a namespace of its own")
 
 
+@pytest.mark.slow
 async def test_of_two_drivers_that_start_together_exactly_one_stays(home: Home) -> None:
     where = f"tcp/127.0.0.1:{free_port()}"
     home.start("router", "--listen", where)

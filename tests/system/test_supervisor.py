@@ -64,6 +64,7 @@ async def test_a_process_that_dies_is_started_again() -> None:
         ]
 
 
+@pytest.mark.slow
 async def test_a_process_that_freezes_for_ever_is_killed_and_started_again() -> None:
     beating = """
 say('ready')

@@ -180,6 +180,7 @@ def pid_of(home: Home, process: str) -> int:
     raise AssertionError(process)
 
 
+@pytest.mark.slow
 async def test_an_e_stop_is_named_with_the_way_out(demo: Home) -> None:
     for _ in range(20):  # as busy as the machine may be
         moves = await demo.run("why")

@@ -241,6 +241,7 @@ async def test_what_is_wrong_in_a_file_is_said_with_its_line(
     assert home.processes() == []
 
 
+@pytest.mark.slow
 async def test_a_taken_port_is_said_in_one_line(home: Home) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))

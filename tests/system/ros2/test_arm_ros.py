@@ -191,6 +191,7 @@ async def test_goals_are_cancelled_and_preempted(robot: Robot, judge: Judge) -> 
     await robot.becomes("idle")
 
 
+@pytest.mark.slow
 async def test_a_tolerance_that_cannot_be_kept_ends_a_goal(robot: Robot, judge: Judge) -> None:
     client = await following(judge, robot)
 
@@ -206,6 +207,7 @@ async def test_a_tolerance_that_cannot_be_kept_ends_a_goal(robot: Robot, judge: 
     await robot.becomes("idle")
 
 
+@pytest.mark.slow
 async def test_the_topic_moves_the_arm_and_wild_messages_are_named(
     robot: Robot, judge: Judge
 ) -> None:
@@ -232,6 +234,7 @@ async def test_the_topic_moves_the_arm_and_wild_messages_are_named(
     await until(lambda: "refused" not in refused(), "nothing is refused")
 
 
+@pytest.mark.slow
 async def test_the_example_moves_two_joints(robot: Robot, judge: Judge, ros2: Path) -> None:
     command = (str(ros2), str(ROOT / "examples/ros2/move_arm.py"))
     text = ""

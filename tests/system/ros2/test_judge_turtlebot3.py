@@ -109,6 +109,7 @@ def test_a_frozen_node_stops_it_until_the_next_command(judge: Judge) -> None:
     moving(robot)
 
 
+@pytest.mark.slow
 def test_two_robots_with_namespaces_share_a_world_of_topics(judge: Judge) -> None:
     left = judge.start("turtlebot3", namespace="/left", stamped=True)
     judge.start("turtlebot3", namespace="/right")

@@ -156,6 +156,7 @@ async def test_an_initialpose_of_rviz_reaches_the_map_maker(robot: Robot, judge:
     await published(judge, "/initialpose", GUESS, right, taken)
 
 
+@pytest.mark.slow
 async def test_the_map_is_saved_and_read_by_those_who_come_late(robot: Robot, judge: Judge) -> None:
     await mapped(judge.start("navigate"))
     caller, listener = judge.start("call"), judge.start("listen")

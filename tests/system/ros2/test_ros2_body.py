@@ -199,6 +199,7 @@ async def test_a_guard_that_starts_slowly_is_not_started_again(
     assert process.returncode == 0  # waited for
 
 
+@pytest.mark.slow
 async def test_bringup_finds_it_whole_or_names_the_wrong_type(judge: Judge, tmp_path: Path) -> None:
     judge.start("turtlebot3", walls=ROOM)  # which takes Twist, as on Humble
     file = robot_file(judge, tmp_path)

@@ -153,6 +153,7 @@ async def test_a_thousand_requests_get_a_thousand_replies(judge: Judge, bus: Bus
     print(f"median {statistics.median(took_ms):.2f} ms, p99 {took_ms[989]:.2f} ms")
 
 
+@pytest.mark.slow
 async def test_many_requests_at_once_are_all_answered(judge: Judge, bus: Bus) -> None:
     bus.serve("/estop", SET_BOOL, wait_s=0.05, success=True)
     programs = [await asyncio.to_thread(judge.start, "call", f"call{n}") for n in range(3)]
@@ -183,6 +184,7 @@ async def test_replies_and_requests_longer_than_a_datagram_arrive(judge: Judge, 
     assert bus.requests[-1].map.data.tolist() == cells[:200_000]
 
 
+@pytest.mark.slow
 async def test_a_server_is_found_again_after_its_process_was_killed(judge: Judge) -> None:
     call = judge.start("call")
     with server(judge.domain, "/estop", "first"):
@@ -198,6 +200,7 @@ async def test_a_server_is_found_again_after_its_process_was_killed(judge: Judge
         print(f"found again in {time.monotonic() - began:.2f} s")
 
 
+@pytest.mark.slow
 async def test_two_servers_in_two_processes_answer_their_services(judge: Judge) -> None:
     call = judge.start("call")
     with server(judge.domain, "/left/estop", "left"), server(judge.domain, "/right/estop", "right"):

@@ -62,6 +62,7 @@ async def test_topics_of_rclpy_are_listed_with_types_qos_and_nodes(
     assert "node /gigabrain is not among them" in shown.err
 
 
+@pytest.mark.slow
 async def test_where_no_node_is_found_it_says_what_to_check(home: Home, judge: Judge) -> None:
     command = await home.run("ros2", "topics", *join(judge))
     assert await command.ended() == 1

@@ -18,7 +18,7 @@ from gigabrain_drivers.bodies.feetech.servo import ServoBus, ServoModel
 from gigabrain_schemas.body import JointDescription
 
 BYTE_ERRORS = 0.001
-SHORT = 50_000
+SHORT = 10_000
 FULL = pytest.param(1_000_000, marks=pytest.mark.slow)
 LATE_FRAMES = 12  # that a servo may wait for the rest of a frame whose length was hit
 PERIOD_NS = 10_000_000

@@ -172,6 +172,7 @@ def test_work_that_failed_is_raised_at_its_scan() -> None:
     background.close()
 
 
+@pytest.mark.slow
 def test_who_crowds_the_robot_does_not_put_it_at_the_other_end_of_a_hall() -> None:
     """In a hall that is the same from both ends, odometry alone says which of them it is."""
     rooms = Rooms(HALL)
@@ -189,6 +190,7 @@ def test_who_crowds_the_robot_does_not_put_it_at_the_other_end_of_a_hall() -> No
     assert error(place, between(at(3.0, 3.0), walker.pose)) < 0.1
 
 
+@pytest.mark.slow
 def test_bumped_askew_it_is_found_where_it_was_though_the_hall_has_another_such_place() -> None:
     _, walker = grown(Rooms(HALL), (3.0, 3.0), *HALL_ROUND)
     walker.go((11.0, 3.2))

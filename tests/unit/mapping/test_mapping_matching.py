@@ -50,6 +50,7 @@ def test_along_a_corridor_without_ends_odometry_decides_and_is_not_believed_for_
     assert across > 100 * along
 
 
+@pytest.mark.slow
 def test_without_points_there_is_nothing_to_find() -> None:
     nothing = Scan.of(np.empty((0, 2)))
     local = build([nothing], IDENTITY[None], IDENTITY, 0.05, 0.08)

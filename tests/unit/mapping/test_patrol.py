@@ -75,6 +75,7 @@ def test_a_map_of_known_ground_is_saved_and_gone_on_with(patrol: Patrol) -> None
     assert again.report()["keyframes"] <= patrol.keyframes[-1] + 0.1 * patrol.keyframes[0]
 
 
+@pytest.mark.slow
 def test_furniture_that_is_moved_is_followed_and_adds_little() -> None:
     patrol = Patrol()
     patrol.rounds(FIRST)

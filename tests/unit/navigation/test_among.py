@@ -145,6 +145,7 @@ def test_what_moves_takes_its_hits_along_and_a_wall_beside_it_stays() -> None:
     assert left[80 + 15, 80 + 32] < 0.03
 
 
+@pytest.mark.slow
 def test_a_stream_of_quick_discs_is_crossed_on_the_hard_plant() -> None:
     lanes = [
         MovingDisc(8.0, np.array([(0.0, 3.0 + i % 2, s * 6.4), (8.0, 3.0 + i % 2, -s * 6.4)]), 0.5)

@@ -149,6 +149,7 @@ def test_a_grid_that_needs_more_room_than_thought_gets_it() -> None:
     np.testing.assert_array_equal(field, GridSearch().field(cost, (30, 30), "from"))
 
 
+@pytest.mark.slow
 def test_marks_of_months_of_searches_are_reset_in_time() -> None:
     search, cost = GridSearch(), np.ones((20, 30))
     expected = search.path(cost, (1, 1), (15, 22))

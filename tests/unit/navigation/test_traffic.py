@@ -168,6 +168,7 @@ def crowd() -> BarnWorld:
     return BarnWorld(3, np.empty((0, 3)), movers, (0.0, 0.0, 0.0), (13.0, 0.0), 13.0)
 
 
+@pytest.mark.slow
 def test_it_goes_round_a_crowd() -> None:
     trial = drive_functions(crowd(), 0, HARD, 200)
     assert trial.result == "success"

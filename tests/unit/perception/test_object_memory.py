@@ -217,6 +217,7 @@ def test_memory_goes_on_after_saving_and_loading_and_keeps_its_ids() -> None:
     assert other.labels == ["can", "ball"]
 
 
+@pytest.mark.slow
 def test_thousands_of_things_anywhere_are_bounded_and_keep_what_is_sure() -> None:
     eye = Eye()
     eye.look(("can", CAN), pictures=20)

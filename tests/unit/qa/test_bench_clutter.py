@@ -73,6 +73,7 @@ def test_most_of_what_stands_there_is_not_in_the_plane_of_the_lidar(world: Clutt
     assert world.pits
 
 
+@pytest.mark.slow
 def test_all_kinds_are_drawn() -> None:
     worlds = [draw_cluttered(seed, BODY) for seed in range(20, 26)]
     assert {kind for world in worlds for kind in world.kinds} == set(KINDS)

@@ -120,6 +120,7 @@ def test_a_cut_log_is_refused_in_one_line(tmp_path: Path) -> None:
         load(tmp_path / "nope.npz")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not DATA, reason="GIGABRAIN_DATA does not name the folder of laser logs")
 def test_edmonton_is_mapped_within_7_cm_of_its_reference() -> None:
     recorded = load(Path(str(DATA)) / "slam" / "edmonton.npz")
@@ -132,6 +133,7 @@ def test_edmonton_is_mapped_within_7_cm_of_its_reference() -> None:
     assert total([result]).mean_m == result.graph.mean_m
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not DATA, reason="GIGABRAIN_DATA does not name the folder of laser logs")
 def test_freiburg_is_mapped_where_its_odometry_has_the_wrong_sign() -> None:
     """Of every fourth scan: a stretch of it is driven backwards, and odometry says forwards."""
@@ -142,6 +144,7 @@ def test_freiburg_is_mapped_where_its_odometry_has_the_wrong_sign() -> None:
     assert result.breaks == 0
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not DATA, reason="GIGABRAIN_DATA does not name the folder of laser logs")
 def test_long_corridors_do_not_cross() -> None:
     """After 600 m without a loop the robot comes back 16 m from where it is thought to be."""
@@ -151,6 +154,7 @@ def test_long_corridors_do_not_cross() -> None:
     assert result.breaks == 0
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not DATA, reason="GIGABRAIN_DATA does not name the folder of laser logs")
 def test_leaves_and_slopes_do_not_end_a_map_outdoors() -> None:
     """Scans that fit nothing broke it eight times, and gtsam raised at scan 976."""

@@ -250,6 +250,7 @@ def test_a_host_that_gets_another_address_is_reached_there():
     assert got == [b"here"]
 
 
+@pytest.mark.slow
 def test_sixty_participants_with_four_services_find_each_other():
     ether = Ether()
     everyone = [ether.join(number) for number in range(1, 61)]

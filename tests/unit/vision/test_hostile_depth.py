@@ -4,6 +4,7 @@ import math
 
 import msgspec
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -105,6 +106,7 @@ def test_depth_of_a_camera_without_depth_is_refused() -> None:
     assert "no depth" in eyes.add_depth("front", image(np.ones((240, 320), np.uint16)), START, 0.0)
 
 
+@pytest.mark.slow
 def test_clutter_is_no_more_than_128_contours() -> None:
     random = np.random.default_rng(0)
     eyes = ObstacleContours(body(LOW))

@@ -15,6 +15,7 @@ def test_it_has_at_most_400_000_parameters_of_four_bytes():
     assert 1_000_000 < WEIGHTS.stat().st_size < 4 * 400_000 + 20_000
 
 
+@pytest.mark.slow
 def test_it_finds_things_in_rooms_with_textures_and_lights_that_it_does_not_know(tmp_path):
     try:
         open_graphics(64, 64).free()
