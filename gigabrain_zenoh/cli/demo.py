@@ -145,7 +145,7 @@ def demo(*, robot: RobotOptions = ROBOT, view: ViewOptions = VIEW) -> int:
 
     Example: gigabrain demo --world house --seconds 60 --speed 5 --headless
 
-    Exit code 1 after a contact, if it did not move, or if a process died.
+    Exit code 1 after a contact, if it did not move, or if a process died; 0 after Ctrl-C.
     """
     from gigabrain_zenoh.launch.demo import Demo, DemoOptions, with_page
 
