@@ -1,6 +1,7 @@
 """Requests to a robot: of its gate, its e-stop and its audit log."""
 
 import asyncio
+import math
 from collections.abc import Mapping
 from typing import TypeVar
 
@@ -32,7 +33,7 @@ from gigabrain_schemas.topics import (
     Service,
 )
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.errors import BodyLost, NotConfirmed, Refused, StillStopping
+from gigabrain_zenoh.errors import BodyLost, ConfigError, NotConfirmed, Refused, StillStopping
 from gigabrain_zenoh.runtime.audit import in_order
 from gigabrain_zenoh.security.identity_files import may_not_ask
 
@@ -86,7 +87,11 @@ async def let_go(bus: Bus, limp: bool, keys: str = "") -> GateReply:
 
 
 def jog(bus: Bus, speeds: Mapping[str, float]) -> None:
-    """Publish the velocities of joints [rad/s or m/s] that an operator wants."""
+    """Publish the velocities of joints [rad/s or m/s] that an operator wants.
+
+    Raises ConfigError for one that is not finite.
+    """
+    check_finite(speeds)
     names, values = tuple(speeds), tuple(speeds.values())
     bus.publish(JOINT_TELEOP, JointSpeeds(name=names, velocity=values))
 
@@ -109,8 +114,19 @@ async def set_param(bus: Bus, process: str, name: str, value: str) -> str:
 
 
 def steer(bus: Bus, wanted: Velocity) -> None:
-    """Publish the velocity that an operator wants of the robot's own control."""
+    """Publish the velocity that an operator wants of the robot's own control.
+
+    Raises ConfigError for one that is not finite.
+    """
+    check_finite(asdict(wanted))
     bus.publish(TELEOP, Twist(**asdict(wanted)))
+
+
+def check_finite(numbers: Mapping[str, float]) -> None:
+    """Raise ConfigError for the first that is NaN or infinite."""
+    for name, number in numbers.items():
+        if not math.isfinite(number):
+            raise ConfigError(f"{name}: expected a finite number, got {number}")
 
 
 async def change_world(bus: Bus, request: SimRequest, keys: str = "") -> SimReply:

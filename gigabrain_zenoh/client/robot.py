@@ -31,6 +31,7 @@ from gigabrain_zenoh.client.objects import known_objects
 from gigabrain_zenoh.client.requests import (
     ANSWER_S,
     audit_log,
+    check_finite,
     enable,
     jog,
     let_go,
@@ -132,13 +133,15 @@ class Robot:
         """Drive [m/s, m/s, rad/s] for one second, or until the next call.
 
         Returns the velocity within the body's limits. The first call asks the gate for the body,
-        which this script then keeps. Raises Refused if the gate does not grant it, or if another
-        commander has taken the body over or latched it.
+        which this script then keeps. Raises ConfigError for a number that is not finite, and
+        Refused if the gate does not grant the body, or if another commander has taken it over or
+        latched it.
         """
+        wanted = Velocity(linear_x=linear_x, linear_y=linear_y, angular_z=angular_z)
+        check_finite(asdict(wanted))
         state, body = await self.read_state(), await self.read_body()
         if not body.has_base:
             raise Unsupported(f"{body.robot_type} has no base to drive")
-        wanted = Velocity(linear_x=linear_x, linear_y=linear_y, angular_z=angular_z)
         wanted = clamp(wanted, limits_of(body))
         if not self._lease.has(state):
             await self._acquire()
@@ -147,7 +150,11 @@ class Robot:
         return wanted
 
     async def drive(self, linear_x: float = 0.0, angular_z: float = 0.0, *, seconds: float) -> None:
-        """Drive for `seconds` of the robot's time, then stop. Raises Refused, and BodyLost."""
+        """Drive for `seconds` of the robot's time, then stop.
+
+        Raises what `set_base_velocity` raises.
+        """
+        check_finite({"seconds": seconds})
         start = (await self.read_state()).tick
         last = start + round(seconds * 50)
         while (left := last - self._bus.time.tick) > 0:
@@ -182,7 +189,8 @@ class Robot:
         return await let_go(self._bus, False, self._keys)
 
     async def _carry_out(self, distance: float, angle: float, speed: float | None) -> Reached:
-        if speed is not None and speed <= 0:
+        check_finite({"distance": distance, "angle": angle})
+        if speed is not None and not speed > 0:
             raise ConfigError(f"speed: expected more than 0, got {speed:g}")
         motion = OdometryMotion(await self.read_body(), await self.read_state(), distance, angle)
         while not motion.done:
