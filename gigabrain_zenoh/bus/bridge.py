@@ -141,40 +141,57 @@ class Bridge:
 
 T = TypeVar("T")
 SPARE = 8  # samples kept at depth 1, of which the newest readable one is delivered
+MOST_KEYS = 64  # of one mailbox
 
 
 class Mailbox(Generic[T]):
-    """Queue of at most `depth` samples for a busy event loop; new samples replace the oldest.
+    """Queues of at most `depth` samples for a busy event loop; new samples replace the oldest.
 
-    With `depth` 1, only the newest readable sample is delivered. A sample is unreadable if
-    `on_sample` returns False. The mailbox keeps a few spares, so that invalid samples do not
-    displace a valid one.
+    Each key has its own queue, so that no camera displaces another one's samples. With `depth` 1,
+    only the newest readable sample of a key is delivered. A sample is unreadable if `on_sample`
+    returns False. The mailbox keeps a few spares, so that invalid samples do not displace a valid
+    one.
     """
 
     def __init__(self, bridge: Bridge, on_sample: Callable[[T], bool | None], depth: int) -> None:
         self._bridge, self._on_sample = bridge, on_sample
         self._newest_only = depth == 1
-        self._samples: deque[T] = deque(maxlen=SPARE if self._newest_only else depth)
+        self._size = SPARE if self._newest_only else depth
+        self._queues: dict[str, deque[T]] = {}
+        self._adding = threading.Lock()
         self._posted = False
 
-    def put(self, sample: T) -> None:
+    def put(self, sample: T, key: str = "") -> None:
         """Store a sample and wake the event loop. Never blocks; may be called from any thread."""
-        self._samples.append(sample)
+        queue = self._queues.get(key)
+        if queue is None:
+            queue = self._add(key)
+        queue.append(sample)
         if not self._posted:
             self._posted = True
             self._bridge.post(Mailbox._deliver, self)
 
+    def _add(self, key: str) -> deque[T]:
+        with self._adding:
+            queues = dict(self._queues)  # a copy, as the loop may be looking through them
+            queue = queues.setdefault(key, deque(maxlen=self._size))
+            if len(queues) > MOST_KEYS:  # the first one is added again with its next sample
+                queues.pop(next(iter(queues)))
+            self._queues = queues
+            return queue
+
     def _deliver(self) -> None:
         self._posted = False  # before emptying, so that samples arriving from now on post again
-        count = len(self._samples)
-        if self._newest_only and count > 1:
-            self._deliver_newest(count)
-            return
-        for _ in range(count):
-            self._on_sample(self._samples.popleft())
+        for queue in self._queues.values():
+            count = len(queue)
+            waiting = [queue.popleft() for _ in range(count)]
+            if self._newest_only and count > 1:
+                self._deliver_newest(waiting)
+                continue
+            for sample in waiting:
+                self._on_sample(sample)
 
-    def _deliver_newest(self, count: int) -> None:
-        waiting = [self._samples.popleft() for _ in range(count)]
+    def _deliver_newest(self, waiting: list[T]) -> None:
         for sample in reversed(waiting):
             if self._on_sample(sample) is not False:
                 break

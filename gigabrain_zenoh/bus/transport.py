@@ -43,7 +43,8 @@ class Transport(Protocol):
     def subscribe(self, key: str, on_sample: OnSample, depth: int) -> Close:
         """Call `on_sample` for each sample on `key`; a busy loop keeps the newest `depth` samples.
 
-        With a depth of one, it keeps the newest sample for which `on_sample` does not return False.
+        Of a pattern it keeps so many of each key. With a depth of one, it keeps the newest sample
+        for which `on_sample` does not return False.
         """
         ...
 

@@ -51,7 +51,7 @@ class Topic(Generic[M]):
     congestion: Literal["drop", "block"] = "drop"
     express: bool = False  # not batched: for small messages that must not wait
     keep: bool = False  # the last value is kept for late joiners
-    depth: int = 1  # messages that wait for a busy reader; the oldest are dropped
+    depth: int = 1  # messages of a key that wait for a busy reader; the oldest are dropped
     max_bytes: int = 4 * KB  # larger ones are not even decoded
     many: bool = False  # one key per camera or process below this one
     publishers: tuple[Role, ...] = ()  # may publish it, besides the robot itself

@@ -17,8 +17,10 @@ from gigabrain_schemas.topics import (
     IMAGE,
     INTENT,
     MAP,
+    PERCEIVED,
     STATE,
     TELEOP,
+    Topic,
 )
 from gigabrain_zenoh.bus.bridge import Mailbox
 from gigabrain_zenoh.bus.bus import Bus
@@ -104,12 +106,28 @@ async def test_each_topic_goes_out_with_the_quality_of_service_of_its_line(
     assert qos("robot/health/control") == (zenoh.Priority.BACKGROUND, drop, False, kind + "Health")
 
 
-def publish_200_without_leaving_the_loop(sender: ZenohTransport, arrived: list[bytes]) -> None:
+@pytest.fixture
+def arrived(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
+    """What the loop will find."""
+    payloads: list[bytes] = []
+
+    class Watched(Mailbox[zenoh.Sample]):
+        def put(self, sample: zenoh.Sample, key: str = "") -> None:
+            super().put(sample, key)
+            payloads.append(sample.payload.to_bytes())
+
+    monkeypatch.setattr(zenoh_transport, "Mailbox", Watched)
+    return payloads
+
+
+def publish_200_without_leaving_the_loop(
+    sender: ZenohTransport, topic: Topic[Any], keys: list[str], arrived: list[bytes]
+) -> None:
     """Each goes out once the one before is in the mailbox."""
     deadline = time.monotonic() + 60
     for number in range(200):
         while b"%d" % number not in arrived and time.monotonic() < deadline:
-            sender.publish(CMD_VEL, "robot/cmd_vel", b"%d" % number, "")
+            sender.publish(topic, keys[number % len(keys)], b"%d" % number, "")
             for _ in range(200):
                 if b"%d" % number in arrived:
                     break
@@ -119,24 +137,25 @@ def publish_200_without_leaving_the_loop(sender: ZenohTransport, arrived: list[b
 
 @pytest.mark.parametrize("depth", [1, 16])
 async def test_a_busy_loop_gets_the_newest_and_not_the_backlog(
-    net: ZenohNetwork, depth: int, monkeypatch: pytest.MonkeyPatch
+    net: ZenohNetwork, depth: int, arrived: list[bytes]
 ) -> None:
-    arrived: list[bytes] = []
-
-    class Watched(Mailbox[zenoh.Sample]):
-        """Tells what the loop will find."""
-
-        def put(self, sample: zenoh.Sample) -> None:
-            super().put(sample)
-            arrived.append(sample.payload.to_bytes())
-
-    monkeypatch.setattr(zenoh_transport, "Mailbox", Watched)
     sender, receiver = await net.client(), await net.client()
     ear = SampleCollector(receiver, "robot/cmd_vel", depth)
-    publish_200_without_leaving_the_loop(sender, arrived)
+    publish_200_without_leaving_the_loop(sender, CMD_VEL, ["robot/cmd_vel"], arrived)
     newest = arrived[-depth:]
     await until(lambda: ear.samples)
     assert ear.payloads[:depth] == newest
+
+
+async def test_a_busy_loop_gets_the_newest_of_each_key_of_a_pattern(
+    net: ZenohNetwork, arrived: list[bytes]
+) -> None:
+    sender, receiver = await net.client(), await net.client()
+    ear = SampleCollector(receiver, "robot/perceived/*", 1)
+    keys = ["robot/perceived/door", "robot/perceived/person"]
+    publish_200_without_leaving_the_loop(sender, PERCEIVED, keys, arrived)
+    await until(lambda: ear.samples)
+    assert ear.samples[:2] == [(keys[0], b"198"), (keys[1], b"199")]
 
 
 async def test_who_has_stopped_listening_hears_nothing(net: ZenohNetwork) -> None:

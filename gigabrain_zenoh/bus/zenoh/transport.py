@@ -69,15 +69,20 @@ class ZenohTransport:
         publisher.put(payload)
 
     def subscribe(self, key: str, on_sample: OnSample, depth: int) -> Close:
-        """Subscribe; while the loop is busy, newer samples replace older ones beyond `depth`."""
+        """Subscribe; a busy loop keeps the newest `depth` samples of each key."""
         fixed = "" if "*" in key else key
 
         def deliver(sample: zenoh.Sample) -> bool | None:
             return on_sample(fixed or str(sample.key_expr), sample.payload.to_bytes())
 
         mailbox = Mailbox(self._bridge, deliver, depth)
+
+        def put(sample: zenoh.Sample) -> None:
+            mailbox.put(sample, str(sample.key_expr))
+
+        take = mailbox.put if fixed else put
         return self._lines.declare(
-            lambda line: line.session.declare_subscriber(key, line.direct(mailbox.put))
+            lambda line: line.session.declare_subscriber(key, line.direct(take))
         )
 
     def tap(self, pattern: str, on_raw: OnRaw) -> Close:

@@ -3,7 +3,7 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from gigabrain_zenoh.bus.bridge import Bridge, Mailbox
+from gigabrain_zenoh.bus.bridge import MOST_KEYS, Bridge, Mailbox
 from gigabrain_zenoh.testing.waiting import start_thread, until
 
 
@@ -54,6 +54,25 @@ async def test_a_deeper_mailbox_keeps_the_newest_in_order(hand: Hand) -> None:
         mailbox.put(number)
     await hand.until(16)
     assert hand.got == list(range(84, 100))
+
+
+async def test_a_busy_loop_is_handed_the_newest_of_each_key(hand: Hand) -> None:
+    mailbox = Mailbox(hand.bridge, hand.got.append, 1)
+    for number in range(100):
+        mailbox.put(number, f"robot/perceived/{number % 3}")
+    await hand.until(3)
+    await asyncio.sleep(0)
+    assert sorted(hand.got) == [97, 98, 99]
+
+
+async def test_a_flood_of_keys_is_bounded_and_later_ones_are_delivered(hand: Hand) -> None:
+    mailbox = Mailbox(hand.bridge, hand.got.append, 2)
+    for number in range(10_000):
+        mailbox.put(number, str(number))
+    await hand.until(MOST_KEYS)
+    mailbox.put(-1, "0")
+    await hand.until(MOST_KEYS + 1)
+    assert hand.got == [*range(10_000 - MOST_KEYS, 10_000), -1]
 
 
 async def test_a_mailbox_that_is_flooded_lets_others_have_their_turn(hand: Hand) -> None:
