@@ -29,6 +29,7 @@ from gigabrain_zenoh.safety.latency import DataLatency
 from gigabrain_zenoh.safety.tracking_error import TrackingError
 from gigabrain_zenoh.safety.zones import Motion, ProtectiveField
 
+LATCHING_TICKS = 10  # how long a cause that latches is repeated: a busy gate may miss a verdict
 SCANS_TO_START = 2  # by the second, the answer to the first has arrived, however slow
 
 
@@ -64,6 +65,7 @@ class SafetyMemory(Struct, frozen=True, kw_only=True):
     history: PoseHistory = PoseHistory()
     field: ProtectiveField = ProtectiveField()
     arm: ArmMonitor = ArmMonitor()
+    latching: tuple[tuple[int, Cause], ...] = ()  # recent causes, each with its tick
 
 
 def step(
@@ -75,6 +77,8 @@ def step(
         memory = SafetyMemory(boot=state.boot, tick=state.tick, tracking=TrackingError.start(state))
     memory = _observe(body, memory, inputs)
     stop = _stop_causes(body, memory, inputs)
+    latching = _latching(memory.latching, stop, state.tick)
+    stop = (*stop, *(one for _, one in latching if one not in stop))
     slow = (*memory.round_trip.causes(limits), *memory.latency.slow_causes(body))
     caps = memory.field.caps(body)
     if slow:
@@ -87,7 +91,20 @@ def step(
         causes=(*stop, *slow, *memory.field.causes, *held),
         warnings=(*memory.power.warnings(limits, state), *inputs.host.warnings(limits)),
     )
-    return replace(memory, caps=caps), verdict
+    return replace(memory, caps=caps, latching=latching), verdict
+
+
+def _latching(
+    recent: tuple[tuple[int, Cause], ...], stop: tuple[Cause, ...], tick: int
+) -> tuple[tuple[int, Cause], ...]:
+    """Return the causes that latch, present and recent ones, each code with its newest tick."""
+    now = {one.code: (tick, one) for one in stop if one.latching}
+    before = (
+        (since, one)
+        for since, one in recent
+        if one.code not in now and 0 <= tick - since < LATCHING_TICKS
+    )
+    return (*now.values(), *before)
 
 
 def _observe(body: BodyDescription, memory: SafetyMemory, inputs: SafetyInputs) -> SafetyMemory:
@@ -118,6 +135,7 @@ def _observe(body: BodyDescription, memory: SafetyMemory, inputs: SafetyInputs) 
         history=history,
         field=memory.field.then(body, inputs.scan, state, history, motion, inputs.pictures),
         arm=memory.arm.then(body, state, elapsed, passed, inputs.arm, inputs.arm_problem),
+        latching=memory.latching,
     )
 
 

@@ -20,7 +20,7 @@ from gigabrain_schemas.body import (
 )
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_zenoh.safety.arm_motion import Kind, Near
-from gigabrain_zenoh.safety.step import SafetyInputs, SafetyMemory, step
+from gigabrain_zenoh.safety.step import LATCHING_TICKS, SafetyInputs, SafetyMemory, step
 from gigabrain_zenoh.testing.samples import state
 
 LIFT = JointDescription(
@@ -131,7 +131,7 @@ def test_what_lasts_stops_the_arm_until_a_person_has_looked(
     assert crane.go(1, **fields) == [code]
     assert crane.verdict.verdict == "stop"
     assert crane.verdict.causes[0].latching
-    assert crane.go(1) == []
+    assert crane.go(LATCHING_TICKS) == []
 
 
 @pytest.mark.parametrize(
@@ -181,7 +181,7 @@ def test_a_joint_that_rests_may_repeat_itself() -> None:
 def test_a_joint_that_moves_faster_than_it_can_has_jumped(to: float, codes: list[str]) -> None:
     """At 1 rad/s with a half more, in one tick and three that may have come late: 0.12 rad."""
     crane = Crane(noise=0.0)
-    assert crane.go(1, at=to, noise=0.0) == codes
+    assert crane.go(LATCHING_TICKS, at=to, noise=0.0) == codes  # told for so long
     assert crane.go(1, at=to, noise=0.0) == []
 
 

@@ -8,8 +8,11 @@ from msgspec.structs import replace
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.brain import CmdVel, Intent, WorldModel
-from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, SAFETY, SCAN, STATE, WORLD
+from gigabrain_schemas.examples import example
+from gigabrain_schemas.sensors import Imu
+from gigabrain_schemas.topics import BODY, CMD_VEL, IMU, INTENT, SAFETY, SCAN, STATE, WORLD
 from gigabrain_zenoh.safety import node as safety
+from gigabrain_zenoh.safety.step import LATCHING_TICKS
 from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import BOOT, DRIVING, TICK_NS, body, open_space, scan, state
 
@@ -102,6 +105,20 @@ async def test_a_change_is_told_at_once() -> None:
         await chain.go(111, battery=1.0)  # 13 until the median has followed, and two seconds
         found = await chain.go(1, battery=1.0)
     assert found == [(133, ("battery_empty",))]
+
+
+@pytest.mark.parametrize("tick", [23, 24])  # the state of tick 25 comes with a scan
+async def test_a_knock_is_told_for_a_while_as_a_busy_gate_may_miss_a_verdict(tick: int) -> None:
+    knock = replace(example(Imu), linear_acceleration=(60.0, 0.0, 9.8), boot=BOOT, tick=tick)
+    async with Chain() as chain:
+        await started(chain)
+        await chain.go(tick - 20)
+        chain.send(IMU, knock)
+        found = await chain.go(20)
+    told = [since for since, causes in found if causes == ("collision",)]
+    verdicts = [since for since, _ in found if tick < since <= tick + LATCHING_TICKS]
+    assert told == verdicts
+    assert len(told) > 5
 
 
 @pytest.mark.parametrize(

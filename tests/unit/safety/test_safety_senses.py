@@ -12,6 +12,7 @@ from msgspec.structs import replace
 from gigabrain_schemas.body import Thresholds
 from gigabrain_zenoh.safety.health import Host, tilt_deg
 from gigabrain_zenoh.safety.node import HostMonitor
+from gigabrain_zenoh.safety.step import LATCHING_TICKS
 from gigabrain_zenoh.testing.waiting import until
 from tests.unit.safety.patrol import BODY, Patrol, imu
 
@@ -53,6 +54,7 @@ def test_a_bumper_stops_the_body_for_good_at_once() -> None:
     patrol = Patrol()
     assert patrol.go(bumpers=(False, True)) == ["collision"]
     assert patrol.verdict.causes[0].latching
+    assert patrol.go(LATCHING_TICKS - 1, bumpers=(False, False)) == ["collision"]
     assert patrol.go(bumpers=(False, False)) == []  # the gate stays latched
 
 
