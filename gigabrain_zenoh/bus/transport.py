@@ -36,6 +36,8 @@ class Transport(Protocol):
     Calls and callbacks run on the event loop's thread, except the callback of `tap`.
     """
 
+    losses: int  # of the link to the others so far; queries on their way then have no answers
+
     def publish(self, topic: Topic[Any], key: str, payload: bytes, encoding: str) -> None:
         """Deliver to all listeners on `key` with the topic's QoS, without waiting for any."""
         ...
@@ -154,7 +156,7 @@ class LocalTransport:
     """One process's transport on a LocalNetwork."""
 
     def __init__(self, network: LocalNetwork) -> None:
-        self._network = network
+        self._network, self.losses = network, 0
         self._closers: list[Close] = []
 
     def publish(self, topic: Topic[Any], key: str, payload: bytes, encoding: str) -> None:

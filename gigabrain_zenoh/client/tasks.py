@@ -177,10 +177,15 @@ class Tasks:
         now = asyncio.get_running_loop().time
         until, waits = now() + self._starting_s, False
         while True:
-            asked = now()
+            asked, losses = now(), self._bus.transport.losses
             replies = await self._bus.ask(service, request, timeout_s=timeout_s)
             if replies:
                 return replies[0]
+            if self._bus.transport.losses != losses:
+                raise BodyLost(
+                    "the link was lost before the answer; `gigabrain task list` shows whether the "
+                    "robot has received the request"
+                )
             # after a timeout the request may have been received: do not repeat it
             if now() >= min(until, asked + timeout_s) or may_not_ask(self._keys):
                 raise self._no_server()

@@ -10,9 +10,12 @@ from collections.abc import Awaitable, Callable
 import pytest
 
 from gigabrain_schemas.topics import SCAN, TELEOP
+from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
+from gigabrain_zenoh.client.tasks import Tasks
+from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import Endpoint
-from gigabrain_zenoh.errors import BusError, ConfigError
+from gigabrain_zenoh.errors import BodyLost, BusError, ConfigError
 from gigabrain_zenoh.testing.processes import (
     SampleCollector,
     free_endpoint,
@@ -21,7 +24,7 @@ from gigabrain_zenoh.testing.processes import (
     router_process,
     session_threads,
 )
-from gigabrain_zenoh.testing.waiting import until
+from gigabrain_zenoh.testing.waiting import PATIENCE_S, until
 
 
 def client_of(endpoint: str) -> Awaitable[ZenohTransport]:
@@ -159,6 +162,27 @@ async def test_a_router_that_is_killed_and_comes_back_carries_data_and_queries_a
         await sender.close()
         await receiver.close()
     assert b"lost" not in ear.payloads
+
+
+async def test_a_script_whose_router_dies_while_it_asks_for_a_goal_does_not_ask_again() -> None:
+    endpoint, asked = free_endpoint(), asyncio.Event()
+
+    async def never(_: bytes) -> tuple[bytes, str]:
+        asked.set()
+        await asyncio.sleep(600)
+        return b"", ""
+
+    with router_process(endpoint) as router:
+        server, client = await client_of(endpoint), await client_of(endpoint)
+        server.serve("robot/goal", never)
+        tasks = Tasks(Bus(client, Clock(), "script"), starting_s=600)
+        goal = asyncio.ensure_future(tasks.go_to(1.0, 0.0, how="queue"))
+        await asyncio.wait_for(asked.wait(), PATIENCE_S)
+        router.kill()
+        with pytest.raises(BodyLost, match="the link was lost before the answer"):
+            await goal
+        await server.close()
+        await client.close()
 
 
 async def test_a_sender_knows_of_readers_again_after_the_routers_restart() -> None:

@@ -44,7 +44,7 @@ class ZenohTransport:
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._questions: QueryQueue[zenoh.Query] = QueryQueue(self._bridge, _refuse)
         self._asking: set[asyncio.Future[None]] = set()
-        self._closed = False
+        self._closed, self.losses = False, 0
         self._lines = ReconnectingSession(session, endpoint, self._bridge, self._lost)
 
     @classmethod
@@ -204,6 +204,7 @@ class ZenohTransport:
 
     def _lost(self) -> None:
         """Drop the old session's publishers, and end queries that will get no answer."""
+        self.losses += 1
         self._publishers.clear()
         self._give_up_asking()
 

@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 from gigabrain_schemas.tasks import GoalReply, GoalRequest, TaskStatus
-from gigabrain_schemas.topics import GOAL
+from gigabrain_schemas.topics import GOAL, Priority
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalTransport
 from gigabrain_zenoh.client.tasks import Tasks
 from gigabrain_zenoh.decision.behaviours import StepOutcome
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
@@ -67,6 +69,31 @@ async def test_a_goal_that_comes_while_the_robot_starts_waits_for_who_serves_goa
     net.one.serve(GOAL, answer)
     assert await sending == "goal to 1"
     assert len(said) == 1
+
+
+async def test_a_request_whose_link_was_lost_is_not_repeated() -> None:
+    class Losing(LocalTransport):
+        """Loses the link with the first request for a goal, which has arrived by then."""
+
+        async def query(
+            self, key: str, payload: bytes, encoding: str, timeout_s: float, priority: Priority
+        ) -> list[bytes | str]:
+            replies = await super().query(key, payload, encoding, timeout_s, priority)
+            if key != GOAL.key or self.losses:
+                return replies
+            self.losses += 1
+            return []
+
+    async def answer(request: GoalRequest) -> GoalReply:
+        received.append(request)
+        return GoalReply(ok=True, text="accepted", goal=f"goal-{len(received)}")
+
+    net, received = Net(), list[GoalRequest]()
+    net.one.serve(GOAL, answer)
+    tasks = Tasks(Bus(Losing(net.network), net.clock, "script"), starting_s=60.0)
+    with pytest.raises(BodyLost, match="lost before the answer; `gigabrain task list` shows"):
+        await tasks.go_to(1.0, 0.0, how="queue")
+    assert len(received) == 1
 
 
 @pytest.mark.parametrize("x", [math.nan, math.inf, -1e300])
