@@ -175,7 +175,7 @@ class Demo:
         """Open a session; return None if the run ends before there is a router."""
         endpoint = structs.replace(client_endpoint(self._deployment), nap_s=NAP_S)
         opening = asyncio.ensure_future(ZenohTransport.open(endpoint))
-        while not opening.done() and not stop.is_set() and not self._supervisor.given_up:
+        while not (opening.done() or stop.is_set() or self._supervisor.lost):
             await asyncio.wait((opening,), timeout=LOOK_S)
         if not opening.done():
             opening.cancel()
@@ -188,7 +188,7 @@ class Demo:
         loop = asyncio.get_running_loop()
         moved_s, seconds = loop.time(), watch.seconds
         with view:
-            while not (stop.is_set() or self._supervisor.given_up or self._over(watch)):
+            while not (stop.is_set() or self._supervisor.lost or self._over(watch)):
                 watch.look()
                 view.show()
                 with contextlib.suppress(TimeoutError):

@@ -315,10 +315,18 @@ PROCESSES: Mapping[str, ProcessType] = {
         roles=("robot",),
     ),
     "page": ProcessType(
-        "gigabrain_zenoh.ui.page.node:run", PageConfig, looks_on=True, roles=OPERATED
+        "gigabrain_zenoh.ui.page.node:run",
+        PageConfig,
+        optional=True,
+        looks_on=True,
+        roles=OPERATED,
     ),
     "foxglove": ProcessType(
-        "gigabrain_zenoh.ui.foxglove.node:run", FoxgloveConfig, looks_on=True, roles=OPERATED
+        "gigabrain_zenoh.ui.foxglove.node:run",
+        FoxgloveConfig,
+        optional=True,
+        looks_on=True,
+        roles=OPERATED,
     ),
     "ros2": ProcessType(
         "gigabrain_zenoh.gateway.node:run",

@@ -64,15 +64,15 @@ class Supervisor:
         return tuple(name for name, status in self.statuses.items() if status.state == "given up")
 
     @property
-    def misconfigured(self) -> tuple[str, ...]:
-        """Return the names of processes given up for a wrong configuration (exit code 2).
+    def lost(self) -> tuple[str, ...]:
+        """Return the names of processes given up that are not optional."""
+        return tuple(name for name in self.given_up if not self._keepers[name].spec.optional)
 
-        Those without which the robot goes on do not count.
-        """
-        keepers = self._keepers
-        needed = (name for name in self.given_up if not keepers[name].spec.optional)
-        given_up = (self.statuses[name] for name in needed)
-        return tuple(s.name for s in given_up if s.last_exit == ConfigError.exit_code)
+    @property
+    def misconfigured(self) -> tuple[str, ...]:
+        """Return the names of lost processes whose configuration is wrong (exit code 2)."""
+        lost = (self.statuses[name] for name in self.lost)
+        return tuple(status.name for status in lost if status.last_exit == ConfigError.exit_code)
 
     @property
     def stuck(self) -> tuple[str, ...]:
