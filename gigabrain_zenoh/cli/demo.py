@@ -182,7 +182,7 @@ def up(
     level: Level = "info",
     keep_stuck: KeepStuck = False,
     cameras: bool = False,
-) -> int:
+) -> None:
     """Run the processes of a deployment file on this host, until Ctrl-C.
 
     Example: gigabrain up deploy/demo.yaml
@@ -218,7 +218,7 @@ def up(
                 display.put(f"{line}\n")
 
             file, stuck = str(path.absolute()), keep_stuck
-            return run_async(run(loaded, where, put, level, keep_stuck=stuck, file=file, rows=rows))
+            run_async(run(loaded, where, put, level, keep_stuck=stuck, file=file, rows=rows))
     except ConfigError as error:
         raise located(path, error) from None
 

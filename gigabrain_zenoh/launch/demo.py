@@ -21,7 +21,7 @@ from gigabrain_zenoh.config.settings import PageConfig
 from gigabrain_zenoh.errors import BodyLost, ConfigError
 from gigabrain_zenoh.host import files
 from gigabrain_zenoh.host.run_folders import new_run_dir
-from gigabrain_zenoh.host.signals import stop_signals
+from gigabrain_zenoh.host.signals import run_until, stop_signals
 from gigabrain_zenoh.launch.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.launch.merging import write_rows
 from gigabrain_zenoh.launch.specs import process_specs
@@ -161,7 +161,11 @@ class Demo:
                 running = asyncio.ensure_future(self._supervisor.run())
                 bus = await self._join(stop)
                 try:
-                    report = await self._watch(RunMonitor(bus), stop) if bus else None
+                    watch = RunMonitor(bus) if bus else None
+                    if watch:
+                        await self._watch(watch, stop)
+                    stopped = stop.is_set()  # if only later, the run has ended by itself
+                    report = await self._ask_for_truth(watch, stop) if watch else None
                 finally:
                     closing = asyncio.ensure_future(bus.close()) if bus else None
                     await self._supervisor.stop(STOP_S)
@@ -169,7 +173,7 @@ class Demo:
                     if closing:
                         await closing
         self._log.close()
-        return self._finish(report, stopped=stop.is_set())
+        return self._finish(report, stopped=stopped)
 
     async def _join(self, stop: asyncio.Event) -> Bus | None:
         """Open a session; return None if the run ends before there is a router."""
@@ -182,8 +186,8 @@ class Demo:
             return None
         return Bus(opening.result(), Clock(), "demo")
 
-    async def _watch(self, watch: RunMonitor, stop: asyncio.Event) -> Report | None:
-        """Look on until the end, then ask the driver for the truth."""
+    async def _watch(self, watch: RunMonitor, stop: asyncio.Event) -> None:
+        """Look on until the end."""
         view = self._view(watch)
         loop = asyncio.get_running_loop()
         moved_s, seconds = loop.time(), watch.seconds
@@ -205,7 +209,6 @@ class Demo:
             watch.look()
             view.show()
         self._last_fault = newest_fault(text for _, text in self._faults)
-        return await self._ask_for_truth(watch, HASTY_S if stop.is_set() else ANSWER_S)
 
     def _look_at_capacity(self, watch: RunMonitor, view: DemoView) -> None:
         """Report once that this machine is too small; in lock-step, time may wait for the brain."""
@@ -258,11 +261,28 @@ class Demo:
             watch, self._supervisor, title, self._faults, seconds, page, self._starting_up
         )
 
-    async def _ask_for_truth(self, watch: RunMonitor, within_s: float) -> Report | None:
+    async def _ask_all(
+        self, watch: RunMonitor, stop: asyncio.Event
+    ) -> dict[str, Mapping[str, Any]]:
+        """Return what processes report of the run, by name; hardly wait once `stop` is set."""
         statuses = self._supervisor.statuses
-        names = [name for name, status in statuses.items() if status.state == "ready"]
-        replies = await asyncio.gather(*(watch.describe(name, within_s) for name in names))
-        answers = {answer.process: answer.report for answer in replies if answer}
+        answers: dict[str, Mapping[str, Any]] = {}
+
+        async def ask(name: str, within_s: float) -> None:
+            if answer := await watch.describe(name, within_s):
+                answers[name] = answer.report
+
+        async def ask_all(within_s: float) -> None:
+            silent = [n for n, s in statuses.items() if s.state == "ready" and n not in answers]
+            await asyncio.gather(*(ask(name, within_s) for name in silent))
+
+        await run_until(stop, ask_all(ANSWER_S))
+        if stop.is_set():
+            await ask_all(HASTY_S)
+        return answers
+
+    async def _ask_for_truth(self, watch: RunMonitor, stop: asyncio.Event) -> Report | None:
+        answers, statuses = await self._ask_all(watch, stop), self._supervisor.statuses
         state = watch.state.newest
         if "driver" not in answers and state is None:
             return None
@@ -321,23 +341,25 @@ class Demo:
             print(summary(report))
         for text in self._mismatches:
             print(f"warning: {text}", file=sys.stderr)
+        why = "".join(f"{text}; " for text in self._failures[-1:])
+        reason = f"{why}logs in {self._run_dir}"
         if stopped and report is None:
             print("ended; the driver did not answer, so there is no report", file=sys.stderr)
         if stopped:
+            if why:
+                print(reason, file=sys.stderr)
             return 0
         if report and report.ok and not self._failures:
             return 0
         if self._supervisor.misconfigured:
             raise ConfigError(self._refusal)
         if report is None:
-            reason = self._failures[-1] if self._failures else "the driver did not answer"
-            raise BodyLost(f"no report: {reason}; logs in {self._run_dir}")
+            raise BodyLost(f"no report: {'' if why else 'the driver did not answer; '}{reason}")
         if self._last_fault:
             print(f"newest fault: {self._last_fault}", file=sys.stderr)
         if self._deployment.link == "real":
             print(RELEASE_FIRST, file=sys.stderr)
-        why = f"{self._failures[-1]}; " if self._failures else ""
-        print(f"{why}logs in {self._run_dir}", file=sys.stderr)
+        print(reason, file=sys.stderr)
         return 1
 
 

@@ -107,8 +107,8 @@ async def up(
     keep_stuck: bool = False,
     file: str = "",
     rows: Sequence[Row] = (),
-) -> int:
-    """Keep a host's processes running until Ctrl-C; return the exit code.
+) -> None:
+    """Keep a host's processes running until Ctrl-C, also where some are given up.
 
     A process without progress is restarted, or with `keep_stuck` left to a debugger. `file` is the
     deployment file, for errors; `rows` are the settings and their sources, for `gigabrain config`.
@@ -140,12 +140,13 @@ async def up(
                 _report(supervisor, notifier, note)
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(stop.wait(), LOOK_S)
+            stopped = stop.is_set()  # if only later, it has ended by itself
             notifier.stopping()
             await supervisor.stop(STOP_S)
             await running
             records.close()
-            records.check(supervisor)
-            return 1 if supervisor.given_up else 0
+            if not stopped:
+                records.check(supervisor)
 
 
 class _Records:

@@ -292,7 +292,6 @@ async def test_a_clock_that_stands_still_ends_the_demo_but_not_while_a_process_i
     """The very first start compiles, which may take minutes on a busy machine."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     monkeypatch.setattr(demo_module, "STALLED_S", 1.0)
-    monkeypatch.setattr(demo_module, "ANSWER_S", 0.1)
     net, stop = Net(), asyncio.Event()
     demo = Demo(Deployment(router="tcp/127.0.0.1:0"), DemoOptions(headless=True))
     statuses = demo._supervisor.statuses
@@ -303,7 +302,7 @@ async def test_a_clock_that_stands_still_ends_the_demo_but_not_while_a_process_i
     assert not watching.done()
     statuses["decision"].state = "ready"
     async with asyncio.timeout(60):
-        assert await watching is None
+        await watching
     assert demo._failures == ["the robot's clock stood still for 1 s"]
     await net.one.close()
     await net.two.close()

@@ -1,15 +1,21 @@
 """How `demo` and `up` end: without which process, with which exit code and reason."""
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
+from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import OwnProcess
+from gigabrain_zenoh.errors import BodyLost
 from gigabrain_zenoh.launch import demo as demo_module
+from gigabrain_zenoh.launch import up as up_module
 from gigabrain_zenoh.launch.demo import Demo, DemoOptions
 from gigabrain_zenoh.launch.deployment import ROBOT, Deployment
+from gigabrain_zenoh.launch.up import up
+from gigabrain_zenoh.runtime.supervisor import Supervisor
 from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.ui.run_report import RunMonitor
 
@@ -33,12 +39,26 @@ class Watch(RunMonitor):
         return float(self.looks)
 
 
+@pytest.fixture(autouse=True)
+def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have runs write into `tmp_path`."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "run"))
+
+
 @pytest.fixture
-def demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Demo:
+def stop(monkeypatch: pytest.MonkeyPatch) -> asyncio.Event:
+    """The event that a signal sets, in both commands."""
+    event = asyncio.Event()
+    for module in (demo_module, up_module):
+        monkeypatch.setattr(module, "stop_signals", lambda _: nullcontext(event))
+    return event
+
+
+@pytest.fixture
+def demo(monkeypatch: pytest.MonkeyPatch) -> Demo:
     """A demo of three seconds, whose processes are ready; none really runs."""
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     monkeypatch.setattr(demo_module, "LOOK_S", 0.001)
-    monkeypatch.setattr(demo_module, "ANSWER_S", 0.0)
     made = Demo(DEPLOYMENT, DemoOptions(headless=True, seconds=3.0))
     for status in made._supervisor.statuses.values():
         status.state = "ready"
@@ -65,17 +85,81 @@ def give_up(demo: Demo, name: str, exit_code: int) -> None:
 @pytest.mark.parametrize("exit_code", [1, 2])
 @pytest.mark.parametrize("name", ["mine", "page", "foxglove"])
 async def test_a_demo_goes_on_without_a_process_that_the_robot_does_not_need(
-    demo: Demo, watch: Watch, name: str, exit_code: int
+    demo: Demo, watch: Watch, stop: asyncio.Event, name: str, exit_code: int
 ) -> None:
     give_up(demo, name, exit_code)
-    await demo._watch(watch, asyncio.Event())
+    await demo._watch(watch, stop)
     assert watch.seconds > 3.0
 
 
 @pytest.mark.parametrize("name", ["router", "driver", "decision"])
 async def test_a_demo_ends_without_a_process_that_the_robot_needs(
-    demo: Demo, watch: Watch, name: str
+    demo: Demo, watch: Watch, stop: asyncio.Event, name: str
 ) -> None:
     give_up(demo, name, 1)
-    await demo._watch(watch, asyncio.Event())
+    await demo._watch(watch, stop)
     assert watch.seconds == 1.0
+
+
+def give_up_at_start(monkeypatch: pytest.MonkeyPatch, name: str, then: Callable[[], None]) -> None:
+    """Have supervisors run nothing, and give a process up; call `then`."""
+
+    async def run(supervisor: Supervisor) -> None:
+        supervisor.statuses[name].state = "given up"
+        then()
+        await supervisor._shared.halt.wait()
+
+    monkeypatch.setattr(Supervisor, "run", run)
+
+
+@pytest.fixture
+def joined(demo: Demo, watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have the demo watch a robot in memory."""
+
+    async def join(_: asyncio.Event) -> Bus:
+        return watch.bus
+
+    monkeypatch.setattr(demo, "_join", join)
+    monkeypatch.setattr(demo_module, "RunMonitor", lambda _: watch)
+
+
+@pytest.mark.usefixtures("joined")
+async def test_a_signal_after_a_demo_has_ended_does_not_hide_why(
+    demo: Demo, watch: Watch, stop: asyncio.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def describe(*_: object) -> None:
+        stop.set()
+
+    give_up_at_start(monkeypatch, "page", lambda: give_up(demo, "decision", 1))
+    monkeypatch.setattr(watch, "describe", describe)
+    with pytest.raises(BodyLost, match="decision ended with exit code 1 and is given up"):
+        await demo.run()
+
+
+@pytest.mark.usefixtures("joined")
+async def test_a_demo_that_a_person_ends_is_not_judged_and_tells_what_failed(
+    demo: Demo,
+    stop: asyncio.Event,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    give_up_at_start(monkeypatch, "mine", lambda: (give_up(demo, "mine", 1), stop.set())[0])
+    assert await demo.run() == 0
+    assert "mine ended with exit code 1 and is given up; logs in " in capfd.readouterr().err
+
+
+async def test_a_signal_cuts_the_wait_for_the_truth_short(
+    demo: Demo, watch: Watch, stop: asyncio.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(demo_module, "ANSWER_S", 1000.0)
+    asyncio.get_running_loop().call_later(0.01, stop.set)
+    async with asyncio.timeout(60):
+        assert await demo._ask_for_truth(watch, stop) is None
+
+
+@pytest.mark.parametrize("name", ["decision", "router", "mine"])
+async def test_up_ends_with_0_after_a_signal_whichever_process_was_given_up(
+    name: str, stop: asyncio.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    give_up_at_start(monkeypatch, name, stop.set)
+    await up(DEPLOYMENT, "robot", lambda _: None)
