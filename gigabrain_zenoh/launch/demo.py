@@ -141,10 +141,10 @@ class Demo:
         self._log = SupervisorLog(self._run_dir)
         self._supervisor = Supervisor(specs, self._record, keep_stuck=options.keep_stuck)
         self._decisions: list[tuple[float, str]] = []
-        self._failures: list[str] = []
+        self._failures: list[tuple[str, str]] = []  # of which process, and what
         self._compiling: set[str] = set()  # processes that reported it
         self._mismatches: dict[str, None] = {}  # between model and robot file, in order
-        self._refusal = ""  # last error of a process that ended
+        self._refusals: dict[str, str] = {}  # by process, the last error with which it ended
         self._faults: deque[tuple[float, str]] = deque(maxlen=4)  # when [s], and what
         self._capacity = Capacity()
         self._last_fault = ""  # before all were asked to end, the driver's first
@@ -164,7 +164,8 @@ class Demo:
                     watch = RunMonitor(bus) if bus else None
                     if watch:
                         await self._watch(watch, stop)
-                    stopped = stop.is_set()  # if only later, the run has ended by itself
+                    # what comes only later has not ended the run
+                    stopped, why = stop.is_set(), self._why()
                     report = await self._ask_for_truth(watch, stop) if watch else None
                 finally:
                     closing = asyncio.ensure_future(bus.close()) if bus else None
@@ -173,7 +174,7 @@ class Demo:
                     if closing:
                         await closing
         self._log.close()
-        return self._finish(report, stopped=stopped)
+        return self._finish(report, why, stopped=stopped)
 
     async def _join(self, stop: asyncio.Event) -> Bus | None:
         """Open a session; return None if the run ends before there is a router."""
@@ -199,12 +200,13 @@ class Demo:
                     await asyncio.wait_for(stop.wait(), LOOK_S)
                 self._look_at_capacity(watch, view)
                 if watch.problem:
-                    self._failures.append(watch.problem)
+                    self._failures.append(("demo", watch.problem))
                     break
                 if watch.seconds != seconds or self._starting:
                     moved_s, seconds = loop.time(), watch.seconds
                 elif loop.time() - moved_s > STALLED_S:
-                    self._failures.append(f"the robot's clock stood still for {STALLED_S:.0f} s")
+                    stall = f"the robot's clock stood still for {STALLED_S:.0f} s"
+                    self._failures.append(("demo", stall))
                     break
             watch.look()
             view.show()
@@ -310,7 +312,7 @@ class Demo:
         )
         return make_report(told_of_all, seen)  # the truth is the simulator's, wherever it runs
 
-    def _record(self, _name: str, record: Mapping[str, Any]) -> None:
+    def _record(self, name: str, record: Mapping[str, Any]) -> None:
         """Process a log record of a process."""
         self._log.add(record)
         event, level = record.get("event"), record.get("level")
@@ -326,14 +328,19 @@ class Demo:
         if event == "mismatch":
             self._mismatches[str(record.get("text", ""))] = None
         if event == "failed":
-            self._refusal = str(record.get("text", ""))
+            self._refusals[name] = str(record.get("text", ""))
         if event in ("given up", "died"):
-            self._failures.append(str(record.get("text", "")))
+            self._failures.append((name, str(record.get("text", ""))))
         if level in ("warning", "error", "critical"):
             text = f"{record['process']}: {record.get('text', '')}"
             self._faults.append((time.monotonic(), text))
 
-    def _finish(self, report: Report | None, *, stopped: bool) -> int:
+    def _why(self) -> str:
+        """Return why the run has failed: the newest failure, of a lost process if there is one."""
+        lost = [text for name, text in self._failures if name in self._supervisor.lost]
+        return (lost or [text for _, text in self._failures] or [""])[-1]
+
+    def _finish(self, report: Report | None, why: str, *, stopped: bool) -> int:
         if self._capacity.problem and self._live:
             print(self._capacity.problem, file=sys.stderr)
         if report:
@@ -341,25 +348,24 @@ class Demo:
             print(summary(report))
         for text in self._mismatches:
             print(f"warning: {text}", file=sys.stderr)
-        why = "".join(f"{text}; " for text in self._failures[-1:])
-        reason = f"{why}logs in {self._run_dir}"
+        told = f"{why}; logs in {self._run_dir}" if why else f"logs in {self._run_dir}"
         if stopped and report is None:
             print("ended; the driver did not answer, so there is no report", file=sys.stderr)
         if stopped:
             if why:
-                print(reason, file=sys.stderr)
+                print(told, file=sys.stderr)
             return 0
-        if report and report.ok and not self._failures:
+        if report and report.ok and not why:
             return 0
-        if self._supervisor.misconfigured:
-            raise ConfigError(self._refusal)
+        if wrong := self._supervisor.misconfigured:
+            raise ConfigError(self._refusals.get(wrong[0], why))
         if report is None:
-            raise BodyLost(f"no report: {'' if why else 'the driver did not answer; '}{reason}")
+            raise BodyLost(f"no report: {'' if why else 'the driver did not answer; '}{told}")
         if self._last_fault:
             print(f"newest fault: {self._last_fault}", file=sys.stderr)
         if self._deployment.link == "real":
             print(RELEASE_FIRST, file=sys.stderr)
-        print(reason, file=sys.stderr)
+        print(told, file=sys.stderr)
         return 1
 
 

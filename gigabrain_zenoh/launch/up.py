@@ -150,38 +150,41 @@ async def up(
 
 
 class _Records:
-    """Logs and prints what processes report, and keeps why one of them refused to start."""
+    """Logs and prints what processes report, and keeps why they refused to start."""
 
     def __init__(self, run_dir: Path, print_line: Callable[[str], None]) -> None:
         self._log, self._print_line = SupervisorLog(run_dir), print_line
-        self._refusal, self._invalid = "", None  # the last one, and the invalid value that it names
+        # by process: the last one, and the invalid value that it names
+        self._refusals: dict[str, tuple[str, str | None]] = {}
 
-    def add(self, _name: str, record: Mapping[str, Any]) -> None:
+    def add(self, name: str, record: Mapping[str, Any]) -> None:
         """Process a record of a process."""
         self._log.add(record)
         if record.get("event") == "failed":
             record = dict(record)
-            self._invalid = record.pop("value", None)
-            before, self._refusal = self._refusal, str(record.get("text", ""))
-            if self._refusal == before:  # printed already, at the first try
+            refusal = str(record.get("text", "")), record.pop("value", None)
+            before, self._refusals[name] = self._refusals.get(name), refusal
+            if refusal == before:  # printed already, at the first try
                 return
         self._print_line(logs.readable(record, colour=False))
 
     def check(self, supervisor: Supervisor) -> None:
         """Raise ConfigError for wrong settings of a process, and BusError for a lost router."""
-        if supervisor.misconfigured:
-            raise ConfigError(self._refusal, value=self._invalid)
-        if lost := ROUTERS & set(supervisor.given_up):
-            raise BusError(self._refusal or f"the {lost.pop()} keeps dying")
+        for name in _hopeless(supervisor)[:1]:
+            text, value = self._refusals.get(name, (f"{name} cannot run; see its log", None))
+            if name in supervisor.misconfigured:
+                raise ConfigError(text, value=value)
+            raise BusError(text)
 
     def close(self) -> None:
         """Write what is left."""
         self._log.close()
 
 
-def _hopeless(supervisor: Supervisor) -> bool:
-    """Return whether nothing is left to keep running."""
-    return bool(supervisor.misconfigured) or bool(ROUTERS & set(supervisor.given_up))
+def _hopeless(supervisor: Supervisor) -> list[str]:
+    """Return the processes given up without which there is nothing left to keep running."""
+    routers = [name for name in supervisor.given_up if name in ROUTERS]
+    return [*supervisor.misconfigured, *routers]
 
 
 def _report(supervisor: Supervisor, notifier: Notifier, note: Path) -> None:

@@ -6,7 +6,7 @@ import os
 import signal
 import tempfile
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -113,16 +113,19 @@ class ProcessGroup:
 
     def check_processes(self) -> None:
         """Raise ConfigError for a refused configuration, Failed for a dead process."""
-        if self.supervisor.misconfigured:
-            raise ConfigError(self._complaint() or "a process refuses its configuration")
+        if wrong := self.supervisor.misconfigured:
+            raise ConfigError(self._complaint(wrong) or "a process refuses its configuration")
         if self.supervisor.given_up:
             raise Failed(f"{', '.join(self.supervisor.given_up)} cannot be started")
         if self._strict and self.supervisor.deaths:
-            raise Failed(f"a process died during the measurement: {self._complaint()}")
+            why = self._complaint(self.supervisor.statuses)
+            raise Failed(f"a process died during the measurement: {why}")
 
-    def _complaint(self) -> str:
-        failed = [r for r in self.records if r.get("event") == "failed"]
-        errors = [r for r in self.records if r.get("level") in ("error", "critical")]
+    def _complaint(self, names: Collection[str]) -> str:
+        """Return why one of these processes failed."""
+        records = [r for r in self.records if r.get("child", r["process"]) in names]
+        failed = [r for r in records if r.get("event") == "failed"]
+        errors = [r for r in records if r.get("level") in ("error", "critical")]
         return str((failed[-1:] or errors[:1] or [{}])[0].get("text", ""))
 
     async def until(

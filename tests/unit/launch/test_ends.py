@@ -9,7 +9,7 @@ import pytest
 
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import OwnProcess
-from gigabrain_zenoh.errors import BodyLost
+from gigabrain_zenoh.errors import BodyLost, BusError, ConfigError, GigabrainError
 from gigabrain_zenoh.launch import demo as demo_module
 from gigabrain_zenoh.launch import up as up_module
 from gigabrain_zenoh.launch.demo import Demo, DemoOptions
@@ -73,40 +73,23 @@ async def watch() -> AsyncIterator[Watch]:
     await net.two.close()
 
 
-def give_up(demo: Demo, name: str, exit_code: int) -> None:
-    """Have a demo see that a process was given up."""
-    status = demo._supervisor.statuses[name]
+def give_up(supervisor: Supervisor, name: str, exit_code: int, error: str = "") -> None:
+    """Have a supervisor give a process up, which has logged `error`."""
+    status, on_record = supervisor.statuses[name], supervisor._shared.on_record
+    if error:
+        failed = {"process": name, "level": "error", "event": "failed", "text": error}
+        on_record(name, {"t": 0, "value": f"value of {name}", **failed})
     status.state, status.last_exit = "given up", exit_code
     text = f"{name} ended with exit code {exit_code} and is given up"
     record = {"process": "supervisor", "level": "error", "event": "given up", "text": text}
-    demo._record(name, record)
+    on_record(name, {"t": 0, **record})
 
 
-@pytest.mark.parametrize("exit_code", [1, 2])
-@pytest.mark.parametrize("name", ["mine", "page", "foxglove"])
-async def test_a_demo_goes_on_without_a_process_that_the_robot_does_not_need(
-    demo: Demo, watch: Watch, stop: asyncio.Event, name: str, exit_code: int
-) -> None:
-    give_up(demo, name, exit_code)
-    await demo._watch(watch, stop)
-    assert watch.seconds > 3.0
-
-
-@pytest.mark.parametrize("name", ["router", "driver", "decision"])
-async def test_a_demo_ends_without_a_process_that_the_robot_needs(
-    demo: Demo, watch: Watch, stop: asyncio.Event, name: str
-) -> None:
-    give_up(demo, name, 1)
-    await demo._watch(watch, stop)
-    assert watch.seconds == 1.0
-
-
-def give_up_at_start(monkeypatch: pytest.MonkeyPatch, name: str, then: Callable[[], None]) -> None:
-    """Have supervisors run nothing, and give a process up; call `then`."""
+def at_start(monkeypatch: pytest.MonkeyPatch, happens: Callable[[Supervisor], None]) -> None:
+    """Have supervisors run nothing; this happens at their start."""
 
     async def run(supervisor: Supervisor) -> None:
-        supervisor.statuses[name].state = "given up"
-        then()
+        happens(supervisor)
         await supervisor._shared.halt.wait()
 
     monkeypatch.setattr(Supervisor, "run", run)
@@ -120,7 +103,27 @@ def joined(demo: Demo, watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
         return watch.bus
 
     monkeypatch.setattr(demo, "_join", join)
+    monkeypatch.setattr(demo_module, "ANSWER_S", 0.0)
     monkeypatch.setattr(demo_module, "RunMonitor", lambda _: watch)
+
+
+@pytest.mark.parametrize("exit_code", [1, 2])
+@pytest.mark.parametrize("name", ["mine", "page", "foxglove"])
+async def test_a_demo_goes_on_without_a_process_that_the_robot_does_not_need(
+    demo: Demo, watch: Watch, name: str, exit_code: int
+) -> None:
+    give_up(demo._supervisor, name, exit_code)
+    await demo._watch(watch, asyncio.Event())
+    assert watch.seconds > 3.0
+
+
+@pytest.mark.parametrize("name", ["router", "driver", "decision"])
+async def test_a_demo_ends_without_a_process_that_the_robot_needs(
+    demo: Demo, watch: Watch, name: str
+) -> None:
+    give_up(demo._supervisor, name, 1)
+    await demo._watch(watch, asyncio.Event())
+    assert watch.seconds == 1.0
 
 
 @pytest.mark.usefixtures("joined")
@@ -130,7 +133,7 @@ async def test_a_signal_after_a_demo_has_ended_does_not_hide_why(
     async def describe(*_: object) -> None:
         stop.set()
 
-    give_up_at_start(monkeypatch, "page", lambda: give_up(demo, "decision", 1))
+    at_start(monkeypatch, lambda supervisor: give_up(supervisor, "decision", 1))
     monkeypatch.setattr(watch, "describe", describe)
     with pytest.raises(BodyLost, match="decision ended with exit code 1 and is given up"):
         await demo.run()
@@ -143,7 +146,11 @@ async def test_a_demo_that_a_person_ends_is_not_judged_and_tells_what_failed(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    give_up_at_start(monkeypatch, "mine", lambda: (give_up(demo, "mine", 1), stop.set())[0])
+    def happens(supervisor: Supervisor) -> None:
+        give_up(supervisor, "mine", 1)
+        stop.set()
+
+    at_start(monkeypatch, happens)
     assert await demo.run() == 0
     assert "mine ended with exit code 1 and is given up; logs in " in capfd.readouterr().err
 
@@ -158,8 +165,76 @@ async def test_a_signal_cuts_the_wait_for_the_truth_short(
 
 
 @pytest.mark.parametrize("name", ["decision", "router", "mine"])
-async def test_up_ends_with_0_after_a_signal_whichever_process_was_given_up(
+async def test_up_ends_without_an_error_after_a_signal_whichever_process_was_given_up(
     name: str, stop: asyncio.Event, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    give_up_at_start(monkeypatch, name, stop.set)
+    def happens(supervisor: Supervisor) -> None:
+        give_up(supervisor, name, 1)
+        stop.set()
+
+    at_start(monkeypatch, happens)
     await up(DEPLOYMENT, "robot", lambda _: None)
+
+
+def needed_first(exit_code: int, name: str = "decision") -> Callable[[Supervisor], None]:
+    """Return what gives up a process that the robot needs, and then one of its own."""
+
+    def happens(supervisor: Supervisor) -> None:
+        give_up(supervisor, name, exit_code, f"{name} lacks something")
+        give_up(supervisor, "mine", 2, "mine has an unknown field")
+
+    return happens
+
+
+@pytest.mark.usefixtures("joined", "stop")
+@pytest.mark.parametrize(
+    ("exit_code", "kind", "text"),
+    [(2, ConfigError, "^decision lacks something$"), (1, BodyLost, "decision ended with")],
+)
+async def test_a_demo_ends_with_the_error_of_the_process_that_ended_it(
+    demo: Demo,
+    monkeypatch: pytest.MonkeyPatch,
+    exit_code: int,
+    kind: type[GigabrainError],
+    text: str,
+) -> None:
+    at_start(monkeypatch, needed_first(exit_code))
+    with pytest.raises(kind, match=text):
+        await demo.run()
+
+
+@pytest.mark.usefixtures("stop")
+async def test_up_ends_with_the_error_and_the_wrong_value_of_the_process_that_ended_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    at_start(monkeypatch, needed_first(2))
+    with pytest.raises(ConfigError, match=r"^decision lacks something$") as caught:
+        await up(DEPLOYMENT, "robot", lambda _: None)
+    assert caught.value.value == "value of decision"
+
+
+@pytest.mark.usefixtures("stop")
+async def test_up_does_not_explain_a_dead_router_by_what_another_process_lacks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def happens(supervisor: Supervisor) -> None:
+        give_up(supervisor, "mine", 2, "mine has an unknown field")
+        give_up(supervisor, "router", 1)
+
+    at_start(monkeypatch, happens)
+    with pytest.raises(BusError, match="router"):
+        await up(DEPLOYMENT, "robot", lambda _: None)
+
+
+@pytest.mark.usefixtures("stop")
+async def test_up_prints_the_same_error_of_a_process_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    def happens(supervisor: Supervisor) -> None:
+        for name in ("mine", "page", "mine", "page"):
+            give_up(supervisor, name, 1, f"{name} lacks something")
+        give_up(supervisor, "router", 1)
+
+    lines: list[str] = []
+    at_start(monkeypatch, happens)
+    with pytest.raises(BusError):
+        await up(DEPLOYMENT, "robot", lines.append)
+    assert sum("lacks something" in line for line in lines) == 2
