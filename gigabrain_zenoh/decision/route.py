@@ -200,6 +200,11 @@ class RoutePlanner:
         elif request.tick - self._blocking_tick > BLOCKED_MEMORY_TICKS:
             self._blocking = np.empty((0, 2))
 
+    def _arrived(self, request: RouteRequest) -> bool:
+        """Return whether the robot has arrived by the present route, not by an older one."""
+        feedback = request.feedback
+        return feedback is not None and feedback.arrived and feedback.version == self._version
+
     def _update_costmap(self, request: RouteRequest) -> Costmap:
         blocked = self._blocking_tick if len(self._blocking) else 0
         seen = self._contours.version
@@ -307,7 +312,7 @@ class RoutePlanner:
     def _explore(self, request: RouteRequest, costs: Costmap) -> Route:
         """Return a route to the best frontier."""
         here = request.here.x, request.here.y
-        arrived = request.feedback is not None and request.feedback.arrived
+        arrived = self._arrived(request)
         if self._goal and (arrived or self._progress.stuck(request.tick, LEAVE_FRONTIER_TICKS)):
             (self._visited if arrived else self._missed).append((self._goal.x, self._goal.y))
             self._drop_frontier(request.tick)
@@ -349,7 +354,7 @@ class RoutePlanner:
         looks, around = self._looks, (costs, request.body, request.here)
         there = looks.goal is not None and self._goal == looks.goal
         looks.look(*around, request.tick)
-        arrived = request.feedback is not None and request.feedback.arrived
+        arrived = self._arrived(request)
         stuck = self._progress.stuck(request.tick, LEAVE_FRONTIER_TICKS)
         if there and looks.goal and (arrived or stuck):
             looks.give_up()

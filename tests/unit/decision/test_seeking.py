@@ -297,3 +297,30 @@ def test_somebody_before_a_thing_has_ten_seconds_to_go_away() -> None:
     assert [state(cells, 1), state(cells, 499), state(cells, 502)] == ["running"] * 2 + ["failed"]
     planner = RoutePlanner()
     assert [state(cells, 1), state(ROOM, 499), state(ROOM, 600)] == ["running"] * 3
+
+
+@pytest.mark.parametrize("kind", ["explore", "look"])
+def test_an_arrival_by_the_last_route_does_not_end_the_next_one(kind: str) -> None:
+    cells = np.full_like(empty(8.0, 6.0), -1)
+    cells[20:41, 10:60] = 0  # a hall, open to all sides
+    planner, command = RoutePlanner(), DriveCommand(1, kind, seek=1)
+
+    def ask(tick: int, arrived: Route | None = None) -> Route:
+        return planner.plan(
+            RouteRequest(
+                tick=tick,
+                command=command,
+                here=Pose(x=3.0, y=3.0, yaw=0.0),
+                grid=grid_of(cells),
+                body=SEEING,
+                feedback=arrived and RouteFeedback(version=arrived.version, arrived=True),
+                seen=np.empty((0, 2)),
+            )
+        )
+
+    first = ask(1)
+    second = ask(6, arrived=first)
+    assert second.goal != first.goal
+    again = ask(11, arrived=first)  # while the second was being planned
+    assert (again.version, again.goal) == (second.version, second.goal)
+    assert ask(16, arrived=second).goal != second.goal
