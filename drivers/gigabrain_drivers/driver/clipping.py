@@ -35,6 +35,17 @@ def clipped(record: R) -> R:
     return msgspec.structs.replace(record, **changes) if changes else record
 
 
+def fault_of(record: Struct) -> str:
+    """Return which value is beyond its bounds, and which bounds those are; empty if none is."""
+    decode = _decoder(type(record))
+    try:
+        if decode:
+            decode(encode(record))
+    except DECODE_ERRORS as error:
+        return str(error)
+    return ""
+
+
 def _within(value: Any, bounds: Bounds | None) -> Any:
     """Return `value` within its bounds; the same object where nothing changes."""
     if isinstance(value, Struct):

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.button import ButtonWatch
 from gigabrain_drivers.driver.catalog import make_driver, ports_folder
-from gigabrain_drivers.driver.clipping import clipped
+from gigabrain_drivers.driver.clipping import clipped, fault_of
 from gigabrain_drivers.driver.gatekeeper import Gatekeeper
 from gigabrain_drivers.driver.lockstep import REPEAT_S, Lockstep, RoundTrip
 from gigabrain_drivers.driver.robot import RobotFile, Run
@@ -53,6 +53,7 @@ from gigabrain_zenoh.geometry.body_settings import SETTINGS, restricted, setting
 from gigabrain_zenoh.geometry.joints import JointMotion
 from gigabrain_zenoh.geometry.limits import ZERO, limits_of
 from gigabrain_zenoh.geometry.stopping import scan_limit_ns
+from gigabrain_zenoh.logs import QuietFault
 from gigabrain_zenoh.runtime.heartbeat import Progress
 
 log = logging.getLogger(__name__)
@@ -95,6 +96,7 @@ class DriverProcess:
         self._limp = False  # in the newest state, or by request
         self._let_go = False  # by request, until it is moved or held again
         self._body_tick = 0  # when BODY was last published
+        self._beyond = QuietFault(log)  # a value beyond its bounds
         driver.emit = self._emit
         bus.report = self.report
         bus.progress = Progress(self._time_goes_on, lambda: bus.sent[STATE.key])
@@ -202,7 +204,7 @@ class DriverProcess:
 
     async def _tick(self, passed: int) -> None:
         """20 ms of the body's time, or several where the process was held up."""
-        state = clipped(await self._driver.read_state())
+        state = self._checked(await self._driver.read_state())
         self._limp = state.limp or self._let_go
         if self._wake.is_set():
             await self._apply_command()  # the gate goes on from the body's newest command
@@ -223,6 +225,16 @@ class DriverProcess:
         else:
             self._publish_tick(state)
         await self._apply_command()
+
+    def _checked(self, reported: RobotState) -> RobotState:
+        """Return a state within its bounds; log what was beyond them."""
+        state, now_ns = clipped(reported), self._bus.clock.now_ns()
+        if state is reported:
+            self._beyond.end("the body's values are within their bounds again", now_ns)
+        else:
+            what = f"{fault_of(reported)}; is it in another unit?"
+            self._beyond.begin(f"the body's state was clipped to its bounds: {what}", now_ns)
+        return state
 
     def _emit(self, topic: Topic[Any], message: Message) -> None:
         """Publish a sensor's message at once, or with the next tick: all of them in lock-step."""

@@ -5,12 +5,15 @@ from collections.abc import AsyncIterator
 from itertools import pairwise
 from pathlib import Path
 
+import pytest
+from msgspec.structs import replace
+
 from gigabrain_drivers.bodies.mock.driver import MockBody, MockOptions
 from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_drivers.driver.process import DriverProcess
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_schemas.base import TICK_NS, Velocity
-from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.body import Battery, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import BODY, CMD_VEL
 from gigabrain_zenoh.bus.bus import Bus
@@ -75,3 +78,23 @@ async def test_what_comes_just_before_a_tick_counts_as_told_before_it(tmp_path: 
         assert robot.mode == "enabled"
         changes = [after - before for before, after in pairwise(speeds)]
         assert -0.04 - 1e-9 <= min(changes) < 0 < max(changes) <= 0.02 + 1e-9
+
+
+async def test_a_battery_in_millivolts_costs_no_state_and_is_logged_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with RobotInMemory(tmp_path) as robot:
+        read = robot.body.read_state
+
+        async def in_millivolts() -> RobotState:
+            return replace(await read(), battery=Battery(voltage=12_600.0, percentage=50.0))
+
+        robot.body.read_state = in_millivolts  # type: ignore[method-assign]
+        await robot.go(10)
+        assert robot.state
+        assert robot.state.battery == Battery(voltage=1000.0, percentage=50.0)
+        (logged,) = [one for one in caplog.messages if "clipped" in one]
+        assert logged == (
+            "the body's state was clipped to its bounds: "
+            "Expected `float` <= 1000.0 - at `$.battery.voltage`; is it in another unit?"
+        )
