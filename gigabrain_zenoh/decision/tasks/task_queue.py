@@ -10,7 +10,7 @@ from msgspec import Struct
 from py_trees.common import Status
 
 from gigabrain_schemas.base import Name
-from gigabrain_schemas.tasks import Goal, How, Task, TaskState, TaskStatus
+from gigabrain_schemas.tasks import MAX_REQUEST_BYTES, Goal, How, Task, TaskState, TaskStatus
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.decision.behaviours import (
     Command,
@@ -31,10 +31,12 @@ from gigabrain_zenoh.decision.tasks.conditions import Read
 from gigabrain_zenoh.decision.tasks.leaves import Hand, MissionContext, StartScript, seek_nothing
 from gigabrain_zenoh.decision.tasks.mission import Mission, find_mission, goal_mission, loads
 from gigabrain_zenoh.errors import ConfigError, Refused
-from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file
+from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file, too_large
 
 MAX_QUEUED, MAX_DONE = 32, 16
-MAX_FILE_BYTES = 1_000_000
+LONGER_AS_JSON = 10  # times as a mission's text: numbers get digits, and moved things a place
+MAX_FILE_BYTES = (MAX_QUEUED + 1) * LONGER_AS_JSON * MAX_REQUEST_BYTES
+LOST = "tasks will not survive a restart"
 AFTER_A_RESTART = "the robot was restarted; resume the task, or cancel it"
 NO_GOAL = Idle("waiting", "waiting: for a goal")
 
@@ -312,11 +314,14 @@ class TaskFile:
         """Write the last of `newest`; return the problem in one line, or an empty text."""
         if self._path is None:
             return ""
+        data = msgspec.json.encode(newest[-1])
+        if len(data) > MAX_FILE_BYTES:  # it could not be read again
+            return f"not saved: {too_large(self._path, len(data), MAX_FILE_BYTES)}; {LOST}"
         try:
             make_folder(self._path.parent)
-            replace_file(self._path, msgspec.json.encode(newest[-1]))
+            replace_file(self._path, data)
         except OSError as error:
-            return f"cannot write {self._path}: {error.strerror}; tasks will not survive a restart"
+            return f"cannot write {self._path}: {error.strerror}; {LOST}"
         return ""
 
     def _set_aside(self, path: Path, error: Exception) -> str:

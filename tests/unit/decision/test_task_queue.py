@@ -1,11 +1,17 @@
 """The task queue: order, cancellation and restarts."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
-from gigabrain_schemas.tasks import Goal
+from gigabrain_schemas.tasks import MAX_REQUEST_BYTES, Goal
 from gigabrain_zenoh.decision.behaviours import describe_end
+from gigabrain_zenoh.decision.tasks import task_queue
+from gigabrain_zenoh.decision.tasks.arm_steps import HeldThing, Solid
+from gigabrain_zenoh.decision.tasks.mission import Mission, Step
+from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile
 from gigabrain_zenoh.errors import Refused
 from tests.unit.decision.sites import Robot, one_robot
 
@@ -132,3 +138,36 @@ def test_after_a_start_of_the_whole_robot_tasks_wait_for_a_person(robot: Robot) 
     assert again.step() == 1.0
     again.tasks.restart(9)  # a driver that starts anew alone: the gate asks for a person already
     assert again.step() == 1.0
+
+
+LEVEL = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+HOLDS = HeldThing(name="cup", solid=Solid(sphere=0.03), axes=LEVEL, grip=0.5, opening=1.0)
+
+
+def test_a_queue_full_of_the_longest_missions_is_read_again(robot: Robot, tmp_path: Path) -> None:
+    names = [f"c{k}" for k in range(10_000, 14_800)]
+    text = f"things: {{{','.join(f'{name}: {{sphere: 1}}' for name in names)}}}\ndo: [{{goto: a}}]"
+    assert 0.9 * MAX_REQUEST_BYTES < len(text) < MAX_REQUEST_BYTES
+    things = dict.fromkeys(names, Solid(sphere=1.0))
+    mission = Mission(things=things, do=(Step(goto=(1.0, 0.0)),))
+    robot.tasks.add_mission(mission, "m", "queue", "ann")
+    (longest,) = robot.tasks.saved.jobs
+    moved = Solid(sphere=1.0, at=(-1 / 3, -1 / 3, -1 / 3), yaw=-1 / 3)
+    longest = replace(longest, things=dict.fromkeys(names, moved))
+    file, saved = TaskFile(str(tmp_path)), Saved(jobs=(longest,) * 33, held=HOLDS)
+    assert file.write([saved]) == ""
+    assert file.read() == (saved, "")
+
+
+def test_what_could_not_be_read_again_is_not_written(
+    robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, before = TaskFile(str(tmp_path)), Saved(held=HOLDS)
+    file.write([before])
+    size = (tmp_path / "tasks.json").stat().st_size
+    monkeypatch.setattr(task_queue, "MAX_FILE_BYTES", size)
+    robot.carry_out(ROUND)
+    problem = file.write([replace(before, jobs=robot.tasks.saved.jobs)])
+    assert problem.startswith("not saved: ")
+    assert problem.endswith("; tasks will not survive a restart")
+    assert file.read() == (before, "")
