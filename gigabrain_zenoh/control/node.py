@@ -219,12 +219,12 @@ def caps_at(verdicts: PreviousTick[SafetyState], state: RobotState) -> SpeedCaps
 
 async def run(bus: Bus, ready: Callable[[], None]) -> None:
     """Publish commands at the body's rate, and at once for each new intent."""
-    memory, lost, commands = ControlMemory(), False, 0
+    memory, lost, done = ControlMemory(), False, 0
     teleop, verdicts = Teleop(bus.clock.now_ns), PreviousTick[SafetyState]()
     arm = ArmControl(bus)
 
     def act(message: Message) -> None:
-        nonlocal commands
+        nonlocal done
         state, body = states.fresh(), bodies.current
         if state is None or body is None:
             return
@@ -232,10 +232,11 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
         if body.description.has_base:
             drive(state, body, intent)
         if body.description.joints and message is state:
-            commands += arm.act(state, body, _recent(intent, state.tick))
+            arm.act(state, body, _recent(intent, state.tick))
+            done += 1  # also where it has no command, as joints are missing
 
     def drive(state: RobotState, body: Body, intent: Intent | None) -> None:
-        nonlocal memory, lost, commands
+        nonlocal memory, lost, done
         inputs = ControlInputs(
             state=state,
             intent=intent,
@@ -250,7 +251,7 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
         due = state.tick % body.description.control.period_ticks == 0
         if due or memory.basis != before:
             bus.publish(command_topic(body.description), command, basis=memory.basis)
-            commands += 1
+            done += 1
 
     def on_intent(intent: Intent) -> None:
         # an intent whose state has not arrived waits for it
@@ -264,7 +265,7 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
     bus.latest(TELEOP, teleop.receive)
     bus.latest(JOINT_TELEOP, arm.teleop.receive)
     bus.progress = Progress(
-        lambda: (bus.arrived.get(STATE.key),) if bodies.current else (), lambda: commands
+        lambda: (bus.arrived.get(STATE.key),) if bodies.current else (), lambda: done
     )
     ready()
     await bus.failed
@@ -294,8 +295,8 @@ class ArmControl:
         if joints := body.description.joints:
             joint_ramp.prepare(len(joints))
 
-    def act(self, state: RobotState, body: Body, intent: Intent | None) -> int:
-        """Publish the command for a state; return how many that were."""
+    def act(self, state: RobotState, body: Body, intent: Intent | None) -> None:
+        """Publish the command for a state, unless joints are missing."""
         if intent and intent.basis > state.tick:
             intent = None  # it rests on future data
         teleop = self.teleop.live(state, echo_wanted=body.link == "real")
@@ -304,11 +305,9 @@ class ArmControl:
         self._memory, command = step_joints(body.description, self._memory, inputs, self._commander)
         if self._memory.problem != before:
             _log_tolerance(state.tick, self._memory)
-        if command is None:
-            return 0
-        self._bus.publish(JOINT_CMD, command, basis=state.tick)
-        self._go_on(state, body, command)
-        return 1
+        if command:
+            self._bus.publish(JOINT_CMD, command, basis=state.tick)
+            self._go_on(state, body, command)
 
     def _go_on(self, state: RobotState, body: Body, command: JointCommand) -> None:
         """Publish more commands until the next state where an arm has a higher rate.

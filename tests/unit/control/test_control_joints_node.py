@@ -71,3 +71,17 @@ async def test_joints_come_to_rest_from_the_third_tick_without_an_intent() -> No
     assert braking[:16] == moving[:16]
     assert moving[16].velocity[0] > 0.5
     assert {(one.position, one.velocity) for one in braking[16:]} == {((), (0.0, 0.0))}
+
+
+async def test_an_arm_whose_joints_are_missing_leaves_control_healthy() -> None:
+    """As before the supply of its servos is switched on."""
+    arm, made = ArmBench(), []
+    async with NodeBench(control.run) as bench:
+        bench.send(BODY, Body(description=arm.body, link="real", boot=BOOT, tick=1))
+        for missing in (True, True, False, False):
+            arm.missing = missing
+            for _ in range(50):
+                arm.tick += 1
+                bench.send(STATE, arm.state())
+            made.append((bench.bus.progress(), bool(bench.sent(JOINT_CMD))))
+    assert made == [(True, False)] * 2 + [(True, True)] * 2
