@@ -36,8 +36,12 @@ class Scan:
 
     @classmethod
     def of(cls, points: NDArray[np.floating], free: NDArray[np.floating] | None = None) -> "Scan":
-        """Make a scan of hits (n, 2) in beam order; ValueError for another shape or NaN."""
+        """Make a scan of hits (n, 2) in beam order; ValueError for another shape or NaN.
+
+        Hits beyond REACH_M are left out: no map could be loaded with them.
+        """
         kept = pairs("points", points)
+        kept = kept[(np.abs(kept) <= REACH_M).all(axis=1)]
         ends = np.empty((0, 2), np.float32) if free is None else pairs("free", free)
         return cls(kept, normals(kept), ends)
 

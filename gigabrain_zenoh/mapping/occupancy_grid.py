@@ -71,7 +71,7 @@ class LogOddsGrid:
         """
         ends, clear = transform(sensor, hits), transform(sensor, free)
         around = np.vstack((sensor[None, :2], ends, clear))
-        self._cover(around.min(axis=0), around.max(axis=0))
+        self._cover(around.min(axis=0), around.max(axis=0), sensor[:2])
         self._scans += 1
         corner = np.array((self.origin_x, self.origin_y))
         start = ((sensor[:2] - corner) / CELL).astype(np.int64)
@@ -111,17 +111,17 @@ class LogOddsGrid:
             cells=self.percent().tobytes(),
         )
 
-    def _cover(self, low: Floats, high: Floats) -> None:
-        """Grow until the rectangle from `low` to `high` [m] lies within, if that may be."""
+    def _cover(self, low: Floats, high: Floats, sensor: Floats) -> None:
+        """Grow until the rectangle from `low` to `high` [m] lies within, or up to the limit."""
         height, width = self.log_odds.shape
         if width == 0:
-            self.origin_x, self.origin_y = (math.floor(v / CELL) * CELL for v in low.tolist())
-        left, right = _missing(float(low[0]), float(high[0]), self.origin_x, width)
-        below, above = _missing(float(low[1]), float(high[1]), self.origin_y, height)
+            corner = np.where(high - low < MAX_CELLS * CELL, low, sensor)
+            self.origin_x, self.origin_y = (math.floor(v / CELL) * CELL for v in corner.tolist())
+        (low_x, low_y), (high_x, high_y), (x, y) = low.tolist(), high.tolist(), sensor.tolist()
+        left, right, narrow = _missing(low_x, high_x, x, self.origin_x, width)
+        below, above, short = _missing(low_y, high_y, y, self.origin_y, height)
+        self.full |= narrow or short
         if not (left or right or below or above):
-            return
-        if max(width + left + right, height + below + above) > MAX_CELLS:
-            self.full = True
             return
         room = ((below, above), (left, right))
         self.log_odds = np.pad(self.log_odds, room)
@@ -130,11 +130,21 @@ class LogOddsGrid:
         self.origin_y -= below * CELL
 
 
-def _missing(low: float, high: float, origin: float, count: int) -> tuple[int, int]:
-    """Return how many cells to add before and after the existing ones."""
+def _missing(
+    low: float, high: float, sensor: float, origin: float, count: int
+) -> tuple[int, int, bool]:
+    """Return how many cells to add before and after the existing ones, and if they do not suffice.
+
+    Where not all may be added, those on both sides of the sensor are.
+    """
     before = math.floor((origin - low) / CELL) + 1 if low < origin else 0
-    after = math.floor((high - origin) / CELL) + 1 - count
-    return _rounded(before), _rounded(after)
+    after = max(math.floor((high - origin) / CELL) + 1 - count, 0)
+    left, right, room = _rounded(before), _rounded(after), MAX_CELLS - count
+    if left + right > room:
+        middle = MAX_CELLS // 2 - math.floor((sensor - origin) / CELL)
+        left = min(max(sorted((before, room - after, middle))[1], 0), room)
+        right = room - left
+    return left, right, before + after > room
 
 
 def _rounded(cells: int) -> int:

@@ -5,7 +5,9 @@ import pytest
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.mapping import occupancy_grid as grids
+from gigabrain_zenoh.mapping.keyframes import Scan, View
 from gigabrain_zenoh.mapping.occupancy_grid import LogOddsGrid
+from gigabrain_zenoh.mapping.slam_map import SlamMap
 from tests.unit.mapping.houses import HOUSE, Rooms, at
 
 NONE = np.empty((0, 2), np.float32)
@@ -63,9 +65,37 @@ def test_it_grows_to_all_sides_and_keeps_what_was_drawn() -> None:
 def test_what_would_not_fit_into_a_message_is_left_out_and_told() -> None:
     grid = LogOddsGrid()
     grid.draw(at(0, 0), points((1.0, 0.0)), NONE)
+    assert not grid.full
     grid.draw(at(0, 0), points((200.0, 0.0)), NONE)
     assert grid.full
-    assert grid.log_odds.size < 100_000
+    assert grid.log_odds.shape == (64, 2800)
+    assert percent(grid, 139.0, 0.0) == 38
+
+
+def test_a_room_longer_than_the_limit_is_drawn_as_far_as_it_goes_round_the_robot() -> None:
+    grid = LogOddsGrid()
+    for _ in range(2):
+        grid.draw(at(0, 0), points((80.0, 0.0), (-90.0, 0.0), (0.0, 3.0)), NONE)
+    assert grid.full
+    assert grid.log_odds.shape == (64, 2800)
+    assert grid.origin_x == pytest.approx(-70.0)
+    assert percent(grid, 0.025, 3.025) > 70 > 30 > percent(grid, -69.9, -0.025)
+
+
+def test_near_the_limit_a_beam_that_is_too_far_does_not_keep_the_grid_from_growing() -> None:
+    grid = LogOddsGrid()
+    grid.draw(at(0, 0), points((130.0, 0.0)), NONE)
+    grid.draw(at(125, 0), points((-200.0, 0.0), (6.0, 0.0), (0.0, 5.0)), NONE)
+    assert grid.log_odds.shape == (128, 2800)
+    assert percent(grid, 131.025, 0.025) == percent(grid, 125.025, 5.025) == 71
+    assert percent(grid, 129.0, 0.025) < 50
+
+
+def test_what_fits_exactly_is_drawn_and_not_told() -> None:
+    grid = LogOddsGrid()
+    grid.draw(at(0.025, 0.025), points((139.95, 0.0)), NONE)
+    assert not grid.full
+    assert percent(grid, 139.975, 0.025) == 71
 
 
 def test_what_walked_by_leaves_no_trace_and_walls_stay() -> None:
@@ -120,3 +150,15 @@ def test_a_part_of_it_is_what_the_whole_shows_there() -> None:
     assert part.shape == (40, 40)
     assert np.array_equal(part, grid.percent()[row : row + 40, column : column + 40])
     assert grid.around(500.0, 0.0, 1.0)[0].size == 0
+
+
+def test_a_map_with_hits_beyond_the_reach_is_drawn_and_gone_on_with() -> None:
+    hits = np.vstack((Rooms(HOUSE).view(at(2.0, 2.5)).scan.points, points((250.0, 0.0))))
+    grown, view = SlamMap(), View(Scan.of(hits), np.zeros(2))
+    for _ in range(6):
+        grown.step(view, np.zeros(3), np.diag((1e-4, 1e-4, 1e-5)))
+    again = SlamMap.thaw(grown.to_save()[1])
+    assert 0 < again.grid().width < 2800
+    assert grown.problems() == ()
+    grown.close()
+    again.close()
