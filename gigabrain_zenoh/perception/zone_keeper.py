@@ -82,7 +82,7 @@ class ZoneKeeper:
         self._now = Zones()  # as published
         self._sent_tick: int | None = None
         self._state = ZoneState(boot=0)  # without items
-        self._file: Path | None = None  # YAML file of the map, if it is saved
+        self._file: Path | None = None  # YAML file of the map, unless it grows
         self._changing = asyncio.Lock()  # one change after the other
         self._fault, self.problem = Fault(log), ""
         self._writer: BackgroundWriter[ZoneState] = BackgroundWriter(self._write, 1)
@@ -90,7 +90,8 @@ class ZoneKeeper:
 
     def use_map(self, name: str, mapping: MappingMode, zones: ZoneFile, *, loaded: bool) -> None:
         """Use the zones of a map from now on; `loaded` tells that it replaces another map."""
-        self._file = map_file.path_of(name) if name else None
+        # a growing map is not the one in the file any more
+        self._file = map_file.path_of(name) if name and mapping == "localize" else None
         count = self._state.maps_loaded + loaded
         short = name if len(name) <= 64 and "/" not in name else Path(name).stem[:64]
         self._state = replace(self._state, map=short, mapping=mapping, maps_loaded=count)
@@ -103,8 +104,7 @@ class ZoneKeeper:
         self._keep_state()
 
     def saved_as(self, name: str) -> None:
-        """Keep further changes beside the saved map `name`."""
-        self._file = map_file.saved_map_path(name)
+        """Name the map that was saved with these zones."""
         self._state = replace(self._state, map=name)
         self._update()
         self._keep_state()

@@ -62,6 +62,11 @@ async def newest(robot: Robot) -> Zones:
     return last(robot, ZONES)
 
 
+def house_file() -> ZoneFile:
+    """Return the zones beside the saved map."""
+    return zone_file.load(map_file.saved_map_path("house"))
+
+
 @pytest.fixture(autouse=True)
 def _own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
@@ -79,14 +84,16 @@ async def test_zones_are_published_saved_with_the_map_and_loaded_with_it() -> No
         assert ([one.name for one in now.zones], now.map) == (["lab"], "")
         assert (await robot.save("house")).ok
         reply = await ask(robot, ZONES_CHANGE, ZonesRequest(remove="lab"))
-        assert reply.text == "removed 'lab', kept with the map house"
-    kept = zone_file.load(map_file.saved_map_path("house"))
-    assert (kept.zones, kept.places) == ((), (KITCHEN,))
+        assert reply.text == "removed 'lab'; save the map to keep it"
+        assert house_file() == ZoneFile(zones=(LAB,), places=(KITCHEN,))
     async with Robot(PerceptionConfig(mapping="localize", map="house")) as robot:
         robot.say()
         robot.drive(3, still=True)
         now = await newest(robot)
         assert (now.places, now.map, now.maps_loaded) == ((KITCHEN,), "house", 0)
+        reply = await ask(robot, ZONES_CHANGE, ZonesRequest(remove="lab"))
+        assert reply.text == "removed 'lab', kept with the map house"
+    assert house_file() == ZoneFile(places=(KITCHEN,))
 
 
 @pytest.mark.parametrize(
@@ -197,6 +204,26 @@ async def test_zones_move_with_the_keyframe_beside_them() -> None:
     assert keeper.present.places[0].x == pytest.approx(3.0)
     keeper.follow(3, poses + 0.001)  # too little to be published
     assert keeper.present.places[0].x == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("loaded", [False, True])
+async def test_zones_of_a_map_that_grows_on_stay_in_its_file_as_they_fit_its_image(
+    loaded: bool,
+) -> None:
+    saved = ZoneFile(zones=(LAB,))
+    zone_file.save(map_file.saved_map_path("house"), saved)
+    net = Net()
+    keeper = ZoneKeeper(net.one, "", lambda: 0)
+    keeper.use_map("house" if loaded else "", "slam", saved, loaded=loaded)
+    if not loaded:
+        keeper.saved_as("house")
+    poses = np.array(((0.0, 0.0, 0.0), (1.0, 1.0, 0.0)))
+    keeper.follow(0, poses)
+    keeper.follow(1, poses + np.array((0.6, 0.0, 0.0)))  # a loop was closed
+    replies = await net.two.ask(ZONES_CHANGE, ZonesRequest(place=KITCHEN))
+    assert [one.text for one in replies] == ["added 'kitchen'; save the map to keep it"]
+    assert keeper.present.zones[0].points[0] == pytest.approx((1.6, 1.0))
+    assert house_file() == saved
 
 
 @pytest.mark.parametrize(
