@@ -129,22 +129,26 @@ class ObjectKeeper:
         self._map = name if len(name) <= 64 and "/" not in name else Path(name).stem[:64]
         # a growing map is not the one in the file any more
         self._file = path if mapping == "localize" else None
-        self.problem, self._sent_tick = "", None
+        self.problem, self._sent_tick, found = "", None, ObjectFile()
         try:
-            found = object_file.load(path) if path else ObjectFile()
+            found = object_file.load(path) if path else found
         except ConfigError as error:
             self._file = None
             self.problem = f"the map's objects are not used: {error}"
-            return
         self.memory.restore([(one, None) for one in found.objects])
         self.tags.restore([(one, None) for one in found.tags])
+        self._keep_state()
 
     def saved_as(self, name: str) -> None:
         """Name the map that was saved with these objects."""
         self._map, self._sent_tick = name, None
+        self._keep_state()
 
     def restore(self, boot: int) -> None:
-        """Go on with what an earlier process kept in this start of the driver, in the same map."""
+        """Go on with what an earlier process kept in this start of the driver.
+
+        The map must be the same, though it may have been saved under a name since.
+        """
         if self._state_path is None or not self._bus.input_log.live:
             return
         try:
@@ -155,7 +159,8 @@ class ObjectKeeper:
         except (OSError, ConfigError, *DECODE_ERRORS) as error:
             log.warning("%s: %s", self._state_path, error, extra={"data": {"event": "objects"}})
             return
-        if found.boot == boot and found.map == self._map:
+        if found.boot == boot:
+            self._map = found.map
             self.memory.restore([(one.object, _anchor(one.anchor)) for one in found.objects])
             self.tags.restore([(one.tag, _anchor(one.anchor)) for one in found.tags])
 
@@ -170,6 +175,7 @@ class ObjectKeeper:
             self._doubt()
         self.memory.restart()
         self.tags.restart()
+        self._keep_state()
 
     def hint(self) -> tuple[PoseHint, OdometrySample] | None:
         """Return where the robot was by the tags in a picture that waits, and its odometry then."""
@@ -342,21 +348,27 @@ class ObjectKeeper:
         return f"forgot {', '.join(names)}"
 
     def _keep(self, tick: int) -> None:
-        """Write what the next process needs, and the map's file in a saved map."""
-        if not self._bus.input_log.live or 0 <= tick - self._saved_tick < SAVED_TICKS:
+        """Write what the next process needs, and the map's file in a saved map, if it changed."""
+        if 0 <= tick - self._saved_tick < SAVED_TICKS:
             return
         found = self.present
         now = ObjectMap(objects=found.objects, tags=found.tags, map=self._map)
-        if _alike(now, self._saved) or (self._state_path is None and self._file is None):
+        if not _alike(now, self._saved):
+            self._saved, self._saved_tick = now, tick
+            self._keep_state()
+
+    def _keep_state(self) -> None:
+        """Write them at once."""
+        nowhere = self._state_path is None and self._file is None
+        if not self._boot or nowhere or not self._bus.input_log.live:
             return
-        self._saved, self._saved_tick = now, tick
         state = ObjectState(
             boot=self._boot,
             map=self._map,
             objects=tuple(KeptObject(one, _kept(at)) for one, at in self.memory.anchored()),
             tags=tuple(KeptTag(one, _kept(at)) for one, at in self.tags.anchored()),
         )
-        written = self._writer.put((state, self._file, found))
+        written = self._writer.put((state, self._file, self.present))
         written.add_done_callback(self._on_written)
 
     def _write(self, newest: Sequence[Write]) -> str:

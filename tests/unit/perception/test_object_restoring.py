@@ -1,0 +1,79 @@
+"""The next perception process goes on with the things and tags of the map."""
+
+from pathlib import Path
+
+import pytest
+
+from gigabrain_schemas.objects import MapObject, MapTag
+from gigabrain_zenoh.mapping import map_file, object_file
+from gigabrain_zenoh.mapping.object_file import ObjectFile
+from gigabrain_zenoh.mapping.odometry import OdometryFusion
+from gigabrain_zenoh.perception.object_keeper import ObjectKeeper
+from gigabrain_zenoh.testing.in_memory import Net
+
+CAN = MapObject(id=1, label="can", x=1, y=2, z=0.1, size=(0.1, 0.1), confidence=0.9, seen=5)
+TAG = MapTag(id=5, x=0, y=0, z=0.2, yaw=0, size=0.16)
+
+
+@pytest.fixture(autouse=True)
+def _own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+
+
+def keeper(folder: Path, boot: int, *, restored: bool = False) -> ObjectKeeper:
+    """Return that of a process which begins with a map that grows."""
+    new = ObjectKeeper(Net().one, str(folder), OdometryFusion)
+    new.use_map("", "slam")
+    if restored:
+        new.restore(boot)
+    new.restart(boot)
+    return new
+
+
+def knowing(folder: Path) -> ObjectKeeper:
+    """Return that of a process which has seen a can and a tag."""
+    new = keeper(folder, 7)
+    new.memory.restore([(CAN, None)])
+    new.tags.restore([(TAG, None)])
+    new.publish(500)
+    return new
+
+
+def known(found: ObjectKeeper) -> list[str | int]:
+    return [*(one.label for one in found.present.objects), *(one.id for one in found.present.tags)]
+
+
+async def test_things_of_a_map_that_was_saved_meanwhile_outlive_perception(tmp_path: Path) -> None:
+    first = knowing(tmp_path)
+    first.saved_as("office")
+    await first.finish_writing()
+    second = keeper(tmp_path, 7, restored=True)
+    second.publish(600)
+    await second.finish_writing()
+    third = keeper(tmp_path, 7, restored=True)  # the name lasts as well
+    await third.finish_writing()
+    assert known(second) == known(third) == ["can", 5]
+    assert b'"map":"office"' in (tmp_path / "objects.json").read_bytes()
+
+
+async def test_things_outlive_a_restart_of_the_driver_and_then_of_perception(
+    tmp_path: Path,
+) -> None:
+    first = knowing(tmp_path)
+    first.restart(8)
+    await first.finish_writing()
+    second = keeper(tmp_path, 8, restored=True)
+    await second.finish_writing()
+    assert known(second) == ["can", 5]
+
+
+async def test_things_of_a_map_are_not_restored_into_one_that_was_loaded_since(
+    tmp_path: Path,
+) -> None:
+    object_file.save(map_file.saved_map_path("office"), ObjectFile(tags=(TAG,)))
+    first = knowing(tmp_path)
+    first.use_map("office", "slam")
+    await first.finish_writing()
+    second = keeper(tmp_path, 7, restored=True)
+    await second.finish_writing()
+    assert known(second) == [5]
