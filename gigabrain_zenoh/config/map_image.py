@@ -15,7 +15,8 @@ from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import read_bounded
 
-MAX_PIXELS = 8_000_000  # what a message may carry
+MAX_PIXELS, MAX_SIDE = 8_000_000, 100_000  # what a message may carry
+MAX_COORDINATE_M = 100_000.0  # likewise
 MAX_HEADER_BYTES = 100_000  # bytes, with all its comments
 PGM_GAP = rb"(?:\s|#[^\n]*\n)+"  # white space and comments
 PGM_HEADER = re.compile(rb"P5" + (PGM_GAP + rb"(\d{1,9})") * 3 + rb"\s")
@@ -77,9 +78,27 @@ def load(path: Path, read_image: Callable[[Path], NDArray[np.uint8]] = read_pgm)
     if about.free_thresh >= about.occupied_thresh:
         raise ConfigError(f"{path}: free_thresh must be below occupied_thresh")
     grey = read_image(path.parent / about.image)
+    _check_bounds(path, about, grey.shape)
     share = grey / 255 if about.negate else (255 - grey.astype(np.float64)) / 255
     cells = np.full(grey.shape, -1, np.int8)
     cells[share > about.occupied_thresh] = 100
     cells[share < about.free_thresh] = 0
     upwards = np.ascontiguousarray(cells[::-1])
     return SavedMap(upwards, about.resolution, about.origin[0], about.origin[1])
+
+
+def _check_bounds(path: Path, about: MapYaml, shape: tuple[int, ...]) -> None:
+    """Raise ConfigError for a map that no message may hold."""
+    height, width = shape
+    if max(shape) > MAX_SIDE:
+        raise ConfigError(
+            f"{path}: image: {width} x {height} pixels; expected at most {MAX_SIDE} a side"
+        )
+    low = np.array(about.origin[:2])
+    high = low + about.resolution * np.array((width, height))
+    x, y = np.where(np.abs(low) > np.abs(high), low, high).tolist()
+    if max(abs(x), abs(y)) > MAX_COORDINATE_M:
+        raise ConfigError(
+            f"{path}: origin: the map reaches to ({x:.0f}, {y:.0f}) m; expected within 100 km of "
+            "(0, 0); shift a map in UTM, such as to 'origin: [0, 0, 0]'"
+        )

@@ -123,6 +123,14 @@ def test_a_damaged_image_is_refused_in_one_line(damage: object, told: str, path:
         ("resolution: 0.05", "resolution: 1e9", "room.yaml:2: resolution: expected a number >= 0."),
         ("room.pgm", '"room\\0.pgm"', "room.yaml:1: image: expected a string matching"),
         ("0.0]", "0.7]", "room.yaml: origin: turned by 0.7 rad; expected yaw 0"),
+        (
+            "[-2.35, 1.1, 0.0]",
+            "[500000, 4500000, 0]",
+            "room.yaml: origin: the map reaches to (500006, 4500005) m; expected within 100 km of "
+            "(0, 0); shift a map in UTM, such as to 'origin: [0, 0, 0]'",
+        ),
+        ("-2.35", "99995", "room.yaml: origin: the map reaches to (100001, 6) m"),
+        ("1.1", "-100001", "room.yaml: origin: the map reaches to (4, -100001) m"),
         ("0.196", "0.7", "room.yaml: free_thresh must be below occupied_thresh"),
         ("room.pgm", "gone.pgm", "gone.pgm: the map's image: No such file or directory"),
     ],
@@ -135,6 +143,12 @@ def test_a_wrong_description_is_refused_in_one_line(
         map_file.load(path)
     assert told in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_an_image_that_is_longer_than_a_message_may_say_is_refused_in_one_line(path: Path) -> None:
+    path.with_suffix(".pgm").write_bytes(b"P5 100001 1 255\n" + bytes(100_001))
+    with pytest.raises(ConfigError, match=r"100001 x 1 pixels; expected at most 100000 a side$"):
+        map_file.load(path)
 
 
 @pytest.mark.parametrize("keep", [0, 100, 200])
