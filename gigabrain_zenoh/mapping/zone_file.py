@@ -7,6 +7,7 @@ from typing import Annotated
 
 import numpy as np
 from msgspec import Meta, Struct
+from msgspec.structs import replace
 
 from gigabrain_schemas.zones import Place, PlaceList, Zone, ZoneList, check_zones
 from gigabrain_zenoh.config import loading
@@ -17,6 +18,7 @@ from gigabrain_zenoh.mapping import map_file
 
 ENDING = map_file.ZONES
 VERSION = 1
+DECIMALS = 6  # of a zone's corners in the file
 HEAD = "# Zones and places of the map; docs/how-to/zones_and_places.md describes them. [m], [rad]\n"
 
 
@@ -76,12 +78,25 @@ def zone_problem(zone: Zone) -> str:
     return f"{problem}; draw a polygon whose edges do not cross" if problem else ""
 
 
+def new_zone_problem(zone: Zone) -> str:
+    """Return why a zone is refused: it must make sense as written, and to 1 mm as well.
+
+    So its file can be read also after a loop closure has moved and turned the zone.
+    """
+    return zone_problem(_rounded(zone, DECIMALS)) or zone_problem(_rounded(zone, 3))
+
+
+def _rounded(zone: Zone, decimals: int) -> Zone:
+    corners = tuple((round(x, decimals), round(y, decimals)) for x, y in zone.points)
+    return replace(zone, points=corners)
+
+
 def _lines(zones: ZoneFile) -> Iterator[str]:
     yield "zones:\n" if zones.zones else "zones: []\n"
     for zone in zones.zones:
         more = "" if zone.max_speed is None else f", max_speed: {zone.max_speed:.6g}"
         more += "" if zone.lane_width is None else f", lane_width: {zone.lane_width:.6g}"
-        points = ", ".join(f"[{x:.3f}, {y:.3f}]" for x, y in zone.points)
+        points = ", ".join(f"[{x}, {y}]" for x, y in _rounded(zone, DECIMALS).points)
         yield f"- {{name: {_quoted(zone.name)}, kind: {zone.kind}{more},\n   points: [{points}]}}\n"
     yield "places:\n" if zones.places else "places: []\n"
     for place in zones.places:

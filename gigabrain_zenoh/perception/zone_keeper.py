@@ -213,7 +213,7 @@ class ZoneKeeper:
             if there and not request.replace:
                 remedy = "replace it (--replace), or choose another name"
                 raise Refused(f"{name!r} is there already; {remedy}")
-            if request.zone and (problem := zone_file.zone_problem(request.zone)):
+            if request.zone and (problem := zone_file.new_zone_problem(request.zone)):
                 raise Refused(f"zone {name!r}: {problem}")
             items = (*others, _anchored(new, self._poses))
             verb = "replaced" if there else "added"

@@ -267,6 +267,40 @@ def test_what_is_written_is_read_again() -> None:
     assert zone_file.load(path) == zones
 
 
+CORNERS = ((0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (2.0003, 1.0003), (0.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("zone", "why"),
+    [
+        (Zone(name="lab", kind="keepout", points=CORNERS), "its edges cross"),
+        (
+            Zone(name="lab", kind="one_way", lane_width=1, points=((0, 0), (0.0004, 0))),
+            "its points are all the same",
+        ),
+    ],
+)
+async def test_a_zone_that_could_not_be_read_again_is_refused(zone: Zone, why: str) -> None:
+    net = Net()
+    ZoneKeeper(net.one, "", lambda: 0)
+    reply = (await net.two.ask(ZONES_CHANGE, ZonesRequest(zone=zone)))[0]
+    assert reply.text.startswith(f"zone 'lab': {why}")
+
+
+async def test_a_narrow_zone_that_has_moved_with_the_map_can_be_read_again() -> None:
+    slit = ((0, 0), (3, 0), (3, 3), (0, 3), (0, 0.001), (1, 0.001), (1, 2), (2, 2), (2, 0.001))
+    lane = Zone(name="lane", kind="one_way", lane_width=1, points=((0, 0), (0.001, 0)))
+    net = Net()
+    keeper = ZoneKeeper(net.one, "", lambda: 0)
+    for zone in (Zone(name="slit", kind="keepout", points=slit), lane):
+        assert (await net.two.ask(ZONES_CHANGE, ZonesRequest(zone=zone)))[0].ok
+    keeper.follow(0, np.zeros((1, 3)))
+    keeper.follow(1, np.array(((0.0003, 0.0004, 1.3),)))
+    path = map_file.saved_map_path("house")
+    zone_file.save(path, keeper.present)
+    assert [one.name for one in zone_file.load(path).zones] == ["slit", "lane"]
+
+
 async def test_a_growing_maps_zones_outlive_its_process(tmp_path: Path) -> None:
     async with Robot(PerceptionConfig(mapping="slam", state_dir=str(tmp_path / "robot"))) as robot:
         robot.say()
