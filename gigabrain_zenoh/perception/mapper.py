@@ -199,7 +199,13 @@ class Mapper:
         """
         kept = self._zones.restore(boot)
         if kept and kept.maps_loaded:  # another map than that of the settings
-            self._use(replace(self._config, map=kept.map, mapping=kept.mapping), loaded=False)
+            try:
+                self._use(replace(self._config, map=kept.map, mapping=kept.mapping), loaded=False)
+            except ConfigError as error:
+                text = f"map {kept.map!r} is not loaded again: {error}; going on without it"
+                log.warning("%s", text, extra={"data": {"event": "map"}})
+                if not kept.mapping == self._config.mapping == "slam":
+                    return False  # what was kept does not fit the map of the settings
         if self._autosave:
             self._resume_map(self._autosave, boot)
         found = self._config.mapping == "localize" and kept and kept.map == self._zones.map

@@ -22,7 +22,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.input_log import log_accepted
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.config.settings import MappingMode
-from gigabrain_zenoh.errors import Refused, unknown
+from gigabrain_zenoh.errors import ConfigError, Refused, unknown
 from gigabrain_zenoh.geometry.se2 import compose, inverse, transform
 from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file
 from gigabrain_zenoh.host.threads import BackgroundWriter
@@ -111,12 +111,14 @@ class ZoneKeeper:
 
     def restore(self, boot: int) -> ZoneState | None:
         """Return what an earlier process kept in this start of the driver, if anything."""
-        if self._state_path is None or not self._state_path.exists():
+        if self._state_path is None:
             return None
         try:
             data = read_bounded(self._state_path, MAX_STATE_BYTES)
             found = msgspec.json.decode(data, type=ZoneState)
-        except (OSError, *DECODE_ERRORS) as error:
+        except FileNotFoundError:
+            return None
+        except (OSError, ConfigError, *DECODE_ERRORS) as error:
             log.warning("%s: %s", self._state_path, error, extra={"data": {"event": "zones"}})
             return None
         return found if found.boot == boot else None

@@ -2,9 +2,10 @@
 
 import asyncio
 import math
-from collections.abc import Awaitable
+import os
+from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 import pytest
@@ -317,3 +318,65 @@ async def test_a_growing_maps_zones_outlive_its_process(tmp_path: Path) -> None:
         robot.say()
         robot.drive(3)
         assert (await newest(robot)).zones == (LAB,)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda path: path.write_bytes(b" " * 5_000_000),
+        Path.mkdir,
+        os.mkfifo,
+        lambda path: path.write_bytes(b"{"),
+    ],
+)
+async def test_a_damaged_state_of_zones_is_left_out_with_one_line(
+    spoil: Callable[[Path], object], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    spoil(tmp_path / "zones.json")
+    assert ZoneKeeper(Net().one, str(tmp_path), lambda: 0).restore(7) is None
+    assert len(caplog.messages) == 1
+    assert str(tmp_path / "zones.json") in caplog.messages[0]
+
+
+@pytest.mark.parametrize("mapping", ["localize", "slam"])
+async def test_a_map_that_was_loaded_and_is_gone_does_not_end_perception(
+    mapping: Literal["localize", "slam"], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Robot(PerceptionConfig(mapping="slam", state_dir=str(tmp_path / "robot"))) as robot:
+        robot.say()
+        robot.drive(40)
+        await ask(robot, ZONES_CHANGE, ZonesRequest(place=KITCHEN))
+        assert (await robot.save("house")).ok
+        assert (await ask(robot, MAP_LOAD, MapLoadRequest(name="house", mapping=mapping))).ok
+        map_file.saved_map_path("house").unlink()
+        for _ in range(2):
+            await robot.restart()
+            await robot.ready()
+            robot.say()
+            robot.drive(3)
+            now = await newest(robot)
+            assert (now.map, now.places) == ("", ())
+            assert last(robot, POSE).localized
+    told = [line for line in caplog.messages if line.startswith("map 'house' is not loaded again")]
+    assert len(told) == 1
+    assert "house.yaml: no such file" in told[0]
+
+
+async def test_a_map_that_grows_on_outlives_the_file_that_it_began_with(tmp_path: Path) -> None:
+    async with Robot(PerceptionConfig(mapping="slam", state_dir=str(tmp_path / "robot"))) as robot:
+        robot.say()
+        robot.drive(40)
+        await ask(robot, ZONES_CHANGE, ZonesRequest(place=KITCHEN))
+        assert (await robot.save("house")).ok
+        assert (await ask(robot, MAP_LOAD, MapLoadRequest(name="house", mapping="slam"))).ok
+        async with asyncio.timeout(60):
+            while not robot.bus.report().get("saves"):
+                robot.drive(1, still=True)
+                await asyncio.sleep(0.002)
+        map_file.saved_map_path("house").unlink()
+        await robot.restart()
+        await robot.ready()
+        robot.say()
+        robot.drive(3, still=True)
+        now = await newest(robot)
+        assert (now.map, now.maps_loaded, now.places) == ("house", 1, (KITCHEN,))
