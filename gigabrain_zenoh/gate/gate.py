@@ -207,7 +207,6 @@ def _enabled(state: GateState, source: str) -> GateState:
         joint_command=None,
         joint_tick=state.tick,
         next_joint_seq=0,
-        nan_ticks=(),
     )
 
 
@@ -272,15 +271,18 @@ def _obeyed(state: GateState, command: CmdVel | JointCommand) -> GateState:
 
 
 def _not_finite(state: GateState, event: NotFinite) -> tuple[GateState, Outcome]:
-    """Stop at once if the commander sent it; otherwise only count it."""
+    """Stop at once if the commander sent it, and latch if it goes on, also once it is none."""
     refused = Outcome(refused="not_finite", ok=False)
-    if event.boot != state.boot or not state.commander or event.source != state.commander:
+    sender = state.commander or state.nan_source
+    if event.boot != state.boot or not sender or event.source != sender or state.mode == "latched":
         return state, refused
-    recent = (*(t for t in state.nan_ticks if state.tick - t < NAN_STORM_TICKS), state.tick)
+    before = state.nan_ticks if event.source == state.nan_source else ()
+    recent = (*(t for t in before if state.tick - t < NAN_STORM_TICKS), state.tick)
     cause = why.NAN_STORM if len(recent) >= NAN_STORM_COUNT else why.NOT_FINITE
     causes = why.merge(state.causes, (cause,))
     state = _stop(state, causes) if state.mode == "enabled" else replace(state, causes=causes)
-    return replace(state, nan_ticks=recent, healthy_ticks=0, before=ZERO), refused
+    state = replace(state, nan_ticks=recent, nan_source=event.source)
+    return replace(state, healthy_ticks=0, before=ZERO), refused
 
 
 def _safety(state: GateState, verdict: SafetyState) -> GateState:

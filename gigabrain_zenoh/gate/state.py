@@ -51,7 +51,8 @@ class GateState(msgspec.Struct, frozen=True, kw_only=True):
     stopped_tick: int = 0  # when stopping began
     still_ticks: int = 0
     healthy_ticks: int = 0
-    nan_ticks: tuple[int, ...] = ()
+    nan_ticks: tuple[int, ...] = ()  # when the newest commands that were not finite came
+    nan_source: str = ""  # from whom
     late: bool = False  # this tick was missed and is made up for
     before: Velocity = ZERO  # output of the last tick
     output: Velocity = ZERO  # velocity for the body

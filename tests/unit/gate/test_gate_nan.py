@@ -78,6 +78,39 @@ def test_five_within_a_second_latch() -> None:
     assert (rig.mode, rig.codes) == ("latched", ["nan_storm"])
 
 
+@pytest.mark.parametrize("apart", [4, 12])
+@pytest.mark.parametrize("again", [False, True])
+def test_five_within_a_second_latch_also_where_the_first_has_closed_the_gate(
+    apart: int, again: bool
+) -> None:
+    rig = enabled()
+    rig.live(5)
+    for _ in range(4):
+        rig.feed(gate.NotFinite("control", BOOT))
+        rig.live(apart)
+        if again:
+            rig.feed(gate.Enable("control"))
+    assert rig.mode != "latched"
+    rig.feed(gate.NotFinite("control", BOOT))
+    rig.live(20)
+    assert (rig.mode, rig.codes) == ("latched", ["nan_storm"])
+    before = rig.state
+    assert rig.feed(gate.NotFinite("control", BOOT)) == refused("not_finite")
+    assert rig.state == before
+
+
+def test_once_the_gate_is_idle_only_that_of_whoever_lost_the_body_by_it_counts() -> None:
+    rig = enabled()
+    rig.live(5)
+    rig.feed(gate.NotFinite("control", BOOT))
+    rig.until("idle", lambda: rig.live(1))
+    before = rig.state
+    assert rig.feed(gate.NotFinite("alice", BOOT)) == refused("not_finite")
+    assert rig.state == before
+    assert rig.feed(gate.NotFinite("control", BOOT)) == refused("not_finite")
+    assert rig.codes == ["nan"]
+
+
 @pytest.mark.parametrize(("ticks", "codes"), [(49, ["nan", "nan_storm"]), (50, ["nan"])])
 def test_five_in_more_than_a_second_do_not(ticks: int, codes: list[str]) -> None:
     rig = driving(0.2)
