@@ -21,6 +21,7 @@ MAX_REACH = 0.999  # of the whole leg; fully stretched it could not be steered
 
 FREQUENCY_HZ = (1.0, 5.0)  # [Hz]
 DUTY_RANGE = (0.5, 0.9)
+F32_ROUNDING = 1e-6
 HEIGHT_M = (0.20, 0.33)  # [m]
 MAX_STRIDE_M = 0.25  # [m], ahead or sideways, in one cycle
 MAX_TURN_RAD = 0.6  # [rad] in one cycle
@@ -190,18 +191,23 @@ WALKER = Walker(frequency=3.6, max_frequency=4.2, duty=0.6)
 
 
 def is_sound(gait: Gait) -> bool:
-    """Return whether all values are numbers, and within what the legs can do."""
+    """Return whether all values are numbers, and within what the legs can do.
+
+    On the wire they are f32, by which a limit may be rounded up.
+    """
     values = (gait.stride_x, gait.stride_y, gait.turn, gait.frequency, gait.duty, gait.height)
     if not all(map(math.isfinite, (*values, *gait.phases))):
         return False
-    return (
-        math.hypot(gait.stride_x, gait.stride_y) <= MAX_STRIDE_M
-        and abs(gait.turn) <= MAX_TURN_RAD
-        and FREQUENCY_HZ[0] <= gait.frequency <= FREQUENCY_HZ[1]
-        and DUTY_RANGE[0] <= gait.duty <= DUTY_RANGE[1]
-        and HEIGHT_M[0] <= gait.height <= HEIGHT_M[1]
-        and all(0.0 <= phase < 1.0 for phase in gait.phases)
+    limited = (
+        (math.hypot(gait.stride_x, gait.stride_y), 0.0, MAX_STRIDE_M),
+        (abs(gait.turn), 0.0, MAX_TURN_RAD),
+        (gait.frequency, *FREQUENCY_HZ),
+        (gait.duty, *DUTY_RANGE),
+        (gait.height, *HEIGHT_M),
     )
+    return all(
+        least - F32_ROUNDING <= value <= most + F32_ROUNDING for value, least, most in limited
+    ) and all(0.0 <= phase < 1.0 for phase in gait.phases)
 
 
 class LegOdometry:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from gigabrain_drivers.bodies.alpha import protocol as alpha
 from gigabrain_drivers.bodies.alpha.protocol import AlphaDecoder, AlphaFrame, State, Walk
-from gigabrain_drivers.kinematics.legs import WALKER, Gait, Senses
+from gigabrain_drivers.kinematics.legs import WALKER, Gait, Senses, is_sound
 from gigabrain_drivers.kinematics.wheels import Twist
 from gigabrain_drivers.links.tcp_link import address
 from gigabrain_zenoh.errors import ConfigError
@@ -99,6 +99,27 @@ def test_a_velocity_survives_the_wire_to_a_millionth(x: float, y: float, turn: f
     command = alpha.decode_walk(frame)
     assert command
     assert WALKER.to_body(command.gait) == pytest.approx((x, y, turn), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("limits", "sound"),
+    [
+        ({"height": 0.33, "turn": 0.6, "frequency": 5.0, "duty": 0.9}, True),
+        ({"height": 0.2, "turn": -0.6, "frequency": 1.0, "duty": 0.5}, True),
+        ({"stride_x": 0.15, "stride_y": -0.2}, True),
+        ({"height": 0.33001}, False),
+        ({"turn": 0.60001}, False),
+        ({"stride_x": 0.25001}, False),
+    ],
+)
+def test_the_limits_of_the_firmware_page_are_obeyed_though_the_wire_rounds_them(
+    limits: dict[str, float], sound: bool
+) -> None:
+    gait = WALKER.to_gait(Twist(0.0, 0.0, 0.0))._replace(**limits)
+    (frame,) = AlphaDecoder().feed(alpha.encode_walk(Walk(1000, gait), 2))
+    walk = alpha.decode_walk(frame)
+    assert walk
+    assert is_sound(walk.gait) == sound
 
 
 def test_a_state_there_and_back() -> None:
