@@ -115,7 +115,7 @@ signals: setup
 	@mkdir -p .qa
 	$(BIN)/python -m tests.qa.signal_sweep --results .qa/signals.jsonl
 
-# every row ten times, the e-stop's thirty
+# every row but 39 ten times, the e-stop's thirty
 INTO ?= .qa/faults.jsonl
 faults: setup
 	@mkdir -p $(dir $(INTO))
