@@ -13,10 +13,11 @@ from tests.system.page import Browser, browser, needs_browser
 
 pytestmark = [needs_browser, pytest.mark.asyncio(loop_scope="module")]
 
-PAD = """
+PADS = """
 const button = (pressed) => ({ pressed, value: pressed ? 1 : 0 })
-window.pad = { axes: [0, 0, 0, 0], buttons: Array.from({ length: 16 }, () => button(false)) }
-navigator.getGamepads = () => [window.pad]
+const idle = () => ({ axes: [0, 0, 0, 0], buttons: Array.from({ length: 16 }, () => button(false)) })
+window.pads = [idle(), idle()]
+navigator.getGamepads = () => [null, ...window.pads]
 """
 
 
@@ -127,25 +128,45 @@ async def test_a_click_sends_a_goal_in_the_map_and_a_drag_its_heading(
 async def test_a_gamepad_drives_while_a_shoulder_button_is_held(
     chromium: Browser, fake: Fake
 ) -> None:
-    page = await chromium.open(before=PAD)
+    page = await chromium.open(before=PADS)
     await page.wait_for_selector("#gate[data-mode=enabled]")
-    await page.evaluate("pad.axes = [0, -1, -0.5, 0]")
+    await page.evaluate("pads[0].axes = [0, -1, -0.5, 0]")
     await page.wait_for_timeout(300)
     assert fake.steered == []  # no shoulder button
-    await page.evaluate("pad.buttons[5].pressed = true")
+    await page.evaluate("pads[0].buttons[5].pressed = true")
     await until(lambda: len(fake.steered) > 3, "steered")
     wanted = fake.steered[-1]
     # half of what the body can, as the slider stands; half of that for half a stick
     assert (round(wanted.linear_x, 3), round(wanted.angular_z, 3)) == (0.13, 0.455)
-    await page.evaluate("pad.buttons[5].pressed = false")
+    await page.evaluate("pads[0].buttons[5].pressed = false")
     await until(lambda: fake.steered[-1].linear_x == 0.0, "a zero at the end")
     count = len(fake.steered)
     await page.wait_for_timeout(300)
     assert len(fake.steered) == count
-    await page.evaluate("pad.buttons[1].pressed = true")
+    await page.evaluate("pads[0].buttons[1].pressed = true")
     await page.wait_for_selector('#confirmed:has-text("CONFIRMED by")')
     await page.wait_for_timeout(200)
     assert fake.presses == ["page"]  # once, for as long as the button is held
+
+
+async def test_button_b_of_any_gamepad_stops_while_a_key_or_the_joystick_is_held(
+    chromium: Browser, fake: Fake
+) -> None:
+    page = await chromium.open(before=PADS)
+    await page.wait_for_selector("#gate[data-mode=enabled]")
+    fake.presses.clear()
+    await page.keyboard.down("w")
+    await until(lambda: fake.steered and fake.steered[-1].linear_x > 0, "driven by a key")
+    await page.evaluate("pads[0].buttons[1].pressed = true")
+    await until(lambda: fake.presses == ["page"], "stopped while a key is held")
+    await until(lambda: fake.steered[-1].linear_x == 0.0, "the key counts as released")
+    await page.keyboard.up("w")
+    await page.hover("#stick", position={"x": 60, "y": 5})
+    await page.mouse.down()
+    await until(lambda: fake.steered[-1].linear_x > 0, "driven by the joystick")
+    await page.evaluate("pads[1].buttons[1].pressed = true")
+    await until(lambda: fake.presses == ["page"] * 2, "stopped while the joystick is held")
+    await page.mouse.up()
 
 
 @pytest.mark.parametrize("file", ["main.js", "link.js", "style.css"])

@@ -6,20 +6,21 @@ const KEYS = {
   KeyQ: [0, 1, 0], KeyE: [0, -1, 0],
 }
 const SHOULDER_BUTTONS = [4, 5], STOP_BUTTON = 1, DEAD_ZONE = 0.12
+const gamepads = () => (document.hidden ? [] : [...(navigator.getGamepads?.() ?? [])].filter(Boolean))
 const isTextInput = (target) => target.matches?.('input:not([type=range]), textarea')
 
 export class Drive {
   #held = new Set()
   #stick = null // [x, z] while it is held
   #sending = false
-  #stopPressed = false // on the gamepad
+  #stopsPressed = 0 // on all gamepads
 
   /** `limits()` returns the highest speeds, `send(x, y, z)` sends a velocity, `stop()` is the e-stop. */
   constructor({ stick, speedShare, limits, send, stop, allowed, show }) {
     Object.assign(this, { stick, speedShare, limits, send, stop, allowed, show })
     this.#listenToKeys()
     this.#listenToStick()
-    setInterval(() => this.#sendWanted(), PERIOD_MS)
+    setInterval(() => { this.#readStopButtons(); this.#sendWanted() }, PERIOD_MS)
   }
 
   /** Count all keys and the joystick as released. */
@@ -47,14 +48,16 @@ export class Drive {
     return sum.some(Boolean) ? sum.map(Math.sign) : this.#gamepadAxes()
   }
 
+  /** Stop once for each press of a gamepad's stop button, whatever else is held. */
+  #readStopButtons() {
+    const pressed = gamepads().filter(({ buttons }) => buttons[STOP_BUTTON]?.pressed).length
+    if (pressed > this.#stopsPressed) this.stop()
+    this.#stopsPressed = pressed
+  }
+
   #gamepadAxes() {
-    const pad = [...(navigator.getGamepads?.() ?? [])].find(Boolean)
-    if (!pad || document.hidden) return [0, 0, 0]
-    const pressed = pad.buttons[STOP_BUTTON]?.pressed ?? false
-    const before = this.#stopPressed
-    this.#stopPressed = pressed // before the stop, which reads the gamepad again
-    if (pressed && !before) this.stop()
-    if (!SHOULDER_BUTTONS.some((n) => pad.buttons[n]?.pressed)) return [0, 0, 0]
+    const [pad] = gamepads()
+    if (!pad || !SHOULDER_BUTTONS.some((n) => pad.buttons[n]?.pressed)) return [0, 0, 0]
     const axis = (n) => (Math.abs(pad.axes[n] ?? 0) < DEAD_ZONE ? 0 : -pad.axes[n])
     return [axis(1), axis(0), axis(2)]
   }
