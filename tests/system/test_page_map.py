@@ -15,10 +15,22 @@ pytestmark = [needs_browser, pytest.mark.asyncio(loop_scope="module")]
 
 PADS = """
 const button = (pressed) => ({ pressed, value: pressed ? 1 : 0 })
-const idle = () => ({ axes: [0, 0, 0, 0], buttons: Array.from({ length: 16 }, () => button(false)) })
+const buttons = () => Array.from({ length: 16 }, () => button(false))
+const idle = () => ({ axes: [0, 0, 0, 0], buttons: buttons() })
 window.pads = [idle(), idle()]
 navigator.getGamepads = () => [null, ...window.pads]
 """
+COUNTED = """
+window.sent = 0
+const send = WebSocket.prototype.send
+WebSocket.prototype.send = function (frame) { window.sent++; send.call(this, frame) }
+"""
+MOVE_STICK_LEFT = """() => {
+  const stick = document.getElementById('stick'), box = stick.getBoundingClientRect(), before = sent
+  const at = { clientX: box.left + 5, clientY: box.top + box.height / 2 }
+  for (let i = 0; i < 200; i++) stick.dispatchEvent(new PointerEvent('pointermove', at))
+  return sent - before
+}"""  # returns how many frames that has sent
 
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
@@ -167,6 +179,21 @@ async def test_button_b_of_any_gamepad_stops_while_a_key_or_the_joystick_is_held
     await page.evaluate("pads[1].buttons[1].pressed = true")
     await until(lambda: fake.presses == ["page"] * 2, "stopped while the joystick is held")
     await page.mouse.up()
+
+
+async def test_a_joystick_that_moves_sends_no_more_commands_than_one_that_is_held(
+    chromium: Browser, fake: Fake
+) -> None:
+    page = await chromium.open(before=COUNTED)
+    await page.wait_for_selector("#gate[data-mode=enabled]")
+    await page.hover("#stick", position={"x": 60, "y": 5})
+    await page.mouse.down()
+    await until(lambda: fake.steered and fake.steered[-1].linear_x > 0, "driven")
+    # more moves at once than the server takes frames in a second
+    assert await page.evaluate(MOVE_STICK_LEFT) == 0
+    await until(lambda: fake.steered[-1].angular_z > 0, "turned as the joystick was moved")
+    await page.mouse.up()
+    await until(lambda: fake.steered[-1].angular_z == 0, "a zero at the end")
 
 
 @pytest.mark.parametrize("file", ["main.js", "link.js", "style.css"])

@@ -90,11 +90,11 @@ export class Drive {
       this.#stick = [-down / length, -right / length].map((v) => (Math.abs(v) < DEAD_ZONE ? 0 : v))
       const knob = this.stick.firstElementChild
       knob.style.transform = `translate(${(right / length) * radius * 0.7}px, ${(down / length) * radius * 0.7}px)`
-      this.#sendWanted()
     }
     this.stick.addEventListener('pointerdown', (event) => {
       this.stick.setPointerCapture(event.pointerId)
       move(event)
+      this.#sendWanted()
     })
     this.stick.addEventListener('pointermove', (event) => this.#stick && move(event))
     for (const end of ['pointerup', 'pointercancel', 'lostpointercapture']) {
