@@ -18,7 +18,7 @@ from msgspec import Struct
 from gigabrain_schemas.topics import CMD_VEL, DEPTH, INTENT, STATE, TASK, TOPICS, Topic
 from gigabrain_zenoh.bus.headers import Header, is_json
 from gigabrain_zenoh.bus.listening import topic_of
-from gigabrain_zenoh.codec import Codec
+from gigabrain_zenoh.codec import Codec, encoding_of
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import open_regular
 from gigabrain_zenoh.host.posix import fcntl
@@ -36,6 +36,7 @@ MIN_DRAWN_INTERVAL_NS = {
     TASK.key: 450_000_000,  # holds the whole path to the goal
     DEPTH.key: 450_000_000,  # of each camera; viewers take it uncompressed
 }
+TYPE_BY_ENCODING = {encoding_of(topic.type): topic.type for topic in TOPICS}
 _fdatasync = getattr(os, "fdatasync", os.fsync)  # macOS has no fdatasync
 
 
@@ -223,7 +224,8 @@ class BagWriter:
         topic = topic_of(key)
         form = MessageEncoding.JSON if json else "msgpack"
         notes = {"kind": RAW, "zenoh_encoding": encoding}
-        schema = self._schema(json_schema(topic.type)) if topic else 0
+        type_ = topic.type if topic else TYPE_BY_ENCODING.get(encoding)
+        schema = self._schema(json_schema(type_)) if type_ else 0
         number = self._writer.register_channel(key, form, schema, notes)
         self._store()  # a large schema may finish the chunk before the message is in it
         drawn = topic if topic and self._viewers and self._drawer.draws(topic) else None

@@ -97,18 +97,24 @@ class LeRobotFrame(Struct, frozen=True, kw_only=True):
 
 
 def frames(path: Path, layout: Layout | None = None) -> Iterator[LeRobotFrame]:
-    """Iterate over the states of an enabled gate, with the newest scan and command."""
+    """Iterate over the states of an enabled gate, with the newest scan and command.
+
+    The command is that of the gate's commander; others may publish as well.
+    """
     layout = layout or layout_of(path)
-    scan, command = np.empty(0, np.float32), Velocity()
+    scan, command, commander = np.empty(0, np.float32), Velocity(), ""
     for sample in samples(path):
         message = message_of(sample)
         if isinstance(message, LaserScan):
             seen = np.minimum(message.ranges_m, np.float32(message.range_max))
             scan = np.nan_to_num(seen, nan=0.0)
-        elif isinstance(message, CmdVel):
+        elif isinstance(message, CmdVel) and message.source == commander:
             command = velocity_of(message)
-        elif isinstance(message, RobotState) and message.gate.mode == "enabled":
-            values = None if message.tick % layout.ticks else _values(layout, message, command)
+        elif isinstance(message, RobotState):
+            if message.gate.commander != commander:
+                command, commander = Velocity(), message.gate.commander
+            due = message.gate.mode == "enabled" and message.tick % layout.ticks == 0
+            values = _values(layout, message, command) if due else None
             if values:
                 state, action = (np.array(one, np.float32) for one in values)
                 yield LeRobotFrame(

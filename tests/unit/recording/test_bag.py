@@ -16,7 +16,9 @@ from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 
+from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import TOPICS
+from gigabrain_zenoh import codec
 from gigabrain_zenoh.bus.headers import Header, SequenceGaps, header_of
 from gigabrain_zenoh.cli.app import make_app
 from gigabrain_zenoh.errors import ConfigError
@@ -52,6 +54,17 @@ def test_messages_are_read_byte_for_byte_with_key_encoding_and_schema(
         (a.log_ns, a.key, a.encoding, a.payload) for a in told
     ]
     assert [s.schema for s in read[-3:]] == ["gigabrain.LaserScan", "", "gigabrain.Twist"]
+
+
+def test_a_key_that_only_one_body_obeys_has_the_schema_of_its_encoding(tmp_path: Path) -> None:
+    path, command = tmp_path / "a.mcap", codec.encode(CmdVel(linear_x=0.2, source="control"))
+    told = bags.arrival(0, "base/cmd", command)._replace(encoding=codec.encoding_of(CmdVel))
+    bags.write(path, iter([told]))
+    (read,) = Bag(path)
+    with path.open("rb") as file:
+        ((schema, _, _),) = make_reader(file).iter_messages()
+    assert schema
+    assert (read.schema, schema.name) == ("gigabrain.CmdVel", "gigabrain.CmdVel")
 
 
 def test_other_programs_read_it_by_its_index(whole: Path) -> None:

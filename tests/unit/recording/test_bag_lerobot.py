@@ -36,7 +36,8 @@ def enabled(states: range) -> Iterator[ReceivedMessage]:
         command = codec.encode(CmdVel(linear_x=seq / 1000, source="control"))
         yield bags.arrival(at_ns - 2, "robot/cmd_vel", command)
         state = msgspec.msgpack.decode(bags.state(seq), type=RobotState)
-        state = msgspec.structs.replace(state, gate=GateStatus(mode="enabled"))
+        gate = GateStatus(mode="enabled", commander="control")
+        state = msgspec.structs.replace(state, gate=gate)
         yield bags.arrival(at_ns, "robot/state", codec.encode(state))
 
 
@@ -47,6 +48,38 @@ def test_a_frame_is_every_fifth_state_with_the_command_of_then(tmp_path: Path) -
     assert [frame.tick for frame in found] == [5, 10, 15, 20]
     assert found[1].state == pytest.approx([0.1, 0.0, 0.0, 0.1, 0.0, 0.0])
     assert found[1].action == pytest.approx([0.010, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("key", ["robot/cmd_vel", "robot/base/cmd"])
+def test_the_action_is_the_command_of_the_commander_by_whatever_key(
+    tmp_path: Path, key: str
+) -> None:
+    def driven_in_turn() -> Iterator[ReceivedMessage]:
+        for seq in range(1, 21):
+            commander = "script" if seq > 10 else "control"
+            gate = GateStatus(mode="enabled", commander=commander)
+            state = msgspec.msgpack.decode(bags.state(seq), type=RobotState)
+            state = msgspec.structs.replace(state, gate=gate)
+            yield bags.arrival(seq * 20_000_000, "robot/state", codec.encode(state))
+            for place, (source, speed) in enumerate((("script", 0.2), ("control", 0.1))):
+                command = codec.encode(CmdVel(linear_x=speed, source=source))
+                sent = bags.arrival(seq * 20_000_000 + 1 + place, key, command)
+                yield sent._replace(encoding=codec.encoding_of(CmdVel))
+
+    path = tmp_path / "a.mcap"
+    bags.write(path, driven_in_turn())
+    actions = [frame.action[0] for frame in frames(path)]
+    assert actions == pytest.approx([0.1, 0.1, 0.2, 0.2])
+
+
+def test_a_new_commander_begins_without_a_command(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    state = msgspec.msgpack.decode(bags.state(25), type=RobotState)
+    gate = GateStatus(mode="enabled", commander="script")
+    state = msgspec.structs.replace(state, gate=gate)
+    begun = bags.arrival(25 * 20_000_000, "robot/state", codec.encode(state))
+    bags.write(path, iter([*enabled(range(1, 21)), begun]))
+    assert [frame.action[0] for frame in frames(path)][-2:] == pytest.approx([0.02, 0.0])
 
 
 def arm(states: range) -> Iterator[ReceivedMessage]:

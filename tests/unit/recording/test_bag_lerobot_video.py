@@ -70,7 +70,8 @@ def driving(states: int, boot: int = 7) -> Iterator[tuple[int, str, bytes]]:
         command = CmdVel(linear_x=seq / 1000, angular_z=seq / 500, source="control")
         yield seq * TICK_NS - 2, "robot/cmd_vel", codec.encode(command)
         state = msgspec.msgpack.decode(bags.state(seq, boot), type=RobotState)
-        state = msgspec.structs.replace(state, gate=GateStatus(mode="enabled"))
+        gate = GateStatus(mode="enabled", commander="control")
+        state = msgspec.structs.replace(state, gate=gate)
         yield seq * TICK_NS, "robot/state", codec.encode(state)
 
 
