@@ -4,6 +4,7 @@ import hmac
 import ipaddress
 import os
 import secrets
+import ssl
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
@@ -41,7 +42,7 @@ def wants_login(config: PageConfig) -> bool:
 
 
 def check(config: PageConfig) -> None:
-    """Raise ConfigError for a page that other machines can reach without TLS."""
+    """Raise ConfigError for a page that needs TLS and has none, or whose TLS cannot work."""
     if bool(config.certificate) != bool(config.certificate_key):
         raise ConfigError("page: set both certificate and certificate_key, or neither")
     if not is_loopback(config.listen) and not config.certificate:
@@ -52,6 +53,33 @@ def check(config: PageConfig) -> None:
     for file in filter(None, (config.certificate, config.certificate_key)):
         if not os.access(file, os.R_OK):
             raise ConfigError(f"page: cannot read {file}")
+    if config.certificate:
+        _check_certificate(config.certificate, config.certificate_key)
+
+
+def _check_certificate(certificate: str, key: str) -> None:
+    """Raise ConfigError for files with which TLS cannot be served."""
+
+    def refuse() -> str:
+        raise ConfigError(
+            f"page: {key} has a pass phrase; set certificate_key to a file without one: "
+            f"openssl pkey -in {key} -out page.key"
+        )
+
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        context.load_verify_locations(certificate)
+    except OSError:
+        raise ConfigError(
+            f"page: {certificate} holds no certificate; set certificate to a PEM file"
+        ) from None
+    try:
+        context.load_cert_chain(certificate, key, refuse)
+    except OSError as error:
+        raise ConfigError(
+            f"page: {key} is no usable key of {certificate} ({error.strerror}); "
+            "set certificate_key to the key that it was made with, a PEM file"
+        ) from None
 
 
 def token_file(named: str) -> Path:

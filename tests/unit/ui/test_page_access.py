@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives import serialization
 
 from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.base import Velocity
@@ -20,6 +21,7 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.launch.demo import with_page
 from gigabrain_zenoh.launch.deployment import Deployment
+from gigabrain_zenoh.security.authority import read_key
 from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.waiting import settle
 from gigabrain_zenoh.ui.page.access import Access, check, tokens
@@ -98,6 +100,35 @@ async def test_a_page_that_cannot_be_served_makes_no_tokens(tmp_path: Path) -> N
         with pytest.raises(ConfigError, match="cannot listen on 127"):
             await run(config, Net().one, lambda: None)
     assert not path.exists()
+
+
+async def test_a_certificate_that_cannot_be_served_is_refused_before_the_page_is_ready(
+    fleet: Path, tmp_path: Path
+) -> None:
+    certificate, key = fleet / "ca.crt", fleet / "ca.key"
+    secret = serialization.BestAvailableEncryption(b"secret")
+    encrypted, text = tmp_path / "encrypted.key", tmp_path / "text.pem"
+    encrypted.write_bytes(
+        read_key(key).private_bytes(
+            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, secret
+        )
+    )
+    text.write_text("no PEM")
+    own = fleet / "operator/identity.key"
+    for certificate_file, key_file, refused in (
+        (text, key, f"{text} holds no certificate; "),
+        (tmp_path, key, f"{tmp_path} holds no certificate; "),
+        (certificate, text, f"{text} is no usable key of {certificate} "),
+        (certificate, own, f"{own} is no usable key of {certificate} "),
+        (certificate, encrypted, f"{encrypted} has a pass phrase; "),
+    ):
+        config = PageConfig(
+            port=0, certificate=str(certificate_file), certificate_key=str(key_file)
+        )
+        with pytest.raises(ConfigError) as caught:
+            await run(config, Net().one, lambda: pytest.fail("it is ready"))
+        assert str(caught.value).startswith(f"page: {refused}")
+    check(PageConfig(certificate=str(certificate), certificate_key=str(key)))
 
 
 def test_new_tokens_are_printed_once(tmp_path: Path) -> None:
