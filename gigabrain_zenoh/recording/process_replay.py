@@ -16,9 +16,11 @@ import msgspec
 from msgspec import Struct
 
 from gigabrain_schemas.base import Message
+from gigabrain_schemas.body import Body
 from gigabrain_schemas.logs import FINISHED, WAITED, AcceptedRequest, InputLog
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import (
+    BODY,
     CMD_VEL,
     INPUT_LOG,
     INTENT,
@@ -30,6 +32,7 @@ from gigabrain_schemas.topics import (
     STATE,
     WORLD,
     Topic,
+    command_topic,
     current_key,
 )
 from gigabrain_zenoh.bus.headers import header_of
@@ -112,11 +115,21 @@ class RecordedRun(Struct, frozen=True, kw_only=True):
     begun_late: bool  # the process had sent messages before
 
 
+def _outputs_of(path: Path, process: str) -> tuple[Topic[Any], ...]:
+    """Return the topics of a process in a recording, whose body may obey a key of its own."""
+    bodies = (message_of(sample) for sample in Bag(path) if sample.key == BODY.key)
+    body = next((body for body in bodies if isinstance(body, Body)), None)
+    return tuple(
+        command_topic(body.description) if body and topic is CMD_VEL else topic
+        for topic in OUTPUTS[process]
+    )
+
+
 def load_run(path: Path, process: str) -> RecordedRun:
     """Read the inputs of a process, with their times [ns], and its outputs. Raises ConfigError."""
     inputs: list[Sample] = []
     outputs: list[tuple[str, Message]] = []
-    keys = {topic.key for topic in OUTPUTS[process]}
+    keys = {topic.key for topic in _outputs_of(path, process)}
     for sample in samples(path):
         message = message_of(sample) if sample.key in keys else None
         if message and getattr(message, "source", BRAIN) == BRAIN:
@@ -286,7 +299,9 @@ async def replay_process(
     """Replay a recording to a process. Raises ConfigError, and what the process raises."""
     run = load_run(path, process)
     node = node_of(ProcessConfig(name=process, endpoint=Endpoint(), settings=settings))
-    decoders = {topic.key: Codec(topic.type, topic.max_bytes).decode for topic in OUTPUTS[process]}
+    decoders = {
+        topic.key: Codec(topic.type, topic.max_bytes).decode for topic in _outputs_of(path, process)
+    }
     sent = await replay(node, run.inputs, process)
     replayed = _by_id((key, decoders[key](data)) for key, data in sent if key in decoders)
     real_time = not run.exact and read_notes(path).get("speed", "1") == "1"

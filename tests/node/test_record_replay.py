@@ -2,7 +2,7 @@
 
 import asyncio
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,8 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.base import Cause
+from gigabrain_schemas.body import Body
+from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.examples import example
 from gigabrain_schemas.logs import AcceptedRequest
 from gigabrain_schemas.requests import ParamRequest
@@ -36,6 +38,7 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.launch.processes import node_of
 from gigabrain_zenoh.qa.drives import DRIVES, file_of
 from gigabrain_zenoh.recording.bag_reader import Bag
+from gigabrain_zenoh.recording.bag_writer import ReceivedMessage
 from gigabrain_zenoh.recording.message_tables import message_of
 from gigabrain_zenoh.recording.process_replay import (
     OUTPUTS,
@@ -72,6 +75,26 @@ async def test_every_process_does_what_it_did_on_the_recorded_drive(
     assert outcome.same, (outcome, RENEW)
     assert outcome.compared > 30
     assert not outcome.begun_late
+
+
+async def test_control_of_a_body_with_a_control_topic_of_its_own_does_what_it_did(
+    tmp_path: Path,
+) -> None:
+    def commanded_elsewhere() -> Iterator[ReceivedMessage]:
+        for sample in Bag(file_of(RECORDINGS, "arena")):
+            key, payload, message = sample.key, sample.payload, message_of(sample)
+            if isinstance(message, Body):
+                own = replace(message.description, control_topic="base/cmd")
+                payload = codec.encode(replace(message, description=own))
+            elif isinstance(message, CmdVel):
+                key = "base/cmd"
+            yield ReceivedMessage(sample.log_ns, key, sample.encoding, payload, sample.header)
+
+    path = tmp_path / "own.mcap"
+    bags.write(path, commanded_elsewhere())
+    outcome = await replay_process(path, "control", {}, node_of)
+    assert outcome.same, outcome
+    assert outcome.compared > 30
 
 
 def reasons(name: str) -> set[str]:
