@@ -34,6 +34,7 @@ from gigabrain_zenoh.recording.arm_drawing import ArmDrawing
 from gigabrain_zenoh.recording.drawn import (
     BASE,
     BLUE,
+    LAST_STAMP_NS,
     LIDAR,
     MAP,
     ODOM,
@@ -127,7 +128,12 @@ class Drawer:
         return topic.plotted or topic.drawing is not None
 
     def draw(self, topic: Topic[Any], message: Message, name: str = "") -> Iterable[Drawn]:
-        """Yield the messages that viewers draw of `message`; `name` is that of a camera."""
+        """Yield the messages that viewers draw of `message`; `name` is that of a camera.
+
+        Of a message with a later stamp than viewers accept, there are none.
+        """
+        if message.stamp_ns > LAST_STAMP_NS:
+            return
         if isinstance(message, Intent) and not self._is_new(message):
             return
         if topic.drawing:

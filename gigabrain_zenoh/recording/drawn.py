@@ -14,6 +14,7 @@ MAP, ODOM, BASE = "map", "odom", "base_link"
 LIDAR = "base_scan"  # as LaserScan has it
 BLUE = fox.Color(r=0.04, g=0.37, b=0.49, a=1.0)
 LABEL_SIZE_M = 0.25
+LAST_STAMP_NS = 2**32 * 1_000_000_000 - 1  # Foxglove's seconds have 32 bits
 
 MAX_SCHEMA_DEPTH = 12  # a Struct may contain itself
 SCALARS = {str: "string", bool: "boolean", int: "integer", float: "number"}

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.examples import EXAMPLES, example
 from gigabrain_schemas.sensors import Image
-from gigabrain_schemas.topics import IMAGE, INTENT, MAP, SCAN, STATE, TOPICS
+from gigabrain_schemas.topics import IMAGE, INTENT, MAP, POSE, SCAN, STATE, TOPICS
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.errors import ConfigError
@@ -128,6 +128,19 @@ def test_every_kind_of_message_is_drawn_for_viewers(tmp_path: Path) -> None:
         "/viz/safety_numbers": "gigabrain.SafetyState",
     }
     assert kept(file.path).total() == len(TOPICS) + 1
+
+
+def test_a_message_from_after_the_year_2106_is_recorded_but_not_drawn(tmp_path: Path) -> None:
+    file = BagWriter(tmp_path / "late.mcap", viewers=True, notes={})
+    for n, topic in enumerate(TOPICS):
+        late = replace(example(topic.type), stamp_ns=2**63 - 1)
+        file.add(bags.arrival(n, topic.at("front"), codec.encode(late)))
+    last = replace(example(POSE.type), stamp_ns=2**32 * 10**9 - 1)
+    file.add(bags.arrival(99, "robot/pose", codec.encode(last)))
+    file.finish()
+    file.close()
+    drawn = {channel.topic for channel, _, _ in Bag(file.path).messages()} - {*kept(file.path)}
+    assert (drawn, kept(file.path).total()) == ({"/viz/pose", "/viz/tf"}, len(TOPICS) + 1)
 
 
 def test_a_file_that_exists_or_cannot_be_made_is_refused_before_anything_is_recorded(
