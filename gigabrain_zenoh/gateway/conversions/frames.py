@@ -13,6 +13,7 @@ Rotation = tuple[float, float, float, float]  # quaternion x, y, z, w
 MAP, ODOM, FOOTPRINT, BASE = "map", "odom", "base_footprint", "base_link"
 IMU_LINK, SCAN_LINK = "imu_link", "base_scan"
 SECOND_NS = 1_000_000_000
+END_NS = 2**31 * SECOND_NS  # of builtin_interfaces/Time
 STRAIGHT: Rotation = (0.0, 0.0, 0.0, 1.0)
 LENS: Rotation = (-0.5, 0.5, -0.5, 0.5)  # of a lens (z forward, x right) on its mount (x forward)
 
@@ -28,9 +29,16 @@ class Placed(NamedTuple):
     rotation: Rotation = STRAIGHT
 
 
+def seconds(stamp_ns: int) -> tuple[int, int]:
+    """Return seconds and nanoseconds of a Unix time. Raises ValueError if ROS cannot hold it."""
+    if stamp_ns >= END_NS:
+        raise ValueError(f"its stamp is {stamp_ns} ns; ROS ends at {END_NS} ns, in 2038")
+    return divmod(stamp_ns, SECOND_NS)
+
+
 def time(make: Make, stamp_ns: int) -> Any:
-    """Return builtin_interfaces/Time of a Unix time."""
-    sec, nanosec = divmod(stamp_ns, SECOND_NS)
+    """Return builtin_interfaces/Time of a Unix time. Raises ValueError like `seconds`."""
+    sec, nanosec = seconds(stamp_ns)
     return make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
 
 

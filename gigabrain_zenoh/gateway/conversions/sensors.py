@@ -8,7 +8,7 @@ import numpy as np
 from gigabrain_schemas.body import Body, Camera
 from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_schemas.vision import DepthImage
-from gigabrain_zenoh.gateway.conversions.frames import SECOND_NS, Make, header, optical_frame
+from gigabrain_zenoh.gateway.conversions.frames import Make, header, optical_frame, seconds
 
 LITTLE_ENDIAN = b"\0\1\0\0"
 HEAD = struct.Struct("<4siII")  # of a message with a header, up to the length of its frame
@@ -23,14 +23,14 @@ def laser_scan(scan: LaserScan, body: Body | None = None) -> bytes:
     """Return sensor_msgs/LaserScan as CDR, packed by hand: a message takes six times as long.
 
     REP-117: infinite is free as far as the sensor reaches, NaN is unknown. So infinite ranges of a
-    lidar that cannot tell them apart become NaN.
+    lidar that cannot tell them apart become NaN. Raises ValueError like `seconds`.
     """
     ranges, lidar = scan.ranges, body.description.lidar if body else None
     if lidar and lidar.no_return == "unknown":
         found = scan.ranges_m
         ranges = np.where(np.isinf(found), np.float32(np.nan), found).tobytes()
     count, frame = len(ranges) // 4, scan.frame_id.encode() + b"\0"
-    head = HEAD.pack(LITTLE_ENDIAN, *divmod(scan.stamp_ns, SECOND_NS), len(frame))
+    head = HEAD.pack(LITTLE_ENDIAN, *seconds(scan.stamp_ns), len(frame))
     numbers = NUMBERS.pack(
         scan.angle_min,
         scan.angle_min + scan.angle_increment * (count - 1),

@@ -69,6 +69,15 @@ def test_a_scan_packed_by_hand_is_what_the_library_writes(frame, beams):
     assert TYPES.encode("sensor_msgs/msg/LaserScan", got) == payload
 
 
+@pytest.mark.parametrize("stamp_ns", [2**31 * 10**9, 2**63 - 1])
+def test_a_stamp_that_ros_cannot_hold_is_refused(stamp_ns):
+    with pytest.raises(ValueError, match=f"its stamp is {stamp_ns} ns; ROS ends"):
+        sensors.laser_scan(replace(SCAN, stamp_ns=stamp_ns))
+    status = TaskStatus(path=((0.0, 0.0),), stamp_ns=stamp_ns)
+    with pytest.raises(ValueError, match=f"its stamp is {stamp_ns} ns; ROS ends"):
+        maps.plan(MAKE, status)
+
+
 def test_a_jpeg_goes_unchanged_and_a_raw_picture_not_at_all():
     jpeg = Image(frame_id="front", encoding="jpeg", height=2, width=2, data=b"\xff\xd8\x01",
                  stamp_ns=STAMP)  # fmt: skip
