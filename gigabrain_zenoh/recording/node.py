@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import functools
-import itertools
 import logging
 import sys
 import threading
@@ -21,7 +20,7 @@ from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.host.signals import stop_signals
 from gigabrain_zenoh.recording.bag_writer import recover_all
-from gigabrain_zenoh.recording.recorder import Recorder, Status
+from gigabrain_zenoh.recording.recorder import Recorder, Status, unused_path
 from gigabrain_zenoh.runtime.connect import Where, connect
 
 log = logging.getLogger(__name__)
@@ -61,12 +60,6 @@ def recording_path(config: RecorderConfig) -> Path:
         return Path(config.file).absolute()
     folder = Path(config.folder).absolute() if config.folder else state_dir() / "recordings"
     return folder / file_name()
-
-
-def unused_path(path: Path) -> Path:
-    """Return `path`, or the first numbered variant of it that does not exist."""
-    others = (path.with_name(f"{path.stem}_{n}{path.suffix}") for n in itertools.count(1))
-    return path if not path.exists() else next(other for other in others if not other.exists())
 
 
 @contextmanager

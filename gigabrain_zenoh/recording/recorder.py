@@ -1,6 +1,8 @@
 """Writes received messages to the disk in a thread of its own, and survives faults of the disk."""
 
+import itertools
 import logging
+import os
 import threading
 import time
 from collections import Counter
@@ -30,6 +32,15 @@ RETRY_S = 1.0  # between two attempts to write to a full disk
 MAX_CHANNELS = 1000  # pairs of key and encoding; any client may make up more
 OTHER_KEYS = "others"  # counts messages beyond those
 MAX_BATCH_NS = round(LONGEST_S * 1e9)  # within it a message's own stamp is its time of reception
+
+
+def unused_path(path: Path, number: int = 0) -> Path:
+    """Return the first of `path`, NAME_1, NAME_2, … from `number` on that does not exist."""
+    numbered = (
+        path.with_name(f"{path.stem}_{n}{path.suffix}") if n else path
+        for n in itertools.count(number)
+    )
+    return next(name for name in numbered if not os.path.lexists(name))
 
 
 class _Exposure(NamedTuple):
@@ -224,7 +235,7 @@ class Recorder:
         Without this call it is created with the first message, and retried every second.
         Raises ConfigError.
         """
-        self._file = self._next_file()
+        self._file = self._open_file(self._path)
 
     def __enter__(self) -> "Recorder":
         self.done = self._pool.submit(self._run)
@@ -258,11 +269,8 @@ class Recorder:
             notes[PICTURES_NOTE] = f"{pictures:g} Hz"
         return BagWriter(path, viewers=self._config.viewers, notes=notes)
 
-    def _next_file(self) -> BagWriter:
+    def _open_file(self, path: Path) -> BagWriter:
         """Create the next file of the row. Raises ConfigError."""
-        path = self._path
-        if self._files:
-            path = path.with_name(f"{path.stem}_{self._files}{path.suffix}")
         file = self._open(path)
         self._files += 1
         return file
@@ -367,7 +375,7 @@ class Recorder:
         if time.monotonic() < self._retry_s:
             return None
         try:
-            file = self._file = self._next_file()
+            file = self._file = self._open_file(unused_path(self._path, self._files))
         except ConfigError as error:
             self._report(str(error))
             return None

@@ -155,6 +155,16 @@ def test_a_file_that_exists_or_cannot_be_made_is_refused_before_anything_is_reco
         Recorder(there / "x.mcap", QUICK).begin()
 
 
+def test_a_recording_of_several_files_skips_names_that_exist(tmp_path: Path) -> None:
+    (tmp_path / "s_1.mcap").write_text("mine")
+    with Recorder(tmp_path / "s.mcap", replace(QUICK, split_mb=1e-6)) as recorder:
+        for seq in (1, 2, 3):  # each fills a file
+            recorder.intake.receive("robot/state", "", bags.state(seq))
+    parts = {path.name: bags.seqs(path) for path in tmp_path.iterdir() if path.stem != "s_1"}
+    assert parts == {"s.mcap": [1], "s_2.mcap": [2], "s_3.mcap": [3]}
+    assert (tmp_path / "s_1.mcap").read_text() == "mine"
+
+
 def test_messages_received_in_a_batch_have_the_times_of_their_stamps() -> None:
     intake = Intake(1 << 20, lambda: 1_000_000_000)
     for ago_ms in (50, 30, 10, 70, -5):
