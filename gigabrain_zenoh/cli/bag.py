@@ -163,11 +163,15 @@ def play(
 
 
 def _pairs(texts: list[str]) -> dict[str, str]:
+    from gigabrain_zenoh.bus.key_expressions import check_key_expression
+
     pairs = dict(text.split("=", 1) for text in texts if text.count("=") == 1)
     for text in texts:
         old, _, new = text.partition("=")
-        if pairs.get(old) != new or not old or not new:
+        if pairs.get(old) != new or "*" in text:
             raise ConfigError(f"--remap: expected old/key=new/key, got {text!r}")
+        check_key_expression(old)
+        check_key_expression(new)
     return pairs
 
 

@@ -15,6 +15,7 @@ from gigabrain_schemas.requests import DescribeRequest, Description
 from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import DESCRIBE, TOPICS, Topic, current_key
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.key_expressions import check_key_expression, matches
 from gigabrain_zenoh.bus.listening import topic_of
 from gigabrain_zenoh.diagnostics.robot_view import ProcessHealth
 from gigabrain_zenoh.errors import BodyLost, ConfigError, UnknownName, unknown
@@ -39,24 +40,16 @@ HEALTH_WINDOW_S = 1.3  # health is published once a second
 
 
 class TopicPattern(Struct, frozen=True):
-    """A key expression to subscribe to, and the topic of the table that it belongs to."""
+    """A key expression to subscribe to, and the topic of the table that it belongs to.
+
+    Raises ConfigError for a pattern that is not a key expression.
+    """
 
     pattern: str
     topic: Topic | None  # type: ignore[type-arg]  # None for keys of other projects
 
-
-def matches(pattern: str, key: str) -> bool:
-    """Return whether a Zenoh key expression covers `key`: `*` is one part, `**` any number."""
-    return _matches(pattern.split("/"), key.split("/"))
-
-
-def _matches(pattern: list[str], key: list[str]) -> bool:
-    if not pattern:
-        return not key
-    first, rest = pattern[0], pattern[1:]
-    if first == "**":
-        return any(_matches(rest, key[i:]) for i in range(len(key) + 1))
-    return bool(key) and first in ("*", key[0]) and _matches(rest, key[1:])
+    def __post_init__(self) -> None:
+        check_key_expression(self.pattern)
 
 
 def short_name(key: str) -> str:
@@ -67,7 +60,8 @@ def short_name(key: str) -> str:
 def topic_pattern(name: str, live_keys: Iterable[str] = ()) -> TopicPattern | None:
     """Return the topic or keys that `name` stands for; None for an unknown name.
 
-    It may be `scan`, `robot/scan`, `health/driver`, a live key, or a key expression.
+    It may be `scan`, `robot/scan`, `health/driver`, a live key, or a key expression. Raises
+    ConfigError for a wrong one.
     """
     key = current_key(PREFIX + short_name(name))
     for topic in TOPICS:

@@ -68,7 +68,7 @@ async def snapshot(bus: Bus, pattern: str = ALL_KEYS, seconds: float = SNAPSHOT_
 async def open_topic(
     where: Where, name: str, *, looks_on: bool = False
 ) -> AsyncIterator[tuple[Bus, TopicPattern]]:
-    """Connect, and find the topic that `name` stands for. Raises BusError and UnknownName."""
+    """Connect, and find the topic that `name` stands for. Raises BusError and ConfigError."""
     async with connect(where, CLIENT_NAME, looks_on=looks_on) as bus:
         found = topic_pattern(name)
         if found is None:

@@ -13,12 +13,12 @@ from rich.table import Table
 
 from gigabrain_schemas.topics import TOPICS, Topic
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.key_expressions import matches
 from gigabrain_zenoh.bus.listening import topic_of
 from gigabrain_zenoh.diagnostics.discovery import (
     TEXT_COLUMNS,
     TopicPattern,
     discover,
-    matches,
     plain_table,
     receivers,
     senders,

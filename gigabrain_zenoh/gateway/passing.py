@@ -20,6 +20,7 @@ from gigabrain_schemas.body import Body
 from gigabrain_schemas.topics import BODY, SERVICES, TOPICS, Topic
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.headers import is_json
+from gigabrain_zenoh.bus.key_expressions import check_key_expression
 from gigabrain_zenoh.bus.transport import Close
 from gigabrain_zenoh.codec import DECODE_ERRORS, MAX_ERROR_CHARS
 from gigabrain_zenoh.config.settings import Ros2Link
@@ -70,6 +71,7 @@ def route(source: str, target: str, type: str, form: Form, types: Types) -> Rout
     key, topic = (source, target) if to_ros else (target, source)
     package, _, short = type.partition("/")
     name = types.known(type if "/" in short else f"{package}/msg/{short}")
+    check_key_expression(key)
     if not to_ros:
         check_own_key(key)
     text = text_field(types, name) if form == "json" else ""

@@ -9,6 +9,7 @@ from typing import Any, Literal, cast
 import msgspec
 from msgspec import Struct, structs
 
+from gigabrain_zenoh.bus.key_expressions import key_expressions
 from gigabrain_zenoh.bus.zenoh.config import secured
 from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.config.settings import (
@@ -103,6 +104,10 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         if self.button and self.speed != 1.0:
             raise ValueError("button: works in real time only; remove `speed`")
         self._check_router()
+        try:
+            key_expressions(self.recorder.topics)
+        except ConfigError as error:
+            raise ValueError(f"recorder.topics: {error}") from None
         if self.fleet and not self.namespace:
             raise ValueError("fleet: this robot has no namespace; set `namespace`")
         if self.resume == "auto" and self.link == "real":

@@ -9,13 +9,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 from gigabrain_schemas.body import Body
 from gigabrain_schemas.topics import BODY, TOPICS
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.bus.listening import topic_named
+from gigabrain_zenoh.bus.key_expressions import key_expressions, matches
 from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.host.signals import stop_signals
@@ -31,21 +30,10 @@ STATUS_INTERVAL_S = 0.5
 CLOSE_S = 10.0  # time that a slow disk has for the rest of a recording
 
 
-def key_expressions(names: tuple[str, ...]) -> list[str]:
-    """Return the key expressions of topic names; others stay as given. Raises UnknownName."""
-    if not names:
-        return [ALL_KEYS]
-    return [name if "*" in name else topic_named(name).at("**") for name in names]
-
-
 def key_filter(names: tuple[str, ...]) -> Callable[[str], bool]:
-    """Return a test for keys that `names` select; empty names select all. Raises UnknownName."""
-    patterns = [each.replace("**", "*") for each in key_expressions(names)] if names else ["*"]
-
-    def wanted(key: str) -> bool:
-        return any(fnmatchcase(key, each) or f"{key}/*" == each for each in patterns)
-
-    return wanted
+    """Return a test for keys that `names` select; empty names select all. Raises ConfigError."""
+    patterns = key_expressions(names) if names else ["**"]
+    return functools.cache(lambda key: any(matches(each, key) for each in patterns))
 
 
 def file_name(label: str = "") -> str:
@@ -64,8 +52,11 @@ def recording_path(config: RecorderConfig) -> Path:
 
 @contextmanager
 def listening(bus: Bus, recorder: Recorder, names: tuple[str, ...]) -> Iterator[None]:
-    """Pass all messages of the topics `names` to the recorder while the block runs."""
-    receive, expressions = recorder.intake.receive, key_expressions(names)
+    """Pass all messages of the topics `names` to the recorder while the block runs.
+
+    Raises ConfigError for a wrong name.
+    """
+    receive, expressions = recorder.intake.receive, key_expressions(names) or [ALL_KEYS]
     taps = {each: bus.tap(each, receive) for each in expressions}
 
     def record_control_topic(_key: str, body: Body) -> None:
@@ -136,6 +127,7 @@ async def _count(bus: Bus, recorder: Recorder) -> None:
 async def record(config: RecorderConfig, where: Where, seconds: float | None) -> int:
     """Record until Ctrl-C or for `seconds`; return the exit code. Raises GigabrainError."""
     path = recording_path(config)
+    key_expressions(config.topics)  # refused before a file is made
     async with connect(where, "record", looks_on=True) as bus:
         recorder = Recorder(path, config)
         recorder.begin()

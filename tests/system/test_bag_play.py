@@ -143,6 +143,9 @@ async def test_an_empty_bag_and_bad_options_are_refused_in_one_line(tmp_path: Pa
         (("--rate", "0"), "--rate: expected a number from 0.01 to 100, got 0"),
         (("--start", "nan"), "--start: expected 0 or more seconds, got nan"),
         (("--remap", "a"), "--remap: expected old/key=new/key, got 'a'"),
+        (("--remap", "a=b*"), "--remap: expected old/key=new/key, got 'a=b*'"),
+        (("--remap", "a=/b"), "expected a key expression, got '/b'"),
+        (("--remap", "a="), "expected a key expression, got ''"),
     ],
 )
 def test_options_are_checked_before_anything_is_sent(
@@ -153,4 +156,4 @@ def test_options_are_checked_before_anything_is_sent(
         make_app(command)(
             command, exit_on_error=False, print_error=False, result_action="return_value"
         )
-    assert str(error.value) == complaint
+    assert str(error.value).startswith(complaint)

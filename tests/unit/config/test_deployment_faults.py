@@ -35,6 +35,11 @@ PORT = "expected a path, or usb:VID:PID[:SERIAL], got"
             "body: mock\nhosts:\n  a: [driver]\n  b: [driver]",
             "f:2: hosts: driver repeated; list each once",
         ),
+        (
+            "recorder:\n  topics: [scan, robot/sc*an]",
+            "f:2: recorder.topics: expected a key expression, got 'robot/sc*an': names joined",
+        ),
+        ("recorder:\n  topics: [scam]", "f:2: recorder.topics: no topic 'scam'; did you mean"),
         ("link: emulated\nspeed: 2", "f:2: speed is for the simulation"),
         ("body: mock\nbutton:\n  port: ''", f"f:3: button.port: {PORT} ''"),
         ("body: mock\nbutton:\n  port: usb:xyz", f"f:3: button.port: {PORT} 'usb:xyz'"),

@@ -47,6 +47,7 @@ LINK = Ros2Link(transport="dds", node="pass")
         ("robot/world", "/w", "std_srvs/srv/SetBool", "json", "no ROS message type"),
         ("robot/world", "/a b", "std_msgs/String", "json", "is no ROS name"),
         ("robot/world", "/w", "sensor_msgs/LaserScan", "json", "a type with one string field"),
+        ("robot/wor*ld", "/w", "std_msgs/String", "json", "expected a key expression"),
         ("/a", "notes", "std_msgs/String", "fields", "a key below robot/"),
         ("/a", "robot/*", "std_msgs/String", "fields", "one key"),
         ("/a", "robot/Big/x", "std_msgs/String", "fields", "a name after robot/"),
