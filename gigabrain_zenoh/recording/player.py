@@ -45,7 +45,10 @@ class Player:
         self.late_s = 0.0  # greatest delay of a message
 
     async def play(self) -> None:
-        """Play to the end, or for ever with `loop`. Raises ConfigError if it is not a bag."""
+        """Play to the end, or for ever with `loop`.
+
+        Raises ConfigError if it is not a bag, or has nothing to play.
+        """
         self._declare()
         await asyncio.sleep(DISCOVERY_S)
         await self._play_once()
@@ -57,10 +60,16 @@ class Player:
         return (sample for sample in Bag(self._path) if wanted(sample.key))
 
     def _declare(self) -> None:
-        """Declare all publishers before the first message."""
-        keys = {sample.key: None for sample in self._samples()}
+        """Declare all publishers before the first message. Raises ConfigError."""
+        keys, first_ns, last_ns = dict[str, None](), 0, 0
+        for sample in self._samples():
+            keys[sample.key] = None
+            first_ns, last_ns = first_ns or sample.log_ns, max(last_ns, sample.log_ns)
         if not keys:
             raise ConfigError(f"{self._path} holds no message to play")
+        if self._options.start_s > (length_s := (last_ns - first_ns) / 1e9):
+            of = " of these topics" if self._options.topics else ""
+            raise ConfigError(f"--start: the recording has {round(length_s, 3):g} s{of}")
         for key in keys:
             known = topic_of(key)
             topic = known or Topic(key, Message, 1.0)

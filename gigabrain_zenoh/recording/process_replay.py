@@ -143,8 +143,10 @@ def load_run(path: Path, process: str) -> RecordedRun:
         outputs = [each for each in outputs if own.start_ns <= each[1].stamp_ns <= own.end_ns]
         events = own.events
     else:
-        first_ns = inputs[0].log_ns
+        first_ns = inputs[0].log_ns if inputs else 0
         events = with_requests([(s.log_ns - first_ns, s.key, s.payload) for s in inputs])
+    if all(key in (WAITED, FINISHED) for _, key, _ in events):
+        raise ConfigError(f"{path} holds no input of {process}; record all topics for a replay")
     return RecordedRun(
         inputs=events,
         outputs=_by_id(outputs),

@@ -10,11 +10,11 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from gigabrain_schemas.base import Cause
+from gigabrain_schemas.base import Cause, Message
 from gigabrain_schemas.body import Body
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.examples import example
-from gigabrain_schemas.logs import AcceptedRequest
+from gigabrain_schemas.logs import AcceptedRequest, ConsumedInput, InputLog
 from gigabrain_schemas.requests import ParamRequest
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import GoalReply, GoalRequest, TaskRequest
@@ -147,6 +147,20 @@ def test_a_recording_without_the_process_is_refused(tmp_path: Path) -> None:
     bags.write(path, bags.drive(10))
     with pytest.raises(ConfigError, match="holds no message from safety"):
         call("replay", "--check", str(path), "--process", "safety")
+
+
+USED = InputLog(began_ns=0, keys=("robot/state",), taken=(ConsumedInput(key=0, seq=1, after_us=0),))
+
+
+@pytest.mark.parametrize("logged", [{}, {"robot/input_log/control": USED}])
+def test_a_recording_without_the_inputs_of_the_process_is_refused(
+    tmp_path: Path, logged: dict[str, Message]
+) -> None:
+    path = tmp_path / "a.mcap"
+    said = {"robot/cmd_vel": replace(example(CmdVel), source="control"), **logged}
+    bags.write(path, (bags.arrival(1, key, codec.encode(one)) for key, one in said.items()))
+    with pytest.raises(ConfigError, match="holds no input of control; record all topics"):
+        call("replay", "--check", str(path), "--process", "control")
 
 
 def test_without_its_settings_a_process_is_not_replayed_as_another(tmp_path: Path) -> None:

@@ -138,6 +138,18 @@ async def test_an_empty_bag_and_bad_options_are_refused_in_one_line(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
+    ("topics", "length"),
+    [((), r"the recording has 2\.001 s$"), (("map",), "the recording has 0 s of these topics$")],
+)
+async def test_a_start_behind_the_end_is_refused(
+    drive: Path, topics: tuple[str, ...], length: str
+) -> None:
+    options = PlayOptions(start_s=2.1, topics=topics)
+    with pytest.raises(ConfigError, match=f"--start: {length}"):
+        await Player(drive, options, LocalNetwork().transport()).play()
+
+
+@pytest.mark.parametrize(
     ("option", "complaint"),
     [
         (("--rate", "0"), "--rate: expected a number from 0.01 to 100, got 0"),
