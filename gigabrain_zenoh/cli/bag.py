@@ -198,7 +198,6 @@ def convert(file: Recording, *, csv: Path | None = None, lerobot: Path | None = 
         csv: Folder for the tables.
         lerobot: New folder for the dataset.
     """
-    from gigabrain_zenoh.recording.lerobot import convert as write_lerobot
     from gigabrain_zenoh.recording.message_tables import write_csv
 
     if csv is None and lerobot is None:
@@ -206,6 +205,8 @@ def convert(file: Recording, *, csv: Path | None = None, lerobot: Path | None = 
     for path in write_csv(file, csv) if csv else ():
         print(path)
     if lerobot:
+        from gigabrain_zenoh.recording.lerobot import convert as write_lerobot  # needs its extra
+
         print(write_lerobot(file, lerobot))
 
 

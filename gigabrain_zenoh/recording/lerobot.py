@@ -6,7 +6,9 @@ episode lasts while the gate is enabled without a gap. Pictures and depth become
 
 import json
 import math
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -210,7 +212,10 @@ def statistics(data: Mapping[str, NDArray[Any]]) -> dict[str, dict[str, list[flo
 
 
 def convert(path: Path, folder: Path) -> str:
-    """Write the dataset into a new folder; return a summary in words. Raises ConfigError."""
+    """Write the dataset into a new folder; return a summary in words. Raises ConfigError.
+
+    Where it fails, the folder is removed again.
+    """
     layout = layout_of(path)
     rows, tables, first = episodes(path, layout), [], 0
     for episode, row in enumerate(rows):
@@ -218,8 +223,7 @@ def convert(path: Path, folder: Path) -> str:
         first += len(row)
     whole = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
     ticks = [(frame.boot, frame.tick) for row in rows for frame in row]
-    try:
-        folder.mkdir(parents=True)
+    with _new_folder(folder):
         videos = write_videos(path, ticks, folder, layout.hz)
         _write_columns(whole, folder / "data" / FILE)
         lengths = [len(row) for row in rows]
@@ -244,10 +248,24 @@ def convert(path: Path, folder: Path) -> str:
         stats = statistics(whole) | {video.key: video.statistics for video in videos}
         (folder / "meta/info.json").write_text(json.dumps(info, indent=4))
         (folder / "meta/stats.json").write_text(json.dumps(stats, indent=4))
-    except OSError as error:
-        raise ConfigError(f"cannot write {folder}: {error.strerror}") from None
     found = [f"{folder}: {len(rows)} episodes, {first} frames"]
     return "\n  ".join(found + [video.summary for video in videos])
+
+
+@contextmanager
+def _new_folder(folder: Path) -> Iterator[None]:
+    """Make a folder, and remove it if the block fails. Raises ConfigError for an OSError."""
+    made = False
+    try:
+        folder.mkdir(parents=True)
+        made = True
+        yield
+    except BaseException as error:
+        if made:
+            shutil.rmtree(folder, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise ConfigError(f"cannot write {folder}: {error.strerror or error}") from None
+        raise
 
 
 def layout_of(path: Path) -> Layout:

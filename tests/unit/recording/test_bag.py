@@ -4,6 +4,7 @@ import dataclasses
 import json
 import random
 import shutil
+import sys
 import zlib
 from pathlib import Path
 
@@ -320,6 +321,16 @@ def test_tables_have_a_row_per_message(whole: Path, tmp_path: Path) -> None:
     assert first[names.index("velocity.linear_x")] == "0.01"
     scans = (tmp_path / "csv" / "robot_scan.csv").read_text().splitlines()
     assert scans[0].split(",")[-1] == "ranges.359"
+
+
+def test_tables_need_no_package_for_datasets(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    monkeypatch.delitem(sys.modules, "gigabrain_zenoh.recording.lerobot", raising=False)
+    assert call("bag", "convert", str(whole), "--csv", str(tmp_path / "csv")) is None
+    with pytest.raises(ConfigError, match="datasets need pyarrow: pip install"):
+        call("bag", "convert", str(whole), "--lerobot", str(tmp_path / "dataset"))
 
 
 def test_a_plot_is_a_picture_and_an_unknown_field_names_the_nearest(

@@ -2,7 +2,7 @@
 
 import importlib.util
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,8 @@ from gigabrain_schemas.examples import example
 from gigabrain_schemas.sensors import Image
 from gigabrain_schemas.vision import DepthImage, pack_depth
 from gigabrain_zenoh import codec
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.recording import lerobot, lerobot_video
 from gigabrain_zenoh.recording.bag_writer import ReceivedMessage
 from gigabrain_zenoh.recording.lerobot import convert
 from gigabrain_zenoh.recording.lerobot_video import dequantized, quantized
@@ -125,6 +127,33 @@ def test_each_frame_has_the_picture_that_was_exposed_at_its_tick(tmp_path: Path)
         assert abs(seen.mean() - pixels(tick).mean()) < 2.0  # levels are kept, not stretched
         assert psnr(seen, pixels(tick - 5)) < 25  # its neighbours are others
         assert psnr(seen, pixels(tick + 5)) < 25
+
+
+def test_a_dataset_that_failed_can_be_converted_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, folder = tmp_path / "a.mcap", tmp_path / "dataset"
+    write(path, driving(50), pictures(range(5, 51, 5)))
+    with monkeypatch.context() as without:
+        without.setattr(lerobot_video, "find_spec", lambda _: None)
+        with pytest.raises(ConfigError, match="videos need PyAV"):
+            convert(path, folder)
+    with monkeypatch.context() as full:
+        full.setattr(lerobot, "write_videos", raising(OSError(28, "No space left on device")))
+        with pytest.raises(ConfigError, match=r"cannot write .*dataset: No space left on device"):
+            convert(path, folder)
+    assert not folder.exists()
+    convert(path, folder)
+    with pytest.raises(ConfigError, match=r"cannot write .*dataset: File exists"):
+        convert(path, folder)
+    assert info_of(folder)["total_frames"] == 10
+
+
+def raising(error: Exception) -> Callable[..., None]:
+    def fail(*_: object) -> None:
+        raise error
+
+    return fail
 
 
 def test_the_dataset_describes_its_videos(tmp_path: Path) -> None:
