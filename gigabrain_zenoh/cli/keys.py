@@ -1,6 +1,7 @@
 """`gigabrain keys`: the authority of a fleet, and identities for its hosts and people."""
 
 import contextlib
+import os
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
@@ -120,7 +121,7 @@ def identities(*, dir: FleetFolder = None) -> int:
     with _needs_cryptography():
         from gigabrain_zenoh.security.authority import list_identities
 
-    folder = dir if dir and (dir / CERTIFICATE).exists() else find_fleet(dir)
+    folder = dir if dir and os.path.exists(dir / CERTIFICATE) else find_fleet(dir)
     all_valid = True
     for line, valid in list_identities(folder):
         print(line)

@@ -342,7 +342,7 @@ def _version(name: str) -> str | None:
 
 def _folder(path: Path) -> Folder:
     existing = path
-    while not existing.exists():
+    while not os.path.exists(existing):  # or may not be looked at
         existing = existing.parent
     free_mb = shutil.disk_usage(existing).free / 1e6
     return Folder(path=str(path), writable=os.access(existing, os.W_OK), free_mb=free_mb)
@@ -370,7 +370,7 @@ async def inspect_robot(where: Where, seconds: float = WINDOW_S) -> tuple[RobotF
     """Return the state of the robot, and the folder of the identity that reaches it."""
     try:
         endpoint = running.find_endpoint(where.connect, where.namespace, where.keys)
-    except BusError as error:
+    except (BusError, ConfigError) as error:
         return RobotFacts(problem=str(error)), where.keys
     router = endpoint.connect[-1]
     try:

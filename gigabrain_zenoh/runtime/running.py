@@ -88,8 +88,10 @@ def _check_private(place: Path) -> None:
     """Raise ConfigError where another user could put notes into the folder, or replace it."""
     for one in (place, place.parent):
         with contextlib.suppress(FileNotFoundError):
-            # a symbolic link of another user may lead to a folder of this one
-            owners = {one.lstat().st_uid, one.stat().st_uid}
+            try:  # a symbolic link of another user may lead to a folder of this one
+                owners = {one.lstat().st_uid, one.stat().st_uid}
+            except PermissionError:  # its parent is closed, so it is of another user
+                owners = set()
             if owners != {os.getuid()} or one.stat().st_mode & 0o022:
                 raise ConfigError(
                     f"{one} belongs to another user, or others may write it, so it cannot show "

@@ -362,7 +362,12 @@ def list_identities(folder: Path) -> Iterator[tuple[str, bool]]:
     places = [folder] if (folder / CERTIFICATE).exists() else sorted(folder.iterdir())
     now, generations = datetime.datetime.now(datetime.UTC), generations_in(folder)
     for place in places:
-        if not (place / CERTIFICATE).exists():
+        try:
+            (place / CERTIFICATE).stat()
+        except PermissionError:
+            yield f"{place.name:<20} {unreadable(place)}", False
+            continue
+        except OSError:  # it is no identity
             continue
         try:
             one = load(place, now)

@@ -26,20 +26,20 @@ REMEDY = "copy the whole folder that `gigabrain keys issue` made"
 
 def check_files(folder: Path) -> None:
     """Check that all files of an identity exist and its key is private. Raises ConfigError."""
-    if not folder.is_dir():
-        raise ConfigError(
-            f"{folder}: no folder with keys; make an identity with `gigabrain keys issue ROLE` "
-            "and copy its folder here"
-        )
-    for name in (CA, CERTIFICATE, KEY):
-        path = folder / name
-        try:
+    path = folder
+    try:
+        if not folder.is_dir():
+            raise ConfigError(
+                f"{folder}: no folder with keys; make an identity with `gigabrain keys issue ROLE` "
+                "and copy its folder here"
+            )
+        for path in (folder / name for name in (CA, CERTIFICATE, KEY)):
             if not path.is_file():
-                raise ConfigError(f"{folder}: {name} is missing; {REMEDY}")
-        except PermissionError:
-            raise unreadable(path) from None
-        if not os.access(path, os.R_OK):
-            raise unreadable(path)
+                raise ConfigError(f"{folder}: {path.name} is missing; {REMEDY}")
+            if not os.access(path, os.R_OK):
+                raise PermissionError
+    except PermissionError:
+        raise unreadable(path) from None
     check_private(folder / KEY)
 
 
@@ -86,7 +86,7 @@ def identity_folder(keys: str, host: str = "") -> Path:
     """Return the folder of the identity: `keys`, or its subfolder for `host` if it has several."""
     folder = Path(keys).expanduser()
     of_host = folder / host
-    if host and not (folder / CERTIFICATE).exists() and of_host.is_dir():
+    if host and not os.path.exists(folder / CERTIFICATE) and os.path.isdir(of_host):
         return of_host
     return folder
 
@@ -183,11 +183,20 @@ def generations_in(folder: Path) -> dict[str, int]:
 def find_fleet(folder: Path | None) -> Path:
     """Return `folder`, or the only fleet in the working folder. Raises ConfigError."""
     if folder:
-        if not (folder / CA_KEY).exists():
-            raise ConfigError(f"{folder}: no {CA_KEY}; create a fleet with `gigabrain keys new`")
+        try:
+            (folder / CA_KEY).stat()
+        except PermissionError:
+            raise unreadable(folder) from None
+        except OSError:
+            text = f"{folder}: no {CA_KEY}; create a fleet with `gigabrain keys new`"
+            raise ConfigError(text) from None
         return folder
-    here = Path()
-    fleets = [place for place in (here, *sorted(here.iterdir())) if (place / CA_KEY).exists()]
+    try:
+        places = (Path(), *sorted(Path().iterdir()))
+    except OSError as error:
+        text = f"cannot list this folder: {error.strerror}; name the fleet's folder with --dir"
+        raise ConfigError(text) from None
+    fleets = [place for place in places if os.path.exists(place / CA_KEY)]
     if not fleets:
         raise ConfigError("no fleet in this folder; create one with `gigabrain keys new`, "
                           "or name its folder with --dir")  # fmt: skip

@@ -1,5 +1,6 @@
 """`gigabrain doctor`: what is broken on purpose is found, with its cure."""
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,7 +19,9 @@ from gigabrain_zenoh.diagnostics.doctor import (
     RobotFacts,
     examine,
     exit_code,
+    inspect_machine,
 )
+from tests.closed import close_folder
 
 SENT = {
     "driver": {"robot/state": 50.0, "robot/scan": 10.0},
@@ -178,3 +181,14 @@ def test_invalid_messages_and_a_busy_process_are_hints() -> None:
         ("driver", "hint"),
     ]
     assert "4 invalid messages" in told[0].text
+
+
+def test_a_state_folder_that_this_user_may_not_enter_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed = tmp_path / "closed"
+    closed.mkdir()
+    monkeypatch.setenv("XDG_STATE_HOME", str(closed / "inner"))
+    close_folder(closed, monkeypatch)
+    state = inspect_machine().folders[0]
+    assert (state.path, state.writable) == (str(closed / "inner" / "gigabrain"), False)

@@ -12,6 +12,7 @@ import pytest
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError
 from gigabrain_zenoh.runtime.running import Running, announced, find_endpoint, folder, running
+from tests.closed import close_folder
 
 HERE = Endpoint(connect=("tcp/127.0.0.1:7001",), namespace="alpha")
 
@@ -65,7 +66,7 @@ def test_a_note_whose_pid_is_used_again_is_that_of_a_dead_supervisor(notes: Path
     assert running() == []
 
 
-@pytest.mark.parametrize("whose", ["folder", "parent", "owner"])
+@pytest.mark.parametrize("whose", ["folder", "parent", "owner", "closed"])
 def test_notes_that_somebody_else_may_have_planted_are_not_believed(
     whose: str, notes: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -73,13 +74,15 @@ def test_notes_that_somebody_else_may_have_planted_are_not_believed(
     if whose == "owner":
         monkeypatch.setattr(os, "getuid", lambda: note.stat().st_uid + 1)
         monkeypatch.setenv("XDG_RUNTIME_DIR", str(notes.parent))
+    elif whose == "closed":
+        close_folder(notes.parent, monkeypatch)
     else:
         (notes if whose == "folder" else notes.parent).chmod(0o777)
     with living(note):
         with pytest.raises(ConfigError, match="belongs to another user, or others may write it"):
             find_endpoint(None)
         with (
-            pytest.raises(ConfigError, match="belongs to another user, or others may write it"),
+            pytest.raises(ConfigError, match=r"belongs to another user|cannot write"),
             announced("mine", HERE),
         ):
             pass

@@ -11,11 +11,13 @@ from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from gigabrain_zenoh.bus.zenoh.config import session_config
+from gigabrain_zenoh.cli.keys import identities, new
 from gigabrain_zenoh.cli.keys import issue as issue_command
-from gigabrain_zenoh.cli.keys import new
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.security.authority import issue, load, new_fleet
+from gigabrain_zenoh.security.authority import issue, list_identities, load, new_fleet
+from gigabrain_zenoh.security.identity_files import check_files, find_fleet, identity_folder
+from tests.closed import close_folder
 
 
 @pytest.fixture
@@ -110,6 +112,25 @@ def test_what_is_wrong_with_keys_is_said_with_what_to_do(copied: Path) -> None:
     )
     (copied / "operator" / "identity.crt").write_text("-----BEGIN")
     assert refused(copied / "operator") == f"F/operator/identity.crt is no certificate; {remedy}"
+
+
+def test_folders_that_this_user_may_not_enter_are_passed_over_or_named(
+    copied: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (copied.parent / "closed").mkdir()
+    close_folder(copied.parent / "closed", monkeypatch)
+    monkeypatch.chdir(copied.parent)
+    assert find_fleet(None) == Path("fleet")
+    for read in (find_fleet, check_files, lambda folder: identities(dir=folder)):
+        with pytest.raises(ConfigError, match=r"^closed\S* cannot be read by this user; run as"):
+            read(Path("closed"))
+    assert identity_folder("closed", "robot") == Path("closed")
+    close_folder(copied / "viewer@red", monkeypatch)
+    lines = [line for line, valid in list_identities(Path("fleet")) if not valid]
+    assert lines == [
+        "viewer@red           fleet/viewer@red cannot be read by this user; run as its owner, "
+        "or chown it"
+    ]
 
 
 def test_a_session_does_not_begin_with_a_key_that_others_may_read(copied: Path) -> None:
