@@ -17,6 +17,7 @@ from gigabrain_zenoh.cli.options import (
     print_table,
 )
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused, unknown
+from gigabrain_zenoh.host.files import check_result_path, replace_file
 
 if TYPE_CHECKING:
     from gigabrain_schemas.requests import ParamReply
@@ -191,6 +192,7 @@ def set_param(
         value: New value.
         save: File to save it in, with all other changed parameters; see `param save`.
     """
+    check_result_path(save)
     reply = ask_params(at, process, name, value)[process]
     if not reply.ok:
         raise Refused(f"{process}: {reply.text}")
@@ -209,11 +211,15 @@ def save_params(file: Path, /, *, at: RobotAddress = LOCAL) -> None:
     """
     from gigabrain_zenoh.cli.config import with_values
 
+    check_result_path(file)
     params = [one for reply in ask_params(at).values() for one in reply.params if one.key]
     changed = {one.key: one.value for one in params if one.value != one.initial}
     if not changed:
         raise Refused("no parameter of this robot was changed, so there is nothing to save")
-    file.write_text(with_values(file, changed), encoding="utf-8")
+    try:
+        replace_file(file, with_values(file, changed).encode())
+    except OSError as error:
+        raise ConfigError(f"cannot write {file}: {error.strerror}") from None
     print_line(f"saved {', '.join(sorted(changed))} in {file}")
 
 

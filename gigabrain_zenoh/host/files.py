@@ -129,9 +129,9 @@ def sync_folder(path: Path) -> None:
 
 def check_result_path(path: Path | None) -> None:
     """Raise ConfigError where `path` cannot be written; call this before a long run."""
-    if path and not path.parent.is_dir():
+    if path and not os.path.isdir(path.parent):
         raise ConfigError(f"cannot write {path}: no such folder")
-    if path and path.is_dir():
+    if path and os.path.isdir(path):
         raise ConfigError(f"cannot write {path}: it is a folder")
 
 
