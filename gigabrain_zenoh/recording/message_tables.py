@@ -1,7 +1,9 @@
 """Messages as rows of named values: CSV tables, and plots over time."""
 
 import csv
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -51,9 +53,14 @@ def _flat(name: str, value: Any) -> Iterator[tuple[str, Value]]:
 
 
 def write_csv(path: Path, folder: Path) -> list[Path]:
-    """Write one file per key with a row per message; return the files. Raises ConfigError."""
+    """Write one file per key with a row per message; return the files. Raises ConfigError.
+
+    Messages that a recorder appends meanwhile are left out.
+    """
     columns: dict[str, dict[str, None]] = {}  # in order of first appearance
+    count = 0
     for sample in samples(path):
+        count += 1
         if message := message_of(sample):
             columns.setdefault(sample.key, {}).update(dict.fromkeys(row(message)))
     if not columns:
@@ -61,21 +68,28 @@ def write_csv(path: Path, folder: Path) -> list[Path]:
     paths = {key: folder / f"{key.replace('/', '_')}.csv" for key in sorted(columns)}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        files = {key: each.open("w", newline="") for key, each in paths.items()}
+        with ExitStack() as files:
+            writers = {
+                key: csv.DictWriter(
+                    files.enter_context(each.open("w", newline="")), ("time_s", *columns[key])
+                )
+                for key, each in paths.items()
+            }
+            _write_rows(islice(Bag(path), count), writers)
     except OSError as error:
         raise ConfigError(f"cannot write {folder}: {error.strerror}") from None
-    writers = {key: csv.DictWriter(file, ("time_s", *columns[key])) for key, file in files.items()}
+    return list(paths.values())
+
+
+def _write_rows(recorded: Iterable[Sample], writers: Mapping[str, "csv.DictWriter[str]"]) -> None:
     for writer in writers.values():
         writer.writeheader()
     first_ns = 0
-    for sample in Bag(path):
+    for sample in recorded:
         first_ns = first_ns or sample.log_ns
         if message := message_of(sample):
             time_s = round((sample.log_ns - first_ns) / 1e9, 6)
             writers[sample.key].writerow({"time_s": time_s, **row(message)})
-    for file in files.values():
-        file.close()
-    return list(paths.values())
 
 
 def read_series(path: Path, fields: Sequence[str]) -> dict[str, Series]:

@@ -6,6 +6,7 @@ import random
 import shutil
 import sys
 import zlib
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import msgspec
@@ -23,8 +24,24 @@ from gigabrain_zenoh import codec
 from gigabrain_zenoh.bus.headers import Header, SequenceGaps, header_of
 from gigabrain_zenoh.cli.app import make_app
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.recording.bag_reader import HEAD, MAGIC, ZSTD_NAME, Bag, faults, read_info
-from gigabrain_zenoh.recording.bag_writer import BagWriter, is_unfinished, recover, recover_all
+from gigabrain_zenoh.recording import message_tables
+from gigabrain_zenoh.recording.bag_reader import (
+    HEAD,
+    MAGIC,
+    ZSTD_NAME,
+    Bag,
+    Sample,
+    faults,
+    read_info,
+    samples,
+)
+from gigabrain_zenoh.recording.bag_writer import (
+    BagWriter,
+    ReceivedMessage,
+    is_unfinished,
+    recover,
+    recover_all,
+)
 from gigabrain_zenoh.recording.drawn import flat_schema
 from tests.unit.recording import bags
 
@@ -321,6 +338,36 @@ def test_tables_have_a_row_per_message(whole: Path, tmp_path: Path) -> None:
     assert first[names.index("velocity.linear_x")] == "0.01"
     scans = (tmp_path / "csv" / "robot_scan.csv").read_text().splitlines()
     assert scans[0].split(",")[-1] == "ranges.359"
+
+
+def test_tables_of_a_recording_that_grows_meanwhile_are_those_of_its_beginning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, folder = tmp_path / "grows.mcap", tmp_path / "csv"
+    file = BagWriter(path, viewers=False, notes={})
+
+    def grow(more: Iterable[ReceivedMessage]) -> None:
+        for each in more:
+            file.add(each)
+        file.flush()
+
+    def read(path: Path) -> Iterator[Sample]:
+        yield from samples(path)
+        grow(bags.arrival(10**9 + n, f"robot/{key}", getattr(bags, key)(n))
+             for n in range(1, 9) for key in ("state", "scan"))  # fmt: skip
+
+    grow(bags.arrival(n, "robot/state", bags.state(n)) for n in range(1, 21))
+    monkeypatch.setattr(message_tables, "samples", read)
+    assert message_tables.write_csv(path, folder) == [folder / "robot_state.csv"]
+    file.close()
+    assert len((folder / "robot_state.csv").read_text().splitlines()) == 21
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+def test_a_full_disk_is_named_in_one_line(whole: Path, tmp_path: Path) -> None:
+    (tmp_path / "robot_scan.csv").symlink_to("/dev/full")
+    with pytest.raises(ConfigError, match=r"^cannot write \S+: No space left on device$"):
+        message_tables.write_csv(whole, tmp_path)
 
 
 def test_tables_need_no_package_for_datasets(
