@@ -34,10 +34,9 @@ from gigabrain_zenoh.decision.detected_objects import ObjectsByPerceptor
 from gigabrain_zenoh.decision.drive_kernels import DriveKernels
 from gigabrain_zenoh.decision.node import InputSource
 from gigabrain_zenoh.decision.seen_things import SeenThings
-from gigabrain_zenoh.decision.task_server import TaskServer
+from gigabrain_zenoh.decision.task_server import StartMission, TaskServer
 from gigabrain_zenoh.decision.tasks import arm_steps
 from gigabrain_zenoh.decision.tasks import mission as missions
-from gigabrain_zenoh.decision.tasks.mission import Mission
 from gigabrain_zenoh.decision.zones import ZoneSource
 from gigabrain_zenoh.errors import GigabrainError, Refused
 from gigabrain_zenoh.geometry.pose import to_parent
@@ -46,6 +45,7 @@ if TYPE_CHECKING:
     from gigabrain_zenoh.decision.manipulator import Manipulator
     from gigabrain_zenoh.decision.navigator import Navigator
 
+NOT_BEGUN = Idle("waiting", "waiting: for the body and the map's places, to begin its mission")
 COMPILING = "mapping and planning compile meanwhile, once per installation"
 FIRST_MAP_TICKS = 3000  # how long after the kernels a first map may come
 STARTING_STATUS_NS = 200_000_000  # of the status, while the kernels compile
@@ -78,7 +78,7 @@ class GoalServer(InputSource):
         self._navigator: Navigator | None = None  # once the kernels are loaded
         self._manipulator: Manipulator | None = None  # likewise, of a body with an arm
         self._outcome: StepOutcome | None = None  # of the last command
-        self._started = False
+        self._started = False  # what it does by itself
         self._first = _first_mission(settings)
         self._checked = 0  # number of a command that the arm can carry out
 
@@ -128,9 +128,12 @@ class GoalServer(InputSource):
         if not self._loaded or self._awaits_map(state):
             return self._start_up(state, world, verdict)
         navigator = self._make_navigator()
-        self._begin(state, body)
         tick = world.basis if world else state.tick
-        command, idle = self._tasks.step(state, self._outcome, tick)
+        if self._begin(state, body):
+            command, idle = self._tasks.step(state, self._outcome, tick)
+        else:
+            self._tasks.wait(state)
+            command, idle = None, NOT_BEGUN
         context = navigator.at_scan(state, world, verdict)
         intent, outcome = behaviour.step(
             Inputs(
@@ -152,12 +155,16 @@ class GoalServer(InputSource):
         self._outcome = outcome if command else None
         return intent, outcome
 
-    def _begin(self, state: RobotState, body: BodyDescription | None) -> None:
-        """Begin what the robot does by itself, once, if there was no task and its body can."""
-        drives = body is None or body.has_base
-        if self._first and not self._started and (drives or not self._first[0].drives):
-            self._tasks.begin(*self._first, state.boot)
-        self._started = True
+    def _begin(self, state: RobotState, body: BodyDescription | None) -> bool:
+        """Begin what the robot does by itself, once, if there was no task and its body can.
+
+        Return False while that has to wait.
+        """
+        if self._started or self._first is None:
+            return True
+        cannot_roam = body is not None and not body.has_base and not self._config.mission
+        self._started = cannot_roam or self._tasks.begin(self._first, state)
+        return self._started
 
     def _move_arm(
         self, state: RobotState, body: BodyDescription, command: Command | None, idle: Idle
@@ -287,12 +294,15 @@ class GoalServer(InputSource):
             await self._bus.clock.sleep_ns(STARTING_STATUS_NS)
 
 
-def _first_mission(config: NavigationConfig) -> tuple[Mission, str] | None:
-    """Return what a robot does by itself, with its label. Raises ConfigError."""
+def _first_mission(config: NavigationConfig) -> StartMission | None:
+    """Return what a robot does by itself. Raises ConfigError."""
     if config.mission:
         path = Path(config.mission).expanduser()
-        return missions.load(path)[0], path.stem
-    return (missions.explore_mission(), "roaming") if config.start == "explore" else None
+        return StartMission(*missions.load(path), label=path.stem, source=str(path))
+    if config.start != "explore":
+        return None
+    roaming = missions.explore_mission()
+    return StartMission(roaming, missions.text_of(roaming), label="roaming", source="roaming")
 
 
 def _roaming(config: NavigationConfig) -> AvoidConfig:

@@ -6,7 +6,7 @@ Goals are accepted from the start, while the planning kernels still compile.
 import asyncio
 import logging
 from collections.abc import Awaitable, Callable, Collection
-from typing import Any
+from typing import Any, NamedTuple
 
 from msgspec.structs import replace
 
@@ -52,6 +52,15 @@ STATUS_TICKS = 10  # robot/task is published at 5 Hz
 # returns how the robot would reach a goal, for people; without a goal, checks only that its pose in
 # the map is known. Raises Refused
 CheckGoal = Callable[[Goal | None], Awaitable[str]]
+
+
+class StartMission(NamedTuple):
+    """A mission that a robot begins with by itself."""
+
+    mission: Mission  # without the map's places that it names
+    text: str
+    label: str
+    source: str  # its file, for errors
 
 
 class TaskServer:
@@ -131,10 +140,25 @@ class TaskServer:
             text = self._queue.cancel("all", "loading another map")
             log.warning("%s: another map was loaded", text, extra={"data": {"event": "task"}})
 
-    def begin(self, mission: Mission, label: str, boot: int) -> None:
-        """Start a mission, unless there were tasks in this start of the driver."""
-        if self.unused(boot):
-            self._queue.add_mission(mission, label, "queue", "itself")
+    def begin(self, start: StartMission, state: RobotState) -> bool:
+        """Start a mission, unless there were tasks in this start of the driver, or log why not.
+
+        Return False while the body, or the map's places that it names, are not known.
+        """
+        now = state.boot, state.tick
+        if not self.unused(state.boot):
+            return True
+        if self._source.body is None:
+            return False
+        try:
+            self._refuse_impossible(start.mission)
+            if any(missions.map_places(start.mission)) and self._zones.maps_loaded(*now) is None:
+                return False
+            mission = missions.loads(start.text, start.source, self._zones.at(*now).places)
+            self._queue.add_mission(mission, start.label, "queue", "itself")
+        except GigabrainError as error:
+            _log_refusal("mission", "itself", error)
+        return True
 
     async def close(self) -> None:
         """Return once all is written."""
@@ -228,13 +252,7 @@ class TaskServer:
             # a long one takes a tenth of a second to parse, which no scan should wait for
             places = self._zones.newest.places
             mission = await asyncio.to_thread(missions.loads, request.mission, label, places)
-            for script in mission.scripts:
-                self._scripts.path(script)
-            if mission.looks:
-                self._refuse_blind()
-            body = self._source.body
-            if body and (actions := mission.arm_actions):
-                arm_steps.check(body, actions, mission.things.values())
+            self._refuse_impossible(mission)
             if mission.drives:
                 await self._check(None)
             name = self._queue.add_mission(mission, label, request.how, request.source)
@@ -243,6 +261,18 @@ class TaskServer:
             return MissionReply(ok=False, text=str(error)[:500])
         self._accept(name, MISSION, request)
         return MissionReply(ok=True, text=f"{name}: {label}"[:500], task=name)
+
+    def _refuse_impossible(self, mission: Mission) -> None:
+        """Raise Refused or UnknownName for steps that this robot cannot carry out."""
+        body = self._source.body
+        if body and mission.drives and not body.has_base:
+            raise Refused(f"{body.robot_type} has no base to drive")
+        for script in mission.scripts:
+            self._scripts.path(script)
+        if mission.looks:
+            self._refuse_blind()
+        if body and (actions := mission.arm_actions):
+            arm_steps.check(body, actions, mission.things.values())
 
     async def _on_change(self, request: TaskRequest) -> TaskReply:
         try:
