@@ -1,6 +1,7 @@
 """Moves the arm: plans each command in a worker thread, and carries it out from tick to tick."""
 
 import dataclasses
+from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 
@@ -66,6 +67,7 @@ from gigabrain_zenoh.manipulation.pick_place import NoWay
 
 TRIES = 3  # to pick a thing up, each with another grasp
 HOLD_UPS = 5  # of one command, after which it fails
+MAX_RESULTS = 64  # that are kept
 WAIT_TICKS = 100  # for a joint that the gate holds back, before another way is planned
 MISSED = f"it was not caught, {TRIES} times"
 CARRYING = ("lift", "traverse", "lower", "move")  # phases in which a thing has to be held
@@ -92,10 +94,12 @@ class Manipulator:
         self._held: HeldThing | None = None  # the same, for the file of tasks
         self._grip = Grip()
         self._recalls = True  # it does not know yet what the gripper holds
-        self._number = 0  # of the present command
+        self._number = 0  # of the present command, or of the last one
         self._misses = 0  # grasps of it that caught nothing
         self._hold_ups = 0  # of it, by a joint that did not follow
         self._achieved = StepOutcome()  # of a command that is done but for the way back
+        # the same of earlier commands, which go on after a task that came first
+        self._results: deque[StepOutcome] = deque(maxlen=MAX_RESULTS)
         self._left: Plan | None = None  # whose thing the hand is still at, without holding it
         self._interim = False  # it goes back from there, or out of a camera's sight
         self._why_not = ""  # why it fails once it is back
@@ -125,7 +129,7 @@ class Manipulator:
             intent = replace(intent, joints=self._keep_grip(self._planner, body, state))
         self._display.show(self._planner, self._plan if self._run else None)
         known = command.held if command and self._recalls else self._held
-        return intent, replace(outcome, holds=known)
+        return intent, replace(outcome, holds=known, placed=self._achieved.placed)
 
     def _step(
         self,
@@ -136,10 +140,11 @@ class Manipulator:
         held: str,
         seen: tuple[SeenSolid, ...],
     ) -> StepResult:
-        number = command.number if command else 0
-        if number != self._number:
+        if command and command.number != self._number:
             self._drop()
-            self._number, self._achieved = number, StepOutcome()
+            self._number = number = command.number
+            results = (one for one in self._results if one.number == number)
+            self._achieved = next(results, StepOutcome())
             self._misses = self._hold_ups = 0
             self._lookout.reset()
         try:
@@ -147,6 +152,8 @@ class Manipulator:
         except GigabrainError as error:
             return self._fail(str(error))
         if command is None:
+            self._interrupt()
+            self._lookout.reset()
             return self._still(idle)
         if held:
             self._touch = None
@@ -346,6 +353,7 @@ class Manipulator:
             if touched:
                 self._achieve(None)
                 self._achieved = replace(self._achieved, reason=str(pressure))
+                self._results.append(self._achieved)
             else:
                 self._why_not = f"nothing was touched, {do.depth * 100:g} cm behind that place"
             self._left, self._interim = self._plan, True
@@ -395,6 +403,7 @@ class Manipulator:
             posture = measured_posture(planner, state)
             name, solid = placed(planner, posture, command.do, hold, body)
             self._achieve(None, placed=(name, solid))
+            self._results.append(self._achieved)
             if self._seen_as is not None:  # others have a place by their mission
                 self._put = PutDown(name=name, solid=solid, state=state)
         if over and over.name == "grip":

@@ -86,7 +86,7 @@ class StepOutcome(Struct, frozen=True, kw_only=True):
     position_error: float | None = None  # [m] from the requested place
     heading_error: float | None = None  # [rad] from the requested heading
     holds: HeldThing | None = None  # what the gripper holds after a command that is done
-    placed: tuple[str, Solid] | None = None  # a thing, and where it was put down
+    placed: tuple[str, Solid] | None = None  # by this command: a thing, and where it was put down
     approach: Target | None = None  # a thing that the body has to stand nearer to
     seek: str = ""  # the class of a thing that it has to look for elsewhere
 

@@ -158,11 +158,11 @@ class ArmNode(Leaf):
                 self.context.things.pop(outcome.holds.name, None)
             elif lost and (given := self.context.given.get(lost.name)) and given.at is None:
                 self.context.things[lost.name] = given  # it stands somewhere, to be seen
-        if outcome and outcome.number == self._command.number and outcome.state != "running":
-            if outcome.placed:
+            if outcome.placed:  # at once, as the way back may be cut short
                 name, solid = outcome.placed
                 given = self.context.given.get(name, solid)
                 self.context.things[name] = solid if given.at else given
+        if outcome and outcome.number == self._command.number and outcome.state != "running":
             done = outcome.state == "done"
             return Status.SUCCESS if done else self.failed(f"{self.name}: {outcome.reason}")
         self.context.command = self._command

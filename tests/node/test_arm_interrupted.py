@@ -1,0 +1,73 @@
+"""Arm missions that are paused, or go on after another task, once the step has done its work."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from gigabrain_zenoh.decision.tasks.mission import loads
+from tests.node.arm_rig import ELSEWHERE, THINGS, Rig
+
+PLACE = THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]}]"
+PRESS = THINGS + "do: [{press: cube}]"
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    made = Rig(tmp_path)
+    yield made
+    made.manipulator.close()
+
+
+def until(rig: Rig, phase: str) -> None:
+    while rig.phases[-1:] != [phase]:
+        rig.tick()
+        assert rig.queue.status.current, rig.queue.status.done
+
+
+def pause(rig: Rig) -> None:
+    rig.queue.pause("", "ann")
+    for _ in range(25):
+        rig.tick()
+    rig.queue.resume("")
+
+
+def preempt(rig: Rig, text: str) -> None:
+    rig.queue.add_mission(loads(text, "mission"), "mission", "preempt", "bob")
+    while not rig.queue.status.done:
+        rig.tick()
+    assert rig.queue.status.done[0].state == "succeeded"
+
+
+@pytest.mark.parametrize("other", ["", "do: [{posture: home}]"])
+def test_what_was_put_down_stays_put_down_for_a_step_that_goes_on(rig: Rig, other: str) -> None:
+    rig.give(PLACE)
+    until(rig, "retreat")
+    rig.tick()
+    things = rig.queue.saved.jobs[0].things
+    assert things
+    assert things["cube"].at == pytest.approx((*ELSEWHERE, 0.015), abs=0.01)
+    preempt(rig, other) if other else pause(rig)
+    task = rig.carry_on()
+    assert (task.id, task.state, task.reason) == ("mission-1", "succeeded", "")
+    assert rig.arm.thing()[:2] == pytest.approx(ELSEWHERE, abs=0.012)
+
+
+@pytest.mark.parametrize("other", ["", "do: [{posture: home}]"])
+def test_what_was_pressed_is_not_pressed_again_by_a_step_that_goes_on(rig: Rig, other: str) -> None:
+    rig.give(PRESS)
+    until(rig, "retreat")
+    preempt(rig, other) if other else pause(rig)
+    task = rig.carry_on()
+    assert (task.id, task.state) == ("mission-1", "succeeded")
+    assert task.reason.startswith("pressed with ")
+    assert rig.phases.count("press") == 1
+
+
+def test_a_pause_in_the_tick_in_which_a_step_is_done_loses_nothing(rig: Rig) -> None:
+    rig.give(PLACE)
+    until(rig, "retreat")
+    while rig.outcome is None or rig.outcome.state == "running":
+        rig.tick()
+    pause(rig)
+    assert rig.carry_on().state == "succeeded"
