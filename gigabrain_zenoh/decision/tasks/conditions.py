@@ -57,13 +57,17 @@ def parse(text: str) -> Condition:
         raise ValueError(f"{EXPECTED}, got {text!r}")
     field, sign, literal = found.groups()
     topic, path = _place(field)
-    kind = _kind(topic.type, path, field)
+    type_ = _type(topic.type, path, field)
+    words = typing.get_args(type_)  # that it may be; none for any
+    kind = str if words else type_
     value = _value(literal)
     wanted: tuple[type, ...] = (bool,) if kind is bool else (str,) if kind is str else (int, float)
     if not isinstance(value, wanted) or (isinstance(value, bool) and kind is not bool):
         raise ValueError(f"{field} is {_named(kind)}; it cannot be compared with {literal!r}")
     if kind in (bool, str) and sign not in ("==", "!="):
         raise ValueError(f"{field} is {_named(kind)}; expected == or !=, got {sign}")
+    if words and value not in words:
+        raise ValueError(f"{field}: {unknown('word', literal, words)}")
     return Condition(topic, path, sign, value, " ".join(text.split()))
 
 
@@ -78,24 +82,26 @@ def _place(field: str) -> tuple[Topic[Any], tuple[str, ...]]:
     return STATE, (first, *rest)
 
 
-def _kind(type_: Any, path: tuple[str, ...], field: str) -> type:
+def _type(type_: Any, path: tuple[str, ...], field: str) -> Any:
     """Return the type of a field's value. Raises ValueError if there is no such field."""
     for part in path:
-        type_ = _bare(type_)
+        outer, type_ = type_, _bare(type_)
         if isinstance(type_, type) and issubclass(type_, msgspec.Struct):
             known = {f.name: f.type for f in msgspec.structs.fields(type_)}
             if part not in known:
                 raise unknown("field", part, known)
             type_ = known[part]
         elif typing.get_origin(type_) is tuple and part.isdigit():
-            type_ = typing.get_args(type_)[0]
+            inner = typing.get_args(type_)
+            size = _max_length(outer) if inner[-1] is Ellipsis else len(inner)
+            if int(part) >= size:
+                raise ValueError(f"{field}: no index {part}; expected 0 to {size - 1}")
+            type_ = inner[0]
         else:
             raise ValueError(f"{field}: no field {part!r}")
     kind = _bare(type_)
-    if typing.get_origin(kind) is typing.Literal:
-        return str
-    if kind in (bool, int, float, str):
-        return kind  # type: ignore[no-any-return]
+    if typing.get_origin(kind) is typing.Literal or kind in (bool, int, float, str):
+        return kind
     raise ValueError(f"{field} is no number, word or truth value; name one of its parts")
 
 
@@ -106,6 +112,13 @@ def _bare(type_: Any) -> Any:
     if typing.get_origin(type_) in (typing.Union, types.UnionType):
         return _bare(next(m for m in typing.get_args(type_) if m is not type(None)))
     return type_
+
+
+def _max_length(type_: Any) -> int:
+    """Return the bound of a tuple's length: each field of a message has one."""
+    meta = next(one for one in typing.get_args(type_) if isinstance(one, msgspec.Meta))
+    assert meta.max_length is not None
+    return meta.max_length
 
 
 def _value(literal: str) -> Value:

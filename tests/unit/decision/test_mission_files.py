@@ -42,6 +42,17 @@ from gigabrain_zenoh.errors import ConfigError
         ("do:\n- check: gate.mode < idle", "gate.mode is a word; expected == or !=, got <"),
         ("do:\n- check: pose.x < nan", "pose.x is a number; it cannot be compared with 'nan'"),
         ("do:\n- check: robot.legs < 4", "no field 'robot'"),
+        (
+            "do:\n- wait_until: gate.mode == enabeld",
+            "m:2: do[0].wait_until: gate.mode: no word 'enabeld'; did you mean 'enabled'? "
+            "known: enabled, idle, latched, stopping",
+        ),
+        ("do:\n- check: task.current.state != runing", "task.current.state: no word 'runing'"),
+        (
+            "do:\n- check: imu.orientation.7 < 1",
+            "m:2: do[0].check: imu.orientation.7: no index 7; expected 0 to 3",
+        ),
+        ("do:\n- check: joints.128.position > 1", "no index 128; expected 0 to 127"),
         ("do:\n- check: map.cells == 3", "map.cells is no number, word or truth value"),
         (
             f"do:\n- check: joints.{'9' * 5000}.position > 1",
