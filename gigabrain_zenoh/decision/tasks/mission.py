@@ -3,15 +3,15 @@
 Checks that need more than one step, such as names of places and the depth of trees, come last.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_args
 
 import msgspec
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
-from gigabrain_schemas.base import Finite, Name, Percentage
+from gigabrain_schemas.base import Angle, Coordinate, Name, Percentage
 from gigabrain_schemas.objects import Label, TagId
 from gigabrain_schemas.tasks import Goal
 from gigabrain_schemas.zones import Place as MapPlace
@@ -39,7 +39,9 @@ MAX_STEPS = 2000  # with each `tree` written out
 MAX_DEPTH = 50  # of nested steps, likewise; carrying them out is recursive
 TOO_DEEP = f"more than {MAX_DEPTH} nested steps once every tree is written out"
 
-Point = Annotated[tuple[Finite, ...], Meta(min_length=2, max_length=3)]  # [m], [m], [rad]
+# x, y [m] and maybe yaw [rad]; see `_beyond`
+Point = Annotated[tuple[Angle, ...], Meta(min_length=2, max_length=3)]
+BOUNDS = get_args(Coordinate)[1]  # [m], of x and y
 
 
 class Part(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -279,8 +281,7 @@ def loads(text: str, source: str, places: Iterable[MapPlace] | None = ()) -> Mis
     if places is not None:
         used = {one.name: _point(one) for one in places if one.name in named}
         mission = replace(mission, places={**used, **mission.places})
-    for keys, problem in _problems(mission, frozenset(named if places is None else ())):
-        raise ConfigError(f"{source}:{_line(text, keys)}: {_dotted(keys)}: {problem}")
+    _refuse(_problems(mission, frozenset(named if places is None else ())), text, source)
     return mission
 
 
@@ -298,11 +299,35 @@ def _point(place: MapPlace) -> Point:
 
 def load_patrol(path: Path) -> PatrolFile:
     """Return the patrol in a file. Raises ConfigError with file and line; see `load`."""
-    return loading.loads(loading.read(path), PatrolFile, str(path))
+    text = loading.read(path)
+    patrol = loading.loads(text, PatrolFile, str(path))
+    points: dict[Keys, Place] = {("points", i): place for i, place in enumerate(patrol.points)}
+    _refuse(_beyond(points | _own_places(patrol)), text, str(path))
+    return patrol
+
+
+def _refuse(problems: Iterable[tuple[Keys, str]], text: str, source: str) -> None:
+    """Raise ConfigError for the first problem, if any."""
+    for keys, problem in problems:
+        raise ConfigError(f"{source}:{_line(text, keys)}: {_dotted(keys)}: {problem}")
+
+
+def _own_places(file: Mission | PatrolFile) -> dict[Keys, Place]:
+    return {("places", name): place for name, place in file.places.items()}
+
+
+def _beyond(places: Mapping[Keys, Place]) -> Iterator[tuple[Keys, str]]:
+    """Yield each coordinate that is in no map."""
+    for keys, place in places.items():
+        for i, value in enumerate(place[:2] if isinstance(place, tuple) else ()):
+            if not BOUNDS.ge <= value <= BOUNDS.le:
+                expected = f"expected {BOUNDS.ge:.0f} to {BOUNDS.le:.0f} [m], got {value}"
+                yield (*keys, i), expected
 
 
 def _problems(mission: Mission, elsewhere: frozenset[str]) -> Iterator[tuple[Keys, str]]:
     """Yield all problems; the places `elsewhere` are not checked."""
+    yield from _beyond(_own_places(mission))
     for keys, step in _steps(mission):
         yield from _in_step(keys, step, mission, elsewhere)
     depths: dict[str, int] = {}
@@ -318,6 +343,7 @@ def _problems(mission: Mission, elsewhere: frozenset[str]) -> Iterator[tuple[Key
 def _in_step(
     keys: Keys, step: Step, mission: Mission, elsewhere: frozenset[str]
 ) -> Iterator[tuple[Keys, str]]:
+    yield from _beyond({(*keys, *more): place for more, place in _places(step)})
     for more, place in _places(step):
         if isinstance(place, str) and place not in mission.places and place not in elsewhere:
             yield (*keys, *more), str(unknown("place", place, mission.places or ("none",)))

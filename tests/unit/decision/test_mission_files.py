@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from gigabrain_schemas.tasks import Goal
 from gigabrain_schemas.zones import Place
 from gigabrain_zenoh.decision.tasks import mission as missions
 from gigabrain_zenoh.errors import ConfigError
@@ -21,6 +22,19 @@ from gigabrain_zenoh.errors import ConfigError
         ),
         ("do:\n- goto: [1, .nan]", "m:2: .nan is not allowed; expected a finite number"),
         ("do:\n- goto: [1]", "m:2: do[0].goto: expected "),
+        ("do:\n- goto: [1, 2, 2e6]", "m:2: do[0].goto[2]: expected a number >= -1000000.0 and"),
+        (
+            "do:\n- wait: 1\n- patrol: {points: [[1, 2], [2e5, 1]]}",
+            "m:3: do[1].patrol.points[1][0]: expected -100000 to 100000 [m], got 200000",
+        ),
+        (
+            "do: [{battery_below: {percentage: 9, goto: [0, -2e5], do: [{wait: 1}]}}]",
+            "m:1: do[0].battery_below.goto[1]: expected -100000 to 100000 [m], got -200000",
+        ),
+        (
+            "places:\n  a: [0, 0]\n  b: [2e5, 1]\ndo: [{goto: a}]",
+            "m:3: places.b[0]: expected -100000 to 100000 [m], got 200000",
+        ),
         ("do:\n- wait: 1\n  goto: [1, 2]", "m:2: do[0].wait: this step is"),
         ("do:\n- explore:", "m:2: do[0]: an empty step; expected one of goto, "),
         ("do:\n- tree: b", "m:2: do[0].tree: no tree 'b'; known: none"),
@@ -72,6 +86,29 @@ def test_a_mission_that_cannot_be_carried_out_is_refused_with_its_line(
     with pytest.raises(ConfigError) as refused:
         missions.loads(text, "m")
     assert problem in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("points:\n- [2e5, 1]", "round.yaml:2: points[0][0]: expected -100000 to 100000 [m]"),
+        ("places: {a: [1, 2e5]}\npoints: [a]", "round.yaml:1: places.a[1]: expected -100000 to"),
+    ],
+)
+def test_a_patrol_beyond_all_maps_is_refused_with_its_line(
+    tmp_path: Path, text: str, problem: str
+) -> None:
+    file = tmp_path / "round.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError) as refused:
+        missions.load_patrol(file)
+    assert problem in str(refused.value)
+
+
+def test_a_goal_may_be_anywhere_that_a_message_can_hold() -> None:
+    goal = Goal(x=1e5, y=-1e5, yaw=-1e6)
+    mission = missions.loads(missions.text_of(missions.goal_mission(goal)), "m")
+    assert mission == missions.goal_mission(goal)
 
 
 def test_trees_that_multiply_are_refused() -> None:
