@@ -1,7 +1,7 @@
 """Contours from the pictures of a body's cameras, made in a thread beside the event loop.
 
-A scan never waits for a picture. One picture is worked on at a time, the newest of each camera; its
-contours are then moved to wherever the body is at a scan.
+A scan never waits for a picture. One picture is worked on at a time, the newest of each camera in
+turn; its contours are then moved to wherever the body is at a scan.
 """
 
 import math
@@ -74,6 +74,7 @@ class _Eye:
 
     camera: Camera
     waiting: DepthImage | Image | None = None
+    look: int = 0  # number of the newest look at one of its pictures
     exposure: int = 0  # tick of the newest picture whose contours are known
     refused: str = ""  # why that picture gave none
     problem: str = ""  # what the camera process says of it
@@ -106,7 +107,7 @@ class CameraContours:
         self._eyes = {one.name: _Eye(one) for one in description.fixed_cameras}
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="contours")
         self._contours, self._boot = ObstacleContours(description), 0
-        self._busy = False
+        self._busy, self._looks = False, 0
         self._view = View()
         self._history = PoseHistory()
         self._solids = _solid_keeper(bus, description)
@@ -168,10 +169,13 @@ class CameraContours:
         self._start()
 
     def _start(self) -> None:
-        """Work on a picture, if none is worked on and the pose of one is known."""
+        """Work on a picture, if none is worked on and the pose of one is known.
+
+        Cameras take turns: on a slow host, the next picture of the last one waits again already.
+        """
         if self._busy:
             return
-        for eye in self._eyes.values():
+        for eye in sorted(self._eyes.values(), key=lambda one: one.look):
             picture = eye.waiting
             if picture is None or picture.basis > self._history.newest_tick:
                 continue
@@ -180,7 +184,8 @@ class CameraContours:
             if pose is None:
                 self._bus.counters[SKIPPED] += 1
                 continue
-            self._busy = True
+            self._busy, self._looks = True, self._looks + 1
+            eye.look = self._looks
             on_arm = self._solids.own(picture.basis) if self._solids else None
             find = self._solids.find if self._solids and on_arm else None
             work = self._contours, eye.camera.name, picture, pose, on_arm, find

@@ -242,22 +242,50 @@ def jpeg(pixels: NDArray[np.uint8]) -> bytes:
     return bytes(cv2.imencode(".jpg", pixels)[1].tobytes())
 
 
+class Late(PatientJournal):
+    """Keeps the work in progress until a test ends it."""
+
+    def __init__(self) -> None:
+        self.unfinished: list[tuple[Job, Callable[[Job], None]]] = []
+
+    def when_done(self, job: Job, then: Callable[[Job], None]) -> None:
+        self.unfinished.append((job, then))
+
+    def end_one(self) -> None:
+        """End the only work in progress."""
+        (one,) = self.unfinished
+        self.unfinished.clear()
+        super().when_done(*one)
+
+
 async def test_a_picture_that_waits_at_the_end_is_left() -> None:
     """The work in progress ends behind the node; nothing is begun then."""
-    unfinished: list[tuple[Job, Callable[[Job], None]]] = []
-
-    class Late(PatientJournal):
-        def when_done(self, job: Job, then: Callable[[Job], None]) -> None:
-            unfinished.append((job, then))
-
     async with Bench() as bench:
-        bench.bus.input_log = Late()
+        bench.bus.input_log = late = Late()
         await bench.begin()
         for tick in (1, 6):
             bench.drive(tick)
             await bench.look(tick)
-    ((job, then),) = unfinished
-    then(job)
+    late.end_one()
+    assert not late.unfinished
+
+
+@pytest.mark.parametrize("behind", [0, 25])
+async def test_cameras_take_turns_where_a_look_takes_as_long_as_a_period(behind: int) -> None:
+    """Also where the pictures of one are older when they come."""
+    async with Bench() as bench:
+        bench.bus.input_log = late = Late()
+        await bench.ready()
+        rear = replace(LOW, name="rear")
+        bench.send(BODY, body(replace(CAMERA_BODY, cameras=(LOW, rear))))
+        dark = DepthImage(frame_id="", height=LOW.height, width=LOW.width, planes=(b"",) * 4)
+        for tick in range(26, 76, 5):
+            bench.drive(tick)
+            await bench.look(tick, dark, "front")
+            await bench.look(tick - behind, dark, "rear")
+            late.end_one()
+        front, back = (await bench.world(71)).cameras
+    assert sorted((front.exposure, back.exposure + behind)) == [61, 66]
 
 
 async def test_a_body_without_cameras_costs_nothing() -> None:
