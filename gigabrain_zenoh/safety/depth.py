@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
-from gigabrain_schemas.body import BodyDescription, Camera
+from gigabrain_schemas.body import MAX_CAMERAS, BodyDescription, Camera
 from gigabrain_zenoh.geometry.stopping import brakes
 from gigabrain_zenoh.geometry.sweep import depth as outside
 from gigabrain_zenoh.geometry.sweep import edges, radius
@@ -24,6 +24,7 @@ MEMORY_M = 0.3  # beyond the stopping distance, what is seen is remembered
 UNDISTORT_STEPS, UNDISTORTED = 20, 1e-3  # and how far off a ray may be then, 1 m ahead
 WIDEST = 20.0  # [m] aside of what is 1 m ahead: no lens sees that
 NEVER = 65535  # [mm], a depth that no pixel has
+KEPT_VIEWS = 8  # of all cameras and tilts
 # beyond depth_min, of depth_max: the floor must be seen there
 JUDGED_NEAR_M, JUDGED_SHARE = 0.05, 0.8
 ALIKE_M, ALIKE_SHARE = 0.015, 0.02  # by which depths on one surface differ from pixel to pixel
@@ -66,7 +67,16 @@ def reach_of(body: BodyDescription) -> float:
     return brakes(body)["forward"].reach + radius(body.footprint) + MEMORY_M
 
 
-@lru_cache(maxsize=64)
+class _Level(NamedTuple):
+    """A camera on a level body, and what its views from a tilted one are computed from."""
+
+    view: View
+    rays: Floats  # (h, w, 3), as in `view`, exact
+    angle: Floats  # (h, w), error of heights for each metre of depth
+    known: Mask  # (h, w)
+
+
+@lru_cache(maxsize=KEPT_VIEWS)
 def view_of(body: BodyDescription, camera: Camera, up: Up = (0.0, 0.0)) -> View:
     """Return the view of a camera on a body, whose vertical is `up` in its own frame.
 
@@ -80,38 +90,51 @@ def view_of(body: BodyDescription, camera: Camera, up: Up = (0.0, 0.0)) -> View:
     if it fills three pixels. A body that is tilted stands on a slope, or on a sill: nothing is an
     obstacle that would be the floor of one of the two.
     """
+    view, rays, angle, known = _level(body, camera)
+    if up == (0.0, 0.0):
+        return view
+    vertical = np.array((*up, math.sqrt(max(0.0, 1.0 - up[0] ** 2 - up[1] ** 2))))
+    height = float(view.mount @ vertical)
+    above, top, below = _bounds(height, rays @ vertical, angle, body.body_height)
+    return view._replace(
+        above=np.where(known, np.minimum(view.above, above), np.uint16(NEVER)),
+        within=np.minimum(view.within, np.minimum(above, top)),
+        below=np.maximum(view.below, below),
+    )
+
+
+@lru_cache(maxsize=MAX_CAMERAS)
+def _level(body: BodyDescription, camera: Camera) -> _Level:
+    """Return the view of a camera on a level body; this takes far longer than another tilt."""
     mount, (rays, known) = np.array((camera.x, camera.y, camera.z)), _rays(camera)
-    level = _floor(camera, body, mount, rays, np.array((0.0, 0.0, 1.0)))
-    if up != (0.0, 0.0):
-        z = math.sqrt(max(0.0, 1.0 - up[0] ** 2 - up[1] ** 2))
-        tilted = _floor(camera, body, mount, rays, np.array((*up, z)))
-        level = (
-            np.minimum(level[0], tilted[0]),
-            np.minimum(level[1], tilted[1]),
-            np.maximum(level[2], tilted[2]),
-            level[3],
-        )
-    above, top, below, floor = level
-    flat = np.hypot(rays[..., 0], rays[..., 1])
-    within = np.minimum(np.minimum(above, top), _reach(mount, rays, reach_of(body)))
+    ahead = np.array((math.cos(camera.yaw), math.sin(camera.yaw)))
+    aside = np.array((-ahead[1], ahead[0]))
+    way = np.abs(rays[..., :2] @ ahead) + np.abs(rays[..., :2] @ aside)
+    angle, height, slope = math.tan(MOUNT_RAD) * way, camera.z, rays[..., 2]
+    above, top, below = _bounds(height, slope, angle, body.body_height)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        floor = np.where(slope < 0, -height / slope, np.inf)
+    reach = np.minimum(_reach(mount, rays, reach_of(body)), camera.depth_max)
+    within = np.minimum(np.minimum(above, top), _millimetres(reach))
     crossing = mount[:2] + np.minimum(floor, 1e6)[..., None] * rays[..., :2]
     away = np.hypot(crossing[..., 0], crossing[..., 1])
     near = known & (away <= reach_of(body)) & (outside(edges(body.footprint), crossing) > 0)
     sure = near & (floor >= camera.depth_min + JUDGED_NEAR_M)
     sure &= floor <= JUDGED_SHARE * camera.depth_max
-    return View(
+    view = View(
         mount=mount,
         rays=rays.astype(np.float32),
-        flat=flat.astype(np.float32),
-        above=np.where(known, _millimetres(above), np.uint16(NEVER)),
+        flat=np.hypot(rays[..., 0], rays[..., 1]).astype(np.float32),
+        above=np.where(known, above, np.uint16(NEVER)),
         own=_millimetres(_inside(body, mount, rays)),
-        within=np.where(known, _millimetres(np.minimum(within, camera.depth_max)), np.uint16(0)),
-        below=np.where(near, _millimetres(below), np.uint16(NEVER)),
+        within=np.where(known, within, np.uint16(0)),
+        below=np.where(near, below, np.uint16(NEVER)),
         floor=floor.astype(np.float32),
         sure=sure,
         upright=abs(math.cos(camera.roll)) >= abs(math.sin(camera.roll)),
         known=float(known.mean()),
     )
+    return _Level(view, rays, angle, known)
 
 
 def _rays(camera: Camera) -> tuple[Floats, Mask]:
@@ -157,35 +180,34 @@ def turn_of(camera: Camera) -> Floats:
     return turn
 
 
-def _floor(
-    camera: Camera, body: BodyDescription, mount: Floats, rays: Floats, up: Floats
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return depths by pixel [m]: above the floor, below the body's top, below the floor; floor.
+def _bounds(
+    height: float, slope: Floats, angle: Floats, body_height: float
+) -> tuple[Pixels, Pixels, Pixels]:
+    """Return depths by pixel [mm]: above the floor, below the body's top, below the floor.
 
     The height at depth z is h + s z, and its tolerance t + a z + q z^2.
     """
-    height, slope = float(mount @ up), rays @ up
-    ahead = np.array((math.cos(camera.yaw), math.sin(camera.yaw)))
-    aside = np.array((-ahead[1], ahead[0]))
-    way = np.abs(rays[..., :2] @ ahead) + np.abs(rays[..., :2] @ aside)
-    angle, noise = math.tan(MOUNT_RAD) * way, SIGMAS * NOISE_PER_M2 * np.abs(slope)
-    room = max(0.0, max(body.body_height, height) - height)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        standing = max(0.0, height - MOUNT_M)
-        falls = angle - slope
-        above = 2 * standing / (falls + np.sqrt(falls**2 + 4 * noise * standing))
-        rises = slope - angle
-        top = 2 * room / (rises + np.sqrt(rises**2 - 4 * noise * room))
-        sinks = -slope - angle
-        sunk = height + MOUNT_M
-        below = 2 * sunk / (sinks + np.sqrt(sinks**2 - 4 * noise * sunk))
-        floor = np.where(slope < 0, -height / slope, np.inf)
+    noise, falls = SIGMAS * NOISE_PER_M2 * np.abs(slope), angle - slope
     return (
-        np.where(np.isfinite(above), above, np.inf),
-        np.where((rises > 0) & np.isfinite(top), top, np.inf),
-        np.where((sinks > 0) & np.isfinite(below), below, np.inf),
-        floor,
+        _crossed(height - MOUNT_M, falls, noise),
+        _crossed(body_height - height, -falls, -noise),
+        _crossed(height + MOUNT_M, -slope - angle, -noise),
     )
+
+
+def _crossed(height: float, slope: Floats, noise: Floats) -> Pixels:
+    """Return the depths z [mm] at which s z + q z^2 is `height`: 2 h / (s + sqrt(s^2 + 4 q h)).
+
+    It works in place: where the tilt changes, this is done for each picture.
+    """
+    height = max(0.0, height)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        root = 4 * height * noise
+        root += slope * slope
+        np.sqrt(root, out=root)
+        root += slope
+        np.maximum(root, 0.0, out=root)
+        return _millimetres(np.divide(2 * height, root, out=root))
 
 
 def _reach(mount: Floats, rays: Floats, reach: float) -> Floats:
@@ -211,7 +233,9 @@ def _inside(body: BodyDescription, mount: Floats, rays: Floats) -> Floats:
 
 
 def _millimetres(depth: Floats) -> Pixels:
-    return np.clip(np.nan_to_num(depth, posinf=NEVER) * 1000.0, 0, NEVER).astype(np.uint16)
+    """Return depths [m] >= 0 in millimetres; NEVER for one that is not known."""
+    depth = depth * 1000.0
+    return np.fmin(depth, NEVER, out=depth).astype(np.uint16)
 
 
 def unknown(camera: Camera, picture: Pixels) -> Mask:
