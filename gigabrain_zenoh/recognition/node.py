@@ -27,7 +27,7 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.pose import PoseHistory, compose, relative, to_parent, wrap_angle
 from gigabrain_zenoh.host.this_process import step_aside
 from gigabrain_zenoh.host.threads import Job
-from gigabrain_zenoh.logs import Fault
+from gigabrain_zenoh.logs import QuietFault
 from gigabrain_zenoh.runtime.heartbeat import Progress
 
 if TYPE_CHECKING:
@@ -50,6 +50,7 @@ class _Eye:
     picture: Image | None = None
     came_ns: int = 0  # when that picture came
     depths: dict[int, DepthImage] = field(default_factory=dict)  # by basis
+    fault: QuietFault = field(default_factory=lambda: QuietFault(log))  # of its pictures
 
     def keep(self, depth: DepthImage) -> None:
         """Keep the depth of an exposure."""
@@ -71,7 +72,7 @@ class Recognition:
         self._period_ns = round(1e9 / config.recognizer.rate_hz)
         self._pool = ThreadPoolExecutor(1, "recognition", initializer=step_aside)
         self._eyes: dict[str, _Eye] = {}
-        self._history, self._fault = PoseHistory(), Fault(log)
+        self._history = PoseHistory()
         self._busy, self._closed, self._taken, self._done = False, False, 0, 0
         self._misread: dict[int, int] = {}  # how often in a row a tag had another size, by number
         self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -128,10 +129,11 @@ class Recognition:
             eye.due_ns = max(eye.due_ns, now_ns - self._period_ns) + self._period_ns
             self._busy = True
             job = self._pool.submit(self._observer.observe, eye.camera, picture, depth)
-            self._bus.input_log.when_done(job, partial(self._finish, picture))
+            self._bus.input_log.when_done(job, partial(self._finish, eye, picture))
             return
 
-    def _finish(self, picture: Image, job: Job) -> None:
+    def _finish(self, eye: _Eye, picture: Image, job: Job) -> None:
+        name, now_ns = eye.camera.name, self._bus.clock.now_ns()
         self._busy, self._done = False, self._done + 1
         if self._closed:
             return
@@ -139,12 +141,12 @@ class Recognition:
             found: Detections = job.result()
         except ValueError as error:
             self._bus.counters["broken_pictures"] += 1
-            self._fault.begin(f"camera {picture.frame_id}: skipped a picture: {error}")
+            eye.fault.begin(f"camera {name}: skipped a picture: {error}", now_ns)
         except Exception as error:  # noqa: BLE001 - handed on whole, to end this process
             if not self.failed.done():
                 self.failed.set_exception(error)
         else:
-            self._fault.end(f"camera {picture.frame_id}: its pictures are whole again")
+            eye.fault.end(f"camera {name}: its pictures are whole again", now_ns)
             self._publish(found, picture)
             self._warn_of_sizes(found)
         self._start()
