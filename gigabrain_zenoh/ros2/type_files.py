@@ -88,7 +88,7 @@ def _parts(file: Path) -> Iterator[tuple[str, str]]:
     """Yield name and text of the messages that a file holds."""
     kind = file.suffix[1:]
     try:
-        text = file.read_text(encoding="utf-8")
+        text = file.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{file}: cannot be read: {error}") from None
     texts: list[str] = [""]

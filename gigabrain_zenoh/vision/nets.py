@@ -71,7 +71,7 @@ def load_net(config: RecognizerConfig) -> Net | None:
 def read_labels(path: Path) -> tuple[str, ...]:
     """Return the classes of a file, one a line; an empty line is a class that is not reported."""
     try:
-        text = read_bounded(path, MAX_LABEL_BYTES).decode()
+        text = read_bounded(path, MAX_LABEL_BYTES).decode("utf-8-sig")
     except OSError as error:
         raise ConfigError(f"recognizer: labels: {path}: {error.strerror or error}") from None
     except UnicodeDecodeError:

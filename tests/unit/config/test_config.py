@@ -79,6 +79,11 @@ def test_a_good_file_becomes_its_struct(tmp_path: Path) -> None:
     )
 
 
+def test_a_byte_order_mark_changes_nothing() -> None:
+    for text in (HEAD, f"# a robot\n{HEAD}", f"---\n{HEAD}"):
+        assert loads(f"\ufeff{text}", Robot, "robot.yaml") == loads(text, Robot, "robot.yaml")
+
+
 def test_numbers_are_read_as_people_write_them() -> None:
     robot = loads(HEAD + "mount: [1e-3, +2, -.5]\nlamps: 0\n", Robot, "robot.yaml")
     assert robot.mount == (0.001, 2.0, -0.5)

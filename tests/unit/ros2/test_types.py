@@ -160,6 +160,11 @@ def test_definitions_of_ones_own_are_read(tmp_path: Path) -> None:
         types.from_dict("my_msgs/msg/Thing", {"parts": [{}] * 3})
 
 
+def test_a_definition_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    types = Types([write(tmp_path, "my_msgs/msg/A.msg", "\ufeffuint8 kind 3\n")])
+    assert types.make("my_msgs/msg/A").kind == 3
+
+
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [

@@ -175,6 +175,8 @@ def test_labels_are_lines_of_text(tmp_path):
     path = tmp_path / "labels.txt"
     path.write_text("person\n traffic light \r\n\ndog\n\n")
     assert read_labels(path) == ("person", "traffic light", "", "dog")
+    path.write_bytes(b"\xef\xbb\xbfperson\r\n")  # with a byte-order mark
+    assert read_labels(path) == ("person",)
     for data, expected in ((b"\n \n", "no class"), (b"\xff\xfe", "UTF-8"), (b"x" * 65, ":1: ")):
         path.write_bytes(data)
         with pytest.raises(ConfigError, match=expected):
