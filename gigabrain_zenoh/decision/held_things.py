@@ -49,8 +49,13 @@ def placed(
 
 def standing_height(hold: Hold, body: BodyDescription) -> float:
     """Return how high the middle of what is held is while it stands on the floor [m]."""
+    return floor_of(body) + float(hold.thing.half[2])
+
+
+def floor_of(body: BodyDescription) -> float:
+    """Return the height of the floor in the frame of the arm's model [m]."""
     assert body.arm
-    return (body.arm.floor or 0.0) + float(hold.thing.half[2])
+    return body.arm.floor or 0.0
 
 
 def held_thing(hold: Hold) -> HeldThing:

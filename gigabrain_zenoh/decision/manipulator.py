@@ -36,6 +36,7 @@ from gigabrain_zenoh.decision.behaviours import (
 )
 from gigabrain_zenoh.decision.grip import Grip
 from gigabrain_zenoh.decision.held_things import (
+    floor_of,
     held_thing,
     hold_of,
     placed,
@@ -243,8 +244,8 @@ class Manipulator:
             self._back_off(planner, body, state, self._left)
         elif self._run is None:
             if self._planning is None:
-                held = self._seen_as if self._hold else None
-                things, numbers = located(command.things, seen, held)
+                held, floor = self._seen_as if self._hold else None, floor_of(body)
+                things, numbers = located(command.things, seen, held, floor)
                 if self._put and (solid := self._put.at(state, seen)):
                     things[f"{self._put.name} put down"] = solid
                 else:

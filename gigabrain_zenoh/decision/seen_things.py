@@ -125,26 +125,31 @@ class Lookout:
 
 
 def located(
-    things: Mapping[str, Solid], seen: tuple[SeenSolid, ...], held: int | None = None
+    things: Mapping[str, Solid],
+    seen: tuple[SeenSolid, ...],
+    held: int | None = None,
+    floor: float = 0.0,
 ) -> tuple[dict[str, Solid], dict[str, int]]:
     """Return where things are, those without a place by what is seen; without what is not seen.
 
     All else that is seen nearby is in the way, by the name `seen` with its number. What the gripper
-    has `held` since it was seen with that number stands there no more. The second result has the
+    has `held` since it was seen with that number stands there no more. Heights are seen from the
+    floor, which is at `floor` [m] in the frame of the arm's model. The second result has the
     numbers of things that are where they are seen.
     """
-    known = {name: one for name, one in things.items() if one.at}
+    given = {name: one for name, one in things.items() if one.at}
     left = [one for one in seen if one.id != held]
-    left = [one for one in left if not any(_stands(one, other) for other in known.values())]
+    left = [one for one in left if not any(_stands(one, other) for other in given.values())]
+    found: dict[str, Solid] = {}
     numbers: dict[str, int] = {}
     for name, wanted in things.items():
-        if wanted.at is None and (found := next((one for one in left if _fits(wanted, one)), None)):
-            left.remove(found)
-            known[name], numbers[name] = _placed(wanted, found), found.id
+        if wanted.at is None and (one := next((one for one in left if _fits(wanted, one)), None)):
+            left.remove(one)
+            found[name], numbers[name] = _placed(wanted, one), one.id
     for one in left:
         if math.hypot(*one.position[:2]) < NEAR_M:
-            known[f"seen {one.id}"] = _as_seen(one)
-    return known, numbers
+            found[f"seen {one.id}"] = _as_seen(one)
+    return given | {name: _raised(one, floor) for name, one in found.items()}, numbers
 
 
 def unseen(do: ArmAction, things: Mapping[str, Solid], known: Mapping[str, Solid]) -> str | None:
@@ -221,3 +226,9 @@ def _placed(wanted: Solid, one: SeenSolid) -> Solid:
     turned = (long - wide) * (lengths[0] - lengths[1]) < 0.0  # its longer side is the other one
     yaw = one.yaw + (math.pi / 2 if turned else 0.0)
     return replace(wanted, at=(x, y, lengths[2] / 2), yaw=yaw, label=None)
+
+
+def _raised(solid: Solid, by: float) -> Solid:
+    assert solid.at
+    x, y, z = solid.at
+    return replace(solid, at=(x, y, z + by))

@@ -20,6 +20,7 @@ class ArmMask:
     def __init__(self, mjcf: str, body: BodyDescription) -> None:
         """Read a model. Raises ConfigError for one that cannot be used."""
         assert body.arm
+        self._floor = np.array((0.0, 0.0, body.arm.floor or 0.0))
         arm = ArmKinematics(mjcf, body.joints, body.arm.tool)
         self._names, self._gripper = arm.names, arm.gripper
         self._model = arm.spec().compile()
@@ -32,13 +33,15 @@ class ArmMask:
         return joints.keys() >= set(self._names)
 
     def covers(self, points: Floats, joints: Mapping[str, float]) -> NDArray[np.bool_]:
-        """Return which points (n, 3) [m], in the body's frame, are on the arm or in its hand.
+        """Return which points (n, 3) [m] are on the arm or in its hand.
 
-        The positions [rad] or [m] of all joints have to be there.
+        They are in the body's frame, z from the floor. The positions [rad] or [m] of all joints
+        have to be there.
         """
         gripper = joints.get(self._gripper.name) if self._gripper else None
         self._set(self._data, np.array([joints[name] for name in self._names]), gripper)
         mujoco.mj_kinematics(self._model, self._data)
+        points = points + self._floor
         away = np.linalg.norm(points - self._data.site_xpos[self._tool], axis=1)
         found: NDArray[np.bool_] = away < HAND_M
         for geom in range(self._model.ngeom):

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 from msgspec.structs import replace
 
@@ -15,6 +16,7 @@ from gigabrain_schemas.objects import Detection, Detections, SeenSolid
 from gigabrain_schemas.topics import ARM_MODEL, BODY, DEPTH, DETECTIONS, SOLIDS, STATE
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.config.settings import PerceptionConfig
+from gigabrain_zenoh.manipulation.arm_mask import ArmMask
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.qa.bench.hands_camera import ArmCamera
 from gigabrain_zenoh.testing.in_memory import NodeBench
@@ -26,6 +28,7 @@ SO101 = load_robot("so101").description()
 (TOP,) = SO101.fixed_cameras
 MODEL = robot_path("so101").with_name("model.xml").read_text()
 assert SO101.arm
+ON_PEDESTAL = replace(SO101, arm=replace(SO101.arm, floor=-0.2))
 HOME = dict(zip((joint.name for joint in SO101.joints), SO101.arm.home, strict=True))
 CUBE = Box(x=0.2, y=0.12, half_x=0.015, half_y=0.015, top=0.03)
 BESIDE = Box(x=0.12, y=-0.15, half_x=0.02, half_y=0.01, top=0.03)
@@ -130,6 +133,25 @@ def test_a_mission_picks_up_what_is_seen_and_puts_it_down(rig: SeeingRig) -> Non
     assert done.state == "succeeded", done.reason
     x, y, _ = rig.arm.thing()
     assert (x, y) == pytest.approx((0.14, 0.15), abs=0.01)
+
+
+@pytest.mark.parametrize("rig", [ASIDE], indirect=True)
+def test_an_arm_on_a_pedestal_picks_up_what_is_seen_at_its_height(rig: SeeingRig) -> None:
+    rig.look()
+    rig.arm.description = ON_PEDESTAL
+    (cube,) = rig.seen
+    x, y, z = cube.position
+    rig.seen = (replace(cube, position=(x, y, z + 0.2), label="cube"),)  # from the floor
+    rig.carry_out("things: {cube: {label: cube}}\ndo: [{pick: cube}]")
+    assert rig.arm.thing()[2] > 0.03
+
+
+def test_an_arm_on_a_pedestal_is_known_at_its_height() -> None:
+    level, raised = ArmMask(MODEL, SO101), ArmMask(MODEL, ON_PEDESTAL)
+    points = np.random.default_rng(1).uniform((-0.1, -0.2, 0.0), (0.3, 0.2, 0.3), (2000, 3))
+    own = level.covers(points, HOME)
+    assert 20 < np.count_nonzero(own) < 1000
+    assert (raised.covers(points + np.array((0.0, 0.0, 0.2)), HOME) == own).all()
 
 
 @pytest.mark.slow

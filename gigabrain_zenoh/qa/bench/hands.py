@@ -30,7 +30,7 @@ from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import Intent
 from gigabrain_schemas.safety import JointCap, SafetyState
 from gigabrain_zenoh.control.joints import JointInputs, JointMemory, step_joints
-from gigabrain_zenoh.decision.held_things import thing_of
+from gigabrain_zenoh.decision.held_things import floor_of, thing_of
 from gigabrain_zenoh.decision.manipulator import TRIES
 from gigabrain_zenoh.decision.seen_things import Lookout, located
 from gigabrain_zenoh.errors import ConfigError
@@ -358,7 +358,7 @@ def _seen(arm: ArmInMemory, planner: ArmPlanner, camera: "ArmCamera") -> Thing |
         aside = planner.take_posture(posture, [], arm.posture(planner.arm.names), None)
         if isinstance(aside, Plan):
             arm.carry_out_all(aside.phases)
-    known, _ = located({}, seen)
+    known, _ = located({}, seen, floor=floor_of(arm.description))
     return thing_of("the thing", known[f"seen {seen[0].id}"])
 
 

@@ -35,6 +35,15 @@ def test_a_thing_by_its_lengths_keeps_them_and_takes_the_place() -> None:
     assert known["seen 3"] == Solid(sphere=0.02, at=BALL.position)
 
 
+def test_heights_are_in_the_frame_of_an_arm_that_stands_on_something() -> None:
+    given = Solid(sphere=0.02, at=(0.0, 0.3, 0.1))
+    things = {"cube": Solid(box=(0.03, 0.03, 0.03)), "it": Solid(label="can"), "ball": given}
+    known, _ = located(things, (CUBE, CAN, BALL), floor=-0.2)
+    heights = {name: one.at[2] for name, one in known.items() if one.at}
+    expected = {"cube": -0.185, "it": -0.143, "ball": 0.1, "seen 3": -0.18}
+    assert heights == pytest.approx(expected)
+
+
 def test_a_long_box_is_turned_as_its_longer_side_is_seen() -> None:
     seen = SeenSolid(id=4, shape="box", size=(0.03, 0.061, 0.03), position=(0.2, 0, 0.015), yaw=0.1)
     known, _ = located({"bar": Solid(box=(0.06, 0.03, 0.03))}, (seen,))
