@@ -71,7 +71,7 @@ class LaserScan(Message, frozen=True, kw_only=True):
 class ImuData(Record, frozen=True, kw_only=True):
     """Attitude, turn rate and acceleration of the body."""
 
-    orientation: Quaternion  # x, y, z, w
+    orientation: Quaternion  # x, y, z, w; all 0 where it is not known
     angular_velocity: Turnings  # [rad/s]
     linear_acceleration: Accelerations  # [m/s2], +9.81 on z at rest
 
@@ -80,7 +80,7 @@ class Imu(Message, frozen=True, kw_only=True):
     """One reading of the inertial measurement unit."""
 
     frame_id: Name = "imu_link"
-    orientation: Quaternion  # x, y, z, w
+    orientation: Quaternion  # x, y, z, w; all 0 where it is not known
     angular_velocity: Turnings  # [rad/s]
     linear_acceleration: Accelerations  # [m/s2]
 

@@ -299,6 +299,25 @@ async def test_all_sensors_become_ours(bench: Bench) -> None:
     assert (await bench.driver.get_sensor_data("imu")) is not None
 
 
+async def test_an_inertial_unit_without_orientation_is_logged_once(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    await bench.found_after_ms()
+    for _ in range(3):
+        bench.robot.send("imu", orientation_covariance=np.array([-1.0] + [0.0] * 8))
+    state = await bench.driver.read_state()
+    assert state.imu
+    assert state.imu.orientation == (0.0, 0.0, 0.0, 0.0)
+    assert [one for one in caplog.messages if "tilt_stop" in one] == [
+        "imu: it has no orientation (orientation_covariance[0] is -1), so tilt_stop cannot stop "
+        "the robot; have a filter add it, such as imu_filter_madgwick, and write its topic as "
+        "topics.imu.name"
+    ]
+    bench.robot.send("imu")
+    assert "imu: it has an orientation" in caplog.messages
+
+
 async def test_what_cannot_be_decoded_is_dropped_and_counted(bench: Bench) -> None:
     await bench.found_after_ms()
     bench.robot.publishers["scan"][0].publish(b"\0\1\0\0nonsense")

@@ -25,7 +25,9 @@ from gigabrain_zenoh.gateway.conversions.frames import (
 )
 
 UNKNOWN_3, UNKNOWN_6 = np.zeros(9), np.zeros(36)  # covariances; ROS: all zero is "unknown"
-UNKNOWN_3.flags.writeable = UNKNOWN_6.flags.writeable = False
+NO_ORIENTATION = np.array([-1.0] + [0.0] * 8)  # by sensor_msgs/Imu
+for _each in (UNKNOWN_3, UNKNOWN_6, NO_ORIENTATION):
+    _each.flags.writeable = False
 NO_FLOATS, NO_FLOATS32 = np.empty(0), np.empty(0, np.float32)
 STATUS_UNKNOWN, CHARGING, DISCHARGING = 0, 1, 2  # of sensor_msgs/BatteryState
 
@@ -131,7 +133,7 @@ def _imu(make: Make, at_ns: int, reading: Imu | ImuData) -> Any:
         "sensor_msgs/msg/Imu",
         header=header(make, at_ns, IMU_LINK),
         orientation=quaternion(make, reading.orientation),
-        orientation_covariance=UNKNOWN_3,
+        orientation_covariance=UNKNOWN_3 if any(reading.orientation) else NO_ORIENTATION,
         angular_velocity=vector(make, *reading.angular_velocity),
         angular_velocity_covariance=UNKNOWN_3,
         linear_acceleration=vector(make, *reading.linear_acceleration),

@@ -3,6 +3,7 @@
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 
 from gigabrain_drivers.bodies.ros2.bringup import (
@@ -22,6 +23,7 @@ from gigabrain_zenoh.ros2.types import Types
 
 STAMPED, TWIST = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist"
 ODOMETRY, SCAN, TF = "nav_msgs/msg/Odometry", "sensor_msgs/msg/LaserScan", "tf2_msgs/msg/TFMessage"
+IMU = "sensor_msgs/msg/Imu"
 LIDAR = Lidar(beams=360, rate_hz=10, range_min=0.1, range_max=8.0, x=-0.032)
 NOW_S = 1_700_000_000.0
 
@@ -162,6 +164,22 @@ def test_messages_with_something_wrong(wrong: Heard, verdict: str, text: str) ->
     assert bad[0].verdict == verdict
     assert text in bad[0].text
     assert bad[0].do
+
+
+def test_an_inertial_unit_without_orientation_is_a_warning() -> None:
+    imu = Types().make(
+        IMU,
+        header={"stamp": {"sec": int(NOW_S)}},
+        orientation_covariance=np.array([-1.0] + [0.0] * 8),
+    )
+    heard = Heard()
+    heard.take(imu, int(NOW_S * 1e9), 0.0)
+    seen = Watched((*GOOD, end("/imu", IMU)), SOUND | {"imu": heard})
+    found = findings(options(topics={"imu": {}}), LIDAR, seen)
+    (wrong,) = (each for each in found if each.verdict != "ok")
+    assert (wrong.what, wrong.verdict) == ("/imu", "warning")
+    assert wrong.text.startswith("it has no orientation")
+    assert "topics.imu.name" in wrong.do
 
 
 def tree(types: Types, x: float) -> FrameTree:

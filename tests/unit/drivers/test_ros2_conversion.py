@@ -26,6 +26,7 @@ from gigabrain_drivers.bodies.ros2.options import (
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import Lidar
 from gigabrain_zenoh.ros2.types import Types
+from gigabrain_zenoh.safety.health import tilt_deg
 
 LIDAR = Lidar(beams=8, rate_hz=10, range_min=0.1, range_max=8.0)
 NAN, INF = math.nan, math.inf
@@ -128,6 +129,23 @@ def test_the_inertial_unit_is_turned_into_the_bodys_frame(types: Types) -> None:
     for axis in "xyz":
         turned = types.make("sensor_msgs/msg/Imu", orientation={axis: 1.0, "w": 0.0})
         assert imu_of(turned).orientation["xyz".index(axis)] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("orientation", [{}, {"w": 0.0}, {"w": NAN}, {"x": 1.0, "w": 0.0}])
+def test_an_inertial_unit_without_orientation_is_not_level(
+    types: Types, orientation: dict[str, float]
+) -> None:
+    message = types.make(
+        "sensor_msgs/msg/Imu",
+        orientation=orientation,
+        orientation_covariance=np.array([-1.0] + [0.0] * 8),
+        angular_velocity={"x": 1.0},
+        linear_acceleration={"x": 9.81},
+    )
+    found = imu_of(message, planar(0.0, 0.0, math.pi / 2).turn)
+    assert tilt_deg(found.orientation) is None
+    assert found.angular_velocity == pytest.approx((0.0, 1.0, 0.0))
+    assert found.linear_acceleration == pytest.approx((0.0, 9.81, 0.0))
 
 
 @pytest.mark.parametrize(

@@ -100,6 +100,19 @@ def test_an_imu_comes_from_its_topic_or_from_the_state():
     assert body.imu_of_state(MAKE, replace(STATE, imu=None)) is None
 
 
+def test_an_imu_without_orientation_says_so_as_ros_does():
+    reading = ImuData(
+        orientation=(0.0, 0.0, 0.0, 0.0),
+        angular_velocity=(0.1, 0.2, 0.3),
+        linear_acceleration=(0.0, 0.0, 9.81),
+    )
+    made = body.imu_of_state(MAKE, replace(STATE, imu=reading))
+    got = through_cdr("sensor_msgs/msg/Imu", made)
+    assert got.orientation_covariance[0] == -1.0
+    assert not got.orientation_covariance[1:].any()
+    assert got.angular_velocity.z == 0.3
+
+
 def test_the_clock_is_the_stamp_of_a_state():
     got = through_cdr("rosgraph_msgs/msg/Clock", body.clock(MAKE, STATE)).clock
     assert (got.sec, got.nanosec) == (1_795_580_000, 123_456_789)

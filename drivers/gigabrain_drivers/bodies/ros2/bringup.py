@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
 from gigabrain_drivers.bodies.ros2 import options as ros2
-from gigabrain_drivers.bodies.ros2.conversion import stamp_ns
+from gigabrain_drivers.bodies.ros2.conversion import has_orientation, stamp_ns
 from gigabrain_drivers.bodies.ros2.frames import FrameTree
 from gigabrain_drivers.bodies.ros2.options import Ros2Options
 from gigabrain_schemas.body import Lidar
@@ -21,6 +21,12 @@ RATE_SHARE = 0.8  # of the rate in the robot's file
 PLACE_M, PLACE_RAD = 0.02, 0.05  # by which a mounting in the file may differ from /tf_static
 SIM_TIME_S = 1e8  # seconds since 1970 below which a stamp counts from a simulation's start
 MAX_NAMED = 4
+NO_TILT = (
+    "it has no orientation (orientation_covariance[0] is -1), so tilt_stop cannot stop the robot"
+)
+ADD_ORIENTATION = (
+    "have a filter add it, such as imu_filter_madgwick, and write its topic as topics.imu.name"
+)
 
 Verdict = Literal["ok", "warning", "error"]
 
@@ -54,6 +60,7 @@ class Heard:
     stamp_s: float = 0.0  # the newest stamp
     frame: str = ""
     child_frame: str = ""
+    tilt: bool = True  # false of an inertial unit without orientation
     unreadable: str = ""  # why a message could not be decoded or used
 
     @property
@@ -71,6 +78,8 @@ class Heard:
             self.offset_s = unix_ns / 1e9 - self.stamp_s
             self.frame = header.frame_id
         self.child_frame = getattr(message, "child_frame_id", "")
+        if hasattr(message, "orientation_covariance"):
+            self.tilt = has_orientation(message)
 
 
 @dataclass
@@ -228,6 +237,8 @@ def _messages(row: Row, heard: Heard) -> list[Finding]:
         do = f"write what it does as {where}, or have the robot send as often"
         text = f"{heard.hz:.1f} messages a second; expected {row.hz:g}"
         found.append(Finding(row.topic, "warning", text, do))
+    if not heard.tilt:
+        found.append(Finding(row.topic, "warning", NO_TILT, ADD_ORIENTATION))
     if wrong := _clock(row, heard):
         found.append(wrong)
     if not found:

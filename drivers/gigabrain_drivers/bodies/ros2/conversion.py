@@ -26,6 +26,7 @@ MAX_BEAMS = 20_000
 MAX_JOINTS = 64
 MAX_IMU_VALUE = 1000.0  # [m/s2] and [rad/s], beyond which an inertial unit is talking nonsense
 NANO = 1_000_000_000
+NO_ORIENTATION = (0.0, 0.0, 0.0, 0.0)  # safety then knows no tilt
 CUT = 1e-6  # by which a speed lies beyond its step, so that a robot that truncates keeps it
 
 
@@ -97,24 +98,32 @@ def _moved(
     return moved, np.where(far, np.inf, np.hypot(points[:, 0], points[:, 1]))
 
 
+def has_orientation(message: Any) -> bool:
+    """Return whether a sensor_msgs/Imu holds an orientation: -1 in its covariance denies it."""
+    return bool(message.orientation_covariance[0] != -1.0)
+
+
 def imu_of(message: Any, turn: np.ndarray | None = None) -> ImuData:
     """Return the reading in the body's frame, in which `turn` (3, 3) places the unit.
 
-    Raises Unusable.
+    Its orientation is NO_ORIENTATION where the message holds none. Raises Unusable.
     """
     rate, pull = message.angular_velocity, message.linear_acceleration
     rates = np.array([rate.x, rate.y, rate.z])
     pulls = np.array([pull.x, pull.y, pull.z])
     if not (np.abs(np.concatenate([rates, pulls])) < MAX_IMU_VALUE).all():
         raise Unusable("its rates or accelerations are no possible numbers")
-    at = message.orientation
-    matrix = rotation(at.x, at.y, at.z, at.w)
-    if matrix is None:
-        raise Unusable("its orientation is no quaternion of length 1")
-    if turn is not None:
-        rates, pulls, matrix = turn @ rates, turn @ pulls, matrix @ turn.T
+    turn = np.eye(3) if turn is None else turn
+    rates, pulls = turn @ rates, turn @ pulls
+    orientation = NO_ORIENTATION
+    if has_orientation(message):
+        at = message.orientation
+        matrix = rotation(at.x, at.y, at.z, at.w)
+        if matrix is None:
+            raise Unusable("its orientation is no quaternion of length 1")
+        orientation = _quaternion(matrix @ turn.T)
     return ImuData(
-        orientation=_quaternion(matrix),
+        orientation=orientation,
         angular_velocity=(float(rates[0]), float(rates[1]), float(rates[2])),
         linear_acceleration=(float(pulls[0]), float(pulls[1]), float(pulls[2])),
     )

@@ -16,11 +16,12 @@ import numpy as np
 from msgspec.structs import asdict
 
 from gigabrain_drivers.bodies.ros2 import options as ros2
-from gigabrain_drivers.bodies.ros2.bringup import explain
+from gigabrain_drivers.bodies.ros2.bringup import ADD_ORIENTATION, NO_TILT, explain
 from gigabrain_drivers.bodies.ros2.conversion import (
     Unusable,
     battery_of,
     cut,
+    has_orientation,
     imu_of,
     joints_of,
     scan_of,
@@ -97,6 +98,7 @@ class Ros2Driver(Driver):
         self._repeat_ns = round(1e9 / topics.command.hz) - GUARD_PERIOD_NS // 2
         self._connected, self._found, self._reconnects = False, False, 0
         self._fault, self._named = Fault(log), ""
+        self._no_tilt = Fault(log)
         self._task: asyncio.Task[None] | None = None
         self._lidar: ScanSource | None = None
         self.sensors = {} if robot.lidar is None else {"scan": None}
@@ -299,12 +301,16 @@ class Ros2Driver(Driver):
         self.publish("scan", SCAN, scan_of(message, options, lidar, place))
 
     def _take_imu(self, message: Any) -> None:
-        turn, yaw = None, self.options.topics.imu.yaw
+        topic, turn = self.options.topics.imu, None
         if self.options.mounting == "tf_static":
             turn = self._frame(message.header.frame_id).turn
-        elif yaw:
-            turn = planar(0.0, 0.0, yaw).turn
+        elif topic.yaw:
+            turn = planar(0.0, 0.0, topic.yaw).turn
         data = imu_of(message, turn)
+        if has_orientation(message):
+            self._no_tilt.end(f"{topic.name}: it has an orientation")
+        else:
+            self._no_tilt.begin(f"{topic.name}: {NO_TILT}; {ADD_ORIENTATION}")
         self._imu = data, self._clock.now_ns()
         self.publish("imu", IMU, Imu(**asdict(data)))
 
