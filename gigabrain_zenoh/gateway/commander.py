@@ -62,6 +62,7 @@ class Lateness(Struct, frozen=True):
     least_ns: int | None = None  # delay in this window, offset included
     before_ns: int | None = None  # in the window before
     began_ns: int = 0  # of this window
+    sent_ns: int = 0  # of its first message, by the sender's clock
 
     @property
     def shortest_ns(self) -> int | None:
@@ -77,10 +78,13 @@ class Lateness(Struct, frozen=True):
         if sent_ns is None:
             return replace(self, now_ns=0)
         delay_ns, fresh = arrived_ns - sent_ns, self
-        if self.least_ns is None:
-            fresh = replace(self, began_ns=clock_ns)
-        elif clock_ns - self.began_ns > WINDOW_NS:
-            fresh = Lateness(0, None, self.least_ns, clock_ns)
+        age_ns = clock_ns - self.began_ns
+        # in a freeze of the network only our clock goes on between two messages
+        paused_ns = min(age_ns, abs(sent_ns - self.sent_ns))
+        if self.least_ns is None or paused_ns > 2 * WINDOW_NS:
+            fresh = Lateness(0, None, None, clock_ns, sent_ns)
+        elif age_ns > WINDOW_NS:
+            fresh = Lateness(0, None, self.least_ns, clock_ns, sent_ns)
         least_ns = delay_ns if fresh.least_ns is None else min(fresh.least_ns, delay_ns)
         after = replace(fresh, least_ns=least_ns)
         return replace(after, now_ns=delay_ns - (after.shortest_ns or 0))
