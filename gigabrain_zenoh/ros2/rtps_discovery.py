@@ -23,6 +23,7 @@ Address = tuple[str, int]  # IPv4 address and UDP port
 
 MULTICAST_GROUP = "239.255.0.1"
 MAX_DOMAIN, MAX_PARTICIPANTS = 232, 120  # participants of a domain on one host
+MAX_PORT = 65535
 PARTICIPANT = bytes((0, 0, 1, 0xC1))
 SPDP_WRITER, SPDP_READER = bytes((0, 1, 0, 0xC2)), bytes((0, 1, 0, 0xC7))
 PUBLICATIONS_WRITER, PUBLICATIONS_READER = bytes((0, 0, 3, 0xC2)), bytes((0, 0, 3, 0xC7))
@@ -175,6 +176,12 @@ def participant_ports(domain: int, index: int) -> tuple[int, int]:
     return multicast_port(domain) + 10 + 2 * index, multicast_port(domain) + 11 + 2 * index
 
 
+def host_ports(domain: int) -> list[tuple[int, int]]:
+    """Return the ports of a domain's participants on a host; the last domain has 63 pairs only."""
+    pairs = (participant_ports(domain, index) for index in range(MAX_PARTICIPANTS))
+    return [pair for pair in pairs if pair[1] <= MAX_PORT]
+
+
 def encode_locator(address: Address) -> bytes:
     """Return the 24 bytes of a locator."""
     host, port = address
@@ -237,7 +244,7 @@ def _locators(order: str, values: Iterable[bytes]) -> tuple[Address, ...]:
         if len(value) < 24:
             continue
         kind, port = struct.unpack(order + "iI", value[:8])
-        if kind == _UDP_V4 and 0 < port < 65536 and value[20] not in (0, *range(224, 256)):
+        if kind == _UDP_V4 and 0 < port <= MAX_PORT and value[20] not in (0, *range(224, 256)):
             found.append((socket.inet_ntoa(value[20:24]), int(port)))
     return tuple(found)
 

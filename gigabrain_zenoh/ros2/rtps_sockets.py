@@ -9,11 +9,10 @@ import psutil
 
 from gigabrain_zenoh.errors import BusError
 from gigabrain_zenoh.ros2.rtps_discovery import (
-    MAX_PARTICIPANTS,
     MULTICAST_GROUP,
     Address,
+    host_ports,
     multicast_port,
-    participant_ports,
 )
 
 LOOPBACK = "127.0.0.1"
@@ -103,16 +102,15 @@ class Sockets:
         local = self._localhost or self._announcements < 3 or self._announcements % PEER_EVERY == 0
         for host in (*self._peers, *([LOOPBACK] if local else [])):
             # ROS looks for the first ones only: of two later ones, one has to look further
-            for index in range(MAX_PARTICIPANTS if host == LOOPBACK else LOCAL_PEERS):
-                port, _ = participant_ports(self._domain, index)
+            for port, _ in host_ports(self._domain)[: None if host == LOOPBACK else LOCAL_PEERS]:
                 if (host, port) != (LOOPBACK, self.builtin_port):
                     self.send(datagram, (host, port))
         self._announcements += 1
 
     def _free_pair(self) -> tuple[socket.socket, socket.socket]:
         host = LOOPBACK if self._localhost else ANY
-        for index in range(MAX_PARTICIPANTS):
-            ports = participant_ports(self._domain, index)
+        pairs = host_ports(self._domain)
+        for ports in pairs:
             pair = socket.socket(type=socket.SOCK_DGRAM), socket.socket(type=socket.SOCK_DGRAM)
             try:
                 for one, port in zip(pair, ports, strict=True):
@@ -123,7 +121,7 @@ class Sockets:
                 continue
             self.builtin_port, self.user_port = ports
             return pair
-        first, last = participant_ports(self._domain, 0)[0], ports[1]
+        first, last = pairs[0][0], pairs[-1][1]
         raise BusError(
             f"no free UDP ports of DDS domain {self._domain} ({first} to {last}); "
             "end other ROS 2 programs, or choose another domain"

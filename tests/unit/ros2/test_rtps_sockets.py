@@ -1,0 +1,30 @@
+"""The ports of a participant, in the last domain, which has ports for 63 of them only."""
+
+import contextlib
+import socket
+
+import pytest
+
+from gigabrain_zenoh.errors import BusError
+from gigabrain_zenoh.ros2.rtps_discovery import MAX_DOMAIN, participant_ports
+from gigabrain_zenoh.ros2.rtps_sockets import Sockets
+
+
+async def test_the_last_domain_is_announced_to_the_ports_that_it_has():
+    sockets = Sockets(MAX_DOMAIN, localhost=True, peers=["127.0.0.2"])
+    await sockets.open(lambda datagram, host: None)
+    with contextlib.closing(sockets):
+        assert 65410 <= sockets.builtin_port < 65535
+        sockets.announce(b"RTPS")
+
+
+async def test_the_last_domain_says_which_of_its_ports_are_all_taken():
+    with contextlib.ExitStack() as others:
+        for index in range(63):
+            for port in participant_ports(MAX_DOMAIN, index):
+                taken = others.enter_context(socket.socket(type=socket.SOCK_DGRAM))
+                with contextlib.suppress(OSError):
+                    taken.bind(("127.0.0.1", port))
+        sockets = Sockets(MAX_DOMAIN, localhost=True, peers=())
+        with pytest.raises(BusError, match=r"domain 232 \(65410 to 65535\)"):
+            await sockets.open(lambda datagram, host: None)
