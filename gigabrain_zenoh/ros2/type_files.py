@@ -34,7 +34,8 @@ class Definition(NamedTuple):
 
     constants: list[tuple[str, str, Any]]  # name, type, value
     fields: Fields
-    defaults: dict[str, Any]  # of those fields that have one
+    defaults: dict[str, Any]  # of those fields that have one, unchecked like the constants
+    file: Path
 
 
 class Found(NamedTuple):
@@ -61,7 +62,7 @@ def read_files(paths: Iterable[Path]) -> Found:
         for file in _files(path):
             for name, text in _parts(file):
                 found.messages[name] = _parse(name, text, file)
-            _derive(_name_of(file), file.suffix[1:], found)
+            _derive(file, found)
     return found
 
 
@@ -111,18 +112,24 @@ def _parse(name: str, text: str, file: Path) -> Definition:
     except TypesysError as error:
         line = str(error).splitlines()[-1] if str(error).splitlines() else ""
         raise ConfigError(f"{file}: no ROS message definition, near {line[:60]!r}") from None
+    except (AssertionError, ValueError) as error:  # of rosbags' parser, and of int()
+        raise ConfigError(f"{file}: {str(error) or 'a constant is a list'}") from None
+    if wrong := [each.name for each in message.fields if min(each.typ.size, each.typ.str_size) < 0]:
+        raise ConfigError(f"{file}: {wrong[0]}: expected a size of 0 or more")
     fields = [(each.name, create_field_desc(each.typ)) for each in message.fields]
     return Definition(
         [(each.name, each.typ.value, each.value) for each in message.constants],
         fields or [(DUMMY, base("uint8"))],
         {each.name: each.value for each in message.fields if each.value is not None},
+        file,
     )
 
 
-def _derive(name: str, kind: str, found: Found) -> None:
+def _derive(file: Path, found: Found) -> None:
     """Add what `rosidl` generates beside the messages of a service or an action."""
+    name, kind = _name_of(file), file.suffix[1:]
     if kind == "srv":
-        _derive_service(name, found)
+        _derive_service(name, file, found)
     if kind != "action":
         return
     derived: dict[str, Fields] = {
@@ -133,9 +140,9 @@ def _derive(name: str, kind: str, found: Found) -> None:
         "_FeedbackMessage": [("goal_id", named(UUID)), ("feedback", named(f"{name}_Feedback"))],
     }
     for ending, fields in derived.items():
-        found.messages[name + ending] = Definition([], fields, {})
-    _derive_service(f"{name}_SendGoal", found)
-    _derive_service(f"{name}_GetResult", found)
+        found.messages[name + ending] = Definition([], fields, {}, file)
+    _derive_service(f"{name}_SendGoal", file, found)
+    _derive_service(f"{name}_GetResult", file, found)
     found.interfaces[name] = [
         ("goal", named(f"{name}_Goal")),
         ("result", named(f"{name}_Result")),
@@ -146,7 +153,7 @@ def _derive(name: str, kind: str, found: Found) -> None:
     ]
 
 
-def _derive_service(name: str, found: Found) -> None:
+def _derive_service(name: str, file: Path, found: Found) -> None:
     request, response = named(f"{name}_Request"), named(f"{name}_Response")
     found.messages[f"{name}_Event"] = Definition(
         [],
@@ -156,6 +163,7 @@ def _derive_service(name: str, found: Found) -> None:
             ("response", (Nodetype.SEQUENCE, (response, 1))),
         ],
         {},
+        file,
     )
     found.interfaces[name] = [
         ("request_message", request),

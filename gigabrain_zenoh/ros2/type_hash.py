@@ -10,6 +10,7 @@ from typing import Any
 
 from rosbags.interfaces import Nodetype
 
+from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.ros2.type_files import Description, Fields
 
 # numbers of type_description_interfaces/msg/FieldType
@@ -34,7 +35,10 @@ ARRAY, BOUNDED_SEQUENCE, SEQUENCE = 48, 96, 144  # added to the number of the el
 
 
 def rihs01(name: str, fields_of: Callable[[str], Fields]) -> str:
-    """Return the hash of a message, service or action. Raises what `fields_of` raises."""
+    """Return the hash of a message, service or action.
+
+    Raises what `fields_of` raises, and ConfigError for a message that contains itself.
+    """
     described: dict[str, Any] = {}
     waiting = [name]
     while waiting:
@@ -43,8 +47,10 @@ def rihs01(name: str, fields_of: Callable[[str], Fields]) -> str:
             continue
         fields = [_field(field, kind) for field, kind in fields_of(each)]
         described[each] = {"type_name": each, "fields": fields}
-        nested = (field["type"]["nested_type_name"] for field in fields)
-        waiting.extend(one for one in nested if one)
+        nested = {field["type"]["nested_type_name"] for field in fields} - {""}
+        if name in nested:
+            raise ConfigError(f"{name} contains itself, which ROS does not allow")
+        waiting.extend(nested)
     whole = {
         "type_description": described[name],
         "referenced_type_descriptions": [described[k] for k in sorted(described) if k != name],

@@ -2,6 +2,7 @@
 
 import base64
 import binascii
+import contextlib
 import functools
 import math
 from collections.abc import Callable, Mapping
@@ -82,6 +83,19 @@ class Values:
             for field, (kind, *_) in self._plan(name).items()
             if field in data
         }
+
+    def default(self, kind: Description, given: Any, path: str) -> Any:
+        """Return a field's default as its definition gives it. Raises BadPayload."""
+        if kind[0] == Nodetype.BASE:
+            return literal(kind[1], given, path)
+        if kind[0] == Nodetype.NAME or kind[1][0][0] == Nodetype.NAME:
+            raise BadPayload(f"{path}: a message has no default, got {_short(given)}")
+        values = [] if given == "[]" else given  # which rosbags takes for a text
+        if not isinstance(values, list):
+            raise BadPayload(f"{path}: expected a list, got {_short(given)}")
+        values = [literal(kind[1][0][1], each, path) for each in values]
+        self._checked(kind, values, path)
+        return values
 
     def _known(self, kind: Description, value: Any) -> Any:
         if kind[0] == Nodetype.NAME and isinstance(value, Mapping):
@@ -191,6 +205,19 @@ def _text(number: float) -> float | str:
 
 
 NAMES = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
+
+
+def literal(kind: tuple[str, int], given: Any, path: str) -> Any:
+    """Return a constant or default of a primitive type as rosidl reads it. Raises BadPayload."""
+    primitive, longest = kind
+    if primitive == "byte":  # of 0 to 255 there; on the wire it is the same
+        return int(np.uint8(_scalar("uint8", 0, given, path)).astype(np.int8))
+    if primitive == "bool" and given in (0, 1):
+        given = bool(given)
+    if primitive.startswith("float") and isinstance(given, str):
+        with contextlib.suppress(ValueError):  # such as nan
+            given = float(given)
+    return _scalar(primitive, longest, given, path)
 
 
 def _scalar(primitive: str, longest: int, value: Any, path: str) -> Any:

@@ -15,9 +15,9 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.base import TypesysError, normalize_fieldname
 
 from gigabrain_zenoh.errors import BadPayload, ConfigError, UnknownName
-from gigabrain_zenoh.ros2.type_files import SHIPPED, Fields, Found, read_files
+from gigabrain_zenoh.ros2.type_files import SHIPPED, Definition, Fields, Found, read_files
 from gigabrain_zenoh.ros2.type_hash import rihs01
-from gigabrain_zenoh.ros2.type_values import Values, is_text
+from gigabrain_zenoh.ros2.type_values import Values, is_text, literal
 
 DEFAULTS: dict[str, dict[str, Any]] = {  # of types in rosbags' store, which keeps none
     "geometry_msgs/msg/Quaternion": {"w": 1.0},
@@ -37,9 +37,9 @@ class Types:
         self._interfaces: dict[str, Fields] = {}  # services and actions
         self._hashes: dict[str, str] = {}
         self._defaults = dict(DEFAULTS)
+        self._values = Values(self._store, self._defaults)
         for found in (read_files([SHIPPED]), read_files(more)):
             self._add(found)
-        self._values = Values(self._store, self._defaults)
 
     def known(self, name: str) -> str:
         """Return the name of a message type. Raises ConfigError if it is unknown."""
@@ -132,15 +132,28 @@ class Types:
             raise ConfigError(f"types: {error}; rename the type") from None
         self._interfaces |= found.interfaces
         for name, each in messages.items():
-            if each.defaults:
-                self._defaults[name] = {
-                    normalize_fieldname(field): value for field, value in each.defaults.items()
-                }
-        for name in messages:
+            if defaults := self._checked_defaults(each):
+                self._defaults[name] = defaults
             try:
                 self.hash(name)
             except ConfigError as error:
-                raise ConfigError(f"types: a field of {name}: {error}") from None
+                raise ConfigError(f"{each.file}: a field of {name}: {error}") from None
+
+    def _checked_defaults(self, of: Definition) -> dict[str, Any]:
+        """Return the defaults of fields by their attributes; check the constants as well."""
+        kinds = dict(of.fields)
+        try:
+            for name, primitive, value in of.constants:
+                if primitive != "string":  # which may be without quotes, and then seem a number
+                    literal((primitive, 0), value, f"constant {name}")
+            return {
+                normalize_fieldname(field): self._values.default(
+                    kinds[field], value, f"default of {field}"
+                )
+                for field, value in of.defaults.items()
+            }
+        except BadPayload as error:
+            raise ConfigError(f"{of.file}: {error}") from None
 
 
 def decoded(store: Any, name: str, payload: bytes) -> Any:

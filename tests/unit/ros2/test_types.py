@@ -173,6 +173,29 @@ def test_a_definition_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
         ("my_msgs/srv/A.srv", "bool ok\n", "expected 2 parts"),
         ("std_msgs/msg/String.msg", "int32 data\n", "already present"),
         ("my_msgs/notes.txt", "", "no .msg, .srv or .action file"),
+        ("my_msgs/msg/A.msg", "int8 x 1000\n", "A.msg: default of x: .* -128 to 127, got 1000"),
+        ("my_msgs/msg/A.msg", "float64 x fast\n", "A.msg: default of x: expected a number"),
+        ("my_msgs/msg/A.msg", "bool x maybe\n", "A.msg: default of x: expected true or false"),
+        (
+            "my_msgs/msg/A.msg",
+            "string<=3 x abcd\n",
+            "A.msg: default of x: .* at most 3 bytes",
+        ),
+        ("my_msgs/msg/A.msg", "int8[2] x [1, 2, 3]\n", "A.msg: default of x: expected 2 elements"),
+        ("my_msgs/msg/A.msg", "uint8[] x AAAA\n", "A.msg: default of x: expected a list"),
+        ("my_msgs/msg/A.msg", "byte[] x [256]\n", "A.msg: default of x: .* 0 to 255, got 256"),
+        ("my_msgs/msg/A.msg", "std_msgs/Header x 3\n", "A.msg: default of x: .*no default"),
+        ("my_msgs/msg/A.msg", "Header[] x [3]\n", "A.msg: default of x: .*no default"),
+        ("my_msgs/msg/A.msg", "int32 X=abc\n", "A.msg: constant X: expected a whole number"),
+        ("my_msgs/msg/A.msg", "int32 X=[1, 2]\n", "A.msg: a constant is a list"),
+        pytest.param(
+            "my_msgs/msg/A.msg", f"int32 X={'9' * 5000}\n", "A.msg: .* 5000 digits", id="digits"
+        ),
+        ("my_msgs/msg/A.msg", "string<=-1[] x\n", "A.msg: x: expected a size of 0 or more"),
+        ("my_msgs/msg/A.msg", "int32[-1] x\n", "A.msg: x: expected a size of 0 or more"),
+        ("my_msgs/srv/A.srv", "---\nuint8 x -1\n", "A.srv: default of x: .* 0 to 255, got -1"),
+        ("my_msgs/msg/A.msg", "A x\n", "A.msg: .*my_msgs/msg/A contains itself"),
+        ("my_msgs/msg/A.msg", "A[] x\n", "A.msg: .*my_msgs/msg/A contains itself"),
     ],
 )
 def test_definitions_that_cannot_be_used_are_named(
@@ -182,6 +205,30 @@ def test_definitions_that_cannot_be_used_are_named(
         Types([write(tmp_path, name, text)])
     with pytest.raises(ConfigError, match=r"expected a \.msg"):
         Types([tmp_path / "missing.msg"])
+
+
+def test_types_that_contain_each_other_are_refused(tmp_path: Path) -> None:
+    write(tmp_path, "my_msgs/msg/A.msg", "B b\n")
+    write(tmp_path, "my_msgs/msg/B.msg", "A[2] a\n")
+    with pytest.raises(ConfigError, match=r"A\.msg: .*my_msgs/msg/A contains itself"):
+        Types([tmp_path])
+
+
+def test_defaults_are_read_as_rosidl_reads_them(tmp_path: Path) -> None:
+    text = (
+        "bool on 1\nfloat32 far inf\nfloat64 half 5e-1\nfloat64 one 1\nbyte high 255\n"
+        "int8[] none []\nbool[2] both [1, false]\nstring[] names ['a', 'b']\nuint8[2] two [1, 2]\n"
+        "string VERSION=1.0\nbool YES=1\nfloat32 NAN=nan\nbyte MAX=255\n"
+    )
+    types = Types([write(tmp_path, "my_msgs/msg/Odd.msg", text)])
+    made = types.make("my_msgs/msg/Odd")
+    made.two[0] = 9
+    made = types.make("my_msgs/msg/Odd")
+    payload = types.encode("my_msgs/msg/Odd", made)
+    assert types.to_dict(types.decode("my_msgs/msg/Odd", payload)) == {
+        "on": True, "far": "Infinity", "half": 0.5, "one": 1.0, "high": -1, "none": [],
+        "both": [True, False], "names": ["a", "b"], "two": [1, 2],
+    }  # fmt: skip
 
 
 def test_every_type_is_read_as_it_was_written(types: Types) -> None:
