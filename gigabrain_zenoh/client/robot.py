@@ -185,7 +185,10 @@ class Robot:
         return await let_go(self._bus, True, self._keys)
 
     async def hold(self) -> GateReply:
-        """Hold limp joints again, where they are. Raises Refused and BodyLost."""
+        """Hold limp joints again, where they are.
+
+        Raises Refused with the reason where they do not hold, and BodyLost.
+        """
         return await let_go(self._bus, False, self._keys)
 
     async def _carry_out(self, distance: float, angle: float, speed: float | None) -> Reached:

@@ -101,7 +101,8 @@ class Driver(abc.ABC):
     async def limp(self) -> None:
         """Switch joint torque off, to move the joints by hand. Raises BodyLost.
 
-        `read_state` says so until the next positions are sent.
+        The next positions that are sent hold the joints again; `read_state` gives `limp` until
+        all of them do. Where they do not, `problem` says why.
         """
         raise Unsupported(f"{type(self).__name__} cannot release its body's joints")
 
@@ -128,6 +129,11 @@ class Driver(abc.ABC):
             if max(abs(now.linear_x), abs(now.linear_y), abs(now.angular_z)) < AT_REST_SPEED:
                 return
             await asyncio.sleep(TICK_NS / 1e9)
+
+    @property
+    def problem(self) -> str:
+        """The reason in one line why the body cannot be moved; empty for none, or none known."""
+        return ""
 
     @property
     def guard_ms(self) -> float | None:

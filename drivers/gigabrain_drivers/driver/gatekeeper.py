@@ -22,7 +22,7 @@ from gigabrain_schemas.requests import (
 from gigabrain_schemas.topics import ENABLE, ESTOP, ESTOP_SAID, LIMP, RELEASE
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.codec import DECODE_ERRORS
-from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.errors import ConfigError, GigabrainError
 from gigabrain_zenoh.gate import causes as why
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.gate.gate import GateState
@@ -46,6 +46,7 @@ Raised = dict[str, tuple[str, Cause]]  # by its code: who raised it, and the cau
 ON_TIME_NS = TICK_NS // 2  # a tick at least this long after the last is not late
 DISK_RETRY_TICKS = 50  # once a second: what the disk did not take is tried again
 Stop = Callable[[], Awaitable[None]]
+LetGo = Callable[[bool], Awaitable[None]]
 
 
 class Latched(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -179,8 +180,11 @@ class Gatekeeper:
         self._bus.serve(RELEASE, self._on_release)
         self._bus.serve(ENABLE, self._on_enable)
 
-    def serve_limp(self, let_go: Callable[[bool], Awaitable[None]]) -> None:
-        """Serve requests to let go of an arm and to hold it, while the gate is not enabled."""
+    def serve_limp(self, let_go: LetGo) -> None:
+        """Serve requests to let go of an arm and to hold it, while the gate is not enabled.
+
+        `let_go` raises a GigabrainError, with the reason, where that cannot be done.
+        """
 
         async def answer(request: LimpRequest) -> GateReply:
             limp, held_by = request.limp, self.state.commander
@@ -188,9 +192,7 @@ class Gatekeeper:
                 text = f"{held_by or 'the gate'} holds the arm; press the e-stop first"
                 outcome = gate.Outcome(ok=False, text=text)
             else:
-                await let_go(limp)
-                done = "all joints are let go of" if limp else "the joints hold where they are"
-                outcome = gate.Outcome(text=done)
+                outcome = await _tried(let_go, limp)
             self._audit("limp" if limp else "hold", request.source, outcome)
             return self._reply(outcome)
 
@@ -322,6 +324,16 @@ class Gatekeeper:
             robot_type=self._robot_type,
             gate=gate.status(self.state),
         )
+
+
+async def _tried(let_go: LetGo, limp: bool) -> gate.Outcome:
+    """Let go of the joints or hold them; return what came of it."""
+    try:
+        await let_go(limp)
+    except GigabrainError as error:
+        return gate.Outcome(ok=False, text=str(error))
+    done = "all joints are let go of" if limp else "the joints hold where they are"
+    return gate.Outcome(text=done)
 
 
 def _differs(before: gate.GateState, now: gate.GateState) -> bool:

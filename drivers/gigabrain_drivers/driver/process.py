@@ -23,7 +23,7 @@ from gigabrain_drivers.driver.world_requests import serve_world
 from gigabrain_drivers.links.frames import describe_command
 from gigabrain_drivers.sim import exposes
 from gigabrain_drivers.sim.worlds import load_world
-from gigabrain_schemas.base import Message
+from gigabrain_schemas.base import TICK_NS, Message
 from gigabrain_schemas.body import Body, BodyDescription, RobotState, SafeState
 from gigabrain_schemas.brain import CmdVel, JointCommand
 from gigabrain_schemas.safety import SafetyState
@@ -46,7 +46,7 @@ from gigabrain_schemas.topics import (
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.params import shown
 from gigabrain_zenoh.config.settings import DriverConfig
-from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 from gigabrain_zenoh.gate import causes as why
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.geometry.body_settings import SETTINGS, restricted, setting_of, split
@@ -62,6 +62,7 @@ PATH = r" - at `[^`]*`$"  # that msgspec adds to an error
 BODY_EVERY_TICKS = 50  # once a second
 OF_THE_STATE = (SIM_SCENE, SIM_POSES)  # they are of the tick whose state comes next
 CAMERAS_S = 30.0  # that the first tick of lock-step waits for pictures
+HOLD_TICKS = 25  # 0.5 s, in which limp joints have to hold once they are asked to
 STALE_NS = 250_000_000  # the echo's 150 ms and the watchdog's 100: older must never move the body
 
 
@@ -93,6 +94,7 @@ class DriverProcess:
         self._line = asyncio.Lock()  # one call at a time goes out to the body
         self._sent = ZERO  # the newest command to the body
         self._joints_sent: tuple[float, ...] = ()
+        self._state: RobotState | None = None  # the newest, before gate and commands are added
         self._limp = False  # in the newest state, or by request
         self._let_go = False  # by request, until it is moved or held again
         self._body_tick = 0  # when BODY was last published
@@ -204,7 +206,7 @@ class DriverProcess:
 
     async def _tick(self, passed: int) -> None:
         """20 ms of the body's time, or several where the process was held up."""
-        state = self._checked(await self._driver.read_state())
+        self._state = state = self._checked(await self._driver.read_state())
         self._limp = state.limp or self._let_go
         if self._wake.is_set():
             await self._apply_command()  # the gate goes on from the body's newest command
@@ -341,13 +343,21 @@ class DriverProcess:
         self._joints_sent = tuple(sent[name] for name in names)
 
     async def _on_limp(self, limp: bool) -> None:
-        """Let go of the joints, or hold them where they are."""
+        """Let go of the joints, or hold them where they are. Raises BodyLost where they do not."""
         async with self._line:
             if limp:
                 await self._driver.limp()
-            elif self._gate.joints:
+                self._let_go = self._limp = True
+                return
+            if self._gate.joints:
                 await self._send_joints(self._gate)
-            self._let_go = self._limp = limp
+            self._state = None  # only a state from now on tells whether they hold
+        for _ in range(HOLD_TICKS):
+            await self._bus.clock.sleep_ns(TICK_NS)
+            if self._state and holds(self._body.description, self._state):
+                self._let_go = self._limp = False
+                return
+        raise BodyLost(self._driver.problem or "the joints do not hold")
 
     def _on_command(self, _key: str, command: CmdVel) -> None:
         arrived_ns = self._bus.clock.now_ns()
@@ -443,6 +453,11 @@ def not_finite(payload: bytes) -> tuple[str, int] | None:
     if all(map(math.isfinite, numbers)):
         return None
     return raw.source, raw.boot
+
+
+def holds(body: BodyDescription, state: RobotState) -> bool:
+    """Return whether all joints that can be commanded are there, and hold."""
+    return state.link.connected and not state.limp and bool(commanded_joints(body, state))
 
 
 def commanded_joints(body: BodyDescription, state: RobotState) -> tuple[JointMotion, ...]:

@@ -93,7 +93,7 @@ class FeetechDriver(Driver):
         self._wheels = self._base.wheels if self._base else []
         self._joints: dict[str, ServoJoint] = {}
         self._armed = self._limp = False
-        self._complaint = "not opened"  # while it is not armed
+        self._complaint = "not opened"  # while it is not armed, or does not hold again
         self._found: dict[ServoJoint | ServoWheel, str] = {}  # how each answered the last time
         self._failure: GigabrainError | None = None
         self._fault = Fault(log)
@@ -123,6 +123,10 @@ class FeetechDriver(Driver):
     @property
     def problem(self) -> str:
         """The reason in one line why the arm cannot be moved, or an empty text."""
+        return self._trouble() or (self._complaint if self._limp else "")
+
+    def _trouble(self) -> str:
+        """Return what is wrong with the line or a servo in one line, or an empty text."""
         if self.link.problem:
             return line_problem(self.link)
         if not self._armed:
@@ -210,8 +214,9 @@ class FeetechDriver(Driver):
                 raise unknown("joint", name, [joint.name for joint in self.robot.joints])
         joints = {name: self._joints[name] for name in positions}
         if self._limp and self._armed:
-            self._limp = bool(await self._arming.arm(self._joints.values()))
-        if self._limp or self.problem:
+            self._complaint = await self._arming.arm(self._joints.values())
+            self._limp = bool(self._complaint)
+        if self._limp or self._trouble():
             return {name: joint.position for name, joint in joints.items()}
         sent = {name: joint.command(positions[name]) for name, joint in joints.items()}
         await self._send_goals()
@@ -224,7 +229,7 @@ class FeetechDriver(Driver):
         if self._base is None:
             return await super().set_base_velocity(linear_x, linear_y, angular_z)
         self._commanded_ns = self._clock.now_ns()
-        wanted = ZERO if self.problem else self.bounded(linear_x, linear_y, angular_z)
+        wanted = ZERO if self._trouble() else self.bounded(linear_x, linear_y, angular_z)
         sent = self._base.command(wanted)
         if self._bus.busy:  # the cycle sends it once its answers are there
             return sent
@@ -265,7 +270,7 @@ class FeetechDriver(Driver):
         self.link.errors = self._bus.errors + self._refused()
         return replace(
             self.link.health,
-            connected=not self.problem,
+            connected=not self._trouble(),
             age_ms=max(0, self._clock.now_ns() - received_ns) / 1e6,
         )
 
@@ -308,7 +313,7 @@ class FeetechDriver(Driver):
 
     async def _keep_base(self, base: ServoBase, now_ns: int) -> None:
         """Have the wheels turn as commanded, or stand while anything has a problem."""
-        if self.problem or self._clock.now_ns() - self._commanded_ns > COMMAND_TIMEOUT_NS:
+        if self._trouble() or self._clock.now_ns() - self._commanded_ns > COMMAND_TIMEOUT_NS:
             base.stop()
         if base.overloaded and now_ns - self._yielded_ns >= YIELD_NS:
             self._yielded_ns = now_ns
@@ -324,7 +329,7 @@ class FeetechDriver(Driver):
             elif joint.status & feetech.OVERLOAD and now_ns - self._yielded_ns >= YIELD_NS:
                 self._yielded_ns = now_ns
                 joint.yield_to_load()  # a goal that gives way ends the protection
-        if self.problem:
+        if self._trouble():
             for joint in self._joints.values():
                 joint.hold()
         await self._send_settings(now_ns)

@@ -1,0 +1,123 @@
+"""Requests to let go of an arm and to hold it: the answer is what the arm really does."""
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+from gigabrain_drivers.bodies.feetech import protocol as feetech
+from gigabrain_drivers.bodies.piper.driver import NOTHING_COMES
+from gigabrain_drivers.driver.catalog import robot_path
+from gigabrain_drivers.driver.process import DriverProcess
+from gigabrain_drivers.driver.robot import Run
+from gigabrain_schemas.requests import LimpRequest
+from gigabrain_schemas.topics import LIMP
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork
+from gigabrain_zenoh.config.settings import DriverConfig
+from gigabrain_zenoh.runtime.audit import read_audit
+from tests.unit.drivers import feetech as so101
+from tests.unit.drivers import piper
+
+Ask = Callable[[bool], Awaitable[tuple[bool, str]]]
+LET_GO = (True, "all joints are let go of")
+HELD = (True, "the joints hold where they are")
+
+
+@asynccontextmanager
+async def asking(rig: so101.Rig | piper.Rig, folder: Path) -> AsyncIterator[Ask]:
+    """Run the driver's process, and ask it to let go (True) or to hold (False)."""
+    network, robot = LocalNetwork(), rig.driver.robot
+    rig.driver.run = Run(folder=robot_path(robot.robot_type).parent, link="real")
+    operator = Bus(network.transport(), rig.clock)
+    config = DriverConfig(body=robot.robot_type, state_dir=str(folder))
+    bus = Bus(network.transport(), rig.clock, "driver")
+    process = DriverProcess(config, robot, rig.driver, bus)
+    running = asyncio.ensure_future(process.run(lambda: None))
+
+    async def ask(limp: bool) -> tuple[bool, str]:
+        request = LimpRequest(limp=limp, source="ann")
+        asked = asyncio.ensure_future(operator.ask(LIMP, request))
+        while not asked.done():
+            await rig.wait(10)
+        [reply] = asked.result()
+        return reply.ok, reply.text
+
+    try:
+        await rig.wait(1000)
+        yield ask
+    finally:
+        running.cancel()
+        while not running.done():
+            await rig.wait(10)
+
+
+def audited(folder: Path) -> list[tuple[str, bool, str]]:
+    records = read_audit(folder, 1000)
+    return [(one.what, one.ok, one.text) for one in records if one.source == "ann"]
+
+
+async def test_an_arm_that_cannot_hold_where_it_is_is_not_said_to(tmp_path: Path) -> None:
+    rig = so101.Rig()
+    pan = rig.joint("shoulder_pan")
+    async with asking(rig, tmp_path) as ask:
+        assert await ask(True) == LET_GO
+        pan.upper, pan.load = pan.upper + 0.3, 0.5
+        await rig.wait(3000)
+        refused = await ask(False)
+        assert refused[0] is False
+        assert "servo 1 (shoulder_pan) is 17 deg outside its calibrated range" in refused[1]
+        assert (await rig.driver.read_state()).limp
+        pan.load = -0.5
+        await rig.wait(800)
+        pan.load = 0.0
+        await rig.wait(200)
+        assert await ask(False) == HELD
+        assert all(servo[feetech.TORQUE] == 1 for servo in rig.arm.servos.values())
+    assert audited(tmp_path) == [
+        ("limp", *LET_GO),
+        ("hold", *refused),
+        ("hold", *HELD),
+    ]
+
+
+async def test_an_arm_without_power_is_not_said_to_hold(tmp_path: Path) -> None:
+    rig = so101.Rig()
+    async with asking(rig, tmp_path) as ask:
+        assert await ask(True) == LET_GO
+        rig.link.to_arm = lambda data: None
+        await rig.wait(200)
+        refused = await ask(False)
+        assert refused == (False, "servo 1 (shoulder_pan) answers no more: cable, power?")
+    assert audited(tmp_path)[1:] == [("hold", *refused)]
+
+
+async def test_an_arm_whose_motors_switch_on_late_is_said_to_hold_once_it_does(
+    tmp_path: Path,
+) -> None:
+    rig = piper.Rig()
+    async with asking(rig, tmp_path) as ask:
+        assert await ask(True) == LET_GO
+        await rig.wait(300)
+        assert await ask(False) == HELD
+        assert all(servo.on for servo in rig.arm.joints)
+        assert not (await rig.driver.read_state()).limp
+
+
+async def test_an_arm_whose_motors_stay_off_is_not_said_to_hold(tmp_path: Path) -> None:
+    rig = piper.Rig()
+    async with asking(rig, tmp_path) as ask:
+        assert await ask(True) == LET_GO
+        await rig.wait(300)
+        rig.cable.to_arm = lambda data: None
+        assert await ask(False) == (False, "the joints do not hold")
+
+
+async def test_an_arm_that_is_not_there_is_neither_let_go_of_nor_held(tmp_path: Path) -> None:
+    rig = piper.Rig()
+    rig.cable.cut = True
+    async with asking(rig, tmp_path) as ask:
+        let_go, held = await ask(True), await ask(False)
+    assert let_go == (False, f"memory: {NOTHING_COMES}")
+    assert held == (False, NOTHING_COMES)
+    assert audited(tmp_path) == [("limp", *let_go), ("hold", *held)]
