@@ -318,6 +318,23 @@ async def test_an_inertial_unit_without_orientation_is_logged_once(
     assert "imu: it has an orientation" in caplog.messages
 
 
+async def test_sensors_that_are_silent_are_no_longer_reported(bench: Bench) -> None:
+    await bench.found_after_ms()
+    for _ in range(5):
+        bench.robot.send("imu", linear_acceleration={"z": 9.81})
+        bench.robot.send("battery_state", voltage=12.0, percentage=83.3)
+        bench.robot.send("joint_states", name=["wheel_left_joint"], position=[1.5])
+        await bench.pass_ms(200)
+    before = await bench.driver.read_state()
+    assert before.imu
+    assert before.battery
+    assert before.joints
+    await bench.pass_ms(2000)
+    after = await bench.driver.read_state()
+    assert (after.imu, after.battery, after.joints) == (None, None, ())
+    assert after.link.connected
+
+
 async def test_what_cannot_be_decoded_is_dropped_and_counted(bench: Bench) -> None:
     await bench.found_after_ms()
     bench.robot.publishers["scan"][0].publish(b"\0\1\0\0nonsense")

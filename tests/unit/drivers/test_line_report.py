@@ -7,15 +7,27 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_drivers.bodies.line.conversion import LineReport
+from gigabrain_drivers.bodies.line.driver import LineDriver
 from gigabrain_drivers.bodies.line.options import LineOptions
 from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.kinematics.wheels import Ackermann, Twist, wheels_of
+from gigabrain_schemas.body import Battery, RobotState
+from gigabrain_zenoh.clock import FakeClock
 
 MS = 1_000_000
 ROBOT, _, OPTIONS, _ = catalog.load_link("mycustombot", Run(folder=Path(), link="real"))
 assert isinstance(OPTIONS, LineOptions)
 TICK = math.tau / 4096
+TWO_LINES = LineOptions(
+    driver="line",
+    port="/dev/null",
+    command="V,{linear_x},{angular_z}\n",
+    state=(
+        "S,{wheel_left_position},{wheel_right_position}\n",
+        "B,{battery_voltage},{battery_percentage},{wheel_left_temperature}\n",
+    ),
+)
 
 
 def report(options: LineOptions = OPTIONS) -> LineReport:
@@ -33,7 +45,7 @@ def test_wheels_that_turn_alike_go_straight() -> None:
         it.update(wheels(1.0 + 0.05 * n, 1.0 + 0.05 * n), (20 + 20 * n) * MS)
     assert (it.pose.x, it.pose.y, it.pose.yaw) == pytest.approx((0.04, 0.0, 0.0))
     assert it.velocity().linear_x == pytest.approx(0.2)
-    assert it.joints()[0].position == pytest.approx(0.5)
+    assert it.joints(0)[0].position == pytest.approx(0.5)
 
 
 def test_counts_that_wrap_go_on() -> None:
@@ -91,7 +103,7 @@ def test_where_there_are_wheel_speeds_alone_the_pose_is_their_integral() -> None
         it.update({"wheel_left_velocity": 1.0, "wheel_right_velocity": 2.0}, 20 * n * MS)
     assert it.pose.yaw == pytest.approx(0.16)
     assert it.pose.x == pytest.approx(0.75 * math.sin(0.16), abs=1e-4)  # 0.12 / 0.16 m of radius
-    assert it.joints()[1].position == pytest.approx(2.0)
+    assert it.joints(0)[1].position == pytest.approx(2.0)
 
 
 def test_wheel_speeds_may_come_line_by_line() -> None:
@@ -122,9 +134,9 @@ def test_a_line_that_says_nothing_of_motion_is_told_apart() -> None:
 )
 def test_the_battery_by_its_voltage(volts: float, percent: float) -> None:
     it = report()
-    assert it.battery() is None
+    assert it.battery(0) is None
     it.update({"battery_voltage": volts}, 20 * MS)
-    battery = it.battery()
+    battery = it.battery(20 * MS)
     assert battery is not None
     assert (battery.voltage, battery.percentage) == pytest.approx((volts, percent))
 
@@ -132,7 +144,7 @@ def test_the_battery_by_its_voltage(volts: float, percent: float) -> None:
 def test_temperatures_belong_to_their_wheels() -> None:
     it = report()
     it.update({"wheel_left_temperature": 31.5, "wheel_right_temperature": 30.0}, 20 * MS)
-    assert [(j.name, j.temperature) for j in it.joints()] == [
+    assert [(j.name, j.temperature) for j in it.joints(20 * MS)] == [
         ("wheel_left_joint", 31.5),
         ("wheel_right_joint", 30.0),
     ]
@@ -151,4 +163,34 @@ def test_a_car_is_reckoned_by_its_steering_angle() -> None:
         it.update(line, 20 * (n + 1) * MS)
     assert it.pose.yaw == pytest.approx(0.5)
     assert it.pose.x == pytest.approx(2.0 * math.sin(0.5), abs=1e-4)
-    assert it.joints()[1].position == pytest.approx(steering)
+    assert it.joints(0)[1].position == pytest.approx(steering)
+
+
+async def test_a_battery_and_temperatures_that_come_no_more_are_not_reported() -> None:
+    clock = FakeClock()
+    driver = LineDriver(ROBOT, TWO_LINES, Run(folder=Path(), link="real"), clock=clock)
+    odometry, power = TWO_LINES.state_templates()
+    values = {"battery_voltage": 12.0, "battery_percentage": 80.0, "wheel_left_temperature": 31.0}
+
+    async def pass_seconds(seconds: int, *, powered: bool) -> RobotState:
+        for _ in range(50 * seconds):
+            driver.link.on_bytes(odometry.encode(wheels(0.0, 0.0)))
+            if powered:
+                driver.link.on_bytes(power.encode(values))
+            await clock.advance(20 * MS)
+        return await driver.read_state()
+
+    before = await pass_seconds(1, powered=True)
+    assert before.battery == Battery(voltage=12.0, percentage=80.0)
+    assert [joint.temperature for joint in before.joints] == [31.0, None]
+    after = await pass_seconds(3, powered=False)
+    assert after.battery is None
+    assert [joint.temperature for joint in after.joints] == [None, None]
+
+
+def test_a_percentage_that_comes_no_more_is_not_an_empty_battery() -> None:
+    it = report(TWO_LINES)
+    for n in range(50):
+        it.update({"battery_percentage": 80.0}, 20 * n * MS)
+    it.update({"battery_voltage": 12.0}, 4000 * MS)
+    assert it.battery(4000 * MS) is None

@@ -145,6 +145,20 @@ async def test_limp_without_an_arm_is_an_error() -> None:
         assert rig.driver.problem == NOTHING_COMES
 
 
+async def test_a_temperature_that_comes_no_more_is_not_reported(rig: Rig) -> None:
+    arrive = rig.cable.on_bytes
+
+    def without_the_third_drive(data: bytes) -> None:
+        frames = [one for one in CanDecoder().feed(data) if one.id != piper.DRIVES + 2]
+        arrive(records(frames))
+
+    rig.cable.on_bytes = without_the_third_drive
+    await rig.wait(2100)
+    state = await rig.driver.read_state()
+    assert state.link.connected
+    assert [joint.temperature is None for joint in state.joints[:4]] == [False, False, True, False]
+
+
 async def test_it_reports_speed_current_temperature_and_effort(rig: Rig) -> None:
     for _ in range(10):
         await rig.driver.set_joint_positions({"joint1": 1.0})

@@ -5,12 +5,23 @@ from collections import deque
 from collections.abc import Mapping
 
 from gigabrain_drivers.bodies.line.options import POSE, LineOptions, position_fields, speed_fields
-from gigabrain_drivers.bodies.line.protocol import ANGLES, BODY, LineDecoder, Template, describe
+from gigabrain_drivers.bodies.line.protocol import (
+    ANGLES,
+    BODY,
+    STATE,
+    LineDecoder,
+    Template,
+    describe,
+)
 from gigabrain_drivers.kinematics.wheels import Base, Twist, advance_pose, step_between
+from gigabrain_drivers.links.recent import Recent
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import Battery, BodyDescription, Joint
 
 WHEEL = "wheel_"
+EXPIRING = tuple(  # fields whose old values safety must not take for measured
+    name for name in STATE if name.startswith("battery_") or name.endswith("_temperature")
+)
 
 VELOCITY_S = 0.05  # a velocity from positions is taken over so much time: one line is noise
 MAX_STEP_FACTOR = 3.0  # a step this many times longer than the body can go is no step ...
@@ -95,6 +106,7 @@ class LineReport:
         self._whole_pose = frozenset(POSE)
         self._speaking = {*BODY, *self._speeds}
         self._values: dict[str, float] = {}
+        self._recent = {name: Recent[float]() for name in EXPIRING}
         self._angles: tuple[float, ...] | None = None  # the wheels', as reported last
         self._pose: Pose | None = None  # as reported last
         self._now_ns = 0
@@ -109,7 +121,11 @@ class LineReport:
 
     def update(self, values: Mapping[str, float], now_ns: int) -> bool:
         """Handle one line; return whether it reports how the body moves."""
-        self._values.update(values)
+        for name, value in values.items():
+            if recent := self._recent.get(name):
+                recent.put(value, now_ns)
+            else:
+                self._values[name] = value
         if self._whole_pose <= values.keys():
             pose = Pose(x=values["x"], y=values["y"], yaw=values["yaw"])
             last, self._pose = self._pose or pose, pose
@@ -140,24 +156,23 @@ class LineReport:
             angular_z=own.get("angular_z", angular_z),
         )
 
-    def joints(self) -> tuple[Joint, ...]:
+    def joints(self, now_ns: int) -> tuple[Joint, ...]:
         """The wheels of which anything is known."""
-        found = []
+        found, known = [], {**self._values, **self._not_expired(now_ns)}
         for name in self._wheels:
             prefix = f"wheel_{name}_"
-            known = self._values.items()
-            own = {k.removeprefix(prefix): v for k, v in known if k.startswith(prefix)}
+            own = {k.removeprefix(prefix): v for k, v in known.items() if k.startswith(prefix)}
             if own:
                 own["position"] = self._turned[name]
                 found.append(Joint(name=f"wheel_{name}_joint", **own))
         return tuple(found)
 
-    def battery(self) -> Battery | None:
+    def battery(self, now_ns: int) -> Battery | None:
         """Return the battery; its percentage as reported, or by its voltage."""
-        values, options = self._values, self._options
+        values, volts = self._not_expired(now_ns), self._options.battery_volts()
         voltage, percentage = values.get("battery_voltage"), values.get("battery_percentage")
-        if voltage is not None and percentage is None:
-            empty, full = options.battery_empty or 0.0, options.battery_full or math.inf
+        if voltage is not None and percentage is None and volts:
+            empty, full = volts
             percentage = 100 * (voltage - empty) / (full - empty)
         if percentage is None:
             return None
@@ -166,6 +181,10 @@ class LineReport:
             percentage=min(max(percentage, 0.0), 100.0),
             current=values.get("battery_current", 0.0),
         )
+
+    def _not_expired(self, now_ns: int) -> dict[str, float]:
+        found = ((name, recent.get(now_ns)) for name, recent in self._recent.items())
+        return {name: value for name, value in found if value is not None}
 
     def _measured(self) -> Twist:
         """The velocity by the wheels' speeds, or by the way of the newest lines."""

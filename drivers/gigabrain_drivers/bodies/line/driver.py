@@ -48,12 +48,14 @@ class LineDriver(Driver):
 
     Options = LineOptions
 
-    def __init__(self, robot: RobotFile, options: LineOptions, run: Run) -> None:
+    def __init__(
+        self, robot: RobotFile, options: LineOptions, run: Run, *, clock: Clock | None = None
+    ) -> None:
         super().__init__(robot, options, run)
         base = base_of(options, robot)
         self._command = LineCommand(options.command_template(), base)
         self._decoder = LineDecoder(options.state_templates())
-        self._clock = Clock()
+        self._clock = clock or Clock()
         self.link = SerialLink(options.port, options.baud, self._clock, probe=self._is_ours)
         self.link.wording = Wording(
             Spelling(SentWording(self._command.template, options.strings()).feed, str),
@@ -112,13 +114,13 @@ class LineDriver(Driver):
 
     async def read_state(self) -> RobotState:
         """Return the newest values of the lines; `link` tells whether they are recent."""
-        report = self._report
+        report, now_ns = self._report, self._clock.now_ns()
         return RobotState(
             robot_type=self.robot.robot_type,
             pose=report.pose,
             velocity=report.velocity(),
-            joints=report.joints(),
-            battery=report.battery(),
+            joints=report.joints(now_ns),
+            battery=report.battery(now_ns),
             bumpers=self._bumpers(),
             link=replace(self.link.health, connected=self._liveness.alive()),
         )

@@ -184,7 +184,9 @@ class PiperDriver(Driver):
 
     def _measured(self) -> tuple[Joint, ...]:
         """Return the newest joints, of the connection before where there are none yet."""
-        return self._feedback.joints() if self._feedback.complete else self._joints
+        if not self._feedback.complete:
+            return self._joints
+        return self._feedback.joints(self._clock.now_ns())
 
     def _fresh(self) -> bool:
         stamp_ns = self._feedback.stamp_ns()

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from gigabrain_drivers.bodies.piper import protocol as piper
 from gigabrain_drivers.bodies.piper.protocol import JOINTS, ArmStatus, Drive, Gripper, Motor
 from gigabrain_drivers.links.can_link import CanFrame
+from gigabrain_drivers.links.recent import Recent
 from gigabrain_schemas.body import Joint, JointDescription
 
 JUMP_FACTOR = 1.5  # times its greatest speed may a joint have moved between two reports, and
@@ -30,6 +31,7 @@ class Feedback:
         self._angles = [0.0] * JOINTS
         self._motors = [Motor(0.0, 0.0)] * JOINTS
         self._drives = [Drive(0.0, 0.0, 0.0, 0, 0.0)] * JOINTS
+        self._temperatures = [Recent[float]() for _ in range(JOINTS)]
         self._gripper, self._gripper_speed = Gripper(0.0, 0.0, 0), 0.0
         self._gripper_before = (0.0, 0)  # [m], [ns]
         self._jumps = deque[bool](maxlen=WINDOW)
@@ -61,7 +63,7 @@ class Feedback:
         bits += [self._gripper.status] if self._hand else []
         return tuple(bool(status & piper.ENABLED) for status in bits)
 
-    def joints(self) -> tuple[Joint, ...]:
+    def joints(self, now_ns: int) -> tuple[Joint, ...]:
         """Return all joints as measured; of the gripper the torque of its motor [N m]."""
         arm = [
             Joint(
@@ -69,12 +71,12 @@ class Feedback:
                 position=angle,
                 velocity=motor.speed,
                 effort=motor.current * ratio,
-                temperature=drive.motor_celsius,
+                temperature=temperature.get(now_ns),
                 current=motor.current,
             )
-            for joint, angle, motor, drive, ratio in zip(
-                self._arm, self._angles, self._motors, self._drives, piper.TORQUE_PER_AMPERE,
-                strict=True,
+            for joint, angle, motor, temperature, ratio in zip(
+                self._arm, self._angles, self._motors, self._temperatures,
+                piper.TORQUE_PER_AMPERE, strict=True,
             )
         ]  # fmt: skip
         hand = [
@@ -103,7 +105,9 @@ class Feedback:
         elif id_ >= piper.POSITIONS:
             self._take_angles(id_, piper.decode_pair(data), now_ns)
         elif id_ >= piper.DRIVES:
-            self._drives[id_ - piper.DRIVES] = piper.decode_drive(data)
+            drive = piper.decode_drive(data)
+            self._drives[id_ - piper.DRIVES] = drive
+            self._temperatures[id_ - piper.DRIVES].put(drive.motor_celsius, now_ns)
             self._stamps[id_] = now_ns
         else:
             self._motors[id_ - piper.MOTORS] = piper.decode_motor(data)

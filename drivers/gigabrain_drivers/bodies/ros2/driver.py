@@ -37,6 +37,7 @@ from gigabrain_drivers.driver.base import AT_REST_SPEED, Driver
 from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.lidars.base import ScanSource, open_lidar
 from gigabrain_drivers.links.device_clock import DeviceClock
+from gigabrain_drivers.links.recent import Recent
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import Battery, Joint, LinkHealth, RobotState
@@ -55,7 +56,6 @@ GUARD_PERIOD_NS = 20_000_000  # between two checks by the driver
 REST_NS = 800_000_000  # for which a closing driver sends zero, at most, until the robot stands
 STAMP_WRAP_MS = 1 << 40
 LOG_AFTER_NS = 500_000_000  # of a problem, before it is logged
-STALE_NS = 2_000_000_000  # after which battery, joints and inertial unit are no longer reported
 
 
 class Ros2Driver(Driver):
@@ -88,9 +88,8 @@ class Ros2Driver(Driver):
         )
         self._stamps = DeviceClock(STAMP_WRAP_MS)
         self._frames = FrameTree()
-        self._battery: Battery | None = None
-        self._joints: tuple[Joint, ...] = ()
-        self._imu: tuple[ImuData, int] | None = None
+        self._battery, self._imu = Recent[Battery](), Recent[ImuData]()
+        self._joints = Recent[tuple[Joint, ...]]()
         self._wanted = ZERO
         self._wanted_ns = self._sent_ns = self._well_ns = self._clock.now_ns()
         self._commanded_ns = self._clock.now_ns()
@@ -166,14 +165,13 @@ class Ros2Driver(Driver):
         """Return the newest values; `link` tells whether they are recent."""
         now_ns = self._clock.now_ns()
         self._judge(now_ns)
-        imu = self._imu
         return RobotState(
             robot_type=self.robot.robot_type,
             pose=self._watch.pose,
             velocity=self._watch.velocity,
-            joints=self._joints,
-            battery=self._battery,
-            imu=imu[0] if imu and now_ns - imu[1] < STALE_NS else None,
+            joints=self._joints.get(now_ns) or (),
+            battery=self._battery.get(now_ns),
+            imu=self._imu.get(now_ns),
             link=LinkHealth(
                 connected=self._connected,
                 age_ms=(self._watch.age_ns(now_ns) or 0) / 1e6,
@@ -311,14 +309,16 @@ class Ros2Driver(Driver):
             self._no_tilt.end(f"{topic.name}: it has an orientation")
         else:
             self._no_tilt.begin(f"{topic.name}: {NO_TILT}; {ADD_ORIENTATION}")
-        self._imu = data, self._clock.now_ns()
+        self._imu.put(data, self._clock.now_ns())
         self.publish("imu", IMU, Imu(**asdict(data)))
 
     def _take_battery(self, message: Any) -> None:
-        self._battery = battery_of(message, self.options.topics.battery)
+        battery = battery_of(message, self.options.topics.battery)
+        self._battery.put(battery, self._clock.now_ns())
 
     def _take_joints(self, message: Any) -> None:
-        self._joints = joints_of(message, self.options.topics.joints)
+        joints = joints_of(message, self.options.topics.joints)
+        self._joints.put(joints, self._clock.now_ns())
 
     def _take_frames(self, message: Any) -> None:
         self._frames.add(message.transforms)
