@@ -63,6 +63,29 @@ def test_counts_that_jump_are_no_way() -> None:
     assert it.pose.x == pytest.approx(0.004)
 
 
+@pytest.mark.parametrize("late_by", [1, 4, 10])
+def test_lines_that_come_at_once_count_as_those_that_come_in_time(late_by: int) -> None:
+    it, turn = report(replace(OPTIONS, state_hz=20.0)), ROBOT.max_angular_speed
+    base = wheels_of(ROBOT)
+    assert base
+    left, right = base.to_wheels(Twist(0.0, 0.0, turn))
+    for n in range(41):  # lines 10 to 10 + `late_by` come in one read
+        read = 10 + late_by if 10 <= n < 10 + late_by else n
+        it.update(wheels(0.05 * n * left, 0.05 * n * right), (20 + 50 * read) * MS)
+    assert it.pose.yaw == pytest.approx(math.remainder(2.0 * turn, math.tau))
+
+
+def test_counts_that_jump_are_no_way_among_lines_that_come_at_once() -> None:
+    it = report()
+    it.update(wheels(0.0, 0.0), 20 * MS)
+    for angle in (0.05, 0.1, 10.0, 0.15, 0.2):  # a tenth of a second, then a wrong number
+        it.update(wheels(angle, angle), 120 * MS)
+    assert it.pose.x == pytest.approx(0.15 * 0.08)
+    it.update(wheels(0.2, 0.2), 220 * MS)
+    it.update(wheels(2.0, 2.0), 240 * MS)  # it was not held up: it has no more than its 20 ms
+    assert it.pose.x == pytest.approx(0.15 * 0.08)
+
+
 def test_after_a_gap_the_shorter_way_counts() -> None:
     rolled, restarted = report(), report()
     for it in (rolled, restarted):

@@ -110,6 +110,7 @@ class LineReport:
         self._angles: tuple[float, ...] | None = None  # the wheels', as reported last
         self._pose: Pose | None = None  # as reported last
         self._now_ns = 0
+        self._period_s, self._unspent_s = 1 / options.state_hz, 0.0
         self._turned = dict.fromkeys(self._wheels, 0.0)  # [rad], since the start
         self._steps: deque[tuple[float, Twist]] = deque()  # (seconds, way) of the newest lines
         self.pose = ORIGIN  # since the start
@@ -144,7 +145,7 @@ class LineReport:
     def restart(self) -> None:
         """Count from the next line on: the connection was cut."""
         self._angles = self._pose = None
-        self._now_ns = 0
+        self._now_ns, self._unspent_s = 0, 0.0
         self._steps.clear()
 
     def velocity(self) -> Velocity:
@@ -233,10 +234,16 @@ class LineReport:
         return now_ns - (self._now_ns or now_ns) > GAP_NS
 
     def _move(self, step: Twist, now_ns: int) -> bool:
-        """The body has made a step since the last line, if it can have made it."""
+        """The body has made a step since the last line, if it can have made it.
+
+        Lines that were held up come at once. They share the time before the first of them.
+        """
         seconds = (now_ns - (self._now_ns or now_ns)) / 1e9
         self._now_ns = now_ns
-        body, room = self._body, MAX_STEP_FACTOR * seconds
+        held_up = seconds < self._period_s / 2
+        took_s = seconds + self._unspent_s if held_up else seconds
+        self._unspent_s = max(took_s - self._period_s, 0.0)
+        body, room = self._body, MAX_STEP_FACTOR * took_s
         speed = max(body.max_linear_speed, body.max_lateral_speed)
         too_far = math.hypot(step.linear_x, step.linear_y) > speed * room + STEP_SLACK_M
         if too_far or abs(step.angular_z) > body.max_angular_speed * room + STEP_SLACK_M:
