@@ -225,6 +225,26 @@ def test_wheels_that_are_not_those_of_the_base_are_refused(
         FeetechDriver.check(ROBOT, FeetechOptions(**{**fields, "scan": None, **changes}))  # type: ignore[arg-type]
 
 
+def test_a_base_without_an_arm_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "robot.yaml"
+    file.write_text(
+        "summary: two servo wheels\n"
+        "robot_type: rover\n"
+        "drive_type: differential\n"
+        "wheel_radius: 0.05\n"
+        "wheel_separation: 0.2\n"
+        "max_linear_speed: 0.2\n"
+        "max_angular_speed: 1.0\n"
+        "footprint: [[0.1, 0.1], [-0.1, 0.1], [-0.1, -0.1], [0.1, -0.1]]\n"
+        "real:\n"
+        "  driver: feetech\n"
+        "  wheels: {left: 7, right: 8}\n"
+        "  servos: {}\n"
+    )
+    with pytest.raises(ConfigError, match=r"robot\.yaml:12: real\.servos: this body has no joints"):
+        load_link(str(file), Run(folder=Path(), link="real"))
+
+
 async def test_servos_of_another_variant_are_refused() -> None:
     rig = LeKiwi()
     rig.arm.wheels["right"].keep(feetech.MAX_VOLTAGE, 140)

@@ -107,6 +107,8 @@ class FeetechDriver(Driver):
     def check(cls, robot: RobotFile, options: FeetechOptions) -> None:
         """Raises ValueError where the servos are not those of the body's joints."""
         names = [joint.name for joint in robot.joints]
+        if not names:
+            raise ValueError("servos: this body has no joints; expected an arm on its servo bus")
         parts = [*names, *options.wheels]
         for field, given, known in (
             ("servos", options.servos, names),
