@@ -52,6 +52,7 @@ from gigabrain_zenoh.security.identity_files import (
 
 MAX_HOSTS = 64
 NET_FILES = ("onnx", "labels")  # in the part `recognizer`
+MISSION_FILES = ("mission", "scripts")  # in the settings of decision
 ROBOT = tuple(name for name, one in PROCESSES.items() if one.default)
 
 
@@ -222,10 +223,15 @@ def with_keys(loaded: Deployment, path: Path, keys: str = "") -> Deployment:
         ros2 = structs.replace(ros2, types=own)
     files = {name: getattr(net, name) for name in NET_FILES}
     there = {name: str(folder / Path(file).expanduser()) for name, file in files.items() if file}
+    settings = dict(loaded.decision.settings)
+    for name in MISSION_FILES:
+        if isinstance(file := settings.get(name), str) and file:
+            settings[name] = str(folder / Path(file).expanduser())
     return structs.replace(
         loaded,
         keys=keys,
         world=config.beside(loaded.world, folder),
+        decision=structs.replace(loaded.decision, settings=settings),
         recognizer=structs.replace(net, **there),
         ros2=ros2,
     )

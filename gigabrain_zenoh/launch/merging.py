@@ -1,7 +1,7 @@
 """A deployment as it is started: its file, then settings files, then `--set`."""
 
 import contextlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +18,7 @@ from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError, UnknownName
 from gigabrain_zenoh.host.files import read_bounded, replace_file
 from gigabrain_zenoh.launch.deployment import (
+    MISSION_FILES,
     NET_FILES,
     Deployment,
     deployment_type,
@@ -107,7 +108,9 @@ def _add_file(layers: Layers, path: Path) -> None:
 
 def with_files(root: Node, folder: Path) -> Node:
     """Return settings in which the files that they name are taken from `folder`."""
-    return _with_world(_with_paths(root, "recognizer", folder), folder)
+    root = _with_paths(root, ("recognizer",), NET_FILES, folder)
+    root = _with_paths(root, ("decision", "settings"), MISSION_FILES, folder)
+    return _with_world(root, folder)
 
 
 def _with_world(root: Node, folder: Path) -> Node:
@@ -121,20 +124,19 @@ def _with_world(root: Node, folder: Path) -> Node:
     return _replaced(root, placed)
 
 
-def _with_paths(root: Node, part: str, folder: Path) -> Node:
-    """Return settings in which each file that a part names is taken from `folder`."""
+def _with_paths(root: Node, parts: Sequence[str], names: Container[str], folder: Path) -> Node:
+    """Return settings in which the files `names` of a part are taken from `folder`."""
 
-    def path(one: Entry) -> Entry:
+    def placed(one: Entry) -> Entry:
+        if parts:
+            if one.key != parts[0] or one.node.entries is None:
+                return one
+            return replace(one, node=_with_paths(one.node, parts[1:], names, folder))
         name = one.node.value
-        if one.key not in NET_FILES or not isinstance(name, str) or not name:
+        if one.key not in names or not isinstance(name, str) or not name:
             return one
         there = str(folder.absolute() / Path(name).expanduser())
         return replace(one, node=replace(one.node, value=there))
-
-    def placed(one: Entry) -> Entry:
-        if one.key != part or one.node.entries is None:
-            return one
-        return replace(one, node=_replaced(one.node, path))
 
     return _replaced(root, placed)
 

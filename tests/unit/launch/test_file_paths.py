@@ -1,4 +1,4 @@
-"""A world's path is relative to whatever names it."""
+"""The path of a world, a mission or scripts is relative to whatever names it."""
 
 from pathlib import Path
 
@@ -45,3 +45,22 @@ def test_of_set_it_is_relative_to_the_present_folder(
 def test_names_of_shipped_worlds_stay_as_they_are(folder: Path) -> None:
     assert merged(folder, "world=house").world == "house"
     assert merged(folder, "world=random:7").world == "random:7"
+
+
+def test_so_are_a_mission_and_scripts(
+    folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = "decision: {behaviour: navigate, settings: {mission: a.yaml, scripts: s}}\n"
+    (folder / "robot.yaml").write_text(text)
+    (folder / "more").mkdir()
+    more = folder / "more" / "settings.yaml"
+    more.write_text("decision: {settings: {scripts: t}}\n")
+    here = tmp_path_factory.mktemp("here")
+    monkeypatch.chdir(here)
+    beside = {"mission": str(folder / "a.yaml"), "scripts": str(folder / "s")}
+    assert load_deployment(folder / "robot.yaml").decision.settings == beside
+    assert merged(folder).decision.settings == beside
+    assert merged(folder, "decision.settings.mission=b.yaml", files=(more,)).decision.settings == {
+        "mission": str(here / "b.yaml"),
+        "scripts": str(folder / "more" / "t"),
+    }
