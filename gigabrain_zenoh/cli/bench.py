@@ -191,18 +191,21 @@ def bodies(
     Exit code 1 after a contact, or if a process of the brain was restarted.
 
     Args:
-        names: Robots. Default: all that have the link.
+        names: Robots. Default: all that have the link and a base.
         link: How to reach them.
         seconds: Time that each drives [s of robot time].
     """
-    from gigabrain_drivers.driver.catalog import simulated
+    from gigabrain_drivers.driver.catalog import load_robot, simulated
     from gigabrain_zenoh.launch.deployment import Deployment
     from gigabrain_zenoh.qa.bench.bodies import measure_bodies
 
     check_positive(seconds=seconds)
     files.check_result_path(json)
     check_names(names, [world])
-    chosen = names or simulated(link)
+    drives = {name: load_robot(name).description().has_base for name in names or simulated(link)}
+    if fixed := [name for name in names if not drives[name]]:
+        raise ConfigError(f"{fixed[0]} has no base to drive")
+    chosen = [name for name, has_base in drives.items() if has_base]
     deployment = Deployment(
         link=link, world=world, seed=seed, resume="auto", router="tcp/127.0.0.1:0"
     )

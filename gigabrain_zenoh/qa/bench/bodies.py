@@ -17,6 +17,7 @@ from gigabrain_schemas.topics import CMD_VEL, HEALTH, STATE
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import LinkName
 from gigabrain_zenoh.errors import BodyLost
+from gigabrain_zenoh.gate.causes import in_words
 from gigabrain_zenoh.launch.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.qa.robot_under_test import ProcessGroup, client
@@ -137,7 +138,8 @@ async def _until_driven(
             seen, seen_s = motion.enabled_ticks, loop.time()
         elif loop.time() - seen_s > (STALL_S if seen else START_S):
             gate = motion.state.gate if motion.state else None
-            raise BodyLost(f"the robot has stalled; gate: {gate}")
+            why = f"its gate is {gate.mode} {in_words(gate.causes)}" if gate else "no robot/state"
+            raise BodyLost(f"the robot has stalled: {why.strip()}")
 
 
 def _figures(
