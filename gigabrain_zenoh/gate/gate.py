@@ -302,7 +302,9 @@ def _enable(config: GateConfig, state: GateState, event: Enable) -> tuple[GateSt
         return rejected(state, "still stopping; try again when it is idle")
     if state.commander not in ("", event.source):
         if not event.take:
-            return rejected(state, f"{state.commander} drives; take it over with take=true")
+            return rejected(
+                state, f"{state.commander} drives; take it over with --take (in a script take=True)"
+            )
         if event.source == BRAIN and event.by in ("", BRAIN):
             return rejected(state, f"{state.commander} drives; only a person can enable the brain")
     found = stop_reasons(config, state, event.source)

@@ -126,7 +126,10 @@ async def test_without_take_it_is_refused_and_told_who_drives(robot: Probe) -> N
     async with connect() as script:
         with pytest.raises(Refused) as refused:
             await script.set_base_velocity(0.1)
-    assert str(refused.value) == "turtlebot3_waffle: control drives; take it over with take=true"
+    assert (
+        str(refused.value)
+        == "turtlebot3_waffle: control drives; take it over with --take (in a script take=True)"
+    )
     assert robot.state.gate.commander == "control"
 
 

@@ -68,13 +68,21 @@ async def test_a_second_commander_is_told_who_drives_and_a_take_over_names_both(
         log = Log(robot)
         await driving(robot)
         reply = await enable(robot, "ann")
-        assert (reply.ok, reply.text) == (False, "control drives; take it over with take=true")
+        assert (reply.ok, reply.text) == (
+            False,
+            "control drives; take it over with --take (in a script take=True)",
+        )
         assert (await enable(robot, "ann", take=True)).ok
         reply = await enable(robot, "control", take=True)
         assert (reply.ok, reply.text) == (False, "ann drives; only a person can enable the brain")
         assert (await enable(robot, "control", take=True, by="bob")).ok
         assert log.of("enable", "take") == [
-            ("enable", "ann", False, "control drives; take it over with take=true"),
+            (
+                "enable",
+                "ann",
+                False,
+                "control drives; take it over with --take (in a script take=True)",
+            ),
             ("take", "ann", True, "ann drives, taken over from control"),
             ("enable", "control", False, "ann drives; only a person can enable the brain"),
             ("take", "bob", True, "control drives, taken over from ann"),

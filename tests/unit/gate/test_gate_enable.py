@@ -92,7 +92,7 @@ def test_one_commander_holds_the_body_and_another_is_told_who() -> None:
     rig = enabled("alice")
     before = rig.state
     assert rig.feed(gate.Enable("bob")) == gate.Outcome(
-        ok=False, text="alice drives; take it over with take=true"
+        ok=False, text="alice drives; take it over with --take (in a script take=True)"
     )
     assert rig.state == before
     assert rig.feed(gate.Enable("bob", take=True)) == gate.Outcome(text="bob drives")
