@@ -132,6 +132,15 @@ def test_a_start_within_a_box_is_refused(tmp_path: Path) -> None:
         simulated(written(tmp_path / "full.yaml", text))
 
 
+@pytest.mark.parametrize("place", ["50, 0", "0, -2.1"])
+def test_a_start_outside_the_walls_is_refused(place: str, tmp_path: Path) -> None:
+    world = written(tmp_path / "small.yaml", f"size: [6, 4]\nstart: [{place}, 0]\n")
+    expected = r"small: .* outside its walls.* x from -3 to 3, and y from -2 to 2"
+    with pytest.raises(ConfigError, match=expected):
+        load_world(world, 0)
+    assert load_world(written(Path(world), Path(world).read_text() + "outer_walls: false\n"), 0)
+
+
 @pytest.mark.parametrize("part", WorldFile.__struct_fields__)
 def test_every_part_refuses_a_value_of_another_kind(part: str, tmp_path: Path) -> None:
     other = "{a: [b]}" if part != "materials" else "[1]"

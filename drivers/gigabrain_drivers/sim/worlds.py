@@ -197,6 +197,7 @@ def _with_start(world: World, seed: int, name: str) -> World:
         share = float(random.uniform(0, 1)) if len(people) < len(world.people) else 0.0
     world = replace(world, people=tuple(people))
     if world.start_fixed:
+        _check_start(world)
         return world
     for _ in range(max(MIN_ATTEMPTS, MAX_LOOKS // max(1, len(shapes)))):
         x, y = _any_place(world, random)
@@ -208,6 +209,18 @@ def _with_start(world: World, seed: int, name: str) -> World:
         f"world {name}: found no place for the robot {START_CLEARANCE_M:g} m from everything; "
         "name one with `start: [x, y, yaw]` in a world file, or make room"
     )
+
+
+def _check_start(world: World) -> None:
+    """Raise ConfigError where the robot would start outside the outer walls."""
+    x, y, (east, north) = world.start.x, world.start.y, world.middle
+    inside = abs(x - east) < world.half_x and abs(y - north) < world.half_y
+    if world.outer_walls and not inside:
+        raise ConfigError(
+            f"world {world.name}: the robot starts outside its walls, at ({x:g}, {y:g}); expected "
+            f"a `start` with x from {east - world.half_x:g} to {east + world.half_x:g}, "
+            f"and y from {north - world.half_y:g} to {north + world.half_y:g}"
+        )
 
 
 def _any_place(world: World, random: np.random.Generator) -> tuple[float, float]:
