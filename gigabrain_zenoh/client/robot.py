@@ -68,7 +68,7 @@ class Robot:
         self._states = bus.latest(STATE, self._repeat)
         self._bodies, self._safety = bus.latest(BODY), bus.latest(SAFETY)
         self._target: Velocity | None = None
-        self._until_tick = 0
+        self._until_tick = self._boot = 0
         self._joints: JointStream | None = None  # once joints were commanded
         self._pressed = 0  # the number of this script's newest e-stop
         self._lease = ControlLease(bus.process)
@@ -404,19 +404,20 @@ class Robot:
 
     def _repeat(self, state: RobotState) -> None:
         self._lease.update(state)
+        if self._lease.lost or state.boot != self._boot:  # what was stopped does not go on
+            self._target = self._joints = None
+        self._boot = state.boot
         self._arrived.set()
         self._send()
         self._send_joints(state)
 
     def _send_joints(self, state: RobotState) -> None:
-        if self._joints is None or self._lease.lost:
-            return
-        if command := self._joints.step(state):
+        if self._joints and (command := self._joints.step(state)):
             self._bus.publish(JOINT_CMD, command)
 
     def _send(self) -> None:
         target, body = self._target, self._bodies.current
-        if target is None or body is None or self._lease.lost:
+        if target is None or body is None:
             return
         if self._bus.time.tick > self._until_tick:
             target = ZERO

@@ -1,0 +1,117 @@
+"""What a stop or a restart has ended does not go on by an enable alone."""
+
+import asyncio
+from collections.abc import AsyncIterator
+
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_schemas.base import TICK_NS, Velocity
+from gigabrain_schemas.body import Body, GateStatus, Joint, RobotState
+from gigabrain_schemas.brain import CmdVel, JointCommand
+from gigabrain_schemas.examples import example
+from gigabrain_schemas.requests import EnableRequest, GateReply, ReleaseRequest
+from gigabrain_schemas.topics import BODY, ENABLE, JOINT_CMD, RELEASE, STATE, command_topic
+from gigabrain_zenoh.client.robot import Robot
+from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.testing.in_memory import Net
+
+BODY_NOW = example(Body)
+JOINT = BODY_NOW.description.joints[0]
+GOAL = 0.9 * JOINT.upper
+
+
+class Driver:
+    """Grants the body to whoever asks; the joints are where they were sent."""
+
+    def __init__(self, net: Net) -> None:
+        self.bus, self.clock = net.one, net.clock
+        self.gate = GateStatus(mode="idle")
+        self.commands, self.joints = list[CmdVel](), dict[str, float]()
+        self.bus.time.boot, self.bus.time.tick = 7, 180_000
+        for joint in BODY_NOW.description.joints:
+            self.joints[joint.name] = max(joint.lower, min(joint.upper, 0.0))
+        command = command_topic(BODY_NOW.description)
+        self.bus.subscribe(command, lambda _, message: self.commands.append(message))
+        self.bus.subscribe(JOINT_CMD, self._move)
+        self.bus.serve(ENABLE, self._enable)
+        self.bus.serve(RELEASE, self._release)
+
+    def _move(self, _key: str, command: JointCommand) -> None:
+        if self.gate.mode == "enabled" and command.position:
+            self.joints.update(zip(command.name, command.position, strict=True))
+
+    async def _enable(self, request: EnableRequest) -> GateReply:
+        enables = self.gate.enables + 1
+        self.gate = GateStatus(mode="enabled", commander=request.source, enables=enables)
+        return GateReply(ok=True, text="", robot_type="m", gate=self.gate)
+
+    async def _release(self, _: ReleaseRequest) -> GateReply:
+        self.gate = replace(self.gate, mode="idle")
+        return GateReply(ok=True, text="", robot_type="m", gate=self.gate)
+
+    async def run(self) -> None:
+        """Publish states for ever."""
+        while True:
+            self.bus.time.tick += 1
+            await self.clock.advance(TICK_NS)
+            state = replace(
+                example(RobotState),
+                gate=self.gate,
+                velocity=Velocity(),
+                joints=tuple(Joint(name=n, position=p, velocity=0) for n, p in self.joints.items()),
+                joints_sent=tuple(self.joints.values()),
+                limp=False,
+            )
+            self.bus.publish(BODY, BODY_NOW)
+            self.bus.publish(STATE, state)
+            await asyncio.sleep(0)
+
+
+@pytest.fixture
+async def net() -> Net:
+    return Net()
+
+
+@pytest.fixture
+async def driver(net: Net) -> AsyncIterator[Driver]:
+    made = Driver(net)
+    running = asyncio.ensure_future(made.run())
+    yield made
+    running.cancel()
+
+
+@pytest.mark.parametrize("mode", ["latched", "idle"])
+async def test_a_base_does_not_drive_on_after_the_driver_has_started_anew(
+    net: Net, driver: Driver, mode: str
+) -> None:
+    robot = Robot(net.two)
+    await robot.set_base_velocity(0.1)
+    await robot._ticks(5)
+    assert driver.commands[-1].linear_x == 0.1
+    driver.bus.time.boot, driver.bus.time.tick = 8, 0
+    driver.gate = GateStatus(mode=mode)  # type: ignore[arg-type]
+    await robot._ticks(5)
+    await robot.release()
+    await robot.enable()
+    driver.commands.clear()
+    await robot._ticks(20)
+    assert [one for one in driver.commands if one.linear_x] == []
+
+
+async def test_an_arm_does_not_go_on_after_an_e_stop_by_somebody_else(
+    net: Net, driver: Driver
+) -> None:
+    robot = Robot(net.two)
+    moving = asyncio.ensure_future(robot.set_joint_positions({JOINT.name: GOAL}))
+    await robot._ticks(25)
+    driver.gate = GateStatus(mode="latched", enables=1, estop_generation=1)
+    with pytest.raises(Refused, match="an e-stop has the body"):
+        await moving
+    stopped = driver.joints[JOINT.name]
+    await robot.release()
+    await robot.enable()
+    await robot._ticks(50)
+    assert 0.0 < driver.joints[JOINT.name] == stopped < 0.9 * GOAL
+    await robot.set_joint_positions({JOINT.name: GOAL})
+    assert driver.joints[JOINT.name] == pytest.approx(GOAL, abs=0.01)
