@@ -11,6 +11,7 @@ from gigabrain_schemas.objects import MapObject, MapTag, ObjectMap
 from gigabrain_schemas.topics import OBJECT_MAP
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.decision.behaviours import Target
+from gigabrain_zenoh.decision.zones import KEPT
 
 TAG_RADIUS_M = 0.02
 MIN_RADIUS_M, MAX_RADIUS_M = 0.02, 1.0
@@ -35,7 +36,7 @@ class ObjectSource:
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
-        self._received: deque[ObjectMap] = deque(maxlen=2)
+        self._received: deque[ObjectMap] = deque(maxlen=KEPT)
         self._watches = False
 
     def observe(self, body: BodyDescription | None) -> None:
@@ -52,7 +53,8 @@ class ObjectSource:
     def at(self, boot: int, tick: int) -> ObjectMap:
         """Return the newest objects from before `tick`, or from an earlier run of the driver."""
         earlier = (one for one in reversed(self._received) if one.boot != boot or one.tick < tick)
-        return next(earlier, NO_OBJECTS)
+        oldest = self._received[0] if len(self._received) == KEPT else NO_OBJECTS
+        return next(earlier, oldest)
 
 
 def sought(

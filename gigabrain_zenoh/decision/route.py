@@ -125,6 +125,7 @@ class RoutePlanner:
         command = request.command
         if restarted:
             self._contours.forget()
+            self._blocking = np.empty((0, 2))
             self._looks = LookAround()
         if restarted or command.number != self._number:
             self._reset(command.number, request.tick)

@@ -10,13 +10,14 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.errors import Refused, unknown
 
 NO_ZONES = Zones()
+KEPT = 16  # messages that may be newer than the scan that is planned with
 
 
 class ZoneSource:
     """The newest zones, also as they were before a tick: so a replay plans with the same ones."""
 
     def __init__(self, bus: Bus) -> None:
-        self._received: deque[Zones] = deque(maxlen=2)
+        self._received: deque[Zones] = deque(maxlen=KEPT)
         bus.latest(ZONES, self._receive)
 
     @property
@@ -48,7 +49,8 @@ class ZoneSource:
 
     def _before(self, boot: int, tick: int) -> Zones | None:
         earlier = (one for one in reversed(self._received) if one.boot != boot or one.tick < tick)
-        return next(earlier, None)
+        oldest = self._received[0] if len(self._received) == KEPT else None
+        return next(earlier, oldest)
 
     def _receive(self, zones: Zones) -> None:
         self._received.append(zones)
