@@ -87,7 +87,9 @@ class TaskServer:
         self._written, self._write_fault = saved, Fault(log)
         self._boot = self._tick = self._status_tick = self._basis = 0
         self._logged: set[str] = set()  # tasks whose end was logged
-        self._maps_loaded: int | None = None  # see Zones
+        # name and count of the map that tasks are for, see Zones
+        self._map = None if saved.maps_loaded is None else (saved.map, saved.maps_loaded)
+        self._from_disk = True  # until the map is known
         self._waits = ""  # what all tasks wait for, before the first step
         bus.serve(GOAL, self._on_goal)
         bus.serve(MISSION, self._on_mission)
@@ -133,10 +135,15 @@ class TaskServer:
     def _drop_if_moved(self) -> None:
         """Cancel all tasks if another map was loaded: their coordinates mean other places."""
         loaded = self._zones.maps_loaded(self._boot, self._tick)
-        if loaded is None or loaded == self._maps_loaded:
+        if loaded is None:
             return
-        before, self._maps_loaded = self._maps_loaded, loaded
-        if before is not None and self._queue.status.current:
+        name = self._zones.at(self._boot, self._tick).map
+        before, self._map = self._map, (name, loaded)
+        # a map that is saved gets a name, but hardly while decision is restarted
+        renamed = before is not None and before[0] != name and self._from_disk
+        self._from_disk = False
+        moved = renamed or (before is not None and before[1] != loaded)
+        if moved and self._queue.status.current:
             text = self._queue.cancel("all", "loading another map")
             log.warning("%s: another map was loaded", text, extra={"data": {"event": "task"}})
 
@@ -178,6 +185,8 @@ class TaskServer:
                 log.info("%s", describe_end(task), extra={"data": data})
         self._logged = {task.id for task in status.done}
         saved = self._queue.saved
+        if saved.jobs and self._map:
+            saved = replace(saved, map=self._map[0], maps_loaded=self._map[1])
         if saved != self._written:
             self._written = saved
             written = self._writer.put(saved)

@@ -108,6 +108,8 @@ class Saved(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="
     count: int = 0  # of all tasks so far
     jobs: tuple[SavedJob, ...] = ()  # the active one first
     held: HeldThing | None = None  # what the gripper holds
+    map: Name = ""  # the one that they are for, see Zones
+    maps_loaded: int | None = None  # None while that is not known
 
 
 class TaskQueue:

@@ -9,8 +9,8 @@ import pytest
 
 from gigabrain_schemas.logs import AcceptedRequest
 from gigabrain_schemas.tasks import Goal, GoalReply, GoalRequest
-from gigabrain_schemas.topics import REQUEST_LOG
-from gigabrain_schemas.zones import Place
+from gigabrain_schemas.topics import REQUEST_LOG, ZONES
+from gigabrain_schemas.zones import Place, Zones
 from gigabrain_zenoh.decision import task_server
 from gigabrain_zenoh.decision.behaviours import StepOutcome
 from gigabrain_zenoh.decision.tasks import mission
@@ -148,6 +148,30 @@ async def test_tasks_survive_a_restart_of_decision(site: Site, tmp_path: Path) -
     assert again.command.goal.x == 3.0
     assert [task.id for task in again.told[-1].queue] == ["goal-2"]
     assert (await again.go(5.0, how="queue")).goal == "goal-3"
+    await again.end()
+
+
+@pytest.mark.parametrize(
+    ("map", "loaded", "goes_on"), [("hall", 1, True), ("yard", 1, False), ("hall", 2, False)]
+)
+async def test_tasks_go_on_only_in_their_map_after_a_restart_of_decision(
+    site: Site, tmp_path: Path, map: str, loaded: int, goes_on: bool
+) -> None:
+    site.net.two.publish(ZONES, Zones(boot=BOOT, map="", maps_loaded=1))
+    await site.step()
+    await site.go(3.0)
+    await site.step()
+    site.net.two.publish(ZONES, Zones(boot=BOOT, map="hall", maps_loaded=1))  # it is saved
+    await site.step()
+    assert site.command
+    await site.end()
+    again = Site(tmp_path)
+    again.net.two.publish(ZONES, Zones(boot=BOOT, map=map, maps_loaded=loaded))
+    await again.step(site.tick + 50)
+    await again.step()
+    assert bool(again.command) == goes_on
+    if not goes_on:
+        assert again.told[-1].done[0].state == "cancelled"
     await again.end()
 
 
