@@ -71,6 +71,7 @@ class LatchFile:
         try:
             make_folder(self._folder)
             found = msgspec.json.decode(read_bounded(self._path, MAX_LATCH_BYTES), type=Latched)
+            self._written = found  # it is on disk already, also where that is full
         except FileNotFoundError:
             found = Latched()
         except (ConfigError, *DECODE_ERRORS):

@@ -1,7 +1,10 @@
+import errno
+import os
 from pathlib import Path
 
 import pytest
 
+from gigabrain_drivers.driver import gatekeeper
 from gigabrain_drivers.driver.gatekeeper import Latched, LatchFile
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate.causes import NAN_STORM, estop
@@ -40,3 +43,18 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=r"cannot write .*file/state: Not a directory"):
         LatchFile(tmp_path / "file" / "state").read()
+
+
+def test_on_a_full_disk_what_was_latched_is_read_and_a_first_start_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    was = Latched(causes=(estop("ann"),), estop_generation=1)
+    LatchFile(tmp_path).write(was)
+
+    def full(path: Path, data: bytes) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(gatekeeper, "replace_file", full)
+    assert LatchFile(tmp_path).read() == was
+    with pytest.raises(ConfigError, match=r"cannot write .*new: No space left on device; [^\n]*$"):
+        LatchFile(tmp_path / "new").read()
