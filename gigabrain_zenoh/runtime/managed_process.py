@@ -117,6 +117,7 @@ class ManagedProcess:
         self._shared, self._patience = shared, RestartPolicy(shared.backoff)
         self._started_s, self._silence = 0.0, heartbeat.Silence()
         self.stuck = False  # it runs and makes no progress
+        self.was_ready = False  # before its last start, with the same configuration
 
     async def run(self, after: Sequence["ManagedProcess"]) -> None:
         """Start once all of `after` are ready, then keep running until the supervisor stops."""
@@ -144,6 +145,7 @@ class ManagedProcess:
     async def _live(self) -> Death:
         """Run the process once, from start to end."""
         loop, status = asyncio.get_running_loop(), self.status
+        self.was_ready |= status.ready_after_s is not None
         status.state, status.ready_after_s, self._started_s = "starting", None, loop.time()
         try:
             child = await self._start()
@@ -162,8 +164,13 @@ class ManagedProcess:
         self.stuck, status.last_exit = False, code
         ready_after_s = status.ready_after_s
         up_s = 0.0 if ready_after_s is None else loop.time() - self._started_s - ready_after_s
-        bad = "what it was given is wrong" if code == ConfigError.exit_code else ""
+        bad = "what it was given is wrong" if self.misconfigured else ""
         return Death(f"ended with {_in_words(code)}", code, up_s, bad)
+
+    @property
+    def misconfigured(self) -> bool:
+        """Return whether its configuration is wrong: exit code 2, and it was never ready before."""
+        return self.status.last_exit == ConfigError.exit_code and not self.was_ready
 
     async def _start(self) -> Child | None:
         spec, shared = self.spec, self._shared

@@ -70,9 +70,8 @@ class Supervisor:
 
     @property
     def misconfigured(self) -> tuple[str, ...]:
-        """Return the names of lost processes whose configuration is wrong (exit code 2)."""
-        lost = (self.statuses[name] for name in self.lost)
-        return tuple(status.name for status in lost if status.last_exit == ConfigError.exit_code)
+        """Return the names of lost processes whose configuration is wrong."""
+        return tuple(name for name in self.lost if self._keepers[name].misconfigured)
 
     @property
     def stuck(self) -> tuple[str, ...]:
