@@ -9,8 +9,10 @@ import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import quote
 
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.files import make_folder
 from gigabrain_zenoh.host.posix import fcntl
 
 log = logging.getLogger(__name__)
@@ -84,6 +86,30 @@ def _in_use(folder: Path) -> bool:
         return False
     finally:
         os.close(lock)
+
+
+@contextlib.contextmanager
+def state_locked(folder: Path, label: str, host: str) -> Iterator[None]:
+    """Keep other supervisors of this host of a deployment from `folder` while the block runs.
+
+    Raises ConfigError where one runs, or where the folder cannot be written.
+    """
+    with contextlib.ExitStack() as closing:
+        try:
+            make_folder(folder)
+            path = folder / f".{quote(host, safe='')}{LOCK}"
+            fcntl.flock(closing.enter_context(path.open("wb")), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(
+                f"a robot {label} runs here already, with its state in {folder}; "
+                "stop it, or give this one a `namespace` of its own"
+            ) from None
+        except OSError as error:
+            raise ConfigError(
+                f"cannot write {folder}: {error.strerror}; "
+                "make it writable, or set XDG_STATE_HOME to a folder that is"
+            ) from None
+        yield
 
 
 def new_run_dir(base: Path | None, label: str) -> Path:

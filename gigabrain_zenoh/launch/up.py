@@ -13,7 +13,7 @@ from gigabrain_zenoh import logs
 from gigabrain_zenoh.config.layers import Row
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import BusError, ConfigError
-from gigabrain_zenoh.host.run_folders import new_run_dir, state_dir
+from gigabrain_zenoh.host.run_folders import new_run_dir, state_dir, state_locked
 from gigabrain_zenoh.host.signals import stop_signals
 from gigabrain_zenoh.launch.deployment import (
     Deployment,
@@ -132,6 +132,7 @@ async def up(
     print_line(f"{deployment.body} on {host}: {names}; logs in {run_dir}")
     with (
         stop_signals(LIMIT_S) as stop,
+        state_locked(remembers, label, host),
         announced(label, local_endpoint(deployment, host), run_dir) as note,
     ):
         async with Supervisor(specs, records.add, keep_stuck=keep_stuck) as supervisor:

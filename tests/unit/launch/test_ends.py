@@ -6,6 +6,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import OwnProcess
@@ -238,3 +239,32 @@ async def test_up_prints_the_same_error_of_a_process_once(monkeypatch: pytest.Mo
     with pytest.raises(BusError):
         await up(DEPLOYMENT, "robot", lines.append)
     assert sum("lacks something" in line for line in lines) == 2
+
+
+async def test_two_robots_of_one_body_need_a_namespace_of_their_own(
+    stop: asyncio.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else both would replace the files of what the other remembers, such as its e-stop."""
+    refused: list[str] = []
+
+    async def another(deployment: Deployment, host: str = "robot") -> None:
+        try:
+            await up(deployment, host, lambda _: None)
+        except ConfigError as error:
+            refused.append(str(error))
+
+    async def run(supervisor: Supervisor) -> None:
+        monkeypatch.setattr(Supervisor, "run", lambda one: one._shared.halt.wait())
+        stop.set()
+        await another(DEPLOYMENT)
+        await another(replace(DEPLOYMENT, namespace="red"))
+        await another(replace(DEPLOYMENT, hosts={"a/b": ROBOT}), "a/b")
+        await supervisor._shared.halt.wait()
+
+    monkeypatch.setattr(Supervisor, "run", run)
+    await up(DEPLOYMENT, "robot", lambda _: None)
+    await another(DEPLOYMENT)  # once the first one has ended
+    (text,) = refused
+    assert text.startswith("a robot turtlebot3_waffle runs here already, with its state in ")
+    assert text.endswith("; stop it, or give this one a `namespace` of its own")
+    assert "\n" not in text
