@@ -83,6 +83,8 @@ def issue(
     """
     if hosts and role not in SERVERS:
         raise ConfigError(f"--host: only a {' or a '.join(SERVERS)} is connected to")
+    if name and (name == ".." or name != Path(name).name):  # revocations look nowhere else
+        raise ConfigError(f"--name {name!r}: expected the name of a folder, without '/'")
     generations = generations_in(fleet_folder)
     first = common_name(role, robot, process=process)
     subject = common_name(role, robot, generations.get(first, 1), process)

@@ -44,6 +44,15 @@ def test_a_router_that_is_made_later_has_the_list(own: Path) -> None:
     assert (later / "generations.json").read_bytes() == b'{\n  "viewer": 2\n}\n'
 
 
+@pytest.mark.parametrize("name", ["red/robot", "/media/usb/robot", "../robot", "robot/", "..", "."])
+def test_an_identity_is_made_only_where_a_revocation_finds_it(own: Path, name: str) -> None:
+    before = sorted(own.parent.rglob("*"))
+    with pytest.raises(ConfigError) as error:
+        issue(own, "router", name=name)
+    assert str(error.value) == f"--name {name!r}: expected the name of a folder, without '/'"
+    assert sorted(own.parent.rglob("*")) == before
+
+
 @pytest.mark.parametrize("role", ["robot", "router"])
 def test_who_may_pass_for_a_router_cannot_be_called_back(own: Path, role: str) -> None:
     with pytest.raises(ConfigError, match="make a new fleet"):
