@@ -179,7 +179,7 @@ async def test_nothing_survives_its_death_not_even_what_is_frozen(home: Home) ->
     up = home.start("up", str(file))
     async with probing(endpoint_of(file)) as robot:
         os.kill(await robot.pid("control"), signal.SIGSTOP)
-        assert len(home.processes()) == 6
+        await until(lambda: len(home.processes()) == 6, "all have started")
         up.send(signal.SIGKILL)
         await until(lambda: not home.processes(), "no orphan is left")
 
