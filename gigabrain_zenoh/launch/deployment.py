@@ -1,7 +1,8 @@
 """A deployment file: which body on which link, and which process runs on which host."""
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Container, Iterable, Sequence
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -32,7 +33,7 @@ from gigabrain_zenoh.config.settings import (
     Speed,
     TagConfig,
 )
-from gigabrain_zenoh.config.yaml_text import Node
+from gigabrain_zenoh.config.yaml_text import Entry, Node
 from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.host.network import exposed, host_and_port, reserve_port
 from gigabrain_zenoh.launch.own_processes import MODULES, PERCEPTORS, check_entries
@@ -51,8 +52,6 @@ from gigabrain_zenoh.security.identity_files import (
 )
 
 MAX_HOSTS = 64
-NET_FILES = ("onnx", "labels")  # in the part `recognizer`
-MISSION_FILES = ("mission", "scripts")  # in the settings of decision
 ROBOT = tuple(name for name, one in PROCESSES.items() if one.default)
 
 
@@ -203,38 +202,59 @@ def deployment_path(name: str) -> Path:
 
 
 def load_deployment(path: Path, keys: str = "") -> Deployment:
-    """Read a deployment file; keys and world lie beside it, unless `keys` replaces the former.
+    """Read a deployment file; the files it names lie beside it, unless `keys` replaces its keys.
 
     Raises ConfigError with file, line and what was expected.
     """
-    root = config.document(config.read(path), str(path))
+    root = with_files(config.document(config.read(path), str(path)), path.absolute().parent)
     kind = deployment_type(own_names(root))
     return with_keys(config.converted(root, kind, lambda line: f"{path}:{line}"), path, keys)
 
 
 def with_keys(loaded: Deployment, path: Path, keys: str = "") -> Deployment:
-    """Return the deployment of a file with its files beside it, unless `keys` replaces these."""
+    """Return the deployment of a file with keys and types beside it, unless `keys` replaces them.
+
+    The other files are placed by `with_files`.
+    """
+    folder, ros2 = path.absolute().parent, loaded.ros2
     if loaded.keys and not keys:
-        keys = str(path.absolute().parent / Path(loaded.keys).expanduser())
-    folder = path.absolute().parent
-    net, ros2 = loaded.recognizer, loaded.ros2
+        keys = str(folder / Path(loaded.keys).expanduser())
     if ros2:
         own = tuple(str(folder / Path(file).expanduser()) for file in ros2.types)
         ros2 = structs.replace(ros2, types=own)
-    files = {name: getattr(net, name) for name in NET_FILES}
-    there = {name: str(folder / Path(file).expanduser()) for name, file in files.items() if file}
-    settings = dict(loaded.decision.settings)
-    for name in MISSION_FILES:
-        if isinstance(file := settings.get(name), str) and file:
-            settings[name] = str(folder / Path(file).expanduser())
-    return structs.replace(
-        loaded,
-        keys=keys,
-        world=config.beside(loaded.world, folder),
-        decision=structs.replace(loaded.decision, settings=settings),
-        recognizer=structs.replace(net, **there),
-        ros2=ros2,
-    )
+    return structs.replace(loaded, keys=keys, ros2=ros2)
+
+
+def with_files(root: Node, folder: Path) -> Node:
+    """Return settings in which the files that they name are taken from `folder`."""
+
+    def beside(name: str) -> str:
+        return config.beside(name, folder)
+
+    def there(name: str) -> str:
+        return str(folder.absolute() / Path(name).expanduser()) if name else name
+
+    root = _placed(root, (), ("body", "world"), beside)
+    root = _placed(root, ("perception",), ("map",), beside)
+    root = _placed(root, ("recorder",), ("folder", "file"), there)
+    root = _placed(root, ("recognizer",), ("onnx", "labels"), there)
+    return _placed(root, ("decision", "settings"), ("mission", "scripts"), there)
+
+
+def _placed(
+    root: Node, parts: Sequence[str], names: Container[str], place: Callable[[str], str]
+) -> Node:
+    """Return settings with `place` of the settings `names` of a part."""
+
+    def placed(one: Entry) -> Entry:
+        if parts and one.key == parts[0] and one.node.entries is not None:
+            return replace(one, node=_placed(one.node, parts[1:], names, place))
+        if parts or one.key not in names or not isinstance(one.node.value, str):
+            return one
+        return replace(one, node=replace(one.node, value=place(one.node.value)))
+
+    entries = tuple(placed(one) for one in root.entries or ())
+    return replace(root, entries=entries, value={one.key: one.node.value for one in entries})
 
 
 def own_names(root: Node) -> list[str]:

@@ -1,8 +1,7 @@
 """A deployment as it is started: its file, then settings files, then `--set`."""
 
 import contextlib
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,16 +12,14 @@ from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.config import loading
 from gigabrain_zenoh.config.layers import Layers, Row, assignment, full_key, keys_of
 from gigabrain_zenoh.config.settings import LinkName
-from gigabrain_zenoh.config.yaml_text import Entry, Node
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError, UnknownName
 from gigabrain_zenoh.host.files import read_bounded, replace_file
 from gigabrain_zenoh.launch.deployment import (
-    MISSION_FILES,
-    NET_FILES,
     Deployment,
     deployment_type,
     own_names,
+    with_files,
     with_keys,
 )
 
@@ -104,46 +101,6 @@ def _add_file(layers: Layers, path: Path) -> None:
     if root.entries is None:
         raise ConfigError(f"{path}:{root.line}: expected a mapping of settings")
     layers.add(with_files(root, path.absolute().parent), lambda line: f"{path}:{line}")
-
-
-def with_files(root: Node, folder: Path) -> Node:
-    """Return settings in which the files that they name are taken from `folder`."""
-    root = _with_paths(root, ("recognizer",), NET_FILES, folder)
-    root = _with_paths(root, ("decision", "settings"), MISSION_FILES, folder)
-    return _with_world(root, folder)
-
-
-def _with_world(root: Node, folder: Path) -> Node:
-    """Return settings in which the file of a world, if they name one, is taken from `folder`."""
-
-    def placed(one: Entry) -> Entry:
-        if one.key != "world" or not isinstance(one.node.value, str):
-            return one
-        return replace(one, node=replace(one.node, value=loading.beside(one.node.value, folder)))
-
-    return _replaced(root, placed)
-
-
-def _with_paths(root: Node, parts: Sequence[str], names: Container[str], folder: Path) -> Node:
-    """Return settings in which the files `names` of a part are taken from `folder`."""
-
-    def placed(one: Entry) -> Entry:
-        if parts:
-            if one.key != parts[0] or one.node.entries is None:
-                return one
-            return replace(one, node=_with_paths(one.node, parts[1:], names, folder))
-        name = one.node.value
-        if one.key not in names or not isinstance(name, str) or not name:
-            return one
-        there = str(folder.absolute() / Path(name).expanduser())
-        return replace(one, node=replace(one.node, value=there))
-
-    return _replaced(root, placed)
-
-
-def _replaced(root: Node, change: Callable[[Entry], Entry]) -> Node:
-    entries = tuple(change(one) for one in root.entries or ())
-    return replace(root, entries=entries, value={one.key: one.node.value for one in entries})
 
 
 def _type_of(layers: Layers) -> type[Deployment]:

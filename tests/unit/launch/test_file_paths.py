@@ -1,4 +1,4 @@
-"""The path of a world, a mission or scripts is relative to whatever names it."""
+"""The path of a robot, a world, a map or a mission is relative to whatever names it."""
 
 from pathlib import Path
 
@@ -64,3 +64,31 @@ def test_so_are_a_mission_and_scripts(
         "mission": str(here / "b.yaml"),
         "scripts": str(folder / "more" / "t"),
     }
+
+
+def test_so_are_a_body_a_map_and_recordings(
+    folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = "body: my/robot.yaml\nperception: {mapping: localize, map: ~/maps/office.yaml}\n"
+    (folder / "robot.yaml").write_text(text + "recorder: {folder: drives, file: a.mcap}\n")
+    more = folder / "more.yaml"
+    more.write_text("perception: {map: hall.yaml}\n")
+    here = tmp_path_factory.mktemp("here")
+    monkeypatch.chdir(here)
+    monkeypatch.setenv("HOME", "/home/ann")
+    for found in (load_deployment(folder / "robot.yaml"), merged(folder)):
+        assert found.body == str(folder / "my" / "robot.yaml")
+        assert found.perception.map == "/home/ann/maps/office.yaml"
+        assert found.recorder.folder == str(folder / "drives")
+        assert found.recorder.file == str(folder / "a.mcap")
+    found = merged(folder, "body=robot.yaml", "recorder.file=b.mcap", files=(more,))
+    assert found.body == str(here / "robot.yaml")
+    assert found.perception.map == str(folder / "hall.yaml")
+    assert found.recorder.file == str(here / "b.mcap")
+
+
+def test_names_of_known_bodies_and_saved_maps_stay_as_they_are(folder: Path) -> None:
+    (folder / "robot.yaml").write_text("body: alpha\nperception: {mapping: slam, map: house}\n")
+    for found in (load_deployment(folder / "robot.yaml"), merged(folder)):
+        assert (found.body, found.perception.map) == ("alpha", "house")
+        assert (found.recorder.folder, found.recorder.file) == ("", "")
