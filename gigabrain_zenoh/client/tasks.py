@@ -27,6 +27,7 @@ PLAN_S = 5.0  # how long path planning in a large map may take
 SILENT_S = 5.0  # after this long without a task status, the robot counts as lost
 STARTING_S = 3.0  # how long a starting robot may take until it serves goals
 AGAIN_S = 0.2
+MAX_WITHOUT = 5  # statuses without a task: those from before it was accepted may still arrive
 OnStatus = Callable[[TaskStatus], None]
 Q = TypeVar("Q", bound=Message)
 R = TypeVar("R", bound=Message)
@@ -157,17 +158,25 @@ class Tasks:
         return self._newest
 
     async def result(self, task: str, on_status: OnStatus | None = None) -> Task:
-        """Wait until a task has ended, and return it. Raises BodyLost.
+        """Wait until a task has ended, and return it. Raises BodyLost, also for an unknown task.
 
         Meanwhile `on_status` is called with each status.
         """
         self._listen()
+        without = 0
         while True:
             status = self._newest
             if status:
                 for one in status.done:
                     if one.id == task:
                         return one
+                waiting = (status.current, *status.queue)
+                without = 0 if any(one and one.id == task for one in waiting) else without + 1
+                if without == MAX_WITHOUT:
+                    raise BodyLost(
+                        f"the robot does not know {task} (any more); "
+                        "`gigabrain task list` shows what it knows"
+                    )
                 if on_status:
                     on_status(status)
             await self._next_status()

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_schemas.tasks import GoalReply, GoalRequest, TaskStatus
-from gigabrain_schemas.topics import GOAL, Priority
+from gigabrain_schemas.tasks import GoalReply, GoalRequest, Task, TaskStatus
+from gigabrain_schemas.topics import GOAL, TASK, Priority
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import LocalTransport
 from gigabrain_zenoh.client.tasks import Tasks
 from gigabrain_zenoh.decision.behaviours import StepOutcome
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 from gigabrain_zenoh.testing.in_memory import Net
-from gigabrain_zenoh.testing.waiting import until
+from gigabrain_zenoh.testing.waiting import settle, until
 from tests.unit.decision.sites import Site
 
 
@@ -54,6 +54,20 @@ async def test_whoever_says_nothing_of_the_tasks_is_taken_for_gone_as_soon_as_wa
     assert done == {hasty}
     with pytest.raises(BodyLost, match="no process serves goals"):
         await hasty
+
+
+async def test_a_task_that_the_robot_does_not_know_any_more_is_not_waited_for() -> None:
+    net = Net()
+    waiting = asyncio.ensure_future(Tasks(net.two, silent_s=60.0).result("goal-3"))
+    one = Task(id="goal-3", kind="goal", label="goal", source="ann", state="queued")
+    for status in (*[TaskStatus()] * 4, TaskStatus(queue=(one,)), *[TaskStatus()] * 5):
+        await settle()
+        assert not waiting.done()
+        net.one.publish(TASK, status)
+    await settle()
+    assert waiting.done()
+    with pytest.raises(BodyLost, match=r"not know goal-3 \(any more\); `gigabrain task list`"):
+        await waiting
 
 
 async def test_a_goal_that_comes_while_the_robot_starts_waits_for_who_serves_goals() -> None:
