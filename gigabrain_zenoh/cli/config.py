@@ -11,6 +11,7 @@ from cyclopts import Parameter
 from gigabrain_zenoh.cli.node import ask_params
 from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, print_line
 from gigabrain_zenoh.errors import ConfigError, UnknownName
+from gigabrain_zenoh.host.files import expanded
 
 if TYPE_CHECKING:
     from msgspec import Struct
@@ -81,7 +82,7 @@ def merged_file(
     from gigabrain_zenoh.launch.merging import file_layers, merge
 
     path = deployment_path(name)
-    folder = str(keys.expanduser().absolute()) if keys else ""
+    folder = str(expanded(keys).absolute()) if keys else ""
     return merge(file_layers(path), files, sets, robot_type, path, folder)
 
 

@@ -22,6 +22,7 @@ from gigabrain_zenoh.config.settings import (
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host import run_folders
+from gigabrain_zenoh.host.files import expanded
 from gigabrain_zenoh.host.network import exposed, reached_at
 from gigabrain_zenoh.launch.processes import grants, names_by_role, process_type, run_process
 from gigabrain_zenoh.runtime.running import announced, find_endpoint
@@ -47,7 +48,7 @@ class HostOptions:
     @property
     def folder(self) -> str:
         """Return the folder of the identity; empty for none."""
-        return str(self.keys.expanduser().absolute()) if self.keys else ""
+        return str(expanded(self.keys).absolute()) if self.keys else ""
 
     def run_at(self, endpoint: Endpoint, name: str, settings: dict[str, Any]) -> int:
         """Run the process `name` until a signal; return its exit code."""

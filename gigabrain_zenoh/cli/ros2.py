@@ -18,6 +18,7 @@ from gigabrain_zenoh.cli.options import (
 )
 from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig, Ros2Config, Ros2Link
 from gigabrain_zenoh.errors import BusError
+from gigabrain_zenoh.host.files import expanded
 from gigabrain_zenoh.host.signals import run_async
 from gigabrain_zenoh.launch.processes import gateway_config, run_process, with_ros_router
 from gigabrain_zenoh.runtime.running import find_endpoint
@@ -51,7 +52,7 @@ class RosLinkOptions:
     def given(self) -> dict[str, Any]:
         """Return the settings as a deployment file has them."""
         given = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        types = tuple(str(file.expanduser().absolute()) for file in self.types)
+        types = tuple(str(expanded(file).absolute()) for file in self.types)
         return given | {"types": types, "namespace": given.pop("ros_namespace")}
 
 

@@ -20,7 +20,7 @@ from gigabrain_zenoh.config import yaml_text
 from gigabrain_zenoh.config.renames import renamed_fields
 from gigabrain_zenoh.config.yaml_text import Entry, Node
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.files import read_bounded
+from gigabrain_zenoh.host.files import expanded, read_bounded
 
 _LONGEST = 60  # characters of a value that are shown
 _NAMES: tuple[tuple[tuple[type, ...], str], ...] = (
@@ -308,7 +308,7 @@ def names_file(name: str) -> bool:
 
 def beside(name: str, folder: Path) -> str:
     """Return a setting with its path, if it is one, taken from `folder`."""
-    return str(folder.absolute() / Path(name).expanduser()) if names_file(name) else name
+    return str(folder.absolute() / expanded(name)) if names_file(name) else name
 
 
 def read(path: Path) -> str:

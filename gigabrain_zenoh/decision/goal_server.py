@@ -4,7 +4,6 @@ The robot can drive before the planning kernels are compiled.
 """
 
 import asyncio
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
@@ -40,6 +39,7 @@ from gigabrain_zenoh.decision.tasks import mission as missions
 from gigabrain_zenoh.decision.zones import ZoneSource
 from gigabrain_zenoh.errors import GigabrainError, Refused
 from gigabrain_zenoh.geometry.pose import to_parent
+from gigabrain_zenoh.host.files import expanded
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.decision.manipulator import Manipulator
@@ -297,7 +297,7 @@ class GoalServer(InputSource):
 def _first_mission(config: NavigationConfig) -> StartMission | None:
     """Return what a robot does by itself. Raises ConfigError."""
     if config.mission:
-        path = Path(config.mission).expanduser()
+        path = expanded(config.mission)
         return StartMission(*missions.load(path), label=path.stem, source=str(path))
     if config.start != "explore":
         return None

@@ -39,6 +39,7 @@ from gigabrain_zenoh.diagnostics.listener import CLIENT_NAME
 from gigabrain_zenoh.diagnostics.robot_view import ProcessHealth
 from gigabrain_zenoh.diagnostics.ros2_check import Shell, check_ros2, inspect_shell
 from gigabrain_zenoh.errors import BusError, ConfigError
+from gigabrain_zenoh.host.files import expanded
 from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.runtime import running
 from gigabrain_zenoh.runtime.connect import Where, connect
@@ -359,7 +360,7 @@ def _ports() -> Iterator[Port]:
 
 def _load_certificate(keys: str) -> Certificate:
     try:
-        identity = identity_in(Path(keys).expanduser())
+        identity = identity_in(expanded(keys))
     except ConfigError as error:
         return Certificate(folder=keys, problem=str(error))
     days = identity.days_left(datetime.datetime.now(datetime.UTC))

@@ -22,6 +22,14 @@ KINDS = (
 )
 
 
+def expanded(path: str | Path) -> Path:
+    """Return a path with `~` replaced by the home folder. Raises ConfigError if there is none."""
+    try:
+        return Path(path).expanduser()
+    except RuntimeError:
+        raise ConfigError(f"{path}: no such home folder; write the whole path") from None
+
+
 def open_regular(path: Path, most_bytes: int | None = None) -> BinaryIO:
     """Open a regular file for reading. Raises OSError.
 

@@ -35,6 +35,7 @@ from gigabrain_zenoh.config.settings import (
 )
 from gigabrain_zenoh.config.yaml_text import Entry, Node
 from gigabrain_zenoh.errors import ConfigError, unknown
+from gigabrain_zenoh.host.files import expanded
 from gigabrain_zenoh.host.network import exposed, host_and_port, reserve_port
 from gigabrain_zenoh.launch.own_processes import MODULES, PERCEPTORS, check_entries
 from gigabrain_zenoh.launch.processes import (
@@ -218,9 +219,9 @@ def with_keys(loaded: Deployment, path: Path, keys: str = "") -> Deployment:
     """
     folder, ros2 = path.absolute().parent, loaded.ros2
     if loaded.keys and not keys:
-        keys = str(folder / Path(loaded.keys).expanduser())
+        keys = str(folder / expanded(loaded.keys))
     if ros2:
-        own = tuple(str(folder / Path(file).expanduser()) for file in ros2.types)
+        own = tuple(str(folder / expanded(file)) for file in ros2.types)
         ros2 = structs.replace(ros2, types=own)
     return structs.replace(loaded, keys=keys, ros2=ros2)
 
@@ -232,7 +233,7 @@ def with_files(root: Node, folder: Path) -> Node:
         return config.beside(name, folder)
 
     def there(name: str) -> str:
-        return str(folder.absolute() / Path(name).expanduser()) if name else name
+        return str(folder.absolute() / expanded(name)) if name else name
 
     root = _placed(root, (), ("body", "world"), beside)
     root = _placed(root, ("perception",), ("map",), beside)

@@ -3,17 +3,17 @@
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.util import find_spec
-from pathlib import Path
 
 from gigabrain_zenoh.config.settings import Endpoint, Ros2Link
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.files import expanded
 from gigabrain_zenoh.ros2.transport import RosTransport
 from gigabrain_zenoh.ros2.types import Types
 
 
 def load_types(link: Ros2Link) -> Types:
     """Load all types, those of the user's files as well. Raises ConfigError."""
-    return Types(Path(each).expanduser() for each in link.types)
+    return Types(expanded(each) for each in link.types)
 
 
 @asynccontextmanager

@@ -15,7 +15,7 @@ from gigabrain_zenoh.bus.zenoh.config import SECURE, secured
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError
-from gigabrain_zenoh.host.files import open_regular
+from gigabrain_zenoh.host.files import expanded, open_regular
 from gigabrain_zenoh.host.posix import fcntl
 
 SOCKET = "unixsock-stream"
@@ -143,7 +143,7 @@ def find_endpoint(connect: str | None, namespace: str = "", keys: str = "") -> E
     of the client's identity, for a router that requires one. A client that names its identity is
     limited to its role: it then does not use the local socket, which has the robot's rights.
     """
-    identity = str(Path(keys).expanduser().absolute()) if keys else ""
+    identity = str(expanded(keys).absolute()) if keys else ""
     if connect:
         return secured(Endpoint(connect=(connect,), namespace=namespace, keys=identity))
     endpoint = find_running(namespace).endpoint

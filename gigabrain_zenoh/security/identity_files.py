@@ -12,7 +12,13 @@ import msgspec
 from gigabrain_schemas.topics import Role
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import BusError, ConfigError
-from gigabrain_zenoh.host.files import create_file, open_regular, read_bounded, replace_file
+from gigabrain_zenoh.host.files import (
+    create_file,
+    expanded,
+    open_regular,
+    read_bounded,
+    replace_file,
+)
 from gigabrain_zenoh.host.network import host_and_port
 from gigabrain_zenoh.host.posix import fcntl
 from gigabrain_zenoh.security.acl import common_name
@@ -84,7 +90,7 @@ def unreadable(path: Path) -> ConfigError:
 
 def identity_folder(keys: str, host: str = "") -> Path:
     """Return the folder of the identity: `keys`, or its subfolder for `host` if it has several."""
-    folder = Path(keys).expanduser()
+    folder = expanded(keys)
     of_host = folder / host
     if host and not os.path.exists(folder / CERTIFICATE) and os.path.isdir(of_host):
         return of_host

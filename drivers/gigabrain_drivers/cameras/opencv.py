@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_drivers.cameras.base import CameraLost, CameraOptions, CameraSource, Frame, Picture
+from gigabrain_zenoh.host.files import expanded
 
 TIMEOUT_MS = 3000  # of opening a stream, and of reading from it
 ASPECT = 0.01  # by which the shape of a scaled picture may differ
@@ -33,7 +34,7 @@ class OpenCvCamera(CameraSource):
     _due_s = 0.0  # of a file's next picture
 
     def open(self) -> None:
-        """Open the device. Raises CameraLost."""
+        """Open the device. Raises CameraLost, and ConfigError without the home of a `~`."""
         if self.camera.depth:
             raise CameraLost("OpenCV gives no depth; write `depth: false` for this camera")
         target, backend = self._target()
@@ -79,7 +80,7 @@ class OpenCvCamera(CameraSource):
             return int(device), cv2.CAP_ANY
         if "://" in device:
             return device, cv2.CAP_ANY
-        path = Path(self.site.folder) / Path(device).expanduser()
+        path = Path(self.site.folder) / expanded(device)
         self._file = path.is_file()
         if not path.exists():
             raise CameraLost(f"{device} is not there")

@@ -12,6 +12,7 @@ from gigabrain_schemas.topics import DEPTH, IMAGE
 from gigabrain_schemas.vision import DepthImage
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.files import expanded
 from gigabrain_zenoh.recording.bag_reader import samples
 from gigabrain_zenoh.vision.pictures import decoded
 
@@ -43,8 +44,8 @@ class ReplayedCamera(CameraSource):
     _last: tuple[int, float] | None = None  # stamp of the newest exposure, and when it was given
 
     def open(self) -> None:
-        """Begin at the start of the recording. Raises CameraLost."""
-        path = Path(self.site.folder) / Path(self.options.file).expanduser()
+        """Begin at the start of the recording. Raises ConfigError without the home of a `~`."""
+        path = Path(self.site.folder) / expanded(self.options.file)
         self._exposures = recorded(path, self.options.camera or self.camera.name)
         self._last = None
 

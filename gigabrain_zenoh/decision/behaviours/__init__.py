@@ -22,6 +22,7 @@ from gigabrain_zenoh.config import loading
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision.tasks.arm_steps import ArmAction, HeldThing, Solid
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.files import expanded
 from gigabrain_zenoh.plugins import load_plugin, plugin_names
 
 GROUP = "gigabrain.behaviours"
@@ -222,7 +223,7 @@ def check(config: DecisionConfig, path: Path | None = None) -> None:
             raise ConfigError(
                 f"behaviour {config.behaviour} needs {package}; pip install 'gigabrain-zenoh[nav]'"
             )
-    if settings.scripts and not Path(settings.scripts).expanduser().is_dir():
+    if settings.scripts and not expanded(settings.scripts).is_dir():
         raise ConfigError(
             f"scripts: no folder {settings.scripts!r}; "
             "expected the folder with the programs that missions may run",

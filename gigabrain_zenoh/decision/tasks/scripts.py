@@ -10,6 +10,7 @@ from pathlib import Path
 from gigabrain_zenoh.decision.tasks.mission import Script
 from gigabrain_zenoh.errors import GigabrainError, Refused, unknown
 from gigabrain_zenoh.host import this_process
+from gigabrain_zenoh.host.files import expanded
 
 MAX_OUTPUT = 200  # bytes of a program's output that its result shows, the last ones
 LINGER_S = 1.0  # for the rest of its output, once it has ended
@@ -23,7 +24,7 @@ class Scripts:
     """Starts programs of the folder that the deployment file allows."""
 
     def __init__(self, folder: str) -> None:
-        self._folder = Path(folder).expanduser() if folder else None
+        self._folder = expanded(folder) if folder else None
 
     def path(self, name: str) -> Path:
         """Return the path of a program. Raises Refused and UnknownName."""

@@ -4,8 +4,12 @@ from pathlib import Path
 
 import pytest
 
+from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.launch import merging
 from gigabrain_zenoh.launch.deployment import Deployment, load_deployment
+from gigabrain_zenoh.runtime.running import find_endpoint
+
+HOMELESS = "~nobody7/a.yaml: no such home folder; write the whole path"
 
 
 def merged(folder: Path, *sets: str, files: tuple[Path, ...] = ()) -> Deployment:
@@ -92,3 +96,23 @@ def test_names_of_known_bodies_and_saved_maps_stay_as_they_are(folder: Path) -> 
     for found in (load_deployment(folder / "robot.yaml"), merged(folder)):
         assert (found.body, found.perception.map) == ("alpha", "house")
         assert (found.recorder.folder, found.recorder.file) == ("", "")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "world: ~nobody7/a.yaml",
+        "recorder: {folder: ~nobody7/a.yaml}",
+        "keys: ~nobody7/a.yaml",
+        "ros2: {types: [~nobody7/a.yaml]}",
+    ],
+)
+def test_a_home_that_is_not_there_is_refused_in_one_line(folder: Path, text: str) -> None:
+    (folder / "robot.yaml").write_text(f"{text}\n")
+    with pytest.raises(ConfigError, match=f"^{HOMELESS}$"):
+        load_deployment(folder / "robot.yaml")
+
+
+def test_so_it_is_for_commands() -> None:
+    with pytest.raises(ConfigError, match=f"^{HOMELESS}$"):
+        find_endpoint(None, keys="~nobody7/a.yaml")

@@ -16,7 +16,7 @@ from gigabrain_drivers.bodies.feetech.protocol import MAX_ID, RADIANS_PER_TICK, 
 from gigabrain_schemas.body import JointDescription
 from gigabrain_zenoh.config import loading
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.files import make_folder, replace_file
+from gigabrain_zenoh.host.files import expanded, make_folder, replace_file
 from gigabrain_zenoh.host.run_folders import state_dir
 
 Tick = Annotated[int, Meta(ge=0, le=TICKS - 1)]
@@ -69,7 +69,7 @@ def calibration_path(robot_type: str, name: str, folder: Path) -> Path:
     Raises ConfigError without a home folder.
     """
     if name:
-        return folder / Path(name).expanduser()
+        return folder / expanded(name)
     return state_dir() / "calibration" / f"{robot_type}.yaml"
 
 

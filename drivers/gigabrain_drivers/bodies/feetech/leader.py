@@ -22,6 +22,7 @@ from gigabrain_drivers.links.link import Link
 from gigabrain_drivers.links.serial_link import SerialLink
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.files import expanded
 
 LEADER = "so101"
 
@@ -140,6 +141,6 @@ def leader_file(port: str, calibration: str = "") -> tuple[RobotFile, FeetechOpt
         raise ConfigError(str(error)) from None
     if not calibration:
         return robot, options, calibration_path(f"{robot.robot_type}-leader", "", folder)
-    here = Path(calibration).expanduser()
+    here = expanded(calibration)
     beside = folder / here
     return robot, options, beside if beside.exists() and not here.exists() else here
