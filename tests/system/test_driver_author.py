@@ -1,7 +1,9 @@
 """Packages of `gigabrain driver new`: they pass the kit as written, and fail with a mistake."""
 
+import runpy
 import tomllib
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
@@ -10,6 +12,7 @@ from gigabrain_drivers.driver import catalog
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.qa.conformance import authoring, driver_checks, kit
 from gigabrain_zenoh.qa.conformance.driver_checks import CheckedRobot
+from gigabrain_zenoh.qa.judging import DriverCheckResult
 
 
 def installed(folder: Path, site: Path) -> Path:
@@ -38,6 +41,17 @@ async def test_a_new_driver_passes_the_kit_by_its_name(tmp_path: Path, site: Pat
     results = await kit.check("kit_probe", "sim", tmp_path / "kit", lambda result: None)
     assert [result for result in results if result.verdict == "FAILED"] == []
     assert sum(result.verdict == "passed" for result in results) == 11
+
+
+async def test_the_test_of_a_new_driver_fails_where_a_check_fails(tmp_path: Path) -> None:
+    folder = authoring.write_package("kit_tested", tmp_path)
+    test = runpy.run_path(str(folder / "tests/test_driver.py"))["test_it_passes_the_kit"]
+    good = DriverCheckResult("opens", "received within 5 s", "received after 1 ms", "passed")
+    bad = DriverCheckResult("obeys", "within 10 %", "linear_x 0 instead of 1", "FAILED")
+    with mock.patch.object(kit, "check", return_value=[good]):
+        await test(tmp_path)
+    with mock.patch.object(kit, "check", return_value=[good, bad]), pytest.raises(AssertionError):
+        await test(tmp_path)
 
 
 def test_a_driver_that_cannot_be_imported_is_refused_in_one_line(
