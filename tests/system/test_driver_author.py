@@ -106,6 +106,32 @@ async def test_a_driver_that_ignores_its_limits_fails(tmp_path: Path, site: Path
         assert not (await driver_checks.refuses_nan(subject)).ok
 
 
+async def test_a_driver_that_ignores_its_limit_sideways_fails(tmp_path: Path, site: Path) -> None:
+    bounded = "self._velocity = self.bounded(linear_x, linear_y, angular_z)"
+    plain = (
+        "self._velocity = self.bounded(linear_x, 0.0, angular_z)\n"
+        "        self._velocity = Velocity(linear_x=self._velocity.linear_x, linear_y=linear_y,\n"
+        "                                  angular_z=self._velocity.angular_z)"
+    )
+    broken("kit_aside", tmp_path, site, bounded, plain)
+    file = site / "kit_aside_driver/robot.yaml"
+    omni = "drive_type: omni\nmax_lateral_speed: 0.2"
+    file.write_text(file.read_text().replace("drive_type: differential", omni))
+    async with CheckedRobot("kit_aside", "sim", tmp_path) as subject:
+        found = await driver_checks.limits(subject)
+        assert (found.ok, found.measured) == (False, "at most 10.00 of max speed")
+
+
+@pytest.mark.parametrize("axis", ["linear_x", "linear_y", "angular_z"])
+async def test_a_driver_that_goes_on_with_nan_in_one_axis_fails(
+    axis: str, tmp_path: Path, site: Path
+) -> None:
+    call = "self.bounded(linear_x, linear_y, angular_z)"
+    lenient = call.replace(axis, f"{axis} if math.isfinite({axis}) else 0.0")
+    async with broken(f"kit_nan_{axis}", tmp_path, site, call, lenient) as subject:
+        assert not (await driver_checks.refuses_nan(subject)).ok
+
+
 async def test_a_driver_whose_stop_raises_fails(tmp_path: Path, site: Path) -> None:
     stop = '"""Bring the body to rest."""'
     async with broken("kit_loud", tmp_path, site, stop, 'raise OSError("gone")') as subject:

@@ -281,28 +281,24 @@ def _near(it: DriverSession, axis: str, wanted: float, slack: float) -> bool:
 
 
 async def limits(checked: CheckedRobot) -> Finding:
-    """Command ten times the greatest speed: the driver sends at most the greatest speed."""
-    robot = checked.file
-    most = Velocity(linear_x=robot.max_linear_speed, angular_z=robot.max_angular_speed)
-    worst = 0.0
+    """Command ten times the greatest speeds: the driver sends at most these."""
+    most, worst = _max_speeds(checked), 0.0
+    share = TOLERANCE if checked.has_peer else 3 * TOLERANCE  # a body that walks sways
     async with DriverSession(checked) as it:
         await it.connected()
-        for asked in (
-            Velocity(linear_x=EXCESS * most.linear_x),
-            Velocity(angular_z=-EXCESS * most.angular_z),
-            Velocity(linear_x=-EXCESS * most.linear_x, angular_z=EXCESS * most.angular_z),
-        ):
-            it.wanted = asked
-            await it.run_for(HOLD_TICKS)
-            sent = it.sent or Velocity()
-            commanded = checked.commanded(it.state)
-            worst = max(
-                worst,
-                abs(sent.linear_x) / most.linear_x,
-                abs(sent.angular_z) / most.angular_z,
-                abs(commanded[0]) / (most.linear_x * (1 + TOLERANCE)),
-                abs(commanded[2]) / (most.angular_z * (1 + TOLERANCE)),
+        for x, y, turn in ((1, 0, 0), (0, 1, 0), (0, 0, -1), (-1, -1, 1)):
+            it.wanted = Velocity(
+                linear_x=x * EXCESS * most[0],
+                linear_y=y * EXCESS * most[1],
+                angular_z=turn * EXCESS * most[2],
             )
+            await it.run_for(HOLD_TICKS)
+            sent, commanded = _axes(it.sent or Velocity()), checked.commanded(it.state)
+            for axis, limit in enumerate(most):
+                if limit:
+                    slack = share * limit + UNIT
+                    worst = max(worst, abs(sent[axis]) / limit)
+                    worst = max(worst, abs(commanded[axis]) / (limit + slack))
     return Finding(worst <= 1.001, f"at most {worst:.2f} of max speed")
 
 
@@ -311,8 +307,7 @@ async def returns(checked: CheckedRobot) -> Finding:
 
     Without a peer, the measured velocity stands for the commanded one.
     """
-    robot = checked.file
-    most = (robot.max_linear_speed, robot.max_lateral_speed, robot.max_angular_speed)
+    most = _max_speeds(checked)
     slack = [UNIT + (0.0 if checked.has_peer else TOLERANCE * axis) for axis in most]
     asked = Velocity(
         linear_x=-0.41234 * most[0], linear_y=0.5 * most[1], angular_z=0.31234 * most[2]
@@ -331,7 +326,7 @@ async def returns(checked: CheckedRobot) -> Finding:
         await it.run_for(2)
         ticks = await it.until(close, RAMP_TICKS)
         worst, sent = max(off()), it.sent or Velocity()
-    within = _axes(clamp(asked, limits_of(robot)))
+    within = _axes(clamp(asked, limits_of(checked.file)))
     honest = all(abs(a - b) <= UNIT for a, b in zip(_axes(sent), within, strict=True) if b)
     speeds = ", ".join(f"{speed:.4f}" for speed in _axes(sent))
     return Finding(
@@ -339,19 +334,25 @@ async def returns(checked: CheckedRobot) -> Finding:
     )
 
 
+def _max_speeds(checked: CheckedRobot) -> tuple[float, float, float]:
+    robot = checked.file
+    return robot.max_linear_speed, robot.max_lateral_speed, robot.max_angular_speed
+
+
 def _axes(velocity: Velocity) -> tuple[float, float, float]:
     return velocity.linear_x, velocity.linear_y, velocity.angular_z
 
 
 async def refuses_nan(checked: CheckedRobot) -> Finding:
-    """Command NaN and infinity without a gate: the driver sends zero."""
+    """Command NaN and infinity in each axis, without a gate: the driver sends zero."""
+    x, y, turn = (0.5 * most for most in _max_speeds(checked))
     async with DriverSession(checked) as it:
         await it.connected()
         for bad in (math.nan, math.inf, -math.inf):
-            sent = await it.driver.set_base_velocity(bad, 0.0, 0.5 * checked.file.max_angular_speed)
-            speeds = (sent.linear_x, sent.linear_y, sent.angular_z)
-            if any(speeds):
-                return Finding(False, f"{bad} became {speeds}")
+            for asked in ((bad, y, turn), (x, bad, turn), (x, y, bad)):
+                speeds = _axes(await it.driver.set_base_velocity(*asked))
+                if any(speeds):
+                    return Finding(False, f"{asked} became {speeds}")
     return Finding(True, "nan, inf and -inf all became zero")
 
 
