@@ -1,13 +1,18 @@
 """Every robot of the package passes the driver author's kit, on every link without hardware."""
 
+import asyncio
+import types
+from asyncio.subprocess import Process
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
 from gigabrain_drivers.driver.catalog import load_robot, robot_files, robot_links
-from gigabrain_zenoh.qa.conformance import kit
+from gigabrain_zenoh.qa.conformance import gate_checks, kit
 from gigabrain_zenoh.qa.conformance.driver_checks import CheckedRobot
 from gigabrain_zenoh.qa.conformance.gate_checks import driver_killed
+from gigabrain_zenoh.qa.judging import Failed
 
 QUICK = ("mock", "mycustombot", "so101")  # the others in `make qa`
 BODIES = [
@@ -51,3 +56,29 @@ async def test_wheels_without_a_watchdog_are_stopped_when_their_driver_is_killed
     async with CheckedRobot("lekiwi", "emulated", tmp_path) as robot:
         assert robot.goes_on
         await driver_killed(robot)  # raises Failed if they turn on
+
+
+async def test_a_driver_that_does_not_start_fails_at_once_with_its_exit_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gate_checks, "__name__", "no_such_module")  # which the child runs
+    async with CheckedRobot("mycustombot", "emulated", tmp_path) as robot:
+        with pytest.raises(Failed, match="the driver ended with exit code 1 before it drove"):
+            await driver_killed(robot)
+
+
+async def test_a_commander_that_has_ended_by_itself_need_not_be_killed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(gate_checks, "COMMANDER", "")
+    start, started = asyncio.create_subprocess_exec, list[Process]()
+
+    async def record(*command: str, stdout: int) -> Process:
+        started.append(await start(*command, stdout=stdout))
+        return started[0]
+
+    gated = types.SimpleNamespace(wanted=None)
+    with mock.patch.object(asyncio, "create_subprocess_exec", record):
+        async with gate_checks._commander(gated):  # type: ignore[arg-type]
+            await started[0].wait()
+    assert started[0].returncode == 0

@@ -142,7 +142,8 @@ async def _commander(gated: GatedDriver) -> AsyncIterator[None]:
     try:
         yield
     finally:
-        commander.kill()
+        with contextlib.suppress(ProcessLookupError):  # it has ended by itself
+            commander.kill()
         relay.cancel()
         await asyncio.gather(commander.wait(), relay, return_exceptions=True)
 
@@ -284,12 +285,19 @@ async def driver_killed(robot: CheckedRobot) -> Finding:
         env=environment,
     )
     loop = asyncio.get_running_loop()
+
+    def drives_or_ended() -> bool:
+        return child.returncode is not None or any(robot.commanded(None))
+
     try:
-        await until(lambda: any(robot.commanded(None)), "the driver drives", START_S)
+        await until(drives_or_ended, "the driver drives", START_S)
+        if child.returncode is not None:
+            raise Failed(f"the driver ended with exit code {child.returncode} before it drove")
         await asyncio.sleep(0.3)
         begin = loop.time()
     finally:
-        child.kill()
+        with contextlib.suppress(ProcessLookupError):  # it has ended by itself
+            child.kill()
         await child.wait()
     await until(lambda: not any(robot.commanded(None)), "the motors stop", 2.0)
     took = (loop.time() - begin) * 1e3
