@@ -82,6 +82,12 @@ def test_a_name_that_no_module_can_have_is_refused(name: str, tmp_path: Path) ->
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_package_of_the_name_of_this_one_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="gigabrain-zenoh is this one"):
+        authoring.write_package("zenoh", tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("name", ["mock", "turtlebot3_waffle", "line"])
 def test_a_name_that_is_taken_is_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="already"):

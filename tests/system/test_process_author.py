@@ -72,6 +72,27 @@ def test_a_bad_name_is_refused_and_nothing_is_overwritten(tmp_path: Path) -> Non
     assert (folder / "README.md").read_text() == "mine"
 
 
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        ("process", "camera"),
+        ("process", "safety"),
+        ("process", "world"),  # a setting of deployment files
+        ("perceptor", "camera"),
+        ("behaviour", "avoid"),
+    ],
+)
+def test_a_name_that_is_taken_is_refused(kind: Kind, name: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=f"the name '{name}' is taken; choose another"):
+        write_package(kind, name, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_name_of_another_kind_is_free(tmp_path: Path) -> None:
+    assert write_package("behaviour", "camera", tmp_path).is_dir()
+    assert write_package("process", "avoid", tmp_path).is_dir()
+
+
 @pytest.mark.slow
 async def test_a_new_process_runs_on_a_robot_as_its_readme_says(tmp_path: Path) -> None:
     site = tmp_path / "site"

@@ -37,13 +37,18 @@ TEMPLATES = {  # source and target of each file
 
 
 def write_package(name: str, folder: Path) -> Path:
-    """Create the folder gigabrain-NAME and return it. Raises ConfigError if it exists."""
+    """Create the folder gigabrain-NAME and return it.
+
+    Raises ConfigError if it exists, or if the name is taken.
+    """
     if not PACKAGE_NAME.fullmatch(name) or keyword.iskeyword(name):
         raise ConfigError(
             f"{name!r}: expected lower-case letters, digits and underscores, such as my_robot"
         )
     if name in robot_files() or name in known_drivers():
         raise ConfigError(f"a robot or a driver is called {name!r} already; choose another name")
+    if name == "zenoh":
+        raise ConfigError("the package gigabrain-zenoh is this one; choose another name")
     path = folder / f"gigabrain-{name.replace('_', '-')}"
     words = {
         "name": name,

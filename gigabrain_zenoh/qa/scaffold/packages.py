@@ -2,13 +2,18 @@
 
 import keyword
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from importlib import resources
 from pathlib import Path
 from string import Template
 from typing import Literal
 
+from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.launch.deployment import Deployment
+from gigabrain_zenoh.launch.processes import GROUP, PROCESSES
+from gigabrain_zenoh.perception import perceptors
+from gigabrain_zenoh.plugins import plugin_names
 
 Kind = Literal["process", "perceptor", "behaviour"]
 PACKAGE_NAME = re.compile(r"[a-z][a-z0-9_]{0,30}[a-z0-9]")
@@ -39,11 +44,16 @@ FILES: Mapping[Kind, Mapping[str, str]] = {  # source and target of each file
 
 
 def write_package(kind: Kind, name: str, folder: Path) -> Path:
-    """Create the folder NAME-KIND and return it. Raises ConfigError if it exists."""
+    """Create the folder NAME-KIND and return it.
+
+    Raises ConfigError if it exists, or if the name is taken.
+    """
     if not PACKAGE_NAME.fullmatch(name) or keyword.iskeyword(name):
         raise ConfigError(
             f"{name!r}: expected lower-case letters, digits and underscores, such as my_lamp"
         )
+    if name in _taken_names(kind):
+        raise ConfigError(f"the name {name!r} is taken; choose another")
     path = folder / f"{name.replace('_', '-')}-{kind}"
     words = {
         "name": name,
@@ -66,3 +76,13 @@ def write_package(kind: Kind, name: str, folder: Path) -> Path:
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error.strerror}") from None
     return path
+
+
+def _taken_names(kind: Kind) -> Collection[str]:
+    """Return the names under which a package of this kind would not be found."""
+    if kind == "behaviour":
+        return behaviours.names()
+    processes = plugin_names(PROCESSES, GROUP)
+    if kind == "perceptor":  # it runs in a process of its name
+        return [*processes, *plugin_names(perceptors.SHIPPED, perceptors.GROUP)]
+    return [*processes, *Deployment.__struct_fields__]  # its settings are a part of that file
