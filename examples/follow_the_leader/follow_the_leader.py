@@ -19,6 +19,7 @@ from gigabrain_zenoh.geometry.scan import hits
 from gigabrain_zenoh.perception.perceptors import PerceptorInputs
 
 NEAREST_M = 0.12  # nearer hits are the robot's own
+GAP_M = 0.15  # between neighbouring points of two things
 SMOOTHING = 0.3  # of a new velocity in the filtered one
 LOST_SCANS = 15
 
@@ -102,11 +103,13 @@ class Leader:
 
 
 def clusters(points: NDArray[np.float64], width: float) -> list[NDArray[np.float64]]:
-    """Return the groups of neighbouring points that are at most `width` wide [m]."""
+    """Return the groups of neighbouring points of a turn that are at most `width` wide [m]."""
     if len(points) < 2:
         return []
-    gaps = np.hypot(*np.diff(points, axis=0).T) > 0.15
+    gaps = np.hypot(*np.diff(points, axis=0).T) > GAP_M
     groups = np.split(points, np.flatnonzero(gaps) + 1)
+    if len(groups) > 1 and math.dist(points[-1], points[0]) <= GAP_M:  # the turn is closed
+        groups[0] = np.concatenate((groups.pop(), groups[0]))
     narrow = (one for one in groups if len(one) >= 3)
     return [one for one in narrow if math.hypot(*np.ptp(one, axis=0)) <= width]
 

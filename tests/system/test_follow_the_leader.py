@@ -67,6 +67,21 @@ def test_it_backs_away_from_a_leader_who_comes_nearer(monkeypatch: pytest.Monkey
         assert math.copysign(1.0, intent.twist.linear_x) == sign
 
 
+def test_a_leader_where_the_scan_begins_is_one_thing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLE)
+    example = importlib.import_module("follow_the_leader")
+    left = [(0.9, 0.0), (0.9, 0.1), (0.9, 0.2)]
+    right = [(0.9, -0.2), (0.9, -0.1)]
+    behind = [(-0.9, 0.1), (-0.9, 0.0), (-0.9, -0.1)]
+    found = example.clusters(np.array([*left, *behind, *right]), 0.7)
+    assert [one.tolist() for one in found] == [
+        [list(point) for point in (*right, *left)],
+        [list(point) for point in behind],
+    ]
+    (alone,) = example.clusters(np.array(left), 0.7)
+    assert len(alone) == 3
+
+
 @pytest.mark.slow
 async def test_it_follows_a_person_round_corners_keeps_its_distance_and_touches_nobody(
     tmp_path: Path,
