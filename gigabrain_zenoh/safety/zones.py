@@ -10,7 +10,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from gigabrain_schemas.arrays import Floats
-from gigabrain_schemas.base import TICK_NS, Cause, Velocity
+from gigabrain_schemas.base import TICK_NS, Cause, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, Lidar, RobotState
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_schemas.sensors import LaserScan
@@ -62,6 +62,7 @@ class ProtectiveField(Struct, frozen=True, kw_only=True):
     by_camera: frozenset[str] = frozenset()  # directions in which that is the nearest
     stopped: frozenset[str] = frozenset()
     sectors: blind_spots.Ranges = ()
+    sectors_at: tuple[int, Pose] | None = None  # tick and odometry pose of their scan
     past: blind_spots.PastViews = ()
     cameras: Cameras = Cameras()
 
@@ -104,9 +105,8 @@ class ProtectiveField(Struct, frozen=True, kw_only=True):
         now = replace(self, scans=self.scans + 1, basis=scan.basis, problem=problem)
         if problem:
             return replace(now, by_scan={})
-        elapsed_s = max(0, scan.basis - self.basis) * TICK_NS / 1e9 if self.basis else 0.0
-        moved = elapsed_s * math.hypot(motion.measured.linear_x, motion.measured.linear_y)
         pose = history.at(state.boot, scan.basis) or state.pose
+        moved = self._moved(body, scan.basis, pose, motion.measured)
         sectors, unknown = blind_spots.update(lidar, scan, HOUSING_M, pose.yaw, self.sectors, moved)
         # a body that does not drive may be carried, which the odometry would not show
         driving = state.gate.mode == "enabled"
@@ -114,7 +114,23 @@ class ProtectiveField(Struct, frozen=True, kw_only=True):
         seen = np.stack(hits(lidar, scan, HOUSING_M), axis=1)
         dark = blind_spots.obstacles(body, pose.yaw, sectors, unknown, HOUSING_M, past)
         free = _free(body, np.concatenate([seen, dark]), motion)
-        return replace(now, by_scan=free, sectors=sectors, past=past)
+        at = scan.basis, pose
+        return replace(now, by_scan=free, sectors=sectors, sectors_at=at, past=past)
+
+    def _moved(self, body: BodyDescription, tick: int, pose: Pose, measured: Velocity) -> float:
+        """Return how far the body may have moved since the scan of the sectors [m].
+
+        The speed now says nothing about a gap in which the body braked; the odometry may jump, but
+        no farther than the body can drive counts.
+        """
+        if self.sectors_at is None:
+            return 0.0
+        since, there = self.sectors_at
+        elapsed_s = max(0, tick - since) * TICK_NS / 1e9
+        farthest = elapsed_s * math.hypot(body.max_linear_speed, body.max_lateral_speed)
+        driven = math.hypot(pose.x - there.x, pose.y - there.y)
+        by_speed = elapsed_s * math.hypot(measured.linear_x, measured.linear_y)
+        return max(by_speed, min(driven, farthest))
 
     def _closed(
         self, body: BodyDescription, state: RobotState, motion: Motion

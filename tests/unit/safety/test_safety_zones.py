@@ -184,6 +184,25 @@ def test_what_is_dark_comes_nearer_as_the_body_moves() -> None:
     assert found * 0.02 * 0.2 == pytest.approx(1.0 - 0.075 - 0.144, abs=0.05)
 
 
+def test_what_is_dark_has_come_nearer_while_the_lidar_was_blind_and_the_body_braked() -> None:
+    patrol, wall, dark = Patrol(), np.full(360, 1.0), np.full(360, 1.0)
+    wall[90:], dark[90:], dark[0:10] = 2.0, 2.0, np.nan
+    patrol.go(20, told=AHEAD, values=wall)
+    patrol.go(20, told=AHEAD, values=np.full(360, np.nan))  # 8 cm
+    patrol.go(5, values=dark)  # it rests
+    assert patrol.memory.field.sectors[0] == pytest.approx(0.92)
+
+
+def test_a_jump_of_the_odometry_brings_what_is_dark_no_nearer_than_the_body_can_drive() -> None:
+    patrol, dark = Patrol(), np.full(360, 2.0)
+    dark[10:] = 3.0
+    patrol.go(5, values=dark)
+    dark[0:10] = np.nan
+    patrol.pose = replace(patrol.pose, x=5.0)
+    patrol.go(5, values=dark)
+    assert patrol.memory.field.sectors[0] == pytest.approx(2.0 - 0.1 * 0.26)
+
+
 def test_a_dark_sector_keeps_its_direction_while_the_body_turns() -> None:
     patrol = Patrol()
     values = np.full(360, np.inf)
