@@ -27,6 +27,7 @@ UNIT_TOLERANCE = 0.1  # of the length of an orientation quaternion
 SYSTEMS = ("perception", "decision", "control")
 MAX_AGES = 100  # of the newest commands, two seconds
 AGE_PERCENTILE = 0.99
+SILENT_TICKS = 50  # a second without commands, after which earlier ones tell nothing
 HALF_SPEED = 0.5
 HOST_CODES = ("disk_low", "cpu_busy", "memory_low")  # depend on the computer, not on messages
 
@@ -266,15 +267,29 @@ class PipelineProgress(Struct, frozen=True, kw_only=True):
 class RoundTrip(Struct, frozen=True, kw_only=True):
     """Monitors the age of commands: from the tick that they echo to their arrival."""
 
-    ages: tuple[int, ...] = ()  # of the newest commands [ticks]
-    late_ticks: int = 0
+    commander: str = ""
+    ages: tuple[int, ...] = ()  # of its newest commands [ticks]
+    late_ticks: int = 0  # up to the newest command
+    silent_ticks: int = 0  # since that
 
-    def then(self, limits: Thresholds, ages: tuple[int, ...], elapsed: int) -> "RoundTrip":
-        """Return the monitor after one more state, with the ages of new commands [ticks]."""
-        newest = (*self.ages, *ages)[-MAX_AGES:]
+    def then(
+        self, limits: Thresholds, commander: str, ages: tuple[int, ...], elapsed: int
+    ) -> "RoundTrip":
+        """Return the monitor after one more state, with the ages of new commands [ticks].
+
+        It begins again with another commander, and when one has been silent for a second.
+        """
+        last = self if commander == self.commander else RoundTrip(commander=commander)
+        silent = last.silent_ticks + elapsed
+        if not ages:
+            over = silent >= SILENT_TICKS
+            return RoundTrip(commander=commander) if over else replace(last, silent_ticks=silent)
+        newest = (*last.ages, *ages)[-MAX_AGES:]
         slowest = percentile(sorted(newest), AGE_PERCENTILE) or 0
         late = slowest * TICK_NS > limits.round_trip * 1e9
-        return RoundTrip(ages=newest, late_ticks=lasting(self.late_ticks, late, elapsed))
+        passed = silent if last.late_ticks else max(1, elapsed)  # two verdicts may have one tick
+        late_ticks = lasting(last.late_ticks, late, passed)
+        return RoundTrip(commander=commander, ages=newest, late_ticks=late_ticks)
 
     def causes(self, limits: Thresholds) -> tuple[Cause, ...]:
         """Return why the body must go at half speed."""

@@ -129,7 +129,7 @@ def _observe(body: BodyDescription, memory: SafetyMemory, inputs: SafetyInputs) 
         power=memory.power.then(limits, state, elapsed),
         attitude=memory.attitude.then(limits, state, inputs.shock, elapsed),
         tracking=tracking,
-        round_trip=memory.round_trip.then(limits, inputs.echo_ages, elapsed),
+        round_trip=memory.round_trip.then(limits, state.gate.commander, inputs.echo_ages, elapsed),
         latency=latency,
         progress=memory.progress.then(inputs.bases, elapsed),
         history=history,

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from gigabrain_schemas.body import Thresholds
-from gigabrain_zenoh.safety.health import Host, tilt_deg
+from gigabrain_schemas.body import GateStatus, Thresholds
+from gigabrain_zenoh.safety.health import Host, RoundTrip, tilt_deg
 from gigabrain_zenoh.safety.node import HostMonitor
 from gigabrain_zenoh.safety.step import LATCHING_TICKS
 from gigabrain_zenoh.testing.waiting import until
@@ -74,6 +74,41 @@ def test_slow_commands_halve_the_speed_after_a_second() -> None:
     assert (caps.forward, caps.backward, caps.rotation) == (0.13, 0.13, 0.91)
     patrol.go(100, echo_ages=(1,))
     assert patrol.verdict.verdict == "ok"
+
+
+def test_slow_commands_at_ten_hertz_halve_the_speed_after_a_second_too() -> None:
+    patrol = Patrol()
+    for _ in range(10):
+        assert patrol.go(echo_ages=(6,)) == []
+        assert patrol.go(4) == []
+    assert patrol.go(echo_ages=(6,)) == ["round_trip"]
+
+
+def test_slow_commands_count_also_where_they_come_with_a_second_verdict_of_a_tick() -> None:
+    limits, monitor = Thresholds(), RoundTrip()
+    for _ in range(50):
+        assert monitor.causes(limits) == ()
+        monitor = monitor.then(limits, "page", (), 1).then(limits, "page", (6,), 0)
+    assert [cause.code for cause in monitor.causes(limits)] == ["round_trip"]
+
+
+def test_a_late_command_without_another_after_it_does_nothing() -> None:
+    patrol = Patrol()
+    patrol.go(echo_ages=(7,))
+    for _ in range(200):
+        assert patrol.go() == []
+    for _ in range(100):
+        assert patrol.go(echo_ages=(1,)) == []
+
+
+def test_slow_commands_do_not_count_for_the_next_commander() -> None:
+    patrol, nobody = Patrol(), GateStatus(mode="idle")
+    assert patrol.go(60, echo_ages=(6,)) == ["round_trip"]
+    assert patrol.go(gate=nobody) == []
+    assert patrol.go(60, echo_ages=(6,)) == ["round_trip"]
+    other = GateStatus(mode="enabled", commander="page", enables=2)
+    for _ in range(60):
+        assert patrol.go(gate=other, echo_ages=(1,)) == []
 
 
 def test_a_single_slow_command_does_nothing() -> None:
