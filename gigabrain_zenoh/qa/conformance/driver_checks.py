@@ -283,7 +283,9 @@ def _near(it: DriverSession, axis: str, wanted: float, slack: float) -> bool:
 async def limits(checked: CheckedRobot) -> Finding:
     """Command ten times the greatest speeds: the driver sends at most these."""
     most, worst = _max_speeds(checked), 0.0
-    share = TOLERANCE if checked.has_peer else 3 * TOLERANCE  # a body that walks sways
+    slack = [TOLERANCE * limit for limit in most]
+    if not checked.has_peer:
+        slack[1] = 3 * TOLERANCE * most[1] + UNIT  # a body that walks sways
     async with DriverSession(checked) as it:
         await it.connected()
         for x, y, turn in ((1, 0, 0), (0, 1, 0), (0, 0, -1), (-1, -1, 1)):
@@ -296,9 +298,8 @@ async def limits(checked: CheckedRobot) -> Finding:
             sent, commanded = _axes(it.sent or Velocity()), checked.commanded(it.state)
             for axis, limit in enumerate(most):
                 if limit:
-                    slack = share * limit + UNIT
                     worst = max(worst, abs(sent[axis]) / limit)
-                    worst = max(worst, abs(commanded[axis]) / (limit + slack))
+                    worst = max(worst, abs(commanded[axis]) / (limit + slack[axis]))
     return Finding(worst <= 1.001, f"at most {worst:.2f} of max speed")
 
 
