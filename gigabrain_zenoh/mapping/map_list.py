@@ -13,7 +13,7 @@ MAX_NAME = 64
 def saved_maps(folder: Path | None = None) -> tuple[list[SavedMapInfo], int]:
     """Return the saved maps by name, and how many more there are.
 
-    A map that cannot be used has a `problem`.
+    A map that cannot be used has a `problem`. One whose name no message can carry is only counted.
     """
     folder = folder or map_file.folder()
     files = sorted(
@@ -21,7 +21,8 @@ def saved_maps(folder: Path | None = None) -> tuple[list[SavedMapInfo], int]:
         for path in folder.glob("*.yaml")
         if not path.name.startswith(".") and not path.name.endswith(zone_file.ENDING)
     )
-    fitting = [path for path in files if len(path.stem) <= MAX_NAME]
+    # a name that is not UTF-8 has surrogates, which are not printable
+    fitting = [path for path in files if len(path.stem) <= MAX_NAME and path.stem.isprintable()]
     chosen = fitting[:MAX_MAPS]
     return [_info(path) for path in chosen], len(files) - len(chosen)
 
