@@ -101,9 +101,12 @@ class Autosave:
 
     def discard(self) -> None:
         """Remove what was saved: another map takes its place."""
-        for path in self._slots:
-            path.unlink(missing_ok=True)
         self._done = None
+        try:
+            for path in self._slots:
+                path.unlink(missing_ok=True)
+        except OSError as error:
+            self.problem = _unsaved(f"{error.filename}: {error.strerror}")
 
     def report(self) -> dict[str, float]:
         """Return counters for health reports."""

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from gigabrain_schemas.brain import OccupancyGrid
-from gigabrain_schemas.topics import MAP, POSE, SCAN, STATE, WORLD
+from gigabrain_schemas.topics import MAP, MAP_LOAD, POSE, SCAN, STATE, WORLD
+from gigabrain_schemas.zones import MapLoadRequest
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.mapping import autosave
 from gigabrain_zenoh.perception import node as perception
@@ -22,6 +23,7 @@ from gigabrain_zenoh.recording.process_replay import with_requests
 from gigabrain_zenoh.runtime.replay import record, replay
 from gigabrain_zenoh.testing.samples import state
 from tests.node.mapping_robot import Robot
+from tests.node.test_zone_keeping import ask
 
 SCANS_IN_5_S = 50
 Usage = namedtuple("Usage", "total used free")
@@ -278,3 +280,21 @@ async def test_a_disk_that_hangs_is_told_after_30_s_and_holds_nobody_up(
         assert robot.bus.problems == ()
     assert [problem.code for problem in problems] == ["map_unsaved"]
     assert "map_0.npz: the disk does not take it" in problems[0].text
+
+
+async def test_a_map_is_loaded_to_grow_on_where_the_state_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    no_folder = tmp_path / "file"
+    no_folder.touch()
+    async with Walking(no_folder) as robot:
+        robot.say()
+        robot.drive(40)
+        assert (await robot.save("house")).ok
+        reply = await ask(robot, MAP_LOAD, MapLoadRequest(name="house", mapping="slam"))
+        assert (reply.ok, reply.text) == (True, "loaded house; looking for the robot in it")
+        robot.drive(1)
+        told = [one.text for one in robot.bus.problems if one.code == "map_unsaved"]
+    assert len(told) == 1
+    assert told[0].endswith(f"{no_folder}/map_0.npz: Not a directory")
