@@ -56,7 +56,7 @@ class Autosave:
         self._slots = [folder / f"map_{number}.npz" for number in (0, 1)]  # the next one first
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="autosave")
         self._job: Future[int] | None = None
-        self._doing: SaveHead | None = None
+        self._doing: SaveHead | None = None  # of the last attempt
         self._done: SaveHead | None = None  # of what was saved last
         self._began_tick = self._next_tick = 0
         self.problem: Cause | None = None
@@ -81,7 +81,7 @@ class Autosave:
     def due(self, boot: int, tick: int) -> bool:
         """Return whether it is time to save."""
         self._finish(tick)
-        new = self._done is None or self._done.boot != boot
+        new = self._doing is None or self._doing.boot != boot
         return self._job is None and (new or tick >= self._next_tick)
 
     def save(self, boot: int, tick: int, odometry: Floats, still: "MapSnapshot") -> None:

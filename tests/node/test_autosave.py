@@ -298,3 +298,25 @@ async def test_a_map_is_loaded_to_grow_on_where_the_state_cannot_be_written(
         told = [one.text for one in robot.bus.problems if one.code == "map_unsaved"]
     assert len(told) == 1
     assert told[0].endswith(f"{no_folder}/map_0.npz: Not a directory")
+
+
+async def test_a_disk_that_takes_no_save_at_all_is_tried_every_4_s_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tries = []
+
+    def refuse(folder: Path) -> None:
+        tries.append(folder)
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr(autosave, "make_folder", refuse)
+    async with Walking(tmp_path) as robot:
+        robot.say()
+        async with asyncio.timeout(60):
+            while not robot.bus.problems:  # which are told once a second
+                robot.drive(1)
+                await asyncio.sleep(0.002)
+        for _ in range(20):
+            robot.drive(1)
+            await asyncio.sleep(0.002)
+    assert len(tries) == 1
