@@ -38,6 +38,7 @@ MIN_FREE_M2, MIN_WALL_M = 1.0, 1.0  # less than that is no map
 GRAPH = ".graph.npz"
 ZONES = ".zones.yaml"  # see zone_file
 OBJECTS = ".objects.json"  # see object_file
+EMPTY = b"{}\n"  # a file of no zones or objects
 STAMP = "grid"  # in the graph's file: which grid it belongs to
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -109,10 +110,11 @@ def save(
     *,
     replace: bool = False,
     zones: bytes = b"",
-    objects: bytes = b"",
+    objects: bytes | None = b"",
 ) -> None:
     """Write `path`, a YAML file's, and its image, graph, zones and objects. All of it, or nothing.
 
+    With `objects` None, those that are there stay; otherwise nothing of a replaced map does.
     Raises Refused for an unusable map, or if a map is there and `replace` is False.
     """
     problem = map_problem(found)
@@ -124,8 +126,9 @@ def save(
         if path.exists() and not replace:
             raise Refused(f"not saved: there is a map {path} already; --replace overwrites it")
         ends = ((ZONES, zones), (OBJECTS, objects))
-        beside = {path.with_suffix(end).name: data for end, data in ends if data}
-        _commit(path, {**_files(path, found, graph), **beside})
+        beside = {path.with_suffix(end): data for end, data in ends if data is not None}
+        more = {file.name: data or EMPTY for file, data in beside.items() if data or file.exists()}
+        _commit(path, {**_files(path, found, graph), **more})
     except ValueError as error:
         raise Refused(f"not saved: {error}") from None
     except OSError as error:

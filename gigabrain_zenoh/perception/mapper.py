@@ -350,7 +350,7 @@ class Mapper:
         same = bool(self._config.map) and path == map_file.path_of(self._config.map)
         try:
             async with self._saving:
-                text = await self._saved(path, replace=request.replace or same)
+                text = await self._saved(path, replace=request.replace or same, same=same)
         except Refused as error:
             log.warning("map for %s: %s", request.source, error, extra={"data": {"event": "map"}})
             return MapReply(ok=False, text=str(error)[:500])
@@ -360,7 +360,8 @@ class Mapper:
         log.info("map by %s: %s", request.source, text, extra={"data": {"event": "map"}})
         return MapReply(ok=True, text=text[:500])
 
-    async def _saved(self, path: Path, *, replace: bool) -> str:
+    async def _saved(self, path: Path, *, replace: bool, same: bool) -> str:
+        """Save the map; `same` tells that it began with the one at `path`. Raises Refused."""
         for _ in range(SETTLES):
             if self._chart.settle():
                 break
@@ -368,7 +369,7 @@ class Mapper:
         saved, graph = await asyncio.to_thread(self._chart.still().to_save)
         if self._bus.input_log.live:
             zones = zone_file.encoded(self._zones.present)
-            objects = self._objects.encoded() if self._objects else b""
+            objects = self._objects.encoded() if self._objects else None if same else b""
             await asyncio.to_thread(
                 map_file.save, path, saved, graph, replace=replace, zones=zones, objects=objects
             )

@@ -9,9 +9,11 @@ from typing import Any
 
 import pytest
 
+from gigabrain_schemas.objects import MapTag
 from gigabrain_schemas.topics import MAP, MAP_SAVE, POSE, WORLD
 from gigabrain_zenoh.config.settings import PerceptionConfig
-from gigabrain_zenoh.mapping import map_file
+from gigabrain_zenoh.mapping import map_file, object_file
+from gigabrain_zenoh.mapping.object_file import ObjectFile
 from gigabrain_zenoh.mapping.slam_map import MapSnapshot
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.recording.process_replay import with_requests
@@ -121,3 +123,25 @@ async def test_a_saved_map_grows_on(own_maps: Path) -> None:
         assert robot.sent(POSE)[-1].localized
         assert (await robot.save("house")).ok  # the same map: nobody else's is lost
     assert map_file.load(own_maps / "house.yaml").cells.size >= size
+
+
+async def test_without_cameras_objects_stay_with_their_own_map_only(own_maps: Path) -> None:
+    path = own_maps / "house.yaml"
+    async with Robot() as robot:
+        robot.say()
+        robot.drive(60)
+        assert (await robot.save("house")).ok
+        known = ObjectFile(tags=(MapTag(id=5, x=0, y=0, z=0.2, yaw=0, size=0.16),))
+        object_file.save(path, known)
+    async with Robot(PerceptionConfig(mapping="slam", map="house")) as robot:
+        robot.say()
+        for _ in range(40):
+            robot.drive(1, still=True)
+            await asyncio.sleep(0.005)
+        assert (await robot.save("house")).ok
+    assert object_file.load(path) == known
+    async with Robot() as robot:
+        robot.say()
+        robot.drive(60)
+        assert (await robot.save("house", replace=True)).ok
+    assert object_file.load(path) == ObjectFile()

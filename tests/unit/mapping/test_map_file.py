@@ -9,12 +9,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from gigabrain_schemas.objects import MapTag
 from gigabrain_schemas.requests import MapRequest
+from gigabrain_schemas.zones import Place
 from gigabrain_zenoh.config.map_image import SavedMap
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.host import files
-from gigabrain_zenoh.mapping import map_file
+from gigabrain_zenoh.mapping import map_file, object_file, zone_file
+from gigabrain_zenoh.mapping.object_file import ObjectFile
+from gigabrain_zenoh.mapping.zone_file import ZoneFile
 
+DOOR = Place(name="door", x=1, y=2)
+TAG = MapTag(id=5, x=0, y=0, z=0.2, yaw=0, size=0.16)
 GRAPH = {"poses": np.arange(6.0).reshape(2, 3)}
 
 
@@ -215,6 +221,16 @@ def test_another_map_is_overwritten_only_when_asked_to(path: Path) -> None:
     assert map_file.load(path).origin_x == -2.35
     map_file.save(path, other, GRAPH, replace=True)
     assert map_file.load(path).origin_x == 0.0
+
+
+def test_a_map_without_zones_and_objects_keeps_none_of_the_one_it_replaces(path: Path) -> None:
+    zones, objects = ZoneFile(places=(DOOR,)), ObjectFile(tags=(TAG,))
+    beside = {"zones": zone_file.encoded(zones), "objects": object_file.encoded(objects)}
+    map_file.save(path, room(), GRAPH, replace=True, **beside)
+    map_file.save(path, room(), GRAPH, replace=True, zones=beside["zones"], objects=None)
+    assert (zone_file.load(path), object_file.load(path)) == (zones, objects)
+    map_file.save(path, room(), GRAPH, replace=True)
+    assert (zone_file.load(path), object_file.load(path)) == (ZoneFile(), ObjectFile())
 
 
 def test_a_save_that_fails_half_way_leaves_the_old_map(
