@@ -322,6 +322,7 @@ class ObjectKeeper:
             text = self._forget(request)
         except Refused as error:
             return ObjectsReply(ok=False, text=str(error)[:500])
+        self._copies.clear()  # they hold what is forgotten
         log_accepted(self._bus, OBJECTS_CHANGE.key, request, self._tick)
         self._sent_tick = None
         if self._tick:

@@ -2,14 +2,20 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from gigabrain_schemas.objects import MapObject, MapTag
+from gigabrain_schemas.brain import WorldModel
+from gigabrain_schemas.objects import MapObject, MapTag, ObjectsRequest
+from gigabrain_schemas.topics import OBJECTS_CHANGE
 from gigabrain_zenoh.mapping import map_file, object_file
+from gigabrain_zenoh.mapping.localizer import Place
 from gigabrain_zenoh.mapping.object_file import ObjectFile
-from gigabrain_zenoh.mapping.odometry import OdometryFusion
+from gigabrain_zenoh.mapping.odometry import OdometryFusion, OdometrySample
 from gigabrain_zenoh.perception.object_keeper import ObjectKeeper
+from gigabrain_zenoh.perception.surroundings import Surroundings
 from gigabrain_zenoh.testing.in_memory import Net
+from gigabrain_zenoh.testing.samples import WAFFLE
 
 CAN = MapObject(id=1, label="can", x=1, y=2, z=0.1, size=(0.1, 0.1), confidence=0.9, seen=5)
 TAG = MapTag(id=5, x=0, y=0, z=0.2, yaw=0, size=0.16)
@@ -77,3 +83,36 @@ async def test_things_of_a_map_are_not_restored_into_one_that_was_loaded_since(
     second = keeper(tmp_path, 7, restored=True)
     await second.finish_writing()
     assert known(second) == [5]
+
+
+def scan(found: ObjectKeeper, tick: int, *, localized: bool) -> None:
+    """Let the robot stand at the origin of the map, where it sees nothing."""
+    still = np.zeros(3)
+    seen = Surroundings(
+        WAFFLE, WorldModel(scan_ok=True, obstacle_ahead=False), np.empty((0, 2)), np.zeros((1, 3))
+    )
+    moment = OdometrySample(tick, still, still, slipping=False, jumps=0)
+    found.at_scan(seen, Place(still, np.eye(3), localized), moment)
+
+
+@pytest.mark.parametrize(
+    ("asked", "left"),
+    [
+        (ObjectsRequest(everything=True), []),
+        (ObjectsRequest(ids=(1,)), [5]),
+        (ObjectsRequest(tags=(5,)), ["can"]),
+        (ObjectsRequest(ids=(1,), tags=(9,)), ["can", 5]),  # refused: there is no tag 9
+    ],
+)
+async def test_what_a_person_forgot_is_not_back_when_the_robot_is_lost_right_after(
+    asked: ObjectsRequest, left: list[str | int]
+) -> None:
+    net = Net()
+    found = ObjectKeeper(net.one, "", OdometryFusion)
+    found.restart(7)
+    found.memory.restore([(CAN, None)])
+    found.tags.restore([(TAG, None)])
+    scan(found, 500, localized=True)
+    await net.two.ask(OBJECTS_CHANGE, asked)
+    scan(found, 505, localized=False)
+    assert known(found) == left
