@@ -190,20 +190,21 @@ class Tasks:
             replies = await self._bus.ask(service, request, timeout_s=timeout_s)
             if replies:
                 return replies[0]
+            took = now() - asked
+            await asyncio.sleep(AGAIN_S)  # a lost link may be known only after the query has ended
             if self._bus.transport.losses != losses:
                 raise BodyLost(
                     "the link was lost before the answer; `gigabrain task list` shows whether the "
                     "robot has received the request"
                 )
             # after a timeout the request may have been received: do not repeat it
-            if now() >= min(until, asked + timeout_s) or may_not_ask(self._keys):
+            if now() >= until or took >= timeout_s or may_not_ask(self._keys):
                 raise self._no_server()
             if self._on_wait and not waits:
                 self._on_wait(
                     "waiting: no process serves goals yet; the robot may still be starting"
                 )
             waits = True
-            await asyncio.sleep(AGAIN_S)
 
     def _listen(self) -> None:
         if not self._subscribed:
