@@ -1,4 +1,4 @@
-"""What recognition logs about cameras whose pictures are broken."""
+"""Recognition logs a camera with broken pictures once, by its own name."""
 
 import logging
 

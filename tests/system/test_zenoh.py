@@ -108,7 +108,7 @@ async def test_each_topic_goes_out_with_the_quality_of_service_of_its_line(
 
 @pytest.fixture
 def arrived(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
-    """What the loop will find."""
+    """Collect the payloads that have reached a mailbox."""
     payloads: list[bytes] = []
 
     class Watched(Mailbox[zenoh.Sample]):

@@ -1,4 +1,4 @@
-"""What a stop or a restart has ended does not go on by an enable alone."""
+"""A stop or a restart of the driver ends a motion: an enable alone does not resume it."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -22,7 +22,7 @@ GOAL = 0.9 * JOINT.upper
 
 
 class Driver:
-    """Grants the body to whoever asks; the joints are where they were sent."""
+    """A driver whose gate grants the body to anyone, and whose joints follow at once."""
 
     def __init__(self, net: Net) -> None:
         self.bus, self.clock = net.one, net.clock

@@ -1,4 +1,4 @@
-"""What is kept over a restart of the driver or of decision, and what is not."""
+"""Decision forgets what blocked a route at a restart, and keeps zones until newer ones count."""
 
 from collections.abc import Callable
 from types import SimpleNamespace

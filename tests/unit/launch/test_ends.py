@@ -1,4 +1,4 @@
-"""How `demo` and `up` end: without which process, with which exit code and reason."""
+"""`demo` and `up` end with the exit code and the reason of the process that they need."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
