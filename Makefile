@@ -1,6 +1,7 @@
 # make demo    install what it needs, and drive a robot round a room
-# make check   install the rest; lint, types, contracts, documentation site and unit tests
-# make test    that, the node tests and the system tests: what to run before a commit is shared
+# make check   install the rest; lint, types, contracts and the short unit tests
+# make test    that, the documentation site and all tests but slow ones: what to run before a commit
+#              is shared
 # make qa      what takes long, for a release; continued where it was stopped
 # make bench   measure this machine
 # ARGS is passed on: make unit ARGS="tests/unit/gate -k latch"
@@ -84,10 +85,12 @@ system: setup
 
 check: setup
 	@$(MAKE) lint
+	$(PYTEST) $(SIDE_BY_SIDE) -q -m 'not long and not slow and not qa' tests/unit tests/fuzz
+
+test: setup
+	@$(MAKE) lint
 	@$(MAKE) site
 	@$(MAKE) unit
-
-test: check
 	@$(MAKE) node
 	@$(MAKE) system
 

@@ -31,6 +31,7 @@ def test_what_broke_a_decoder_once_does_so_no_more(name: str) -> None:
         MODULES[name].check(data)
 
 
+@pytest.mark.long
 @by_module
 def test_what_is_good_is_taken(name: str) -> None:
     for data in MODULES[name].seeds():

@@ -28,6 +28,7 @@ def is_valid_for_zenoh(text: str) -> bool:
     return True
 
 
+@pytest.mark.long
 def test_what_zenoh_takes_is_taken_and_nothing_else() -> None:
     assert [text for text in TEXTS if is_valid(text) != is_valid_for_zenoh(text)] == []
 

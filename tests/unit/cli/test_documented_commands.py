@@ -4,6 +4,7 @@ import re
 import shlex
 from collections.abc import Iterator
 
+import pytest
 from cyclopts import CycloptsError, MissingArgumentError
 
 from gigabrain_zenoh.cli.app import PARENTS, make_app
@@ -25,6 +26,7 @@ def documented() -> Iterator[str]:
                 yield f"{path.name}: {line}"
 
 
+@pytest.mark.long
 def test_documented_commands_can_be_parsed() -> None:
     app, wrong = make_app(tuple(PARENTS)), []
     for line in sorted(set(documented())):

@@ -2,10 +2,13 @@
 
 import re
 
+import pytest
+
 from gigabrain_zenoh.cli.app import COMMANDS
 from tests import user_texts
 
 
+@pytest.mark.long
 def test_texts_for_users_are_those_of_the_golden_file() -> None:
     assert user_texts.render() == user_texts.GOLDEN.read_text()
 

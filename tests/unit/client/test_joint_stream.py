@@ -99,6 +99,7 @@ class LateArm(Arm):
         self.at = tuple(at + 0.22 * (motion.position - at) for at, motion in pairs)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gap", range(1, 10))  # ticks without a command
 @pytest.mark.parametrize("back", range(12))  # ticks of commands between it and the end
 def test_joints_that_have_arrived_stay_there_without_commands(gap: int, back: int) -> None:

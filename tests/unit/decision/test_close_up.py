@@ -79,6 +79,7 @@ class Stopped(Drive):
         return cosine * x + sine * y, cosine * y - sine * x
 
 
+@pytest.mark.long
 def test_a_body_that_safety_stops_for_a_ghost_turns_away_and_goes_on() -> None:
     drive = Stopped(WAFFLE, Goal(x=1.0, y=0.0), np.empty((0, 2)))
     drive.bars = False

@@ -118,6 +118,7 @@ def test_trees_that_multiply_are_refused() -> None:
         missions.loads(text, "m")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("order", [1, -1])
 def test_trees_that_lead_deeper_than_can_be_carried_out_are_refused(order: int) -> None:
     def chain(count: int) -> str:

@@ -164,6 +164,7 @@ def test_a_camera_on_an_arm_looks_at_no_room() -> None:
     assert goals[0] == goals[1]
 
 
+@pytest.mark.long
 def test_it_looks_into_each_room_of_a_flat() -> None:
     cells = empty(8.0, 6.0)
     cells[:25, 40] = 100
@@ -181,6 +182,7 @@ def test_a_room_behind_a_wall_is_not_looked_for_for_ever() -> None:
     assert max(pose.x for pose in poses) < 4.0
 
 
+@pytest.mark.long
 def test_a_room_whose_door_somebody_stood_in_is_looked_into_as_well() -> None:
     cells = empty(8.0, 4.0)
     cells[:, 40] = 100
@@ -191,6 +193,7 @@ def test_a_room_whose_door_somebody_stood_in_is_looked_into_as_well() -> None:
     assert max(pose.x for pose in poses) > 4.5
 
 
+@pytest.mark.long
 def test_a_second_door_that_somebody_stands_in_is_waited_for_as_well() -> None:
     cells = empty(8.0, 4.0)
     cells[:, 40] = cells[:, 60] = 100
@@ -224,6 +227,7 @@ def test_it_tries_again_to_get_to_unexplored_space_and_then_ends() -> None:
     assert route.reason == "everything reachable was looked at"
 
 
+@pytest.mark.long
 def test_it_turns_on_the_spot_before_it_drives() -> None:
     poses, _ = search(ROOM)
     assert (poses[0].x, poses[0].y) == (1.0, 1.0)

@@ -144,6 +144,7 @@ LEVEL = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 HOLDS = HeldThing(name="cup", solid=Solid(sphere=0.03), axes=LEVEL, grip=0.5, opening=1.0)
 
 
+@pytest.mark.long
 def test_a_queue_full_of_the_longest_missions_is_read_again(robot: Robot, tmp_path: Path) -> None:
     names = [f"c{k}" for k in range(10_000, 14_800)]
     text = f"things: {{{','.join(f'{name}: {{sphere: 1}}' for name in names)}}}\ndo: [{{goto: a}}]"

@@ -100,6 +100,7 @@ def column(table: DataTable[Text], index: int) -> list[str]:
     return [table.get_row_at(row)[index].plain for row in range(table.row_count)]
 
 
+@pytest.mark.long
 async def test_top_shows_both_tables_and_sorts_them_by_keys() -> None:
     app = TopApp(Feed())
     async with app.run_test(size=(120, 40)) as pilot:

@@ -74,6 +74,7 @@ def test_without_a_router_nothing_else_is_judged() -> None:
     assert verdict.broken.text == "no router answers at tcp/127.0.0.1:1"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", ["kill", "freeze"])
 @pytest.mark.parametrize(
     ("process", "link", "code", "what"),

@@ -30,6 +30,7 @@ def test_every_page_is_in_the_navigation_once() -> None:
     assert sorted(named) == sorted(written | made | project)
 
 
+@pytest.mark.long
 def test_the_page_of_commands_has_each_with_its_options() -> None:
     page = "\n".join(reference.cli())
     assert re.findall(r"^## gigabrain (.*)$", page, re.MULTILINE) == [*COMMANDS]

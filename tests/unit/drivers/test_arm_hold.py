@@ -5,6 +5,8 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 
+import pytest
+
 from gigabrain_drivers.bodies.feetech import protocol as feetech
 from gigabrain_drivers.bodies.piper.driver import NOTHING_COMES
 from gigabrain_drivers.driver.catalog import robot_path
@@ -57,6 +59,7 @@ def audited(folder: Path) -> list[tuple[str, bool, str]]:
     return [(one.what, one.ok, one.text) for one in records if one.source == "ann"]
 
 
+@pytest.mark.long
 async def test_an_arm_that_cannot_hold_where_it_is_is_not_said_to(tmp_path: Path) -> None:
     rig = so101.Rig()
     pan = rig.joint("shoulder_pan")

@@ -49,6 +49,7 @@ def test_data_that_come_100_ms_late_are_so_within_half_a_second() -> None:
     assert said[-1] == pytest.approx(100.0, abs=5.0)
 
 
+@pytest.mark.long
 def test_lateness_is_not_forgotten_and_ends_when_it_ends() -> None:
     line = Line()
     line.run(120.0)
@@ -71,6 +72,7 @@ def test_a_host_that_was_held_up_for_a_quarter_of_a_second_hears_nothing_late() 
         assert max(line.run(1.0)) < 30.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rate", [0.995, 0.9999, 1.0001, 1.005])
 def test_clocks_that_drift_apart_make_nothing_late_and_hide_nothing(rate: float) -> None:
     line = Line(rate=rate)

@@ -50,6 +50,7 @@ async def test_the_body_is_described_once_a_second_whatever_ticks_are_missed(
     assert told == [0, 56, 112, 168]
 
 
+@pytest.mark.long
 async def test_a_state_says_what_the_body_was_told_last(tmp_path: Path) -> None:
     async with RobotInMemory(tmp_path) as robot:
         for _ in range(200):
@@ -59,6 +60,7 @@ async def test_a_state_says_what_the_body_was_told_last(tmp_path: Path) -> None:
         assert robot.state.sent == Velocity(linear_x=0.26)
 
 
+@pytest.mark.long
 async def test_what_comes_just_before_a_tick_counts_as_told_before_it(tmp_path: Path) -> None:
     async with RobotInMemory(tmp_path) as robot:
         await robot.go(200)

@@ -61,6 +61,7 @@ class Line:
         return bytes(noisy)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("frames", [SHORT, FULL])
 @pytest.mark.parametrize("hit", [replaced, flipped])
 def test_no_wrong_position_is_believed(hit: Hit, frames: int) -> None:
@@ -90,6 +91,7 @@ def test_no_wrong_position_is_believed(hit: Hit, frames: int) -> None:
     assert 0.9 * frames < believed < frames
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("frames", [SHORT, FULL])
 def test_few_wrong_goals_pass_the_sum_and_each_is_within_limits_and_short(frames: int) -> None:
     line, decoder = Line(replaced), FeetechDecoder()

@@ -108,6 +108,7 @@ async def test_nothing_is_written_to_the_memory_of_a_wheels_servo() -> None:
     assert {name: servo.kept for name, servo in rig.arm.wheels.items()} == before
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "twist", [(0.2, 0.0, 0.0), (0.0, 0.15, 0.0), (0.0, 0.0, -1.0), (0.1, -0.05, 0.4)]
 )

@@ -89,6 +89,7 @@ async def test_a_second_commander_is_told_who_drives_and_a_take_over_names_both(
         ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "payload", [b"", b"{}", b"\x80", b'{"source": "ann", "reason": "a child"}']
 )
@@ -143,6 +144,7 @@ async def test_a_disk_that_hangs_holds_up_the_confirmation_and_no_tick(
         assert (reply.ok, reply.gate.mode, reply.gate.estop_generation) == (True, "latched", 1)
 
 
+@pytest.mark.long
 async def test_a_disk_that_takes_nothing_stops_no_e_stop_and_is_told(tmp_path: Path) -> None:
     async with RobotInMemory(tmp_path) as robot:
         await driving(robot)

@@ -29,6 +29,7 @@ def frame(number: int, time_ms: int) -> bytes:
     )
 
 
+@pytest.mark.long
 async def test_scans_of_an_ld19_say_how_late_they_are() -> None:
     clock, scans = FakeClock(), list[LaserScan]()
     source = Ld19(ScanOptions(driver="ld19", port="/dev/null"), LIDAR, clock)
@@ -49,6 +50,7 @@ async def test_scans_of_an_ld19_say_how_late_they_are() -> None:
     assert (await turn(10, 0))[-1] <= 5.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("from_the_start", [False, True])
 async def test_alpha_says_how_late_its_states_are(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, from_the_start: bool

@@ -89,6 +89,7 @@ def test_without_a_line_there_is_nothing_to_guard(line: tuple[int, int]) -> None
     assert guard.pid is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("last_words", "stopped"),
     [("os._exit(1)", True), ("guard.close()", False)],

@@ -33,6 +33,7 @@ def samples(found: list[Answer | Samples]) -> list[tuple[float, float]]:
     return points
 
 
+@pytest.mark.long
 @given(st.data())
 def test_a_dense_stream_decodes_the_same_however_it_is_cut(data: st.DataObject) -> None:
     stream, decoder, found = DENSE + dense_turns(2), RplidarDecoder(), list[Answer | Samples]()

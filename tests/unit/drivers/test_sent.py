@@ -38,6 +38,7 @@ def driver_of(body: str) -> Driver:
     return catalog.make_driver(body, Run(folder=Path()))[1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("body", BODIES)
 def test_the_drivers_own_clamp_changes_nothing_of_what_the_gate_lets_out(body: str) -> None:
     driver = driver_of(body)
@@ -45,6 +46,7 @@ def test_the_drivers_own_clamp_changes_nothing_of_what_the_gate_lets_out(body: s
         assert axes(driver.bounded(*axes(now))) == pytest.approx(axes(now), abs=ROUNDING)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("body", BODIES)
 def test_what_the_gate_lets_out_keeps_the_accelerations_straight_on_and_turning(body: str) -> None:
     robot = catalog.load_robot(body)
@@ -52,6 +54,7 @@ def test_what_the_gate_lets_out_keeps_the_accelerations_straight_on_and_turning(
     assert worst < 1e-6
 
 
+@pytest.mark.long
 async def test_a_simulated_base_is_told_just_that() -> None:
     for body in ("turtlebot3_burger", "mycustombot", "alpha"):
         async with driver_of(body) as driver:

@@ -108,6 +108,7 @@ def test_a_command_is_told_as_received_and_as_converted() -> None:
     )
 
 
+@pytest.mark.long
 async def test_a_trace_shows_both_ways_and_leaves_the_log_as_it_was(tmp_path: Path) -> None:
     before, lines = (links.log.level, list(links.log.handlers)), list[str]()
     await trace_line(

@@ -146,6 +146,7 @@ def compare(body: Body, mjcf: str, count: int, names: dict[str, str] | None = No
             np.testing.assert_allclose(places[tool][:3, 3], data.site(tool).xpos, atol=1e-7)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ARMS)
 def test_the_links_of_an_arm_are_where_mujoco_has_them(name: str) -> None:
     compare(*body_of(name), count=100)

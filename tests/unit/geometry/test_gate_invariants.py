@@ -6,6 +6,7 @@ The test keeps a record of its own, from the events alone, and compares the gate
 import math
 from typing import Literal
 
+import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
@@ -302,3 +303,4 @@ class GateMachine(RuleBasedStateMachine):
 
 TestGate = GateMachine.TestCase
 TestGate.settings = settings(stateful_step_count=50)
+TestGate.pytestmark = pytest.mark.long

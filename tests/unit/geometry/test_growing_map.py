@@ -57,6 +57,7 @@ def test_where_people_walked_the_map_is_free() -> None:
     assert inside.max() < 40
 
 
+@pytest.mark.long
 def test_carried_off_it_is_lost_and_found_and_the_map_is_not_spoilt() -> None:
     chart, walker = grown(Rooms(HOUSE), START, *ROUND)
     before = chart.to_save()[0]
@@ -75,6 +76,7 @@ def test_carried_off_it_is_lost_and_found_and_the_map_is_not_spoilt() -> None:
     assert np.count_nonzero(after.cells[free] > 60) < 0.01 * np.count_nonzero(free)
 
 
+@pytest.mark.long
 def test_lifted_without_a_sign_in_the_odometry_it_notices_after_3_scans() -> None:
     chart, walker = grown(Rooms(HOUSE), START, *ROUND)
     before = chart.to_save()[0]
@@ -88,6 +90,7 @@ def test_lifted_without_a_sign_in_the_odometry_it_notices_after_3_scans() -> Non
     assert error(place, in_map(walker)) < 0.05
 
 
+@pytest.mark.long
 def test_what_was_saved_goes_on(toured: tuple[SlamMap, Walker]) -> None:
     chart, walker = toured
     _, arrays = chart.to_save()
@@ -145,6 +148,7 @@ def test_points_that_no_lidar_has_seen_are_refused(
         SlamMap.thaw({**arrays, name: far})
 
 
+@pytest.mark.long
 def test_the_same_drive_gives_the_same_map_bit_for_bit() -> None:
     maps = [grown(Rooms(HOUSE), START, *ROUND)[0].to_save()[0] for _ in range(2)]
     assert np.array_equal(maps[0].cells, maps[1].cells)

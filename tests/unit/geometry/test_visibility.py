@@ -31,6 +31,7 @@ def test_a_scan_looks_through_nothing_where_it_was_taken() -> None:
     assert seen_through(shown, scan(ROOM, there).points, there) == pytest.approx(0.0, abs=0.02)
 
 
+@pytest.mark.long
 def test_a_scan_looks_through_the_walls_of_a_place_that_is_smaller() -> None:
     shown = scan(np.array(box(-1.5, -1.5, 3, 3)), IDENTITY).points
     assert seen_through(shown, scan(ROOM, IDENTITY).points, IDENTITY) > 0.5

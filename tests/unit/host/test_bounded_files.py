@@ -227,6 +227,7 @@ def test_a_zip_of_3_mb_that_holds_3_gb_is_not_unpacked(tmp_path: Path) -> None:
         tracemalloc.stop()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", [30_000, 70_000])  # the plain end record counts to 65535
 def test_the_directory_of_a_zip_is_not_read_where_it_is_large(tmp_path: Path, count: int) -> None:
     with zipfile.ZipFile(tmp_path / "map.graph.npz", "w") as file:

@@ -14,6 +14,7 @@ ASKED = 20_000  # times, of some 28,000 ports that there are to give
 on_linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux keeps it")
 
 
+@pytest.mark.long
 @on_linux
 @pytest.mark.parametrize("reuse", [False, True])
 def test_nobody_else_is_given_a_reserved_port(reuse: bool) -> None:

@@ -118,6 +118,7 @@ def assert_within_limits(trajectory: JointTrajectory) -> None:
     assert not np.any(trajectory.velocities[-1]) or np.abs(trajectory.velocities[-1]).max() < 1e-9
 
 
+@pytest.mark.long
 def test_a_trajectory_round_a_shelf_with_a_held_cube_touches_nothing() -> None:
     checker = CollisionChecker(arm(), [FLOOR, SHELF], held=CUBE)
     judge, timing = Judge(held=True), TimeParametrization(arm().joints, period=0.005)
@@ -173,6 +174,7 @@ def near_the_shelf(checker: CollisionChecker, posture: Floats, gap: float) -> Fl
     return low
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gap", [0.0012, -0.003, -0.008])
 def test_a_start_that_is_a_bit_too_near_is_left_without_coming_nearer(gap: float) -> None:
     checker = CollisionChecker(arm(), [FLOOR, SHELF], margin=0.002)
@@ -246,6 +248,7 @@ def assert_held(grasp: Grasp, thing: Thing) -> None:
         assert checker.touches(posture) == ""
 
 
+@pytest.mark.long
 def test_what_cannot_be_grasped_says_why() -> None:
     planner = GraspPlanner(arm(), inverse())
     wide = Thing(name="crate", kind="box", size=(0.2,) * 3, position=np.array([0.25, 0, 0.1]))

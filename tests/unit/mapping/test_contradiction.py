@@ -1,6 +1,7 @@
 """The share of beams that a map rules out, by distances that are capped nearer than others."""
 
 import numpy as np
+import pytest
 
 from gigabrain_zenoh.mapping.keyframes import Beams
 from gigabrain_zenoh.mapping.likelihood_field import CONTRADICTED_M, contradiction, field_of
@@ -18,6 +19,7 @@ def share(ends: list[tuple[float, float]], farthest: float) -> float:
     return contradiction(field, beams, AT)
 
 
+@pytest.mark.long
 def test_short_distances_tell_the_same_of_beams_as_long_ones() -> None:
     on_wall, through, amid = (1.52, 0.3), (2.5, 0.4), (-1.0, 0.2)
     for ends, expected in (

@@ -163,6 +163,7 @@ TOUR = (
 )  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("keyframe", [5, 45])
 def test_a_map_grows_on_after_its_optimiser_raised_at_a_keyframe(
     keyframe: int, fail: Callable[[Plan], None]

@@ -54,6 +54,7 @@ def test_a_scan_is_drawn_to_where_it_belongs(house: SavedMap) -> None:
     assert elsewhere.score < 0.45
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "pose", [at(1.0, 1.0, 77), at(3.3, 5.2, -140), at(5.5, 1.5, 180), at(7.2, 4.4, -12)]
 )
@@ -76,6 +77,7 @@ def test_a_scan_of_nothing_and_a_map_of_nothing_give_no_place(house: SavedMap) -
     assert search(unknown, seen.beams) == []
 
 
+@pytest.mark.long
 def test_it_is_found_from_nothing_and_followed_to_3_cm(house: SavedMap) -> None:
     robot = walker(house, HOUSE, 3.0, 2.0, 45)
     assert not robot.look().localized
@@ -87,6 +89,7 @@ def test_it_is_found_from_nothing_and_followed_to_3_cm(house: SavedMap) -> None:
     assert np.sqrt(place.covariance.diagonal()).max() < 0.03
 
 
+@pytest.mark.long
 def test_carried_off_it_is_lost_within_5_scans_and_found_again(house: SavedMap) -> None:
     robot = walker(house, HOUSE, 3.0, 2.0)
     assert robot.look(15).localized
@@ -99,6 +102,7 @@ def test_carried_off_it_is_lost_within_5_scans_and_found_again(house: SavedMap) 
     assert error(place, robot.pose) < 0.03
 
 
+@pytest.mark.long
 def test_while_two_places_look_alike_neither_is_believed(corridor: SavedMap) -> None:
     walls = [*CORRIDOR, *NICHE]
     robot = walker(corridor, walls, 1.5, 0.7)
@@ -122,6 +126,7 @@ def ends(found: list[Candidate]) -> list[float]:
     return [round(float(one.pose[0]), 1) for one in found]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("x", [11.0, 11.5])
 def test_a_place_that_is_mapped_whole_is_not_taken_for_one_that_is_mapped_half(x: float) -> None:
     robot = walker(hall(9), HALL, x, 3.0)
@@ -130,6 +135,7 @@ def test_a_place_that_is_mapped_whole_is_not_taken_for_one_that_is_mapped_half(x
     assert place.why == "it could be in 2 places"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(  # m of the hall that are mapped
     "reach", [9, pytest.param(15, marks=pytest.mark.qa)]
 )
@@ -152,6 +158,7 @@ def test_a_hall_goes_on_as_itself_turned_about() -> None:
     assert not is_self_similar(field, at(-20.0, 0.0))  # nothing comes to lie on anything
 
 
+@pytest.mark.long
 def test_where_it_was_known_to_be_last_stays_a_place_if_it_explains_what_is_seen() -> None:
     saved, view = hall(8), Rooms(HALL).view(at(12.0, 3.0))  # little of what is seen is mapped
     field = field_of(saved.cells, saved.resolution, (saved.origin_x, saved.origin_y))
@@ -161,6 +168,7 @@ def test_where_it_was_known_to_be_last_stays_a_place_if_it_explains_what_is_seen
     assert ends(search(field, scan, at(3.0, 3.0))) == [4.0, 11.4]
 
 
+@pytest.mark.long
 def test_in_open_space_it_goes_on_by_odometry_until_that_is_too_vague(house: SavedMap) -> None:
     robot = walker(house, HOUSE, 3.0, 2.0)
     assert robot.look(15).localized

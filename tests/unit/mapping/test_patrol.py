@@ -45,6 +45,7 @@ def patrol() -> Patrol:
     return patrol
 
 
+@pytest.mark.long
 def test_the_same_rounds_again_add_no_keyframes(patrol: Patrol) -> None:
     first = patrol.keyframes[0]
     assert patrol.keyframes[1] > 1.8 * first  # the second round is still mapped
@@ -59,6 +60,7 @@ def test_on_known_ground_the_robot_is_where_it_is(patrol: Patrol) -> None:
     assert max(patrol.errors[-LATER * len(ROUND) :]) < 0.04
 
 
+@pytest.mark.long
 def test_a_map_of_known_ground_is_saved_and_gone_on_with(patrol: Patrol) -> None:
     _, arrays = patrol.chart.to_save()
     again = SlamMap.thaw(arrays, PATIENCE_S)

@@ -31,6 +31,7 @@ def searched(
     return loops
 
 
+@pytest.mark.long
 def test_a_place_is_recognised_four_metres_from_where_the_robot_is_thought_to_be() -> None:
     once = lap()
     poses = np.concatenate((once, lap()[17:125]))
@@ -43,6 +44,7 @@ def test_a_place_is_recognised_four_metres_from_where_the_robot_is_thought_to_be
         assert loop.relative == pytest.approx(true, abs=0.1)
 
 
+@pytest.mark.long
 def test_a_corridor_in_which_all_doors_are_alike_is_recognised_nowhere() -> None:
     doors: list[tuple[float, ...]] = []
     for k in range(40):
@@ -55,6 +57,7 @@ def test_a_corridor_in_which_all_doors_are_alike_is_recognised_nowhere() -> None
     assert searched(walls, poses, poses + shift, Lidar(180, reach=6.0), len(out)) == []
 
 
+@pytest.mark.long
 def test_a_place_that_drift_cannot_have_led_away_from_is_another_one_like_it() -> None:
     once = lap()
     poses = np.concatenate((once, lap()[17:125]))

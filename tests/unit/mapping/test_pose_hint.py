@@ -65,6 +65,7 @@ def test_a_hint_to_where_the_scan_does_not_fit_gives_nothing(house: SavedMap) ->
     assert explained(field(house), view.beams, far_off) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("x", [1.5, 14.5])
 def test_of_two_places_that_look_alike_the_hint_chooses(x: float, corridor: SavedMap) -> None:
     robot = Walker(

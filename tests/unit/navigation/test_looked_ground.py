@@ -141,12 +141,14 @@ def deepest_in_unknown(names: tuple[str, ...], goal: Goal) -> float:
     return deepest
 
 
+@pytest.mark.long
 def test_it_keeps_away_from_ground_that_was_never_in_view() -> None:
     goal = Goal(x=1.2, y=0.9)
     assert deepest_in_unknown((), goal) > 0.0
     assert deepest_in_unknown(("front",), goal) < 0.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("begins", [(-1.0, 0.3, 2.0), (-0.4, -0.9, -1.5), (-0.9, -0.2, 0.1)])
 def test_a_body_that_can_go_aside_gets_before_a_thing_from_wherever_it_looks(
     begins: tuple[float, float, float],
@@ -218,6 +220,7 @@ def test_it_backs_off_from_ground_that_is_too_near_to_be_in_view() -> None:
     assert plan.trajectory[-1].x < -0.1
 
 
+@pytest.mark.long
 def test_it_looks_for_a_few_seconds_and_only_at_what_was_not_seen() -> None:
     assert plan_after(8.3, Goal(x=1.2, y=0.0)).reason != LOOKING
     assert plan_after(14.3, Goal(x=1.2, y=0.0)).reason == LOOKING  # and again

@@ -83,6 +83,7 @@ def random_plans() -> Floats:
     return plans
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("weights", "discs"), [(Weights(), NOBODY), (WEIGHTS, SOMEBODY)])
 def test_a_plan_is_given_up_only_where_it_costs_as_much_as_the_limit(
     weights: Weights, discs: Floats
@@ -115,6 +116,7 @@ def not_worth_pricing(
             dropped[block, lane] = not may_cost_less(problem, bounds, end, limit)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("goal", [(3.0, 0.0), (0.4, 0.1)])
 @pytest.mark.parametrize(("weights", "discs"), [(Weights(), NOBODY), (WEIGHTS, SOMEBODY)])
 def test_a_plan_is_dropped_by_its_end_only_where_it_costs_as_much_as_the_limit(

@@ -26,6 +26,7 @@ def spent(cost: np.ndarray, cells: np.ndarray) -> float:
     return float((steps * (on[1:] + on[:-1]) / 2).sum())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(20))
 def test_no_way_is_cheaper_on_random_grids(seed: int) -> None:
     cost, search = random_costs(seed), GridSearch()

@@ -49,6 +49,7 @@ def test_where_nothing_quick_was_seen_ways_cost_what_they_are_long() -> None:
     assert traffic.ways(GOAL) is None
 
 
+@pytest.mark.long
 def test_what_is_compiled_before_it_drives_is_all_that_it_will_call() -> None:
     local_planner.warm_up(ANY_BODY)
     kernels: list[Any] = [dynamic_obstacles._add_watched, dynamic_obstacles._pass]

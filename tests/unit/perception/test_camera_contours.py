@@ -188,6 +188,7 @@ async def test_broken_pictures_are_refused_and_perception_goes_on(
         assert status(await bench.world(6)).ok
 
 
+@pytest.mark.long
 async def test_a_flood_costs_no_more_than_the_rate_of_the_camera() -> None:
     async with Bench() as bench:
         await bench.begin()

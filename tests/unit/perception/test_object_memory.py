@@ -62,6 +62,7 @@ class Eye:
         return [one.label for one in self.memory.objects()]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("noise", [0.03, 0.05])
 @pytest.mark.parametrize("distance", [0.8, 2.0])
 def test_after_ten_pictures_an_object_is_within_5_cm(noise: float, distance: float) -> None:

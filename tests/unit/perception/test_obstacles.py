@@ -99,6 +99,7 @@ def speed(one: Obstacle) -> float:
     return math.hypot(one.velocity_x, one.velocity_y)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("v", [0.5, 1.0])
 @pytest.mark.parametrize("distance", [1.0, 2.0])
 def test_a_person_who_crosses_is_followed_with_the_right_speed(v: float, distance: float) -> None:
@@ -181,6 +182,7 @@ def test_what_comes_into_view_as_the_robot_turns_does_not_move() -> None:
         assert all(speed(one) == 0.0 for one in obstacles), (i, obstacles)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("drift", [-0.03, 0.03])
 def test_posts_stand_though_the_odometry_of_a_turning_robot_drifts(drift: float) -> None:
     posts = [(1.2 * i + 0.3 * (j % 2), 0.7 * j, 0.08) for i in range(-2, 4) for j in range(-4, 5)]
@@ -299,6 +301,7 @@ def test_noise_of_3_cm_and_lost_beams_break_nothing_into_pieces() -> None:
             assert speed(nearest(obstacles, 3.0, y)) == pytest.approx(1.0, abs=0.2)
 
 
+@pytest.mark.long
 def test_the_covariance_says_how_far_off_it_may_be() -> None:
     errors = []
     for seed in range(20):

@@ -68,6 +68,7 @@ def test_a_thing_that_is_seen_through_goes_and_one_that_is_hidden_stays() -> Non
     assert memory.solids(ORIGIN, 40) == ()
 
 
+@pytest.mark.long
 def test_what_was_not_seen_for_long_is_forgotten_and_there_are_not_too_many() -> None:
     memory = SolidMemory()
     for tick in (1, 2):

@@ -33,11 +33,13 @@ def _graphics() -> None:
         pytest.skip(str(error))
 
 
+@pytest.mark.long
 def test_worlds_repeat_and_are_all_other() -> None:
     assert draw_world(3) == draw_world(3)
     assert len({draw_world(seed) for seed in range(20)}) == 20
 
 
+@pytest.mark.long
 def test_things_stand_apart_from_each_other_and_from_the_robot() -> None:
     for seed in range(30):
         world = draw_world(seed)
@@ -72,6 +74,7 @@ def test_ghosts_are_timed_from_when_they_are_seen_to_be_gone() -> None:
         assert counted[-1] == pytest.approx(2.9)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_graphics")
 def test_the_renderer_shows_parts_at_their_depth() -> None:
     camera = bodies()[0].cameras[0]

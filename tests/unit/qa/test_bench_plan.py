@@ -17,6 +17,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[PlanResult, Path
     return measure_plan((400,), 3, 1, png, lambda text: None), png
 
 
+@pytest.mark.long
 def test_every_path_is_as_cheap_as_dijkstras(measured: tuple[PlanResult, Path]) -> None:
     (size,) = measured[0].sizes
     assert size.ratio == pytest.approx(1.0, abs=1e-9)

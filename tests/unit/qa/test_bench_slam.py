@@ -34,6 +34,7 @@ def log(reference: Floats) -> LaserLog:
     return LaserLog("circles", np.ones((len(reference), 180)), reference, reference)
 
 
+@pytest.mark.long
 def test_relations_are_near_in_place_and_far_in_time() -> None:
     reference = circles()
     pairs = relations(log(reference))

@@ -66,6 +66,7 @@ async def test_a_tampering_process_spoils_what_it_should_from_one_signal_to_the_
     }
 
 
+@pytest.mark.long
 def test_on_the_track_only_safety_keeps_a_blind_driver_from_a_post() -> None:
     post = ((0.6, 0.0, 0.035),)
     seen, unseen = (SafetyTrack("turtlebot3_waffle", 4, 4, post) for _ in range(2))

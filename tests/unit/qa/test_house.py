@@ -24,6 +24,7 @@ def test_no_string_names_a_module_that_its_room_must_not_import() -> None:
     assert house.broken(house.ROOT) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("where", "name", "contract"),
     [

@@ -61,6 +61,7 @@ def test_the_schemas_need_nothing_but_msgspec_and_numpy() -> None:
         assert imports(path) - STANDARD <= allowed, path
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("library", ONLY_IN)
 def test_a_library_stays_behind_its_own_modules(library: str) -> None:
     for path in sources():
@@ -69,5 +70,6 @@ def test_a_library_stays_behind_its_own_modules(library: str) -> None:
             assert name.startswith(ONLY_IN[library]), path
 
 
+@pytest.mark.long
 def test_every_function_fits_on_a_screen() -> None:
     assert house.long_functions(sources()) == []

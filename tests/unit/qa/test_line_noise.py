@@ -11,6 +11,7 @@ def test_a_bare_line_lets_some_wrong_commands_through() -> None:
     assert 3 < wrong < 100
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("check", ["*{crc16}", "*{crc32}"])
 @pytest.mark.parametrize("byte_errors", [0.001, 0.05])
 def test_a_checksum_of_sixteen_bits_lets_next_to_none_through(

@@ -26,6 +26,7 @@ def turned_round(poses: Floats) -> bool:
     return bool((np.abs(np.mod(poses[:, 2], math.tau) - math.pi) < 0.3).any())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("body", [LONG, SIDEWAYS, CAR])
 def test_in_a_wide_room_every_heading_is_reached(body: BodyDescription) -> None:
     poses = reachable_poses(body, lane(half_y=1.5))

@@ -53,6 +53,7 @@ def test_an_ignored_thing_is_masked_in_its_class_only():
     assert mask[7, 7, CLASSES.index("ball")] == 1
 
 
+@pytest.mark.long
 def test_boxes_follow_what_is_in_the_changed_picture():
     one = labelled(("cube", (100, 60, 180, 160)))
     for seed in range(30):
@@ -65,6 +66,7 @@ def test_boxes_follow_what_is_in_the_changed_picture():
         assert inside > 100
 
 
+@pytest.mark.long
 def test_a_thing_that_is_nearly_cut_away_is_to_be_ignored():
     one = labelled(("cube", (0, 60, 60, 160)))
     changes = [augment(np.random.default_rng(seed), one, 320, 240)[1] for seed in range(60)]

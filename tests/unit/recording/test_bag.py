@@ -265,6 +265,7 @@ def test_flipped_bytes_anywhere_never_break_the_reader(whole: Path, tmp_path: Pa
         assert len(list(Bag(path))) >= 588 - 12, at
 
 
+@pytest.mark.long
 def test_a_file_cut_anywhere_can_be_read_up_to_the_cut(tmp_path: Path) -> None:
     path, cut = tmp_path / "open.mcap", tmp_path / "cut.mcap"
     bags.write(path, bags.drive(200), end=False)

@@ -114,6 +114,7 @@ def info_of(folder: Path) -> dict[str, Any]:
     return json.loads((folder / "meta/info.json").read_text())  # type: ignore[no-any-return]
 
 
+@pytest.mark.long
 def test_each_frame_has_the_picture_that_was_exposed_at_its_tick(tmp_path: Path) -> None:
     path, folder = tmp_path / "a.mcap", tmp_path / "dataset"
     write(path, driving(100), pictures(range(5, 101, 5)))

@@ -18,6 +18,7 @@ def types() -> Types:
     return Types()
 
 
+@pytest.mark.long
 async def test_dds_without_its_library_names_the_extra(
     types: Types, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -41,6 +42,7 @@ def test_the_deployments_own_router_is_used_outside_the_robots_namespace(types: 
     assert other.endpoint.connect == ("tcp/10.0.0.2:7447",)
 
 
+@pytest.mark.long
 def test_types_of_ones_own_are_loaded(tmp_path: Path) -> None:
     (tmp_path / "msg").mkdir()
     (tmp_path / "msg/Thing.msg").write_text("int32 a\n")

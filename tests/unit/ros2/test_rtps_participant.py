@@ -376,6 +376,7 @@ def mutated(rng: random.Random, datagram: bytes) -> bytes:
     return bytes(data)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 def test_mutated_datagrams_raise_nothing_and_are_not_amplified(seed):
     rng, ether = random.Random(seed), Ether()

@@ -165,6 +165,7 @@ def test_a_definition_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
     assert types.make("my_msgs/msg/A").kind == 3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [

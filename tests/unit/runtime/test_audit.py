@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
+import pytest
 
 from gigabrain_schemas.logs import AuditPage, AuditRecord, AuditRequest
 from gigabrain_schemas.topics import AUDIT, AUDIT_LOG
@@ -153,6 +154,7 @@ async def test_a_crowd_of_sources_takes_the_place_of_nobody_who_was_obeyed(tmp_p
     await rig.trail.close()
 
 
+@pytest.mark.long
 async def test_refusals_and_events_push_no_act_of_a_person_out_of_the_log(tmp_path: Path) -> None:
     file = AuditFile(tmp_path, "driver", max_bytes=1000, kept=3)
     file.append([entry(1)])

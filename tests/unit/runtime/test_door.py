@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import pytest
+
 from gigabrain_schemas.logs import AuditRecord
 from gigabrain_schemas.topics import AUDIT
 from gigabrain_zenoh.bus.bus import Bus
@@ -57,6 +59,7 @@ class Rig:
         self.door.note_link(Link(ZID, "viewer@red", "tls/127.0.0.1:5", there=True))
 
 
+@pytest.mark.long
 async def test_40000_denials_are_one_record_a_minute_and_push_out_no_estop(tmp_path: Path) -> None:
     rig = Rig(tmp_path)
     for what in ("boot", "estop", "release", "enable"):
@@ -88,6 +91,7 @@ async def test_40000_denials_are_one_record_a_minute_and_push_out_no_estop(tmp_p
     )
 
 
+@pytest.mark.long
 async def test_why_strangers_are_turned_away_is_told_without_what_they_choose(
     tmp_path: Path,
 ) -> None:

@@ -151,6 +151,7 @@ async def beats(robot: RobotInMemory, name: str, seconds: int) -> list[bool]:
     return made
 
 
+@pytest.mark.long
 async def test_a_robot_that_drives_makes_progress_in_every_second(tmp_path: Path) -> None:
     async with RobotInMemory(tmp_path) as robot:
         await robot.go(SECOND_TICKS)
@@ -159,6 +160,7 @@ async def test_a_robot_that_drives_makes_progress_in_every_second(tmp_path: Path
             assert await beats(robot, name, 3) == [True] * 3, name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", BRAIN)
 async def test_who_hears_nothing_any_more_is_well(name: str, tmp_path: Path) -> None:
     """Its upstream is dead, or the link is."""
@@ -169,6 +171,7 @@ async def test_who_hears_nothing_any_more_is_well(name: str, tmp_path: Path) -> 
         assert await beats(robot, name, 6) == [True] * 6
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["perception", "decision", "control", "safety"])
 async def test_who_is_not_reached_by_its_own_input_makes_no_progress(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -97,6 +97,7 @@ async def stayed(begins_ns: list[int], delays_ns: Iterable[int]) -> int:
     return len(left)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(20))
 async def test_of_several_that_start_together_exactly_one_stays(seed: int) -> None:
     chance = random.Random(seed)

@@ -92,6 +92,7 @@ async def _drive() -> list[Event]:
     return events
 
 
+@pytest.mark.long
 def test_the_recorded_drive_has_something_of_everything() -> None:
     def told(key: str, kind: type[msgspec.Struct]) -> list[msgspec.Struct]:
         return [msgspec.msgpack.decode(data, type=kind) for _, k, data in drive() if k == key]
@@ -111,6 +112,7 @@ def test_the_recorded_drive_has_something_of_everything() -> None:
     assert commands[-1].linear_x == pytest.approx(-0.1 / 0.95, rel=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SYSTEMS)
 async def test_a_system_replayed_on_its_own_sends_the_same_bytes(name: str) -> None:
     node, key = SYSTEMS[name]

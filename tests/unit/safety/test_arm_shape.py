@@ -152,6 +152,7 @@ def test_neighbours_and_what_cannot_move_apart_are_no_pairs() -> None:
     assert not pairs & {("base", "shelf"), ("base", "the floor")}
 
 
+@pytest.mark.long
 def test_an_arm_that_falls_towards_the_floor_is_stopped_in_time() -> None:
     """The gate's part is played by the caps alone, a tick late, and greatest accelerations."""
     arm, dt = MujocoArm(model(), replace(BODY, arm=replace(SO101.arm, floor=0.0))), 0.02
@@ -172,6 +173,7 @@ def test_an_arm_that_falls_towards_the_floor_is_stopped_in_time() -> None:
     assert [cause.code for cause in found.causes] == ["arm_floor"]
 
 
+@pytest.mark.long
 def test_mujoco_is_imported_for_an_arm_alone() -> None:
     code = "import sys, gigabrain_zenoh.safety.node; print('mujoco' in sys.modules)"
     path = f"import sys; sys.path[:] = {sys.path!r}; {code}"

@@ -12,6 +12,7 @@ print(sum(name.startswith(("gigabrain_zenoh", "gigabrain_schemas")) for name in 
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("module", "most"), [("gigabrain_zenoh.safety.step", 34), ("gigabrain_zenoh.gate.gate", 15)]
 )

@@ -134,6 +134,7 @@ def test_what_lasts_stops_the_arm_until_a_person_has_looked(
     assert crane.go(LATCHING_TICKS) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "fields",
     [

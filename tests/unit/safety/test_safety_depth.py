@@ -95,6 +95,7 @@ def _moved(pose: Pose, moves: Velocity) -> Pose:
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 def test_a_thing_of_3_cm_stops_the_body_before_it(seed: int) -> None:
     drive = Drive(Scene(boxes=(LOW,)), eye=Eye(seed=seed))
@@ -126,6 +127,7 @@ def test_what_hangs_over_the_way_counts_up_to_the_height_of_the_body(
     assert drive.go(150, AHEAD) == code
 
 
+@pytest.mark.long
 def test_what_has_left_the_picture_is_still_in_the_way() -> None:
     drive = Drive(Scene(boxes=(LOW,)))
     drive.go(250, AHEAD)
@@ -134,6 +136,7 @@ def test_what_has_left_the_picture_is_still_in_the_way() -> None:
     assert drive.go(500, AHEAD) == ["zone_ahead"]
 
 
+@pytest.mark.long
 def test_the_body_does_not_back_into_what_it_has_seen() -> None:
     """It turns round before the thing, and drives back to where it was."""
     drive = Drive(Scene(boxes=(LOW,)))
@@ -163,6 +166,7 @@ def test_what_is_out_of_reach_is_forgotten() -> None:
     assert drive.marks == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_an_empty_floor_has_no_obstacles(seed: int) -> None:
     drive = Drive(Scene(), eye=Eye(seed=seed))
@@ -252,6 +256,7 @@ def _first_plane(seen: DepthImage, plane: bytes) -> DepthImage:
 BOMB = image(np.zeros((4096, 4096))).planes[0]  # 8 MB of zeros
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("code", "spoil"), FAULTS.values(), ids=FAULTS)
 def test_a_camera_that_fails_closes_the_way_it_looks_until_it_is_well(
     code: str, spoil: Spoil
@@ -353,6 +358,7 @@ def test_random_pictures_are_borne() -> None:
     assert drive.verdict.verdict in ("ok", "slow")
 
 
+@pytest.mark.long
 def test_cameras_of_all_kinds_and_places_are_borne() -> None:
     """On the floor, over the body, looking up, back and down, with lenses that bend all."""
     random = np.random.default_rng(3)

@@ -122,6 +122,7 @@ async def test_a_body_without_cameras_listens_to_no_picture() -> None:
     assert (codes(verdict), verdict.caps) == ([], SpeedCaps())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("changes", [{"basis": 999}, {"tick": 999}])
 async def test_pictures_of_the_future_keep_none_out(changes: dict[str, int]) -> None:
     async with Watch() as watch:
@@ -146,6 +147,7 @@ async def test_a_flood_of_old_and_repeated_pictures_is_counted() -> None:
         assert watch.bus.counters["repeated_pictures"] == 200
 
 
+@pytest.mark.long
 async def test_pictures_of_cameras_that_the_body_has_not_are_counted() -> None:
     async with Watch() as watch:
         await watch.go(25)
@@ -155,6 +157,7 @@ async def test_pictures_of_cameras_that_the_body_has_not_are_counted() -> None:
         assert watch.bus.counters["refused_pictures"] == 100
 
 
+@pytest.mark.long
 async def test_garbage_on_its_key_closes_the_way_and_ends_no_process() -> None:
     """Bytes at random, damaged pictures, wrong sizes; then it sees again."""
     chance = random.Random(7)

@@ -166,6 +166,7 @@ def test_jitter_of_a_line_casts_no_doubt() -> None:
         assert body.drive(1, FAST, age_ms=chance.uniform(0.0, 60.0)) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("changes", [25, pytest.param(100, marks=pytest.mark.qa)])
 @pytest.mark.parametrize("delay", [0, 1, 3, 5])
 def test_a_body_that_follows_as_it_always_does_is_not_late(delay: int, changes: int) -> None:
@@ -186,6 +187,7 @@ def test_it_is_forgotten_at_rest_so_that_a_line_that_was_mended_is_tried_again()
     assert body.codes == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("delay", [10, 15, 20, 25])
 def test_a_line_that_is_late_however_much_makes_no_runaway(delay: int) -> None:
     """A stop from full speed, whose reports still tell of motion when it is over."""

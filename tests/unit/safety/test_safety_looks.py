@@ -95,6 +95,7 @@ def test_it_may_go_back_the_way_it_has_come_and_at_first_nowhere() -> None:
     assert walker.back is None or walker.back > 0.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("speed", [0.03, 0.1, 0.26])
 def test_it_comes_back_to_where_it_began_and_no_farther(speed: float) -> None:
     walker = Walker().go(0.5 / speed, Velocity(linear_x=speed)).wait(0.3)
@@ -105,12 +106,14 @@ def test_it_comes_back_to_where_it_began_and_no_farther(speed: float) -> None:
     assert -0.05 <= walker.pose.x <= 0.3  # it stops in time before what nobody has seen
 
 
+@pytest.mark.long
 def test_a_way_back_is_forgotten_after_half_a_minute() -> None:
     walker = Walker().go(3.0, AHEAD)
     assert walker.wait(25.0).back != 0.0
     assert walker.wait(6.0).back == 0.0
 
 
+@pytest.mark.long
 def test_turning_to_and_fro_does_not_make_it_forget() -> None:
     walker = Walker().go(3.0, AHEAD)
     for _ in range(8):

@@ -97,6 +97,7 @@ def test_one_that_becomes_late_is_named_when_the_turn_ends() -> None:
     assert "lidar_late" in robot.drive(50, -0.5, 0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("body", [BODY, SLOW_LIDAR])
 def test_a_lidar_that_is_in_time_is_left_alone_however_the_body_drives(
     body: BodyDescription,

@@ -102,6 +102,7 @@ def test_the_tighter_a_curve_the_less_of_it_must_be_free() -> None:
     assert patrol.go(5, told=curve, values=near(-20, 0.23)) == ["zone_ahead"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("angular_acceleration", [0.6, pytest.param(3.0, marks=pytest.mark.slow)])
 def test_on_whatever_curve_it_may_go_on_it_stops_before_a_post(angular_acceleration: float) -> None:
     """It obeys for the reaction time, and then brakes speed and turn as quickly as it can."""

@@ -110,6 +110,7 @@ def test_bytes_behind_the_message_are_refused(name: str, trailing: bytes) -> Non
     assert refuses(name, msgspec.json.encode(EXAMPLES[name]) + trailing)
 
 
+@pytest.mark.long
 @by_name
 @given(payload=st.binary(max_size=300))
 def test_random_bytes_are_refused_that_do_not_spell_out_what_is_required(
@@ -123,6 +124,7 @@ def test_random_bytes_are_refused_that_do_not_spell_out_what_is_required(
         assert all(word in payload for word in required)
 
 
+@pytest.mark.long
 @by_name
 @given(data=st.data())
 def test_a_damaged_message_is_refused_or_still_a_valid_one(name: str, data: st.DataObject) -> None:

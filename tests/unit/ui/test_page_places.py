@@ -91,6 +91,7 @@ async def test_20_viewers_keep_no_operator_out_and_the_oldest_viewer_gives_way(p
     assert (await page.comes(page.tokens.viewer)).code == 4429  # the place is not his again
 
 
+@pytest.mark.long
 async def test_operators_get_in_though_all_places_are_taken_by_operators(page: Page) -> None:
     operators = [await page.comes(page.tokens.operator) for _ in range(65)]
     assert [operator.code for operator in operators] == [0] * 64 + [4429]

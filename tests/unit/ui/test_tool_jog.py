@@ -49,6 +49,7 @@ class Jogged:
         return self.judge.forward(np.array([self.at[name] for name in self.judge.names])).position
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("body", ["so101", "piper"])
 @pytest.mark.parametrize("wanted", ALONG)
 def test_the_tool_moves_along_the_line(body: str, wanted: tuple[float, float, float]) -> None:
@@ -59,6 +60,7 @@ def test_the_tool_moves_along_the_line(body: str, wanted: tuple[float, float, fl
     assert arm.at[arm.about.joints[-1].name] == gripper
 
 
+@pytest.mark.long
 def test_at_the_edge_of_its_reach_no_joint_is_too_fast_or_leaves_its_range() -> None:
     arm = Jogged("so101")
     limits = {joint.name: joint for joint in arm.about.joints}

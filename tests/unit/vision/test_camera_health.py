@@ -67,6 +67,7 @@ def bad_exposures(room: Room, name: str) -> Callable[[int], Exposure | None]:
 FAULTS = ["frozen", "repeats pictures", "no picture", "covered", "underexposed", "overexposed"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_of_a_depth_camera_is_named_within_half_a_second(name: str) -> None:
     room, health = Room(), CameraHealth(RGBD)

@@ -20,6 +20,7 @@ def turned(degrees: float, x: float = 0.0) -> Pose:
     return Pose(x=x, y=0.0, yaw=math.radians(degrees))
 
 
+@pytest.mark.long
 @CAMERAS
 @pytest.mark.parametrize(
     "thing",

@@ -1,6 +1,7 @@
 """The floor's boundary by colour: a second source, marked as such."""
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.vision.obstacle_contours import ObstacleContours
@@ -24,12 +25,14 @@ def shown(eyes: ObstacleContours, *boxes: Box, begin: float = 0.0, pictures: int
         assert eyes.add_colour("front", pixels, START, begin + number / 10) == ""
 
 
+@pytest.mark.long
 def test_an_even_floor_has_no_contours() -> None:
     eyes = ObstacleContours(body(HIGH))
     shown(eyes, pictures=10)
     assert eyes.contours(START, 1.0) == ()
 
 
+@pytest.mark.long
 def test_the_foot_of_a_thing_is_found_and_marked() -> None:
     eyes = ObstacleContours(body(HIGH))
     shown(eyes, Box(1.5, 0.0, 0.1, 0.2, 0.3))
@@ -40,6 +43,7 @@ def test_the_foot_of_a_thing_is_found_and_marked() -> None:
     assert all(one.confidence <= 0.5 for one in contours)
 
 
+@pytest.mark.long
 def test_it_is_gone_when_floor_is_seen_there() -> None:
     eyes = ObstacleContours(body(HIGH))
     shown(eyes, Box(1.5, 0.0, 0.1, 0.2, 0.3))
@@ -47,6 +51,7 @@ def test_it_is_gone_when_floor_is_seen_there() -> None:
     assert eyes.contours(START, 0.9) == ()
 
 
+@pytest.mark.long
 def test_the_colour_of_a_thing_right_before_it_is_not_learnt() -> None:
     eyes = ObstacleContours(body(HIGH))
     shown(eyes)

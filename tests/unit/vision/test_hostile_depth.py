@@ -53,6 +53,7 @@ def check(contours: tuple[Contour, ...]) -> None:
     assert all(math.isfinite(x) and math.isfinite(y) for c in contours for x, y in c.polygon)
 
 
+@pytest.mark.long
 @QUICK
 @given(st.lists(st.tuples(pictures, poses), min_size=1, max_size=4))
 def test_any_picture_makes_valid_contours(seen: list[tuple[np.ndarray, Pose]]) -> None:
@@ -62,6 +63,7 @@ def test_any_picture_makes_valid_contours(seen: list[tuple[np.ndarray, Pose]]) -
         check(eyes.contours(pose, number / 10))
 
 
+@pytest.mark.long
 @QUICK
 @given(cameras, pictures, poses)
 @example(UNSEEING, np.ones((24, 32), np.uint16), START)

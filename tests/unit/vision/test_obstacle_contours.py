@@ -40,6 +40,7 @@ def noisy(
     return eyes
 
 
+@pytest.mark.long
 @CAMERAS
 def test_an_empty_floor_has_no_contours(camera: Camera) -> None:
     for seed in SEEDS:
@@ -47,6 +48,7 @@ def test_an_empty_floor_has_no_contours(camera: Camera) -> None:
         assert eyes.contours(START, 2.0) == ()
 
 
+@pytest.mark.long
 @CAMERAS
 @pytest.mark.parametrize("place", [(0.8, 0.2), (1.4, -0.3), (1.95, 0.0)])
 def test_3_cm_are_found_within_2_m(camera: Camera, place: tuple[float, float]) -> None:
@@ -121,6 +123,7 @@ def test_a_picture_of_nothing_is_refused_and_frees_nothing() -> None:
     assert near(eyes.contours(START, 1.3), 0.9, 0.0)
 
 
+@pytest.mark.long
 @CAMERAS
 def test_a_table_top_or_a_wall_is_never_the_floor(camera: Camera) -> None:
     eyes = ObstacleContours(body(camera))
@@ -130,6 +133,7 @@ def test_a_table_top_or_a_wall_is_never_the_floor(camera: Camera) -> None:
     assert near(feed(wall, camera, Box(0.6, 0.0, 0.1, 3.0, 2.0), pictures=30), 0.5, 0.0, 0.01)
 
 
+@pytest.mark.long
 @CAMERAS
 def test_the_floor_does_not_follow_a_ramp(camera: Camera) -> None:
     steps = tuple(Box(0.8 + 0.02 * n, 0.0, 0.01, 3.0, 0.002 * n + 1e-4) for n in range(60))
@@ -177,6 +181,7 @@ def test_a_camera_that_looks_back_and_lies_on_its_side_sees_the_same() -> None:
     assert len(contours) == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("width", "height"), [(640, 480), (848, 480), (1280, 720), (322, 242)])
 def test_larger_pictures_show_the_same_and_cost_no_more(width: int, height: int) -> None:
     camera = replace(LOW, width=width, height=height, field_of_view=1.2)

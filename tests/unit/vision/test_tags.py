@@ -40,6 +40,7 @@ def turned_deg(one: np.ndarray, other: np.ndarray) -> float:
     return math.degrees(math.acos(np.clip((np.trace(one.T @ other) - 1) / 2, -1, 1)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("model", [MODEL, BENT, TURNED], ids=["straight", "bent", "turned"])
 def test_tags_are_found_where_they_are_within_1_cm_and_2_degrees_by_depth(model):
     rng, finder = np.random.default_rng(3), TagFinder()
@@ -53,6 +54,7 @@ def test_tags_are_found_where_they_are_within_1_cm_and_2_degrees_by_depth(model)
         assert turned_deg(axes_of(found.orientation), plate.axes) < 2
 
 
+@pytest.mark.long
 def test_without_depth_what_is_told_is_within_3_cm_and_what_is_open_is_left_out():
     rng, finder, told = np.random.default_rng(4), TagFinder(), 0
     for _ in range(40):
@@ -146,6 +148,7 @@ def test_a_quaternion_turns_as_its_matrix():
     assert quaternion(np.eye(3)) == pytest.approx((0, 0, 0, 1))
 
 
+@pytest.mark.long
 def test_pupil_apriltags_finds_the_same_corners_and_poses():
     detector = judge()
     rng, finder = np.random.default_rng(6), TagFinder()
