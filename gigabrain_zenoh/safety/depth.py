@@ -22,6 +22,7 @@ MOUNT_M, MOUNT_RAD = 0.005, math.radians(0.5)  # to which the mounting of a came
 NOISE_PER_M2, SIGMAS = 0.0015, 3.0  # [1/m], the deviation of a depth z is this times z^2
 MEMORY_M = 0.3  # beyond the stopping distance, what is seen is remembered
 UNDISTORT_STEPS, UNDISTORTED = 20, 1e-3  # and how far off a ray may be then, 1 m ahead
+MIN_DIVISOR = 1e-3  # of the rational model of a lens; that of a real one is larger
 WIDEST = 20.0  # [m] aside of what is 1 m ahead: no lens sees that
 NEVER = 65535  # [mm], a depth that no pixel has
 KEPT_VIEWS = 8  # of all cameras and tilts
@@ -158,9 +159,10 @@ def _rays(camera: Camera) -> tuple[Floats, Mask]:
 
 def _distorted(camera: Camera, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """Return where a lens shows what is at x (right) and y (down), 1 m before it."""
-    k1, k2, p1, p2, k3 = (*camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*camera.distortion, *[0.0] * 8)[:8]
     square = x * x + y * y
     radial = 1.0 + square * (k1 + square * (k2 + square * k3))
+    radial /= np.maximum(1.0 + square * (k4 + square * (k5 + square * k6)), MIN_DIVISOR)
     return (
         x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x),
         y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y,

@@ -1,6 +1,7 @@
 """Conversion between the pixels of a camera and points in the body's frame.
 
-Brown's model of distortion (k1, k2, p1, p2, k3), as in OpenCV and ROS.
+Distortion by Brown's model (k1, k2, p1, p2, k3), or by the rational one (and k4, k5, k6), as in
+OpenCV and ROS.
 """
 
 import math
@@ -26,7 +27,7 @@ class CameraModel:
         self.camera = camera
         self.origin: Floats = np.array((camera.x, camera.y, camera.z))  # [m], body's frame
         self.rotation = rotation(camera.roll, camera.pitch, camera.yaw)  # to the body's frame
-        self._distortion = (*camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
+        self._distortion = (*camera.distortion, *[0.0] * 8)[:8]
         self.rays: Singles = self._rays()
         # (3, height, width): in the body's frame, for a depth of 1 m; NaN where it has none
 
@@ -50,9 +51,10 @@ class CameraModel:
         return np.ascontiguousarray(turned, dtype=np.float32)
 
     def _distorted(self, x: Floating, y: Floating) -> tuple[Floating, Floating]:
-        k1, k2, p1, p2, k3 = self._distortion
+        k1, k2, p1, p2, k3, k4, k5, k6 = self._distortion
         square = x * x + y * y
         radial = 1 + square * (k1 + square * (k2 + square * k3))
+        radial /= 1 + square * (k4 + square * (k5 + square * k6))
         return (
             x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x),
             y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y,

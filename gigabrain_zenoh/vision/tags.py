@@ -149,7 +149,7 @@ def _poses(corners: Floats, size: float, model: CameraModel) -> list[tuple[Place
 def _lens(model: CameraModel) -> tuple[Floats, Floats]:
     fx, fy, cx, cy = model.camera.pinhole
     matrix = np.array(((fx, 0, cx), (0, fy, cy), (0, 0, 1.0)))
-    return matrix, np.array((*model.camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5])
+    return matrix, np.array((*model.camera.distortion, *[0.0] * 8)[:8])
 
 
 def _to_body(vector: Floats, model: CameraModel) -> Floats:

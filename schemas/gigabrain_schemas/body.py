@@ -230,7 +230,8 @@ class Camera(Record, frozen=True, kw_only=True):
     field_of_view: FieldOfView = 1.047  # [rad], horizontal, where `intrinsics` are not given
     intrinsics: tuple[FocalLength, FocalLength, PixelOffset, PixelOffset] | None = None
     # [px]: fx, fy, cx, cy of its calibration
-    distortion: Annotated[tuple[Coefficient, ...], Meta(max_length=8)] = ()  # k1, k2, p1, p2, k3
+    distortion: Annotated[tuple[Coefficient, ...], Meta(max_length=8)] = ()
+    # k1, k2, p1, p2, k3, and k4, k5, k6 of the rational model
     depth: bool = False  # measures the depth of each pixel too
     depth_min: Range = 0.25  # [m]; nearer, the depth is unknown
     depth_max: RangeMax = 6.0  # [m]

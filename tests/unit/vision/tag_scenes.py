@@ -74,7 +74,7 @@ def project(model: CameraModel, points: NDArray[np.float64]) -> NDArray[np.float
     ahead, left, up = model.rotation.T @ (points - model.origin).T
     in_camera = np.stack((-left, -up, ahead), axis=1)
     matrix = np.array(((fx, 0, cx), (0, fy, cy), (0, 0, 1.0)))
-    lens = np.array((*model.camera.distortion, 0, 0, 0, 0, 0)[:5], float)
+    lens = np.array((*model.camera.distortion, *[0.0] * 8)[:8])
     return cv2.projectPoints(in_camera, np.zeros(3), np.zeros(3), matrix, lens)[0].reshape(-1, 2)
 
 

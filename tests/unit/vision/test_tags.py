@@ -12,6 +12,9 @@ from tests.unit.vision.tag_scenes import CAMERA, Plate, draw, facing, judge, pro
 
 MODEL = CameraModel(CAMERA)
 BENT = CameraModel(replace(CAMERA, distortion=(-0.25, 0.08, 0.001, -0.001)))
+RATIONAL = CameraModel(
+    replace(CAMERA, distortion=(0.49, -2.66, 0.0006, -0.0002, 1.56, 0.37, -2.48, 1.48))
+)
 TURNED = CameraModel(replace(CAMERA, x=0.2, y=-0.1, z=0.3, roll=0.1, pitch=0.2, yaw=0.5))
 
 
@@ -96,6 +99,13 @@ def test_a_size_may_be_given_for_one_tag():
     (found,) = TagFinder(sizes={9: 0.1}).find(picture, MODEL, depth)
     assert found.size == 0.1
     assert found.position == pytest.approx((0.8, 0.0, 0.1), abs=0.01)
+
+
+def test_a_tag_aside_is_placed_through_a_rational_lens():
+    plate = facing(9, 0.16, (0.96, 0.4, 0.2), 0.2, 0.0, 0.0)
+    picture, depth = draw(plate, RATIONAL, np.random.default_rng(0))
+    (found,) = TagFinder().find(picture, RATIONAL, depth)
+    assert found.position == pytest.approx(tuple(plate.position), abs=0.01)
 
 
 def test_a_tag_of_less_than_12_pixels_is_left_out():
