@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats, hits_bytes
 from gigabrain_schemas.base import TICK_S, Pose
-from gigabrain_schemas.body import Body, BodyDescription, Camera, RobotState
+from gigabrain_schemas.body import Body, BodyDescription, RobotState
 from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import BODY, SCAN, STATE, WORLD
@@ -100,7 +100,7 @@ class WorldPublisher:
         self._bus = bus
         self.cameras: CameraContours | None = None  # imported and made only where there are some
         self.on_state: Callable[[RobotState], object] = id  # called while there are cameras
-        self._of: tuple[Camera, ...] = ()
+        self._of: BodyDescription | None = None
         self._newest: tuple[WorldModel, Pose | None] | None = None
         self.body = bus.latest(BODY, self._on_body)
 
@@ -136,11 +136,11 @@ class WorldPublisher:
 
     def _on_body(self, body: Body) -> None:
         description = body.description
-        if description.fixed_cameras == self._of:
+        if description == self._of:
             return
         self.close()
-        self._of, self._newest = description.fixed_cameras, None
-        if self._of:
+        self._of, self._newest = description, None
+        if description.fixed_cameras:
             from gigabrain_zenoh.perception.camera_contours import CameraContours
 
             self.cameras = CameraContours(self._bus, description, self._on_new, self._on_state)

@@ -215,6 +215,22 @@ async def test_a_restarted_driver_begins_with_nothing_seen() -> None:
         assert (await bench.world(3)).contours
 
 
+async def test_a_body_that_has_become_higher_sees_what_is_in_its_way_now() -> None:
+    """Its driver was restarted with another file, and its cameras are the same."""
+    beam = Box(x=1.0, y=0.0, half_x=0.05, half_y=0.2, top=0.45, bottom=0.3)
+    seen = image(millimetres(LOW, depth_of(LOW, (beam,))))
+    async with Bench() as bench:
+        await bench.begin()
+        await bench.look(1, seen)
+        assert not near((await bench.world(1)).contours, 0.95, 0.0)
+        bench.boot = BOOT + 1
+        for tick in (1, 2, 3):
+            bench.send(BODY, body(replace(CAMERA_BODY, body_height=0.5), boot=bench.boot))
+            bench.drive(tick)
+        await bench.look(3, seen)
+        assert near((await bench.world(3)).contours, 0.95, 0.0)
+
+
 @pytest.mark.parametrize("encoding", ["bgr8", "jpeg"])
 async def test_a_camera_without_depth_gives_contours_by_colour_that_are_marked(
     encoding: str,
