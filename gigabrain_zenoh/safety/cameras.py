@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
-from gigabrain_schemas.base import TICK_NS, Cause, Pose
+from gigabrain_schemas.base import TICK_NS, TICK_S, Cause, Pose
 from gigabrain_schemas.body import BodyDescription, Camera, RobotState
 from gigabrain_schemas.vision import DepthImage
 from gigabrain_zenoh.geometry.pose import PoseHistory, relative
@@ -45,7 +45,7 @@ NEAR_M = 0.04  # within which two sightings of a doubtful point confirm each oth
 PENDING, BELIEVED = 1, 3  # levels; from 2 on a point counts, and each look through it takes one
 PENDING_PERIODS = 2.5  # after which a doubtful point that was not seen again is dropped
 DRIFT_M = 0.02  # inside the footprint: what stands there can be no thing
-JUMP_M = 0.5  # between two pictures: the odometry has restarted
+JUMP_M = 0.5  # between two pictures, farther than it can drive: the odometry has restarted
 MAX_POINTS = 1500
 MIN_KNOWN = 0.8  # share of the pixels whose rays follow from the intrinsics
 CHECK_TICKS = 5  # without pictures, between two looks at what is remembered
@@ -97,6 +97,7 @@ class Cameras(Struct, frozen=True, kw_only=True):
     states: Mapping[str, CameraState] = {}
     marks: Marks = NO_MARKS
     pose: Pose | None = None  # at the newest picture
+    basis: int = 0  # tick of that picture
     checked: int = 0  # tick at which `obstacles` were last wanted
     pictures: int = 0  # that were looked at
     causes: tuple[Cause, ...] = ()
@@ -156,7 +157,9 @@ class Cameras(Struct, frozen=True, kw_only=True):
         same = image.planes[0] == before.plane
         since = before.since if same and before.since else pose
         marks, code, text = self.marks, "", ""
-        if self.pose and math.hypot(pose.x - self.pose.x, pose.y - self.pose.y) > JUMP_M:
+        fastest = math.hypot(body.max_linear_speed, body.max_lateral_speed)
+        most = JUMP_M + fastest * abs(image.basis - self.basis) * TICK_S
+        if self.pose and math.hypot(pose.x - self.pose.x, pose.y - self.pose.y) > most:
             marks = NO_MARKS
         wanted = (camera.width, camera.height)
         if image.frame_id != camera.name:
@@ -174,7 +177,10 @@ class Cameras(Struct, frozen=True, kw_only=True):
             before, basis=image.basis, code=code, text=text, plane=image.planes[0], since=since
         )
         states = {**self.states, camera.name: seen}
-        return replace(self, states=states, marks=marks, pose=pose, pictures=self.pictures + 1)
+        return replace(
+            self, states=states, marks=marks, pose=pose, basis=image.basis,
+            pictures=self.pictures + 1,
+        )  # fmt: skip
 
     def _cause(
         self, body: BodyDescription, camera: Camera, picture: Picture | None, state: RobotState
