@@ -31,12 +31,15 @@ class OpenCvCamera(CameraSource):
 
     _capture: cv2.VideoCapture | None = None
     _file = False
+    _ended = False  # a file that does not repeat
     _due_s = 0.0  # of a file's next picture
 
     def open(self) -> None:
         """Open the device. Raises CameraLost, and ConfigError without the home of a `~`."""
         if self.camera.depth:
             raise CameraLost("OpenCV gives no depth; write `depth: false` for this camera")
+        if self._ended:
+            raise CameraLost(f"{self.options.device} has ended")
         target, backend = self._target()
         timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, TIMEOUT_MS]
         timeouts += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, TIMEOUT_MS]
@@ -64,6 +67,7 @@ class OpenCvCamera(CameraSource):
             capture.set(cv2.CAP_PROP_POS_FRAMES, 0)
             came, picture = capture.read()
         if not came or picture is None:
+            self._ended = self._file
             end = "has ended" if self._file else "gives no picture"
             raise CameraLost(f"{self.options.device} {end}")
         return Frame(fitted(np.asarray(picture), self.camera.width, self.camera.height))

@@ -41,10 +41,16 @@ class ReplayedCamera(CameraSource):
     options: ReplayOptions
 
     _exposures: Iterator[Recorded] | None = None
+    _ended = False
     _last: tuple[int, float] | None = None  # stamp of the newest exposure, and when it was given
 
     def open(self) -> None:
-        """Begin at the start of the recording. Raises ConfigError without the home of a `~`."""
+        """Begin at the start of the recording, once unless it repeats. Raises CameraLost.
+
+        Raises ConfigError without the home of a `~`.
+        """
+        if self._ended:
+            raise CameraLost(f"{self.options.file} has ended")
         path = Path(self.site.folder) / expanded(self.options.file)
         self._exposures = recorded(path, self.options.camera or self.camera.name)
         self._last = None
@@ -61,7 +67,8 @@ class ReplayedCamera(CameraSource):
             self.open()
             return self.read()
         if one is None:
-            raise CameraLost(f"{self.options.file} {'has ended' if self._last else 'has none'}")
+            self._ended = bool(self._last)
+            raise CameraLost(f"{self.options.file} {'has ended' if self._ended else 'has none'}")
         self._wait(one.stamp_ns)
         return self._frame(one)
 

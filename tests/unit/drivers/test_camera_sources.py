@@ -62,6 +62,8 @@ def test_a_film_is_shown_at_the_camera_s_rate_and_ends(tmp_path: Path, slept: li
         source.read()
     source.close()
     source.close()
+    with pytest.raises(CameraLost, match=r"film.avi has ended"):
+        source.open()  # as the process does after a loss
 
 
 def test_a_film_may_begin_again(tmp_path: Path, slept: list[float]) -> None:
@@ -207,6 +209,9 @@ def test_a_recording_may_end(tmp_path: Path, slept: list[float]) -> None:
         source.read()
     with pytest.raises(CameraLost, match=r"drive\.mcap has ended"):
         source.read()
+    source.close()
+    with pytest.raises(CameraLost, match=r"drive\.mcap has ended"):
+        source.open()  # as the process does after a loss
 
 
 @pytest.mark.parametrize(
