@@ -64,6 +64,7 @@ class ReplayedCamera(CameraSource):
         except ConfigError as error:
             raise CameraLost(str(error)) from None
         if one is None and self.options.repeat and self._last:
+            time.sleep(1 / self.camera.rate_hz)
             self.open()
             return self.read()
         if one is None:

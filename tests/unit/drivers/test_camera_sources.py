@@ -126,11 +126,11 @@ def jpeg(grey: int) -> bytes:
     return bytes(cv2.imencode(".jpg", picture)[1].tobytes())
 
 
-def recording(path: Path, *, broken: bool = False) -> None:
-    """Three exposures at 10 Hz of the camera `front`, and one of another."""
+def recording(path: Path, *, broken: bool = False, exposures: int = 3) -> None:
+    """Up to three exposures at 10 Hz of the camera `front`, and as many of another."""
     file = BagWriter(path, viewers=False, notes={})
     with closing(file):
-        for number, grey in enumerate(GREYS):
+        for number, grey in enumerate(GREYS[:exposures]):
             header = {"basis": 5 * number + 5, "stamp_ns": 10**18 + number * 10**8}
             about = {"frame_id": "front", "height": 48, "width": 64}
             data = b"no jpeg" if broken else jpeg(grey)
@@ -169,6 +169,16 @@ def test_a_recording_gives_picture_and_depth_of_one_exposure_together(
     assert greys == pytest.approx([*GREYS, *GREYS], abs=3)
     assert all(0 <= pause <= 0.3 for pause in slept)
     source.close()
+
+
+def test_a_recording_of_one_exposure_repeats_it_at_the_camera_s_rate(
+    tmp_path: Path, slept: list[float]
+) -> None:
+    recording(tmp_path / "drive.mcap", exposures=1)
+    source = replayed(tmp_path, repeat=True)
+    source.open()
+    assert means(source, 4) == [GREYS[0]] * 4
+    assert slept == pytest.approx([0.1] * 3)
 
 
 def test_a_thinned_recording_gives_whole_exposures_at_their_rate(
