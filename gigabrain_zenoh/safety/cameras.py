@@ -111,7 +111,8 @@ class Cameras(Struct, frozen=True, kw_only=True):
         for camera in depth_cameras(body):
             picture = pictures.get(camera.name)
             if picture and now._due(camera, picture.image, state):
-                now = now._with(body, camera, picture.image, state, history)
+                pose = history.at(state.boot, picture.image.basis)
+                now = now._with(body, camera, picture.image, state, pose) if pose else now
         causes, dark = [], set[str]()
         for camera in depth_cameras(body):
             seen = now.states.get(camera.name)
@@ -149,11 +150,10 @@ class Cameras(Struct, frozen=True, kw_only=True):
         camera: Camera,
         image: DepthImage,
         state: RobotState,
-        history: PoseHistory,
+        pose: Pose,
     ) -> "Cameras":
-        """Look at one picture."""
+        """Look at one picture, which was taken where the body was at `pose`."""
         before = self.states.get(camera.name, CameraState())
-        pose = history.at(state.boot, image.basis) or state.pose
         same = image.planes[0] == before.plane
         since = before.since if same and before.since else pose
         marks, code, text = self.marks, "", ""

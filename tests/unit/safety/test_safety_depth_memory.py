@@ -8,7 +8,7 @@ from gigabrain_schemas.base import Pose
 from gigabrain_zenoh.geometry.pose import PoseHistory
 from gigabrain_zenoh.safety.cameras import Cameras, Picture
 from gigabrain_zenoh.testing.samples import state
-from tests.unit.safety.depth_scene import CAMERA, SEEING, Eye, Scene
+from tests.unit.safety.depth_scene import CAMERA, LOW, SEEING, Eye, Scene
 
 PERIOD_TICKS = 25
 SLOW = replace(CAMERA, rate_hz=2.0)
@@ -30,3 +30,17 @@ def test_a_fast_body_remembers_what_has_left_the_picture(metres: float, kept: bo
         if number == 1:
             assert len(cameras.obstacles(pose))
     assert bool(len(cameras.marks.level)) == kept
+
+
+@pytest.mark.parametrize("missing", ["forgotten", "left out"])
+def test_a_picture_from_a_place_that_is_not_known_shows_nothing(missing: str) -> None:
+    """The camera's process was stopped for seconds, or safety got no states for a while."""
+    ticks = range(1, 180) if missing == "forgotten" else (1, 30)
+    history = PoseHistory()
+    for tick in ticks:
+        now = replace(state(tick), pose=Pose(x=0.0, y=0.0, yaw=0.02 * tick))
+        history = history.then(now)
+    old = Eye(errors=NO_ERRORS).picture(Scene(boxes=(LOW,)), Pose(x=0.0, y=0.0, yaw=0.0), 15)
+    cameras = Cameras().then(SEEING, {"front": Picture(image=old)}, now, history)
+    assert not len(cameras.marks.level)
+    assert [cause.code for cause in cameras.causes] == ["camera_lost"]
