@@ -112,6 +112,11 @@ class PoseHistory(Struct, frozen=True):
         return interpolate(self.poses[i - 1], self.poses[i], (tick - before) / (after - before))
 
     @property
+    def newest(self) -> Pose | None:
+        """Return the pose of the newest state; None before the first state."""
+        return self.poses[-1] if self.poses else None
+
+    @property
     def newest_tick(self) -> int:
         """Return the tick of the newest state; 0 before the first state."""
         return self.ticks[-1] if self.ticks else 0

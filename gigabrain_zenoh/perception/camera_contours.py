@@ -130,8 +130,11 @@ class CameraContours:
         self._pool.shutdown()
 
     def contours(self, pose: Pose | None, tick: int) -> tuple[Contour, ...]:
-        """Return what is known at `tick`, in the frame of a body at `pose`."""
-        return self._view.at(pose, tick) if pose else ()
+        """Return what is known at `tick`, in the frame of a body at `pose`.
+
+        Where that is not known, the body is taken to be where it was last.
+        """
+        return self._view.at(pose or self._history.newest or self._view.pose, tick)
 
     def statuses(self, tick: int) -> tuple[CameraStatus, ...]:
         """Return whether each camera can be believed at `tick`."""

@@ -119,6 +119,20 @@ async def test_a_picture_brings_the_newest_world_again_with_its_contours(mapping
         assert bench.sent(WORLD) == []  # that scan is old by now
 
 
+@MAPPING
+async def test_a_scan_from_a_place_that_is_not_known_hides_no_contours(mapping: str) -> None:
+    """Perception was busy, and of the states meanwhile only the newest came through."""
+    async with Bench(mapping) as bench:
+        await bench.begin()
+        await bench.look(1)
+        bench.drive(18, x=0.1)
+        world = await bench.world(12)
+        assert status(world).ok
+        assert front_of(world) == pytest.approx(0.85, abs=0.02)  # as of the newest state
+        await bench.look(18)
+        assert near(bench.sent(WORLD)[-1].contours, 0.85, 0.0)
+
+
 async def test_a_picture_that_comes_before_the_state_of_its_tick_waits_for_it() -> None:
     async with Bench() as bench:
         await bench.begin()
