@@ -42,7 +42,9 @@ class ColourCamera:
 
     def __init__(self, model: CameraModel) -> None:
         self.model = model
-        rays = model.rays[:, ::STEP, ::STEP].astype(np.float64)
+        self._rows = np.s_[::-1] if model.rotation[2, 2] < 0 else np.s_[:]
+        # the lower a row, the nearer is its floor, also where the camera hangs upside down
+        rays = model.rays[:, ::STEP, ::STEP][:, self._rows].astype(np.float64)
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = np.where(rays[2] < -1e-3, -model.origin[2] / rays[2], np.inf)
             self._places = (rays[:2] * depth + model.origin[:2, None, None]).transpose(1, 2, 0)
@@ -60,7 +62,7 @@ class ColourCamera:
 
     def view(self, pixels: NDArray[np.uint8]) -> ColourView | None:
         """Return what a picture (height, width, 3) shows; None while no floor is known."""
-        features = _features(pixels[::STEP, ::STEP])
+        features = _features(pixels[::STEP, ::STEP][self._rows])
         self._learn(features[self._patch])
         if self._mean is None:
             return None
@@ -74,7 +76,8 @@ class ColourCamera:
         outward = places - self.model.origin[:2]
         outward /= np.maximum(np.hypot(*outward.T), 1e-9)[:, None]
         boundary = np.concatenate([places + deep * outward for deep in DEEP_M])
-        return ColourView(boundary, _large(seen, pixels), _large(seen, pixels).astype(np.float32))
+        known = _large(seen[self._rows], pixels)
+        return ColourView(boundary, known, known.astype(np.float32))
 
     def _learn(self, patch: Floats) -> None:
         """Take the colour of the patch before the robot, if floor is all that it shows."""

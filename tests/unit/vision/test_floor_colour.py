@@ -1,7 +1,10 @@
 """The floor's boundary by colour: a second source, marked as such."""
 
+import math
+
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.vision.obstacle_contours import ObstacleContours
@@ -41,6 +44,21 @@ def test_the_foot_of_a_thing_is_found_and_marked() -> None:
     assert not near(contours, 1.3, 0.0, 0.03)
     assert {one.source for one in contours} == {"floor_colour"}
     assert all(one.confidence <= 0.5 for one in contours)
+
+
+def test_a_camera_that_hangs_upside_down_finds_the_same() -> None:
+    box = Box(1.2, 0.3, 0.1, 0.2, 0.3)
+    eyes = ObstacleContours(body(replace(HIGH, roll=math.pi)))
+    for number in range(4):
+        pixels = np.rot90(picture(box, seed=number), 2)
+        assert eyes.add_colour("front", pixels, START, number / 10) == ""
+    contours = eyes.contours(START, 0.4)
+    assert near(contours, 1.1, 0.3, 0.03)
+    assert not near(contours, 1.0, 0.3, 0.03)
+    shown = np.rot90(picture(seed=9), 2)
+    for number in range(5):
+        eyes.add_colour("front", shown, START, 0.4 + number / 10)
+    assert eyes.contours(START, 0.9) == ()
 
 
 @pytest.mark.long
