@@ -113,7 +113,7 @@ class ObjectKeeper:
         self._copied_tick = 0
         self._map = ""  # in use
         self._file: Path | None = None  # where its objects are written
-        self._saved = ObjectMap()  # as written last
+        self._saved: ObjectMap | None = ObjectMap()  # as written last; None where that failed
         self._saved_tick = 0
         self.problem = ""
         self._writer: BackgroundWriter[Write] = BackgroundWriter(self._write, 1)
@@ -239,7 +239,9 @@ class ObjectKeeper:
         """Return why objects are not kept, if they are not."""
         if not self.problem:
             return ()
-        remedy = "remove the damaged file, or make room on the disk, and load the map again"
+        remedy = "remove the damaged file, and load the map again"
+        if self.problem.startswith(UNSAVED):  # a map that is loaded again has those of its file
+            remedy = "make room on the disk; it is tried again every few seconds"
         return (Cause(code="objects_unsaved", text=self.problem[:500], remedy=remedy),)
 
     async def finish_writing(self) -> None:
@@ -354,7 +356,7 @@ class ObjectKeeper:
             return
         found = self.present
         now = ObjectMap(objects=found.objects, tags=found.tags, map=self._map)
-        if not _alike(now, self._saved):
+        if self._saved is None or not _alike(now, self._saved):
             self._saved, self._saved_tick = now, tick
             self._keep_state()
 
@@ -388,7 +390,7 @@ class ObjectKeeper:
 
     def _on_written(self, done: "asyncio.Future[str]") -> None:
         if problem := done.result():
-            self.problem = problem
+            self.problem, self._saved = problem, None
         elif self.problem.startswith(UNSAVED):
             self.problem = ""
 

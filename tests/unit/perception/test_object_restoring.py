@@ -1,5 +1,6 @@
 """The next perception process goes on with the things and tags of the map."""
 
+import asyncio
 from pathlib import Path
 
 import numpy as np
@@ -83,6 +84,23 @@ async def test_things_of_a_map_are_not_restored_into_one_that_was_loaded_since(
     second = keeper(tmp_path, 7, restored=True)
     await second.finish_writing()
     assert known(second) == [5]
+
+
+async def test_what_could_not_be_written_is_written_once_there_is_room(tmp_path: Path) -> None:
+    """Nothing new is seen meanwhile."""
+    folder = tmp_path / "full"
+    folder.write_text("no folder can be made here")
+    found = knowing(folder)
+    await found.finish_writing()
+    await asyncio.sleep(0)
+    (unsaved,) = found.problems()
+    assert (unsaved.code, "load" in unsaved.remedy) == ("objects_unsaved", False)
+    folder.unlink()
+    found.publish(1000)
+    await found.finish_writing()
+    await asyncio.sleep(0)
+    assert found.problems() == ()
+    assert b'"can"' in (folder / "objects.json").read_bytes()
 
 
 def scan(found: ObjectKeeper, tick: int, *, localized: bool) -> None:
