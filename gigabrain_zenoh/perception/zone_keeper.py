@@ -149,6 +149,8 @@ class ZoneKeeper:
         if self._sent_tick is None or not 0 <= tick - self._sent_tick < AGAIN_TICKS:
             self._now = self._bus.publish(ZONES, self._now, basis=tick)
             self._sent_tick = tick
+            if self.problem:  # there may be room by now
+                self._keep_state()
 
     async def finish_writing(self) -> None:
         """Return once all is written."""

@@ -338,6 +338,23 @@ async def test_a_damaged_state_of_zones_is_left_out_with_one_line(
     assert str(tmp_path / "zones.json") in caplog.messages[0]
 
 
+async def test_zones_that_could_not_be_written_are_once_there_is_room(tmp_path: Path) -> None:
+    folder, net = tmp_path / "full", Net()
+    folder.write_text("no folder can be made here")
+    keeper = ZoneKeeper(net.one, str(folder), lambda: 0)
+    keeper.set_boot(7)
+    await net.two.ask(ZONES_CHANGE, ZonesRequest(zone=LAB))
+    await keeper.finish_writing()
+    assert keeper.problems()
+    folder.unlink()
+    keeper.publish(500)
+    await keeper.finish_writing()
+    assert not keeper.problems()
+    kept = ZoneKeeper(Net().one, str(folder), lambda: 0).restore(7)
+    assert kept
+    assert [one.zone for one in kept.items] == [LAB]
+
+
 @pytest.mark.parametrize("mapping", ["localize", "slam"])
 async def test_a_map_that_was_loaded_and_is_gone_does_not_end_perception(
     mapping: Literal["localize", "slam"], tmp_path: Path, caplog: pytest.LogCaptureFixture
