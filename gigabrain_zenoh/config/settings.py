@@ -209,6 +209,7 @@ class Ros2Link(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     types: tuple[str, ...] = ()  # .msg, .srv and .action files of one's own, or folders of them
 
 
+DRIVER_NODE = "gigabrain_driver"  # name of the node of a driver whose body is a ROS 2 robot
 FREE_FLEET = ("tf", "battery_state", "navigate_to_pose")  # topics and actions of ROS that it uses
 
 

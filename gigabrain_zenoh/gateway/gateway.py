@@ -69,8 +69,9 @@ class Gateway:
         await self.work.failed
 
     async def _report(self) -> None:
-        """Put into health what ROS wants and does not get, once a second."""
+        """Put into health what ROS wants and does not get, once a second. Raises ConfigError."""
         async for _ in self._bus.clock.every(PERIOD_NS):
+            self.graph.refuse_own_body()
             refused = (
                 Cause(code=f"ros2_{one.name}", text=f"/{one.name}: {one.text}"[:500], remedy=REMEDY)
                 for one in self._statuses()

@@ -3,7 +3,8 @@
 from collections.abc import Callable, Iterable, Mapping
 
 from gigabrain_schemas.base import Cause
-from gigabrain_zenoh.config.settings import Ros2Config
+from gigabrain_zenoh.config.settings import DRIVER_NODE, Ros2Config
+from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gateway.conversions.diagnostics import Level, Status
 from gigabrain_zenoh.ros2.graph import (
     CLOCK_S,
@@ -17,6 +18,7 @@ from gigabrain_zenoh.ros2.transport import RosTransport
 
 MAX_CAUSES = 8
 MAX_TEXT = 500
+TOPIC_KINDS = ("publisher", "subscriber")
 EVERY = 5  # calls from one look at the graph to the next
 
 
@@ -30,6 +32,21 @@ class GraphWatch:
         self._ros, self._config, self._offsets_s = ros, config, offsets_s
         self._calls = 0
         self.causes: tuple[Cause, ...] = ()
+
+    def refuse_own_body(self) -> None:
+        """Raise ConfigError where the driver of a ROS 2 robot has topics of the gateway.
+
+        Its commands and scans would come back to it by the gateway, and keep the robot moving.
+        """
+        endpoints = self._ros.endpoints()
+        ours = {one.topic for one in endpoints if one.ours and one.kind in TOPIC_KINDS}
+        theirs = [one for one in endpoints if one.node.rpartition("/")[2] == DRIVER_NODE]
+        if shared := sorted(ours & {one.topic for one in theirs if not one.ours}):
+            raise ConfigError(
+                f"ros2: {theirs[0].node}, whose body is a ROS 2 robot, uses {', '.join(shared)} "
+                "here as well: the robot's own commands and scans would come back to it; set "
+                "another `namespace:`, such as /gigabrain, or another `domain:`"
+            )
 
     def look(self) -> tuple[Cause, ...]:
         """Return what is wrong; each fifth call looks again."""

@@ -1,12 +1,24 @@
 """The gateway's report on the ROS graph: our keys, QoS mismatches, and clocks."""
 
-from gigabrain_zenoh.config.settings import Ros2Config
+import asyncio
+
+import pytest
+
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork
+from gigabrain_zenoh.clock import FakeClock
+from gigabrain_zenoh.config.settings import DRIVER_NODE, Ros2Config, Ros2Link
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.gateway.gateway import serve
 from gigabrain_zenoh.gateway.topic_list import rows
+from gigabrain_zenoh.ros2.memory import MemoryNetwork
 from gigabrain_zenoh.ros2.qos import DEFAULT
+from tests.node.ros2_robot import TYPES
 from tests.node.test_ros2_topics import driver
 
 DDS = Ros2Config(transport="dds", domain=7, namespace="/red")
 LASER = "sensor_msgs/msg/LaserScan"
+STAMPED = "geometry_msgs/msg/TwistStamped"
 SECOND_NS = 1_000_000_000
 
 
@@ -72,3 +84,40 @@ async def test_the_gateway_reports_how_it_has_joined() -> None:
         robot.node.read("/red/scan", LASER, DEFAULT)
         assert (robot.gateway_bus.report()["other_nodes"]) == 1
         assert robot.gateway_bus.report()["to_check"] == ""
+
+
+async def beside_a_driver(config: Ros2Config) -> "asyncio.Task[None]":
+    """Return a gateway, 2 s after the driver of a ROS 2 robot has joined its domain."""
+    clock, ros = FakeClock(), MemoryNetwork(TYPES)
+    bus = Bus(LocalNetwork().transport(), clock, "ros2")
+    running = asyncio.ensure_future(serve(config, bus, ros.transport(config), TYPES, str))
+    await clock.advance(SECOND_NS)
+    node = ros.transport(Ros2Link(node=DRIVER_NODE))
+    node.subscribe("scan", LASER, DEFAULT, lambda _: None)
+    node.publisher("cmd_vel", STAMPED)
+    assert not running.done()
+    await clock.advance(2 * SECOND_NS)
+    return running
+
+
+async def test_a_gateway_ends_where_the_body_is_a_ros_robot_with_the_same_topics() -> None:
+    running = await beside_a_driver(Ros2Config())
+    with pytest.raises(ExceptionGroup) as ended:
+        await asyncio.wait_for(running, 1.0)
+    (error,) = ended.value.exceptions
+    assert isinstance(error, ConfigError)
+    assert str(error) == (
+        "ros2: /gigabrain_driver, whose body is a ROS 2 robot, uses /cmd_vel, /scan here as well: "
+        "the robot's own commands and scans would come back to it; set another `namespace:`, such "
+        "as /gigabrain, or another `domain:`"
+    )
+
+
+@pytest.mark.parametrize(
+    "config", [Ros2Config(namespace="/gigabrain"), Ros2Config(leave_out=("scan", "cmd_vel"))]
+)
+async def test_a_gateway_with_other_topics_may_be_beside_a_ros_robot(config: Ros2Config) -> None:
+    running = await beside_a_driver(config)
+    assert not running.done()
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)

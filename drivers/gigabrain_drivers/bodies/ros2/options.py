@@ -12,7 +12,7 @@ from msgspec import Meta, Struct
 
 from gigabrain_drivers.driver.robot import LinkOptions, RobotFile
 from gigabrain_schemas.base import Name
-from gigabrain_zenoh.config.settings import Ros2Link, RosName, RosNamespace
+from gigabrain_zenoh.config.settings import DRIVER_NODE, Ros2Link, RosName, RosNamespace
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import read_bounded
 
@@ -117,7 +117,7 @@ class Ros2Options(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
     transport: Literal["rmw_zenoh", "dds"]
     domain: Annotated[int, Meta(ge=0, le=232)] = 0  # ROS_DOMAIN_ID of the robot
     namespace: RosNamespace = "/"
-    node: RosName = "gigabrain_driver"  # name of the driver's node
+    node: RosName = DRIVER_NODE  # name of the driver's node
     router: str = ""  # Zenoh endpoint of the robot's ROS router, for rmw_zenoh
     distro: Literal["humble", "iron", "jazzy", "kilted", "rolling"] = "jazzy"  # of the robot
     localhost: bool = False  # DDS talks to nodes of this host only
