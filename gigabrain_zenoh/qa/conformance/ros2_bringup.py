@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import functools
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 from gigabrain_drivers.bodies.ros2 import options as ros2
 from gigabrain_drivers.bodies.ros2.bringup import Finding, Heard, Row, Watched, findings, rows
+from gigabrain_drivers.bodies.ros2.conversion import Unusable, battery_of, imu_of, joints_of
 from gigabrain_drivers.bodies.ros2.link import all_types
 from gigabrain_drivers.bodies.ros2.options import Ros2Options
 from gigabrain_drivers.driver import catalog
@@ -66,7 +68,7 @@ async def watch(
     for row in rows(options):
         if row.part != "mounting":
             heard = watched.heard[row.part] = Heard()
-            taker = _taker(row, types, heard, lambda: begun)
+            taker = _taker(row, types, heard, _converter(row.part, options), lambda: begun)
             transport.subscribe(row.topic, row.type, best_effort, taker)
     latched = Qos(transient_local=True, depth=DEPTH)
 
@@ -82,8 +84,22 @@ async def watch(
     return watched
 
 
+def _converter(part: str, options: Ros2Options) -> Callable[[Any], object]:
+    """Return what the driver makes of a topic's messages, without their mounting."""
+    topics = options.topics
+    if part == "battery" and topics.battery:
+        return functools.partial(battery_of, options=topics.battery)
+    if part == "joints" and topics.joints:
+        return functools.partial(joints_of, options=topics.joints)
+    return imu_of if part == "imu" else lambda message: message
+
+
 def _taker(
-    row: Row, types: Types, heard: Heard, begun: Callable[[], bool]
+    row: Row,
+    types: Types,
+    heard: Heard,
+    convert: Callable[[Any], object],
+    begun: Callable[[], bool],
 ) -> Callable[[Received], None]:
     """Return what takes the messages of a topic."""
     first_s: list[float] = []
@@ -100,5 +116,9 @@ def _taker(
             heard.unreadable = str(error)
             return
         heard.take(message, time.time_ns(), now_s - first_s[0])
+        try:
+            convert(message)
+        except Unusable as error:
+            heard.unusable = str(error)
 
     return take

@@ -1,5 +1,6 @@
 """The bringup check names what is wrong with a ROS 2 robot, and what to do."""
 
+import asyncio
 from typing import Any
 
 import msgspec
@@ -17,6 +18,9 @@ from gigabrain_drivers.bodies.ros2.bringup import (
 from gigabrain_drivers.bodies.ros2.frames import FrameTree
 from gigabrain_drivers.bodies.ros2.options import Ros2Options
 from gigabrain_schemas.body import Lidar
+from gigabrain_zenoh.config.settings import Ros2Link
+from gigabrain_zenoh.qa.conformance.ros2_bringup import watch
+from gigabrain_zenoh.ros2.memory import MemoryNetwork
 from gigabrain_zenoh.ros2.qos import LATCHED, SENSOR_DATA, Qos
 from gigabrain_zenoh.ros2.transport import EndpointKind, GraphEndpoint
 from gigabrain_zenoh.ros2.types import Types
@@ -150,6 +154,7 @@ def test_messages_with_right_rates_and_stamps_are_fine() -> None:
     [
         (Heard(), "error", "no message came"),
         (Heard(unreadable="bad"), "error", "bad"),
+        (heard(unusable="odd"), "error", "odd"),
         (heard(10.0), "warning", "10.0 messages a second; expected 20"),
         (heard(offset_s=3.0), "warning", "3.0 s behind this machine's clock"),
         (heard(offset_s=-3.0), "warning", "3.0 s ahead of this machine's clock"),
@@ -217,3 +222,17 @@ def test_frames_must_lead_to_the_base(
     found = only(findings(options(mounting=mounting), LIDAR, seen), "scan frame")
     assert found.verdict == verdict
     assert text in found.text
+
+
+async def test_a_watch_tells_what_the_driver_could_not_use() -> None:
+    kind, types = "sensor_msgs/msg/BatteryState", Types()
+    network, given = MemoryNetwork(types), options(topics={"battery": {}})
+    watching = asyncio.create_task(watch(network.transport(), types, given, 0.2))
+    publisher = network.transport(Ros2Link(node="base")).publisher("battery_state", kind)
+    full = types.encode(kind, types.make(kind, voltage=12.0, percentage=83.0))
+    while not watching.done():
+        publisher.publish(full)
+        await asyncio.sleep(0.01)
+    battery = (await watching).heard["battery"]
+    assert battery.count > 0
+    assert battery.unusable.startswith("its percentage is 83; expected 0 to 1")

@@ -1,7 +1,7 @@
 """ROS messages as ours: angles, ranges, mountings, and what is no measurement."""
 
 import math
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -181,6 +181,29 @@ def test_batteries_have_percent_and_their_current_the_other_sign(types: Types) -
     assert (found.percentage, found.current) == (83.0, 0.0)
     with pytest.raises(Unusable):
         battery_of(types.make(kind, voltage=12.0, percentage=NAN), BatteryTopic())
+
+
+@pytest.mark.parametrize(
+    ("percentage", "full", "text"),
+    [
+        (83.0, 1, "its percentage is 83; expected 0 to 1, or write battery: {full: 100}"),
+        (1.2, 1, "its percentage is 1.2; expected 0 to 1, or write battery: {full: 100}"),
+        (130.0, 100, "its percentage is 130; expected 0 to 100"),
+        (-1.0, 1, "its percentage is -1; expected 0 to 1"),
+    ],
+)
+def test_a_charge_that_cannot_be_is_no_full_or_empty_battery(
+    types: Types, percentage: float, full: Literal[1, 100], text: str
+) -> None:
+    message = types.make("sensor_msgs/msg/BatteryState", voltage=12.0, percentage=percentage)
+    with pytest.raises(Unusable) as error:
+        battery_of(message, BatteryTopic(full=full))
+    assert str(error.value) == text
+
+
+def test_a_charge_just_above_full_is_full(types: Types) -> None:
+    message = types.make("sensor_msgs/msg/BatteryState", voltage=12.6, percentage=1.03)
+    assert battery_of(message, BatteryTopic()).percentage == 100.0
 
 
 def test_joints_have_names_positions_and_velocities(types: Types) -> None:

@@ -61,7 +61,8 @@ class Heard:
     frame: str = ""
     child_frame: str = ""
     tilt: bool = True  # false of an inertial unit without orientation
-    unreadable: str = ""  # why a message could not be decoded or used
+    unreadable: str = ""  # why a message could not be decoded
+    unusable: str = ""  # why the driver drops a message
 
     @property
     def hz(self) -> float:
@@ -228,6 +229,9 @@ def _messages(row: Row, heard: Heard) -> list[Finding]:
     if heard.unreadable:
         do = "is it the same definition on the robot? Other distributions changed some"
         return [Finding(row.topic, "error", heard.unreadable, do)]
+    if heard.unusable:
+        do = f"correct topics.{row.part} in the file, or the node that publishes it"
+        return [Finding(row.topic, "error", heard.unusable, do)]
     if not heard.count:
         do = "is its node alive, and the network between open for UDP both ways?"
         return [Finding(row.topic, "error", "its publisher is there, but no message came", do)]

@@ -25,6 +25,7 @@ from gigabrain_zenoh.ros2.types import Types
 MAX_BEAMS = 20_000
 MAX_JOINTS = 64
 MAX_IMU_VALUE = 1000.0  # [m/s2] and [rad/s], beyond which an inertial unit is talking nonsense
+BEYOND_CHARGE = 0.1  # share by which a gauge may be beyond empty or full
 NANO = 1_000_000_000
 NO_ORIENTATION = (0.0, 0.0, 0.0, 0.0)  # safety then knows no tilt
 CUT = 1e-6  # by which a speed lies beyond its step, so that a robot that truncates keeps it
@@ -147,10 +148,14 @@ def _quaternion(turn: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def battery_of(message: Any, options: BatteryTopic) -> Battery:
-    """Return the battery. Raises Unusable where its charge is not known."""
+    """Return the battery. Raises Unusable where its charge is not known, or cannot be."""
     volts, share = float(message.voltage), float(message.percentage)
     if not math.isfinite(volts) or not math.isfinite(share):
         raise Unusable("it has no voltage or no percentage")
+    if abs(share / options.full - 0.5) > 0.5 + BEYOND_CHARGE:
+        percent = share > 0 and options.full == 1
+        hint = ", or write battery: {full: 100}" if percent else ""
+        raise Unusable(f"its percentage is {share:g}; expected 0 to {options.full}{hint}")
     current = float(message.current)
     return Battery(
         voltage=max(volts, 0.0),
