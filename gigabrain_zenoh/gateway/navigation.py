@@ -14,7 +14,7 @@ import msgspec
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.tasks import Task, TaskStatus
-from gigabrain_schemas.topics import MAP
+from gigabrain_schemas.topics import MAP, TASK
 from gigabrain_zenoh.client.tasks import Tasks
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import GigabrainError, Refused
@@ -66,6 +66,9 @@ class Navigator:
     def __init__(self, scene: Scene) -> None:
         self._scene, self._tasks = scene, Tasks(scene.bus)
         self._task = ""  # name of the task that the robot is at for ROS
+        self._abandoned: set[str] = set()  # tasks whose goals were aborted without an answer
+        self._cancels: set[asyncio.Task[None]] = set()
+        self._listens = False
 
     async def carry_out(
         self, codes: Codes, poses: Sequence[Pose], on_progress: OnProgress
@@ -90,6 +93,7 @@ class Navigator:
         try:
             task = await self._tasks.result(name, follow.update)
         except GigabrainError as error:
+            self._abandon(name)
             return Outcome(EndState.ABORTED, codes.navigator + result_codes.UNKNOWN, str(error))
         except asyncio.CancelledError:
             if self._task == name:  # no other goal takes its place
@@ -110,6 +114,21 @@ class Navigator:
         if name:
             with contextlib.suppress(GigabrainError):  # it has just ended
                 await self._tasks.cancel(name)
+
+    def _abandon(self, name: str) -> None:
+        """Have a task cancelled if it goes on after its goal was aborted in a silence."""
+        self._abandoned.add(name)
+        if not self._listens:
+            self._listens = True
+            self._scene.bus.subscribe(TASK, self._on_status)
+
+    def _on_status(self, _key: str, status: TaskStatus) -> None:
+        for task in (status.current, *status.queue):
+            if task and task.id in self._abandoned:
+                self._abandoned.remove(task.id)
+                cancel = asyncio.ensure_future(self._cancel(task.id))
+                self._cancels.add(cancel)
+                cancel.add_done_callback(self._cancels.discard)
 
     async def _refused(self, codes: Codes, poses: Sequence[Pose], error: GigabrainError) -> Outcome:
         """Return the outcome of a goal that was not accepted, with a code by the map."""
