@@ -7,6 +7,7 @@ from collections.abc import Callable
 from gigabrain_schemas.base import Cause
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import Ros2Config
+from gigabrain_zenoh.errors import UnknownName, unknown
 from gigabrain_zenoh.gateway import free_fleet
 from gigabrain_zenoh.gateway.background import Background
 from gigabrain_zenoh.gateway.conversions.diagnostics import Level, Status
@@ -16,7 +17,7 @@ from gigabrain_zenoh.gateway.graph_watch import GraphWatch
 from gigabrain_zenoh.gateway.joint_requests import JointRequests
 from gigabrain_zenoh.gateway.nav2 import Nav2Actions
 from gigabrain_zenoh.gateway.parameters import Parameters
-from gigabrain_zenoh.gateway.publishing import Publishing
+from gigabrain_zenoh.gateway.publishing import COMMANDED, Publishing, table
 from gigabrain_zenoh.gateway.scene import Scene
 from gigabrain_zenoh.gateway.services import Services
 from gigabrain_zenoh.ros2.transport import RosTransport
@@ -91,10 +92,20 @@ class Gateway:
         self.joints.forget(why)
 
 
+def _check_left_out(config: Ros2Config) -> None:
+    """Raise UnknownName for a name to leave out that the gateway does not offer."""
+    known = {row.topic for row in table()} | COMMANDED.keys()
+    for name in config.leave_out:
+        plain = name.strip("/")
+        if plain not in known and not plain.startswith("camera/"):
+            raise UnknownName(f"ros2: leave_out: {unknown('name', name, known)}", value=name)
+
+
 async def serve(
     config: Ros2Config, bus: Bus, ros: RosTransport, types: Types, ready: Callable[[], None]
 ) -> None:
-    """Serve ROS until the process ends."""
+    """Serve ROS until the process ends. Raises ConfigError."""
+    _check_left_out(config)
     gateway = Gateway(config, bus, ros, types)
     running = asyncio.ensure_future(gateway.run())
     try:

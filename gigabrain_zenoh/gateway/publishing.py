@@ -8,7 +8,26 @@ from typing import Any
 
 from gigabrain_schemas.body import Body, Camera, RobotState
 from gigabrain_schemas.tasks import TaskStatus
-from gigabrain_schemas.topics import BODY, DEPTH, IMAGE, IMU, MAP, SCAN, STATE, TASK, Topic
+from gigabrain_schemas.topics import (
+    BODY,
+    CMD_VEL,
+    DEPTH,
+    ENABLE,
+    ESTOP,
+    GOAL,
+    IMAGE,
+    IMU,
+    JOINT_CMD,
+    MAP,
+    MAP_SAVE,
+    MISSION,
+    POSE_SET,
+    RELEASE,
+    SCAN,
+    STATE,
+    TASK,
+    Topic,
+)
 from gigabrain_zenoh.bus.transport import Close
 from gigabrain_zenoh.config.settings import Ros2Config
 from gigabrain_zenoh.gateway.conversions import body as of_body
@@ -34,6 +53,12 @@ log = logging.getLogger(__name__)
 SECOND_NS = 1_000_000_000
 TF = Qos(depth=100)  # as tf2's broadcaster
 CLOCK = Qos(reliable=False, depth=1)  # as ROS's own subscription
+COMMANDED = {  # what ROS asks of the robot; what it reads is in `table`
+    "cmd_vel": CMD_VEL.key, "initialpose": POSE_SET.key, "goal_pose": GOAL.key,
+    "navigate_to_pose": GOAL.key, "navigate_through_poses": MISSION.key, "estop": ESTOP.key,
+    "release": RELEASE.key, "enable": ENABLE.key, "map_save": MAP_SAVE.key,
+    "joint_trajectory": JOINT_CMD.key, "follow_joint_trajectory": JOINT_CMD.key,
+}  # fmt: skip
 # a message, or its CDR; None: nothing to publish
 Convert = Callable[[Make, Any, Scene], Any | None]
 

@@ -7,33 +7,13 @@ from typing import Literal
 from msgspec import Struct
 from rich.table import Table
 
-from gigabrain_schemas.topics import (
-    CMD_VEL,
-    DEPTH,
-    ENABLE,
-    ESTOP,
-    GOAL,
-    HEALTH,
-    IMAGE,
-    JOINT_CMD,
-    MAP_SAVE,
-    MISSION,
-    POSE_SET,
-    RELEASE,
-    SAFETY,
-)
+from gigabrain_schemas.topics import DEPTH, HEALTH, IMAGE, SAFETY
 from gigabrain_zenoh.config.settings import Ros2Link
 from gigabrain_zenoh.diagnostics.discovery import plain_table
-from gigabrain_zenoh.gateway.publishing import table
+from gigabrain_zenoh.gateway.publishing import COMMANDED, table
 from gigabrain_zenoh.ros2.graph import troubles
 from gigabrain_zenoh.ros2.transport import EndpointKind, GraphEndpoint
 
-COMMANDED = {  # what ROS asks of the robot; what it reads is in `table`
-    "cmd_vel": CMD_VEL.key, "initialpose": POSE_SET.key, "goal_pose": GOAL.key,
-    "navigate_to_pose": GOAL.key, "navigate_through_poses": MISSION.key, "estop": ESTOP.key,
-    "release": RELEASE.key, "enable": ENABLE.key, "map_save": MAP_SAVE.key,
-    "joint_trajectory": JOINT_CMD.key, "follow_joint_trajectory": JOINT_CMD.key,
-}  # fmt: skip
 EVERY_NODE = ("rcl_interfaces/", "type_description_interfaces/")  # types of what all nodes have
 ACTION = "/_action/"
 GOES_OUT: tuple[EndpointKind, ...] = ("publisher", "server")

@@ -121,3 +121,11 @@ async def test_a_gateway_with_other_topics_may_be_beside_a_ros_robot(config: Ros
     assert not running.done()
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)
+
+
+@pytest.mark.parametrize("name", ["navigate_to_pos", "/red/map", "diagnostics", ""])
+async def test_a_name_to_leave_out_that_the_gateway_does_not_have_is_refused(name: str) -> None:
+    config, ros = Ros2Config(leave_out=(name,)), MemoryNetwork(TYPES)
+    bus = Bus(LocalNetwork().transport(), FakeClock(), "ros2")
+    with pytest.raises(ConfigError, match=r"^ros2: leave_out: no name .*known: .*map, map_save"):
+        await asyncio.wait_for(serve(config, bus, ros.transport(config), TYPES, str), 1.0)
