@@ -191,8 +191,8 @@ class DdsTransport:
 
     async def __aenter__(self) -> "DdsTransport":
         self._loop = asyncio.get_running_loop()
-        self._bridge = Bridge()
         self._services = await RequestReply.open(self.link.domain, localhost=self.link.localhost)
+        self._bridge = Bridge()
         try:
             self._open()
         except DDSException as error:

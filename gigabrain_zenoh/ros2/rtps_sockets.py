@@ -48,13 +48,18 @@ class Sockets:
 
     async def open(self, receive: Callable[[bytes, str], None]) -> None:
         """Bind the ports of the first free participant. Raises BusError if there is none."""
-        builtin, user = self._free_pair()
+        # bound to its port, it would get what others of this host have joined for
+        self._group = None if self._localhost else self._group_socket()
+        try:
+            builtin, user = self._free_pair()
+        except BusError:
+            if self._group:
+                self._group.close()
+            raise
         self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._out.setblocking(False)
         self._out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
         self._out.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, RECEIVE_BYTES)
-        # bound to its port, it would get what others of this host have joined for
-        self._group = None if self._localhost else self._group_socket()
         for one in (builtin, user, *([self._group] if self._group else [])):
             one.setblocking(False)
             with contextlib.suppress(OSError):
@@ -133,7 +138,15 @@ class Sockets:
         if hasattr(socket, "SO_REUSEPORT"):
             with contextlib.suppress(OSError):
                 group.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
-        group.bind((ANY, multicast_port(self._domain)))
+        port = multicast_port(self._domain)
+        try:
+            group.bind((ANY, port))
+        except OSError as error:
+            group.close()
+            raise BusError(
+                f"UDP port {port} of DDS domain {self._domain}: {error.strerror}; end the program "
+                "that has it, choose another domain, or set localhost: true"
+            ) from None
         return group
 
 

@@ -1,15 +1,18 @@
 """Opening a transport: what is missing is named."""
 
+import socket
 from pathlib import Path
 
+import psutil
 import pytest
 
 from gigabrain_zenoh.config.settings import Endpoint, Ros2Config, Ros2Link
-from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.errors import BusError, ConfigError
 from gigabrain_zenoh.ros2 import opening
 from gigabrain_zenoh.ros2.opening import load_types, open_transport
 from gigabrain_zenoh.ros2.qos import LATCHED, SENSOR_DATA, Qos, mismatch
 from gigabrain_zenoh.ros2.rmw_zenoh import RmwZenohTransport
+from gigabrain_zenoh.ros2.rtps_discovery import multicast_port
 from gigabrain_zenoh.ros2.types import Types
 
 
@@ -26,6 +29,20 @@ async def test_dds_without_its_library_names_the_extra(
     with pytest.raises(ConfigError, match=r"gigabrain-zenoh\[dds\]"):
         async with open_transport(Ros2Link(transport="dds"), types):
             pass
+
+
+@pytest.mark.skipif(not hasattr(psutil.Process, "num_fds"), reason="Windows counts no files")
+async def test_a_domain_that_cannot_be_joined_leaves_no_file_open(types: Types) -> None:
+    pytest.importorskip("cyclonedds")
+    with socket.socket(type=socket.SOCK_DGRAM) as taken:
+        taken.bind(("", multicast_port(230)))
+        link, files = Ros2Link(transport="dds", domain=230), []
+        for _ in range(3):  # as a driver does five times a second
+            with pytest.raises(BusError, match="UDP port 64900 of DDS domain 230"):
+                async with open_transport(link, types):
+                    pass
+            files.append(psutil.Process().num_fds())
+    assert files[2] == files[0]
 
 
 async def test_rmw_zenoh_without_a_router_names_the_option(types: Types) -> None:

@@ -6,7 +6,11 @@ import socket
 import pytest
 
 from gigabrain_zenoh.errors import BusError
-from gigabrain_zenoh.ros2.rtps_discovery import MAX_DOMAIN, participant_ports
+from gigabrain_zenoh.ros2.rtps_discovery import (
+    MAX_DOMAIN,
+    multicast_port,
+    participant_ports,
+)
 from gigabrain_zenoh.ros2.rtps_sockets import Sockets
 
 
@@ -28,3 +32,16 @@ async def test_the_last_domain_says_which_of_its_ports_are_all_taken():
         sockets = Sockets(MAX_DOMAIN, localhost=True, peers=())
         with pytest.raises(BusError, match=r"domain 232 \(65410 to 65535\)"):
             await sockets.open(lambda datagram, host: None)
+
+
+async def test_a_port_of_announcements_that_another_program_has_is_named():
+    domain = 231
+    with socket.socket(type=socket.SOCK_DGRAM) as taken:
+        taken.bind(("", multicast_port(domain)))
+        sockets = Sockets(domain, localhost=False, peers=())
+        with pytest.raises(BusError, match=r"UDP port 65150 of DDS domain 231: Address already"):
+            await sockets.open(lambda datagram, host: None)
+    sockets.close()
+    for port in participant_ports(domain, 0):  # nothing is left open
+        with socket.socket(type=socket.SOCK_DGRAM) as free:
+            free.bind(("", port))
