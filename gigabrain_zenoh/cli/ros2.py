@@ -108,8 +108,8 @@ def topics(
         all_topics: Also list what every node has, and the parts of actions.
     """
     link = checked(options.given(), Ros2Link)
-    endpoint = None if link.transport == "dds" else _endpoint(at)
-    link = with_ros_router(link, endpoint) if endpoint else link
+    if link.transport == "rmw_zenoh" and not link.router:
+        link = with_ros_router(link, _endpoint(at))
     listed = run_async(_listed(link, all_topics=all_topics))
     if json:
         for row in listed:

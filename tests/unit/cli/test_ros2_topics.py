@@ -1,0 +1,27 @@
+"""`gigabrain ros2 topics` on a computer without a robot."""
+
+import importlib
+
+import pytest
+
+from gigabrain_zenoh.config.settings import Ros2Link
+
+ros2 = importlib.import_module("gigabrain_zenoh.cli.ros2")
+
+
+@pytest.mark.parametrize(
+    "given", [{"router": "tcp/127.0.0.1:7447"}, {"transport": "dds", "domain": 7}]
+)
+def test_a_network_of_ros_that_is_named_needs_no_robot(
+    given: dict[str, str], monkeypatch: pytest.MonkeyPatch, tmp_path: str
+) -> None:
+    joined: list[Ros2Link] = []
+
+    async def listed(link: Ros2Link, *, all_topics: bool) -> list[object]:
+        joined.append(link)
+        return []
+
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))  # no robot runs here
+    monkeypatch.setattr(ros2, "_listed", listed)
+    ros2.topics(options=ros2.RosLinkOptions(**given))
+    assert joined == [Ros2Link(**given)]
