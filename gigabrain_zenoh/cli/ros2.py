@@ -128,10 +128,10 @@ async def _listed(link: Ros2Link, *, all_topics: bool) -> "list[TopicRow]":
     """Join ROS for a while. Raises BusError where no other node is there."""
     from gigabrain_zenoh.gateway.topic_list import rows
     from gigabrain_zenoh.ros2.graph import discovered, unreached
-    from gigabrain_zenoh.ros2.opening import load_types, open_transport
+    from gigabrain_zenoh.ros2.opening import ROUTER_S, load_types, open_transport
 
     own = msgspec.structs.replace(link, node=f"{link.node}_topics", namespace="/")
-    async with open_transport(own, load_types(own)) as ros:
+    async with open_transport(own, load_types(own), timeout_s=ROUTER_S) as ros:
         found = await discovered(ros.endpoints)
     if not found:
         do = unreached(link.transport, link.domain, link.router)

@@ -10,6 +10,8 @@ from gigabrain_zenoh.host.files import expanded
 from gigabrain_zenoh.ros2.transport import RosTransport
 from gigabrain_zenoh.ros2.types import Types
 
+ROUTER_S = 5.0  # how long a router may take to answer a tool
+
 
 def load_types(link: Ros2Link) -> Types:
     """Load all types, those of the user's files as well. Raises ConfigError."""
@@ -18,12 +20,16 @@ def load_types(link: Ros2Link) -> Types:
 
 @asynccontextmanager
 async def open_transport(
-    link: Ros2Link, types: Types, endpoint: Endpoint | None = None
+    link: Ros2Link,
+    types: Types,
+    endpoint: Endpoint | None = None,
+    timeout_s: float | None = None,
 ) -> AsyncIterator[RosTransport]:
     """Open a node, and close it at the end of the context.
 
-    `endpoint` is the deployment's own, for `rmw_zenoh` without a router of its own. Raises
-    ConfigError where a library or a router is missing, BusError where the domain cannot be joined.
+    `endpoint` is the deployment's own, for `rmw_zenoh` without a router of its own. With
+    `timeout_s` None it waits for a router as long as it takes. Raises ConfigError where a library
+    or the name of a router is missing, BusError where router or domain cannot be joined.
     """
     made: RosTransport
     if link.transport == "dds":
@@ -36,5 +42,5 @@ async def open_transport(
     else:
         from gigabrain_zenoh.ros2.rmw_zenoh import RmwZenohTransport
 
-        async with RmwZenohTransport(link, types, endpoint) as made:
+        async with RmwZenohTransport(link, types, endpoint, timeout_s) as made:
             yield made

@@ -28,7 +28,7 @@ from gigabrain_zenoh.bus.zenoh.session import (
     open_session,
 )
 from gigabrain_zenoh.config.settings import Endpoint, Ros2Link
-from gigabrain_zenoh.errors import ConfigError, GigabrainError, NoAnswer
+from gigabrain_zenoh.errors import BusError, ConfigError, GigabrainError, NoAnswer
 from gigabrain_zenoh.logs import QuietFault
 from gigabrain_zenoh.ros2.qos import DEFAULT, SERVICES, Qos
 from gigabrain_zenoh.ros2.rmw_declared import REMOTE, advanced_publisher, subscriber
@@ -55,6 +55,7 @@ from gigabrain_zenoh.ros2.transport import (
 from gigabrain_zenoh.ros2.types import Types
 
 log = logging.getLogger(__name__)
+PATIENCE_S = 2.0  # how long the router may be missing before a warning is logged
 RETRY_S = 0.1  # until a service is asked again that no node serves yet
 
 
@@ -164,9 +165,18 @@ class RmwZenohTransport:
     lines: ReconnectingSession
     bridge: Bridge
 
-    def __init__(self, link: Ros2Link, types: Types, endpoint: Endpoint | None = None) -> None:
-        """Prepare; `endpoint` is the deployment's own, used if `link` names no router."""
-        self.link, self.types = link, types
+    def __init__(
+        self,
+        link: Ros2Link,
+        types: Types,
+        endpoint: Endpoint | None = None,
+        timeout_s: float | None = None,
+    ) -> None:
+        """Prepare; `endpoint` is the deployment's own, used if `link` names no router.
+
+        With `timeout_s` None it waits for the router as long as it takes.
+        """
+        self.link, self.types, self._timeout_s = link, types, timeout_s
         self.counts: Counter[str] = Counter()
         self.ids = count(1)  # of endpoints; 0 is the node's
         self.publishers: set[RmwZenohPublisher] = set()
@@ -176,7 +186,7 @@ class RmwZenohTransport:
         self._clients: dict[tuple[str, str], _Entity] = {}
 
     async def __aenter__(self) -> "RmwZenohTransport":
-        session = await open_session(self.endpoint)
+        session = await self._session()
         self.bridge = Bridge()
         self._questions: QueryQueue[zenoh.Query] = QueryQueue(self.bridge, _drop)
         self.lines = ReconnectingSession(session, self.endpoint, self.bridge, self._lost)
@@ -310,6 +320,21 @@ class RmwZenohTransport:
             and (each.topic, each.type, each.hash) == (entity.topic, entity.type, hash)
             for each in self.endpoints()
         )
+
+    async def _session(self) -> zenoh.Session:
+        """Open the first session. Raises BusError without a router in time."""
+        opening = asyncio.ensure_future(open_session(self.endpoint))
+        try:
+            done, _ = await asyncio.wait((opening,), timeout=self._timeout_s or PATIENCE_S)
+            if not done:
+                where = ", ".join(self.endpoint.connect)
+                text = f"no router answers at {where}; start it, or correct `router`"
+                if self._timeout_s:
+                    raise BusError(text)
+                log.warning("%s; waiting for it", text)
+            return await opening
+        finally:
+            opening.cancel()
 
     def _declare_node(self, line: OpenSession) -> Bundle:
         name = self.name_in(line.session)

@@ -7,14 +7,17 @@ from typing import Any
 import pytest
 import zenoh
 
-from gigabrain_zenoh.config.settings import Ros2Link
-from gigabrain_zenoh.errors import ConfigError, NoAnswer, Refused
+from gigabrain_zenoh.bus.zenoh.session import open_session
+from gigabrain_zenoh.config.settings import Endpoint, Ros2Link
+from gigabrain_zenoh.errors import BusError, ConfigError, NoAnswer, Refused
+from gigabrain_zenoh.ros2 import rmw_zenoh
 from gigabrain_zenoh.ros2.actions import ActionServer, Goal, GoalState, Outcome
+from gigabrain_zenoh.ros2.opening import open_transport
 from gigabrain_zenoh.ros2.qos import LATCHED, Qos
 from gigabrain_zenoh.ros2.rmw_names import NodeName, parse_attachment
 from gigabrain_zenoh.ros2.rmw_zenoh import RmwZenohTransport
 from gigabrain_zenoh.ros2.transport import Received
-from gigabrain_zenoh.testing.processes import repeat, robot
+from gigabrain_zenoh.testing.processes import free_endpoint, repeat, robot
 from gigabrain_zenoh.testing.waiting import until
 from tests.ros2.nodes import STRING, TRIGGER, ZenohNodes, types, zenoh_nodes
 
@@ -263,3 +266,19 @@ async def test_a_closed_node_keeps_no_publisher_that_a_callback_could_drop(
         publisher = node.publisher("/map", STRING, LATCHED)
         assert publisher._put
     assert publisher._put is None
+
+
+async def test_a_router_that_is_not_there_is_named_and_waited_for(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(rmw_zenoh, "PATIENCE_S", 0.05)
+    here = free_endpoint()
+    link = Ros2Link(router=here)
+    with pytest.raises(BusError, match=f"^no router answers at {here}; start it, or correct"):
+        async with open_transport(link, types(), timeout_s=0.05):
+            pass
+    joining = asyncio.ensure_future(RmwZenohTransport(link, types()).__aenter__())
+    await until(lambda: f"no router answers at {here}" in caplog.text)
+    router = await open_session(Endpoint(listen=(here,)))
+    await (await joining).__aexit__(None, None, None)
+    await asyncio.to_thread(router.close)
