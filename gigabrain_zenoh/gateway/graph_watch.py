@@ -1,4 +1,4 @@
-"""Mismatches between ROS and the gateway, for health: types, QoS, type hashes and clocks."""
+"""Faults between ROS and the gateway, for health: types, QoS, hashes, clocks, doubled names."""
 
 from collections.abc import Callable, Iterable, Mapping
 
@@ -10,6 +10,7 @@ from gigabrain_zenoh.ros2.graph import (
     CLOCK_S,
     SYNCHRONISE,
     clock_text,
+    doubles,
     nameless,
     troubles,
     unreached,
@@ -77,7 +78,7 @@ class GraphWatch:
 
     def _find(self) -> Iterable[Cause]:
         endpoints = self._ros.endpoints()
-        found = troubles(self._config, endpoints, ours_only=True)
+        found = [*doubles(endpoints), *troubles(self._config, endpoints, ours_only=True)]
         if odd := nameless(self._config, endpoints):
             found.append(odd)
         for one in found:

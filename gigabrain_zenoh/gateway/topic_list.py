@@ -11,11 +11,10 @@ from gigabrain_schemas.topics import DEPTH, HEALTH, IMAGE, SAFETY
 from gigabrain_zenoh.config.settings import Ros2Link
 from gigabrain_zenoh.diagnostics.discovery import plain_table
 from gigabrain_zenoh.gateway.publishing import COMMANDED, table
-from gigabrain_zenoh.ros2.graph import troubles
+from gigabrain_zenoh.ros2.graph import ACTION, troubles
 from gigabrain_zenoh.ros2.transport import EndpointKind, GraphEndpoint
 
 EVERY_NODE = ("rcl_interfaces/", "type_description_interfaces/")  # types of what all nodes have
-ACTION = "/_action/"
 GOES_OUT: tuple[EndpointKind, ...] = ("publisher", "server")
 COLUMNS = ("name", "type", "QoS", "from", "to", "robot")
 Kind = Literal["topic", "service", "action"]

@@ -20,13 +20,20 @@ ENDS: tuple[tuple[EndpointKind, EndpointKind], ...] = (
     ("publisher", "subscriber"),
     ("server", "client"),
 )
+ACTION = "/_action/"  # between an action's name and its parts
+# topics, below a namespace, that several nodes may publish
+SHARED = ("tf", "tf_static", "joint_states", "diagnostics", "rosout", "parameter_events")
+APART = (
+    "give each robot its own `namespace:` or `domain:`; or name in `leave_out:` what the other "
+    "node offers"
+)
 Owner = tuple[str, EndpointKind]  # a node, and its endpoints of a kind
 
 
 class Trouble(NamedTuple):
-    """The reason why two endpoints of a topic or service exchange nothing."""
+    """The reason why two endpoints exchange nothing, or get in each other's way."""
 
-    kind: str  # type, qos, hash or name
+    kind: str  # type, qos, hash, name or twice
     topic: str
     text: str
     do: str
@@ -131,6 +138,24 @@ def _definitions(link: Ros2Link, giver: GraphEndpoint, taker: GraphEndpoint) -> 
 
 def _name(one: GraphEndpoint) -> str:
     return one.node or "a node without a name"
+
+
+def doubles(endpoints: Iterable[GraphEndpoint]) -> list[Trouble]:
+    """Return the nodes that offer what ours offers, such as a second robot's, each once."""
+    endpoints = [one for one in endpoints if one.kind in ("publisher", "server")]
+    ours = [one for one in endpoints if one.ours and one.topic.rpartition("/")[2] not in SHARED]
+    names, nodes = {(one.kind, one.topic) for one in ours}, {one.node for one in ours}
+    same: dict[str, set[str]] = defaultdict(set)
+    for one in endpoints:
+        if not one.ours and (one.kind, one.topic) in names:
+            node = f"another {one.node}" if one.node in nodes else _name(one)
+            same[node].add(one.topic.partition(ACTION)[0])
+    found = []
+    for node, topics in same.items():
+        first, *more = sorted(topics)
+        text = f"{node} offers it as well" + (f", and {len(more)} more" if more else "")
+        found.append(Trouble("twice", first, text, APART))
+    return sorted(found)
 
 
 def nameless(link: Ros2Link, endpoints: Iterable[GraphEndpoint]) -> Trouble | None:

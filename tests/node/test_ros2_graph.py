@@ -57,6 +57,16 @@ async def test_a_reader_that_wants_more_is_a_problem_until_it_goes() -> None:
         assert await problems(robot) == []
 
 
+async def test_a_second_robot_with_the_same_names_is_a_problem() -> None:
+    async with driver() as robot:
+        await robot.body()
+        other = robot.node.transport.network.transport(Ros2Link(node="gigabrain"))
+        other.publisher("odom", "nav_msgs/msg/Odometry")
+        assert [text for code, text, _ in await problems(robot) if code == "ros2_twice"] == [
+            "/odom: another /gigabrain offers it as well"
+        ]
+
+
 async def test_a_commander_with_another_clock_is_a_problem_while_it_commands() -> None:
     async with driver() as robot:
         await robot.body()

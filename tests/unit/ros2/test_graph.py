@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from gigabrain_zenoh.config.settings import Ros2Link
-from gigabrain_zenoh.ros2.graph import nameless, troubles, unreached
+from gigabrain_zenoh.ros2.graph import doubles, nameless, troubles, unreached
 from gigabrain_zenoh.ros2.qos import DEFAULT, LATCHED, SENSOR_DATA
 from gigabrain_zenoh.ros2.transport import GraphEndpoint
 
@@ -107,3 +107,26 @@ def test_where_nothing_is_found_the_usual_reasons_are_named() -> None:
     over_zenoh = unreached("rmw_zenoh", 7, "tcp/127.0.0.1:7447")
     assert "the router tcp/127.0.0.1:7447" in over_zenoh
     assert "RMW_IMPLEMENTATION=rmw_zenoh_cpp and ROS_DOMAIN_ID=7" in over_zenoh
+
+
+def test_what_another_node_offers_as_well_is_named_once_for_each_node() -> None:
+    names = ["/odom", "/scan", "/tf", "/red/tf_static", "/joint_states", "/diagnostics"]
+    goal = {"topic": "/navigate_to_pose/_action/send_goal", "type": "a/action/B_SendGoal"}
+    ours = [
+        *(endpoint("/gigabrain", "publisher", topic=one, ours=True) for one in names),
+        endpoint("/gigabrain", "subscriber", topic="/cmd_vel", ours=True),
+        endpoint("/gigabrain", "server", ours=True, **goal),
+    ]
+    same = [endpoint("/gigabrain", "publisher", topic=one) for one in names]
+    nav2 = endpoint("/bt_navigator", "server", **goal)
+    do = (
+        "give each robot its own `namespace:` or `domain:`; or name in `leave_out:` what the other "
+        "node offers"
+    )
+    assert doubles([*ours, *same, nav2]) == [
+        ("twice", "/navigate_to_pose", "/bt_navigator offers it as well", do),
+        ("twice", "/odom", "another /gigabrain offers it as well, and 1 more", do),
+    ]
+    teleop = endpoint("/teleop", "publisher", topic="/cmd_vel")
+    rviz = endpoint("/rviz", "subscriber", topic="/odom")
+    assert doubles([*ours, teleop, rviz]) == []
