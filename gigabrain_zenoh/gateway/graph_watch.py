@@ -15,11 +15,13 @@ from gigabrain_zenoh.ros2.graph import (
     troubles,
     unreached,
 )
+from gigabrain_zenoh.ros2.rtps_sockets import addresses
 from gigabrain_zenoh.ros2.transport import RosTransport
 
 MAX_CAUSES = 8
 MAX_TEXT = 500
 TOPIC_KINDS = ("publisher", "subscriber")
+REJOIN = "restart the robot's processes, or the process ros2 alone"
 EVERY = 5  # calls from one look at the graph to the next
 
 
@@ -31,6 +33,8 @@ class GraphWatch:
     ) -> None:
         """Watch; `offsets_s` returns how far clocks of the publishers of /cmd_vel are behind."""
         self._ros, self._config, self._offsets_s = ros, config, offsets_s
+        # this host's addresses on joining: Cyclone DDS stays on an interface of theirs
+        self._joined = _outer() if config.transport == "dds" and not config.localhost else None
         self._calls = 0
         self.causes: tuple[Cause, ...] = ()
 
@@ -84,7 +88,25 @@ class GraphWatch:
         for one in found:
             text = f"{one.topic}: {one.text}"[:MAX_TEXT]
             yield Cause(code=f"ros2_{one.kind}", text=text, remedy=one.do)
+        if text := self._moved():
+            yield Cause(code="ros2_network", text=text[:MAX_TEXT], remedy=REJOIN)
         for offset_s in self._offsets_s():
             if abs(offset_s) > CLOCK_S:
                 text = f"/cmd_vel: the clock of a publisher is {clock_text(offset_s)}"
                 yield Cause(code="ros2_clock", text=text, remedy=SYNCHRONISE)
+
+    def _moved(self) -> str:
+        """Return why other hosts may not see the topics any more; empty if they may."""
+        now = _outer()
+        if self._joined is None or not now or self._joined & now:
+            return ""
+        then = ", ".join(sorted(self._joined)) or "127.0.0.1 only"
+        return (
+            f"the network has changed since the gateway joined DDS: then {then}, now "
+            f"{', '.join(sorted(now))}; other hosts see its services, but not its topics"
+        )
+
+
+def _outer() -> set[str]:
+    """Return this host's IPv4 addresses, without those of the loopback."""
+    return {one for one in addresses() if not one.startswith("127.")}

@@ -9,6 +9,7 @@ from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import FakeClock
 from gigabrain_zenoh.config.settings import DRIVER_NODE, Ros2Config, Ros2Link
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.gateway import graph_watch
 from gigabrain_zenoh.gateway.gateway import serve
 from gigabrain_zenoh.gateway.topic_list import rows
 from gigabrain_zenoh.ros2.memory import MemoryNetwork
@@ -65,6 +66,32 @@ async def test_a_second_robot_with_the_same_names_is_a_problem() -> None:
         assert [text for code, text, _ in await problems(robot) if code == "ros2_twice"] == [
             "/odom: another /gigabrain offers it as well"
         ]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "seen"),
+    [
+        (["127.0.0.1"], ["10.9.9.1", "127.0.0.1"], True),
+        (["10.9.9.1", "127.0.0.1"], ["10.8.8.1", "127.0.0.1"], True),
+        (["10.9.9.1", "127.0.0.1"], ["127.0.0.1"], False),  # it may come back
+        (["10.9.9.1"], ["10.8.8.1", "10.9.9.1"], False),
+    ],
+)
+async def test_a_network_that_came_or_changed_after_joining_dds_is_a_problem(
+    before: list[str], after: list[str], seen: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(graph_watch, "addresses", lambda: before)
+    async with driver(Ros2Config(transport="dds")) as robot:
+        await robot.body()
+        assert await problems(robot) == []
+        monkeypatch.setattr(graph_watch, "addresses", lambda: after)
+        found = await problems(robot)
+        assert [code for code, _, _ in found] == ["ros2_network"] * seen
+        if seen:
+            _, text, remedy = found[0]
+            assert text.startswith("the network has changed since the gateway joined DDS: then ")
+            assert after[0] in text
+            assert "restart" in remedy
 
 
 async def test_a_commander_with_another_clock_is_a_problem_while_it_commands() -> None:
