@@ -15,7 +15,7 @@ from gigabrain_zenoh.ros2.graph import (
     troubles,
     unreached,
 )
-from gigabrain_zenoh.ros2.rtps_sockets import addresses
+from gigabrain_zenoh.ros2.rtps_sockets import outer_addresses
 from gigabrain_zenoh.ros2.transport import RosTransport
 
 MAX_CAUSES = 8
@@ -34,7 +34,8 @@ class GraphWatch:
         """Watch; `offsets_s` returns how far clocks of the publishers of /cmd_vel are behind."""
         self._ros, self._config, self._offsets_s = ros, config, offsets_s
         # this host's addresses on joining: Cyclone DDS stays on an interface of theirs
-        self._joined = _outer() if config.transport == "dds" and not config.localhost else None
+        bound = config.transport == "dds" and not config.localhost
+        self._joined = outer_addresses() if bound else None
         self._calls = 0
         self.causes: tuple[Cause, ...] = ()
 
@@ -97,7 +98,7 @@ class GraphWatch:
 
     def _moved(self) -> str:
         """Return why other hosts may not see the topics any more; empty if they may."""
-        now = _outer()
+        now = outer_addresses()
         if self._joined is None or not now or self._joined & now:
             return ""
         then = ", ".join(sorted(self._joined)) or "127.0.0.1 only"
@@ -105,8 +106,3 @@ class GraphWatch:
             f"the network has changed since the gateway joined DDS: then {then}, now "
             f"{', '.join(sorted(now))}; other hosts see its services, but not its topics"
         )
-
-
-def _outer() -> set[str]:
-    """Return this host's IPv4 addresses, without those of the loopback."""
-    return {one for one in addresses() if not one.startswith("127.")}

@@ -161,3 +161,8 @@ def addresses() -> list[str]:
         if one.family == socket.AF_INET
     }
     return sorted(found)
+
+
+def outer_addresses() -> set[str]:
+    """Return the addresses without those of the loopback."""
+    return {one for one in addresses() if not one.startswith("127.")}

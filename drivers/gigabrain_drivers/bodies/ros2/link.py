@@ -21,12 +21,14 @@ from gigabrain_zenoh.errors import BadPayload, GigabrainError
 from gigabrain_zenoh.logs import Fault
 from gigabrain_zenoh.ros2.opening import load_types, open_transport
 from gigabrain_zenoh.ros2.qos import Qos
+from gigabrain_zenoh.ros2.rtps_sockets import outer_addresses
 from gigabrain_zenoh.ros2.transport import Received, RosPublisher, RosTransport
 from gigabrain_zenoh.ros2.types import Types
 
 log = logging.getLogger(__name__)
 
 RETRY_NS = 200_000_000  # between two attempts to join
+MOVED_NS = 1_000_000_000  # between two looks at this host's addresses
 CLOSE_S = 1.0  # for leaving
 DEPTH = 5  # messages that wait where the loop is busy; the newest count
 STATIC_DEPTH = 100  # publishers of /tf_static keep one message each
@@ -121,13 +123,27 @@ class RosLink:
                     fault.end(f"{self}: joined")
                     self._attach(transport)
                     try:
-                        await asyncio.Event().wait()
+                        await self._until_moved()
                     finally:
                         self.transport = self._command = None
             except GigabrainError as error:
                 self.problem = str(error)
                 fault.begin(f"{self}: {error}")
                 await self._clock.sleep_ns(RETRY_NS)
+
+    async def _until_moved(self) -> None:
+        """Return when this host has another network, and no robot is there.
+
+        Cyclone DDS stays on the interface that it has joined on.
+        """
+        if not self._options.bound:
+            await asyncio.Event().wait()
+        joined = outer_addresses()
+        async for _ in self._clock.every(MOVED_NS):
+            now = outer_addresses()
+            if now and not now & joined and not self.readers:
+                log.info("%s: the network has changed; joining again", self)
+                return
 
     def _attach(self, transport: RosTransport) -> None:
         self.transport, self.problem = transport, ""

@@ -144,6 +144,11 @@ class Ros2Options(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
         """True where the robot would drive on for long if this driver died."""
         return self.watchdog == "none" or self.watchdog > MAX_WATCHDOG_S
 
+    @property
+    def bound(self) -> bool:
+        """True where it reaches other hosts by the network interface that it has joined on."""
+        return self.transport == "dds" and not (self.localhost or self.port)
+
     def link(self, node: str = "") -> Ros2Link:
         """Return how to join ROS 2. Raises ConfigError while an emulator's address is not there."""
         link = Ros2Link(

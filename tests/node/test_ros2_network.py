@@ -1,0 +1,44 @@
+"""The driver of a ROS 2 robot on a machine whose network changes."""
+
+import pytest
+
+from gigabrain_drivers.bodies.ros2 import link
+from gigabrain_zenoh.testing.waiting import until
+from tests.node.test_ros2_driver import Bench, made, running
+
+WLAN = {"10.9.9.1"}
+
+
+async def joins(bench: Bench) -> bool:
+    """Let 3 s pass; return whether the driver has joined anew."""
+    before = bench.driver.link.transport
+    for _ in range(30):
+        await bench.pass_ms(100)
+    await until(lambda: bench.driver.link.transport, "the driver's node")
+    return bench.driver.link.transport is not before
+
+
+@pytest.mark.parametrize(("transport", "joined"), [("dds", True), ("rmw_zenoh", False)])
+async def test_a_driver_without_a_robot_joins_again_in_another_network(
+    transport: str, joined: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(link, "outer_addresses", set)
+    router = {"router": "tcp/127.0.0.1:7447"} if transport == "rmw_zenoh" else {}
+    async with running(made(transport=transport, **router)) as bench:
+        await bench.robot.die()
+        assert not await joins(bench)
+        monkeypatch.setattr(link, "outer_addresses", lambda: WLAN)
+        assert await joins(bench) is joined
+        assert not await joins(bench)
+        bench.robot.start()
+        assert await bench.found_after_ms() <= 500
+
+
+async def test_a_driver_with_a_robot_stays_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(link, "outer_addresses", set)
+    async with running() as bench:
+        await bench.found_after_ms()
+        monkeypatch.setattr(link, "outer_addresses", lambda: WLAN)
+        assert not await joins(bench)
+        await bench.robot.die()
+        assert await joins(bench)
