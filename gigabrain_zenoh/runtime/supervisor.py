@@ -46,9 +46,9 @@ class Supervisor:
             self._shared.fork_servers = forking.ForkServers(forks, self._on_fork_failure)
         else:
             forking.end_early()
-        self._keepers = {spec.name: ManagedProcess(spec, self._shared) for spec in specs}
+        self._processes = {spec.name: ManagedProcess(spec, self._shared) for spec in specs}
         self.statuses: Mapping[str, ProcessStatus] = {
-            name: keeper.status for name, keeper in self._keepers.items()
+            name: process.status for name, process in self._processes.items()
         }
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._stopping: asyncio.Task[None] | None = None
@@ -56,7 +56,7 @@ class Supervisor:
     @property
     def deaths(self) -> int:
         """Return how often a process has ended unexpectedly."""
-        return sum(keeper.deaths for keeper in self._keepers.values())
+        return sum(process.deaths for process in self._processes.values())
 
     @property
     def given_up(self) -> tuple[str, ...]:
@@ -66,17 +66,17 @@ class Supervisor:
     @property
     def lost(self) -> tuple[str, ...]:
         """Return the names of processes given up that are not optional."""
-        return tuple(name for name in self.given_up if not self._keepers[name].spec.optional)
+        return tuple(name for name in self.given_up if not self._processes[name].spec.optional)
 
     @property
     def misconfigured(self) -> tuple[str, ...]:
         """Return the names of lost processes whose configuration is wrong."""
-        return tuple(name for name in self.lost if self._keepers[name].misconfigured)
+        return tuple(name for name in self.lost if self._processes[name].misconfigured)
 
     @property
     def stuck(self) -> tuple[str, ...]:
         """Return the names of processes that run and make no progress."""
-        return tuple(name for name, keeper in self._keepers.items() if keeper.stuck)
+        return tuple(name for name, process in self._processes.items() if process.stuck)
 
     async def __aenter__(self) -> Self:
         return self
@@ -89,13 +89,13 @@ class Supervisor:
         if self._shared.fork_servers:
             self._shared.fork_servers.open()
         self._tasks = {
-            name: asyncio.create_task(keeper.run([self._keepers[n] for n in keeper.spec.after]))
-            for name, keeper in self._keepers.items()
+            name: asyncio.create_task(process.run([self._processes[n] for n in process.spec.after]))
+            for name, process in self._processes.items()
         }
         halted = asyncio.create_task(self._shared.halt.wait())
         watching = asyncio.create_task(self._watch())
         try:
-            # a keeper ends only when all are stopped, or with an exception; one whose process the
+            # a process ends only when all are stopped, or with an exception; one whose process the
             # kernel does not let go may never end
             ends = [halted, watching, *self._tasks.values()]
             await asyncio.wait(ends, return_when="FIRST_COMPLETED")
@@ -120,8 +120,8 @@ class Supervisor:
                 async with asyncio.timeout(heartbeat.LOOK_S):
                     await halt.wait()
             passed_s, looked_s = loop.time() - looked_s, loop.time()
-            for keeper in self._keepers.values():
-                keeper.check_progress(passed_s)
+            for process in self._processes.values():
+                process.check_progress(passed_s)
 
     async def stop(self, within_s: float = 1.5) -> None:
         """Stop all processes within `within_s`: first by request, then by force."""
@@ -130,15 +130,15 @@ class Supervisor:
         await asyncio.shield(self._stopping)
 
     async def _stop(self, within_s: float) -> None:
-        begin_s, keepers = asyncio.get_running_loop().time(), self._keepers.values()
+        begin_s, processes = asyncio.get_running_loop().time(), self._processes.values()
         self._shared.halt.set()
-        for keeper in keepers:
-            keeper.settled.set()
+        for process in processes:
+            process.settled.set()
         try:
             async with self._shared.starting:  # a starting process has its pid after this
-                running = [keeper for keeper in keepers if keeper.child]
-            last = [keeper for keeper in running if keeper.spec.stop_last]
-            first = [keeper for keeper in running if not keeper.spec.stop_last]
+                running = [process for process in processes if process.child]
+            last = [process for process in running if process.spec.stop_last]
+            first = [process for process in running if not process.spec.stop_last]
             if last:
                 await self._end(first, begin_s + _FIRST * within_s, begin_s + _REAPED * within_s)
             await self._end(last or first, begin_s + _LAST * within_s, begin_s + within_s)
@@ -152,22 +152,24 @@ class Supervisor:
         """Kill every process that still runs, without waiting for it."""
         if self._shared.fork_servers:
             self._shared.fork_servers.close()
-        for name, keeper in self._keepers.items():
-            if keeper.child:
-                keeper.child.abandon()
+        for name, process in self._processes.items():
+            if process.child:
+                process.child.abandon()
                 self._tasks[name].cancel()
 
-    async def _end(self, keepers: Sequence[ManagedProcess], kill_s: float, leave_s: float) -> None:
+    async def _end(
+        self, processes: Sequence[ManagedProcess], kill_s: float, leave_s: float
+    ) -> None:
         """Request the end, kill at `kill_s`, and stop waiting at `leave_s` (both loop times)."""
-        for keeper in keepers:
-            keeper.ask_to_end()
-        await self._wait_for(keepers, kill_s)
-        for keeper in keepers:
-            keeper.force_to_end()
-        await self._wait_for(keepers, leave_s)
+        for process in processes:
+            process.ask_to_end()
+        await self._wait_for(processes, kill_s)
+        for process in processes:
+            process.force_to_end()
+        await self._wait_for(processes, leave_s)
 
-    async def _wait_for(self, keepers: Sequence[ManagedProcess], until_s: float) -> None:
-        tasks = [self._tasks[keeper.spec.name] for keeper in keepers]
+    async def _wait_for(self, processes: Sequence[ManagedProcess], until_s: float) -> None:
+        tasks = [self._tasks[process.spec.name] for process in processes]
         if tasks:
             left_s = until_s - asyncio.get_running_loop().time()
             await asyncio.wait(tasks, timeout=max(left_s, 0.0))

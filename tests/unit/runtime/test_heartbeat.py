@@ -78,68 +78,68 @@ class Ended(Child):
         self.signals.append(number)
 
 
-def keeper_of(said: list[str], *, beats: bool = True, keep_stuck: bool = False) -> ManagedProcess:
-    """The keeper of a process that has just become ready."""
+def process_of(said: list[str], *, beats: bool = True, keep_stuck: bool = False) -> ManagedProcess:
+    """A process that has just become ready."""
 
     def note(_name: str, record: Mapping[str, Any]) -> None:
         said.append(str(record.get("text", record["event"])))
 
     shared = Shared(note, Backoff(), keep_stuck)
-    keeper = ManagedProcess(ProcessSpec("decision", (), beats=beats), shared)
-    keeper.child, keeper.status.state = Ended(), "ready"
-    return keeper
+    process = ManagedProcess(ProcessSpec("decision", (), beats=beats), shared)
+    process.child, process.status.state = Ended(), "ready"
+    return process
 
 
-def look(keeper: ManagedProcess, times: int) -> list[int]:
+def look(process: ManagedProcess, times: int) -> list[int]:
     """Look so often; the signals that the process has got so far."""
     for _ in range(times):
-        keeper.check_progress(LOOK_S)
-    assert isinstance(keeper.child, Ended)
-    return keeper.child.signals
+        process.check_progress(LOOK_S)
+    assert isinstance(process.child, Ended)
+    return process.child.signals
 
 
 async def test_a_process_without_progress_for_5_s_is_killed_once_and_told() -> None:
     said: list[str] = []
-    keeper = keeper_of(said)
-    assert look(keeper, 19) == []
-    assert not keeper.stuck
-    assert look(keeper, 40) == [9]
-    assert keeper.stuck
+    process = process_of(said)
+    assert look(process, 19) == []
+    assert not process.stuck
+    assert look(process, 40) == [9]
+    assert process.stuck
     assert said == ["decision has made no progress for 5 s and is killed"]
 
 
 async def test_a_process_that_beats_is_never_killed() -> None:
-    keeper = keeper_of([])
+    process = process_of([])
     for _ in range(100):
-        assert look(keeper, 19) == []
-        keeper._handle_record({"event": "progress"})
+        assert look(process, 19) == []
+        process._handle_record({"event": "progress"})
 
 
 @pytest.mark.parametrize("state", ["starting", "backing off", "given up", "stopped"])
 async def test_only_what_is_ready_can_be_stuck(state: Any) -> None:
-    keeper = keeper_of([])
-    keeper.status.state = state
-    assert look(keeper, 1000) == []
+    process = process_of([])
+    process.status.state = state
+    assert look(process, 1000) == []
 
 
 async def test_a_stop_has_its_own_patience() -> None:
-    keeper = keeper_of([])
-    keeper._shared.halt.set()
-    assert look(keeper, 1000) == []
+    process = process_of([])
+    process._shared.halt.set()
+    assert look(process, 1000) == []
 
 
 async def test_a_process_that_never_beats_is_left_alone() -> None:
-    assert look(keeper_of([], beats=False), 1000) == []
+    assert look(process_of([], beats=False), 1000) == []
 
 
 async def test_a_debugger_has_all_the_time_it_wants() -> None:
     said: list[str] = []
-    keeper = keeper_of(said, keep_stuck=True)
-    assert look(keeper, 1000) == []
-    assert keeper.stuck
+    process = process_of(said, keep_stuck=True)
+    assert look(process, 1000) == []
+    assert process.stuck
     assert said == ["decision has made no progress for 5 s and is left alone"]
-    keeper._handle_record({"event": "progress"})
-    assert not keeper.stuck
+    process._handle_record({"event": "progress"})
+    assert not process.stuck
 
 
 async def beats(robot: RobotInMemory, name: str, seconds: int) -> list[bool]:
