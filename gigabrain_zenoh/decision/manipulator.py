@@ -377,10 +377,7 @@ class Manipulator:
         run, plan, hold = self._run, self._plan, self._hold
         assert run
         if hold and run.phase and run.phase.name in CARRYING and not holds(planner, hold, state):
-            if run.phase.name == "lift":
-                return self._missed(planner, body, state)
-            self._set_hold(None)
-            return self._fail(f"{hold.thing.name} has slipped out of the gripper")
+            return self._missed(planner, body, state)
         waits = run.wait(state.tick, *pace(body, state))
         if run.waited > WAIT_TICKS:
             return self._held_up(f"{waits} is held back for {WAIT_TICKS * TICK_S:g} s")
@@ -415,9 +412,15 @@ class Manipulator:
         return self._moving(state)
 
     def _missed(self, planner: ArmPlanner, body: BodyDescription, state: RobotState) -> StepResult:
-        """Go back from a thing that was not caught; afterwards another grasp is tried."""
-        self._misses += 1
+        """Go back from a thing that was not caught; afterwards another grasp is tried.
+
+        A command that does not pick fails: what it moves was held before, and is lost.
+        """
+        lost = self._hold
         self._set_hold(None)
+        if lost and self._plan.grasp is None:
+            return self._fail(f"{lost.thing.name} has slipped out of the gripper")
+        self._misses += 1
         self._achieved = StepOutcome()
         self._back_off(planner, body, state, self._plan)
         return self._moving(state)

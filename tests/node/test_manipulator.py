@@ -276,6 +276,20 @@ def test_what_slips_out_of_the_gripper_is_told(rig: Rig) -> None:
     assert "cube has slipped out of the gripper" in task.reason
 
 
+@pytest.mark.parametrize("step", ["place: [0.1388, 0.15, 0.015]", "posture: home"])
+def test_what_is_lost_before_the_arm_moves_on_is_told(rig: Rig, step: str) -> None:
+    assert rig.carry_out(THINGS + "do: [{pick: cube}]").state == "succeeded"
+    for _ in range(SOON):
+        rig.tick()
+    rig.give(f"do: [{{{step}}}]")
+    while rig.outcome is None or rig.outcome.reason != "squeeze":
+        rig.tick()
+    rig.take_away()
+    task = rig.carry_on()
+    assert task.state == "failed"
+    assert task.reason.endswith("cube has slipped out of the gripper")
+
+
 @pytest.mark.slow
 def test_a_gripper_that_safety_holds_back_is_not_taken_for_one_that_holds_something(
     rig: Rig,
