@@ -72,13 +72,13 @@ def still_held(
     """Return `hold` by where the gripper was sent meanwhile; None if it holds nothing any more."""
     gripper = planner.arm.gripper
     assert gripper
-    grip = hold.grip
-    if not sent_to(planner, body, state, grip):
-        grip = sent_place(planner, body, state, grip)
-    squeezes = (grip - gripper_place(planner, state, grip)) * (hold.grip - hold.opening) > 0.0
+    sent = sent_place(planner, body, state, hold.grip)
+    grip = hold.grip if sent_to(planner, body, state, hold.grip) else sent
+    measured = gripper_place(planner, state, sent)
+    squeezes = (sent - measured) * (hold.grip - hold.opening) > 0.0
     near = abs(grip - hold.grip) <= REGRIP * (gripper.upper - gripper.lower)
-    now = replace(hold, grip=grip)
-    return now if squeezes and near and holds(planner, now, state) else None
+    held = squeezes and near and planner.holds(measured, sent)
+    return replace(hold, grip=grip) if held else None
 
 
 def gripper_moves(

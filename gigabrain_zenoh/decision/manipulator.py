@@ -230,6 +230,8 @@ class Manipulator:
         command: ArmCommand,
         seen: tuple[SeenSolid, ...],
     ) -> StepResult:
+        if self._hold and not (self._run or self._planning or self._grip.moves):
+            self._set_hold(still_held(planner, body, state, self._hold))
         do, hold = command.do, self._hold
         if isinstance(do, Pick) and self._run is None and hold and hold.thing.name == do.thing:
             self._achieve(hold)

@@ -276,6 +276,22 @@ def test_what_slips_out_of_the_gripper_is_told(rig: Rig) -> None:
     assert "cube has slipped out of the gripper" in task.reason
 
 
+@pytest.mark.parametrize("wide", [0.01, 0.05, 1.0])
+def test_what_an_operator_has_let_go_of_is_not_put_down(rig: Rig, wide: float) -> None:
+    assert rig.carry_out(THINGS + "do: [{pick: cube}]").state == "succeeded"
+    for _ in range(SOON):
+        rig.tick()
+    opened = JointTarget(name="gripper", position=rig.arm.measured("gripper") + wide)
+    for _ in range(SOON):
+        rig.arm.step(Intent(joints=(opened,), behaviour="test", reason="open"))
+    task = rig.carry_out("do: [{place: [0.1388, 0.15, 0.015]}]")
+    assert (task.state, task.reason.partition(": ")[2]) == (
+        "failed",
+        "the gripper holds nothing",
+    )
+    assert rig.carry_out("do: [{posture: home}]").state == "succeeded"
+
+
 @pytest.mark.parametrize("step", ["place: [0.1388, 0.15, 0.015]", "posture: home"])
 def test_what_is_lost_before_the_arm_moves_on_is_told(rig: Rig, step: str) -> None:
     assert rig.carry_out(THINGS + "do: [{pick: cube}]").state == "succeeded"
