@@ -13,6 +13,7 @@ from gigabrain_schemas.body import BodyDescription, Joint, JointDescription, Rob
 from gigabrain_schemas.requests import GateReply
 from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, Take, check_finite, print_line
 from gigabrain_zenoh.cli.task import Mode, Wait, send
+from gigabrain_zenoh.client.arm import held_posture
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.decision.tasks.arm_steps import describe
 from gigabrain_zenoh.errors import ConfigError, Unsupported, unknown
@@ -64,7 +65,8 @@ def jog(joint: str, distance: Distance, /, *, take: Take = False, at: RobotAddre
 
     Args:
         joint: Name of the joint; see `gigabrain arm state`.
-        distance: Distance from the last commanded position; may be negative.
+        distance: Distance from the last commanded position, of a limp joint from the measured one;
+            may be negative.
     """
     check_finite("distance", distance)
 
@@ -73,9 +75,9 @@ def jog(joint: str, distance: Distance, /, *, take: Take = False, at: RobotAddre
         known = [one.name for one in body.joints]
         if joint not in known:
             raise unknown("joint", joint, known)
-        one, sent = body.joints[known.index(joint)], (await robot.read_state()).joints_sent
+        one, posture = body.joints[known.index(joint)], held_posture(body, await robot.read_state())
         scale, unit = shown_in(one)
-        place = sent[known.index(joint)] + distance / scale
+        place = posture[known.index(joint)].position + distance / scale
         if not one.lower <= place <= one.upper:
             low, high, there = (scale * at for at in (one.lower, one.upper, place))
             raise ConfigError(
@@ -358,7 +360,8 @@ def shown_in(joint: JointDescription) -> tuple[float, str]:
 def lines(body: BodyDescription, state: RobotState) -> list[str]:
     """Return a table of the joints, in degrees, or millimetres of those that slide."""
     measured = {joint.name: joint for joint in state.joints}
-    sent = dict(zip((joint.name for joint in body.joints), state.joints_sent, strict=False))
+    places = () if state.limp else state.joints_sent  # nothing holds limp joints there
+    sent = dict(zip((joint.name for joint in body.joints), places, strict=False))
     gate = state.gate
     limp = ", limp" if state.limp else ""
     rows = [f"{state.robot_type}: {gate.mode}, commander {gate.commander or 'none'}{limp}"]

@@ -50,6 +50,17 @@ def _check_position(joint: JointDescription, position: float) -> None:
         )
 
 
+def held_posture(body: BodyDescription, state: RobotState) -> tuple[JointPoint, ...]:
+    """Return the posture that joints were sent to, or are in. Raises BodyLost where one is missing.
+
+    See `held`.
+    """
+    posture = held(body, state)
+    if not posture:
+        raise BodyLost(f"{body.robot_type}: not all of its joints are measured; see `arm state`")
+    return posture
+
+
 class JointPath:
     """Points in time and positions [rad] or [m], from the present posture on."""
 
@@ -116,11 +127,7 @@ class JointStream:
         Raises BodyLost where one is not measured.
         """
         self._body, self._source = body, source
-        self._now = held(body, state)
-        if not self._now:
-            raise BodyLost(
-                f"{body.robot_type}: not all of its joints are measured; see `arm state`"
-            )
+        self._now = held_posture(body, state)
         self._tick, self._sent = state.tick, self._now
         self._postures = (self._now, self._now)  # where the gate held the joints, newest last
         self._ends: dict[str, float] = {}
