@@ -24,6 +24,7 @@ LOST_TICKS = 3  # by whose motion the joints may be away from where they were se
 ARRIVED = 1e-4  # [rad] or [m], off a goal
 SENT = 2e-3  # [rad] or [m], off a goal, as servos round what they are sent
 LONGEST_S = 600.0  # of a trajectory
+HELD_BACK_TICKS = 100  # without progress, after which joints are not waited for any longer
 
 
 def checked_positions(body: BodyDescription, positions: Positions) -> dict[str, float]:
@@ -134,6 +135,7 @@ class JointStream:
         self._speed: float | None = None
         self._path: JointPath | None = None
         self._path_tick = 0  # when it began
+        self._least, self._progress_tick = math.inf, state.tick  # way to the goals, [rad] or [m]
 
     @property
     def posture(self) -> dict[str, float]:
@@ -145,6 +147,7 @@ class JointStream:
         """Move joints to `positions` [rad] or [m] from now on."""
         self._path, self._speed = None, speed
         self._ends |= positions
+        self._least = math.inf
 
     def follow(self, path: JointPath) -> None:
         """Follow a path from now on."""
@@ -154,6 +157,11 @@ class JointStream:
     def rest(self) -> None:
         """Brake, and stay where that ends."""
         self._ends, self._path = {}, None
+
+    def give_up(self) -> None:
+        """Stay where the gate holds the joints."""
+        self._now = self._postures[-1]
+        self.rest()
 
     def step(self, state: RobotState) -> JointCommand | None:
         """Return the command for the tick after that of `state`; None while joints are missing."""
@@ -165,6 +173,7 @@ class JointStream:
             self._now = posture
         ticks = max(0, min(state.tick - self._tick, LOST_TICKS))
         self._tick = state.tick
+        self._watch_progress(posture)
         if ticks:
             self._now = self._moved(ticks)
         self._sent = self._now
@@ -197,11 +206,26 @@ class JointStream:
             for sent, point, joint in zip(self._sent, posture, self._body.joints, strict=True)
         )
 
+    def _watch_progress(self, posture: tuple[JointPoint, ...]) -> None:
+        places = zip(self._body.joints, posture, strict=True)
+        left = sum(abs(p.position - self._ends.get(j.name, p.position)) for j, p in places)
+        if not self._over or left < self._least - ARRIVED:
+            self._least, self._progress_tick = left, self._tick
+
+    @property
+    def _over(self) -> bool:
+        """Return whether the time of the path is over, or there is none."""
+        return self._path is None or (self._tick - self._path_tick) * TICK_S >= self._path.seconds
+
+    @property
+    def held_back(self) -> bool:
+        """Return whether the gate has not sent the joints nearer to their goals for a while."""
+        return not self.arrived and self._tick - self._progress_tick > HELD_BACK_TICKS
+
     @property
     def arrived(self) -> bool:
         """Return whether all joints have been sent to their goals."""
-        over = self._path is None or (self._tick - self._path_tick) * TICK_S >= self._path.seconds
-        return over and all(
+        return self._over and all(
             abs(self.posture[name] - place) < ARRIVED for name, place in self._ends.items()
         )
 

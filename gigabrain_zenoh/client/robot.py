@@ -382,7 +382,10 @@ class Robot:
     async def _joints_there(
         self, body: BodyDescription, stream: JointStream, wait: bool
     ) -> dict[str, float]:
-        """Wait until the joints are where they were sent, or as near as they get."""
+        """Wait until the joints are where they were sent, or as near as they get.
+
+        Those that safety holds back stay there, also once they are free again.
+        """
         assert body.arm
         left = round(body.arm.goal_time / TICK_S)
         while wait and left and not stream.reached(state := await self.read_state()):
@@ -390,6 +393,8 @@ class Robot:
                 await self._acquire()
             await self._ticks(1)
             left -= stream.arrived
+            if stream.held_back:
+                stream.give_up()
         return {joint.name: joint.position for joint in await self.get_joint_states()}
 
     async def _acquire(self) -> None:

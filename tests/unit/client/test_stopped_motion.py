@@ -1,6 +1,7 @@
 """A stop or a restart of the driver ends a motion: an enable alone does not resume it."""
 
 import asyncio
+import math
 from collections.abc import AsyncIterator
 
 import pytest
@@ -15,6 +16,7 @@ from gigabrain_schemas.topics import BODY, ENABLE, JOINT_CMD, RELEASE, STATE, co
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.testing.in_memory import Net
+from gigabrain_zenoh.testing.waiting import PATIENCE_S
 
 BODY_NOW = example(Body)
 JOINT = BODY_NOW.description.joints[0]
@@ -28,6 +30,7 @@ class Driver:
         self.bus, self.clock = net.one, net.clock
         self.gate = GateStatus(mode="idle")
         self.commands, self.joints = list[CmdVel](), dict[str, float]()
+        self.most = math.inf  # [rad] or [m], beyond which safety lets no joint go
         self.bus.time.boot, self.bus.time.tick = 7, 180_000
         for joint in BODY_NOW.description.joints:
             self.joints[joint.name] = max(joint.lower, min(joint.upper, 0.0))
@@ -39,7 +42,8 @@ class Driver:
 
     def _move(self, _key: str, command: JointCommand) -> None:
         if self.gate.mode == "enabled" and command.position:
-            self.joints.update(zip(command.name, command.position, strict=True))
+            wanted = zip(command.name, command.position, strict=True)
+            self.joints |= {name: min(place, self.most) for name, place in wanted}
 
     async def _enable(self, request: EnableRequest) -> GateReply:
         enables = self.gate.enables + 1
@@ -115,3 +119,18 @@ async def test_an_arm_does_not_go_on_after_an_e_stop_by_somebody_else(
     assert 0.0 < driver.joints[JOINT.name] == stopped < 0.9 * GOAL
     await robot.set_joint_positions({JOINT.name: GOAL})
     assert driver.joints[JOINT.name] == pytest.approx(GOAL, abs=0.01)
+
+
+@pytest.mark.parametrize("path", [False, True])
+async def test_joints_that_safety_holds_back_are_not_waited_for_and_stay_there(
+    net: Net, driver: Driver, path: bool
+) -> None:
+    robot = Robot(net.two)
+    driver.most = 0.5 * GOAL
+    points = [(1.0, {JOINT.name: GOAL})]
+    moving = robot.set_joint_trajectory(points) if path else robot.set_joint_positions(points[0][1])
+    found = await asyncio.wait_for(moving, PATIENCE_S)
+    assert found[JOINT.name] == pytest.approx(0.5 * GOAL)
+    driver.most = math.inf
+    await robot._ticks(50)
+    assert driver.joints[JOINT.name] == pytest.approx(0.5 * GOAL, abs=0.05 * GOAL)
