@@ -119,6 +119,7 @@ class TimeParametrization:
         for before, after in pairwise(slopes):
             onward = before * after > 0
             mean = 2 * before * after / np.where(onward, before + after, 1.0)
+            mean = np.clip(mean, -self._speeds, self._speeds)  # it may be beyond by rounding
             found.append(np.where(onward, mean, 0.0))
         return [*found, rest] if len(postures) > 1 else found
 
@@ -151,9 +152,11 @@ class TimeParametrization:
         given.max_acceleration = [one.max_acceleration for one in self.joints]
         given.max_jerk = [one.max_jerk for one in self.joints]
         given.synchronization = ruckig.Synchronization.Phase  # a straight line from rest to rest
-        code = self._otg.calculate(given, result)
-        if code not in (ruckig.Result.Working, ruckig.Result.Finished):
-            raise Refused(f"no trajectory within the limits of the joints: {code.name}")
+        try:
+            self._otg.calculate(given, result)
+        except ruckig.RuckigError as error:
+            why = str(error).strip()
+            raise Refused(f"no trajectory within the limits of the joints: {why}") from None
         return result
 
     def _is_clear(self, part: ruckig.Trajectory, checker: CollisionChecker | None) -> bool:

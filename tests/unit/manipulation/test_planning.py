@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.body import KeepOut
-from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Plan, surroundings
 from gigabrain_zenoh.manipulation.collision import CollisionChecker, Thing
 from gigabrain_zenoh.manipulation.grasps import ROOM_M, Grasp, GraspPlanner, NoGrasp
@@ -199,6 +199,24 @@ def test_a_start_in_motion_goes_on_smoothly() -> None:
     moving = timing.trajectory(np.stack((np.zeros(5), np.full(5, 0.5))), velocity=speed)
     assert np.allclose(moving.velocities[0], speed)
     assert_within_limits(moving)
+
+
+def test_what_ruckig_cannot_solve_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    timing = TimeParametrization(arm().joints)
+    monkeypatch.setattr(timing, "joints", tuple(replace(j, max_jerk=-1.0) for j in timing.joints))
+    with pytest.raises(Refused, match=r"no trajectory within the limits of the joints: .*jerk"):
+        timing.trajectory(np.stack((np.zeros(5), np.full(5, 0.5))))
+
+
+@pytest.mark.parametrize("speed", [0.91, 1.5, 1.57])  # of shares of 2.6, 3 and 3.14
+def test_a_joint_may_pass_corners_at_its_greatest_speed(speed: float) -> None:
+    timing = TimeParametrization([replace(one, max_speed=speed) for one in arm().joints])
+    moves = np.random.default_rng(0).uniform(0.0, 0.3, (200, 2, 5))
+    moves[:, :, 0] += 0.3  # the first joint is the slowest all the way
+    for ways in moves:
+        found = timing.trajectory(np.concatenate((np.zeros((1, 5)), np.cumsum(ways, axis=0))))
+        assert np.allclose(found.positions[-1], ways.sum(axis=0))
+        assert np.abs(found.velocities).max() < speed + 1e-9
 
 
 def test_no_move_takes_no_time() -> None:
