@@ -186,9 +186,12 @@ class Manipulator:
             return None
         wanted = model.mjcf, body
         if wanted != self._made_for:
-            self._drop()
+            known = self._made_for
+            self._interrupt()
             self._made_for, self._planner = wanted, None
-            self._set_hold(None)
+            if known is None or (known[0], known[1].joints) != (model.mjcf, body.joints):
+                self._left = None
+                self._set_hold(None)
             self._making = self._pool.submit(ArmPlanner, *wanted)
         if self._planner is None and self._making and self._in_time(self._making, 0.0):
             self._planner = self._making.result()  # raises as long as there is no other model

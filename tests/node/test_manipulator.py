@@ -211,6 +211,17 @@ def test_after_a_restart_of_decision_it_goes_on_with_what_it_holds(rig: Rig, pha
     assert rig.arm.thing()[:2] == pytest.approx(ELSEWHERE, abs=0.012)
 
 
+@pytest.mark.parametrize("phase", ["descend", "traverse"])
+def test_another_speed_limit_of_the_body_does_not_lose_what_it_holds(rig: Rig, phase: str) -> None:
+    rig.give(THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]}]")
+    while rig.outcome is None or rig.outcome.reason != phase:
+        rig.tick()
+    rig.arm.description = replace(rig.arm.description, max_linear_speed=0.1)
+    task = rig.carry_on()
+    assert (task.state, task.reason) == ("succeeded", "")
+    assert rig.arm.thing()[:2] == pytest.approx(ELSEWHERE, abs=0.012)
+
+
 def test_after_a_restart_things_are_where_they_were_put(rig: Rig) -> None:
     rig.give(
         THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]}, {posture: home}, {pick: cube}]"
