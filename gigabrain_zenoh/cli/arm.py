@@ -11,7 +11,7 @@ from cyclopts import Parameter
 
 from gigabrain_schemas.body import BodyDescription, Joint, JointDescription, RobotState
 from gigabrain_schemas.requests import GateReply
-from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, Take, check_finite, print_line
+from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, Take, angle, check_finite, print_line
 from gigabrain_zenoh.cli.task import Mode, Wait, send
 from gigabrain_zenoh.client.arm import held_posture
 from gigabrain_zenoh.client.robot import Robot
@@ -129,7 +129,7 @@ def goto(
     from gigabrain_zenoh.decision.tasks.arm_steps import Reach
     from gigabrain_zenoh.decision.tasks.mission import Mission, Step
 
-    down = None if pitch is None else math.radians(pitch)
+    down = angle("pitch", pitch)
     _carry_out(at, Mission(do=(Step(reach=Reach(at=(x, y, z), pitch=down)),)), mode, wait)
 
 
@@ -248,7 +248,7 @@ def press(
     from gigabrain_zenoh.decision.tasks.arm_steps import Press
     from gigabrain_zenoh.decision.tasks.mission import Mission, Step
 
-    down = None if pitch is None else math.radians(pitch)
+    down = angle("pitch", pitch)
     what = Press(at=(x, y, z), pitch=down, depth=depth, force=force, seconds=seconds)
     _carry_out(at, Mission(do=(Step(press=what),)), mode, wait)
 
@@ -276,7 +276,7 @@ def hand_over(
     from gigabrain_zenoh.decision.tasks.arm_steps import HandOver
     from gigabrain_zenoh.decision.tasks.mission import Mission, Step
 
-    down = None if pitch is None else math.radians(pitch)
+    down = angle("pitch", pitch)
     what = HandOver(at=to, pitch=down, seconds=seconds)
     _carry_out(at, Mission(do=(Step(hand_over=what),)), mode, wait)
 

@@ -195,6 +195,14 @@ def check_finite(name: str, value: float) -> None:
         raise ConfigError(f"--{shown}: expected a number, got {value:g}")
 
 
+def angle(name: str, degrees: float | None) -> float | None:
+    """Return the angle [rad] of the option `name`, if given. Raises as `check_finite` does."""
+    if degrees is None:
+        return None
+    check_finite(name, degrees)
+    return math.radians(degrees)
+
+
 def check_positive(**options: float | None) -> None:
     """Raise ConfigError for the first option that is not above 0; None is an option not given."""
     for name, value in options.items():
