@@ -129,6 +129,12 @@ def check_finite(numbers: Mapping[str, float]) -> None:
             raise ConfigError(f"{name}: expected a finite number, got {number}")
 
 
+def check_speed(speed: float | None) -> None:
+    """Raise ConfigError for an upper limit that is not above 0; None is no limit."""
+    if speed is not None and not speed > 0:
+        raise ConfigError(f"speed: expected more than 0, got {speed:g}")
+
+
 async def change_world(bus: Bus, request: SimRequest, keys: str = "") -> SimReply:
     """Change a simulated world, or list what was put in. Raises Refused and BodyLost."""
     replies = await bus.ask(SIM_CHANGE, request, timeout_s=WORLD_ANSWER_S)

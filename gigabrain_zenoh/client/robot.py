@@ -32,6 +32,7 @@ from gigabrain_zenoh.client.requests import (
     ANSWER_S,
     audit_log,
     check_finite,
+    check_speed,
     enable,
     jog,
     let_go,
@@ -193,8 +194,7 @@ class Robot:
 
     async def _carry_out(self, distance: float, angle: float, speed: float | None) -> Reached:
         check_finite({"distance": distance, "angle": angle})
-        if speed is not None and not speed > 0:
-            raise ConfigError(f"speed: expected more than 0, got {speed:g}")
+        check_speed(speed)
         motion = OdometryMotion(await self.read_body(), await self.read_state(), distance, angle)
         while not motion.done:
             verdict = self._safety.fresh()
@@ -309,8 +309,7 @@ class Robot:
         """
         body = await self.read_body()
         positions = checked_positions(body, positions)
-        if speed is not None and not speed > 0:
-            raise ConfigError(f"speed: expected more than 0, got {speed:g}")
+        check_speed(speed)
         stream = await self._joint_stream(body)
         stream.go(positions, speed)
         return await self._joints_there(body, stream, wait)
@@ -327,6 +326,7 @@ class Robot:
         """
         body = await self.read_body()
         positions = checked_positions(body, positions)
+        check_speed(speed)
         stream = await self._joint_stream(body)
         stream.go(positions, speed)
         await self._ticks(1)

@@ -14,7 +14,7 @@ from gigabrain_schemas.examples import example
 from gigabrain_schemas.requests import EnableRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import BODY, ENABLE, JOINT_CMD, RELEASE, STATE, command_topic
 from gigabrain_zenoh.client.robot import Robot
-from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.waiting import PATIENCE_S
 
@@ -134,3 +134,12 @@ async def test_joints_that_safety_holds_back_are_not_waited_for_and_stay_there(
     driver.most = math.inf
     await robot._ticks(50)
     assert driver.joints[JOINT.name] == pytest.approx(0.5 * GOAL, abs=0.05 * GOAL)
+
+
+@pytest.mark.parametrize("speed", [0.0, -0.1, math.nan])
+async def test_a_speed_that_is_none_moves_no_joint(net: Net, driver: Driver, speed: float) -> None:
+    robot = Robot(net.two)
+    with pytest.raises(ConfigError, match=r"^speed: expected more than 0, got "):
+        await robot.track_joint_positions({JOINT.name: GOAL}, speed=speed)
+    await robot._ticks(25)
+    assert driver.joints[JOINT.name] == 0.0
