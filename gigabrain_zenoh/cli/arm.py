@@ -15,7 +15,7 @@ from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, Take, angle, check_
 from gigabrain_zenoh.cli.task import Mode, Wait, send
 from gigabrain_zenoh.client.arm import held_posture
 from gigabrain_zenoh.client.robot import Robot
-from gigabrain_zenoh.decision.tasks.arm_steps import describe
+from gigabrain_zenoh.decision.tasks.arm_steps import describe, describe_point
 from gigabrain_zenoh.errors import ConfigError, Unsupported, unknown
 from gigabrain_zenoh.host.signals import run_async
 
@@ -167,8 +167,8 @@ def pick(
     if shapes != 1:
         raise ConfigError(f"arm pick: expected --box, --cylinder or --sphere, got {shapes} of them")
     thing = Solid(box=box, cylinder=cylinder, sphere=sphere, at=(x, y, z), yaw=math.radians(yaw))
-    mission = Mission(things={"the thing": thing}, do=(Step(pick="the thing"),))
-    _carry_out(at, mission, mode, wait)
+    name = f"the thing at {describe_point((x, y, z))}"  # another one than what it may hold
+    _carry_out(at, Mission(things={name: thing}, do=(Step(pick=name),)), mode, wait)
 
 
 def pick_seen(

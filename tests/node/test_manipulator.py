@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.brain import Intent, JointTarget
 from gigabrain_schemas.objects import SeenSolid
 from gigabrain_schemas.safety import JointCap
+from gigabrain_zenoh.cli import arm
 from gigabrain_zenoh.decision.behaviours import ArmCommand, Idle
 from gigabrain_zenoh.decision.grip import REST_TICKS
 from gigabrain_zenoh.manipulation.arm_planner import MOVING, STILL, ArmPlanner
@@ -285,6 +287,20 @@ def test_what_slips_out_of_the_gripper_is_told(rig: Rig) -> None:
     task = rig.carry_on()
     assert task.state == "failed"
     assert "cube has slipped out of the gripper" in task.reason
+
+
+def test_a_second_thing_is_not_taken_for_the_one_that_it_holds(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    missions: list[str] = []
+    given = SimpleNamespace(carry_out=lambda text, **_: missions.append(text))
+    monkeypatch.setattr(arm, "send", lambda _at, give, _wait: give(given))
+    for x, y in (THERE, ELSEWHERE):
+        arm.pick(x, y, 0.015, box=(0.03, 0.03, 0.03))
+    assert rig.carry_out(missions[0]).state == "succeeded"
+    task = rig.carry_out(missions[1])
+    assert task.state == "failed"
+    assert task.reason.endswith("the gripper holds the thing at (0.239, 0.000, 0.015) already")
 
 
 @pytest.mark.parametrize("wide", [0.01, 0.05, 1.0])
