@@ -81,6 +81,14 @@ class Arming:
                 return ""
         return "the arm moves while it is switched on: let go of it"
 
+    async def measure(self, joints: Collection[ServoJoint]) -> str:
+        """Believe where servos are, and switch none on; return why not, or an empty text."""
+        for joint in joints:
+            if (now := await self.block(joint.id)) is None:
+                return f"{joint} answers only at times"
+            joint.begin(now, self._clock.now_ns())
+        return ""
+
     async def _switched_on(self, joints: Collection[ServoJoint]) -> bool:
         """Give each servo its goal, and torque once it is seen to be there."""
         now_ns = self._clock.now_ns()

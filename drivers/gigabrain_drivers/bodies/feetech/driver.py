@@ -200,6 +200,8 @@ class FeetechDriver(Driver):
 
     async def limp(self) -> None:
         """Let go of all joints, until they are sent somewhere. Raises BodyLost."""
+        if not self._armed:
+            raise BodyLost(self.problem)
         self._limp = True
         for joint in self._joints.values():
             if not await self._bus.write(joint.id, feetech.TORQUE, 0):
@@ -364,7 +366,10 @@ class FeetechDriver(Driver):
             await self._bus.send(feetech.sync_write(feetech.GOAL.address, goals))
 
     async def _find(self) -> bool:
-        """Look for the whole arm, and have it hold; return whether it does. Raises ConfigError."""
+        """Look for the whole arm, and have it hold unless it is limp; return whether it is there.
+
+        Raises ConfigError.
+        """
         if not self.link.connected:
             return False
         if self._base:  # what ran before may have left its wheels turning
@@ -383,7 +388,8 @@ class FeetechDriver(Driver):
         refuse_incomplete(str(self.link), {str(joint): how for joint, how in self._found.items()})
         for joint in self._joints.values():
             await self._arming.check(joint)
-        self._complaint = await self._arming.arm(self._joints.values())
+        prepare = self._arming.measure if self._limp else self._arming.arm
+        self._complaint = await prepare(self._joints.values())
         if self._base and not self._complaint:
             self._complaint = await self._base.start(self._clock.now_ns())
         self._armed = not self._complaint
