@@ -145,13 +145,6 @@ def test_each_part_of_the_velocity_comes_from_where_it_is_known() -> None:
     assert it.velocity().angular_z == pytest.approx(0.4)  # 2.5 rad/s * 0.08 / 0.5
 
 
-def test_a_line_that_says_nothing_of_motion_is_told_apart() -> None:
-    it = report()
-    assert not it.update({"battery_voltage": 12.0}, 20 * MS)
-    assert it.update(wheels(0.0, 0.0), 40 * MS)
-    assert it.update({"wheel_left_velocity": 0.0}, 60 * MS)
-
-
 @pytest.mark.parametrize(
     ("volts", "percent"), [(9.9, 0), (11.25, 50), (12.6, 100), (14, 100), (5, 0)]
 )
@@ -209,6 +202,39 @@ async def test_a_battery_and_temperatures_that_come_no_more_are_not_reported() -
     after = await pass_seconds(3, powered=False)
     assert after.battery is None
     assert [joint.temperature for joint in after.joints] == [None, None]
+
+
+@pytest.mark.parametrize(
+    ("lines", "needed"),
+    [
+        (("A,{wheel_left_velocity}\n", "B,{wheel_right_velocity}\n"), (0, 1)),
+        (("A,{linear_x}\n", "B,{angular_z}\n"), (0, 1)),
+        (("A,{linear_x},{angular_z}\n", "B,{x},{y},{yaw}\n"), (0,)),
+        (("A,{linear_x}\n", "B,{x},{y},{yaw}\n"), (0, 1)),
+        (("A,{wheel_left_position},{wheel_right_position}\n", "B,{wheel_left_velocity}\n"), (0,)),
+        (("A,{linear_x},{angular_z}\n", "B,{battery_percentage}\n"), (0,)),
+    ],
+)
+async def test_a_body_is_lost_once_a_line_with_its_velocity_comes_no_more(
+    lines: tuple[str, ...], needed: tuple[int, ...]
+) -> None:
+    clock = FakeClock()
+    options = replace(TWO_LINES, state=lines)
+    driver = LineDriver(ROBOT, options, Run(folder=Path(), link="real"), clock=clock)
+    templates = options.state_templates()
+
+    async def connected_without(missing: int | None) -> bool:
+        for _ in range(10):
+            for place, template in enumerate(templates):
+                if place != missing:
+                    driver.link.on_bytes(template.encode({}))
+            await clock.advance(20 * MS)
+        return (await driver.read_state()).link.connected
+
+    assert await connected_without(None)
+    for place in range(len(lines)):
+        assert await connected_without(place) is (place not in needed)
+        assert await connected_without(None)
 
 
 def test_a_percentage_that_comes_no_more_is_not_an_empty_battery() -> None:

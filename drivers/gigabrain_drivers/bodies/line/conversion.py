@@ -120,8 +120,8 @@ class LineReport:
         """The bits that the firmware reports."""
         return int(self._values.get("flags", 0))
 
-    def update(self, values: Mapping[str, float], now_ns: int) -> bool:
-        """Handle one line; return whether it reports how the body moves."""
+    def update(self, values: Mapping[str, float], now_ns: int) -> None:
+        """Handle one line."""
         for name, value in values.items():
             if recent := self._recent.get(name):
                 recent.put(value, now_ns)
@@ -136,11 +136,8 @@ class LineReport:
             self._move(step, now_ns)
         elif (angles := _all_of(self._positions, values)) and self._base:
             self._roll(angles, now_ns)
-        elif not self._speaking & values.keys():
-            return False
-        elif self._pose is None and self._angles is None:
+        elif self._speaking & values.keys() and self._pose is None and self._angles is None:
             self._integrate(now_ns)
-        return True
 
     def restart(self) -> None:
         """Count from the next line on: the connection was cut."""

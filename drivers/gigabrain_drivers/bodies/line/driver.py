@@ -6,6 +6,7 @@ stops the body (docs/reference/firmware_line.md).
 
 import logging
 import time
+from collections.abc import Mapping
 
 import serial
 from msgspec.structs import replace
@@ -16,6 +17,7 @@ from gigabrain_drivers.bodies.line.options import (
     LineOptions,
     base_of,
     check_lines,
+    velocity_fields,
 )
 from gigabrain_drivers.bodies.line.protocol import LineDecoder, describe
 from gigabrain_drivers.driver.base import Driver
@@ -36,7 +38,10 @@ log = logging.getLogger(__name__)
 MISSED_LINES = 3  # state lines in a row, and the body counts as lost
 MIN_TIMEOUT_NS = 100_000_000
 REPEAT_SHARE = 0.9  # of the repetition's period: ticks are not that even
-NO_VALID_LINE = "no valid line comes: check firmware, baud rate and wiring"
+NO_VALID_LINE = (
+    "no valid line comes, or one that is part of the velocity is missing: "
+    "check firmware, baud rate and wiring"
+)
 BUMPER = "bumper"  # flags of such names are bumpers
 PROBE_S = 2.5  # an Arduino that opening has reset takes two seconds to say anything
 FLUSH_NS = 10_000_000  # and the time of one line, before a port is closed
@@ -64,6 +69,8 @@ class LineDriver(Driver):
         self.link.on_bytes, self.link.on_open = self._received, self._opened
         self.link.on_lost = self._lost
         self._report = LineReport(options, robot, base)
+        self._velocity_fields = velocity_fields(options, robot)
+        self._awaited = set(self._velocity_fields)  # until all have come once more
         silent_ns = max(round(MISSED_LINES / options.state_hz * 1e9), MIN_TIMEOUT_NS)
         self._liveness = Liveness(self.link, self._clock, silent_ns, NO_VALID_LINE, log)
         self._repeat_ns = round(REPEAT_SHARE / options.command_hz * 1e9)
@@ -155,6 +162,7 @@ class LineDriver(Driver):
     def _opened(self) -> None:
         """Start again on a new line; nothing is sent before the body reports."""
         self._decoder.clear()
+        self._awaited = set(self._velocity_fields)
         self._report.restart()
         self._liveness.reset()
 
@@ -165,14 +173,21 @@ class LineDriver(Driver):
     def _received(self, data: bytes) -> None:
         now_ns = self._clock.now_ns()
         for values in self._decoder.feed(data):
-            moves = self._report.update(values, now_ns)
-            if (
-                moves and self._liveness.mark_received()
-            ):  # after a boot or a loss: at rest, whatever was commanded
+            self._report.update(values, now_ns)
+            if self._completes(values) and self._liveness.mark_received():
+                # after a boot or a loss: at rest, whatever was commanded
                 self._sent_ns = 0
                 self._send_zero()
             self._log_flags()
         self.link.errors = self._decoder.errors
+
+    def _completes(self, values: Mapping[str, float]) -> bool:
+        """Return whether all that the velocity follows from has come since that was last so."""
+        self._awaited -= values.keys()
+        if self._awaited:
+            return False
+        self._awaited = set(self._velocity_fields)
+        return True
 
     def _bumpers(self) -> tuple[bool, ...]:
         """The flags whose names begin with `bumper`."""

@@ -179,6 +179,17 @@ def position_fields(base: Base) -> tuple[str, ...]:
     return tuple(f"wheel_{name}_position" for name in base.wheels)
 
 
+def velocity_fields(options: LineOptions, robot: RobotFile) -> frozenset[str]:
+    """The state fields from which the body's velocity follows, in whichever lines they stand."""
+    seen = frozenset[str]().union(*(template.names for template in options.state_templates()))
+    ways, base = _ways(robot), base_of(options, robot)
+    own = seen.intersection(ways)
+    if len(own) == len(ways):
+        return own
+    speeds, positions = ((speed_fields(base),), (position_fields(base),)) if base else ((), ())
+    return own.union(next(filter(seen.issuperset, (*speeds, POSE, *positions)), ()))
+
+
 def _numbered(state: tuple[Template, ...]) -> dict[str, Template]:
     return {f"state[{i}]": template for i, template in enumerate(state)}
 
