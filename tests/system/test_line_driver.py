@@ -133,6 +133,16 @@ async def test_a_reboot_does_not_move_the_pose(tmp_path: Path) -> None:
         assert (state.link.errors, state.velocity.linear_x) == (2, 0.0)  # two lines of banner
 
 
+async def test_a_board_that_restarts_behind_its_port_is_started_again(tmp_path: Path) -> None:
+    async with bench(tmp_path, STARTED) as it:
+        await it.drive(0.1, 0.2)
+        it.station.set(Faults(reboot=True))
+        await it.drive_until(lambda state: not state.link.connected, 0.0)
+        it.station.set(NO_FAULTS)
+        await it.drive_until(lambda state: state.link.connected, 0.0)
+        await it.drive_until(lambda _: it.body.commanded == (0.2, 0.0, 0.0), 0.2)
+
+
 async def test_a_brown_out_switches_the_body_off_and_it_comes_back_at_rest(tmp_path: Path) -> None:
     async with bench(tmp_path) as it:
         await it.drive(0.1, 0.2)

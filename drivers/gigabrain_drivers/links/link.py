@@ -268,6 +268,7 @@ class Liveness:
         self._silent_ns, self._senseless = silent_ns, senseless
         self._received_ns: int | None = None  # None since the line was opened or lost
         self._hoping_ns = clock.now_ns()  # since when there is nothing
+        self._lost = False  # whether a loss has been reported since the newest message
         self._fault = Fault(log)
 
     @property
@@ -276,8 +277,9 @@ class Liveness:
         return self._received_ns is not None
 
     def mark_received(self) -> bool:
-        """Note a message; return whether it is the first on this line."""
-        first, self._received_ns = self._received_ns is None, self._clock.now_ns()
+        """Note a message; return whether it is the first on this line, or after a loss."""
+        first = self._received_ns is None or self._lost
+        self._received_ns, self._lost = self._clock.now_ns(), False
         return first
 
     def reset(self) -> None:
@@ -289,6 +291,7 @@ class Liveness:
         """Return whether the newest message is recent enough."""
         silent_ns = self._clock.now_ns() - (self._received_ns or self._hoping_ns)
         alive = self._received_ns is not None and silent_ns <= self._silent_ns
+        self._lost = self._lost or not alive
         if alive:
             self._fault.end(f"{self._link}: reports again")
         elif silent_ns > LOG_AFTER_NS:

@@ -34,6 +34,8 @@ async def test_it_is_alive_for_as_long_as_its_word_is_fresh() -> None:
     assert await body.alive_after(100)
     assert not await body.alive_after(1)
     assert body.liveness.received
+    assert body.liveness.mark_received()  # after a loss
+    assert not body.liveness.mark_received()
     body.liveness.reset()
     assert not body.liveness.received
 

@@ -173,7 +173,8 @@ class AlphaDriver(Driver):
         if last and not alpha.is_newer(frame.sequence, last[0]):
             self._last = last
             return
-        first, self._state = self._liveness.mark_received(), state
+        first, self._state = not self._liveness.received, state
+        self._liveness.mark_received()
         now_ns = self._clock.now_ns()
         self._stamps.arrived(state.milliseconds, now_ns)
         self._echoes.echoed(state.echo, now_ns)
