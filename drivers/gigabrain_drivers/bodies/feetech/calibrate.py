@@ -17,6 +17,7 @@ from gigabrain_drivers.bodies.feetech.calibration import (
     Calibration,
     JointRange,
     ServoCalibration,
+    check_writable,
     save_calibration,
 )
 from gigabrain_drivers.bodies.feetech.driver import FeetechOptions, refuse_incomplete, until_open
@@ -53,6 +54,7 @@ async def calibrate(
 
     The gripper of a `leader` is a trigger, whose range is its own. Raises ConfigError.
     """
+    check_writable(path)
     link = SerialLink(options.port, feetech.BAUD, clock := Clock())
     bus = HostBus(link, clock)
     try:

@@ -4,6 +4,9 @@ It is made by `gigabrain driver calibrate`, and kept in a YAML file. The servos'
 limits are in it too, as the mark by which the arm is known again.
 """
 
+import errno
+import os
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -20,6 +23,7 @@ from gigabrain_zenoh.host.files import expanded, make_folder, replace_file
 from gigabrain_zenoh.host.run_folders import state_dir
 
 Tick = Annotated[int, Meta(ge=0, le=TICKS - 1)]
+CALIBRATION_BYTES = 4096  # for which the disk has to have room
 MAX_OFFSET = 2047  # ticks, in 11 bits
 SPAN_TOLERANCE = 0.17  # [rad], by which a joint's range may differ from that in the robot's file
 TRIGGER_SPAN = 0.35  # [rad], the least range of a leader's trigger
@@ -99,6 +103,18 @@ def load_calibration(
     return calibration
 
 
+def check_writable(path: Path) -> None:
+    """Raise ConfigError where no calibration can be written; call this before one is made."""
+    try:
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        make_folder(path.parent)
+        with tempfile.TemporaryFile(dir=path.parent) as draft:
+            draft.write(bytes(CALIBRATION_BYTES))
+    except OSError as error:
+        raise _unwritable(path, error) from None
+
+
 def save_calibration(path: Path, calibration: Calibration) -> None:
     """Write the file, durably. Raises ConfigError."""
     text = yaml.safe_dump(msgspec.to_builtins(calibration), sort_keys=False)
@@ -106,7 +122,11 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
         make_folder(path.parent)
         replace_file(path, text.encode())
     except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error.strerror}") from None
+        raise _unwritable(path, error) from None
+
+
+def _unwritable(path: Path, error: OSError) -> ConfigError:
+    return ConfigError(f"cannot write {path}: {error.strerror}")
 
 
 class JointRange:
