@@ -162,20 +162,21 @@ async def test_limp_lets_go_until_joints_are_sent_somewhere() -> None:
         assert not (await rig.driver.read_state()).limp
 
 
-async def test_a_gripper_is_gentle_once_it_touches_something() -> None:
-    rig = Rig()
+@pytest.mark.parametrize(("limit", "gentle"), [(1.0, 0.4), (0.3, 0.3)])
+async def test_a_gripper_is_gentle_once_it_touches_something(limit: float, gentle: float) -> None:
+    rig = Rig(torque_limit=limit)
     async with opened(rig):
         await rig.go(1500, gripper=1.0)
         rig.joint("gripper").lower = 0.5  # something is between its fingers
         await rig.go(1000, gripper=0.0)
-        assert rig.servo("gripper")[feetech.TORQUE_LIMIT] == 400
-        assert rig.joint("gripper").effort == pytest.approx(-0.4 * 1.91, abs=0.01)
+        assert rig.servo("gripper")[feetech.TORQUE_LIMIT] == 1000 * gentle
+        assert rig.joint("gripper").effort == pytest.approx(-gentle * 1.91, abs=0.01)
         await rig.driver.hold()
         await rig.wait(5000)
-        assert rig.joint("gripper").effort == pytest.approx(-0.4 * 1.91, abs=0.01)
+        assert rig.joint("gripper").effort == pytest.approx(-gentle * 1.91, abs=0.01)
         assert (await rig.driver.read_state()).link.connected
         await rig.go(1500, gripper=1.0)
-        assert rig.servo("gripper")[feetech.TORQUE_LIMIT] == 1000
+        assert rig.servo("gripper")[feetech.TORQUE_LIMIT] == 1000 * limit
         assert rig.joint("gripper").position == pytest.approx(1.0, abs=0.02)
 
 

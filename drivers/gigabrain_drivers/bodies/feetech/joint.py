@@ -61,7 +61,8 @@ class ServoJoint:
         self.newest: ServoReadings | None = None
         self.received_ns = 0  # when the newest one was asked for
         self._stall_torque = stall_torque
-        self._full, self._gentle = round(torque_limit * 1000), round(grip_torque * 1000)
+        self._full = round(torque_limit * 1000)
+        self._gentle = min(self._full, round(grip_torque * 1000))
         self._last: ServoReadings | None = None  # believed or not
         self._speed = 0.0  # [rad/s] between the two newest that are believed
         self._held = False
