@@ -131,6 +131,21 @@ async def test_limp_lets_go_and_the_next_positions_hold_where_it_is(rig: Rig) ->
     assert rig.angles[1] == pytest.approx(state.joints[1].position, abs=1e-4)
 
 
+async def test_limp_that_the_bus_does_not_take_is_an_error_and_the_arm_is_held(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    with monkeypatch.context() as full:
+        full.setattr(rig.cable, "write", lambda data: rig.cable.drop("buffer full"))
+        with pytest.raises(BodyLost, match="memory: buffer full"):
+            await rig.driver.limp()
+    rig.cable.plug()
+    await rig.wait(500)
+    assert all(servo.on for servo in rig.arm.joints)
+    rig.arm.joints[1].on = False  # which is noticed, as it is to hold
+    await rig.wait(100)
+    assert "motor 2 has switched itself off" in caplog.text
+
+
 async def test_limp_without_an_arm_is_an_error() -> None:
     rig = Rig()
     rig.cable.cut = True

@@ -136,16 +136,20 @@ class PiperDriver(Driver):
             self._send(self._targets or self._feedback.positions)
 
     async def limp(self) -> None:
-        """Let go of all joints, which fall where nothing holds them; positions hold them again."""
+        """Let go of all joints, which fall where nothing holds them; positions hold them again.
+
+        Raises BodyLost.
+        """
         if not self._fresh():
             raise BodyLost(f"{self.link}: {self.problem}")
-        self._hold_on = self._were_on = False
-        self._targets = self._enabling_ns = None
         frames = [piper.enable(on=False)]
         if len(self._names) > piper.JOINTS:
             width = 2 * self._feedback.positions[-1]
             frames.append(piper.move_gripper(width, 0.0, piper.GRIPPER_OFF))
-        self.link.write(records(frames))
+        if not self.link.write(records(frames)):
+            raise BodyLost(f"{self.link}: {self.problem}")
+        self._hold_on = self._were_on = False
+        self._targets = self._enabling_ns = None
 
     async def set_joint_positions(self, positions: Mapping[str, float]) -> Mapping[str, float]:
         """Move joints together [rad] or [m]; one that is not a number has all stay.
