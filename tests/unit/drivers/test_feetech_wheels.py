@@ -251,3 +251,23 @@ async def test_servos_of_another_variant_are_refused() -> None:
     rig.arm.wheels["right"].keep(feetech.MAX_VOLTAGE, 140)
     with pytest.raises(ConfigError, match=r"servo 9 \(wheel right\) takes up to 14 V"):
         await rig.during(rig.driver.open())
+
+
+async def test_a_wheel_that_has_protected_itself_stands_as_it_is_switched_on_again() -> None:
+    rig = LeKiwi()
+    async with opened(rig):
+        await rig.drive(500, 0.1, 0.0, 0.0)
+        servo, goals = rig.arm.wheels["left"], list[int]()
+        assert servo[feetech.GOAL_VELOCITY]
+        write = servo.write
+
+        def recorded(address: int, data: bytes) -> None:
+            write(address, data)
+            if (address, data) == (feetech.TORQUE.address, b"\1"):
+                goals.append(servo[feetech.GOAL_VELOCITY])
+
+        servo.write = recorded  # type: ignore[method-assign]
+        servo._latched = True  # something blocks it
+        await rig.drive(500, 0.1, 0.0, 0.0)
+        assert goals == [0]
+        assert (await rig.state()).link.connected

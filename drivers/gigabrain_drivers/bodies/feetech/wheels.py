@@ -284,11 +284,16 @@ class ServoBase:
         return any(wheel.status & feetech.OVERLOAD for wheel in self.wheels)
 
     async def end_overload(self) -> None:
-        """Switch servos that protect themselves from overload off and on: that ends it."""
+        """Switch servos that protect themselves from overload off and on: that ends it.
+
+        They keep the speed that they had, so each gets zero before it is on.
+        """
+        write = self._bus.write
         for wheel in self.wheels:
             if wheel.status & feetech.OVERLOAD:
-                await self._bus.write(wheel.id, feetech.TORQUE, 0)
-                await self._bus.write(wheel.id, feetech.TORQUE, 1)
+                await write(wheel.id, feetech.TORQUE, 0)
+                if await write(wheel.id, feetech.GOAL_VELOCITY, 0):
+                    await write(wheel.id, feetech.TORQUE, 1)
 
 
 def check_wheels(robot: RobotFile, wheels: Mapping[str, int]) -> None:
