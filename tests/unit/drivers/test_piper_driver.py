@@ -4,6 +4,7 @@ import logging
 import math
 
 import pytest
+from msgspec.structs import replace
 
 from gigabrain_drivers.bodies.piper import protocol as piper
 from gigabrain_drivers.bodies.piper.driver import NOTHING_COMES, PiperDriver
@@ -129,6 +130,16 @@ async def test_limp_lets_go_and_the_next_positions_hold_where_it_is(rig: Rig) ->
     assert rig.angles[1] == pytest.approx(state.joints[1].position, abs=1e-4)
     await rig.wait(300)
     assert rig.angles[1] == pytest.approx(state.joints[1].position, abs=1e-4)
+
+
+async def test_a_driver_that_ends_limp_leaves_the_gripper_limp_too() -> None:
+    rig = Rig()
+    rig.driver.robot = replace(ROBOT, safe_state="limp")
+    async with rig.driver:
+        await rig.wait(400)
+        await rig.move(1000, gripper=0.01)
+    await rig.wait(300)
+    assert not any(servo.on for servo in (*rig.arm.joints, rig.arm.gripper))
 
 
 async def test_limp_that_the_bus_does_not_take_is_an_error_and_the_arm_is_held(

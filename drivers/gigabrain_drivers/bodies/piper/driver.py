@@ -198,8 +198,13 @@ class PiperDriver(Driver):
         return recent and self._feedback.complete and self.link.connected
 
     def _movable(self) -> bool:
-        """Return whether positions reach motors that hold."""
-        return self._fresh() and not self._feedback.problem() and all(self._feedback.motors_on)
+        """Return whether positions reach motors that hold, and still are to.
+
+        A position would switch a gripper on that was just let go of.
+        """
+        feedback = self._feedback
+        holds = self._hold_on and all(feedback.motors_on)
+        return holds and self._fresh() and not feedback.problem()
 
     def _quantised(self, positions: Mapping[str, float]) -> list[float]:
         """Return where all joints go, in the arm's own units."""
