@@ -44,7 +44,7 @@ NO_VALID_LINE = (
 )
 BUMPER = "bumper"  # flags of such names are bumpers
 PROBE_S = 2.5  # an Arduino that opening has reset takes two seconds to say anything
-FLUSH_NS = 10_000_000  # and the time of one line, before a port is closed
+FLUSH_NS = 10_000_000  # and the time of what was written, before a port is closed
 SEQUENCES = 1 << 16
 
 
@@ -99,8 +99,7 @@ class LineDriver(Driver):
         if self._open:
             await self.stop()
             if self.link.connected:  # what is still in the port when it is closed is lost
-                bits = self._command.template.longest() * BITS_PER_BYTE
-                await self._clock.sleep_ns(FLUSH_NS + round(bits / self.options.baud * 1e9))
+                await self._clock.sleep_ns(FLUSH_NS + self._longest_write_ns())
         self._open = False
         await self.link.close()
         if self._lidar:
@@ -131,6 +130,13 @@ class LineDriver(Driver):
             bumpers=self._bumpers(),
             link=replace(self.link.health, connected=self._liveness.alive()),
         )
+
+    def _longest_write_ns(self) -> int:
+        """Return the time on the line of a command that starts the body, and of its stop."""
+        options: LineOptions = self.options
+        command = self._command.template.longest()
+        bits = (2 * command + len(options.start) + len(options.stop)) * BITS_PER_BYTE
+        return round(bits / options.baud * 1e9)
 
     def _send_zero(self) -> None:
         self._send(ZERO)
