@@ -155,6 +155,22 @@ async def test_wheels_stand_after(end: str) -> None:
         assert rig.rolling.commanded == (0.0, 0.0, 0.0)
 
 
+async def test_wheels_stand_after_a_close_whose_first_bytes_get_lost() -> None:
+    rig, left = LeKiwi(), 200  # a servo waits for so many where the length of a frame was hit
+
+    def swallow(data: bytes) -> bytes:
+        nonlocal left
+        taken = min(left, len(data))
+        left -= taken
+        return data[taken:]
+
+    async with opened(rig):
+        await rig.drive(500, 0.1, 0.0, 0.0)
+        rig.link.disturb_sent = swallow
+    await rig.wait(200)
+    assert rig.rolling.commanded == (0.0, 0.0, 0.0)
+
+
 async def test_what_is_no_number_stops_all_wheels() -> None:
     rig = LeKiwi()
     async with opened(rig):

@@ -180,7 +180,7 @@ class FeetechDriver(Driver):
             await self._bus.ask(feetech.ping(servo), [servo], 0)  # the goals have gone out before
         self._armed = False
         if self._base:
-            self._base.close()
+            await self._base.close()
         await self.link.close()
         if self._lidar:
             await self._lidar.close()

@@ -6,7 +6,7 @@ from typing import Protocol
 
 from gigabrain_drivers.bodies.feetech import protocol as feetech
 from gigabrain_drivers.bodies.feetech.arming import VARIANT_LIMIT, Arming
-from gigabrain_drivers.bodies.feetech.bus import HostBus
+from gigabrain_drivers.bodies.feetech.bus import ANSWER_TIMEOUT_NS, HostBus
 from gigabrain_drivers.bodies.feetech.joint import LOST_NS
 from gigabrain_drivers.bodies.feetech.protocol import RADIANS_PER_TICK, TICKS, ServoReadings
 from gigabrain_drivers.driver.robot import RobotFile
@@ -20,6 +20,7 @@ VELOCITY_MODE = 1
 MAX_SPEED = 3000  # ticks/s, of an STS3215 under load, as LeRobot has it
 FASTEST = 1.5 * MAX_SPEED  # ticks/s that readings may show: it is pushed, or runs free
 SLACK = 8  # ticks more between two readings; the rest is no motion
+STOP_ATTEMPTS = 20  # at the end: a servo may wait for 250 bytes where a frame's length was hit
 WINDOW_NS = 50_000_000  # over which speeds are measured: a shorter one would be encoder noise
 
 
@@ -180,9 +181,24 @@ class ServoBase:
         self.pose = Pose(x=0.0, y=0.0, yaw=0.0)
         self._guard = LineGuard(self._goals())
 
-    def close(self) -> None:
-        """End the process that would stop the wheels if this one died."""
+    async def close(self) -> None:
+        """Come to rest, and end the process that would stop the wheels if this one died.
+
+        Nothing stops them later. So it is read back, until it has come through a disturbed line.
+        """
+        self.stop()
+        for _ in range(STOP_ATTEMPTS):
+            if not self._bus.link.connected or (await self.send() and await self._stands()):
+                break
         self._guard.close()
+
+    async def _stands(self) -> bool:
+        """Return whether all servos have a speed of zero for their goal."""
+        speed, servos = feetech.GOAL_VELOCITY, [wheel.id for wheel in self.wheels]
+        question = feetech.sync_read(servos, speed.address, speed.size)
+        answers = await self._bus.ask(question, servos, speed.size, len(servos) * ANSWER_TIMEOUT_NS)
+        goals = [speed.decode(answer[1:]) for answer in answers.values()]
+        return goals == [0] * len(servos)
 
     def command(self, wanted: Velocity) -> Velocity:
         """Drive; return what was sent. All wheels slow down alike if one would be too fast."""
