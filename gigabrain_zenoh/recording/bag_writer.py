@@ -3,6 +3,8 @@
 import contextlib
 import logging
 import os
+import shutil
+import struct
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,13 +24,15 @@ from gigabrain_zenoh.codec import Codec, encoding_of
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import open_regular
 from gigabrain_zenoh.host.posix import fcntl
-from gigabrain_zenoh.recording.bag_reader import MAGIC, RAW, Bag, BagDamage, check_magic
+from gigabrain_zenoh.recording.bag_reader import HEAD, MAGIC, RAW, Bag, BagDamage, check_magic
 from gigabrain_zenoh.recording.drawing import Drawer
 from gigabrain_zenoh.recording.drawn import Drawn, json_schema
 
 log = logging.getLogger(__name__)
 
 PROFILE, LIBRARY = "gigabrain", "gigabrain-zenoh"
+OWN_PROFILE = struct.pack("<I", len(PROFILE)) + PROFILE.encode()  # begins the first record
+HEAD_BYTES = len(MAGIC) + HEAD.size + len(OWN_PROFILE)
 VIEW = "view"  # kind of a channel, in its metadata; that of recorded messages is RAW
 MIN_DRAWN_INTERVAL_NS = {
     STATE.key: 30_000_000,
@@ -339,26 +343,49 @@ def recover(path: Path, to: Path) -> Recovered:
 
 
 def is_unfinished(path: Path) -> bool:
-    """Return whether `path` is a recording that was interrupted, and is not being written now."""
+    """Return whether `path` is a recording of ours that was cut off, and is not being written."""
     with open_regular(path) as file:
-        if file.read(len(MAGIC)) != MAGIC:
+        head = file.read(HEAD_BYTES)
+        if not head.startswith(MAGIC) or not head.endswith(OWN_PROFILE):
             return False
         file.seek(-len(MAGIC), os.SEEK_END)
-        ended = file.read() == MAGIC and file.tell() > len(MAGIC)
+        ended = file.read() == MAGIC
     return not ended and not is_being_written(path)
 
 
-def recover_all(folder: Path) -> None:
-    """Recover every unfinished recording in `folder` in place; log those that cannot be."""
+def recover_all(folder: Path, *, keep_free_mb: float) -> None:
+    """Recover every unfinished recording of ours in `folder` in place; log those that cannot be.
+
+    A file whose copy would leave less than `keep_free_mb` of the disk free stays as it is, and so
+    does one that changes meanwhile, as a file that is being copied.
+    """
     for path in sorted(folder.glob("*.mcap")):
-        part = path.with_suffix(".recovering")
         try:
             if not is_unfinished(path):
                 continue
-            part.unlink(missing_ok=True)  # of an earlier attempt that was interrupted
-            done = recover(path, part)
-            part.replace(path)
+            with path.open("r+b") as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # keeps other recorders off it
+                _recover_in_place(path, os.fstat(file.fileno()), keep_free_mb)
+        except BlockingIOError:  # another recorder was faster
+            continue
         except (ConfigError, OSError) as error:
             log.warning("%s could not be recovered: %s", path, error)
-        else:
-            log.info("%s was cut off; recovered %d messages", path, done.messages)
+
+
+def _recover_in_place(path: Path, before: os.stat_result, keep_free_mb: float) -> None:
+    if shutil.disk_usage(path.parent).free - before.st_size < keep_free_mb * 1e6:
+        log.warning(
+            "%s was cut off, and is not recovered: a copy of %.1f MB would leave less than %g MB "
+            "of the disk free; make space, or: gigabrain bag recover %s -o FILE",
+            path, before.st_size / 1e6, keep_free_mb, path,
+        )  # fmt: skip
+        return
+    part = path.with_suffix(".recovering")
+    part.unlink(missing_ok=True)  # of an earlier attempt that was interrupted
+    done, now = recover(path, part), path.stat()
+    if (now.st_ino, now.st_size) != (before.st_ino, before.st_size):
+        part.unlink()
+        log.warning("%s changed while it was recovered, and stays as it is", path)
+        return
+    part.replace(path)
+    log.info("%s was cut off; recovered %d messages", path, done.messages)

@@ -85,16 +85,17 @@ async def _fetch_kept(bus: Bus, recorder: Recorder, expressions: list[str]) -> N
                     recorder.intake.receive(topic.key, "", payload)
 
 
-def _recover_in_background(folder: Path) -> None:
+def _recover_in_background(folder: Path, config: RecorderConfig) -> None:
     """Recover recordings that were interrupted earlier, in a thread."""
-    threading.Thread(target=functools.partial(recover_all, folder), daemon=True).start()
+    work = functools.partial(recover_all, folder, keep_free_mb=config.keep_free_mb)
+    threading.Thread(target=work, daemon=True).start()
 
 
 async def run(config: RecorderConfig, bus: Bus, ready: Callable[[], None]) -> None:
     """Record until the process ends."""
     path = unused_path(recording_path(config))  # after a restart it continues in another file
     recorder = Recorder(path, config)
-    _recover_in_background(path.parent)
+    _recover_in_background(path.parent, config)
     with recorder, listening(bus, recorder, config.topics):
         ready()
         log.info("recording into %s", path)
@@ -131,7 +132,7 @@ async def record(config: RecorderConfig, where: Where, seconds: float | None) ->
     async with connect(where, "record", looks_on=True) as bus:
         recorder = Recorder(path, config)
         recorder.begin()
-        _recover_in_background(path.parent)
+        _recover_in_background(path.parent, config)
         with stop_signals(CLOSE_S) as stop, recorder, listening(bus, recorder, config.topics):
             print(f"recording into {path}; Ctrl-C ends it", flush=True)
             await _show_status(recorder, stop, seconds)

@@ -1,0 +1,81 @@
+"""Recordings that were cut off are recovered in place when the next one starts."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from mcap.writer import Writer
+
+from gigabrain_zenoh.recording import bag_writer
+from gigabrain_zenoh.recording.bag_reader import Bag, read_info
+from gigabrain_zenoh.recording.bag_writer import Recovered, recover, recover_all
+from tests.unit.recording import bags
+
+
+@pytest.fixture
+def cut(tmp_path: Path) -> Path:
+    path = tmp_path / "cut.mcap"
+    bags.write(path, bags.drive(100), end=False)
+    return path
+
+
+def test_a_file_whose_copy_would_fill_the_disk_stays_as_it_is(
+    cut: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    inode, free_mb = cut.stat().st_ino, shutil.disk_usage(cut.parent).free / 1e6
+    recover_all(cut.parent, keep_free_mb=free_mb + 1e6)
+    assert (cut.stat().st_ino, list(cut.parent.iterdir())) == (inode, [cut])
+    (text,) = caplog.messages
+    assert text.startswith(f"{cut} was cut off, and is not recovered: a copy of 0.")
+    assert text.endswith(f"; make space, or: gigabrain bag recover {cut} -o FILE")
+    recover_all(cut.parent, keep_free_mb=0)
+    assert read_info(cut).finished
+
+
+def test_a_file_that_another_program_writes_stays_as_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "ros.mcap"
+    with path.open("wb") as file:
+        foreign = Writer(file, use_chunking=False)
+        foreign.start("ros2", "libmcap 1.4.0")
+        channel = foreign.register_channel("/chatter", "cdr", 0)
+        foreign.add_message(channel, 1, b"first", 1)
+        file.flush()
+        recover_all(tmp_path, keep_free_mb=0)
+        foreign.add_message(channel, 2, b"second", 2)
+        foreign.finish()
+    assert [each.data for _, _, each in Bag(path).messages()] == [b"first", b"second"]
+
+
+def test_a_file_that_is_being_copied_stays_as_it_is(
+    cut: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, content = cut.with_name("copy.mcap"), cut.read_bytes()
+    cut.unlink()
+    with path.open("wb", buffering=0) as copying:
+        copying.write(content[:-500])
+
+        def recover_meanwhile(source: Path, to: Path) -> Recovered:
+            done = recover(source, to)
+            copying.write(content[-500:])
+            return done
+
+        monkeypatch.setattr(bag_writer, "recover", recover_meanwhile)
+        recover_all(path.parent, keep_free_mb=0)
+    assert (path.stat().st_size, list(path.parent.iterdir())) == (len(content), [path])
+
+
+def test_two_recorders_that_start_at_once_recover_a_file_once(
+    cut: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recovered: list[Path] = []
+
+    def recover_twice(source: Path, to: Path) -> Recovered:
+        recovered.append(source)
+        if len(recovered) == 1:
+            recover_all(cut.parent, keep_free_mb=0)
+        return recover(source, to)
+
+    monkeypatch.setattr(bag_writer, "recover", recover_twice)
+    recover_all(cut.parent, keep_free_mb=0)
+    assert recovered == [cut]
+    assert bags.seqs(cut) == list(range(1, 101))
