@@ -3,6 +3,7 @@
 import asyncio
 import os
 import stat
+import threading
 from collections import deque
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
@@ -80,19 +81,22 @@ async def open_topic(
 
 
 async def messages(bus: Bus, wanted: TopicPattern) -> AsyncIterator[RawMessage | int]:
-    """Yield messages as they arrive, the kept value first; an int is a number of dropped ones."""
+    """Yield messages as they arrive, the kept value first; an int is a number of dropped ones.
+
+    They are queued in Zenoh's own thread, as the output may block the loop for as long as it likes.
+    """
     loop, arrived = asyncio.get_running_loop(), asyncio.Event()
     queue: deque[RawMessage] = deque(maxlen=MAX_QUEUED)
-    dropped = 0
-
-    def append(message: RawMessage) -> None:
-        nonlocal dropped
-        dropped += len(queue) == MAX_QUEUED
-        queue.append(message)
-        arrived.set()
+    lock, dropped, waking = threading.Lock(), 0, False
 
     def receive(key: str, _encoding: str, payload: bytes) -> None:
-        loop.call_soon_threadsafe(append, RawMessage(key, payload))
+        nonlocal dropped, waking
+        with lock:
+            dropped += len(queue) == MAX_QUEUED
+            queue.append(RawMessage(key, payload))
+            wakes, waking = not waking, True
+        if wakes:
+            loop.call_soon_threadsafe(arrived.set)
 
     close = bus.tap(wanted.pattern, receive)
     try:
@@ -102,8 +106,9 @@ async def messages(bus: Bus, wanted: TopicPattern) -> AsyncIterator[RawMessage |
         while True:
             await arrived.wait()
             arrived.clear()
-            if dropped:
-                count, dropped = dropped, 0
+            with lock:
+                count, dropped, waking = dropped, 0, False
+            if count:
                 yield count
             while queue:
                 yield queue.popleft()

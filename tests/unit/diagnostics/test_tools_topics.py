@@ -27,7 +27,7 @@ from gigabrain_zenoh.diagnostics.discovery import (
     topic_pattern,
     unknown_topic,
 )
-from gigabrain_zenoh.diagnostics.listener import RawMessage, snapshot
+from gigabrain_zenoh.diagnostics.listener import MAX_QUEUED, RawMessage, messages, snapshot
 from gigabrain_zenoh.diagnostics.message_text import (
     as_json,
     in_a_line,
@@ -331,3 +331,23 @@ async def test_flows_are_what_really_goes_from_one_to_another(net: Net) -> None:
     health.cancel()
     found = flows(nodes.described.values(), nodes.health)
     assert found == [Flow("two", "robot/scan", "one", 10.0)]
+
+
+async def test_what_arrives_while_the_output_blocks_is_held_up_to_a_bound() -> None:
+    freed: list[int] = []
+
+    class Payload(bytes):
+        def __del__(self) -> None:
+            freed.append(1)
+
+    net = Net()
+    shown = messages(net.one, TopicPattern("robot/image/front", None))
+    first = asyncio.ensure_future(anext(shown))
+    await settle()
+    for number in range(MAX_QUEUED + 744):  # the loop does not run meanwhile: its output blocks
+        net.network.deliver("robot/image/front", Payload(b"%d" % number))
+    assert len(freed) == 744
+    assert await first == 744
+    assert await anext(shown) == RawMessage("robot/image/front", b"744")
+    await net.one.close()
+    await net.two.close()
