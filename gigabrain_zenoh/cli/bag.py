@@ -113,7 +113,7 @@ def recover(file: Recording, *, output: Output = None) -> int:
     Args:
         output: File to write. Default: the same name with `_recovered`.
     """
-    from gigabrain_zenoh.recording.bag_writer import recover as run
+    from gigabrain_zenoh.recording.recovery import recover as run
 
     done = run(file, output or file.with_name(f"{file.stem}_recovered{file.suffix}"))
     for damage in done.damages:

@@ -107,10 +107,13 @@ class Bag:
         self.damages, self.finished, self.index_ok = [], False, False
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
+        undeclared = 0
         for item in read_records(self.path):
             if isinstance(item, Message):
                 if channel := channels.get(item.channel_id):
                     yield channel, schemas.get(channel.schema_id), item
+                else:
+                    undeclared += 1
             elif isinstance(item, Channel):
                 channels[item.id] = item
             elif isinstance(item, Schema):
@@ -121,6 +124,9 @@ class Bag:
                 self.damages.append(item)
             elif isinstance(item, BagEnd):
                 self.finished, self.index_ok = True, item.index_ok
+        if undeclared:
+            text = f"{undeclared} messages of keys that only damaged parts declare cannot be read"
+            self.damages.append(BagDamage(len(MAGIC), text))
 
 
 def samples(path: Path) -> Iterator[Sample]:

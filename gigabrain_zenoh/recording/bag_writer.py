@@ -3,36 +3,31 @@
 import contextlib
 import logging
 import os
-import shutil
-import struct
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from foxglove import Schema
-from mcap.records import Channel, Message
+from mcap.data_stream import RecordBuilder
+from mcap.records import Channel
 from mcap.records import Schema as RecordedSchema
 from mcap.well_known import MessageEncoding
 from mcap.writer import IndexType, Writer
-from msgspec import Struct
 
 from gigabrain_schemas.topics import CMD_VEL, DEPTH, INTENT, STATE, TASK, TOPICS, Topic
 from gigabrain_zenoh.bus.headers import Header, is_json
 from gigabrain_zenoh.bus.listening import topic_of
 from gigabrain_zenoh.codec import Codec, encoding_of
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.files import open_regular
 from gigabrain_zenoh.host.posix import fcntl
-from gigabrain_zenoh.recording.bag_reader import HEAD, MAGIC, RAW, Bag, BagDamage, check_magic
+from gigabrain_zenoh.recording.bag_reader import RAW
 from gigabrain_zenoh.recording.drawing import Drawer
 from gigabrain_zenoh.recording.drawn import Drawn, json_schema
 
 log = logging.getLogger(__name__)
 
 PROFILE, LIBRARY = "gigabrain", "gigabrain-zenoh"
-OWN_PROFILE = struct.pack("<I", len(PROFILE)) + PROFILE.encode()  # begins the first record
-HEAD_BYTES = len(MAGIC) + HEAD.size + len(OWN_PROFILE)
 VIEW = "view"  # kind of a channel, in its metadata; that of recorded messages is RAW
 MIN_DRAWN_INTERVAL_NS = {
     STATE.key: 30_000_000,
@@ -116,16 +111,6 @@ class AppendOnlyFile:
         os.close(self._fd)
 
 
-def is_being_written(path: Path) -> bool:
-    """Return whether a recorder holds the lock on `path`."""
-    with open_regular(path) as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-    return False
-
-
 class _Channel(NamedTuple):
     """Channel for messages of one key and encoding."""
 
@@ -183,9 +168,10 @@ class BagWriter:
         """
         log_ns, key, encoding, payload, header = message
         kind = key, encoding, is_json(payload)
-        channel = self._channels.get(kind) or self._add_channel(kind)
-        if not repeated:
-            self.pending[key] += 1
+        try:
+            channel = self._channels.get(kind) or self._add_channel(kind)
+        finally:  # where the disk is full, the message is lost
+            self.pending[key] += not repeated
         self.first_ns = self.first_ns or log_ns
         stamp_ns = header.stamp_ns or log_ns
         self._writer.add_message(channel.id, log_ns, payload, stamp_ns, header.seq & 0xFFFF_FFFF)
@@ -230,16 +216,31 @@ class BagWriter:
         notes = {"kind": RAW, "zenoh_encoding": encoding}
         type_ = topic.type if topic else TYPE_BY_ENCODING.get(encoding)
         schema = self._schema(json_schema(type_)) if type_ else 0
-        number = self._writer.register_channel(key, form, schema, notes)
-        self._store()  # a large schema may finish the chunk before the message is in it
+        number = self._register(key, form, schema, notes)
         drawn = topic if topic and self._viewers and self._drawer.draws(topic) else None
         self._channels[kind] = _Channel(number, drawn)
         return self._channels[kind]
 
+    def _register(self, key: str, form: str, schema: int, notes: dict[str, str]) -> int:
+        number = self._writer.register_channel(key, form, schema, notes)
+        self._declare_again(Channel(number, key, form, notes, schema))
+        return number
+
     def _schema(self, of: Schema) -> int:
         if of.name not in self._schemas:
-            self._schemas[of.name] = self._writer.register_schema(of.name, of.encoding, of.data)
+            number = self._writer.register_schema(of.name, of.encoding, of.data)
+            self._declare_again(RecordedSchema(number, of.data, of.encoding, of.name))
+            self._schemas[of.name] = number
         return self._schemas[of.name]
+
+    def _declare_again(self, record: Channel | RecordedSchema) -> None:
+        """Append a declaration beside the chunks: else a damaged chunk may cost all after it."""
+        self._store()  # a large schema may finish the chunk before the message is in it
+        builder = RecordBuilder()
+        record.write(builder)
+        self._file.write(builder.end())
+        self._file.flush()
+        self._stored_bytes = self._file.size
 
     def _draw(self, topic: Topic[Any], received: ReceivedMessage) -> None:
         try:
@@ -268,124 +269,5 @@ class BagWriter:
         kind = drawn.topic, drawn.encoding
         if kind not in self._view_channels:
             schema = self._schema(drawn.schema())
-            self._view_channels[kind] = self._writer.register_channel(*kind, schema, {"kind": VIEW})
+            self._view_channels[kind] = self._register(*kind, schema, {"kind": VIEW})
         return self._view_channels[kind]
-
-
-class Recovered(Struct, frozen=True, kw_only=True):
-    """Result of a recovery."""
-
-    path: Path
-    messages: int
-    damages: tuple[BagDamage, ...]
-
-
-class _Copier:
-    """Copies messages with their channels and schemas into another file."""
-
-    def __init__(self, file: AppendOnlyFile) -> None:
-        self._file, self._writer = file, Writer(file)  # type: ignore[arg-type]
-        self._schemas: dict[int, int] = {}  # new number by old number
-        self._channels: dict[int, int] = {}  # likewise
-        self.messages = 0
-
-    def copy(self, bag: Bag) -> None:
-        """Copy all messages and notes, and write the index. Raises OSError."""
-        self._writer.start(PROFILE, LIBRARY)
-        for each in bag.messages():
-            self._add(*each)
-            self._file.flush()
-        for name, values in bag.notes.items():
-            self._writer.add_metadata(name, dict(values))
-        self._writer.finish()
-        self._file.flush()
-        self._file.sync()
-
-    def _add(self, channel: Channel, schema: RecordedSchema | None, message: Message) -> None:
-        writer = self._writer
-        if schema and schema.id not in self._schemas:
-            self._schemas[schema.id] = writer.register_schema(
-                schema.name, schema.encoding, schema.data
-            )
-        if channel.id not in self._channels:
-            self._channels[channel.id] = writer.register_channel(
-                channel.topic,
-                channel.message_encoding,
-                self._schemas[schema.id] if schema else 0,
-                channel.metadata,
-            )
-        writer.add_message(
-            self._channels[channel.id],
-            message.log_time,
-            message.data,
-            message.publish_time,
-            message.sequence,
-        )
-        self.messages += 1
-
-
-def recover(path: Path, to: Path) -> Recovered:
-    """Write everything readable of `path` into the new file `to`.
-
-    Raises ConfigError if `path` is not a bag, or `to` cannot be written.
-    """
-    check_magic(path)  # before a file is made
-    bag, file = Bag(path), AppendOnlyFile(to)
-    copier = _Copier(file)
-    try:
-        copier.copy(bag)
-    except OSError as error:
-        to.unlink(missing_ok=True)
-        raise ConfigError(f"cannot write {to}: {error.strerror}") from None
-    finally:
-        file.close()
-    return Recovered(path=to, messages=copier.messages, damages=tuple(bag.damages))
-
-
-def is_unfinished(path: Path) -> bool:
-    """Return whether `path` is a recording of ours that was cut off, and is not being written."""
-    with open_regular(path) as file:
-        head = file.read(HEAD_BYTES)
-        if not head.startswith(MAGIC) or not head.endswith(OWN_PROFILE):
-            return False
-        file.seek(-len(MAGIC), os.SEEK_END)
-        ended = file.read() == MAGIC
-    return not ended and not is_being_written(path)
-
-
-def recover_all(folder: Path, *, keep_free_mb: float) -> None:
-    """Recover every unfinished recording of ours in `folder` in place; log those that cannot be.
-
-    A file whose copy would leave less than `keep_free_mb` of the disk free stays as it is, and so
-    does one that changes meanwhile, as a file that is being copied.
-    """
-    for path in sorted(folder.glob("*.mcap")):
-        try:
-            if not is_unfinished(path):
-                continue
-            with path.open("r+b") as file:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # keeps other recorders off it
-                _recover_in_place(path, os.fstat(file.fileno()), keep_free_mb)
-        except BlockingIOError:  # another recorder was faster
-            continue
-        except (ConfigError, OSError) as error:
-            log.warning("%s could not be recovered: %s", path, error)
-
-
-def _recover_in_place(path: Path, before: os.stat_result, keep_free_mb: float) -> None:
-    if shutil.disk_usage(path.parent).free - before.st_size < keep_free_mb * 1e6:
-        log.warning(
-            "%s was cut off, and is not recovered: a copy of %.1f MB would leave less than %g MB "
-            "of the disk free; make space, or: gigabrain bag recover %s -o FILE",
-            path, before.st_size / 1e6, keep_free_mb, path,
-        )  # fmt: skip
-        return
-    part = path.with_suffix(".recovering")
-    part.unlink(missing_ok=True)  # of an earlier attempt that was interrupted
-    done, now = recover(path, part), path.stat()
-    if (now.st_ino, now.st_size) != (before.st_ino, before.st_size):
-        part.unlink()
-        log.warning("%s changed while it was recovered, and stays as it is", path)
-        return
-    part.replace(path)
-    log.info("%s was cut off; recovered %d messages", path, done.messages)

@@ -94,6 +94,20 @@ def test_the_bus_never_waits_for_the_disk(tmp_path: Path, monkeypatch: pytest.Mo
     assert status.written + status.dropped == first + 1000
 
 
+def test_the_first_message_of_a_key_that_a_full_disk_refuses_counts_as_dropped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bag_writer, "AppendOnlyFile", FullTape)
+    with Recorder(tmp_path / "full.mcap", QUICK) as recorder:
+        recorder.intake.receive("robot/state", "", bags.state(1))
+        wait(recorder, lambda now: now.written == 1)
+        monkeypatch.setattr(FullTape, "full", True)
+        recorder.intake.receive("robot/scan", "", bags.scan(1))
+        wait(recorder, lambda now: "No space left on device" in now.fault)
+        monkeypatch.setattr(FullTape, "full", False)
+    assert (recorder.status().written, recorder.status().dropped) == (1, 1)
+
+
 def test_a_full_disk_costs_what_comes_meanwhile_and_recording_goes_on_in_a_new_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

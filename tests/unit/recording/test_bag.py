@@ -35,14 +35,9 @@ from gigabrain_zenoh.recording.bag_reader import (
     read_info,
     samples,
 )
-from gigabrain_zenoh.recording.bag_writer import (
-    BagWriter,
-    ReceivedMessage,
-    is_unfinished,
-    recover,
-    recover_all,
-)
+from gigabrain_zenoh.recording.bag_writer import BagWriter, ReceivedMessage
 from gigabrain_zenoh.recording.drawn import flat_schema
+from gigabrain_zenoh.recording.recovery import is_unfinished, recover, recover_all
 from tests.unit.recording import bags
 
 

@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
-from gigabrain_zenoh.recording import bag_writer
-from gigabrain_zenoh.recording.bag_reader import Bag, read_info
-from gigabrain_zenoh.recording.bag_writer import Recovered, recover, recover_all
+from gigabrain_zenoh.recording import recovery
+from gigabrain_zenoh.recording.bag_reader import ZSTD_NAME, Bag, read_info
+from gigabrain_zenoh.recording.bag_writer import BagWriter
+from gigabrain_zenoh.recording.recovery import Recovered, recover, recover_all
 from tests.unit.recording import bags
 
 
@@ -59,7 +60,7 @@ def test_a_file_that_is_being_copied_stays_as_it_is(
             copying.write(content[-500:])
             return done
 
-        monkeypatch.setattr(bag_writer, "recover", recover_meanwhile)
+        monkeypatch.setattr(recovery, "recover", recover_meanwhile)
         recover_all(path.parent, keep_free_mb=0)
     assert (path.stat().st_size, list(path.parent.iterdir())) == (len(content), [path])
 
@@ -75,7 +76,31 @@ def test_two_recorders_that_start_at_once_recover_a_file_once(
             recover_all(cut.parent, keep_free_mb=0)
         return recover(source, to)
 
-    monkeypatch.setattr(bag_writer, "recover", recover_twice)
+    monkeypatch.setattr(recovery, "recover", recover_twice)
     recover_all(cut.parent, keep_free_mb=0)
     assert recovered == [cut]
     assert bags.seqs(cut) == list(range(1, 101))
+
+
+def _damage_first_chunk(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[content.index(ZSTD_NAME) + 100] ^= 0x10  # in what is compressed
+    path.write_bytes(content)
+
+
+def test_a_cut_file_whose_first_chunk_is_damaged_loses_that_chunk_alone(cut: Path) -> None:
+    _damage_first_chunk(cut)
+    assert bags.seqs(cut) == list(range(11, 101))  # two scans are lost as well
+    recover_all(cut.parent, keep_free_mb=0)
+    assert bags.seqs(cut) == list(range(11, 101))
+
+
+def test_messages_of_keys_whose_declaration_is_lost_are_reported(
+    cut: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = cut.with_name("old.mcap")
+    monkeypatch.setattr(BagWriter, "_declare_again", lambda *_: None)
+    bags.write(path, bags.drive(100), end=False)
+    _damage_first_chunk(path)
+    lost = "108 messages of keys that only damaged parts declare cannot be read"
+    assert lost in [damage.partition(": ")[2] for damage in read_info(path).damages]
