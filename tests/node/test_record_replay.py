@@ -20,9 +20,11 @@ from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import GoalReply, GoalRequest, TaskRequest
 from gigabrain_schemas.topics import (
     GOAL,
+    INPUT_LOG,
     INTENT,
     PARAM,
     REQUEST_LOG,
+    SCAN,
     STATE,
     TASK,
     TASK_CHANGE,
@@ -43,6 +45,7 @@ from gigabrain_zenoh.recording.message_tables import message_of
 from gigabrain_zenoh.recording.process_replay import (
     OUTPUTS,
     compare,
+    load_run,
     replay_process,
     settings_for,
     with_requests,
@@ -161,6 +164,18 @@ def test_a_recording_without_the_inputs_of_the_process_is_refused(
     bags.write(path, (bags.arrival(1, key, codec.encode(one)) for key, one in said.items()))
     with pytest.raises(ConfigError, match="holds no input of control; record all topics"):
         call("replay", "--check", str(path), "--process", "control")
+
+
+@pytest.mark.parametrize("key", [INPUT_LOG.at("decision"), REQUEST_LOG.key])
+def test_an_invalid_message_among_the_logs_of_a_process_is_left_out(
+    tmp_path: Path, key: str
+) -> None:
+    path = tmp_path / "a.mcap"
+    told = [*bags.drive(5), bags.arrival(10**9, INTENT.key, codec.encode(example(INTENT.type)))]
+    bags.write(path, iter([*told, bags.arrival(2 * 10**9, key, b'{"linear_x": 0.2}')]))
+    assert [key for _, key, _ in load_run(path, "decision").inputs] == [
+        *[STATE.key] * 5, SCAN.key,
+    ]  # fmt: skip
 
 
 def test_without_its_settings_a_process_is_not_replayed_as_another(tmp_path: Path) -> None:
