@@ -22,6 +22,7 @@ from gigabrain_zenoh.runtime.connect import Where, connect
 
 DISCOVERY_S = 0.5  # until all subscribers are known, before the first message is sent
 ASK_S = 0.3
+MIN_ROUND_S = 0.1  # of a loop, in the recording's time; a single message has no rate
 
 
 class PlayOptions(Struct, frozen=True, kw_only=True):
@@ -41,6 +42,7 @@ class Player:
         self._path, self._options, self._transport = path, options, transport
         self._topics: dict[str, Topic[Message]] = {}
         self._kept: dict[str, Sample] = {}  # newest of topics kept for late subscribers
+        self._round_end_s = 0.0  # earliest end of this round
         self.sent = 0
         self.late_s = 0.0  # greatest delay of a message
 
@@ -53,6 +55,7 @@ class Player:
         await asyncio.sleep(DISCOVERY_S)
         await self._play_once()
         while self._options.loop:
+            await asyncio.sleep(max(0.0, self._round_end_s - time.monotonic()))
             await self._play_once()
 
     def _samples(self) -> Iterable[Sample]:
@@ -97,18 +100,21 @@ class Player:
     async def _due_samples(self) -> AsyncIterator[Sample]:
         """Yield every message when it is due; first the kept ones of the part that is skipped."""
         start_s, first_ns, started = 0.0, 0, False
+        skipped: dict[str, Sample] = {}
         for sample in self._samples():
             first_ns = first_ns or sample.log_ns
             at_s = (sample.log_ns - first_ns) / 1e9 - self._options.start_s
             if sample.key in self._topics and self._topics[sample.key].keep:
                 self._kept[sample.key] = sample
+                if at_s < 0:
+                    skipped[sample.key] = sample
             if at_s < 0:
                 continue
             if not started:
                 started, start_s = True, time.monotonic()
-                for kept in self._kept.values():
-                    if kept is not sample:
-                        yield kept
+                self._round_end_s = start_s + MIN_ROUND_S / self._options.rate
+                for kept in skipped.values():
+                    yield kept
             await self._until(start_s + at_s / self._options.rate)
             yield sample
 

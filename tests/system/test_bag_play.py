@@ -2,8 +2,10 @@
 
 import asyncio
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from msgspec.structs import replace
 
 from gigabrain_schemas.examples import example
 from gigabrain_schemas.requests import DescribeRequest, EnableRequest, ReleaseRequest
@@ -14,6 +16,7 @@ from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.cli.app import make_app
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.recording import player
 from gigabrain_zenoh.recording.bag_reader import Bag
 from gigabrain_zenoh.recording.bag_writer import BagWriter
 from gigabrain_zenoh.recording.player import Player, PlayOptions, check_no_driver
@@ -75,6 +78,43 @@ async def test_it_can_be_looped_chosen_from_and_sent_on_other_keys(drive: Path) 
     await asyncio.wait((playing,))
     assert {key for key, _ in network.sent} == {"old/scan"}
     assert network.sent[0] == network.sent[20]
+
+
+async def test_each_round_of_a_loop_is_like_the_first(tmp_path: Path) -> None:
+    path, grid = tmp_path / "maps.mcap", example(MAP.type)
+    maps = [codec.encode(replace(grid, seq=seq)) for seq in (1, 2)]
+    told = [("robot/scan", bags.scan(1)), *(("robot/map", each) for each in maps)]
+    bags.write(path, (bags.arrival(n * 10**9, *each) for n, each in enumerate(told)))
+    network = LocalNetwork()
+    options = PlayOptions(rate=100.0, loop=True)
+    playing = asyncio.ensure_future(Player(path, options, network.transport()).play())
+    await until(lambda: len(network.sent) >= 6)
+    playing.cancel()
+    await asyncio.wait((playing,))
+    assert network.sent[:6] == told * 2
+
+
+async def test_a_single_message_is_not_repeated_without_a_pause(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pauses: list[float] = []
+    sleep = asyncio.sleep
+
+    async def note(seconds: float) -> None:
+        pauses.append(seconds)
+        await sleep(0)
+
+    monkeypatch.setattr(asyncio, "sleep", note)
+    monkeypatch.setattr(player, "time", SimpleNamespace(monotonic=lambda: 0.0))
+    path, network = tmp_path / "map.mcap", LocalNetwork()
+    bags.write(path, iter([bags.arrival(1, "robot/map", codec.encode(example(MAP.type)))]))
+    looped = Player(path, PlayOptions(rate=2.0, loop=True), network.transport())
+    playing = asyncio.ensure_future(looped.play())
+    while looped.sent < 20:
+        await sleep(0)
+    playing.cancel()
+    await asyncio.wait((playing,))
+    assert pauses.count(0.05) >= 19
 
 
 async def test_the_pace_is_that_of_the_recording(drive: Path) -> None:
