@@ -4,6 +4,7 @@ import asyncio
 import time
 from collections.abc import AsyncIterator, Iterable, Mapping
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 from msgspec import Struct
@@ -42,6 +43,7 @@ class Player:
         self._path, self._options, self._transport = path, options, transport
         self._topics: dict[str, Topic[Message]] = {}
         self._kept: dict[str, Sample] = {}  # newest of topics kept for late subscribers
+        self._count: int | None = None  # of messages to play, once they were read
         self._round_end_s = 0.0  # earliest end of this round
         self.sent = 0
         self.late_s = 0.0  # greatest delay of a message
@@ -59,17 +61,20 @@ class Player:
             await self._play_once()
 
     def _samples(self) -> Iterable[Sample]:
+        """Iterate over the chosen messages, later without those that a recorder has appended."""
         wanted = key_filter(self._options.topics)
-        return (sample for sample in Bag(self._path) if wanted(sample.key))
+        return islice((sample for sample in Bag(self._path) if wanted(sample.key)), self._count)
 
     def _declare(self) -> None:
         """Declare all publishers before the first message. Raises ConfigError."""
-        keys, first_ns, last_ns = dict[str, None](), 0, 0
+        keys, first_ns, last_ns, count = dict[str, None](), 0, 0, 0
         for sample in self._samples():
+            count += 1
             keys[sample.key] = None
             first_ns, last_ns = first_ns or sample.log_ns, max(last_ns, sample.log_ns)
         if not keys:
             raise ConfigError(f"{self._path} holds no message to play")
+        self._count = count
         if self._options.start_s > (length_s := (last_ns - first_ns) / 1e9):
             of = " of these topics" if self._options.topics else ""
             raise ConfigError(f"--start: the recording has {round(length_s, 3):g} s{of}")

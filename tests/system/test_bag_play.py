@@ -117,6 +117,24 @@ async def test_a_single_message_is_not_repeated_without_a_pause(
     assert pauses.count(0.05) >= 19
 
 
+async def test_what_a_recorder_appends_meanwhile_is_not_played(tmp_path: Path) -> None:
+    network, file = LocalNetwork(), BagWriter(tmp_path / "a.mcap", viewers=False, notes={})
+    growing = Player(file.path, PlayOptions(rate=100.0), network.transport())
+
+    def append(key: str, payload: bytes) -> None:
+        file.add(bags.arrival(len(network.sent), key, payload))
+        file.flush()
+
+    append("robot/state", bags.state(1))
+    playing = asyncio.ensure_future(growing.play())
+    await asyncio.sleep(0)  # it has read the file, and waits for subscribers
+    append("robot/state", bags.state(2))
+    append("robot/scan", bags.scan(1))
+    await playing
+    file.close()
+    assert network.sent == [("robot/state", bags.state(1))]
+
+
 async def test_the_pace_is_that_of_the_recording(drive: Path) -> None:
     network = LocalNetwork()
     loop = asyncio.get_running_loop()
