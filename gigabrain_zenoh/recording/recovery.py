@@ -77,16 +77,19 @@ class _Copier:
 def recover(path: Path, to: Path) -> Recovered:
     """Write everything readable of `path` into the new file `to`.
 
-    Raises ConfigError if `path` is not a bag, or `to` cannot be written.
+    Where it fails or is interrupted, `to` is removed again. Raises ConfigError if `path` is not a
+    bag, or `to` cannot be written.
     """
     check_magic(path)  # before a file is made
     bag, file = Bag(path), AppendOnlyFile(to)
     copier = _Copier(file)
     try:
         copier.copy(bag)
-    except OSError as error:
+    except BaseException as error:
         to.unlink(missing_ok=True)
-        raise ConfigError(f"cannot write {to}: {error.strerror}") from None
+        if isinstance(error, OSError):
+            raise ConfigError(f"cannot write {to}: {error.strerror}") from None
+        raise
     finally:
         file.close()
     return Recovered(path=to, messages=copier.messages, damages=tuple(bag.damages))

@@ -1,9 +1,11 @@
 """Recordings that were cut off are recovered in place when the next one starts."""
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from mcap.records import Channel, Message, Schema
 from mcap.writer import Writer
 
 from gigabrain_zenoh.recording import recovery
@@ -104,3 +106,16 @@ def test_messages_of_keys_whose_declaration_is_lost_are_reported(
     _damage_first_chunk(path)
     lost = "108 messages of keys that only damaged parts declare cannot be read"
     assert lost in [damage.partition(": ")[2] for damage in read_info(path).damages]
+
+
+def test_a_recovery_that_is_interrupted_leaves_no_file(
+    cut: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def messages(_: Bag) -> Iterator[tuple[Channel, Schema | None, Message]]:
+        raise KeyboardInterrupt  # as Ctrl-C does in a command
+        yield
+
+    monkeypatch.setattr(Bag, "messages", messages)
+    with pytest.raises(KeyboardInterrupt):
+        recover(cut, cut.with_name("recovered.mcap"))
+    assert list(cut.parent.iterdir()) == [cut]
