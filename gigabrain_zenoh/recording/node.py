@@ -79,7 +79,7 @@ def listening(bus: Bus, recorder: Recorder, names: tuple[str, ...]) -> Iterator[
 async def _fetch_kept(bus: Bus, recorder: Recorder, expressions: list[str]) -> None:
     """Record messages kept for late subscribers, such as a map sent before the recording began."""
     for topic in TOPICS:
-        if topic.keep and (ALL_KEYS in expressions or topic.key in expressions):
+        if topic.keep and any(matches(each, topic.key) for each in expressions):
             for payload in await bus.kept(topic):
                 if not recorder.intake.seen[topic.key]:
                     recorder.intake.receive(topic.key, "", payload)

@@ -53,10 +53,13 @@ async def test_only_the_topics_that_were_asked_for_are_recorded(tmp_path: Path) 
     await net.two.close()
 
 
-async def test_a_map_from_before_the_recording_is_in_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("topics", [(), ("map",), ("robot/*",), ("**", "scan")])
+async def test_a_map_from_before_the_recording_is_in_it(
+    tmp_path: Path, topics: tuple[str, ...]
+) -> None:
     net, path = Net(), tmp_path / "a.mcap"
     net.two.publish(MAP, example(MAP.type))
-    with Recorder(path, QUICK) as recorder, listening(net.one, recorder, ()):
+    with Recorder(path, QUICK) as recorder, listening(net.one, recorder, topics):
         await until(lambda: recorder.intake.seen["robot/map"])
     assert kept(path) == {"robot/map": 1}
     await net.one.close()
