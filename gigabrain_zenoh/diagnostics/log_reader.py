@@ -1,6 +1,7 @@
 """Reads the logs of a run from its files, and those on the bus in the same form."""
 
 import asyncio
+import heapq
 import re
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -84,10 +85,12 @@ def read(folder: Path, wanted: LogFilter, newest: int) -> list[Line]:
     if wanted.process and wanted.process not in names:
         raise unknown("log of a process", wanted.process, names)
     try:
-        lines = [line for path in files for line in _lines(path) if wanted.accepts(line)]
+        lines = (line for path in files for line in _lines(path) if wanted.accepts(line))
+        # of all lines of a long run only the newest are held in memory
+        numbered = heapq.nlargest(newest, enumerate(lines), key=lambda one: (one[1]["t"], one[0]))
     except OSError as error:
         raise ConfigError(f"cannot read {error.filename}: {error.strerror}") from None
-    return sorted(lines, key=lambda line: int(line["t"]))[-newest:]
+    return [line for _, line in reversed(numbered)]
 
 
 def _lines(path: Path) -> Iterator[Line]:

@@ -17,6 +17,7 @@ from gigabrain_schemas.safety import Health, LogRecord
 from gigabrain_schemas.topics import PARAM
 from gigabrain_zenoh.config.settings import DecisionConfig, Endpoint
 from gigabrain_zenoh.decision import node as decision
+from gigabrain_zenoh.diagnostics import log_reader
 from gigabrain_zenoh.diagnostics.discovery import (
     Flow,
     Processes,
@@ -172,6 +173,29 @@ def test_the_log_of_the_newest_run_is_read_in_the_order_of_time(runs: Path) -> N
     assert [e["t"] for e in read(folder, LogFilter(level="warning"), 9)] == [20, 30]
     assert [e["t"] for e in read(folder, LogFilter(since_ns=20), 9)] == [20, 30]
     assert run_folder("demo") == runs / "20260101T000000Z-demo-1"
+
+
+def test_of_a_long_log_only_the_newest_lines_are_held(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held: list[int] = []
+
+    class Line(dict[str, object]):
+        alive = 0
+
+        def __init__(self, number: int) -> None:
+            super().__init__(t=number // 2, level="info", process="driver", number=number)
+            Line.alive += 1
+            held.append(Line.alive)
+
+        def __del__(self) -> None:
+            Line.alive -= 1
+
+    (tmp_path / "driver.jsonl").touch()
+    monkeypatch.setattr(log_reader, "_lines", lambda _: map(Line, range(1000)))
+    newest = [line["number"] for line in read(tmp_path, LogFilter(), 4)]
+    assert newest == [996, 997, 998, 999]
+    assert max(held) < 10
 
 
 def test_the_log_of_a_run_that_goes_on_is_preferred_to_a_newer_one_that_has_ended(
