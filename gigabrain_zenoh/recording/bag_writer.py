@@ -146,6 +146,7 @@ class BagWriter:
         self.pending: Counter[str] = Counter()  # messages per key that are not on the disk yet
         self.written = 0  # messages on the disk
         self.first_ns = 0
+        self.index_entries = 0  # held in memory until the end: one of each channel and chunk
 
     @property
     def path(self) -> Path:
@@ -206,6 +207,7 @@ class BagWriter:
         self._file.flush()
         if self._file.size != self._stored_bytes:
             self._stored_bytes = self._file.size
+            self.index_entries += len(self._channels) + len(self._view_channels)
             self.written += self.pending.total()
             self.pending = Counter()
 

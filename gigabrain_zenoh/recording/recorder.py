@@ -30,6 +30,7 @@ MB = 1_000_000
 WRITE_INTERVAL_S = 0.3  # at most; shorter intervals cost more CPU time, for cold caches
 RETRY_S = 1.0  # between two attempts to write to a full disk
 MAX_CHANNELS = 1000  # pairs of key and encoding; any client may make up more
+MAX_INDEX_ENTRIES = 1_000_000  # of one file: they take 80 MB of memory, and 13 MB at its end
 OTHER_KEYS = "others"  # counts messages beyond those
 MAX_BATCH_NS = round(LONGEST_S * 1e9)  # within it a message's own stamp is its time of reception
 
@@ -310,8 +311,10 @@ class Recorder:
     def _is_full(self, file: BagWriter, message: ReceivedMessage) -> bool:
         split_mb, split_s = self._config.split_mb, self._config.split_s
         too_big = split_mb is not None and file.size >= split_mb * MB
-        return too_big or (
-            split_s is not None and message.log_ns - file.first_ns >= split_s * 1_000_000_000
+        return (
+            too_big
+            or file.index_entries >= MAX_INDEX_ENTRIES
+            or (split_s is not None and message.log_ns - file.first_ns >= split_s * 1_000_000_000)
         )
 
     def _flush(self) -> None:

@@ -1,6 +1,7 @@
 """The recorder writes messages as they arrive, and counts them."""
 
 import asyncio
+import functools
 import os
 import re
 from collections import Counter
@@ -18,10 +19,11 @@ from gigabrain_zenoh import codec
 from gigabrain_zenoh.cli.app import make_app
 from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.recording import recorder as recorder_module
 from gigabrain_zenoh.recording.bag_reader import Bag, read_info
 from gigabrain_zenoh.recording.bag_writer import BagWriter
 from gigabrain_zenoh.recording.node import key_filter, listening, run
-from gigabrain_zenoh.recording.recorder import MAX_CHANNELS, OTHER_KEYS, Intake, Recorder
+from gigabrain_zenoh.recording.recorder import MAX_CHANNELS, OTHER_KEYS, Intake, Recorder, Status
 from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.waiting import until
 from tests.unit.recording import bags
@@ -179,6 +181,23 @@ def test_a_recording_of_several_files_skips_names_that_exist(tmp_path: Path) -> 
     parts = {path.name: bags.seqs(path) for path in tmp_path.iterdir() if path.stem != "s_1"}
     assert parts == {"s.mcap": [1], "s_2.mcap": [2], "s_3.mcap": [3]}
     assert (tmp_path / "s_1.mcap").read_text() == "mine"
+
+
+def is_written(count: int, now: Status) -> bool:
+    return now.written == count
+
+
+def test_a_new_file_begins_before_the_index_of_the_old_one_fills_the_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder_module, "MAX_INDEX_ENTRIES", 3)
+    config = replace(QUICK, flush_s=1e-9)  # a chunk for each batch
+    with Recorder(tmp_path / "long.mcap", config) as recorder:
+        for seq in range(1, 6):
+            recorder.intake.receive("robot/state", "", bags.state(seq))
+            bags.wait(recorder, functools.partial(is_written, seq))
+    parts = {path.name: bags.seqs(path) for path in tmp_path.iterdir()}
+    assert parts == {"long.mcap": [1, 2, 3, 4], "long_1.mcap": [5]}
 
 
 def test_messages_received_in_a_batch_have_the_times_of_their_stamps() -> None:
