@@ -106,6 +106,10 @@ class AppendOnlyFile:
         disk = os.fstatvfs(self._fd)
         return disk.f_bavail * disk.f_frsize
 
+    def is_deleted(self) -> bool:
+        """Return whether the file has no name any more, so that nobody can read it."""
+        return os.fstat(self._fd).st_nlink == 0
+
     def close(self) -> None:
         """Close and unlock the file."""
         os.close(self._fd)
@@ -161,6 +165,10 @@ class BagWriter:
     def free_bytes(self) -> int:
         """Return the free space on the disk [bytes]."""
         return self._file.free_bytes()
+
+    def is_deleted(self) -> bool:
+        """Return whether the file was deleted."""
+        return self._file.is_deleted()
 
     def add(self, message: ReceivedMessage, *, repeated: bool = False) -> None:
         """Append one message, and what viewers draw of it.

@@ -310,10 +310,9 @@ class Recorder:
 
     def _is_full(self, file: BagWriter, message: ReceivedMessage) -> bool:
         split_mb, split_s = self._config.split_mb, self._config.split_s
-        too_big = split_mb is not None and file.size >= split_mb * MB
         return (
-            too_big
-            or file.index_entries >= MAX_INDEX_ENTRIES
+            file.index_entries >= MAX_INDEX_ENTRIES
+            or (split_mb is not None and file.size >= split_mb * MB)
             or (split_s is not None and message.log_ns - file.first_ns >= split_s * 1_000_000_000)
         )
 
@@ -324,7 +323,10 @@ class Recorder:
             return
         try:
             file.flush()
-            if self._disk_is_low(file):
+            if file.is_deleted():
+                log.warning("%s was deleted; recording continues in another file", file.path)
+                self._finish()
+            elif self._disk_is_low(file):
                 self._finish()
                 self._report(self._low_text())
         except OSError as error:

@@ -4,6 +4,7 @@ import asyncio
 import functools
 import os
 import re
+import shutil
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -181,6 +182,20 @@ def test_a_recording_of_several_files_skips_names_that_exist(tmp_path: Path) -> 
     parts = {path.name: bags.seqs(path) for path in tmp_path.iterdir() if path.stem != "s_1"}
     assert parts == {"s.mcap": [1], "s_2.mcap": [2], "s_3.mcap": [3]}
     assert (tmp_path / "s_1.mcap").read_text() == "mine"
+
+
+def test_a_file_that_is_deleted_meanwhile_is_followed_by_another(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    first, second = tmp_path / "drives" / "a.mcap", tmp_path / "drives" / "a_1.mcap"
+    with Recorder(first, QUICK) as recorder:
+        recorder.intake.receive("robot/state", "", bags.state(1))
+        bags.wait(recorder, functools.partial(is_written, 1))
+        shutil.rmtree(first.parent)
+        bags.wait(recorder, lambda _: bool(caplog.messages))
+        recorder.intake.receive("robot/state", "", bags.state(2))
+    assert caplog.messages == [f"{first} was deleted; recording continues in another file"]
+    assert bags.seqs(second) == [2]
 
 
 def is_written(count: int, now: Status) -> bool:
