@@ -136,6 +136,8 @@ def plot(path: Path, fields: Sequence[str], to: Path) -> Path:
         raise ConfigError("plots need matplotlib: pip install 'gigabrain-zenoh[record]'") from None
     if not fields:
         raise ConfigError("no field to plot; name one, such as cmd_vel.linear_x")
+    if to.exists() and path.exists() and to.samefile(path):
+        raise ConfigError(f"{to} is the recording; name another file")
     drawn = read_series(path, fields)
     figure = Figure(figsize=(10, 5), layout="constrained")
     axes = figure.subplots()

@@ -390,6 +390,16 @@ def test_a_plot_is_a_picture_and_an_unknown_field_names_the_nearest(
         call("bag", "plot", str(whole), "stat.pose.x")
 
 
+def test_a_plot_does_not_replace_its_recording(whole: Path, tmp_path: Path) -> None:
+    path, link = tmp_path / "a.mcap", tmp_path / "link.mcap"
+    shutil.copy(whole, path)
+    link.symlink_to(path)
+    for output in (path, link):
+        with pytest.raises(ConfigError, match=f"^{output} is the recording; name another file"):
+            call("bag", "plot", str(path), "state.pose.x", "-o", str(output))
+    assert len(bags.seqs(path)) == 500
+
+
 def test_settings_are_kept_for_a_replay(tmp_path: Path) -> None:
     notes = {"decision": msgspec.json.encode({"turn": "left"}).decode()}
     BagWriter(tmp_path / "n.mcap", viewers=False, notes=notes).close()
