@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar, overload
 
 from msgspec.structs import asdict
@@ -80,15 +80,16 @@ class Robot:
         """Drive straight by `distance` [m]; backwards if it is negative.
 
         `speed` [m/s] is an upper limit. Returns what odometry has measured and what has held the
-        body back. Raises Refused if the gate does not grant the body, and BodyLost.
+        body back. Cutting this call short, as with Ctrl-C or a timeout, stops the body. Raises
+        Refused if the gate does not grant the body, and BodyLost.
         """
         return await self._carry_out(distance, 0.0, speed)
 
     async def turn(self, angle: float, *, speed: float | None = None) -> Reached:
         """Turn on the spot by `angle` [rad], counter-clockwise if it is positive.
 
-        `speed` [rad/s] is an upper limit. Returns and raises as `move` does, and raises Unsupported
-        for a body that cannot turn on the spot.
+        `speed` [rad/s] is an upper limit. Returns, stops and raises as `move` does, and raises
+        Unsupported for a body that cannot turn on the spot.
         """
         return await self._carry_out(0.0, angle, speed)
 
@@ -151,16 +152,17 @@ class Robot:
         return wanted
 
     async def drive(self, linear_x: float = 0.0, angular_z: float = 0.0, *, seconds: float) -> None:
-        """Drive for `seconds` of the robot's time, then stop.
+        """Drive for `seconds` of the robot's time, then stop; also when this call is cut short.
 
         Raises what `set_base_velocity` raises.
         """
         check_finite({"seconds": seconds})
         start = (await self.read_state()).tick
         last = start + round(seconds * 50)
-        while (left := last - self._bus.time.tick) > 0:
-            await self.set_base_velocity(linear_x, 0.0, angular_z)
-            await self._ticks(min(left, HOLD_TICKS // 2))
+        with self._halting():
+            while (left := last - self._bus.time.tick) > 0:
+                await self.set_base_velocity(linear_x, 0.0, angular_z)
+                await self._ticks(min(left, HOLD_TICKS // 2))
         await self.stop()
 
     def steer(self, wanted: Velocity) -> None:
@@ -196,27 +198,42 @@ class Robot:
         check_finite({"distance": distance, "angle": angle})
         check_speed(speed)
         motion = OdometryMotion(await self.read_body(), await self.read_state(), distance, angle)
-        while not motion.done:
-            verdict = self._safety.fresh()
-            causes = verdict.causes if verdict else ()
-            wanted = motion.step(await self.read_state(), speed, causes)
-            await self.set_base_velocity(wanted.linear_x, 0.0, wanted.angular_z)
-            await self._ticks(1)
+        with self._halting():
+            while not motion.done:
+                verdict = self._safety.fresh()
+                causes = verdict.causes if verdict else ()
+                wanted = motion.step(await self.read_state(), speed, causes)
+                await self.set_base_velocity(wanted.linear_x, 0.0, wanted.angular_z)
+                await self._ticks(1)
         await self.stop()
         return motion.result()
 
     async def stop(self) -> None:
         """Come to rest, if this script drives; it keeps the body."""
-        if self._joints:
-            self._joints.rest()
+        self._halt()
         if self._target is None:
             return
-        self._target, self._until_tick = ZERO, self._bus.time.tick + HOLD_TICKS
         for _ in range(HOLD_TICKS):
             state = self._states.fresh()
             if state is None or at_rest(state.velocity):
                 break
             await self._ticks(1)
+
+    def _halt(self) -> None:
+        """Let base and joints brake from the next command on, if this script moves them."""
+        if self._joints:
+            self._joints.rest()
+        if self._target is not None:
+            self._target = ZERO
+
+    @contextlib.contextmanager
+    def _halting(self) -> Iterator[None]:
+        """Brake if the block is cut short: by an error, a timeout or Ctrl-C."""
+        try:
+            yield
+        except BaseException:
+            self._halt()
+            raise
 
     async def enable(self, source: str = "", *, take: bool = False) -> GateReply:
         """Ask the gate for the body, for this script or for `source`, once it no longer stops.
@@ -302,7 +319,8 @@ class Robot:
 
         The others are held. `speed` [rad/s or m/s] is an upper limit. The first call asks the gate
         for the body, which this script then keeps. With `wait`, it returns once the joints are
-        there within their tolerance, or rest as near as they get; without, at once.
+        there within their tolerance, or rest as near as they get, and cutting it short stops them;
+        without, it returns at once.
 
         Raises Unsupported for a body without joints, UnknownName and ConfigError for a joint or a
         position that it does not have, Refused as `set_base_velocity` does, and BodyLost.
@@ -388,13 +406,14 @@ class Robot:
         """
         assert body.arm
         left = round(body.arm.goal_time / TICK_S)
-        while wait and left and not stream.reached(state := await self.read_state()):
-            if not self._lease.has(state):
-                await self._acquire()
-            await self._ticks(1)
-            left -= stream.arrived
-            if stream.held_back:
-                stream.give_up()
+        with self._halting():
+            while wait and left and not stream.reached(state := await self.read_state()):
+                if not self._lease.has(state):
+                    await self._acquire()
+                await self._ticks(1)
+                left -= stream.arrived
+                if stream.held_back:
+                    stream.give_up()
         return {joint.name: joint.position for joint in await self.get_joint_states()}
 
     async def _acquire(self) -> None:
@@ -452,6 +471,7 @@ class Robot:
         for _ in range(count):
             self._arrived.clear()
             try:
-                await asyncio.wait_for(self._arrived.wait(), ANSWER_S)
+                async with asyncio.timeout(ANSWER_S):  # `wait_for` may swallow a cancellation
+                    await self._arrived.wait()
             except TimeoutError:
                 raise BodyLost("robot/state has stopped; is the driver running?") from None

@@ -218,7 +218,8 @@ class Tasks:
     async def _next_status(self) -> None:
         self._arrived.clear()
         try:
-            await asyncio.wait_for(self._arrived.wait(), self._silent_s)
+            async with asyncio.timeout(self._silent_s):  # `wait_for` may swallow a cancellation
+                await self._arrived.wait()
         except TimeoutError:
             raise self._no_server() from None
 

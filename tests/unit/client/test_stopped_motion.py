@@ -2,7 +2,8 @@
 
 import asyncio
 import math
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable, Coroutine
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
@@ -31,6 +32,7 @@ class Driver:
         self.gate = GateStatus(mode="idle")
         self.commands, self.joints = list[CmdVel](), dict[str, float]()
         self.most = math.inf  # [rad] or [m], beyond which safety lets no joint go
+        self._published = asyncio.Event()
         self.bus.time.boot, self.bus.time.tick = 7, 180_000
         for joint in BODY_NOW.description.joints:
             self.joints[joint.name] = max(joint.lower, min(joint.upper, 0.0))
@@ -54,6 +56,12 @@ class Driver:
         self.gate = replace(self.gate, mode="idle")
         return GateReply(ok=True, text="", robot_type="m", gate=self.gate)
 
+    async def ticks(self, count: int) -> None:
+        """Wait for `count` states."""
+        for _ in range(count):
+            self._published.clear()
+            await self._published.wait()
+
     async def run(self) -> None:
         """Publish states for ever."""
         while True:
@@ -69,6 +77,7 @@ class Driver:
             )
             self.bus.publish(BODY, BODY_NOW)
             self.bus.publish(STATE, state)
+            self._published.set()
             await asyncio.sleep(0)
 
 
@@ -143,3 +152,56 @@ async def test_a_speed_that_is_none_moves_no_joint(net: Net, driver: Driver, spe
         await robot.track_joint_positions({JOINT.name: GOAL}, speed=speed)
     await robot._ticks(25)
     assert driver.joints[JOINT.name] == 0.0
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        lambda robot: robot.move(1.0),
+        lambda robot: robot.turn(3.0),
+        lambda robot: robot.drive(0.1, 0.1, seconds=9.0),
+    ],
+)
+async def test_a_motion_of_the_base_that_is_cut_short_stops_it(
+    net: Net, driver: Driver, motion: Callable[[Robot], Coroutine[Any, Any, object]]
+) -> None:
+    robot = Robot(net.two)
+    moving = asyncio.create_task(motion(robot))
+    await driver.ticks(10)
+    last = driver.commands[-1]
+    assert last.linear_x or last.angular_z
+    moving.cancel()
+    await driver.ticks(5)
+    driver.commands.clear()
+    await driver.ticks(10)
+    assert driver.commands
+    assert [one for one in driver.commands if one.linear_x or one.angular_z] == []
+    assert moving.cancelled()
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        lambda robot: robot.set_joint_positions({JOINT.name: GOAL}, speed=0.2),
+        lambda robot: robot.set_joint_trajectory([(9.0, {JOINT.name: GOAL})]),
+    ],
+)
+async def test_a_motion_of_the_arm_that_is_cut_short_stops_it(
+    net: Net, driver: Driver, motion: Callable[[Robot], Coroutine[Any, Any, object]]
+) -> None:
+    robot = Robot(net.two)
+    moving = asyncio.create_task(motion(robot))
+    await driver.ticks(50)
+    assert driver.joints[JOINT.name] > 0.0
+    moving.cancel()
+    await driver.ticks(25)
+    stopped = driver.joints[JOINT.name]
+    await driver.ticks(25)
+    assert driver.joints[JOINT.name] == stopped < 0.9 * GOAL
+
+
+async def test_a_motion_of_the_arm_without_waiting_goes_on(net: Net, driver: Driver) -> None:
+    robot = Robot(net.two)
+    await robot.set_joint_positions({JOINT.name: GOAL}, wait=False)
+    await driver.ticks(200)
+    assert driver.joints[JOINT.name] == pytest.approx(GOAL, abs=0.01)
