@@ -2,6 +2,7 @@
 
 import asyncio
 import threading
+from collections import deque
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, overload
@@ -40,6 +41,34 @@ class EventLoopThread:
             future.cancel()
             raise
 
+    def run_calling(
+        self,
+        start: Callable[[Callable[[M], None]], Coroutine[Any, Any, T]],
+        call: Callable[[M], None],
+    ) -> T:
+        """Run the coroutine that `start` makes of a callback, and return its result.
+
+        What the callback is given is passed to `call` in the present thread; it gets the newest.
+        """
+        newest, came = deque[M](maxlen=1), threading.Event()
+
+        def take(message: M) -> None:
+            newest.append(message)
+            came.set()
+
+        future = asyncio.run_coroutine_threadsafe(start(take), self._loop)
+        future.add_done_callback(lambda _: came.set())
+        try:
+            while not future.done():
+                came.wait()
+                came.clear()
+                if newest:
+                    call(newest.pop())
+            return future.result()
+        except BaseException:
+            future.cancel()
+            raise
+
     def close(self) -> None:
         """Cancel what still runs, and stop the loop and its thread."""
         self.run(_cancel_others())
@@ -60,7 +89,7 @@ class SyncTasks:
     """The tasks of one robot; each call returns when it is done. See `Tasks` for details."""
 
     def __init__(self, tasks: Tasks, loop: EventLoopThread) -> None:
-        self._tasks, self._run = tasks, loop.run
+        self._tasks, self._run, self._run_calling = tasks, loop.run, loop.run_calling
 
     def go_to(self, x: float, y: float, yaw: float | None = None, *, how: How = "replace") -> str:
         """Send the robot to a pose in the map [m, m, rad]; return the task's name."""
@@ -101,8 +130,13 @@ class SyncTasks:
         return self._run(self._tasks.status())
 
     def result(self, task: str, on_status: OnStatus | None = None) -> Task:
-        """Wait until a task has ended, and return it."""
-        return self._run(self._tasks.result(task, on_status))
+        """Wait until a task has ended, and return it; meanwhile call `on_status` in this thread.
+
+        `on_status` may use the robot.
+        """
+        if on_status is None:
+            return self._run(self._tasks.result(task))
+        return self._run_calling(lambda take: self._tasks.result(task, take), on_status)
 
 
 class SyncRobot:

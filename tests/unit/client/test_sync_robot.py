@@ -1,13 +1,19 @@
 """The robot for scripts without asyncio offers all that the asynchronous one does."""
 
 import asyncio
+import contextlib
 import inspect
+import threading
+from collections.abc import Iterator
 
 import pytest
 
+from gigabrain_schemas.tasks import Task, TaskReply, TaskRequest, TaskState, TaskStatus
+from gigabrain_schemas.topics import TASK, TASK_CHANGE
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.client.sync_robot import EventLoopThread, SyncRobot, SyncTasks
 from gigabrain_zenoh.client.tasks import Tasks
+from gigabrain_zenoh.testing.in_memory import Net
 
 
 def public(kind: type) -> dict[str, list[tuple[str, object, object]]]:
@@ -43,3 +49,57 @@ def test_closing_ends_what_an_interrupt_left_running() -> None:
     task = thread.run(start())
     thread.close()
     assert (ended, task.cancelled()) == ([True], True)
+
+
+async def serve_task(net: Net) -> None:
+    """Publish a task that goes on until somebody pauses it."""
+    state: TaskState = "active"
+
+    async def pause(request: TaskRequest) -> TaskReply:
+        nonlocal state
+        state = "succeeded"
+        return TaskReply(ok=True, text="paused", task=request.task)
+
+    net.one.serve(TASK_CHANGE, pause)
+    while True:
+        task = Task(id="goal-1", kind="goal", label="goal", source="ann", state=state)
+        active = state == "active"
+        net.one.publish(TASK, TaskStatus(current=task) if active else TaskStatus(done=(task,)))
+        await asyncio.sleep(0.01)
+
+
+@contextlib.contextmanager
+def tasks_of_a_robot() -> Iterator[SyncTasks]:
+    thread = EventLoopThread()
+
+    async def start() -> tuple[Tasks, object]:
+        net = Net()
+        return Tasks(net.two), asyncio.ensure_future(serve_task(net))
+
+    tasks, _serving = thread.run(start())
+    yield SyncTasks(tasks, thread)
+    thread.close()
+
+
+def test_a_callback_may_use_the_robot_as_it_is_called_in_the_scripts_own_thread() -> None:
+    with tasks_of_a_robot() as tasks:
+        said = list[str]()
+
+        def on_status(_: TaskStatus) -> None:
+            assert threading.current_thread() is threading.main_thread()  # else it hangs here:
+            said.append(tasks.pause("goal-1"))
+
+        assert tasks.result("goal-1", on_status).state == "succeeded"
+        assert set(said) == {"paused"}
+
+
+def test_an_error_in_a_callback_reaches_the_script_and_ends_the_wait() -> None:
+    with tasks_of_a_robot() as tasks:
+
+        def on_status(_: TaskStatus) -> None:
+            raise KeyError("of the script")
+
+        with pytest.raises(KeyError, match="of the script"):
+            tasks.result("goal-1", on_status)
+        tasks.pause("goal-1")
+        assert tasks.result("goal-1").state == "succeeded"
