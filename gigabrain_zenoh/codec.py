@@ -1,7 +1,7 @@
 """Encodes messages to bytes and decodes them. A decoded message is valid."""
 
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import msgspec
 
@@ -13,7 +13,16 @@ M = TypeVar("M", bound=Message)
 DECODE_ERRORS = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
 MAX_ERROR_CHARS = 200  # an error quotes the message, which may have 60 kB
 
-encode = msgspec.msgpack.Encoder().encode
+
+def _plain(value: Any) -> Any:
+    """Return a single number or truth value of numpy as Python's own. Raises TypeError."""
+    if getattr(value, "ndim", None) != 0:
+        kind = f"{type(value).__module__}.{type(value).__name__}"
+        raise TypeError(f"Encoding objects of type {kind} is unsupported")
+    return value.item()
+
+
+encode = msgspec.msgpack.Encoder(enc_hook=_plain).encode
 
 
 def encoding_of(message: type[Message]) -> str:

@@ -1,6 +1,7 @@
 """Motion of joints for scripts: postures and trajectories, streamed at the body's rate."""
 
 import math
+import numbers
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 
@@ -43,7 +44,7 @@ def checked_positions(body: BodyDescription, positions: Positions) -> dict[str, 
 
 
 def _check_position(joint: JointDescription, position: float) -> None:
-    if isinstance(position, bool) or not isinstance(position, (int, float)):
+    if isinstance(position, bool) or not isinstance(position, numbers.Real):
         raise ConfigError(f"{joint.name}: expected a number, got {position!r}")
     if not joint.lower <= position <= joint.upper:  # NaN as well
         raise ConfigError(

@@ -1,5 +1,6 @@
 """A script's commands for joints that follow a posture which changes all the time."""
 
+import numpy as np
 import pytest
 from msgspec.structs import replace
 
@@ -8,8 +9,8 @@ from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import Joint, RobotState
 from gigabrain_schemas.brain import JointCommand
 from gigabrain_schemas.examples import example
-from gigabrain_zenoh.client.arm import JointPath, JointStream
-from gigabrain_zenoh.errors import BodyLost
+from gigabrain_zenoh.client.arm import JointPath, JointStream, checked_positions
+from gigabrain_zenoh.errors import BodyLost, ConfigError
 from gigabrain_zenoh.geometry.joints import JointMotion, approach, braked
 
 ARM = load_robot("so101").description()
@@ -120,3 +121,14 @@ def test_joints_that_are_not_measured_are_not_commanded() -> None:
     state = replace(example(RobotState), joints=(Joint(name="shoulder_pan", position=0.0),))
     with pytest.raises(BodyLost, match="not all of its joints are measured"):
         JointStream(ARM, state, "script")
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.int64, int])
+def test_a_position_may_be_a_number_of_numpy(kind: type) -> None:
+    assert checked_positions(ARM, {"shoulder_pan": kind(1)}) == {"shoulder_pan": 1.0}
+
+
+@pytest.mark.parametrize("position", [True, "1", np.zeros(2), None])
+def test_a_position_that_is_no_number_is_refused(position: float) -> None:
+    with pytest.raises(ConfigError, match="shoulder_pan: expected a number, got "):
+        checked_positions(ARM, {"shoulder_pan": position})
