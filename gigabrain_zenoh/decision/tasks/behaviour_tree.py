@@ -43,7 +43,8 @@ Progress = dict[str, Index]  # of each running node, by its number in depth-firs
 class _TimeoutNode(Decorator):
     """Fails if its child takes longer than some seconds of the robot's time.
 
-    The clock stops while the gate or an operator holds the body.
+    The clock stops while the gate or an operator holds the body, and while a guard runs its `then`
+    instead.
     """
 
     def __init__(self, child: Behaviour, seconds: float, context: MissionContext) -> None:
@@ -52,6 +53,10 @@ class _TimeoutNode(Decorator):
 
     def initialise(self) -> None:
         self.began_s = self._context.free_s
+
+    def delay(self, seconds: float) -> None:
+        """Leave out `seconds` of the time that has passed."""
+        self.began_s += seconds
 
     def update(self) -> Status:
         too_long = self._context.free_s - self.began_s > self._seconds
@@ -83,6 +88,8 @@ class _GuardNode(Behaviour):
             self.interrupted = False
         if not self.interrupted and self._condition.holds(self._context.read):
             self.interrupted = True
+        if self.interrupted:
+            self._delay()
         child = self._then if self.interrupted else self._do
         yield from child.tick()
         status = child.status
@@ -95,6 +102,12 @@ class _GuardNode(Behaviour):
 
     def update(self) -> Status:
         return self.status  # of the last `tick`
+
+    def _delay(self) -> None:
+        """Stop the clocks of `do` for the present tick."""
+        for node in _nodes(self._do):
+            if isinstance(node, _TimeoutNode | OfferNode):
+                node.delay(self._context.passed_s)
 
     def _resume(self) -> Status:
         """Continue with `do` after `then`; fail if the condition still holds."""

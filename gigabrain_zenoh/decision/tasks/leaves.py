@@ -64,6 +64,7 @@ class MissionContext:
     hand: Hand = field(default_factory=Hand)
     now_s: float = 0.0
     held_s: float = 0.0  # of that, while the body did not follow a command
+    passed_s: float = 0.0  # in this tick, unless the body was held
     outcome: StepOutcome | None = None  # of the command of the last tick
     command: Command | None = None  # of the active node
     given: Mapping[str, Solid] = field(default_factory=dict)  # things of the mission's file
@@ -82,9 +83,10 @@ class MissionContext:
 
     def begin(self, seconds: float, outcome: StepOutcome | None) -> None:
         """Begin the next tick, `seconds` after the last."""
+        held = outcome is not None and outcome.held
         self.now_s += seconds
-        if outcome and outcome.held:
-            self.held_s += seconds
+        self.held_s += seconds if held else 0.0
+        self.passed_s = 0.0 if held else seconds
         self.outcome, self.command, self.doing = outcome, None, ""
         self.progress = self.left_s = None
         self.offers = False
@@ -181,6 +183,10 @@ class OfferNode(ArmNode):
         super().initialise()
         self.context.may_let_go = False
         self._until_s = self.context.free_s + self._seconds
+
+    def delay(self, seconds: float) -> None:
+        """Wait for so much longer."""
+        self._until_s += seconds
 
     def update(self) -> Status:
         """Advance the node by one tick, and return its status."""

@@ -132,6 +132,37 @@ def test_a_low_battery_sends_it_to_the_dock_and_then_on_where_it_was(robot: Robo
     assert robot.step() == 2.0  # and not to a again
 
 
+def test_a_timeout_does_not_run_while_the_robot_charges(robot: Robot) -> None:
+    within = "{timeout: {seconds: 100, do: [{goto: a}]}}"
+    robot.carry_out(
+        f"do: [{{battery_below: {{percentage: 20, goto: dock, until: 80, do: [{within}]}}}}]"
+    )
+    robot.step()
+    assert robot.step(60.0) == 1.0
+    robot.charge = 19.0
+    assert robot.step() == 0.0
+    robot.reached()
+    robot.step(3600.0)
+    again = Robot(robot.tasks.saved)  # and not over a restart either
+    for one in (robot, again):
+        one.charge = 80.0
+        one.step(600.0)
+        assert one.step(30.0) == 1.0
+        assert one.step(20.0) is None
+        assert one.last == ("failed", "going to a: not done within 100 s")
+
+
+def test_a_timeout_round_all_of_it_runs_while_the_robot_charges(robot: Robot) -> None:
+    low = "{battery_below: {percentage: 20, goto: dock, until: 80, do: [{goto: a}]}}"
+    robot.carry_out(f"do: [{{timeout: {{seconds: 10, do: [{low}]}}}}]")
+    robot.step()
+    robot.charge = 19.0
+    robot.step()
+    robot.reached()
+    robot.step(11.0)
+    assert robot.last[0] == "failed"
+
+
 def test_a_dock_that_does_not_charge_ends_the_mission(robot: Robot) -> None:
     robot.carry_out("do: [{battery_below: {percentage: 20, goto: dock, do: [{goto: a}]}}]")
     robot.step()
