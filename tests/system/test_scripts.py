@@ -42,6 +42,15 @@ async def test_a_program_of_the_folder_is_run_there_with_its_arguments(tmp_path:
     assert await ended(run) == (True, f"ended well: twice in {tmp_path}")
 
 
+async def test_the_folder_may_be_given_by_a_relative_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program(tmp_path, "pwd")
+    monkeypatch.chdir(tmp_path.parent)
+    run = Scripts(tmp_path.name).start(Script(run="beep"))
+    assert await ended(run) == (True, f"ended well: {tmp_path}")
+
+
 @pytest.mark.parametrize(("before", "then"), [(None, "any"), ("egl", "egl")])
 async def test_a_program_may_open_windows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str | None, then: str

@@ -24,7 +24,7 @@ class Scripts:
     """Starts programs of the folder that the deployment file allows."""
 
     def __init__(self, folder: str) -> None:
-        self._folder = expanded(folder) if folder else None
+        self._folder = expanded(folder).absolute() if folder else None
 
     def path(self, name: str) -> Path:
         """Return the path of a program. Raises Refused and UnknownName."""
