@@ -44,6 +44,7 @@ WORLD_ANSWER_S = 3.0  # time may stand still for 2 s before the driver gives up
 
 FIRST_S, AGAIN_S = 0.15, 0.05  # until the e-stop request is repeated, and between repetitions
 GIVE_UP_S = 2.0
+MAX_SOURCE_CHARS, MAX_TEXT_BYTES = 64, 500  # of an e-stop request
 LAST_LOOK_S = 0.05  # for answers that arrived while this process was blocked
 BY_HAND = "press the hardware e-stop or cut the robot's power"
 
@@ -155,9 +156,13 @@ async def audit_log(bus: Bus, newest: int) -> tuple[AuditRecord, ...]:
 
 
 async def press_estop(bus: Bus, reason: str = "", *, within_s: float = GIVE_UP_S) -> GateReply:
-    """Press the e-stop until a body confirms that it is latched. Raises NotConfirmed."""
+    """Press the e-stop until a body confirms that it is latched. Raises NotConfirmed.
+
+    A `reason` that is too long is cut, as a request that is not valid would not stop the body.
+    """
     loop = asyncio.get_running_loop()
-    request = EstopRequest(source=bus.process or "anonymous", reason=reason)
+    source = _text(bus.process or "anonymous")[:MAX_SOURCE_CHARS]
+    request = EstopRequest(source=source, reason=_text(reason))
     end_s, pause_s, refused = loop.time() + within_s, FIRST_S, ""
     asks: Asks = set()
     try:
@@ -177,6 +182,11 @@ async def press_estop(bus: Bus, reason: str = "", *, within_s: float = GIVE_UP_S
         await asyncio.gather(*asks, return_exceptions=True)
     why = refused or "no driver answers"
     raise NotConfirmed(f"NOT CONFIRMED: {why}; {BY_HAND}")
+
+
+def _text(given: object) -> str:
+    """Return what is given as a text that an e-stop request has room for."""
+    return str(given).encode(errors="replace")[:MAX_TEXT_BYTES].decode(errors="ignore")
 
 
 async def _answer(asks: Asks, within_s: float) -> tuple[GateReply | None, str]:

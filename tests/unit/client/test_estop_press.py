@@ -42,6 +42,25 @@ async def test_the_first_confirmation_ends_it() -> None:
     assert driver.asked == [EstopRequest(source="two", reason="a child")]
 
 
+@pytest.mark.parametrize(
+    ("reason", "sent"),
+    [
+        ("x" * 100_000, "x" * 500),
+        ("人" * 500, "人" * 166),  # 500 bytes of 3 for each
+        ("\udcff is no text", "? is no text"),
+        (ValueError("a wheel slips"), "a wheel slips"),
+    ],
+)
+async def test_no_reason_that_a_script_gives_keeps_the_robot_from_stopping(
+    reason: str, sent: str
+) -> None:
+    net = Net()
+    driver = Driver(net, LATCHED)
+    script = net.bus("人" * 100)
+    assert await press_estop(script, reason) == LATCHED
+    assert driver.asked == [EstopRequest(source="人" * 64, reason=sent)]
+
+
 async def test_a_lost_request_is_repeated() -> None:
     net = Net()
     driver = Driver(net, None, None, LATCHED)
