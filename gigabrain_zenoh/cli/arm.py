@@ -1,7 +1,6 @@
 """`gigabrain arm`: the joints of an arm, by hand. People read and type degrees."""
 
 import asyncio
-import getpass
 import math
 import sys
 from collections.abc import Awaitable, Callable
@@ -18,6 +17,7 @@ from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.decision.tasks.arm_steps import describe, describe_point
 from gigabrain_zenoh.errors import ConfigError, Unsupported, unknown
 from gigabrain_zenoh.host.signals import run_async
+from gigabrain_zenoh.host.this_process import user_name
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.decision.tasks.mission import Mission
@@ -327,7 +327,7 @@ def _ask(at: RobotAddress, request: Callable[[Robot], Awaitable[GateReply]]) -> 
 
 def _with_robot(at: RobotAddress, name: str, do: Callable[[Robot], Awaitable[None]]) -> None:
     async def run() -> None:
-        async with at.robot(f"{getpass.getuser()}-{name}" if name else "") as robot:
+        async with at.robot(f"{user_name()}-{name}" if name else "") as robot:
             await do(robot)
 
     run_async(run())

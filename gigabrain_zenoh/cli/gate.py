@@ -1,6 +1,5 @@
 """`gigabrain estop`, `release` and `enable`: requests to the gate; `audit`: their log."""
 
-import getpass
 import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -15,6 +14,7 @@ from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.errors import ConfigError, GigabrainError, NotConfirmed, unknown
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.host.signals import run_async
+from gigabrain_zenoh.host.this_process import user_name
 
 if TYPE_CHECKING:
     from gigabrain_schemas.logs import AuditRecord
@@ -65,7 +65,7 @@ def _ask(
     wait: bool = True,
 ) -> None:
     async def run() -> None:
-        async with at.robot(f"{getpass.getuser()}-cli", wait=wait) as robot:
+        async with at.robot(f"{user_name()}-cli", wait=wait) as robot:
             start_s = time.perf_counter()
             reply = await request(robot)
             took_ms = (time.perf_counter() - start_s) * 1e3

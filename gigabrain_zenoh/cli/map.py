@@ -23,11 +23,10 @@ def save(name: str, /, *, at: RobotAddress = LOCAL, replace: bool = False) -> No
         name: Name of the files: NAME.yaml and NAME.pgm for ROS, NAME.graph.npz to continue.
         replace: Replace a map of the same name.
     """
-    import getpass
-
     from gigabrain_zenoh.client.zones import save_map
+    from gigabrain_zenoh.host.this_process import user_name
 
-    user = getpass.getuser()
+    user = user_name()
     print_line(on_bus(at, lambda bus: save_map(bus, name, replace=replace, source=user)))
 
 
@@ -59,11 +58,10 @@ def load(name: str, /, *, proceed: bool = False, at: RobotAddress = LOCAL) -> No
         name: Name of the map.
         proceed: Continue mapping from it. Default: only localize in it.
     """
-    import getpass
-
     from gigabrain_zenoh.client.zones import load_map
+    from gigabrain_zenoh.host.this_process import user_name
 
-    user, mapping = getpass.getuser(), "slam" if proceed else "localize"
+    user, mapping = user_name(), "slam" if proceed else "localize"
     print_line(on_bus(at, lambda bus: load_map(bus, name, mapping=mapping, source=user)))
 
 

@@ -227,13 +227,12 @@ def ask_params(
     at: RobotAddress, process: str = "", name: str = "", value: str = ""
 ) -> "dict[str, ParamReply]":
     """Return the replies of one process, or of all without a name."""
-    import getpass
-
     from gigabrain_schemas.requests import ParamRequest
     from gigabrain_schemas.topics import PARAM
     from gigabrain_zenoh.diagnostics.discovery import discover
+    from gigabrain_zenoh.host.this_process import user_name
 
-    request = ParamRequest(name=name, value=value, source=getpass.getuser())
+    request = ParamRequest(name=name, value=value, source=user_name())
 
     async def ask(bus: "Bus") -> "dict[str, ParamReply]":
         known = await discover(bus)

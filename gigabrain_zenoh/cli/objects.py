@@ -106,6 +106,6 @@ def ago(seen_ns: int, now_s: float) -> str:
 
 
 def _name() -> str:
-    import getpass
+    from gigabrain_zenoh.host.this_process import user_name
 
-    return f"{getpass.getuser()}-cli"
+    return f"{user_name()}-cli"

@@ -193,11 +193,10 @@ async def _print_reply(reply: Awaitable[str]) -> None:
 
 
 def _with_tasks(at: RobotAddress, do: "Callable[[Tasks], Awaitable[None]]") -> None:
-    import getpass
-
     from gigabrain_zenoh.client.tasks import Tasks
+    from gigabrain_zenoh.host.this_process import user_name
 
-    name = f"{getpass.getuser()}-cli"
+    name = f"{user_name()}-cli"
     on_bus(at, lambda bus: do(Tasks(bus, at.folder, on_wait=print_line)), name)
 
 

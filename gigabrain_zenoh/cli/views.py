@@ -1,6 +1,5 @@
 """`gigabrain teleop`, `page`, `view` and `foxglove`: views of a robot for people."""
 
-import getpass
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from cyclopts import Parameter
 from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, Take, checked, print_line
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.signals import run_async
+from gigabrain_zenoh.host.this_process import user_name
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.config.settings import PageConfig
@@ -47,7 +47,7 @@ def teleop(
         try:
             if not sys.stdin.isatty() and pad.pad is None:
                 raise ConfigError("teleop needs a terminal or a gamepad; connect one of them")
-            async with at.robot(f"{getpass.getuser()}-teleop") as robot:
+            async with at.robot(f"{user_name()}-teleop") as robot:
                 await TeleopStation(robot, pad).drive(take)
         finally:
             pad.close()
@@ -63,7 +63,7 @@ def _follow(port: str, calibration: str, at: RobotAddress, take: bool) -> None:
         async with LeaderArm(port, calibration) as leader:
             if leader.let_go:
                 print_line("the leader's motors are off now: hold it")
-            async with at.robot(f"{getpass.getuser()}-leader") as robot:
+            async with at.robot(f"{user_name()}-leader") as robot:
                 await LeaderStation(robot, leader, print_line).drive(take)
 
     run_async(run())

@@ -1,11 +1,11 @@
 """`gigabrain world`: obstacles and people in a running simulation."""
 
-import getpass
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, checked, on_bus, print_line
+from gigabrain_zenoh.host.this_process import user_name
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def add(
     }  # fmt: skip
     values |= {"size": size} if size else {}
     values |= {"name": name} if name else {}
-    request = SimRequest(do="add", thing=checked(values, Thing), source=getpass.getuser())
+    request = SimRequest(do="add", thing=checked(values, Thing), source=user_name())
     print_line(_ask(request, at).text)
 
 
@@ -63,7 +63,7 @@ def remove(name: str, /, *, at: RobotAddress = LOCAL) -> None:
     """
     from gigabrain_schemas.sim import SimRequest
 
-    fields = {"do": "remove", "name": name, "source": getpass.getuser()}
+    fields = {"do": "remove", "name": name, "source": user_name()}
     print_line(_ask(checked(fields, SimRequest), at).text)
 
 
@@ -74,7 +74,7 @@ def list_(*, at: RobotAddress = LOCAL) -> None:
     """
     from gigabrain_schemas.sim import SimRequest
 
-    reply = _ask(SimRequest(source=getpass.getuser()), at)
+    reply = _ask(SimRequest(source=user_name()), at)
     if robot := reply.robot:
         print_line(f"{'robot':<12} at ({robot.x:.2f}, {robot.y:.2f}), yaw {robot.yaw:.2f}")
     for thing in reply.things:

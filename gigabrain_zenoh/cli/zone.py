@@ -148,15 +148,14 @@ async def _here(bus: "Bus") -> dict[str, Any]:
 
 async def _ask(bus: "Bus", fields: dict[str, Any]) -> str:
     """Ask for a change; return the answer as text. Raises ConfigError, BodyLost and Refused."""
-    import getpass
-
     import msgspec
 
     from gigabrain_schemas.zones import ZonesRequest
     from gigabrain_zenoh.client.zones import change_zones
+    from gigabrain_zenoh.host.this_process import user_name
 
     try:
-        request = msgspec.convert({**fields, "source": getpass.getuser()}, ZonesRequest)
+        request = msgspec.convert({**fields, "source": user_name()}, ZonesRequest)
     except (ValueError, OverflowError) as error:  # msgspec.ValidationError is one
         text = re.sub(r" - at `\$\.(zone|place)`$", "", str(error))
         raise ConfigError(f"not a valid place or zone: {text}") from None

@@ -1,7 +1,6 @@
 """`gigabrain topic pub`: builds a message from typed words, and publishes it or drives by it."""
 
 import asyncio
-import getpass
 import re
 from collections.abc import Sequence
 from typing import Any, TypeVar
@@ -18,6 +17,7 @@ from gigabrain_zenoh.diagnostics.discovery import PREFIX, short_name, unknown_to
 from gigabrain_zenoh.errors import ConfigError, Refused, unknown
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.host.signals import run_until, stop_signals
+from gigabrain_zenoh.host.this_process import user_name
 from gigabrain_zenoh.runtime.connect import Where
 
 M = TypeVar("M", bound=Message)
@@ -109,7 +109,7 @@ async def drive(
         where.connect,
         namespace=where.namespace,
         keys=where.keys,
-        source=command.source or f"{getpass.getuser()}-pub",
+        source=command.source or f"{user_name()}-pub",
         take=take,
     ) as robot:
         control_topic = (await robot.read_body()).control_topic

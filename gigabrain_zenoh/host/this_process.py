@@ -6,6 +6,7 @@ A supervised process calls `set_up` first, so this module imports nothing heavy.
 import contextlib
 import ctypes
 import faulthandler
+import getpass
 import mmap
 import os
 import signal
@@ -16,6 +17,7 @@ from pathlib import Path
 
 SUPERVISOR_VARIABLE = "GIGABRAIN_SUPERVISOR"  # the supervisor puts its pid there
 STACK_SIGNAL = getattr(signal, "SIGUSR2", None)  # Windows has none
+MAX_USER_CHARS = 48  # of the 64 that a request has for its source
 _PR_SET_PDEATHSIG = 1  # prctl(2)
 
 
@@ -24,6 +26,18 @@ def set_up() -> None:
     die_with_supervisor()
     map_large_blocks()
     multiply_in_one_thread()
+
+
+def user_name() -> str:
+    """Return the name of the user, as a text for requests; a number where they have no name.
+
+    A container may run as any number.
+    """
+    try:
+        name = getpass.getuser()
+    except (KeyError, OSError):
+        name = f"user-{os.getuid()}"
+    return name.encode(errors="replace").decode()[:MAX_USER_CHARS]
 
 
 def die_with_supervisor() -> None:
