@@ -25,6 +25,7 @@ MAX_TAG = 1_000_000
 LARGEST = 1e9  # limit of coordinates on the bus
 PLAN_S = 5.0  # how long path planning in a large map may take
 SILENT_S = 5.0  # after this long without a task status, the robot counts as lost
+STALE_NS = 1_000_000_000  # the age up to which a status is given: it comes five times a second
 STARTING_S = 3.0  # how long a starting robot may take until it serves goals
 AGAIN_S = 0.2
 MAX_WITHOUT = 5  # statuses without a task: those from before it was accepted may still arrive
@@ -55,6 +56,7 @@ class Tasks:
         self._on_wait, self._starting_s, self._silent_s = on_wait, starting_s, silent_s
         self._arrived = asyncio.Event()
         self._newest: TaskStatus | None = None
+        self._newest_ns = 0  # when it came
         self._subscribed = False
 
     async def go_to(
@@ -152,7 +154,7 @@ class Tasks:
     async def status(self) -> TaskStatus:
         """Return the current, the waiting and the most recent ended tasks. Raises BodyLost."""
         self._listen()
-        if self._newest is None:
+        if self._newest is None or self._bus.clock.now_ns() - self._newest_ns > STALE_NS:
             await self._next_status()
         assert self._newest
         return self._newest
@@ -212,7 +214,7 @@ class Tasks:
             self._bus.subscribe(TASK, self._on_status)
 
     def _on_status(self, _key: str, status: TaskStatus) -> None:
-        self._newest = status
+        self._newest, self._newest_ns = status, self._bus.clock.now_ns()
         self._arrived.set()
 
     async def _next_status(self) -> None:

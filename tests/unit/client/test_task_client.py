@@ -56,6 +56,25 @@ async def test_whoever_says_nothing_of_the_tasks_is_taken_for_gone_as_soon_as_wa
         await hasty
 
 
+async def test_a_status_of_a_robot_that_has_fallen_silent_is_not_given_again() -> None:
+    net = Net()
+    tasks = Tasks(net.two, silent_s=0.0)
+    one = Task(id="goal-3", kind="goal", label="goal", source="ann", state="active")
+    waiting = asyncio.ensure_future(Tasks(net.two, silent_s=60.0).status())
+    with pytest.raises(BodyLost):
+        await tasks.status()
+    net.one.publish(TASK, TaskStatus(current=one))
+    assert (await waiting).current == one
+    await net.clock.advance(1_000_000_000)  # it misses some, as on a busy machine
+    assert (await tasks.status()).current == one
+    await net.clock.advance(9_000_000_000)
+    with pytest.raises(BodyLost, match="no process serves goals"):
+        await tasks.status()
+    net.one.publish(TASK, TaskStatus())
+    await settle()
+    assert (await tasks.status()).current is None
+
+
 async def test_a_task_that_the_robot_does_not_know_any_more_is_not_waited_for() -> None:
     net = Net()
     waiting = asyncio.ensure_future(Tasks(net.two, silent_s=60.0).result("goal-3"))
