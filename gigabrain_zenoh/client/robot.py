@@ -112,8 +112,13 @@ class Robot:
         if sum((x is not None, bool(object), tag is not None)) != 1:
             raise ConfigError("goto: expected x and y, the name of a place, an object or a tag")
         if x is None:
+            if y is not None or yaw is not None:
+                raise ConfigError("goto: expected an object or a tag without y and yaw")
             name = await self.tasks.go_to_object(object, tag=tag)
         elif isinstance(x, str):
+            if y is not None:
+                expected = "expected numbers x and y, or a place and yaw="
+                raise ConfigError(f"goto: {expected}; got {x!r} and y={y!r}")
             name = await self.tasks.go_to_place(x, yaw)
         elif y is None:
             raise ConfigError("goto: expected x and y, or the name of a place")

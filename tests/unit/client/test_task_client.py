@@ -4,6 +4,7 @@ import asyncio
 import math
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -11,6 +12,7 @@ from gigabrain_schemas.tasks import GoalReply, GoalRequest, Task, TaskStatus
 from gigabrain_schemas.topics import GOAL, TASK, Priority
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import LocalTransport
+from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.client.tasks import Tasks
 from gigabrain_zenoh.decision.behaviours import StepOutcome
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
@@ -148,3 +150,28 @@ async def test_a_refusal_reaches_the_script(site: Site) -> None:
     await site.step()
     assert (await tasks.status()).current
     await site.end()
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({}, "expected x and y, the name of a place, an object or a tag"),
+        ({"x": "door", "object": "can"}, "expected x and y, the name of a place, an object or a t"),
+        ({"x": 1.0}, "expected x and y, or the name of a place"),
+        (
+            {"x": "door", "y": 1.57},
+            "expected numbers x and y, or a place and yaw=; got 'door' and y=1.57",
+        ),
+        (
+            {"x": "1.0", "y": "2.0"},
+            "expected numbers x and y, or a place and yaw=; got '1.0' and y='2.0'",
+        ),
+        ({"object": "can", "yaw": 1.57}, "expected an object or a tag without y and yaw"),
+        ({"y": 1.0, "tag": 7}, "expected an object or a tag without y and yaw"),
+    ],
+)
+async def test_goto_leaves_out_nothing_that_a_script_gives(
+    given: dict[str, Any], expected: str
+) -> None:
+    with pytest.raises(ConfigError, match=f"^goto: {re.escape(expected)}"):
+        await Robot(Net().two).goto(**given)
