@@ -1,14 +1,17 @@
 """Client for tasks from a script: send the robot to a goal, and follow the task's progress."""
 
 import asyncio
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.tasks import (
+    GoalReply,
     GoalRequest,
     How,
+    MissionReply,
     MissionRequest,
     Task,
     TaskRequest,
@@ -17,7 +20,7 @@ from gigabrain_schemas.tasks import (
 from gigabrain_schemas.topics import GOAL, MISSION, TASK, TASK_CHANGE, Service
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.client.requests import ANSWER_S
-from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
+from gigabrain_zenoh.errors import BodyLost, ConfigError, GigabrainError, Refused
 from gigabrain_zenoh.security.identity_files import may_not_ask
 
 MAX_NAME_CHARS = 64
@@ -189,7 +192,7 @@ class Tasks:
         until, waits = now() + self._starting_s, False
         while True:
             asked, losses = now(), self._bus.transport.losses
-            replies = await self._bus.ask(service, request, timeout_s=timeout_s)
+            replies = await self._ask_once(service, request, timeout_s)
             if replies:
                 return replies[0]
             took = now() - asked
@@ -207,6 +210,23 @@ class Tasks:
                     "waiting: no process serves goals yet; the robot may still be starting"
                 )
             waits = True
+
+    async def _ask_once(self, service: Service[Q, R], request: Q, timeout_s: float) -> list[R]:
+        """Return every answer. If this call is cancelled, a task that it has begun is as well."""
+        asking = asyncio.ensure_future(self._bus.ask(service, request, timeout_s=timeout_s))
+        try:
+            return await asyncio.shield(asking)
+        except asyncio.CancelledError:
+            with contextlib.suppress(GigabrainError):
+                await self._cancel_begun(await asking)
+            raise
+
+    async def _cancel_begun(self, replies: list[R]) -> None:
+        for reply in replies:
+            if isinstance(reply, GoalReply) and reply.ok:
+                await self.cancel(reply.goal)
+            if isinstance(reply, MissionReply) and reply.ok:
+                await self.cancel(reply.task)
 
     def _listen(self) -> None:
         if not self._subscribed:

@@ -3,13 +3,23 @@
 import asyncio
 import math
 import re
+from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from gigabrain_schemas.tasks import GoalReply, GoalRequest, Task, TaskStatus
-from gigabrain_schemas.topics import GOAL, TASK, Priority
+from gigabrain_schemas.tasks import (
+    GoalReply,
+    GoalRequest,
+    MissionReply,
+    MissionRequest,
+    Task,
+    TaskReply,
+    TaskRequest,
+    TaskStatus,
+)
+from gigabrain_schemas.topics import GOAL, MISSION, TASK, TASK_CHANGE, Priority
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import LocalTransport
 from gigabrain_zenoh.client.robot import Robot
@@ -175,3 +185,53 @@ async def test_goto_leaves_out_nothing_that_a_script_gives(
 ) -> None:
     with pytest.raises(ConfigError, match=f"^goto: {re.escape(expected)}"):
         await Robot(Net().two).goto(**given)
+
+
+@pytest.mark.parametrize(
+    "start", [lambda robot: robot.goto(1.0, 0.0), lambda robot: robot.tasks.explore()]
+)
+async def test_a_task_is_cancelled_also_where_its_answer_comes_only_afterwards(
+    start: Callable[[Robot], Coroutine[Any, Any, object]],
+) -> None:
+    net, planned, cancelled = Net(), asyncio.Event(), list[str]()
+
+    async def plan(_: GoalRequest) -> GoalReply:
+        await planned.wait()
+        return GoalReply(ok=True, text="on the way", goal="goal-1")
+
+    async def read(_: MissionRequest) -> MissionReply:
+        await planned.wait()
+        return MissionReply(ok=True, text="exploring", task="mission-1")
+
+    async def change(request: TaskRequest) -> TaskReply:
+        cancelled.append(request.task)
+        return TaskReply(ok=True, text="is cancelled")
+
+    net.one.serve(GOAL, plan)
+    net.one.serve(MISSION, read)
+    net.one.serve(TASK_CHANGE, change)
+    starting = asyncio.create_task(start(Robot(net.two)))
+    await settle()
+    starting.cancel()
+    await settle()
+    planned.set()
+    with pytest.raises(asyncio.CancelledError):
+        await starting
+    assert cancelled in (["goal-1"], ["mission-1"])
+
+
+async def test_a_refusal_that_comes_after_a_cancellation_is_no_error() -> None:
+    net, planned = Net(), asyncio.Event()
+
+    async def plan(_: GoalRequest) -> GoalReply:
+        await planned.wait()
+        raise Refused("too many others ask")
+
+    net.one.serve(GOAL, plan)
+    going = asyncio.create_task(Robot(net.two).goto(1.0, 0.0))
+    await settle()
+    going.cancel()
+    await settle()
+    planned.set()
+    with pytest.raises(asyncio.CancelledError):
+        await going
