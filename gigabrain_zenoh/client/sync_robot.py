@@ -1,9 +1,11 @@
 """A robot for scripts and notebooks without asyncio: each call returns when it is done."""
 
 import asyncio
+import contextlib
 import threading
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
@@ -21,6 +23,8 @@ from gigabrain_zenoh.client.tasks import OnStatus, Tasks
 M = TypeVar("M", bound=Message)
 T = TypeVar("T")
 
+CLEAN_UP_S = 10.0  # within which a call that was cut short has ended
+
 
 class EventLoopThread:
     """An event loop in a thread of its own, which runs coroutines for other threads."""
@@ -33,13 +37,12 @@ class EventLoopThread:
         self._thread.start()
 
     def run(self, coroutine: Coroutine[Any, Any, T]) -> T:
-        """Run `coroutine` and return its result; an interrupt cancels it."""
-        future = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
-        try:
+        """Run `coroutine` and return its result.
+
+        An interrupt cancels it, and waits until it has ended, as it may cancel a goal then.
+        """
+        with self._running(coroutine) as future:
             return future.result()
-        except BaseException:
-            future.cancel()
-            raise
 
     def run_calling(
         self,
@@ -56,17 +59,33 @@ class EventLoopThread:
             newest.append(message)
             came.set()
 
-        future = asyncio.run_coroutine_threadsafe(start(take), self._loop)
-        future.add_done_callback(lambda _: came.set())
-        try:
+        with self._running(start(take)) as future:
+            future.add_done_callback(lambda _: came.set())
             while not future.done():
                 came.wait()
                 came.clear()
                 if newest:
                     call(newest.pop())
             return future.result()
+
+    @contextlib.contextmanager
+    def _running(self, coroutine: Coroutine[Any, Any, T]) -> Iterator[Future[T]]:
+        """Run `coroutine` while a block waits for it, and cancel it if the block is cut short."""
+        begun, ended = threading.Event(), threading.Event()
+
+        async def work() -> T:
+            begun.set()
+            try:
+                return await coroutine
+            finally:
+                ended.set()
+
+        future = asyncio.run_coroutine_threadsafe(work(), self._loop)
+        try:
+            yield future
         except BaseException:
-            future.cancel()
+            if future.cancel() and begun.is_set():
+                ended.wait(CLEAN_UP_S)
             raise
 
     def close(self) -> None:

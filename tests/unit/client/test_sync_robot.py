@@ -3,8 +3,9 @@
 import asyncio
 import contextlib
 import inspect
+import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -103,3 +104,39 @@ def test_an_error_in_a_callback_reaches_the_script_and_ends_the_wait() -> None:
             tasks.result("goal-1", on_status)
         tasks.pause("goal-1")
         assert tasks.result("goal-1").state == "succeeded"
+
+
+async def tidied(tidy: list[str], ready: Callable[[], object]) -> None:
+    """Run `ready`, and tidy up slowly once cancelled, as `goto` cancels its goal."""
+    try:
+        await asyncio.sleep(0.05)  # the script waits by then
+        ready()
+        await asyncio.Event().wait()
+    finally:
+        await asyncio.sleep(0.05)
+        tidy.append("done")
+
+
+def test_an_interrupt_waits_until_the_call_has_tidied_up() -> None:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    thread, tidy, main = EventLoopThread(), list[str](), threading.main_thread().ident
+    assert main
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            thread.run(tidied(tidy, lambda: signal.pthread_kill(main, signal.SIGINT)))
+        assert tidy == ["done"]
+    finally:
+        signal.signal(signal.SIGINT, before)
+        thread.close()
+
+
+def test_an_error_in_a_callback_waits_as_well() -> None:
+    thread, tidy = EventLoopThread(), list[str]()
+
+    def fail(_: int) -> None:
+        raise KeyError("of the script")
+
+    with pytest.raises(KeyError):
+        thread.run_calling(lambda take: tidied(tidy, lambda: take(1)), fail)
+    assert tidy == ["done"]
+    thread.close()
