@@ -1,30 +1,47 @@
 """Connects to a robot: `async with connect()`, or `with connect()` in scripts and notebooks."""
 
 import os
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from gigabrain_zenoh.client.requests import MAX_SOURCE_CHARS
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.client.sync_robot import EventLoopThread, SyncRobot
+from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.runtime.running import find_endpoint
+
+ROBOT = frozenset(dir(SyncRobot)) | {"tasks"}
 
 
 class Connection:
-    """A robot that is connected while a block runs: `async with`, or `with` in a script."""
+    """A robot that is connected while a block runs: `async with`, or `with` in a script.
 
-    def __init__(self, opening: AbstractAsyncContextManager[Robot]) -> None:
-        self._opening = opening
+    It connects again with each block.
+    """
+
+    def __init__(self, open_robot: Callable[[], AbstractAsyncContextManager[Robot]]) -> None:
+        self._open_robot = open_robot
+        self._opening: AbstractAsyncContextManager[Robot] | None = None
         self._thread: EventLoopThread | None = None
 
+    if not TYPE_CHECKING:  # a checker knows that it has no other attributes
+
+        def __getattr__(self, name: str) -> None:
+            """Raise AttributeError; for what only a connected robot has, say how to connect."""
+            how = "; use `with gigabrain_zenoh.connect() as robot:`" if name in ROBOT else ""
+            raise AttributeError(f"a connection has no {name!r}{how}", name=name, obj=self)
+
     async def __aenter__(self) -> Robot:
+        self._opening = self._open_robot()
         return await self._opening.__aenter__()
 
     async def __aexit__(self, *error: Any) -> bool | None:
+        assert self._opening
         return await self._opening.__aexit__(*error)
 
     def __enter__(self) -> SyncRobot:
-        self._thread = EventLoopThread()
+        self._thread, self._opening = EventLoopThread(), self._open_robot()
         try:
             return SyncRobot(self._thread.run(self._opening.__aenter__()), self._thread)
         except BaseException:
@@ -33,6 +50,7 @@ class Connection:
 
     def __exit__(self, *error: Any) -> bool | None:
         assert self._thread
+        assert self._opening
         try:
             return self._thread.run(self._opening.__aexit__(*error))
         finally:
@@ -56,7 +74,10 @@ def connect(
     first state is not awaited, so that an e-stop reaches a silent body. Raises BusError without a
     router, ConfigError for invalid keys, and BodyLost without a driver.
     """
-    return Connection(_open(connect, namespace, keys, source, take, wait))
+    if len(source) > MAX_SOURCE_CHARS:
+        expected = f"expected at most {MAX_SOURCE_CHARS} characters"
+        raise ConfigError(f"source: {expected}, got {len(source)}")
+    return Connection(lambda: _open(connect, namespace, keys, source, take, wait))
 
 
 @asynccontextmanager
