@@ -4,8 +4,9 @@ Goals are accepted from the start, while the planning kernels still compile.
 """
 
 import asyncio
+import contextlib
 import logging
-from collections.abc import Awaitable, Callable, Collection
+from collections.abc import Awaitable, Callable, Collection, Iterator
 from typing import Any, NamedTuple
 
 from msgspec.structs import replace
@@ -204,13 +205,22 @@ class TaskServer:
         else:
             self._write_fault.end("tasks are saved again")
 
+    @contextlib.contextmanager
+    def _in_one_map(self) -> Iterator[None]:
+        """Raise Refused if another map was loaded during the block: places are others there."""
+        before = self._zones.newest_loaded
+        yield
+        if before not in (None, self._zones.newest_loaded):
+            raise Refused("another map was loaded meanwhile; send it again for this one")
+
     async def _on_goal(self, request: GoalRequest) -> GoalReply:
         try:
             if request.object or request.tag is not None:
                 name, path = await self._find(request)
             else:
-                goal = self._goal_of(request)
-                path = await self._check(goal)
+                with self._in_one_map():
+                    goal = self._goal_of(request)
+                    path = await self._check(goal)
                 name = self._queue.add_goal(goal, request.how, request.source, request.place)
         except GigabrainError as error:
             _log_refusal("goal", request.source, error)
@@ -259,11 +269,12 @@ class TaskServer:
         label = request.label or "mission"
         try:
             # a long one takes a tenth of a second to parse, which no scan should wait for
-            places = self._zones.newest.places
-            mission = await asyncio.to_thread(missions.loads, request.mission, label, places)
-            self._refuse_impossible(mission)
-            if mission.drives:
-                await self._check(None)
+            with self._in_one_map():
+                places = self._zones.newest.places
+                mission = await asyncio.to_thread(missions.loads, request.mission, label, places)
+                self._refuse_impossible(mission)
+                if mission.drives:
+                    await self._check(None)
             name = self._queue.add_mission(mission, label, request.how, request.source)
         except GigabrainError as error:
             _log_refusal("mission", request.source, error)

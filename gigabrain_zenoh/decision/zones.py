@@ -25,6 +25,11 @@ class ZoneSource:
         """The zones that were received last."""
         return self._received[-1] if self._received else NO_ZONES
 
+    @property
+    def newest_loaded(self) -> int | None:
+        """How many maps were loaded by the newest message; None before the first."""
+        return self._received[-1].maps_loaded if self._received else None
+
     def at(self, boot: int, tick: int) -> Zones:
         """Return the newest zones from before `tick`, or from an earlier run of the driver."""
         return self._before(boot, tick) or NO_ZONES

@@ -175,6 +175,33 @@ async def test_tasks_go_on_only_in_their_map_after_a_restart_of_decision(
     await again.end()
 
 
+@pytest.mark.parametrize(("known", "ok"), [(True, False), (False, True)])
+async def test_what_was_asked_for_another_map_is_not_accepted_in_the_new_one(
+    site: Site, monkeypatch: pytest.MonkeyPatch, known: bool, ok: bool
+) -> None:
+    loaded = 0
+
+    async def check(_: Goal | None) -> str:
+        nonlocal loaded
+        loaded += 1
+        site.net.two.publish(ZONES, Zones(boot=BOOT, map="yard", maps_loaded=loaded))
+        await settle()
+        return "on the way, 4.2 m"
+
+    monkeypatch.setattr(site.service, "_check", check)
+    if known:  # else the first message of perception only comes meanwhile
+        site.net.two.publish(ZONES, Zones(boot=BOOT, map="house", maps_loaded=0))
+    await site.step()
+    goal = await site.go(3.0)
+    assert goal.ok == ok
+    if not ok:
+        assert goal.text == "another map was loaded meanwhile; send it again for this one"
+        assert not (await site.carry_out("do: [{goto: [3, 0]}]")).ok
+        await site.step()
+        assert site.command is None
+    await site.end()
+
+
 async def test_tasks_of_another_start_of_the_robot_wait_for_a_person(
     site: Site, tmp_path: Path
 ) -> None:
