@@ -198,7 +198,8 @@ class TaskQueue:
             if status is Status.RUNNING:
                 return job.context.command, Idle(doing, doing) if doing else NO_GOAL
             succeeded = status is Status.SUCCESS
-            reason = outcome.reason if outcome and succeeded else job.context.problem
+            done = outcome.reason if outcome and outcome.state == "done" else ""
+            reason = done if succeeded else job.context.problem
             self._end(job, "succeeded" if succeeded else "failed", reason, outcome)
             outcome, seconds = None, 0.0
         return None, NO_GOAL

@@ -70,6 +70,13 @@ def test_a_fallback_takes_the_first_that_succeeds(robot: Robot) -> None:
     assert robot.last[0] == "succeeded"
 
 
+def test_a_mission_that_succeeds_does_not_name_what_failed_before(robot: Robot) -> None:
+    robot.carry_out("do: [{fallback: [{goto: a}, {check: battery.percentage > 1}]}]")
+    assert robot.step() == 1.0
+    assert robot.failed("a wall") is None
+    assert robot.last == ("succeeded", "")
+
+
 def test_a_retry_gives_a_new_order_each_time_and_gives_up_after_so_many(robot: Robot) -> None:
     robot.carry_out("do: [{retry: {times: 3, do: [{goto: a}]}}]")
     robot.step()
