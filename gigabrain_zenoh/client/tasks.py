@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
@@ -23,6 +24,7 @@ from gigabrain_zenoh.client.requests import ANSWER_S
 from gigabrain_zenoh.errors import BodyLost, ConfigError, GigabrainError, Refused
 from gigabrain_zenoh.security.identity_files import may_not_ask
 
+FILE_NAME = re.compile(r".+\.ya?ml")  # and no text of a mission, which has more lines or brackets
 MAX_NAME_CHARS = 64
 MAX_TAG = 1_000_000
 LARGEST = 1e9  # limit of coordinates on the bus
@@ -110,14 +112,15 @@ class Tasks:
     ) -> str:
         """Start a mission, given as a file or as its text; return the task's name.
 
-        Raises ConfigError with the line number for an invalid mission, and Refused.
+        One line that ends with `.yaml` or `.yml` is a file. Raises ConfigError with the line number
+        for an invalid mission, and Refused.
         """
         self._listen()
         from gigabrain_zenoh.decision.tasks.mission import load, refuse_long
 
-        if isinstance(mission, Path):
-            label = mission.stem
-            mission = load(mission)[1]
+        if isinstance(mission, Path) or FILE_NAME.fullmatch(mission):
+            label = Path(mission).stem
+            mission = load(Path(mission))[1]
         refuse_long(mission, label)
         request = MissionRequest(
             mission=mission,

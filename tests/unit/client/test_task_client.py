@@ -187,6 +187,24 @@ async def test_goto_leaves_out_nothing_that_a_script_gives(
         await Robot(Net().two).goto(**given)
 
 
+async def test_a_file_may_be_named_by_a_text(tmp_path: Path) -> None:
+    net, asked = Net(), list[MissionRequest]()
+
+    async def read(request: MissionRequest) -> MissionReply:
+        asked.append(request)
+        return MissionReply(ok=True, text="accepted", task="mission-1")
+
+    net.one.serve(MISSION, read)
+    tasks, file, text = Tasks(net.two), tmp_path / "evening.yaml", "do: [{explore: {}}]"
+    file.write_text(text)
+    for given in (file, str(file), text, "do:\n- script:\n    run: beep.yaml"):
+        await tasks.carry_out(given)
+    sent = [(one.label, one.mission[:4]) for one in asked]
+    assert sent == [("evening", "do: ")] * 2 + [("mission", "do: "), ("mission", "do:\n")]
+    with pytest.raises(ConfigError, match=r"mornin\.yaml: no such file"):
+        await tasks.carry_out("mornin.yaml")
+
+
 @pytest.mark.parametrize(
     "start", [lambda robot: robot.goto(1.0, 0.0), lambda robot: robot.tasks.explore()]
 )
