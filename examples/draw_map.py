@@ -8,8 +8,8 @@ import gigabrain_zenoh
 SCALE = 4  # pixels for each cell
 
 with gigabrain_zenoh.connect() as robot:
-    grid = next(robot.topic("map"))
-    pose = next(robot.topic("pose"))
+    grid = robot.get_sensor_data("map")
+    pose = robot.get_sensor_data("pose")
 
 cells = grid.array()  # (height, width): -1 unknown, 0 free, 100 occupied
 picture = np.full((*cells.shape, 3), 128, np.uint8)
