@@ -1,6 +1,7 @@
 """A deployment as it is started: its file, then settings files, then `--set`."""
 
 import contextlib
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +24,7 @@ from gigabrain_zenoh.launch.deployment import (
     with_keys,
 )
 
+log = logging.getLogger(__name__)
 ROWS_FILE, MAX_ROWS_BYTES = "config.json", 1_000_000
 SETTINGS = "decision.settings"
 # returns the type of a robot's file, for its name or path and the link
@@ -82,9 +84,15 @@ def merge(
 
 
 def write_rows(run_dir: Path, rows: Sequence[Row]) -> None:
-    """Keep the settings of a run, and where they come from, in its folder."""
-    if rows:
-        replace_file(run_dir / ROWS_FILE, msgspec.json.encode(rows))
+    """Keep the settings of a run, and where they come from, in its folder.
+
+    Only `gigabrain config` reads them, so a robot starts without them on a full disk.
+    """
+    try:
+        if rows:
+            replace_file(run_dir / ROWS_FILE, msgspec.json.encode(rows))
+    except OSError as error:
+        log.warning("cannot write %s: %s", run_dir / ROWS_FILE, error.strerror)
 
 
 def read_rows(run_dir: Path) -> list[Row]:

@@ -1,11 +1,14 @@
 """Settings from a deployment file, settings files and `--set`: what counts, and from where."""
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
 
 from gigabrain_zenoh.cli.app import make_app
 from gigabrain_zenoh.cli.config import merged_file, rows_of, with_values
+from gigabrain_zenoh.config.layers import Row
 from gigabrain_zenoh.errors import ConfigError, GigabrainError, UnknownName
 from gigabrain_zenoh.geometry.body_settings import split
 from gigabrain_zenoh.launch.deployment import Deployment
@@ -144,6 +147,18 @@ def test_the_settings_of_a_run_are_read_back(file: Path, tmp_path: Path) -> None
     assert [tuple(row) for row in read_rows(tmp_path)] == [tuple(row) for row in rows]
     with pytest.raises(ConfigError, match="cannot be read"):
         read_rows(tmp_path / "other")
+
+
+def test_a_full_disk_does_not_keep_a_robot_from_starting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fsync(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    write_rows(tmp_path, [Row("seed", 3, "default")])
+    assert caplog.messages == [f"cannot write {tmp_path / 'config.json'}: No space left on device"]
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_config_prints_every_key_with_value_and_source(
