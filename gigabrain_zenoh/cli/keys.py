@@ -15,6 +15,7 @@ from gigabrain_zenoh.security.identity_files import (
     CA_KEY,
     CERTIFICATE,
     INSTALL,
+    LIST,
     find_fleet,
     generations_in,
 )
@@ -103,7 +104,7 @@ def revoke(role: Role, *, robot: str = "", process: str = "", dir: FleetFolder =
     for path in lists:
         print(f"{path}: copy it to that identity's folder on its host, and restart its router")
     if not lists:
-        print("no identity of a router here; those issued from now on include the list")
+        print(f"{folder / LIST}: copy it to the keys of each router on its host, and restart it")
     option = f" --process {process}" if process else ""
     option += f" --robot {robot}" if robot else ""
     print(f"next, for those who keep access: gigabrain keys issue {role}{option}"

@@ -216,7 +216,7 @@ def _write(folder: Path, contents: Mapping[str, bytes]) -> None:
 def revoke(fleet_folder: Path, role: Role, robot: str = "", process: str = "") -> tuple[Path, ...]:
     """Revoke all identities issued under a common name; return the lists for the routers.
 
-    Raises ConfigError for roles that may be a router: no router checks those.
+    Raises ConfigError for roles that may be a router (none checks those) and for closed folders.
     """
     if role in SERVERS:
         raise ConfigError(
@@ -225,11 +225,24 @@ def revoke(fleet_folder: Path, role: Role, robot: str = "", process: str = "") -
         )
     name, known = common_name(role, robot, process=process), generations_in(fleet_folder)
     generations = {**known, name: known.get(name, 1) + 1}
-    places = [place.parent for place in sorted(fleet_folder.glob(f"*/{CERTIFICATE}"))]
-    routers = [place for place in places if read(place)[0].role in SERVERS]
+    routers = list(_routers(fleet_folder))
     for folder in (fleet_folder, *routers):
         write_list(folder, generations)
     return tuple(folder / LIST for folder in routers)
+
+
+def _routers(fleet_folder: Path) -> Iterator[Path]:
+    """Yield the folders of identities that may be a router, also without their keys."""
+    for folder in sorted(fleet_folder.iterdir()):
+        try:
+            (folder / CERTIFICATE).stat()
+        except PermissionError:
+            raise unreadable(folder) from None
+        except OSError:  # it is no identity
+            continue
+        certificate = read_certificate(folder / CERTIFICATE)
+        if parse(_attribute(certificate, NameOID.COMMON_NAME)).role in SERVERS:
+            yield folder
 
 
 def write_list(folder: Path, generations: Mapping[str, int]) -> None:

@@ -6,9 +6,11 @@ from pathlib import Path
 import pytest
 
 from gigabrain_zenoh.bus.zenoh.config import router_config, session_config
+from gigabrain_zenoh.cli.keys import revoke as revoke_command
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.security.authority import issue, read, revoke
+from gigabrain_zenoh.security.authority import issue, new_fleet, read, revoke
+from tests.closed import close_folder
 
 
 @pytest.fixture
@@ -42,6 +44,34 @@ def test_a_router_that_is_made_later_has_the_list(own: Path) -> None:
     revoke(own, "viewer")
     later = issue(own, "router", name="later")
     assert (later / "generations.json").read_bytes() == b'{\n  "viewer": 2\n}\n'
+
+
+def test_keys_that_are_elsewhere_or_open_keep_no_other_keys_from_being_revoked(own: Path) -> None:
+    (own / "operator" / "identity.key").unlink()
+    (own / "viewer@red" / "identity.key").chmod(0o644)
+    (own / "router" / "identity.key").unlink()
+    assert own / "router" / "generations.json" in revoke(own, "operator")
+
+
+def test_the_list_of_a_router_that_cannot_be_read_is_not_passed_over(
+    own: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    close_folder(own / "router", monkeypatch)
+    with pytest.raises(ConfigError, match=r"router cannot be read by this user; run as its owner"):
+        revoke(own, "operator")
+    assert not (own / "generations.json").exists()
+
+
+def test_without_a_router_the_command_says_where_the_list_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    home = tmp_path / "home"
+    new_fleet("home", home)
+    revoke_command("operator", dir=home)
+    list_there = home / "generations.json"
+    assert list_there.exists()
+    expected = f"{list_there}: copy it to the keys of each router on its host, and restart it\n"
+    assert capsys.readouterr().out.startswith(expected)
 
 
 @pytest.mark.parametrize("name", ["red/robot", "/media/usb/robot", "../robot", "robot/", "..", "."])
