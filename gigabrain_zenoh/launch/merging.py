@@ -12,7 +12,7 @@ from msgspec import Struct
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.config import loading
 from gigabrain_zenoh.config.layers import Layers, Row, assignment, full_key, keys_of
-from gigabrain_zenoh.config.settings import LinkName
+from gigabrain_zenoh.config.settings import DecisionConfig, LinkName
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError, UnknownName
 from gigabrain_zenoh.host.files import read_bounded, replace_file
@@ -115,10 +115,17 @@ def _type_of(layers: Layers) -> type[Deployment]:
     return deployment_type(own_names(layers.root))
 
 
+class _Choices(Struct, frozen=True, kw_only=True):
+    """The settings on which it depends which others there are."""
+
+    body: str = Deployment().body
+    link: LinkName = Deployment().link
+    decision: DecisionConfig = DecisionConfig()
+
+
 def _keys(layers: Layers, robot_type: RobotType) -> list[str]:
-    """Return all keys that may be set, as the settings are now."""
-    kind = _type_of(layers)
-    now = layers.convert(kind)
+    """Return all keys that may be set; the settings need not fit one another yet."""
+    kind, now = _type_of(layers), layers.convert(_Choices)
     known = {"robot": robot_type(now.body, now.link)}
     with contextlib.suppress(UnknownName):  # its package may be on another host
         known[SETTINGS] = behaviours.load(now.decision.behaviour).Config

@@ -85,6 +85,24 @@ def test_later_settings_count_and_each_value_has_its_source(file: Path, tmp_path
 
 
 @pytest.mark.parametrize(
+    "given",
+    [
+        ("link=emulated", "speed=1"),
+        ("perception.map=/maps/office.yaml", "mapping=localize"),
+        ("fleet=[blue]", "namespace=red"),
+    ],
+)
+def test_settings_that_need_one_another_may_come_in_any_order(
+    file: Path, given: tuple[str, ...]
+) -> None:
+    file.write_text("body: mycustombot\nspeed: 2\n")
+    forwards, backwards = (sources(file, *sets) for sets in (given, given[::-1]))
+    assert forwards == backwards
+    with pytest.raises(ConfigError, match=r"^--set link=far: link: expected one of "):
+        merged(file, "link=far", "seed=2")
+
+
+@pytest.mark.parametrize(
     ("given", "problem"),
     [
         ("stop_margn=0.1", "did you mean 'robot.thresholds.stop_margin'"),
