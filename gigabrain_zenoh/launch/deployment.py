@@ -104,6 +104,11 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
                 raise ValueError(f"hosts: {name} needs settings; add a part `{name}:` to this file")
         if self.button and self.speed != 1.0:
             raise ValueError("button: works in real time only; remove `speed`")
+        if self.namespace and not _is_namespace(self.namespace):
+            raise ValueError(
+                f"namespace: expected a name such as red, or names joined by '/', "
+                f"got {self.namespace!r}"
+            )
         self._check_router()
         try:
             key_expressions(self.recorder.topics)
@@ -146,6 +151,11 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
                 "name `keys:` that `gigabrain keys new` and `keys issue` made, use a loopback "
                 "address, or write `insecure: true`"
             )
+
+
+def _is_namespace(text: str) -> bool:
+    """Return whether a text can begin keys of the bus, and name a folder of a robot's state."""
+    return not {"", ".", ".."} & {*text.split("/")} and not {*"*$#?"} & {*text}
 
 
 def deployment_type(own: Iterable[str] = ()) -> type[Deployment]:
