@@ -147,7 +147,7 @@ def demo(*, robot: RobotOptions = ROBOT, view: ViewOptions = VIEW) -> int:
 
     Exit code 1 after a contact, if it did not move, or if a process died; 0 after Ctrl-C.
     """
-    from gigabrain_zenoh.launch.demo import Demo, DemoOptions, with_page
+    from gigabrain_zenoh.launch.demo import Demo, DemoOptions, only_host, with_page
 
     robot.check()
     if view.record and view.record.exists():
@@ -155,8 +155,9 @@ def demo(*, robot: RobotOptions = ROBOT, view: ViewOptions = VIEW) -> int:
     values = robot.values() | (recorded(view.record) if view.record else {})
     checked(values, Deployment)
     merged = merged_values(values, robot.settings, robot.set)
-    deployment, address = with_cameras(merged.deployment, "robot"), ""
-    check_recognizer(deployment, "robot")
+    host = only_host(merged.deployment)
+    deployment, address = with_cameras(merged.deployment, host), ""
+    check_recognizer(deployment, host)
     if view.page or (view.page is None and not view.headless):
         checked({"port": view.port}, PageConfig)
         deployment, address = with_page(deployment, view.port, login=view.login)

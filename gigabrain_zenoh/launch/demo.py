@@ -123,6 +123,15 @@ def with_page(deployment: Deployment, port: int, *, login: bool = False) -> tupl
     return structs.replace(deployment, hosts=hosts, page=page), page_address(page)
 
 
+def only_host(deployment: Deployment) -> str:
+    """Return the host of a demo. Raises ConfigError for a deployment of several."""
+    host, *others = deployment.hosts
+    if others:
+        names = ", ".join(deployment.hosts)
+        raise ConfigError(f"hosts: a demo has one host, got {names}; run them with `gigabrain up`")
+    return host
+
+
 class Demo:
     """One run."""
 
@@ -133,7 +142,7 @@ class Demo:
         write_rows(self._run_dir, options.rows)
         specs = process_specs(
             self._deployment,
-            "robot",
+            only_host(deployment),
             self._run_dir,
             self._run_dir / "state",
             seconds=options.seconds,

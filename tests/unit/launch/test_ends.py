@@ -108,6 +108,19 @@ def joined(demo: Demo, watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(demo_module, "RunMonitor", lambda _: watch)
 
 
+def test_the_one_host_of_a_demo_may_have_any_name() -> None:
+    made = Demo(Deployment(router="tcp/127.0.0.1:0", hosts={"lab": ROBOT}), DemoOptions())
+    assert set(made._supervisor.statuses) == set(ROBOT)
+
+
+def test_a_demo_of_several_hosts_is_refused_in_one_line() -> None:
+    hosts = {"robot": ("router", "driver"), "brain": ("decision",)}
+    with pytest.raises(ConfigError) as refused:
+        Demo(Deployment(hosts=hosts), DemoOptions())
+    expected = "hosts: a demo has one host, got robot, brain; run them with `gigabrain up`"
+    assert str(refused.value) == expected
+
+
 @pytest.mark.parametrize("exit_code", [1, 2])
 @pytest.mark.parametrize("name", ["mine", "page", "foxglove"])
 async def test_a_demo_goes_on_without_a_process_that_the_robot_does_not_need(
