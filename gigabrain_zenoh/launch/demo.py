@@ -353,8 +353,8 @@ class Demo:
         if self._capacity.problem and self._live:
             print(self._capacity.problem, file=sys.stderr)
         if report:
-            files.write_result(report, self._options.report)
             print(summary(report))
+            files.write_result(report, self._options.report)
         for text in self._mismatches:
             print(f"warning: {text}", file=sys.stderr)
         told = f"{why}; logs in {self._run_dir}" if why else f"logs in {self._run_dir}"

@@ -18,7 +18,7 @@ from gigabrain_zenoh.launch.deployment import ROBOT, Deployment
 from gigabrain_zenoh.launch.up import up
 from gigabrain_zenoh.runtime.supervisor import Supervisor
 from gigabrain_zenoh.testing.in_memory import Net
-from gigabrain_zenoh.ui.run_report import RunMonitor
+from gigabrain_zenoh.ui.run_report import Observed, RunMonitor, make_report
 
 DEPLOYMENT = Deployment(
     router="tcp/127.0.0.1:0",
@@ -138,6 +138,28 @@ async def test_a_demo_ends_without_a_process_that_the_robot_needs(
     give_up(demo._supervisor, name, 1)
     await demo._watch(watch, asyncio.Event())
     assert watch.seconds == 1.0
+
+
+def test_a_report_that_cannot_be_written_is_still_printed(
+    demo: Demo, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen = Observed(
+        body="mock",
+        world="arena",
+        seed=0,
+        speed=1.0,
+        seconds=3600.0,
+        distance_m=700.0,
+        decisions=(),
+        turns=9,
+        deaths=0,
+        restarts=0,
+        rejected=0,
+    )
+    demo._options = replace(demo._options, report=tmp_path / "gone" / "report.json")
+    with pytest.raises(ConfigError, match=r"cannot write .*report\.json: No such file or dir"):
+        demo._finish(make_report({}, seen), "", stopped=False)
+    assert capsys.readouterr().out.startswith("ok: 700.00 m in 3600 s, 9 turns")
 
 
 @pytest.mark.usefixtures("joined")
