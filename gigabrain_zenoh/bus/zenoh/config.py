@@ -166,12 +166,11 @@ def robots_of(endpoint: Endpoint) -> tuple[str, ...]:
 
 def router_config(endpoint: Endpoint, state_dir: Path) -> RouterConfig:
     """Build the router process's settings, with the names that have rights in its session."""
-    watches = tuple(endpoint.grants)
     if not endpoint.keys:
-        return RouterConfig(state_dir=str(state_dir), watches=watches)
+        return RouterConfig(state_dir=str(state_dir))
     generations = generations_in(Path(endpoint.keys))
     knows = known_names(robots_of(endpoint), generations, endpoint.grants)
-    return RouterConfig(state_dir=str(state_dir), knows=knows, watches=watches)
+    return RouterConfig(state_dir=str(state_dir), knows=knows)
 
 
 def secured(endpoint: Endpoint) -> Endpoint:

@@ -1,11 +1,13 @@
 """Processes of one's own in a deployment file: where they run, and errors with their line."""
 
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
 
-from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
+from gigabrain_zenoh.cli.processes import HostOptions, router
+from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig, RouterConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.launch.deployment import load_deployment
 from gigabrain_zenoh.launch.own_processes import check_installed, load_own
@@ -60,6 +62,22 @@ def test_the_only_host_runs_it_and_its_row_is_like_ours(tmp_path: Path) -> None:
     router = msgspec.json.decode(ours[0].argv[-1], type=ProcessConfig)
     assert router.settings["watches"] == ["mine"]
     assert router.endpoint.grants["mine"] == ("robot/lamp/**",)
+
+
+def test_a_router_by_hand_misses_no_process_that_nobody_has_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran: list[RouterConfig] = []
+
+    def run_at(_: HostOptions, at: Endpoint, name: str, settings: dict[str, Any]) -> int:
+        assert (name, "ros2" in at.grants) == ("router", True)
+        ran.append(msgspec.convert(settings, RouterConfig))
+        return 0
+
+    monkeypatch.setattr(HostOptions, "run_at", run_at)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    router()
+    assert [one.watches for one in ran] == [()]
 
 
 def test_hosts_may_place_it_and_several_hosts_must(tmp_path: Path) -> None:
