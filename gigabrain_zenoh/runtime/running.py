@@ -154,7 +154,14 @@ def find_endpoint(connect: str | None, namespace: str = "", keys: str = "") -> E
 
 def find_running(namespace: str = "") -> Running:
     """Return the only robot on this machine. Raises BusError for none, Ambiguous for several."""
-    robots = [r for r in running() if not namespace or r.endpoint.namespace == namespace]
+    here = running()
+    robots = [r for r in here if not namespace or r.endpoint.namespace == namespace]
+    if here and not robots:
+        names = ", ".join(sorted({r.endpoint.namespace or "none" for r in here}))
+        raise BusError(
+            f"no robot runs here with namespace {namespace!r}; known: {names}; "
+            "for one of another router, set `connect`"
+        )
     if not robots:
         raise BusError("no robot runs here; start one with `gigabrain demo`, or set `connect`")
     nearest = {_place(robot): robot for robot in sorted(robots, key=_ways)}
