@@ -1,5 +1,6 @@
 """Whole robots on this machine: `demo`, `up`, and what can be simulated."""
 
+import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -202,7 +203,8 @@ def up(
     from gigabrain_zenoh.launch.up import up as run
 
     if map:
-        set = (*set, "perception.mapping=localize", f"perception.map={checked_map(map)}")
+        quoted = json.dumps(checked_map(map), ensure_ascii=False)  # a map called 2 is no number
+        set = (*set, "perception.mapping=localize", f"perception.map={quoted}")
     set = (*set, "cameras=true") if cameras else set
     merged = merged_file(deployment, settings, set, keys)
     path, loaded = deployment_path(deployment), merged.deployment

@@ -8,6 +8,7 @@ from gigabrain_schemas.body import Thresholds
 from gigabrain_zenoh.cli.demo import up
 from gigabrain_zenoh.cli.processes import button
 from gigabrain_zenoh.config import loading as config
+from gigabrain_zenoh.config.layers import assignment
 from gigabrain_zenoh.config.settings import ButtonConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.launch.deployment import Deployment, deployment_type, host_of
@@ -113,6 +114,20 @@ def test_a_folder_of_scripts_is_looked_for_only_where_decision_runs(tmp_path: Pa
         up(str(file), host="a")
     with pytest.raises(ConfigError, match=r"robot\.yaml:2: scripts: no folder '/nowhere/beeps'; "):
         up(str(file), host="b")
+
+
+@pytest.mark.parametrize("name", ["2", "on", "1e3", "/maps/hall: floor #1.yaml"])
+def test_a_map_of_up_may_have_a_name_that_yaml_reads_otherwise(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def merge(_: str, __: object, sets: tuple[str, ...], ___: object) -> None:
+        assert [assignment(one).node.value for one in sets] == ["localize", name]
+        raise Begun
+
+    monkeypatch.setattr("gigabrain_zenoh.cli.demo.checked_map", lambda _: name)
+    monkeypatch.setattr("gigabrain_zenoh.cli.demo.merged_file", merge)
+    with pytest.raises(Begun):
+        up("demo", map=name)
 
 
 def test_a_host_that_is_like_no_other_gets_no_suggestion() -> None:
