@@ -107,7 +107,10 @@ def router(
     if not keys and not insecure:
         _refuse_exposed(listen)
     settings = router_config(endpoint, run_folders.state_dir() / "robots" / (namespace or "router"))
-    here = Endpoint(connect=(reached_at(listen[0]),), namespace=namespace, keys=keys)
+    near = reached_at(listen[0])
+    if keys:  # clients with keys take no IPv6 address
+        near = near.replace("/[::1]:", "/localhost:")
+    here = Endpoint(connect=(near,), namespace=namespace, keys=keys)
     with announced(namespace or "router", secured(here)):
         return process.run_at(endpoint, "router", msgspec.to_builtins(settings))
 

@@ -322,6 +322,7 @@ def check_keys(deployment: Deployment, host: str) -> None:
     """Check that the identity of `host` permits its processes. Raises ConfigError."""
     if not deployment.keys:
         return
+    client_endpoint(deployment, host)  # refuse an address for which no keys would do
     folder = identity_folder(deployment.keys, host)
     rows = {name: deployed_type(deployment, name) for name in deployment.hosts[host]}
     ours = {name: row.roles for name, row in rows.items() if not row.own}

@@ -184,6 +184,12 @@ def secured(endpoint: Endpoint) -> Endpoint:
     for text in texts:
         if not text.startswith((SECURE, PLAIN)) and not LOCAL_ENDPOINT.fullmatch(text):
             raise ConfigError(f"{text!r}: with keys, expected one like tls/192.168.1.10:7447")
+    for text in endpoint.connect:  # zenoh 1.10 takes it for an invalid DNS name, and would wait
+        if text.startswith((f"{SECURE}[", f"{PLAIN}[")):
+            raise ConfigError(
+                f"{text!r}: with keys, Zenoh connects to no IPv6 address; "
+                "give the host's name, or its IPv4 address"
+            )
     return structs.replace(
         endpoint,
         connect=tuple(_secure(text) for text in endpoint.connect),

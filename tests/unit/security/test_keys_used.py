@@ -7,7 +7,7 @@ import pytest
 
 from gigabrain_zenoh.bus.zenoh.config import session_config
 from gigabrain_zenoh.cli.faults import proxy
-from gigabrain_zenoh.cli.processes import router
+from gigabrain_zenoh.cli.processes import HostOptions, router
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.launch.deployment import (
@@ -18,6 +18,7 @@ from gigabrain_zenoh.launch.deployment import (
 )
 from gigabrain_zenoh.launch.processes import grants, names_by_role
 from gigabrain_zenoh.launch.specs import process_specs
+from gigabrain_zenoh.runtime.running import find_endpoint
 
 ROOT = Path(__file__).parents[3]
 
@@ -31,6 +32,33 @@ def test_with_keys_everything_is_tls_and_without_nothing_is(fleet: Path) -> None
         session_config(Endpoint(connect=("udp/10.0.0.1:1",), keys=keys))
     with pytest.raises(ConfigError, match=r"tls/10\.0\.0\.1:1 needs keys"):
         session_config(Endpoint(connect=("tls/10.0.0.1:1",)))
+
+
+@pytest.mark.parametrize("at", ["tls/[fd00::1]:7447", "tcp/[FD00:0::1]:7447"])
+def test_an_ipv6_address_that_zenoh_would_wait_for_is_refused(fleet: Path, at: str) -> None:
+    refusal = r"\]:7447': with keys, Zenoh connects to no IPv6 address; give the host's name"
+    with pytest.raises(ConfigError, match=refusal):
+        session_config(Endpoint(connect=(at,), keys=str(fleet / "operator")))
+    with pytest.raises(ConfigError, match=refusal):
+        check_keys(Deployment(router=at, keys=str(fleet / "robot@red")), "robot")
+    named = Endpoint(connect=("tls/robot.lan:7447",), keys=str(fleet / "operator"))
+    assert session_config(named)["connect/endpoints"] == ["tls/robot.lan:7447"]
+    assert session_config(Endpoint(connect=("tcp/[fd00::1]:7447",)))["mode"] == "client"
+
+
+def test_a_router_with_keys_may_listen_on_all_ipv6_addresses(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: list[Endpoint] = []
+
+    def run_at(*_: object) -> int:
+        found.append(find_endpoint(None))
+        return 0
+
+    monkeypatch.setattr(HostOptions, "run_at", run_at)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    router(listen=("tls/[::]:7447",), fleet=("red",), process=HostOptions(keys=fleet / "router"))
+    assert [one.connect for one in found] == [("tls/localhost:7447",)]
 
 
 @pytest.mark.parametrize(
