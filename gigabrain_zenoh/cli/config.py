@@ -160,7 +160,10 @@ def _running_rows(at: RobotAddress) -> list["Row"]:
 
 
 def with_values(path: Path, values: Mapping[str, str]) -> str:
-    """Return the YAML of a settings file with other values, given as text by dotted key."""
+    """Return the YAML of a settings file with other values, given as text by dotted key.
+
+    Raises ConfigError for a file that holds no settings.
+    """
     import yaml
 
     from gigabrain_zenoh.config.layers import Layers, assignment
@@ -168,7 +171,10 @@ def with_values(path: Path, values: Mapping[str, str]) -> str:
 
     layers = Layers(str(path))
     if path.exists():
-        layers.add(document(read(path), str(path)), lambda line: f"{path}:{line}")
+        root = document(read(path), str(path))
+        if root.entries is None:
+            raise ConfigError(f"{path}:{root.line}: expected a mapping of settings")
+        layers.add(root, lambda line: f"{path}:{line}")
     for key, text in values.items():
         layers.add(assignment(f"{key}={text}").nested(), lambda _: "param")
     return yaml.safe_dump(layers.root.value, sort_keys=False)

@@ -192,7 +192,11 @@ def set_param(
         value: New value.
         save: File to save it in, with all other changed parameters; see `param save`.
     """
+    from gigabrain_zenoh.cli.config import with_values
+
     check_result_path(save)
+    if save:
+        with_values(save, {})  # refuse a file that holds something else
     reply = ask_params(at, process, name, value)[process]
     if not reply.ok:
         raise Refused(f"{process}: {reply.text}")

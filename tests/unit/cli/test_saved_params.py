@@ -52,6 +52,20 @@ def test_a_file_that_cannot_be_written_is_named_before_anything_is_changed(
     assert asked == []
 
 
+@pytest.mark.parametrize("text", ["hello world\n", "- a\n- b\n", "a: [\n"])
+def test_a_file_that_holds_something_else_is_not_overwritten(
+    tmp_path: Path, asked: list[tuple[str, ...]], text: str
+) -> None:
+    file = tmp_path / "notes.txt"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=r"notes\.txt:[12]: (expected a mapping of|not YAML)"):
+        node.set_param("decision", "stop_margin", "0.1", save=file)
+    assert asked == []
+    with pytest.raises(ConfigError, match=r"notes\.txt:[12]: (expected a mapping of|not YAML)"):
+        node.save_params(file)
+    assert file.read_text() == text
+
+
 def test_a_full_disk_leaves_the_file_as_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
