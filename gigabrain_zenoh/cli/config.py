@@ -83,7 +83,7 @@ def merged_file(
 
     path = deployment_path(name)
     folder = str(expanded(keys).absolute()) if keys else ""
-    return merge(file_layers(path), files, sets, robot_type, path, folder)
+    return merge(file_layers(path), files, sets, robot_type, folder)
 
 
 def merged_values(

@@ -218,22 +218,8 @@ def load_deployment(path: Path, keys: str = "") -> Deployment:
     Raises ConfigError with file, line and what was expected.
     """
     root = with_files(config.document(config.read(path), str(path)), path.absolute().parent)
-    kind = deployment_type(own_names(root))
-    return with_keys(config.converted(root, kind, lambda line: f"{path}:{line}"), path, keys)
-
-
-def with_keys(loaded: Deployment, path: Path, keys: str = "") -> Deployment:
-    """Return the deployment of a file with keys and types beside it, unless `keys` replaces them.
-
-    The other files are placed by `with_files`.
-    """
-    folder, ros2 = path.absolute().parent, loaded.ros2
-    if loaded.keys and not keys:
-        keys = str(folder / expanded(loaded.keys))
-    if ros2:
-        own = tuple(str(folder / expanded(file)) for file in ros2.types)
-        ros2 = structs.replace(ros2, types=own)
-    return structs.replace(loaded, keys=keys, ros2=ros2)
+    loaded = config.converted(root, deployment_type(own_names(root)), lambda line: f"{path}:{line}")
+    return structs.replace(loaded, keys=keys or loaded.keys)
 
 
 def with_files(root: Node, folder: Path) -> Node:
@@ -246,9 +232,13 @@ def with_files(root: Node, folder: Path) -> Node:
         return str(folder.absolute() / expanded(name)) if name else name
 
     root = _placed(root, (), ("body", "world"), beside)
+    root = _placed(root, (), ("keys",), there)
     root = _placed(root, ("perception",), ("map",), beside)
     root = _placed(root, ("recorder",), ("folder", "file"), there)
     root = _placed(root, ("recognizer",), ("onnx", "labels"), there)
+    root = _placed(root, ("page",), ("certificate", "certificate_key", "tokens"), there)
+    root = _placed(root, ("foxglove",), ("secret",), there)
+    root = _placed(root, ("ros2",), ("types",), there)
     return _placed(root, ("decision", "settings"), ("mission", "scripts"), there)
 
 
@@ -260,12 +250,20 @@ def _placed(
     def placed(one: Entry) -> Entry:
         if parts and one.key == parts[0] and one.node.entries is not None:
             return replace(one, node=_placed(one.node, parts[1:], names, place))
-        if parts or one.key not in names or not isinstance(one.node.value, str):
+        if parts or one.key not in names:
             return one
-        return replace(one, node=replace(one.node, value=place(one.node.value)))
+        return replace(one, node=_with_place(one.node, place))
 
     entries = tuple(placed(one) for one in root.entries or ())
     return replace(root, entries=entries, value={one.key: one.node.value for one in entries})
+
+
+def _with_place(node: Node, place: Callable[[str], str]) -> Node:
+    """Return a text, or a list of texts, with `place` of each."""
+    if node.items is not None:
+        items = tuple(_with_place(one, place) for one in node.items)
+        return replace(node, items=items, value=[one.value for one in items])
+    return replace(node, value=place(node.value)) if isinstance(node.value, str) else node
 
 
 def own_names(root: Node) -> list[str]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.config import loading
@@ -21,7 +21,6 @@ from gigabrain_zenoh.launch.deployment import (
     deployment_type,
     own_names,
     with_files,
-    with_keys,
 )
 
 log = logging.getLogger(__name__)
@@ -63,10 +62,9 @@ def merge(
     files: Sequence[Path],
     sets: Iterable[str],
     robot_type: RobotType,
-    path: Path | None = None,
     keys: str = "",
 ) -> MergedDeployment:
-    """Lay settings files and `--set KEY=VALUE` over a deployment; `path` is its file.
+    """Lay settings files and `--set KEY=VALUE` over a deployment; `keys` replaces its keys.
 
     Raises ConfigError and UnknownName, with the place of the value.
     """
@@ -78,9 +76,7 @@ def merge(
         value = with_files(one._replace(key=key).nested(), Path())
         layers.add(value, lambda _, text=text: f"--set {text}")  # type: ignore[misc]
     deployment = layers.convert(_type_of(layers))
-    if path:
-        deployment = with_keys(deployment, path, keys)
-    return MergedDeployment(layers, deployment)
+    return MergedDeployment(layers, structs.replace(deployment, keys=keys or deployment.keys))
 
 
 def write_rows(run_dir: Path, rows: Sequence[Row]) -> None:

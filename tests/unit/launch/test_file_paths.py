@@ -15,7 +15,7 @@ HOMELESS = "~nobody7/a.yaml: no such home folder; write the whole path"
 def merged(folder: Path, *sets: str, files: tuple[Path, ...] = ()) -> Deployment:
     path = folder / "robot.yaml"
     return merging.merge(
-        merging.file_layers(path), files, sets, lambda body, link: Deployment, path
+        merging.file_layers(path), files, sets, lambda body, link: Deployment
     ).deployment
 
 
@@ -89,6 +89,34 @@ def test_so_are_a_body_a_map_and_recordings(
     assert found.body == str(here / "robot.yaml")
     assert found.perception.map == str(folder / "hall.yaml")
     assert found.recorder.file == str(here / "b.mcap")
+
+
+def test_so_are_keys_certificates_secrets_and_types_of_ros(
+    folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = "page: {certificate: page.crt, certificate_key: page.key, tokens: ~/tokens}\n"
+    text += "foxglove: {secret: secret}\nros2: {types: [msg, /b.msg]}\nkeys: home\n"
+    (folder / "robot.yaml").write_text(text)
+    (folder / "more").mkdir()
+    more = folder / "more" / "settings.yaml"
+    more.write_text("keys: others\nros2: {types: [srv]}\n")
+    here = tmp_path_factory.mktemp("here")
+    monkeypatch.chdir(here)
+    monkeypatch.setenv("HOME", "/home/ann")
+    for found in (load_deployment(folder / "robot.yaml"), merged(folder)):
+        assert found.page.certificate == str(folder / "page.crt")
+        assert found.page.certificate_key == str(folder / "page.key")
+        assert found.page.tokens == "/home/ann/tokens"
+        assert found.foxglove.secret == str(folder / "secret")
+        assert found.ros2
+        assert found.ros2.types == (str(folder / "msg"), "/b.msg")
+        assert found.keys == str(folder / "home")
+    found = merged(folder, "page.certificate=page.crt", files=(more,))
+    assert found.page.certificate == str(here / "page.crt")
+    assert found.ros2
+    assert found.ros2.types == (str(folder / "more" / "srv"),)
+    assert found.keys == str(folder / "more" / "others")
+    assert merged(folder, "keys=home/robot").keys == str(here / "home" / "robot")
 
 
 def test_names_of_known_bodies_and_saved_maps_stay_as_they_are(folder: Path) -> None:
