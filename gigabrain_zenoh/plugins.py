@@ -3,7 +3,7 @@
 import importlib
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -57,11 +57,13 @@ def plugin_names(shipped: Mapping[str, Any], group: str) -> list[str]:
     return list(dict.fromkeys((*shipped, *(point.name for point in offered(group)))))
 
 
-def load_plugin(kind: str, name: str, shipped: Mapping[str, Any], group: str) -> Any:
+def load_plugin(
+    kind: str, name: str, shipped: Mapping[str, Any], group: str, parts: Sequence[str] = ()
+) -> Any:
     """Return the object called `name`: a shipped one, or an entry point of `group`.
 
-    The table of shipped objects holds them, or strings "module:name".
-    Raises UnknownName with all names, and ConfigError if its import fails in any way.
+    The table of shipped objects holds them, or strings "module:name". Raises UnknownName with all
+    names, and ConfigError if its import fails in any way, or if it lacks an attribute of `parts`.
     """
     if name in shipped:
         found = shipped[name]
@@ -69,8 +71,13 @@ def load_plugin(kind: str, name: str, shipped: Mapping[str, Any], group: str) ->
     points = {point.name: point for point in offered(group)}
     if name not in points:
         raise unknown(kind, name, plugin_names(shipped, group))
+    where = f"{kind} {name!r} of {points[name].value}"
     try:
-        return points[name].load()
+        found = points[name].load()
     except Exception as error:  # noqa: BLE001 - a package may raise anything
         what = error if isinstance(error, ImportError | AttributeError) else repr(error)
-        raise ConfigError(f"{kind} {name!r} of {points[name].value}: {what}") from None
+        raise ConfigError(f"{where}: {what}") from None
+    if missing := [part for part in parts if not hasattr(found, part)]:
+        text = f"a {type(found).__name__} without {missing[0]}; see docs/how-to/your_own_process.md"
+        raise ConfigError(f"{where}: {text}")
+    return found

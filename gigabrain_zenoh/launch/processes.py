@@ -356,7 +356,7 @@ PROCESSES: Mapping[str, ProcessType] = {
 
 def process_type(name: str) -> ProcessType:
     """Return the row of a process. Raises UnknownName, and ConfigError if it is broken."""
-    found: ProcessType = load_plugin("process", name, PROCESSES, GROUP)
+    found: ProcessType = load_plugin("process", name, PROCESSES, GROUP, ("run", "roles"))
     return found
 
 

@@ -56,7 +56,8 @@ def check_known(name: str) -> None:
 
 def load(name: str) -> type[Perceptor]:
     """Return the perceptor called `name`. Raises UnknownName, and ConfigError if it is broken."""
-    return cast("type[Perceptor]", load_plugin("perceptor", name, SHIPPED, GROUP))
+    found = load_plugin("perceptor", name, SHIPPED, GROUP, ("Config", "step"))
+    return cast("type[Perceptor]", found)
 
 
 class PerceptorLoop:

@@ -192,7 +192,8 @@ def names() -> list[str]:
 
 def load(name: str) -> type[Behaviour]:
     """Return the behaviour called `name`. Raises UnknownName, and ConfigError if it is broken."""
-    return cast("type[Behaviour]", load_plugin("behaviour", name, SHIPPED, GROUP))
+    found = load_plugin("behaviour", name, SHIPPED, GROUP, ("Config", "step"))
+    return cast("type[Behaviour]", found)
 
 
 def needs_map(name: str) -> bool:

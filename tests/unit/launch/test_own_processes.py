@@ -8,11 +8,13 @@ import pytest
 
 from gigabrain_zenoh.cli.processes import HostOptions, router
 from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig, RouterConfig
+from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.launch.deployment import load_deployment
 from gigabrain_zenoh.launch.own_processes import check_installed, load_own
-from gigabrain_zenoh.launch.processes import own_processes
+from gigabrain_zenoh.launch.processes import own_processes, process_type, process_types
 from gigabrain_zenoh.launch.specs import process_specs
+from gigabrain_zenoh.perception import perceptors
 
 MODULE = '''"""A lamp."""
 
@@ -62,6 +64,29 @@ def test_the_only_host_runs_it_and_its_row_is_like_ours(tmp_path: Path) -> None:
     router = msgspec.json.decode(ours[0].argv[-1], type=ProcessConfig)
     assert router.settings["watches"] == ["mine"]
     assert router.endpoint.grants["mine"] == ("robot/lamp/**",)
+
+
+def test_what_a_package_offers_by_mistake_harms_only_who_names_it(
+    site: Path, tmp_path: Path
+) -> None:
+    info = site / "wrong-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: wrong\nVersion: 1.0\n")
+    groups = "[gigabrain.processes]\nbulb = lone_lamp:run\n"
+    groups += "[gigabrain.behaviours]\nbulb = lone_lamp\n"
+    groups += "[gigabrain.perceptors]\nbulb = lone_lamp:Config\n"
+    (info / "entry_points.txt").write_text(groups)
+    assert "bulb" not in process_types()
+    assert load_deployment(written(tmp_path, HEAD)).router == "tcp/127.0.0.1:7447"
+    for kind, load, what in (
+        ("process", process_type, "lone_lamp:run: a function without run"),
+        ("behaviour", behaviours.load, "lone_lamp: a module without step"),
+        ("perceptor", perceptors.load, "lone_lamp:Config: a StructMeta without Config"),
+    ):
+        with pytest.raises(ConfigError) as refused:
+            load("bulb")
+        expected = f"{kind} 'bulb' of {what}; see docs/how-to/your_own_process.md"
+        assert str(refused.value) == expected
 
 
 def test_a_router_by_hand_misses_no_process_that_nobody_has_named(
