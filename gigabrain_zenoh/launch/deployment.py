@@ -95,6 +95,9 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         if len(self.hosts) > MAX_HOSTS:
             raise ValueError(f"hosts: {len(self.hosts)} of them; expected at most {MAX_HOSTS}")
         self._place_own()
+        for host, names in self.hosts.items():
+            if not names:
+                raise ValueError(f"hosts.{host}: no process; name at least one, or remove the host")
         placed = Counter(name for names in self.hosts.values() for name in names)
         twice = sorted(name for name, times in placed.items() if times > 1)
         if twice:

@@ -41,6 +41,10 @@ PORT = "expected a path, or usb:VID:PID[:SERIAL], got"
             "f:2: recorder.topics: expected a key expression, got 'robot/sc*an': names joined",
         ),
         ("recorder:\n  topics: [scam]", "f:2: recorder.topics: no topic 'scam'; did you mean"),
+        (
+            "hosts:\n  robot: [router]\n  brain: []",
+            "f:3: hosts.brain: no process; name at least one, or remove the host",
+        ),
         ("body: mock\nnamespace: /red", "f:2: namespace: expected a name such as red, or names j"),
         ("namespace: a//b", "f:1: namespace: expected a name such as red, or names joined by '/'"),
         ("namespace: ../red", "f:1: namespace: expected a name such as red, or names joined by"),
