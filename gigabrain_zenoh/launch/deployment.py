@@ -206,6 +206,8 @@ def deployment_path(name: str) -> Path:
     """Return the deployment file at a path, or the shipped one of that name. Raises UnknownName."""
     path = Path(name)
     ours = {file.stem: file for file in sorted(deployment_folder().glob("*.yaml"))}
+    if name in ours and path.is_dir():
+        return ours[name]
     if not name or (not path.exists() and not name.endswith((".yaml", ".yml"))):
         if name not in ours:
             raise unknown("deployment", name, ours)

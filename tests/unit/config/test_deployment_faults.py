@@ -11,7 +11,13 @@ from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.config.layers import assignment
 from gigabrain_zenoh.config.settings import ButtonConfig
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.launch.deployment import Deployment, deployment_type, host_of
+from gigabrain_zenoh.launch.deployment import (
+    Deployment,
+    deployment_folder,
+    deployment_path,
+    deployment_type,
+    host_of,
+)
 
 PORT = "expected a path, or usb:VID:PID[:SERIAL], got"
 
@@ -132,6 +138,16 @@ def test_a_map_of_up_may_have_a_name_that_yaml_reads_otherwise(
     monkeypatch.setattr("gigabrain_zenoh.cli.demo.merged_file", merge)
     with pytest.raises(Begun):
         up("demo", map=name)
+
+
+def test_a_folder_does_not_hide_the_known_deployment_of_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "demo").mkdir()
+    assert deployment_path("demo") == deployment_folder() / "demo.yaml"
+    (tmp_path / "mine").mkdir()
+    assert deployment_path("mine") == Path("mine")
 
 
 def test_a_host_that_is_like_no_other_gets_no_suggestion() -> None:
