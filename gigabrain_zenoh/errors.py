@@ -2,7 +2,8 @@
 
 GigabrainError
 ├── ConfigError       a file or an option is wrong (exit code 2)
-│   └── UnknownName   no such robot, world, driver, process or behaviour
+│   ├── UnknownName   no such robot, world, driver, process or behaviour
+│   └── NotYetValid   keys that are valid only later: is the clock right?
 ├── BusError          the router is missing, or its port is taken
 │   └── Ambiguous     several robots run here, and none is named
 ├── Refused           the robot refused a request, with the reason
@@ -37,6 +38,10 @@ class ConfigError(GigabrainError):
 
 class UnknownName(ConfigError):
     """An unknown name."""
+
+
+class NotYetValid(ConfigError):
+    """Keys whose validity has not begun; it may once the clock is set."""
 
 
 class BusError(GigabrainError):

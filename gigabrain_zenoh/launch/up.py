@@ -12,7 +12,7 @@ from typing import Any, Self
 from gigabrain_zenoh import logs
 from gigabrain_zenoh.config.layers import Row
 from gigabrain_zenoh.decision import behaviours
-from gigabrain_zenoh.errors import BusError, ConfigError
+from gigabrain_zenoh.errors import BusError, ConfigError, NotYetValid
 from gigabrain_zenoh.host.run_folders import new_run_dir, state_dir, state_locked
 from gigabrain_zenoh.host.signals import stop_signals
 from gigabrain_zenoh.launch.deployment import (
@@ -95,6 +95,7 @@ class Notifier:
 STOP_S = 1.5  # until processes that do not end are killed
 LIMIT_S = STOP_S + 2.0  # until the supervisor itself is ended by force
 LOOK_S = 0.1
+CLOCK_S = 1.0  # between looks whether the clock is set
 ROUTERS = {"router", "relay"}  # without one of them no message is delivered on the host
 
 
@@ -115,13 +116,13 @@ async def up(
     Raises ConfigError for wrong settings and for a folder that cannot be written, and BusError if
     the router cannot run.
     """
-    check_keys(deployment, host)
+    notifier = Notifier.from_environment()
+    await _check_keys(deployment, host, print_line, notifier)
     check_installed(deployment, host, file)
     if "decision" in deployment.hosts[host]:
         behaviours.check(deployment.decision)
     deployment = with_free_port(deployment)
     label = deployment.namespace or deployment.body.replace("/", "-")
-    notifier = Notifier.from_environment()
     run_dir = new_run_dir(None, label)
     write_rows(run_dir, rows)
     remembers = state_dir() / "robots" / label
@@ -148,6 +149,28 @@ async def up(
             records.close()
             if not stopped:
                 records.check(supervisor)
+
+
+async def _check_keys(
+    deployment: Deployment, host: str, print_line: Callable[[str], None], notifier: Notifier
+) -> None:
+    """Check the keys of a host. Wait while its clock is before them, as at boot without a battery.
+
+    Raises ConfigError.
+    """
+    told = False
+    while True:
+        try:
+            check_keys(deployment, host)
+        except NotYetValid as error:
+            text = f"waiting for the clock to be set: {error}"
+            notifier.status(text)
+            if not told:
+                print_line(text)
+            told = True
+            await asyncio.sleep(CLOCK_S)
+        else:
+            return
 
 
 class _Records:

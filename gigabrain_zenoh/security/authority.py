@@ -21,7 +21,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from msgspec import Struct
 
 from gigabrain_schemas.topics import Role
-from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.errors import ConfigError, NotYetValid
 from gigabrain_zenoh.host.files import read_bounded, replace_file, sync_folder, write_synced
 from gigabrain_zenoh.host.network import host_and_port, is_host, is_ip
 from gigabrain_zenoh.security.acl import MAX_NAME_LENGTH, SERVERS, common_name, parse
@@ -288,7 +288,7 @@ def load(folder: Path, now: datetime.datetime | None = None) -> Identity:
         )
     if now < certificate.not_valid_before_utc:
         begins = certificate.not_valid_before_utc
-        raise ConfigError(f"{path} is valid from {begins:%Y-%m-%d}; is this machine's clock right?")
+        raise NotYetValid(f"{path} is valid from {begins:%Y-%m-%d}; is this machine's clock right?")
     authority = read_certificate(folder / CA)
     try:
         certificate.verify_directly_issued_by(authority)

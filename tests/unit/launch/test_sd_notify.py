@@ -1,12 +1,19 @@
 """Notifications of `gigabrain up` to a service manager, on a real datagram socket."""
 
+import asyncio
+import datetime
 import os
+import shutil
+from pathlib import Path
 
 import pytest
 
 from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.launch import up as up_module
+from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.launch.up import Notifier
 from gigabrain_zenoh.runtime import heartbeat
+from gigabrain_zenoh.security import authority
 from gigabrain_zenoh.testing.processes import ServiceManager
 
 
@@ -54,6 +61,34 @@ def test_a_watchdog_that_is_meant_for_another_process_is_not_fed(
         monkeypatch.setenv("WATCHDOG_PID", pid)
         Notifier.from_environment().alive()
         assert service_manager.received == received
+
+
+async def test_keys_that_are_valid_later_are_waited_for_until_the_clock_is_set(
+    service_manager: ServiceManager,
+    fleet: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    own = Path(shutil.copytree(fleet, tmp_path / "fleet"))
+    with monkeypatch.context() as set_back:  # of this host's clock, by a year
+        set_back.setattr(authority, "EARLY", -datetime.timedelta(days=365))
+        early = authority.issue(own, "robot", name="early", days=700)
+    deployment, printed = Deployment(keys=str(early)), list[str]()
+
+    async def pause(_: float) -> None:
+        if len(pauses) == 2:  # now it is set
+            shutil.rmtree(early)
+            authority.issue(own, "robot", name="early")
+        pauses.append(None)
+
+    pauses: list[None] = []
+    monkeypatch.setattr(asyncio, "sleep", pause)
+    notifier = Notifier(service_manager.address)
+    await up_module._check_keys(deployment, "robot", printed.append, notifier)
+    assert len(pauses) == 3
+    (line,) = printed
+    assert line.startswith(f"waiting for the clock to be set: {early / 'identity.crt'} is valid fr")
+    assert service_manager.received == [f"STATUS={line}"]
 
 
 class TurningClock(Clock):
