@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import errno
 import logging
 import socket
 import threading
@@ -80,6 +81,7 @@ async def open_session(endpoint: Endpoint) -> ZenohTransport:
     """
     session_config(endpoint)
     await _wait_for_names(endpoint.listen)
+    await _wait_for_addresses(endpoint.listen)
     opening = asyncio.ensure_future(ZenohTransport.open(endpoint))
     try:
         done, _ = await asyncio.wait((opening,), timeout=PATIENCE_S)
@@ -136,6 +138,30 @@ async def _wait_for_names(listen: Iterable[str]) -> None:
             _warn(_unknown_name(host))
         reported = host
         await asyncio.sleep(AGAIN_S)
+
+
+async def _wait_for_addresses(listen: Iterable[str]) -> None:
+    """Wait until this host has the router's own addresses: at boot, DHCP may be later."""
+    reported = ""
+    while missing := _missing_address(listen):
+        if missing != reported:
+            _warn(f"this host has no address {missing}; waiting for it (is it this host's own?)")
+        reported = missing
+        await asyncio.sleep(AGAIN_S)
+
+
+def _missing_address(endpoints: Iterable[str]) -> str:
+    """Return the first IP address in endpoints that this host does not have; empty for none."""
+    for host, _ in map(host_and_port, endpoints):
+        if is_ip(host):
+            family = socket.AF_INET6 if ":" in host else socket.AF_INET
+            try:
+                with socket.socket(family, socket.SOCK_STREAM) as trial:
+                    trial.bind((host, 0))
+            except OSError as error:
+                if error.errno == errno.EADDRNOTAVAIL:  # the session reports all others
+                    return host
+    return ""
 
 
 async def _explain(endpoint: Endpoint, opening: asyncio.Future[ZenohTransport]) -> None:

@@ -1,6 +1,7 @@
 """A process on its way to its router, where names of hosts are not known, or not yet."""
 
 import asyncio
+import errno
 import logging
 import socket
 
@@ -65,6 +66,26 @@ async def test_a_router_waits_for_its_own_name_and_says_so_once(
     transport = await joining
     await transport.close()
     assert len([text for text in told(caplog) if "cannot resolve" in text]) == 1
+
+
+async def test_a_router_waits_for_its_own_address_and_says_so_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(connect, "AGAIN_S", 0.01)
+    here, bind, asked = free_endpoint(), socket.socket.bind, list[object]()
+
+    def late(self: socket.socket, address: tuple[str, int]) -> None:
+        asked.append(address)
+        if len(asked) < 4:  # as before DHCP
+            raise OSError(errno.EADDRNOTAVAIL, "Cannot assign requested address")
+        bind(self, address)
+
+    monkeypatch.setattr(socket.socket, "bind", late)
+    transport = await open_session(Endpoint(listen=(here,)))
+    await transport.close()
+    assert told(caplog) == [
+        "this host has no address 127.0.0.1; waiting for it (is it this host's own?)"
+    ]
 
 
 async def test_who_waits_for_a_router_that_has_no_known_name_says_which(
