@@ -294,7 +294,8 @@ def limp(*, yes: bool = False, at: RobotAddress = LOCAL) -> None:
     if not yes:
         if not sys.stdin.isatty():
             raise ConfigError("arm limp asks a person first; give --yes where nobody can answer")
-        if input(LIMP_PROMPT).strip().lower() != "yes":
+        print(LIMP_PROMPT, end="", flush=True)
+        if sys.stdin.readline().strip().lower() != "yes":  # at Ctrl-D it is empty
             print_line("nothing is done")
             return
     _ask(at, lambda robot: robot.limp())
