@@ -61,8 +61,6 @@ export class Arm {
     tool.append('tool', ...AXES.flatMap((name, axis) => [
       this.#makeButton({ axis, way: -1 }, `tool ${name}`, '−'), makeElement('span', name), this.#makeButton({ axis, way: 1 }, `tool ${name}`, '+'),
     ]))
-    addEventListener('blur', () => this.releaseAll())
-    document.addEventListener('visibilitychange', () => this.releaseAll())
     setInterval(() => this.#sendWanted(), PERIOD_MS)
   }
 

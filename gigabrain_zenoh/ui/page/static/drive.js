@@ -78,8 +78,6 @@ export class Drive {
       if (event.code === 'Space' && !isTextInput(event.target)) event.preventDefault()
       if (this.#held.delete(event.code)) this.#sendWanted()
     }, true)
-    addEventListener('blur', () => this.releaseAll())
-    document.addEventListener('visibilitychange', () => this.releaseAll())
   }
 
   #listenToStick() {

@@ -6,6 +6,7 @@ import { Link } from './link.js'
 import { MapView } from './map.js'
 import { Objects } from './objects.js'
 import { $, publishedCameras, setText, showFigures, showGate, showHealth, showLogLine, showSafety, showTables, showTask } from './panels.js'
+import { onLostRelease } from './release.js'
 import { Settings } from './settings.js'
 import { WorldView } from './world_view.js'
 import { Zones } from './zones.js'
@@ -134,6 +135,8 @@ const arm = new Arm({
 const armHold = new ArmHold({
   hold: $('arm-hold'), limp: $('arm-limp'), ask: $('let-go'), yes: $('let-go-yes'), no: $('let-go-no'), request,
 })
+
+onLostRelease(releaseAll)
 
 /** Show what moves this body: its base, its joints, or both. */
 function showDrives(body) {

@@ -1,0 +1,75 @@
+"""Whatever drives by the page ends with its release, also where a browser reports none."""
+
+import asyncio
+from collections.abc import AsyncIterator
+
+import pytest
+import pytest_asyncio
+from playwright.async_api import Dialog, Page
+
+from gigabrain_zenoh.testing.waiting import until
+from tests.system.fake_page import Fake, serving
+from tests.system.page import Browser, browser, needs_browser
+from tests.system.test_page_map import PADS
+
+pytestmark = [needs_browser, pytest.mark.asyncio(loop_scope="module")]
+
+
+@pytest_asyncio.fixture(loop_scope="module", scope="module")
+async def fake(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Fake]:
+    made = Fake(tmp_path_factory.mktemp("fake"))
+    async with serving(made):
+        yield made
+
+
+@pytest_asyncio.fixture(loop_scope="module", scope="module")
+async def chromium(fake: Fake, tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Browser]:
+    async with browser(fake, tmp_path_factory.mktemp("profile")) as made:
+        yield made
+
+
+async def opened(chromium: Browser, fake: Fake) -> Page:
+    page = await chromium.open(before=PADS)
+    await page.wait_for_selector("#gate[data-mode=enabled]")
+    fake.steered.clear()
+    return page
+
+
+async def drives(fake: Fake) -> None:
+    await until(lambda: fake.steered and fake.steered[-1].linear_x > 0, "driven")
+
+
+async def stays_at_rest(page: Page, fake: Fake) -> None:
+    await until(lambda: not fake.steered or fake.steered[-1].linear_x == 0.0, "a zero at the end")
+    count = len(fake.steered)
+    await page.wait_for_timeout(500)
+    assert len(fake.steered) == count
+
+
+async def test_a_key_that_is_let_go_of_while_cmd_is_held_drives_no_more(
+    chromium: Browser, fake: Fake
+) -> None:
+    page = await opened(chromium, fake)
+    await page.keyboard.down("w")
+    await drives(fake)
+    await page.keyboard.down("Meta")  # on macOS, no keyup of "w" comes from now on
+    await stays_at_rest(page, fake)
+    await page.keyboard.up("Meta")
+    await page.keyboard.up("w")
+
+
+async def test_a_key_that_is_let_go_of_while_a_dialog_is_open_drives_no_more(
+    chromium: Browser, fake: Fake
+) -> None:
+    page = await opened(chromium, fake)
+    await page.keyboard.down("w")
+    await drives(fake)
+
+    async def answer(dialog: Dialog) -> None:
+        await asyncio.sleep(1.5)  # the key is let go of meanwhile, which the page is not told
+        await dialog.dismiss()
+
+    page.once("dialog", answer)
+    await page.evaluate("confirm('Load the map?')")
+    await stays_at_rest(page, fake)
+    await page.keyboard.up("w")
