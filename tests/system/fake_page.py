@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.arrays import ranges_bytes
 from gigabrain_schemas.base import Pose
-from gigabrain_schemas.body import Body, Camera, RobotState
+from gigabrain_schemas.body import Body, Camera, GateMode, RobotState
 from gigabrain_schemas.brain import (
     Contour,
     DetectedObject,
@@ -99,6 +99,7 @@ class Fake:
         values = {"port": free_port(), "tokens": str(tokens), "login": True} | config
         self.config = msgspec.convert(values, PageConfig)
         self._said = 0
+        self.mode: GateMode = "enabled"
         self.goals: list[GoalRequest] = []
         self.changes: list[TaskRequest] = []
         self.steered: list[Twist] = []
@@ -131,7 +132,7 @@ class Fake:
         """All that is said again and again."""
         state = EXAMPLES["RobotState"]
         assert isinstance(state, RobotState)
-        gate = replace(state.gate, mode="enabled", commander="control", causes=())
+        gate = replace(state.gate, mode=self.mode, commander="control", causes=())
         state = replace(state, pose=Pose(x=1.0, y=1.0, yaw=0.0), gate=gate)
         self.robot.publish(STATE, state)
         self.robot.publish(POSE, PoseInMap(x=0.5, y=0.0, yaw=0.0, covariance=(0.0,) * 9))

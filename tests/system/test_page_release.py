@@ -73,3 +73,36 @@ async def test_a_key_that_is_let_go_of_while_a_dialog_is_open_drives_no_more(
     await page.evaluate("confirm('Load the map?')")
     await stays_at_rest(page, fake)
     await page.keyboard.up("w")
+
+
+async def test_a_gamepad_held_while_the_robot_was_latched_must_be_pressed_again(
+    chromium: Browser, fake: Fake
+) -> None:
+    page = await opened(chromium, fake)
+    await page.evaluate("pads[0].axes[1] = -1; pads[0].buttons[5].pressed = true")
+    await drives(fake)
+    fake.mode = "latched"
+    await page.wait_for_selector("#gate[data-mode=latched]")
+    await stays_at_rest(page, fake)
+    fake.mode = "enabled"
+    await page.wait_for_selector("#gate[data-mode=enabled]")
+    await stays_at_rest(page, fake)
+    await page.evaluate("pads[0].buttons[5].pressed = false")
+    await page.wait_for_timeout(200)
+    await page.evaluate("pads[0].buttons[5].pressed = true")
+    await drives(fake)
+    await page.close()
+
+
+async def test_a_gamepad_drives_by_the_window_with_the_focus_only(
+    chromium: Browser, fake: Fake
+) -> None:
+    page = await opened(chromium, fake)
+    await page.evaluate("document.hasFocus = () => false")
+    await page.evaluate("pads[0].axes[1] = -1; pads[0].buttons[5].pressed = true")
+    await stays_at_rest(page, fake)
+    await page.evaluate("document.hasFocus = () => true")
+    await stays_at_rest(page, fake)  # until the button is pressed again
+    fake.presses.clear()
+    await page.evaluate("document.hasFocus = () => false; pads[0].buttons[1].pressed = true")
+    await until(lambda: fake.presses == ["page"], "stopped also without the focus")

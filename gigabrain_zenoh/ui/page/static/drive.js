@@ -13,6 +13,7 @@ export class Drive {
   #held = new Set()
   #stick = null // [x, z] while it is held
   #sending = false
+  #padWaits = false // for its shoulder buttons to be released
   #stopsPressed = 0 // on all gamepads
 
   /** `limits()` returns the highest speeds, `send(x, y, z)` sends a velocity, `stop()` is the e-stop. */
@@ -23,9 +24,10 @@ export class Drive {
     setInterval(() => { this.#readStopButtons(); this.#sendWanted() }, PERIOD_MS)
   }
 
-  /** Count all keys and the joystick as released. */
+  /** Count all keys, the joystick and gamepads as released. */
   releaseAll() {
     this.#held.clear()
+    this.#padWaits = true
     this.#centreStick()
     this.#sendWanted()
   }
@@ -57,7 +59,9 @@ export class Drive {
 
   #gamepadAxes() {
     const [pad] = gamepads()
-    if (!pad || !SHOULDER_BUTTONS.some((n) => pad.buttons[n]?.pressed)) return [0, 0, 0]
+    const held = pad && SHOULDER_BUTTONS.some((n) => pad.buttons[n]?.pressed)
+    this.#padWaits = held && (this.#padWaits || !document.hasFocus()) // another window may show another robot
+    if (!held || this.#padWaits) return [0, 0, 0]
     const axis = (n) => (Math.abs(pad.axes[n] ?? 0) < DEAD_ZONE ? 0 : -pad.axes[n])
     return [axis(1), axis(0), axis(2)]
   }
