@@ -106,3 +106,18 @@ async def test_a_gamepad_drives_by_the_window_with_the_focus_only(
     fake.presses.clear()
     await page.evaluate("document.hasFocus = () => false; pads[0].buttons[1].pressed = true")
     await until(lambda: fake.presses == ["page"], "stopped also without the focus")
+
+
+async def test_the_joystick_ignores_the_right_button_and_opens_no_menu(
+    chromium: Browser, fake: Fake
+) -> None:
+    page = await opened(chromium, fake)
+    await page.evaluate(
+        "addEventListener('contextmenu', (event) => { window.menu = !event.defaultPrevented })"
+    )
+    await page.hover("#stick", position={"x": 60, "y": 5})
+    await page.mouse.down(button="right")
+    await page.wait_for_timeout(500)
+    assert fake.steered == []
+    await page.mouse.up(button="right")
+    assert await page.evaluate("menu") is False  # it would hide the release of the left button

@@ -93,7 +93,9 @@ export class Drive {
       const knob = this.stick.firstElementChild
       knob.style.transform = `translate(${(right / length) * radius * 0.7}px, ${(down / length) * radius * 0.7}px)`
     }
+    this.stick.addEventListener('contextmenu', (event) => event.preventDefault()) // which hides the release
     this.stick.addEventListener('pointerdown', (event) => {
+      if (event.button > 0) return
       this.stick.setPointerCapture(event.pointerId)
       move(event)
       this.#sendWanted()
