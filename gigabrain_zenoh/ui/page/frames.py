@@ -41,6 +41,7 @@ ABOUT, STATE, SCAN, MAP, HEALTH, LOG, REPLY, IMAGE, TASK = range(1, 10)  # to th
 SCENE, POSES, ZONES = 10, 11, 12
 CAMERA, FOUND, CONTOURS, PERCEIVED, OBJECTS, ARM_PLAN = range(13, 19)
 LOGIN, DRIVE, ASK, WATCH, SHOWN, JOG = range(1, 7)  # from the browser
+ENTERED = ("goal", "world", "zones", "process", "name", "value")  # by a person, in a request
 MAX_KEPT_LINES = 30  # of the log, for viewers that connect later
 
 log = logging.getLogger(__name__)
@@ -184,6 +185,24 @@ def decoded(content: bytes, kind: type[T]) -> T:
         return msgspec.json.decode(content, type=kind)
     except DECODE_ERRORS as error:
         raise ValueError(str(error)) from None
+
+
+def request_of(content: bytes) -> PageRequest | PageReply:
+    """Return the request in a frame, or its refusal if a value in it was entered wrong.
+
+    Raises ValueError for a frame that the page never sends.
+    """
+    try:
+        return decoded(content, PageRequest)
+    except ValueError as error:
+        fields = decoded(content, dict[str, Any])
+        made = {name: value for name, value in fields.items() if name not in ENTERED}
+        request = decoded(msgspec.json.encode(made), PageRequest)
+        text, _, path = str(error).partition(" - at `$.")
+        if "regex" in text:
+            text = "Expected a name of letters, digits, spaces, - _ and ."
+        text = f"{text[0].lower()}{text[1:]} at {path.rstrip('`')}"
+        return PageReply(id=request.id, what=request.what, ok=False, text=text)
 
 
 class PageView(ViewerScene):

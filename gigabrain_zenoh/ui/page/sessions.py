@@ -364,7 +364,11 @@ class Sessions:
             if not self._arbiter.jog(viewer.number, speeds, now_s):
                 self._reply(viewer, OTHER_STEERS)
         elif kind == bytes((frames.ASK,)):
-            self._start_request(viewer, frames.decoded(content, PageRequest))
+            request = frames.request_of(content)
+            if isinstance(request, PageReply):
+                self._reply(viewer, request)
+            else:
+                self._start_request(viewer, request)
         else:
             raise ValueError("unknown frame")
 

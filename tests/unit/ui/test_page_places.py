@@ -5,6 +5,7 @@ import contextlib
 from collections.abc import AsyncIterator
 from pathlib import Path
 
+import msgspec
 import pytest
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
@@ -102,3 +103,50 @@ async def test_200_browsers_without_a_login_keep_no_operator_out(page: Page) -> 
     assert [each.code for each in silent] == [4401] * 136 + [0] * 64
     operator = await page.comes(page.tokens.operator)
     assert (operator.code, len(page.sessions.viewers)) == (0, 1)
+
+
+TRIANGLE = [[0, 0], [1, 0], [1, 1]]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "text"),
+    [
+        (
+            {"what": "zones", "zones": {"place": {"name": "desk #1", "x": 0, "y": 0}}},
+            "expected a name of letters, digits, spaces, - _ and . at zones.place.name",
+        ),
+        (
+            {
+                "what": "zones",
+                "zones": {
+                    "zone": {"name": "z", "kind": "speed", "points": TRIANGLE, "max_speed": 0}
+                },
+            },
+            "expected `float` >= 0.05 at zones.zone.max_speed",
+        ),
+        (
+            {
+                "what": "zones",
+                "zones": {"zone": {"name": "z", "kind": "keepout", "points": [[0, 0]] * 300}},
+            },
+            "expected `array` of length <= 256 at zones.zone.points",
+        ),
+        (
+            {"what": "set", "process": "driver", "name": "speed_limit", "value": "1" * 501},
+            "expected `str` of length <= 500 at value",
+        ),
+    ],
+    ids=["name", "speed", "corners", "setting"],
+)
+async def test_a_value_out_of_bounds_is_refused_and_the_browser_stays_connected(
+    page: Page, wanted: dict[str, object], text: str
+) -> None:
+    operator = await page.comes(page.tokens.operator)
+    operator.said.put_nowait(frames.as_json(frames.ASK, {"id": 3, **wanted}))
+    for _ in range(5):
+        await settle()
+    assert operator.code == 0
+    replies = [frame for frame in operator.got if frame[0] == frames.REPLY]
+    assert [msgspec.json.decode(reply[1:], type=frames.PageReply) for reply in replies] == [
+        frames.PageReply(id=3, what=str(wanted["what"]), ok=False, text=text)
+    ]
