@@ -25,6 +25,14 @@ window.sent = 0
 const send = WebSocket.prototype.send
 WebSocket.prototype.send = function (frame) { window.sent++; send.call(this, frame) }
 """
+QUICK_CHECKS = """
+window.sockets = []
+window.WebSocket = class extends WebSocket {
+  constructor(...args) { super(...args); sockets.push(this) }
+}
+const every = setInterval
+window.setInterval = (act, ms) => every(act, ms / 20)
+"""
 MOVE_STICK_LEFT = """() => {
   const stick = document.getElementById('stick'), box = stick.getBoundingClientRect(), before = sent
   const at = { clientX: box.left + 5, clientY: box.top + box.height / 2 }
@@ -204,3 +212,12 @@ async def test_a_page_of_which_a_file_did_not_arrive_is_loaded_again(
     page = await chromium.open()
     await expect(page.locator("header")).to_have_css("display", "flex")
     await expect(page.locator("#link")).to_have_class("badge live")
+
+
+async def test_a_connection_whose_end_is_not_reported_is_replaced(chromium: Browser) -> None:
+    page = await chromium.open(before=QUICK_CHECKS)
+    await page.evaluate("sockets[0].onmessage = null")  # as when the robot has lost its power
+    await page.wait_for_selector("#link:not(.live)")
+    assert await page.evaluate("sockets[0].readyState") == 1  # open
+    await page.wait_for_selector("#link.live")
+    assert await page.evaluate("sockets.map((one) => one.readyState > 1)") == [True, False]

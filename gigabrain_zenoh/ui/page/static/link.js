@@ -3,6 +3,7 @@ const ABOUT = 1, STATE = 2, SCAN = 3, MAP = 4, HEALTH = 5, LOG = 6, REPLY = 7, I
 const CAMERA = 13, FOUND = 14, CONTOURS = 15, PERCEIVED = 16, OBJECTS = 17, ARM_PLAN = 18
 const LOGIN = 1, DRIVE = 2, ASK = 3, WATCH = 4, SHOWN = 5, JOG = 6
 const SILENT_AFTER_MS = 1000, RETRY_MS = [300, 600, 1200, 2500], FULL_RETRY_MS = 5000
+const CHECK_MS = 250, MAX_SILENT_CHECKS = 80 // 20 s; checks are counted, as a page that is held up receives nothing
 const WRONG_TOKEN = 4401, FULL = 4429 // codes of a closed WebSocket
 
 const decoder = new TextDecoder(), encoder = new TextEncoder()
@@ -13,13 +14,14 @@ export class Link {
   #lastId = 0
   #pending = new Map() // by the id of a request: what resolves it
   #receivedMs = 0
+  #silentChecks = 0
 
   /** `on` has about, robot, scan, map, task, health, log, image, camera, found, contours, perceived, objects, armPlan, scene, poses, zones, reply, connection(status) and login(). */
   constructor(on, token) {
     this.on = on
     this.token = token
     this.open()
-    setInterval(() => this.#checkSilence(), 250)
+    setInterval(() => this.#checkSilence(), CHECK_MS)
   }
 
   open() {
@@ -30,6 +32,7 @@ export class Link {
     socket.onmessage = (event) => this.#receive(event.data)
     socket.onclose = (event) => this.#closed(event.code)
     this.#socket = socket
+    this.#silentChecks = 0
   }
 
   get live() { return performance.now() - this.#receivedMs < SILENT_AFTER_MS }
@@ -117,5 +120,14 @@ export class Link {
 
   #checkSilence() {
     if (this.#receivedMs && !this.live) this.on.connection('silent')
+    this.#silentChecks = this.live ? 0 : this.#silentChecks + 1
+    if (this.#silentChecks > MAX_SILENT_CHECKS && this.#socket.readyState < WebSocket.CLOSING) this.#abandon()
+  }
+
+  /** Replace a connection whose end is not reported, as of a robot that has lost its power. */
+  #abandon() {
+    this.#socket.onmessage = this.#socket.onclose = null
+    this.#socket.close()
+    this.#closed()
   }
 }
