@@ -5,6 +5,7 @@ import contextlib
 import itertools
 import logging
 from collections.abc import Callable, Iterable, Sequence
+from typing import Literal
 
 from msgspec.structs import replace
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -53,6 +54,7 @@ MAX_REPLY_CHARS = 500
 MAX_REASON_BYTES = 120  # of a reason for closing
 MAX_WAITING_FRAMES = 64  # for a slow browser
 BAD_FRAME, WRONG_TOKEN, FULL = 1008, 4401, 4429  # codes for closing a WebSocket (RFC 6455 7.4)
+Admission = Role | Literal["late"] | None  # None for a wrong token
 OTHER_STEERS = PageReply(
     id=0, what="drive", ok=False, text="another page steers the robot; wait until it stops"
 )
@@ -202,7 +204,7 @@ class Sessions:
         self._access = access
         self._numbers = itertools.count(1)
         self._pending: dict[asyncio.Task[None], Viewer] = {}
-        self._logins: list[asyncio.Task[Role | None]] = []
+        self._logins: list[asyncio.Task[Admission]] = []
         self._loop = asyncio.get_running_loop()
         self._rates = RateLimiter()
         self.viewers: list[Viewer] = []
@@ -250,7 +252,7 @@ class Sessions:
         await socket.accept()
         with contextlib.suppress(WebSocketDisconnect):
             role = await self._admit(socket)
-            if role is None or not self._has_place(role):
+            if role is None or role == "late" or not self._has_place(role):
                 await socket.close(FULL if role else WRONG_TOKEN)
                 return
             viewer = Viewer(next(self._numbers), role)
@@ -268,7 +270,7 @@ class Sessions:
             self.viewers.remove(looking[0])
         return len(self.viewers) < MAX_OPERATORS
 
-    async def _admit(self, socket: WebSocket) -> Role | None:
+    async def _admit(self, socket: WebSocket) -> Admission:
         login = self._loop.create_task(self._login(socket))
         self._logins.append(login)
         if len(self._logins) > MAX_LOGINS:
@@ -279,16 +281,18 @@ class Sessions:
             login.cancel()
             if login in self._logins:
                 self._logins.remove(login)
-        return None if login.cancelled() else login.result()
+        return "late" if login.cancelled() else login.result()
 
-    async def _login(self, socket: WebSocket) -> Role | None:
+    async def _login(self, socket: WebSocket) -> Admission:
         try:
             message = await asyncio.wait_for(socket.receive(), LOGIN_TIMEOUT_S)
             frame = message.get("bytes") or b""
             if frame[:1] != bytes((frames.LOGIN,)):
                 return None
             role = self._access.role(frames.decoded(frame[1:], frames.Login).token)
-        except (TimeoutError, ValueError):
+        except TimeoutError:
+            return "late"
+        except ValueError:
             return None
         if role is None:
             log.warning("refused a browser with a wrong token")

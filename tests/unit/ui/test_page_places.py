@@ -11,8 +11,8 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from gigabrain_zenoh.config.settings import PageConfig
 from gigabrain_zenoh.testing.in_memory import Net
-from gigabrain_zenoh.testing.waiting import settle
-from gigabrain_zenoh.ui.page import frames
+from gigabrain_zenoh.testing.waiting import settle, until
+from gigabrain_zenoh.ui.page import frames, sessions
 from gigabrain_zenoh.ui.page.access import Access, tokens
 from gigabrain_zenoh.ui.page.sessions import Sessions
 
@@ -100,9 +100,21 @@ async def test_operators_get_in_though_all_places_are_taken_by_operators(page: P
 
 async def test_200_browsers_without_a_login_keep_no_operator_out(page: Page) -> None:
     silent = [await page.comes() for _ in range(200)]
-    assert [each.code for each in silent] == [4401] * 136 + [0] * 64
+    assert [each.code for each in silent] == [4429] * 136 + [0] * 64
     operator = await page.comes(page.tokens.operator)
     assert (operator.code, len(page.sessions.viewers)) == (0, 1)
+
+
+async def test_a_browser_that_logs_in_late_is_told_to_come_again_and_keeps_its_token(
+    page: Page, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sessions, "LOGIN_TIMEOUT_S", 0.01)
+    late = await page.comes()
+    await until(lambda: late.code)
+    assert late.code == 4429
+    wrong = await page.comes("not-a-token-of-this-page")
+    await until(lambda: wrong.code)
+    assert wrong.code == 4401
 
 
 TRIANGLE = [[0, 0], [1, 0], [1, 1]]
