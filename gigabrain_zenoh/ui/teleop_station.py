@@ -25,6 +25,7 @@ from gigabrain_zenoh.errors import GigabrainError, Refused
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.host.posix import termios
+from gigabrain_zenoh.host.terminal import Display
 
 PERIOD_S = 0.05
 KEYS_HELP = (
@@ -241,7 +242,11 @@ class TeleopStation:
 
     async def _until_quit(self, body: BodyDescription) -> None:
         loop = asyncio.get_running_loop()
-        with typed_keys(self._type), Live(auto_refresh=False, screen=False) as live:
+        with (
+            typed_keys(self._type),
+            Live(auto_refresh=False, screen=False) as live,
+            Display[Text](lambda text: live.update(text, refresh=True), room=1) as display,
+        ):
             while not self._quit:
                 wanted = self._keys.velocity(body, loop.time())
                 if wanted == ZERO and self._pad.pad:
@@ -252,7 +257,7 @@ class TeleopStation:
                 self._steer(body, wanted)
                 if body.joints:
                     self._jog(body, loop.time())
-                live.update(Text("\n".join(self._lines(wanted))), refresh=True)
+                display.put(Text("\n".join(self._lines(wanted))))
                 await asyncio.sleep(PERIOD_S)
 
     def _steer(self, body: BodyDescription, wanted: Velocity) -> None:
@@ -371,6 +376,7 @@ def typed_keys(take: Callable[[str], None]) -> Iterator[None]:
         take(os.read(fd, 1024).decode(errors="replace"))
 
     keys = termios.tcgetattr(fd)
+    keys[0] &= ~termios.IXON  # Ctrl-S does not stop the display
     keys[3] &= ~(termios.ICANON | termios.ECHO | termios.ISIG)  # Ctrl-C is a key here, so that the
     termios.tcsetattr(fd, termios.TCSADRAIN, keys)  # body is stopped before the program ends
     loop.add_reader(fd, read)

@@ -1,9 +1,14 @@
 """Keys and gamepad of teleoperation; releasing either stops the robot."""
 
 import asyncio
+import contextlib
 import os
+import pty
 import struct
-from collections.abc import Callable
+import sys
+import termios
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import cast
 
@@ -137,7 +142,7 @@ class Held:
     def __init__(self, asked: Callable[[], None] = lambda: None) -> None:
         self.state: RobotState | None = None
         self.steered: list[Velocity] = []
-        self.enabled = 0
+        self.enabled = self.pressed = 0
         self._asked = asked
 
     async def read_body(self) -> object:
@@ -150,6 +155,10 @@ class Held:
 
     def steer(self, wanted: Velocity) -> None:
         self.steered.append(wanted)
+
+    async def estop(self, reason: str) -> GateReply:
+        self.pressed += 1
+        return example(GateReply)
 
     async def enable(self, source: str, *, take: bool) -> object:
         self.enabled += source == BRAIN
@@ -172,6 +181,56 @@ async def test_a_station_that_a_signal_ends_stops_the_body_and_hands_it_back(
     await cancelled_while_driving(robot, tmp_path)
     assert robot.steered[-1] == ZERO
     assert robot.enabled == 2  # for the station, and for the brain again
+
+
+@contextlib.contextmanager
+def terminal() -> Iterator[int]:
+    """A terminal as standard input and output; yields its other end."""
+    screen, tty = pty.openpty()
+    with (
+        open(tty) as typed,
+        open(tty, "w", closefd=False) as shown,
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        patch.setenv("TERM", "xterm")
+        patch.setattr("rich._console", None)  # remembers what its output was
+        patch.setattr("sys.stdin", typed)
+        patch.setattr("sys.stdout", shown)
+        yield screen
+    os.close(screen)
+
+
+@pytest.mark.parametrize("halt", ["Ctrl-S", "Scroll Lock"])
+async def test_the_space_bar_stops_while_the_terminal_takes_no_output(
+    tmp_path: Path, halt: str
+) -> None:
+    robot, resumed = Held(), threading.Event()
+    station = TeleopStation(cast(Robot, robot), Gamepad(tmp_path))
+    with terminal() as screen:
+        driving = asyncio.create_task(station.drive(take=True))
+        await until(lambda: len(robot.steered) > 1)
+
+        def resume() -> None:
+            resumed.set()
+            termios.tcflow(sys.stdin, termios.TCOON)
+            os.write(screen, b"\x11")
+
+        watchdog = threading.Timer(5.0, resume)
+        watchdog.start()
+        if halt == "Ctrl-S":
+            os.write(screen, b"\x13")
+        else:
+            termios.tcflow(sys.stdin, termios.TCOOFF)
+        await asyncio.sleep(0.2)  # for several updates
+        os.write(screen, b" ")
+        await until(lambda: robot.pressed)
+        if halt == "Scroll Lock":
+            termios.tcflow(sys.stdin, termios.TCOON)
+        driving.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await driving
+        watchdog.cancel()
+    assert not resumed.is_set()
 
 
 async def test_a_station_that_cannot_return_the_body_reports_it_and_ends(
