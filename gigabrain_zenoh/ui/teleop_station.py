@@ -49,6 +49,7 @@ MOVES: Final[dict[str, Axes]] = {
 }  # fmt: skip
 JOG_KEYS: Final[dict[str, int]] = {"j": -1, "k": 1}  # of the chosen joint
 ARROW_KEYS = {"A": "up", "B": "down", "C": "right", "D": "left"}
+BEGUN_SEQUENCE = re.compile(r"\x1b(?:[\[O][\d;]*)?\Z")  # its rest is still to come
 KEY_PATTERN = re.compile(r"\x1b[\[O](?:\d+(?:;\d+)*)?([A-Za-z~])|(.)", re.DOTALL)
 
 EVENT = struct.Struct("<IhBB")  # milliseconds, value, type, number
@@ -370,10 +371,14 @@ def typed_keys(take: Callable[[str], None]) -> Iterator[None]:
         yield
         return
     fd, loop = sys.stdin.fileno(), asyncio.get_running_loop()
-    before = termios.tcgetattr(fd)
+    before, begun = termios.tcgetattr(fd), ""
 
     def read() -> None:
-        take(os.read(fd, 1024).decode(errors="replace"))
+        nonlocal begun
+        typed = begun + os.read(fd, 1024).decode(errors="replace")
+        found = BEGUN_SEQUENCE.search(typed)
+        begun = found.group() if found else ""
+        take(typed.removesuffix(begun))
 
     keys = termios.tcgetattr(fd)
     keys[0] &= ~termios.IXON  # Ctrl-S does not stop the display

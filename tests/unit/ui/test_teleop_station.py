@@ -35,6 +35,7 @@ from gigabrain_zenoh.ui.teleop_station import (
     joint_readout,
     keys_of,
     readout,
+    typed_keys,
 )
 
 WAFFLE = load_robot("turtlebot3_waffle")  # 0.26 m/s, 1.82 rad/s
@@ -231,6 +232,16 @@ async def test_the_space_bar_stops_while_the_terminal_takes_no_output(
             await driving
         watchdog.cancel()
     assert not resumed.is_set()
+
+
+async def test_an_arrow_that_arrives_byte_by_byte_is_no_letter() -> None:
+    found: list[str] = []
+    with terminal() as screen, typed_keys(lambda typed: found.extend(keys_of(typed))):
+        for byte in b"\x1b[A\x1bw\x1b[1;5D ":
+            os.write(screen, bytes((byte,)))
+            await asyncio.sleep(0.01)  # read before the next
+        await until(lambda: " " in found)
+    assert found == ["up", "w", "left", " "]
 
 
 async def test_a_station_that_cannot_return_the_body_reports_it_and_ends(
