@@ -61,7 +61,7 @@ OTHER_STEERS = PageReply(
 
 
 class Viewer:
-    """Frames that wait for one browser: the newest of each slot; the oldest go if too many."""
+    """Frames that wait for one browser: the newest of each slot; lines of the log give way."""
 
     def __init__(self, number: int, role: Role) -> None:
         self.number, self.role = number, role
@@ -74,7 +74,7 @@ class Viewer:
         """Send `frame` instead of what still waits in its slot. Never waits."""
         self._slots[slot] = frame
         while len(self._slots) > MAX_WAITING_FRAMES:
-            del self._slots[next(iter(self._slots))]
+            del self._slots[min(self._slots, key=lambda slot: not slot.startswith("log/"))]
         self._filled.set()
 
     async def next_frame(self) -> bytes:

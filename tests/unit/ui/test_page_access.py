@@ -212,6 +212,18 @@ async def test_a_slow_browser_gets_the_newest_and_never_more_than_64_frames() ->
     assert await viewer.next_frame() == b"936"
 
 
+async def test_lines_of_the_log_displace_nothing_else_for_a_slow_browser() -> None:
+    viewer = Viewer(1, "viewer")
+    once = [b"about", b"map", b"zones", b"reply/1"]
+    for frame in once:
+        viewer.queue(frame.decode(), frame)
+    for n in range(100):
+        viewer.queue(f"log/{n}", b"log %d" % n)
+    viewer.queue("state", b"state")
+    got = [await viewer.next_frame() for _ in range(64)]
+    assert got == [*once, *(b"log %d" % n for n in range(41, 100)), b"state"]
+
+
 def test_of_each_viewer_120_messages_a_second_are_processed() -> None:
     rates = RateLimiter()
     assert not any(rates.is_exceeded(1, 10.0 + n / 200) for n in range(120))
