@@ -9,7 +9,7 @@ from playwright.async_api import Page, expect
 
 from gigabrain_zenoh.testing.waiting import until
 from tests.system.fake_page import Fake, serving
-from tests.system.page import Browser, browser, needs_browser
+from tests.system.page import OPERATOR, Browser, browser, needs_browser
 
 pytestmark = [needs_browser, pytest.mark.asyncio(loop_scope="module")]
 
@@ -221,3 +221,15 @@ async def test_a_connection_whose_end_is_not_reported_is_replaced(chromium: Brow
     assert await page.evaluate("sockets[0].readyState") == 1  # open
     await page.wait_for_selector("#link.live")
     assert await page.evaluate("sockets.map((one) => one.readyState > 1)") == [True, False]
+
+
+async def test_an_address_with_a_token_logs_in_a_page_that_is_open_already(
+    chromium: Browser, fake: Fake
+) -> None:
+    page = await chromium.open()
+    await page.evaluate("sessionStorage.clear()")
+    await page.goto(fake.origin)
+    await page.wait_for_selector("#login[open]")
+    await page.goto(f"{fake.origin}/#{OPERATOR}")  # only the part after # changes
+    await page.wait_for_selector("#link.live")
+    assert await page.evaluate("location.hash") == ""

@@ -59,7 +59,6 @@ async def test_over_tls_a_token_opens_the_page_to_drive_and_another_to_look(
         stranger = await chromium.open(VIEWER)
         await stranger.evaluate("sessionStorage.clear()")
         await stranger.goto(f"{fake.origin}/#a-wrong-token-of-some-length")
-        await stranger.reload()
         await stranger.wait_for_selector("#login[open]")
         await stranger.fill("#token", OPERATOR)
         await stranger.click("#login button")

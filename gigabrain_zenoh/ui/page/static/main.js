@@ -23,6 +23,7 @@ let robot = null // its present state
 
 const token = decodeURIComponent(location.hash.slice(1))
 if (token) { store('token', token); history.replaceState(null, '', location.pathname) }
+addEventListener('hashchange', () => location.reload()) // another token
 
 const map = new MapView($('map'), sendGoal)
 const world = new WorldView($('world'), {
