@@ -233,3 +233,9 @@ async def test_an_address_with_a_token_logs_in_a_page_that_is_open_already(
     await page.goto(f"{fake.origin}/#{OPERATOR}")  # only the part after # changes
     await page.wait_for_selector("#link.live")
     assert await page.evaluate("location.hash") == ""
+
+
+async def test_an_address_with_a_percent_sign_opens_the_page(chromium: Browser, fake: Fake) -> None:
+    page = await chromium.open()
+    await page.goto(f"{fake.origin}/#100%-of-nothing")
+    await page.wait_for_selector("#login[open]")

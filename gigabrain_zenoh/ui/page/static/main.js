@@ -16,12 +16,13 @@ const NARROW_PX = 860 // below, the page is that of a phone; see style.css
 const STOP_TIMEOUT_MS = 2500 // the server gives up after two seconds
 const BY_HAND = 'press the hardware e-stop or cut the power'
 const stored = (key) => { try { return sessionStorage.getItem(key) ?? '' } catch { return '' } }
+const decoded = (text) => { try { return decodeURIComponent(text) } catch { return text } } // no % of a URL
 const store = (key, value) => { try { sessionStorage.setItem(key, value) } catch { /* private mode */ } }
 
 let about = { role: 'operator', body: null }
 let robot = null // its present state
 
-const token = decodeURIComponent(location.hash.slice(1))
+const token = decoded(location.hash.slice(1))
 if (token) { store('token', token); history.replaceState(null, '', location.pathname) }
 addEventListener('hashchange', () => location.reload()) // another token
 
