@@ -2,11 +2,15 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
+from pathlib import Path
 
 import pytest
 import pytest_asyncio
 from playwright.async_api import Page, expect
 
+from gigabrain_drivers.driver.catalog import load_robot
+from gigabrain_schemas.body import Body
+from gigabrain_schemas.topics import BODY
 from gigabrain_zenoh.testing.waiting import until
 from tests.system.fake_page import Fake, serving
 from tests.system.page import OPERATOR, Browser, browser, needs_browser
@@ -33,6 +37,21 @@ window.WebSocket = class extends WebSocket {
 const every = setInterval
 window.setInterval = (act, ms) => every(act, ms / 20)
 """
+RESTARTED_DRIVER = """async () => {
+  const { MapView } = await import('/map.js')
+  const view = new MapView(document.createElement('canvas'), () => {})
+  const head = new DataView(new ArrayBuffer(20))
+  head.setFloat32(0, 0.05, true)
+  head.setUint32(12, 1, true)
+  head.setUint32(16, 1, true)
+  view.setMap(head, new Int8Array(1))
+  view.setTask({ goal: { x: 3, y: 0, yaw: null } })
+  const at = (x) => ({ x, y: 0, yaw: 0 })
+  const frame = (boot, x) => ({ state: { boot, pose: at(x) }, pose: at(x), frame: 'odom' })
+  const silent = { state: null, pose: null, frame: 'odom' }
+  for (const robot of [frame(1, 0), frame(1, 1), silent, frame(2, 5)]) view.setRobot(robot)
+  return [view.trail, Boolean(view.map), view.goal.x]
+}"""  # returns the driven path, whether there is a map, and the goal
 MOVE_STICK_LEFT = """() => {
   const stick = document.getElementById('stick'), box = stick.getBoundingClientRect(), before = sent
   const at = { clientX: box.left + 5, clientY: box.top + box.height / 2 }
@@ -239,3 +258,29 @@ async def test_an_address_with_a_percent_sign_opens_the_page(chromium: Browser, 
     page = await chromium.open()
     await page.goto(f"{fake.origin}/#100%-of-nothing")
     await page.wait_for_selector("#login[open]")
+
+
+async def test_a_driver_that_starts_again_begins_a_new_path_on_the_same_map(
+    chromium: Browser,
+) -> None:
+    page = await chromium.open()
+    assert await page.evaluate(RESTARTED_DRIVER) == [[[5, 0]], True, 3]
+
+
+class Mapless(Fake):
+    """A robot that makes no map."""
+
+    def say_once(self) -> None:
+        body = load_robot("turtlebot3_waffle").description()
+        self.robot.publish(BODY, Body(description=body, link="sim"))
+
+
+async def test_of_an_earlier_run_no_map_is_left_after_a_new_connection(tmp_path: Path) -> None:
+    first = Fake(tmp_path)
+    async with browser(first, tmp_path / "profile") as chromium:
+        async with serving(first):
+            page = await chromium.open()
+            await drawn(page, -1.5, 0.5, dark, "the wall")
+        async with serving(Mapless(tmp_path, port=first.config.port)):
+            await page.wait_for_selector("#link.live")
+            await drawn(page, -1.5, 0.5, nothing, "the floor")

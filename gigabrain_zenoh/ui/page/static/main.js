@@ -21,6 +21,7 @@ const store = (key, value) => { try { sessionStorage.setItem(key, value) } catch
 
 let about = { role: 'operator', body: null }
 let robot = null // its present state
+let lost = false // the connection; the next one may be to another run of the robot
 
 const token = decoded(location.hash.slice(1))
 if (token) { store('token', token); history.replaceState(null, '', location.pathname) }
@@ -41,6 +42,8 @@ const link = new Link({
   about(info) {
     const first = !about.body
     about = info
+    if (lost) forget()
+    lost = false
     map.body = info.body
     setText($('robot'), info.body ? `${info.body.robot_type} · ${info.link}` : 'gigabrain')
     document.title = `${info.body?.robot_type ?? 'gigabrain'}${viewOnly() ? ' (view only)' : ''}`
@@ -97,6 +100,7 @@ const link = new Link({
     $('link').classList.toggle('live', live)
     document.body.classList.toggle('silent', !live)
     if (!live) {
+      lost ||= status === 'offline'
       releaseAll()
       robot = null
       arm.setState(null)
@@ -139,6 +143,13 @@ const armHold = new ArmHold({
 })
 
 onLostRelease(releaseAll)
+
+/** Forget what a server sends only when it changes, and at the begin of a connection. */
+function forget() {
+  map.forget()
+  zones.set({ zones: [], places: [], map: '' })
+  objects.set({ objects: [], tags: [] })
+}
 
 /** Show what moves this body: its base, its joints, or both. */
 function showDrives(body) {

@@ -14,6 +14,7 @@ export class MapView {
   #drag = null
   #drawScheduled = false
   #pointers = new Map()
+  #boot = null // which start of the driver the odometry is of
 
   constructor(canvas, onGoal) {
     this.canvas = canvas
@@ -24,16 +25,21 @@ export class MapView {
     this.pick = null // takes a click on something that is drawn; returns whether there is anything
     this.follow = true
     this.dragMoves = false // a drag moves the map and sets no goal
-    this.clear()
+    this.robot = null
+    this.forget()
+    this.#clearOdometry()
     this.recolour()
     new ResizeObserver(() => this.draw()).observe(canvas)
     this.#listen()
   }
 
-  clear() {
+  /** Forget the map and the task. */
+  forget() { this.map = this.goal = this.task = null }
+
+  #clearOdometry() {
     this.trace = new OffscreenCanvas(TRACE_CELLS, TRACE_CELLS)
     this.trail = []
-    this.scan = this.map = this.goal = this.robot = this.task = null
+    this.scan = null
   }
 
   recolour() {
@@ -44,7 +50,9 @@ export class MapView {
   }
 
   setRobot(robot) {
-    if (this.robot?.state && robot.state && robot.state.boot !== this.robot.state.boot) this.clear()
+    const boot = robot.state?.boot ?? this.#boot
+    if (boot !== this.#boot) this.#clearOdometry()
+    this.#boot = boot
     if (this.robot?.frame !== robot.frame) this.trail = []
     this.robot = robot
     const pose = robot.pose
