@@ -339,8 +339,9 @@ class PageView(ViewerScene):
             self._keep("zones", as_json(ZONES, zones))
 
     def _keep(self, slot: str, frame: bytes) -> None:
-        self._kept[slot] = frame
-        self._send(slot, frame)
+        if self._kept.get(slot) != frame:  # an unchanged map is published every two seconds
+            self._kept[slot] = frame
+            self._send(slot, frame)
 
     def _newest_pose(self, state: RobotState | None) -> tuple[Pose | None, bool]:
         """Return the robot's pose, and whether it is in the map."""

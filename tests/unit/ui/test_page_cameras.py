@@ -8,7 +8,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from gigabrain_schemas.brain import Contour, DetectedObject, Objects, WorldModel
+from gigabrain_schemas.brain import (
+    Contour,
+    DetectedObject,
+    Objects,
+    OccupancyGrid,
+    WorldModel,
+)
 from gigabrain_schemas.examples import example
 from gigabrain_schemas.objects import Detection, Detections, ObjectMap
 from gigabrain_schemas.sensors import Image
@@ -16,6 +22,7 @@ from gigabrain_schemas.topics import (
     CAMERA,
     DETECTIONS,
     IMAGE,
+    MAP,
     OBJECT_MAP,
     PERCEIVED,
     STATE,
@@ -251,6 +258,16 @@ async def test_findings_and_the_map_of_objects_are_sent(page: Page) -> None:
     assert len(content(viewer, frames.OBJECTS)) == 1
     later = await page.comes(page.tokens.viewer)
     assert len(content(later, frames.OBJECTS)) == 1
+
+
+async def test_a_map_is_sent_when_it_has_changed_and_to_those_who_come_later(page: Page) -> None:
+    viewer, grid = await page.comes(page.tokens.viewer), example(OccupancyGrid)
+    for cells in (grid.cells, grid.cells, bytes(len(grid.cells))):
+        page.net.two.publish(MAP, msgspec.structs.replace(grid, cells=cells))
+        await tick(page)
+    assert [frame[0] for frame in viewer.got].count(frames.MAP) == 2
+    later = await page.comes(page.tokens.viewer)
+    assert [frame[0] for frame in later.got].count(frames.MAP) == 1
 
 
 async def test_a_frame_that_the_page_never_sends_ends_the_connection(page: Page) -> None:

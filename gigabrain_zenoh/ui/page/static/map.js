@@ -117,10 +117,14 @@ export class MapView {
     this.picture = new OffscreenCanvas(width, height)
     const pen = this.picture.getContext('2d'), image = pen.createImageData(width, height)
     const dark = this.colour.floor < '#8'
-    for (let i = 0; i < cells.length; i++) {
-      const cell = cells[i], at = 4 * ((height - 1 - Math.floor(i / width)) * width + (i % width))
+    const bytes = new Uint8ClampedArray(4 * 256) // of each value of a cell; unknown ones have no colour
+    for (let cell = 0; cell <= 100; cell++) {
       const grey = dark ? 30 + cell * 2 : 255 - cell * 2.4
-      image.data.set([grey, grey, grey, cell < 0 ? 0 : 255], at)
+      bytes.set([grey, grey, grey, 255], 4 * cell)
+    }
+    const colours = new Uint32Array(bytes.buffer), pixels = new Uint32Array(image.data.buffer)
+    for (let row = 0, i = 0; row < height; row++) {
+      for (let at = (height - 1 - row) * width, end = at + width; at < end; at++, i++) pixels[at] = colours[cells[i] & 255]
     }
     pen.putImageData(image, 0, 0)
   }
