@@ -56,22 +56,28 @@ class ReplayedCamera(CameraSource):
         self._last = None
 
     def read(self) -> Frame:
-        """Return the next exposure when its time has come. Raises CameraLost."""
+        """Return the next whole exposure when its time has come. Raises CameraLost."""
         if self._exposures is None:
             raise CameraLost("the recording is not open")
+        broken = ""
         try:
-            one = next(self._exposures, None)
+            for one in self._exposures:
+                try:
+                    frame = self._frame(one)
+                except ValueError as error:
+                    broken = str(error)
+                    continue
+                self._wait(one.stamp_ns)
+                return frame
         except ConfigError as error:
             raise CameraLost(str(error)) from None
-        if one is None and self.options.repeat and self._last:
+        if self.options.repeat and self._last:
             time.sleep(1 / self.camera.rate_hz)
             self.open()
             return self.read()
-        if one is None:
-            self._ended = bool(self._last)
-            raise CameraLost(f"{self.options.file} {'has ended' if self._ended else 'has none'}")
-        self._wait(one.stamp_ns)
-        return self._frame(one)
+        self._ended = bool(self._last)
+        end = "has ended" if self._ended else f"has none: {broken}" if broken else "has none"
+        raise CameraLost(f"{self.options.file} {end}")
 
     def close(self) -> None:
         """Let go of the recording."""
@@ -88,12 +94,10 @@ class ReplayedCamera(CameraSource):
         self._last = stamp_ns, now_s
 
     def _frame(self, one: Recorded) -> Frame:
+        """Return an exposure. Raises ValueError for a broken one, CameraLost for another size."""
         camera = self.camera
-        try:
-            picture = None if one.picture is None else decoded(one.picture)
-            depth = one.depth.array() if one.depth and camera.depth else None
-        except ValueError as error:
-            raise CameraLost(str(error)) from None
+        picture = None if one.picture is None else decoded(one.picture)
+        depth = one.depth.array() if one.depth and camera.depth else None
         if picture is not None:
             picture = fitted(picture, camera.width, camera.height)
         return Frame(picture, depth)

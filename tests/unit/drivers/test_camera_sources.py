@@ -1,6 +1,7 @@
 """Pictures of files, and of recordings, come as those of a camera do."""
 
 import time
+from collections.abc import Container
 from contextlib import closing
 from pathlib import Path
 
@@ -126,14 +127,14 @@ def jpeg(grey: int) -> bytes:
     return bytes(cv2.imencode(".jpg", picture)[1].tobytes())
 
 
-def recording(path: Path, *, broken: bool = False, exposures: int = 3) -> None:
+def recording(path: Path, *, broken: Container[int] = (), exposures: int = 3) -> None:
     """Up to three exposures at 10 Hz of the camera `front`, and as many of another."""
     file = BagWriter(path, viewers=False, notes={})
     with closing(file):
         for number, grey in enumerate(GREYS[:exposures]):
             header = {"basis": 5 * number + 5, "stamp_ns": 10**18 + number * 10**8}
             about = {"frame_id": "front", "height": 48, "width": 64}
-            data = b"no jpeg" if broken else jpeg(grey)
+            data = b"no jpeg" if number in broken else jpeg(grey)
             depth = np.full((48, 64), grey, np.uint16)
             messages: list[tuple[Topic, str, object]] = [
                 (IMAGE, "front", Image(**about, **header, encoding="jpeg", data=data)),
@@ -179,6 +180,19 @@ def test_a_recording_of_one_exposure_repeats_it_at_the_camera_s_rate(
     source.open()
     assert means(source, 4) == [GREYS[0]] * 4
     assert slept == pytest.approx([0.1] * 3)
+
+
+@pytest.mark.parametrize("broken", [0, 1])
+def test_a_broken_picture_of_a_recording_is_skipped(
+    tmp_path: Path, slept: list[float], broken: int
+) -> None:
+    recording(tmp_path / "drive.mcap", broken=[broken])
+    source = replayed(tmp_path, repeat=True)
+    source.open()
+    whole = [grey for number, grey in enumerate(GREYS) if number != broken]
+    assert means(source, 4) == [*whole, *whole]
+    assert slept[0] == pytest.approx(0.1 if broken == 0 else 0.2, abs=0.05)
+    source.close()
 
 
 def test_a_thinned_recording_gives_whole_exposures_at_their_rate(
@@ -240,7 +254,7 @@ def test_a_recording_that_cannot_be_shown_is_a_lost_camera(
     if isinstance(content, bytes):
         path.write_bytes(content)
     elif content:
-        recording(path, broken=content == "broken")
+        recording(path, broken=range(3) if content == "broken" else ())
     source = replayed(tmp_path, camera="top" if content == "other camera" else "front")
     source.open()
     with pytest.raises(CameraLost, match=error):
