@@ -60,8 +60,9 @@ class OpenCvCamera(CameraSource):
         if capture is None:
             raise CameraLost(f"{self.options.device} is not open")
         if self._file:
-            self._due_s += 1 / self.camera.rate_hz
-            time.sleep(max(0.0, self._due_s - time.monotonic()))
+            now_s = time.monotonic()
+            self._due_s = max(self._due_s + 1 / self.camera.rate_hz, now_s)
+            time.sleep(self._due_s - now_s)
         came, picture = capture.read()
         if not came and self._file and self.options.repeat:
             capture.set(cv2.CAP_PROP_POS_FRAMES, 0)

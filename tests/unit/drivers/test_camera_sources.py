@@ -67,6 +67,21 @@ def test_a_film_is_shown_at_the_camera_s_rate_and_ends(tmp_path: Path, slept: li
         source.open()  # as the process does after a loss
 
 
+def test_a_film_goes_on_at_its_rate_after_the_process_was_stopped(
+    tmp_path: Path, slept: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    film(tmp_path / "film.avi")
+    source = camera(tmp_path, "film.avi", repeat=True)
+    now_s = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now_s[0] + sum(slept))
+    source.open()
+    means(source, 2)
+    now_s[0] += 60.0  # stopped, and continued
+    means(source, 4)
+    assert slept == pytest.approx([0.1, 0.1, 0.0, 0.1, 0.1, 0.1])
+    source.close()
+
+
 def test_a_film_may_begin_again(tmp_path: Path, slept: list[float]) -> None:
     film(tmp_path / "film.avi")
     source = camera(tmp_path, "film.avi", repeat=True)
