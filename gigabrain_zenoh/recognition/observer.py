@@ -1,6 +1,8 @@
 """Turns one picture, with its depth, into detections. It knows no bus and no clock."""
 
+import math
 import time
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -52,7 +54,7 @@ class Observer:
         mono = picture.ndim == 2
         grey = picture if mono else _converted(picture, cv2.COLOR_BGR2GRAY)
         to_rgb = cv2.COLOR_GRAY2RGB if mono else cv2.COLOR_BGR2RGB
-        found = self._net.find(_converted(picture, to_rgb)) if self._net else None
+        found = _find(self._net, _converted(picture, to_rgb), model) if self._net else None
         tags = self._tags.find(grey, model, far)
         taken = [_plate(tag) for tag in tags]
         return Detections(
@@ -73,6 +75,18 @@ class Observer:
         if camera not in self._models:
             self._models[camera] = CameraModel(camera)
         return self._models[camera]
+
+
+def _find(net: Net, picture: NDArray[np.uint8], model: CameraModel) -> Found:
+    """Return what a net finds in a picture, turned upright by quarters for it."""
+    turns = round(math.atan2(-model.rotation[2, 1], model.rotation[2, 2]) / (math.pi / 2)) % 4
+    found = net.find(np.ascontiguousarray(np.rot90(picture, turns)))
+    boxes = found.boxes
+    for turn in reversed(range(turns)):
+        wide = picture.shape[1 - turn % 2]
+        left, top, right, bottom = boxes.T
+        boxes = np.stack([wide - bottom, left, wide - top, right], axis=1)
+    return replace(found, boxes=boxes)
 
 
 def _converted(picture: NDArray[np.uint8], how: int) -> NDArray[np.uint8]:

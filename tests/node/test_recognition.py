@@ -399,6 +399,33 @@ def test_a_thing_that_is_too_narrow_for_the_surest_class_is_the_next_one(metres,
     assert thing.label == label
 
 
+@pytest.mark.parametrize(
+    ("roll", "pitch"), [(0.1, 0.2), (1.5, 0.0), (-1.6, 0.2), (math.pi, 0.3), (0.0, 3.0)]
+)
+def test_the_net_gets_pictures_upright_however_the_camera_is_mounted(roll, pitch):
+    camera = replace(CAMERA, roll=roll, pitch=pitch, yaw=0.0 if pitch < 2 else math.pi)
+    model, pixels = CameraModel(camera), np.zeros((240, 320, 3), np.uint8)
+    side, high = np.meshgrid(np.linspace(-0.05, 0.05, 90), np.linspace(0.0, 0.1, 90))
+    for up, colour in ((0.0, (0, 0, 250)), (-0.1, (250, 0, 0))):  # red stands on blue
+        ahead = np.full(side.size, 1.0)
+        points = model.origin + np.column_stack((ahead, side.ravel(), high.ravel() + up))
+        row, column, _ = model.project(points)
+        pixels[row, column] = colour
+
+    class Net(SeesABall):
+        def find(self, picture: np.ndarray) -> Found:
+            red, blue = (np.argwhere(picture[..., one] > 200)[:, 0] for one in (0, 2))
+            assert red.mean() < blue.mean() - 20
+            rows, columns = np.nonzero(picture.any(axis=2))
+            box = (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
+            return Found(np.array([box], np.float32), np.array([1]), np.array([0.9], np.float32))
+
+    picture = Image(frame_id="front", width=320, height=240, encoding="bgr8", data=pixels.tobytes())
+    (thing,) = Observer(Net(), TagFinder()).observe(camera, picture, None).things
+    rows, columns = np.nonzero(pixels.any(axis=2))
+    assert thing.box == (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
+
+
 def test_the_net_gets_red_green_blue():
     got = []
 
