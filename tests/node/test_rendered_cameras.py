@@ -6,6 +6,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, closing
 from pathlib import Path
 
+import cv2
 import msgspec
 import mujoco
 import numpy as np
@@ -55,7 +56,7 @@ def sent(driver: MujocoDriver) -> tuple[SimScene, SimPoses]:
     return scene, poses  # type: ignore[return-value]
 
 
-def true_depth(driver: MujocoDriver, camera: Camera, u: int, v: int) -> float:
+def true_depth(driver: MujocoDriver, camera: Camera, u: float, v: float) -> float:
     """The depth along the camera's axis by a ray through a pixel, from the physics itself [m]."""
     model, data = driver._simulation.model, driver._simulation.data
     base = model.body("robot/base").id
@@ -107,6 +108,29 @@ def test_a_lens_bends_the_picture_as_opencv_says() -> None:
     x = float(seen[119, 300]) / focal  # a ray of the ideal camera
     bent_x = x * (1 - 0.2 * x**2 + 0.05 * x**4)
     assert focal * bent_x + cx == pytest.approx(300, abs=1.0)
+
+
+def test_pixels_that_no_light_reaches_through_the_lens_stay_dark(driver: MujocoDriver) -> None:
+    lens = (190.0, 190.0, 159.5, 119.5), (-0.33, 0.11, 0.0, 0.0, -0.016)
+    camera = replace(FRONT, intrinsics=lens[0], distortion=lens[1])
+    scene, poses = sent(driver)
+    with closing(Renderer({"front": View(camera, 0, errors=False)})) as renderer:
+        renderer.show(scene)
+        frame = renderer.expose(poses, ["front"])["front"]
+    assert frame.depth is not None
+    assert frame.picture is not None
+    corners = np.ix_((0, -1), (0, -1))
+    assert not frame.picture[corners].any()
+    assert not frame.depth[corners].any()
+    assert (frame.picture.max(axis=2) > 0).mean() > 0.98
+    matrix = np.array([[190.0, 0, 159.5], [0, 190.0, 119.5], [0, 0, 1]])
+    rays = np.array([[x, y, 1.0] for x in np.linspace(-0.8, 0.8, 9) for y in (0.1, 0.3)])
+    pixels, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, np.array(lens[1]))
+    off_mm = [
+        abs(frame.depth[round(v), round(u)] - 1000 * true_depth(driver, camera, *straight))
+        for (u, v), straight in zip(pixels[:, 0], 190 * rays[:, :2] + lens[0][2:], strict=True)
+    ]
+    assert np.median(off_mm) < 15.0  # a pixel is up to a half off its ray
 
 
 class Simulated:

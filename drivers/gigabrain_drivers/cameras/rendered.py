@@ -25,6 +25,9 @@ from gigabrain_zenoh.errors import ConfigError, Unsupported
 NEAR_M, FAR_M = 0.01, 60.0  # of what is drawn
 COSTLY = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)
 STEEPEST = 4.0  # of a ray, sideways for each metre ahead
+MIN_SEEN = 0.5  # share of the pixels that light reaches through a lens
+NOWHERE = -9.0  # column and row of what the others show
+UNDISTORT = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 1e-9)
 PIXEL_NOISE = 2.0  # standard deviation, of 255
 NOISE_MARGIN = 256  # [px], by which a table of noise is larger than a picture
 
@@ -68,6 +71,8 @@ class View:
         noise = self._noise[down : down + camera.height, right : right + camera.width]
         noisy = cv2.add(cv2.cvtColor(colours, cv2.COLOR_RGB2BGR), noise, dtype=cv2.CV_8U)
         measured = self.sensor.measure(depth) if camera.depth else None
+        if measured is not None:
+            measured[np.isnan(depth)] = 0
         return Frame(np.asarray(noisy, np.uint8), measured)
 
 
@@ -87,35 +92,41 @@ class Lens:
         given = np.array(camera.distortion)
         coefficients = np.zeros(5 if len(given) <= 5 else 8)
         coefficients[: len(given)] = given
-        rays = cv2.undistortPoints(pixels, matrix, coefficients)
-        x, y = rays[:, 0, 0], rays[:, 0, 1]
-        ahead = np.column_stack([x, y, np.ones_like(x)])
+        plain = np.eye(3)
+        rays = cv2.undistortPoints(pixels, matrix, coefficients, None, plain, plain, UNDISTORT)
+        ahead = np.column_stack([rays[:, 0], np.ones(len(rays))])
         back, _ = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), matrix, coefficients)
-        if not ((np.abs(rays) < STEEPEST) & (np.abs(back - pixels) < 1.0)).all():
+        seen = ((np.abs(rays) < STEEPEST) & (np.abs(back - pixels) < 1.0)).all(axis=(1, 2))
+        if seen.mean() < MIN_SEEN:
             raise ConfigError(
                 f"camera {camera.name!r}: its distortion folds the picture; "
                 "expected the k1, k2, p1, p2, k3 of its calibration"
             )
         self.focal = max(fx, fy)
+        x, y = rays[seen, 0].T
         left, top = -np.floor(self.focal * x.min()), -np.floor(self.focal * y.min())
         self.centre = float(left), float(top)
         self.width = int(left + np.ceil(self.focal * x.max())) + 1
         self.height = int(top + np.ceil(self.focal * y.max())) + 1
         shape = camera.height, camera.width
-        self._maps = tuple(
-            (self.focal * rays + middle).reshape(shape).astype(np.float32)
-            for rays, middle in ((x, left), (y, top))
+        column, row = (
+            np.where(seen, self.focal * ways + middle, NOWHERE).reshape(shape).astype(np.float32)
+            for ways, middle in ((rays[:, 0, 0], left), (rays[:, 0, 1], top))
         )
+        self._maps = column, row
 
     def bend(
         self, colours: Picture, depth: NDArray[np.float32]
     ) -> tuple[Picture, NDArray[np.float32]]:
-        """Return the pictures as the lens shows them, from the ideal ones."""
+        """Return the pictures as the lens shows them, from the ideal ones.
+
+        Pixels that no light reaches are black, with NaN as their depth.
+        """
         if self._maps is None:
             return colours, depth
         bent = cv2.remap(colours, *self._maps, cv2.INTER_LINEAR)
         return np.asarray(bent, np.uint8), np.asarray(
-            cv2.remap(depth, *self._maps, cv2.INTER_NEAREST), np.float32
+            cv2.remap(depth, *self._maps, cv2.INTER_NEAREST, borderValue=np.nan), np.float32
         )
 
 
