@@ -8,7 +8,7 @@ from gigabrain_schemas.base import Coordinate, Count, Key, Message, Name, Pose, 
 from gigabrain_schemas.base import array_meta as array
 
 MAX_SHAPES, MAX_BODIES = 20_000, 1_000
-MAX_MESH_BYTES = 4 * 1024 * 1024  # of all meshes of a scene
+MAX_MESHES, MAX_MESH_BYTES = 1_000, 4 * 1024 * 1024  # of a scene; bytes of all together
 ShapeKind = Literal["plane", "box", "cylinder", "sphere", "capsule", "ellipsoid", "mesh"]
 SHAPE_KINDS: tuple[ShapeKind, ...] = get_args(ShapeKind)
 ThingKind = Literal["box", "cylinder", "person"]
@@ -56,7 +56,7 @@ class SimScene(Message, frozen=True, kw_only=True):
     places: Annotated[bytes, array(28 * MAX_SHAPES, "float32", ("n", 7), "m")]
     # on its body: x, y, z, and a quaternion w, x, y, z
     colours: Annotated[bytes, array(4 * MAX_SHAPES, "uint8", ("n", 4))]  # red, green, blue, alpha
-    meshes: Annotated[tuple[SceneMesh, ...], Meta(max_length=1000)] = ()
+    meshes: Annotated[tuple[SceneMesh, ...], Meta(max_length=MAX_MESHES)] = ()
     things: Annotated[tuple[Thing, ...], Meta(max_length=64)] = ()
 
     def __post_init__(self) -> None:

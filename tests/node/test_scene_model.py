@@ -13,6 +13,7 @@ from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.sim.body import sim_body
 from gigabrain_drivers.sim.live_world import LiveWorld
 from gigabrain_drivers.sim.physics import Simulation
+from gigabrain_drivers.sim.scene_message import SceneWriter
 from gigabrain_drivers.sim.scene_model import SceneModel, shapes_of
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.examples import EXAMPLES
@@ -108,6 +109,22 @@ def test_a_scene_whose_numbers_name_nothing_is_refused() -> None:
     for changes in ({"kinds": b"\0\0\x63"}, {"owners": b"\0\0\0\0\xff\xff"}):
         with pytest.raises(ConfigError, match="unknown kind, or on an unknown body"):
             SceneModel(msgspec.structs.replace(scene, **changes))
+
+
+def test_a_scene_of_more_meshes_than_a_message_may_carry_shows_the_rest_as_boxes() -> None:
+    corners = "0 0 0 1 0 0 0 1 0 0 0 1"
+    meshes = [f'<mesh name="m{n}" vertex="{corners}" scale=".1 .1 .1"/>' for n in range(1010)]
+    geoms = [f'<geom type="mesh" mesh="m{n}" pos="{n} 0 0"/>' for n in range(1010)]
+    text = (
+        f"<mujoco><asset>{''.join(meshes)}</asset><worldbody>{''.join(geoms)}</worldbody></mujoco>"
+    )
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    scene = SceneWriter(model, data, "hall").scene(1, (), {})
+    received = msgspec.msgpack.decode(msgspec.msgpack.encode(scene), type=SimScene)
+    kinds = [shape.kind for shape in shapes_of(received)]
+    assert (kinds.count("mesh"), kinds.count("box")) == (1000, 10)
 
 
 def test_a_picture_of_a_running_world_is_saved(tmp_path: Path) -> None:

@@ -8,7 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_drivers.sim.scene import ROBOT, SPARE
-from gigabrain_schemas.sim import MAX_MESH_BYTES, SHAPE_KINDS, SceneMesh, SimPoses, SimScene, Thing
+from gigabrain_schemas.sim import (
+    MAX_MESH_BYTES,
+    MAX_MESHES,
+    SHAPE_KINDS,
+    SceneMesh,
+    SimPoses,
+    SimScene,
+    Thing,
+)
 
 TYPES = {
     mujoco.mjtGeom.mjGEOM_PLANE: "plane",
@@ -122,14 +130,14 @@ class SceneWriter:
         return SHAPE_KINDS.index(kind), sizes
 
     def _mesh(self, mesh: int) -> int | None:
-        """Return a mesh's number in the scene; None where its meshes would be too large."""
+        """Return a mesh's number in the scene; None for one too many, or too large."""
         model = self._model
         if mesh not in self._mesh_numbers:
             vertex, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
             vertices = model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]]
             faces = model.mesh_face[face : face + model.mesh_facenum[mesh]]
             size = 4 * (vertices.size + faces.size)
-            if self._mesh_bytes + size > MAX_MESH_BYTES:
+            if self._mesh_bytes + size > MAX_MESH_BYTES or len(self._meshes) == MAX_MESHES:
                 return None
             self._mesh_bytes += size
             self._mesh_numbers[mesh] = len(self._meshes)
