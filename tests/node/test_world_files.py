@@ -201,6 +201,15 @@ def test_a_world_file_adds_to_a_map(tmp_path: Path) -> None:
     assert {shape.height for shape in world.shapes} == {0.8, 1.0}
 
 
+@pytest.mark.parametrize("group", range(6))
+def test_the_lidar_sees_what_a_model_may_be_bumped_into_in_any_group(
+    group: int, tmp_path: Path
+) -> None:
+    text = MODEL.replace('type="box"', f'type="box" group="{group}"')
+    ranges = simulated(written(tmp_path / "hall.xml", text)).scan()
+    assert np.isfinite(ranges).mean() > 0.5
+
+
 def test_merged_cells_cover_exactly_what_is_occupied() -> None:
     random = np.random.default_rng(4)
     for share in (0.1, 0.5, 0.9):

@@ -12,7 +12,7 @@ from gigabrain_drivers.sim import STEP_S
 from gigabrain_drivers.sim.body import SimBody, SimModel
 from gigabrain_drivers.sim.mjcf_world import has_floor, load_model, model_error
 from gigabrain_drivers.sim.model_measures import align, mismatches
-from gigabrain_drivers.sim.model_parts import PartFinder
+from gigabrain_drivers.sim.model_parts import ROBOT_GROUP, PartFinder
 from gigabrain_drivers.sim.world import (
     Ball,
     Box,
@@ -36,6 +36,7 @@ WORLDS_OWN = ("option", "njmax", "nconmax", "memory")  # parts of a model
 ROBOT = "robot/"  # prefix of all names of the robot's model
 MODEL = "world/"  # prefix of all names of the world's own model
 PERSON = "person"  # body of the first; the others have a number behind it
+WORLD_GROUP = 1  # of what would be in the robot's
 SPARE = "spare/"  # prefix of what people may put in while it runs
 SPARE_THINGS, SPARE_PEOPLE = 12, 4  # each costs time in every step
 SPARE_M = 0.01  # size of a spare that is not in use
@@ -188,6 +189,9 @@ def _attach_model(spec: mujoco.MjSpec, path: Path) -> bool:
     child = load_model(path)
     for key in list(child.keys):
         child.delete(key)
+    for geom in child.geoms:
+        if geom.group == ROBOT_GROUP and (geom.contype or geom.conaffinity):
+            geom.group = WORLD_GROUP
     child.option, floor = mujoco.MjSpec().option, has_floor(child)
     try:
         spec.attach(child, prefix=MODEL, frame=spec.worldbody.add_frame())
