@@ -201,6 +201,13 @@ def test_a_world_file_adds_to_a_map(tmp_path: Path) -> None:
     assert {shape.height for shape in world.shapes} == {0.8, 1.0}
 
 
+def test_a_map_without_outer_walls_has_none(tmp_path: Path) -> None:
+    grid(tmp_path)
+    world = load_world(written(tmp_path / "open.yaml", "map: room.yaml\nouter_walls: false\n"), 0)
+    assert world.walls() == ()
+    assert len(world.shapes) == 5
+
+
 @pytest.mark.parametrize("group", range(6))
 def test_the_lidar_sees_what_a_model_may_be_bumped_into_in_any_group(
     group: int, tmp_path: Path

@@ -367,6 +367,7 @@ def build_world(file: WorldFile, path: Path) -> World:
             name=world.name,
             description=world.description or extruded.description,
             shapes=extruded.shapes + world.shapes,
+            outer_walls=file.outer_walls,
             floor=world.floor,
             check=world.check,
             materials=world.materials,
