@@ -202,7 +202,7 @@ def _write(folder: Path, files: Mapping[str, bytes]) -> None:
 def _finish(path: Path) -> None:
     """Put the files of a complete save in their places. Raises ConfigError where it cannot."""
     complete = _complete(path)
-    if not complete.is_dir():
+    if not os.path.isdir(complete):  # Path's raises where a folder may not be looked into
         return
     try:
         for file in complete.iterdir():

@@ -249,6 +249,12 @@ def test_a_save_that_fails_half_way_leaves_the_old_map(
     assert len(list(path.parent.iterdir())) == 3
 
 
+def test_a_map_that_cannot_be_looked_for_is_refused_in_one_line() -> None:
+    for read in (map_file.load, map_file.load_graph):
+        with pytest.raises(ConfigError, match="File name too long"):
+            read(Path("/" + "room" * 100 + ".yaml"))
+
+
 def test_whoever_looks_next_finishes_a_save_that_a_crash_interrupted(path: Path) -> None:
     complete = path.with_name(".room.complete")
     complete.mkdir()
