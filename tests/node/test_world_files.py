@@ -293,6 +293,16 @@ def test_an_mjcf_model_is_a_world(tmp_path: Path) -> None:
     assert clearance(world.obstacles(), world.start.x, world.start.y) >= 0.6
 
 
+def test_a_model_may_have_more_floors_and_one_that_stands_upright(tmp_path: Path) -> None:
+    upstairs = '<geom type="plane" size="0 0 .1" pos="0 0 3"/>'
+    wall = '<geom name="floor2" type="box" size=".1 1 1" pos="9 0 1" euler="0 45 0"/>'
+    text = MODEL.replace("<worldbody>", f"<worldbody>{upstairs}{wall}")
+    assert load_world(written(tmp_path / "house.xml", text), 0)
+    assert load_world(
+        written(tmp_path / "wall.xml", f"<mujoco><worldbody>{wall}</worldbody></mujoco>"), 0
+    )
+
+
 def test_a_model_and_a_world_file_are_one_world(tmp_path: Path) -> None:
     written(tmp_path / "office.xml", MODEL)
     text = "model: office.xml\nstart: [0, 0, 0]\nboxes:\n  - {at: [1, 0], size: [0.2, 0.2, 0.5]}\n"
@@ -314,6 +324,14 @@ def test_a_model_and_a_world_file_are_one_world(tmp_path: Path) -> None:
             "<mujoco><worldbody><replicate count='300000' offset='.1 0 0'>"
             "<geom size='.1'/></replicate></worldbody></mujoco>",
             "repeats parts more than 10000 times",
+        ),
+        (
+            "<mujoco><worldbody><geom type='plane' size='1 1 1' pos='0 0 2'/></worldbody></mujoco>",
+            "its floor is at a height of 2 m; expected 0",
+        ),
+        (
+            "<mujoco><worldbody><geom name='ground' type='box' size='9 9 1'/></worldbody></mujoco>",
+            "its floor is at a height of 1 m; expected 0",
         ),
     ],
 )

@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 FLOOR_NAME = re.compile(r"(^|/)(floor|ground)\d*$")  # of geoms that a robot stands on
 COUNT = re.compile(rb"\bcount\s*=\s*[\"']([\d\s]{1,60})[\"']")  # of replicated parts
-PLANE = mujoco.mjtGeom.mjGEOM_PLANE
+PLANE, BOX = mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX
 
 
 def load_model(path: Path) -> mujoco.MjSpec:
@@ -62,6 +62,12 @@ def measured(world: World) -> World:
         raise ConfigError(f"{world.model}: {model.nbody} bodies; expected at most {MAX_BODIES}")
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
+    heights = _floor_heights(model, data)
+    if heights and min(map(abs, heights)) > LOW_M:
+        raise ConfigError(
+            f"{world.model}: its floor is at a height of {heights[0]:g} m; expected 0, where "
+            "robots start"
+        )
     outlines = _outlines(model, data)
     if not all(abs(value) <= MAX_EXTENT_M for one in outlines for value in _bounds(one)):
         raise ConfigError(
@@ -89,6 +95,15 @@ def is_floor(model: mujoco.MjModel, geom: int) -> bool:
 def has_floor(spec: mujoco.MjSpec) -> bool:
     """Return whether a model brings its own floor."""
     return any(geom.type == PLANE or FLOOR_NAME.search(geom.name) for geom in spec.geoms)
+
+
+def _floor_heights(model: mujoco.MjModel, data: mujoco.MjData) -> list[float]:
+    """Return the heights of all level floors that are planes or boxes [m]."""
+    return [
+        float(data.geom_xpos[geom, 2] + (0.0 if kind == PLANE else model.geom_size[geom, 2]))
+        for geom, kind in enumerate(model.geom_type.tolist())
+        if kind in (PLANE, BOX) and is_floor(model, geom) and data.geom_xmat[geom, 8] > UPRIGHT
+    ]
 
 
 def _outlines(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Shape, ...]:
