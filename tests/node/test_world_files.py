@@ -303,6 +303,18 @@ def test_a_model_may_have_more_floors_and_one_that_stands_upright(tmp_path: Path
     )
 
 
+def test_a_world_file_may_name_what_is_in_the_home(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    grid(tmp_path)
+    written(tmp_path / "office.xml", MODEL)
+    (tmp_path / "worlds").mkdir()
+    text = "map: ~/room.yaml\nmodel: ~/office.xml\nstart: [0, 0, 0]\n"
+    world = load_world(written(tmp_path / "worlds" / "both.yaml", text), 0)
+    assert (len(world.shapes), len(world.outlines)) == (5, 4)
+
+
 def test_a_model_and_a_world_file_are_one_world(tmp_path: Path) -> None:
     written(tmp_path / "office.xml", MODEL)
     text = "model: office.xml\nstart: [0, 0, 0]\nboxes:\n  - {at: [1, 0], size: [0.2, 0.2, 0.5]}\n"

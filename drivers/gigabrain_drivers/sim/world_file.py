@@ -28,6 +28,7 @@ from gigabrain_drivers.sim.world import (
 from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.config.loading import nearest
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.files import expanded
 
 MAX_DISTANCE_M = 400.0  # from the origin to anything in a world
 MAX_THINGS, MAX_TAGS = 200, 50
@@ -358,10 +359,10 @@ def build_world(file: WorldFile, path: Path) -> World:
         lights=tuple(one.light() for one in file.lights),
         start=Pose(*(file.start or (0.0, 0.0, 0.0))),
         start_fixed=file.start is not None,
-        model=path.parent / file.model if file.model else None,
+        model=path.parent / expanded(file.model) if file.model else None,
     )
     if file.map:
-        extruded = map_world(path.parent / file.map, file.wall_height)
+        extruded = map_world(path.parent / expanded(file.map), file.wall_height)
         world = replace(
             extruded,
             name=world.name,
