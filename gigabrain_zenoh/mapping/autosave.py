@@ -45,7 +45,8 @@ class SaveHead(Struct, frozen=True, kw_only=True):
     boot: Count  # which start of the driver
     tick: Count
     odometry: Triple  # x, y [m] and yaw [rad] of the robot
-    place: Triple | None  # the same in the map, if it was known
+    place: Triple | None  # the same in the map, as far as odometry knows it
+    lost: bool = False  # it was looked for
     changes: tuple[int, int, int]  # see MapSnapshot
 
 
@@ -88,7 +89,12 @@ class Autosave:
         """Begin to save a map as of one tick, unless it has not changed since the last save."""
         place = None if still.pose is None else _triple(still.pose)
         head = SaveHead(
-            boot=boot, tick=tick, odometry=_triple(odometry), place=place, changes=still.changes
+            boot=boot,
+            tick=tick,
+            odometry=_triple(odometry),
+            place=place,
+            lost=still.lost,
+            changes=still.changes,
         )
         if self._job:
             return
@@ -183,7 +189,12 @@ def _unsaved(why: str) -> Cause:
 
 def _alike(one: SaveHead, other: SaveHead) -> bool:
     """Return whether neither the map nor the robot's place has changed much."""
-    x, y, yaw = (b - a for a, b in zip(one.odometry, other.odometry, strict=True))
-    moved = math.hypot(x, y) > MOVED_M or abs(math.remainder(yaw, math.tau)) > MOVED_RAD
-    found = one.place is None and other.place is not None
-    return one.changes == other.changes and one.boot == other.boot and not moved and not found
+    if (one.changes, one.boot, one.lost) != (other.changes, other.boot, other.lost):
+        return False
+    found = other.place is not None and (one.place is None or _moved(one.place, other.place))
+    return not found and not _moved(one.odometry, other.odometry)
+
+
+def _moved(before: Triple, after: Triple) -> bool:
+    x, y, yaw = (b - a for a, b in zip(before, after, strict=True))
+    return math.hypot(x, y) > MOVED_M or abs(math.remainder(yaw, math.tau)) > MOVED_RAD

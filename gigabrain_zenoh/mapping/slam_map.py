@@ -56,7 +56,8 @@ FULL = Cause(
 class MapSnapshot:
     """A map as it was at one scan; it can be put into arrays in another thread."""
 
-    pose: Floats | None  # (3,), of the robot at that scan, if it was known
+    pose: Floats | None  # (3,), of the robot at that scan, as far as odometry knows it
+    lost: bool  # it was looked for
     slam: Slam
     sweeps: GridScans
     grid: LogOddsGrid
@@ -120,11 +121,14 @@ class SlamMap:
         patience_s: float = PATIENCE_S,
         in_time: InTime = done,
         last: Floats | None = None,
+        *,
+        lost: bool = False,
     ) -> "SlamMap":
         """Continue a saved map.
 
-        The robot is at `last` (3,) if its odometry has continued since. If the next scan does not
-        belong there, the whole map is searched. Raises ConfigError for invalid arrays.
+        The robot is at `last` (3,) if its odometry has continued since. If it was `lost`, or the
+        next scan does not belong there, the whole map is searched. Raises ConfigError for invalid
+        arrays.
         """
         grown = cls(patience_s, in_time)
         try:
@@ -140,8 +144,10 @@ class SlamMap:
         except (ValueError, IndexError, TypeError, RuntimeError) as error:  # the last is gtsam's
             text = " ".join(str(error).split())[:200]
             raise ConfigError(f"no pose graph: {text}") from None
-        if last is None:
+        if last is None or lost:
             grown.lose(LOOKING)
+            if grown._finder:
+                grown._finder.last = last
         else:
             grown._moved, grown._resumed = between(grown._slam.pose, last), True
         return grown
@@ -245,6 +251,7 @@ class SlamMap:
     def _copied(self) -> MapSnapshot:
         return MapSnapshot(
             pose=self._here(),
+            lost=self._finder is not None,
             slam=self._slam.still(),
             sweeps=self._sweeps.still(),
             grid=self._grid.still(),

@@ -220,7 +220,8 @@ class Mapper:
         for head, arrays in autosave.found(boot):
             last = None if head.place is None else np.array(head.place)
             try:
-                chart = SlamMap.thaw(arrays, in_time=self._bus.input_log.in_time, last=last)
+                in_time = self._bus.input_log.in_time
+                chart = SlamMap.thaw(arrays, in_time=in_time, last=last, lost=head.lost)
             except ConfigError as error:
                 refuse(str(error))
                 continue

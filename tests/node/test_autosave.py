@@ -5,8 +5,10 @@ import functools
 import logging
 import random
 import threading
+import time
 from collections import namedtuple
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -17,7 +19,7 @@ from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.topics import MAP, MAP_LOAD, POSE, SCAN, STATE, WORLD
 from gigabrain_schemas.zones import MapLoadRequest
 from gigabrain_zenoh.config.settings import PerceptionConfig
-from gigabrain_zenoh.mapping import autosave
+from gigabrain_zenoh.mapping import autosave, localizer
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.recording.process_replay import with_requests
 from gigabrain_zenoh.runtime.replay import record, replay
@@ -181,11 +183,44 @@ async def test_a_death_after_a_new_start_of_the_driver_loses_nothing_either(
         robot.boot, robot.tick = 8, 0
         robot.say()
         await robot.look()
-        while robot.report("saves") <= saves:
+        while robot.report("saves") <= saves + 1:  # the first may be of a lost robot
             await robot.look(1)
         await robot.die()
         assert all(await robot.look())  # from the first scan on
         assert robot.known() > 0.98 * before
+
+
+async def test_a_robot_that_is_lost_when_perception_dies_is_still_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with Walking(tmp_path) as robot:
+        robot.say()
+        await robot.drive_until_saved()
+        saves = robot.report("saves")
+        with monkeypatch.context() as patch:
+            patch.setattr(localizer, "search", lambda *_: [])  # finds nothing yet
+            robot.boot, robot.tick = 8, 0
+            robot.say()
+            while robot.report("saves") <= saves:
+                assert not any(await robot.look(1))
+        await robot.die()
+        looked = await robot.look()
+    assert not looked[0]
+    assert looked[-1]
+
+
+def test_a_robot_that_is_lost_or_found_elsewhere_is_saved_as_it_is(tmp_path: Path) -> None:
+    saved, saves, tick = autosave.Autosave(tmp_path), [], 0
+    for x, lost in ((0.0, False), (0.0, True), (5.0, False), (5.0, False)):
+        still: Any = SimpleNamespace(
+            pose=np.array((x, 0.0, 0.0)), lost=lost, changes=(1, 0, 1), freeze=dict
+        )
+        saved.save(7, tick, np.zeros(3), still)
+        while not saved.due(7, tick := tick + 1000):
+            time.sleep(0.002)
+        saves.append(saved.saves)
+    saved.close()
+    assert saves == [1, 2, 3, 3]
 
 
 async def test_saving_changes_nothing_that_is_said(tmp_path: Path) -> None:
