@@ -367,10 +367,14 @@ class Mapper:
             if self._chart.settle():
                 break
             await self._bus.clock.sleep_ns(SETTLE_NS)
-        saved, graph = await asyncio.to_thread(self._chart.still().to_save)
+        still = self._chart.still()  # what belongs to it is taken with it: a loop may move them
+        self._zones.follow(*self._chart.keyframes())
+        zones, objects = zone_file.encoded(self._zones.present), None if same else b""
+        if self._objects:
+            self._objects.follow(self._chart.keyframes()[1])
+            objects = self._objects.encoded()
+        saved, graph = await asyncio.to_thread(still.to_save)
         if self._bus.input_log.live:
-            zones = zone_file.encoded(self._zones.present)
-            objects = self._objects.encoded() if self._objects else None if same else b""
             await asyncio.to_thread(
                 map_file.save, path, saved, graph, replace=replace, zones=zones, objects=objects
             )

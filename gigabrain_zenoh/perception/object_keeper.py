@@ -197,13 +197,18 @@ class ObjectKeeper:
         self._tick = moment.tick
         if not place.localized:
             self._doubt()
-        self._follow(seen.keyframes)
+        self.follow(seen.keyframes)
         for picture in self._ready():
             self._take(picture, seen, place, moment)
-        self._follow(seen.keyframes)
+        self.follow(seen.keyframes)
         if place.localized and not 0 <= moment.tick - self._copied_tick < DOUBT_TICKS:
             self._copied_tick = moment.tick
             self._copies.append((self.memory.anchored(), self.tags.anchored()))
+
+    def follow(self, keyframes: Floats) -> None:
+        """Move objects and tags with the keyframes (n, 3) that they are fixed to."""
+        self.memory.follow(keyframes)
+        self.tags.follow(keyframes)
 
     def publish(self, tick: int) -> None:
         """Publish the objects if they are due at this tick, and keep them."""
@@ -314,10 +319,6 @@ class ObjectKeeper:
             return True
         turn = abs(float(between(before.fused, sample.fused)[2]))
         return turn <= STEADY_RAD_S * RATE_TICKS * TICK_S
-
-    def _follow(self, keyframes: Floats) -> None:
-        self.memory.follow(keyframes)
-        self.tags.follow(keyframes)
 
     async def _change(self, request: ObjectsRequest) -> ObjectsReply:
         try:

@@ -7,18 +7,21 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from gigabrain_schemas.objects import MapTag
-from gigabrain_schemas.topics import MAP, MAP_SAVE, POSE, WORLD
+from gigabrain_schemas.topics import MAP, MAP_SAVE, POSE, WORLD, ZONES_CHANGE
+from gigabrain_schemas.zones import Zone, ZonesRequest
 from gigabrain_zenoh.config.settings import PerceptionConfig
-from gigabrain_zenoh.mapping import map_file, object_file
+from gigabrain_zenoh.mapping import map_file, object_file, zone_file
 from gigabrain_zenoh.mapping.object_file import ObjectFile
-from gigabrain_zenoh.mapping.slam_map import MapSnapshot
+from gigabrain_zenoh.mapping.slam_map import MapSnapshot, SlamMap
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.recording.process_replay import with_requests
 from gigabrain_zenoh.runtime.replay import record, replay
 from tests.node.mapping_robot import SLAM, Robot
+from tests.node.test_zone_keeping import ask
 
 
 @pytest.fixture(autouse=True)
@@ -49,6 +52,28 @@ async def test_a_map_is_saved_and_found_in_again(own_maps: Path) -> None:
     assert (pose.x, pose.y) == pytest.approx((0.0, 0.0), abs=0.05)
     assert grid.resolution == 0.05
     assert reply.text == "not saved: perception finds its way in a saved map, it makes none"
+
+
+async def test_zones_are_saved_where_the_saved_map_has_them(
+    own_maps: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A save waits for a loop that is being closed, which moves the map."""
+    still = SlamMap.still
+
+    def corrected(chart: SlamMap) -> MapSnapshot:
+        chart._drawn = [pose + np.array((1.0, 0.0, 0.0)) for pose in chart._drawn]
+        chart._renewals += 1
+        return still(chart)
+
+    monkeypatch.setattr(SlamMap, "still", corrected)
+    lab = Zone(name="lab", kind="keepout", points=((1.0, 1.0), (2.0, 1.0), (2.0, 2.0)))
+    async with Robot() as robot:
+        robot.say()
+        robot.drive(80)
+        assert (await ask(robot, ZONES_CHANGE, ZonesRequest(zone=lab))).ok
+        assert (await robot.save("house")).ok
+    (saved,) = zone_file.load(own_maps / "house.yaml").zones
+    assert np.array(saved.points) == pytest.approx(np.array(lab.points) + np.array((1.0, 0.0)))
 
 
 async def test_two_who_save_at_once_do_not_write_into_each_others_files(
