@@ -15,6 +15,7 @@ from gigabrain_zenoh.host.files import expanded
 TIMEOUT_MS = 3000  # of opening a stream, and of reading from it
 ASPECT = 0.01  # by which the shape of a scaled picture may differ
 MAX_PIXELS = 16_000_000  # of a picture that is scaled
+MAX_BROKEN = 1000  # pictures in a row: behind so many a film has ended
 
 
 class OpenCvOptions(CameraOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -33,6 +34,7 @@ class OpenCvCamera(CameraSource):
     _file = False
     _ended = False  # a file that does not repeat
     _due_s = 0.0  # of a file's next picture
+    _reads = 0  # of a file since its start, also of broken pictures
 
     def open(self) -> None:
         """Open the device. Raises CameraLost, and ConfigError without the home of a `~`."""
@@ -45,7 +47,7 @@ class OpenCvCamera(CameraSource):
         timeouts += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, TIMEOUT_MS]
         network = isinstance(target, str) and "://" in target
         capture = cv2.VideoCapture(target, backend, timeouts if network else [])
-        self._capture, self._due_s = capture, time.monotonic()
+        self._capture, self._due_s, self._reads = capture, time.monotonic(), 0
         if not capture.isOpened():
             raise CameraLost(f"{self.options.device} cannot be opened")
         if not self._file and not network:
@@ -63,21 +65,34 @@ class OpenCvCamera(CameraSource):
             now_s = time.monotonic()
             self._due_s = max(self._due_s + 1 / self.camera.rate_hz, now_s)
             time.sleep(self._due_s - now_s)
-        came, picture = capture.read()
-        if not came and self._file and self.options.repeat:
+        picture = self._next(capture)
+        if picture is None and self._file and self.options.repeat:
             capture.set(cv2.CAP_PROP_POS_FRAMES, 0)
-            came, picture = capture.read()
-        if not came or picture is None:
+            self._reads = 0
+            picture = self._next(capture)
+        if picture is None:
             self._ended = self._file
             end = "has ended" if self._file else "gives no picture"
             raise CameraLost(f"{self.options.device} {end}")
-        return Frame(fitted(np.asarray(picture), self.camera.width, self.camera.height))
+        return Frame(fitted(picture, self.camera.width, self.camera.height))
 
     def close(self) -> None:
         """Free the device."""
         capture, self._capture = self._capture, None
         if capture:
             capture.release()
+
+    def _next(self, capture: cv2.VideoCapture) -> NDArray[Any] | None:
+        """Return the next picture, a file's next whole one; None if there is none."""
+        count = capture.get(cv2.CAP_PROP_FRAME_COUNT) if self._file else 0
+        for _ in range(MAX_BROKEN):
+            came, picture = capture.read()
+            self._reads += 1
+            if came:
+                return np.asarray(picture)
+            if self._reads >= count:
+                break
+        return None
 
     def _target(self) -> tuple[int | str, int]:
         device = self.options.device

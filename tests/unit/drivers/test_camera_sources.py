@@ -82,6 +82,31 @@ def test_a_film_goes_on_at_its_rate_after_the_process_was_stopped(
     source.close()
 
 
+@pytest.mark.parametrize("repeat", [False, True])
+def test_a_film_goes_on_behind_pictures_that_are_broken(
+    tmp_path: Path, slept: list[float], repeat: bool
+) -> None:
+    path, random = tmp_path / "film.mp4", np.random.default_rng(0)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10, (64, 48))
+    for grey in range(20, 220, 5):
+        picture = np.full((48, 64, 3), grey, np.uint8)
+        picture[:, :8] = random.integers(0, 255, (48, 8, 3))  # noise fills the file
+        writer.write(picture)
+    writer.release()
+    data = bytearray(path.read_bytes())
+    first, last = int(0.4 * len(data)), int(0.5 * len(data))
+    data[first:last] = bytes(last - first)
+    path.write_bytes(data)
+    source = camera(tmp_path, "film.mp4", repeat=repeat)
+    source.open()
+    greys = [float(one.mean()) for _ in range(30) if (one := source.read().picture) is not None]
+    assert greys[-1] > 150
+    if not repeat:
+        with pytest.raises(CameraLost, match=r"film.mp4 has ended"):
+            means(source, 40)
+    source.close()
+
+
 def test_a_film_may_begin_again(tmp_path: Path, slept: list[float]) -> None:
     film(tmp_path / "film.avi")
     source = camera(tmp_path, "film.avi", repeat=True)
