@@ -208,7 +208,7 @@ class Mapper:
                     return False  # what was kept does not fit the map of the settings
         if self._autosave:
             self._resume_map(self._autosave, boot)
-        found = self._config.mapping == "localize" and kept and kept.map == self._zones.map
+        found = bool(self._config.map) and kept and kept.map == self._zones.map
         if kept and (self._mapped or found):
             self._zones.resume(kept)
         return self._mapped or bool(found)

@@ -14,10 +14,11 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from gigabrain_schemas.brain import OccupancyGrid
-from gigabrain_schemas.topics import MAP, MAP_LOAD, POSE, SCAN, STATE, WORLD
-from gigabrain_schemas.zones import MapLoadRequest
+from gigabrain_schemas.topics import MAP, MAP_LOAD, POSE, SCAN, STATE, WORLD, ZONES_CHANGE
+from gigabrain_schemas.zones import MapLoadRequest, ZonesRequest
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.mapping import autosave, localizer
 from gigabrain_zenoh.perception import node as perception
@@ -25,7 +26,7 @@ from gigabrain_zenoh.recording.process_replay import with_requests
 from gigabrain_zenoh.runtime.replay import record, replay
 from gigabrain_zenoh.testing.samples import state
 from tests.node.mapping_robot import Robot
-from tests.node.test_zone_keeping import ask
+from tests.node.test_zone_keeping import LAB, ask, newest
 
 SCANS_IN_5_S = 50
 Usage = namedtuple("Usage", "total used free")
@@ -355,3 +356,30 @@ async def test_a_disk_that_takes_no_save_at_all_is_tried_every_4_s_only(
             robot.drive(1)
             await asyncio.sleep(0.002)
     assert len(tries) == 1
+
+
+@pytest.mark.parametrize("loaded", [False, True])
+async def test_zones_outlive_perception_where_the_growing_map_cannot_be_saved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, loaded: bool
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    async with Robot() as robot:
+        robot.say()
+        robot.drive(40)
+        assert (await robot.save("house")).ok
+    monkeypatch.setattr(autosave, "KEEP_FREE_BYTES", 10**18)
+    config = PerceptionConfig(mapping="slam", state_dir=str(tmp_path / "robot"))
+    async with Robot(config if loaded else replace(config, map="house")) as robot:
+        robot.say()
+        robot.drive(3, still=True)
+        if loaded:
+            assert (await ask(robot, MAP_LOAD, MapLoadRequest(name="house", mapping="slam"))).ok
+        assert (await ask(robot, ZONES_CHANGE, ZonesRequest(zone=LAB))).ok
+        for _ in range(2):
+            await robot.restart()
+            await robot.ready()
+            robot.say()
+            robot.drive(3, still=True)
+            now = await newest(robot)
+            assert ([one.name for one in now.zones], now.map) == (["lab"], "house")
+            assert now.maps_loaded == loaded
