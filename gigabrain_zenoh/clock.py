@@ -18,6 +18,14 @@ class Clock:
         """Return the time since 1970 [ns], for people and recordings; it jumps when set."""
         return time.time_ns()
 
+    def boot_ns(self) -> int:
+        """Return the time since an arbitrary start [ns], in which a suspend counts.
+
+        It does not jump when the clock is set. A host without such a clock returns Unix time.
+        """
+        boot = getattr(time, "CLOCK_BOOTTIME", None)
+        return time.time_ns() if boot is None else time.clock_gettime_ns(boot)
+
     async def sleep_ns(self, duration_ns: int) -> None:
         """Let other tasks run for `duration_ns`."""
         await asyncio.sleep(duration_ns / 1e9)
@@ -50,6 +58,10 @@ class FakeClock(Clock):
     def unix_ns(self) -> int:
         """Current fake time after 2001-09-09 [ns]."""
         return 1_000_000_000_000_000_000 + self._now
+
+    def boot_ns(self) -> int:
+        """Current fake time [ns]."""
+        return self._now
 
     async def sleep_ns(self, duration_ns: int) -> None:
         """Wait until the test has moved the clock far enough."""

@@ -26,9 +26,11 @@ AHEAD_NS = 100 * MS  # by which the clock of a stamp may be ahead of ours
 ASK_NS = 500 * MS  # from one request for the body to the next
 INTERVALS = 9  # of a sender, for their median
 WINDOW_NS = 10_000_000_000  # for which the shortest delay of a sender counts, at least
+BACK_NS = 20 * MS  # by which two threads of a sender may confuse their messages
 MAX_SENDERS = 8
 FRAMES = ("", "base_link", "base_footprint")  # in which a body can be commanded
 NO_ROBOT = "no state from the robot; check that its driver runs"
+HELD = "the network had held it back, or its sender's clock was set back"
 PAUSE = "send zero, or pause for 0.5 s, before it may drive again"
 
 
@@ -55,7 +57,8 @@ class Lateness(Struct, frozen=True):
     """Delay of messages beyond the shortest one of the last ten to twenty seconds.
 
     Clocks need not agree: an offset is in all delays alike. What a network hands over after a
-    freeze is late, whatever its sender's clock says.
+    freeze is late, whatever its sender's clock says. Messages come in order: where their times go
+    back, their sender's clock was set.
     """
 
     now_ns: int = 0  # of the newest message; 0 for one without a time
@@ -63,6 +66,7 @@ class Lateness(Struct, frozen=True):
     before_ns: int | None = None  # in the window before
     began_ns: int = 0  # of this window
     sent_ns: int = 0  # of its first message, by the sender's clock
+    newest: tuple[int, int, int] = (0, 0, 0)  # when it was sent and arrived, and `clock_ns` then
 
     @property
     def shortest_ns(self) -> int | None:
@@ -70,24 +74,36 @@ class Lateness(Struct, frozen=True):
         known = [ns for ns in (self.least_ns, self.before_ns) if ns is not None]
         return min(known, default=None)
 
-    def then(self, sent_ns: int | None, arrived_ns: int, clock_ns: int) -> "Lateness":
+    def then(
+        self, sent_ns: int | None, arrived_ns: int, clock_ns: int, period_ns: int = 0
+    ) -> "Lateness":
         """Return the state after a message, sent and arrived by clocks that may differ.
 
-        `clock_ns` only goes forward; it ends the windows.
+        `clock_ns` only goes forward; it ends the windows. `period_ns` is the sender's.
         """
         if sent_ns is None:
             return replace(self, now_ns=0)
-        delay_ns, fresh = arrived_ns - sent_ns, self
+        delay_ns, newest, fresh = arrived_ns - sent_ns, (sent_ns, arrived_ns, clock_ns), self
         age_ns = clock_ns - self.began_ns
         # in a freeze of the network only our clock goes on between two messages
         paused_ns = min(age_ns, abs(sent_ns - self.sent_ns))
         if self.least_ns is None or paused_ns > 2 * WINDOW_NS:
             fresh = Lateness(0, None, None, clock_ns, sent_ns)
+        elif sent_ns < self.newest[0] - BACK_NS:
+            late_ns, gap_ns = self._at_most(arrived_ns, clock_ns)
+            least_ns = delay_ns - late_ns - max(0, gap_ns - period_ns)
+            return Lateness(late_ns + gap_ns, least_ns, None, clock_ns, sent_ns, newest)
         elif age_ns > WINDOW_NS:
             fresh = Lateness(0, None, self.least_ns, clock_ns, sent_ns)
         least_ns = delay_ns if fresh.least_ns is None else min(fresh.least_ns, delay_ns)
-        after = replace(fresh, least_ns=least_ns)
+        after = replace(fresh, least_ns=least_ns, newest=newest)
         return replace(after, now_ns=delay_ns - (after.shortest_ns or 0))
+
+    def _at_most(self, arrived_ns: int, clock_ns: int) -> tuple[int, int]:
+        """Return how late the last message was, and the time since: the next is no later."""
+        sent_ns, last_ns, last_clock_ns = self.newest
+        gap_ns = max(arrived_ns - last_ns, clock_ns - last_clock_ns)
+        return last_ns - sent_ns - (self.shortest_ns or 0), gap_ns
 
 
 class Now(NamedTuple):
@@ -96,6 +112,7 @@ class Now(NamedTuple):
     ns: int  # by a clock that only goes forward
     ros_ns: int  # ROS time: Unix time, or that of the simulation
     unix_ns: int  # of this host
+    boot_ns: int  # by a clock of this host that nobody sets, and that a suspend does not stop
 
 
 class Sender(Struct, frozen=True):
@@ -178,11 +195,11 @@ def arrive(config: Config, limits: Limits, memory: Memory, wanted: Wanted, now: 
         return memory, (Refuse(code), *((Send(ZERO),) if memory.holds else ()))
     if code:
         return replace(memory, refusal=text), (Refuse(code),)
-    sender = _next(memory, wanted, now)
+    sender = _next(config, memory, wanted, now)
     late_ns = now.ros_ns - wanted.stamp_ns if wanted.stamp_ns else sender.lateness.now_ns
     memory = replace(memory, senders=_kept(memory.senders, sender))
     if late_ns > config.timeout_ns:
-        text = f"a command came {late_ns / 1e6:.0f} ms late: the network had held it back"
+        text = f"a command came {late_ns / 1e6:.0f} ms late: {HELD}"
         return replace(memory, refusal=text), (Refuse("late"),)
     velocity = clamp(Velocity(linear_x=wanted.linear[0], linear_y=wanted.linear[1],
                               angular_z=wanted.angular[2]), limits)  # fmt: skip
@@ -250,7 +267,7 @@ def offsets_s(memory: Memory, now: Now) -> list[float]:
     least = (
         one.lateness.shortest_ns for one in memory.senders if now.ns - one.last_ns < RELEASE_NS
     )
-    return [ns / 1e9 for ns in least if ns is not None]
+    return [(ns + now.unix_ns - now.boot_ns) / 1e9 for ns in least if ns is not None]
 
 
 def _obey(config: Config, memory: Memory, now: Now) -> Step:
@@ -330,10 +347,11 @@ def _fault(config: Config, wanted: Wanted, now: Now) -> tuple[str, str]:
     return "", ""
 
 
-def _next(memory: Memory, wanted: Wanted, now: Now) -> Sender:
+def _next(config: Config, memory: Memory, wanted: Wanted, now: Now) -> Sender:
     """Return the sender with this command."""
     known = next((one for one in memory.senders if one.id == wanted.sender), None)
-    lateness = (known.lateness if known else Lateness()).then(wanted.sent_ns, now.unix_ns, now.ns)
+    lateness, period_ns = (known.lateness, _period_ns(config, known)) if known else (Lateness(), 0)
+    lateness = lateness.then(wanted.sent_ns, now.boot_ns, now.ns, period_ns)
     if known is None or now.ns - known.last_ns >= RELEASE_NS:
         return Sender(wanted.sender, now.ns, (), lateness)
     intervals = (*known.intervals, now.ns - known.last_ns)[-INTERVALS:]

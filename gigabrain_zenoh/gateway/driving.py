@@ -114,7 +114,7 @@ class RosCommander:
 
     def _now(self) -> Now:
         clock = self._bus.clock
-        return Now(clock.now_ns(), self._scene.ros_ns(), clock.unix_ns())
+        return Now(clock.now_ns(), self._scene.ros_ns(), clock.unix_ns(), clock.boot_ns())
 
     def _act(self, actions: Iterable[Action]) -> None:
         for action in actions:

@@ -38,11 +38,14 @@ class Machine:
     def __init__(self, config=CONFIG, limits=LIMITS):
         self.config, self.limits = config, limits
         self.ms, self.memory, self.gate, self.boot = 0, Memory(), IDLE, samples.BOOT
+        self.set_ms = self.suspended_ms = 0  # by which the clock was set, and the host slept
 
     @property
     def now(self):
         passed = self.ms * 1_000_000
-        return Now(passed, UNIX_NS + passed, UNIX_NS + passed)
+        boot = passed + self.suspended_ms * 1_000_000
+        unix = UNIX_NS + boot + self.set_ms * 1_000_000
+        return Now(passed, unix, unix, boot)
 
     def run(self, step, *about):
         self.memory, actions = step(self.config, *about, self.now)
@@ -373,6 +376,56 @@ def test_what_a_network_hands_over_after_a_freeze_is_refused():
     for late_ms in (4000, 2000, 1210):
         assert machine.command(late_ms=late_ms) == [Refuse("late")]
     assert machine.command(late_ms=1190) == [Ask(False)]
+
+
+@pytest.mark.parametrize("step_ms", [-5000, -300, 300, 5000])
+@pytest.mark.parametrize("own", [False, True])
+def test_a_clock_that_is_set_while_its_host_is_driven_makes_no_sender_late(step_ms, own):
+    machine = Machine()
+    machine.drives()
+    for turn in range(40):
+        machine.ms += 50
+        machine.set_ms = 0 if turn < 10 else step_ms
+        behind_ms = 0 if own else machine.set_ms  # the sender runs on this host, or another
+        machine.state()
+        assert machine.command(late_ms=2 + behind_ms) == [Send(AHEAD)]
+    assert offsets_s(machine.memory, machine.now) == [(2 + behind_ms) / 1000]
+    machine.ms += 300  # held back by the network
+    assert machine.command(late_ms=303 + behind_ms) == [Refuse("late")]
+
+
+def test_what_is_handed_over_after_a_suspend_of_this_host_is_refused():
+    machine = Machine()
+    machine.drives()
+    machine.ms += 50
+    assert machine.command(late_ms=2) == [Send(AHEAD)]
+    machine.suspended_ms = 3000
+    assert machine.command(late_ms=2950) == [Refuse("late")]
+
+
+@pytest.mark.parametrize("back_ms", [300, 5000, 7_200_000])
+def test_a_sender_whose_clock_is_set_back_while_it_drives_is_obeyed(back_ms):
+    machine = Machine()
+    machine.drives(period_ms=100)
+    for turn in range(40):
+        machine.ms += 100
+        machine.state()
+        behind_ms = 0 if turn < 10 else back_ms
+        assert machine.command(late_ms=2 + behind_ms) == [Send(AHEAD)]
+    assert max(ms for ms, speed in machine.sends(300) if speed) == 100
+    assert machine.command(late_ms=303 + back_ms) == [Refuse("late")]
+
+
+def test_what_a_network_holds_back_while_its_senders_clock_is_set_back_is_refused():
+    machine = Machine()
+    machine.drives()
+    machine.ms += 50
+    assert machine.command(late_ms=2) == [Send(AHEAD)]
+    machine.ms += 1050  # sent after 50 ms by a clock that is 5 s behind since
+    machine.state(replace(IDLE, enables=9))
+    for late_ms in (1002, 952, 252):
+        assert machine.command(late_ms=late_ms + 5000) == [Refuse("late")]
+    assert "its sender's clock was set back" in machine.memory.refusal
 
 
 def test_frames_that_are_not_the_body_are_refused():
