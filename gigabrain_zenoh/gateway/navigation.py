@@ -78,10 +78,12 @@ class Navigator:
         A goal that comes while another one is carried out replaces its task.
         """
         before, self._task = self._task, ""
+        abandoned, self._abandoned = self._abandoned, set()  # an accepted goal replaces them
         sending = asyncio.ensure_future(self._send(poses))
         try:
             name = self._task = await asyncio.shield(sending)
         except GigabrainError as error:
+            self._abandoned |= abandoned
             await self._cancel(before)
             return await self._refused(codes, poses, error)
         except asyncio.CancelledError:
@@ -123,8 +125,9 @@ class Navigator:
             self._scene.bus.subscribe(TASK, self._on_status)
 
     def _on_status(self, _key: str, status: TaskStatus) -> None:
+        source = self._scene.bus.process  # another client's task may have the name by now
         for task in (status.current, *status.queue):
-            if task and task.id in self._abandoned:
+            if task and task.source == source and task.id in self._abandoned:
                 self._abandoned.remove(task.id)
                 cancel = asyncio.ensure_future(self._cancel(task.id))
                 self._cancels.add(cancel)

@@ -81,9 +81,9 @@ class Brain:
     def begin(self, poses=(THERE,), codes=TO_POSE):
         return asyncio.ensure_future(self.navigator.carry_out(codes, poses, self.progress.append))
 
-    async def say(self, state, name="goal-1", reason="", **about):
+    async def say(self, state, name="goal-1", reason="", source="ros2", **about):
         """Publish the status of a task that is active, or has ended."""
-        task = Task(id=name, kind="goal", label="", source="ros2", state=state, reason=reason)
+        task = Task(id=name, kind="goal", label="", source=source, state=state, reason=reason)
         if state in ("succeeded", "failed", "cancelled"):
             self.done.insert(0, task)
             status = TaskStatus(done=tuple(self.done), **about)
