@@ -51,14 +51,16 @@ class Tasks:
         on_wait: OnWait | None = None,
         starting_s: float = STARTING_S,
         silent_s: float = SILENT_S,
+        plan_s: float = PLAN_S,
     ) -> None:
         """Create a client that waits up to `starting_s` for a process that serves goals.
 
         The callback `on_wait` receives a text when it starts to wait. After `silent_s` without a
-        task status, BodyLost is raised.
+        task status, or `plan_s` without an answer to a goal, BodyLost is raised.
         """
         self._bus, self._keys = bus, keys
         self._on_wait, self._starting_s, self._silent_s = on_wait, starting_s, silent_s
+        self._plan_s = plan_s
         self._arrived = asyncio.Event()
         self._newest: TaskStatus | None = None
         self._newest_ns = 0  # when it came
@@ -102,7 +104,7 @@ class Tasks:
 
     async def _go(self, request: GoalRequest) -> str:
         self._listen()
-        reply = await self._ask(GOAL, request, PLAN_S)
+        reply = await self._ask(GOAL, request, self._plan_s)
         if not reply.ok:
             raise Refused(reply.text)
         return reply.goal
@@ -128,7 +130,7 @@ class Tasks:
             source=self._bus.process,
             label=label.encode(errors="replace").decode()[:64],  # file names may be any bytes
         )
-        reply = await self._ask(MISSION, request, PLAN_S)
+        reply = await self._ask(MISSION, request, self._plan_s)
         if not reply.ok:
             raise Refused(reply.text)
         return reply.task

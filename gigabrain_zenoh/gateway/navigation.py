@@ -5,7 +5,7 @@ import contextlib
 import itertools
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -15,9 +15,9 @@ from gigabrain_schemas.base import Pose
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.tasks import Task, TaskStatus
 from gigabrain_schemas.topics import MAP, TASK
-from gigabrain_zenoh.client.tasks import Tasks
+from gigabrain_zenoh.client.tasks import PLAN_S, STARTING_S, Tasks
 from gigabrain_zenoh.codec import Codec
-from gigabrain_zenoh.errors import GigabrainError, Refused
+from gigabrain_zenoh.errors import BodyLost, GigabrainError, Refused
 from gigabrain_zenoh.gateway import result_codes
 from gigabrain_zenoh.gateway.conversions.frames import MAP as MAP_FRAME
 from gigabrain_zenoh.gateway.conversions.frames import Make, pose_stamped
@@ -28,6 +28,8 @@ from gigabrain_zenoh.gateway.scene import Scene
 log = logging.getLogger(__name__)
 SECOND_NS = 1_000_000_000
 NEAR_M = 0.5  # by which the task's goal may be off the pose that it stands for
+ACCEPT_S = PLAN_S + STARTING_S  # for which ROS waits until a goal is accepted
+LATE_S = 60.0  # for which an answer is awaited, to cancel what ROS has given up
 MAX_POSES = 200
 NO_TREES = "this navigator has no behavior trees; leave behavior_tree empty"
 _decode_map = Codec(MAP.type, MAP.max_bytes).decode
@@ -64,7 +66,7 @@ class Navigator:
     """Carries out one goal at a time. A new one preempts the one before."""
 
     def __init__(self, scene: Scene) -> None:
-        self._scene, self._tasks = scene, Tasks(scene.bus)
+        self._scene, self._tasks = scene, Tasks(scene.bus, plan_s=LATE_S)
         self._task = ""  # name of the task that the robot is at for ROS
         self._abandoned: set[str] = set()  # tasks whose goals were aborted without an answer
         self._cancels: set[asyncio.Task[None]] = set()
@@ -81,14 +83,13 @@ class Navigator:
         abandoned, self._abandoned = self._abandoned, set()  # an accepted goal replaces them
         sending = asyncio.ensure_future(self._send(poses))
         try:
-            name = self._task = await asyncio.shield(sending)
+            name = self._task = await self._accepted(sending)
         except GigabrainError as error:
             self._abandoned |= abandoned
             await self._cancel(before)
             return await self._refused(codes, poses, error)
         except asyncio.CancelledError:
-            with contextlib.suppress(GigabrainError):  # refused: then there is nothing to cancel
-                await self._cancel(await sending)
+            await asyncio.wait((self._begin_cancel(sending),), timeout=ACCEPT_S)
             await self._cancel(before)
             raise
         follow = _Follower(self._scene, name, poses, on_progress)
@@ -112,6 +113,34 @@ class Navigator:
         text = msgspec.json.encode({"do": steps}).decode()
         return await self._tasks.carry_out(text, label="navigate_through_poses")
 
+    async def _accepted(self, sending: asyncio.Future[str]) -> str:
+        """Return the name of a task; one that is accepted later is cancelled.
+
+        Raises GigabrainError.
+        """
+        await asyncio.wait((sending,), timeout=ACCEPT_S)
+        if sending.done():
+            return sending.result()
+        self._begin_cancel(sending)
+        raise BodyLost(
+            f"no answer within {ACCEPT_S:g} s; the goal is cancelled if it is accepted later"
+        )
+
+    def _begin_cancel(self, sending: asyncio.Future[str]) -> asyncio.Task[None]:
+        """Cancel a task in the background, once it is accepted."""
+
+        async def cancel() -> None:
+            with contextlib.suppress(GigabrainError):  # refused: then there is nothing to cancel
+                await self._cancel(await sending)
+
+        return self._begin(cancel())
+
+    def _begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        task = asyncio.create_task(work)
+        self._cancels.add(task)
+        task.add_done_callback(self._cancels.discard)
+        return task
+
     async def _cancel(self, name: str) -> None:
         if name:
             with contextlib.suppress(GigabrainError):  # it has just ended
@@ -129,9 +158,7 @@ class Navigator:
         for task in (status.current, *status.queue):
             if task and task.source == source and task.id in self._abandoned:
                 self._abandoned.remove(task.id)
-                cancel = asyncio.ensure_future(self._cancel(task.id))
-                self._cancels.add(cancel)
-                cancel.add_done_callback(self._cancels.discard)
+                self._begin(self._cancel(task.id))
 
     async def _refused(self, codes: Codes, poses: Sequence[Pose], error: GigabrainError) -> Outcome:
         """Return the outcome of a goal that was not accepted, with a code by the map."""

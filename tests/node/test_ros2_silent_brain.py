@@ -1,5 +1,10 @@
-"""A brain that falls silent while it carries out a goal of ROS, and comes back."""
+"""A brain that falls silent, or answers late, while ROS has a goal for it."""
 
+import asyncio
+
+import pytest
+
+from gigabrain_zenoh.gateway import navigation
 from gigabrain_zenoh.gateway.navigation import EndState
 from tests.node.test_ros2_navigation import Brain
 
@@ -50,3 +55,36 @@ async def test_a_goal_that_another_client_has_from_a_restarted_brain_is_not_canc
     assert (await goal).state is EndState.ABORTED
     await brain.say("active", source="ann")
     assert len(brain.asked) == 1
+
+
+class SlowBrain(Brain):
+    """A brain that answers a goal when the test says so."""
+
+    def __init__(self):
+        super().__init__()
+        self.may_answer = asyncio.Event()
+
+    async def _goal(self, request):
+        await self.may_answer.wait()
+        return await super()._goal(request)
+
+
+@pytest.mark.parametrize("cancelled", [False, True])
+async def test_a_goal_that_is_accepted_after_it_was_given_up_is_cancelled(monkeypatch, cancelled):
+    monkeypatch.setattr(navigation, "ACCEPT_S", 0.05)
+    brain = SlowBrain()
+    await brain.located()
+    goal = brain.begin()
+    await brain.settle()
+    if cancelled:
+        goal.cancel()
+        await asyncio.wait((goal,))
+        assert goal.cancelled()
+    else:
+        outcome = await goal
+        assert (outcome.state, outcome.code) == (EndState.ABORTED, 9000)
+        assert "no answer" in outcome.text
+    assert brain.asked == []
+    brain.may_answer.set()
+    await brain.settle()
+    assert brain.asked == [(2.0, 1.0, 0.5, "replace"), ("cancel", "goal-1")]
