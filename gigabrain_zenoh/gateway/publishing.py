@@ -59,6 +59,7 @@ COMMANDED = {  # what ROS asks of the robot; what it reads is in `table`
     "release": RELEASE.key, "enable": ENABLE.key, "map_save": MAP_SAVE.key,
     "joint_trajectory": JOINT_CMD.key, "follow_joint_trajectory": JOINT_CMD.key,
 }  # fmt: skip
+OF_FIRST_CAMERA = ("image", "depth", "camera_info")  # parts of its topics, below `camera`
 # a message, or its CDR; None: nothing to publish
 Convert = Callable[[Make, Any, Scene], Any | None]
 
@@ -160,9 +161,13 @@ class _Plans:
 
 
 def camera_rows(cameras: tuple[Camera, ...]) -> Iterator[Row]:
-    """Yield the rows of the cameras: the first below `camera`, others below `camera/NAME`."""
+    """Yield the rows of the cameras: the first below `camera`, others below `camera/NAME`.
+
+    A further camera `depth` is below `camera/depth_camera`.
+    """
+    names = {camera.name for camera in cameras}
     for number, camera in enumerate(cameras):
-        at = f"camera/{camera.name}" if number else "camera"
+        at = f"camera/{_apart(camera.name, names)}" if number else "camera"
 
         def picture(make: Make, image: Any, _: Scene, camera: Camera = camera) -> Any:
             return sensors.compressed_image(make, image, camera.name)
@@ -181,6 +186,16 @@ def camera_rows(cameras: tuple[Camera, ...]) -> Iterator[Row]:
             yield Row(f"{at}/image_raw", raw, SENSOR_DATA, ((DEPTH, depth),), camera.name)
             # depth_image_proc looks for it there
             yield Row(f"{at}/camera_info", about, SENSOR_DATA, ((DEPTH, info),), camera.name)
+
+
+def _apart(name: str, names: Collection[str]) -> str:
+    """Return the name below `camera`: another one where the first camera has topics by it."""
+    if name not in OF_FIRST_CAMERA:
+        return name
+    name += "_camera"
+    while name in names:
+        name += "_"
+    return name
 
 
 @dataclass

@@ -341,6 +341,18 @@ async def test_topics_of_cameras_follow_the_body():
         assert set(robot.node.topics()) == plain
 
 
+async def test_a_camera_whose_name_the_first_one_has_topics_of_is_apart():
+    names = ("depth", "image", "depth_camera")
+    further = tuple(Camera(name=name, width=16, height=16, depth=True) for name in names)
+    async with driver() as robot:
+        await robot.body(replace(BURGER, cameras=(CAMERAS[0], *further)))
+        topics = [one.topic for one in robot.node.transport.endpoints() if one.kind == "publisher"]
+        assert len(topics) == len(set(topics))
+        cameras = {topic.rpartition("/camera_info")[0] for topic in topics if "info" in topic}
+        apart = ("", "/depth_camera_", "/image_camera", "/depth_camera")
+        assert cameras == {f"/camera{at}{part}" for at in apart for part in ("", "/depth")}
+
+
 async def test_a_path_ends_with_an_empty_one():
     async with driver() as robot:
         robot.read("/plan")
