@@ -12,6 +12,7 @@ Rotation = tuple[float, float, float, float]  # quaternion x, y, z, w
 
 MAP, ODOM, FOOTPRINT, BASE = "map", "odom", "base_footprint", "base_link"
 IMU_LINK, SCAN_LINK = "imu_link", "base_scan"
+PARTS = ("base", "imu", "wheel_left", "wheel_right")  # of a body, whose frames end in `_link`
 SECOND_NS = 1_000_000_000
 END_NS = 2**31 * SECOND_NS  # of builtin_interfaces/Time
 STRAIGHT: Rotation = (0.0, 0.0, 0.0, 1.0)
@@ -128,8 +129,8 @@ def _transform(make: Make, at_ns: int, placed: Placed) -> Any:
 
 
 def camera_link(camera: str) -> str:
-    """Return the frame of a camera's mount, which looks along x."""
-    return f"{camera}_link"
+    """Return the frame of a camera's mount, which looks along x; no part of the body has it."""
+    return f"{camera}_camera_link" if camera in PARTS else f"{camera}_link"
 
 
 def optical_frame(camera: str) -> str:

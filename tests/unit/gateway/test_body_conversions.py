@@ -173,6 +173,16 @@ def test_wheels_are_known_of_a_differential_base_with_sizes_only():
     assert len(body.moving_frames(None, STATE)) == 1
 
 
+def test_a_camera_that_is_called_like_a_part_of_the_body_has_a_frame_of_its_own():
+    cameras = tuple(Camera(name=name) for name in ("base", "imu", "wheel_left"))
+    body = samples.body(replace(BURGER, cameras=cameras))
+    robot = xml.fromstring(description.urdf(body))
+    links = [link.get("name") for link in robot.iter("link")]
+    assert len(links) == len(set(links))
+    assert "base_camera_link" in links
+    assert [placed.parent for placed in frames.static_frames(body)][3::2] == ["base_link"] * 3
+
+
 def test_a_urdf_has_the_hull_the_wheels_and_all_frames_of_tf():
     robot = xml.fromstring(description.urdf(samples.body(BURGER)))
     links = {link.get("name") for link in robot.findall("link")}
