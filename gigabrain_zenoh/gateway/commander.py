@@ -30,6 +30,7 @@ BACK_NS = 20 * MS  # by which two threads of a sender may confuse their messages
 MAX_SENDERS = 8
 FRAMES = ("", "base_link", "base_footprint")  # in which a body can be commanded
 NO_ROBOT = "no state from the robot; check that its driver runs"
+NO_BASE = "the robot has no base to drive; move its joints by /joint_trajectory"
 HELD = "the network had held it back, or its sender's clock was set back"
 PAUSE = "send zero, or pause for 0.5 s, before it may drive again"
 
@@ -189,7 +190,7 @@ def arrive(config: Config, limits: Limits, memory: Memory, wanted: Wanted, now: 
     """Process a command of ROS."""
     paused = memory.silence.then(now.ns).is_pause
     memory = replace(memory, silence=Silence.broken(now.ns))
-    code, text = _fault(config, wanted, now)
+    code, text = _fault(config, limits, wanted, now)
     if code == "not_finite":  # its sender is out of order: brake
         memory = replace(memory, velocity=ZERO, refusal=text)
         return memory, (Refuse(code), *((Send(ZERO),) if memory.holds else ()))
@@ -331,10 +332,12 @@ def _is_old(memory: Memory) -> bool:
     return memory.gate is not None and memory.boot == boot and memory.gate.enables < enables
 
 
-def _fault(config: Config, wanted: Wanted, now: Now) -> tuple[str, str]:
+def _fault(config: Config, limits: Limits, wanted: Wanted, now: Now) -> tuple[str, str]:
     """Return code and text of what is wrong with a command; empty if nothing is."""
     if not all(math.isfinite(value) for value in (*wanted.linear, *wanted.angular)):
         return "not_finite", "a command holds NaN or infinity; repair the program that sends it"
+    if not limits.linear_speed and any((*wanted.linear, *wanted.angular)):
+        return "no_base", NO_BASE
     if wanted.frame.rpartition("/")[2] not in FRAMES:
         return "frame", f"a command is in frame {wanted.frame[:60]!r}; expected base_link"
     if wanted.stamp_ns:

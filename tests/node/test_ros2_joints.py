@@ -237,6 +237,22 @@ async def test_an_estop_ends_a_goal_and_what_follows_is_refused(tmp_path):
         assert "gigabrain: joint_trajectory" not in robot.diagnostics()
 
 
+async def test_a_velocity_for_an_arm_without_a_base_is_refused_and_says_so(tmp_path):
+    async with ready(tmp_path) as (robot, _):
+        robot.node.read("/diagnostics", DIAGNOSTICS)
+        for speed in (0.0, 0.2):
+            for _ in range(60):
+                robot.node.drive(speed)
+                await robot.go(1)
+            found = robot.diagnostics()["gigabrain: cmd_vel"]
+            assert (found.level, "has no base to drive" in found.message) == (
+                (1, True) if speed else (0, False)
+            )
+        assert robot.gateway_bus.counters["cmd_vel_no_base"] == 60
+        await robot.go(80)
+        assert robot.diagnostics()["gigabrain: cmd_vel"].level == 0
+
+
 async def stream(robot, ticks):
     """Publish a trajectory that goes on a little from what was sent, every second tick."""
     for _ in range(ticks // 2):
