@@ -32,6 +32,8 @@ RESTART_NS = 500_000_000
 CLOSE_S = 1.0  # for its own link,
 END_S = 2.0  # and for the whole process
 START_S = 60.0  # for its first word, on a busy machine; to start it again would make that slower
+MAX_CHARS = 200  # of a fault
+GUARD = "the guard, which stops the robot if this driver dies,"
 
 
 class Guard:
@@ -42,18 +44,18 @@ class Guard:
         self._options, self._clock, self._reached = options, clock, reached
         self._process: asyncio.subprocess.Process | None = None
         self._received_ns: int | None = None
-        self._readers = 0
+        self._readers, self._fault = 0, ""  # the fault of the one before
         self._task: asyncio.Task[None] | None = None
 
     @property
     def problem(self) -> str:
         """Return why the guard could not stop the robot now; empty if it could."""
         if self._received_ns is None:
-            return "the guard, which stops the robot if this driver dies, is starting"
+            return f"{GUARD} {self._fault or 'is starting'}"
         if self._clock.now_ns() - self._received_ns > LOST_NS:
-            return "the guard, which stops the robot if this driver dies, does not answer"
+            return f"{GUARD} does not answer"
         if not self._readers:
-            return "the guard, which stops the robot if this driver dies, does not reach it yet"
+            return f"{GUARD} does not reach it yet"
         return ""
 
     def open(self) -> None:
@@ -83,22 +85,29 @@ class Guard:
     async def _keep(self) -> None:
         while True:
             try:
-                await self._run()
+                self._fault = f"{await self._run()}; starting it again"
             finally:
                 self._process, self._received_ns = None, None
             await self._clock.sleep_ns(RESTART_NS)
 
-    async def _run(self) -> None:
+    async def _start(self) -> asyncio.subprocess.Process:
+        """Start the process. Raises OSError."""
         settings = msgspec.to_builtins(self._options)
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-        process = await asyncio.create_subprocess_exec(
+        return await asyncio.create_subprocess_exec(
             *(sys.executable, "-P", "-m", __name__, json.dumps(settings)),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             env=environment,
             start_new_session=True,  # what ends the driver's group must not end it
         )
-        self._process = process
+
+    async def _run(self) -> str:
+        """Start the process, and listen to it; return why it is of no use any more."""
+        try:
+            process = self._process = await self._start()
+        except OSError as error:
+            return f"cannot be started: {error}"
         assert process.stdout
         assert process.stdin
         alone_ns: int | None = None  # from its first word on
@@ -107,12 +116,16 @@ class Guard:
                 async with asyncio.timeout(START_S if self._received_ns is None else LOST_NS / 1e9):
                     line = await process.stdout.readline()
                 if not line:
-                    return
-                self._received_ns, self._readers = self._clock.now_ns(), int(line)
+                    return "has ended"
+                self._readers = int(line)
+                self._received_ns = self._clock.now_ns()
                 if alone_ns is None or self._readers or not self._reached():
                     alone_ns = self._received_ns
+            return "does not reach the robot, which this driver does"
         except TimeoutError:
-            return
+            return "does not answer"
+        except ValueError as error:
+            return f"printed something other than a number: {str(error)[:MAX_CHARS]}"
         finally:
             process.stdin.close()  # it ends by that
             await _ended(process, 0.0 if self._task else END_S)  # one that is replaced may hang
