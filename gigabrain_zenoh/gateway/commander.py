@@ -51,7 +51,7 @@ class Wanted(NamedTuple):
     sender: bytes = b""
     frame: str = ""
     stamp_ns: int = 0  # of a TwistStamped, in ROS time; 0 for none
-    sent_ns: int | None = None  # Unix time of its publication, by the sender's clock
+    sent_ns: int | None = None  # Unix time by the sender's clock; None or 0: unknown
 
 
 class Lateness(Struct, frozen=True):
@@ -82,7 +82,7 @@ class Lateness(Struct, frozen=True):
 
         `clock_ns` only goes forward; it ends the windows. `period_ns` is the sender's.
         """
-        if sent_ns is None:
+        if not sent_ns:  # Cyclone DDS has 0 for a message without a time
             return replace(self, now_ns=0)
         delay_ns, newest, fresh = arrived_ns - sent_ns, (sent_ns, arrived_ns, clock_ns), self
         age_ns = clock_ns - self.began_ns

@@ -428,6 +428,16 @@ def test_what_a_network_holds_back_while_its_senders_clock_is_set_back_is_refuse
     assert "its sender's clock was set back" in machine.memory.refusal
 
 
+def test_a_sender_whose_messages_have_no_time_is_obeyed():
+    machine = Machine()
+    machine.drives()
+    for _ in range(40):
+        machine.ms += 50
+        machine.state()
+        timeless = Wanted((0.2, 0.0, 0.0), (0.0, 0.0, 0.0), b"a", sent_ns=0)
+        assert machine.run(arrive, LIMITS, machine.memory, timeless) == [Send(AHEAD)]
+
+
 def test_frames_that_are_not_the_body_are_refused():
     machine = Machine()
     machine.drives()
