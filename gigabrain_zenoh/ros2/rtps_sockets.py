@@ -80,6 +80,7 @@ class Sockets:
     def refresh(self) -> tuple[list[str], list[str]]:
         """Return this host's IPv4 addresses, to announce and all; join the group on new ones."""
         own = addresses()
+        own = sorted(self._joined) if own is None else own
         outer = [one for one in own if not one.startswith("127.")]
         for one in own:
             if self._group and one not in self._joined:
@@ -150,12 +151,16 @@ class Sockets:
         return group
 
 
-def addresses() -> list[str]:
-    """Return the IPv4 addresses of this host's interfaces that are up."""
-    up = {name for name, stats in psutil.net_if_stats().items() if stats.isup}
+def addresses() -> list[str] | None:
+    """Return the IPv4 addresses of this host's interfaces that are up; None: not known now."""
+    try:
+        stats, interfaces = psutil.net_if_stats(), psutil.net_if_addrs()
+    except OSError:  # such as too many open files
+        return None
+    up = {name for name, one in stats.items() if one.isup}
     found = {
         one.address
-        for name, some in psutil.net_if_addrs().items()
+        for name, some in interfaces.items()
         if name in up
         for one in some
         if one.family == socket.AF_INET
@@ -164,5 +169,5 @@ def addresses() -> list[str]:
 
 
 def outer_addresses() -> set[str]:
-    """Return the addresses without those of the loopback."""
-    return {one for one in addresses() if not one.startswith("127.")}
+    """Return the addresses without those of the loopback; none while they are not known."""
+    return {one for one in addresses() or () if not one.startswith("127.")}

@@ -1,8 +1,10 @@
 """The ports of a participant, in the last domain, which has ports for 63 of them only."""
 
 import contextlib
+import errno
 import socket
 
+import psutil
 import pytest
 
 from gigabrain_zenoh.errors import BusError
@@ -11,7 +13,7 @@ from gigabrain_zenoh.ros2.rtps_discovery import (
     multicast_port,
     participant_ports,
 )
-from gigabrain_zenoh.ros2.rtps_sockets import Sockets
+from gigabrain_zenoh.ros2.rtps_sockets import Sockets, outer_addresses
 
 
 async def test_the_last_domain_is_announced_to_the_ports_that_it_has():
@@ -45,3 +47,15 @@ async def test_a_port_of_announcements_that_another_program_has_is_named():
     for port in participant_ports(domain, 0):  # nothing is left open
         with socket.socket(type=socket.SOCK_DGRAM) as free:
             free.bind(("", port))
+
+
+async def test_addresses_that_cannot_be_read_leave_those_before(monkeypatch):
+    sockets = Sockets(MAX_DOMAIN, localhost=False, peers=())
+    before = sockets.refresh()
+
+    def fail():
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(psutil, "net_if_stats", fail)
+    assert sockets.refresh() == before
+    assert outer_addresses() == set()
