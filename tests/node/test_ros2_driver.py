@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gigabrain_drivers.bodies.ros2.driver import Ros2Driver
-from gigabrain_drivers.bodies.ros2.link import all_types
+from gigabrain_drivers.bodies.ros2.link import RETRY_NS, all_types
 from gigabrain_drivers.bodies.ros2.options import Ros2Options
 from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_drivers.driver.robot import Run
@@ -179,6 +179,23 @@ async def test_it_is_found_once_it_reports_and_takes_commands(bench: Bench) -> N
     assert bench.driver.problem == "odom: no message yet"
     assert await bench.found_after_ms() <= 60
     assert (await bench.driver.read_state()).link.reconnects == 0
+
+
+@pytest.mark.parametrize("error", [OSError(24, "Too many open files"), RuntimeError("no thread")])
+async def test_a_fault_while_joining_is_named_and_joining_goes_on(error: Exception) -> None:
+    bench = Bench(made())
+    link, good = bench.driver.link, bench.driver.link._opener
+
+    def fails() -> Any:
+        raise error
+
+    link._opener = fails
+    await bench.driver.open()
+    await until(lambda: str(error) in link.problem, "the fault")
+    link._opener = good
+    await bench.clock.advance(RETRY_NS)
+    await until(lambda: link.transport, "the driver's node")
+    await bench.driver.close()
 
 
 async def test_commands_arrive_in_the_robots_steps_and_are_repeated(bench: Bench) -> None:

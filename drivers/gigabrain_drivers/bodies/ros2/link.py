@@ -17,7 +17,7 @@ from gigabrain_drivers.links import link as links
 from gigabrain_drivers.links.link import Trace
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import BadPayload, GigabrainError
+from gigabrain_zenoh.errors import BadPayload
 from gigabrain_zenoh.logs import Fault
 from gigabrain_zenoh.ros2.opening import load_types, open_transport
 from gigabrain_zenoh.ros2.qos import Qos
@@ -126,9 +126,9 @@ class RosLink:
                         await self._until_moved()
                     finally:
                         self.transport = self._command = None
-            except GigabrainError as error:
-                self.problem = str(error)
-                fault.begin(f"{self}: {error}")
+            except Exception as error:  # noqa: BLE001 - such as no thread left; there may be one soon
+                self.problem = str(error) or type(error).__name__
+                fault.begin(f"{self}: {self.problem}")
                 await self._clock.sleep_ns(RETRY_NS)
 
     async def _until_moved(self) -> None:
