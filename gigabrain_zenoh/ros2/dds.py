@@ -192,13 +192,16 @@ class DdsTransport:
     async def __aenter__(self) -> "DdsTransport":
         self._loop = asyncio.get_running_loop()
         self._services = await RequestReply.open(self.link.domain, localhost=self.link.localhost)
-        self._bridge = Bridge()
-        try:
-            self._open()
-        except DDSException as error:
-            await self._services.close()
-            self._bridge.close()
-            raise BusError(f"DDS domain {self.link.domain} cannot be joined: {error}") from None
+        async with contextlib.AsyncExitStack() as undo:
+            undo.push_async_callback(self._services.close)
+            self._bridge = Bridge()
+            undo.callback(self._bridge.close)
+            try:
+                self._open()
+            except DDSException as error:
+                text = f"DDS domain {self.link.domain} cannot be joined: {error}"
+                raise BusError(text) from None
+            undo.pop_all()
         return self
 
     async def __aexit__(

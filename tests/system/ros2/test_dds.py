@@ -1,5 +1,6 @@
 """Tests of the DDS transport alone, with our participants in this process."""
 
+import asyncio
 import contextlib
 import socket
 from collections.abc import AsyncIterator
@@ -7,10 +8,11 @@ from collections.abc import AsyncIterator
 import pytest
 
 from gigabrain_zenoh.errors import BusError
+from gigabrain_zenoh.ros2 import dds
 from gigabrain_zenoh.ros2.qos import SENSOR_DATA, Qos
 from gigabrain_zenoh.ros2.rtps_discovery import participant_ports
 from gigabrain_zenoh.ros2.transport import Received
-from gigabrain_zenoh.testing.waiting import until
+from gigabrain_zenoh.testing.waiting import settle, until
 from tests.ros2.judge import free_domain
 from tests.ros2.nodes import STRING, Nodes, dds_nodes
 
@@ -50,6 +52,26 @@ async def test_where_many_have_joined_it_stays_on_the_loopback_or_is_refused(tak
                 socket.socket(type=socket.SOCK_DGRAM) as probe,
             ):
                 probe.bind(("127.0.0.1", last))
+
+
+@pytest.mark.parametrize("part", ["Bridge", "_Waiting"])
+async def test_where_it_cannot_be_opened_nothing_is_left(
+    monkeypatch: pytest.MonkeyPatch, part: str
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(24, "Too many open files")
+
+    before = asyncio.all_tasks()
+    monkeypatch.setattr(dds, part, fail)
+    with free_domain() as domain:
+        opened = Nodes(transport="dds", domain=domain, localhost=True).opened()
+        with pytest.raises(OSError, match="Too many open files"):
+            await opened.__aenter__()
+        assert asyncio.all_tasks() == before
+        await settle()  # sockets are closed in the next turn of the loop
+        for port in participant_ports(domain, 0):
+            with socket.socket(type=socket.SOCK_DGRAM) as free:
+                free.bind(("127.0.0.1", port))
 
 
 async def test_what_is_no_message_of_the_type_is_not_sent(nodes: Nodes) -> None:
