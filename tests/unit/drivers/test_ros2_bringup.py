@@ -1,6 +1,7 @@
 """The bringup check names what is wrong with a ROS 2 robot, and what to do."""
 
 import asyncio
+import math
 from typing import Any
 
 import msgspec
@@ -187,20 +188,36 @@ def test_an_inertial_unit_without_orientation_is_a_warning() -> None:
     assert "topics.imu.name" in wrong.do
 
 
-def tree(types: Types, x: float) -> FrameTree:
+def tree(types: Types, x: float, yaw: float = 0.0) -> FrameTree:
     made = FrameTree()
-    for parent, child, at in (("base_footprint", "base_link", 0.0), ("base_link", "base_scan", x)):
+    turn = {"z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
+    for parent, child, at, rotation in (
+        ("base_footprint", "base_link", 0.0, {"w": 1.0}),
+        ("base_link", "base_scan", x, turn),
+    ):
         made.add(
             [
                 types.make(
                     "geometry_msgs/msg/TransformStamped",
                     header={"frame_id": parent},
                     child_frame_id=child,
-                    transform={"translation": {"x": at}},
+                    transform={"translation": {"x": at}, "rotation": rotation},
                 )
             ]
         )
     return made
+
+
+@pytest.mark.parametrize(
+    ("turned", "verdict"), [(math.pi, "ok"), (-3.12, "ok"), (-3.0, "warning"), (0.0, "warning")]
+)
+def test_a_lidar_that_looks_back_is_turned_by_half_a_turn_either_way(
+    turned: float, verdict: str
+) -> None:
+    frames = tree(Types(), -0.032, turned)
+    seen = Watched(GOOD, {"scan": heard(10.0, frame="base_scan")}, frames)
+    found = findings(options(), msgspec.structs.replace(LIDAR, yaw=math.pi), seen)
+    assert only(found, "scan frame").verdict == verdict
 
 
 @pytest.mark.parametrize(

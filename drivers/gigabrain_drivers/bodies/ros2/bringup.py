@@ -13,6 +13,7 @@ from gigabrain_drivers.bodies.ros2.conversion import has_orientation, stamp_ns
 from gigabrain_drivers.bodies.ros2.frames import FrameTree
 from gigabrain_drivers.bodies.ros2.options import Ros2Options
 from gigabrain_schemas.body import Lidar
+from gigabrain_zenoh.geometry.pose import wrap_angle
 from gigabrain_zenoh.ros2.graph import CLOCK_S, SYNCHRONISE, clock_text, unreached
 from gigabrain_zenoh.ros2.qos import Qos, mismatch
 from gigabrain_zenoh.ros2.transport import GraphEndpoint, absolute
@@ -287,7 +288,7 @@ def _connected(options: Ros2Options, lidar: Lidar | None, watched: Watched) -> l
         x, y, yaw = place.planar
         text = f"{name} at x {x:.3f} m, y {y:.3f} m, yaw {yaw:.3f} rad of {base}"
         if part == "scan" and lidar and options.mounting == "file":
-            off = max(abs(x - lidar.x), abs(y - lidar.y)), abs(yaw - lidar.yaw)
+            off = max(abs(x - lidar.x), abs(y - lidar.y)), abs(wrap_angle(yaw - lidar.yaw))
             if off[0] > PLACE_M or off[1] > PLACE_RAD:
                 do = "correct x, y and yaw of `lidar:`, or write mounting: tf_static"
                 expected = f"the file says x {lidar.x:g}, y {lidar.y:g}, yaw {lidar.yaw:g}"
