@@ -40,6 +40,14 @@ R = TypeVar("R", bound=Message)
 OnWait = Callable[[str], None]
 
 
+def late(timeout_s: float) -> str:
+    """Return what is known of a request that was not answered in time."""
+    return (
+        f"no answer within {timeout_s:g} s; `gigabrain task list` shows whether the robot has "
+        "accepted it"
+    )
+
+
 class Tasks:
     """Client for the tasks of one robot."""
 
@@ -207,8 +215,10 @@ class Tasks:
                     "the link was lost before the answer; `gigabrain task list` shows whether the "
                     "robot has received the request"
                 )
-            # after a timeout the request may have been received: do not repeat it
-            if now() >= until or took >= timeout_s or may_not_ask(self._keys):
+            doubt = may_not_ask(self._keys)
+            if took >= timeout_s:  # the request may have been received: do not repeat it
+                raise BodyLost(f"{late(timeout_s)}{doubt}")
+            if now() >= until or doubt:
                 raise self._no_server()
             if self._on_wait and not waits:
                 self._on_wait(

@@ -1,5 +1,6 @@
 """Commands of ROS on the bus: /cmd_vel by the commander, and the poses that RViz publishes."""
 
+import asyncio
 import logging
 from collections.abc import Iterable
 from typing import Any
@@ -12,9 +13,9 @@ from gigabrain_schemas.requests import PoseRequest
 from gigabrain_schemas.tasks import GoalRequest
 from gigabrain_schemas.topics import GOAL, POSE_SET, command_topic
 from gigabrain_zenoh.client.requests import ANSWER_S, enable
-from gigabrain_zenoh.client.tasks import PLAN_S
+from gigabrain_zenoh.client.tasks import PLAN_S, late
 from gigabrain_zenoh.config.settings import Ros2Config
-from gigabrain_zenoh.errors import BadPayload, GigabrainError, Refused
+from gigabrain_zenoh.errors import BadPayload, BodyLost, GigabrainError, Refused
 from gigabrain_zenoh.gateway import commander
 from gigabrain_zenoh.gateway.background import Background
 from gigabrain_zenoh.gateway.commander import Action, Ask, Memory, Now, Refuse, Send, wanted_of
@@ -179,7 +180,11 @@ class PoseRequests:
         at = in_map(message.header.frame_id, planar(message.pose), self._scene.odom_in_map)
         bus = self._scene.bus
         request = GoalRequest(x=at.x, y=at.y, yaw=at.yaw, source=bus.process)
+        now = asyncio.get_running_loop().time
+        asked = now()
         replies = await bus.ask(GOAL, request, timeout_s=PLAN_S)
+        if not replies and now() - asked >= PLAN_S:
+            raise BodyLost(late(PLAN_S))
         if not replies:
             raise Refused("no process serves goals; run decision with behaviour: navigate")
         if not replies[0].ok:

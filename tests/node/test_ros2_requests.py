@@ -11,6 +11,8 @@ from gigabrain_schemas.requests import PoseReply
 from gigabrain_schemas.tasks import GoalReply
 from gigabrain_schemas.topics import GOAL, POSE, POSE_SET
 from gigabrain_zenoh.config.settings import Ros2Config
+from gigabrain_zenoh.gateway import driving
+from gigabrain_zenoh.testing.waiting import until
 from tests.node.ros2_robot import TICK_NS
 from tests.node.test_ros2_topics import diagnosed, driver
 
@@ -48,6 +50,19 @@ async def test_initialpose_says_where_the_robot_is_and_how_sure_that_is():
 
 
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
+
+
+async def test_a_goal_pose_that_is_answered_late_may_have_been_accepted(monkeypatch):
+    monkeypatch.setattr(driving, "PLAN_S", 0.01)
+    async with driver() as robot:
+        await robot.body()
+        robot.read("/diagnostics")
+        robot.bus.serve(GOAL, lambda _: asyncio.Event().wait())
+        robot.node.publish("/goal_pose", POSE_STAMPED, header={"frame_id": "map"}, pose=THERE)
+        await robot.clock.advance(0)
+        await until(lambda: robot.gateway_bus.counters["goal_pose_refused"], "the timeout")
+        _, text = (await diagnosed(robot))["gigabrain: goal_pose"]
+        assert "no answer within 0.01 s; `gigabrain task list` shows" in text
 
 
 async def test_goal_pose_is_a_goal_in_map_or_odom():

@@ -141,6 +141,17 @@ async def test_a_request_whose_link_was_lost_is_not_repeated() -> None:
     assert len(received) == 1
 
 
+async def test_a_goal_that_is_answered_late_may_have_been_accepted() -> None:
+    async def answer(_: GoalRequest) -> GoalReply:
+        await asyncio.Event().wait()
+        raise AssertionError
+
+    net = Net()
+    net.one.serve(GOAL, answer)
+    with pytest.raises(BodyLost, match=r"no answer within 0\.01 s; `gigabrain task list` shows"):
+        await Tasks(net.two, plan_s=0.01).go_to(1.0, 0.0)
+
+
 @pytest.mark.parametrize("x", [math.nan, math.inf, -1e300])
 async def test_a_script_is_told_of_a_goal_that_is_no_place(x: float) -> None:
     with pytest.raises(ConfigError, match=re.escape(f"numbers up to 1e+09, got {x:g} 0 1")):
