@@ -16,6 +16,7 @@ from msgspec.structs import replace
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import GateStatus, RobotState
 from gigabrain_zenoh.geometry.limits import ZERO, Limits, clamp
+from gigabrain_zenoh.ros2.transport import Received
 
 MS = 1_000_000
 TIMEOUT_NS = 200 * MS  # longest period of a sender
@@ -52,14 +53,15 @@ class Wanted(NamedTuple):
     frame: str = ""
     stamp_ns: int = 0  # of a TwistStamped, in ROS time; 0 for none
     sent_ns: int | None = None  # Unix time by the sender's clock; None or 0: unknown
+    number: int | None = None  # of its sender's messages; None where only their order is known
 
 
 class Lateness(Struct, frozen=True):
     """Delay of messages beyond the shortest one of the last ten to twenty seconds.
 
     Clocks need not agree: an offset is in all delays alike. What a network hands over after a
-    freeze is late, whatever its sender's clock says. Messages come in order: where their times go
-    back, their sender's clock was set.
+    freeze is late, whatever its sender's clock says. Where the times of messages in order go back,
+    their sender's clock was set.
     """
 
     now_ns: int = 0  # of the newest message; 0 for one without a time
@@ -76,11 +78,13 @@ class Lateness(Struct, frozen=True):
         return min(known, default=None)
 
     def then(
-        self, sent_ns: int | None, arrived_ns: int, clock_ns: int, period_ns: int = 0
-    ) -> "Lateness":
+        self, sent_ns: int | None, arrived_ns: int, clock_ns: int, period_ns: int = 0, *,
+        ordered: bool = True,
+    ) -> "Lateness":  # fmt: skip
         """Return the state after a message, sent and arrived by clocks that may differ.
 
-        `clock_ns` only goes forward; it ends the windows. `period_ns` is the sender's.
+        `clock_ns` only goes forward; it ends the windows. `period_ns` is the sender's. A message
+        that is not `ordered` was sent before the last one.
         """
         if not sent_ns:  # Cyclone DDS has 0 for a message without a time
             return replace(self, now_ns=0)
@@ -90,7 +94,7 @@ class Lateness(Struct, frozen=True):
         paused_ns = min(age_ns, abs(sent_ns - self.sent_ns))
         if self.least_ns is None or paused_ns > 2 * WINDOW_NS:
             fresh = Lateness(0, None, None, clock_ns, sent_ns)
-        elif sent_ns < self.newest[0] - BACK_NS:
+        elif ordered and sent_ns < self.newest[0] - BACK_NS:
             late_ns, gap_ns = self._at_most(arrived_ns, clock_ns)
             least_ns = delay_ns - late_ns - max(0, gap_ns - period_ns)
             return Lateness(late_ns + gap_ns, least_ns, None, clock_ns, sent_ns, newest)
@@ -123,6 +127,7 @@ class Sender(Struct, frozen=True):
     last_ns: int
     intervals: tuple[int, ...] = ()  # [ns], newest last
     lateness: Lateness = Lateness()
+    number: int | None = None  # of its last message
 
 
 class Silence(Struct, frozen=True):
@@ -353,12 +358,14 @@ def _fault(config: Config, limits: Limits, wanted: Wanted, now: Now) -> tuple[st
 def _next(config: Config, memory: Memory, wanted: Wanted, now: Now) -> Sender:
     """Return the sender with this command."""
     known = next((one for one in memory.senders if one.id == wanted.sender), None)
-    lateness, period_ns = (known.lateness, _period_ns(config, known)) if known else (Lateness(), 0)
-    lateness = lateness.then(wanted.sent_ns, now.boot_ns, now.ns, period_ns)
-    if known is None or now.ns - known.last_ns >= RELEASE_NS:
-        return Sender(wanted.sender, now.ns, (), lateness)
-    intervals = (*known.intervals, now.ns - known.last_ns)[-INTERVALS:]
-    return Sender(wanted.sender, now.ns, intervals, lateness)
+    known = known or Sender(wanted.sender, now.ns - RELEASE_NS)
+    last, number, period_ns = known.number, wanted.number, _period_ns(config, known)
+    ordered = bool(wanted.sender) and (last is None or number is None or number >= last)
+    sent_ns, before = wanted.sent_ns, known.lateness
+    lateness = before.then(sent_ns, now.boot_ns, now.ns, period_ns, ordered=ordered)
+    passed_ns = now.ns - known.last_ns
+    intervals = (*known.intervals, passed_ns)[-INTERVALS:] if passed_ns < RELEASE_NS else ()
+    return Sender(wanted.sender, now.ns, intervals, lateness, number)
 
 
 def _kept(senders: tuple[Sender, ...], newest: Sender) -> tuple[Sender, ...]:
@@ -373,9 +380,12 @@ def _period_ns(config: Config, sender: Sender) -> int:
     return min(config.timeout_ns, round(statistics.median(sender.intervals)))
 
 
-def wanted_of(twist: Any, sender: bytes = b"", sent_ns: int | None = None) -> Wanted:
+def wanted_of(twist: Any, received: Received) -> Wanted:
     """Return a geometry_msgs/Twist as a command."""
-    linear, angular = twist.linear, twist.angular
     return Wanted(
-        (linear.x, linear.y, linear.z), (angular.x, angular.y, angular.z), sender, "", 0, sent_ns
+        (twist.linear.x, twist.linear.y, twist.linear.z),
+        (twist.angular.x, twist.angular.y, twist.angular.z),
+        received.gid,
+        sent_ns=received.source_ns,
+        number=received.number,
     )

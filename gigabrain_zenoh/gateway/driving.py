@@ -79,13 +79,13 @@ class RosCommander:
     def _on_twist(self, received: Received) -> None:
         twist = self._decoded(TWIST, received)
         if twist is not None:
-            self._arrive(wanted_of(twist, received.gid, received.source_ns))
+            self._arrive(wanted_of(twist, received))
 
     def _on_stamped(self, received: Received) -> None:
         message = self._decoded(STAMPED, received)
         if message is None:
             return
-        wanted = wanted_of(message.twist, received.gid, received.source_ns)
+        wanted = wanted_of(message.twist, received)
         at = stamp_ns(message.header.stamp)
         self._arrive(wanted._replace(stamp_ns=at, frame=message.header.frame_id))
 

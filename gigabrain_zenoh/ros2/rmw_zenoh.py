@@ -222,7 +222,8 @@ class RmwZenohTransport:
             if sample.kind == zenoh.SampleKind.PUT:
                 known = self._attachment(sample.attachment, entity.topic)
                 source_ns, gid = (known.source_ns, known.gid) if known else (None, b"")
-                handle(Received(sample.payload.to_bytes(), source_ns, gid))
+                number = known.sequence if known else None
+                handle(Received(sample.payload.to_bytes(), source_ns, gid, number))
 
         mailbox = Mailbox(self.bridge, deliver, qos.depth)
 

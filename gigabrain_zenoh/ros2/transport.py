@@ -25,6 +25,7 @@ class Received(NamedTuple):
     payload: bytes  # CDR; may have a tail
     source_ns: int | None  # [ns] Unix time of its publication, by the publisher's clock
     gid: bytes  # of the publisher: 16 bytes; empty if unknown
+    number: int | None = None  # by the publisher; None where a transport keeps the order itself
 
 
 OnReceived = Callable[[Received], None]

@@ -51,11 +51,12 @@ class Machine:
         self.memory, actions = step(self.config, *about, self.now)
         return list(actions)
 
-    def command(self, x=0.2, *, y=0.0, turn=0.0, sender=b"a", frame="", age_ms=None, late_ms=None):
+    def command(self, x=0.2, *, y=0.0, turn=0.0, sender=b"a", frame="", age_ms=None, late_ms=None,
+                number=None):  # fmt: skip
         now = self.now.unix_ns
         stamp = 0 if age_ms is None else now - age_ms * 1_000_000
         sent = None if late_ms is None else now - late_ms * 1_000_000
-        wanted = Wanted((x, y, 0.0), (0.0, 0.0, turn), sender, frame, stamp, sent)
+        wanted = Wanted((x, y, 0.0), (0.0, 0.0, turn), sender, frame, stamp, sent, number)
         return self.run(arrive, self.limits, self.memory, wanted)
 
     def state(self, gate=None, boot=None):
@@ -426,6 +427,29 @@ def test_what_a_network_holds_back_while_its_senders_clock_is_set_back_is_refuse
     for late_ms in (1002, 952, 252):
         assert machine.command(late_ms=late_ms + 5000) == [Refuse("late")]
     assert "its sender's clock was set back" in machine.memory.refusal
+
+
+def test_what_comes_by_another_way_after_newer_messages_is_refused():
+    machine = Machine()
+    machine.drives()
+    for number in range(40):
+        machine.ms += 50
+        machine.state()
+        assert machine.command(late_ms=2, number=number) == [Send(AHEAD)]
+    for number in (4, 5, 6):
+        assert machine.command(late_ms=1752 - 50 * number, number=number) == [Refuse("late")]
+    machine.ms += 50
+    assert machine.command(late_ms=2, number=40) == [Send(AHEAD)]
+    machine.ms += 50  # a clock that was set back does not change the numbers
+    assert machine.command(late_ms=1752, number=41) == [Send(AHEAD)]
+
+
+def test_the_messages_of_unknown_senders_have_no_order():
+    machine = Machine()
+    machine.drives()
+    machine.command(sender=b"", late_ms=2)
+    machine.ms += 50
+    assert machine.command(sender=b"", late_ms=5002) == [Refuse("late")]
 
 
 def test_a_sender_whose_messages_have_no_time_is_obeyed():
