@@ -287,3 +287,18 @@ async def test_a_wheel_that_has_protected_itself_stands_as_it_is_switched_on_aga
         await rig.drive(500, 0.1, 0.0, 0.0)
         assert goals == [0]
         assert (await rig.state()).link.connected
+
+
+@pytest.mark.parametrize("stuck", ["left", "arm_shoulder_pan"])
+async def test_a_servo_that_stays_overloaded_keeps_no_other_from_giving_way(stuck: str) -> None:
+    rig = LeKiwi()
+    async with opened(rig):
+        lift = rig.servo("arm_shoulder_lift")
+        rig.joint("arm_shoulder_lift").load = 0.3
+        await rig.wait(1000)
+        lift._latched = True
+        its = {**rig.arm.wheels, **rig.arm.servos}[stuck]
+        its._status = lambda: feetech.OVERLOAD  # type: ignore[method-assign]
+        await rig.wait(1500)
+        assert lift[feetech.STATUS] == 0
+        assert "protects itself: overload" in rig.driver.problem

@@ -97,7 +97,8 @@ class FeetechDriver(Driver):
         self._found: dict[ServoJoint | ServoWheel, str] = {}  # how each answered the last time
         self._failure: GigabrainError | None = None
         self._fault = Fault(log)
-        self._yielded_ns = self._tried_ns = self._commanded_ns = 0
+        self._tried_ns = self._commanded_ns = 0
+        self._yielded_ns: dict[ServoJoint | ServoBase, int] = {}
         self._rewritten = 0
         self._cycles: asyncio.Task[None] | None = None
         self._lidar: ScanSource | None = None
@@ -319,8 +320,7 @@ class FeetechDriver(Driver):
         """Have the wheels turn as commanded, or stand while anything has a problem."""
         if self._trouble() or self._clock.now_ns() - self._commanded_ns > COMMAND_TIMEOUT_NS:
             base.stop()
-        if base.overloaded and now_ns - self._yielded_ns >= YIELD_NS:
-            self._yielded_ns = now_ns
+        if base.overloaded and self._yields(base, now_ns):
             await base.end_overload()
         self._rewritten += await base.keep()
         await base.send()
@@ -330,14 +330,20 @@ class FeetechDriver(Driver):
         for joint in self._joints.values():
             if joint.let_go and not joint.status:
                 await self._catch(joint)
-            elif joint.status & feetech.OVERLOAD and now_ns - self._yielded_ns >= YIELD_NS:
-                self._yielded_ns = now_ns
+            elif joint.status & feetech.OVERLOAD and self._yields(joint, now_ns):
                 joint.yield_to_load()  # a goal that gives way ends the protection
         if self._trouble():
             for joint in self._joints.values():
                 joint.hold()
         await self._send_settings(now_ns)
         await self._send_goals()
+
+    def _yields(self, overloaded: ServoJoint | ServoBase, now_ns: int) -> bool:
+        """Return whether it is time for an attempt to end its overload, and count it as made."""
+        due = now_ns - self._yielded_ns.get(overloaded, 0) >= YIELD_NS
+        if due:
+            self._yielded_ns[overloaded] = now_ns
+        return due
 
     async def _catch(self, joint: ServoJoint) -> None:
         """Have a servo that has started again hold where it is. Raises BodyLost always."""
