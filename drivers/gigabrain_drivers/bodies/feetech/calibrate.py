@@ -127,7 +127,8 @@ class Calibrator:
                 while not asking.done():
                     for name, ticks in (await self._positions()).items():
                         ranges[name].add(ticks)
-                    self._dialogue.show(ranges)
+                    if not asking.done():
+                        self._dialogue.show(ranges)
                     await asyncio.wait((asking,), timeout=SAMPLE_S)
             finally:
                 asking.cancel()
