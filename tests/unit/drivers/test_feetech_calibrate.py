@@ -96,3 +96,20 @@ async def test_no_range_is_shown_once_the_person_is_done() -> None:
     person = Person(rig)
     await calibrated(rig, person)
     assert person.shown_late == 0
+
+
+@pytest.mark.parametrize("period", [5, 7, 11])
+async def test_wrong_answers_with_a_right_sum_change_no_calibration(period: int) -> None:
+    quiet, noisy, answers = Rig(), Rig(), 0
+    expected = await calibrated(quiet, Person(quiet))
+
+    def disturb(data: bytes) -> bytes:
+        nonlocal answers
+        answers += 1
+        wrong = bytearray(data)
+        if len(data) > 7 and not answers % period:
+            wrong[5], wrong[6] = (wrong[5] + 3) % 256, (wrong[6] - 3) % 256
+        return bytes(wrong)
+
+    noisy.link.disturb = disturb
+    assert await calibrated(noisy, Person(noisy)) == expected

@@ -190,12 +190,12 @@ def test_a_leader_without_a_calibration_is_told_how_to_get_one(
 
 def test_a_trigger_needs_no_more_than_a_range_of_its_own() -> None:
     trigger, gripper = JointRange(GRIPPER, 2000, trigger=True), JointRange(GRIPPER, 2000)
-    for ticks in (2000, 2200, 2400):
+    for ticks in (2000, 2200, 2400, 2400):
         trigger.add(ticks)
         gripper.add(ticks)
     assert not trigger.missing
     assert math.degrees(gripper.missing) == pytest.approx(65, abs=1)
-    for ticks in (1500, 1000, 500):
+    for ticks in (1500, 1000, 500, 500):
         trigger.add(ticks)
     assert not trigger.endless
     made = trigger.calibrated(6, 1)

@@ -302,3 +302,21 @@ async def test_a_servo_that_stays_overloaded_keeps_no_other_from_giving_way(stuc
         await rig.wait(1500)
         assert lift[feetech.STATUS] == 0
         assert "protects itself: overload" in rig.driver.problem
+
+
+async def test_a_memory_that_was_read_wrongly_once_is_not_another_robot_s() -> None:
+    rig, hit = LeKiwi(), set[int]()
+
+    def disturb(data: bytes) -> bytes:
+        wrong = bytearray(data)
+        if len(data) == feetech.EEPROM_SIZE + 6 and data[2] not in hit:
+            hit.add(data[2])
+            for first in (5 + feetech.MAX_VOLTAGE.address, 5 + feetech.OFFSET.address):
+                wrong[first], wrong[first + 1] = data[first] ^ 0xFF, data[first + 1] ^ 0xFF
+            wrong[-1] = feetech.checksum(bytes(wrong[2:-1]))
+        return bytes(wrong)
+
+    rig.link.disturb = disturb
+    async with opened(rig):
+        assert hit == {1, 2, 3, 4, 5, 6, 7, 8, 9}
+        assert rig.driver.problem == ""

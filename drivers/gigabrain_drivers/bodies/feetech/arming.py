@@ -45,7 +45,7 @@ class Arming:
 
     async def recognise(self, joint: ServoJoint) -> ServoMemory:
         """Return what a servo keeps. Raises ConfigError where it was not the calibrated one."""
-        data = await self._bus.read(joint.id, 0, feetech.EEPROM_SIZE)
+        data = await self._bus.confirm(joint.id, 0, feetech.EEPROM_SIZE)
         if data is None:
             raise ConfigError(f"{self._bus.link}: {joint} does not answer any more")
         memory = feetech.decode_memory(data)

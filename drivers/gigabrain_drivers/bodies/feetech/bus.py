@@ -98,6 +98,19 @@ class HostBus:
                 return answers[servo][1:]
         return None
 
+    async def confirm(self, servo: int, address: int, length: int) -> bytes | None:
+        """Return bytes of a control table that were read twice alike, or None.
+
+        A sum of 8 bits lets some wrong answers through.
+        """
+        before = None
+        for _ in range(ATTEMPTS):
+            data = await self.read(servo, address, length)
+            if data is None or data == before:
+                return data
+            before = data
+        return None
+
     async def write(self, servo: int, register: feetech.Register, value: int) -> bool:
         """Write an item and read it back; return whether it holds the value."""
         data = register.encode(value)

@@ -11,7 +11,7 @@ from typing import Protocol
 from msgspec.structs import replace
 
 from gigabrain_drivers.bodies.feetech import protocol as feetech
-from gigabrain_drivers.bodies.feetech.bus import HostBus
+from gigabrain_drivers.bodies.feetech.bus import ATTEMPTS, HostBus
 from gigabrain_drivers.bodies.feetech.calibration import (
     MAX_OFFSET,
     Calibration,
@@ -29,6 +29,7 @@ from gigabrain_zenoh.errors import ConfigError
 
 SAMPLE_S = 0.02
 MIDDLE = TICKS // 2
+HELD_TICKS = 12  # 1 deg, between two readings of a joint that is held still
 LIMIT_MARGIN = 12  # ticks, 1 deg, that a servo may go beyond the range that was seen
 
 
@@ -109,7 +110,7 @@ class Calibrator:
 
     async def _ranges(self) -> dict[str, JointRange]:
         """Watch the joints being moved until each has been through its whole range."""
-        now = await self._positions()
+        now = {name: await self._held(servo) for name, servo in self._servos.items()}
         ranges = {
             name: JointRange(
                 self._joints[name],
@@ -163,7 +164,7 @@ class Calibrator:
         """Have a servo count from the middle posture."""
         await self._keep(servo, feetech.MIN_POSITION, 0)
         await self._keep(servo, feetech.MAX_POSITION, TICKS - 1)
-        memory, now = await self._memory(servo), await self._position(servo)
+        memory, now = await self._memory(servo), await self._held(servo)
         offset = (memory.offset + now - MIDDLE + TICKS // 2) % TICKS - TICKS // 2
         await self._keep(servo, feetech.OFFSET, max(-MAX_OFFSET, offset))
 
@@ -180,8 +181,21 @@ class Calibrator:
             raise ConfigError(f"servo {servo} takes no value at {register.address}: cable, power?")
 
     async def _memory(self, servo: int) -> ServoMemory:
-        data = await self._bus.read(servo, 0, feetech.EEPROM_SIZE)
+        data = await self._bus.confirm(servo, 0, feetech.EEPROM_SIZE)
         return feetech.decode_memory(_answered(servo, data))
+
+    async def _held(self, servo: int) -> int:
+        """Return where a joint is held still, as two readings in a row have it."""
+        before = await self._position(servo)
+        for _ in range(ATTEMPTS):
+            now = await self._position(servo)
+            if abs((now - before + MIDDLE) % TICKS - MIDDLE) <= HELD_TICKS:
+                return now
+            before = now
+        raise ConfigError(
+            f"servo {servo} reports another position each time: hold the arm still, or is its "
+            "cable loose?"
+        )
 
     async def _position(self, servo: int) -> int:
         data = await self._bus.read(servo, feetech.POSITION.address, feetech.POSITION.size)

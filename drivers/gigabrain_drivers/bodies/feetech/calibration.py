@@ -135,13 +135,20 @@ class JointRange:
     def __init__(self, joint: JointDescription, middle: int, *, trigger: bool = False) -> None:
         """The range of a `trigger` is its own, and not that of the gripper that it leads."""
         self.joint, self._trigger = joint, trigger
-        self.middle = self.ticks = self.lower = self.upper = middle
+        self.middle = self.ticks = self.lower = self.upper = self._newest = middle
 
     def add(self, ticks: int) -> None:
-        """Take a reading; from one to the next it turns less than half a turn."""
+        """Take a reading; from one to the next it turns less than a quarter of a turn.
+
+        The range reaches as far as two readings in a row do: a sum of 8 bits lets some wrong ones
+        through.
+        """
         half = TICKS // 2
-        self.ticks += (ticks - self.ticks + half) % TICKS - half
-        self.lower, self.upper = min(self.lower, self.ticks), max(self.upper, self.ticks)
+        before, now = self._newest, self.ticks + (ticks - self.ticks + half) % TICKS - half
+        self.ticks = min(before, now, key=lambda its: abs(its - self.ticks))
+        self._newest = now
+        self.lower = min(self.lower, max(before, now))
+        self.upper = max(self.upper, min(before, now))
 
     @property
     def missing(self) -> float:

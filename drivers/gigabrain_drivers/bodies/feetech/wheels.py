@@ -254,7 +254,7 @@ class ServoBase:
         ConfigError for other servos.
         """
         for wheel in self.wheels:
-            data = await self._bus.read(wheel.id, 0, feetech.EEPROM_SIZE)
+            data = await self._bus.confirm(wheel.id, 0, feetech.EEPROM_SIZE)
             if data is None:
                 return f"{wheel} answers only at times"
             memory = feetech.decode_memory(data)
