@@ -16,7 +16,7 @@ from gigabrain_drivers.emulators.hand import posture_in
 from gigabrain_drivers.sim.live_world import LiveWorld, News
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import EmulatorConfig
-from gigabrain_zenoh.errors import BodyLost, ConfigError
+from gigabrain_zenoh.errors import BodyLost, ConfigError, unknown
 from gigabrain_zenoh.host.signals import stop_signals
 from gigabrain_zenoh.host.terminal import typed_lines
 from gigabrain_zenoh.runtime.heartbeat import Progress
@@ -127,15 +127,21 @@ async def watch(emulator: Emulator, path: Path) -> None:
 
 
 def _changed_ns(path: Path) -> int | None:
-    return path.stat().st_mtime_ns if path.exists() else None
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return None
 
 
 def _from_file(emulator: Emulator, path: Path) -> None:
     try:
         faults = msgspec.json.decode(path.read_bytes(), type=dict[str, Faults])
+        for name in faults:
+            if name not in emulator.stations:
+                raise unknown("station", name, emulator.stations)
     except FileNotFoundError:
         faults = {}
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+    except (OSError, msgspec.MsgspecError, UnicodeDecodeError, ConfigError) as error:
         log.warning("%s: %s", path.name, error)
         return
     emulator.set(faults)
