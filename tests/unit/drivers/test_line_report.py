@@ -237,6 +237,39 @@ async def test_a_body_is_lost_once_a_line_with_its_velocity_comes_no_more(
         assert await connected_without(None)
 
 
+FLAGGED = replace(TWO_LINES, state=(TWO_LINES.state[0], "F,{flags}\n"), flags=("estop", "bumper"))
+
+
+@pytest.mark.parametrize(
+    ("period", "lost"),
+    [(1, True), (25, True), (None, False)],  # a line each so many of motion; None: on changes
+)
+async def test_a_body_is_lost_once_flags_that_it_repeats_come_no_more(
+    period: int | None, lost: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    clock = FakeClock()
+    driver = LineDriver(ROBOT, FLAGGED, Run(folder=Path(), link="real"), clock=clock)
+    motion, flags = FLAGGED.state_templates()
+
+    async def state_after(lines: int, *changes: float, every: int | None = None) -> RobotState:
+        for value in changes:
+            driver.link.on_bytes(flags.encode({"flags": value}))
+        for n in range(lines):
+            driver.link.on_bytes(motion.encode(wheels(0.0, 0.0)))
+            if every and n % every == 0:
+                driver.link.on_bytes(flags.encode({"flags": 0.0}))
+            await clock.advance(20 * MS)
+            state = await driver.read_state()
+        return state
+
+    assert (await state_after(500, 2.0, 0.0, 2.0, 0.0, every=period)).link.connected
+    assert (await state_after(100)).link.connected is not lost
+    assert ("flags come no more" in caplog.text) is lost
+    back = await state_after(1, 2.0)
+    assert back.link.connected
+    assert back.bumpers == (True,)
+
+
 def test_a_percentage_that_comes_no_more_is_not_an_empty_battery() -> None:
     it = report(TWO_LINES)
     for n in range(50):

@@ -23,6 +23,8 @@ EXPIRING = tuple(  # fields whose old values safety must not take for measured
     name for name in STATE if name.startswith("battery_") or name.endswith("_temperature")
 )
 
+FLAGS_REPEATED = 10  # times in a row unchanged: it sends them at a rate, not only on changes
+
 VELOCITY_S = 0.05  # a velocity from positions is taken over so much time: one line is noise
 MAX_STEP_FACTOR = 3.0  # a step this many times longer than the body can go is no step ...
 STEP_SLACK_M = 0.05  # ... but the lines' own unevenness is
@@ -107,6 +109,7 @@ class LineReport:
         self._speaking = {*BODY, *self._speeds}
         self._values: dict[str, float] = {}
         self._recent = {name: Recent[float]() for name in EXPIRING}
+        self._flags, self._flags_unchanged = Recent[int](), 0  # lines in a row
         self._angles: tuple[float, ...] | None = None  # the wheels', as reported last
         self._pose: Pose | None = None  # as reported last
         self._now_ns = 0
@@ -120,8 +123,16 @@ class LineReport:
         """The bits that the firmware reports."""
         return int(self._values.get("flags", 0))
 
+    def flags_overdue(self, now_ns: int) -> bool:
+        """Return whether flags that were repeated come no more."""
+        return self._flags_unchanged >= FLAGS_REPEATED and self._flags.get(now_ns) is None
+
     def update(self, values: Mapping[str, float], now_ns: int) -> None:
         """Handle one line."""
+        if "flags" in values:
+            unchanged = int(values["flags"]) == self.flags
+            self._flags_unchanged = self._flags_unchanged + 1 if unchanged else 0
+            self._flags.put(int(values["flags"]), now_ns)
         for name, value in values.items():
             if recent := self._recent.get(name):
                 recent.put(value, now_ns)

@@ -79,6 +79,7 @@ class LineDriver(Driver):
         self._sent_ns = self._seq = 0
         self._open = False
         self._logged_flags = 0
+        self._overdue = Fault(log)  # flags that were repeated
         self._flags = {bit: Fault(log) for bit in range(len(options.flags))}
         self._lidar: ScanSource | None = None
         self.sensors = {"scan": None} if robot.lidar else {}
@@ -121,6 +122,11 @@ class LineDriver(Driver):
     async def read_state(self) -> RobotState:
         """Return the newest values of the lines; `link` tells whether they are recent."""
         report, now_ns = self._report, self._clock.now_ns()
+        alive, overdue = self._liveness.alive(), report.flags_overdue(now_ns)
+        if alive and overdue:
+            self._overdue.begin(f"{self.link}: its flags come no more: check firmware and wiring")
+        elif alive:
+            self._overdue.end(f"{self.link}: its flags come again")
         return RobotState(
             robot_type=self.robot.robot_type,
             pose=report.pose,
@@ -128,7 +134,7 @@ class LineDriver(Driver):
             joints=report.joints(now_ns),
             battery=report.battery(now_ns),
             bumpers=self._bumpers(),
-            link=replace(self.link.health, connected=self._liveness.alive()),
+            link=replace(self.link.health, connected=alive and not overdue),
         )
 
     def _longest_write_ns(self) -> int:
