@@ -16,6 +16,7 @@ from gigabrain_zenoh.manipulation.phases import Phase
 GRIPS = 0.1  # of the gripper's greatest speed, above which it moves: an encoder's steps are less
 MOVED = 0.02  # [rad] or [m] off the beginning of a plan: it was made for another posture
 SENT = 0.01  # of the gripper's range, within which it was sent to its target
+AT_THINGS = ("descend", "press", "lift")  # phases in which an arm moves at a thing
 REGRIP = 0.12  # of its range, by which a grip changes at most while something is held
 
 
@@ -59,6 +60,16 @@ def begins_at(plan: Plan, posture: Floats) -> bool:
     """Return whether a plan's first trajectory begins where the arm was sent (n,) [rad] or [m]."""
     first = next((phase.arm for phase in plan.phases if phase.arm), None)
     return first is None or bool(np.abs(first.positions[0] - posture).max() < MOVED)
+
+
+def is_at(left: Plan, planner: ArmPlanner, body: BodyDescription, state: RobotState) -> bool:
+    """Return whether the arm was sent to a posture on a plan's last way to its thing."""
+    if len(state.joints_sent) != len(body.joints):
+        return False
+    slack = MOVED + np.array([joint.gains.max_correction for joint in planner.arm.joints])
+    posture = sent_posture(planner, body, state)
+    ways = [phase.arm for phase in left.phases if phase.arm and phase.name in AT_THINGS]
+    return any((np.abs(way.positions - posture) < slack).all(axis=1).any() for way in ways)
 
 
 def holds(planner: ArmPlanner, hold: Hold, state: RobotState) -> bool:

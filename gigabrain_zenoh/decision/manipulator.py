@@ -18,6 +18,7 @@ from gigabrain_zenoh.decision.arm_readings import (
     gripper_moves,
     gripper_place,
     holds,
+    is_at,
     measured_posture,
     off_from,
     pace,
@@ -142,7 +143,7 @@ class Manipulator:
         seen: tuple[SeenSolid, ...],
     ) -> StepResult:
         if command and command.number != self._number:
-            self._drop()
+            self._interrupt()
             self._number = number = command.number
             results = (one for one in self._results if one.number == number)
             self._achieved = next(results, StepOutcome())
@@ -165,6 +166,8 @@ class Manipulator:
             return self._still(NO_MODEL)
         if {joint.name for joint in body.joints} - {joint.name for joint in state.joints}:
             return self._still(NOT_MEASURED)
+        if self._run is None and self._left and not is_at(self._left, planner, body, state):
+            self._left = None  # an operator has moved the arm
         if self._run is None and self._achieved.number and not self._left:
             return self._still(Idle("done", self._achieved.reason), self._achieved)
         try:
@@ -486,7 +489,7 @@ class Manipulator:
         return moving(self._run, state.tick, self._number, self._behaviour)
 
     def _fail(self, reason: str, approach: Target | None = None, seek: str = "") -> StepResult:
-        self._drop()
+        self._interrupt()
         outcome = StepOutcome(state="failed", reason=reason[:500], approach=approach, seek=seek)
         return self._still(Idle("failed", reason), outcome)
 

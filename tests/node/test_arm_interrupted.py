@@ -5,8 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from gigabrain_schemas.brain import Intent, JointTarget
+from gigabrain_schemas.safety import JointCap
+from gigabrain_zenoh.decision.manipulator import HOLD_UPS
 from gigabrain_zenoh.decision.tasks.mission import loads
-from tests.node.arm_rig import ELSEWHERE, THINGS, Rig
+from tests.node.arm_rig import ELSEWHERE, THERE, THINGS, Rig
 
 PLACE = THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]}]"
 PRESS = THINGS + "do: [{press: cube}]"
@@ -71,3 +74,54 @@ def test_a_pause_in_the_tick_in_which_a_step_is_done_loses_nothing(rig: Rig) -> 
         rig.tick()
     pause(rig)
     assert rig.carry_on().state == "succeeded"
+
+
+@pytest.mark.parametrize("cancelled", [False, True])
+@pytest.mark.parametrize("phase", ["descend", "close", "press"])
+def test_another_task_first_leaves_the_thing_that_the_hand_is_at(
+    rig: Rig, phase: str, cancelled: bool
+) -> None:
+    rig.give(PRESS if phase == "press" else PLACE)
+    until(rig, phase)
+    for _ in range(20):
+        rig.tick()
+    if cancelled:
+        rig.queue.cancel("", "ann")
+        rig.tick()
+    rig.phases = []
+    task = rig.carry_out("do: [{posture: {shoulder_pan: 1.0}}]")
+    assert (task.state, task.reason) == ("succeeded", "")
+    assert rig.phases.index("retreat") < rig.phases.index("move")
+    assert rig.arm.thing()[:2] == pytest.approx(THERE, abs=0.01)
+
+
+def test_a_command_that_fails_at_a_thing_leaves_the_next_one_to_go_back(rig: Rig) -> None:
+    rig.give(PLACE)
+    until(rig, "descend")
+    rig.manipulator._hold_ups = HOLD_UPS
+    rig.arm.caps = tuple(JointCap(name=name, rise=0.0, fall=0.0) for name in rig.planner.arm.names)
+    assert rig.carry_on().state == "failed"
+    rig.arm.caps, rig.phases = (), []
+    assert rig.carry_out("do: [{posture: {shoulder_pan: 1.0}}]").state == "succeeded"
+    assert rig.phases.index("retreat") < rig.phases.index("move")
+
+
+@pytest.mark.parametrize("paused", [False, True])
+def test_an_arm_that_an_operator_has_moved_away_from_a_thing_does_not_go_back(
+    rig: Rig, paused: bool
+) -> None:
+    rig.give(PLACE)
+    until(rig, "descend")
+    rig.queue.pause("", "ann") if paused else rig.queue.cancel("", "ann")
+    rig.tick()
+    away = tuple(JointTarget(name=name, position=0.3) for name in rig.planner.arm.names)
+    for _ in range(200):
+        rig.arm.step(Intent(joints=away, behaviour="test", reason="jog"))
+    rig.phases = []
+    if paused:
+        rig.queue.resume("")
+        assert rig.carry_on().state == "succeeded"
+        assert rig.phases.index("descend") < rig.phases.index("retreat")
+    else:
+        assert rig.carry_out("do: [{posture: {shoulder_pan: 1.0}}]").state == "succeeded"
+        assert "retreat" not in rig.phases
