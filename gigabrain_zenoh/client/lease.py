@@ -7,8 +7,8 @@ class ControlLease:
     """Tracks whether one commander has the body, from the gate's states.
 
     A passing stop, as for an obstacle, does not end the lease. It is lost when another commander
-    takes over or the gate latches. Then the script must ask again: it must not take the body
-    back from the person who has just stopped it.
+    takes over, the gate latches or the driver restarts. Then the script must ask again: it must not
+    take the body back from the person who has just stopped it.
     """
 
     def __init__(self, source: str) -> None:
@@ -28,14 +28,19 @@ class ControlLease:
             return
         has, gate = self.has(state), state.gate
         taken = self._had and gate.commander not in ("", self._source)
-        self.lost = not has and (self.lost or taken or gate.mode == "latched")
+        ended = taken or gate.mode == "latched" or self.restarted(state)
+        self.lost = not has and (self.lost or ended)
         self._had = has
 
     def has(self, state: RobotState) -> bool:
         """Return whether the body obeys this commander."""
         gate = state.gate
         mine = gate.mode == "enabled" and gate.commander == self._source
-        return mine or (self._boot > 0 and self._is_old(state))
+        return (mine and not self.restarted(state)) or (self._boot > 0 and self._is_old(state))
+
+    def restarted(self, state: RobotState) -> bool:
+        """Return whether the driver has restarted since its gate granted the body."""
+        return self._boot > 0 and state.boot != self._boot
 
     def _is_old(self, state: RobotState) -> bool:
         return state.boot == self._boot and state.gate.enables < self._enables

@@ -425,10 +425,10 @@ class Robot:
         """Ask the gate for the body, unless another commander has taken it."""
         if self._lease.lost:
             state = await self.read_state()
-            holder = state.gate.commander or "an e-stop"
-            raise Refused(
-                f"{state.robot_type}: {holder} has the body; ask again with enable(take=True)"
-            )
+            why = f"{state.gate.commander or 'an e-stop'} has the body"
+            if self._lease.restarted(state):
+                why = "the driver was restarted"
+            raise Refused(f"{state.robot_type}: {why}; ask again with enable(take=True)")
         await self.enable(take=self._take)
 
     def _repeat(self, state: RobotState) -> None:

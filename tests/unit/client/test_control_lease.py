@@ -68,5 +68,6 @@ def test_a_latch_loses_it_until_it_asks_anew() -> None:
     assert not lease.has(state("enabled", "control", 6))
 
 
-def test_another_start_of_the_driver_gives_it_nothing() -> None:
-    assert after(state("idle", "", 0, boot=8)) == (False, False)
+def test_another_start_of_the_driver_loses_it_until_it_asks_anew() -> None:
+    assert after(state("idle", "", 0, boot=8)) == (False, True)
+    assert after(state("enabled", "script", 1, boot=8)) == (False, True)

@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.base import TICK_NS, Velocity
-from gigabrain_schemas.body import Body, GateStatus, Joint, RobotState
+from gigabrain_schemas.body import Body, GateMode, GateStatus, Joint, RobotState
 from gigabrain_schemas.brain import CmdVel, JointCommand
 from gigabrain_schemas.examples import example
 from gigabrain_schemas.requests import EnableRequest, GateReply, ReleaseRequest
@@ -110,6 +110,37 @@ async def test_a_base_does_not_drive_on_after_the_driver_has_started_anew(
     driver.commands.clear()
     await robot._ticks(20)
     assert [one for one in driver.commands if one.linear_x] == []
+
+
+@pytest.mark.parametrize(
+    "begin",
+    [
+        lambda robot: robot.set_joint_positions({JOINT.name: GOAL}),
+        lambda robot: robot.set_joint_trajectory([(2.0, {JOINT.name: GOAL})]),
+        lambda robot: robot.move(1.0),
+        lambda robot: robot.drive(0.1, seconds=5.0),
+    ],
+    ids=["positions", "trajectory", "move", "drive"],
+)
+@pytest.mark.parametrize("mode", ["latched", "idle", "enabled"])
+async def test_a_motion_ends_when_the_driver_has_started_anew(
+    net: Net, driver: Driver, mode: GateMode, begin: Callable[[Robot], Coroutine[Any, Any, object]]
+) -> None:
+    robot = Robot(net.two)
+    moving = asyncio.ensure_future(begin(robot))
+    await robot._ticks(25)
+    driver.bus.time.boot, driver.bus.time.tick = 8, 0
+    source = net.two.process if mode == "enabled" else ""
+    driver.gate = GateStatus(mode=mode, commander=source)
+    await robot._ticks(3)
+    driver.commands.clear()
+    stopped = driver.joints[JOINT.name]
+    with pytest.raises(Refused, match=r"the driver was restarted; ask again with enable"):
+        await asyncio.wait_for(moving, PATIENCE_S)
+    await robot._ticks(25)
+    assert [one for one in driver.commands if one.linear_x] == []
+    assert driver.joints[JOINT.name] == stopped
+    assert driver.gate.enables == 0
 
 
 async def test_an_arm_does_not_go_on_after_an_e_stop_by_somebody_else(
