@@ -166,6 +166,9 @@ def pick(
     shapes = sum(one is not None for one in (box, cylinder, sphere))
     if shapes != 1:
         raise ConfigError(f"arm pick: expected --box, --cylinder or --sphere, got {shapes} of them")
+    for name, value in (("sphere", sphere), ("yaw", yaw)):
+        if value is not None:
+            check_finite(name, value)
     thing = Solid(box=box, cylinder=cylinder, sphere=sphere, at=(x, y, z), yaw=math.radians(yaw))
     name = f"the thing at {describe_point((x, y, z))}"  # another one than what it may hold
     _carry_out(at, Mission(things={name: thing}, do=(Step(pick=name),)), mode, wait)

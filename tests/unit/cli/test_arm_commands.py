@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.body import BodyDescription, Joint, RobotState
 from gigabrain_schemas.examples import example
-from gigabrain_zenoh.cli.arm import goto, hand_over, jog, lines, press
+from gigabrain_zenoh.cli.arm import goto, hand_over, jog, lines, pick, press
 from gigabrain_zenoh.errors import BodyLost, ConfigError
 
 ARM = load_robot("so101").description()
@@ -80,3 +80,11 @@ def test_a_pitch_that_is_not_finite_is_not_taken_for_any_pitch(
 ) -> None:
     with pytest.raises(ConfigError, match=f"^--pitch: expected a number, got {angle:g}$"):
         command(angle, Arm(STATE))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("option", ["sphere", "yaw"])
+def test_what_is_not_finite_of_a_thing_is_named(option: str, value: float) -> None:
+    given: Any = {"sphere": 0.02, option: value}
+    with pytest.raises(ConfigError, match=f"^--{option}: expected a number, got {value:g}$"):
+        pick(0.2, 0.0, 0.02, **given)
