@@ -145,7 +145,7 @@ class GoalServer(InputSource):
                 drive=lambda wanted: navigator.drive(wanted, idle),
             )
         )
-        if body and (isinstance(command, ArmCommand) or self._manipulator):
+        if body and (isinstance(command, ArmCommand) or self._manipulator or self._tasks.held):
             moved, done = self._move_arm(state, body, command, idle)
             if isinstance(command, ArmCommand):
                 outcome = done
@@ -180,19 +180,30 @@ class GoalServer(InputSource):
             self._checked = number
         if wanted is None and command and not body.has_base:
             return self._refused(number, f"{body.robot_type} has no base to drive")
-        if wanted and not self._kernels.arm_loaded():
-            text = f"waiting: {WaitReason.STARTING}"
-            intent = Intent(behaviour=self._name, reason=text)
-            return intent, StepOutcome(number=number, activity="waiting", reason=text)
-        if self._manipulator is None and wanted:
+        needed = self._manipulator is None and (wanted or self._may_hold(body))
+        if needed and self._kernels.arm_loaded():
             from gigabrain_zenoh.decision.manipulator import Manipulator  # imports MuJoCo
 
-            self._manipulator = Manipulator(self._bus, self._name)
+            self._manipulator = Manipulator(self._bus, self._name, self._tasks.held)
         if self._manipulator is None:
-            return Intent(behaviour=self._name, reason=idle.reason), StepOutcome()
+            if wanted is None:
+                return Intent(behaviour=self._name, reason=idle.reason), StepOutcome()
+            text, known = f"waiting: {WaitReason.STARTING}", self._tasks.held
+            outcome = StepOutcome(number=number, activity="waiting", reason=text, holds=known)
+            return Intent(behaviour=self._name, reason=text), outcome
         held, seen = self._source.held(state), self._seen.at(state)
         intent, outcome = self._manipulator.step(state, body, wanted, idle, held, seen)
         return intent, self._on_map(outcome, state)
+
+    def _may_hold(self, body: BodyDescription) -> bool:
+        """Return whether the gripper may hold something since before a restart."""
+        if self._tasks.held is None:
+            return False
+        try:
+            arm_steps.check(body, [arm_steps.Gripper("close")])
+        except GigabrainError:
+            return False
+        return True
 
     def _on_map(self, outcome: StepOutcome, state: RobotState) -> StepOutcome:
         """Return an outcome with what to approach in the map, instead of in the body's frame."""
@@ -208,7 +219,8 @@ class GoalServer(InputSource):
     def _refused(self, number: int, reason: str) -> StepResult:
         """Return that a command cannot be carried out."""
         intent = Intent(behaviour=self._name, reason=reason)
-        return intent, StepOutcome(number=number, state="failed", reason=reason)
+        held = self._tasks.held
+        return intent, StepOutcome(number=number, state="failed", reason=reason, holds=held)
 
     def _make_navigator(self) -> "Navigator":
         if self._navigator is None:

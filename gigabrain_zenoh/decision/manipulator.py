@@ -22,6 +22,7 @@ from gigabrain_zenoh.decision.arm_readings import (
     measured_posture,
     off_from,
     pace,
+    sent_place,
     sent_posture,
     sent_to,
     still_held,
@@ -82,7 +83,8 @@ OFFERING = "waiting for somebody to pull at {}; `gigabrain task resume` lets go 
 class Manipulator:
     """Carries out one command for the arm at a time, and knows what its gripper holds."""
 
-    def __init__(self, bus: Bus, behaviour: str) -> None:
+    def __init__(self, bus: Bus, behaviour: str, held: HeldThing | None = None) -> None:
+        """Prepare for an arm; `held` is what its gripper held before a restart."""
         self._behaviour, self._in_time = behaviour, bus.input_log.in_time
         self._models, self._display = bus.latest(ARM_MODEL), PlanDisplay(bus)
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="arm")
@@ -95,7 +97,7 @@ class Manipulator:
         self._hold: Hold | None = None
         self._held: HeldThing | None = None  # the same, for the file of tasks
         self._grip = Grip()
-        self._recalls = True  # it does not know yet what the gripper holds
+        self._recalls = held  # it does not know yet whether the gripper still holds it
         self._number = 0  # of the present command, or of the last one
         self._misses = 0  # grasps of it that caught nothing
         self._hold_ups = 0  # of it, by a joint that did not follow
@@ -130,8 +132,8 @@ class Manipulator:
         if self._planner and not self._run and not held:
             intent = replace(intent, joints=self._keep_grip(self._planner, body, state))
         self._display.show(self._planner, self._plan if self._run else None)
-        known = command.held if command and self._recalls else self._held
-        return intent, replace(outcome, holds=known, placed=self._achieved.placed)
+        holds = self._recalls or self._held
+        return intent, replace(outcome, holds=holds, placed=self._achieved.placed)
 
     def _step(
         self,
@@ -153,6 +155,9 @@ class Manipulator:
             planner = self._ready(body)
         except GigabrainError as error:
             return self._fail(str(error))
+        measured = {joint.name for joint in body.joints} <= {joint.name for joint in state.joints}
+        if self._recalls and planner and measured and not held:
+            self._recall(planner, body, state, self._recalls)
         if command is None:
             self._interrupt()
             self._lookout.reset()
@@ -164,15 +169,13 @@ class Manipulator:
             return self._still(Idle("waiting", f"waiting: {held}"), held=True)
         if planner is None:
             return self._still(NO_MODEL)
-        if {joint.name for joint in body.joints} - {joint.name for joint in state.joints}:
+        if not measured:
             return self._still(NOT_MEASURED)
         if self._run is None and self._left and not is_at(self._left, planner, body, state):
             self._left = None  # an operator has moved the arm
         if self._run is None and self._achieved.number and not self._left:
             return self._still(Idle("done", self._achieved.reason), self._achieved)
         try:
-            if self._recalls:
-                self._recall(planner, body, state, command.held)
             return self._carry_out(planner, state, body, command, seen)
         except GigabrainError as error:  # a thing that does not fit, or an arm without pads
             return self._fail(str(error))
@@ -205,12 +208,13 @@ class Manipulator:
         planner: ArmPlanner,
         body: BodyDescription,
         state: RobotState,
-        held: HeldThing | None,
+        held: HeldThing,
     ) -> None:
         """Believe that something is held since before a restart, if the gripper agrees."""
-        self._recalls = False
-        if held and (hold := still_held(planner, body, state, hold_of(held))):
+        self._recalls = None
+        if planner.arm.gripper and (hold := still_held(planner, body, state, hold_of(held))):
             self._set_hold(hold)
+            self._grip.hold_by(sent_place(planner, body, state, hold.grip))
 
     def _set_hold(self, hold: Hold | None) -> None:
         """Record what the gripper holds."""

@@ -38,6 +38,7 @@ from gigabrain_zenoh.decision.context import ContextSource
 from gigabrain_zenoh.decision.known_objects import ObjectSource, Sought, Wanted, named, sought
 from gigabrain_zenoh.decision.tasks import arm_steps
 from gigabrain_zenoh.decision.tasks import mission as missions
+from gigabrain_zenoh.decision.tasks.arm_steps import HeldThing
 from gigabrain_zenoh.decision.tasks.mission import Mission
 from gigabrain_zenoh.decision.tasks.scripts import Scripts
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile, TaskQueue
@@ -106,6 +107,11 @@ class TaskServer:
         self._tick = state.tick
         if not 0 <= state.tick - self._status_tick < STATUS_TICKS:
             self.publish_starting()
+
+    @property
+    def held(self) -> HeldThing | None:
+        """What the gripper is believed to hold."""
+        return self._queue.held
 
     def unused(self, boot: int) -> bool:
         """Return whether there is no task, nor was there one in this start of the driver."""

@@ -72,7 +72,7 @@ class Rig:
 
     def start(self, saved: Saved) -> None:
         """Start decision."""
-        self.manipulator = Manipulator(self._bus, "navigate")
+        self.manipulator = Manipulator(self._bus, "navigate", saved.held)
         self.queue = TaskQueue(lambda _topic: None, lambda _script: None, saved)  # type: ignore[arg-type, return-value]
         self.outcome: StepOutcome | None = None
 

@@ -12,6 +12,9 @@ from gigabrain_drivers.driver.robot import Run
 from gigabrain_schemas.body import Joint
 from gigabrain_schemas.tasks import MissionRequest
 from gigabrain_schemas.topics import ARM_MODEL, BODY, MISSION, STATE, Topic
+from gigabrain_zenoh.config.settings import DecisionConfig
+from gigabrain_zenoh.decision.tasks.arm_steps import HeldThing, Solid
+from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile
 from gigabrain_zenoh.manipulation.arm_planner import STILL
 from tests.node.plane import ROOM, Plane, drawn
 
@@ -19,14 +22,16 @@ LEKIWI = load_robot("lekiwi")
 assert LEKIWI.arm
 HOME = LEKIWI.arm.home
 GRIPPER = LEKIWI.joints[-1]
+WIDTH = 0.8  # [rad], where a thing stops the gripper
+GRIP = WIDTH - STILL[1] * (GRIPPER.upper - GRIPPER.lower)
 
 
 class Carrier(Plane):
     """A body with LeKiwi's arm, whose joints are at once where they are sent."""
 
-    def __init__(self) -> None:
-        super().__init__(drawn(ROOM))
-        self.width = 0.8  # [rad], where a thing stops the gripper
+    def __init__(self, config: DecisionConfig | None = None) -> None:
+        super().__init__(drawn(ROOM), config=config)
+        self.width = WIDTH
         self.description = LEKIWI.description()
         self._model = make_driver("lekiwi", Run(folder=Path()))[1].arm_model()
         self.sent = {joint.name: at for joint, at in zip(LEKIWI.joints, HOME, strict=True)}
@@ -60,6 +65,43 @@ async def test_a_grip_follows_what_creeps_while_the_base_drives(creeps: float) -
         assert not STILL[0] < plane.lag < STILL[-1]
         await drive(plane, 1.0)
         assert STILL[0] < plane.lag < STILL[-1]
+
+
+@pytest.mark.parametrize("creeps", [-0.01, 0.01])
+async def test_a_grip_is_followed_after_a_restart_of_decision(
+    tmp_path: Path, creeps: float
+) -> None:
+    async with Carrier(DecisionConfig(behaviour="navigate", state_dir=str(tmp_path))) as plane:
+        await restart(plane, tmp_path)
+        assert (await plane.ask(MISSION, MissionRequest(mission="do: [{goto: [4.0, 0.8]}]"))).ok
+        await drive(plane, 0.3)
+        assert plane.sent[GRIPPER.name] == GRIP
+        plane.width += creeps
+        assert not STILL[0] < plane.lag < STILL[-1]
+        await drive(plane, 1.0)
+        assert STILL[0] < plane.lag < STILL[-1]
+
+
+async def test_what_is_held_is_not_forgotten_while_an_arm_gets_ready(tmp_path: Path) -> None:
+    config = DecisionConfig(behaviour="navigate", state_dir=str(tmp_path))
+    async with Carrier(config) as plane:
+        await restart(plane, tmp_path)
+        assert (await plane.ask(MISSION, MissionRequest(mission="do: [{posture: home}]"))).ok
+        await plane.go(0.5)
+        await plane.bench.restart()
+        saved, _ = TaskFile(str(tmp_path)).read()
+        assert saved.jobs
+        assert saved.held
+
+
+async def restart(plane: Carrier, folder: Path) -> None:
+    """Have decision start with a file that says that the gripper holds a can."""
+    plane.sent[GRIPPER.name] = GRIP
+    can = Solid(cylinder=(0.03, 0.1), at=(0.0, 0.0, 0.0))
+    axes = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    held = HeldThing(name="can", solid=can, axes=axes, grip=GRIP - 0.01, opening=1.5)
+    TaskFile(str(folder)).write([Saved(boot=plane.boot, held=held)])
+    await plane.restart()
 
 
 async def drive(plane: Carrier, way: float) -> None:

@@ -65,7 +65,6 @@ class ArmCommand(Struct, frozen=True):
     number: int  # as of a DriveCommand
     do: ArmAction
     things: Mapping[str, Solid]  # what stands round it
-    held: HeldThing | None = None  # what the gripper held when decision was started
 
 
 Command = DriveCommand | ArmCommand

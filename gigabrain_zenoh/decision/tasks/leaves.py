@@ -148,7 +148,7 @@ class ArmNode(Leaf):
     def initialise(self) -> None:
         """Start the node, or start it again."""
         number, things = next(self.context.numbers), dict(self.context.things)
-        self._command = ArmCommand(number, self._action, things, self.context.hand.held)
+        self._command = ArmCommand(number, self._action, things)
 
     def update(self) -> Status:
         """Advance the node by one tick, and return its status."""

@@ -209,6 +209,11 @@ class TaskQueue:
         return not self._jobs and self._boot != boot
 
     @property
+    def held(self) -> HeldThing | None:
+        """What the gripper is believed to hold."""
+        return self._hand.held
+
+    @property
     def saved(self) -> Saved:
         """The part that survives a restart."""
         jobs = tuple(job.saved for job in self._jobs)
