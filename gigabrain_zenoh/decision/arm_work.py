@@ -86,6 +86,12 @@ def work_for(planner: ArmPlanner, do: ArmAction, now: WorkInputs) -> Callable[[]
             raise AssertionError("nothing is planned for it")
 
 
+def names_gripper(body: BodyDescription, do: ArmAction) -> bool:
+    """Return whether an action gives the joint of the gripper a position among others."""
+    grippers = {joint.name for joint in body.joints if joint.part == "gripper"}
+    return isinstance(do, TakePosture) and not isinstance(do.to, str) and bool(grippers & {*do.to})
+
+
 def moving(run: PhaseRun, tick: int, number: int, behaviour: str) -> StepResult:
     """Return the intent to go on with a plan, and the progress of the command."""
     joints, window = run.wish(tick)

@@ -28,7 +28,13 @@ from gigabrain_zenoh.decision.arm_readings import (
     still_held,
 )
 from gigabrain_zenoh.decision.arm_touch import Touch
-from gigabrain_zenoh.decision.arm_work import Planned, WorkInputs, moving, work_for
+from gigabrain_zenoh.decision.arm_work import (
+    Planned,
+    WorkInputs,
+    moving,
+    names_gripper,
+    work_for,
+)
 from gigabrain_zenoh.decision.behaviours import (
     ArmCommand,
     Idle,
@@ -78,6 +84,7 @@ NO_MODEL = Idle("waiting", "waiting: for the arm's model, robot/arm_model")
 NOT_MEASURED = Idle("waiting", "waiting: for all joints to be measured")
 PLANNING = Idle("planning", "planning")
 OFFERING = "waiting for somebody to pull at {}; `gigabrain task resume` lets go of it"
+GRIPPER_STAYS = "so the gripper stays; `place` and `gripper` let go of it"
 
 
 class Manipulator:
@@ -420,7 +427,7 @@ class Manipulator:
             self._set_hold(None)
             self._grip.hold_by(over.gripper)
         if run.phase is None:
-            return self._end(body, state, run)
+            return self._end(body, state, run, command.do)
         return self._moving(state)
 
     def _missed(self, planner: ArmPlanner, body: BodyDescription, state: RobotState) -> StepResult:
@@ -471,7 +478,9 @@ class Manipulator:
             placed=placed,
         )
 
-    def _end(self, body: BodyDescription, state: RobotState, run: PhaseRun) -> StepResult:
+    def _end(
+        self, body: BodyDescription, state: RobotState, run: PhaseRun, do: ArmAction
+    ) -> StepResult:
         """End a command whose phases are over, once the joints are where they should be."""
         assert body.arm
         last = self._plan.phases[-1].arm
@@ -485,6 +494,9 @@ class Manipulator:
             return self._fail(why) if why else self._still(PLANNING)
         if not self._achieved.number:
             self._achieve(self._hold)
+            if self._hold and names_gripper(body, do):
+                text = f"{self._achieved.reason}, {GRIPPER_STAYS}"
+                self._achieved = replace(self._achieved, reason=text)
         self._drop()
         return self._still(Idle("done", self._achieved.reason), self._achieved)
 

@@ -303,6 +303,21 @@ def test_a_second_thing_is_not_taken_for_the_one_that_it_holds(
     assert task.reason.endswith("the gripper holds the thing at (0.239, 0.000, 0.015) already")
 
 
+def test_a_posture_that_does_not_open_the_gripper_says_so(rig: Rig) -> None:
+    assert rig.carry_out(THINGS + "do: [{pick: cube}]").state == "succeeded"
+    assert rig.carry_out("do: [{posture: home}]").reason == "it holds cube"
+    task = rig.carry_out("do: [{posture: {shoulder_pan: 0.2, gripper: 1.0}}]")
+    assert (task.state, task.reason) == (
+        "succeeded",
+        "it holds cube, so the gripper stays; `place` and `gripper` let go of it",
+    )
+    assert rig.manipulator._hold
+    assert rig.carry_out("do: [{posture: {shoulder_pan: 0.0}}]").reason == "it holds cube"
+    assert rig.carry_out("do: [{gripper: 1.0}]").reason == ""
+    assert rig.carry_out("do: [{posture: {shoulder_pan: 0.2, gripper: 0.5}}]").reason == ""
+    assert rig.arm.measured("gripper") == pytest.approx(0.5, abs=0.05)
+
+
 @pytest.mark.parametrize("wide", [0.01, 0.05, 1.0])
 def test_what_an_operator_has_let_go_of_is_not_put_down(rig: Rig, wide: float) -> None:
     assert rig.carry_out(THINGS + "do: [{pick: cube}]").state == "succeeded"
