@@ -22,7 +22,7 @@ from gigabrain_schemas.requests import (
 from gigabrain_schemas.topics import ENABLE, ESTOP, ESTOP_SAID, LIMP, RELEASE
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.codec import DECODE_ERRORS
-from gigabrain_zenoh.errors import ConfigError, GigabrainError
+from gigabrain_zenoh.errors import ConfigError, GigabrainError, Refused
 from gigabrain_zenoh.gate import causes as why
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.gate.gate import GateState
@@ -188,16 +188,27 @@ class Gatekeeper:
         """
 
         async def answer(request: LimpRequest) -> GateReply:
-            limp, held_by = request.limp, self.state.commander
-            if self.state.mode in ("enabled", "stopping"):
-                text = f"{held_by or 'the gate'} holds the arm; press the e-stop first"
-                outcome = gate.Outcome(ok=False, text=text)
-            else:
-                outcome = await _tried(let_go, limp)
-            self._audit("limp" if limp else "hold", request.source, outcome)
+            outcome = await self._tried(let_go, request.limp)
+            self._audit("limp" if request.limp else "hold", request.source, outcome)
             return self._reply(outcome)
 
         self._bus.serve(LIMP, answer)
+
+    async def _tried(self, let_go: LetGo, limp: bool) -> gate.Outcome:
+        """Let go of the joints or hold them; return what came of it."""
+        try:
+            self.refuse_if_enabled()
+            await let_go(limp)
+        except GigabrainError as error:
+            return gate.Outcome(ok=False, text=str(error))
+        done = "all joints are let go of" if limp else "the joints hold where they are"
+        return gate.Outcome(text=done)
+
+    def refuse_if_enabled(self) -> None:
+        """Raise Refused while somebody has the arm, or it comes to rest."""
+        if self.state.mode in ("enabled", "stopping"):
+            holder = self.state.commander or "the gate"
+            raise Refused(f"{holder} holds the arm; press the e-stop first")
 
     def limit(self, limits: Limits) -> None:
         """Let no command exceed other limits from now on; a faster body is slowed at its ramp."""
@@ -325,16 +336,6 @@ class Gatekeeper:
             robot_type=self._robot_type,
             gate=gate.status(self.state),
         )
-
-
-async def _tried(let_go: LetGo, limp: bool) -> gate.Outcome:
-    """Let go of the joints or hold them; return what came of it."""
-    try:
-        await let_go(limp)
-    except GigabrainError as error:
-        return gate.Outcome(ok=False, text=str(error))
-    done = "all joints are let go of" if limp else "the joints hold where they are"
-    return gate.Outcome(text=done)
 
 
 def _differs(before: gate.GateState, now: gate.GateState) -> bool:

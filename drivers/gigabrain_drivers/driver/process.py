@@ -343,11 +343,22 @@ class DriverProcess:
         self._joints_sent = tuple(sent[name] for name in names)
 
     async def _on_limp(self, limp: bool) -> None:
-        """Let go of the joints, or hold them where they are. Raises BodyLost where they do not."""
+        """Let go of the joints, or hold them where they are. Raises BodyLost where they do not.
+
+        Raises Refused where somebody was given the arm meanwhile: then it is held again.
+        """
         async with self._line:
             if limp:
+                self._gatekeeper.refuse_if_enabled()
                 await self._driver.limp()
                 self._let_go = self._limp = True
+                try:
+                    self._gatekeeper.refuse_if_enabled()
+                except Refused:
+                    self._let_go = False
+                    if self._gate.joints:
+                        await self._send_joints(self._gate)
+                    raise
                 return
             if self._gate.joints:
                 await self._send_joints(self._gate)

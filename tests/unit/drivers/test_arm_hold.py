@@ -6,6 +6,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from gigabrain_drivers.bodies.feetech import protocol as feetech
 from gigabrain_drivers.bodies.piper.driver import NOTHING_COMES
@@ -29,6 +30,15 @@ HELD = (True, "the joints hold where they are")
 @asynccontextmanager
 async def asking(rig: so101.Rig | piper.Rig, folder: Path) -> AsyncIterator[Ask]:
     """Run the driver's process, and ask it to let go (True) or to hold (False)."""
+    async with driving(rig, folder) as (_, ask):
+        yield ask
+
+
+@asynccontextmanager
+async def driving(
+    rig: so101.Rig | piper.Rig, folder: Path
+) -> AsyncIterator[tuple[DriverProcess, Ask]]:
+    """Run the driver's process, and give it with what asks it as above."""
     network, robot = LocalNetwork(), rig.driver.robot
     rig.driver.run = Run(folder=robot_path(robot.robot_type).parent, link="real")
     operator = Bus(network.transport(), rig.clock)
@@ -47,7 +57,7 @@ async def asking(rig: so101.Rig | piper.Rig, folder: Path) -> AsyncIterator[Ask]
 
     try:
         await rig.wait(1000)
-        yield ask
+        yield process, ask
     finally:
         running.cancel()
         while not running.done():
@@ -82,6 +92,37 @@ async def test_an_arm_that_cannot_hold_where_it_is_is_not_said_to(tmp_path: Path
         ("hold", *refused),
         ("hold", *HELD),
     ]
+
+
+@pytest.mark.parametrize("late", [False, True], ids=["before", "meanwhile"])
+async def test_an_arm_that_somebody_is_given_is_not_said_to_be_let_go_of(
+    tmp_path: Path, late: bool
+) -> None:
+    rig = so101.Rig()
+    async with driving(rig, tmp_path) as (process, ask):
+        limp, let_go = rig.driver.limp, list[None]()
+
+        def enable() -> None:
+            gate = process._gatekeeper
+            gate.state = replace(gate.state, mode="enabled", causes=(), commander="control")
+
+        async def lets_go() -> None:
+            let_go.append(None)
+            await limp()
+            enable()
+
+        rig.driver.limp = lets_go  # type: ignore[method-assign]
+        await process._line.acquire()
+        asked = asyncio.ensure_future(ask(True))
+        await rig.wait(10)
+        if not late:
+            enable()
+        process._line.release()
+        assert await asked == (False, "control holds the arm; press the e-stop first")
+        assert bool(let_go) is late
+        await rig.wait(200)
+        assert not (await rig.driver.read_state()).limp
+    assert audited(tmp_path) == [("limp", False, "control holds the arm; press the e-stop first")]
 
 
 async def test_an_arm_without_power_is_not_said_to_hold(tmp_path: Path) -> None:
