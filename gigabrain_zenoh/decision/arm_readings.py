@@ -11,12 +11,13 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_zenoh.decision.tasks.arm_steps import NamedPosture
 from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold, Plan
+from gigabrain_zenoh.manipulation.joint_trajectory import JointTrajectory
 from gigabrain_zenoh.manipulation.phases import Phase
 
 GRIPS = 0.1  # of the gripper's greatest speed, above which it moves: an encoder's steps are less
 MOVED = 0.02  # [rad] or [m] off the beginning of a plan: it was made for another posture
 SENT = 0.01  # of the gripper's range, within which it was sent to its target
-AT_THINGS = ("descend", "press", "lift")  # phases in which an arm moves at a thing
+AT_THINGS = ("descend", "press", "lift", "retreat")  # phases in which an arm moves at a thing
 REGRIP = 0.12  # of its range, by which a grip changes at most while something is held
 
 
@@ -70,6 +71,19 @@ def is_at(left: Plan, planner: ArmPlanner, body: BodyDescription, state: RobotSt
     posture = sent_posture(planner, body, state)
     ways = [phase.arm for phase in left.phases if phase.arm and phase.name in AT_THINGS]
     return any((np.abs(way.positions - posture) < slack).all(axis=1).any() for way in ways)
+
+
+def rest_of_retreat(left: Plan, posture: Floats) -> Plan:
+    """Return the rest of a plan's way back, for an arm that was sent to `posture` (n,)."""
+    way = left.phases[-1].arm
+    assert way
+    begun = int(np.abs(way.positions - posture).max(axis=1).argmin())
+    rest = JointTrajectory(
+        names=way.names, times=way.times[begun:] - way.times[begun],
+        positions=way.positions[begun:], velocities=way.velocities[begun:],
+        accelerations=way.accelerations[begun:],
+    )  # fmt: skip
+    return Plan(phases=(Phase(name="retreat", arm=rest),))
 
 
 def holds(planner: ArmPlanner, hold: Hold, state: RobotState) -> bool:

@@ -22,6 +22,7 @@ from gigabrain_zenoh.decision.arm_readings import (
     measured_posture,
     off_from,
     pace,
+    rest_of_retreat,
     sent_place,
     sent_posture,
     sent_to,
@@ -360,7 +361,9 @@ class Manipulator:
     ) -> None:
         """Begin to go back from a thing that is not held; afterwards it is planned again."""
         self._left, self._interim = left, True
-        self._begin(planner, planner.back_off(left, sent_posture(planner, body, state)), state)
+        posture, put_down = sent_posture(planner, body, state), left.phases[-1].name == "retreat"
+        back = rest_of_retreat(left, posture) if put_down else planner.back_off(left, posture)
+        self._begin(planner, back, state)
 
     def _press(
         self, planner: ArmPlanner, body: BodyDescription, state: RobotState, do: Press, over: bool
@@ -523,6 +526,8 @@ class Manipulator:
         left, phase = self._left, self._run.phase if self._run else None
         if phase and phase.name in ("descend", "close", "press"):
             left = self._plan
+        elif phase and phase.name == "retreat":
+            left = left or self._plan  # from what was put down
         self._drop()
         self._left = left
 

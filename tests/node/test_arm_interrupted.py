@@ -95,6 +95,16 @@ def test_another_task_first_leaves_the_thing_that_the_hand_is_at(
     assert rig.arm.thing()[:2] == pytest.approx(THERE, abs=0.01)
 
 
+def test_another_task_first_leaves_what_was_put_down(rig: Rig) -> None:
+    rig.give(PLACE)
+    until(rig, "retreat")
+    rig.tick()
+    rig.phases = []
+    rig.carry_out("do: [{posture: {shoulder_pan: -0.5}}]")
+    assert rig.arm.thing()[:2] == pytest.approx(ELSEWHERE, abs=0.012)
+    assert rig.phases.index("retreat") < rig.phases.index("move")
+
+
 def test_a_command_that_fails_at_a_thing_leaves_the_next_one_to_go_back(rig: Rig) -> None:
     rig.give(PLACE)
     until(rig, "descend")
