@@ -186,7 +186,10 @@ class BusHandler(logging.Handler):
 
 
 def _message(record: logging.LogRecord, process: str) -> LogRecord:
-    """Return the record, shortened to the bounds of its message; the file has all of it."""
+    """Return the record, shortened to the bounds of its message; the file has all of it.
+
+    It has the time of its line in the file, by which both are known as one.
+    """
     known = fields(record, process)
     text = str(known.pop("text"))
     event, level = str(known.pop("event")), known.pop("level")
@@ -195,6 +198,7 @@ def _message(record: logging.LogRecord, process: str) -> LogRecord:
     if traceback := known.get("traceback"):
         short["traceback"] = _clean(traceback)[-1500:]
     return LogRecord(
+        stamp_ns=known["t"],
         process=process[:64],
         level=level,
         event=_clean(event)[:64],

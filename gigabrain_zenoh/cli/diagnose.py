@@ -153,8 +153,13 @@ def log(
     def show(line: "Line") -> None:
         print_line(logs.encode(line).decode() if json else logs.readable(line))
 
-    if not at.connect:
-        for line in read(run_folder(run), wanted, newest):
-            show(line)
+    folder = None if at.connect else run_folder(run)
+
+    def logged() -> "list[Line]":
+        return read(folder, wanted, newest) if folder else []
+
     if follow:
-        on_bus(at, lambda bus: follow_log(bus, wanted, show))
+        on_bus(at, lambda bus: follow_log(bus, wanted, show, logged))
+        return
+    for line in logged():
+        show(line)

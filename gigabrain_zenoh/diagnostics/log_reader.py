@@ -4,6 +4,7 @@ import asyncio
 import heapq
 import re
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from gigabrain_schemas.safety import LogRecord
 from gigabrain_schemas.topics import LOG
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.codec import DECODE_ERRORS
+from gigabrain_zenoh.diagnostics.discovery import discover
 from gigabrain_zenoh.diagnostics.listener import stop_on_broken_pipe
 from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.host.files import open_regular
@@ -24,6 +26,7 @@ from gigabrain_zenoh.runtime.running import running
 
 LOG_FILES = "*.jsonl*"  # driver.jsonl, and the older driver.jsonl.1
 UNITS_S = {"s": 1, "m": 60, "h": 3600, "d": 86400}
+MAX_EARLY = 10_000  # lines that may arrive while the files are read; the oldest are dropped
 Line = Mapping[str, Any]
 
 
@@ -127,18 +130,51 @@ def as_line(record: LogRecord) -> Line:
     return known | {name: value for name, value in record.data.items() if name not in known}
 
 
-async def follow_log(bus: Bus, wanted: LogFilter, show: Callable[[Line], None]) -> None:
-    """Pass new lines to `show`, until a signal or until the reader of stdout is gone."""
+def _identity(line: Line) -> tuple[str, int]:
+    """Return what a line from a file and the record of it on the bus have in common."""
+    return line["process"][:64], line["t"]
+
+
+async def follow_log(
+    bus: Bus, wanted: LogFilter, show: Callable[[Line], None], logged: Callable[[], list[Line]]
+) -> None:
+    """Pass the `logged` lines to `show`, then new ones, until a signal or a broken pipe.
+
+    `logged` is called in a thread, and only once all processes know of the subscription. So no line
+    is lost in between, and none comes twice.
+    """
+    early: deque[Line] = deque(maxlen=MAX_EARLY)
+    known: set[tuple[str, int]] | None = None
 
     def receive(_key: str, record: LogRecord) -> None:
         line = as_line(record)
-        if wanted.accepts(line):
+        if not wanted.accepts(line):
+            return
+        if known is None:
+            early.append(line)
+        elif _identity(line) not in known:
             show(line)
 
     bus.subscribe(LOG, receive)
     with stop_signals() as stop, stop_on_broken_pipe(stop):
         stopped = asyncio.ensure_future(stop.wait())
-        await asyncio.wait((stopped, bus.failed), return_when=asyncio.FIRST_COMPLETED)
+        reading = asyncio.ensure_future(_read_behind(bus, logged))
+        waiting = (stopped, bus.failed)
+        await asyncio.wait((*waiting, reading), return_when=asyncio.FIRST_COMPLETED)
+        if reading.done():
+            lines = reading.result()
+            known = set(map(_identity, lines))
+            lines += [line for line in early if _identity(line) not in known]
+            for line in sorted(lines, key=lambda line: line["t"]):
+                show(line)
+            await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+        reading.cancel()
         stopped.cancel()
     if bus.failed.done():
         bus.failed.result()  # raises, as where the reader of the pipe is gone
+
+
+async def _read_behind(bus: Bus, logged: Callable[[], list[Line]]) -> list[Line]:
+    """Read the files after each process has answered, and so knows of the subscription."""
+    await discover(bus)
+    return await asyncio.to_thread(logged)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from msgspec import Struct
 
+from gigabrain_schemas.safety import LogRecord
 from gigabrain_schemas.topics import INPUT_LOG, LOG, Role
 from gigabrain_zenoh import logs
 from gigabrain_zenoh.bus.bus import Bus
@@ -193,7 +194,11 @@ async def _work(
     endpoint, looks_on = config.endpoint, process_type.looks_on
     bus_of = connect(endpoint, config.name, timeout_s=None, looks_on=looks_on, make_bus=make_bus)
     async with bus_of as bus:
-        handler = logs.BusHandler(functools.partial(bus.publish, LOG), config.name)
+
+        def publish_log(record: LogRecord) -> None:
+            bus.publish(LOG, record, stamp_ns=record.stamp_ns)
+
+        handler = logs.BusHandler(publish_log, config.name)
         logging.getLogger().addHandler(handler)
         if process_type.repeats:
             publish = functools.partial(bus.publish, INPUT_LOG, name=config.name)

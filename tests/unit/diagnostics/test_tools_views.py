@@ -14,7 +14,7 @@ from textual.widgets import DataTable
 from gigabrain_schemas.examples import example
 from gigabrain_schemas.requests import Description, ParamReply, ParamRequest
 from gigabrain_schemas.safety import Health, LogRecord
-from gigabrain_schemas.topics import PARAM
+from gigabrain_schemas.topics import LOG, PARAM
 from gigabrain_zenoh.config.settings import DecisionConfig, Endpoint
 from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.diagnostics import log_reader
@@ -29,7 +29,15 @@ from gigabrain_zenoh.diagnostics.discovery import (
     graph_positions,
     write_graph_png,
 )
-from gigabrain_zenoh.diagnostics.log_reader import LogFilter, ago_ns, as_line, read, run_folder
+from gigabrain_zenoh.diagnostics.log_reader import (
+    Line,
+    LogFilter,
+    ago_ns,
+    as_line,
+    follow_log,
+    read,
+    run_folder,
+)
 from gigabrain_zenoh.diagnostics.top import (
     PROCESS_COLUMNS,
     TOPIC_COLUMNS,
@@ -235,6 +243,31 @@ def test_a_record_from_the_bus_is_shown_like_one_from_a_file() -> None:
     assert (told["process"], told["reason"]) == ("decision", "obstacle ahead")
     assert LogFilter(process="decision").accepts(told)
     assert not LogFilter(level="error").accepts(told)
+
+
+async def test_lines_logged_while_the_files_are_read_are_shown_once_in_order(net: Net) -> None:
+    def publish(t: int) -> None:
+        record = replace(example(LogRecord), process="driver", stamp_ns=t)
+        net.one.publish(LOG, record, stamp_ns=t)
+
+    def logged() -> list[Line]:
+        return [json.loads(line(10)), json.loads(line(20))]
+
+    def show(each: Line) -> None:
+        shown.append(each["t"])
+        begun.set()
+
+    shown, begun = list[int](), asyncio.Event()
+    following = asyncio.create_task(follow_log(net.two, LogFilter(), show, logged))
+    await asyncio.sleep(0)
+    publish(20)  # which the files have as well
+    publish(15)
+    await begun.wait()
+    publish(10)  # late
+    publish(30)
+    await asyncio.sleep(0)
+    following.cancel()
+    assert shown == [10, 15, 20, 30]
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ async def test_the_bus_gets_records_from_info_up_as_valid_messages(quiet: loggin
     quiet.addHandler(logs.BusHandler(sent.append, "driver"))
     quiet.debug("not this")
     quiet.info("ready to drive", extra={"data": {"event": "ready", "port": np.int64(7447)}})
-    assert sent == [
+    assert [msgspec.structs.replace(record, stamp_ns=0) for record in sent] == [
         LogRecord(
             process="driver",
             level="info",
@@ -37,6 +37,15 @@ async def test_the_bus_gets_records_from_info_up_as_valid_messages(quiet: loggin
             data={"port": "7447"},
         )
     ]
+
+
+async def test_a_record_on_the_bus_has_the_time_of_its_line_in_the_file(
+    quiet: logging.Logger,
+) -> None:
+    sent: list[LogRecord] = []
+    record = quiet.makeRecord("bus.test", logging.INFO, "", 0, "ready to drive", (), None)
+    logs.BusHandler(sent.append, "driver").emit(record)
+    assert sent[0].stamp_ns == logs.fields(record, "driver")["t"] > 0
 
 
 async def test_the_bus_gets_the_gist_of_a_record_of_any_size(quiet: logging.Logger) -> None:
