@@ -19,7 +19,7 @@ from gigabrain_zenoh.diagnostics.discovery import discover
 from gigabrain_zenoh.diagnostics.listener import stop_on_broken_pipe
 from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.host.files import open_regular
-from gigabrain_zenoh.host.run_folders import state_dir
+from gigabrain_zenoh.host.run_folders import past_runs, state_dir
 from gigabrain_zenoh.host.signals import stop_signals
 from gigabrain_zenoh.logs import FILE_BYTES, LEVELS
 from gigabrain_zenoh.runtime.running import running
@@ -69,7 +69,7 @@ def run_folder(name: str = "") -> Path:
             raise ConfigError(f"{name}: no logs; expected files such as decision.jsonl")
         return Path(name)
     base = state_dir() / "runs"
-    runs = sorted((p for p in base.glob("*") if p.is_dir()), key=lambda p: p.name)
+    runs = past_runs(base)
     if not runs:
         raise ConfigError(f"{base}: no logs of any run; start one with `gigabrain demo`")
     found = [run for run in runs if name in run.name]

@@ -19,12 +19,30 @@ log = logging.getLogger(__name__)
 
 MAX_RUNS = 50
 MAX_BYTES = 1_000_000_000  # of all folders together
-LOCK = ".in_use"  # locked by the supervisor for as long as it runs
+LOCK = ".in_use"  # locked by the supervisor for as long as it runs; holds the run's number
 
 
-def hold(folder: Path) -> None:
-    """Mark a folder as in use until this process ends. Raises OSError."""
-    fcntl.flock(os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o600), fcntl.LOCK_EX)
+def hold(folder: Path, number: int = 0) -> None:
+    """Mark a folder as in use until this process ends, and number it. Raises OSError."""
+    lock = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o600)
+    fcntl.flock(lock, fcntl.LOCK_EX)
+    os.write(lock, str(number).encode())
+
+
+def past_runs(base: Path) -> list[Path]:
+    """Return all run folders, oldest first.
+
+    They are numbered, as the clock may have stepped back since. Those without a number, of earlier
+    versions, come first and in the order of their names.
+    """
+    return sorted((p for p in base.glob("*") if p.is_dir()), key=lambda p: (_number(p), p.name))
+
+
+def _number(folder: Path) -> int:
+    try:
+        return int((folder / LOCK).read_bytes())
+    except (OSError, ValueError):
+        return 0
 
 
 @contextlib.contextmanager
@@ -49,7 +67,7 @@ def prune(base: Path, max_runs: int = MAX_RUNS, max_bytes: int = MAX_BYTES) -> N
 
     Folders in use are kept. Folders that cannot be removed are skipped, and do not fail the run.
     """
-    runs = sorted((path for path in base.glob("*") if path.is_dir()), key=lambda path: path.name)
+    runs = past_runs(base)
     sizes = {path: _size(path) for path in runs}
     for path in runs:
         if len(sizes) < max_runs and sum(sizes.values()) <= max_bytes:
@@ -127,8 +145,9 @@ def new_run_dir(base: Path | None, label: str) -> Path:
                 path = base / (name if n == 1 else f"{name}-{n}")
                 if not path.exists():  # by an earlier run of this process in this second
                     break
+            number = max(map(_number, past_runs(base)), default=0) + 1
             path.mkdir()
-            hold(path)
+            hold(path, number)
             return path
     except OSError as error:
         raise unwritable(base, error) from None

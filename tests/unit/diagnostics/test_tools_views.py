@@ -50,6 +50,7 @@ from gigabrain_zenoh.diagnostics.top import (
 )
 from gigabrain_zenoh.diagnostics.top_app import TopApp
 from gigabrain_zenoh.errors import ConfigError, Refused, UnknownName
+from gigabrain_zenoh.host.run_folders import hold
 from gigabrain_zenoh.runtime.running import announced
 from gigabrain_zenoh.runtime.services import serve_params
 from gigabrain_zenoh.testing.in_memory import Net
@@ -214,6 +215,16 @@ def test_the_log_of_a_run_that_goes_on_is_preferred_to_a_newer_one_that_has_ende
         assert run_folder() == older
         assert run_folder("red") == runs / "20260102T000000Z-red-2"
     assert run_folder().name == "20260102T000000Z-red-2"
+
+
+def test_the_newest_run_is_the_last_that_began_also_after_the_clock_has_stepped_back(
+    runs: Path,
+) -> None:
+    last = runs / "20000101T000000Z-demo-3"
+    last.mkdir()
+    hold(last, number=1)
+    assert run_folder() == last
+    assert run_folder("demo") == last
 
 
 def test_what_is_not_there_to_be_read_is_answered_with_what_is(runs: Path) -> None:

@@ -1,6 +1,7 @@
 """Old run folders are removed, but never one that is in use."""
 
 import os
+import time
 from pathlib import Path
 
 import pytest
@@ -37,6 +38,20 @@ def test_each_new_run_tidies_up_and_is_held(
     assert sorted(tmp_path.iterdir()) == [*made[3:], new]
     run_folders.prune(tmp_path, max_runs=1)
     assert sorted(tmp_path.iterdir()) == [new]
+
+
+def test_runs_are_in_order_also_where_the_clock_has_stepped_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (old,) = runs(tmp_path, 1)  # of an earlier version, in 2026
+    made = []
+    for stamp in ("20260301T000000Z", "20000101T000000Z", "20000101T000000Z"):
+        monkeypatch.setattr(time, "strftime", lambda *_, stamp=stamp: stamp)
+        made.append(run_folders.new_run_dir(tmp_path, "demo"))
+    assert run_folders.past_runs(tmp_path) == [old, *made]
+    monkeypatch.setattr(run_folders, "_in_use", lambda _: False)
+    run_folders.prune(tmp_path, max_runs=3)
+    assert run_folders.past_runs(tmp_path) == made[1:]
 
 
 @pytest.mark.skipif(os.getuid() == 0, reason="root may remove anything")
