@@ -236,6 +236,7 @@ def _call(words: "Sequence[str]") -> object:
     from gigabrain_zenoh.config.renames import renamed_arguments
     from gigabrain_zenoh.errors import ConfigError, GigabrainError
     from gigabrain_zenoh.host.signals import interrupts
+    from gigabrain_zenoh.host.terminal import printable
 
     if {*words[:1]} & SUPERVISING and not {*words} & {"--help", "-h"}:
         from gigabrain_zenoh.runtime.forking import start_early
@@ -250,7 +251,7 @@ def _call(words: "Sequence[str]") -> object:
         with interrupts.raising():
             return command(*bound.args, **bound.kwargs)
     except GigabrainError as error:
-        print(f"gigabrain: {error}", file=sys.stderr)
+        print(f"gigabrain: {printable(error)}", file=sys.stderr)
         return interrupts.exit_code if interrupts.received else error.exit_code
     except CycloptsError as error:
         from gigabrain_zenoh.cli.options import usage_error

@@ -13,6 +13,8 @@ from gigabrain_zenoh.cli.options import (
     TopicNames,
     check_positive,
     checked,
+    print_json,
+    print_line,
 )
 from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.errors import ConfigError
@@ -72,14 +74,12 @@ def info(file: Recording, *, json: bool = False) -> None:
     Args:
         json: Print JSON.
     """
-    import msgspec
-
     from gigabrain_zenoh.recording.bag_reader import print_info
     from gigabrain_zenoh.recording.bag_reader import read_info as read
 
     found = read(file)
     if json:
-        print(msgspec.json.format(msgspec.json.encode(found), indent=2).decode())
+        print_json(found, indent=2)
     else:
         print_info(found)
 
@@ -97,7 +97,7 @@ def check(file: Recording) -> int:
     found = read(file)
     problems = faults(found)
     for problem in problems:
-        print(f"{file}: {problem}")
+        print_line(f"{file}: {problem}")
     if found.damages or not found.finished:
         print(f"repair it with: gigabrain bag recover {file}")
     if not problems:
@@ -117,7 +117,7 @@ def recover(file: Recording, *, output: Output = None) -> int:
 
     done = run(file, output or file.with_name(f"{file.stem}_recovered{file.suffix}"))
     for damage in done.damages:
-        print(f"{file}: byte {damage.offset}: {damage.text}")
+        print_line(f"{file}: byte {damage.offset}: {damage.text}")
     if not done.messages:
         done.path.unlink()
         print(f"{file}: nothing could be recovered")
@@ -203,7 +203,7 @@ def convert(file: Recording, *, csv: Path | None = None, lerobot: Path | None = 
     if csv is None and lerobot is None:
         raise ConfigError("no output; add --csv FOLDER or --lerobot FOLDER")
     for path in write_csv(file, csv) if csv else ():
-        print(path)
+        print_line(str(path))
     if lerobot:
         from gigabrain_zenoh.recording.lerobot import convert as write_lerobot  # needs its extra
 

@@ -12,10 +12,12 @@ from gigabrain_zenoh.cli.options import (
     ProcessOrAll,
     RobotAddress,
     on_bus,
+    print_json,
     print_line,
 )
 from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError
 from gigabrain_zenoh.host.signals import run_async
+from gigabrain_zenoh.host.terminal import printable_json
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.diagnostics.log_reader import Line
@@ -50,7 +52,7 @@ def why(*, at: RobotAddress = LOCAL, json: bool = False) -> int:
             "waits": waits.text if waits and not verdict.moves else None,
             **msgspec.to_builtins(verdict),
         }
-        print_line(msgspec.json.encode(summary).decode())
+        print_json(summary)
         return verdict.exit_code
     for one in verdict.findings:
         word = "BROKEN" if not one.ok else "waits" if one.waits else "ok"
@@ -87,8 +89,6 @@ def doctor(*, at: RobotAddress = LOCAL, json: JsonLines = False) -> int:
 
     Exit code 1 if anything is bad; hints do not count.
     """
-    import msgspec
-
     from gigabrain_zenoh.diagnostics.doctor import (
         examine,
         exit_code,
@@ -100,7 +100,7 @@ def doctor(*, at: RobotAddress = LOCAL, json: JsonLines = False) -> int:
     results = examine(inspect_machine(keys), robot)
     for one in results:
         if json:
-            print_line(msgspec.json.encode(one).decode())
+            print_json(one)
             continue
         print_line(f"{GRADES[one.grade]}  {one.about:<14} {one.text}")
         if one.cure:
@@ -151,7 +151,10 @@ def log(
     wanted = LogFilter(process=process, level=level, since_ns=since_ns)
 
     def show(line: "Line") -> None:
-        print_line(logs.encode(line).decode() if json else logs.readable(line))
+        if json:
+            print_line(printable_json(logs.encode(line).decode()))
+        else:
+            print(logs.readable(line), flush=True)  # escaped; a traceback has several lines
 
     folder = None if at.connect else run_folder(run)
 

@@ -64,6 +64,7 @@ def test(
     from rich.table import Table
 
     from gigabrain_drivers.driver.catalog import load_robot, robot_links
+    from gigabrain_zenoh.diagnostics.discovery import plain
     from gigabrain_zenoh.qa.conformance import kit
     from gigabrain_zenoh.qa.judging import coloured
 
@@ -79,7 +80,7 @@ def test(
     with warnings, place as folder, console.status("") as status:
         results = run_async(kit.check(name, chosen, Path(folder), status.update, repeat))
     for result in results:
-        table.add_row(*result[:-1], coloured(result.verdict))
+        table.add_row(*map(plain, result[:-1]), coloured(result.verdict))
     if warnings.texts:
         console.print(f"warnings during the checks: {warnings}", markup=False, soft_wrap=True)
     console.print(table)
@@ -140,6 +141,7 @@ def bringup(name: Body, *, link: Literal["emulated", "real"] = "real", seconds: 
     from rich.console import Console
     from rich.table import Table
 
+    from gigabrain_zenoh.diagnostics.discovery import plain
     from gigabrain_zenoh.qa.conformance import ros2_bringup
 
     check_positive(seconds=seconds)
@@ -150,7 +152,8 @@ def bringup(name: Body, *, link: Literal["emulated", "real"] = "real", seconds: 
         table.add_column(title)
     for one in found:
         colour = {"ok": "green", "warning": "yellow", "error": "red"}[one.verdict]
-        table.add_row(one.what, f"[{colour}]{one.verdict}[/{colour}]", one.text, one.do)
+        verdict = f"[{colour}]{one.verdict}[/{colour}]"
+        table.add_row(plain(one.what), verdict, plain(one.text), plain(one.do))
     Console().print(table)
     return int(any(one.verdict == "error" for one in found))
 

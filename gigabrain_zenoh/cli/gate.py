@@ -69,7 +69,7 @@ def _ask(
             start_s = time.perf_counter()
             reply = await request(robot)
             took_ms = (time.perf_counter() - start_s) * 1e3
-            print(f"{prefix}{reply.robot_type}: {reply.text} ({took_ms:.0f} ms)")
+            print_line(f"{prefix}{reply.robot_type}: {reply.text} ({took_ms:.0f} ms)")
 
     run_async(run())
 

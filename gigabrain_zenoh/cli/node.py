@@ -13,6 +13,7 @@ from gigabrain_zenoh.cli.options import (
     ProcessOrAll,
     RobotAddress,
     on_bus,
+    print_json,
     print_line,
     print_table,
 )
@@ -33,8 +34,6 @@ def list_(*, at: RobotAddress = LOCAL, json: JsonLines = False) -> None:
 
     Example: gigabrain node list
     """
-    import msgspec
-
     from gigabrain_zenoh.diagnostics.discovery import process_table
 
     processes = _find(at)
@@ -47,7 +46,7 @@ def list_(*, at: RobotAddress = LOCAL, json: JsonLines = False) -> None:
             "description": processes.described.get(name),
             "health": processes.health.get(name),
         }
-        print_line(msgspec.json.encode(row).decode())
+        print_json(row)
 
 
 def info(process: Process, /, *, at: RobotAddress = LOCAL) -> None:

@@ -5,7 +5,14 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, check_finite, on_bus, print_line
+from gigabrain_zenoh.cli.options import (
+    LOCAL,
+    RobotAddress,
+    check_finite,
+    on_bus,
+    print_json,
+    print_line,
+)
 
 if TYPE_CHECKING:
     from gigabrain_schemas.objects import ObjectMap
@@ -41,9 +48,7 @@ def objects(
         return
     found = on_bus(at, known_objects)
     if json:
-        import msgspec
-
-        print(msgspec.json.format(msgspec.json.encode(found), indent=2).decode())
+        print_json(found, indent=2)
         return
     for line in lines(found, time.time()):
         print_line(line)

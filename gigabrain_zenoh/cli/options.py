@@ -24,6 +24,7 @@ from cyclopts import (
 
 from gigabrain_zenoh.errors import ConfigError, GigabrainError
 from gigabrain_zenoh.host.signals import run_async
+from gigabrain_zenoh.host.terminal import printable, printable_json
 
 if TYPE_CHECKING:
     from msgspec import Struct
@@ -288,15 +289,23 @@ def _is_fraction(text: str) -> bool:
 
 
 def print_line(line: str) -> None:
-    """Print a line and flush it, for pipes."""
-    print(line, flush=True)
+    """Print a line with control characters escaped, and flush it, for pipes."""
+    print(printable(line), flush=True)
+
+
+def print_json(value: object, *, indent: int = -1) -> None:
+    """Print a value as JSON, on one line unless `indent` is 0 or more."""
+    import msgspec
+
+    line = printable_json(msgspec.json.encode(value).decode())
+    print(msgspec.json.format(line, indent=indent), flush=True)
 
 
 def print_progress(line: str) -> None:
     """Print a line to stderr, so that stdout holds the result alone."""
     import sys
 
-    print(line, file=sys.stderr, flush=True)
+    print(printable(line), file=sys.stderr, flush=True)
 
 
 def print_table(table: "Table") -> None:

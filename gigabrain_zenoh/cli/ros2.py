@@ -12,6 +12,7 @@ from gigabrain_zenoh.cli.options import (
     JsonLines,
     RobotAddress,
     checked,
+    print_json,
     print_line,
     print_progress,
     print_table,
@@ -113,7 +114,7 @@ def topics(
     listed = run_async(_listed(link, all_topics=all_topics))
     if json:
         for row in listed:
-            print_line(msgspec.json.encode(row).decode())
+            print_json(row)
         return
     from gigabrain_zenoh.gateway.topic_list import gateway_node, topic_table
 

@@ -11,6 +11,7 @@ from cyclopts import Parameter
 from gigabrain_schemas.tasks import TaskStatus
 from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, on_bus, print_line
 from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.host.terminal import printable
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.client.tasks import Tasks
@@ -236,7 +237,7 @@ class ProgressLine:
         """Show the progress of the task `name`."""
         text = progress(name, status)
         if self._terminal:
-            print(f"\r\x1b[K{text}", end="", flush=True)
+            print(f"\r\x1b[K{printable(text)}", end="", flush=True)
         elif status.doing != self._step:
             self._step = status.doing
             print_line(text)

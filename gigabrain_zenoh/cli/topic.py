@@ -14,6 +14,7 @@ from gigabrain_zenoh.cli.options import (
     TopicName,
     check_positive,
     on_bus,
+    print_json,
     print_line,
     print_table,
 )
@@ -33,8 +34,6 @@ def list_(*, at: RobotAddress = LOCAL, all_topics: bool = False, json: JsonLines
     Args:
         all_topics: Also list topics without senders and receivers.
     """
-    import msgspec
-
     from gigabrain_zenoh.diagnostics.listener import snapshot, widest_pattern
     from gigabrain_zenoh.diagnostics.topics import rows, topic_table
 
@@ -47,7 +46,7 @@ def list_(*, at: RobotAddress = LOCAL, all_topics: bool = False, json: JsonLines
         print_table(topic_table(listed))
         return
     for row in listed:
-        print_line(msgspec.json.encode(row).decode())
+        print_json(row)
 
 
 def echo(

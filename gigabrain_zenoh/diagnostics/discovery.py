@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from msgspec import Struct, field
 from rich.table import Table
+from rich.text import Text
 
 from gigabrain_schemas.requests import DescribeRequest, Description
 from gigabrain_schemas.safety import Health
@@ -19,6 +20,7 @@ from gigabrain_zenoh.bus.key_expressions import check_key_expression, matches
 from gigabrain_zenoh.bus.listening import topic_of
 from gigabrain_zenoh.diagnostics.robot_view import ProcessHealth
 from gigabrain_zenoh.errors import BodyLost, ConfigError, UnknownName, unknown
+from gigabrain_zenoh.host.terminal import printable
 
 PREFIX = "robot/"
 COMMAND_OF_SERVICE = {  # services that people take for topics, and the commands that call them
@@ -252,8 +254,13 @@ def plain_table(
         justify: Literal["left", "right"] = "left" if name in left else "right"
         table.add_column(name, justify=justify, no_wrap=name not in wraps)
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(plain, row))
     return table
+
+
+def plain(cell: str) -> Text:
+    """Return a cell of any origin as it is: neither as markup nor with control characters."""
+    return Text(printable(cell))
 
 
 def process_table(processes: Processes) -> Table:

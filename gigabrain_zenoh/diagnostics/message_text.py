@@ -201,7 +201,7 @@ def _paths(value: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
 
 def as_json(value: Any) -> str:
     """Return a tree as JSON on one line."""
-    return msgspec.json.encode(value, enc_hook=_encode_other).decode()
+    return terminal.printable_json(msgspec.json.encode(value, enc_hook=_encode_other).decode())
 
 
 def _encode_other(value: object) -> object:

@@ -10,6 +10,7 @@ from gigabrain_zenoh.bus.listening import topic_of
 from gigabrain_zenoh.diagnostics.discovery import short_name
 from gigabrain_zenoh.diagnostics.robot_view import ProcessHealth
 from gigabrain_zenoh.diagnostics.topic_stats import StreamStats, TopicMonitor
+from gigabrain_zenoh.host.terminal import printable
 
 BARS = "▁▂▃▄▅▆▇█"
 MAX_BARS = 20
@@ -67,7 +68,7 @@ def topic_cells(
 def cell_text(cell: Cell) -> str:
     """Return a cell as text."""
     if isinstance(cell, str):
-        return cell
+        return printable(cell)
     return str(cell) if isinstance(cell, int) else f"{cell:.1f}"
 
 

@@ -29,6 +29,7 @@ from gigabrain_zenoh.diagnostics.message_text import as_json, in_a_line, lines, 
 from gigabrain_zenoh.diagnostics.topic_stats import StreamStats, monitored
 from gigabrain_zenoh.errors import BodyLost
 from gigabrain_zenoh.host.signals import stop_signals
+from gigabrain_zenoh.host.terminal import printable
 
 SILENCE_NOTICE_S = 2.0  # without a message, until the user gets a notice
 REPORT_PERIOD_S = 1.0
@@ -236,7 +237,7 @@ async def _report_silence(
         text = f"no messages on {wanted.pattern} (senders: {by}; receivers: {to})"
         if within_s:
             raise BodyLost(text) from None
-        print(f"{text}; waiting", file=sys.stderr, flush=True)
+        print(f"{printable(text)}; waiting", file=sys.stderr, flush=True)
         await first.wait()
 
 

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import errno
+import json
 import os
 import queue
 import sys
@@ -91,6 +92,13 @@ class LineSplitter:
 def printable(text: object) -> str:
     """Return `text` with control characters escaped, so that it cannot move the cursor."""
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
+
+
+def printable_json(text: str) -> str:
+    """Return a line of JSON with control characters escaped; its value stays the same."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text)
 
 
 @contextlib.contextmanager

@@ -22,6 +22,7 @@ from gigabrain_zenoh.errors import BodyLost, ConfigError
 from gigabrain_zenoh.host import files
 from gigabrain_zenoh.host.run_folders import new_run_dir
 from gigabrain_zenoh.host.signals import run_until, stop_signals
+from gigabrain_zenoh.host.terminal import printable
 from gigabrain_zenoh.launch.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.launch.merging import write_rows
 from gigabrain_zenoh.launch.specs import process_specs
@@ -341,7 +342,7 @@ class Demo:
         if event in ("given up", "died"):
             self._failures.append((name, str(record.get("text", ""))))
         if level in ("warning", "error", "critical"):
-            text = f"{record['process']}: {record.get('text', '')}"
+            text = printable(f"{record['process']}: {record.get('text', '')}")
             self._faults.append((time.monotonic(), text))
 
     def _why(self) -> str:

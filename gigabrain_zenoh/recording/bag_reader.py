@@ -30,6 +30,7 @@ from gigabrain_schemas.topics import DEPTH, IMAGE, current_key
 from gigabrain_zenoh.bus.headers import Header, SequenceGaps, header_of
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import open_regular
+from gigabrain_zenoh.host.terminal import printable
 
 log = logging.getLogger(__name__)
 
@@ -404,14 +405,14 @@ def print_info(info: BagInfo) -> None:
     notes = "  ".join(
         f"{k} {v}" for k, v in info.notes.get("gigabrain", {}).items() if v[:1] != "{"
     )
-    print(f"{info.path}: {info.bytes / 1e6:.2f} MB, {state}  {notes}".rstrip())
+    print(printable(f"{info.path}: {info.bytes / 1e6:.2f} MB, {state}  {notes}".rstrip()))
     print(f"{when}, {info.seconds:.1f} s, {info.messages} messages" if info.messages else "empty")
     print(TABLE_HEAD)
     for key in info.keys:
         gap = f"{key.longest_gap_s:.2f} s"
         print(
-            f"{key.key:<28} {key.message:<14} {key.messages:>8} {key.hz:>7.1f} "
-            f"{key.bytes / 1e3:>9.1f} {key.missing:>8} {key.restarts:>9} {gap:>11}"
+            f"{printable(key.key):<28} {printable(key.message):<14} {key.messages:>8} "
+            f"{key.hz:>7.1f} {key.bytes / 1e3:>9.1f} {key.missing:>8} {key.restarts:>9} {gap:>11}"
         )
     for damage in info.damages:
         print(damage)

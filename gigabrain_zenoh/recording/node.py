@@ -18,6 +18,7 @@ from gigabrain_zenoh.bus.key_expressions import key_expressions, matches
 from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.host.signals import stop_signals
+from gigabrain_zenoh.host.terminal import printable
 from gigabrain_zenoh.recording.recorder import Recorder, Status, unused_path
 from gigabrain_zenoh.recording.recovery import recover_all
 from gigabrain_zenoh.runtime.connect import Where, connect
@@ -188,7 +189,7 @@ def _rates(before: Status, now: Status) -> str:
 
 def _key_line(recorder: Recorder, key: str) -> str:
     intake = recorder.intake
-    line = f"  {key:<28} {intake.seen[key]:>7} {intake.bytes[key] / 1e6:>8.2f} MB"
+    line = f"  {printable(key):<28} {intake.seen[key]:>7} {intake.bytes[key] / 1e6:>8.2f} MB"
     for name, counts in (
         ("missing", intake.gaps.missing),
         ("dropped", intake.dropped),

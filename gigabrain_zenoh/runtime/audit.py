@@ -22,7 +22,7 @@ from gigabrain_schemas.topics import AUDIT, AUDIT_LOG
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import read_bounded
-from gigabrain_zenoh.host.terminal import printable
+from gigabrain_zenoh.host.terminal import printable, printable_json
 from gigabrain_zenoh.host.threads import BackgroundWriter
 from gigabrain_zenoh.logs import Fault
 
@@ -160,7 +160,7 @@ def readable(record: AuditRecord) -> str:
 
 def as_json(record: AuditRecord) -> str:
     """Return the entry as JSON in one line."""
-    return msgspec.json.encode(record).decode()
+    return printable_json(msgspec.json.encode(record).decode())
 
 
 log = logging.getLogger(__name__)

@@ -23,7 +23,7 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.recording import recorder as recorder_module
 from gigabrain_zenoh.recording.bag_reader import Bag, read_info
 from gigabrain_zenoh.recording.bag_writer import BagWriter
-from gigabrain_zenoh.recording.node import key_filter, listening, run
+from gigabrain_zenoh.recording.node import _key_line, key_filter, listening, run
 from gigabrain_zenoh.recording.recorder import MAX_CHANNELS, OTHER_KEYS, Intake, Recorder, Status
 from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.waiting import until
@@ -364,3 +364,9 @@ def test_pictures_that_are_no_messages_are_thinned_too(tmp_path: Path, payload: 
         for _ in range(200):
             recorder.intake.receive("robot/image/front", "", payload)
     assert len(list(Bag(path))) < 5
+
+
+def test_a_key_is_listed_with_control_characters_escaped(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "a.mcap", QUICK) as recorder:
+        recorder.intake.receive("robot/\x1b[2J\nx", "", b"{}")
+    assert _key_line(recorder, "robot/\x1b[2J\nx").startswith("  robot/\\x1b[2J\\nx ")
