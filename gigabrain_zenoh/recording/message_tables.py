@@ -1,11 +1,13 @@
 """Messages as rows of named values: CSV tables, and plots over time."""
 
 import csv
+import io
+import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import msgspec
 
@@ -14,6 +16,7 @@ from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import TOPICS
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import ConfigError, unknown
+from gigabrain_zenoh.host.files import replacing
 from gigabrain_zenoh.recording.bag_reader import Bag, Sample, samples
 
 Value = float | int | str | bool | None
@@ -55,7 +58,7 @@ def _flat(name: str, value: Any) -> Iterator[tuple[str, Value]]:
 def write_csv(path: Path, folder: Path) -> list[Path]:
     """Write one file per key with a row per message; return the files. Raises ConfigError.
 
-    Messages that a recorder appends meanwhile are left out.
+    The files appear once all are whole. Messages that a recorder appends meanwhile are left out.
     """
     columns: dict[str, dict[str, None]] = {}  # in order of first appearance
     count = 0
@@ -65,13 +68,13 @@ def write_csv(path: Path, folder: Path) -> list[Path]:
             columns.setdefault(sample.key, {}).update(dict.fromkeys(row(message)))
     if not columns:
         raise ConfigError(f"{path} holds no message to convert")
-    paths = {key: folder / f"{key.replace('/', '_')}.csv" for key in sorted(columns)}
+    paths = _paths(folder, sorted(columns))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with ExitStack() as files:
             writers = {
                 key: csv.DictWriter(
-                    files.enter_context(each.open("w", newline="")), ("time_s", *columns[key])
+                    files.enter_context(_replacing_text(each)), ("time_s", *columns[key])
                 )
                 for key, each in paths.items()
             }
@@ -79,6 +82,27 @@ def write_csv(path: Path, folder: Path) -> list[Path]:
     except OSError as error:
         raise ConfigError(f"cannot write {folder}: {error.strerror}") from None
     return list(paths.values())
+
+
+def _paths(folder: Path, keys: Iterable[str]) -> dict[str, Path]:
+    """Return a file per key; `a/b` and `a_b` do not share one."""
+    paths: dict[str, Path] = {}
+    for key in keys:
+        name = key.replace("/", "_")
+        names = (f"{name}_{n}.csv" if n else f"{name}.csv" for n in itertools.count())
+        paths[key] = next(folder / each for each in names if folder / each not in paths.values())
+    return paths
+
+
+@contextmanager
+def _replacing_text(path: Path) -> Iterator[TextIO]:
+    """Yield a file for text that replaces `path` when the block ends. Raises OSError."""
+    with replacing(path) as file:
+        text = io.TextIOWrapper(file, encoding="utf-8", newline="")
+        try:
+            yield text
+        finally:
+            text.detach()  # writes the rest; `file` is closed by its own block
 
 
 def _write_rows(recorded: Iterable[Sample], writers: Mapping[str, "csv.DictWriter[str]"]) -> None:

@@ -361,7 +361,7 @@ def test_tables_of_a_recording_that_grows_meanwhile_are_those_of_its_beginning(
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
 def test_a_full_disk_is_named_in_one_line(whole: Path, tmp_path: Path) -> None:
-    (tmp_path / "robot_scan.csv").symlink_to("/dev/full")
+    (tmp_path / ".robot_scan.csv.new").symlink_to("/dev/full")
     with pytest.raises(ConfigError, match=r"^cannot write \S+: No space left on device$"):
         message_tables.write_csv(whole, tmp_path)
 
