@@ -4,7 +4,7 @@ import contextlib
 import logging
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -150,6 +150,7 @@ class BagWriter:
         self.pending: Counter[str] = Counter()  # messages per key that are not on the disk yet
         self.written = 0  # messages on the disk
         self.first_ns = 0
+        self.repeated_bytes = 0  # on the disk, of messages of earlier files
         self.index_entries = 0  # held in memory until the end: one of each channel and chunk
 
     @property
@@ -187,6 +188,14 @@ class BagWriter:
         if channel.drawn and self._is_worth_drawing(channel.drawn, message):
             self._draw(channel.drawn, message)
         self._store()
+
+    def repeat(self, messages: Iterable[ReceivedMessage], log_ns: int) -> None:
+        """Begin with messages of earlier files, and bring them to the disk."""
+        before = self.size
+        for message in messages:
+            self.add(message._replace(log_ns=log_ns), repeated=True)
+        self.flush()
+        self.repeated_bytes = self.size - before
 
     def flush(self) -> None:
         """Bring all messages to the disk."""

@@ -310,9 +310,10 @@ class Recorder:
 
     def _is_full(self, file: BagWriter, message: ReceivedMessage) -> bool:
         split_mb, split_s = self._config.split_mb, self._config.split_s
+        new_bytes = file.size - file.repeated_bytes  # a map may be larger than a small `split_mb`
         return (
             file.index_entries >= MAX_INDEX_ENTRIES
-            or (split_mb is not None and file.size >= split_mb * MB)
+            or (split_mb is not None and new_bytes >= split_mb * MB)
             or (split_s is not None and message.log_ns - file.first_ns >= split_s * 1_000_000_000)
         )
 
@@ -385,9 +386,8 @@ class Recorder:
             self._report(str(error))
             return None
         try:
-            for kept in self._kept.values():
-                if kept is not message:
-                    file.add(kept._replace(log_ns=message.log_ns), repeated=True)
+            earlier = (kept for kept in self._kept.values() if kept is not message)
+            file.repeat(earlier, message.log_ns)
             low = self._disk_is_low(file)
         except OSError as error:
             self._abandon(file, f"cannot write {file.path}: {error.strerror}")

@@ -184,6 +184,15 @@ def test_a_recording_of_several_files_skips_names_that_exist(tmp_path: Path) -> 
     assert (tmp_path / "s_1.mcap").read_text() == "mine"
 
 
+def test_kept_values_that_begin_each_file_do_not_count_as_its_size(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "s.mcap", replace(QUICK, split_mb=1)) as recorder:
+        recorder.intake.receive("robot/map", "", os.urandom(2_000_000))
+        for _ in range(4):
+            recorder.intake.receive("robot/scan", "", os.urandom(600_000))
+    parts = [dict(kept(path)) for path in sorted(tmp_path.iterdir())]
+    assert parts == [{"robot/map": 1}, *[{"robot/map": 1, "robot/scan": 2}] * 2]
+
+
 def test_a_file_that_is_deleted_meanwhile_is_followed_by_another(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
