@@ -209,7 +209,7 @@ async def _work(
             serve_params(bus)
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(publish_health(bus))
-                tasks.create_task(claim.settle())
+                tasks.create_task(claim.keep())
                 if config.json_console:
                     out = os.dup(STDOUT)  # the router redirects its standard output to Zenoh's log
                     tasks.create_task(beat(bus.clock, lambda: bus.progress(), out))

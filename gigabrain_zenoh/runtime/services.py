@@ -63,7 +63,7 @@ CONFIRM_NS = (1_000_000_000, 3_000_000_000)  # pauses before each query after th
 
 
 class NameClaim:
-    """A process's claim to its name, from start to settled."""
+    """A process's claim to its name."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus, self.instance = bus, secrets.randbits(62)
@@ -84,6 +84,22 @@ class NameClaim:
             await self._bus.clock.sleep_ns(pause_ns)
             await self._alone()
         self.claim = "settled"
+
+    async def keep(self) -> None:
+        """Settle, and claim the name again after each loss of the link, until cancelled.
+
+        A process that was stopped or cut off may have been replaced: then it has to exit, as one
+        that is settled keeps the name. Raises ConfigError like `acquire`.
+        """
+        while True:
+            losses = self._bus.transport.losses
+            await self.settle()
+            while self._bus.transport.losses == losses:
+                await self._bus.clock.sleep_ns(PERIOD_NS)
+            self.claim = "working"
+            while not any(one.instance == self.instance for one in await self._answers()):
+                await self._bus.clock.sleep_ns(AGAIN_NS)  # there is no link yet
+            await self._alone()
 
     async def _alone(self) -> None:
         """Wait until no other process answers to the name."""

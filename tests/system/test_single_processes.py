@@ -77,3 +77,20 @@ async def test_of_two_drivers_that_start_together_exactly_one_stays(home: Home) 
         await robot.ticks(250)  # until the one that stays has settled
         replies = await robot.bus.ask(DESCRIBE, DescribeRequest(), name="driver", timeout_s=20)
         assert [(one.pid, one.claim) for one in replies] == [(stays.pid, "settled")]
+
+
+async def test_a_process_that_was_replaced_while_it_was_stopped_leaves(home: Home) -> None:
+    where = f"tcp/127.0.0.1:{free_port()}"
+    router = home.start("router", "--listen", where)
+    await until(lambda: "ready" in router.err, "the router")
+    first = home.start("driver", "run", "mock", "--connect", where)
+    async with probing(Endpoint(connect=(where,))) as robot:
+        await robot.ticks(250)  # until it has settled
+        first.send(signal.SIGSTOP)  # Ctrl-Z
+        second = home.start("driver", "run", "mock", "--connect", where)
+        await until(lambda: "ready" in second.err, "the second driver")
+        await robot.ticks(250)
+    first.send(signal.SIGCONT)
+    assert await first.ended() == 2
+    assert f"a driver is already running here (pid {second.pid} on " in first.err
+    assert second.running

@@ -146,3 +146,47 @@ async def test_who_is_alone_does_not_wait() -> None:
     await clock.advance(4 * SECOND_NS)
     await keeping
     assert claim.claim == "settled"
+
+
+@pytest.mark.parametrize("lost", [(0,), (1,), (0, 1)])
+async def test_of_two_that_were_parted_the_one_that_lost_its_link_leaves(
+    lost: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, parted = FakeClock(), [LocalNetwork(), LocalNetwork()]
+    transports = [network.transport() for network in parted]
+    claims = [NameClaim(Bus(transport, clock, "driver")) for transport in transports]
+    for claim in claims:
+        await claim.acquire()
+    keeping = [asyncio.ensure_future(claim.keep()) for claim in claims]
+    await clock.advance(5 * SECOND_NS)
+    assert [claim.claim for claim in claims] == ["settled", "settled"]
+    both = [*parted[0].servers("robot/describe/*"), *parted[1].servers("robot/describe/*")]
+    for network in parted:
+        monkeypatch.setattr(network, "servers", lambda _: both)
+    for index in lost:
+        transports[index].losses += 1
+    await clock.advance(10 * SECOND_NS)
+    (left,) = [index for index, task in enumerate(keeping) if task.done()]
+    assert left in lost
+    assert isinstance(keeping[left].exception(), ConfigError)
+    both.pop(left)
+    await clock.advance(10 * SECOND_NS)
+    assert claims[1 - left].claim == "settled"
+    keeping[1 - left].cancel()
+
+
+async def test_who_is_alone_after_a_loss_settles_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, network = FakeClock(), LocalNetwork()
+    transport = network.transport()
+    claim = NameClaim(Bus(transport, clock, "driver"))
+    await claim.acquire()
+    keeping = asyncio.ensure_future(claim.keep())
+    await clock.advance(5 * SECOND_NS)
+    transport.losses += 1
+    with monkeypatch.context() as cut:
+        cut.setattr(network, "servers", lambda _: [])
+        await clock.advance(20 * SECOND_NS)
+        assert claim.claim == "working"
+    await clock.advance(5 * SECOND_NS)
+    assert (claim.claim, keeping.done()) == ("settled", False)
+    keeping.cancel()
