@@ -108,8 +108,21 @@ def read_audit(folder: Path, count: int, process: str = "") -> tuple[AuditRecord
 
 
 def in_order(logs: Iterable[Sequence[AuditRecord]]) -> tuple[AuditRecord, ...]:
-    """Several processes' logs as one, by wall time; each keeps its own order."""
-    return tuple(heapq.merge(*logs, key=lambda record: record.stamp_ns))
+    """Several processes' logs as one, by wall time; each keeps its own order.
+
+    The newest are put in order first, as the clock may have stepped back before them.
+    """
+    backwards = [_with_latest_time(log) for log in reversed(list(logs))]
+    merged = heapq.merge(*backwards, key=lambda timed: timed[0], reverse=True)
+    return tuple(record for _, record in merged)[::-1]
+
+
+def _with_latest_time(log: Sequence[AuditRecord]) -> Iterator[tuple[int, AuditRecord]]:
+    """Yield the entries, newest first, each with a time that is no later than of any after it."""
+    time_ns = 2**63
+    for record in reversed(log):
+        time_ns = min(time_ns, record.stamp_ns)
+        yield time_ns, record
 
 
 def _records(lines: Iterable[bytes]) -> Iterator[AuditRecord]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from msgspec.structs import replace
 
 from gigabrain_schemas.logs import AuditPage, AuditRecord, AuditRequest
 from gigabrain_schemas.topics import AUDIT, AUDIT_LOG
@@ -78,6 +79,15 @@ def test_logs_of_several_processes_become_one_and_keep_their_own_order(tmp_path:
     assert texts(read_audit(tmp_path, 10)) == ["1", "3", "2"]
     assert texts(read_audit(tmp_path, 1)) == ["2"]
     assert texts(in_order([[entry(1, 300), entry(2, 100)], [entry(3, 400)]])) == ["1", "2", "3"]
+
+
+def test_what_follows_a_step_back_of_the_clock_is_the_newest(tmp_path: Path) -> None:
+    file = AuditFile(tmp_path, "driver")
+    refusal = replace(entry(2, 900), what="refused", ok=False)
+    file.append([entry(1, 800), refusal])
+    file.append([entry(3, 10), replace(refusal, text="4", stamp_ns=20), entry(5, 30)])
+    assert texts(read_audit(tmp_path, 3)) == ["2", "4", "5"]
+    assert texts(read_audit(tmp_path, 2)) == ["4", "5"]
 
 
 def test_a_place_that_cannot_be_written_is_told_and_does_not_raise(tmp_path: Path) -> None:
