@@ -27,9 +27,23 @@ _COLOURS = {"debug": "2", "warning": "33", "error": "31", "critical": "1;31"}
 _FORMATTER = logging.Formatter()
 
 
+def is_time(t: object) -> bool:
+    """Return whether `t` is a time in nanoseconds that can be shown."""
+    return type(t) is int and 0 <= t < 2**63
+
+
 def level_of(record: logging.LogRecord) -> str:
     """Return the highest of LEVELS that is not above the record's own level."""
-    return LEVELS[min(max(record.levelno // 10 - 1, 0), len(LEVELS) - 1)]
+    return _level(record.levelno)
+
+
+def level_named(name: str) -> str:
+    """Return the one of LEVELS that `WARN` or `Fatal` stands for; info for an unknown name."""
+    return _level(logging.getLevelNamesMapping().get(name.upper(), logging.INFO))
+
+
+def _level(number: int) -> str:
+    return LEVELS[min(max(number // 10 - 1, 0), len(LEVELS) - 1)]
 
 
 def fields(record: logging.LogRecord, process: str) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.host.files import open_regular
 from gigabrain_zenoh.host.run_folders import past_runs, state_dir
 from gigabrain_zenoh.host.signals import stop_signals
-from gigabrain_zenoh.logs import FILE_BYTES, LEVELS
+from gigabrain_zenoh.logs import FILE_BYTES, LEVELS, is_time
 from gigabrain_zenoh.runtime.running import running
 
 LOG_FILES = "*.jsonl*"  # driver.jsonl, and the older driver.jsonl.1
@@ -111,7 +111,7 @@ def _lines(path: Path) -> Iterator[Line]:
 def _is_complete(line: object) -> bool:
     return (
         isinstance(line, dict)
-        and isinstance(line.get("t"), int)
+        and is_time(line.get("t"))
         and line.get("level") in LEVELS
         and isinstance(line.get("process"), str)
         and isinstance(line.get("event"), str)

@@ -13,6 +13,7 @@ import msgspec
 
 from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.host.terminal import LineSplitter
+from gigabrain_zenoh.logs import is_time, level_named
 
 _DRAIN_S = 0.2  # what a dead child has written arrives at once; someone else may hold its pipe
 REAP_S = 0.2  # a killed process ends at once, unless the kernel waits for a device
@@ -25,13 +26,18 @@ def supervised_environment() -> dict[str, str]:
 
 
 def as_record(line: bytes, process: str) -> dict[str, Any]:
-    """Return the log record in a line of output; other lines become the text of a record."""
+    """Return the log record in a line of output; other lines become the text of a record.
+
+    Libraries name levels differently, and `gigabrain log` shows only ours.
+    """
     known = {"t": time.time_ns(), "level": "info", "process": process, "event": "output"}
     with contextlib.suppress(msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         found = msgspec.json.decode(line)
         if isinstance(found, dict) and isinstance(found.get("event"), str):
             fit = {k: v for k, v in found.items() if type(v) is type(known.get(k, v))}
-            return known | fit
+            record = known | fit
+            t = record["t"] if is_time(record["t"]) else known["t"]
+            return record | {"t": t, "level": level_named(record["level"])}
     return known | {"level": "error", "text": line.decode(errors="replace").rstrip()}
 
 

@@ -184,6 +184,13 @@ def test_the_log_of_the_newest_run_is_read_in_the_order_of_time(runs: Path) -> N
     assert run_folder("demo") == runs / "20260101T000000Z-demo-1"
 
 
+@pytest.mark.parametrize("t", [10**30, 2**63, -1, True])
+def test_a_line_whose_time_is_none_is_left_out(tmp_path: Path, t: int) -> None:
+    (tmp_path / "driver.jsonl").write_text(line(t) + line(10))
+    (shown,) = read(tmp_path, LogFilter(), 9)
+    assert shown["t"] == 10
+
+
 def test_of_a_long_log_only_the_newest_lines_are_held(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,3 +1,6 @@
+import pytest
+
+from gigabrain_zenoh import logs
 from gigabrain_zenoh.host.terminal import LineSplitter
 from gigabrain_zenoh.runtime.child import as_record
 
@@ -21,6 +24,17 @@ def test_a_record_with_fields_of_the_wrong_kind_is_put_right() -> None:
     record = as_record(b'{"event": "ready", "t": "noon", "level": 3, "port": 7}', "driver")
     assert record.pop("t") > 1_700_000_000_000_000_000
     assert record == {"event": "ready", "level": "info", "process": "driver", "port": 7}
+
+
+@pytest.mark.parametrize(
+    ("level", "shown"),
+    [("WARN", "warning"), ("Error", "error"), ("fatal", "critical"), ("loud", "info")],
+)
+def test_a_record_of_another_library_has_a_level_and_a_time_of_ours(level: str, shown: str) -> None:
+    line = f'{{"event": "started", "level": "{level}", "t": {10**30}}}'
+    record = as_record(line.encode(), "lamp")
+    assert (record["level"], record["event"]) == (shown, "started")
+    assert logs.readable(record)
 
 
 def test_deeply_nested_output_is_text() -> None:
