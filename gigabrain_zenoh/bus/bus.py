@@ -215,9 +215,18 @@ class Bus:
         self.transport.serve(key, reply, urgent=service.priority == "real_time")
 
     async def ask(
-        self, service: Service[Q, R], request: Q, *, timeout_s: float = 1.0, name: str = ""
+        self,
+        service: Service[Q, R],
+        request: Q,
+        *,
+        timeout_s: float = 1.0,
+        name: str = "",
+        skip_refusals: bool = False,
     ) -> list[R]:
-        """Return every answer that arrives in time; none without a server. Raises Refused."""
+        """Return every answer that arrives in time; none without a server.
+
+        Raises Refused if any server refuses, unless `skip_refusals`.
+        """
         decode, key = Codec(service.reply, service.max_bytes).decode, service.at(name)
         payload, encoding = codec.encode(request), codec.encoding_of(service.request)
         answers = []
@@ -225,6 +234,8 @@ class Bus:
             key, payload, encoding, timeout_s, service.priority
         ):
             if isinstance(reply, str):
+                if skip_refusals:
+                    continue
                 raise Refused(reply)
             try:
                 answers.append(decode(reply))

@@ -106,7 +106,9 @@ class Processes(Struct, frozen=True):
 
 async def discover(bus: Bus, timeout_s: float = DESCRIBE_TIMEOUT_S) -> dict[str, Description]:
     """Return the description of each process that answers, by name."""
-    replies = await bus.ask(DESCRIBE, DescribeRequest(), timeout_s=timeout_s, name="*")
+    replies = await bus.ask(
+        DESCRIBE, DescribeRequest(), timeout_s=timeout_s, name="*", skip_refusals=True
+    )
     return {one.process: one for one in sorted(replies, key=lambda one: one.process)}
 
 

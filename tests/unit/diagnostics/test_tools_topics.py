@@ -16,12 +16,14 @@ from hypothesis import strategies as st
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import CmdVel, OccupancyGrid, WorldModel
 from gigabrain_schemas.examples import EXAMPLES, example
+from gigabrain_schemas.requests import DescribeRequest, Description
 from gigabrain_schemas.sensors import Image, LaserScan
-from gigabrain_schemas.topics import CMD_VEL, INTENT, SCAN, SERVICES, STATE, TOPICS, WORLD
+from gigabrain_schemas.topics import CMD_VEL, DESCRIBE, INTENT, SCAN, SERVICES, STATE, TOPICS, WORLD
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.diagnostics.discovery import (
     Flow,
     TopicPattern,
+    discover,
     find_processes,
     flows,
     topic_pattern,
@@ -47,7 +49,7 @@ from gigabrain_zenoh.diagnostics.topics import (
     rows,
     stats_text,
 )
-from gigabrain_zenoh.errors import BodyLost, ConfigError, UnknownName
+from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused, UnknownName
 from gigabrain_zenoh.runtime.services import NameClaim, publish_health
 from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.waiting import settle
@@ -276,6 +278,15 @@ async def test_echo_shows_what_comes_and_ends_after_so_many(net: Net) -> None:
         net.two.publish(CMD_VEL, CmdVel(linear_x=speed))
     assert await work == 0
     assert out == ["linear_x=0.1", "linear_x=0.2"]
+
+
+async def test_a_process_that_refuses_to_answer_hides_no_other(net: Net) -> None:
+    async def refuse(_: DescribeRequest) -> Description:
+        raise Refused("too many others ask for robot/describe/one; try again")
+
+    net.one.serve(DESCRIBE, refuse, name="one")
+    await NameClaim(net.two).acquire()
+    assert list(await discover(net.one)) == ["two"]
 
 
 async def test_echo_reports_a_silent_topic_after_its_time_limit(net: Net) -> None:
