@@ -174,7 +174,7 @@ def serve_params(bus: Bus) -> None:
             log_accepted(bus, PARAM.at(bus.process), request, bus.time.tick)
         text = f"{request.name} is {now} now, it was {before}"
         log.info("param by %s: %s", request.source, text, extra={"data": data})
-        return ParamReply(ok=True, text=text, params=bus.params.all())
+        return ParamReply(ok=True, text=text[:500], params=bus.params.all())
 
     bus.serve(PARAM, answer, name=bus.process)
 

@@ -375,6 +375,14 @@ async def test_a_value_that_cannot_be_is_refused_with_what_was_expected(
     assert reply.params == before
 
 
+async def test_the_change_of_a_long_text_is_confirmed(net: Net) -> None:
+    held = ["a" * 400]
+    net.one.params.add("route", "any text", lambda: held[0], lambda text: held.__setitem__(0, text))
+    serve_params(net.one)
+    reply = await told(net, "route", "b" * 400)
+    assert (reply.ok, held, len(reply.text)) == (True, ["b" * 400], 500)
+
+
 async def test_a_process_without_settings_still_has_its_log_level(net: Net) -> None:
     serve_params(net.one)
     assert [one.name for one in (await told(net)).params] == ["log_level"]
