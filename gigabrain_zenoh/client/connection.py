@@ -12,6 +12,11 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.runtime.running import find_endpoint
 
 ROBOT = frozenset(dir(SyncRobot)) | {"tasks"}
+# of the robot itself: the gate would take the commands of a script of that name for theirs
+PROCESSES = (
+    "router", "emulator", "driver", "camera", "perception", "recognition", "decision", "relay",
+    "control", "safety", "page", "foxglove", "ros2", "recorder", "button",
+)  # fmt: skip
 
 
 class Connection:
@@ -70,13 +75,17 @@ def connect(
 
     `connect` is its router's Zenoh endpoint; by default the only robot on this machine. `keys` is
     the folder of this script's identity, if the router requires one. `source` names this script to
-    the gate; with `take` it takes the body over from another commander. With `wait=False` the
-    first state is not awaited, so that an e-stop reaches a silent body. Raises BusError without a
-    router, ConfigError for invalid keys, and BodyLost without a driver.
+    the gate, by a name that no process of the robot has; with `take` it takes the body over from
+    another commander. With `wait=False` the first state is not awaited, so that an e-stop reaches a
+    silent body. Raises BusError without a router, ConfigError for invalid keys or such a name, and
+    BodyLost without a driver.
     """
     if len(source) > MAX_SOURCE_CHARS:
         expected = f"expected at most {MAX_SOURCE_CHARS} characters"
         raise ConfigError(f"source: {expected}, got {len(source)}")
+    if source in PROCESSES:
+        text = f"source: {source!r} is a process of the robot itself; choose another name"
+        raise ConfigError(text)
     return Connection(lambda: _open(connect, namespace, keys, source, take, wait))
 
 

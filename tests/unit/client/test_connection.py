@@ -9,6 +9,7 @@ import gigabrain_zenoh
 from gigabrain_zenoh.client.connection import Connection
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.launch.processes import PROCESSES
 from gigabrain_zenoh.testing.in_memory import Net
 
 
@@ -52,3 +53,15 @@ def test_what_a_robot_has_not_is_not_there_either() -> None:
 def test_a_name_that_no_request_has_room_for_is_refused() -> None:
     with pytest.raises(ConfigError, match="source: expected at most 64 characters, got 65"):
         gigabrain_zenoh.connect(source="x" * 65)
+
+
+@pytest.mark.parametrize("name", PROCESSES)
+def test_no_script_takes_the_name_of_a_process_of_the_robot(name: str) -> None:
+    text = f"source: {name!r} is a process of the robot itself; choose another name"
+    with pytest.raises(ConfigError, match=text):
+        gigabrain_zenoh.connect(source=name)
+
+
+def test_a_name_that_only_resembles_one_is_its_own() -> None:
+    for name in ("", "my-control", "control-2"):
+        gigabrain_zenoh.connect(source=name)
