@@ -5,7 +5,7 @@ import gigabrain_zenoh
 READINGS = 3
 
 with gigabrain_zenoh.connect() as robot:
-    for count, state in enumerate(robot.topic("state"), 1):
+    for count, state in enumerate(robot.topic("state", timeout=5), 1):
         if count % 50:  # fifty states a second
             continue
         if state.battery:

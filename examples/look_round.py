@@ -14,7 +14,7 @@ async def main() -> None:
         mounting, points = np.array([body.lidar.x, body.lidar.y]), []
 
         async def collect() -> None:
-            async for scan in robot.topic("scan"):
+            async for scan in robot.topic("scan", timeout=5):
                 pose = robot.state.pose
                 cosine, sine = math.cos(pose.yaw), math.sin(pose.yaw)
                 rotation = np.array([[cosine, -sine], [sine, cosine]])

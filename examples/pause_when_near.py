@@ -16,7 +16,7 @@ async def main() -> None:
         task = await robot.tasks.carry_out(PATROL, label="patrol")
         paused = False
         scans = 0
-        async for world in robot.topic("world"):
+        async for world in robot.topic("world", timeout=5):
             near = min((one for one in world.sectors if one is not None), default=9.0)
             try:
                 if near < NEAR_M and not paused:

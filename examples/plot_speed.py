@@ -13,7 +13,7 @@ SECONDS, HZ = 6, 50
 
 states = []
 with gigabrain_zenoh.connect(take=True) as robot:
-    for count, state in enumerate(robot.topic("state")):
+    for count, state in enumerate(robot.topic("state", timeout=5)):
         if count >= SECONDS * HZ:
             break
         states.append(state)

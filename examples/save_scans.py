@@ -9,7 +9,7 @@ import gigabrain_zenoh
 COUNT = 20
 
 with gigabrain_zenoh.connect() as robot:
-    scans = list(islice(robot.topic("scan"), COUNT))
+    scans = list(islice(robot.topic("scan", timeout=5), COUNT))
 
 ranges = np.stack([scan.ranges_m for scan in scans])
 np.save("scans.npy", ranges)

@@ -17,7 +17,7 @@ def nearest(scan, degrees: float) -> float:
 
 
 with gigabrain_zenoh.connect(take=True) as robot:
-    for count, scan in enumerate(robot.topic("scan")):
+    for count, scan in enumerate(robot.topic("scan", timeout=5)):
         ahead, right = nearest(scan, 0), nearest(scan, -90)
         if ahead < 0.6:
             linear, angular = 0.0, 0.8  # a wall ahead: turn left

@@ -10,7 +10,7 @@ from gigabrain_schemas.topics import TOPICS, Topic, current_key
 from gigabrain_zenoh.bus.bus import Bus, Latest
 from gigabrain_zenoh.bus.freshness import CLOCK_KEYS, CONFIRMED
 from gigabrain_zenoh.codec import Codec
-from gigabrain_zenoh.errors import unknown
+from gigabrain_zenoh.errors import BodyLost, unknown
 
 M = TypeVar("M", bound=Message)
 TOPIC_BY_KEY: dict[str, Topic[Any]] = {topic.key: topic for topic in TOPICS}
@@ -34,8 +34,11 @@ def topic_of(key: str) -> Topic[Any] | None:
     return topic if topic and topic.many else None
 
 
-async def listen(bus: Bus, topic: Topic[M]) -> AsyncIterator[M]:
-    """Yield every message on `topic` from the first `anext` on."""
+async def listen(bus: Bus, topic: Topic[M], timeout_s: float | None = None) -> AsyncIterator[M]:
+    """Yield every message on `topic` from the first `anext` on.
+
+    Raises BodyLost after `timeout_s` without one; with None it waits for ever.
+    """
     waiting: deque[M] = deque(maxlen=MAX_WAITING)
     arrived = asyncio.Event()
 
@@ -49,7 +52,11 @@ async def listen(bus: Bus, topic: Topic[M]) -> AsyncIterator[M]:
             while waiting:
                 yield waiting.popleft()
             arrived.clear()
-            await arrived.wait()
+            async with asyncio.timeout(timeout_s):  # `wait_for` may swallow a cancellation
+                await arrived.wait()
+    except TimeoutError:
+        text = f"no message on {topic.key} for {timeout_s:g} s; is it published?"
+        raise BodyLost(text) from None
     finally:
         close()
 

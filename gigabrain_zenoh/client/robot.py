@@ -372,25 +372,25 @@ class Robot:
 
     async def get_sensor_data(self, sensor_name: str) -> Message:
         """Return the next message of `scan`, `imu` or another topic. Raises BodyLost after 1 s."""
-        readings = self.topic(sensor_name)
-        try:
-            reading: Message = await asyncio.wait_for(anext(readings), ANSWER_S)
-        except TimeoutError:
-            raise BodyLost(f"no message on robot/{sensor_name}; is it published?") from None
+        reading: Message = await anext(self.topic(sensor_name, timeout=ANSWER_S))
         return reading
 
     @overload
-    def topic(self, topic: Topic[M]) -> AsyncIterator[M]: ...
+    def topic(self, topic: Topic[M], *, timeout: float | None = None) -> AsyncIterator[M]: ...
 
     @overload
-    def topic(self, topic: str) -> AsyncIterator[Any]: ...
+    def topic(self, topic: str, *, timeout: float | None = None) -> AsyncIterator[Any]: ...
 
-    def topic(self, topic: Topic[M] | str) -> AsyncIterator[M]:
-        """Yield each message on a topic: `async for scan in robot.topic("scan")`.
+    def topic(self, topic: Topic[M] | str, *, timeout: float | None = None) -> AsyncIterator[M]:
+        """Yield each message on a topic: `async for scan in robot.topic("scan", timeout=5)`.
 
-        Raises UnknownName for a topic that is not in the table.
+        Without a `timeout` [s] it waits for ever, also for a driver that has died. Raises BodyLost
+        after one without a message, and UnknownName for a topic that is not in the table.
         """
-        return listen(self._bus, topic_named(topic) if isinstance(topic, str) else topic)
+        if timeout is not None and not timeout > 0:
+            raise ConfigError(f"timeout: expected more than 0, got {timeout:g}")
+        wanted = topic_named(topic) if isinstance(topic, str) else topic
+        return listen(self._bus, wanted, timeout)
 
     async def _joint_stream(self, body: BodyDescription) -> JointStream:
         """Return the stream of commands for joints, with the body for this script."""

@@ -283,14 +283,14 @@ class SyncRobot:
         return self._run(self._robot.get_sensor_data(sensor_name))
 
     @overload
-    def topic(self, topic: Topic[M]) -> Iterator[M]: ...
+    def topic(self, topic: Topic[M], *, timeout: float | None = None) -> Iterator[M]: ...
 
     @overload
-    def topic(self, topic: str) -> Iterator[Any]: ...
+    def topic(self, topic: str, *, timeout: float | None = None) -> Iterator[Any]: ...
 
-    def topic(self, topic: Topic[M] | str) -> Iterator[M]:
-        """Yield each message on a topic: `for scan in robot.topic("scan")`."""
-        messages = self._robot.topic(topic)
+    def topic(self, topic: Topic[M] | str, *, timeout: float | None = None) -> Iterator[M]:
+        """Yield each message on a topic: `for scan in robot.topic("scan", timeout=5)`."""
+        messages = self._robot.topic(topic, timeout=timeout)
         while True:
             try:
                 yield self._run(_next_of(messages))
