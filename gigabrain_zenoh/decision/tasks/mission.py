@@ -15,6 +15,7 @@ from gigabrain_schemas.base import Angle, Coordinate, Name, Percentage
 from gigabrain_schemas.objects import Label, TagId
 from gigabrain_schemas.tasks import Goal
 from gigabrain_schemas.zones import Place as MapPlace
+from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.config import loading, yaml_text
 from gigabrain_zenoh.decision.tasks import conditions
 from gigabrain_zenoh.decision.tasks.arm_steps import (
@@ -283,6 +284,18 @@ def loads(text: str, source: str, places: Iterable[MapPlace] | None = ()) -> Mis
         mission = replace(mission, places={**used, **mission.places})
     _refuse(_problems(mission, frozenset(named if places is None else ())), text, source)
     return mission
+
+
+def restored(text: str, source: str) -> Mission:
+    """Return the mission in a text of `text_of`, read as JSON. Raises ConfigError.
+
+    YAML allows fewer characters in a JSON text, and folds some of them.
+    """
+    try:
+        mission = msgspec.json.decode(text, type=Mission)
+    except DECODE_ERRORS:
+        return loads(text, source)  # raises the error with its place
+    return loads(text, source) if any(_problems(mission, frozenset())) else mission
 
 
 def map_places(mission: Mission) -> Iterator[str]:

@@ -29,7 +29,7 @@ from gigabrain_zenoh.decision.tasks.behaviour_tree import (
 )
 from gigabrain_zenoh.decision.tasks.conditions import Read
 from gigabrain_zenoh.decision.tasks.leaves import Hand, MissionContext, StartScript, seek_nothing
-from gigabrain_zenoh.decision.tasks.mission import Mission, find_mission, goal_mission, loads
+from gigabrain_zenoh.decision.tasks.mission import Mission, find_mission, goal_mission, restored
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file, too_large
 
@@ -48,7 +48,7 @@ class SavedJob(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     kind: Literal["goal", "mission"]
     label: str
     source: str
-    mission: str  # as JSON, which is YAML too
+    mission: str  # as JSON
     held: bool = False
     memory: Progress = {}
     things: dict[Name, Solid] | None = None  # where they are by now; None: as the mission says
@@ -126,7 +126,7 @@ class TaskQueue:
         self._outcome: StepOutcome | None = None
         for one in saved.jobs:
             try:
-                mission = loads(one.mission, one.label)
+                mission = restored(one.mission, one.label)
             except ConfigError as error:
                 self._done.insert(0, _unreadable(one, error))
                 continue

@@ -108,6 +108,33 @@ def test_after_a_restart_a_mission_goes_on_with_the_step_it_was_at(robot: Robot)
     assert again.tasks.add_goal(Goal(x=1.0, y=0.0), "queue", "ann") == "goal-3"
 
 
+@pytest.mark.parametrize(
+    "name", ["\x01", "\x7f", "\x9b", "\x85", "\u2028", "\ufeff", "\uffff", "🤖"]
+)
+def test_after_a_restart_a_name_may_hold_whatever_it_may_hold_before(
+    robot: Robot, name: str
+) -> None:
+    escaped = f'"a\\U{ord(name):08x}b"'
+    robot.carry_out(f"trees: {{{escaped}: [{{goto: a}}]}}\ndo: [{{tree: {escaped}}}]")
+    robot.tasks.add_find(f"a{name}b", "queue", "ann")
+    again = Robot(robot.tasks.saved)
+    assert [task.reason for task in again.status.done] == []
+    assert [job.mission for job in again.tasks.saved.jobs] == [
+        job.mission for job in robot.tasks.saved.jobs
+    ]
+    assert again.step() == 1.0
+
+
+def test_after_a_restart_a_mission_that_no_longer_holds_says_why(robot: Robot) -> None:
+    robot.carry_out("do: [{check: pose.x > 1}, {wait: 1}]")
+    (job,) = robot.tasks.saved.jobs
+    other = replace(job, mission=job.mission.replace("pose.x", "pose.q"))
+    damaged = replace(job, mission=job.mission[:-1])
+    reasons = [task.reason for task in Robot(Saved(jobs=(other, damaged))).status.done]
+    assert reasons[0].startswith("the saved mission is invalid: m:2: not YAML: ")
+    assert reasons[1].startswith("the saved mission is invalid: m:1: do[0].check: no field 'q'")
+
+
 def test_after_a_restart_two_failures_are_still_two(robot: Robot) -> None:
     robot.carry_out("do: [{retry: {times: 3, do: [{goto: a}]}}]")
     robot.step()
