@@ -9,7 +9,7 @@ import msgspec
 from msgspec import Struct
 
 from gigabrain_zenoh.config import loading
-from gigabrain_zenoh.config.loading import is_mapping, is_struct, members_of
+from gigabrain_zenoh.config.type_members import is_mapping, is_struct, members_of
 from gigabrain_zenoh.config.yaml_text import Entry, Node
 from gigabrain_zenoh.errors import ConfigError, UnknownName
 

@@ -6,9 +6,8 @@ walks the document beside the type and finds the line.
 
 import difflib
 import re
-import types
 import typing
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,6 +17,13 @@ from msgspec import inspect as mi
 
 from gigabrain_zenoh.config import yaml_text
 from gigabrain_zenoh.config.renames import renamed_fields
+from gigabrain_zenoh.config.type_members import (
+    is_list,
+    is_mapping,
+    is_struct,
+    members_of,
+    structs_in,
+)
 from gigabrain_zenoh.config.yaml_text import Entry, Node
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import expanded, read_bounded
@@ -124,7 +130,7 @@ def find_fault(root: Node, type_: Any) -> FieldFault | None:
 
 
 def _find(node: Node, type_: Any, path: str, key_line: int) -> FieldFault | None:
-    structs = _structs(type_) if node.entries is not None else []
+    structs = structs_in(type_) if node.entries is not None else []
     if fault := _wrong_tag(node, structs, path, key_line):
         return fault
     for fault in _inside(node, _meant(type_, node), path, key_line):
@@ -193,7 +199,7 @@ def _inside(node: Node, type_: Any, path: str, key_line: int) -> Iterator[FieldF
     elif node.entries is not None and is_mapping(type_):
         for entry in node.entries:
             yield from _in_entry(entry, typing.get_args(type_), path)
-    elif node.items is not None and _is_list(type_):
+    elif node.items is not None and is_list(type_):
         for i, (item, of) in enumerate(zip(node.items, _item_types(type_, node), strict=False)):
             if fault := _find(item, of, f"{path}[{i}]", item.line):
                 yield fault
@@ -238,44 +244,12 @@ def _item_types(type_: Any, node: Node) -> list[Any]:
 def _meant(type_: Any, node: Node) -> Any:
     """Return the member of an Annotated, Optional or Union type that fits a value like `node`."""
     members = members_of(type_)
-    if node.entries is not None and (structs := _structs(type_)):
+    if node.entries is not None and (structs := structs_in(type_)):
         name = structs[0].__struct_config__.tag_field
         tag = node.value.get(name) if len(structs) > 1 else structs[0].__struct_config__.tag
         return next(s for s in structs if s.__struct_config__.tag == tag)
-    fits = _is_list if node.entries is None else is_mapping
+    fits = is_list if node.entries is None else is_mapping
     return next((member for member in members if fits(member)), None)
-
-
-def members_of(type_: Any) -> list[Any]:
-    """Return the members of an Annotated, Optional or Union type, or the type itself."""
-    if typing.get_origin(type_) is typing.Annotated:
-        return members_of(typing.get_args(type_)[0])
-    if typing.get_origin(type_) in (typing.Union, types.UnionType):
-        return [part for member in typing.get_args(type_) for part in members_of(member)]
-    return [type_]
-
-
-def _structs(type_: Any) -> list[Any]:
-    return [member for member in members_of(type_) if is_struct(member)]
-
-
-def is_struct(type_: Any) -> bool:
-    """Return whether a type is a Struct."""
-    return isinstance(type_, type) and issubclass(type_, msgspec.Struct)
-
-
-def is_mapping(type_: Any) -> bool:
-    """Return whether a type is a dict or another mapping."""
-    return _is_a(type_, Mapping)
-
-
-def _is_list(type_: Any) -> bool:
-    return _is_a(type_, Collection) and not _is_a(type_, (Mapping, str, bytes))
-
-
-def _is_a(type_: Any, families: type | tuple[type, ...]) -> bool:
-    origin = typing.get_origin(type_) or type_
-    return isinstance(origin, type) and issubclass(origin, families)
 
 
 def _join(path: str, key: str) -> str:
