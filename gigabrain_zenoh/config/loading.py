@@ -6,6 +6,7 @@ walks the document beside the type and finds the line.
 
 import difflib
 import re
+import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -133,17 +134,40 @@ def _find(node: Node, type_: Any, path: str, key_line: int) -> FieldFault | None
     structs = structs_in(type_) if node.entries is not None else []
     if fault := _wrong_tag(node, structs, path, key_line):
         return fault
-    for fault in _inside(node, _meant(type_, node), path, key_line):
+    for fault in _inside(node, type_, path, key_line):
         return fault
     try:
         msgspec.convert(node.value, type_)
     except msgspec.ValidationError as error:
         line = key_line if node.entries or node.items else node.line
+        if structs and (fault := _no_value(node.entries or (), structs, path)):
+            return fault
         if structs:  # its fields are valid, so its own __post_init__ refused it
             return _own_fault(node, path, line, re.sub(r" - at `[^`]*`$", "", str(error)))
-        hint = nearest(node.value, choices(type_))
+        hint = nearest(node.value, choices(type_)) or _as_field(node.value, structs_in(type_))
         return FieldFault(line, _at(path, f"expected {expected(type_)}, got {got(node)}{hint}"))
     return None
+
+
+def _no_value(entries: tuple[Entry, ...], structs: list[Any], path: str) -> FieldFault | None:
+    """Return the fault of the first field if none has a value, as where `explore:` stands alone."""
+    of = {field.encode_name: field.type for field in msgspec.structs.fields(structs[0])}
+    first = next(iter(entries), None)
+    if first is None or first.key not in of or any(one.node.value is not None for one in entries):
+        return None
+    wanted = expected(of[first.key]).removesuffix(" or null")
+    text = f"expected {wanted}, got {got(first.node)}{_as_field(first.key, structs)}"
+    return FieldFault(first.line, _at(_join(path, first.key), text))
+
+
+def _as_field(name: object, structs: list[Any]) -> str:
+    """Return `; write `explore: {}`` if one of the Structs has a field of that name."""
+    for field in (one for struct in structs for one in msgspec.structs.fields(struct)):
+        if field.encode_name == name:
+            inner = [msgspec.structs.fields(one) for one in structs_in(field.type)]
+            bare = any(not any(one.required for one in fields) for fields in inner)
+            return f"; write `{name}: {'{}' if bare else '...'}`"
+    return ""
 
 
 def _own_fault(node: Node, path: str, line: int, text: str) -> FieldFault:
@@ -193,9 +217,12 @@ def _wrong_tag(node: Node, structs: list[Any], path: str, key_line: int) -> Fiel
     return None
 
 
-def _inside(node: Node, type_: Any, path: str, key_line: int) -> Iterator[FieldFault]:
+def _inside(node: Node, of: Any, path: str, key_line: int) -> Iterator[FieldFault]:
+    type_ = _meant(of, node)
     if node.entries is not None and is_struct(type_):
-        yield from _in_struct(node, node.entries, type_, path, key_line)
+        others = [one for one in members_of(of) if not is_struct(one) and one is not types.NoneType]
+        instead = f"; without fields: {' or '.join(map(expected, others))}" if others else ""
+        yield from _in_struct(node, node.entries, type_, path, key_line, instead)
     elif node.entries is not None and is_mapping(type_):
         for entry in node.entries:
             yield from _in_entry(entry, typing.get_args(type_), path)
@@ -206,7 +233,7 @@ def _inside(node: Node, type_: Any, path: str, key_line: int) -> Iterator[FieldF
 
 
 def _in_struct(
-    node: Node, entries: tuple[Entry, ...], type_: Any, path: str, key_line: int
+    node: Node, entries: tuple[Entry, ...], type_: Any, path: str, key_line: int, instead: str
 ) -> Iterator[FieldFault]:
     fields = {f.encode_name: f for f in msgspec.structs.fields(type_)}
     config = type_.__struct_config__
@@ -218,7 +245,8 @@ def _in_struct(
                 yield fault
         elif entry.key not in known and config.forbid_unknown_fields:
             hint = nearest(entry.key, known) or ";"
-            yield FieldFault(entry.line, f"unknown field {entry.key!r}{hint} known: {among}")
+            text = f"unknown field {entry.key!r}{hint} known: {among}{instead}"
+            yield FieldFault(entry.line, text)
     for name, field in fields.items():
         if field.required and name not in node.value:
             text = f"missing field {name!r}; expected {expected(field.type)}"

@@ -36,7 +36,28 @@ from gigabrain_zenoh.errors import ConfigError
             "m:3: places.b[0]: expected -100000 to 100000 [m], got 200000",
         ),
         ("do:\n- wait: 1\n  goto: [1, 2]", "m:2: do[0].wait: this step is"),
-        ("do:\n- explore:", "m:2: do[0]: an empty step; expected one of goto, "),
+        ("do:\n- {}", "m:2: do[0]: an empty step; expected one of goto, "),
+        (
+            "do:\n- wait: 1\n- explore:",
+            "m:3: do[1].explore: expected a mapping, got nothing; write `explore: {}`",
+        ),
+        ("do:\n- hand_over: ~", "do[0].hand_over: expected a list of 3 or a mapping, got ~; write"),
+        ("do:\n- goto:", "m:2: do[0].goto: expected a string of length <= 64 or a list of length"),
+        ("do:\n- timeout:", "m:2: do[0].timeout: expected a mapping, got nothing"),
+        (
+            "do:\n- wait: 1\n- explore",
+            "m:3: do[1]: expected a mapping, got 'explore'; write `explore: {}`",
+        ),
+        ("do: [goto]", "m:1: do[0]: expected a mapping, got 'goto'; write `goto: ...`"),
+        ("do: [dance]", "m:1: do[0]: expected a mapping, got 'dance'"),
+        (
+            "do:\n- goto: {x: 1, y: 2}",
+            "m:2: unknown field 'x'; known: tag; without fields: a string or a list",
+        ),
+        (
+            "do:\n- battery_below: {percentage: 9, goto: {x: 1}, do: [{wait: 1}]}",
+            "m:2: unknown field 'x'; known: tag; without fields: a string or a list",
+        ),
         ("do:\n- tree: b", "m:2: do[0].tree: no tree 'b'; known: none"),
         (
             "trees:\n  a: [{tree: b}]\n  b: [{retry: {times: 2, do: [{tree: a}]}}]\n"
