@@ -22,6 +22,7 @@ NEAREST_M = 0.12  # nearer hits are the robot's own
 GAP_M = 0.15  # between neighbouring points of two things
 SMOOTHING = 0.3  # of a new velocity in the filtered one
 LOST_SCANS = 15
+HIDDEN_M = 1.0  # farthest that a leader moves while it is not seen
 
 
 class LeaderConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -42,10 +43,12 @@ class Leader:
         self._config = config
         self._at: tuple[float, float] | None = None  # [m], in the odometry frame
         self._velocity = (0.0, 0.0)  # [m/s]
-        self._tick = self._unseen = 0
+        self._boot = self._tick = self._unseen = 0
 
     def step(self, inputs: PerceptorInputs) -> Sequence[DetectedObject]:
         """Return the leader, or nobody."""
+        if inputs.scan.boot != self._boot:  # the driver was restarted, and odometry began again
+            self._boot, self._at, self._velocity = inputs.scan.boot, None, (0.0, 0.0)
         found = self._find(inputs)
         if found is None:
             self._unseen += 1
@@ -82,7 +85,8 @@ class Leader:
             return to_parent(inputs.pose, *min(near, key=lambda one: math.hypot(*one)))
         placed = [to_parent(inputs.pose, *one) for one in things]
         nearest = min(placed, key=lambda one: math.dist(one, self._at or one), default=None)
-        far = self._config.jump * (1 + self._unseen)
+        jump = self._config.jump
+        far = min(jump * (1 + self._unseen), max(jump, HIDDEN_M))
         return nearest if nearest and math.dist(nearest, self._at) < far else None
 
     def _middle(self, points: NDArray[np.float64]) -> tuple[float, float]:

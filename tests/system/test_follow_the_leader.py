@@ -11,14 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.brain import DetectedObject, Objects, WorldModel
 from gigabrain_schemas.requests import DescribeRequest
 from gigabrain_schemas.sim import SimPoses
 from gigabrain_schemas.topics import DESCRIBE, SIM_POSES, STATE
 from gigabrain_zenoh.decision.behaviours import Inputs
+from gigabrain_zenoh.perception.perceptors import PerceptorInputs
 from gigabrain_zenoh.runtime.connect import connect
 from gigabrain_zenoh.testing.processes import Home, robot_of
+from gigabrain_zenoh.testing.samples import open_space, scan
 from gigabrain_zenoh.testing.waiting import until
 from tests.places import ROOT
 
@@ -80,6 +83,49 @@ def test_a_leader_where_the_scan_begins_is_one_thing(monkeypatch: pytest.MonkeyP
     ]
     (alone,) = example.clusters(np.array(left), 0.7)
     assert len(alone) == 3
+
+
+def inputs(x: float | None, tick: int, boot: int = 1) -> PerceptorInputs:
+    """Return the inputs of a scan of one thing at `x` [m] ahead or behind; None for nothing."""
+    body = load_robot("turtlebot3_waffle").description()
+    assert body.lidar
+    ranges = open_space()
+    if x is not None:
+        middle = 0 if x > 0 else 180
+        ranges[np.arange(middle - 4, middle + 5) % 360] = abs(x - body.lidar.x)
+    return PerceptorInputs(
+        scan=scan(ranges, tick, boot=boot),
+        world=WorldModel(scan_ok=True, obstacle_ahead=False),
+        pose=Pose(x=0.0, y=0.0, yaw=0.0),
+        body=body,
+    )
+
+
+def test_a_leader_who_was_hidden_is_not_taken_for_a_thing_across_the_hall(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.syspath_prepend(EXAMPLE)
+    example = importlib.import_module("follow_the_leader")
+    leader = example.Leader(example.LeaderConfig())
+    assert len(leader.step(inputs(1.0, 5))) == 1
+    for hidden in range(14):
+        assert leader.step(inputs(None, 10 + 5 * hidden)) == ()
+    assert leader.step(inputs(-2.0, 80)) == ()
+    (found,) = leader.step(inputs(1.5, 85))
+    assert found.x == pytest.approx(1.65, abs=0.1)
+
+
+def test_a_leader_is_looked_for_again_after_a_start_of_the_driver(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.syspath_prepend(EXAMPLE)
+    example = importlib.import_module("follow_the_leader")
+    leader = example.Leader(example.LeaderConfig())
+    leader.step(inputs(0.8, 1000))
+    (walking,) = leader.step(inputs(1.0, 1005))
+    assert walking.velocity_x > 0.1
+    (found,) = leader.step(inputs(1.6, 5, boot=2))
+    assert (found.velocity_x, found.velocity_y) == (0.0, 0.0)
 
 
 @pytest.mark.slow
