@@ -4,7 +4,9 @@ import sys
 
 import gigabrain_zenoh
 
-x, y = (float(word) for word in sys.argv[1:3]) if len(sys.argv) > 2 else (0.5, 0.0)
+if len(sys.argv) not in (1, 3):
+    sys.exit("usage: python go_to.py [X Y]")
+x, y = (float(word) for word in sys.argv[1:] or (0.5, 0.0))
 
 with gigabrain_zenoh.connect() as robot:
     task = robot.goto(x, y)  # plans round obstacles; returns once the task has ended

@@ -10,6 +10,8 @@ from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.recording.bag_reader import samples
 
+if len(sys.argv) != 2:
+    sys.exit("usage: python read_recording.py drive.mcap")
 poses, ranges = [], []
 for sample in samples(Path(sys.argv[1])):
     if sample.key == "robot/state":

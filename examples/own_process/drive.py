@@ -38,6 +38,8 @@ def intent(number: int) -> dict:
     }
 
 
+if len(sys.argv) not in (2, 3):
+    sys.exit("usage: python drive.py tcp/127.0.0.1:7447 [SECONDS]")
 config = zenoh.Config()
 config.insert_json5("mode", '"client"')
 config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
@@ -48,12 +50,17 @@ with zenoh.open(config) as session:
         session.declare_subscriber("robot/world", lambda sample: keep(world, sample)),
     ]
     publisher = session.declare_publisher("robot/intent", encoding="application/json")
-    sent = 0
+    sent, last = 0, {}
     while time.monotonic() < end:
         time.sleep(0.02)  # intents are promised at 50 Hz; after 0.1 s of silence the robot stops
         if state and world and state["boot"] == world["boot"]:
             sent += 1
-            publisher.put(json.dumps(intent(sent)))
-    print(f"{sent} intents, the last one: {intent(sent)['reason']}")
+            last = intent(sent)
+            publisher.put(json.dumps(last))
     for subscriber in subscribers:
         subscriber.undeclare()
+if not state:
+    sys.exit("no intents: nothing on robot/state; is the driver running?")
+if not last:
+    sys.exit("no intents: nothing on robot/world of this driver; is perception running?")
+print(f"{sent} intents, the last one: {last['reason']}")

@@ -16,7 +16,13 @@ import pytest
 from nbclient import NotebookClient
 
 from gigabrain_zenoh.config.settings import Endpoint
-from gigabrain_zenoh.testing.processes import CommandProcess, Home, robot_of
+from gigabrain_zenoh.testing.processes import (
+    CommandProcess,
+    Home,
+    free_endpoint,
+    robot_of,
+    router_process,
+)
 from tests.places import ROOT
 
 EXAMPLES = ROOT / "examples"
@@ -82,6 +88,48 @@ def test_a_notebook_holds_no_outputs(name: str) -> None:
     cells = json.loads((EXAMPLES / f"{name}.ipynb").read_text())["cells"]
     code = [cell for cell in cells if cell["cell_type"] == "code"]
     assert [(cell["outputs"], cell["execution_count"]) for cell in code] == [([], None)] * len(code)
+
+
+@pytest.mark.parametrize(
+    ("program", "arguments", "line"),
+    [
+        ("no_package.py", (), "python no_package.py tcp/127.0.0.1:7447"),
+        ("own_process/drive.py", (), "python drive.py tcp/127.0.0.1:7447 [SECONDS]"),
+        ("read_recording.py", (), "python read_recording.py drive.mcap"),
+        ("go_to.py", ("kitchen",), "python go_to.py [X Y]"),
+    ],
+)
+def test_a_program_says_which_arguments_it_takes(
+    program: str, arguments: tuple[str, ...], line: str
+) -> None:
+    done = run(program, *arguments)
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", f"usage: {line}\n")
+
+
+@pytest.mark.parametrize(
+    ("program", "arguments", "line"),
+    [
+        ("no_package.py", (), "nothing on robot/state; is the driver running?"),
+        (
+            "own_process/drive.py",
+            ("0.1",),
+            "no intents: nothing on robot/state; is the driver running?",
+        ),
+    ],
+)
+def test_a_program_without_the_package_says_that_the_robot_is_silent(
+    program: str, arguments: tuple[str, ...], line: str
+) -> None:
+    endpoint = free_endpoint()
+    with router_process(endpoint):
+        done = run(program, endpoint, *arguments)
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", f"{line}\n")
+
+
+def run(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run a program to its end."""
+    command = (sys.executable, str(EXAMPLES / program), *arguments)
+    return subprocess.run(command, capture_output=True, text=True, timeout=LONGEST_S)
 
 
 class Robot(NamedTuple):
