@@ -1,14 +1,23 @@
 """`gigabrain estop`, `release` and `enable`: requests to the gate; `audit`: their log."""
 
+import os
 import time
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from gigabrain_schemas.requests import GateReply
-from gigabrain_zenoh.cli.options import LOCAL, JsonLines, RobotAddress, Take, print_line
+from gigabrain_zenoh.cli.options import (
+    LOCAL,
+    JsonLines,
+    RobotAddress,
+    Take,
+    print_line,
+    print_progress,
+)
 from gigabrain_zenoh.client.requests import BY_HAND
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.errors import ConfigError, GigabrainError, NotConfirmed, unknown
@@ -33,6 +42,9 @@ def estop(*, at: RobotAddress = LOCAL, reason: str = "") -> None:
     Args:
         reason: Reason, for the audit log.
     """
+    if at.keys and not os.path.isdir(at.keys):
+        print_progress(f"no folder {at.keys}: tried without keys")
+        at = replace(at, keys=None)
     try:
         _ask(at, lambda robot: robot.estop(reason), "CONFIRMED by ", wait=False)
     except NotConfirmed:

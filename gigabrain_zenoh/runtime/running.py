@@ -17,6 +17,7 @@ from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError
 from gigabrain_zenoh.host.files import expanded, open_regular
 from gigabrain_zenoh.host.posix import fcntl
+from gigabrain_zenoh.security.identity_files import check_files
 
 SOCKET = "unixsock-stream"
 NOTE_BYTES = 65536  # maximum size of a note
@@ -139,9 +140,10 @@ def _locked(file: BinaryIO) -> bool:
 def find_endpoint(connect: str | None, namespace: str = "", keys: str = "") -> Endpoint:
     """Return the endpoint given by `connect`, or that of the only robot on this machine.
 
-    Raises BusError where there is no robot, Ambiguous where there are several. `keys` is the folder
-    of the client's identity, for a router that requires one. A client that names its identity is
-    limited to its role: it then does not use the local socket, which has the robot's rights.
+    Raises BusError where there is no robot, Ambiguous where there are several, and ConfigError.
+    `keys` is the folder of the client's identity, for a router that requires one. A client that
+    names its identity is limited to its role: it then does not use the local socket, which has the
+    robot's rights.
     """
     identity = str(expanded(keys).absolute()) if keys else ""
     if connect:
@@ -149,6 +151,8 @@ def find_endpoint(connect: str | None, namespace: str = "", keys: str = "") -> E
     endpoint = find_running(namespace).endpoint
     if identity and endpoint.connect[-1].startswith(SECURE):
         return structs.replace(endpoint, connect=endpoint.connect[-1:], keys=identity)
+    if identity:
+        check_files(Path(identity))  # not needed here, but a typo is one everywhere
     return endpoint
 
 

@@ -9,9 +9,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from gigabrain_zenoh.cli.gate import estop
+from gigabrain_zenoh.cli.options import RobotAddress
+from gigabrain_zenoh.client import connection
 from gigabrain_zenoh.config.settings import Endpoint
-from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError
+from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError, NotConfirmed
 from gigabrain_zenoh.runtime.running import Running, announced, find_endpoint, folder, running
+from gigabrain_zenoh.security.authority import issue, new_fleet
 from tests.closed import close_folder
 
 HERE = Endpoint(connect=("tcp/127.0.0.1:7001",), namespace="alpha")
@@ -59,6 +63,33 @@ def test_a_client_that_names_its_identity_does_not_get_the_rights_of_the_local_s
         assert find_endpoint(None).connect == ways
     expected = Endpoint(connect=ways[1:], namespace="red", keys="/home/viewer")
     assert as_viewer == expected
+
+
+def test_a_folder_of_keys_that_is_not_there_is_refused_where_the_robot_has_none(
+    tmp_path: Path, notes: Path
+) -> None:
+    with announced("waffle in arena", HERE):
+        with pytest.raises(ConfigError, match="operater: no folder with keys; make an identity"):
+            find_endpoint(None, keys=str(tmp_path / "operater"))
+        new_fleet("home", tmp_path / "home")
+        assert find_endpoint(None, keys=str(issue(tmp_path / "home", "operator"))) == HERE
+
+
+def test_an_estop_is_tried_without_a_folder_of_keys_that_is_not_there(
+    tmp_path: Path, notes: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tried = list[str]()
+
+    def connect(*_: object, keys: str, **__: object) -> None:
+        tried.append(keys)
+        raise BusError("no robot")
+
+    monkeypatch.setattr(connection, "connect", connect)
+    for keys in (tmp_path / "operater", tmp_path):
+        with pytest.raises(NotConfirmed, match="no robot"):
+            estop(at=RobotAddress(keys=keys))
+    assert tried == ["", str(tmp_path)]
+    assert capsys.readouterr().err == f"no folder {tmp_path / 'operater'}: tried without keys\n"
 
 
 def test_a_note_whose_pid_is_used_again_is_that_of_a_dead_supervisor(notes: Path) -> None:
