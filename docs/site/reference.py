@@ -218,6 +218,7 @@ PYTHON = {
     ],
     "Drivers": ["gigabrain_drivers.driver.base.Driver"],
 }
+INHERITING = {"gigabrain_zenoh.Robot": ("    options:", "      inherited_members: true")}
 
 
 def python() -> Lines:
@@ -227,7 +228,7 @@ def python() -> Lines:
     for title, names in PYTHON.items():
         yield from ("", f"## {title}", "")
         for name in names:
-            yield from (f"::: {name}", "")
+            yield from (f"::: {name}", *INHERITING.get(name, ()), "")
 
 
 # ---- examples ----

@@ -1,31 +1,22 @@
 """Python API to a running robot, for scripts and notebooks: the HAL's primitives over Zenoh."""
 
 import asyncio
-import contextlib
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Mapping, Sequence
 from typing import Any, TypeVar, overload
 
 from msgspec.structs import asdict
 
 from gigabrain_schemas.base import TICK_S, Message, Velocity
-from gigabrain_schemas.body import BodyDescription, Joint, RobotState
-from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.body import BodyDescription, Joint
 from gigabrain_schemas.logs import AuditRecord
 from gigabrain_schemas.objects import ObjectMap
 from gigabrain_schemas.requests import GateReply
 from gigabrain_schemas.tasks import Task
-from gigabrain_schemas.topics import (
-    BODY,
-    JOINT_CMD,
-    SAFETY,
-    STATE,
-    Topic,
-    command_topic,
-)
+from gigabrain_schemas.topics import SAFETY, Topic
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.listening import listen, topic_named
 from gigabrain_zenoh.client.arm import JointPath, JointStream, checked_positions
-from gigabrain_zenoh.client.lease import ControlLease
+from gigabrain_zenoh.client.commander import HOLD_TICKS, Commander
 from gigabrain_zenoh.client.motion import OdometryMotion, Reached
 from gigabrain_zenoh.client.objects import known_objects
 from gigabrain_zenoh.client.requests import (
@@ -33,47 +24,23 @@ from gigabrain_zenoh.client.requests import (
     audit_log,
     check_finite,
     check_speed,
-    enable,
     jog,
     let_go,
-    press_estop,
-    release,
     steer,
 )
 from gigabrain_zenoh.client.tasks import Tasks
-from gigabrain_zenoh.errors import (
-    BodyLost,
-    ConfigError,
-    NotConfirmed,
-    Refused,
-    StillStopping,
-    Unsupported,
-)
-from gigabrain_zenoh.gate.gate import STILL_TICKS
-from gigabrain_zenoh.geometry.limits import ZERO, at_rest, clamp, limits_of
-from gigabrain_zenoh.security.identity_files import may_not_ask
+from gigabrain_zenoh.errors import ConfigError, Unsupported
+from gigabrain_zenoh.geometry.limits import clamp, limits_of
 
 M = TypeVar("M", bound=Message)
 
-HOLD_TICKS = 50  # how long a requested velocity lasts: one second of the robot's time
-ROUTER_S = 3.0  # timeout of the connection
-REST_TICKS = 150  # timeout for a body to come to rest before a release
-BODY_TICKS = 100  # timeout for `robot/body`, which is published once a second
 
-
-class Robot:
+class Robot(Commander):
     """A running robot. Commands are published at 50 Hz with the echo that the gate requires."""
 
     def __init__(self, bus: Bus, *, take: bool = False, keys: str = "") -> None:
-        self._bus, self._take, self._keys = bus, take, keys
-        self._states = bus.latest(STATE, self._repeat)
-        self._bodies, self._safety = bus.latest(BODY), bus.latest(SAFETY)
-        self._target: Velocity | None = None
-        self._until_tick = self._boot = 0
-        self._joints: JointStream | None = None  # once joints were commanded
-        self._pressed = 0  # the number of this script's newest e-stop
-        self._lease = ControlLease(bus.process)
-        self._arrived = asyncio.Event()
+        super().__init__(bus, take=take, keys=keys)
+        self._safety = bus.latest(SAFETY)
         self.tasks = Tasks(bus, keys)
 
     async def move(self, distance: float, *, speed: float | None = None) -> Reached:
@@ -213,95 +180,9 @@ class Robot:
         await self.stop()
         return motion.result()
 
-    async def stop(self) -> None:
-        """Come to rest, if this script drives; it keeps the body."""
-        self._halt()
-        if self._target is None:
-            return
-        for _ in range(HOLD_TICKS):
-            state = self._states.fresh()
-            if state is None or at_rest(state.velocity):
-                break
-            await self._ticks(1)
-
-    def _halt(self) -> None:
-        """Let base and joints brake from the next command on, if this script moves them."""
-        if self._joints:
-            self._joints.rest()
-        if self._target is not None:
-            self._target = ZERO
-
-    @contextlib.contextmanager
-    def _halting(self) -> Iterator[None]:
-        """Brake if the block is cut short: by an error, a timeout or Ctrl-C."""
-        try:
-            yield
-        except BaseException:
-            self._halt()
-            raise
-
-    async def enable(self, source: str = "", *, take: bool = False) -> GateReply:
-        """Ask the gate for the body, for this script or for `source`, once it no longer stops.
-
-        Raises Refused and BodyLost.
-        """
-        source = source or self._bus.process
-        reply = await self._once_stopped(
-            lambda: enable(self._bus, source, take=take, keys=self._keys)
-        )
-        if source == self._bus.process:
-            self._lease.granted(self._bus.time.boot, reply.gate)
-        return reply
-
-    async def release(self) -> GateReply:
-        """Release a latched gate once the body has rested; `enable` is still needed to move.
-
-        Raises Refused.
-        """
-        gate = (await self.read_state()).gate
-        known = max(self._pressed, gate.estop_generation)
-        if gate.mode in ("latched", "stopping") or known > gate.estop_generation:
-            await self._rest()
-        return await self._once_stopped(lambda: release(self._bus, known, self._keys))
-
-    async def estop(self, reason: str = "") -> GateReply:
-        """Stop at once and latch; this script's own commands stop first.
-
-        Raises NotConfirmed if no body has confirmed it within two seconds.
-        """
-        self._target = self._joints = None
-        try:
-            reply = await press_estop(self._bus, reason)
-        except NotConfirmed as error:
-            raise NotConfirmed(f"{error}{may_not_ask(self._keys)}") from None
-        self._pressed = reply.gate.estop_generation
-        return reply
-
     async def audit(self, newest: int = 100) -> tuple[AuditRecord, ...]:
         """Return the newest entries of all audit logs, oldest first. Raises BodyLost."""
         return await audit_log(self._bus, newest)
-
-    async def read_state(self) -> RobotState:
-        """Return the newest state. Raises BodyLost if none arrives within a second."""
-        if self._states.fresh() is None:
-            await self._ticks(1)
-        state = self._states.fresh()
-        if state is None:
-            raise BodyLost("no robot/state; is the driver running?")
-        return state
-
-    @property
-    def state(self) -> RobotState | None:
-        """The newest state; None while the robot is silent."""
-        return self._states.fresh()
-
-    async def read_body(self) -> BodyDescription:
-        """Return the body's description: limits, footprint, sensors. Raises BodyLost."""
-        for _ in range(BODY_TICKS):
-            if body := self._bodies.current:
-                return body.description
-            await self._ticks(1)
-        raise BodyLost("no robot/body; is the driver running?")
 
     async def get_joint_states(self) -> tuple[Joint, ...]:
         """Return all measured joints. Raises BodyLost."""
@@ -392,16 +273,6 @@ class Robot:
         wanted = topic_named(topic) if isinstance(topic, str) else topic
         return listen(self._bus, wanted, timeout)
 
-    async def _joint_stream(self, body: BodyDescription) -> JointStream:
-        """Return the stream of commands for joints, with the body for this script."""
-        state = await self.read_state()
-        if not self._lease.has(state):
-            self._joints = None
-            await self._acquire()
-        if self._joints is None:
-            self._joints = JointStream(body, await self.read_state(), self._bus.process)
-        return self._joints
-
     async def _joints_there(
         self, body: BodyDescription, stream: JointStream, wait: bool
     ) -> dict[str, float]:
@@ -420,63 +291,3 @@ class Robot:
                 if stream.held_back:
                     stream.give_up()
         return {joint.name: joint.position for joint in await self.get_joint_states()}
-
-    async def _acquire(self) -> None:
-        """Ask the gate for the body, unless another commander has taken it."""
-        if self._lease.lost:
-            state = await self.read_state()
-            why = f"{state.gate.commander or 'an e-stop'} has the body"
-            if self._lease.restarted(state):
-                why = "the driver was restarted"
-            raise Refused(f"{state.robot_type}: {why}; ask again with enable(take=True)")
-        await self.enable(take=self._take)
-
-    def _repeat(self, state: RobotState) -> None:
-        self._lease.update(state)
-        if self._lease.lost or state.boot != self._boot:  # what was stopped does not go on
-            self._target = self._joints = None
-        self._boot = state.boot
-        self._arrived.set()
-        self._send()
-        self._send_joints(state)
-
-    def _send_joints(self, state: RobotState) -> None:
-        if self._joints and (command := self._joints.step(state)):
-            self._bus.publish(JOINT_CMD, command)
-
-    def _send(self) -> None:
-        target, body = self._target, self._bodies.current
-        if target is None or body is None:
-            return
-        if self._bus.time.tick > self._until_tick:
-            target = ZERO
-        command = CmdVel(**asdict(target), source=self._bus.process)
-        self._bus.publish(command_topic(body.description), command)
-
-    async def _once_stopped(self, ask: Callable[[], Awaitable[GateReply]]) -> GateReply:
-        """Ask the gate once it no longer stops, by its newest state and by its answer."""
-        for _ in range(HOLD_TICKS):
-            if (await self.read_state()).gate.mode != "stopping":
-                with contextlib.suppress(StillStopping):  # the answer is newer than the state
-                    return await ask()
-            await self._ticks(1)
-        return await ask()
-
-    async def _rest(self) -> None:
-        """Wait until the body has rested as long as a release needs; for three seconds at most."""
-        rested = 0
-        for _ in range(REST_TICKS):
-            rested = rested + 1 if at_rest((await self.read_state()).velocity) else 0
-            if rested > STILL_TICKS:
-                break
-            await self._ticks(1)
-
-    async def _ticks(self, count: int) -> None:
-        """Wait for `count` states. Raises BodyLost after a second without one."""
-        for _ in range(count):
-            self._arrived.clear()
-            try:
-                async with asyncio.timeout(ANSWER_S):  # `wait_for` may swallow a cancellation
-                    await self._arrived.wait()
-            except TimeoutError:
-                raise BodyLost("robot/state has stopped; is the driver running?") from None
