@@ -17,6 +17,7 @@ from gigabrain_schemas.tasks import Goal
 from gigabrain_schemas.zones import Place as MapPlace
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.config import loading, yaml_text
+from gigabrain_zenoh.config.yaml_text import Node
 from gigabrain_zenoh.decision.tasks import conditions
 from gigabrain_zenoh.decision.tasks.arm_steps import (
     ArmAction,
@@ -277,13 +278,29 @@ def loads(text: str, source: str, places: Iterable[MapPlace] | None = ()) -> Mis
     The `places` of the map that it names are added to its own, which come first; None if they are
     not known.
     """
-    mission = loading.loads(text, Mission, source)
+    root = loading.document(text, source)
+    mission = loading.converted(root, Mission, lambda line: f"{source}:{line}")
+    for line, problem in _without_value(root):
+        raise ConfigError(f"{source}:{line}: {problem}")
     named = set(map_places(mission))
     if places is not None:
         used = {one.name: _point(one) for one in places if one.name in named}
         mission = replace(mission, places={**used, **mission.places})
     _refuse(_problems(mission, frozenset(named if places is None else ())), text, source)
     return mission
+
+
+def _without_value(node: Node) -> Iterator[tuple[int, str]]:
+    """Yield each field of a step that would be dropped, as it stands without a value by another."""
+    for item in node.items or ():
+        entries = item.entries or ()
+        empty = [one for one in entries if one.node.value is None and not one.node.text]
+        kind = next((one.key for one in entries if one.node.value is not None), None)
+        for one in empty if kind else ():
+            text = f"{one.key!r} has no value, and this step is {kind!r} already; split it in two"
+            yield one.line, text
+    for inner in (*(node.items or ()), *(one.node for one in node.entries or ())):
+        yield from _without_value(inner)
 
 
 def restored(text: str, source: str) -> Mission:

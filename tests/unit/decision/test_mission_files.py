@@ -42,6 +42,14 @@ from gigabrain_zenoh.errors import ConfigError
             "m:3: do[1].explore: expected a mapping, got nothing; write `explore: {}`",
         ),
         ("do:\n- hand_over: ~", "do[0].hand_over: expected a list of 3 or a mapping, got ~; write"),
+        (
+            "do:\n- wait: 1\n- explore:\n  wait: 5",
+            "m:3: 'explore' has no value, and this step is 'wait' already; split it in two",
+        ),
+        (
+            "trees: {a: [{retry: {times: 2, do: [{goto: [1, 2], visit: }]}}]}\ndo: [{tree: a}]",
+            "m:1: 'visit' has no value, and this step is 'goto' already; split it in two",
+        ),
         ("do:\n- goto:", "m:2: do[0].goto: expected a string of length <= 64 or a list of length"),
         ("do:\n- timeout:", "m:2: do[0].timeout: expected a mapping, got nothing"),
         (
@@ -130,6 +138,11 @@ def test_a_goal_may_be_anywhere_that_a_message_can_hold() -> None:
     goal = Goal(x=1e5, y=-1e5, yaw=-1e6)
     mission = missions.loads(missions.text_of(missions.goal_mission(goal)), "m")
     assert mission == missions.goal_mission(goal)
+
+
+def test_a_field_that_another_program_has_written_as_null_is_left_out() -> None:
+    mission = missions.loads('{"do": [{"goto": [1, 2], "explore": null}]}', "m")
+    assert missions.text_of(mission) == '{"do":[{"goto":[1.0,2.0]}]}'
 
 
 def test_trees_that_multiply_are_refused() -> None:
