@@ -179,6 +179,8 @@ class TaskQueue:
         if not job.held and job is self._jobs[0] and job.context.offers:
             job.context.may_let_go = True
             return f"{job.id} lets go of it"
+        if not job.held and job is not self._jobs[0]:
+            raise Refused(f"{job.id} waits for {self._jobs[0].id}; it goes on by itself after that")
         if not job.held:
             raise Refused(f"{job.id} is not paused")
         job.held, job.why_held = False, ""

@@ -52,6 +52,19 @@ def test_how_a_task_ended_is_told_in_words(robot: Robot) -> None:
     assert describe_end(robot.status.done[0]) == "mission-3 was cancelled by bob"
 
 
+def test_resuming_a_task_that_waits_for_another_names_that_one(robot: Robot) -> None:
+    robot.tasks.add_goal(Goal(x=1.0, y=0.0), "replace", "ann")
+    robot.step()
+    robot.tasks.add_goal(Goal(x=2.0, y=0.0), "preempt", "bob")
+    robot.tasks.add_goal(Goal(x=3.0, y=0.0), "queue", "bob")
+    assert [one.state for one in robot.status.queue] == ["paused", "queued"]
+    for name in ("goal-1", "goal-3"):
+        with pytest.raises(Refused, match=f"{name} waits for goal-2; it goes on by itself"):
+            robot.tasks.resume(name)
+    with pytest.raises(Refused, match="goal-2 is not paused"):
+        robot.tasks.resume("")
+
+
 def test_cancelling_goes_by_name_and_all_at_once(robot: Robot) -> None:
     for x in (1.0, 2.0, 3.0):
         robot.tasks.add_goal(Goal(x=x, y=0.0), "queue", "ann")
