@@ -86,7 +86,8 @@ class TaskServer:
             log.warning("%s", problem, extra={"data": {"event": "tasks"}})
         self._queue = TaskQueue(self._topics.read, self._scripts.start, saved, self._seek)
         self._writer: BackgroundWriter[Saved] = BackgroundWriter(file.write, 1)
-        self._written, self._write_fault = saved, Fault(log)
+        self._written: Saved | None = saved  # None after a fault
+        self._write_fault = Fault(log)
         self._boot = self._tick = self._status_tick = self._basis = 0
         self._logged: set[str] = set()  # tasks whose end was logged
         # name and count of the map that tasks are for, see Zones
@@ -206,7 +207,8 @@ class TaskServer:
         return replace(status, current=replace(status.current, reason=self._waits))
 
     def _on_written(self, problem: str) -> None:
-        if problem:
+        if problem:  # tried again with the next status, as a cancelled task must not come back
+            self._written = None
             self._write_fault.begin(problem)
         else:
             self._write_fault.end("tasks are saved again")

@@ -1,5 +1,6 @@
 """Tasks on the bus and on disk: what is asked, answered, told and remembered."""
 
+import errno
 import threading
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,7 +14,7 @@ from gigabrain_schemas.topics import REQUEST_LOG, ZONES
 from gigabrain_schemas.zones import Place, Zones
 from gigabrain_zenoh.decision import task_server
 from gigabrain_zenoh.decision.behaviours import StepOutcome
-from gigabrain_zenoh.decision.tasks import mission
+from gigabrain_zenoh.decision.tasks import mission, task_queue
 from gigabrain_zenoh.decision.tasks.mission import Mission
 from gigabrain_zenoh.decision.tasks.task_queue import TaskFile
 from gigabrain_zenoh.testing.samples import BOOT, state
@@ -247,6 +248,35 @@ async def test_a_disk_that_cannot_be_written_is_told_and_the_robot_goes_on(
     await settle()
     assert site.command
     assert "tasks will not survive a restart" in caplog.text
+
+
+async def test_a_task_that_is_cancelled_while_the_disk_is_full_does_not_come_back(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    caplog.set_level("INFO")
+    site = Site(tmp_path)
+    await site.step()
+    await site.go(3.0)
+    await site.end()
+    assert len(TaskFile(str(tmp_path)).read()[0].jobs) == 1
+    with monkeypatch.context() as patch:
+        patch.setattr(task_queue, "replace_file", full)
+        await site.change("cancel")
+        await site.end()
+    assert len(TaskFile(str(tmp_path)).read()[0].jobs) == 1
+    await settle()
+    await site.step(10)
+    await site.end()
+    await settle()
+    assert TaskFile(str(tmp_path)).read()[0].jobs == ()
+    assert [one for one in caplog.messages if "survive" in one or "saved" in one] == [
+        f"cannot write {tmp_path}/tasks.json: No space left on device; "
+        "tasks will not survive a restart",
+        "tasks are saved again",
+    ]
 
 
 async def test_what_was_granted_is_told_with_the_tick_and_the_world_from_which_it_counts(
