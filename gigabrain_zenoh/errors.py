@@ -96,4 +96,5 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownName:
     close = difflib.get_close_matches(name, parts, n=1, cutoff=0.6)
     hint = f"; did you mean {parts[close[0]]!r}?" if close else ";"
     text = f"no {kind} {name!r}{hint} known: {', '.join(names) or 'none'}"
+    text = text.encode(errors="replace").decode()  # names of files may be any bytes
     return UnknownName(text, value=name)

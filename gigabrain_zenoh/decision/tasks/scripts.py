@@ -33,7 +33,11 @@ class Scripts:
                 f"script {name!r}: this robot runs no scripts; name their folder in its "
                 "deployment file, as in decision: {settings: {scripts: /home/robot/scripts}}"
             )
-        there = sorted(p.name for p in self._folder.glob("*") if p.is_file())
+        try:
+            there = sorted(p.name for p in self._folder.glob("*") if p.is_file())
+        except OSError as error:
+            text = f"script {name!r}: {self._folder} cannot be read: {error.strerror}"
+            raise Refused(text) from None
         if name not in there:
             raise unknown("script", name, there or ("none",))
         path = self._folder / name

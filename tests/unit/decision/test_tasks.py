@@ -1,6 +1,8 @@
 """Tasks on the bus and on disk: what is asked, answered, told and remembered."""
 
 import errno
+import os
+import sys
 import threading
 from pathlib import Path
 from types import SimpleNamespace
@@ -110,6 +112,35 @@ async def test_missions_are_checked_before_they_are_accepted(site: Site, tmp_pat
     site.lost = "no localization"
     assert (await site.carry_out("do: [{explore: {}}]")).text == site.lost
     assert (await site.carry_out("do: [{wait: 5}]")).ok
+    await site.end()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are text there")
+async def test_a_script_beside_one_whose_name_is_no_text_is_refused_in_words(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / os.fsdecode(b"caf\xe9")).touch()
+    site = Site(tmp_path / "state", scripts=str(tmp_path))
+    await site.step()
+    reply = await site.carry_out("do: [{script: {run: beep}}]")
+    assert (reply.ok, reply.text) == (False, "no script 'beep'; known: caf?")
+    assert not site.net.one.failed.done()
+    await site.end()
+
+
+async def test_a_folder_of_scripts_that_cannot_be_searched_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def closed(_: Path) -> bool:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    (tmp_path / "beep").touch()
+    site = Site(tmp_path / "state", scripts=str(tmp_path))
+    await site.step()
+    monkeypatch.setattr(Path, "is_file", closed)
+    reply = await site.carry_out("do: [{script: {run: beep}}]")
+    assert reply.text == f"script 'beep': {tmp_path} cannot be read: Permission denied"
+    monkeypatch.undo()
     await site.end()
 
 
