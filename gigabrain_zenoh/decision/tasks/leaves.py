@@ -37,6 +37,7 @@ from gigabrain_zenoh.decision.tasks.scripts import Run
 StartScript = Callable[[Script], Run]
 MOVED_M = 0.15  # that a target may be off where the robot drives to
 LEFT_M = 0.4  # round where a thing was not known any more: it does not go there again without it
+FIRST_MESSAGE_S = 1.0  # for which a check waits for a message of its topic
 MAX_WAYS = 4  # to a thing that is to be picked up
 NOBODY_LOOKS = "waiting: nothing is recognised in pictures; run the process `recognition`"
 
@@ -331,11 +332,18 @@ class WaitNode(Leaf):
 
 
 class ConditionNode(Leaf):
-    """Succeeds if a condition holds; otherwise waits or fails. An unknown value does not hold."""
+    """Succeeds if a condition holds; otherwise waits or fails. An unknown value does not hold.
+
+    A topic is subscribed to when it is read first, so its first message may still be on the way.
+    """
 
     def __init__(self, condition: Condition, context: MissionContext, *, waits: bool) -> None:
         super().__init__(f"{'waiting until' if waits else 'checking'} {condition.text}", context)
-        self._condition, self._waits = condition, waits
+        self._condition, self._waits, self._until_s = condition, waits, 0.0
+
+    def initialise(self) -> None:
+        """Start the node, or start it again."""
+        self._until_s = self.context.now_s + FIRST_MESSAGE_S
 
     def update(self) -> Status:
         """Advance the node by one tick, and return its status."""
@@ -343,6 +351,9 @@ class ConditionNode(Leaf):
         holds = self._condition.holds(self.context.read)
         if holds or self._waits:
             return Status.SUCCESS if holds else Status.RUNNING
+        silent = holds is None and self.context.read(self._condition.topic) is None
+        if silent and self.context.now_s < self._until_s:
+            return Status.RUNNING
         why = "is not known" if holds is None else "does not hold"
         return self.failed(f"{self._condition.text} {why}")
 

@@ -200,7 +200,6 @@ def test_waiting_until_a_field_is_as_wanted(robot: Robot) -> None:
     [
         ("battery.percentage >= 50", ("succeeded", "")),
         ("battery.percentage < 50", ("failed", "battery.percentage < 50 does not hold")),
-        ("pose.x > 0", ("failed", "pose.x > 0 is not known")),
         ("gate.mode == enabled", ("succeeded", "")),
         ("state.gate.mode != enabled", ("failed", "state.gate.mode != enabled does not hold")),
         ("joints.0.temperature < 31", ("succeeded", "")),
@@ -211,6 +210,16 @@ def test_a_check(robot: Robot, condition: str, ended: tuple[str, str]) -> None:
     robot.carry_out(f"do: [{{check: {condition}}}]")
     robot.step()
     assert robot.last == ended
+
+
+def test_a_check_of_a_silent_topic_fails_after_a_second(robot: Robot) -> None:
+    robot.carry_out("do: [{fallback: [{check: pose.x > 0}, {check: pose.y > 0}]}]")
+    for _ in range(19):
+        robot.step()
+        assert robot.status.current
+    robot.step(1.0)
+    robot.step()
+    assert robot.last == ("failed", "pose.y > 0 is not known")
 
 
 def test_a_script_is_run_and_what_it_comes_to_counts(robot: Robot) -> None:

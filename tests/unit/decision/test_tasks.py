@@ -10,9 +10,10 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
+from gigabrain_schemas.brain import PoseInMap
 from gigabrain_schemas.logs import AcceptedRequest
 from gigabrain_schemas.tasks import Goal, GoalReply, GoalRequest
-from gigabrain_schemas.topics import REQUEST_LOG, ZONES
+from gigabrain_schemas.topics import POSE, REQUEST_LOG, ZONES
 from gigabrain_schemas.zones import Place, Zones
 from gigabrain_zenoh.decision import task_server
 from gigabrain_zenoh.decision.behaviours import StepOutcome
@@ -141,6 +142,21 @@ async def test_a_folder_of_scripts_that_cannot_be_searched_is_named(
     reply = await site.carry_out("do: [{script: {run: beep}}]")
     assert reply.text == f"script 'beep': {tmp_path} cannot be read: Permission denied"
     monkeypatch.undo()
+    await site.end()
+
+
+async def test_a_check_of_a_topic_that_nothing_has_read_before_waits_for_its_message(
+    site: Site,
+) -> None:
+    await site.step()
+    assert (await site.carry_out("do: [{check: pose.x > 1}, {wait: 5}]")).ok
+    for _ in range(4):
+        await site.step()
+        site.net.two.time.boot, site.net.two.time.tick = BOOT, site.tick
+        site.net.two.publish(POSE, PoseInMap(x=2.0, y=0.0, yaw=0.0, covariance=(0.0,) * 9))
+    await site.step(10)
+    assert [one.reason for one in site.told[-1].done] == []
+    assert site.told[-1].doing == "waiting 5 s"
     await site.end()
 
 
