@@ -117,7 +117,7 @@ class ManagedProcess:
         self._shared, self._patience = shared, RestartPolicy(shared.backoff)
         self._started_s, self._silence = 0.0, heartbeat.Silence()
         self.stuck = False  # it runs and makes no progress
-        self.was_ready = False  # before its last start, with the same configuration
+        self.was_ready = False  # at least once, with the same configuration
 
     async def run(self, after: Sequence["ManagedProcess"]) -> None:
         """Start once all of `after` are ready, then keep running until the supervisor stops."""
@@ -145,7 +145,6 @@ class ManagedProcess:
     async def _live(self) -> Death:
         """Run the process once, from start to end."""
         loop, status = asyncio.get_running_loop(), self.status
-        self.was_ready |= status.ready_after_s is not None
         status.state, status.ready_after_s, self._started_s = "starting", None, loop.time()
         try:
             child = await self._start()
@@ -169,7 +168,7 @@ class ManagedProcess:
 
     @property
     def misconfigured(self) -> bool:
-        """Return whether its configuration is wrong: exit code 2, and it was never ready before."""
+        """Return whether its configuration is wrong: exit code 2, and it was never ready."""
         return self.status.last_exit == ConfigError.exit_code and not self.was_ready
 
     async def _start(self) -> Child | None:
@@ -215,7 +214,7 @@ class ManagedProcess:
             self._progressed()
             return
         if record["event"] == "ready" and self.status.state == "starting":
-            self.status.state = "ready"
+            self.status.state, self.was_ready = "ready", True
             self.status.ready_after_s = asyncio.get_running_loop().time() - self._started_s
             self._progressed()
             self.settled.set()

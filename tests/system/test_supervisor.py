@@ -148,22 +148,19 @@ async def test_a_bad_configuration_is_not_tried_twice() -> None:
         )
 
 
-async def test_a_process_that_was_ready_before_is_not_misconfigured(tmp_path: Path) -> None:
-    """It refuses to start for another reason, such as a disk that is full for a while."""
+@pytest.mark.parametrize("ready_end", [1, 2])
+async def test_a_process_that_was_ready_before_is_not_misconfigured(
+    tmp_path: Path, ready_end: int
+) -> None:
+    """It ends for another reason, such as a full disk, or another process of its name."""
     once = f"os.path.exists({str(tmp_path / 'once')!r}) and sys.exit(2)"
-    code = f"{once}; open({str(tmp_path / 'once')!r}, 'w'); say('ready'); sys.exit(1)"
+    code = f"{once}; open({str(tmp_path / 'once')!r}, 'w'); say('ready'); sys.exit({ready_end})"
     async with running(spec("driver", code)) as (supervisor, records):
         await until(lambda: supervisor.given_up)
         assert (supervisor.misconfigured, supervisor.deaths) == ((), 5)
         assert records.texts("given up") == [
             "driver ended with exit code 2 and is given up: 5 deaths within 60 s"
         ]
-
-
-async def test_a_bad_configuration_that_is_found_once_ready_is_not_tried_twice() -> None:
-    async with running(spec("driver", "say('ready'); sys.exit(2)")) as (supervisor, _):
-        await until(lambda: supervisor.given_up)
-        assert (supervisor.misconfigured, supervisor.deaths) == (("driver",), 1)
 
 
 async def test_a_program_that_is_not_there_is_not_tried_twice() -> None:
