@@ -26,6 +26,7 @@ from gigabrain_zenoh.launch.deployment import (
 log = logging.getLogger(__name__)
 ROWS_FILE, MAX_ROWS_BYTES = "config.json", 1_000_000
 SETTINGS = "decision.settings"
+FIRST = "body", "link"  # which need one another, and on which it depends what else can be set
 # returns the type of a robot's file, for its name or path and the link
 RobotType = Callable[[str, LinkName], type[Struct]]
 
@@ -70,9 +71,10 @@ def merge(
     """
     for file in files:
         _add_file(layers, file)
-    for text in sets:
+    for text in sorted(sets, key=lambda text: assignment(text).key not in FIRST):
         one = assignment(text)
-        key = full_key(one.key, _keys(layers, robot_type), SETTINGS)
+        first = one.key in FIRST
+        key = one.key if first else full_key(one.key, _keys(layers, robot_type), SETTINGS)
         value = with_files(one._replace(key=key).nested(), Path())
         layers.add(value, lambda _, text=text: f"--set {text}")  # type: ignore[misc]
     deployment = layers.convert(_type_of(layers))

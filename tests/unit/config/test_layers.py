@@ -1,6 +1,7 @@
 """Settings from a deployment file, settings files and `--set`: what counts, and from where."""
 
 import errno
+import itertools
 import os
 from pathlib import Path
 
@@ -100,6 +101,20 @@ def test_settings_that_need_one_another_may_come_in_any_order(
     assert forwards == backwards
     with pytest.raises(ConfigError, match=r"^--set link=far: link: expected one of "):
         merged(file, "link=far", "seed=2")
+
+
+@pytest.mark.parametrize(
+    "given", list(itertools.permutations(("link=emulated", "body=mycustombot", "stop_margin=0.3")))
+)
+def test_a_link_that_the_body_of_the_file_lacks_may_come_before_another_body(
+    file: Path, given: tuple[str, ...]
+) -> None:
+    found = sources(file, *given)
+    assert found["link"] == ("emulated", "--set link=emulated")
+    assert found["body"] == ("mycustombot", "--set body=mycustombot")
+    assert found["robot.thresholds.stop_margin"] == (0.3, "--set stop_margin=0.3")
+    with pytest.raises(ConfigError, match=r"^mock has no link 'emulated'; it has: sim$"):
+        sources(file, "link=emulated", "seed=2")
 
 
 @pytest.mark.parametrize(
