@@ -136,7 +136,10 @@ def _audit_folder(robot: str) -> Path:
     from gigabrain_zenoh.host.run_folders import state_dir
     from gigabrain_zenoh.runtime.audit import FOLDER
 
-    known = {path.parent.name: path.parent for path in (state_dir() / "robots").glob(f"*/{FOLDER}")}
+    robots = state_dir() / "robots"
+    logs = robots.glob(f"*/**/{FOLDER}/*.jsonl")  # a namespace may have parts
+    folders = {path.parent.parent for path in logs}
+    known = {folder.relative_to(robots).as_posix(): folder for folder in folders}
     if robot in known:
         return known[robot]
     if (Path(robot) / FOLDER).is_dir():
