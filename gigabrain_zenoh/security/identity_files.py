@@ -129,7 +129,8 @@ def check_identity(
         wanted = common_name(identity.role, namespace)
         raise ConfigError(f"{folder} is the identity of {identity.name}; expected {wanted}")
     host, _ = host_and_port(router)
-    if "router" in processes and host and host not in identity.hosts:
+    names = map(str.lower, identity.hosts)
+    if "router" in processes and host and host.lower() not in names:
         raise ConfigError(
             f"{folder} is for a router at {', '.join(identity.hosts)}, not at {host}; "
             f"issue one with --host {host}"
