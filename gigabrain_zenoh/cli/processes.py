@@ -24,6 +24,7 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host import run_folders
 from gigabrain_zenoh.host.files import expanded
 from gigabrain_zenoh.host.network import exposed, reached_at
+from gigabrain_zenoh.launch.merging import value_layers
 from gigabrain_zenoh.launch.processes import grants, names_by_role, process_type, run_process
 from gigabrain_zenoh.runtime.running import announced, find_endpoint
 from gigabrain_zenoh.security.identity_files import identity_in
@@ -126,7 +127,7 @@ def run(name: str, /, *, set: tuple[str, ...] = (), process: ProcessOptions = LO
     """
     settings, kind = behaviours.parse_settings(set), process_type(name).settings
     if kind:
-        settings = msgspec.to_builtins(checked(settings, kind))
+        settings = msgspec.to_builtins(value_layers(settings, "--set").convert(kind))
     elif settings:
         raise ConfigError(f"--set: {name} has no settings")
     return process.run(name, settings)
