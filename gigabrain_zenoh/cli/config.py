@@ -162,21 +162,27 @@ def _running_rows(at: RobotAddress) -> list["Row"]:
 def with_values(path: Path, values: Mapping[str, str]) -> str:
     """Return the YAML of a settings file with other values, given as text by dotted key.
 
-    Raises ConfigError for a file that holds no settings.
+    Raises ConfigError for a file that holds no settings, or comments, which would be lost.
     """
     import yaml
 
     from gigabrain_zenoh.config.layers import Layers, assignment
     from gigabrain_zenoh.config.loading import document, read
+    from gigabrain_zenoh.config.yaml_text import comment_line
 
     layers = Layers(str(path))
     if path.exists():
-        root = document(read(path), str(path))
+        text = read(path)
+        root = document(text, str(path))
         if root.entries is None:
             raise ConfigError(f"{path}:{root.line}: expected a mapping of settings")
+        if line := comment_line(text):
+            raise ConfigError(
+                f"{path}:{line}: has a comment, which would be lost; save to another file"
+            )
         layers.add(root, lambda line: f"{path}:{line}")
-    for key, text in values.items():
-        layers.add(assignment(f"{key}={text}").nested(), lambda _: "param")
+    for key, value in values.items():
+        layers.add(assignment(f"{key}={value}").nested(), lambda _: "param")
     return yaml.safe_dump(layers.root.value, sort_keys=False)
 
 

@@ -210,7 +210,7 @@ def save_params(file: Path, /, *, at: RobotAddress = LOCAL) -> None:
     Example: gigabrain param save slow.yaml
 
     Args:
-        file: File to write. Its other values are kept.
+        file: File to write. Its other values are kept; a file with comments is refused.
     """
     from gigabrain_zenoh.cli.config import with_values
 

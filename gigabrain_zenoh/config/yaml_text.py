@@ -66,6 +66,17 @@ def read(text: str) -> Node:
     return _node(root)
 
 
+def comment_line(text: str) -> int | None:
+    """Return the line of the first comment in a valid text; None where there is none."""
+    end = 0
+    for token in yaml.scan(text, Loader=yaml.SafeLoader):
+        at = text.find("#", end, token.start_mark.index)
+        if at >= 0:
+            return text.count("\n", 0, at) + 1
+        end = token.end_mark.index
+    return None
+
+
 def _refuse_indirections(text: str) -> None:
     """Check the events first: they need no recursion, and show aliases and tags."""
     depth = documents = 0

@@ -66,6 +66,35 @@ def test_a_file_that_holds_something_else_is_not_overwritten(
     assert file.read_text() == text
 
 
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("# of the hall\nrobot: {max_linear_speed: 0.2}\n", 1),
+        ("world: 'a#b'\nrobot:\n  max_linear_speed: 0.2 # by the door\n", 3),
+    ],
+)
+def test_comments_of_a_file_by_hand_are_not_lost(
+    tmp_path: Path, asked: list[tuple[str, ...]], text: str, line: int
+) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(text)
+    fault = rf"mine\.yaml:{line}: has a comment, which would be lost; save to another file"
+    with pytest.raises(ConfigError, match=fault):
+        node.set_param("decision", "stop_margin", "0.1", save=file)
+    assert asked == []
+    with pytest.raises(ConfigError, match=fault):
+        node.save_params(file)
+    assert file.read_text() == text
+
+
+def test_a_number_sign_in_a_text_is_no_comment(tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text("world: 'a # b'\nbody: c#d\n")
+    node.save_params(file)
+    kept = "world: 'a # b'\nbody: c#d\n"
+    assert file.read_text() == f"{kept}robot:\n  stop_margin: 0.1\n"
+
+
 def test_a_full_disk_leaves_the_file_as_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
