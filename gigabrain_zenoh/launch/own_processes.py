@@ -74,6 +74,20 @@ def own_config(deployment: "Deployment", name: str, file: str) -> dict[str, Any]
     return {}
 
 
+def unknown_to_router(deployment: "Deployment", host: str) -> str:
+    """Return a warning for processes of one's own whose rights another file decides, or none."""
+    own = {*deployment.processes, *deployment.perceptors}
+    here = [name for name in deployment.hosts[host] if name in own]
+    routes = any("router" in names for names in deployment.hosts.values())
+    if routes or not deployment.keys or not here:
+        return ""
+    return (
+        f"{', '.join(here)}: the router at {deployment.router} is not of this file; with keys it "
+        "drops what they publish unless its own file, or a package on its host, declares them "
+        "as well"
+    )
+
+
 def check_installed(deployment: "Deployment", host: str, file: str) -> None:
     """Raise ConfigError for a module or perceptor that this host lacks, without importing it."""
     from gigabrain_zenoh.perception.perceptors import check_known

@@ -22,7 +22,7 @@ from gigabrain_zenoh.launch.deployment import (
     with_free_port,
 )
 from gigabrain_zenoh.launch.merging import write_rows
-from gigabrain_zenoh.launch.own_processes import check_installed
+from gigabrain_zenoh.launch.own_processes import check_installed, unknown_to_router
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.launch.supervisor_log import SupervisorLog
 from gigabrain_zenoh.runtime.running import announced
@@ -131,6 +131,8 @@ async def up(
     records = _Records(run_dir, print_line)
     names = ", ".join(spec.name for spec in specs)
     print_line(f"{deployment.body} on {host}: {names}; logs in {run_dir}")
+    if unknown := unknown_to_router(deployment, host):
+        print_line(f"warning: {unknown}")
     with (
         stop_signals(LIMIT_S) as stop,
         state_locked(remembers, label, host),

@@ -212,6 +212,39 @@ async def test_up_ends_without_an_error_after_a_signal_whichever_process_was_giv
     await up(DEPLOYMENT, "robot", lambda _: None)
 
 
+@pytest.mark.parametrize(
+    ("names", "keys", "told"),
+    [
+        (("driver", "mine"), "blue", ["mine"]),
+        (("router", "driver", "mine"), "blue", []),  # it knows the file
+        (("driver",), "blue", []),
+        (("driver", "mine"), "", []),  # and forbids nothing
+    ],
+)
+async def test_up_names_processes_that_the_router_of_another_robot_may_not_know(
+    stop: asyncio.Event,
+    monkeypatch: pytest.MonkeyPatch,
+    names: tuple[str, ...],
+    keys: str,
+    told: list[str],
+) -> None:
+    async def checked(*_: object) -> None:
+        pass
+
+    monkeypatch.setattr(up_module, "_check_keys", checked)
+    at_start(monkeypatch, lambda _: stop.set())
+    router = "tcp/127.0.0.1:7447"
+    blue = {"namespace": "blue", "keys": keys, "router": router, "hosts": {"robot": names}}
+    processes = DEPLOYMENT.processes if "mine" in names else {}
+    lines: list[str] = []
+    await up(replace(DEPLOYMENT, **blue, processes=processes), "robot", lines.append)
+    assert [line for line in lines if line.startswith("warning: ")] == [
+        f"warning: {name}: the router at {router} is not of this file; with keys it drops what "
+        "they publish unless its own file, or a package on its host, declares them as well"
+        for name in told
+    ]
+
+
 def needed_first(exit_code: int, name: str = "decision") -> Callable[[Supervisor], None]:
     """Return what gives up a process that the robot needs, and then one of its own."""
 
