@@ -3,7 +3,8 @@
 GigabrainError
 ├── ConfigError       a file or an option is wrong (exit code 2)
 │   ├── UnknownName   no such robot, world, driver, process or behaviour
-│   └── NotYetValid   keys that are valid only later: is the clock right?
+│   ├── NotYetValid   keys that are valid only later: is the clock right?
+│   └── DiskFull      a disk without room for what a robot has to keep (exit code 1)
 ├── BusError          the router is missing, or its port is taken
 │   └── Ambiguous     several robots run here, and none is named
 ├── Refused           the robot refused a request, with the reason
@@ -42,6 +43,12 @@ class UnknownName(ConfigError):
 
 class NotYetValid(ConfigError):
     """Keys whose validity has not begun; it may once the clock is set."""
+
+
+class DiskFull(ConfigError):
+    """A folder that cannot be written for now; there may be space later."""
+
+    exit_code = 1
 
 
 class BusError(GigabrainError):

@@ -18,7 +18,7 @@ import msgspec
 from gigabrain_schemas.safety import LogRecord
 from gigabrain_zenoh import errors
 from gigabrain_zenoh.errors import GigabrainError
-from gigabrain_zenoh.host.run_folders import unwritable
+from gigabrain_zenoh.host.run_folders import unwritable_runs
 from gigabrain_zenoh.host.terminal import printable
 
 LEVELS: Final = ("debug", "info", "warning", "error", "critical")
@@ -346,7 +346,7 @@ def file_sink(process: str, run_dir: Path) -> QueuedHandler:
         run_dir.mkdir(parents=True, exist_ok=True)
         file = _File(run_dir / f"{process}.jsonl")
     except OSError as error:
-        raise unwritable(run_dir, error) from None
+        raise unwritable_runs(run_dir, error) from None
     return QueuedHandler(file, _JsonFormatter(process), "log file")
 
 

@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 import msgspec
 
-from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.errors import ConfigError, DiskFull
 
 KINDS = (
     (stat.S_ISDIR, "a folder"),
@@ -133,6 +133,16 @@ def sync_folder(path: Path) -> None:
             raise
     finally:
         os.close(fd)
+
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+def unwritable(folder: str | Path, error: OSError, remedy: str) -> ConfigError:
+    """Return the error for a folder that cannot be written: DiskFull if it only lacks space."""
+    full = error.errno in FULL
+    text = f"cannot write {folder}: {error.strerror}; {'free some space' if full else remedy}"
+    return DiskFull(text) if full else ConfigError(text)
 
 
 def check_result_path(path: Path | None) -> None:

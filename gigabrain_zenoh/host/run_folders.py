@@ -12,13 +12,14 @@ from pathlib import Path
 from urllib.parse import quote
 
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.files import make_folder
+from gigabrain_zenoh.host.files import make_folder, unwritable
 from gigabrain_zenoh.host.posix import fcntl
 
 log = logging.getLogger(__name__)
 
 MAX_RUNS = 50
 MAX_BYTES = 1_000_000_000  # of all folders together
+REMEDY = "make it writable, or set XDG_STATE_HOME to a folder that is"
 LOCK = ".in_use"  # locked by the supervisor for as long as it runs; holds the run's number
 
 
@@ -110,7 +111,7 @@ def _in_use(folder: Path) -> bool:
 def state_locked(folder: Path, label: str, host: str) -> Iterator[None]:
     """Keep other supervisors of this host of a deployment from `folder` while the block runs.
 
-    Raises ConfigError where one runs, or where the folder cannot be written.
+    Raises ConfigError where one runs, or where the folder cannot be written, and DiskFull.
     """
     with contextlib.ExitStack() as closing:
         try:
@@ -123,10 +124,7 @@ def state_locked(folder: Path, label: str, host: str) -> Iterator[None]:
                 "stop it, or give this one a `namespace` of its own"
             ) from None
         except OSError as error:
-            raise ConfigError(
-                f"cannot write {folder}: {error.strerror}; "
-                "make it writable, or set XDG_STATE_HOME to a folder that is"
-            ) from None
+            raise unwritable(folder, error, REMEDY) from None
         yield
 
 
@@ -134,7 +132,7 @@ def new_run_dir(base: Path | None, label: str) -> Path:
     """Create `<base>/<UTC stamp>-<label>-<pid>`; `base` None is the user's state folder (XDG).
 
     Old run folders are removed first (see `prune`), and this one is marked as in use. Raises
-    ConfigError when it cannot be created.
+    ConfigError when it cannot be created, and DiskFull.
     """
     base = base or state_dir() / "runs"
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
@@ -150,7 +148,7 @@ def new_run_dir(base: Path | None, label: str) -> Path:
             hold(path, number)
             return path
     except OSError as error:
-        raise unwritable(base, error) from None
+        raise unwritable_runs(base, error) from None
 
 
 def state_dir() -> Path:
@@ -163,9 +161,6 @@ def state_dir() -> Path:
         raise ConfigError("there is no home folder; set XDG_STATE_HOME to a folder") from None
 
 
-def unwritable(folder: Path, error: OSError) -> ConfigError:
-    """Build the error for a run folder that cannot be written."""
-    return ConfigError(
-        f"cannot write the run folder {folder}: {error.strerror}; "
-        "make it writable, or set XDG_STATE_HOME to a folder that is"
-    )
+def unwritable_runs(folder: Path, error: OSError) -> ConfigError:
+    """Return the error for a run folder that cannot be written."""
+    return unwritable(f"the run folder {folder}", error, REMEDY)

@@ -6,13 +6,14 @@ import os
 import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 from gigabrain_zenoh import logs
 from gigabrain_zenoh.config.layers import Row
 from gigabrain_zenoh.decision import behaviours
-from gigabrain_zenoh.errors import BusError, ConfigError, NotYetValid
+from gigabrain_zenoh.errors import BusError, ConfigError, DiskFull, NotYetValid
 from gigabrain_zenoh.host.run_folders import new_run_dir, state_dir, state_locked
 from gigabrain_zenoh.host.signals import stop_signals
 from gigabrain_zenoh.launch.deployment import (
@@ -95,7 +96,7 @@ class Notifier:
 STOP_S = 1.5  # until processes that do not end are killed
 LIMIT_S = STOP_S + 2.0  # until the supervisor itself is ended by force
 LOOK_S = 0.1
-CLOCK_S = 1.0  # between looks whether the clock is set
+RETRY_S = 1.0  # between looks whether the clock is set, or the disk has space
 ROUTERS = {"router", "relay"}  # without one of them no message is delivered on the host
 
 
@@ -123,34 +124,40 @@ async def up(
         behaviours.check(deployment.decision)
     deployment = with_free_port(deployment)
     label = deployment.namespace or deployment.body.replace("/", "-")
-    run_dir = new_run_dir(None, label)
-    write_rows(run_dir, rows)
     remembers = state_dir() / "robots" / label
-    specs = process_specs(deployment, host, run_dir, remembers, level=level, file=file)
-
-    records = _Records(run_dir, print_line)
-    names = ", ".join(spec.name for spec in specs)
-    print_line(f"{deployment.body} on {host}: {names}; logs in {run_dir}")
-    if unknown := unknown_to_router(deployment, host):
-        print_line(f"warning: {unknown}")
-    with (
-        stop_signals(LIMIT_S) as stop,
-        state_locked(remembers, label, host),
-        announced(label, local_endpoint(deployment, host), run_dir) as note,
-    ):
+    space = Waiting("space on the disk", DiskFull, print_line, notifier)
+    with contextlib.ExitStack() as held:
+        await space.until_done(lambda: held.enter_context(state_locked(remembers, label, host)))
+        run_dir = await space.until_done(lambda: new_run_dir(None, label))
+        write_rows(run_dir, rows)
+        specs = process_specs(deployment, host, run_dir, remembers, level=level, file=file)
+        names = ", ".join(spec.name for spec in specs)
+        print_line(f"{deployment.body} on {host}: {names}; logs in {run_dir}")
+        if unknown := unknown_to_router(deployment, host):
+            print_line(f"warning: {unknown}")
+        stop = held.enter_context(stop_signals(LIMIT_S))
+        note = held.enter_context(announced(label, local_endpoint(deployment, host), run_dir))
+        records = _Records(run_dir, print_line)
         async with Supervisor(specs, records.add, keep_stuck=keep_stuck) as supervisor:
-            running = asyncio.ensure_future(supervisor.run())
-            while not stop.is_set() and not running.done() and not _hopeless(supervisor):
-                _report(supervisor, notifier, note)
-                with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(stop.wait(), LOOK_S)
-            stopped = stop.is_set()  # if only later, it has ended by itself
-            notifier.stopping()
-            await supervisor.stop(STOP_S)
-            await running
-            records.close()
-            if not stopped:
-                records.check(supervisor)
+            await _supervise(supervisor, records, notifier, note, stop)
+
+
+async def _supervise(
+    supervisor: Supervisor, records: "_Records", notifier: Notifier, note: Path, stop: asyncio.Event
+) -> None:
+    """Run the processes until a signal, or until there is nothing left to keep running."""
+    running = asyncio.ensure_future(supervisor.run())
+    while not stop.is_set() and not running.done() and not _hopeless(supervisor):
+        _report(supervisor, notifier, note)
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(stop.wait(), LOOK_S)
+    stopped = stop.is_set()  # if only later, it has ended by itself
+    notifier.stopping()
+    await supervisor.stop(STOP_S)
+    await running
+    records.close()
+    if not stopped:
+        records.check(supervisor)
 
 
 async def _check_keys(
@@ -160,19 +167,35 @@ async def _check_keys(
 
     Raises ConfigError.
     """
-    told = False
-    while True:
-        try:
-            check_keys(deployment, host)
-        except NotYetValid as error:
-            text = f"waiting for the clock to be set: {error}"
-            notifier.status(text)
+    waiting = Waiting("the clock to be set", NotYetValid, print_line, notifier)
+    await waiting.until_done(lambda: check_keys(deployment, host))
+
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """Retries what cannot be done yet, and says so once."""
+
+    what: str
+    error: type[ConfigError]
+    print_line: Callable[[str], None]
+    notifier: Notifier
+
+    async def until_done(self, act: Callable[[], T]) -> T:
+        """Return what `act` does, once it no longer raises the error."""
+        told = False
+        while True:
+            try:
+                return act()
+            except self.error as error:
+                text = f"waiting for {self.what}: {error}"
+            self.notifier.status(text)
             if not told:
-                print_line(text)
+                self.print_line(text)
             told = True
-            await asyncio.sleep(CLOCK_S)
-        else:
-            return
+            await asyncio.sleep(RETRY_S)
 
 
 class _Records:

@@ -21,13 +21,14 @@ from gigabrain_schemas.requests import (
 )
 from gigabrain_schemas.topics import ENABLE, ESTOP, ESTOP_SAID, LIMP, RELEASE
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.codec import DECODE_ERRORS
-from gigabrain_zenoh.errors import ConfigError, GigabrainError, Refused
+from gigabrain_zenoh.errors import ConfigError, DiskFull, GigabrainError, Refused
 from gigabrain_zenoh.gate import causes as why
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.gate.gate import GateState
 from gigabrain_zenoh.geometry.limits import Limits
-from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file
+from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file, unwritable
 from gigabrain_zenoh.host.threads import BackgroundWriter
 from gigabrain_zenoh.logs import Fault
 from gigabrain_zenoh.runtime.audit import AuditTrail
@@ -45,6 +46,7 @@ UNREADABLE = Cause(
 Raised = dict[str, tuple[str, Cause]]  # by its code: who raised it, and the cause
 ON_TIME_NS = TICK_NS // 2  # a tick at least this long after the last is not late
 DISK_RETRY_TICKS = 50  # once a second: what the disk did not take is tried again
+REMEDY = "make it writable, or name another with --state-dir or XDG_STATE_HOME"
 Stop = Callable[[], Awaitable[None]]
 LetGo = Callable[[bool], Awaitable[None]]
 
@@ -66,7 +68,7 @@ class LatchFile:
     def read(self) -> Latched:
         """Return what was latched when the driver ended; an unreadable file counts as latched.
 
-        Raises ConfigError when the folder cannot be written.
+        Raises ConfigError when the folder cannot be written, and DiskFull.
         """
         try:
             make_folder(self._folder)
@@ -77,7 +79,7 @@ class LatchFile:
         except (ConfigError, *DECODE_ERRORS):
             found = Latched(causes=(UNREADABLE,))
         except OSError as error:
-            raise ConfigError(_unwritable(self._folder, error)) from None
+            raise unwritable(self._folder, error, REMEDY) from None
         self.write(found)
         return found
 
@@ -90,21 +92,32 @@ class LatchFile:
         return ""
 
     def write(self, latched: Latched) -> None:
-        """On disk when this returns. Raises ConfigError when the folder cannot be written."""
+        """On disk when this returns. Raises ConfigError and DiskFull as `read` does."""
         if latched == self._written and self._path.exists():
             return
         try:
             replace_file(self._path, msgspec.json.encode(latched))
         except OSError as error:
-            raise ConfigError(_unwritable(self._folder, error)) from None
+            raise unwritable(self._folder, error, REMEDY) from None
         self._written = latched
 
 
-def _unwritable(folder: Path, error: OSError) -> str:
-    return (
-        f"cannot write {folder}: {error.strerror}; make it writable, "
-        "or name another with --state-dir or XDG_STATE_HOME"
-    )
+async def wait_for_disk(folder: Path, clock: Clock) -> None:
+    """Wait until there is space for the latch: without it a restart would forget an e-stop.
+
+    Raises ConfigError when the folder cannot be written for another reason.
+    """
+    told = False
+    while True:
+        try:
+            LatchFile(folder).read()
+        except DiskFull as error:
+            if not told:
+                log.warning("%s; waiting for it", error, extra={"data": {"event": "waiting"}})
+            told = True
+            await clock.sleep_ns(DISK_RETRY_TICKS * TICK_NS)
+        else:
+            return
 
 
 class CauseWatch:

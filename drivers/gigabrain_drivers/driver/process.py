@@ -16,7 +16,7 @@ from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.button import ButtonWatch
 from gigabrain_drivers.driver.catalog import make_driver, ports_folder
 from gigabrain_drivers.driver.clipping import clipped, fault_of
-from gigabrain_drivers.driver.gatekeeper import Gatekeeper
+from gigabrain_drivers.driver.gatekeeper import Gatekeeper, wait_for_disk
 from gigabrain_drivers.driver.lockstep import REPEAT_S, Lockstep, RoundTrip
 from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.driver.world_requests import serve_world
@@ -435,6 +435,7 @@ async def run(config: DriverConfig, bus: Bus, ready: Callable[[], None]) -> None
             f"safe_state: {robot.safe_state} is more than {type(driver).__name__} can do; "
             f"expected one of: {known}"
         )
+    await wait_for_disk(Path(config.state_dir), bus.clock)
     try:
         process = DriverProcess(config, robot, driver, bus)
     except ValueError as error:

@@ -1,3 +1,4 @@
+import asyncio
 import errno
 import os
 from pathlib import Path
@@ -6,7 +7,8 @@ import pytest
 
 from gigabrain_drivers.driver import gatekeeper
 from gigabrain_drivers.driver.gatekeeper import Latched, LatchFile
-from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.clock import FakeClock
+from gigabrain_zenoh.errors import ConfigError, DiskFull
 from gigabrain_zenoh.gate.causes import NAN_STORM, estop
 
 
@@ -56,5 +58,33 @@ def test_on_a_full_disk_what_was_latched_is_read_and_a_first_start_says_why(
 
     monkeypatch.setattr(gatekeeper, "replace_file", full)
     assert LatchFile(tmp_path).read() == was
-    with pytest.raises(ConfigError, match=r"cannot write .*new: No space left on device; [^\n]*$"):
+    with pytest.raises(DiskFull, match=r"cannot write .*new: No space left on device; [^\n]*$"):
         LatchFile(tmp_path / "new").read()
+
+
+@pytest.mark.parametrize("content", [b"", None])
+async def test_a_driver_that_cannot_keep_its_latch_waits_until_there_is_space(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    content: bytes | None,
+) -> None:
+    clock = FakeClock()
+    folder = tmp_path if content is None else tmp_path / "robot"
+    if content is not None:
+        folder.mkdir()
+        (folder / "latch.json").write_bytes(content)
+
+    def full(path: Path, data: bytes) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as before:
+        before.setattr(gatekeeper, "replace_file", full)
+        waiting = asyncio.ensure_future(gatekeeper.wait_for_disk(folder, clock))
+        await clock.advance(60_000_000_000)
+        assert not waiting.done()
+    await clock.advance(1_000_000_000)
+    await waiting
+    assert (folder / "latch.json").stat().st_size
+    (line,) = caplog.messages
+    assert line.startswith(f"cannot write {folder}: No space left on device; free some space")

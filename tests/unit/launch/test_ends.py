@@ -1,9 +1,12 @@
 """`demo` and `up` end with the exit code and the reason of the process that they need."""
 
 import asyncio
+import errno
+import os
 from collections.abc import AsyncIterator, Callable
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
@@ -307,6 +310,30 @@ async def test_up_prints_the_same_error_of_a_process_once(monkeypatch: pytest.Mo
     with pytest.raises(BusError):
         await up(DEPLOYMENT, "robot", lines.append)
     assert sum("lacks something" in line for line in lines) == 2
+
+
+@pytest.mark.parametrize("full", ["runs", "robots"])
+async def test_up_waits_while_its_disk_is_full(
+    stop: asyncio.Event, monkeypatch: pytest.MonkeyPatch, full: str
+) -> None:
+    mkdir, pauses, lines = Path.mkdir, list[float](), list[str]()
+
+    def make(path: Path, *more: Any, **options: Any) -> None:
+        if full in path.parts and len(pauses) < 3:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        mkdir(path, *more, **options)
+
+    async def pause(seconds: float) -> None:
+        pauses.append(seconds)
+
+    monkeypatch.setattr(Path, "mkdir", make)
+    monkeypatch.setattr(asyncio, "sleep", pause)
+    at_start(monkeypatch, lambda _: stop.set())
+    await up(DEPLOYMENT, "robot", lines.append)
+    assert len(pauses) == 3
+    assert lines[0].startswith("waiting for space on the disk: cannot write ")
+    assert lines[0].endswith(": No space left on device; free some space")
+    assert lines[1].startswith("turtlebot3_waffle on robot: ")
 
 
 async def test_two_robots_of_one_body_need_a_namespace_of_their_own(
