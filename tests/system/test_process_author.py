@@ -65,6 +65,8 @@ def test_each_kind_is_found_by_its_name(tmp_path: Path, site: Path) -> None:
 def test_a_bad_name_is_refused_and_nothing_is_overwritten(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="expected lower-case letters"):
         write_package("process", "Red-Lamp", tmp_path)
+    with pytest.raises(ConfigError, match="expected lower-case letters"):
+        write_package("behaviour", "none", tmp_path)  # `class None` is none
     folder = write_package("process", "lamp", tmp_path)
     (folder / "README.md").write_text("mine")
     with pytest.raises(ConfigError, match="exists; nothing was written"):
@@ -78,6 +80,9 @@ def test_a_bad_name_is_refused_and_nothing_is_overwritten(tmp_path: Path) -> Non
         ("process", "camera"),
         ("process", "safety"),
         ("process", "world"),  # a setting of deployment files
+        ("process", "map"),  # a topic, below which it could write nothing of its own
+        ("process", "health"),
+        ("process", "goal"),
         ("perceptor", "camera"),
         ("behaviour", "avoid"),
     ],

@@ -14,6 +14,7 @@ from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.launch.processes import GROUP, PROCESSES
 from gigabrain_zenoh.perception import perceptors
 from gigabrain_zenoh.plugins import plugin_names
+from gigabrain_zenoh.security.acl import check_write
 
 Kind = Literal["process", "perceptor", "behaviour"]
 PACKAGE_NAME = re.compile(r"[a-z][a-z0-9_]{0,30}[a-z0-9]")
@@ -48,11 +49,12 @@ def write_package(kind: Kind, name: str, folder: Path) -> Path:
 
     Raises ConfigError if it exists, or if the name is taken.
     """
-    if not PACKAGE_NAME.fullmatch(name) or keyword.iskeyword(name):
+    camel = "".join(part.capitalize() for part in name.split("_"))
+    if not PACKAGE_NAME.fullmatch(name) or {name, camel} & {*keyword.kwlist}:
         raise ConfigError(
             f"{name!r}: expected lower-case letters, digits and underscores, such as my_lamp"
         )
-    if name in _taken_names(kind):
+    if name in _taken_names(kind) or (kind == "process" and not _may_write(name)):
         raise ConfigError(f"the name {name!r} is taken; choose another")
     path = folder / f"{name.replace('_', '-')}-{kind}"
     words = {
@@ -60,7 +62,7 @@ def write_package(kind: Kind, name: str, folder: Path) -> Path:
         "kind": kind,
         "package": f"{name}_{kind}",
         "dashed": path.name,
-        "camel": "".join(part.capitalize() for part in name.split("_")),
+        "camel": camel,
     }
     group, where = GROUPS[kind]
     words |= {"group": group, "where": Template(where).substitute(words)}
@@ -86,3 +88,12 @@ def _taken_names(kind: Kind) -> Collection[str]:
     if kind == "perceptor":  # it runs in a process of its name
         return [*processes, *plugin_names(perceptors.SHIPPED, perceptors.GROUP)]
     return [*processes, *Deployment.__struct_fields__]  # its settings are a part of that file
+
+
+def _may_write(name: str) -> bool:
+    """Return whether the keys below `robot/NAME` are free, as no topic or service is there."""
+    try:
+        check_write(f"robot/{name}/**")
+    except ValueError:
+        return False
+    return True
