@@ -18,7 +18,7 @@ from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.png import png
 from gigabrain_drivers.sim.world import Pose, World, clearance
 from gigabrain_drivers.sim.worlds import load_world
-from gigabrain_zenoh.errors import Unsupported
+from gigabrain_zenoh.errors import ConfigError, Unsupported
 
 DISTANCE_M, HEIGHT_M = 1.0, 0.50  # of the camera, from the robot and above the floor
 AIM_HEIGHT_M = 0.22  # above the robot, so that the room is in the picture
@@ -53,7 +53,7 @@ def save_picture(
 ) -> None:
     """Write what a camera sees to a PNG; `add` adds shapes of its own.
 
-    Raises ConfigError where nothing can be drawn.
+    Raises ConfigError where nothing can be drawn, or the file cannot be written.
     """
     model.vis.global_.offwidth, model.vis.global_.offheight = (
         width * SUPERSAMPLING,
@@ -62,8 +62,11 @@ def save_picture(
     with _graphics(width * SUPERSAMPLING, height * SUPERSAMPLING):
         fine = _draw(model, data, camera, add)
     pixels = fine.reshape(height, SUPERSAMPLING, width, SUPERSAMPLING, 3).mean(axis=(1, 3)).round()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(png(pixels.astype(np.uint8)))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(png(pixels.astype(np.uint8)))
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error.strerror}") from None
 
 
 def _light(model: mujoco.MjModel, robot: Pose) -> None:
