@@ -51,6 +51,21 @@ def test_the_unit_is_exposed_to_2_of_10_at_most(unit: Path) -> None:
     assert judged.returncode == 0, judged.stdout
 
 
+def test_the_docs_say_what_a_unit_with_can_and_cameras_needs(unit: Path) -> None:
+    docs = (ROOT / "docs" / "how-to" / "many_hosts.md").read_text()
+    (more,) = re.findall(r"^```text\n(\[Service\]\n.*?)^```", docs, re.MULTILINE | re.DOTALL)
+    own = unit.with_name("gigabrain@arm.service")
+    own.write_text(f"{unit.read_text()}\n{more}")  # later lines of a list are added
+    verified = analyze("verify", "--man=no", str(own))
+    assert (verified.returncode, verified.stderr) == (0, "")
+    judged = analyze("security", "--offline=true", "--threshold=25", "--no-pager", str(own))
+    if "unrecognized option" in judged.stderr:
+        pytest.skip("this systemd-analyze cannot judge a unit that does not run")
+    assert judged.returncode == 0, judged.stdout
+    assert "AF_CAN" not in UNIT.read_text()  # only where it is needed
+    assert {"AF_CAN", "char-video4linux"} <= {*re.split(r"[\s=]", more)}
+
+
 BARE = """
 mount --bind {folder} {folder} && mount -o remount,bind,ro / &&
 exec setpriv --no-new-privs --bounding-set=-all --inh-caps=-all -- "$@"
