@@ -123,6 +123,7 @@ async def _compile_all() -> None:
 
 
 async def _compile(name: str, *warm_ups: str, links: bool) -> None:
+    from gigabrain_zenoh.kernels import cache
     from gigabrain_zenoh.kernels import precompile as kernels
 
     start_s = time.monotonic()
@@ -132,6 +133,11 @@ async def _compile(name: str, *warm_ups: str, links: bool) -> None:
                 kernels.compile_all(warm_up)  # raises the reason of the failure
             except ModuleNotFoundError as error:
                 raise kernels.missing_package(error) from None
+    if not all(map(kernels.is_kept, warm_ups)):
+        raise ConfigError(
+            f"{name}: compiled, but not kept: cannot write {cache.kernel_folder()}; "
+            f"make room there, or name another folder with {cache.FOLDER}"
+        )
     if links:
         await kernels.link_in_child(name, *warm_ups)
     print_line(f"{name}: {time.monotonic() - start_s:.1f} s")

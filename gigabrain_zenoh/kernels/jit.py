@@ -10,7 +10,7 @@ import importlib
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -51,6 +51,16 @@ def _as_if_missing(*names: str) -> Iterator[None]:
             del modules[name]
 
 
+def _if_possible(save: Callable[..., None]) -> Callable[..., None]:
+    """Return `save`, without its errors of the disk: numba would raise them from a kernel."""
+
+    def saved(*arguments: object) -> None:
+        with suppress(OSError):
+            save(*arguments)
+
+    return saved
+
+
 class Kernel:
     """A compiled function. Other kernels may call it as well."""
 
@@ -83,14 +93,16 @@ class Kernel:
         """The function as numba has it: it is compiled at its first call with other types.
 
         The result is kept in NUMBA_CACHE_DIR, or in the user's cache folder. If neither can be
-        written, each process compiles again.
+        written, or the disk is full, each process compiles again.
         """
         numba, lean = import_numba(), self._lean
         options = {"nogil": True, "error_model": "numpy", "_nrt": not lean, "forceinline": lean}
         try:
-            return numba.njit(cache=True, **options)(self.function)
+            made = numba.njit(cache=True, **options)(self.function)
         except RuntimeError:  # numba: no locator available
             return numba.njit(**options)(self.function)
+        made._cache.save_overload = _if_possible(made._cache.save_overload)
+        return made
 
     @property
     def _numba_type_(self) -> Any:

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host import this_process
+from gigabrain_zenoh.host.files import replace_file
 from gigabrain_zenoh.host.this_process import join_in
 from gigabrain_zenoh.host.threads import InTime, Job
 from gigabrain_zenoh.kernels import cache
@@ -131,6 +132,12 @@ def _is_missing(warm_up: str) -> bool:
     return mark is not None and not mark.exists()
 
 
+def is_kept(warm_up: str) -> bool:
+    """Return whether what it calls is compiled, and on disk."""
+    mark = cache.mark_of(warm_up)
+    return mark is not None and mark.exists()
+
+
 def _call(warm_up: str) -> None:
     find(warm_up)()  # imports too
 
@@ -195,8 +202,8 @@ def compile_all(warm_up: str) -> None:
     find(warm_up)()
     mark = cache.mark_of(warm_up)
     if mark:
-        with contextlib.suppress(OSError):  # a folder that can be read only: as if nothing was kept
-            mark.touch()
+        with contextlib.suppress(OSError):  # read only, or full: as if nothing was kept
+            replace_file(mark, b"compiled\n")
 
 
 if __name__ == "__main__":

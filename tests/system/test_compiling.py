@@ -14,10 +14,12 @@ pytest.importorskip("numba")
 
 from gigabrain_zenoh.cli import map as map_commands
 from gigabrain_zenoh.decision.drive_kernels import ARM_KERNELS, CAR_KERNELS, DRIVE_KERNELS
+from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.kernels import cache as kernels
 from gigabrain_zenoh.kernels import jit, precompile
 from gigabrain_zenoh.perception.node import LOCALIZE_KERNELS, MAP_KERNELS
 from gigabrain_zenoh.plugins import find
+from tests.places import ROOT
 
 CALLS = """
 import os
@@ -70,6 +72,55 @@ async def test_where_nothing_can_be_kept_it_compiles_here(
     assert who(calls) == [True]
 
 
+TINY = """
+from gigabrain_zenoh.kernels.jit import kernel
+@kernel
+def double(x: int) -> int:
+    return 2 * x
+def warm_up() -> None:
+    assert double(21) == 42
+"""
+FULL = """
+import asyncio, errno, os
+from gigabrain_zenoh.kernels import jit, precompile
+from numba.core.caching import IndexDataCacheFile
+def full(*_):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+IndexDataCacheFile._save_data = full
+precompile.replace_file = full
+async def in_child(*_):
+    return 1
+precompile.compile_in_child = in_child
+asyncio.run(precompile.ensure_compiled("tiny:warm_up"))
+print(precompile.is_kept("tiny:warm_up"))
+precompile.compile_all("tiny:warm_up")
+print(precompile.is_kept("tiny:warm_up"))
+"""
+
+
+def test_on_a_full_disk_kernels_run_and_do_not_count_as_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "tiny.py").write_text(TINY)
+    places = (str(tmp_path), str(ROOT), os.environ.get("PYTHONPATH", ""))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(places))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
+    done = subprocess.run((sys.executable, "-c", FULL), capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "False\nFalse\n"), done.stderr
+
+
+async def test_precompile_does_not_claim_what_was_not_kept(
+    calls: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+    folder = tmp_path / "file" / "below"
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder))
+    fault = f"compiled, but not kept: cannot write {folder}; make room there, or "
+    fault += "name another folder with NUMBA_CACHE_DIR"
+    with pytest.raises(ConfigError, match=f"^mapping: {fault}$"):
+        await map_commands._compile("mapping", WARM_UP, links=True)
+
+
 def test_what_was_compiled_beforehand_is_not_compiled_at_the_start(calls: Path) -> None:
     mark = kernels.mark_of(WARM_UP)
     assert mark
@@ -95,6 +146,7 @@ def test_what_is_compiled_beforehand_is_what_each_process_calls(
 
     monkeypatch.setattr(precompile, "compile_in_child", in_child)
     monkeypatch.setattr(precompile, "compile_all", done.append)
+    monkeypatch.setattr(precompile, "is_kept", lambda _: True)
     monkeypatch.setattr(precompile, "can_link", lambda: False)
     map_commands.precompile()
     assert sorted(tried) == sorted(WARM_UPS)
@@ -118,6 +170,7 @@ async def test_precompile_links_what_each_process_calls(
 
     monkeypatch.setattr(precompile, "can_link", lambda: True)
     monkeypatch.setattr(precompile, "compile_in_child", in_child)
+    monkeypatch.setattr(precompile, "is_kept", lambda _: True)
     monkeypatch.setattr(precompile, "link_in_child", link)
     await map_commands._compile_all()
     assert set(linked) == {"mapping", "driving"}
