@@ -233,8 +233,13 @@ HEADER = """\
 
 
 def configuration(endpoint: Endpoint, generations: Mapping[str, int] = FIRST) -> str:
-    """Return a file for `zenohd --config`; its `keys` are a folder on its own host."""
+    """Return a file for `zenohd --config`; its `keys` are a folder on its own host.
+
+    Raises ConfigError.
+    """
     endpoint, robots = secured(endpoint), endpoint.fleet
+    for text in endpoint.listen:
+        _check(text)
     settings = session_settings(endpoint) | security(endpoint, generations)
     options = "".join(f" --robot {robot}" for robot in robots if robot)
     return HEADER.format(options=options) + json.dumps(_nested(settings), indent=2) + "\n"

@@ -135,6 +135,14 @@ def test_the_router_listens_where_it_is_told_and_on_a_socket_of_its_user(
     assert '"robot@blue"' in router
 
 
+@pytest.mark.parametrize("listen", ["tls/0.0.0.0", "tcp/my host:7447", "tls/0.0.0.0:77447"])
+def test_a_router_of_a_larger_site_is_refused_an_address_that_is_none(listen: str) -> None:
+    from gigabrain_zenoh.bus.zenoh.config import configuration
+
+    with pytest.raises(ConfigError, match=f"'tls/{listen[4:]}' is not a Zenoh endpoint; expected"):
+        configuration(Endpoint(listen=(listen,), keys="/etc/gigabrain/keys", fleet=("red",)))
+
+
 def test_the_committed_router_of_a_larger_site_is_what_the_command_prints() -> None:
     from gigabrain_zenoh.bus.zenoh.config import configuration
 
