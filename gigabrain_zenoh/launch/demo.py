@@ -157,6 +157,7 @@ class Demo:
         self._refusals: dict[str, str] = {}  # by process, the last error with which it ended
         self._faults: deque[tuple[float, str]] = deque(maxlen=4)  # when [s], and what
         self._capacity = Capacity()
+        self._disk_full = False  # and the driver waits for space
         self._last_fault = ""  # before all were asked to end, the driver's first
 
     async def run(self) -> int:
@@ -255,7 +256,7 @@ class Demo:
 
     def _over(self, watch: RunMonitor) -> bool:
         seconds = self._options.seconds
-        return seconds is not None and watch.seconds >= seconds - 1e-6
+        return self._disk_full or (seconds is not None and watch.seconds >= seconds - 1e-6)
 
     @property
     def _live(self) -> bool:
@@ -339,7 +340,8 @@ class Demo:
             self._mismatches[str(record.get("text", ""))] = None
         if event == "failed":
             self._refusals[name] = str(record.get("text", ""))
-        if event in ("given up", "died"):
+        self._disk_full |= event == "disk full"
+        if event in ("disk full", "given up", "died"):
             self._failures.append((name, str(record.get("text", ""))))
         if level in ("warning", "error", "critical"):
             text = printable(f"{record['process']}: {record.get('text', '')}")

@@ -113,7 +113,7 @@ async def wait_for_disk(folder: Path, clock: Clock) -> None:
             LatchFile(folder).read()
         except DiskFull as error:
             if not told:
-                log.warning("%s; waiting for it", error, extra={"data": {"event": "waiting"}})
+                log.warning("%s; waiting for it", error, extra={"data": {"event": "disk full"}})
             told = True
             await clock.sleep_ns(DISK_RETRY_TICKS * TICK_NS)
         else:

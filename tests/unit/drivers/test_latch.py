@@ -86,5 +86,6 @@ async def test_a_driver_that_cannot_keep_its_latch_waits_until_there_is_space(
     await clock.advance(1_000_000_000)
     await waiting
     assert (folder / "latch.json").stat().st_size
-    (line,) = caplog.messages
+    ((line, data),) = ((one.getMessage(), vars(one)["data"]) for one in caplog.records)
+    assert data == {"event": "disk full"}  # by which a demo knows it
     assert line.startswith(f"cannot write {folder}: No space left on device; free some space")

@@ -143,6 +143,17 @@ async def test_a_demo_ends_without_a_process_that_the_robot_needs(
     assert watch.seconds == 1.0
 
 
+async def test_a_demo_does_not_wait_for_space_on_the_disk_of_its_driver(
+    demo: Demo, watch: Watch
+) -> None:
+    waits = {"process": "driver", "level": "warning", "text": "no space"}
+    demo._record("driver", waits | {"event": "disk full"})
+    await demo._watch(watch, asyncio.Event())
+    assert (watch.seconds, demo._why()) == (1.0, "no space")
+    with pytest.raises(BodyLost, match=r"^no report: no space; logs in "):
+        demo._finish(None, demo._why(), stopped=False)
+
+
 def test_a_report_that_cannot_be_written_is_still_printed(
     demo: Demo, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
