@@ -74,10 +74,9 @@ def own_config(deployment: "Deployment", name: str, file: str) -> dict[str, Any]
     return {}
 
 
-def unknown_to_router(deployment: "Deployment", host: str) -> str:
-    """Return a warning for processes of one's own whose rights another file decides, or none."""
-    own = {*deployment.processes, *deployment.perceptors}
-    here = [name for name in deployment.hosts[host] if name in own]
+def unknown_to_router(deployment: "Deployment", host: str, shipped: Collection[str]) -> str:
+    """Return a warning for processes that another robot's router may not know, or an empty text."""
+    here = [name for name in deployment.hosts[host] if name not in shipped]
     routes = any("router" in names for names in deployment.hosts.values())
     if routes or not deployment.keys or not here:
         return ""

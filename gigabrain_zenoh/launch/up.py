@@ -24,6 +24,7 @@ from gigabrain_zenoh.launch.deployment import (
 )
 from gigabrain_zenoh.launch.merging import write_rows
 from gigabrain_zenoh.launch.own_processes import check_installed, unknown_to_router
+from gigabrain_zenoh.launch.processes import PROCESSES
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.launch.supervisor_log import SupervisorLog
 from gigabrain_zenoh.runtime.running import announced
@@ -133,7 +134,7 @@ async def up(
         specs = process_specs(deployment, host, run_dir, remembers, level=level, file=file)
         names = ", ".join(spec.name for spec in specs)
         print_line(f"{deployment.body} on {host}: {names}; logs in {run_dir}")
-        if unknown := unknown_to_router(deployment, host):
+        if unknown := unknown_to_router(deployment, host, PROCESSES):
             print_line(f"warning: {unknown}")
         stop = held.enter_context(stop_signals(LIMIT_S))
         note = held.enter_context(announced(label, local_endpoint(deployment, host), run_dir))

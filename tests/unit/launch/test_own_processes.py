@@ -10,9 +10,14 @@ from gigabrain_zenoh.cli.processes import HostOptions, router
 from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig, RouterConfig
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.launch.deployment import load_deployment
-from gigabrain_zenoh.launch.own_processes import check_installed, load_own
-from gigabrain_zenoh.launch.processes import own_processes, process_type, process_types
+from gigabrain_zenoh.launch.deployment import Deployment, load_deployment
+from gigabrain_zenoh.launch.own_processes import check_installed, load_own, unknown_to_router
+from gigabrain_zenoh.launch.processes import (
+    PROCESSES,
+    own_processes,
+    process_type,
+    process_types,
+)
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.perception import perceptors
 
@@ -178,3 +183,14 @@ def test_a_module_without_its_coroutine_says_what_is_expected(tmp_path: Path) ->
     path = written(tmp_path, MINE.replace("my_lamp.node", "lone_lamp:shine"))
     with pytest.raises(ConfigError, match=r":4: .*has no coroutine 'shine'; expected run\(config"):
         load_own(config_of(path))
+
+
+def test_a_process_of_a_package_may_be_unknown_to_the_router_of_another_robot_too() -> None:
+    deployment = Deployment(
+        hosts={"robot": ("driver", "lamp")},
+        namespace="blue",
+        keys="home",
+        router="tcp/10.0.0.1:7447",
+    )
+    warning = unknown_to_router(deployment, "robot", PROCESSES)
+    assert warning.startswith("lamp: the router at tcp/10.0.0.1:7447 is not of this file; with ")
