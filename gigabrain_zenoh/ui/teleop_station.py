@@ -78,6 +78,7 @@ class HeldKeys:
 
     def __init__(self) -> None:
         self._until_s: dict[str, float] = {}
+        self._released: set[str] = set()  # until their next press, which no repeat is
         self._share = 0
         self.joint = 0  # index of the chosen one
 
@@ -95,15 +96,16 @@ class HeldKeys:
             self.joint = int(key) - 1
         elif key in MOVES or key in JOG_KEYS:
             repeated = now_s < self._until_s.get(key, now_s)
-            held_s = HELD_S if repeated else TAP_S
-            self._until_s[key] = now_s + held_s
+            if not repeated:
+                self._released.discard(key)
+            self._until_s[key] = now_s + (HELD_S if repeated else TAP_S)
         else:
             return False
         return True
 
     def release_all(self) -> None:
-        """Count all keys as released."""
-        self._until_s.clear()
+        """Count all keys as released, until they are pressed again."""
+        self._released = set(self._until_s)
 
     def velocity(self, body: BodyDescription, now_s: float) -> Velocity:
         """Return the velocity for the keys that are held now."""
@@ -124,7 +126,8 @@ class HeldKeys:
         return {joint.name: way * self.share * joint.max_speed for joint in chosen}
 
     def _held(self, now_s: float) -> list[str]:
-        return [key for key, until_s in self._until_s.items() if now_s < until_s]
+        held = (key for key, until_s in self._until_s.items() if now_s < until_s)
+        return [key for key in held if key not in self._released]
 
 
 class PadState:
@@ -142,20 +145,21 @@ class PadState:
         self._rest, stop = data[whole:], False
         for _, value, kind, number in EVENT.iter_unpack(data[:whole]):
             if kind & BUTTON:
-                self._buttons[number] = bool(value)
-                stop = stop or (number == STOP_BUTTON and bool(value) and not kind & INITIAL)
+                pressed = bool(value and not kind & INITIAL)
+                self._buttons[number] = pressed or bool(value and self._buttons.get(number))
+                stop = stop or (number == STOP_BUTTON and pressed)
             elif kind & AXIS:
                 self._axes[number] = value / AXIS_RANGE
         return stop
 
-    @property
-    def held(self) -> bool:
-        """Return whether a dead-man button is held."""
-        return any(self._buttons.get(button) for button in DEAD_MAN_BUTTONS)
+    def release_all(self) -> None:
+        """Count all buttons as released, until they are pressed again."""
+        self._buttons.clear()
 
     def velocity(self, body: BodyDescription, share: float) -> Velocity:
         """Return the velocity that the sticks ask for, at most `share` of the body's limits."""
-        if not self.held or (body.joints and self._buttons.get(ARM_BUTTON)):
+        held = any(self._buttons.get(button) for button in DEAD_MAN_BUTTONS)
+        if not held or (body.joints and self._buttons.get(ARM_BUTTON)):
             return ZERO
         ahead, turn, left = (
             -self._pushed(axis) * share for axis in (AHEAD_AXIS, TURN_AXIS, SIDEWAYS_AXIS)
@@ -249,21 +253,20 @@ class TeleopStation:
             Display[Text](lambda text: live.update(text, refresh=True), room=1) as display,
         ):
             while not self._quit:
+                if self._robot.state and self._robot.state.gate.mode == "latched":
+                    self._release_all()  # what is held must not move the robot after the release
                 wanted = self._keys.velocity(body, loop.time())
                 if wanted == ZERO and self._pad.pad:
                     wanted = self._pad.pad.velocity(body, self._keys.share)
                 if self._pad.stop.is_set():
                     self._pad.stop.clear()
                     self._ask("stop")
-                self._steer(body, wanted)
+                if body.has_base:
+                    self._robot.steer(wanted)
                 if body.joints:
                     self._jog(body, loop.time())
                 display.put(Text("\n".join(self._lines(wanted))))
                 await asyncio.sleep(PERIOD_S)
-
-    def _steer(self, body: BodyDescription, wanted: Velocity) -> None:
-        if body.has_base:
-            self._robot.steer(wanted)
 
     def _jog(self, body: BodyDescription, now_s: float) -> None:
         speeds = self._keys.speeds(body, now_s)
@@ -281,9 +284,14 @@ class TeleopStation:
             else:
                 self._keys.press(key, asyncio.get_running_loop().time())
 
-    def _ask(self, what: str) -> None:
-        """Release all keys, then send a request to the gate."""
+    def _release_all(self) -> None:
         self._keys.release_all()
+        if self._pad.pad:
+            self._pad.pad.release_all()
+
+    def _ask(self, what: str) -> None:
+        """Count keys and gamepad as released, then send a request to the gate."""
+        self._release_all()
         self._robot.steer(ZERO)
         task = asyncio.create_task(self._answer(what))
         self._asking.add(task)
@@ -327,11 +335,8 @@ class TeleopStation:
             self._reply,
             KEYS_HELP,
             *([JOINT_KEYS_HELP] if self._body and self._body.joints else []),
-            *self._pad_line(),
+            *([PAD_HELP] if self._pad.pad else []),
         ]
-
-    def _pad_line(self) -> list[str]:
-        return [PAD_HELP] if self._pad.pad else []
 
 
 def readout(state: RobotState, wanted: Velocity, share: float) -> list[str]:

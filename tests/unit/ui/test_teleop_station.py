@@ -84,6 +84,17 @@ def test_the_operator_chooses_how_fast_within_what_the_body_can() -> None:
     assert keys.share == 0.25
 
 
+def test_a_released_key_counts_from_its_next_press_and_not_from_a_repeat() -> None:
+    keys = HeldKeys()
+    keys.press("w", 0.0)
+    keys.release_all()
+    keys.press("w", 0.3)
+    keys.press("w", 0.4)
+    assert keys.velocity(WAFFLE, 0.4) == ZERO
+    keys.press("w", 1.0)
+    assert keys.velocity(WAFFLE, 1.0) == Velocity(linear_x=0.065)
+
+
 def event(value: int, kind: int, number: int) -> bytes:
     return struct.pack("<IhBB", 0, value, kind, number)
 
@@ -111,6 +122,24 @@ def test_its_stop_button_counts_when_it_is_pressed_and_not_as_it_was_found() -> 
     assert not pad.feed(event(1, 1 | 0x80, 1))
     assert not pad.feed(event(0, 1, 1))
     assert pad.feed(event(1, 1, 1))
+
+
+def test_a_released_gamepad_moves_nothing_until_a_dead_man_button_is_pressed_again() -> None:
+    pad = PadState()
+    pad.feed(event(1, 1, 4) + event(-32767, 2, 1))
+    pad.feed(event(1, 1 | 0x80, 4))  # sent again, after events were lost
+    assert pad.velocity(WAFFLE, 1.0) == Velocity(linear_x=0.26)
+    pad.release_all()
+    pad.feed(event(1, 1 | 0x80, 4) + event(-32000, 2, 1))
+    assert pad.velocity(WAFFLE, 1.0) == ZERO
+    pad.feed(event(0, 1, 4) + event(1, 1, 4) + event(-32767, 2, 1))
+    assert pad.velocity(WAFFLE, 1.0) == Velocity(linear_x=0.26)
+
+
+def test_a_dead_man_button_that_is_held_when_the_station_starts_moves_nothing() -> None:
+    pad = PadState()
+    pad.feed(event(1, 1 | 0x80, 4) + event(-32767, 2 | 0x80, 1))
+    assert pad.velocity(WAFFLE, 1.0) == ZERO
 
 
 async def test_a_gamepad_that_is_unplugged_holds_no_button(tmp_path: Path) -> None:
@@ -182,6 +211,35 @@ async def test_a_station_that_a_signal_ends_stops_the_body_and_hands_it_back(
     await cancelled_while_driving(robot, tmp_path)
     assert robot.steered[-1] == ZERO
     assert robot.enabled == 2  # for the station, and for the brain again
+
+
+@pytest.mark.parametrize("stopped_by", ["this station", "somebody else"])
+async def test_a_gamepad_held_through_an_estop_must_be_pressed_again(
+    tmp_path: Path, stopped_by: str
+) -> None:
+    os.mkfifo(tmp_path / "js0")
+    robot, pad = Held(), Gamepad(tmp_path)
+    latched = replace(example(RobotState), gate=GateStatus(mode="latched"))
+    with terminal() as screen, (tmp_path / "js0").open("wb", buffering=0) as kernel:
+        driving = asyncio.create_task(TeleopStation(cast(Robot, robot), pad).drive(take=True))
+        kernel.write(event(1, 1, 4) + event(-32767, 2, 1))
+        await until(lambda: robot.steered and robot.steered[-1] != ZERO)
+        if stopped_by == "this station":
+            os.write(screen, b" ")
+            await until(lambda: robot.pressed)
+        else:
+            robot.state = latched
+            await asyncio.sleep(0.2)  # for several updates
+            robot.state = None
+        robot.steered.clear()
+        await until(lambda: len(robot.steered) > 3)
+        assert set(robot.steered) == {ZERO}
+        kernel.write(event(0, 1, 4) + event(1, 1, 4))
+        await until(lambda: robot.steered[-1] != ZERO)
+        driving.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await driving
+    pad.close()
 
 
 @contextlib.contextmanager
