@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import secrets
 from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping
 from types import TracebackType
@@ -69,6 +70,8 @@ class Bus:
 
     def __init__(self, transport: Transport, clock: Clock, process: str = "") -> None:
         self.transport, self.clock, self.process = transport, clock, process
+        # unlike its process, no other session has this name: there may be two pages
+        self.session = f"{process[:40]}-{secrets.token_hex(8)}"
         self.time = RobotTime()
         self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._failed_at: tuple[BaseException | None, TracebackType | None] = None, None

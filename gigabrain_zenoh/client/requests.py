@@ -94,7 +94,7 @@ def jog(bus: Bus, speeds: Mapping[str, float]) -> None:
     """
     check_finite(speeds)
     names, values = tuple(speeds), tuple(speeds.values())
-    bus.publish(JOINT_TELEOP, JointSpeeds(name=names, velocity=values))
+    bus.publish(JOINT_TELEOP, JointSpeeds(name=names, velocity=values, source=bus.session))
 
 
 async def params(bus: Bus, process: str) -> tuple[Param, ...]:
@@ -120,7 +120,7 @@ def steer(bus: Bus, wanted: Velocity) -> None:
     Raises ConfigError for one that is not finite.
     """
     check_finite(asdict(wanted))
-    bus.publish(TELEOP, Twist(**asdict(wanted)))
+    bus.publish(TELEOP, Twist(**asdict(wanted), source=bus.session))
 
 
 def check_finite(numbers: Mapping[str, float]) -> None:

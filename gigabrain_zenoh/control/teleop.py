@@ -1,20 +1,42 @@
 """Operators' streams, accepted only while they are clearly live."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from gigabrain_schemas.base import TICK_NS, Message, Velocity
+from gigabrain_schemas.base import TICK_NS, Velocity
 from gigabrain_schemas.body import RobotState
-from gigabrain_schemas.brain import Twist
+from gigabrain_schemas.brain import JointSpeeds, Twist
+from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.geometry.pose import velocity_of
 
-M = TypeVar("M", bound=Message)
+M = TypeVar("M", Twist, JointSpeeds)
 GAP_NS = 200_000_000  # after a longer gap the stream has ended
 SETTLE_NS = 500_000_000  # how long a stream without an echo is ignored after a gap
+MAX_STREAMS = 16  # of all sources; the newest are kept
+
+
+def at_rest(message: Twist | JointSpeeds) -> bool:
+    """Return whether an operator asks for no motion."""
+    if isinstance(message, Twist):
+        return velocity_of(message) == ZERO
+    return not any(message.velocity)
+
+
+@dataclass(frozen=True)
+class _Stream(Generic[M]):
+    """Messages of one source."""
+
+    newest: M
+    arrived_ns: int
+    trusted_from_ns: int  # without an echo
 
 
 class OperatorStream(Generic[M]):
-    """An operator's stream, accepted only while it is clearly live.
+    """The operators' streams, accepted only while they are clearly live.
+
+    Of several sources, such as two pages, the one that moves the robot is followed until it asks
+    for rest or is silent.
 
     After an outage, a network delivers the messages it had buffered. A client may echo the robot's
     newest tick in its messages, so its live messages are recognized immediately. A stream without
@@ -27,37 +49,44 @@ class OperatorStream(Generic[M]):
 
     def __init__(self, now_ns: Callable[[], int]) -> None:
         self._now_ns = now_ns
-        self._newest: M | None = None
-        self._arrived_ns = 0
-        self._trusted_from_ns = 0
+        self.streams: dict[str, _Stream[M]] = {}  # by source, the newest last
+        self._source = ""  # the one that is followed
+        self._trusted_from_ns = 0  # without an echo, after a hand-over
         self._handed_over = (0, -1)  # boot, and the gate's count of enables
         self._handed_over_tick = 0
 
     def receive(self, message: M) -> None:
-        """Store a message of the operator's stream."""
-        now = self._now_ns()
-        if self._newest is None or now - self._arrived_ns > GAP_NS:
-            self._trusted_from_ns = now + SETTLE_NS
-        self._newest, self._arrived_ns = message, now
+        """Store a message of an operator's stream."""
+        now, before = self._now_ns(), self.streams.pop(message.source, None)
+        goes_on = before is not None and now - before.arrived_ns <= GAP_NS
+        trusted_from_ns = before.trusted_from_ns if before and goes_on else now + SETTLE_NS
+        self.streams[message.source] = _Stream(message, now, trusted_from_ns)
+        if len(self.streams) > MAX_STREAMS:
+            del self.streams[next(iter(self.streams))]
 
     def live(self, state: RobotState, echo_wanted: bool) -> M | None:
-        """Return the newest message, or None if no live stream exists.
+        """Return the newest message of the stream to follow, or None if no live stream exists."""
+        self._note_hand_over(state, self._now_ns())
+        live = [each for each in self.streams.values() if self._is_live(each, state, echo_wanted)]
+        if not live:
+            return None
+        moving = [each for each in live if not at_rest(each.newest)]
+        follow = min(
+            moving or live,
+            key=lambda each: (each.newest.source != self._source, each.trusted_from_ns),
+        )
+        self._source = follow.newest.source
+        return follow.newest
 
-        With `echo_wanted`, as on a real body, a stream without an echo is never accepted.
-        """
-        now, message = self._now_ns(), self._newest
-        self._note_hand_over(state, now)
-        if message is None or now - self._arrived_ns > GAP_NS:
-            return None
+    def _is_live(self, stream: _Stream[M], state: RobotState, echo_wanted: bool) -> bool:
+        now, message = self._now_ns(), stream.newest
+        if now - stream.arrived_ns > GAP_NS:
+            return False
+        if not echo_wanted and not message.boot:
+            return now >= max(stream.trusted_from_ns, self._trusted_from_ns)
         off_ns = abs(state.tick - message.tick) * TICK_NS  # a future tick is as wrong as an old one
-        if echo_wanted or message.boot:
-            if message.boot != state.boot or off_ns > GAP_NS:
-                return None
-            if message.tick < self._handed_over_tick:
-                return None
-        elif now < self._trusted_from_ns:
-            return None
-        return message
+        echoes = message.boot == state.boot and off_ns <= GAP_NS
+        return echoes and message.tick >= self._handed_over_tick
 
     def _note_hand_over(self, state: RobotState, now: int) -> None:
         handed_over = state.boot, state.gate.enables
@@ -67,9 +96,9 @@ class OperatorStream(Generic[M]):
 
 
 class Teleop(OperatorStream[Twist]):
-    """The operator's stream of velocities of the base."""
+    """The operators' streams of velocities of the base."""
 
     def velocity(self, state: RobotState, echo_wanted: bool) -> Velocity | None:
-        """Return the operator's velocity, or None if no live stream exists."""
+        """Return the velocity of the operator to follow, or None if no live stream exists."""
         twist = self.live(state, echo_wanted)
         return velocity_of(twist) if twist else None

@@ -279,6 +279,7 @@ class Twist(Message, frozen=True, kw_only=True):
     linear_x: LinearSpeed  # [m/s]
     linear_y: LinearSpeed = 0.0  # [m/s]
     angular_z: AngularSpeed = 0.0  # [rad/s]
+    source: Name = ""  # who asks: of several operators control follows one at a time
 
 
 class JointSpeeds(Message, frozen=True, kw_only=True):
@@ -286,6 +287,7 @@ class JointSpeeds(Message, frozen=True, kw_only=True):
 
     name: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MAX_ARM_JOINTS)]
     velocity: Annotated[tuple[JointSpeed, ...], Meta(max_length=MAX_ARM_JOINTS)]  # [rad/s] or [m/s]
+    source: Name = ""  # who asks, as in Twist
 
     def __post_init__(self) -> None:
         if len(self.velocity) != len(self.name):

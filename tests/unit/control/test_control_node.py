@@ -7,13 +7,13 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.body import ControlGains, GateStatus
-from gigabrain_schemas.brain import Intent, Twist
+from gigabrain_schemas.brain import Intent, JointSpeeds, Twist
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, SAFETY, STATE, TELEOP, Topic
 from gigabrain_zenoh.bus.freshness import PreviousTick
 from gigabrain_zenoh.control import node as control
 from gigabrain_zenoh.control.node import caps_at
-from gigabrain_zenoh.control.teleop import Teleop
+from gigabrain_zenoh.control.teleop import OperatorStream, Teleop
 from gigabrain_zenoh.geometry.limits import NO_CAPS
 from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import BOOT, DRIVING, TICK_NS, WAFFLE, body, state
@@ -264,6 +264,69 @@ async def test_the_kind_of_link_decides_whether_the_echo_is_wanted(real: bool) -
         chain.send(BODY, body(real=real))
         speeds = await chain.go(40, teleop=FORWARD)
     assert (speeds[-1] == 0.0) is real
+
+
+REST = Twist(linear_x=0.0)
+
+
+def by(source: str, twist: Twist = FORWARD) -> Twist:
+    """A message of an operator who echoes the newest tick."""
+    return replace(twist, source=source, boot=BOOT, tick=100)
+
+
+def speed_of(stick: Stick) -> float | None:
+    velocity = stick.teleop.velocity(state(100), echo_wanted=True)
+    return velocity.linear_x if velocity else None
+
+
+def test_of_two_operators_the_first_one_steers_until_it_rests_or_is_silent() -> None:
+    stick, back = Stick(), Twist(linear_x=-0.2)
+    stick.push(10, 1, by("page-1"))
+    stick.push(10, 1, by("page-2", back))
+    stick.push(10, 1, by("teleop", REST))  # a station that nobody touches
+    assert speed_of(stick) == 0.1
+    stick.push(10, 1, by("page-1", REST))
+    assert speed_of(stick) == -0.2
+    stick.push(10, 1, by("page-1"))
+    assert speed_of(stick) == -0.2
+    for _ in range(10):  # the second one is cut off
+        stick.push(20, 1, by("page-1"))
+    assert speed_of(stick) == 0.1
+
+
+def test_when_all_operators_rest_the_robot_is_still_theirs() -> None:
+    stick = Stick()
+    stick.push(10, 1, by("page-1"))
+    assert speed_of(stick) == 0.1
+    for source in ("teleop", "page-1"):
+        stick.push(10, 1, by(source, REST))
+    assert speed_of(stick) == 0.0
+
+
+def test_joints_are_moved_by_one_operator_at_a_time_as_well() -> None:
+    stream = OperatorStream[JointSpeeds](lambda: 1000 * MS)
+    for source, speed in (("page-1", 0.5), ("page-2", -0.5), ("teleop", 0.0)):
+        speeds = JointSpeeds(name=("pan",), velocity=(speed,), source=source, boot=BOOT, tick=100)
+        stream.receive(speeds)
+        found = stream.live(state(100), echo_wanted=True)
+        assert found is not None
+        assert found.velocity == (0.5,)
+
+
+def test_a_stream_that_is_not_believed_keeps_no_operator_out() -> None:
+    stick = Stick()
+    stored = replace(by("a network"), tick=50)
+    stick.push(10, 1, stored)
+    stick.push(10, 1, by("page-1", Twist(linear_x=0.2)))
+    stick.push(10, 1, stored)
+    assert speed_of(stick) == 0.2
+
+
+def test_of_a_flood_of_sources_only_the_newest_16_are_kept() -> None:
+    stick = Stick()
+    for number in range(1000):
+        stick.push(0, 1, by(f"flood {number}"))
+    assert list(stick.teleop.streams) == [f"flood {number}" for number in range(984, 1000)]
 
 
 def test_what_the_operator_asks_for_is_passed_on_whole() -> None:

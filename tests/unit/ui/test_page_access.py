@@ -16,6 +16,8 @@ from gigabrain_schemas.brain import Twist
 from gigabrain_schemas.examples import example
 from gigabrain_schemas.requests import GateReply, LimpRequest
 from gigabrain_schemas.topics import BODY, LIMP, TELEOP
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.client.requests import steer
 from gigabrain_zenoh.config.settings import PageConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.limits import ZERO
@@ -267,6 +269,16 @@ async def test_one_viewer_steers_until_it_lets_go_or_falls_silent() -> None:
     page.seat.leave(page.one)
     await settle()
     assert page.speeds == [0.26, 0.1, 0.0]
+
+
+async def test_two_pages_are_two_sources_though_both_are_called_page() -> None:
+    net, sources = Net(), list[str]()
+    net.one.subscribe(TELEOP, lambda _key, twist: sources.append(twist.source))
+    for bus in (net.two, Bus(net.two.transport, net.two.clock, net.two.process)):
+        steer(bus, Velocity(linear_x=0.1))
+    await settle()
+    assert len(set(sources)) == 2
+    assert all(source.startswith(net.two.process) for source in sources)
 
 
 async def test_commands_buffered_by_a_network_do_not_steer() -> None:
