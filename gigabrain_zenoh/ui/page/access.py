@@ -3,6 +3,7 @@
 import hmac
 import ipaddress
 import os
+import re
 import secrets
 import ssl
 from collections.abc import Mapping
@@ -22,6 +23,7 @@ from gigabrain_zenoh.security.identity_files import made_once
 Role = Literal["operator", "viewer"]
 LOOPBACK_NAMES = ("127.0.0.1", "localhost", "::1")
 PORTS = {"http": 80, "https": 443}
+PORT = re.compile(r":\d{1,5}\Z", re.ASCII)
 TOKEN_BYTES = 24
 
 
@@ -112,6 +114,8 @@ class Access:
         self._hosts = {f"{name}:{port}" for name in names}
         if port == PORTS[self._scheme]:
             self._hosts |= names  # browsers leave out the default port
+        # with any port, as a tunnel has another one: no other site can have such a name
+        self._loopback = {name for name in names if is_loopback(name.strip("[]"))}
 
     def new_tokens_text(self) -> str:
         """Return the tokens in words if they were made now, else an empty text."""
@@ -129,7 +133,8 @@ class Access:
 
     def named(self, headers: Mapping[str, str]) -> bool:
         """Return whether the Host is a name of this page (DNS rebinding, RFC 9110 7.2)."""
-        return headers.get("host", "").lower() in self._hosts
+        host = headers.get("host", "").lower()
+        return host in self._hosts or PORT.sub("", host) in self._loopback
 
     def own_page(self, headers: Mapping[str, str]) -> bool:
         """Return whether a WebSocket is opened by this page, and not by another site."""

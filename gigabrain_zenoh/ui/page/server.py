@@ -81,7 +81,8 @@ class GuardedApp:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
         if scope["type"] == "http" and not self._access.named(Headers(scope=scope)):
-            response = PlainTextResponse("unknown name of this page; add it with --name\n", 421)
+            text = "unknown name or port of this page; add a name with --name, and keep the port\n"
+            response = PlainTextResponse(text, 421)
             await response(scope, receive, send)
             return
 

@@ -170,7 +170,16 @@ def test_beyond_loopback_it_wants_tls_and_a_token(tmp_path: Path) -> None:
         ("127.0.0.1:8080", "https://127.0.0.1:8080", True, False),
         ("127.0.0.1:8080", "null", True, False),
         ("127.0.0.1:8080", "", True, False),
-        ("127.0.0.1:9090", "http://127.0.0.1:9090", False, False),
+        ("127.0.0.1:9090", "http://127.0.0.1:9090", True, True),  # by a tunnel
+        ("[::1]:9090", "http://[::1]:9090", True, True),
+        ("localhost", "http://localhost", True, True),
+        ("localhost:9090", "http://localhost:3000", True, False),
+        ("localhost:9090", "http://127.0.0.1:9090", True, False),
+        ("localhost:8080", "http://localhost:9090", True, False),
+        ("localhost:9090", "http://evil.example:9090", True, False),
+        ("localhost.evil.example:9090", "http://localhost.evil.example:9090", False, False),
+        ("localhost:9090:evil", "http://localhost:9090:evil", False, False),
+        ("robot.lan:9090", "http://robot.lan:9090", False, False),
         ("evil.example:8080", "http://evil.example:8080", False, False),
         ("", "", False, False),
     ],
@@ -201,6 +210,11 @@ def test_it_answers_to_names_as_browsers_write_them(
     access = Access(config, port)
     assert access.own_page({"host": host, "origin": f"http://{host}"})
     assert not access.named({"host": f"x{host}"})
+
+
+def test_a_page_for_the_network_answers_to_no_name_of_loopback(tmp_path: Path) -> None:
+    config = PageConfig(listen="192.168.1.10", tokens=str(tmp_path / "tokens.json"))
+    assert not Access(config, 8080).named({"host": "localhost:8080"})
 
 
 async def test_a_slow_browser_gets_the_newest_and_never_more_than_64_frames() -> None:
