@@ -1,5 +1,6 @@
 """Zones, places and maps by hand on the page."""
 
+import asyncio
 from collections.abc import AsyncIterator
 
 import pytest
@@ -30,12 +31,16 @@ pytestmark = [needs_browser, pytest.mark.asyncio(loop_scope="module")]
 class Mapped(Fake):
     """A robot with zones and saved maps."""
 
+    answer_s = 0.0  # time that it takes for an answer
+
     async def change(self, request: ZonesRequest) -> ZonesReply:
+        await asyncio.sleep(self.answer_s)
         self.wanted.append(request)
         ok = not (request.zone and request.zone.name == "bad")
         return ZonesReply(ok=ok, text="done" if ok else "zone 'bad': its edges cross")
 
     async def list(self, _request: MapListRequest) -> MapListReply:
+        await asyncio.sleep(self.answer_s)
         maps = (SavedMapInfo(name="house"), SavedMapInfo(name="old", problem="cut"))
         return MapListReply(maps=maps, present="house")
 
@@ -164,3 +169,19 @@ async def test_a_viewer_sees_zones_and_may_not_change_them(chromium: Browser) ->
     page = await chromium.open(VIEWER)
     await drawn(page, 1.2, -0.75, reddish, "the zone")
     assert not await page.is_visible("#edit-zones")
+
+
+async def test_the_page_waits_as_long_as_its_server_for_zones_and_maps(
+    chromium: Browser, fake: Mapped, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = await chromium.open()
+    await drawn(page, 1.2, -0.75, reddish, "the zone")
+    monkeypatch.setattr(fake, "answer_s", 4.0)
+    await page.click("#edit-zones")
+    await page.click('[data-zone="place"]')
+    box = await page.locator("#map").bounding_box()
+    assert box
+    await page.mouse.click(box["x"] + box["width"] / 2 + 45, box["y"] + box["height"] / 2)
+    note = page.locator("#zone-note")
+    await expect(note).to_have_text("done")  # and no answer is given up on before
+    await expect(page.locator("#maps option")).to_have_text(["house", "old"])

@@ -4,6 +4,8 @@ const CAMERA = 13, FOUND = 14, CONTOURS = 15, PERCEIVED = 16, OBJECTS = 17, ARM_
 const LOGIN = 1, DRIVE = 2, ASK = 3, WATCH = 4, SHOWN = 5, JOG = 6
 const SILENT_AFTER_MS = 1000, RETRY_MS = [300, 600, 1200, 2500], FULL_RETRY_MS = 5000
 const CHECK_MS = 250, MAX_SILENT_CHECKS = 80 // 20 s; checks are counted, as a page that is held up receives nothing
+// longer than the server waits for the robot, so that its answer says what has become of a request
+const ANSWER_MS = 3000, ANSWERS_MS = { estop: 2500, world: 5000, zones: 8000, maps: 25_000, map_save: 25_000, map_load: 25_000 }
 const WRONG_TOKEN = 4401, FULL = 4429 // codes of a closed WebSocket
 
 const decoder = new TextDecoder(), encoder = new TextEncoder()
@@ -59,7 +61,7 @@ export class Link {
   }
 
   /** Resolve to the robot's reply, or to the reason why there is none; never reject. */
-  request(what, more = {}, timeoutMs = 3000) {
+  request(what, more = {}) {
     if (this.#socket.readyState !== WebSocket.OPEN) {
       return Promise.resolve({ ok: false, text: 'this page has no connection' })
     }
@@ -67,7 +69,7 @@ export class Link {
     this.#socket.send(this.#frame(ASK, { id, what, ...more }))
     return new Promise((resolve) => {
       const finish = (reply) => { this.#pending.delete(id); clearTimeout(timer); resolve(reply) }
-      const timer = setTimeout(() => finish({ ok: false, text: 'no answer' }), timeoutMs)
+      const timer = setTimeout(() => finish({ ok: false, text: 'no answer' }), ANSWERS_MS[what] ?? ANSWER_MS)
       this.#pending.set(id, finish)
     })
   }

@@ -13,7 +13,6 @@ import { Zones } from './zones.js'
 
 const ARM_DISTANCE_M = 0.9 // from which an arm is seen
 const NARROW_PX = 860 // below, the page is that of a phone; see style.css
-const STOP_TIMEOUT_MS = 2500 // the server gives up after two seconds
 const BY_HAND = 'press the hardware e-stop or cut the power'
 const stored = (key) => { try { return sessionStorage.getItem(key) ?? '' } catch { return '' } }
 const decoded = (text) => { try { return decodeURIComponent(text) } catch { return text } } // no % of a URL
@@ -33,7 +32,7 @@ const world = new WorldView($('world'), {
   say: (text, ok) => show($('goal'), text, `note${ok ? '' : ' bad'}`),
 })
 const zones = new Zones(map, {
-  request: (what, more, timeoutMs) => link.request(what, more, timeoutMs),
+  request: (what, more) => link.request(what, more),
   say: (text, ok) => show($('zone-note'), text, `note${ok ? '' : ' bad'}`),
 })
 const objects = new Objects(map, { go: requestGoal, allowed: () => !viewOnly() })
@@ -185,7 +184,7 @@ async function stop() {
   releaseAll()
   const startMs = performance.now()
   show($('confirmed'), 'stopping …', '')
-  const reply = await link.request('estop', {}, STOP_TIMEOUT_MS)
+  const reply = await link.request('estop')
   if (reply.ok) return show($('confirmed'), `CONFIRMED by ${reply.robot} in ${(performance.now() - startMs).toFixed(0)} ms: ${reply.text}`, 'ok')
   const text = reply.not_confirmed ? reply.text : `NOT CONFIRMED: ${reply.text}; ${BY_HAND}`
   show($('confirmed'), text, 'bad')

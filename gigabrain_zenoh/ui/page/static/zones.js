@@ -135,8 +135,8 @@ export class Zones {
     const name = $('map-save-name').value.trim()
     if (!name) return this.say('enter a name for the map', false)
     this.say('saving the map …', true)
-    let reply = await this.request('map_save', { name }, 30_000)
-    if (!reply.ok && reply.text.includes('there is a map') && confirm(`Replace the map ${name}?`)) reply = await this.request('map_save', { name, value: 'replace' }, 30_000)
+    let reply = await this.request('map_save', { name })
+    if (!reply.ok && reply.text.includes('there is a map') && confirm(`Replace the map ${name}?`)) reply = await this.request('map_save', { name, value: 'replace' })
     this.say(reply.text, reply.ok)
     this.#list()
   }
@@ -145,7 +145,7 @@ export class Zones {
     const name = $('maps').value
     if (!confirm(`Load the map ${name}? All tasks are cancelled.`)) return
     this.say('loading the map …', true)
-    const reply = await this.request('map_load', { name }, 30_000)
+    const reply = await this.request('map_load', { name })
     this.say(reply.text, reply.ok)
   }
 
