@@ -2,7 +2,7 @@
 
 import asyncio
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import TypeVar
 
 from msgspec.structs import asdict
@@ -101,6 +101,30 @@ async def params(bus: Bus, process: str) -> tuple[Param, ...]:
     """Return the parameters of a process; none if it does not answer."""
     replies = await bus.ask(PARAM, ParamRequest(), timeout_s=ANSWER_S, name=process)
     return replies[0].params if replies else ()
+
+
+class ParamTable:
+    """Parameters of all processes. One that does not answer keeps those that it had."""
+
+    def __init__(self, bus: Bus, processes: Callable[[], Iterable[str]]) -> None:
+        self._bus, self._processes = bus, processes
+        self._known: dict[str, tuple[Param, ...]] = {}
+
+    async def read(self) -> Mapping[str, tuple[Param, ...]]:
+        """Ask all processes; return their parameters by process."""
+        names = sorted(self._processes())
+        answers = await asyncio.gather(*map(self._ask, names))
+        self._known = {
+            name: found or self._known.get(name, ())
+            for name, found in zip(names, answers, strict=True)
+        }
+        return self._known
+
+    async def _ask(self, name: str) -> tuple[Param, ...]:
+        try:
+            return await params(self._bus, name)
+        except Refused:  # it is busy
+            return ()
 
 
 async def set_param(bus: Bus, process: str, name: str, value: str) -> str:

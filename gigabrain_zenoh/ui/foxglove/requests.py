@@ -19,8 +19,8 @@ from gigabrain_schemas.requests import Param
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.client.requests import (
     GIVE_UP_S,
+    ParamTable,
     enable,
-    params,
     press_estop,
     release,
     set_param,
@@ -48,7 +48,8 @@ class FoxgloveRequests:
         processes: Callable[[], Iterable[str]],
         may: Callable[[int], bool],
     ) -> None:
-        self._bus, self._state, self._processes, self._may = bus, state, processes, may
+        self._bus, self._state, self._may = bus, state, may
+        self._params = ParamTable(bus, processes)
         self._loop = asyncio.get_running_loop()
         self._known: dict[str, tuple[str, Param]] = {}  # by a viewer's name: process, parameter
 
@@ -59,13 +60,8 @@ class FoxgloveRequests:
 
     async def refresh(self) -> list[Parameter]:
         """Ask all processes for their parameters; return those that have changed."""
-        names = sorted(self._processes())
-        answers = await asyncio.gather(*(params(self._bus, name) for name in names))
-        found = {
-            f"{name}.{one.name}": (name, one)
-            for name, some in zip(names, answers, strict=True)
-            for one in some
-        }
+        table = await self._params.read()
+        found = {f"{name}.{one.name}": (name, one) for name, some in table.items() for one in some}
         changed = [name for name, one in found.items() if self._known.get(name) != one]
         self._known = found
         return self.shown(changed)

@@ -18,10 +18,10 @@ from gigabrain_schemas.zones import SavedMapInfo
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.client.requests import (
     ANSWER_S,
+    ParamTable,
     change_world,
     enable,
     let_go,
-    params,
     press_estop,
     release,
     set_param,
@@ -95,7 +95,8 @@ class RequestHandler:
         processes: Callable[[], Iterable[str]] = tuple,
         hold_joints: Callable[[], bool] = bool,
     ) -> None:
-        self._bus, self._processes, self._hold_joints = bus, processes, hold_joints
+        self._bus, self._hold_joints = bus, hold_joints
+        self._params = ParamTable(bus, processes)
 
     async def handle(self, request: PageRequest) -> PageReply:
         """Carry out a request. Errors are part of the reply."""
@@ -166,12 +167,11 @@ class RequestHandler:
 
     async def _settings(self) -> tuple[Setting, ...]:
         """Return the settings of all processes that a file can keep."""
-        names = sorted(self._processes())
-        answers = await asyncio.gather(*(params(self._bus, name) for name in names))
+        found = await self._params.read()
         return tuple(
             Setting(process=name, param=one)
-            for name, found in zip(names, answers, strict=True)
-            for one in found
+            for name, some in found.items()
+            for one in some
             if one.key
         )
 

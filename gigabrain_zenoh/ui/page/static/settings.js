@@ -16,7 +16,9 @@ export class Settings {
     if (!reply.ok) return this.#say(reply)
     this.shown = reply.settings
     const known = new Set(this.shown.map(({ process, param }) => `${process} ${param.name}`))
-    for (const [key, row] of this.#rows) if (!known.has(key)) { row.remove(); this.#rows.delete(key) }
+    for (const [key, row] of this.#rows) {
+      if (!known.has(key) && !row.contains(document.activeElement)) { row.remove(); this.#rows.delete(key) }
+    }
     for (const setting of this.shown) this.#fill(setting)
     this.#offer()
   }
