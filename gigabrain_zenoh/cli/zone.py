@@ -152,11 +152,12 @@ async def _ask(bus: "Bus", fields: dict[str, Any]) -> str:
 
     from gigabrain_schemas.zones import ZonesRequest
     from gigabrain_zenoh.client.zones import change_zones
+    from gigabrain_zenoh.config.name_words import plain
     from gigabrain_zenoh.host.this_process import user_name
 
     try:
         request = msgspec.convert({**fields, "source": user_name()}, ZonesRequest)
     except (ValueError, OverflowError) as error:  # msgspec.ValidationError is one
-        text = re.sub(r" - at `\$\.(zone|place)`$", "", str(error))
+        text = re.sub(r"^(zone|place)(\.|: )", "", plain(error))
         raise ConfigError(f"not a valid place or zone: {text}") from None
     return await change_zones(bus, request)

@@ -13,6 +13,7 @@ from gigabrain_schemas.topics import OBJECT_MAP, OBJECTS_CHANGE, POSE, POSE_SET
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.client.zones import ANSWER_S, NO_MAPPING
 from gigabrain_zenoh.codec import Codec
+from gigabrain_zenoh.config.name_words import plain
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 
 FOUND_S = 4.0  # within which a robot is found where somebody says that it is
@@ -85,4 +86,4 @@ def _request(kind: Any, fields: dict[str, Any]) -> Any:
     try:
         return msgspec.convert(fields, kind)
     except (ValueError, OverflowError) as error:  # msgspec.ValidationError is one
-        raise ConfigError(f"not a valid request: {error}") from None
+        raise ConfigError(f"not a valid request: {plain(error)}") from None

@@ -17,6 +17,7 @@ import msgspec
 from msgspec import inspect as mi
 
 from gigabrain_zenoh.config import yaml_text
+from gigabrain_zenoh.config.name_words import words_of
 from gigabrain_zenoh.config.renames import renamed_fields
 from gigabrain_zenoh.config.type_members import (
     is_list,
@@ -47,7 +48,6 @@ _LIMITS = {
     "multiple_of": "a multiple of",
     "min_length": "of length >=",
     "max_length": "of length <=",
-    "pattern": "matching",
 }
 
 
@@ -75,6 +75,8 @@ def _words(info: mi.Type) -> str:
 def _limits(info: mi.Type) -> str:
     given = [(words, getattr(info, name, None)) for name, words in _LIMITS.items()]
     found = [f"{words} {limit}" for words, limit in given if limit is not None]
+    if pattern := getattr(info, "pattern", None):
+        found.append(words_of(pattern))
     return " " + " and ".join(found) if found else ""
 
 

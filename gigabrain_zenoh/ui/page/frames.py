@@ -30,6 +30,7 @@ from gigabrain_schemas.zones import SavedMapInfo, Zones, ZonesRequest
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import Close
 from gigabrain_zenoh.codec import DECODE_ERRORS
+from gigabrain_zenoh.config.name_words import plain
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.geometry.link_model import LinkModel
@@ -198,11 +199,7 @@ def request_of(content: bytes) -> PageRequest | PageReply:
         fields = decoded(content, dict[str, Any])
         made = {name: value for name, value in fields.items() if name not in ENTERED}
         request = decoded(msgspec.json.encode(made), PageRequest)
-        text, _, path = str(error).partition(" - at `$.")
-        if "regex" in text:
-            text = "Expected a name of letters, digits, spaces, - _ and ."
-        text = f"{text[0].lower()}{text[1:]} at {path.rstrip('`')}"
-        return PageReply(id=request.id, what=request.what, ok=False, text=text)
+        return PageReply(id=request.id, what=request.what, ok=False, text=plain(error))
 
 
 class PageView(ViewerScene):

@@ -123,7 +123,10 @@ def test_hosts_may_place_it_and_several_hosts_must(tmp_path: Path) -> None:
     [
         (MINE + "    modul: x\n", r":5: unknown field 'modul'; did you mean 'module'\?"),
         (HEAD + "processes:\n  mine: {}\n", r":3: processes\.mine: missing field 'module'"),
-        (HEAD + "processes:\n  Mine: {module: a}\n", r":3: processes: expected a string matching"),
+        (
+            HEAD + "processes:\n  Mine: {module: a}\n",
+            ":3: processes: expected a string of at most 32 lower-case letters",
+        ),
         (HEAD + "processes:\n  mine:\n    module: a-b\n", r":4: processes\.mine\.module: expected"),
         (HEAD + "processes:\n  driver: {module: a}\n", r":3: processes\.driver: a process has tha"),
         (MINE + "perceptors:\n  mine: {}\n", r":3: processes\.mine: a process has that name alre"),

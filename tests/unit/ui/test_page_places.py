@@ -125,7 +125,8 @@ TRIANGLE = [[0, 0], [1, 0], [1, 1]]
     [
         (
             {"what": "zones", "zones": {"place": {"name": "desk #1", "x": 0, "y": 0}}},
-            "expected a name of letters, digits, spaces, - _ and . at zones.place.name",
+            "zones.place.name: expected a string of letters, digits, spaces, - _ and ., "
+            "a letter or digit first",
         ),
         (
             {
@@ -134,18 +135,18 @@ TRIANGLE = [[0, 0], [1, 0], [1, 1]]
                     "zone": {"name": "z", "kind": "speed", "points": TRIANGLE, "max_speed": 0}
                 },
             },
-            "expected `float` >= 0.05 at zones.zone.max_speed",
+            "zones.zone.max_speed: expected `float` >= 0.05",
         ),
         (
             {
                 "what": "zones",
                 "zones": {"zone": {"name": "z", "kind": "keepout", "points": [[0, 0]] * 300}},
             },
-            "expected `array` of length <= 256 at zones.zone.points",
+            "zones.zone.points: expected `array` of length <= 256",
         ),
         (
             {"what": "set", "process": "driver", "name": "speed_limit", "value": "1" * 501},
-            "expected `str` of length <= 500 at value",
+            "value: expected `str` of length <= 500",
         ),
     ],
     ids=["name", "speed", "corners", "setting"],
