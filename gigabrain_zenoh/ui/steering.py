@@ -35,6 +35,12 @@ class ViewerScene(SampledView):
         state = self.state.fresh()
         return state.gate.enables if state else None
 
+    @property
+    def latched(self) -> bool:
+        """Return whether the gate is latched, as by an e-stop."""
+        state = self.state.fresh()
+        return state is not None and state.gate.mode == "latched"
+
     def publish(self, wanted: Wanted) -> None:
         """Publish the velocity or the joints' speeds that an operator wants, by the newest tick."""
         self.sampled[STATE].poll()
@@ -66,12 +72,15 @@ class _Stream(NamedTuple):
     obey_from_s: float
     last_s: float
     rest: Wanted  # the command that ends them
+    ignored: bool  # it came while the gate was latched, and is obeyed only after a pause
 
 
 class TeleopArbiter:
     """Lets one viewer steer at a time, while its commands arrive. Commands are never repeated.
 
-    It may drive the base and move joints at once: each is a stream that ends by itself.
+    It may drive the base and move joints at once: each is a stream that ends by itself. One that
+    goes on while the gate is latched is ignored until it has ended, so that what is held through an
+    e-stop does not move the robot after the release.
     """
 
     def __init__(self, scene: ViewerScene) -> None:
@@ -115,10 +124,11 @@ class TeleopArbiter:
         goes_on = stream is not None and now_s - stream.last_s <= STREAM_GAP_S
         obey_from_s = stream.obey_from_s if stream and goes_on else now_s + SETTLE_S
         self._viewer, self._lease_end_s = viewer, now_s + LEASE_S
-        self._streams[type(wanted)] = _Stream(obey_from_s, now_s, rest)
+        ignored = self._scene.latched or bool(stream and goes_on and stream.ignored)
+        self._streams[type(wanted)] = _Stream(obey_from_s, now_s, rest, ignored)
         if wanted == rest:
             self._end(type(wanted))
-        elif now_s >= obey_from_s:
+        elif now_s >= obey_from_s and not ignored:
             self._enables = self._scene.enables
             self._scene.publish(wanted)
         return True

@@ -16,7 +16,7 @@ from websockets.asyncio.client import connect
 
 from gigabrain_schemas.arrays import hits_bytes
 from gigabrain_schemas.base import Message, Pose, Velocity
-from gigabrain_schemas.body import ArmModel, Joint, RobotState
+from gigabrain_schemas.body import ArmModel, GateStatus, Joint, RobotState
 from gigabrain_schemas.brain import Obstacle, OccupancyGrid, PoseInMap, WorldModel
 from gigabrain_schemas.examples import EXAMPLES, example
 from gigabrain_schemas.objects import Detections
@@ -54,7 +54,12 @@ from tests.places import ROOT
 from tests.system.foxglove_bridge import Bridge, bridged, hold
 from tests.system.foxglove_viewer import Viewer, fields
 
-STANDING = RobotState(robot_type="waffle", pose=Pose(x=0.0, y=0.0, yaw=0.0), velocity=Velocity())
+STANDING = RobotState(
+    robot_type="waffle",
+    pose=Pose(x=0.0, y=0.0, yaw=0.0),
+    velocity=Velocity(),
+    gate=GateStatus(mode="enabled", commander="control"),
+)
 LINKS = ("base", "shoulder", "upper_arm", "lower_arm", "wrist", "gripper", "jaw")
 LEFT = {"linear": {"x": 0, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0.5}}
 

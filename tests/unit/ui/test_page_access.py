@@ -11,11 +11,11 @@ from cryptography.hazmat.primitives import serialization
 
 from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.base import Velocity
-from gigabrain_schemas.body import Body
+from gigabrain_schemas.body import Body, GateMode, GateStatus
 from gigabrain_schemas.brain import Twist
 from gigabrain_schemas.examples import example
 from gigabrain_schemas.requests import GateReply, LimpRequest
-from gigabrain_schemas.topics import BODY, LIMP, TELEOP
+from gigabrain_schemas.topics import BODY, LIMP, STATE, TELEOP
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.client.requests import steer
 from gigabrain_zenoh.config.settings import PageConfig
@@ -25,6 +25,7 @@ from gigabrain_zenoh.launch.demo import with_page
 from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.security.authority import read_key
 from gigabrain_zenoh.testing.in_memory import Net
+from gigabrain_zenoh.testing.samples import state
 from gigabrain_zenoh.testing.waiting import settle
 from gigabrain_zenoh.ui.page.access import Access, check, tokens
 from gigabrain_zenoh.ui.page.frames import GoalRequest, PageRequest, PageView
@@ -283,6 +284,27 @@ async def test_one_viewer_steers_until_it_lets_go_or_falls_silent() -> None:
     page.seat.leave(page.one)
     await settle()
     assert page.speeds == [0.26, 0.1, 0.0]
+
+
+async def test_what_is_held_while_the_gate_is_latched_steers_only_after_a_pause() -> None:
+    page, ahead = Seated(), Velocity(linear_x=0.1)
+
+    async def held(*at_s: float, mode: GateMode) -> list[float]:
+        page.net.two.publish(STATE, state(10, gate=GateStatus(mode=mode, commander="control")))
+        await settle()
+        page.steered.clear()
+        for each in at_s:
+            page.seat.drive(page.one, ahead, each)
+        await settle()
+        return page.speeds
+
+    assert await held(0.0, 0.1, mode="enabled") == [0.1]
+    assert await held(0.2, 0.3, mode="latched") == []
+    assert await held(0.4, 0.5, 0.6, mode="enabled") == []
+    page.seat.drive(page.one, ZERO, 0.65)  # let go
+    assert await held(0.7, 0.8, mode="enabled") == [0.1]
+    assert await held(0.9, mode="latched") == []
+    assert await held(1.2, 1.3, mode="enabled") == [0.1]
 
 
 async def test_two_pages_are_two_sources_though_both_are_called_page() -> None:
