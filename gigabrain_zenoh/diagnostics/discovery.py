@@ -250,7 +250,10 @@ def plain_table(
     left: Collection[str],
     wraps: Collection[str] = (),
 ) -> Table:
-    """Return a table without lines; columns named in `left` are texts, others are numbers."""
+    """Return a table without lines; columns named in `left` are texts, others are numbers.
+
+    Cells are shown as they are, without markup: a process may have any name.
+    """
     table = Table(box=None, pad_edge=False, header_style="dim")
     for name in columns:
         justify: Literal["left", "right"] = "left" if name in left else "right"
@@ -261,8 +264,8 @@ def plain_table(
 
 
 def plain(cell: str) -> Text:
-    """Return a cell of any origin as it is: neither as markup nor with control characters."""
-    return Text(printable(cell))
+    """Return the lines of a cell as they are: neither as markup nor with control characters."""
+    return Text("\n".join(map(printable, cell.split("\n"))))
 
 
 def process_table(processes: Processes) -> Table:

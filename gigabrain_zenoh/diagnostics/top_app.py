@@ -18,6 +18,7 @@ from gigabrain_zenoh.diagnostics.top import (
     sorted_rows,
 )
 from gigabrain_zenoh.host.signals import stop_signals
+from gigabrain_zenoh.host.terminal import printable
 
 PERIOD_S = 1.0
 COLUMNS = {"processes": PROCESS_COLUMNS, "topics": TOPIC_COLUMNS}
@@ -124,7 +125,7 @@ class TopApp(App[None]):
 
 
 def _text(cell: Cell) -> Text:
-    return Text(cell_text(cell), justify="left" if isinstance(cell, str) else "right")
+    return Text(printable(cell_text(cell)), justify="left" if isinstance(cell, str) else "right")
 
 
 async def watch(feed: Feed) -> None:

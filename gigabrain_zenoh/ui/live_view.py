@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gigabrain_zenoh.gate.causes import in_words
-from gigabrain_zenoh.host.terminal import LINES, Display, writer
+from gigabrain_zenoh.host.terminal import LINES, Display, printable, writer
 from gigabrain_zenoh.runtime.supervisor import Supervisor
 from gigabrain_zenoh.ui.run_report import RunMonitor
 
@@ -86,7 +86,7 @@ class HeadlessView:
             return
         self._next = watch.seconds + LINE_INTERVAL_S
         of = f"/{self._seconds:.0f}" if self._seconds else ""
-        does = doing(watch, self._starting())
+        does = printable(doing(watch, self._starting()))
         line = f"{watch.seconds:6.1f}{of} s  {watch.distance_m:6.2f} m  {does}"
         if self._in_place:
             self._display.put(f"\r{line[:100]:<100}")
@@ -194,14 +194,14 @@ class LiveView:
                 str(status.pid or ""),
                 f"{health.cpu * 100:.1f} %" if health else "",
                 f"{health.rss_bytes / 1e6:.0f} MB" if health else "",
-                _activity(name, self._watch) if ready else "",
+                _line(_activity(name, self._watch) if ready else ""),
             )
         return table
 
 
-def _line(text: str, style: str, justify: Literal["left", "center"] = "left") -> Text:
-    """Return a line that ends in an ellipsis if it is too long."""
-    return Text(text, style=style, justify=justify, no_wrap=True, overflow="ellipsis")
+def _line(text: str, style: str = "", justify: Literal["left", "center"] = "left") -> Text:
+    """Return a line without markup that ends in an ellipsis if it is too long."""
+    return Text(printable(text), style=style, justify=justify, no_wrap=True, overflow="ellipsis")
 
 
 def doing(watch: RunMonitor, starting: str = "") -> str:

@@ -25,7 +25,7 @@ from gigabrain_zenoh.errors import GigabrainError, Refused
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.host.posix import termios
-from gigabrain_zenoh.host.terminal import Display
+from gigabrain_zenoh.host.terminal import Display, printable
 
 PERIOD_S = 0.05
 KEYS_HELP = (
@@ -265,7 +265,7 @@ class TeleopStation:
                     self._robot.steer(wanted)
                 if body.joints:
                     self._jog(body, loop.time())
-                display.put(Text("\n".join(self._lines(wanted))))
+                display.put(Text("\n".join(map(printable, self._lines(wanted)))))
                 await asyncio.sleep(PERIOD_S)
 
     def _jog(self, body: BodyDescription, now_s: float) -> None:

@@ -1,9 +1,13 @@
 """RunMonitor counts the way, repeats lost queries, and notices a brain that is held up by load."""
 
 import asyncio
+import io
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
+from rich.console import Console, RenderableType
 
 from gigabrain_schemas.base import Cause, Pose, Velocity
 from gigabrain_schemas.body import GateMode, GateStatus, RobotState
@@ -12,8 +16,9 @@ from gigabrain_schemas.examples import example
 from gigabrain_schemas.requests import DescribeRequest, Description
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import DESCRIBE, INTENT, SAFETY, STATE
+from gigabrain_zenoh.diagnostics.discovery import plain_table
 from gigabrain_zenoh.testing.in_memory import Net
-from gigabrain_zenoh.ui.live_view import _activity
+from gigabrain_zenoh.ui.live_view import HeadlessView, LiveView, _activity
 from gigabrain_zenoh.ui.run_report import RunMonitor
 
 
@@ -88,3 +93,40 @@ async def test_each_look_adds_the_way_since_the_last_and_counts_turns_that_begin
     assert watch.start_times.state_s is not None
     assert watch.start_times.motion_s is not None
     assert watch.start_times.metre_s is None
+
+
+NASTY = "avoid [left], [/], \x1b[2J"  # markup of rich, and a control sequence of the terminal
+SHOWN = r"avoid [left], [/], \x1b[2J"
+
+
+def text_of(shown: RenderableType) -> str:
+    console = Console(width=200, force_terminal=True, color_system=None, file=io.StringIO())
+    with console.capture() as capture:
+        console.print(shown)
+    return capture.get()
+
+
+def test_a_table_shows_names_as_they_are() -> None:
+    assert SHOWN in text_of(plain_table(("process",), [(NASTY,)], left=("process",)))
+
+
+async def test_the_view_of_a_demo_shows_a_reason_as_it_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    net = Net()
+    watch = RunMonitor(net.one)
+    gate = GateStatus(mode="enabled", commander="control")
+    pose = Pose(x=0.0, y=0.0, yaw=0.0)
+    net.two.publish(STATE, RobotState(robot_type="any", pose=pose, velocity=Velocity(), gate=gate))
+    net.two.publish(INTENT, Intent(twist=Velocity(), behaviour="own", reason=NASTY))
+    supervisor: Any = SimpleNamespace(
+        statuses={"decision": SimpleNamespace(state="ready", restarts=0, pid=7)}
+    )
+    page = text_of(LiveView(watch, supervisor, "demo", (), None)._page())
+    assert page.count(SHOWN) == 2  # as headline, and beside decision
+    written: list[str] = []
+    monkeypatch.setattr("gigabrain_zenoh.ui.live_view.writer", lambda _: written.append)
+    monkeypatch.setattr("gigabrain_zenoh.ui.live_view.LINE_INTERVAL_S", 0.0)
+    with HeadlessView(watch, None) as headless:
+        headless.show()
+    assert SHOWN in "".join(written)
