@@ -108,8 +108,9 @@ class LiveView:
         starting: Starting = str,
     ) -> None:
         self._starting = starting
-        self._subtitle = f"{page} · Ctrl-C ends it" if page else "Ctrl-C ends it"
-        self._watch, self._supervisor, self._title = watch, supervisor, title
+        self._title = _line(title)
+        self._subtitle = _line(f"{page} · Ctrl-C ends it" if page else "Ctrl-C ends it")
+        self._watch, self._supervisor = watch, supervisor
         self._faults, self._seconds = faults, seconds
         # drawn on the loop's thread, so that all values are of one time
         self._live = Live(self._page(), screen=True, auto_refresh=False)

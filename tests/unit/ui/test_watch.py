@@ -19,6 +19,7 @@ from gigabrain_schemas.topics import DESCRIBE, INTENT, SAFETY, STATE
 from gigabrain_zenoh.diagnostics.discovery import plain_table
 from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.ui.live_view import HeadlessView, LiveView, _activity
+from gigabrain_zenoh.ui.page.node import INSTALL
 from gigabrain_zenoh.ui.run_report import RunMonitor
 
 
@@ -130,3 +131,11 @@ async def test_the_view_of_a_demo_shows_a_reason_as_it_is(
     with HeadlessView(watch, None) as headless:
         headless.show()
     assert SHOWN in "".join(written)
+
+
+async def test_the_view_of_a_demo_without_the_page_says_how_to_install_it() -> None:
+    supervisor: Any = SimpleNamespace(statuses={})
+    view = LiveView(RunMonitor(Net().one), supervisor, "[red] in a world", (), None, page=INSTALL)
+    shown = text_of(view._page())
+    assert "pip install 'gigabrain-zenoh[page]' · Ctrl-C ends it" in shown
+    assert "[red] in a world" in shown
