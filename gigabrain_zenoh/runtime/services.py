@@ -60,13 +60,15 @@ ASK_S = 2.0  # how long an answer may take; without other processes there is no 
 AGAIN_NS = 100_000_000  # until a process that has to exit, or refused to answer, is queried again
 TRIES = 10  # after this many refusals a process is ignored
 CONFIRM_NS = (1_000_000_000, 3_000_000_000)  # pauses before each query after the first
+INSTANCE_BITS = 62
+WEAKEST = 1 << INSTANCE_BITS  # instance of a process that exits
 
 
 class NameClaim:
     """A process's claim to its name."""
 
     def __init__(self, bus: Bus) -> None:
-        self._bus, self.instance = bus, secrets.randbits(62)
+        self._bus, self.instance = bus, secrets.randbits(INSTANCE_BITS)
         self.claim: Claim = "starting"
 
     async def acquire(self) -> None:
@@ -115,6 +117,7 @@ class NameClaim:
         others = [other for other in await self._answers() if other.instance != self.instance]
         for other in others:
             if _strength(other.claim, other.instance) > _strength(self.claim, self.instance):
+                self.claim, self.instance = "starting", WEAKEST  # it makes no other one exit
                 raise ConfigError(
                     f"a {name} is already running here (pid {other.pid} on {other.host}); "
                     "stop it, or give this robot a namespace of its own"
