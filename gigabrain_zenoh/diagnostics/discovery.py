@@ -245,7 +245,7 @@ def graph_positions(names: Iterable[str]) -> dict[str, tuple[float, float]]:
 
 def plain_table(
     columns: Sequence[str],
-    rows: Iterable[Sequence[str]],
+    rows: Iterable[Sequence[str | Text]],
     *,
     left: Collection[str],
     wraps: Collection[str] = (),
@@ -259,13 +259,13 @@ def plain_table(
         justify: Literal["left", "right"] = "left" if name in left else "right"
         table.add_column(name, justify=justify, no_wrap=name not in wraps)
     for row in rows:
-        table.add_row(*map(plain, row))
+        table.add_row(*(plain(cell) if isinstance(cell, str) else cell for cell in row))
     return table
 
 
 def plain(cell: str) -> Text:
-    """Return the lines of a cell as they are: neither as markup nor with control characters."""
-    return Text("\n".join(map(printable, cell.split("\n"))))
+    """Return a cell of any origin as it is: neither as markup nor with control characters."""
+    return Text(printable(cell))
 
 
 def process_table(processes: Processes) -> Table:

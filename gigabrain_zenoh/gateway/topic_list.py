@@ -6,10 +6,11 @@ from typing import Literal
 
 from msgspec import Struct
 from rich.table import Table
+from rich.text import Text
 
 from gigabrain_schemas.topics import DEPTH, HEALTH, IMAGE, SAFETY
 from gigabrain_zenoh.config.settings import Ros2Link
-from gigabrain_zenoh.diagnostics.discovery import plain_table
+from gigabrain_zenoh.diagnostics.discovery import plain, plain_table
 from gigabrain_zenoh.gateway.publishing import COMMANDED, table
 from gigabrain_zenoh.ros2.graph import ACTION, troubles
 from gigabrain_zenoh.ros2.transport import EndpointKind, GraphEndpoint
@@ -87,8 +88,8 @@ def topic_table(listed: Iterable[TopicRow]) -> Table:
     return plain_table(COLUMNS, cells, left=COLUMNS, wraps=COLUMNS[2:])
 
 
-def _lines(texts: Collection[str]) -> str:
-    return "\n".join(texts) or "-"
+def _lines(texts: Collection[str]) -> Text:
+    return Text("\n").join(map(plain, texts)) or Text("-")
 
 
 def _group(one: GraphEndpoint, all_topics: bool) -> tuple[str, Kind, str] | None:
