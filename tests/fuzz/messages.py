@@ -89,7 +89,8 @@ def looked_at(picture: DepthImage) -> None:
         return  # such a camera takes as long as it takes
     camera = Camera(name="front", depth=True, width=picture.width, height=picture.height, z=0.1)
     pictures = {"front": Picture(image=replace(picture, basis=1))}
-    seen = Cameras().then(replace(WAFFLE, cameras=(camera,)), pictures, state(1), PoseHistory())
+    history = PoseHistory().then(state(1))
+    seen = Cameras().then(replace(WAFFLE, cameras=(camera,)), pictures, state(1), history)
     assert seen.pictures == 1
     assert len(seen.obstacles(HERE)) <= MAX_POINTS
 
