@@ -315,6 +315,12 @@ def test_a_world_file_may_name_what_is_in_the_home(
     assert (len(world.shapes), len(world.outlines)) == (5, 4)
 
 
+def test_the_floor_of_a_model_may_be_below_what_an_arm_stands_on(tmp_path: Path) -> None:
+    floor = "<geom type='plane' size='1 1 1' pos='0 0 -.75'/>"
+    path = written(tmp_path / "table.xml", f"<mujoco><worldbody>{floor}</worldbody></mujoco>")
+    assert load_world(path, 0)
+
+
 def test_a_model_and_a_world_file_are_one_world(tmp_path: Path) -> None:
     written(tmp_path / "office.xml", MODEL)
     text = "model: office.xml\nstart: [0, 0, 0]\nboxes:\n  - {at: [1, 0], size: [0.2, 0.2, 0.5]}\n"

@@ -62,11 +62,11 @@ def measured(world: World) -> World:
         raise ConfigError(f"{world.model}: {model.nbody} bodies; expected at most {MAX_BODIES}")
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    heights = _floor_heights(model, data)
-    if heights and min(map(abs, heights)) > LOW_M:
+    lowest = min(_floor_heights(model, data), default=0.0)
+    if lowest > LOW_M:
         raise ConfigError(
-            f"{world.model}: its floor is at a height of {heights[0]:g} m; expected 0, where "
-            "robots start"
+            f"{world.model}: its floor is at a height of {lowest:g} m; expected 0, where robots "
+            "start, or less for an arm that stands on something"
         )
     outlines = _outlines(model, data)
     if not all(abs(value) <= MAX_EXTENT_M for one in outlines for value in _bounds(one)):
