@@ -18,8 +18,8 @@ import msgspec
 from gigabrain_schemas.safety import LogRecord
 from gigabrain_zenoh import errors
 from gigabrain_zenoh.errors import GigabrainError
+from gigabrain_zenoh.host.escaping import printable
 from gigabrain_zenoh.host.run_folders import unwritable_runs
-from gigabrain_zenoh.host.terminal import printable
 
 LEVELS: Final = ("debug", "info", "warning", "error", "critical")
 _SHOWN_APART = frozenset({"t", "level", "process", "event", "text", "traceback"})

@@ -235,8 +235,8 @@ def _call(words: "Sequence[str]") -> object:
 
     from gigabrain_zenoh.config.renames import renamed_arguments
     from gigabrain_zenoh.errors import ConfigError, GigabrainError
+    from gigabrain_zenoh.host.escaping import printable
     from gigabrain_zenoh.host.signals import interrupts
-    from gigabrain_zenoh.host.terminal import printable
 
     if {*words[:1]} & SUPERVISING and not {*words} & {"--help", "-h"}:
         from gigabrain_zenoh.runtime.forking import start_early

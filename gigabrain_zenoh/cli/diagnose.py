@@ -16,8 +16,8 @@ from gigabrain_zenoh.cli.options import (
     print_line,
 )
 from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError
+from gigabrain_zenoh.host.escaping import printable_json
 from gigabrain_zenoh.host.signals import run_async
-from gigabrain_zenoh.host.terminal import printable_json
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.diagnostics.log_reader import Line

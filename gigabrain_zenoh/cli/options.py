@@ -23,8 +23,8 @@ from cyclopts import (
 )
 
 from gigabrain_zenoh.errors import ConfigError, GigabrainError
+from gigabrain_zenoh.host.escaping import printable, printable_json
 from gigabrain_zenoh.host.signals import run_async
-from gigabrain_zenoh.host.terminal import printable, printable_json
 
 if TYPE_CHECKING:
     from msgspec import Struct

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from gigabrain_schemas.tasks import TaskStatus
 from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, on_bus, print_line
 from gigabrain_zenoh.errors import ConfigError, Refused
-from gigabrain_zenoh.host.terminal import printable
+from gigabrain_zenoh.host.escaping import printable
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.client.tasks import Tasks

@@ -20,7 +20,7 @@ from gigabrain_zenoh.bus.key_expressions import check_key_expression, matches
 from gigabrain_zenoh.bus.listening import topic_of
 from gigabrain_zenoh.diagnostics.robot_view import ProcessHealth
 from gigabrain_zenoh.errors import BodyLost, ConfigError, UnknownName, unknown
-from gigabrain_zenoh.host.terminal import printable
+from gigabrain_zenoh.host.escaping import printable
 
 PREFIX = "robot/"
 COMMAND_OF_SERVICE = {  # services that people take for topics, and the commands that call them

@@ -16,7 +16,7 @@ from gigabrain_zenoh.bus.headers import is_json
 from gigabrain_zenoh.bus.listening import topic_of
 from gigabrain_zenoh.codec import DECODE_ERRORS, Codec
 from gigabrain_zenoh.errors import unknown
-from gigabrain_zenoh.host import terminal
+from gigabrain_zenoh.host import escaping
 
 MAX_LISTED = 8  # numbers; longer lists are summarised
 MAX_RAW_BYTES = 64  # shown of a payload that cannot be decoded
@@ -134,7 +134,7 @@ def lines(value: Any, indent: int = 0) -> Iterator[str]:
     """Yield the lines of a tree, similar to YAML."""
     pad = "  " * indent
     for name, inner in value.items():
-        shown = terminal.printable(name)
+        shown = escaping.printable(name)
         if isinstance(inner, Mapping) and inner:
             yield f"{pad}{shown}:"
             yield from lines(inner, indent + 1)
@@ -167,7 +167,7 @@ def in_a_line(value: Any) -> str:
         return "-"
     if isinstance(value, bool):
         return str(value).lower()
-    return terminal.printable(value) if value != "" else '""'
+    return escaping.printable(value) if value != "" else '""'
 
 
 def pick(value: Mapping[str, Any], fields: Sequence[str]) -> dict[str, Any]:
@@ -201,7 +201,7 @@ def _paths(value: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
 
 def as_json(value: Any) -> str:
     """Return a tree as JSON on one line."""
-    return terminal.printable_json(msgspec.json.encode(value, enc_hook=_encode_other).decode())
+    return escaping.printable_json(msgspec.json.encode(value, enc_hook=_encode_other).decode())
 
 
 def _encode_other(value: object) -> object:

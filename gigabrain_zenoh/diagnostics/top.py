@@ -10,7 +10,7 @@ from gigabrain_zenoh.bus.listening import topic_of
 from gigabrain_zenoh.diagnostics.discovery import short_name
 from gigabrain_zenoh.diagnostics.robot_view import ProcessHealth
 from gigabrain_zenoh.diagnostics.topic_stats import StreamStats, TopicMonitor
-from gigabrain_zenoh.host.terminal import printable
+from gigabrain_zenoh.host.escaping import printable
 
 BARS = "▁▂▃▄▅▆▇█"
 MAX_BARS = 20

@@ -17,8 +17,8 @@ from gigabrain_zenoh.diagnostics.top import (
     cell_text,
     sorted_rows,
 )
+from gigabrain_zenoh.host.escaping import printable
 from gigabrain_zenoh.host.signals import stop_signals
-from gigabrain_zenoh.host.terminal import printable
 
 PERIOD_S = 1.0
 COLUMNS = {"processes": PROCESS_COLUMNS, "topics": TOPIC_COLUMNS}

@@ -28,8 +28,8 @@ from gigabrain_zenoh.diagnostics.listener import RawMessage, Snapshot, messages,
 from gigabrain_zenoh.diagnostics.message_text import as_json, in_a_line, lines, pick, read
 from gigabrain_zenoh.diagnostics.topic_stats import StreamStats, monitored
 from gigabrain_zenoh.errors import BodyLost
+from gigabrain_zenoh.host.escaping import printable
 from gigabrain_zenoh.host.signals import stop_signals
-from gigabrain_zenoh.host.terminal import printable
 
 SILENCE_NOTICE_S = 2.0  # without a message, until the user gets a notice
 REPORT_PERIOD_S = 1.0

@@ -1,9 +1,8 @@
-"""A terminal: text written from a thread, lines typed in, control characters escaped."""
+"""A terminal: text written from a thread, and lines typed in."""
 
 import asyncio
 import contextlib
 import errno
-import json
 import os
 import queue
 import sys
@@ -86,19 +85,6 @@ class LineSplitter:
         """Return the rest after the last newline."""
         rest, self._rest = self._rest, b""
         return rest
-
-
-# own code: rich's strip_control_codes leaves ESC, which moves the cursor
-def printable(text: object) -> str:
-    """Return `text` with control characters escaped, so that it cannot move the cursor."""
-    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
-
-
-def printable_json(text: str) -> str:
-    """Return a line of JSON with control characters escaped; its value stays the same."""
-    if text.isprintable():
-        return text
-    return "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text)
 
 
 @contextlib.contextmanager

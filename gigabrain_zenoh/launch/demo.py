@@ -20,9 +20,9 @@ from gigabrain_zenoh.config.layers import Row
 from gigabrain_zenoh.config.settings import PageConfig
 from gigabrain_zenoh.errors import BodyLost, ConfigError
 from gigabrain_zenoh.host import files
+from gigabrain_zenoh.host.escaping import printable
 from gigabrain_zenoh.host.run_folders import new_run_dir
 from gigabrain_zenoh.host.signals import run_until, stop_signals
-from gigabrain_zenoh.host.terminal import printable
 from gigabrain_zenoh.launch.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.launch.merging import write_rows
 from gigabrain_zenoh.launch.specs import process_specs

@@ -29,8 +29,8 @@ from msgspec import Struct
 from gigabrain_schemas.topics import DEPTH, IMAGE, current_key
 from gigabrain_zenoh.bus.headers import Header, SequenceGaps, header_of
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.escaping import printable
 from gigabrain_zenoh.host.files import open_regular
-from gigabrain_zenoh.host.terminal import printable
 
 log = logging.getLogger(__name__)
 

@@ -16,9 +16,9 @@ from gigabrain_schemas.topics import BODY, TOPICS
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.key_expressions import key_expressions, matches
 from gigabrain_zenoh.config.settings import RecorderConfig
+from gigabrain_zenoh.host.escaping import printable
 from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.host.signals import stop_signals
-from gigabrain_zenoh.host.terminal import printable
 from gigabrain_zenoh.recording.recorder import Recorder, Status, unused_path
 from gigabrain_zenoh.recording.recovery import recover_all
 from gigabrain_zenoh.runtime.connect import Where, connect

@@ -41,7 +41,7 @@ from gigabrain_zenoh.config.renames import renamed_settings
 from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate.gate import BRAIN
-from gigabrain_zenoh.host.terminal import printable
+from gigabrain_zenoh.host.escaping import printable
 from gigabrain_zenoh.recording.bag_reader import Bag, Sample, samples
 from gigabrain_zenoh.recording.message_tables import message_of, row
 from gigabrain_zenoh.runtime.replay import Event, Node, replay

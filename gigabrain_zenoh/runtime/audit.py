@@ -21,8 +21,8 @@ from gigabrain_schemas.logs import AuditPage, AuditRecord, AuditRequest, What
 from gigabrain_schemas.topics import AUDIT, AUDIT_LOG
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.escaping import printable, printable_json
 from gigabrain_zenoh.host.files import read_bounded
-from gigabrain_zenoh.host.terminal import printable, printable_json
 from gigabrain_zenoh.host.threads import BackgroundWriter
 from gigabrain_zenoh.logs import Fault
 

@@ -12,7 +12,8 @@ from rich.table import Table
 from rich.text import Text
 
 from gigabrain_zenoh.gate.causes import in_words
-from gigabrain_zenoh.host.terminal import LINES, Display, printable, writer
+from gigabrain_zenoh.host.escaping import printable
+from gigabrain_zenoh.host.terminal import LINES, Display, writer
 from gigabrain_zenoh.runtime.supervisor import Supervisor
 from gigabrain_zenoh.ui.run_report import RunMonitor
 

@@ -24,8 +24,9 @@ from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.errors import GigabrainError, Refused
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.geometry.limits import ZERO
+from gigabrain_zenoh.host.escaping import printable
 from gigabrain_zenoh.host.posix import termios
-from gigabrain_zenoh.host.terminal import Display, printable
+from gigabrain_zenoh.host.terminal import Display
 
 PERIOD_S = 0.05
 KEYS_HELP = (

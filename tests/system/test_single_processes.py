@@ -79,6 +79,7 @@ async def test_of_two_drivers_that_start_together_exactly_one_stays(home: Home) 
         assert [(one.pid, one.claim) for one in replies] == [(stays.pid, "settled")]
 
 
+@pytest.mark.slow
 async def test_a_process_that_was_replaced_while_it_was_stopped_leaves(home: Home) -> None:
     where = f"tcp/127.0.0.1:{free_port()}"
     router = home.start("router", "--listen", where)
