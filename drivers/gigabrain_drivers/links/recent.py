@@ -10,19 +10,24 @@ FIRST_AGE_NS = 30_000_000_000  # the same for the first value, whose period is n
 
 
 class Recent(Generic[T]):
-    """The newest of the values that a device repeats. It expires after three of its periods."""
+    """The newest of the values that a device repeats. It expires after three of its periods.
 
-    def __init__(self) -> None:
+    But not before `min_age_ns`, and at the latest after `first_age_ns`.
+    """
+
+    def __init__(self, min_age_ns: int = MIN_AGE_NS, first_age_ns: int = FIRST_AGE_NS) -> None:
+        self._min_age_ns, self._first_age_ns = min_age_ns, first_age_ns
         self._value: T | None = None
-        self._came_ns, self._max_age_ns = 0, FIRST_AGE_NS
+        self._came_ns, self._max_age_ns = 0, first_age_ns
 
     def put(self, value: T, now_ns: int) -> None:
         """Take a new value."""
         if self.get(now_ns) is None:
-            self._max_age_ns = FIRST_AGE_NS
+            self._max_age_ns = self._first_age_ns
         else:  # at least half of what it was: after a delay, several values come at once
             period_ns = now_ns - self._came_ns
-            self._max_age_ns = max(PERIODS * period_ns, MIN_AGE_NS, self._max_age_ns // 2)
+            age_ns = max(PERIODS * period_ns, self._min_age_ns, self._max_age_ns // 2)
+            self._max_age_ns = min(age_ns, self._first_age_ns)
         self._value, self._came_ns = value, now_ns
 
     def get(self, now_ns: int) -> T | None:

@@ -237,6 +237,23 @@ async def test_a_body_is_lost_once_a_line_with_its_velocity_comes_no_more(
         assert await connected_without(None)
 
 
+@pytest.mark.parametrize("every", [5, 8])  # of the quick one's lines, 20 ms each
+async def test_a_body_is_there_although_one_line_of_its_velocity_is_slower(every: int) -> None:
+    clock = FakeClock()
+    options = replace(TWO_LINES, state=("V,{linear_x}\n", "G,{angular_z}\n"))
+    driver = LineDriver(ROBOT, options, Run(folder=Path(), link="real"), clock=clock)
+    quick, slow = options.state_templates()
+    connected = list[bool]()
+    for n in range(300):
+        driver.link.on_bytes(quick.encode({}))
+        if n % every == 0 and n < 200:
+            driver.link.on_bytes(slow.encode({}))
+        await clock.advance(20 * MS)
+        connected.append((await driver.read_state()).link.connected)
+    assert all(connected[:200])
+    assert not any(connected[240:])
+
+
 FLAGGED = replace(TWO_LINES, state=(TWO_LINES.state[0], "F,{flags}\n"), flags=("estop", "bumper"))
 
 

@@ -25,6 +25,7 @@ from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.lidars.base import ScanSource, open_lidar
 from gigabrain_drivers.links.frames import Spelling, Wording
 from gigabrain_drivers.links.link import Liveness
+from gigabrain_drivers.links.recent import Recent
 from gigabrain_drivers.links.serial_link import SerialLink
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import RobotState
@@ -37,6 +38,7 @@ log = logging.getLogger(__name__)
 
 MISSED_LINES = 3  # state lines in a row, and the body counts as lost
 MIN_TIMEOUT_NS = 100_000_000
+MAX_TIMEOUT_NS = 500_000_000  # of a line that is slower than the others
 REPEAT_SHARE = 0.9  # of the repetition's period: ticks are not that even
 NO_VALID_LINE = (
     "no valid line comes, or one that is part of the velocity is missing: "
@@ -69,9 +71,11 @@ class LineDriver(Driver):
         self.link.on_bytes, self.link.on_open = self._received, self._opened
         self.link.on_lost = self._lost
         self._report = LineReport(options, robot, base)
-        self._velocity_fields = velocity_fields(options, robot)
-        self._awaited = set(self._velocity_fields)  # until all have come once more
         silent_ns = max(round(MISSED_LINES / options.state_hz * 1e9), MIN_TIMEOUT_NS)
+        self._parts = {  # of the velocity
+            name: Recent[float](silent_ns, max(silent_ns, MAX_TIMEOUT_NS))
+            for name in velocity_fields(options, robot)
+        }
         self._liveness = Liveness(self.link, self._clock, silent_ns, NO_VALID_LINE, log)
         self._repeat_ns = round(REPEAT_SHARE / options.command_hz * 1e9)
         self._started = False  # whether start went out and no stop since: then a stop is owed
@@ -174,7 +178,6 @@ class LineDriver(Driver):
     def _opened(self) -> None:
         """Start again on a new line; nothing is sent before the body reports."""
         self._decoder.clear()
-        self._awaited = set(self._velocity_fields)
         self._report.restart()
         self._liveness.reset()
 
@@ -186,20 +189,19 @@ class LineDriver(Driver):
         now_ns = self._clock.now_ns()
         for values in self._decoder.feed(data):
             self._report.update(values, now_ns)
-            if self._completes(values) and self._liveness.mark_received():
+            if self._is_whole(values, now_ns) and self._liveness.mark_received():
                 # after a boot or a loss: at rest, whatever was commanded
                 self._sent_ns = 0
                 self._send_zero()
             self._log_flags()
         self.link.errors = self._decoder.errors
 
-    def _completes(self, values: Mapping[str, float]) -> bool:
-        """Return whether all that the velocity follows from has come since that was last so."""
-        self._awaited -= values.keys()
-        if self._awaited:
-            return False
-        self._awaited = set(self._velocity_fields)
-        return True
+    def _is_whole(self, values: Mapping[str, float], now_ns: int) -> bool:
+        """Return whether a line reports motion, and no other part of the velocity is overdue."""
+        own = self._parts.keys() & values.keys()
+        for name in own:
+            self._parts[name].put(values[name], now_ns)
+        return bool(own) and all(part.get(now_ns) is not None for part in self._parts.values())
 
     def _bumpers(self) -> tuple[bool, ...]:
         """The flags whose names begin with `bumper`."""
