@@ -42,7 +42,7 @@ def estop(*, at: RobotAddress = LOCAL, reason: str = "") -> None:
     Args:
         reason: Reason, for the audit log.
     """
-    if at.keys and not os.path.isdir(at.keys):
+    if at.keys and not os.path.isdir(os.path.expanduser(at.keys)):
         print_progress(f"no folder {at.keys}: tried without keys")
         at = replace(at, keys=None)
     try:

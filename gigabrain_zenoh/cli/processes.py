@@ -108,11 +108,11 @@ def router(
     if not keys and not insecure:
         _refuse_exposed(listen)
     settings = router_config(endpoint, run_folders.state_dir() / "robots" / (namespace or "router"))
-    near = reached_at(listen[0])
+    near = reached_at(endpoint.listen[0])
     if keys:  # clients with keys take no IPv6 address
         near = near.replace("/[::1]:", "/localhost:")
     here = Endpoint(connect=(near,), namespace=namespace, keys=keys)
-    with announced(namespace or "router", secured(here)):
+    with announced(namespace or "router", here):
         return process.run_at(endpoint, "router", msgspec.to_builtins(settings))
 
 

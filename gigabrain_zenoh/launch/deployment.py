@@ -303,29 +303,30 @@ def with_free_port(deployment: Deployment) -> Deployment:
 
 
 def client_endpoint(deployment: Deployment, host: str = "") -> Endpoint:
-    """Return the endpoint at which the processes of `host` connect. Raises ConfigError."""
-    keys = str(identity_folder(deployment.keys, host)) if deployment.keys else ""
-    return secured(
-        Endpoint(connect=(deployment.router,), namespace=deployment.namespace, keys=keys)
-    )
+    """Return the endpoint at which clients of the robot connect. Raises ConfigError."""
+    return _endpoint(deployment, host, deployment.router)
 
 
 def local_endpoint(deployment: Deployment, host: str) -> Endpoint:
     """Return the endpoint for `host` itself: with keys the Unix socket of its own router, if any.
 
-    No other machine can interfere there.
+    No other machine can interfere there. Raises ConfigError.
     """
-    endpoint = client_endpoint(deployment, host)
-    if not endpoint.keys or "router" not in deployment.hosts[host]:
-        return endpoint
-    return msgspec.structs.replace(endpoint, connect=(local_socket(), *endpoint.connect))
+    near = deployment.keys and "router" in deployment.hosts[host]
+    connect = (local_socket(), deployment.router) if near else (deployment.router,)
+    return _endpoint(deployment, host, *connect)
+
+
+def _endpoint(deployment: Deployment, host: str, *connect: str) -> Endpoint:
+    keys = str(identity_folder(deployment.keys, host)) if deployment.keys else ""
+    return secured(Endpoint(connect=connect, namespace=deployment.namespace, keys=keys))
 
 
 def check_keys(deployment: Deployment, host: str) -> None:
     """Check that the identity of `host` permits its processes. Raises ConfigError."""
     if not deployment.keys:
         return
-    client_endpoint(deployment, host)  # refuse an address for which no keys would do
+    local_endpoint(deployment, host)  # refuse an address for which no keys would do
     folder = identity_folder(deployment.keys, host)
     rows = {name: deployed_type(deployment, name) for name in deployment.hosts[host]}
     ours = {name: row.roles for name, row in rows.items() if not row.own}

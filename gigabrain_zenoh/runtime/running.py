@@ -151,7 +151,7 @@ def find_endpoint(connect: str | None, namespace: str = "", keys: str = "") -> E
     endpoint = find_running(namespace).endpoint
     if identity and endpoint.connect[-1].startswith(SECURE):
         return structs.replace(endpoint, connect=endpoint.connect[-1:], keys=identity)
-    if identity:
+    if identity and not os.path.isdir(identity):
         check_files(Path(identity))  # not needed here, but a typo is one everywhere
     return endpoint
 

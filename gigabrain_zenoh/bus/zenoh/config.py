@@ -78,6 +78,7 @@ def _at_ingress(name: str, message: str, keys: list[str]) -> Rule:
 # variable is documented by Zenoh (zenoh_runtime::ZRuntime); a value set by the user wins.
 ZENOH_RUNTIME = "(rx: (handover: app), acc: (handover: app), net: (handover: app))"
 SECURE, PLAIN = "tls/", "tcp/"
+IPV6 = f"{SECURE}[", f"{PLAIN}["
 ROOMY = ("real_time", "interactive_high", "data_high", "data")
 PENDING = 4000  # links that may wait to be accepted; silent ones are dropped after a second
 
@@ -184,12 +185,12 @@ def secured(endpoint: Endpoint) -> Endpoint:
     for text in texts:
         if not text.startswith((SECURE, PLAIN)) and not LOCAL_ENDPOINT.fullmatch(text):
             raise ConfigError(f"{text!r}: with keys, expected one like tls/192.168.1.10:7447")
-    for text in endpoint.connect:  # zenoh 1.10 takes it for an invalid DNS name, and would wait
-        if text.startswith((f"{SECURE}[", f"{PLAIN}[")):
-            raise ConfigError(
-                f"{text!r}: with keys, Zenoh connects to no IPv6 address; "
-                "give the host's name, or its IPv4 address"
-            )
+    # zenoh 1.10 takes it for an invalid DNS name, and would wait
+    if endpoint.connect and all(text.startswith(IPV6) for text in endpoint.connect):
+        raise ConfigError(
+            f"{endpoint.connect[0]!r}: with keys, Zenoh connects to no IPv6 address; "
+            "give the host's name, or its IPv4 address"
+        )
     return structs.replace(
         endpoint,
         connect=tuple(_secure(text) for text in endpoint.connect),

@@ -72,7 +72,10 @@ def test_a_folder_of_keys_that_is_not_there_is_refused_where_the_robot_has_none(
         with pytest.raises(ConfigError, match="operater: no folder with keys; make an identity"):
             find_endpoint(None, keys=str(tmp_path / "operater"))
         new_fleet("home", tmp_path / "home")
-        assert find_endpoint(None, keys=str(issue(tmp_path / "home", "operator"))) == HERE
+        identity = issue(tmp_path / "home", "operator")
+        assert find_endpoint(None, keys=str(identity)) == HERE
+        (identity / "ca.crt").unlink()  # a stop must not fail for what is not needed
+        assert find_endpoint(None, keys=str(identity)) == HERE
 
 
 def test_an_estop_is_tried_without_a_folder_of_keys_that_is_not_there(
@@ -85,10 +88,11 @@ def test_an_estop_is_tried_without_a_folder_of_keys_that_is_not_there(
         raise BusError("no robot")
 
     monkeypatch.setattr(connection, "connect", connect)
-    for keys in (tmp_path / "operater", tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for keys in (tmp_path / "operater", tmp_path, Path("~")):
         with pytest.raises(NotConfirmed, match="no robot"):
             estop(at=RobotAddress(keys=keys))
-    assert tried == ["", str(tmp_path)]
+    assert tried == ["", str(tmp_path), "~"]
     assert capsys.readouterr().err == f"no folder {tmp_path / 'operater'}: tried without keys\n"
 
 

@@ -15,12 +15,14 @@ from gigabrain_zenoh.launch.deployment import (
     check_keys,
     client_endpoint,
     load_deployment,
+    local_endpoint,
 )
 from gigabrain_zenoh.launch.processes import grants, names_by_role
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.runtime.running import find_endpoint
 
 ROOT = Path(__file__).parents[3]
+APART = {"robot": ("router", "driver"), "brain": ("decision",)}
 
 
 def test_with_keys_everything_is_tls_and_without_nothing_is(fleet: Path) -> None:
@@ -40,7 +42,7 @@ def test_an_ipv6_address_that_zenoh_would_wait_for_is_refused(fleet: Path, at: s
     with pytest.raises(ConfigError, match=refusal):
         session_config(Endpoint(connect=(at,), keys=str(fleet / "operator")))
     with pytest.raises(ConfigError, match=refusal):
-        check_keys(Deployment(router=at, keys=str(fleet / "robot@red")), "robot")
+        check_keys(Deployment(router=at, keys=str(fleet / "brain@red"), hosts=APART), "brain")
     named = Endpoint(connect=("tls/robot.lan:7447",), keys=str(fleet / "operator"))
     assert session_config(named)["connect/endpoints"] == ["tls/robot.lan:7447"]
     assert session_config(Endpoint(connect=("tcp/[fd00::1]:7447",)))["mode"] == "client"
@@ -59,6 +61,27 @@ def test_a_router_with_keys_may_listen_on_all_ipv6_addresses(
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     router(listen=("tls/[::]:7447",), fleet=("red",), process=HostOptions(keys=fleet / "router"))
     assert [one.connect for one in found] == [("tls/localhost:7447",)]
+
+
+def test_beside_its_router_no_process_needs_the_ipv6_address_of_it(fleet: Path) -> None:
+    keys, at = str(fleet / "robot@red"), "tls/[fd00::1]:7447"
+    near = local_endpoint(Deployment(router=at, keys=keys, hosts=APART), "robot")
+    assert session_config(near)["connect/endpoints"][1:] == [at]
+
+
+def test_a_router_with_keys_may_listen_on_one_ipv6_address(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: list[Endpoint] = []
+
+    def run_at(_: object, endpoint: Endpoint, *__: object) -> int:
+        found.append(endpoint)
+        return 0
+
+    monkeypatch.setattr(HostOptions, "run_at", run_at)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    router(listen=("tcp/[fd00::5]:7447",), process=HostOptions(keys=fleet / "router"))
+    assert [one.listen for one in found] == [("tls/[fd00::5]:7447",)]
 
 
 @pytest.mark.parametrize(
