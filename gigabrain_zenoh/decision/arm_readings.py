@@ -8,8 +8,10 @@ from typing import Literal
 import numpy as np
 
 from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_zenoh.decision.tasks.arm_steps import NamedPosture
+from gigabrain_zenoh.geometry.pose import relative
 from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold, Plan
 from gigabrain_zenoh.manipulation.joint_trajectory import JointTrajectory
 from gigabrain_zenoh.manipulation.phases import Phase
@@ -18,6 +20,7 @@ GRIPS = 0.1  # of the gripper's greatest speed, above which it moves: an encoder
 MOVED = 0.02  # [rad] or [m] off the beginning of a plan: it was made for another posture
 SENT = 0.01  # of the gripper's range, within which it was sent to its target
 AT_THINGS = ("descend", "press", "lift", "retreat")  # phases in which an arm moves at a thing
+BASE_M, BASE_RAD = 0.03, 0.05  # by which a base moves at most that stands
 REGRIP = 0.12  # of its range, by which a grip changes at most while something is held
 
 
@@ -63,8 +66,13 @@ def begins_at(plan: Plan, posture: Floats) -> bool:
     return first is None or bool(np.abs(first.positions[0] - posture).max() < MOVED)
 
 
-def is_at(left: Plan, planner: ArmPlanner, body: BodyDescription, state: RobotState) -> bool:
-    """Return whether the arm was sent to a posture on a plan's last way to its thing."""
+def is_at(
+    left: Plan, base: Pose, planner: ArmPlanner, body: BodyDescription, state: RobotState
+) -> bool:
+    """Return whether the arm is on a plan's last way to its thing, and the body still at `base`."""
+    off = relative(base, state.pose)
+    if math.hypot(off.x, off.y) > BASE_M or abs(off.yaw) > BASE_RAD:
+        return False
     if len(state.joints_sent) != len(body.joints):
         return False
     slack = MOVED + np.array([joint.gains.max_correction for joint in planner.arm.joints])

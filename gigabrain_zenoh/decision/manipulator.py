@@ -7,7 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 from msgspec.structs import replace
 
-from gigabrain_schemas.base import TICK_S
+from gigabrain_schemas.base import TICK_S, Pose
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import Intent, JointTarget
 from gigabrain_schemas.objects import SeenSolid
@@ -113,6 +113,7 @@ class Manipulator:
         # the same of earlier commands, which go on after a task that came first
         self._results: deque[StepOutcome] = deque(maxlen=MAX_RESULTS)
         self._left: Plan | None = None  # whose thing the hand is still at, without holding it
+        self._base = Pose(x=0.0, y=0.0, yaw=0.0)  # of the body when the arm moved last
         self._interim = False  # it goes back from there, or out of a camera's sight
         self._why_not = ""  # why it fails once it is back
         self._touch: Touch | None = None  # while it presses, or offers something
@@ -163,6 +164,8 @@ class Manipulator:
             planner = self._ready(body)
         except GigabrainError as error:
             return self._fail(str(error))
+        if self._run:
+            self._base = state.pose
         measured = {joint.name for joint in body.joints} <= {joint.name for joint in state.joints}
         if self._recalls and planner and measured and not held:
             self._recall(planner, body, state, self._recalls)
@@ -179,8 +182,9 @@ class Manipulator:
             return self._still(NO_MODEL)
         if not measured:
             return self._still(NOT_MEASURED)
-        if self._run is None and self._left and not is_at(self._left, planner, body, state):
-            self._left = None  # an operator has moved the arm
+        near = self._left and is_at(self._left, self._base, planner, body, state)
+        if self._run is None and not near:  # the base has driven off, or an operator has moved it
+            self._left = None
         if self._run is None and self._achieved.number and not self._left:
             return self._still(Idle("done", self._achieved.reason), self._achieved)
         try:

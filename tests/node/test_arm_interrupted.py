@@ -4,7 +4,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
+from gigabrain_schemas.base import Pose
 from gigabrain_schemas.brain import Intent, JointTarget
 from gigabrain_schemas.safety import JointCap
 from gigabrain_zenoh.decision.manipulator import HOLD_UPS
@@ -114,6 +116,29 @@ def test_a_command_that_fails_at_a_thing_leaves_the_next_one_to_go_back(rig: Rig
     rig.arm.caps, rig.phases = (), []
     assert rig.carry_out("do: [{posture: {shoulder_pan: 1.0}}]").state == "succeeded"
     assert rig.phases.index("retreat") < rig.phases.index("move")
+
+
+def test_a_way_back_that_is_interrupted_is_gone_on_with(rig: Rig) -> None:
+    rig.give(PLACE)
+    until(rig, "lift")
+    rig.take_away()
+    until(rig, "retreat")
+    rig.tick()
+    pause(rig)
+    rig.phases = []
+    until(rig, "retreat")
+    assert "move" not in rig.phases
+
+
+def test_an_arm_whose_base_has_driven_off_does_not_go_back(rig: Rig) -> None:
+    rig.give(PLACE)
+    until(rig, "descend")
+    rig.queue.cancel("", "ann")
+    rig.tick()
+    before, rig.phases = rig.arm.state, []
+    rig.arm.state = lambda: replace(before(), pose=Pose(x=0.1, y=0.0, yaw=0.0))  # type: ignore[method-assign]
+    assert rig.carry_out("do: [{posture: {shoulder_pan: 1.0}}]").state == "succeeded"
+    assert "retreat" not in rig.phases
 
 
 @pytest.mark.parametrize("paused", [False, True])
