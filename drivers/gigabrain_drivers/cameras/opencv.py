@@ -71,7 +71,7 @@ class OpenCvCamera(CameraSource):
             self._reads = 0
             picture = self._next(capture)
         if picture is None:
-            self._ended = self._file
+            self._ended = self._file and not self.options.repeat  # not all can be rewound
             end = "has ended" if self._file else "gives no picture"
             raise CameraLost(f"{self.options.device} {end}")
         return Frame(fitted(picture, self.camera.width, self.camera.height))

@@ -1,5 +1,6 @@
 """Pictures of files, and of recordings, come as those of a camera do."""
 
+import contextlib
 import time
 from collections.abc import Container
 from contextlib import closing
@@ -65,6 +66,18 @@ def test_a_film_is_shown_at_the_camera_s_rate_and_ends(tmp_path: Path, slept: li
     source.close()
     with pytest.raises(CameraLost, match=r"film.avi has ended"):
         source.open()  # as the process does after a loss
+
+
+@pytest.mark.usefixtures("slept")
+def test_what_cannot_be_rewound_is_opened_again_if_it_repeats(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "still.png"), np.full((48, 64, 3), GREYS[0], np.uint8))
+    source = camera(tmp_path, "still.png", repeat=True)
+    for _ in range(3):  # as the process does after a loss
+        source.open()
+        assert means(source, 1) == [GREYS[0]]
+        with contextlib.suppress(CameraLost):
+            source.read()
+        source.close()
 
 
 def test_a_film_goes_on_at_its_rate_after_the_process_was_stopped(
