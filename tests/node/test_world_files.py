@@ -315,6 +315,15 @@ def test_a_world_file_may_name_what_is_in_the_home(
     assert (len(world.shapes), len(world.outlines)) == (5, 4)
 
 
+@pytest.mark.parametrize(
+    "real", ["", "<geom name='floor' type='cylinder' size='5 .05' pos='0 0 -.05'/>"]
+)
+def test_a_plane_above_the_floor_is_no_floor(tmp_path: Path, real: str) -> None:
+    plane = f"<geom type='plane' size='.2 .2 1' pos='0 0 .75' contype='{int(bool(real))}'/>"
+    text = f"<mujoco><worldbody>{real}{plane}</worldbody></mujoco>"
+    assert load_world(written(tmp_path / "table.xml", text), 0)
+
+
 def test_the_floor_of_a_model_may_be_below_what_an_arm_stands_on(tmp_path: Path) -> None:
     floor = "<geom type='plane' size='1 1 1' pos='0 0 -.75'/>"
     path = written(tmp_path / "table.xml", f"<mujoco><worldbody>{floor}</worldbody></mujoco>")

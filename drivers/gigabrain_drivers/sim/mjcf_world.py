@@ -98,11 +98,18 @@ def has_floor(spec: mujoco.MjSpec) -> bool:
 
 
 def _floor_heights(model: mujoco.MjModel, data: mujoco.MjData) -> list[float]:
-    """Return the heights of all level floors that are planes or boxes [m]."""
+    """Return the heights of all level floors [m]; none where one is no plane or box."""
+    floors = [
+        (geom, kind)
+        for geom, kind in enumerate(model.geom_type.tolist())
+        if is_floor(model, geom) and model.geom_contype[geom]
+    ]
+    if any(kind not in (PLANE, BOX) for _, kind in floors):
+        return []
     return [
         float(data.geom_xpos[geom, 2] + (0.0 if kind == PLANE else model.geom_size[geom, 2]))
-        for geom, kind in enumerate(model.geom_type.tolist())
-        if kind in (PLANE, BOX) and is_floor(model, geom) and data.geom_xmat[geom, 8] > UPRIGHT
+        for geom, kind in floors
+        if data.geom_xmat[geom, 8] > UPRIGHT
     ]
 
 
