@@ -10,7 +10,7 @@ import importlib
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -51,12 +51,17 @@ def _as_if_missing(*names: str) -> Iterator[None]:
             del modules[name]
 
 
+unsaved: list[OSError] = []  # why kernels that this process has compiled are not on disk
+
+
 def _if_possible(save: Callable[..., None]) -> Callable[..., None]:
     """Return `save`, without its errors of the disk: numba would raise them from a kernel."""
 
     def saved(*arguments: object) -> None:
-        with suppress(OSError):
+        try:
             save(*arguments)
+        except OSError as error:
+            unsaved.append(error)
 
     return saved
 

@@ -20,7 +20,7 @@ from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.host.files import replace_file
 from gigabrain_zenoh.host.this_process import join_in
 from gigabrain_zenoh.host.threads import InTime, Job
-from gigabrain_zenoh.kernels import cache
+from gigabrain_zenoh.kernels import cache, jit
 from gigabrain_zenoh.plugins import find
 
 log = logging.getLogger(__name__)
@@ -201,7 +201,7 @@ def compile_all(warm_up: str) -> None:
     """Compile here, and mark it as done where it can be kept. Raises ModuleNotFoundError."""
     find(warm_up)()
     mark = cache.mark_of(warm_up)
-    if mark:
+    if mark and not jit.unsaved:
         with contextlib.suppress(OSError):  # read only, or full: as if nothing was kept
             replace_file(mark, b"compiled\n")
 
