@@ -118,6 +118,7 @@ def _taker(
         heard.take(message, time.time_ns(), now_s - first_s[0])
         try:
             convert(message)
+            heard.unusable = ""  # the first messages of a sensor may be empty
         except Unusable as error:
             heard.unusable = str(error)
 

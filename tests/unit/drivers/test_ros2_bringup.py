@@ -241,15 +241,25 @@ def test_frames_must_lead_to_the_base(
     assert text in found.text
 
 
-async def test_a_watch_tells_what_the_driver_could_not_use() -> None:
+@pytest.mark.parametrize(
+    ("last", "problem"), [(83.0, "its percentage is 83; expected 0 to 1"), (0.83, "")]
+)
+async def test_a_watch_tells_why_the_driver_drops_the_newest_message(
+    last: float, problem: str
+) -> None:
     kind, types = "sensor_msgs/msg/BatteryState", Types()
     network, given = MemoryNetwork(types), options(topics={"battery": {}})
     watching = asyncio.create_task(watch(network.transport(), types, given, 0.2))
     publisher = network.transport(Ros2Link(node="base")).publisher("battery_state", kind)
-    full = types.encode(kind, types.make(kind, voltage=12.0, percentage=83.0))
+    first, then = (
+        types.encode(kind, types.make(kind, voltage=12.0, percentage=share))
+        for share in (math.nan, last)
+    )
     while not watching.done():
-        publisher.publish(full)
+        publisher.publish(first)
+        publisher.publish(then)
         await asyncio.sleep(0.01)
     battery = (await watching).heard["battery"]
     assert battery.count > 0
-    assert battery.unusable.startswith("its percentage is 83; expected 0 to 1")
+    assert battery.unusable.startswith(problem)
+    assert bool(battery.unusable) == bool(problem)

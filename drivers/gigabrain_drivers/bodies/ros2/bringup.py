@@ -63,7 +63,7 @@ class Heard:
     child_frame: str = ""
     tilt: bool = True  # false of an inertial unit without orientation
     unreadable: str = ""  # why a message could not be decoded
-    unusable: str = ""  # why the driver drops a message
+    unusable: str = ""  # why the driver drops the newest message
 
     @property
     def hz(self) -> float:
