@@ -151,7 +151,8 @@ class BagWriter:
         self.written = 0  # messages on the disk
         self.first_ns = 0
         self.repeated_bytes = 0  # on the disk, of messages of earlier files
-        self.index_entries = 0  # held in memory until the end: one of each channel and chunk
+        self.index_entries = 0  # held in memory until the end: one of each chunk and channel in it
+        self._in_chunk: set[int] = set()  # channels of the messages since the last chunk
 
     @property
     def path(self) -> Path:
@@ -184,6 +185,7 @@ class BagWriter:
             self.pending[key] += not repeated
         self.first_ns = self.first_ns or log_ns
         stamp_ns = header.stamp_ns or log_ns
+        self._in_chunk.add(channel.id)
         self._writer.add_message(channel.id, log_ns, payload, stamp_ns, header.seq & 0xFFFF_FFFF)
         if channel.drawn and self._is_worth_drawing(channel.drawn, message):
             self._draw(channel.drawn, message)
@@ -224,7 +226,8 @@ class BagWriter:
         self._file.flush()
         if self._file.size != self._stored_bytes:
             self._stored_bytes = self._file.size
-            self.index_entries += len(self._channels) + len(self._view_channels)
+            self.index_entries += len(self._in_chunk)
+            self._in_chunk.clear()
             self.written += self.pending.total()
             self.pending = Counter()
 
@@ -269,6 +272,7 @@ class BagWriter:
         stamp_ns = received.header.stamp_ns or received.log_ns
         for drawn in self._drawer.draw(topic, message, received.key.rpartition("/")[2]):
             channel = self._view_channel(drawn)
+            self._in_chunk.add(channel)
             self._writer.add_message(channel, received.log_ns, drawn.data, stamp_ns)
 
     def _is_worth_drawing(self, topic: Topic[Any], message: ReceivedMessage) -> bool:
