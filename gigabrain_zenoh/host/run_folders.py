@@ -27,7 +27,8 @@ def hold(folder: Path, number: int = 0) -> None:
     """Mark a folder as in use until this process ends, and number it. Raises OSError."""
     lock = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o600)
     fcntl.flock(lock, fcntl.LOCK_EX)
-    os.write(lock, str(number).encode())
+    with contextlib.suppress(OSError):  # on a full disk it has no number
+        os.write(lock, str(number).encode())
 
 
 def past_runs(base: Path) -> list[Path]:

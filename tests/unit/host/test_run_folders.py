@@ -1,5 +1,6 @@
 """Old run folders are removed, but never one that is in use."""
 
+import errno
 import os
 import time
 from pathlib import Path
@@ -52,6 +53,18 @@ def test_runs_are_in_order_also_where_the_clock_has_stepped_back(
     monkeypatch.setattr(run_folders, "_in_use", lambda _: False)
     run_folders.prune(tmp_path, max_runs=3)
     assert run_folders.past_runs(tmp_path) == made[1:]
+
+
+def test_a_run_has_its_folder_where_a_full_disk_takes_no_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "write", full)
+    assert run_folders.past_runs(tmp_path) == []
+    new = run_folders.new_run_dir(tmp_path, "demo")
+    assert run_folders.past_runs(tmp_path) == [new]
 
 
 @pytest.mark.skipif(os.getuid() == 0, reason="root may remove anything")
