@@ -50,8 +50,8 @@ class GraphWatch:
         if shared := sorted(ours & {one.topic for one in theirs if not one.ours}):
             raise ConfigError(
                 f"ros2: {theirs[0].node}, whose body is a ROS 2 robot, uses {', '.join(shared)} "
-                "here as well: the robot's own commands and scans would come back to it; set "
-                "another `namespace:`, such as /gigabrain, or another `domain:`"
+                "here as well: that robot's commands and scans would come to this one, or back to "
+                "it; set another `namespace:`, such as /gigabrain, or another `domain:`"
             )
 
     def look(self) -> tuple[Cause, ...]:

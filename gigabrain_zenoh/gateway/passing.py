@@ -30,7 +30,7 @@ from gigabrain_zenoh.errors import BadPayload, ConfigError, Refused
 from gigabrain_zenoh.host.signals import run_until, stop_signals
 from gigabrain_zenoh.logs import Fault
 from gigabrain_zenoh.ros2.graph import troubles
-from gigabrain_zenoh.ros2.opening import ROUTER_S, open_transport
+from gigabrain_zenoh.ros2.opening import open_transport
 from gigabrain_zenoh.ros2.qos import LATCHED, Qos
 from gigabrain_zenoh.ros2.transport import GraphEndpoint, Received, RosTransport, absolute
 from gigabrain_zenoh.ros2.types import Types
@@ -375,8 +375,7 @@ async def pass_on(route: Route, where: Where, link: Ros2Link, types: Types) -> N
         else:
             check_writer(where.keys, route.key)
             bus = await stack.enter_async_context(connect(where, CLIENT_NAME))
-        opening = open_transport(own, types, timeout_s=ROUTER_S)
-        ros = await stack.enter_async_context(opening)
+        ros = await stack.enter_async_context(open_transport(own, types))
         passage = Passage(route, bus, ros, types, own, topic)
         log.info("passing %s", route)
         with stop_signals() as stop:

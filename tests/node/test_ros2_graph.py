@@ -145,8 +145,8 @@ async def test_a_gateway_ends_where_the_body_is_a_ros_robot_with_the_same_topics
     assert isinstance(error, ConfigError)
     assert str(error) == (
         "ros2: /gigabrain_driver, whose body is a ROS 2 robot, uses /cmd_vel, /scan here as well: "
-        "the robot's own commands and scans would come back to it; set another `namespace:`, such "
-        "as /gigabrain, or another `domain:`"
+        "that robot's commands and scans would come to this one, or back to it; set another "
+        "`namespace:`, such as /gigabrain, or another `domain:`"
     )
 
 
