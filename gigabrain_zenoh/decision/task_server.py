@@ -111,7 +111,7 @@ class TaskServer:
 
     @property
     def held(self) -> HeldThing | None:
-        """What the gripper is believed to hold."""
+        """Return the thing in the gripper, as far as decision knows."""
         return self._queue.held
 
     def unused(self, boot: int) -> bool:

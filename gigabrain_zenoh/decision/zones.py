@@ -27,7 +27,7 @@ class ZoneSource:
 
     @property
     def newest_loaded(self) -> int | None:
-        """How many maps were loaded by the newest message; None before the first."""
+        """Return the count of loaded maps in the newest message; None before the first."""
         return self._received[-1].maps_loaded if self._received else None
 
     def at(self, boot: int, tick: int) -> Zones:

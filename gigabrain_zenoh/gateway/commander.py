@@ -117,7 +117,7 @@ class Now(NamedTuple):
     ns: int  # by a clock that only goes forward
     ros_ns: int  # ROS time: Unix time, or that of the simulation
     unix_ns: int  # of this host
-    boot_ns: int  # by a clock of this host that nobody sets, and that a suspend does not stop
+    boot_ns: int  # since this host's start: setting the clock does not change it; suspends count
 
 
 class Sender(Struct, frozen=True):

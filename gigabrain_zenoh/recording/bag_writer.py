@@ -107,7 +107,7 @@ class AppendOnlyFile:
         return disk.f_bavail * disk.f_frsize
 
     def is_deleted(self) -> bool:
-        """Return whether the file has no name any more, so that nobody can read it."""
+        """Return whether the file was deleted from its folder."""
         return os.fstat(self._fd).st_nlink == 0
 
     def close(self) -> None:

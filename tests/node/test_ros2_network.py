@@ -10,7 +10,7 @@ WLAN = {"10.9.9.1"}
 
 
 async def joins(bench: Bench) -> bool:
-    """Let 3 s pass; return whether the driver has joined anew."""
+    """Let 3 s pass; return whether the driver has joined again."""
     before = bench.driver.link.transport
     for _ in range(30):
         await bench.pass_ms(100)

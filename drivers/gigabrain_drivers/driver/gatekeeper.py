@@ -218,7 +218,7 @@ class Gatekeeper:
         return gate.Outcome(text=done)
 
     def refuse_if_enabled(self) -> None:
-        """Raise Refused while somebody has the arm, or it comes to rest."""
+        """Raise Refused while the gate is enabled or stopping."""
         if self.state.mode in ("enabled", "stopping"):
             holder = self.state.commander or "the gate"
             raise Refused(f"{holder} holds the arm; press the e-stop first")

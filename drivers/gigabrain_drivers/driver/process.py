@@ -345,7 +345,7 @@ class DriverProcess:
     async def _on_limp(self, limp: bool) -> None:
         """Let go of the joints, or hold them where they are. Raises BodyLost where they do not.
 
-        Raises Refused where somebody was given the arm meanwhile: then it is held again.
+        If the gate is enabled meanwhile, it holds the joints again and raises Refused.
         """
         async with self._line:
             if limp:

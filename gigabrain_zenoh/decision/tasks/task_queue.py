@@ -212,7 +212,7 @@ class TaskQueue:
 
     @property
     def held(self) -> HeldThing | None:
-        """What the gripper is believed to hold."""
+        """Return the thing in the gripper, as far as decision knows."""
         return self._hand.held
 
     @property

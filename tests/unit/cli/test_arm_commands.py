@@ -1,4 +1,4 @@
-"""Where `gigabrain arm` sends joints, and what it shows of them."""
+"""Tests the positions that `gigabrain arm` sends and shows."""
 
 import math
 from collections.abc import AsyncIterator, Callable, Mapping
