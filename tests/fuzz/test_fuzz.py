@@ -38,6 +38,7 @@ def test_what_is_good_is_taken(name: str) -> None:
         MODULES[name].check(data)
 
 
+@pytest.mark.long
 @by_module
 def test_what_is_damaged_is_refused_or_still_right(name: str) -> None:
     module, chance = MODULES[name], random.Random(name)

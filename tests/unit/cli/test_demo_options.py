@@ -23,6 +23,7 @@ def test_both_arms_move_the_blocks_of_the_table_by_one_mission() -> None:
     assert RobotOptions(body="piper").values()["world"] == "table"
 
 
+@pytest.mark.long
 def test_a_mission_is_for_the_world_of_its_demo_and_for_no_real_arm() -> None:
     assert mission_of(body="piper", world="arena") == ""
     assert mission_of(body="piper", link="real") == ""

@@ -18,6 +18,7 @@ def test_the_table_of_commands_in_the_readme_is_current() -> None:
     assert user_texts.with_commands(readme) == readme
 
 
+@pytest.mark.long
 def test_every_command_has_help_with_an_example() -> None:
     text = user_texts.GOLDEN.read_text()
     for command in COMMANDS:

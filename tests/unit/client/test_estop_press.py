@@ -74,6 +74,7 @@ async def test_an_answer_from_a_gate_that_is_not_latched_confirms_nothing() -> N
     assert await press_estop(net.two) == LATCHED
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("answers", "why"), [((), "no driver answers"), (("its disk",) * 9, "its disk")]
 )

@@ -204,6 +204,7 @@ def test_a_second_door_that_somebody_stands_in_is_waited_for_as_well() -> None:
     assert max(pose.x for pose in poses) > 6.5
 
 
+@pytest.mark.long
 def test_it_tries_again_to_get_to_unexplored_space_and_then_ends() -> None:
     cells = np.full_like(empty(6.0, 4.0), 100)
     cells[1:-1, 1:-1] = 0
@@ -252,6 +253,7 @@ def ask(planner: RoutePlanner, command: DriveCommand, cells: np.ndarray, tick: i
     )
 
 
+@pytest.mark.long
 def test_a_search_that_somebody_ends_goes_aside_for_them() -> None:
     cells = np.full_like(empty(4.0, 3.0), 100)
     cells[1:-1, 1:-1] = 0

@@ -125,6 +125,7 @@ async def test_an_arm_that_somebody_is_given_is_not_said_to_be_let_go_of(
     assert audited(tmp_path) == [("limp", False, "control holds the arm; press the e-stop first")]
 
 
+@pytest.mark.long
 async def test_an_arm_without_power_is_not_said_to_hold(tmp_path: Path) -> None:
     rig = so101.Rig()
     async with asking(rig, tmp_path) as ask:

@@ -57,6 +57,7 @@ def test_lateness_is_not_forgotten_and_ends_when_it_ends() -> None:
     assert max(line.run(60.0)[100:]) <= 10.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("most_ms", [20.0, 40.0])
 def test_jitter_and_a_machine_that_is_busy_are_no_lateness(most_ms: float) -> None:
     chance, line = random.Random(1), Line()

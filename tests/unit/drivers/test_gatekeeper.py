@@ -128,6 +128,7 @@ async def test_an_e_stop_is_on_disk_when_it_is_confirmed(tmp_path: Path) -> None
     assert (entries[0].what, entries[-1].what) == ("boot", "end")
 
 
+@pytest.mark.long
 async def test_a_disk_that_hangs_holds_up_the_confirmation_and_no_tick(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -161,6 +162,7 @@ async def test_a_disk_that_takes_nothing_stops_no_e_stop_and_is_told(tmp_path: P
         assert LatchFile(tmp_path).read().estop_generation == 1
 
 
+@pytest.mark.long
 async def test_causes_are_written_down_when_they_come_and_go_with_who_raised_them(
     tmp_path: Path,
 ) -> None:

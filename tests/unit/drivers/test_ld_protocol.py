@@ -120,6 +120,7 @@ def test_a_frame_that_no_lidar_can_mean_is_refused_though_its_crc_is_right(
     assert ld.decode(ld.encode(frame._replace(**{field: value}))) is None
 
 
+@pytest.mark.long
 @given(st.lists(st.sampled_from([MANUAL, CAPTURED]), max_size=6), st.data())
 def test_it_does_not_matter_how_the_bytes_are_cut(parts: list[bytes], data: st.DataObject) -> None:
     stream, decoder, found = b"".join(parts), ld.LdDecoder(), []
@@ -163,6 +164,7 @@ def test_a_lidar_that_sends_ec_in_place_of_2c_is_understood() -> None:
     assert ld.decode(other + bytes([ld.crc8(other)])) == ld.decode(MANUAL)
 
 
+@pytest.mark.long
 def test_of_frames_with_a_tenth_of_a_percent_of_bytes_wrong_next_to_none_pass_as_others() -> None:
     chance = random.Random(3)
     decoder, sent, wrong, whole = ld.LdDecoder(), ld.decode(MANUAL), 0, 0

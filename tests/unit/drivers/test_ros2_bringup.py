@@ -220,6 +220,7 @@ def test_a_lidar_that_looks_back_is_turned_by_half_a_turn_either_way(
     assert only(found, "scan frame").verdict == verdict
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("mounting", "x", "frame", "verdict", "text"),
     [

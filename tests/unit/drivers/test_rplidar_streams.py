@@ -141,6 +141,7 @@ def test_no_single_wrong_byte_in_a_capsule_is_accepted() -> None:
             assert not Dense().is_block(bytes(bad)), (at, pattern)
 
 
+@pytest.mark.long
 def test_a_tenth_of_a_percent_of_wrong_bytes_bends_next_to_no_dense_sample() -> None:
     chance = random.Random(5)
     stream = bytearray(dense_turns(400))

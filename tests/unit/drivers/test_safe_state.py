@@ -88,6 +88,7 @@ async def test_an_exception_and_a_cancellation_lead_to_it_too() -> None:
     assert cancelled.done[-2:] == ["limp", "close"]
 
 
+@pytest.mark.long
 async def test_a_body_that_never_rests_is_not_waited_for_longer_than_braking_takes() -> None:
     async with Arm("limp") as arm:
         arm.moving = 1000

@@ -27,6 +27,7 @@ def toured() -> tuple[SlamMap, Walker]:
     return grown(Rooms(HOUSE), START, *ROUND, *ROUND[:3])
 
 
+@pytest.mark.long
 def test_after_a_tour_it_knows_where_it_is_and_has_drawn_the_house(
     toured: tuple[SlamMap, Walker],
 ) -> None:
@@ -114,6 +115,7 @@ def test_what_was_kept_goes_on_at_the_next_scan(toured: tuple[SlamMap, Walker]) 
     assert error(place, in_map(again)) < 0.05
 
 
+@pytest.mark.long
 def test_carried_off_before_it_goes_on_it_is_looked_for(toured: tuple[SlamMap, Walker]) -> None:
     chart, _ = toured
     still = chart.still()

@@ -144,6 +144,7 @@ def test_a_huge_footprint_and_a_long_way_ask_for_bounded_memory() -> None:
     assert most < 200_000_000
 
 
+@pytest.mark.long
 def test_a_way_of_many_looks_is_worked_out_in_parts_with_the_same_result() -> None:
     points = at((0.5, 0.3), (0.7, 0.1))
     found = arc(WAFFLE, points, 0.03, 0.8, (0.2, 0.0, 0.3))

@@ -49,6 +49,7 @@ def test_of_a_place_that_shows_nothing_nothing_is_said() -> None:
     assert np.isnan(seen_through(scan(ROOM, IDENTITY).points, nothing, IDENTITY))
 
 
+@pytest.mark.long
 def test_a_robot_that_backs_along_a_corridor_does_not_slide_back_over_what_it_knows() -> None:
     """Half of each scan is new then: what fits best is a place too far ahead."""
     poses = line(np.array((5.0, 0.0, 0.0)), np.array((-25.0, 0.1, 0.0)), 1.0)

@@ -208,6 +208,7 @@ def test_arrays_that_are_none_are_refused_in_one_line(member: bytes, tmp_path: P
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.long
 def test_a_zip_of_3_mb_that_holds_3_gb_is_not_unpacked(tmp_path: Path) -> None:
     path = tmp_path / "map.graph.npz"
     piece = bytes(1_000_000)

@@ -118,6 +118,7 @@ def test_hosts_may_place_it_and_several_hosts_must(tmp_path: Path) -> None:
         load_deployment(written(tmp_path, MINE + hosts % ""))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [

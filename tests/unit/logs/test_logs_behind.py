@@ -36,6 +36,7 @@ def unread() -> Iterator[IO[bytes]]:
         root.setLevel(level)
 
 
+@pytest.mark.long
 def test_a_console_that_nobody_reads_holds_up_neither_the_program_nor_its_log_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

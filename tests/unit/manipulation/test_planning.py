@@ -137,6 +137,7 @@ def test_a_trajectory_round_a_shelf_with_a_held_cube_touches_nothing() -> None:
             assert judge.contacts(posture) == []
 
 
+@pytest.mark.long
 def test_a_plan_is_the_same_for_the_same_seed() -> None:
     checker = CollisionChecker(arm(), [FLOOR, SHELF])
     ((start, goal),) = below_and_above(checker, 1)

@@ -178,6 +178,7 @@ def test_a_map_grows_on_after_its_optimiser_raised_at_a_keyframe(
     assert chart.problems() == ()
 
 
+@pytest.mark.long
 def test_a_map_whose_optimiser_always_raises_grows_without_loops_says_so_and_is_kept(
     fail: Callable[[Plan], None],
 ) -> None:

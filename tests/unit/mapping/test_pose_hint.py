@@ -89,6 +89,7 @@ def test_a_robot_just_started_is_found_at_once(house: SavedMap) -> None:
     assert error(places[-1], robot.pose) < 0.03
 
 
+@pytest.mark.long
 def test_a_localized_robot_stays_whatever_a_hint_says(house: SavedMap) -> None:
     robot = Walker(Rooms(HOUSE), StaticMap(house, PATIENCE_S), at(3.0, 4.0, 50))
     assert robot.look(16).localized
@@ -99,6 +100,7 @@ def test_a_localized_robot_stays_whatever_a_hint_says(house: SavedMap) -> None:
         assert error(place, robot.pose) < 0.03
 
 
+@pytest.mark.long
 def test_a_growing_map_takes_a_hint_after_the_robot_was_carried_off() -> None:
     chart, robot = grown(Rooms(HOUSE), (2.0, 2.0), (3.5, 3.0), (6.0, 3.0), (6.5, 2.0))
     robot.pose = at(3.0, 3.5, 100)

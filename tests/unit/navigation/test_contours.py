@@ -60,6 +60,7 @@ def test_the_local_planner_goes_round_what_only_a_camera_sees() -> None:
     assert max(abs(pose.y) for pose in drive.poses) > 0.35
 
 
+@pytest.mark.long
 def test_a_contour_that_is_gone_is_gone_at_once() -> None:
     line = np.array(((0.6, -6.0), (0.65, -6.0), (0.65, 6.0), (0.6, 6.0)))
     drive = Seen(Goal(x=1.5, y=0.0), line)
@@ -76,6 +77,7 @@ def test_without_contours_plans_are_bit_equal() -> None:
     assert plain.poses == seen.poses
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("far", [1e5, 1e3, 60.0])
 def test_contours_of_extreme_size_are_borne(far: float) -> None:
     line = np.array(((1.0, -far), (1.02, -far), (1.02, far), (1.0, far)))

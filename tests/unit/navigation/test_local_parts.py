@@ -35,6 +35,7 @@ NOBODY = np.empty((0, 6))
 NOTHING = np.empty((0, 2))
 
 
+@pytest.mark.long
 def test_a_car_turns_no_more_tightly_than_at_full_speed_and_lock() -> None:
     model = model_of(CAR)
     assert model.radius == 0.5

@@ -21,6 +21,7 @@ DOOR = np.concatenate(
 )  # 45 cm wide, for a body of 31 cm
 
 
+@pytest.mark.long
 def test_a_goal_is_reached_with_its_yaw() -> None:
     drive = Drive(WAFFLE, Goal(x=0.8, y=0.4, yaw=-1.0), NOTHING, response=LATE)
     assert drive.go(20.0).arrived

@@ -357,6 +357,7 @@ class Noting(PatientJournal):
         self._events.append((self._clock.now_ns(), FINISHED, b"\1"))
 
 
+@pytest.mark.long
 async def test_a_replay_gives_the_same_worlds() -> None:
     """What a thread has done counts from where the log says, and not when it is done again."""
     async with Bench("slam") as bench:

@@ -104,6 +104,7 @@ def test_a_small_run_prints_every_figure() -> None:
     assert "1 worlds from seed 4" in said.get()
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_graphics")
 def test_contours_that_are_wrong_count_as_wrong() -> None:
     body = bodies()[0]

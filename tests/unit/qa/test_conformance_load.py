@@ -74,6 +74,7 @@ async def test_a_driver_that_does_not_come_as_far_fails_on_a_machine_with_time(
         await kit._found(stuck)
 
 
+@pytest.mark.long
 async def test_a_speed_that_is_not_reached_counts_on_a_machine_with_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

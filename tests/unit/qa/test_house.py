@@ -20,6 +20,7 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_no_string_names_a_module_that_its_room_must_not_import() -> None:
     assert house.broken(house.ROOT) == []
 

@@ -7,6 +7,7 @@ from gigabrain_zenoh.qa.robot_under_test import ProcessGroup
 from gigabrain_zenoh.runtime.supervisor import ProcessSpec
 
 
+@pytest.mark.long
 async def test_a_measurement_ends_with_the_error_of_the_process_that_ended_it() -> None:
     group = ProcessGroup([ProcessSpec("driver", ()), ProcessSpec("camera", (), optional=True)])
     for status in group.supervisor.statuses.values():

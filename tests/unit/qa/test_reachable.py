@@ -34,6 +34,7 @@ def test_in_a_wide_room_every_heading_is_reached(body: BodyDescription) -> None:
     assert len(poses) > 1000
 
 
+@pytest.mark.long
 def test_poses_keep_away_from_what_stands() -> None:
     poses = reachable_poses(LONG, lane(Box(0.5, 0.0, 0.2, 0.2, 0.5)))
     for x, y, yaw in poses.tolist():
@@ -49,6 +50,7 @@ def test_in_a_narrow_lane_nobody_turns() -> None:
         assert poses[:, 0].max() > 1.3
 
 
+@pytest.mark.long
 def test_only_a_body_that_strafes_gets_into_a_niche_beside_a_lane() -> None:
     """The niche is 1 m long and as deep as the body is wide; the lane is too narrow to turn in."""
     beside = (Box(-1.25, 0.6, 0.75, 0.3, 0.5), Box(1.25, 0.6, 0.75, 0.3, 0.5))

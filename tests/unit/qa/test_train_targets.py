@@ -75,6 +75,7 @@ def test_a_thing_that_is_nearly_cut_away_is_to_be_ignored():
     assert all(c.ignored[0] for c in small)
 
 
+@pytest.mark.long
 def test_a_smaller_picture_has_smaller_boxes():
     one = labelled(("cube", (100, 60, 180, 160)))
     whole = [augment(np.random.default_rng(s), one, 320, 240)[1].boxes[0] for s in range(20)]

@@ -129,6 +129,7 @@ async def world(types: Types) -> AsyncIterator[World]:
     await made.server.close()
 
 
+@pytest.mark.long
 async def test_a_goal_is_followed_to_its_result(world: World) -> None:
     heard: list[Any] = []
     kind = f"{NAVIGATE}_FeedbackMessage"

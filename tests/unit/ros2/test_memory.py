@@ -22,6 +22,7 @@ def network(types: Types) -> MemoryNetwork:
     return MemoryNetwork(types, lambda: 5)
 
 
+@pytest.mark.long
 def test_a_message_reaches_readers_of_other_nodes_only(
     network: MemoryNetwork, types: Types
 ) -> None:

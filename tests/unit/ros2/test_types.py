@@ -232,6 +232,7 @@ def test_defaults_are_read_as_rosidl_reads_them(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
+@pytest.mark.long
 def test_every_type_is_read_as_it_was_written(types: Types) -> None:
     source = random.Random(1)
     for name in types.messages():

@@ -151,6 +151,7 @@ async def test_a_crowd_is_told_as_others(tmp_path: Path) -> None:
     assert (rig.received[-1].source, rig.received[-1].times) == ("others", 9899)
 
 
+@pytest.mark.long
 async def test_a_crowd_of_sources_takes_the_place_of_nobody_who_was_obeyed(tmp_path: Path) -> None:
     rig = Rig(tmp_path)
     for second in range(120):

@@ -225,6 +225,7 @@ def world_of(robot: RobotInMemory, late_ticks: int) -> WorldModel:
     )
 
 
+@pytest.mark.long
 async def test_old_worlds_are_looked_at_and_refused_which_is_progress(tmp_path: Path) -> None:
     async with RobotInMemory(tmp_path) as robot:
         await robot.go(SECOND_TICKS)

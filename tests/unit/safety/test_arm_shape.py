@@ -104,6 +104,7 @@ def test_gradients_of_distances_are_those_of_the_distances() -> None:
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("kind", "size"),
     [

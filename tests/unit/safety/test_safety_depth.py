@@ -147,6 +147,7 @@ def test_the_body_does_not_back_into_what_it_has_seen() -> None:
     assert -drive.pose.x + LOW[0] - 0.2 > 0.03
 
 
+@pytest.mark.long
 def test_what_was_taken_away_is_gone_once_it_is_seen_through() -> None:
     drive = Drive(Scene(boxes=(LOW,)))
     drive.go(250, AHEAD)
@@ -158,6 +159,7 @@ def test_what_was_taken_away_is_gone_once_it_is_seen_through() -> None:
     assert drive.go(150, AHEAD) == []
 
 
+@pytest.mark.long
 def test_what_is_out_of_reach_is_forgotten() -> None:
     drive = Drive(Scene(boxes=(LOW,)))
     drive.go(250, AHEAD)
@@ -342,6 +344,7 @@ def test_a_camera_should_see_what_is_on_its_side(yaw: float, ways: set[str]) -> 
     assert directions(replace(CAMERA, yaw=yaw)) == ways
 
 
+@pytest.mark.long
 def test_random_pictures_are_borne() -> None:
     drive, random = Drive(Scene()), np.random.default_rng(5)
 
@@ -385,6 +388,7 @@ def test_cameras_of_all_kinds_and_places_are_borne() -> None:
         assert drive.memory.field.cameras.pictures >= 4
 
 
+@pytest.mark.long
 def test_a_camera_turned_upright_sees_the_same() -> None:
     camera = replace(CAMERA, roll=math.pi / 2, width=240, height=320, intrinsics=None)
     body = replace(SEEING, cameras=(camera,))

@@ -127,6 +127,7 @@ moments = st.tuples(
 )
 
 
+@pytest.mark.long
 @given(st.lists(moments, max_size=10))
 def test_a_body_whose_telemetry_is_known_to_be_frozen_is_never_told_to_move_again(
     moments: list[tuple[int, Velocity, bool]],

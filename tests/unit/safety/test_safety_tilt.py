@@ -31,6 +31,7 @@ def test_nothing_counts_that_may_be_the_floor_of_a_level_or_of_the_tilted_body(
         np.testing.assert_allclose(found[PIXELS].astype(int), expected, atol=1)
 
 
+@pytest.mark.long
 def test_of_many_tilts_few_views_are_kept_which_share_what_no_tilt_changes() -> None:
     level = view_of(SEEING, CAMERA)
     kept = []

@@ -95,6 +95,7 @@ def test_counts_refuse_fractions_and_what_is_below_zero(name: str) -> None:
                 assert refuses(name, msgspec.msgpack.encode(replaced(whole, path, bad))), path
 
 
+@pytest.mark.long
 @by_name
 def test_a_message_cut_at_any_byte_is_refused(name: str) -> None:
     message = EXAMPLES[name]

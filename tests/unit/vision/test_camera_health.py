@@ -163,6 +163,7 @@ def test_a_picture_of_a_few_pixels_can_be_judged() -> None:
     assert health.take(0.0, picture, None) in (True, False)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", FAULTS)
 def test_only_silence_is_a_fault_of_a_camera_on_an_arm(name: str) -> None:
     """A still arm gives still pictures, and what the gripper holds may cover the lens."""

@@ -74,6 +74,7 @@ def test_any_camera_makes_valid_contours(camera: Camera, pixels: np.ndarray, pos
         check(eyes.contours(pose, number / 10))
 
 
+@pytest.mark.long
 @QUICK
 @given(cameras, arrays(np.uint8, (24, 32, 3)), poses)
 def test_any_colours_make_valid_contours(camera: Camera, pixels: np.ndarray, pose: Pose) -> None:
@@ -92,6 +93,7 @@ def test_broken_planes_are_refused(plane: bytes, now: float) -> None:
     assert eyes.contours(START, now) == ()
 
 
+@pytest.mark.long
 def test_wrong_sizes_and_names_are_refused() -> None:
     eyes = ObstacleContours(body(LOW))
     feed(eyes, LOW, Box(1.0, 0.0, 0.1, 0.1, 0.2))

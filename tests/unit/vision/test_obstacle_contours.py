@@ -142,6 +142,7 @@ def test_the_floor_does_not_follow_a_ramp(camera: Camera) -> None:
     assert all(one.top > 0.02 for one in contours)
 
 
+@pytest.mark.long
 @CAMERAS
 def test_mounting_errors_make_no_obstacles(camera: Camera) -> None:
     for roll, pitch, z in ((0.5, 0.5, 5), (-0.5, 0.5, -5), (0.5, -0.5, 5), (-0.5, -0.5, -5)):

@@ -40,6 +40,7 @@ def top(points: Floats, height: float) -> Floats:
     return np.column_stack((points, np.full(len(points), height)))
 
 
+@pytest.mark.long
 @given(st.floats(-math.pi / 4, math.pi / 4), st.floats(0.03, 0.06), st.floats(0.02, 0.029))
 def test_a_box_seen_from_above_has_its_sides_and_its_turn(
     yaw: float, long: float, wide: float
@@ -113,6 +114,7 @@ def test_too_few_points_fit_nothing() -> None:
     assert fit_solid(np.zeros((MIN_POINTS - 1, 3)), ABOVE, STEP_M) is None
 
 
+@pytest.mark.long
 @given(st.integers(0, 2**32 - 1), st.integers(MIN_POINTS, 60))
 def test_any_points_give_finite_sizes_or_nothing(seed: int, count: int) -> None:
     points = np.random.default_rng(seed).uniform(0.0, 0.3, (count, 3))

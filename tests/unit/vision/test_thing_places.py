@@ -176,6 +176,7 @@ def test_a_part_of_a_wall_is_no_thing_but_doors_and_pictures_may_be(name, box):
     assert not part_of_wall("picture", box, MODEL, depth)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("label", "shape", "size"), THINGS)
 @pytest.mark.parametrize("ahead", [0.7, 1.5, 2.5])
 @pytest.mark.parametrize("gap", [0.0, 0.3])
