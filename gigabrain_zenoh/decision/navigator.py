@@ -46,6 +46,7 @@ from gigabrain_zenoh.navigation.contours import placed
 from gigabrain_zenoh.navigation.costmap import inflation
 from gigabrain_zenoh.navigation.global_planner import Unreachable
 from gigabrain_zenoh.navigation.local_planner import DEFAULTS, LocalSettings
+from gigabrain_zenoh.navigation.warm_up import warm_up_local_planner
 from gigabrain_zenoh.navigation.zones import NO_ZONES, SpeedCap, ZoneMap
 
 EXACT_M = 0.05  # from where an arm needs the body
@@ -443,4 +444,4 @@ def _thinned(points: Floats) -> tuple[tuple[float, float], ...]:
 def warm_up() -> None:
     """Call every kernel that all bodies need for planning and driving, so that it is compiled."""
     global_planner.warm_up()
-    local_planner.warm_up(ANY_BODY)
+    warm_up_local_planner(ANY_BODY)

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from msgspec import Meta, Struct
@@ -30,15 +30,8 @@ from gigabrain_zenoh.navigation.motion_model import (
     slowed_model,
 )
 from gigabrain_zenoh.navigation.mppi import SampledPlan, Sampler, mean_past_commands, step_duration
+from gigabrain_zenoh.navigation.plan_reason import PlanKind, classify_plan, explain_plan
 from gigabrain_zenoh.navigation.planning_problem import Scene, Weights
-
-PlanKind = Literal["going", "going round", "waiting", "backing out", "turning in place", "arrived"]
-
-SOON_S = 1.0  # the motion within this time is reported
-STILL_SHARE = 0.08  # share of the largest speed that counts as standing
-NAMED_WITHIN_M = 1.5  # [m], what moves within this is named
-AT_GOAL_M = 0.2  # [m], so little is left where only standing and turning are
-DETOUR_M = 0.15  # [m], so far off the straight way is round something
 
 TURN_COST_SHARE = 1.0  # of time, at full turn, where a strafing body has a heading to keep
 STUCK_RADIUS_M = 0.3  # [m], who gets no farther than this is in one place
@@ -123,83 +116,12 @@ class LocalPlan:
     """A twist to command, the expected trajectory, and the reason."""
 
     twist: Velocity  # to command now
-    trajectory: tuple[TrajectoryPoint, ...]  # expected, in the body's frame of the moment
+    trajectory: tuple[TrajectoryPoint, ...]  # expected, in the body's frame of that tick
     kind: PlanKind
     reason: str  # in words, for people
     blocked: bool = False  # nothing has come of it for a while: another way is wanted
     arrived: bool = False
     remaining: float = 0.0  # [m of free way], cost to go from here
-
-
-def classify_plan(model: MotionModel, track: Floats, dt: float, goal: Goal) -> PlanKind:
-    """Return the kind of motion of `track` (T + 1, 6) within the next second."""
-    soon = min(len(track) - 1, max(1, round(SOON_S / dt)))
-    begin, end = track[0].tolist(), track[soon].tolist()  # plain numbers are quicker
-    made = math.hypot(end[0] - begin[0], end[1] - begin[1])
-    turned = abs(end[2] - begin[2])
-    if made < STILL_SHARE * model.forward * soon * dt:
-        return "waiting" if turned < STILL_SHARE * model.turning * soon * dt else "turning in place"
-    back = (end[0] - begin[0]) * math.cos(begin[2]) + (end[1] - begin[1]) * math.sin(begin[2])
-    if model.lateral == 0.0 and back < 0.0:
-        return "backing out"
-    return "going round" if _aside(track, goal) > DETOUR_M else "going"
-
-
-def explain_plan(
-    kind: PlanKind, track: Floats, discs: Floats, room: float, left: float, *, follows: bool = False
-) -> str:
-    """Return the reason of a plan as text: `room` [m] around the body, `left` [m] to go.
-
-    A car `follows` a path that may lead back.
-    """
-    moving = _nearest_moving(track, discs)
-    if left < AT_GOAL_M and not moving and kind in ("waiting", "turning in place"):
-        return f"{kind}: at the goal"
-    if kind == "waiting":
-        return f"waiting: {moving}" if moving else f"waiting: no way on, {room:.2f} m of room"
-    if kind == "going round":
-        return f"going round: {moving or f'something {room:.2f} m away'}"
-    if kind == "backing out" and follows and not moving:
-        return f"backing: the path leads back, {left:.1f} m to go"
-    if kind == "backing out":
-        return f"backing out: {moving or f'no way on ahead, {room:.2f} m of room'}"
-    if kind == "turning in place":
-        return "turning in place: the way on is to the side"
-    return f"going: {left:.1f} m to go"
-
-
-def _nearest_moving(track: Floats, discs: Floats) -> str:
-    """Describe the nearest moving disc; an empty text if none is near."""
-    if not len(discs):
-        return ""
-    away = np.hypot(discs[:, 0] - track[0, 0], discs[:, 1] - track[0, 1]) - discs[:, 4]
-    nearest = int(np.argmin(away))
-    if away[nearest] > NAMED_WITHIN_M:
-        return ""
-    dx, dy = discs[nearest, :2] - track[0, :2]
-    side = math.remainder(math.atan2(dy, dx) - track[0, 2], math.tau)
-    where = _side(side)
-    speed = float(np.hypot(*discs[nearest, 2:4]))
-    return f"somebody at {speed:.1f} m/s {max(0.0, float(away[nearest])):.1f} m {where}"
-
-
-def _side(bearing: float) -> str:
-    if abs(bearing) < math.radians(45):
-        return "ahead"
-    if abs(bearing) > math.radians(135):
-        return "behind"
-    return "to the left" if bearing > 0 else "to the right"
-
-
-def _aside(track: Floats, goal: Goal) -> float:
-    """Return how far the track leaves the straight line to the goal [m]."""
-    then: list[tuple[float, float]] = track[:, :2].tolist()
-    x, y = then[0]
-    dx, dy = goal.x - x, goal.y - y
-    length = math.hypot(dx, dy)
-    if length < DETOUR_M:
-        return 0.0
-    return max(abs((to_y - y) * dx - (to_x - x) * dy) for to_x, to_y in then) / length
 
 
 class LocalPlanner:
@@ -253,44 +175,44 @@ class LocalPlanner:
         self._began = 0
         self._anchor, self._anchor_tick = Pose(x=0.0, y=0.0, yaw=0.0), 0
 
-    def plan(self, moment: PlanRequest) -> LocalPlan:
-        """Plan the motion from this moment on. Raises ValueError for a goal that is not finite."""
-        goal = moment.goal
+    def plan(self, request: PlanRequest) -> LocalPlan:
+        """Plan the motion from then on. Raises ValueError for a goal that is not finite."""
+        goal = request.goal
         if not all(math.isfinite(v) for v in (goal.x, goal.y, goal.yaw or 0.0)):
             raise ValueError(f"a goal has finite numbers, got {goal}")
-        self._pass_time(moment)
-        place = Pose2D(moment.pose.x, moment.pose.y, moment.pose.yaw)
-        discs = dynamic_obstacles.discs_of(moment.obstacles)
-        hits = np.ascontiguousarray(moment.hits, dtype=np.float64)
-        self._window.see(moment.tick, place, self._lidar, hits)
-        discs = self._window.moving(moment.tick, discs)
-        model = slowed_model(self._model, moment.max_speed)
-        weights = self._look_out(moment.tick, place, discs, model)
-        if self._at_goal(moment):
-            if not self._turns(moment.velocity):
+        self._pass_time(request)
+        place = Pose2D(request.pose.x, request.pose.y, request.pose.yaw)
+        discs = dynamic_obstacles.discs_of(request.obstacles)
+        hits = np.ascontiguousarray(request.hits, dtype=np.float64)
+        self._window.see(request.tick, place, self._lidar, hits)
+        discs = self._window.moving(request.tick, discs)
+        model = slowed_model(self._model, request.max_speed)
+        weights = self._look_out(request.tick, place, discs, model)
+        if self._at_goal(request):
+            if not self._turns(request.velocity):
                 return _standing("arrived: at the goal", arrived=True)
             if goal.yaw is None:
                 return _standing("waiting: at the goal")
-        looks_round = self._looks_round(moment.tick)
+        looks_round = self._looks_round(request.tick)
         if looks_round:
             if weights is self._weights or dynamic_obstacles.stay_clear(discs, place.x, place.y):
                 return _standing("waiting: it looks round for what moves")
-            moment = replace(moment, goal=Goal(x=place.x, y=place.y), path=None, headings=None)
-        lookout = self._lookout(moment, place)
+            request = replace(request, goal=Goal(x=place.x, y=place.y), path=None, headings=None)
+        lookout = self._lookout(request, place)
         if lookout:
-            moment = replace(moment, goal=lookout, path=None, headings=None)
-        if self._model.strafes and moment.goal.yaw is not None:
+            request = replace(request, goal=lookout, path=None, headings=None)
+        if self._model.strafes and request.goal.yaw is not None:
             weights = weights._replace(turning=TURN_COST_SHARE * SECOND / self._model.turning**2)
-        scene = self._scene(moment, discs)
-        model = delayed_model(model, moment.delayed)
+        scene = self._scene(request, discs)
+        model = delayed_model(model, request.delayed)
         planned = self._sampler.plan(
-            model if moment.may_back else model._replace(backward=0.0),
+            model if request.may_back else model._replace(backward=0.0),
             self._outline,
             weights,
             scene,
-            self._start(moment, place),
+            self._start(request, place),
         )
-        answer = self._answer(moment, scene, planned)
+        answer = self._answer(request, scene, planned)
         if lookout:
             return replace(answer, reason=LOOKING)
         return replace(answer, reason=MAKING_WAY) if looks_round else answer
@@ -314,19 +236,19 @@ class LocalPlanner:
         traffic, alone = dynamic_obstacles.LOOK_AROUND_IN_TRAFFIC_S, dynamic_obstacles.LOOK_AROUND_S
         return (tick - self._began) * TICK_S < (traffic if self._traffic.any else alone)
 
-    def _lookout(self, moment: PlanRequest, place: Pose2D) -> Goal | None:
+    def _lookout(self, request: PlanRequest, place: Pose2D) -> Goal | None:
         """Return where a body that gets no farther sees the ground on its way; None if it need not.
 
         It turns there first; if the ground is too near to be in view, it backs off. A plan that
         leads over such ground costs less the later it begins, so without this it is put off.
         """
-        waits_s = self._waits_s(moment) % LOOK_EVERY_S
+        waits_s = self._waits_s(request) % LOOK_EVERY_S
         differential = self._model.lateral == 0.0 and self._model.radius == 0.0
         if not differential or not LOOK_AFTER_S < waits_s < LOOK_UNTIL_S:
             return None
-        path = moment.path if moment.path is not None else no_points()
+        path = request.path if request.path is not None else no_points()
         ahead = path[np.hypot(path[:, 0] - place.x, path[:, 1] - place.y) > WAY_ON_M]
-        x, y = ahead[0].tolist() if len(ahead) else (moment.goal.x, moment.goal.y)
+        x, y = ahead[0].tolist() if len(ahead) else (request.goal.x, request.goal.y)
         bearing = math.atan2(y - place.y, x - place.x)
         if not self._ground.hides(place, bearing, self._half_width):
             return None
@@ -335,49 +257,49 @@ class LocalPlanner:
         x, y = place.x - back * math.cos(bearing), place.y - back * math.sin(bearing)
         return Goal(x=x, y=y, yaw=bearing)
 
-    def _scene(self, moment: PlanRequest, discs: Floats) -> Scene:
-        goal = moment.goal
-        body = transform(from_pose(moment.pose), self._rim)
-        seen = dynamic_obstacles.standing(moment.contours, discs)
-        grid = self._window.grid(moment.tick, moment.known, discs, moment.keepouts, body, seen)
-        place = Pose2D(moment.pose.x, moment.pose.y, moment.pose.yaw)
-        if self._stuck(moment):
+    def _scene(self, request: PlanRequest, discs: Floats) -> Scene:
+        goal = request.goal
+        body = transform(from_pose(request.pose), self._rim)
+        seen = dynamic_obstacles.standing(request.contours, discs)
+        grid = self._window.grid(request.tick, request.known, discs, request.keepouts, body, seen)
+        place = Pose2D(request.pose.x, request.pose.y, request.pose.yaw)
+        if self._stuck(request):
             self._ground.fill_gaps(place)
-        looked = self._ground.limited(grid, place, moment.cameras, moment.contours)
+        looked = self._ground.limited(grid, place, request.cameras, request.contours)
         ways = self._traffic.ways((goal.x, goal.y)) if self._traffic else None
         to, aside = (goal.x, goal.y), self._half_width
-        field = self._costs.field(grid, aside, to, moment.path, ways, moment.avoid)
+        field = self._costs.field(grid, aside, to, request.path, ways, request.avoid)
         yaw = math.nan if goal.yaw is None else goal.yaw
-        near, turned = self._tolerance(moment), self._settings.yaw_tolerance
-        return Scene(looked, field, discs, goal.x, goal.y, yaw, near, turned, self._track(moment))
+        near, turned = self._tolerance(request), self._settings.yaw_tolerance
+        return Scene(looked, field, discs, goal.x, goal.y, yaw, near, turned, self._track(request))
 
-    def _track(self, moment: PlanRequest) -> Floats:
+    def _track(self, request: PlanRequest) -> Floats:
         """Return what a car follows; other bodies go by the cost to go alone."""
-        if moment.path is None or moment.headings is None:
+        if request.path is None or request.headings is None:
             return no_track()
-        pose = moment.pose
+        pose = request.pose
         return track_of(
-            moment.path, moment.headings, (pose.x, pose.y, pose.yaw), self._model.radius
+            request.path, request.headings, (pose.x, pose.y, pose.yaw), self._model.radius
         )
 
-    def _start(self, moment: PlanRequest, place: Pose2D) -> InitialState:
-        v, sent, dt = moment.velocity, moment.sent, self._sampler.dt
-        times = [((one.tick - moment.tick) * TICK_S, *_axes(one.velocity)) for one in sent]
+    def _start(self, request: PlanRequest, place: Pose2D) -> InitialState:
+        v, sent, dt = request.velocity, request.sent, self._sampler.dt
+        times = [((one.tick - request.tick) * TICK_S, *_axes(one.velocity)) for one in sent]
         rows = np.array([row for row in times if row[0] <= 0.0]).reshape(-1, 4)
-        gain = moment.response.turn_gain
+        gain = request.response.turn_gain
         rows[:, 3] *= gain  # what the floor makes of it; control undoes that in what is to come
         before = tuple(rows[-1, 1:].tolist()) if len(rows) else _axes(v)
-        past, share = mean_past_commands(rows, _axes(v), moment.response.delay, dt)
-        lag = first_order_lag(moment.response.lag, dt)
+        past, share = mean_past_commands(rows, _axes(v), request.response.delay, dt)
+        lag = first_order_lag(request.response.lag, dt)
         return InitialState(*place, *_axes(v), before, past, share, lag, gain)
 
-    def _answer(self, moment: PlanRequest, scene: Scene, planned: SampledPlan) -> LocalPlan:
-        place = moment.pose
+    def _answer(self, request: PlanRequest, scene: Scene, planned: SampledPlan) -> LocalPlan:
+        place = request.pose
         at = Placement(place.x, place.y, math.cos(place.yaw), math.sin(place.yaw))
         room = clearance(scene.grid, self._outline, at)
         left = cost_to_go_at(scene.field, place.x, place.y)
-        blocked = self._stuck(moment)
-        kind = classify_plan(self._model, planned.track, self._sampler.dt, moment.goal)
+        blocked = self._stuck(request)
+        kind = classify_plan(self._model, planned.track, self._sampler.dt, request.goal)
         vx, vy, w = planned.commands[0].tolist()
         return LocalPlan(
             twist=Velocity(linear_x=vx, linear_y=vy, angular_z=w),
@@ -390,42 +312,42 @@ class LocalPlanner:
             remaining=left,
         )
 
-    def _pass_time(self, moment: PlanRequest) -> None:
+    def _pass_time(self, request: PlanRequest) -> None:
         if self._tick is None:
-            self._began = moment.tick
-        elif moment.tick > self._tick:
-            self._sampler.shift((moment.tick - self._tick) * TICK_S)
-        self._tick = moment.tick
+            self._began = request.tick
+        elif request.tick > self._tick:
+            self._sampler.shift((request.tick - self._tick) * TICK_S)
+        self._tick = request.tick
 
-    def _at_goal(self, moment: PlanRequest) -> bool:
+    def _at_goal(self, request: PlanRequest) -> bool:
         """Return whether the body is at its goal, and moves no farther; it may turn there still."""
-        goal, pose, v = moment.goal, moment.pose, moment.velocity
+        goal, pose, v = request.goal, request.pose, request.velocity
         off = math.hypot(goal.x - pose.x, goal.y - pose.y)
         turn = 0.0 if goal.yaw is None else abs(math.remainder(goal.yaw - pose.yaw, math.tau))
         slow = max(0.02, ARRIVED_SPEED_SHARE * self._model.forward)
-        near = off <= self._tolerance(moment) and turn <= self._settings.yaw_tolerance
+        near = off <= self._tolerance(request) and turn <= self._settings.yaw_tolerance
         return near and math.hypot(v.linear_x, v.linear_y) <= slow
 
     def _turns(self, velocity: Velocity) -> bool:
         return abs(velocity.angular_z) > max(0.05, ARRIVED_SPEED_SHARE * self._model.turning)
 
-    def _tolerance(self, moment: PlanRequest) -> float:
-        given = moment.tolerance
+    def _tolerance(self, request: PlanRequest) -> float:
+        given = request.tolerance
         return self._settings.position_tolerance if given is None else given
 
-    def _stuck(self, moment: PlanRequest) -> bool:
+    def _stuck(self, request: PlanRequest) -> bool:
         patience = self._settings.stuck_after
-        if moment.max_speed:
-            patience = max(patience, SLOW_PATIENCE * STUCK_RADIUS_M / moment.max_speed)
-        return self._waits_s(moment) > patience
+        if request.max_speed:
+            patience = max(patience, SLOW_PATIENCE * STUCK_RADIUS_M / request.max_speed)
+        return self._waits_s(request) > patience
 
-    def _waits_s(self, moment: PlanRequest) -> float:
+    def _waits_s(self, request: PlanRequest) -> float:
         """Return for how long the body has been in one place [s]."""
-        here, then = moment.pose, self._anchor
+        here, then = request.pose, self._anchor
         gone = math.hypot(here.x - then.x, here.y - then.y) > STUCK_RADIUS_M
         if gone or not self._anchor_tick:
-            self._anchor, self._anchor_tick = here, moment.tick
-        return (moment.tick - self._anchor_tick) * TICK_S
+            self._anchor, self._anchor_tick = here, request.tick
+        return (request.tick - self._anchor_tick) * TICK_S
 
 
 def _standing(reason: str, *, arrived: bool = False, blocked: bool = False) -> LocalPlan:
@@ -458,35 +380,3 @@ def _trajectory(track: Floats, dt: float) -> tuple[TrajectoryPoint, ...]:
 
 def _axes(of: Velocity) -> tuple[float, float, float]:
     return of.linear_x, of.linear_y, of.angular_z
-
-
-def warm_up(body: BodyDescription) -> None:
-    """Compile all that a driving robot will call, with `body`'s own shapes."""
-    _warm_up_traffic()
-    goal, here = Goal(x=0.5, y=0.0), Pose(x=0.0, y=0.0, yaw=0.0)
-    planner = LocalPlanner(body, LocalSettings(samples=64, steps=10, window=2.0))
-    for tick, x in ((1, 0.9), (51, 0.7)):  # once it has looked round
-        somebody = Obstacle(id=1, x=x, y=0.0, velocity_x=1.0, radius=0.3)
-        planner.plan(
-            PlanRequest(
-                tick=tick,
-                pose=here,
-                velocity=Velocity(),
-                goal=goal,
-                hits=np.array([[x, 0.0]]),
-                obstacles=(somebody,),
-            )
-        )
-
-
-def _warm_up_traffic() -> None:
-    """Compile the kernels of quick bodies in traffic."""
-    seen, disc = (
-        dynamic_obstacles.TrafficMap(1.0, 1.0, 1.0),
-        np.array([[0.5, 0.0, 1.0, 0.0, 0.3, 0.0]]),
-    )
-    for tick in (1, 1 + dynamic_obstacles.UPDATE_TICKS):
-        seen.see(tick, 0.0, 0.0, disc)
-    window, goal = LocalCostmap(1.0, 1.0), (9.0, 0.0)
-    grid = window.grid(1, np.empty((0, 2)), np.empty((0, 6)))
-    CostToGo(window.cells).field(grid, 0.1, goal, None, seen.ways(goal))

@@ -30,8 +30,8 @@ from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.geometry.limits import ZERO, SentCommand, clamp, limits_of, ramp
 from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.host.signals import end_on_interrupt
-from gigabrain_zenoh.navigation import local_planner
 from gigabrain_zenoh.navigation.local_planner import LocalPlanner, LocalSettings, PlanRequest
+from gigabrain_zenoh.navigation.warm_up import warm_up_local_planner
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.perception.obstacle_tracker import ObstacleTracker
 from gigabrain_zenoh.qa.bench.barn_course import (
@@ -127,7 +127,7 @@ def _when_warm(drive: Callable[..., BarnTrial], *arguments: object) -> BarnTrial
 @functools.cache
 def _warm_up() -> None:
     """Compile and freeze existing objects, as a robot's process does before it drives."""
-    local_planner.warm_up(JACKAL)
+    warm_up_local_planner(JACKAL)
     gc.collect()
     gc.freeze()
 

@@ -90,7 +90,7 @@ class Drive:
     def go(self, seconds: float) -> LocalPlan:
         """Drive for so long, or until it has arrived."""
         for _ in range(round(seconds / 0.1)):
-            plan = self.planner.plan(self.moment())
+            plan = self.planner.plan(self.request())
             self.plans.append(plan)
             if plan.arrived:
                 break
@@ -98,7 +98,7 @@ class Drive:
                 self._tick(plan.twist)
         return self.plans[-1]
 
-    def moment(self) -> PlanRequest:
+    def request(self) -> PlanRequest:
         """Return the planner's request for the present tick."""
         cosine, sine = math.cos(self.pose.yaw), math.sin(self.pose.yaw)
         off = self.walls - (self.pose.x, self.pose.y)

@@ -80,20 +80,20 @@ def test_a_quick_body_among_quick_things_looks_two_seconds_ahead(
 
 def test_a_quick_body_looks_round_before_it_first_drives_off() -> None:
     planner = LocalPlanner(JACKAL, FEW)
-    moment = PlanRequest(
+    request = PlanRequest(
         tick=100,
         pose=Pose(x=0.0, y=0.0, yaw=0.0),
         velocity=Velocity(),
         goal=Goal(x=2.5, y=0.0),
         hits=NOTHING,
     )
-    first, last = planner.plan(moment), planner.plan(replace(moment, tick=129))
+    first, last = planner.plan(request), planner.plan(replace(request, tick=129))
     for one in (first, last):
         assert (one.twist, one.kind) == (Velocity(), "waiting")
         assert one.reason == "waiting: it looks round for what moves"
-    assert planner.plan(replace(moment, tick=130)).twist.linear_x > 0.0
+    assert planner.plan(replace(request, tick=130)).twist.linear_x > 0.0
     slow = LocalPlanner(WAFFLE, FEW)
-    assert slow.plan(moment).twist.linear_x > 0.0
+    assert slow.plan(request).twist.linear_x > 0.0
 
 
 def near(discs: list[tuple[float, ...]], seconds: float) -> tuple[float, float]:

@@ -43,10 +43,10 @@ class Seen(Drive):
         super().__init__(SEEING, goal, np.concatenate(outlines) if outlines else NOTHING)
         self.contours = contours
 
-    def moment(self) -> PlanRequest:
+    def request(self) -> PlanRequest:
         from dataclasses import replace
 
-        return replace(super().moment(), hits=NOTHING, contours=self.contours)
+        return replace(super().request(), hits=NOTHING, contours=self.contours)
 
 
 def kinds(plans: list[LocalPlan]) -> set[str]:

@@ -41,14 +41,14 @@ def test_who_is_there_and_looks_elsewhere_turns_at_once(body: BodyDescription, y
 
 
 def test_who_is_there_and_wants_no_yaw_stops_turning() -> None:
-    moment = PlanRequest(
+    request = PlanRequest(
         tick=1,
         pose=Pose(x=0.05, y=0.0, yaw=2.0),
         velocity=Velocity(angular_z=0.8),
         goal=Goal(x=0.0, y=0.0),
         hits=wall((0.3, -0.5), (0.3, 0.5)),
     )
-    plan = LocalPlanner(WAFFLE).plan(moment)
+    plan = LocalPlanner(WAFFLE).plan(request)
     assert (plan.twist, plan.reason, plan.arrived) == (Velocity(), "waiting: at the goal", False)
 
 
@@ -73,7 +73,7 @@ def test_a_narrow_door_is_passed() -> None:
 def test_who_may_not_back_plans_no_way_backwards(may_back: bool) -> None:
     planner = LocalPlanner(WAFFLE)
     ahead = wall((0.35, -0.5), (0.35, 0.5))
-    moment = PlanRequest(
+    request = PlanRequest(
         tick=1,
         pose=Pose(x=0.0, y=0.0, yaw=0.0),
         velocity=Velocity(),
@@ -82,7 +82,7 @@ def test_who_may_not_back_plans_no_way_backwards(may_back: bool) -> None:
         response=LATE,
         may_back=may_back,
     )
-    plan = planner.plan(moment)
+    plan = planner.plan(request)
     backwards = [point.linear_x for point in plan.trajectory if point.linear_x < -0.02]
     assert bool(backwards) == may_back
 
@@ -142,8 +142,8 @@ def test_a_car_never_turns_on_the_spot() -> None:
 def test_the_expected_trajectory_is_what_a_late_body_then_does() -> None:
     drive = Drive(TRIKE, Goal(x=4.0, y=0.0), NOTHING, response=LATE)
     drive.go(1.0)
-    moment, start = drive.moment(), drive.pose
-    plan = drive.planner.plan(moment)
+    request, start = drive.request(), drive.pose
+    plan = drive.planner.plan(request)
     # 0.1 s on, all of it decided by commands that had been sent before
     for _ in range(5):
         drive._tick(Velocity(linear_x=-9.9))
@@ -169,9 +169,9 @@ def test_the_same_questions_get_the_same_answers() -> None:
 )
 def test_a_goal_that_is_no_place_is_refused(goal: Goal) -> None:
     planner = LocalPlanner(WAFFLE, QUICK)
-    moment = PlanRequest(
+    request = PlanRequest(
         tick=1, pose=Pose(x=0.0, y=0.0, yaw=0.0), velocity=Velocity(), goal=goal, hits=NOTHING,
         sent=(SentCommand(0, Velocity()),),
     )  # fmt: skip
     with pytest.raises(ValueError, match="a goal has finite numbers"):
-        planner.plan(moment)
+        planner.plan(request)

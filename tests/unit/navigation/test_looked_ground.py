@@ -122,8 +122,8 @@ def deepest_in_unknown(names: tuple[str, ...], goal: Goal) -> float:
     """
 
     class SeeingDrive(Drive):
-        def moment(self) -> PlanRequest:
-            return dataclasses.replace(super().moment(), cameras=names)
+        def request(self) -> PlanRequest:
+            return dataclasses.replace(super().request(), cameras=names)
 
     drive, axis = SeeingDrive(BODY, goal, np.empty((0, 2))), np.arange(-1.5, 1.5, 0.03)
     cells = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
@@ -157,8 +157,8 @@ def test_a_body_that_can_go_aside_gets_before_a_thing_from_wherever_it_looks(
     can = np.array([(0.265 + 0.0345 * math.cos(a), 0.0345 * math.sin(a)) for a in range(7)])
 
     class SeeingDrive(Drive):
-        def moment(self) -> PlanRequest:
-            seen = dataclasses.replace(super().moment(), cameras=("front",), contours=(can,))
+        def request(self) -> PlanRequest:
+            seen = dataclasses.replace(super().request(), cameras=("front",), contours=(can,))
             return close_up(seen, body)
 
     drive = SeeingDrive(body, Goal(x=0.0, y=0.0, yaw=0.0), np.empty((0, 2)))
@@ -192,8 +192,8 @@ def test_a_narrow_gap_is_filled_and_a_wide_one_stays(wide: float, filled: bool) 
 class StandingDrive(Drive):
     """A body that stays where it is, whatever is planned."""
 
-    def moment(self) -> PlanRequest:
-        return dataclasses.replace(super().moment(), pose=Pose(x=0.0, y=0.0, yaw=0.0))
+    def request(self) -> PlanRequest:
+        return dataclasses.replace(super().request(), pose=Pose(x=0.0, y=0.0, yaw=0.0))
 
 
 def plan_after(

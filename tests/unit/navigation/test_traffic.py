@@ -10,7 +10,7 @@ from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.brain import Obstacle
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.decision.navigator import ANY_BODY
-from gigabrain_zenoh.navigation import cost_to_go, dynamic_obstacles, local_planner
+from gigabrain_zenoh.navigation import cost_to_go, dynamic_obstacles
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
 from gigabrain_zenoh.navigation.dynamic_obstacles import UPDATE_TICKS, TrafficMap
 from gigabrain_zenoh.navigation.footprint import distance_at
@@ -21,6 +21,7 @@ from gigabrain_zenoh.navigation.local_planner import (
     LocalSettings,
     PlanRequest,
 )
+from gigabrain_zenoh.navigation.warm_up import warm_up_local_planner
 from gigabrain_zenoh.qa.bench.barn import drive_functions
 from gigabrain_zenoh.qa.bench.barn_course import HARD, JACKAL, BarnWorld, MovingDisc
 
@@ -51,7 +52,7 @@ def test_where_nothing_quick_was_seen_ways_cost_what_they_are_long() -> None:
 
 @pytest.mark.long
 def test_what_is_compiled_before_it_drives_is_all_that_it_will_call() -> None:
-    local_planner.warm_up(ANY_BODY)
+    warm_up_local_planner(ANY_BODY)
     kernels: list[Any] = [dynamic_obstacles._add_watched, dynamic_obstacles._pass]
     kernels += [cost_to_go._scale_costs, cost_to_go._seed_rim]
     before = [kernel.overloads for kernel in kernels]
@@ -131,7 +132,7 @@ def looks(discs: tuple[Obstacle, ...], seconds: float) -> LocalPlan:
     """Return the plan of a Jackal `seconds` after it was given a goal."""
     planner = LocalPlanner(JACKAL, LocalSettings(samples=128, window=6.0))
     for tick in (1, 1 + round(seconds / 0.02)):
-        moment = PlanRequest(
+        request = PlanRequest(
             tick=tick,
             pose=Pose(x=0.0, y=0.0, yaw=0.0),
             velocity=Velocity(),
@@ -139,7 +140,7 @@ def looks(discs: tuple[Obstacle, ...], seconds: float) -> LocalPlan:
             hits=NOTHING,
             obstacles=discs,
         )
-        plan = planner.plan(moment)
+        plan = planner.plan(request)
     return plan
 
 
