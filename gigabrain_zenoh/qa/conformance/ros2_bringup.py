@@ -9,7 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from gigabrain_drivers.bodies.ros2 import options as ros2
-from gigabrain_drivers.bodies.ros2.bringup import Finding, Heard, Row, Watched, findings, rows
+from gigabrain_drivers.bodies.ros2.bringup import (
+    Finding,
+    Row,
+    TopicStatistics,
+    Watched,
+    findings,
+    rows,
+)
 from gigabrain_drivers.bodies.ros2.conversion import Unusable, battery_of, imu_of, joints_of
 from gigabrain_drivers.bodies.ros2.link import all_types
 from gigabrain_drivers.bodies.ros2.options import Ros2Options
@@ -67,8 +74,8 @@ async def watch(
     best_effort = Qos(reliable=False, depth=DEPTH)  # which matches every publisher
     for row in rows(options):
         if row.part != "mounting":
-            heard = watched.heard[row.part] = Heard()
-            taker = _taker(row, types, heard, _converter(row.part, options), lambda: begun)
+            statistics = watched.statistics[row.part] = TopicStatistics()
+            taker = _taker(row, types, statistics, _converter(row.part, options), lambda: begun)
             transport.subscribe(row.topic, row.type, best_effort, taker)
     latched = Qos(transient_local=True, depth=DEPTH)
 
@@ -97,7 +104,7 @@ def _converter(part: str, options: Ros2Options) -> Callable[[Any], object]:
 def _taker(
     row: Row,
     types: Types,
-    heard: Heard,
+    statistics: TopicStatistics,
     convert: Callable[[Any], object],
     begun: Callable[[], bool],
 ) -> Callable[[Received], None]:
@@ -113,13 +120,13 @@ def _taker(
         try:
             message = types.decode(row.type, received.payload)
         except BadPayload as error:
-            heard.unreadable = str(error)
+            statistics.unreadable = str(error)
             return
-        heard.take(message, time.time_ns(), now_s - first_s[0])
+        statistics.take(message, time.time_ns(), now_s - first_s[0])
         try:
             convert(message)
-            heard.unusable = ""  # the first messages of a sensor may be empty
+            statistics.unusable = ""  # the first messages of a sensor may be empty
         except Unusable as error:
-            heard.unusable = str(error)
+            statistics.unusable = str(error)
 
     return take

@@ -10,7 +10,7 @@ import pytest
 
 from gigabrain_drivers.bodies.ros2.bringup import (
     Finding,
-    Heard,
+    TopicStatistics,
     Watched,
     explain,
     findings,
@@ -132,16 +132,16 @@ def test_two_publishers_of_one_topic_are_a_warning() -> None:
     assert (found.verdict, found.text) == ("warning", "2 publishers: /base, /ekf")
 
 
-def watched(heard: dict[str, Heard], frames: FrameTree | None = None) -> Watched:
-    return Watched(GOOD, heard, frames or FrameTree())
+def watched(statistics: dict[str, TopicStatistics], frames: FrameTree | None = None) -> Watched:
+    return Watched(GOOD, statistics, frames or FrameTree())
 
 
-def heard(hz: float = 20.0, offset_s: float = 0.01, **fields: Any) -> Heard:
+def statistics(hz: float = 20.0, offset_s: float = 0.01, **fields: Any) -> TopicStatistics:
     stamp_s = fields.pop("stamp_s", NOW_S - offset_s)
-    return Heard(101, 100 / hz, offset_s, stamp_s, **fields)
+    return TopicStatistics(101, 100 / hz, offset_s, stamp_s, **fields)
 
 
-SOUND = {"odometry": heard(), "scan": heard(10.0)}
+SOUND = {"odometry": statistics(), "scan": statistics(10.0)}
 
 
 def test_messages_with_right_rates_and_stamps_are_fine() -> None:
@@ -153,17 +153,17 @@ def test_messages_with_right_rates_and_stamps_are_fine() -> None:
 @pytest.mark.parametrize(
     ("wrong", "verdict", "text"),
     [
-        (Heard(), "error", "no message came"),
-        (Heard(unreadable="bad"), "error", "bad"),
-        (heard(unusable="odd"), "error", "odd"),
-        (heard(10.0), "warning", "10.0 messages a second; expected 20"),
-        (heard(offset_s=3.0), "warning", "3.0 s behind this machine's clock"),
-        (heard(offset_s=-3.0), "warning", "3.0 s ahead of this machine's clock"),
-        (heard(offset_s=NOW_S - 12.5, stamp_s=12.5), "error", "of a simulation: 12.5 s"),
-        (heard(offset_s=NOW_S, stamp_s=0.0), "error", "its stamps are 0"),
+        (TopicStatistics(), "error", "no message came"),
+        (TopicStatistics(unreadable="bad"), "error", "bad"),
+        (statistics(unusable="odd"), "error", "odd"),
+        (statistics(10.0), "warning", "10.0 messages a second; expected 20"),
+        (statistics(offset_s=3.0), "warning", "3.0 s behind this machine's clock"),
+        (statistics(offset_s=-3.0), "warning", "3.0 s ahead of this machine's clock"),
+        (statistics(offset_s=NOW_S - 12.5, stamp_s=12.5), "error", "of a simulation: 12.5 s"),
+        (statistics(offset_s=NOW_S, stamp_s=0.0), "error", "its stamps are 0"),
     ],
 )
-def test_messages_with_something_wrong(wrong: Heard, verdict: str, text: str) -> None:
+def test_messages_with_something_wrong(wrong: TopicStatistics, verdict: str, text: str) -> None:
     found = findings(options(), LIDAR, watched(SOUND | {"odometry": wrong}))
     bad = [each for each in found if each.what == "/odom" and each.verdict != "ok"]
     assert len(bad) == 1
@@ -178,9 +178,9 @@ def test_an_inertial_unit_without_orientation_is_a_warning() -> None:
         header={"stamp": {"sec": int(NOW_S)}},
         orientation_covariance=np.array([-1.0] + [0.0] * 8),
     )
-    heard = Heard()
-    heard.take(imu, int(NOW_S * 1e9), 0.0)
-    seen = Watched((*GOOD, end("/imu", IMU)), SOUND | {"imu": heard})
+    statistics = TopicStatistics()
+    statistics.take(imu, int(NOW_S * 1e9), 0.0)
+    seen = Watched((*GOOD, end("/imu", IMU)), SOUND | {"imu": statistics})
     found = findings(options(topics={"imu": {}}), LIDAR, seen)
     (wrong,) = (each for each in found if each.verdict != "ok")
     assert (wrong.what, wrong.verdict) == ("/imu", "warning")
@@ -215,7 +215,7 @@ def test_a_lidar_that_looks_back_is_turned_by_half_a_turn_either_way(
     turned: float, verdict: str
 ) -> None:
     frames = tree(Types(), -0.032, turned)
-    seen = Watched(GOOD, {"scan": heard(10.0, frame="base_scan")}, frames)
+    seen = Watched(GOOD, {"scan": statistics(10.0, frame="base_scan")}, frames)
     found = findings(options(), msgspec.structs.replace(LIDAR, yaw=math.pi), seen)
     assert only(found, "scan frame").verdict == verdict
 
@@ -234,9 +234,12 @@ def test_a_lidar_that_looks_back_is_turned_by_half_a_turn_either_way(
 def test_frames_must_lead_to_the_base(
     mounting: str, x: float, frame: str, verdict: str, text: str
 ) -> None:
-    heards = {"odometry": heard(child_frame="base_footprint"), "scan": heard(10.0, frame=frame)}
+    topics = {
+        "odometry": statistics(child_frame="base_footprint"),
+        "scan": statistics(10.0, frame=frame),
+    }
     graph = (*GOOD, end("/tf_static", TF, qos=LATCHED))
-    seen = Watched(graph, heards, tree(Types(), x))
+    seen = Watched(graph, topics, tree(Types(), x))
     found = only(findings(options(mounting=mounting), LIDAR, seen), "scan frame")
     assert found.verdict == verdict
     assert text in found.text
@@ -260,7 +263,7 @@ async def test_a_watch_tells_why_the_driver_drops_the_newest_message(
         publisher.publish(first)
         publisher.publish(then)
         await asyncio.sleep(0.01)
-    battery = (await watching).heard["battery"]
+    battery = (await watching).statistics["battery"]
     assert battery.count > 0
     assert battery.unusable.startswith(problem)
     assert bool(battery.unusable) == bool(problem)

@@ -52,7 +52,7 @@ class Row(NamedTuple):
 
 
 @dataclass
-class Heard:
+class TopicStatistics:
     """Messages of a topic received while it was watched."""
 
     count: int = 0
@@ -89,7 +89,7 @@ class Watched:
     """All that a watch of the robot has brought."""
 
     endpoints: tuple[GraphEndpoint, ...] = ()
-    heard: dict[str, Heard] = field(default_factory=dict)  # by part
+    statistics: dict[str, TopicStatistics] = field(default_factory=dict)  # by part
     frames: FrameTree = field(default_factory=FrameTree)
 
 
@@ -220,64 +220,64 @@ def findings(options: Ros2Options, lidar: Lidar | None, watched: Watched) -> lis
         return found
     for row in rows(options, lidar):
         if row.topic not in bad and row.part != "mounting":
-            found += _messages(row, watched.heard.get(row.part) or Heard())
+            found += _messages(row, watched.statistics.get(row.part) or TopicStatistics())
     if options.mounting == "tf_static" or len(watched.frames):
         found += _connected(options, lidar, watched)
     return found
 
 
-def _messages(row: Row, heard: Heard) -> list[Finding]:
-    if heard.unreadable:
+def _messages(row: Row, statistics: TopicStatistics) -> list[Finding]:
+    if statistics.unreadable:
         do = "is it the same definition on the robot? Other distributions changed some"
-        return [Finding(row.topic, "error", heard.unreadable, do)]
-    if heard.unusable:
+        return [Finding(row.topic, "error", statistics.unreadable, do)]
+    if statistics.unusable:
         do = f"correct topics.{row.part} in the file, or the node that publishes it"
-        return [Finding(row.topic, "error", heard.unusable, do)]
-    if not heard.count:
+        return [Finding(row.topic, "error", statistics.unusable, do)]
+    if not statistics.count:
         do = "is its node alive, and the network between open for UDP both ways?"
         return [Finding(row.topic, "error", "its publisher is there, but no message came", do)]
     found = []
-    if row.hz and heard.hz < RATE_SHARE * row.hz:
+    if row.hz and statistics.hz < RATE_SHARE * row.hz:
         where = "topics.odometry.hz" if row.part == "odometry" else "rate_hz of `lidar:`"
         do = f"write what it does as {where}, or have the robot send as often"
-        text = f"{heard.hz:.1f} messages a second; expected {row.hz:g}"
+        text = f"{statistics.hz:.1f} messages a second; expected {row.hz:g}"
         found.append(Finding(row.topic, "warning", text, do))
-    if not heard.tilt:
+    if not statistics.tilt:
         found.append(Finding(row.topic, "warning", NO_TILT, ADD_ORIENTATION))
-    if wrong := _clock(row, heard):
+    if wrong := _clock(row, statistics):
         found.append(wrong)
     if not found:
-        found.append(Finding(row.topic, "ok", f"{heard.hz:.1f} Hz, stamps of this clock"))
+        found.append(Finding(row.topic, "ok", f"{statistics.hz:.1f} Hz, stamps of this clock"))
     return found
 
 
-def _clock(row: Row, heard: Heard) -> Finding | None:
-    if heard.offset_s is None or abs(heard.offset_s) <= CLOCK_S:
+def _clock(row: Row, statistics: TopicStatistics) -> Finding | None:
+    if statistics.offset_s is None or abs(statistics.offset_s) <= CLOCK_S:
         return None
-    if heard.stamp_s == 0.0:
+    if statistics.stamp_s == 0.0:
         return Finding(row.topic, "error", "its stamps are 0", "have its node fill in the header")
-    if heard.stamp_s < SIM_TIME_S:
+    if statistics.stamp_s < SIM_TIME_S:
         do = "set use_sim_time false on the robot; a simulation belongs on link sim or emulated"
-        text = f"its stamps are of a simulation: {heard.stamp_s:.1f} s"
+        text = f"its stamps are of a simulation: {statistics.stamp_s:.1f} s"
         return Finding(row.topic, "error", text, do)
     do = f"{SYNCHRONISE}; TwistStamped commands look old otherwise"
-    return Finding(row.topic, "warning", f"its stamps are {clock_text(heard.offset_s)}", do)
+    return Finding(row.topic, "warning", f"its stamps are {clock_text(statistics.offset_s)}", do)
 
 
 def _connected(options: Ros2Options, lidar: Lidar | None, watched: Watched) -> list[Finding]:
     """Return which frames of messages do not lead to the base."""
     level: Verdict = "error" if options.mounting == "tf_static" else "warning"
     base, found = options.base_frame, list[Finding]()
-    frame_of: dict[str, Callable[[Heard], str]] = {
-        "odometry": lambda heard: heard.child_frame,
-        "scan": lambda heard: heard.frame,
-        "imu": lambda heard: heard.frame,
+    frame_of: dict[str, Callable[[TopicStatistics], str]] = {
+        "odometry": lambda statistics: statistics.child_frame,
+        "scan": lambda statistics: statistics.frame,
+        "imu": lambda statistics: statistics.frame,
     }
     for part, frame in frame_of.items():
-        heard = watched.heard.get(part)
-        if not heard or not heard.count:
+        statistics = watched.statistics.get(part)
+        if not statistics or not statistics.count:
             continue
-        name = frame(heard)
+        name = frame(statistics)
         place = watched.frames.find(name, base)
         if place is None:
             known = ", ".join(watched.frames.names[:12]) or "none"
