@@ -126,6 +126,7 @@ def _run(
     """Run the tests, and print a line after each run."""
     from rich.console import Console
 
+    from gigabrain_zenoh.diagnostics.discovery import plain
     from gigabrain_zenoh.qa.faults.suite import RunsFile, run_suite
 
     # warnings about the messages that the suite itself forges
@@ -138,7 +139,7 @@ def _run(
             status.update(f"{chosen.index(fault) + 1} of {len(chosen)}: {fault.name}")
 
         def ended(fault: "FaultRow", run: "FaultRun") -> None:
-            console.print(_line(fault, run))
+            console.print(plain(_line(fault, run)), soft_wrap=True)
             if file:
                 file.append(fault, run)
 

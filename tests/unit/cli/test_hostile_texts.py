@@ -1,16 +1,22 @@
 """Keys and texts of other clients, and of files, cannot move the cursor or add a line."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from gigabrain_zenoh.bus.headers import header_of
 from gigabrain_zenoh.cli.app import _call
+from gigabrain_zenoh.cli.faults import _run
 from gigabrain_zenoh.cli.options import print_json, print_line, print_table
 from gigabrain_zenoh.diagnostics.message_text import as_json
 from gigabrain_zenoh.diagnostics.top import cell_text
 from gigabrain_zenoh.diagnostics.topics import TopicRow, topic_table
+from gigabrain_zenoh.qa.faults import suite
+from gigabrain_zenoh.qa.faults.rig import Options
+from gigabrain_zenoh.qa.judging import FaultResult, FaultRow, FaultRun
 from gigabrain_zenoh.recording.bag_reader import print_info, read_info
 from gigabrain_zenoh.recording.bag_writer import BagWriter, ReceivedMessage
 from tests.unit.recording.bags import BEGIN_NS
@@ -65,6 +71,21 @@ def test_the_keys_and_notes_of_a_recording_are_escaped(
     assert last.startswith(f"robot/{SHOWN}")
     assert _call(["bag", "check", str(path)]) == 1
     assert lines_of(capsys) == [f"{path}: robot/{SHOWN}: 1 messages are missing"]
+
+
+def test_the_reason_of_a_fault_test_is_printed_as_it_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async def run_one(
+        rows: Sequence[FaultRow], options: Options, *others: Any
+    ) -> list[FaultResult]:
+        _, _, _, ended, _ = others
+        ended(rows[0], FaultRun(verdict="FAILED", reason=KEY))
+        return []
+
+    monkeypatch.setattr(suite, "run_suite", run_one)
+    _run(suite.FAULTS[:1], Options(), 1, None)
+    assert f": FAILED: robot/{SHOWN} (" in lines_of(capsys)[0]
 
 
 def test_an_error_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
