@@ -360,24 +360,24 @@ class Demo:
             files.write_result(report, self._options.report)
         for text in self._mismatches:
             print(f"warning: {text}", file=sys.stderr)
-        told = f"{why}; logs in {self._run_dir}" if why else f"logs in {self._run_dir}"
+        closing = f"{why}; logs in {self._run_dir}" if why else f"logs in {self._run_dir}"
         if stopped and report is None:
             print("ended; the driver did not answer, so there is no report", file=sys.stderr)
         if stopped:
             if why:
-                print(told, file=sys.stderr)
+                print(closing, file=sys.stderr)
             return 0
         if report and report.ok and not why:
             return 0
         if wrong := self._supervisor.misconfigured:
             raise ConfigError(self._refusals.get(wrong[0], why))
         if report is None:
-            raise BodyLost(f"no report: {'' if why else 'the driver did not answer; '}{told}")
+            raise BodyLost(f"no report: {'' if why else 'the driver did not answer; '}{closing}")
         if self._last_fault:
             print(f"newest fault: {self._last_fault}", file=sys.stderr)
         if self._deployment.link == "real":
             print(RELEASE_FIRST, file=sys.stderr)
-        print(told, file=sys.stderr)
+        print(closing, file=sys.stderr)
         return 1
 
 

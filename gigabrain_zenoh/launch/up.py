@@ -186,16 +186,16 @@ class Waiting:
 
     async def until_done(self, act: Callable[[], T]) -> T:
         """Return what `act` does, once it no longer raises the error."""
-        told = False
+        printed = False
         while True:
             try:
                 return act()
             except self.error as error:
                 text = f"waiting for {self.what}: {error}"
             self.notifier.status(text)
-            if not told:
+            if not printed:
                 self.print_line(text)
-            told = True
+            printed = True
             await asyncio.sleep(RETRY_S)
 
 

@@ -294,7 +294,7 @@ def _update(track: ObjectTrack, sighting: Sighting, glance: Glance) -> None:
         track.size = old[0] + gain * (new[0] - old[0]), old[1] + gain * (new[1] - old[1])
     track.odds = min(track.odds + SEEN_ODDS + CONFIDENCE_ODDS * sighting.confidence, MAX_ODDS)
     track.seen, track.last_s, track.last_ns = track.seen + 1, glance.time_s, glance.unix_ns
-    track.anchor = None  # it is fixed anew, to what is mapped round it now
+    track.anchor = None  # it is then tied to what is mapped round it now
     track.votes.add(sighting.label, sighting.confidence, sighting.distance)
 
 

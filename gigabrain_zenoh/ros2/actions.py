@@ -184,8 +184,8 @@ class ActionServer:
         self._name, self._preempts, self._now_ns = name, preempts, now_ns
         self._ends: dict[bytes, asyncio.Event] = {}
         self._tasks: set[asyncio.Task[None]] = set()
-        self._loop, self._told_s = asyncio.get_running_loop(), 0.0
-        self._telling: asyncio.TimerHandle | None = None
+        self._loop, self._published_s = asyncio.get_running_loop(), 0.0
+        self._publishing: asyncio.TimerHandle | None = None
         base = f"{name}/_action"
         servers = [transport, polled] if polled else [transport]
         message = f"{type}_FeedbackMessage"
@@ -199,7 +199,7 @@ class ActionServer:
                 one.serve(f"{base}/get_result", f"{type}_GetResult", get_result),
                 one.serve(f"{base}/cancel_goal", CANCEL, self._cancel_goal),
             ]
-        self._tell()
+        self._publish_states()
 
     async def close(self) -> None:
         """Withdraw the action; its goals end as aborted."""
@@ -211,9 +211,9 @@ class ActionServer:
         for goal in self.goals.active():  # whose task had not begun
             self.goals.end(goal, Outcome(GoalState.ABORTED), self._now_ns())
             self._ends.pop(goal.id).set()
-        if self._telling:
-            self._telling.cancel()
-        self._tell()
+        if self._publishing:
+            self._publishing.cancel()
+        self._publish_states()
         for publisher in (*self._feedback, *self._status):
             publisher.close()
 
@@ -235,12 +235,12 @@ class ActionServer:
         task = self._loop.create_task(self._run(goal))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
-        self._tell_soon()
+        self._publish_states_soon()
 
     async def _run(self, goal: Goal) -> None:
         if goal.state == GoalState.ACCEPTED:  # unless it was canceled already
             goal.state = GoalState.EXECUTING
-            self._tell_soon()
+            self._publish_states_soon()
         outcome = Outcome(GoalState.ABORTED)
         try:
             outcome = await self._handler.run(goal, lambda fields: self._feed(goal, fields))
@@ -248,7 +248,7 @@ class ActionServer:
             log.warning("%s: goal aborted: %s", self._name, error)
         finally:
             self.goals.end(goal, outcome, self._now_ns())
-            self._tell_soon()
+            self._publish_states_soon()
             self._ends.pop(goal.id).set()
 
     def _feed(self, goal: Goal, fields: Any) -> None:
@@ -280,7 +280,7 @@ class ActionServer:
         if meant and not canceling:
             code = CancelCode.REJECTED
         if canceling:
-            self._tell_soon()
+            self._publish_states_soon()
         response = self._types.make(
             f"{CANCEL}_Response",
             return_code=int(code),
@@ -288,17 +288,17 @@ class ActionServer:
         )
         return self._types.encode(f"{CANCEL}_Response", response)
 
-    def _tell_soon(self) -> None:
+    def _publish_states_soon(self) -> None:
         """Publish the states once this turn of the loop is over and the last time is a while ago.
 
         The states of many goals take milliseconds to encode.
         """
-        if self._telling is None:
-            at_s = max(self._loop.time(), self._told_s + STATUS_S)
-            self._telling = self._loop.call_at(at_s, self._tell)
+        if self._publishing is None:
+            at_s = max(self._loop.time(), self._published_s + STATUS_S)
+            self._publishing = self._loop.call_at(at_s, self._publish_states)
 
-    def _tell(self) -> None:
-        self._telling, self._told_s = None, self._loop.time()
+    def _publish_states(self) -> None:
+        self._publishing, self._published_s = None, self._loop.time()
         states = [
             {"goal_info": _info(goal), "status": int(goal.state)} for goal in self.goals.all()
         ]

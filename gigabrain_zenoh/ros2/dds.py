@@ -79,7 +79,7 @@ class _Waiting:
 
     def __init__(self, participant: DomainParticipant) -> None:
         self._set = WaitSet(participant)
-        self._told: dict[Entity, tuple[int, Callable[[], None]]] = {}
+        self._watched: dict[Entity, tuple[int, Callable[[], None]]] = {}
         self._ended = GuardCondition(participant)
         self._set.attach(self._ended)
         self._thread = threading.Thread(target=self._run, name="dds", daemon=True)
@@ -88,13 +88,13 @@ class _Waiting:
     def watch(self, entity: Entity, status: int, post: Callable[[], None]) -> None:
         """Call `post`, in the thread, each time that the status is set. Calls it now as well."""
         entity.set_status_mask(status)
-        self._told = {**self._told, entity: (status, post)}
+        self._watched = {**self._watched, entity: (status, post)}
         self._set.attach(entity)
         post()
 
     def forget(self, entity: Entity) -> None:
         """Watch it no more."""
-        self._told = {one: told for one, told in self._told.items() if one is not entity}
+        self._watched = {one: how for one, how in self._watched.items() if one is not entity}
         self._set.detach(entity)
 
     def close(self) -> None:
@@ -104,7 +104,7 @@ class _Waiting:
 
     def _run(self) -> None:
         while self._set.wait(FOREVER) and not self._ended.read():
-            for entity, (status, post) in self._told.items():
+            for entity, (status, post) in self._watched.items():
                 with contextlib.suppress(DDSException):  # it may be deleted meanwhile
                     if entity.take_status(status):
                         post()
@@ -186,7 +186,7 @@ class DdsTransport:
         self._idl, self._info_idl = IdlTypes(types.fields), IdlTypes(self._info.fields_of)
         self._topics: dict[tuple[str, str], Any] = {}
         self._mine: list[DdsPublisher | DdsSubscriber] = []
-        self._telling = self._closed = False
+        self._publishing = self._closed = False
         self._kept: list[Entity] = []  # cyclonedds deletes what is not referenced
 
     async def __aenter__(self) -> "DdsTransport":
@@ -246,18 +246,18 @@ class DdsTransport:
         """Answer requests of a service, each in a task of its own."""
         name = absolute(service, self.link.namespace)
         server = self._services.serve(name, self._service_type(type), handle)
-        self._tell_soon()
+        self._publish_graph_soon()
 
         def close() -> None:
             server.close()
-            self._tell_soon()
+            self._publish_graph_soon()
 
         return close
 
     async def call(self, service: str, type: str, request: bytes, timeout_s: float) -> bytes:
         """Return the response of the service's server, waiting for it to appear."""
         name = absolute(service, self.link.namespace)
-        self._tell_soon()
+        self._publish_graph_soon()
         return await self._services.call(name, self._service_type(type), request, timeout_s)
 
     def endpoints(self) -> tuple[GraphEndpoint, ...]:
@@ -275,7 +275,7 @@ class DdsTransport:
         self._mine.remove(one)
         self._waiting.forget(entity)
         self._loop.run_in_executor(None, _delete, entity)
-        self._tell_soon()
+        self._publish_graph_soon()
 
     def _open(self) -> None:
         if self.link.localhost:
@@ -295,9 +295,9 @@ class DdsTransport:
         self._teller = DataWriter(self._participant, topic, dds_qos(INFO_QOS, hash, own=True))
         qos = dds_qos(INFO_QOS, hash, keep_all=True, own=True)
         reader = DataReader(self._participant, topic, qos)
-        self._listen(reader, DdsSubscriber(self, reader, MAX_DEPTH, self._told).take)
+        self._listen(reader, DdsSubscriber(self, reader, MAX_DEPTH, self._on_discovery).take)
         self._kept += [topic, reader]
-        self._tell()
+        self._publish_graph()
 
     def _watch(self, topic: Any, take: Callable[[Any], None]) -> None:
         """Call `take` for each change that DDS knows of participants or endpoints."""
@@ -321,9 +321,9 @@ class DdsTransport:
         """Have the loop call `take` when a reader has data, and again while it returns True."""
         self._waiting.watch(reader, DDSStatus.DataAvailable, _Once(self._bridge, take))
 
-    def _told(self, received: Received) -> None:
+    def _on_discovery(self, received: Received) -> None:
         try:
-            self._graph.told(received.payload)
+            self._graph.update(received.payload)
         except BadPayload as error:
             self.counts["malformed discovery"] += 1
             log.debug("%s", error)
@@ -340,16 +340,16 @@ class DdsTransport:
 
     def _add(self, one: DdsPublisher | DdsSubscriber) -> None:
         self._mine.append(one)
-        self._tell_soon()
+        self._publish_graph_soon()
 
-    def _tell_soon(self) -> None:
+    def _publish_graph_soon(self) -> None:
         """Tell the others our endpoints once this turn of the loop is over."""
-        if not self._telling:
-            self._telling = True
-            self._loop.call_soon(self._tell)
+        if not self._publishing:
+            self._publishing = True
+            self._loop.call_soon(self._publish_graph)
 
-    def _tell(self) -> None:
-        self._telling = False
+    def _publish_graph(self) -> None:
+        self._publishing = False
         if self._closed:
             return
         readers, writers = self._services.gids()

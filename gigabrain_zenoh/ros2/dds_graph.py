@@ -128,7 +128,7 @@ class DdsGraph:
         if sample.sample_info.instance_state != InstanceState.Alive:
             self._nodes.pop(sample.key.bytes, None)
 
-    def told(self, payload: bytes) -> None:
+    def update(self, payload: bytes) -> None:
         """Take a message of `ros_discovery_info`. Raises BadPayload."""
         participant, nodes = self._info.decode(payload)
         if participant in self._nodes or len(self._nodes) < MAX_NODES:

@@ -145,13 +145,13 @@ class RmwZenohPublisher:
         made: list[Any] = [plain]
         if entity.qos.transient_local:
             made.append(advanced_publisher(session, entity.key, entity.qos))
-        made.append(plain.declare_matching_listener(line.guard(self._told)))
+        made.append(plain.declare_matching_listener(line.guard(self._on_matching)))
         made.append(entity.declare_token(line))
         self._put = made[1 if entity.qos.transient_local else 0].put
         self._match(has_subscriber(plain))
         return Bundle(*made)
 
-    def _told(self, status: zenoh.MatchingStatus) -> None:
+    def _on_matching(self, status: zenoh.MatchingStatus) -> None:
         self._home.bridge.post(self._match, status.matching)
 
     def _match(self, matched: bool) -> None:
@@ -341,12 +341,12 @@ class RmwZenohTransport:
         name = self.name_in(line.session)
         liveliness = line.session.liveliness()
 
-        def told(sample: zenoh.Sample) -> None:
+        def on_token(sample: zenoh.Sample) -> None:
             there = sample.kind == zenoh.SampleKind.PUT
             self.bridge.post(self._token, (str(sample.key_expr), there, name.zid))
 
         watch = liveliness.declare_subscriber(
-            f"{SPACE}/{name.domain}/**", line.guard(told), history=True
+            f"{SPACE}/{name.domain}/**", line.guard(on_token), history=True
         )
         return Bundle(watch, liveliness.declare_token(name.token))
 

@@ -107,14 +107,14 @@ async def wait_for_disk(folder: Path, clock: Clock) -> None:
 
     Raises ConfigError when the folder cannot be written for another reason.
     """
-    told = False
+    logged = False
     while True:
         try:
             LatchFile(folder).read()
         except DiskFull as error:
-            if not told:
+            if not logged:
                 log.warning("%s; waiting for it", error, extra={"data": {"event": "disk full"}})
-            told = True
+            logged = True
             await clock.sleep_ns(DISK_RETRY_TICKS * TICK_NS)
         else:
             return

@@ -255,7 +255,7 @@ def _nothing() -> None:
 
 
 class Liveness:
-    """Watches whether a body that reports by itself is still heard; logs each change once.
+    """Watches whether a body that reports by itself still does; logs each change once.
 
     It counts as lost after `silent_ns` without a message. `senseless` is logged where the line
     itself is in order. Silence of a moment is not logged; the gate reports it.

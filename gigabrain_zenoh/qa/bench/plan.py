@@ -129,10 +129,10 @@ def _measure(
     cells = office(size, rng)
     grid, planner = grid_of(cells), GlobalPlanner()
     made = costmap(grid, RULES)
-    anew, changed, first = OperationTimer(), OperationTimer(), OperationTimer()
+    whole, changed, first = OperationTimer(), OperationTimer(), OperationTimer()
     asked = list(itertools.islice(_queries(made, planner.search, rng), queries))
     for i in range(ROUNDS):
-        with anew:
+        with whole:
             costmap(grid, RULES)
         now = grid_of(with_new_furniture(cells, rng))
         with changed:
@@ -149,7 +149,7 @@ def _measure(
             found = planner.plan(made, one.start, one.goal)
         paths += [found] if isinstance(found, Path) else []
     timings = (
-        anew.timing("costs of the whole map"),
+        whole.timing("costs of the whole map"),
         changed.timing("costs after a change"),
         first.timing("costs after a change, and a plan"),
         searching.timing("optimal path, office"),

@@ -310,7 +310,7 @@ class StudioScene:
         return False
 
     def _set(self, thing: Thing, x: float, y: float, z: float) -> None:
-        """Put a thing at a place, turned and painted anew."""
+        """Put a thing at a place, with a new turn and new colours."""
         rng, look = self._rng, thing.look
         yaw = math.atan2(y, x) + math.pi + rng.uniform(-look.facing, look.facing)
         turn = np.array(about((0, 0, 1), yaw))

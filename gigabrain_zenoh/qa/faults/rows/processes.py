@@ -62,7 +62,7 @@ ENABLED_LATCHED = Figure("enabled while latched")
 OLD_OBEYED = Figure("commands of the old boot obeyed")
 STARTS = Figure("starts")
 READY_AFTER = Figure("ready after", "s", wall=True)
-NOT_TOLD = Figure("faults not told")
+NOT_REPORTED = Figure("faults not reported")
 WAIT_TOO_SHORT = Figure("wait too short", "s")
 CPU_ADDED = Figure("cpu added", "%")
 IDLE = Figure("idle after", "s")
@@ -391,12 +391,12 @@ async def _recovery_s(robot: RobotUnderTest, victim: str) -> float:
     return (probe.state.tick - since) * TICK_MS / 1e3
 
 
-@fault_row(63, "", READY_AFTER.at_most(30), NOT_TOLD.at_most(0))
+@fault_row(63, "", READY_AFTER.at_most(30), NOT_REPORTED.at_most(0))
 async def fork_server_lost(rig: Rig) -> Measured:
     """Kill and freeze the fork server while a robot starts: its processes start by themselves."""
     if not forking.works_here():
         raise Skipped("processes are not forked on this system")
-    longest_s, not_told = 0.0, 0
+    longest_s, not_reported = 0.0, 0
     for fault in (signal.SIGKILL, signal.SIGSTOP):
         await rig.end_robot()
         attack = asyncio.create_task(_break_fork_server(fault))
@@ -405,8 +405,8 @@ async def fork_server_lost(rig: Rig) -> Measured:
             await attack
             await robot.until_driving()
             longest_s = max(longest_s, robot.ready_s)
-            not_told += all(record.get("event") != "fork server" for record in robot.records)
-    return {READY_AFTER: longest_s, NOT_TOLD: not_told}
+            not_reported += all(record.get("event") != "fork server" for record in robot.records)
+    return {READY_AFTER: longest_s, NOT_REPORTED: not_reported}
 
 
 async def _break_fork_server(fault: signal.Signals) -> None:
