@@ -15,7 +15,7 @@ from gigabrain_schemas.topics import DESCRIBE, Topic
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.listening import topic_of
 from gigabrain_zenoh.bus.transport import Transport
-from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.errors import ConfigError, Refused, unknown
 from gigabrain_zenoh.host.signals import run_until, stop_signals
 from gigabrain_zenoh.recording.bag_reader import Bag, Sample, check_magic
 from gigabrain_zenoh.recording.node import key_filter
@@ -66,7 +66,10 @@ class Player:
         return islice((sample for sample in Bag(self._path) if wanted(sample.key)), self._count)
 
     def _declare(self) -> None:
-        """Declare all publishers before the first message. Raises ConfigError."""
+        """Declare all publishers before the first message.
+
+        Raises ConfigError, and UnknownName for a remapped key that is not played.
+        """
         keys, first_ns, last_ns, count = dict[str, None](), 0, 0, 0
         for sample in self._samples():
             count += 1
@@ -74,6 +77,9 @@ class Player:
             first_ns, last_ns = first_ns or sample.log_ns, max(last_ns, sample.log_ns)
         if not keys:
             raise ConfigError(f"{self._path} holds no message to play")
+        for key in self._options.remap:
+            if key not in keys:
+                raise unknown("key", key, keys)
         self._count = count
         if self._options.start_s > (length_s := (last_ns - first_ns) / 1e9):
             of = " of these topics" if self._options.topics else ""

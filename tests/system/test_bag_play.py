@@ -227,3 +227,10 @@ def test_options_are_checked_before_anything_is_sent(
             command, exit_on_error=False, print_error=False, result_action="return_value"
         )
     assert str(error.value).startswith(complaint)
+
+
+async def test_a_remapped_key_that_is_not_played_is_refused(drive: Path) -> None:
+    for key in ("scan", "robot/state"):
+        options = PlayOptions(topics=("scan",), remap={key: "old/scan"})
+        with pytest.raises(ConfigError, match=f"no key '{key}'.* known: robot/scan$"):
+            await Player(drive, options, LocalNetwork().transport()).play()
