@@ -20,6 +20,7 @@ from gigabrain_zenoh.host.files import replacing
 from gigabrain_zenoh.recording.bag_reader import Bag, Sample, samples
 
 Value = float | int | str | bool | None
+NUMBER = int | float  # what can be plotted
 Series = tuple[list[float], list[float]]  # times since the first message [s], values
 DECODERS = {f"gigabrain.{t.type.__name__}": Codec(t.type, t.max_bytes).decode for t in TOPICS}
 
@@ -120,30 +121,33 @@ def read_series(path: Path, fields: Sequence[str]) -> dict[str, Series]:
     """Return each field's values over time. Raises UnknownName for a field not in the bag."""
     found: dict[str, Series] = {field: ([], []) for field in fields}
     wanted = {field: _split(field) for field in fields}
-    known: set[str] = set()
+    topics, numbers = set[str](), set[str]()
     first_ns = 0
     for sample in samples(path):
         first_ns = first_ns or sample.log_ns
         topic = sample.key.removeprefix("robot/")
         selected = [field for field, (name, _) in wanted.items() if name == topic]
-        if not selected and topic in known:
+        if not selected and topic in topics:
             continue
         message = message_of(sample)
         if message is None:
             continue
         values = row(message)
-        if topic not in known:
-            known |= {topic, *(f"{topic}.{name}" for name in values)}
+        if topic not in topics:
+            topics.add(topic)
+            numbers |= {f"{topic}.{name}" for name in values if isinstance(values[name], NUMBER)}
         for field in selected:
             value = values.get(wanted[field][1])
-            if isinstance(value, int | float):
+            if isinstance(value, NUMBER):
                 found[field][0].append((sample.log_ns - first_ns) / 1e9)
                 found[field][1].append(float(value))
     for field, (times, _) in found.items():
         if not times:
-            numbers = {name for name in known if name.startswith(f"{wanted[field][0]}.")}
-            topics = {name for name in known if "." not in name}
-            raise unknown("number", field, numbers) if numbers else unknown("topic", field, topics)
+            topic = wanted[field][0]
+            if topic not in topics:
+                raise unknown("topic", field, topics)
+            of_topic = {name for name in numbers if name.startswith(f"{topic}.")}
+            raise unknown("number", field, of_topic)
     return found
 
 

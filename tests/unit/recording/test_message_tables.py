@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from gigabrain_schemas.base import Message
+from gigabrain_zenoh.errors import UnknownName
 from gigabrain_zenoh.recording import message_tables
 from tests.unit.recording import bags
 
@@ -47,3 +48,11 @@ def test_keys_that_differ_only_in_a_slash_have_tables_of_their_own(tmp_path: Pat
     tables = message_tables.write_csv(path, tmp_path / "csv")
     assert [table.name for table in tables] == ["a_b_c.csv", "a_b_c_1.csv"]
     assert [len(table.read_text().splitlines()) for table in tables] == [2, 3]
+
+
+def test_a_text_is_refused_by_naming_numbers_alone(recording: Path) -> None:
+    with pytest.raises(UnknownName, match=r"^no number 'state\.gate\.mode'; ") as error:
+        message_tables.read_series(recording, ["state.gate.mode"])
+    _, _, known = str(error.value).partition("known: ")
+    assert known.startswith("state.basis, state.boot, state.gate.enables, ")
+    assert "state.robot_type" not in known
