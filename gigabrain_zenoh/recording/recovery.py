@@ -14,7 +14,7 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import open_regular
 from gigabrain_zenoh.host.posix import fcntl
 from gigabrain_zenoh.recording.bag_reader import HEAD, MAGIC, Bag, BagDamage, check_magic
-from gigabrain_zenoh.recording.bag_writer import LIBRARY, PROFILE, AppendOnlyFile
+from gigabrain_zenoh.recording.bag_writer import LIBRARY, PROFILE, VIEW, AppendOnlyFile
 
 log = logging.getLogger(__name__)
 
@@ -26,7 +26,7 @@ class Recovered(Struct, frozen=True, kw_only=True):
     """Result of a recovery."""
 
     path: Path
-    messages: int
+    messages: int  # without drawings for viewers
     damages: tuple[BagDamage, ...]
 
 
@@ -71,7 +71,8 @@ class _Copier:
             message.publish_time,
             message.sequence,
         )
-        self.messages += 1
+        if channel.metadata.get("kind") != VIEW:
+            self.messages += 1
 
 
 def recover(path: Path, to: Path) -> Recovered:

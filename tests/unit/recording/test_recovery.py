@@ -119,3 +119,14 @@ def test_a_recovery_that_is_interrupted_leaves_no_file(
     with pytest.raises(KeyboardInterrupt):
         recover(cut, cut.with_name("recovered.mcap"))
     assert list(cut.parent.iterdir()) == [cut]
+
+
+def test_drawings_for_viewers_are_copied_but_not_counted(tmp_path: Path) -> None:
+    file = BagWriter(tmp_path / "drawn.mcap", viewers=True, notes={})
+    for each in bags.drive(20):
+        file.add(each)
+    file.finish()
+    file.close()
+    done = recover(file.path, tmp_path / "copy.mcap")
+    assert (done.messages, read_info(done.path).messages) == (24, 24)
+    assert len(list(Bag(done.path).messages())) == len(list(Bag(file.path).messages())) > 24
