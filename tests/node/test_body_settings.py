@@ -82,9 +82,10 @@ async def test_a_stop_margin_reaches_safety_and_its_caps(tmp_path: Path) -> None
         ("side_margin", "0.01", "below the body's own need, 0.03 m"),
         ("stop_margin", "3.5", "the lidar sees no farther than 3.5 m"),
         ("max_linear_speed", "0", "expected"),
-        ("max_linear_speed", "-0.1", "expected"),
-        ("max_linear_speed", "nan", "expected"),
-        ("stop_margin", "inf", "expected"),
+        ("max_linear_speed", "-0.1", "max_linear_speed: expected a number, above 0, at most 0.26"),
+        ("max_linear_speed", "nan", "max_linear_speed: expected a number, above 0, at most 0.26"),
+        ("stop_margin", "0", "stop_margin: expected a number, at least 0.08 [m]"),
+        ("stop_margin", "inf", "stop_margin: expected a number, at least 0.08 [m]"),
         ("stop_margin", "much", "expected"),
     ],
 )

@@ -173,7 +173,9 @@ class DriverProcess:
         try:
             description = restricted(self._robot.description(), settings)
         except ValueError as error:
-            raise Refused(re.sub(PATH, "", str(error))) from None
+            if re.search(PATH, str(error)):  # no body may have it: `Params` names what is expected
+                raise
+            raise Refused(str(error)) from None
         self._settings, self._body = settings, replace(self._body, description=description)
         self._gatekeeper.limit(limits_of(description))
         self._bus.publish(BODY, self._body)
