@@ -205,11 +205,12 @@ def angle(name: str, degrees: float | None) -> float | None:
 
 
 def check_positive(**options: float | None) -> None:
-    """Raise ConfigError for the first option that is not above 0; None is an option not given."""
+    """Raise ConfigError for the first option not above 0, or too large; None is one not given."""
     for name, value in options.items():
         if value is not None and not 0 < value < 1e9:
             shown = name.replace("_", "-")
-            raise ConfigError(f"--{shown}: expected a number above 0, got {value:g}")
+            bound = "below 1e+09" if value > 0 else "above 0"
+            raise ConfigError(f"--{shown}: expected a number {bound}, got {value:g}")
 
 
 def check_names(robots: Iterable[str] = (), worlds: Iterable[str] = ()) -> None:

@@ -166,6 +166,7 @@ async def test_a_trace_says_whether_anything_was_received(tmp_path: Path) -> Non
     [
         ({"seconds": math.nan}, "--seconds: expected a number above 0, got nan"),
         ({"seconds": -1.0}, "--seconds: expected a number above 0, got -1"),
+        ({"seconds": 1e9}, r"--seconds: expected a number below 1e\+09, got 1e\+09"),
         ({"linear_x": math.nan}, "--linear-x: expected a number, got nan"),
         ({"linear_y": math.inf}, "--linear-y: expected a number, got inf"),
     ],
