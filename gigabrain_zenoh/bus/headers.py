@@ -10,6 +10,7 @@ from gigabrain_zenoh.host.bounded import put_newest
 
 DRIVER_KEYS = (STATE.key, SCAN.key, IMU.key, BODY.key, IMAGE.key)  # with the driver's boot
 MAX_COUNT = 2**63 - 1
+MAX_GAP = 1_000_000  # messages; a count that jumps farther is another count, not a loss
 MAX_SENDERS = 4096  # pairs of key and sender whose messages are counted at a time
 
 
@@ -50,13 +51,14 @@ class SequenceGaps:
 
     def __init__(self) -> None:
         self.missing: Counter[str] = Counter()
-        self.restarts: Counter[str] = Counter()  # how often a sender began to count from 1 again
+        self.restarts: Counter[str] = Counter()  # how often a sender began another count
         self._last: dict[tuple[str, str], Header] = {}
 
     def count(self, key: str, header: Header) -> int:
         """Count one message, and return how many are missing before it.
 
-        A sender that restarts counts from 1. Nothing is missing before the first message received.
+        A sender that restarts counts from 1. Nothing is missing before the first message received,
+        nor where a count jumps by more than MAX_GAP.
         """
         if header.seq == 0:  # its sender does not count
             return 0
@@ -69,10 +71,11 @@ class SequenceGaps:
         if header.seq == last.seq + 1 and header.boot == last.boot:  # the usual case
             return 0
         new_driver = header.boot != last.boot and key.startswith(DRIVER_KEYS)
-        if header.seq <= last.seq or new_driver:
+        restarted = header.seq <= last.seq or new_driver
+        missing = header.seq - 1 if restarted else header.seq - last.seq - 1
+        if restarted or missing > MAX_GAP:
             self.restarts[key] += 1
-            missing = header.seq - 1
-        else:
-            missing = header.seq - last.seq - 1
+        if missing > MAX_GAP:
+            return 0
         self.missing[key] += missing
         return missing

@@ -136,6 +136,15 @@ def test_a_restarted_sender_is_not_a_gap() -> None:
     assert (gaps.missing["robot/intent"], gaps.restarts["robot/intent"]) == (0, 1)
 
 
+def test_a_count_that_jumps_too_far_is_a_restart() -> None:
+    gaps = SequenceGaps()
+    most = 2**63 - 1
+    for seq in (5, most, 6, most - 1, 7, 1_000_008, 1_000_009, 2_000_011):
+        gaps.count("robot/intent", Header(seq=seq))
+    assert gaps.missing["robot/intent"] == 5 + 6 + 1_000_000
+    assert gaps.restarts["robot/intent"] == 5
+
+
 def test_two_senders_on_one_key_have_a_count_each() -> None:
     gaps = SequenceGaps()
     for seq, source in ((100, "control"), (1, "script"), (101, "control"), (2, "script")):
