@@ -45,6 +45,7 @@ from gigabrain_schemas.topics import (
 )
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.params import shown
+from gigabrain_zenoh.bus.restoring import RestoringPublisher
 from gigabrain_zenoh.config.settings import DriverConfig
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 from gigabrain_zenoh.gate import causes as why
@@ -90,6 +91,7 @@ class DriverProcess:
         self._lockstep = Lockstep(robot.control.period_ticks, wait_s) if driver.lockstep else None
         self._sensors: list[tuple[Topic[Any], Message]] = []  # that wait for the next tick
         self._poses: Message | None = None  # of the simulated world, the newest
+        self._restoring = RestoringPublisher(bus)
         self._round_trip = RoundTrip()
         self._line = asyncio.Lock()  # one call at a time goes out to the body
         self._sent = ZERO  # the newest command to the body
@@ -126,7 +128,7 @@ class DriverProcess:
         self._serve_settings()
         bus.publish(BODY, self._body)
         if model := self._driver.arm_model():
-            bus.publish(ARM_MODEL, model)
+            self._restoring.publish(ARM_MODEL, model)
         ready()
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._run_ticks())
@@ -253,7 +255,8 @@ class DriverProcess:
         tick = self._gate.tick
         if topic is SCAN:
             self._round_trip.sent(tick, self._bus.clock.now_ns())
-        self._bus.publish(topic, message, basis=tick)
+        publisher = self._restoring if topic is SIM_SCENE else self._bus
+        publisher.publish(topic, message, basis=tick)
 
     def _publish_tick(self, state: RobotState) -> None:
         bus, tick = self._bus, self._gate.tick
@@ -267,6 +270,7 @@ class DriverProcess:
         if tick - self._body_tick >= BODY_EVERY_TICKS:
             self._body_tick = tick
             bus.publish(BODY, self._body)
+            self._restoring.restore(basis=tick)
             self._update_figures()
 
     async def _step_in_lockstep(self, lockstep: Lockstep, state: RobotState) -> None:

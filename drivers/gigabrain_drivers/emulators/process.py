@@ -14,7 +14,9 @@ from gigabrain_drivers.emulators.emulator import Emulator
 from gigabrain_drivers.emulators.faults import Faults
 from gigabrain_drivers.emulators.hand import posture_in
 from gigabrain_drivers.sim.live_world import LiveWorld, News
+from gigabrain_schemas.topics import SIM_SCENE
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.restoring import RestoringPublisher
 from gigabrain_zenoh.config.settings import EmulatorConfig
 from gigabrain_zenoh.errors import BodyLost, ConfigError, unknown
 from gigabrain_zenoh.host.signals import stop_signals
@@ -46,9 +48,12 @@ def show_world(emulator: Emulator, name: str, bus: Bus) -> LiveWorld:
         asyncio.get_running_loop(),
     )
 
+    restoring = RestoringPublisher(bus)
+
     def publish(news: News) -> None:
         for topic, message in news:
-            bus.publish(topic, message)
+            (restoring if topic is SIM_SCENE else bus).publish(topic, message)
+        restoring.restore()
 
     def step(_: Snapshot) -> None:
         if news := world.step():

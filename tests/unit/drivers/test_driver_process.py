@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import AsyncIterator
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
@@ -12,15 +13,23 @@ from gigabrain_drivers.bodies.mock.driver import MockBody, MockOptions
 from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_drivers.driver.process import DriverProcess
 from gigabrain_drivers.driver.robot import Run
-from gigabrain_schemas.base import TICK_NS, Velocity
-from gigabrain_schemas.body import Battery, RobotState
+from gigabrain_schemas.base import TICK_NS, Message, Velocity
+from gigabrain_schemas.body import ArmModel, Battery, RobotState
 from gigabrain_schemas.brain import CmdVel
-from gigabrain_schemas.topics import BODY, CMD_VEL
+from gigabrain_schemas.sim import SimScene
+from gigabrain_schemas.topics import ARM_MODEL, BODY, CMD_VEL, SIM_SCENE, Topic
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.restoring import NO_HEADER
 from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import Clock, FakeClock
 from gigabrain_zenoh.config.settings import DriverConfig
 from gigabrain_zenoh.testing.in_memory import RobotInMemory
+
+MODEL = ArmModel(mjcf="its own")
+SCENE = SimScene(
+    version=1, world="arena", bodies=("world",), kinds=b"", owners=b"", sizes=b"", places=b"",
+    colours=b"",
+)  # fmt: skip
 
 
 class HeldUp(MockBody):
@@ -48,6 +57,38 @@ async def test_the_body_is_described_once_a_second_whatever_ticks_are_missed(
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)
     assert told == [0, 56, 112, 168]
+
+
+class WithArm(HeldUp):
+    """A body whose arm has a model."""
+
+    def arm_model(self) -> ArmModel:
+        return MODEL
+
+
+@pytest.mark.parametrize(
+    ("topic", "own", "other"),
+    [(ARM_MODEL, MODEL, ArmModel(mjcf="<")), (SIM_SCENE, SCENE, replace(SCENE, version=9))],
+)
+async def test_what_another_sender_replaced_is_published_again_once(
+    tmp_path: Path, topic: Topic[Any], own: Message, other: Message
+) -> None:
+    network, clock, told = LocalNetwork(), FakeClock(), list[tuple[int, Message]]()
+    driver = WithArm(load_robot("mock"), MockOptions(driver="mock"), Run(folder=Path()))
+    config = DriverConfig(body="mock", state_dir=str(tmp_path))
+    bus, stranger = Bus(network.transport(), clock, "driver"), Bus(network.transport(), clock)
+    process = DriverProcess(config, driver.robot, driver, bus)
+    stranger.subscribe(topic, lambda _key, one: told.append((one.tick, replace(one, **NO_HEADER))))
+    running = asyncio.ensure_future(process.run(lambda: None))
+    await clock.advance(TICK_NS)
+    driver.emit(SIM_SCENE, SCENE)
+    await clock.advance(27 * TICK_NS)
+    (first,) = told
+    stranger.publish(topic, other)
+    await clock.advance(400 * TICK_NS)
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
+    assert [first[1], *told[1:]] == [own, (0, other), (56, own)]
 
 
 @pytest.mark.long

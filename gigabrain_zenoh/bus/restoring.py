@@ -1,0 +1,38 @@
+"""Messages that are published only when they change, and again if another sender replaces them."""
+
+from typing import Any
+
+from msgspec.structs import replace
+
+from gigabrain_schemas.base import Message
+from gigabrain_schemas.topics import Topic
+from gigabrain_zenoh.bus.bus import Bus
+
+NO_HEADER = dict.fromkeys(Message.__struct_fields__, 0)
+
+
+class RestoringPublisher:
+    """Publishes messages, and on `restore` again those that another sender has replaced."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._own: dict[str, tuple[Topic[Any], Message]] = {}  # by key
+        self._replaced: set[str] = set()
+
+    def publish(self, topic: Topic[Any], message: Message, *, basis: int = 0) -> None:
+        """Publish a message of which receivers keep the newest one."""
+        first = topic.key not in self._own
+        self._own[topic.key] = topic, replace(message, **NO_HEADER)
+        if first:
+            self._bus.subscribe(topic, self._on_message)
+        self._bus.publish(topic, message, basis=basis)
+
+    def restore(self, *, basis: int = 0) -> None:
+        """Publish again what was replaced since the last call."""
+        replaced, self._replaced = self._replaced, set()
+        for key in replaced:
+            self.publish(*self._own[key], basis=basis)
+
+    def _on_message(self, key: str, message: Message) -> None:
+        if replace(message, **NO_HEADER) != self._own[key][1]:
+            self._replaced.add(key)
