@@ -92,6 +92,7 @@ class DriverProcess:
         self._sensors: list[tuple[Topic[Any], Message]] = []  # that wait for the next tick
         self._poses: Message | None = None  # of the simulated world, the newest
         self._restoring = RestoringPublisher(bus)
+        self._bodies = RestoringPublisher(bus)  # restored at once: a wrong one latches the gate
         self._round_trip = RoundTrip()
         self._line = asyncio.Lock()  # one call at a time goes out to the body
         self._sent = ZERO  # the newest command to the body
@@ -126,7 +127,7 @@ class DriverProcess:
         if self._config.link != "emulated":  # the emulator has the world then
             serve_world(bus, self._driver.change_world)
         self._serve_settings()
-        bus.publish(BODY, self._body)
+        self._bodies.publish(BODY, self._body)
         if model := self._driver.arm_model():
             self._restoring.publish(ARM_MODEL, model)
         ready()
@@ -180,7 +181,7 @@ class DriverProcess:
             raise Refused(str(error)) from None
         self._settings, self._body = settings, replace(self._body, description=description)
         self._gatekeeper.limit(limits_of(description))
-        self._bus.publish(BODY, self._body)
+        self._bodies.publish(BODY, self._body)
 
     async def _run_ticks(self) -> None:
         async for passed in self._driver.ticks(self._bus.clock):
@@ -267,9 +268,10 @@ class DriverProcess:
         for topic, message in self._sensors:
             self._send(topic, message)
         self._sensors.clear()
+        self._bodies.restore()
         if tick - self._body_tick >= BODY_EVERY_TICKS:
             self._body_tick = tick
-            bus.publish(BODY, self._body)
+            self._bodies.publish(BODY, self._body)
             self._restoring.restore(basis=tick)
             self._update_figures()
 

@@ -14,7 +14,7 @@ from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_drivers.driver.process import DriverProcess
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_schemas.base import TICK_NS, Message, Velocity
-from gigabrain_schemas.body import ArmModel, Battery, RobotState
+from gigabrain_schemas.body import ArmModel, Battery, Body, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.sim import SimScene
 from gigabrain_schemas.topics import ARM_MODEL, BODY, CMD_VEL, SIM_SCENE, Topic
@@ -89,6 +89,24 @@ async def test_what_another_sender_replaced_is_published_again_once(
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)
     assert [first[1], *told[1:]] == [own, (0, other), (56, own)]
+
+
+async def test_another_description_of_the_body_is_replaced_at_the_next_tick(
+    tmp_path: Path,
+) -> None:
+    network, clock, told = LocalNetwork(), FakeClock(), list[tuple[int, str]]()
+    driver = HeldUp(load_robot("mock"), MockOptions(driver="mock"), Run(folder=Path()))
+    config = DriverConfig(body="mock", state_dir=str(tmp_path))
+    bus, stranger = Bus(network.transport(), clock, "driver"), Bus(network.transport(), clock)
+    process = DriverProcess(config, driver.robot, driver, bus)
+    running = asyncio.ensure_future(process.run(lambda: None))
+    await clock.advance(28 * TICK_NS)
+    stranger.subscribe(BODY, lambda _key, one: told.append((one.tick, one.link)))
+    stranger.publish(BODY, Body(description=driver.robot.description(), link="emulated"))
+    await clock.advance(70 * TICK_NS)
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
+    assert told == [(0, "emulated"), (35, "sim"), (56, "sim")]
 
 
 @pytest.mark.long
