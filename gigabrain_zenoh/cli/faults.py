@@ -108,6 +108,8 @@ def faults(
 
     left_out = choose(skip) if skip else ()
     chosen = tuple(fault for fault in choose(only) if fault not in left_out)
+    if not chosen:
+        raise ConfigError("--skip leaves no test to run; see `gigabrain faults --list`")
     if list_:
         print_table(_plan(chosen))
         return 0

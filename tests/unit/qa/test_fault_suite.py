@@ -14,6 +14,7 @@ from gigabrain_schemas.brain import Intent, WorldModel
 from gigabrain_schemas.topics import INTENT, WORLD
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import LocalNetwork
+from gigabrain_zenoh.cli.faults import faults
 from gigabrain_zenoh.clock import FakeClock
 from gigabrain_zenoh.config.renames import FAULT_NAMES
 from gigabrain_zenoh.errors import ConfigError, UnknownName
@@ -144,6 +145,11 @@ def test_the_same_robots_can_be_had_navigating() -> None:
     assert robot.decision.settings == {"start": "explore", "max_linear_speed": 0.26}
     assert robot.perception.mapping == "slam"
     assert deployment_of(Options(), "serial").perception.mapping == "off"
+
+
+def test_a_choice_of_no_test_is_refused() -> None:
+    with pytest.raises(ConfigError, match="--skip leaves no test to run"):
+        faults(only=("8", "decision-killed"), skip=("1", "driver-killed"))
 
 
 async def test_what_cannot_run_is_skipped_and_says_why(tmp_path: Path) -> None:
