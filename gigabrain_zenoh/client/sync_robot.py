@@ -19,6 +19,7 @@ from gigabrain_schemas.topics import Topic
 from gigabrain_zenoh.client.motion import Reached
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.client.tasks import OnStatus, Tasks
+from gigabrain_zenoh.errors import BusError
 
 M = TypeVar("M", bound=Message)
 T = TypeVar("T")
@@ -70,7 +71,16 @@ class EventLoopThread:
 
     @contextlib.contextmanager
     def _running(self, coroutine: Coroutine[Any, Any, T]) -> Iterator[Future[T]]:
-        """Run `coroutine` while a block waits for it, and cancel it if the block is cut short."""
+        """Run `coroutine` while a block waits for it, and cancel it if the block is cut short.
+
+        Raises BusError once the loop is closed, as in a notebook's cell after that of the `with`.
+        """
+        if self._loop.is_closed():
+            coroutine.close()
+            raise BusError(
+                "the connection is closed; use `with gigabrain_zenoh.connect() as robot:` again, "
+                "and the robot inside it"
+            )
         begun, ended = threading.Event(), threading.Event()
 
         async def work() -> T:

@@ -14,6 +14,7 @@ from gigabrain_schemas.topics import TASK, TASK_CHANGE
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.client.sync_robot import EventLoopThread, SyncRobot, SyncTasks
 from gigabrain_zenoh.client.tasks import Tasks
+from gigabrain_zenoh.errors import BusError
 from gigabrain_zenoh.testing.in_memory import Net
 
 
@@ -50,6 +51,18 @@ def test_closing_ends_what_an_interrupt_left_running() -> None:
     task = thread.run(start())
     thread.close()
     assert (ended, task.cancelled()) == ([True], True)
+
+
+@pytest.mark.filterwarnings("error")  # as of a coroutine that was never awaited
+def test_a_robot_that_outlived_its_block_says_how_to_connect_again() -> None:
+    with tasks_of_a_robot() as tasks:
+        pass
+    with pytest.raises(
+        BusError, match=r"closed.*use `with gigabrain_zenoh\.connect\(\) as robot:`"
+    ):
+        tasks.explore()
+    with pytest.raises(BusError, match="closed"):
+        tasks.result("goal-1", lambda _: None)
 
 
 async def serve_task(net: Net) -> None:
