@@ -35,7 +35,7 @@ class OdometryMotion:
     """
 
     def __init__(self, body: BodyDescription, start: RobotState, distance: float, angle: float):
-        if not distance and body.turning_radius:
+        if angle and not distance and body.turning_radius:
             raise Unsupported(
                 f"{body.robot_type} cannot turn on the spot: its tightest turn has a radius of "
                 f"{body.turning_radius:.2f} m; use `goto` with a heading, or `drive`"

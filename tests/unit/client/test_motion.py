@@ -114,3 +114,6 @@ def test_a_car_is_not_asked_to_turn_on_the_spot() -> None:
     with pytest.raises(Unsupported, match=r"toy cannot turn on the spot: .* 0\.40 m"):
         OdometryMotion(car, start, 0.0, math.pi)
     assert OdometryMotion(car, start, 0.5, 0.0).step(start).linear_x > 0
+    nowhere = OdometryMotion(car, start, 0.0, 0.0)  # `move(0.0)`
+    assert nowhere.step(start) == Velocity()
+    assert (nowhere.done, nowhere.result().ok) == (True, True)
