@@ -27,7 +27,7 @@ from gigabrain_zenoh.security.identity_files import may_not_ask
 FILE_NAME = re.compile(r".+\.ya?ml")  # and no text of a mission, which has more lines or brackets
 MAX_NAME_CHARS = 64
 MAX_TAG = 1_000_000
-LARGEST = 1e9  # limit of coordinates on the bus
+LARGEST = 1e5  # limit of coordinates on the bus [m]
 PLAN_S = 5.0  # how long path planning in a large map may take
 SILENT_S = 5.0  # after this long without a task status, the robot counts as lost
 STALE_NS = 1_000_000_000  # the age up to which a status is given: it comes five times a second
