@@ -6,7 +6,8 @@ module that raises or hangs costs nobody else anything.
 
 import functools
 import importlib
-from collections.abc import Collection, Mapping
+import inspect
+from collections.abc import Callable, Collection, Mapping
 from importlib.machinery import PathFinder
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,6 +17,7 @@ import msgspec
 from msgspec import Struct
 
 from gigabrain_schemas.topics import PERCEIVED
+from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config import loading
 from gigabrain_zenoh.config.settings import OwnPerceptor, OwnProcess, ProcessConfig
 from gigabrain_zenoh.errors import ConfigError
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
 MAX_OWN = 32  # of one robot
 MODULES, PERCEPTORS = "processes", "perceptors"  # parts of a deployment file
 OWN = ProcessType("")
+Ready = Callable[[], None]
 
 
 def check_entries(
@@ -129,18 +132,30 @@ def load_own(config: ProcessConfig) -> tuple[ProcessType, Node]:
         made = _settings(config, perceptor.Config, (PERCEPTORS, config.name, "settings"))
         return OWN, functools.partial(perceptors.run, perceptor(made))
     path, _, function = config.module.partition(":")
+    function = function or "run"
     place = (MODULES, config.name, "module")
     try:
         module = importlib.import_module(path)
     except ImportError as error:
         raise _at(config.file, place, f"cannot import {path}: {error}") from None
-    node = getattr(module, function or "run", None)
+    node = getattr(module, function, None)
+    expected = f"expected async def {function}(config, bus, ready)"
+    wrong = _at(config.file, place, f"{path} has no coroutine {function!r}; {expected}")
     if not callable(node):
-        text = f"{path} has no coroutine {function or 'run'!r}; expected run(config, bus, ready)"
-        raise _at(config.file, place, text)
+        raise wrong
     kind = getattr(module, "Config", NoSettings)
     made = _settings(config, kind, (MODULES, config.name, "settings"))
-    return OWN, functools.partial(node, made)
+    return OWN, functools.partial(_run, made, node, wrong)
+
+
+async def _run(
+    config: Struct, node: Callable[..., Any], wrong: ConfigError, bus: Bus, ready: Ready
+) -> None:
+    """Run the node of a module; raise `wrong` if it is no coroutine."""
+    running = node(config, bus, ready)
+    if not inspect.isawaitable(running):
+        raise wrong
+    await running
 
 
 class NoSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -20,6 +20,7 @@ from gigabrain_zenoh.launch.processes import (
 )
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.perception import perceptors
+from gigabrain_zenoh.testing.in_memory import Net
 
 MODULE = '''"""A lamp."""
 
@@ -185,8 +186,17 @@ def test_its_own_process_finds_its_settings_wrong_and_names_the_line(tmp_path: P
 
 def test_a_module_without_its_coroutine_says_what_is_expected(tmp_path: Path) -> None:
     path = written(tmp_path, MINE.replace("my_lamp.node", "lone_lamp:shine"))
-    with pytest.raises(ConfigError, match=r":4: .*has no coroutine 'shine'; expected run\(config"):
+    with pytest.raises(
+        ConfigError, match=r":4: .*has no coroutine 'shine'; expected async def shine\("
+    ):
         load_own(config_of(path))
+
+
+async def test_one_whose_run_is_no_coroutine_is_refused_as_well(site: Path, tmp_path: Path) -> None:
+    (site / "lone_lamp.py").write_text(MODULE.replace("async def", "def"))
+    _, node = load_own(config_of(written(tmp_path, MINE.replace("my_lamp.node", "lone_lamp"))))
+    with pytest.raises(ConfigError, match=r":4: .*has no coroutine 'run'; expected async def run"):
+        await node(Net().one, lambda: None)
 
 
 def test_a_process_of_a_package_may_be_unknown_to_the_router_of_another_robot_too() -> None:
