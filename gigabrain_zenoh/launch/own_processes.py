@@ -158,6 +158,21 @@ async def _run(
     await running
 
 
+def failing_on_bus(load: Callable[[], Node]) -> Node:
+    """Return the node that `load` makes, or one that raises the error of `load`.
+
+    So the process is on the bus by then, and `why` and `doctor` say what is wrong with it.
+    """
+    try:
+        return load()
+    except Exception as error:  # noqa: BLE001 - the node raises it
+        return functools.partial(_fail, error)
+
+
+async def _fail(error: Exception, _bus: Bus, _ready: Ready) -> None:
+    raise error
+
+
 class NoSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of a module without a Config."""
 

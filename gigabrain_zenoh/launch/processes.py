@@ -51,7 +51,7 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.body_settings import split
 from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.host.signals import interrupts
-from gigabrain_zenoh.launch.own_processes import load_own, own_type
+from gigabrain_zenoh.launch.own_processes import OWN, failing_on_bus, load_own, own_type
 from gigabrain_zenoh.launch.process import ProcessPlace, ProcessType, run
 from gigabrain_zenoh.plugins import load_plugin, plugin_names
 from gigabrain_zenoh.runtime.connect import MakeBus
@@ -410,10 +410,11 @@ def node_of(config: ProcessConfig) -> Node:
 def load_process(config: ProcessConfig) -> tuple[ProcessType, Node]:
     """Return the row of a process, and its node. Raises ValidationError and ConfigError."""
     if config.module or config.perceptor:
-        return load_own(config)
+        return OWN, failing_on_bus(lambda: load_own(config)[1])
     row = process_type(config.name)
-    if not row.own:
-        this_process.open_no_window()
+    if row.own:
+        return row, failing_on_bus(lambda: node_of(config))
+    this_process.open_no_window()
     return row, node_of(config)
 
 

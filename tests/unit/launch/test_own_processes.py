@@ -14,6 +14,7 @@ from gigabrain_zenoh.launch.deployment import Deployment, load_deployment
 from gigabrain_zenoh.launch.own_processes import check_installed, load_own, unknown_to_router
 from gigabrain_zenoh.launch.processes import (
     PROCESSES,
+    load_process,
     own_processes,
     process_type,
     process_types,
@@ -196,6 +197,17 @@ async def test_one_whose_run_is_no_coroutine_is_refused_as_well(site: Path, tmp_
     (site / "lone_lamp.py").write_text(MODULE.replace("async def", "def"))
     _, node = load_own(config_of(written(tmp_path, MINE.replace("my_lamp.node", "lone_lamp"))))
     with pytest.raises(ConfigError, match=r":4: .*has no coroutine 'run'; expected async def run"):
+        await node(Net().one, lambda: None)
+
+
+async def test_one_that_cannot_be_loaded_fails_on_the_bus_where_its_end_is_heard(
+    site: Path, tmp_path: Path
+) -> None:
+    (site / "lone_lamp.py").write_text("raise RuntimeError('no such board')\n")
+    mine = MINE.replace("my_lamp.node", "lone_lamp")
+    row, node = load_process(config_of(written(tmp_path, mine)))
+    assert row.own
+    with pytest.raises(RuntimeError, match="no such board"):
         await node(Net().one, lambda: None)
 
 
