@@ -224,6 +224,10 @@ def _intent(facts: ChainFacts) -> LinkStatus:
             text=f"decision does not drive: {intent.reason}",
             remedy=FIND_IT if WaitReason.NOT_LOCALIZED in intent.reason else GOES_ON,
         )
+    is_car = facts.body is not None and facts.body.description.turning_radius > 0.0
+    if is_car and intent.twist and at_rest(Velocity(linear_x=intent.twist.linear_x)):
+        text = f"{intent.reason}, but the body cannot turn on the spot"
+        return _broken("intent", text, "use a behaviour that plans its turns, such as `navigate`")
     return _ok("intent", f"{intent.reason}{_after(facts, INTENT.key, 'the world')}")
 
 

@@ -388,6 +388,20 @@ def test_an_operator_that_keeps_the_body_from_a_goal_is_named(moving: ChainFacts
     assert "control sends zero" in silent.broken.text
 
 
+def test_a_car_that_is_to_turn_on_the_spot_is_no_fault_of_control(moving: ChainFacts) -> None:
+    assert moving.body
+    car = replace(moving.body.description, drive_type="ackermann", min_turning_radius=0.4)
+    facts = replace(moving, body=replace(moving.body, description=car))
+    verdict = judge(standing(facts, DRIVES, wants=Velocity(angular_z=-0.5)))
+    assert verdict.broken
+    assert (verdict.broken.link, verdict.exit_code) == ("intent", 15)
+    assert "cannot turn on the spot" in verdict.broken.text
+    assert "behaviour" in verdict.broken.remedy
+    silent = judge(standing(facts, DRIVES, wants=Velocity(linear_x=0.2)))
+    assert silent.broken
+    assert "control sends zero" in silent.broken.text
+
+
 def test_a_starting_decision_differs_from_a_silent_one(moving: ChainFacts) -> None:
     starting = replace(standing(moving, TaskStatus()), intent=None)
     assert judge(starting).waits
