@@ -87,6 +87,7 @@ class DriverConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     resume: Resume = "manual"
     state_dir: str  # folder where it saves the causes that latched it
     emulator: str = ""  # folder of the emulator's ports, if the link is `emulated`
+    checkpoint: str = ""  # path of a simulation's checkpoints in this run; empty: it keeps none
     button: bool = False  # an e-stop button must be present
     cameras: bool = False  # the body's cameras are used; otherwise it counts as one without
     robot: dict[str, Any] = {}  # fields of the body's file that are other here

@@ -57,6 +57,11 @@ class ProcessPlace:
         """Return the folder of an emulator's ports."""
         return self.run_dir / "ports"
 
+    @property
+    def checkpoint(self) -> Path:
+        """Return the path of a simulation's checkpoints."""
+        return self.run_dir / "checkpoint"
+
 
 @dataclass(frozen=True)
 class ProcessType:

@@ -103,6 +103,7 @@ def _driver(deployment: "Deployment", place: ProcessPlace) -> DriverConfig:
         resume=deployment.resume,
         state_dir=str(place.state_dir),
         emulator=str(place.ports) if deployment.link == "emulated" else "",
+        checkpoint=str(place.checkpoint) if deployment.link == "sim" else "",
         button=deployment.button is not None,
         cameras=deployment.cameras,
         robot=deployment.robot,

@@ -434,6 +434,7 @@ async def run(config: DriverConfig, bus: Bus, ready: Callable[[], None]) -> None
         seconds=config.seconds,
         emulator=config.emulator or str(ports_folder(config.body)),
         cameras=config.cameras,
+        checkpoint=config.checkpoint,
         changes=split(config.robot)[1],
     )
     robot, driver = make_driver(config.body, where)

@@ -75,4 +75,5 @@ class Run(Struct, frozen=True, kw_only=True):
     seconds: float | None = None  # of simulated time, then it holds still
     emulator: str = ""  # the folder of the emulator's ports, where the link is `emulated`
     cameras: bool = False  # whether its cameras are used; otherwise the robot has none
+    checkpoint: str = ""  # path of a simulation's checkpoints in this run; empty: it keeps none
     changes: dict[str, Any] = {}  # fields of the robot's file that are other in this run

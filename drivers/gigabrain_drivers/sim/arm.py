@@ -50,6 +50,13 @@ class SimArm:
         self.act()
         mujoco.mj_forward(model, data)  # for the torques with which they hold
 
+    def restore(self, aims: tuple[float, ...], *, limp: bool) -> None:
+        """Be at rest where the physics has the joints, with these goals [rad] or [m]."""
+        self._now = self._before = self._measured()
+        self._aims = dict(zip(self.names, aims, strict=True))
+        self._sent, self.limp = np.array(aims), limp
+        self.act()
+
     @property
     def targets(self) -> tuple[float, ...]:
         """The servos' goals [rad] or [m], in the order of the description."""

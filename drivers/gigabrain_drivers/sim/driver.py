@@ -2,10 +2,12 @@
 
 import asyncio
 import contextlib
+import logging
 import math
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -15,6 +17,7 @@ from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.sim import STEP_NS, STEP_S, Pace
 from gigabrain_drivers.sim.body import MujocoOptions, sim_body
+from gigabrain_drivers.sim.checkpoint import CheckpointFiles
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.arrays import ranges_bytes
 from gigabrain_schemas.base import TICK_NS, Message, Pose, Velocity
@@ -29,9 +32,12 @@ from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 if TYPE_CHECKING:
     from gigabrain_drivers.sim.physics import Simulation
 
+log = logging.getLogger(__name__)
+
 T = TypeVar("T")
 STEPS_PER_TICK = TICK_NS // STEP_NS  # physics steps per tick of the robot's clock
 COMMAND_TIMEOUT_NS = 150_000_000  # of simulated time: as long as a firmware would wait
+CHECKPOINT_TICKS = 5  # 100 ms
 SPEED_RANGE = (0.1, 100.0)
 
 
@@ -78,9 +84,8 @@ class MujocoDriver(Driver):
     Options = MujocoOptions
 
     def __init__(self, robot: RobotFile, options: MujocoOptions, run: Run) -> None:
-        # they import MuJoCo, which takes 0.2 s; to read its options is quick
+        # it imports MuJoCo, which takes 0.2 s; to read its options is quick
         from gigabrain_drivers.sim.live_world import LiveWorld
-        from gigabrain_drivers.sim.physics import Simulation
 
         super().__init__(robot, options, run)
         if not SPEED_RANGE[0] <= run.speed <= SPEED_RANGE[1]:
@@ -88,13 +93,13 @@ class MujocoDriver(Driver):
                 f"speed must be {SPEED_RANGE[0]:g} to {SPEED_RANGE[1]:g}, got {run.speed:g}"
             )
         self.lockstep = run.speed != 1.0
-        world = load_world(run.world, run.seed)
-        self._simulation = Simulation(sim_body(robot, options, run), world, run.seed)
+        self._checkpoints = CheckpointFiles(Path(run.checkpoint)) if run.checkpoint else None
+        self._simulation = self._begin()
         self._world = LiveWorld(self._simulation, run.world, robot.cameras)
         period_ns = 1e9 / robot.lidar.rate_hz if robot.lidar else math.inf
         self._scan_ticks = period_ns / TICK_NS
         self._next_scan = self._scan_ticks
-        self._ticks = 0
+        self._ticks = 0  # since this driver began, like those of the robot's clock
         self._last_ticks = round(run.seconds * 1e9 / TICK_NS) if run.seconds else None
         self._commanded_ns = 0
         self._physics_s = 0.0  # CPU time of physics and lidar
@@ -106,6 +111,23 @@ class MujocoDriver(Driver):
         self._account = self._simulation.report(robot, run)  # as of the newest tick
         self._state: RobotState | None = None
         self.sensors = dict.fromkeys(("imu", "scan") if robot.lidar else ("imu",))
+
+    def _begin(self) -> "Simulation":
+        """Go on where an earlier driver of this run has died, or begin at the world's start."""
+        from gigabrain_drivers.sim.physics import Simulation  # imports MuJoCo, as above
+
+        body = sim_body(self.robot, self.options, self.run)
+        world, seed = load_world(self.run.world, self.run.seed), self.run.seed
+        if files := self._checkpoints:
+            try:
+                if checkpoint := files.read():
+                    simulation = Simulation(body, world, seed, checkpoint)
+                    log.info("the simulation goes on at %.2f s", simulation.time_ns / 1e9)
+                    return simulation
+            except (ConfigError, OSError) as error:
+                log.warning("the simulation begins at its start again: %s", error)
+                files.clear()
+        return Simulation(body, world, seed)
 
     async def open(self) -> None:
         """Take the first readings; time stands still until `ticks` is iterated."""
@@ -206,6 +228,8 @@ class MujocoDriver(Driver):
         try:
             self._simulate()
         except Exception as error:  # noqa: BLE001 - handed on whole, to end the driver's process
+            if self._checkpoints:
+                self._checkpoints.clear()  # it would fall or diverge again
             self._post(error)
 
     def _simulate(self) -> None:
@@ -235,12 +259,24 @@ class MujocoDriver(Driver):
         news = self._world.step()
         if last:
             self._account = self._simulation.report(self.robot, self.run)
+            if self._ticks % CHECKPOINT_TICKS == 0:
+                self._save()
             return Reading(self._imu(), state=self._read_state(), news=news)
         # a lidar is not synchronous with the states; between two of them the cores are idle
         due = self._ticks >= self._next_scan
         if due:
             self._next_scan += self._scan_ticks
         return Reading(self._imu(), scan=self._scan() if due else None, news=news)
+
+    def _save(self) -> None:
+        if self._checkpoints is None:
+            return
+        try:
+            self._checkpoints.write(self._simulation.checkpoint())
+        except OSError as error:
+            log.warning("the simulation will begin at its start after a crash: %s", error)
+            self._checkpoints.clear()
+            self._checkpoints = None
 
     def _timed(self, work: Callable[[], T]) -> T:
         """Run a piece of physics and add its CPU time to the report."""

@@ -36,17 +36,17 @@ class Battery:
 
     def __init__(self, config: SimBattery) -> None:
         self._config = config
-        self._left_ah = config.capacity_ah * config.percentage / 100
+        self.left_ah = config.capacity_ah * config.percentage / 100
         self._current = config.idle_current_a
 
     def drain(self, drive_current: float) -> None:
         """Drain one step of `drive_current` [A] and the idle current."""
         self._current = self._config.idle_current_a + drive_current
-        self._left_ah = max(self._left_ah - self._current * STEP_S / HOUR_S, 0.0)
+        self.left_ah = max(self.left_ah - self._current * STEP_S / HOUR_S, 0.0)
 
     def read(self) -> Charge:
         """Return what the board reports."""
-        config, share = self._config, self._left_ah / self._config.capacity_ah
+        config, share = self._config, self.left_ah / self._config.capacity_ah
         if share > 0.5:
             rest = config.nominal_voltage
             rest += (2 * share - 1) * (config.full_voltage - config.nominal_voltage)
@@ -184,10 +184,11 @@ class Wheels(Locomotion):
         self._motors = [int(model.actuator(f"{ROBOT}{n}").id) for n in body.wheels]
         self._heat = [MotorHeat(body.motor) for _ in body.wheels]
         self._angle_per_tick = math.tau / body.encoder_ticks
-        count = len(body.wheels)
         self._rolling = len(body.rolling)  # they come first; what steers after them
-        self._target = self._speed = (0.0,) * count  # [rad/s]; [rad] of what steers
-        self._counts = (0,) * count
+        data.qpos[self._angles[: self._rolling]] = 0.0  # where their encoders begin
+        angles = data.qpos[self._angles].tolist()
+        self._target = self._speed = tuple(angles)  # [rad/s], at rest; [rad] of what steers
+        self._counts = tuple(self._counted(angle, 0) for angle in angles)
         self._past = deque([self._counts] * (VELOCITY_TICKS + 1), maxlen=VELOCITY_TICKS + 1)
         self._x = self._y = self._yaw = 0.0
 

@@ -1,5 +1,6 @@
 """A body in a world, one step of 10 ms at a time. No bus, no clock and no thread of its own."""
 
+import hashlib
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +19,7 @@ from gigabrain_drivers.sim.body import (
     SimModel,
     SimQuadruped,
 )
+from gigabrain_drivers.sim.checkpoint import Checkpoint
 from gigabrain_drivers.sim.locomotion import (
     Battery,
     Charge,
@@ -39,6 +41,7 @@ from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
 GRAVITY = 9.81  # [m/s2]
 STALL_AMPERES, STALL_SHARE = 1.4, 4.0  # of the usual motor; times its gear's friction
 EDGE_OF_THE_WORLD_M = 1e3
+PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
 DIVERGED = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
     mujoco.mjtWarning.mjWARN_BADQVEL,
@@ -49,8 +52,12 @@ DIVERGED = (
 class Simulation:
     """A body in a world. The same body, world, seed and calls give the same bits."""
 
-    def __init__(self, body: SimModel, world: World, seed: int) -> None:
+    def __init__(
+        self, body: SimModel, world: World, seed: int, checkpoint: Checkpoint | None = None
+    ) -> None:
+        """Begin at the world's start, or at rest at a checkpoint. Raises ConfigError."""
         self.model = compile_scene(body, world)
+        self._digest = _digest(self.model)
         body = with_motors(body, self.model)
         self.data = mujoco.MjData(self.model)
         self._steps, self._substeps = 0, body.substeps
@@ -71,12 +78,62 @@ class Simulation:
                 f"world {world.name}: the robot touches something at its start "
                 f"({world.start.x:g}, {world.start.y:g}); expected a `start` with room round it"
             )
-        self._imu = Imu(self.model, self.data, world.start.yaw, generator(seed, Stream.IMU))
+        yaw = world.start.yaw
+        if checkpoint:
+            self._resume(checkpoint, body)
+            yaw = self.truth.pose().yaw
+        self._imu = Imu(self.model, self.data, yaw, generator(seed, Stream.IMU))
         self._sample = self._imu.sample()
         self._lidar = (
             Lidar(body.lidar, self.model, f"{ROBOT}lidar", generator(seed, Stream.LIDAR))
             if body.lidar
             else None
+        )
+
+    def checkpoint(self) -> Checkpoint:
+        """Return the state at the end of this step."""
+        physics = np.empty(mujoco.mj_stateSize(self.model, PHYSICS))
+        mujoco.mj_getState(self.model, self.data, physics, PHYSICS)
+        arm, truth = self.arm, self.truth
+        return Checkpoint(
+            model=self._digest,
+            steps=self._steps,
+            physics=physics.tobytes(),
+            charge_ah=self._battery.left_ah,
+            aims=arm.targets if arm else (),
+            limp=bool(arm and arm.limp),
+            things=self.things.all(),
+            walked=tuple(person.walked for person in self._people.values()),
+            person_stood=self.person_stood,
+            contacts=truth.contacts,
+            falls=truth.falls,
+            min_clearance_m=truth.min_clearance_m,
+            distance_m=truth.distance_m,
+        )
+
+    def _resume(self, checkpoint: Checkpoint, body: SimModel) -> None:
+        """Go on at rest; the body's own sensors begin at zero. Raises ConfigError."""
+        if checkpoint.model != self._digest:
+            raise ConfigError("the checkpoint is of another body or world")
+        physics = np.frombuffer(checkpoint.physics)
+        mujoco.mj_setState(self.model, self.data, physics, PHYSICS)
+        self.data.qvel[:] = 0.0
+        self._steps = checkpoint.steps
+        self._locomotion = make_locomotion(body, self.model, self.data)
+        if self.arm:
+            self.arm.restore(checkpoint.aims, limp=checkpoint.limp)
+        self._battery.left_ah = checkpoint.charge_ah
+        self.things.restore(checkpoint.things)
+        for person, walked in zip(self._people.values(), checkpoint.walked, strict=True):
+            person.go_to(walked)
+        self._stood_before = checkpoint.person_stood
+        self._place_people()
+        mujoco.mj_forward(self.model, self.data)
+        self.truth.restore(
+            contacts=checkpoint.contacts,
+            falls=checkpoint.falls,
+            min_clearance_m=checkpoint.min_clearance_m,
+            distance_m=checkpoint.distance_m,
         )
 
     @property
@@ -216,6 +273,13 @@ class Simulation:
         lost = any(self.data.warning[kind].number for kind in DIVERGED)
         if lost or not (abs(x) < far and abs(y) < far and abs(z) < 1):
             raise BodyLost(f"the simulation diverged after {self.time_ns / 1e9:.2f} s")
+
+
+def _digest(model: mujoco.MjModel) -> bytes:
+    """Return the SHA-256 of a model, before it is changed."""
+    data = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, data)
+    return hashlib.sha256(data.tobytes()).digest()
 
 
 def with_motors(body: SimModel, model: mujoco.MjModel) -> SimModel:

@@ -100,18 +100,21 @@ class Person:
 
     def __init__(self, walk: WalkingPath) -> None:
         self._path, self._step_m = ClosedPath(walk.corners), walk.speed * STEP_S
-        self._walked = walk.start
-        self.pose = self._path.at(walk.start)
+        self.go_to(walk.start)
         self.stood = 0  # how often it had to, for the robot
         self._since_m = NEW_MEETING_M
 
+    def go_to(self, walked: float) -> None:
+        """Be at this place along the path [m]."""
+        self.walked, self.pose = walked, self._path.at(walked)
+
     def advance(self, robot_distance: Callable[[float, float], float]) -> Pose:
         """Walk for one step; `robot_distance(x, y)` is from a point to the robot's edge [m]."""
-        walked = (self._walked + self._step_m) % self._path.length
+        walked = (self.walked + self._step_m) % self._path.length
         ahead = self._path.at(walked)
         gap = robot_distance(ahead.x, ahead.y)
         if gap >= PERSON_GAP_M + PERSON_RADIUS_M or gap > robot_distance(self.pose.x, self.pose.y):
-            self._walked, self.pose = walked, ahead
+            self.walked, self.pose = walked, ahead
             self._since_m += self._step_m
         else:
             self.stood += self._since_m >= NEW_MEETING_M

@@ -1,7 +1,7 @@
 """Things and people put into a simulated world while it runs, in spare bodies of its model."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import mujoco
@@ -74,7 +74,7 @@ class Things:
         """Put something in; return it with its name. Raises Refused."""
         thing = replace(thing, name=self._name(thing))
         self._check_place(thing)
-        spare = self._free["person" if thing.kind == "person" else "thing"]
+        spare = self._spares(thing)
         if not spare:
             raise Refused(
                 f"no {thing.kind} is left; remove something with `gigabrain world remove`"
@@ -89,12 +89,25 @@ class Things:
                 f"the robot is in the way at ({thing.x:.2f}, {thing.y:.2f}): {gap:.2f} m from it; "
                 f"expected at least {needed:g} m"
             )
-        spare.pop(0)
+        self._use(spare.pop(0), thing)
+        return thing
+
+    def restore(self, things: Iterable[Thing]) -> None:
+        """Put in things of an earlier simulation, however near the robot they are."""
+        for thing in things:
+            body = self._spares(thing).pop(0)
+            self._show(body, thing)
+            self._use(body, thing)
+
+    def _use(self, body: int, thing: Thing) -> None:
         self._used[thing.name] = Used(thing, body)
         if thing.kind == "person" and thing.path:
             self._walk(body, Person(WalkingPath(((thing.x, thing.y), *thing.path), thing.speed)))
         self._changed()
-        return thing
+
+    def _spares(self, thing: Thing) -> list[int]:
+        """Return the bodies that are left for things like this."""
+        return self._free["person" if thing.kind == "person" else "thing"]
 
     def remove(self, name: str) -> Thing:
         """Take something out. Raises Refused with what there is."""
@@ -104,7 +117,7 @@ class Things:
         used = self._used.pop(name)
         self._walk(used.body, None)
         self._hide(used.body)
-        self._free["person" if used.thing.kind == "person" else "thing"].append(used.body)
+        self._spares(used.thing).append(used.body)
         self._changed()
         return used.thing
 

@@ -63,6 +63,15 @@ class Truth:
         self._touch()
         self._clear()
 
+    def restore(
+        self, *, contacts: int, falls: int, min_clearance_m: float, distance_m: float
+    ) -> None:
+        """Go on with an earlier account, from where the robot is now."""
+        self._position = self.pose()
+        self._touch()  # which is no new contact
+        self.contacts, self.falls = contacts, falls
+        self.min_clearance_m, self.distance_m = min_clearance_m, distance_m
+
     def find_obstacles(self) -> None:
         """Look again at what can be touched, after a change of the model."""
         model = self._model

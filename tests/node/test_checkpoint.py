@@ -1,0 +1,260 @@
+"""A simulation whose driver dies goes on where it was, in the same run only."""
+
+import logging
+import math
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from gigabrain_drivers.driver import catalog
+from gigabrain_drivers.driver.robot import Run
+from gigabrain_drivers.sim.body import MujocoOptions, sim_body
+from gigabrain_drivers.sim.checkpoint import Checkpoint, CheckpointFiles
+from gigabrain_drivers.sim.driver import MujocoDriver
+from gigabrain_drivers.sim.physics import Simulation
+from gigabrain_drivers.sim.worlds import load_world
+from gigabrain_schemas.sim import Thing
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.config.settings import LinkName
+from gigabrain_zenoh.errors import BodyLost, ConfigError
+from gigabrain_zenoh.launch.deployment import Deployment
+from gigabrain_zenoh.launch.specs import process_specs
+
+WAFFLE = "turtlebot3_waffle"
+BOX_IN_ROOM = """
+<mujoco><worldbody>
+  <geom name="ground" type="plane" size="0 0 0.1"/>
+  <body name="crate" pos="0.7 0 0.1"><freejoint/>
+    <geom type="box" size="0.1 0.1 0.1" mass="0.2"/></body>
+</worldbody></mujoco>
+"""
+
+
+def simulation(
+    body: str = WAFFLE, world: str = "arena", checkpoint: Checkpoint | None = None
+) -> Simulation:
+    robot, _, options, folder = catalog.load_link(body, Run(folder=Path()))
+    assert isinstance(options, MujocoOptions)
+    model = sim_body(robot, options, Run(folder=folder))
+    return Simulation(model, load_world(world, 0), 0, checkpoint)
+
+
+def run(one: Simulation, seconds: float) -> None:
+    for _ in range(round(seconds * 100)):
+        one.advance()
+
+
+def resumed(one: Simulation, body: str = WAFFLE, world: str = "arena") -> Simulation:
+    """Return a simulation that goes on from the checkpoint of `one`, as a new process does."""
+    text = msgspec.msgpack.encode(one.checkpoint())
+    return simulation(body, world, msgspec.msgpack.decode(text, type=Checkpoint))
+
+
+def place(one: Simulation) -> tuple[float, float, float]:
+    pose = one.truth.pose()
+    return pose.x, pose.y, pose.yaw
+
+
+@pytest.mark.parametrize("body", [WAFFLE, "lekiwi", "ackermann_car"])
+def test_a_body_stands_where_it_was_and_its_odometry_begins_at_zero(body: str) -> None:
+    before = simulation(body)
+    before.drive(0.15, 0.0, 0.4)
+    run(before, 2)
+    after = resumed(before, body)
+    assert place(after) == pytest.approx(place(before))
+    assert after.time_ns == 2_000_000_000
+    assert after.battery().percentage == before.battery().percentage
+    assert after.truth.distance_m == before.truth.distance_m > 0.1
+    run(after, 1)
+    assert place(after) == pytest.approx(place(before), abs=0.005)
+    assert after.odometry() == pytest.approx((0, 0, 0, 0, 0), abs=0.01)
+    _, _, z, w = after.imu().orientation
+    assert 2 * math.atan(z / w) == pytest.approx(0, abs=0.02)
+
+
+def test_an_arm_keeps_its_goals_and_one_that_was_limp_stays_limp() -> None:
+    before = simulation("so101", "table")
+    assert before.arm
+    name = before.arm.names[0]
+    before.arm.aim({name: 0.5})
+    run(before, 2)
+    after = resumed(before, "so101", "table")
+    assert after.arm
+    assert after.arm.targets == before.arm.targets
+    run(after, 1)
+    assert after.arm.truth()[0] == pytest.approx(before.arm.truth()[0], abs=0.01)
+    after.arm.let_go()
+    run(after, 0.1)
+    last = resumed(after, "so101", "table")
+    assert last.arm
+    assert last.arm.limp
+    last.advance()
+    assert last.model.actuator_gainprm[:, 0].max() == 0.0
+
+
+def test_a_quadruped_that_trots_stands_and_does_not_fall() -> None:
+    for steps in (5, 23, 41):
+        before = simulation("alpha")
+        before.drive(0.2, 0.0, 0.0)
+        run(before, 1.0 + steps / 100)
+        after = resumed(before, "alpha")
+        run(after, 2)
+        assert not after.fallen
+        assert math.dist(place(after)[:2], place(before)[:2]) < 0.1
+
+
+def test_things_people_and_the_account_of_the_run_stay() -> None:
+    before = simulation(world="playroom")
+    x, y, yaw = place(before)
+    ahead = x + 0.4 * math.cos(yaw), y + 0.4 * math.sin(yaw)
+    before.things.add(Thing(name="crate", x=ahead[0], y=ahead[1], size=(0.2, 0.2, 0.3)))
+    walk = Thing(kind="person", x=x, y=y + 2, path=((x + 1, y + 2),))
+    before.things.add(walk)
+    before.command(0.2, 0.0)
+    run(before, 4)  # into the box
+    assert before.truth.contacts == 1
+    after = resumed(before, world="playroom")
+    assert after.things.all() == before.things.all()
+    assert [one.pose for one in after.people()] == [one.pose for one in before.people()]
+    assert after.truth.contacts == 1
+    assert after.truth.min_clearance_m == 0.0
+    run(after, 0.2)
+    assert after.truth.contacts == 1  # it still touches the box
+    same = np.isclose(after.scan(), before.scan(), atol=0.1)
+    assert same.mean() > 0.9  # but for people, and beams that pass an edge
+
+
+def test_what_the_robot_has_moved_stays_there(tmp_path: Path) -> None:
+    path = tmp_path / "room.xml"
+    path.write_text(BOX_IN_ROOM)
+    before = simulation(world=str(path))
+    crate = before.model.body("world/crate").id
+    began = before.data.xpos[crate].copy()
+    before.data.qpos[0:2] += (0.3, 0.2)
+    run(before, 0.5)
+    after = resumed(before, world=str(path))
+    assert np.hypot(*(after.data.xpos[crate] - began)[:2]) > 0.3
+
+
+def test_a_checkpoint_of_another_world_or_body_is_refused() -> None:
+    with pytest.raises(ConfigError, match="another body or world"):
+        resumed(simulation(), world="house")
+    with pytest.raises(ConfigError, match="another body or world"):
+        resumed(simulation(), "turtlebot3_burger")
+
+
+def test_the_newest_intact_checkpoint_is_read(tmp_path: Path) -> None:
+    path, one = tmp_path / "checkpoint", simulation()
+    files = CheckpointFiles(path)
+    assert files.read() is None
+    for _ in range(3):
+        one.advance()
+        files.write(one.checkpoint())
+    assert CheckpointFiles(path).read() == one.checkpoint()
+    newest = Path(f"{path}.0")
+    newest.write_bytes(newest.read_bytes()[:100])  # killed while it wrote
+    older = CheckpointFiles(path).read()
+    assert older
+    assert older.steps == 2
+    Path(f"{path}.1").write_bytes(b"x" * 400)
+    with pytest.raises(ConfigError, match="damaged"):
+        CheckpointFiles(path).read()
+    files.clear()
+    assert CheckpointFiles(path).read() is None
+
+
+def driver(checkpoint: Path, world: str = "arena", seconds: float | None = None) -> MujocoDriver:
+    where = Run(
+        folder=Path(), world=world, speed=100.0, seconds=seconds, checkpoint=str(checkpoint)
+    )
+    _, made = catalog.make_driver(WAFFLE, where)
+    assert isinstance(made, MujocoDriver)
+    return made
+
+
+async def drive(one: MujocoDriver, ticks: int) -> dict[str, object]:
+    """Drive for some ticks; return the report. Files are left as a killed process leaves them."""
+    async with one:
+        times = one.ticks(Clock())
+        for _ in range(ticks):
+            await anext(times)
+            await one.set_base_velocity(0.2, 0.0, 0.0)
+        await times.aclose()  # type: ignore[attr-defined]
+    return dict(one.report())
+
+
+async def test_the_next_driver_of_a_run_goes_on_where_the_last_one_died(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint"
+    first = await drive(driver(path, seconds=4.0), 100)
+    second = driver(path, seconds=4.0)
+    assert second.report()["true_x"] == pytest.approx(first["true_x"], abs=0.03)
+    assert second.report()["sim_seconds"] == pytest.approx(2.0, abs=0.1)
+    async with second:
+        assert (await second.read_state()).pose.x == 0.0
+    end = await drive(driver(path, seconds=0.1), 5)
+    assert end["sim_seconds"] == pytest.approx(2.1, abs=0.1)  # each driver has its own seconds
+    other = await drive(driver(tmp_path / "another run"), 1)
+    assert other["sim_seconds"] == 0.02
+
+
+def overwrite(checkpoint: Path, content: bytes) -> None:
+    for number in range(2):
+        Path(f"{checkpoint}.{number}").write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    ("world", "content", "why"),
+    [("house", None, "of another body or world"), ("arena", b"?" * 99, "damaged")],
+)
+async def test_a_driver_that_cannot_go_on_begins_at_the_start_and_says_so(
+    tmp_path: Path, world: str, content: bytes | None, why: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "checkpoint"
+    await drive(driver(path), 20)
+    if content:
+        overwrite(path, content)
+    with caplog.at_level(logging.WARNING):
+        again = await drive(driver(path, world), 10)
+    assert again["sim_seconds"] == 0.2
+    assert why in caplog.text
+    third = driver(path, world)  # which finds the checkpoint of the second
+    assert third.report()["sim_seconds"] == 0.2
+    await third.close()
+
+
+async def test_a_body_that_fell_begins_at_the_start_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "checkpoint"
+    await drive(driver(path), 10)
+    monkeypatch.setattr(Simulation, "fallen", True)
+    with pytest.raises(BodyLost, match="fell over"):
+        await drive(driver(path), 1)
+    assert CheckpointFiles(path).read() is None
+
+
+async def test_a_full_disk_stops_no_tick_and_leaves_no_old_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "checkpoint"
+    await drive(driver(path), 10)
+
+    def full(files: CheckpointFiles, checkpoint: Checkpoint) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(CheckpointFiles, "write", full)
+    report = await drive(driver(path), 20)
+    assert report["sim_seconds"] == pytest.approx(0.6)
+    assert caplog.text.count("No space left") == 1
+    assert CheckpointFiles(path).read() is None
+
+
+@pytest.mark.parametrize(("link", "kept"), [("sim", True), ("emulated", False), ("real", False)])
+def test_each_run_has_checkpoints_of_its_own(link: LinkName, kept: bool, tmp_path: Path) -> None:
+    for run_dir in (tmp_path / "one", tmp_path / "two"):
+        specs = process_specs(Deployment(link=link), "robot", run_dir, tmp_path / "state")
+        (spec,) = (one for one in specs if one.name == "driver")
+        settings = msgspec.json.decode(spec.argv[-1])["settings"]
+        assert settings["checkpoint"] == (str(run_dir / "checkpoint") if kept else "")
