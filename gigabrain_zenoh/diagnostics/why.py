@@ -34,6 +34,7 @@ from gigabrain_zenoh.diagnostics.topic_stats import HOPS, ChainMonitor, monitor_
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.geometry.limits import NO_CAPS, ZERO, at_rest
 from gigabrain_zenoh.geometry.stopping import scan_limit_ns
+from gigabrain_zenoh.perception import FIND_IT
 
 Link = Literal[
     "router", "driver", "link", "scan", "world", "intent", "control", "safety", "gate", "body"
@@ -49,10 +50,6 @@ START_ROUTER = (
 READ_SAFETY_LOG = "read its log with `gigabrain log --process safety`"
 GOES_ON = "remove the cause; decision then goes on by itself"
 BY_HAND = "move it with `gigabrain teleop` or `gigabrain arm jog`"
-FIND_IT = (
-    "turn the robot with `gigabrain teleop`, show its camera a known tag, "
-    "or set its pose with `gigabrain pose X Y`"
-)
 CHECK_LIDAR = "check the lidar's power and cable"
 
 

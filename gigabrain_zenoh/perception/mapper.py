@@ -246,6 +246,8 @@ class Mapper:
         self._mapped = True
         if place.localized:
             self._hints.found()
+        else:
+            self._hints.missed(scan.basis, place.why)
         if self._objects:
             keyframes = self._chart.keyframes()[1]
             seen = self._objects.surroundings(body.description, world, view, keyframes)
@@ -319,11 +321,12 @@ class Mapper:
         problems, known = self._chart.problems(), self._bus.problems
         if self._autosave and self._autosave.problem:
             problems = (*problems, self._autosave.problem)
-        problems = (*problems, *self._zones.problems())
+        problems = (*problems, *self._hints.problems(), *self._zones.problems())
         problems = (*problems, *(self._objects.problems() if self._objects else ()))
         for problem in problems:
             if problem.code not in {one.code for one in known}:
-                log.warning("%s", problem.text, extra={"data": {"event": problem.code}})
+                text = f"{problem.text}: {problem.remedy}"
+                log.warning("%s", text, extra={"data": {"event": problem.code}})
         self._bus.problems = problems
         self._bus.counters["optimiser_rebuilt"] = self._chart.report().get("optimiser_rebuilt", 0)
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from gigabrain_schemas.arrays import Floats
-from gigabrain_schemas.base import TICK_NS
+from gigabrain_schemas.base import TICK_NS, Cause
 from gigabrain_schemas.requests import PoseReply, PoseRequest
 from gigabrain_schemas.topics import POSE_SET
 from gigabrain_zenoh.bus.bus import Bus
@@ -15,9 +15,12 @@ from gigabrain_zenoh.bus.input_log import log_accepted
 from gigabrain_zenoh.geometry.se2 import between, compose
 from gigabrain_zenoh.mapping.odometry import OdometrySample
 from gigabrain_zenoh.mapping.pose_hint import PoseHint
+from gigabrain_zenoh.perception import FIND_IT
 
 log = logging.getLogger(__name__)
 
+LOST_S = 10.0  # after which a person is told
+LOST_TICKS = round(LOST_S * 1e9 / TICK_NS)
 COUNTS_TICKS = round(2e9 / TICK_NS)  # for how long a hint counts while the robot is not found
 PERSON_M, PERSON_RAD = 0.3, 0.25  # deviation of what a person says
 MIN_VARIANCE = 1e-6  # [m2], [rad2]
@@ -34,11 +37,12 @@ class PoseHints:
         self._hint: PoseHint | None = None
         self._sample: OdometrySample | None = None  # at which the hint counts
         self._by_person = False
+        self._lost: tuple[int, str] | None = None  # since which tick it is not localized, and why
         bus.serve(POSE_SET, self._set)
 
     def clear(self) -> None:
         """Forget the hint: odometry begins again."""
-        self._hint = None
+        self._hint = self._lost = None
 
     def add(self, hint: PoseHint, sample: OdometrySample) -> None:
         """Take a tag's hint for the place of `sample`, unless a person has just said another."""
@@ -50,8 +54,21 @@ class PoseHints:
 
         It tells at once where a robot is that was carried off.
         """
+        self._lost = None
         if self._by_person:
             self._hint, self._by_person = None, False
+
+    def missed(self, tick: int, why: str) -> None:
+        """Note that the scan of a tick has not localized the robot."""
+        self._lost = self._lost[0] if self._lost else tick, why
+
+    def problems(self) -> tuple[Cause, ...]:
+        """Return why the robot needs a hint, if it has not been localized for long."""
+        moment = self._moment()
+        if moment is None or self._lost is None or moment.tick - self._lost[0] < LOST_TICKS:
+            return ()
+        text = f"the robot has not been found in the map for {LOST_S:g} s: {self._lost[1]}"
+        return (Cause(code="not_localized", text=text[:500], remedy=FIND_IT),)
 
     def at(self, moment: OdometrySample) -> PoseHint | None:
         """Return the hint as of `moment`; None if there is none, or it is too old."""

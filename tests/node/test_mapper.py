@@ -19,7 +19,7 @@ from gigabrain_zenoh.perception.mapper import chart_of
 from gigabrain_zenoh.runtime.services import publish_health
 from gigabrain_zenoh.testing.samples import scan, state
 from tests.node.mapping_robot import Robot
-from tests.unit.mapping.houses import HOUSE, Rooms, at, drawn
+from tests.unit.mapping.houses import HOUSE, Rooms, at, box, drawn
 
 START = at(3.0, 2.0)
 
@@ -162,6 +162,31 @@ async def test_after_a_new_start_of_the_driver_the_map_stays_and_the_robot_is_fo
     assert (pose.x, pose.y) == pytest.approx((0.0, 0.0), abs=0.05)
 
 
+async def test_a_robot_that_is_lost_for_long_is_told_with_the_command_that_helps(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async with Robot() as robot:
+        robot.say()
+        robot.drive(20, still=True)
+        robot.boot, robot.tick = 8, 0  # the driver starts again, and the body is somewhere else
+        robot.rooms = Rooms(box(-1, -1, 6, 12))
+        robot.say()
+        robot.drive(99, still=True)
+        early = robot.bus.problems
+        robot.drive(11, still=True)
+        assert not robot.sent(POSE)[-1].localized
+        late = robot.bus.problems
+        robot.rooms = Rooms(HOUSE)
+        for _ in range(60):
+            robot.drive(1, still=True)
+            await asyncio.sleep(0.005)
+        assert robot.sent(POSE)[-1].localized
+        assert robot.bus.problems == early == ()
+    assert [problem.code for problem in late] == ["not_localized"]
+    assert "`gigabrain pose X Y`" in late[0].remedy
+    assert caplog.messages.count(f"{late[0].text}: {late[0].remedy}") == 1
+
+
 async def test_a_map_that_may_grow_no_more_is_told_once_and_in_the_health(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -177,7 +202,7 @@ async def test_a_map_that_may_grow_no_more_is_told_once_and_in_the_health(
     assert [problem.code for problem in problems] == ["map_full"]
     assert problems[0].text == "the map is full: 140 m long; what lies beyond is left out"
     assert Codec(Health, HEALTH.max_bytes).decode(told[-1]).problems == problems
-    assert caplog.messages.count(problems[0].text) == 1
+    assert caplog.messages.count(f"{problems[0].text}: map a large site in parts") == 1
 
 
 def test_a_map_for_nothing_is_refused_with_its_line() -> None:
