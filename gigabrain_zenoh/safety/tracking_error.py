@@ -69,7 +69,7 @@ class TrackingError(Struct, frozen=True, kw_only=True):
         stuck = active and moving and _rests(body, state.velocity)
         fast = bool(watch) and _too_fast(bands, state.velocity)
         slow = active and _too_slow(bands, state.velocity)
-        same = telemetry == self.telemetry
+        same = telemetry == self.telemetry or self._odometry_repeats(body, state)
         return replace(
             now,
             telemetry=telemetry,
@@ -78,6 +78,14 @@ class TrackingError(Struct, frozen=True, kw_only=True):
             stuck_ticks=lasting(self.stuck_ticks, stuck, elapsed),
             frozen_ticks=self.frozen_ticks + elapsed * moving if same else 0,
         )
+
+    def _odometry_repeats(self, body: BodyDescription, state: RobotState) -> bool:
+        """Return whether pose and velocity repeat while the velocity says that the body moves.
+
+        Those of a body that stands, or is held, may repeat.
+        """
+        repeats = self.telemetry is not None and self.telemetry[:2] == (state.pose, state.velocity)
+        return repeats and not _rests(body, state.velocity)
 
     def causes(self, body: BodyDescription) -> tuple[Cause, ...]:
         """Return why the body must stop.

@@ -7,8 +7,9 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import GateStatus, RobotState
+from gigabrain_schemas.sensors import ImuData
 from gigabrain_zenoh.testing.samples import DRIVING, state
-from tests.unit.safety.patrol import Patrol
+from tests.unit.safety.patrol import Patrol, imu
 
 REST, AHEAD, TURN = Velocity(), Velocity(linear_x=0.2), Velocity(angular_z=1.0)
 IDLE, STOPPING = GateStatus(mode="idle"), GateStatus(mode="stopping", commander="control")
@@ -109,6 +110,29 @@ def test_frozen_telemetry_is_frozen_until_a_value_changes() -> None:
     assert patrol.go(500, told=REST, frozen=True, gate=IDLE) == ["telemetry_frozen"]
     assert patrol.go(told=REST, moves=Velocity(linear_x=0.01), gate=IDLE) == []
     assert patrol.go(300, told=REST, frozen=True, gate=IDLE) == []
+
+
+def shaken(tick: int) -> ImuData:
+    """The sample of an inertial unit that works."""
+    return imu(push=0.01 * (tick % 7))
+
+
+def test_frozen_odometry_is_found_beside_an_inertial_unit_that_works() -> None:
+    patrol = under_way()
+    where, found = patrol.pose, []
+    for tick in range(30):
+        patrol.pose = where
+        found.append("telemetry_frozen" in patrol.go(told=AHEAD, imu=shaken(tick)))
+    assert found.index(True) == 20
+
+
+def test_a_body_that_is_held_is_stuck_and_not_frozen() -> None:
+    patrol = under_way()
+    codes = set[str]()
+    for tick in range(200):
+        codes |= {*patrol.go(told=AHEAD, moves=REST, imu=shaken(tick))}
+    assert "telemetry_frozen" not in codes
+    assert "not_following" in codes
 
 
 def test_short_moves_with_frozen_telemetry_add_up() -> None:
