@@ -1,6 +1,7 @@
 """Anything that OpenCV opens: USB cameras (v4l2), network streams (RTSP, HTTP), and video files."""
 
 import math
+import re
 import time
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,7 @@ class OpenCvCamera(CameraSource):
         if self.camera.depth:
             raise CameraLost("OpenCV gives no depth; write `depth: false` for this camera")
         if self._ended:
-            raise CameraLost(f"{self.options.device} has ended")
+            raise CameraLost(f"{self._shown} has ended")
         target, backend = self._target()
         timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, TIMEOUT_MS]
         timeouts += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, TIMEOUT_MS]
@@ -49,7 +50,7 @@ class OpenCvCamera(CameraSource):
         capture = cv2.VideoCapture(target, backend, timeouts if network else [])
         self._capture, self._due_s, self._reads = capture, time.monotonic(), 0
         if not capture.isOpened():
-            raise CameraLost(f"{self.options.device} cannot be opened")
+            raise CameraLost(f"{self._shown} cannot be opened")
         if not self._file and not network:
             capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # an old picture is worse than none
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, self.camera.width)
@@ -60,7 +61,7 @@ class OpenCvCamera(CameraSource):
         """Return the next picture. Raises CameraLost."""
         capture = self._capture
         if capture is None:
-            raise CameraLost(f"{self.options.device} is not open")
+            raise CameraLost(f"{self._shown} is not open")
         if self._file:
             now_s = time.monotonic()
             self._due_s = max(self._due_s + 1 / self.camera.rate_hz, now_s)
@@ -73,7 +74,7 @@ class OpenCvCamera(CameraSource):
         if picture is None:
             self._ended = self._file and not self.options.repeat  # not all can be rewound
             end = "has ended" if self._file else "gives no picture"
-            raise CameraLost(f"{self.options.device} {end}")
+            raise CameraLost(f"{self._shown} {end}")
         return Frame(fitted(picture, self.camera.width, self.camera.height))
 
     def close(self) -> None:
@@ -81,6 +82,11 @@ class OpenCvCamera(CameraSource):
         capture, self._capture = self._capture, None
         if capture:
             capture.release()
+
+    @property
+    def _shown(self) -> str:
+        """Return the device for messages: of an address, which may hold a password, the host."""
+        return re.sub(r"://(?:.*@)?([^/?#]*).*", r"://\1", self.options.device)
 
     def _next(self, capture: cv2.VideoCapture) -> NDArray[Any] | None:
         """Return the next picture, a file's next whole one; None if there is none."""

@@ -163,6 +163,13 @@ def test_what_cannot_be_opened_is_named(tmp_path: Path, device: str, error: str)
         source.read()
 
 
+def test_a_stream_is_named_by_its_host_alone(tmp_path: Path) -> None:
+    source = camera(tmp_path, "rtsp://admin:secret@127.0.0.1:9/live?token=secret")
+    with pytest.raises(CameraLost) as caught:
+        source.open()
+    assert str(caught.value) == "rtsp://127.0.0.1:9 cannot be opened"
+
+
 def test_opencv_gives_no_depth(tmp_path: Path) -> None:
     with pytest.raises(CameraLost, match="write `depth: false`"):
         camera(tmp_path, "0", RGBD).open()
