@@ -110,6 +110,8 @@ class OpenCvCamera(CameraSource):
         self._file = path.is_file()
         if not path.exists():
             raise CameraLost(f"{device} is not there")
+        if not self._file and not path.is_char_device():  # opening a pipe would block all others
+            raise CameraLost(f"{device} is no camera and no file")
         return str(path), cv2.CAP_ANY
 
 

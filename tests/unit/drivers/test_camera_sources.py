@@ -1,8 +1,9 @@
 """Pictures of files, and of recordings, come as those of a camera do."""
 
 import contextlib
+import os
 import time
-from collections.abc import Container
+from collections.abc import Callable, Container
 from contextlib import closing
 from pathlib import Path
 
@@ -161,6 +162,13 @@ def test_what_cannot_be_opened_is_named(tmp_path: Path, device: str, error: str)
     source.close()
     with pytest.raises(CameraLost, match="is not open"):
         source.read()
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
+def test_a_pipe_and_a_folder_are_no_cameras(tmp_path: Path, make: Callable[[str], None]) -> None:
+    make(str(tmp_path / "pictures"))
+    with pytest.raises(CameraLost, match="pictures is no camera and no file"):
+        camera(tmp_path, "pictures").open()
 
 
 def test_a_stream_is_named_by_its_host_alone(tmp_path: Path) -> None:
