@@ -59,6 +59,7 @@ class CameraSource(abc.ABC):
     """
 
     Options: ClassVar[type[CameraOptions]] = CameraOptions  # its part of a robot's file
+    gives_depth: ClassVar[bool] = True  # or may do so
 
     def __init__(self, options: Any, camera: Camera, site: CameraSite) -> None:
         self.options, self.camera, self.site = options, camera, site

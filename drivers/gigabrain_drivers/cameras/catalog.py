@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gigabrain_drivers.cameras.base import CameraOptions, options_of
+from gigabrain_drivers.cameras.base import CameraOptions, options_of, source_class
 from gigabrain_drivers.driver.catalog import load_link, robot_path
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_schemas.body import Camera
@@ -41,11 +41,16 @@ def cameras_of(body: str, link: LinkName, changes: Mapping[str, Any]) -> list[Li
     found = []
     for camera in robot.cameras:
         given = options_of(options.cameras, camera.name)
+        wrong = ""
         if given is None and not simulated:
+            wrong = f"has no source on the link {link!r}"
+        elif given and camera.depth and not source_class(given.source).gives_depth:
+            wrong = f"gets no depth from the source {given.source!r}"
+        if wrong:
+            example = f"`cameras: {{{camera.name}: {{source: opencv, device: /dev/video0}}}}`"
+            advice = "name one that gives depth, or write `depth: false`"
+            remedy = advice if camera.depth else f"add {example} to it"
             line = line_in(path, (link,)) or 1
-            raise ConfigError(
-                f"{path}:{line}: camera {camera.name!r} has no source on the link {link!r}; add "
-                f"`cameras: {{{camera.name}: {{source: opencv, device: /dev/video0}}}}` to it"
-            )
+            raise ConfigError(f"{path}:{line}: camera {camera.name!r} {wrong}; {remedy}")
         found.append(LinkedCamera(camera, given or CameraOptions(source=RENDERED), folder))
     return found

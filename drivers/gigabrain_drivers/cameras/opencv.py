@@ -30,6 +30,7 @@ class OpenCvCamera(CameraSource):
 
     Options = OpenCvOptions
     options: OpenCvOptions
+    gives_depth = False
 
     _capture: cv2.VideoCapture | None = None
     _file = False
@@ -39,8 +40,6 @@ class OpenCvCamera(CameraSource):
 
     def open(self) -> None:
         """Open the device. Raises CameraLost, and ConfigError without the home of a `~`."""
-        if self.camera.depth:
-            raise CameraLost("OpenCV gives no depth; write `depth: false` for this camera")
         if self._ended:
             raise CameraLost(f"{self._shown} has ended")
         target, backend = self._target()

@@ -93,8 +93,20 @@ def test_a_link_may_name_a_source_for_each_camera(tmp_path: Path) -> None:
 
 def test_the_real_link_names_all_sources(tmp_path: Path) -> None:
     assert error_of(file(tmp_path), "real") == (
+        "robot.yaml:14: camera 'front' has no source on the link 'real'; name one that gives "
+        "depth, or write `depth: false`"
+    )
+    assert error_of(file(tmp_path, "depth: true, "), "real") == (
         "robot.yaml:14: camera 'front' has no source on the link 'real'; add "
         "`cameras: {front: {source: opencv, device: /dev/video0}}` to it"
+    )
+
+
+def test_a_camera_with_depth_is_not_read_by_opencv(tmp_path: Path) -> None:
+    part = "  cameras: {front: {source: opencv, device: /dev/video0}}\n"
+    assert error_of(file(tmp_path, "  driver: mujoco\n", f"  driver: mujoco\n{part}")) == (
+        "robot.yaml:12: camera 'front' gets no depth from the source 'opencv'; name one that "
+        "gives depth, or write `depth: false`"
     )
 
 

@@ -178,11 +178,6 @@ def test_a_stream_is_named_by_its_host_alone(tmp_path: Path) -> None:
     assert str(caught.value) == "rtsp://127.0.0.1:9 cannot be opened"
 
 
-def test_opencv_gives_no_depth(tmp_path: Path) -> None:
-    with pytest.raises(CameraLost, match="write `depth: false`"):
-        camera(tmp_path, "0", RGBD).open()
-
-
 def test_grey_pictures_get_three_channels_and_enormous_ones_are_refused() -> None:
     assert fitted(np.full((48, 64), 9, np.uint8), 64, 48).shape == (48, 64, 3)
     for wrong in (np.zeros((5000, 5000, 3), np.uint8), np.zeros((48, 64), np.uint16)):
