@@ -129,6 +129,21 @@ async def test_a_source_that_is_lost_is_opened_again(tmp_path: Path) -> None:
         assert problem(received) == ""
 
 
+async def test_the_advice_is_about_the_source_where_that_says_what_is_wrong(tmp_path: Path) -> None:
+    def advice(bus: Bus) -> str:
+        return bus.problems[0].remedy if bus.problems else ""
+
+    async with running(tmp_path) as (bus, received):
+        Scripted.lost = "film.avi has ended"
+        await until(lambda: bool(advice(bus)), "the loss")
+        assert advice(bus) == "check its source in the robot's file, then its cable"
+        Scripted.lost = ""
+        await until(lambda: not bus.problems, "the end of it")
+        Scripted.hangs.set()
+        await until(lambda: problem(received) == "no picture" and bool(bus.problems), "silence")
+        assert advice(bus) == "check its cable, or connect it again"
+
+
 async def test_a_picture_of_another_size_is_withheld_and_said(tmp_path: Path) -> None:
     async with running(tmp_path) as (_, received):
         Scripted.size = (200, 320, 3)

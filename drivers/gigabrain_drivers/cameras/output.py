@@ -29,6 +29,7 @@ REMEDIES = {
 }
 HEADER_BYTES = 1024  # of a message, beside its pixels
 RECONNECT = "check its cable, or connect it again"
+CHECK_SOURCE = "check its source in the robot's file, then its cable"
 
 
 class Packed(NamedTuple):
@@ -125,7 +126,8 @@ class CameraOutput:
         if not self._problem:
             return None
         text = f"camera {self.camera.name}: {self._problem}"[:500]
-        return Cause(code="camera", text=text, remedy=REMEDIES.get(self._problem, RECONNECT))
+        remedy = CHECK_SOURCE if self._lost else REMEDIES.get(self._problem, RECONNECT)
+        return Cause(code="camera", text=text, remedy=remedy)
 
     def _look(self) -> bool:
         """Look for a problem; return whether it is another one than before, and published."""
