@@ -196,20 +196,30 @@ def multiply_in_one_thread() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
-NO_WINDOW = "MUJOCO_GL", "disable"
+GRAPHICS, CHOSEN = "MUJOCO_GL", "GIGABRAIN_MUJOCO_GL"
+NO_WINDOW = "disable"
 
 
 def open_no_window() -> None:
     """Have MuJoCo import nothing for windows, which takes 0.2 s and 6 MB; before it is imported.
 
-    What draws pictures chooses its own graphics. MUJOCO_GL in the environment is respected.
+    It also fails to be imported where what MUJOCO_GL names is not installed. What draws pictures
+    chooses its own graphics: see `chosen_graphics`.
     """
-    os.environ.setdefault(*NO_WINDOW)
+    if os.environ.get(GRAPHICS) != NO_WINDOW:
+        os.environ[CHOSEN] = os.environ.get(GRAPHICS, "")
+        os.environ[GRAPHICS] = NO_WINDOW
+
+
+def chosen_graphics() -> str:
+    """Return what MUJOCO_GL was before `open_no_window`; empty if nothing was chosen."""
+    return os.environ.get(CHOSEN, os.environ.get(GRAPHICS, ""))
 
 
 def environment_for_others() -> dict[str, str]:
     """Return the environment for programs of others, which may open windows."""
-    return dict(os.environ.items() - {NO_WINDOW})
+    found = {name: value for name, value in os.environ.items() if name not in (GRAPHICS, CHOSEN)}
+    return found | ({GRAPHICS: chosen_graphics()} if chosen_graphics() else {})
 
 
 M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = -3, -1  # mallopt(3)

@@ -58,7 +58,10 @@ async def test_a_program_may_open_windows(
     monkeypatch.setenv("MUJOCO_GL", before or "")
     if before is None:
         monkeypatch.delenv("MUJOCO_GL")
-    this_process.open_no_window()
+    monkeypatch.setenv("GIGABRAIN_MUJOCO_GL", "")  # so that it is put back afterwards
+    monkeypatch.delenv("GIGABRAIN_MUJOCO_GL")
+    for _ in range(2):  # in a process, and in the one that it was forked from
+        this_process.open_no_window()
     folder = program(tmp_path, 'echo "${MUJOCO_GL:-any}"')
     assert await ended(Scripts(folder).start(Script(run="beep"))) == (True, f"ended well: {then}")
 
@@ -74,6 +77,21 @@ print("glfw" in sys.modules)
 """
     env = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
     assert subprocess.check_output([sys.executable, "-c", code], text=True, env=env) == "False\n"
+
+
+@pytest.mark.parametrize("chosen", ["osmesa", "nonsense"])
+def test_a_process_of_ours_does_not_import_the_graphics_that_were_chosen(chosen: str) -> None:
+    code = """
+from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
+from gigabrain_zenoh.launch.processes import load_process
+load_process(ProcessConfig(name="safety", endpoint=Endpoint()))
+import mujoco, sys
+from gigabrain_zenoh.host.this_process import chosen_graphics
+print(chosen_graphics(), "mujoco.osmesa" in sys.modules)
+"""
+    env = {**os.environ, "MUJOCO_GL": chosen}
+    made = subprocess.check_output([sys.executable, "-c", code], text=True, env=env)
+    assert made == f"{chosen} False\n"
 
 
 async def test_a_program_that_fails_says_why(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import sys
 from typing import Any
 
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host import this_process
 
 BACKENDS = ("cgl",) if sys.platform == "darwin" else ("egl", "osmesa")
 MISSING = (
@@ -22,7 +23,7 @@ def open_graphics(width: int, height: int) -> Any:
     missing.
     """
     logging.getLogger("OpenGL.acceleratesupport").setLevel(logging.WARNING)
-    chosen = os.environ.get("MUJOCO_GL", "").lower()
+    chosen = this_process.chosen_graphics().lower()
     problems = []
     for name in (chosen,) if chosen in BACKENDS else BACKENDS:
         try:
