@@ -216,17 +216,29 @@ def main() -> None:
         os._exit(130)
     try:
         code = _call(sys.argv[1:])
+        with suppress(BrokenPipeError):
+            sys.stdout.flush()  # stderr is written line by line
     except KeyboardInterrupt:
         code = interrupts.exit_code
     except BrokenPipeError:  # the reader is gone, as in `gigabrain robots | head -1`
         code = 1
-    except Exception:  # an error that a signal caused is not shown
-        if not interrupts.received:
+    except Exception as error:  # an error that a signal caused is not shown
+        if not interrupts.received and not _report_full_disk(error):
             raise
-        code = interrupts.exit_code
+        code = interrupts.exit_code if interrupts.received else 1
     with suppress(OSError):  # the reader is gone, or the disk is full
-        sys.stdout.flush()  # stderr is written line by line
+        sys.stdout.flush()
     os._exit(code if isinstance(code, int) else 0)  # without waiting for Zenoh's threads
+
+
+def _report_full_disk(error: Exception) -> bool:
+    """Print that the disk of the output is full; return False if `error` is another one."""
+    from gigabrain_zenoh.host.files import FULL
+
+    if not isinstance(error, OSError) or error.errno not in FULL:
+        return False
+    print(f"gigabrain: cannot write: {error.strerror}; free some space", file=sys.stderr)
+    return True
 
 
 def _call(words: "Sequence[str]") -> object:

@@ -1,11 +1,13 @@
 """The `gigabrain` command: help, names that are nearly right, and what it costs to ask."""
 
 import json
+import os
 import re
 import subprocess
 import sys
 from collections.abc import Iterator
 from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 from cyclopts import App
@@ -68,6 +70,23 @@ async def test_what_is_mistyped_is_refused_in_one_line(
     assert named in command.err
     assert (command.err.startswith("gigabrain: "), command.err.count("\n")) == (True, 1)
     assert command.out == ""
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="by /dev/full")
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("words", ["robots", "--help", "demo --help", "completion bash"])
+def test_a_full_disk_under_the_output_is_said_in_one_line(words: str, unbuffered: str) -> None:
+    with Path("/dev/full").open("w") as full:
+        command = subprocess.run(
+            (*GIGABRAIN, *words.split()),
+            env=os.environ | {"PYTHONUNBUFFERED": unbuffered},
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert command.stderr == "gigabrain: cannot write: No space left on device; free some space\n"
+    assert command.returncode == 1
 
 
 async def test_robots_and_worlds_are_listed(home: Home) -> None:
