@@ -214,6 +214,9 @@ def main() -> None:
         multiply_in_one_thread()
     except KeyboardInterrupt:
         os._exit(130)
+    for stream in ("stdout", "stderr"):
+        if getattr(sys, stream) is None:  # closed, as by `gigabrain up FILE >&-`
+            setattr(sys, stream, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
     try:
         code = _call(sys.argv[1:])
         with suppress(BrokenPipeError):

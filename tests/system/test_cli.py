@@ -89,6 +89,21 @@ def test_a_full_disk_under_the_output_is_said_in_one_line(words: str, unbuffered
     assert command.returncode == 1
 
 
+@pytest.mark.parametrize(
+    ("words", "code"), [("robots", 0), ("--help", 0), ("completion bash", 0), ("dmeo", 2)]
+)
+@pytest.mark.parametrize("stream", [1, 2])
+def test_a_command_runs_with_a_closed_stream(stream: int, words: str, code: int) -> None:
+    argv = [*GIGABRAIN, *words.split()]
+    closing = f"import os, sys; os.close({stream}); os.execv(sys.executable, {argv})"
+    command = subprocess.run(
+        (sys.executable, "-c", closing), capture_output=True, text=True, check=False
+    )
+    assert command.returncode == code
+    assert "Traceback" not in command.stderr
+    assert bool(command.stdout) is (stream == 2 and code == 0)
+
+
 async def test_robots_and_worlds_are_listed(home: Home) -> None:
     robots = (await home.run("robots")).out.splitlines()
     assert [line.split()[0] for line in robots] == list(robot_files())
