@@ -115,7 +115,9 @@ async def trace_line(
     async with contextlib.AsyncExitStack() as stack:
         if link == "emulated":
             await stack.enter_async_context(Emulator(name, where))
-        _, driver = catalog.make_driver(name, where)
+        robot, driver = catalog.make_driver(name, where)
+        if part == SCAN and not driver.options.scan:
+            raise ConfigError(f"{robot.robot_type} has no lidar on its own line; trace its {BASE}")
         shown = _LineLog(driver, part)
         stack.enter_context(_logged(shown))
         await stack.enter_async_context(driver)

@@ -161,6 +161,16 @@ async def test_a_trace_says_whether_anything_was_received(tmp_path: Path) -> Non
     assert not received
 
 
+async def test_a_lidar_that_a_body_does_not_have_is_not_traced(tmp_path: Path) -> None:
+    text = BARE.replace("{port}", str(tmp_path / "nothing"))
+    (tmp_path / "robot.yaml").write_text(text)
+    name = str(tmp_path / "robot.yaml")
+    with pytest.raises(ConfigError, match="has no lidar on its own line; trace its base"):
+        await trace_line(
+            name, "real", tmp_path, part="scan", seconds=0.1, wanted=Velocity(), print_line=print
+        )
+
+
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
