@@ -75,7 +75,7 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     assert (folder / "README.md").read_text() == "mine"
 
 
-@pytest.mark.parametrize("name", ["My Robot", "class", "1st", "a", "../x", "robot_"])
+@pytest.mark.parametrize("name", ["My Robot", "class", "1st", "a", "../x", "robot_", "a" * 65])
 def test_a_name_that_no_module_can_have_is_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="expected lower-case letters"):
         authoring.write_package(name, tmp_path)

@@ -25,7 +25,7 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.qa.conformance.driver_checks import link_of
 
-PACKAGE_NAME = re.compile(r"[a-z][a-z0-9_]*[a-z0-9]")
+PACKAGE_NAME = re.compile(r"[a-z][a-z0-9_]{0,62}[a-z0-9]")
 TEMPLATES = {  # source and target of each file
     "pyproject.toml.txt": "pyproject.toml",
     "readme.md.txt": "README.md",
@@ -43,7 +43,8 @@ def write_package(name: str, folder: Path) -> Path:
     """
     if not PACKAGE_NAME.fullmatch(name) or keyword.iskeyword(name):
         raise ConfigError(
-            f"{name!r}: expected lower-case letters, digits and underscores, such as my_robot"
+            f"{name!r}: expected lower-case letters, digits and underscores, such as my_robot; "
+            "2 to 64 of them, and no keyword of Python"
         )
     if name in robot_files() or name in known_drivers():
         raise ConfigError(f"a robot or a driver is called {name!r} already; choose another name")
