@@ -169,8 +169,16 @@ KeepStuck = Annotated[
 ]
 
 
-def checked(values: Mapping[str, object], type: type[T]) -> T:
-    """Return `values` as a `type`. Raises ConfigError, which names the option that does not fit."""
+def checked(
+    values: Mapping[str, object], type: type[T], options: Mapping[str, str] | None = None
+) -> T:
+    """Return `values` as a `type`. Raises ConfigError, which names the option that does not fit.
+
+    Args:
+        values: Settings by their names.
+        type: What they are settings of.
+        options: Names of options that differ from those of their settings.
+    """
     import msgspec
 
     from gigabrain_zenoh.config.loading import expected
@@ -185,7 +193,7 @@ def checked(values: Mapping[str, object], type: type[T]) -> T:
             text = f"expected {expected(fields[name])}, got {values[name]}"
         elif text.partition(": ")[0] in fields:  # the type refuses the value of this field
             name, _, text = text.partition(": ")
-        option = "--" + UNIT.sub("", name).replace("_", "-")
+        option = "--" + UNIT.sub("", (options or {}).get(name, name)).replace("_", "-")
         raise ConfigError(f"{option}: {text}" if name else text) from None
 
 

@@ -27,6 +27,8 @@ from gigabrain_zenoh.runtime.running import find_endpoint
 if TYPE_CHECKING:
     from gigabrain_zenoh.gateway.topic_list import TopicRow
 
+RENAMED = {"namespace": "ros_namespace"}  # settings whose options have other names
+
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +56,7 @@ class RosLinkOptions:
         """Return the settings as a deployment file has them."""
         given = {name: getattr(self, name) for name in self.__dataclass_fields__}
         types = tuple(str(expanded(file).absolute()) for file in self.types)
-        return given | {"types": types, "namespace": given.pop("ros_namespace")}
+        return given | {"types": types, "namespace": given.pop(RENAMED["namespace"])}
 
 
 @Parameter(name="*")
@@ -85,7 +87,7 @@ def ros2(*, options: RosOptions = LOCAL_ROS, at: RobotAddress = LOCAL) -> int:
     file, a part `ros2:` starts it with the robot.
     """
     endpoint = _endpoint(at)
-    config = gateway_config(checked(options.given(), Ros2Config), endpoint)
+    config = gateway_config(checked(options.given(), Ros2Config, RENAMED), endpoint)
     settings = msgspec.to_builtins(config)
     return run_process(ProcessConfig(name="ros2", endpoint=endpoint, settings=settings))
 
@@ -108,7 +110,7 @@ def topics(
     Args:
         all_topics: Also list what every node has, and the parts of actions.
     """
-    link = checked(options.given(), Ros2Link)
+    link = checked(options.given(), Ros2Link, RENAMED)
     if link.transport == "rmw_zenoh" and not link.router:
         link = with_ros_router(link, _endpoint(at))
     listed = run_async(_listed(link, all_topics=all_topics))
@@ -169,7 +171,7 @@ def pass_(
     from gigabrain_zenoh.gateway.passing import pass_on, route
     from gigabrain_zenoh.ros2.opening import load_types
 
-    link = checked(options.given(), Ros2Link)
+    link = checked(options.given(), Ros2Link, RENAMED)
     types = load_types(link)
     chosen = route(source, target, type, as_, types)
     link = with_ros_router(link, _endpoint(at))
