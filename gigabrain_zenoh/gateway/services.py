@@ -94,8 +94,10 @@ class Services:
 
     async def _map_save(self, _: Any) -> str:
         bus = self._scene.bus
-        when = datetime.datetime.fromtimestamp(bus.clock.unix_ns() // 10**9, datetime.UTC)
-        request = MapRequest(name=f"ros2-{when:%Y%m%d-%H%M%S}", source=bus.process)
+        seconds, ns = divmod(bus.clock.unix_ns(), 10**9)
+        when = datetime.datetime.fromtimestamp(seconds, datetime.UTC)
+        name = f"ros2-{when:%Y%m%d-%H%M%S}-{ns // 10**6:03d}"  # robots may save at once
+        request = MapRequest(name=name, source=bus.process)
         replies = await bus.ask(MAP_SAVE, request, timeout_s=SAVE_S)
         if not replies:
             raise Refused("no process makes a map; run perception with mapping: slam")

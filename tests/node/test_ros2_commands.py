@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from gigabrain_schemas.requests import EnableRequest
-from gigabrain_schemas.topics import ENABLE, STATE
+from gigabrain_schemas.requests import EnableRequest, MapReply
+from gigabrain_schemas.topics import ENABLE, MAP_SAVE, STATE
 from gigabrain_zenoh.client import requests
 from gigabrain_zenoh.client.requests import enable
 from gigabrain_zenoh.config.settings import Ros2Config
@@ -264,6 +264,21 @@ async def test_map_save_says_who_would_make_a_map(tmp_path):
         await robot.go(5)
         response = await robot.node.call("/map_save", TRIGGER)
         assert (response.success, "mapping: slam" in response.message) == (False, True)
+
+
+async def test_maps_that_are_saved_within_a_second_have_different_names(tmp_path):
+    async with RosRobot(tmp_path) as robot:
+        names = []
+
+        async def save(request):
+            names.append(request.name)
+            return MapReply(ok=True, text="saved")
+
+        robot.operator.serve(MAP_SAVE, save)
+        for _ in range(3):
+            await robot.go(5)
+            assert (await robot.node.call("/map_save", TRIGGER)).success
+        assert len(set(names)) == 3
 
 
 async def test_the_gateway_sends_nothing_to_the_gate_unasked(tmp_path):
