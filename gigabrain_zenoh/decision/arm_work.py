@@ -8,7 +8,7 @@ import numpy as np
 from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import Intent
-from gigabrain_zenoh.decision.arm_readings import posture_of, sent_posture
+from gigabrain_zenoh.decision.arm_readings import gripper_place, posture_of, sent_posture
 from gigabrain_zenoh.decision.behaviours import StepOutcome, StepResult
 from gigabrain_zenoh.decision.held_things import standing_height, thing_of
 from gigabrain_zenoh.decision.tasks.arm_steps import (
@@ -56,12 +56,13 @@ def work_for(planner: ArmPlanner, do: ArmAction, now: WorkInputs) -> Callable[[]
     others = {one: thing_of(one, solid) for one, solid in now.things.items()}
     thing = others.pop(name) if name is not None else None
     around = [*others.values()]
+    gripper_at = gripper_place(planner, now.state, 0.0) if planner.arm.gripper else None
     match do:
         case Reach(at=at, pitch=pitch):
-            return lambda: planner.reach(np.array(at), pitch, around, posture, hold)
+            return lambda: planner.reach(np.array(at), pitch, around, posture, hold, gripper_at)
         case TakePosture(to=to):
             goal = posture_of(now.body, to) if isinstance(to, str) else to
-            return lambda: planner.take_posture(goal, around, posture, hold)
+            return lambda: planner.take_posture(goal, around, posture, hold, gripper_at)
         case Gripper(to=to):
             return lambda: planner.grip(to)
         case Pick():

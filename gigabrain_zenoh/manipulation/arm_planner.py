@@ -96,6 +96,7 @@ class ArmPlanner:
         things: Sequence[Thing],
         posture: Floats,
         hold: Hold | None,
+        gripper_at: float | None = None,
     ) -> Plan | NoWay:
         """Return how to bring the tool to a point (3,) [m] in the frame of the arm's base.
 
@@ -105,13 +106,15 @@ class ArmPlanner:
             things: What is around.
             posture: Where the arm is (n,).
             hold: What it holds.
+            gripper_at: Where an empty gripper is [rad] or [m]; otherwise as in the model.
         """
         goal = self.tool_goal(point, pitch)
         if self._above_floor and hold is None:  # first a way that safety does not hold up there
-            way = self._way_to(self._checker([*things, *self._above_floor], None), goal, posture)
+            higher = self._checker([*things, *self._above_floor], None, gripper_at)
+            way = self._way_to(higher, goal, posture)
             if isinstance(way, Plan):
                 return way
-        return self._way_to(self._checker(things, hold), goal, posture)
+        return self._way_to(self._checker(things, hold, gripper_at), goal, posture)
 
     def _way_to(self, checker: CollisionChecker, goal: ToolGoal, posture: Floats) -> Plan | NoWay:
         found = self._inverse.solve(goal, posture, checker.touches)
@@ -133,11 +136,15 @@ class ArmPlanner:
         things: Sequence[Thing],
         posture: Floats,
         hold: Hold | None,
+        gripper_at: float | None = None,
     ) -> Plan | NoWay:
-        """Return how to move joints to `positions` [rad] or [m], and the gripper at the end."""
+        """Return how to move joints to `positions` [rad] or [m], and the gripper at the end.
+
+        Until then an empty gripper is at `gripper_at` [rad] or [m]; None: as in the model.
+        """
         wanted = zip(self.arm.names, posture, strict=True)
         goal = np.array([positions.get(name, here) for name, here in wanted])
-        moved = self._move(self._checker(things, hold), posture, goal)
+        moved = self._move(self._checker(things, hold, gripper_at), posture, goal)
         gripper = self.arm.gripper
         if isinstance(moved, NoWay) or gripper is None or gripper.name not in positions or hold:
             return moved
@@ -314,12 +321,16 @@ class ArmPlanner:
     def _all(self, things: Sequence[Thing]) -> list[Thing]:
         return [*self._around, *things]
 
-    def _checker(self, things: Sequence[Thing], hold: Hold | None) -> CollisionChecker:
+    def _checker(
+        self, things: Sequence[Thing], hold: Hold | None, gripper_at: float | None
+    ) -> CollisionChecker:
         around = self._all(things)
         if hold is None:
-            return CollisionChecker(self.arm, around, margin=MARGIN_M)
-        ignore = may_touch(hold.thing, around)
-        return CollisionChecker(self.arm, around, held=hold.thing, margin=0.001, ignore=ignore)
+            return CollisionChecker(self.arm, around, margin=MARGIN_M, gripper=gripper_at)
+        return CollisionChecker(
+            self.arm, around, held=hold.thing, margin=0.001,
+            ignore=may_touch(hold.thing, around), gripper=hold.grip,
+        )  # fmt: skip
 
     def _move(self, checker: CollisionChecker, start: Floats, goal: Floats) -> Plan | NoWay:
         way = plan(checker, start, goal)

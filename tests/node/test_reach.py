@@ -1,9 +1,21 @@
-"""An arm in MuJoCo goes to random goals near its body, past a shelf, and touches nothing."""
+"""An arm in MuJoCo goes to goals near its body, past a shelf and the table, and touches nothing."""
+
+from pathlib import Path
 
 import pytest
 
+from gigabrain_drivers.driver.catalog import load_robot, robot_path
+from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.body import Joint, RobotState
+from gigabrain_zenoh.decision.arm_work import WorkInputs, work_for
+from gigabrain_zenoh.decision.tasks.arm_steps import Reach
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Plan
 from gigabrain_zenoh.qa.bench.reach import measure_reach
+from tests.node.arm_rig import Rig
+
+BASE = "robot/base_plate"
+FALLEN = (-0.5016, 0.4755, 0.3543, 1.6276, -0.25, -0.1745)  # as it lies on the table
 
 
 @pytest.mark.parametrize(
@@ -28,3 +40,41 @@ def test_an_arm_comes_to_each_goal_that_it_has_a_posture_for(body: str, goals: i
 def test_a_body_without_an_arm_that_stands_is_refused(body: str) -> None:
     with pytest.raises(ConfigError, match=f"{body} has no arm that stands in MuJoCo"):
         measure_reach(body, 1, 0, lambda _: None)
+
+
+def on_the_floor(rig: Rig) -> set[str]:
+    """Return the moving parts of the arm that touch the floor, by the physics."""
+    model, contacts = rig.arm.simulation.model, rig.arm.simulation.data.contact
+    pairs = [{str(model.geom(geom).name) for geom in pair} for pair in contacts.geom]
+    on_it = {name for pair in pairs if "world/floor" in pair for name in pair}
+    return {name for name in on_it if name.startswith("robot/")} - {BASE}
+
+
+def test_a_gripper_that_is_open_touches_no_table(tmp_path: Path) -> None:
+    rig, touched = Rig(tmp_path), set[str]()
+    for step in ("posture: {wrist_roll: 2.6}", "gripper: 0.8", "reach: [0.2505, 0.0165, 0.0421]",
+                 "reach: [0.2649, 0.1855, 0.032]", "reach: [0.1913, -0.1977, 0.041]"):  # fmt: skip
+        rig.give(f"do: [{{{step}}}]")
+        while rig.queue.status.current:
+            rig.tick()
+            touched |= on_the_floor(rig)
+        assert (rig.queue.status.done[0].state, step) == ("succeeded", step)
+    assert touched == set()
+    rig.manipulator.close()
+
+
+def test_an_arm_that_lies_on_the_table_with_closed_fingers_leaves_it() -> None:
+    body = load_robot("so101").description()
+    planner = ArmPlanner(robot_path("so101").with_name("model.xml").read_text(), body)
+    joints = tuple(
+        Joint(name=joint.name, position=position)
+        for joint, position in zip(body.joints, FALLEN, strict=True)
+    )
+    here = Pose(x=0.0, y=0.0, yaw=0.0)
+    state = RobotState(
+        robot_type="so101", pose=here, velocity=Velocity(), joints=joints, joints_sent=FALLEN
+    )
+    now = WorkInputs(state=state, body=body, things={}, hold=None, misses=0, drives=False)
+    work = work_for(planner, Reach(at=(0.2, 0.0, 0.15)), now)
+    assert not isinstance(work, str)
+    assert isinstance(work(), Plan)
