@@ -118,7 +118,7 @@ def goto(
 
     Example: gigabrain arm goto 0.22 0.05 0.12 --pitch 60
 
-    If it cannot, it says why, and which point is nearest.
+    If it cannot, it says why, and of a point that is too far, the nearest one.
 
     Args:
         x: Forwards, from the arm's base [m].

@@ -349,8 +349,11 @@ class ArmPlanner:
     def _explained(self, found: OutOfReach) -> str:
         if found.posture is None:
             return found.reason
+        text = f"not reachable: {found.reason}"
+        if found.cause in ("collision", "orientation"):  # the tool can be at the point itself
+            return text
         x, y, z = self.arm.forward(found.posture).position
-        return f"not reachable: {found.reason}; the nearest is ({x:.3f}, {y:.3f}, {z:.3f})"
+        return f"{text}; the nearest is ({x:.3f}, {y:.3f}, {z:.3f})"
 
 
 def surroundings(body: BodyDescription) -> list[Thing]:

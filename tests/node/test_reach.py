@@ -78,3 +78,21 @@ def test_an_arm_that_lies_on_the_table_with_closed_fingers_leaves_it() -> None:
     work = work_for(planner, Reach(at=(0.2, 0.0, 0.15)), now)
     assert not isinstance(work, str)
     assert isinstance(work(), Plan)
+
+
+@pytest.mark.parametrize(
+    ("goal", "why", "tells"),
+    [
+        ("[0.9, 0.0, 0.1]", "too far by", True),
+        ("[0.2, 0.0, -0.05]", "collides: the table", False),
+        ("{at: [0.25, 0.1, 0.03], pitch: 0.0}", "the orientation is not possible there", False),
+    ],
+)
+def test_the_nearest_point_is_told_where_it_is_another(
+    tmp_path: Path, goal: str, why: str, tells: bool
+) -> None:
+    rig = Rig(tmp_path)
+    task = rig.carry_out(f"do: [{{reach: {goal}}}]")
+    assert why in task.reason
+    assert ("the nearest is" in task.reason) == tells
+    rig.manipulator.close()
