@@ -138,31 +138,90 @@ async def test_who_leaves_a_programs_group_does_not_hold_its_result_up(tmp_path:
     assert well
 
 
-def test_a_program_whose_decision_died_before_it_began_ends_at_once() -> None:
-    command = ("/bin/sh", "-c", LEASHED, "sh", "sleep", "600")
-    ran = subprocess.run(command, stdin=subprocess.DEVNULL, start_new_session=True, check=False)
-    assert ran.returncode == -signal.SIGKILL
+async def test_a_program_that_is_paused_goes_on_when_resumed_and_has_its_time_left(
+    tmp_path: Path,
+) -> None:
+    os.mkfifo(tmp_path / "go")
+    text = f"echo $$ > {tmp_path}/pid; read -r _ < {tmp_path}/go"
+    run = Scripts(program(tmp_path, text)).start(Script(run="beep", seconds=20.0))
+    pid = int(await written(tmp_path / "pid"))
+    run.pause()
+    run.pause()
+    await until(lambda: _state(pid) == "T")
+    assert run._limit
+    assert run._limit.when() is None
+    run.resume()
+    run.resume()
+    (tmp_path / "go").write_text("on\n")
+    assert await ended(run) == (True, "ended well")
 
 
-async def test_a_program_does_not_outlive_a_decision_that_is_killed(tmp_path: Path) -> None:
+async def test_a_program_that_is_paused_while_it_starts_has_not_begun(tmp_path: Path) -> None:
+    run = Scripts(program(tmp_path, f"touch {tmp_path}/begun")).start(Script(run="beep"))
+    run.pause()
+    await until(lambda: run._program)
+    assert not (tmp_path / "begun").exists()
+    run.resume()
+    assert await ended(run) == (True, "ended well")
+
+
+async def test_a_program_that_is_paused_can_be_ended(tmp_path: Path) -> None:
+    text = f"echo $$ > {tmp_path}/pid; exec sleep 600"
+    run = Scripts(program(tmp_path, text)).start(Script(run="beep"))
+    pid = int(await written(tmp_path / "pid"))
+    run.pause()
+    await until(lambda: _state(pid) == "T")
+    run.stop()
+    await until(run._task.done)
+    assert _gone(pid)
+
+
+def test_a_program_whose_decision_died_before_it_began_does_not_begin() -> None:
+    command = ("/bin/sh", "-c", LEASHED, "sh", "echo", "begun")
+    ran = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
+    assert (ran.returncode, ran.stdout) == (1, b"")
+
+
+@pytest.mark.parametrize("paused", [False, True])
+async def test_a_program_does_not_outlive_a_decision_that_is_killed(
+    tmp_path: Path, paused: bool
+) -> None:
     folder = program(tmp_path, f"sleep 600 & echo $! > {tmp_path}/child; wait")
     text = (
-        "import asyncio\n"
+        "import asyncio, os\n"
         "from gigabrain_zenoh.decision.tasks.mission import Script\n"
         "from gigabrain_zenoh.decision.tasks.scripts import Scripts\n"
         "async def main():\n"
-        f"    Scripts({folder!r}).start(Script(run='beep'))\n"
+        f"    run = Scripts({folder!r}).start(Script(run='beep'))\n"
+        f"    while not os.path.exists('{tmp_path}/pause'):\n"
+        "        await asyncio.sleep(0.01)\n"
+        "    run.pause()\n"
         "    await asyncio.sleep(600)\n"
         "asyncio.run(main())\n"
     )
     decision = await asyncio.create_subprocess_exec(sys.executable, "-c", text)
-    file = tmp_path / "child"
-    await until(lambda: file.exists() and file.read_text().strip())
-    child = int(file.read_text())
+    child = int(await written(tmp_path / "child"))
     assert not _gone(child)
+    if paused:
+        (tmp_path / "pause").touch()
+        await until(lambda: _state(child) == "T")
     decision.kill()
     await decision.wait()
     await until(lambda: _gone(child))
+
+
+async def written(file: Path) -> str:
+    """Return what is written to a file, once there is something."""
+
+    def text() -> str:
+        return file.read_text() if file.exists() else ""
+
+    await until(lambda: text().strip())
+    return text()
+
+
+def _state(pid: int) -> str:
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
 
 
 def _gone(pid: int) -> bool:

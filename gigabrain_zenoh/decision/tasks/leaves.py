@@ -4,7 +4,7 @@ All use the robot's time.
 """
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 
 from msgspec.structs import replace
@@ -32,9 +32,8 @@ from gigabrain_zenoh.decision.tasks.arm_steps import (
 )
 from gigabrain_zenoh.decision.tasks.conditions import Condition, Read
 from gigabrain_zenoh.decision.tasks.mission import Script
-from gigabrain_zenoh.decision.tasks.scripts import Run
+from gigabrain_zenoh.decision.tasks.scripts import Run, RunningScripts
 
-StartScript = Callable[[Script], Run]
 MOVED_M = 0.15  # that a target may be off where the robot drives to
 LEFT_M = 0.4  # round where a thing was not known any more: it does not go there again without it
 FIRST_MESSAGE_S = 1.0  # for which a check waits for a message of its topic
@@ -59,7 +58,7 @@ class MissionContext:
     """Inputs and outputs of a mission's nodes in one tick. Time stops while a mission waits."""
 
     read: Read
-    start: StartScript
+    scripts: RunningScripts
     numbers: Iterator[int]  # of commands, each only once
     seek: Seek = seek_nothing
     hand: Hand = field(default_factory=Hand)
@@ -368,20 +367,21 @@ class ScriptNode(Leaf):
 
     def initialise(self) -> None:
         """Start the node, or start it again."""
-        self._running = self.context.start(self._script)
+        self._running = self.context.scripts.start(self._script)
 
     def update(self) -> Status:
         """Advance the node by one tick, and return its status."""
-        self.context.doing = self.name
-        result = self._running.result if self._running else None
+        assert self._running
+        self.context.doing, result = self.name, self._running.result
         if result is None:
+            self.context.scripts.go_on(self._running)
             return Status.RUNNING
         return Status.SUCCESS if result[0] else self.failed(f"{self._script.run} {result[1]}")
 
     def terminate(self, new_status: Status) -> None:
         """Stop what the node has started."""
         if self._running:
-            self._running.stop()
+            self.context.scripts.stop(self._running)
             self._running = None
 
 

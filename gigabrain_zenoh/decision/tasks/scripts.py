@@ -4,8 +4,9 @@ import asyncio
 import contextlib
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from typing import cast
 
 from gigabrain_zenoh.decision.tasks.mission import Script
 from gigabrain_zenoh.errors import GigabrainError, Refused, unknown
@@ -14,10 +15,10 @@ from gigabrain_zenoh.host.files import expanded
 
 MAX_OUTPUT = 200  # bytes of a program's output that its result shows, the last ones
 LINGER_S = 1.0  # for the rest of its output, once it has ended
-# becomes the program; kills its process group, itself included, once its input is closed
-LEASHED = """exec 3<&0 </dev/null
-{ read -r _ <&3; kill -s KILL 0; } >/dev/null 2>&1 &
-exec "$@" 3<&-"""
+# becomes the program once it reads a line; ends if its input is closed before
+LEASHED = 'read -r _ && exec "$@" </dev/null'
+# kills a program's process group once its input is closed, also if that group is stopped
+LEASH = 'read -r _; kill -s KILL -- "-$1"'
 
 
 class Scripts:
@@ -55,37 +56,123 @@ class Run:
 
     def __init__(self, scripts: Scripts, script: Script) -> None:
         self.result: tuple[bool, str] | None = None  # success, and a text for people
+        self._program: asyncio.SubprocessTransport | None = None
+        self._limit: asyncio.Timeout | None = None  # of its time, while it runs
+        self._left_s = script.seconds
+        self._resumed = asyncio.Event()
+        self._resumed.set()
         self._task = asyncio.ensure_future(self._run(scripts, script))
 
     def stop(self) -> None:
         """Kill it and all that it has started."""
         self._task.cancel()
 
+    def pause(self) -> None:
+        """Stop it and all that it has started until `resume`; its time limit waits as well."""
+        self._resumed.clear()
+        if self._limit and not self._limit.expired() and (end_s := self._limit.when()):
+            self._left_s = end_s - asyncio.get_running_loop().time()
+            self._limit.reschedule(None)
+            self._signal(signal.SIGSTOP)
+
+    def resume(self) -> None:
+        """Have it go on, if it is paused."""
+        self._resumed.set()
+        if self._limit and self._limit.when() is None:
+            self._limit.reschedule(asyncio.get_running_loop().time() + self._left_s)
+            self._signal(signal.SIGCONT)
+
     async def _run(self, scripts: Scripts, script: Script) -> None:
         try:
             path = scripts.path(script.run)
-            with _leash() as end:
-                program, output = await asyncio.get_running_loop().subprocess_exec(
-                    _Output, "/bin/sh", "-c", LEASHED, "sh", path, *script.arguments,
-                    cwd=path.parent, start_new_session=True, stdin=end,
-                    env=this_process.environment_for_others(),
-                    stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
-                )  # fmt: skip
-                with contextlib.closing(program):
-                    self.result = await _outcome(program, output, script.seconds)
+            program, output = await asyncio.get_running_loop().subprocess_exec(
+                _Output, "/bin/sh", "-c", LEASHED, "sh", path, *script.arguments,
+                cwd=path.parent, start_new_session=True,
+                env=this_process.environment_for_others(),
+                stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
+                stderr=asyncio.subprocess.STDOUT,
+            )  # fmt: skip
+            self._program = program
+            with contextlib.closing(program):
+                async with _leash(program.get_pid()):
+                    result = await self._outcome(program, output, script.seconds)
+            self.result = result
         except (GigabrainError, OSError, ValueError) as error:
             self.result = False, f"cannot be run: {error}"
 
+    async def _outcome(
+        self, program: asyncio.SubprocessTransport, output: "_Output", seconds: float
+    ) -> tuple[bool, str]:
+        """Begin a program, wait for its end, kill its process group, and return its outcome."""
+        try:
+            await self._resumed.wait()
+            cast("asyncio.WriteTransport", program.get_pipe_transport(0)).write(b"\n")
+            async with asyncio.timeout(seconds) as self._limit:
+                await output.ended.wait()
+        except TimeoutError:
+            return False, f"did not end within {seconds:g} s; killed"
+        finally:
+            self._limit = None
+            self._signal(signal.SIGKILL)
+            await output.ended.wait()
+            with contextlib.suppress(
+                TimeoutError
+            ):  # a process outside the group may keep the output open
+                await asyncio.wait_for(output.silent.wait(), LINGER_S)
+        code = program.get_returncode()
+        return code == 0, _in_words(code, str(output))
 
-@contextlib.contextmanager
-def _leash() -> Iterator[int]:
-    """Yield a pipe that closes when this process ends, even by SIGKILL."""
-    end, ours = os.pipe()
-    try:
-        yield end
-    finally:
-        os.close(end)
-        os.close(ours)
+    def _signal(self, number: signal.Signals) -> None:
+        assert self._program
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._program.get_pid(), number)
+
+
+StartScript = Callable[[Script], Run]
+
+
+class RunningScripts:
+    """The programs of all missions, of which only that of the active step goes on."""
+
+    def __init__(self, start: StartScript) -> None:
+        self._start, self._running, self._active = start, set[Run](), set[Run]()
+
+    def start(self, script: Script) -> Run:
+        """Start a program."""
+        run = self._start(script)
+        self._running.add(run)
+        return run
+
+    def go_on(self, run: Run) -> None:
+        """Have a program go on for the present step."""
+        self._active.add(run)
+
+    def stop(self, run: Run) -> None:
+        """Kill a program."""
+        self._running.discard(run)
+        run.stop()
+
+    def settle(self) -> None:
+        """Pause all programs but those that go on; to be called after each step."""
+        for run in self._running:
+            run.resume() if run in self._active else run.pause()
+        self._active.clear()
+
+
+@contextlib.asynccontextmanager
+async def _leash(group: int) -> AsyncIterator[None]:
+    """Have a process group killed if this process ends during the block, even by SIGKILL."""
+    leash, output = await asyncio.get_running_loop().subprocess_exec(
+        _Output, "/bin/sh", "-c", LEASH, "sh", str(group),
+        start_new_session=True, stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.DEVNULL,
+    )  # fmt: skip
+    with contextlib.closing(leash):
+        try:
+            yield
+        finally:
+            leash.kill()
+            await output.ended.wait()
 
 
 class _Output(asyncio.SubprocessProtocol):
@@ -103,31 +190,11 @@ class _Output(asyncio.SubprocessProtocol):
         del self._text[:-MAX_OUTPUT]
 
     def pipe_connection_lost(self, fd: int, exc: Exception | None) -> None:
-        self.silent.set()
+        if fd == 1:
+            self.silent.set()
 
     def process_exited(self) -> None:
         self.ended.set()
-
-
-async def _outcome(
-    program: asyncio.SubprocessTransport, output: _Output, seconds: float
-) -> tuple[bool, str]:
-    """Wait for a program's end, kill its process group, and return its success and a text."""
-    try:
-        async with asyncio.timeout(seconds):
-            await output.ended.wait()
-    except TimeoutError:
-        return False, f"did not end within {seconds:g} s; killed"
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(program.get_pid(), signal.SIGKILL)
-        await output.ended.wait()
-        with contextlib.suppress(
-            TimeoutError
-        ):  # a process outside the group may keep the output open
-            await asyncio.wait_for(output.silent.wait(), LINGER_S)
-    code = program.get_returncode()
-    return code == 0, _in_words(code, str(output))
 
 
 def _in_words(code: int | None, output: str) -> str:

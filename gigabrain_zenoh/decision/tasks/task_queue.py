@@ -28,8 +28,9 @@ from gigabrain_zenoh.decision.tasks.behaviour_tree import (
     restore,
 )
 from gigabrain_zenoh.decision.tasks.conditions import Read
-from gigabrain_zenoh.decision.tasks.leaves import Hand, MissionContext, StartScript, seek_nothing
+from gigabrain_zenoh.decision.tasks.leaves import Hand, MissionContext, seek_nothing
 from gigabrain_zenoh.decision.tasks.mission import Mission, find_mission, goal_mission, restored
+from gigabrain_zenoh.decision.tasks.scripts import RunningScripts, StartScript
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file, too_large
 
@@ -118,7 +119,7 @@ class TaskQueue:
     def __init__(
         self, read: Read, start: StartScript, saved: Saved, seek: Seek = seek_nothing
     ) -> None:
-        self._read, self._start, self._numbers = read, start, itertools.count(1)
+        self._read, self._scripts, self._numbers = read, RunningScripts(start), itertools.count(1)
         self._seek, self._hand = seek, Hand(saved.held)
         self._count, self._boot = saved.count, saved.boot
         self._jobs: list[Job] = []
@@ -192,6 +193,11 @@ class TaskQueue:
         Return the next command, and why the robot stands if there is none.
         """
         self._outcome = outcome
+        wanted = self._advance(seconds, outcome)
+        self._scripts.settle()
+        return wanted
+
+    def _advance(self, seconds: float, outcome: StepOutcome | None) -> tuple[Command | None, Idle]:
         while self._jobs:
             job = self._jobs[0]
             if job.held:
@@ -264,7 +270,7 @@ class TaskQueue:
         return name
 
     def _context(self) -> MissionContext:
-        return MissionContext(self._read, self._start, self._numbers, self._seek, self._hand)
+        return MissionContext(self._read, self._scripts, self._numbers, self._seek, self._hand)
 
     def _job(self, name: str) -> Job:
         if not self._jobs:

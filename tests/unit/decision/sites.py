@@ -39,8 +39,14 @@ class Program:
     """A program of the host that ends when the test says so."""
 
     def __init__(self, script: Script) -> None:
-        self.script, self.stopped = script, False
+        self.script, self.stopped, self.paused = script, False, False
         self.result: tuple[bool, str] | None = None
+
+    def pause(self) -> None:
+        self.paused = True
+
+    def resume(self) -> None:
+        self.paused = False
 
     def stop(self) -> None:
         self.stopped = True

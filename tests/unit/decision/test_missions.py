@@ -242,3 +242,61 @@ def test_a_script_that_fails_says_why_and_one_that_is_cancelled_is_ended(robot: 
     assert not robot.programs[1].stopped
     robot.tasks.cancel("", "ann")
     assert robot.programs[1].stopped
+
+
+def test_a_script_stands_still_while_its_mission_is_paused(robot: Robot) -> None:
+    robot.carry_out("do: [{script: {run: beep}}]")
+    robot.step()
+    robot.tasks.pause("", "ann")
+    robot.step()
+    assert robot.programs[0].paused
+    robot.tasks.resume("")
+    robot.step()
+    assert not robot.programs[0].paused
+    robot.tasks.cancel("", "ann")
+
+
+def test_a_script_stands_still_while_another_task_comes_first(robot: Robot) -> None:
+    robot.carry_out("do: [{script: {run: beep}}]")
+    robot.step()
+    robot.carry_out("do: [{goto: a}]", "preempt")
+    assert robot.step() == 1.0
+    assert robot.programs[0].paused
+    robot.reached()
+    assert not robot.programs[0].paused
+    robot.tasks.cancel("", "ann")
+
+
+def test_a_script_stands_still_while_a_guard_has_interrupted_it(robot: Robot) -> None:
+    low = "battery_below: {percentage: 20, goto: dock, until: 80, do: [{script: {run: beep}}]}"
+    robot.carry_out(f"do: [{{{low}}}]")
+    robot.step()
+    robot.charge = 10.0
+    assert robot.step() == 0.0
+    assert robot.programs[0].paused
+    robot.charge = 90.0
+    robot.reached()
+    robot.step()
+    assert not robot.programs[0].paused
+    robot.tasks.cancel("", "ann")
+
+
+def test_a_script_that_is_paused_is_ended_with_its_mission(robot: Robot) -> None:
+    robot.carry_out("do: [{script: {run: beep}}]")
+    robot.step()
+    robot.tasks.pause("", "ann")
+    robot.step()
+    robot.tasks.cancel("", "ann")
+    assert robot.programs[0].stopped
+    robot.step()
+
+
+def test_a_mission_that_is_paused_before_its_script_starts_it_when_resumed(robot: Robot) -> None:
+    robot.carry_out("do: [{script: {run: beep}}]")
+    robot.tasks.pause("", "ann")
+    robot.step()
+    assert robot.programs == []
+    robot.tasks.resume("")
+    robot.step()
+    assert not robot.programs[0].paused
+    robot.tasks.cancel("", "ann")
