@@ -1,6 +1,8 @@
 """Topics by name, as async iterators, and sampled for viewers."""
 
 import asyncio
+import contextlib
+import math
 from collections import deque
 from collections.abc import AsyncIterator
 from typing import Any, TypeVar
@@ -15,6 +17,7 @@ from gigabrain_zenoh.errors import BodyLost, unknown
 M = TypeVar("M", bound=Message)
 TOPIC_BY_KEY: dict[str, Topic[Any]] = {topic.key: topic for topic in TOPICS}
 MAX_WAITING = 64  # messages that wait for a slow `async for`; the oldest give way
+PART_S = 0.1  # of a timeout, of which a process that is stopped meanwhile misses only one
 
 
 def topic_named(name: str) -> Topic[Any]:
@@ -32,6 +35,23 @@ def topic_of(key: str) -> Topic[Any] | None:
         return TOPIC_BY_KEY[key]
     topic = TOPIC_BY_KEY.get(key.rpartition("/")[0])
     return topic if topic and topic.many else None
+
+
+async def arrival(arrived: asyncio.Event, timeout_s: float | None) -> None:
+    """Wait until `arrived` is set; with None for ever.
+
+    Raises TimeoutError after `timeout_s`, without the time in which this process was stopped.
+    """
+    left_s = math.inf if timeout_s is None else timeout_s
+    while left_s > 0.0:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(
+                min(left_s, PART_S)
+            ):  # `wait_for` may swallow a cancellation
+                await arrived.wait()
+                return
+        left_s -= PART_S
+    raise TimeoutError
 
 
 async def listen(bus: Bus, topic: Topic[M], timeout_s: float | None = None) -> AsyncIterator[M]:
@@ -52,8 +72,7 @@ async def listen(bus: Bus, topic: Topic[M], timeout_s: float | None = None) -> A
             while waiting:
                 yield waiting.popleft()
             arrived.clear()
-            async with asyncio.timeout(timeout_s):  # `wait_for` may swallow a cancellation
-                await arrived.wait()
+            await arrival(arrived, timeout_s)
     except TimeoutError:
         text = f"no message on {topic.key} for {timeout_s:g} s; is it published?"
         raise BodyLost(text) from None

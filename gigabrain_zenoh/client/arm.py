@@ -172,7 +172,10 @@ class JointStream:
         self._postures = (self._postures[1], posture)
         if self._lost(posture):
             self._now = posture
-        ticks = max(0, min(state.tick - self._tick, LOST_TICKS))
+        passed = max(0, state.tick - self._tick)
+        ticks = min(passed, LOST_TICKS)
+        self._path_tick += passed - ticks  # it waits, as the gate does without commands
+        self._progress_tick += passed - ticks
         self._tick = state.tick
         self._watch_progress(posture)
         if ticks:

@@ -12,6 +12,7 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.requests import GateReply
 from gigabrain_schemas.topics import BODY, JOINT_CMD, STATE, command_topic
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.listening import arrival
 from gigabrain_zenoh.client.arm import JointStream
 from gigabrain_zenoh.client.lease import ControlLease
 from gigabrain_zenoh.client.requests import ANSWER_S, enable, press_estop, release
@@ -190,7 +191,6 @@ class Commander:
         for _ in range(count):
             self._arrived.clear()
             try:
-                async with asyncio.timeout(ANSWER_S):  # `wait_for` may swallow a cancellation
-                    await self._arrived.wait()
+                await arrival(self._arrived, ANSWER_S)
             except TimeoutError:
                 raise BodyLost("robot/state has stopped; is the driver running?") from None

@@ -2,24 +2,28 @@
 
 from gigabrain_schemas.body import GateStatus, RobotState
 
+MISSED_TICKS = 25  # without a state, hence without a command, after which the gate has let go of it
+
 
 class ControlLease:
     """Tracks whether one commander has the body, from the gate's states.
 
-    A passing stop, as for an obstacle, does not end the lease. It is lost when another commander
-    takes over, the gate latches or the driver restarts. Then the script must ask again: it must not
+    A passing stop, as for an obstacle, does not end the lease, nor does a time in which the script
+    was stopped. It is lost when another commander takes over, a person presses the e-stop, the gate
+    latches or the driver restarts. Then the script must ask again: it must not
     take the body back from the person who has just stopped it.
     """
 
     def __init__(self, source: str) -> None:
         self._source = source
         self._boot = self._enables = 0  # of the gate when it granted the body
+        self._tick = self._estops = 0  # of the last state
         self._had = False  # in the last state
         self.lost = False
 
     def granted(self, boot: int, gate: GateStatus) -> None:
         """Record that the gate has granted the body."""
-        self._boot, self._enables = boot, gate.enables
+        self._boot, self._enables, self._estops = boot, gate.enables, gate.estop_generation
         self._had, self.lost = True, False
 
     def update(self, state: RobotState) -> None:
@@ -27,8 +31,10 @@ class ControlLease:
         if not self._boot or self._is_old(state):
             return
         has, gate = self.has(state), state.gate
-        taken = self._had and gate.commander not in ("", self._source)
-        ended = taken or gate.mode == "latched" or self.restarted(state)
+        missed, self._tick = state.tick - self._tick > MISSED_TICKS, state.tick
+        pressed, self._estops = gate.estop_generation > self._estops, gate.estop_generation
+        taken = self._had and not missed and gate.commander not in ("", self._source)
+        ended = taken or pressed or gate.mode == "latched" or self.restarted(state)
         self.lost = not has and (self.lost or ended)
         self._had = has
 

@@ -16,6 +16,7 @@ MIN_LINEAR, MIN_ANGULAR = 0.02, 0.05  # [m/s], [rad/s], so that a motion ends
 HEADING_GAIN = 2.0  # [1/s]
 STALL_TICKS = 10 * 50  # without progress
 REST_TICKS = 50  # how long the end of a motion waits until the body is at rest
+MISSED_TICKS = 25  # between two states, from which a motion was not gone on with
 
 
 class Reached(Struct, frozen=True, kw_only=True):
@@ -53,6 +54,8 @@ class OdometryMotion:
         `safety` has the causes of safety's verdict: an obstacle limits only motion towards it.
         """
         self._turned += math.remainder(state.pose.yaw - self._yaw, math.tau)
+        if (passed := state.tick - self._last.tick) > MISSED_TICKS:
+            self._best_tick += passed
         self._yaw, self._last = state.pose.yaw, state
         self._held.update(dict.fromkeys(one.code for one in state.gate.causes))
         self._held.update({one.code: None for one in safety if one.code == self._zone})

@@ -20,6 +20,7 @@ from gigabrain_schemas.tasks import (
 )
 from gigabrain_schemas.topics import GOAL, MISSION, TASK, TASK_CHANGE, Service
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.listening import arrival
 from gigabrain_zenoh.client.requests import ANSWER_S
 from gigabrain_zenoh.errors import BodyLost, ConfigError, GigabrainError, Refused
 from gigabrain_zenoh.security.identity_files import may_not_ask
@@ -255,8 +256,7 @@ class Tasks:
     async def _next_status(self) -> None:
         self._arrived.clear()
         try:
-            async with asyncio.timeout(self._silent_s):  # `wait_for` may swallow a cancellation
-                await self._arrived.wait()
+            await arrival(self._arrived, self._silent_s)
         except TimeoutError:
             raise self._no_server() from None
 

@@ -5,13 +5,21 @@ from gigabrain_schemas.body import GateMode, GateStatus, RobotState
 from gigabrain_zenoh.client.lease import ControlLease
 
 
-def state(mode: GateMode, commander: str = "", enables: int = 1, boot: int = 7) -> RobotState:
+def state(
+    mode: GateMode,
+    commander: str = "",
+    enables: int = 1,
+    boot: int = 7,
+    tick: int = 0,
+    estops: int = 0,
+) -> RobotState:
     return RobotState(
         boot=boot,
+        tick=tick,
         robot_type="waffle",
         pose=Pose(x=0.0, y=0.0, yaw=0.0),
         velocity=Velocity(),
-        gate=GateStatus(mode=mode, commander=commander, enables=enables),
+        gate=GateStatus(mode=mode, commander=commander, enables=enables, estop_generation=estops),
     )
 
 
@@ -71,3 +79,16 @@ def test_a_latch_loses_it_until_it_asks_anew() -> None:
 def test_another_start_of_the_driver_loses_it_until_it_asks_anew() -> None:
     assert after(state("idle", "", 0, boot=8)) == (False, True)
     assert after(state("enabled", "script", 1, boot=8)) == (False, True)
+
+
+def test_a_script_that_was_stopped_for_a_while_may_ask_for_the_body_again() -> None:
+    mine = state("enabled", "script", 4, tick=100)
+    assert after(mine, state("enabled", "control", 5, tick=110)) == (False, True)
+    assert after(mine, state("enabled", "control", 5, tick=2000)) == (False, False)
+
+
+def test_an_e_stop_that_it_missed_meanwhile_loses_it() -> None:
+    mine = state("enabled", "script", 4, tick=100)
+    pressed = state("enabled", "control", 5, tick=2000, estops=1)
+    assert after(mine, pressed) == (False, True)
+    assert after(mine, pressed, state("idle", "", 5, tick=2001, estops=1)) == (False, True)

@@ -132,3 +132,26 @@ def test_a_position_may_be_a_number_of_numpy(kind: type) -> None:
 def test_a_position_that_is_no_number_is_refused(position: float) -> None:
     with pytest.raises(ConfigError, match="shoulder_pan: expected a number, got "):
         checked_positions(ARM, {"shoulder_pan": position})
+
+
+def test_a_path_goes_on_where_it_was_when_its_script_was_stopped() -> None:
+    arm = Arm()
+    path = JointPath(ARM, [(2.0, {"shoulder_pan": 1.0})], arm.stream.posture)
+    arm.stream.follow(path)
+    for _ in range(50):
+        before = arm.step().position[PAN]
+    places = [arm.step(3000).position[PAN], *(arm.step().position[PAN] for _ in range(25))]
+    assert before == pytest.approx(0.5, abs=0.05)
+    assert max(places) < 0.85
+    for _ in range(60):
+        places.append(arm.step().position[PAN])
+    assert places[-1] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_joints_are_not_held_back_by_a_time_in_which_their_script_was_stopped() -> None:
+    arm = Arm()
+    arm.stream.go({"shoulder_pan": 1.0}, None)
+    for ticks in (1, 3000):  # the gate has not moved them yet
+        arm.tick += ticks
+        arm.stream.step(arm.state())
+    assert not arm.stream.held_back

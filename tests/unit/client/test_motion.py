@@ -117,3 +117,14 @@ def test_a_car_is_not_asked_to_turn_on_the_spot() -> None:
     nowhere = OdometryMotion(car, start, 0.0, 0.0)  # `move(0.0)`
     assert nowhere.step(start) == Velocity()
     assert (nowhere.done, nowhere.result().ok) == (True, True)
+
+
+def test_a_motion_whose_script_was_stopped_for_a_minute_goes_on() -> None:
+    plant = Plant()
+    motion = OdometryMotion(BODY, plant.state, 1.0, 0.0)
+    motion.step(plant.state)
+    for _ in range(3000):
+        plant.follow(Velocity())
+    while not motion.done:
+        plant.follow(motion.step(plant.state))
+    assert motion.result().distance == pytest.approx(1.0, abs=0.02)

@@ -1,6 +1,7 @@
 """A topic that nobody publishes does not hold up a script that gives a timeout."""
 
 import asyncio
+import time
 
 import pytest
 
@@ -47,3 +48,15 @@ def test_so_does_one_without_asyncio() -> None:
 async def test_a_timeout_that_cannot_be_is_refused(seconds: float) -> None:
     with pytest.raises(ConfigError, match=f"timeout: expected more than 0, got {seconds:g}"):
         Robot(Net().two).topic("scan", timeout=seconds)
+
+
+async def test_time_in_which_the_script_was_stopped_does_not_count() -> None:
+    net = Net()
+    reading = asyncio.ensure_future(anext(Robot(net.two).topic(STATE, timeout=0.5)))
+    await asyncio.sleep(0.01)
+    loop = asyncio.get_running_loop()
+    loop.call_soon(time.sleep, 1.0)
+    loop.call_later(
+        0.05, lambda: loop.call_later(0.05, net.one.publish, STATE, example(RobotState))
+    )
+    assert (await reading).robot_type == example(RobotState).robot_type
