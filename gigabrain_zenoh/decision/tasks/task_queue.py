@@ -51,6 +51,7 @@ class SavedJob(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     source: str
     mission: str  # as JSON
     held: bool = False
+    why_held: str = ""
     memory: Progress = {}
     things: dict[Name, Solid] | None = None  # where they are by now; None: as the mission says
 
@@ -60,9 +61,8 @@ class Job:
 
     def __init__(self, saved: SavedJob, mission: Mission, context: MissionContext) -> None:
         self._saved, self.context = saved, context
-        self.id, self.held = saved.id, saved.held  # held: paused by a person
-        self.begun = bool(saved.memory)
-        self.why_held = ""
+        self.id, self.begun = saved.id, bool(saved.memory)
+        self.held, self.why_held = saved.held, saved.why_held  # held: paused by a person
         self._root = TreeBuilder(mission, context).tree()
         self._things = bool(mission.things)
         if saved.things is not None:
@@ -85,7 +85,7 @@ class Job:
         """The part that survives a restart."""
         return SavedJob(
             id=self.id, kind=self._saved.kind, label=self._saved.label, source=self._saved.source,
-            mission=self._saved.mission, held=self.held,
+            mission=self._saved.mission, held=self.held, why_held=self.why_held,
             memory=progress_of(self._root, self.context.free_s),
             things=dict(self.context.things) if self._things else None,
         )  # fmt: skip

@@ -161,6 +161,22 @@ def test_after_a_restart_two_failures_are_still_two(robot: Robot) -> None:
     assert again.last == ("failed", "a: no way")
 
 
+def test_after_a_restart_a_paused_task_stays_paused_and_says_by_whom(robot: Robot) -> None:
+    robot.carry_out("do: [{script: {run: beep}}]")
+    robot.step()
+    robot.tasks.pause("", "ann")
+    again = Robot(robot.tasks.saved)
+    again.step()
+    current = again.status.current
+    assert current
+    assert (current.state, current.reason) == ("paused", "paused by ann")
+    assert again.programs == []
+    again.tasks.resume("")
+    again.step()
+    assert len(again.programs) == 1
+    robot.tasks.cancel("", "ann")
+
+
 def test_after_a_start_of_the_whole_robot_tasks_wait_for_a_person(robot: Robot) -> None:
     robot.tasks.restart(7)
     robot.carry_out("do: [{goto: a}]")
