@@ -81,9 +81,10 @@ def is_at(
     return any((np.abs(way.positions - posture) < slack).all(axis=1).any() for way in ways)
 
 
-def rest_of_retreat(left: Plan, posture: Floats) -> Plan:
-    """Return the rest of a plan's way back, for an arm that was sent to `posture` (n,)."""
-    way = left.phases[-1].arm
+def rest_of_place(left: Plan, posture: Floats) -> Plan:
+    """Return how to let go and retreat as planned, for an arm that was sent to `posture` (n,)."""
+    *_, let_go, retreat = left.phases
+    way = retreat.arm
     assert way
     begun = int(np.abs(way.positions - posture).max(axis=1).argmin())
     rest = JointTrajectory(
@@ -91,7 +92,7 @@ def rest_of_retreat(left: Plan, posture: Floats) -> Plan:
         positions=way.positions[begun:], velocities=way.velocities[begun:],
         accelerations=way.accelerations[begun:],
     )  # fmt: skip
-    return Plan(phases=(Phase(name="retreat", arm=rest),))
+    return Plan(phases=(let_go, Phase(name="retreat", arm=rest)))
 
 
 def holds(planner: ArmPlanner, hold: Hold, state: RobotState) -> bool:

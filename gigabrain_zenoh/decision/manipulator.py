@@ -22,7 +22,7 @@ from gigabrain_zenoh.decision.arm_readings import (
     measured_posture,
     off_from,
     pace,
-    rest_of_retreat,
+    rest_of_place,
     sent_place,
     sent_posture,
     sent_to,
@@ -112,7 +112,8 @@ class Manipulator:
         self._achieved = StepOutcome()  # of a command that is done but for the way back
         # the same of earlier commands, which go on after a task that came first
         self._results: deque[StepOutcome] = deque(maxlen=MAX_RESULTS)
-        self._left: Plan | None = None  # whose thing the hand is still at, without holding it
+        self._put_down: StepOutcome | None = None  # of the command whose thing is being let go of
+        self._left: Plan | None = None  # that was cut short: the hand may still be at its thing
         self._base = Pose(x=0.0, y=0.0, yaw=0.0)  # of the body when the arm moved last
         self._interim = False  # it goes back from there, or out of a camera's sight
         self._why_not = ""  # why it fails once it is back
@@ -253,7 +254,8 @@ class Manipulator:
         seen: tuple[SeenSolid, ...],
     ) -> StepResult:
         if self._hold and not (self._run or self._planning or self._grip.moves):
-            self._set_hold(still_held(planner, body, state, self._hold))
+            kept = still_held(planner, body, state, self._hold)
+            self._let_go(state) if self._put_down and not kept else self._set_hold(kept)
         do, hold = command.do, self._hold
         if isinstance(do, Pick) and self._run is None and hold and hold.thing.name == do.thing:
             self._achieve(hold)
@@ -264,7 +266,7 @@ class Manipulator:
             return self._fail(f"{name} is not in the gripper: it is seen where it was")
         if isinstance(do, AwaitTaken):
             return self._offer(planner, body, state)
-        if self._run is None and self._left:
+        if self._run is None and self._left and not self._hold:
             self._back_off(planner, body, state, self._left)
         elif self._run is None:
             if self._planning is None:
@@ -306,6 +308,7 @@ class Manipulator:
         if not begins_at(found, sent_posture(planner, body, state)):
             self._interim = False
             return self._still(PLANNING)
+        self._left = None
         self._begin(planner, found, state)
         return self._follow(planner, state, body, command)
 
@@ -366,7 +369,7 @@ class Manipulator:
         """Begin to go back from a thing that is not held; afterwards it is planned again."""
         self._left, self._interim = left, True
         posture, put_down = sent_posture(planner, body, state), left.phases[-1].name == "retreat"
-        back = rest_of_retreat(left, posture) if put_down else planner.back_off(left, posture)
+        back = rest_of_place(left, posture) if put_down else planner.back_off(left, posture)
         self._begin(planner, back, state)
 
     def _press(
@@ -391,7 +394,7 @@ class Manipulator:
 
     def _begin(self, planner: ArmPlanner, plan: Plan, state: RobotState) -> None:
         gripper = planner.arm.gripper
-        self._plan = plan
+        self._plan, self._put_down = plan, None
         self._run = PhaseRun(plan.phases, gripper.name if gripper else "", state.tick)
         if self._hold:
             self._squeeze(planner, self._run, self._hold, state)
@@ -423,13 +426,11 @@ class Manipulator:
             if not holds(planner, hold, state):
                 return self._missed(planner, body, state)
             self._squeeze(planner, run, hold, state)
+        if over and over.name == "lower" and hold:
+            thing = placed(planner, measured_posture(planner, state), command.do, hold, body)
+            self._put_down = self._success(None, placed=thing)
         if over and over.name == "open" and hold:
-            posture = measured_posture(planner, state)
-            name, solid = placed(planner, posture, command.do, hold, body)
-            self._achieve(None, placed=(name, solid))
-            self._results.append(self._achieved)
-            if self._seen_as is not None:  # others have a place by their mission
-                self._put = PutDown(name=name, solid=solid, state=state)
+            self._let_go(state)
         if over and over.name == "grip":
             self._set_hold(None)
             self._grip.hold_by(over.gripper)
@@ -474,10 +475,25 @@ class Manipulator:
         self._interrupt()
         return self._still(PLANNING)
 
-    def _achieve(self, hold: Hold | None, placed: tuple[str, Solid] | None = None) -> None:
-        """Record that the gripper holds a thing, or has put one down."""
+    def _let_go(self, state: RobotState) -> None:
+        """Record that what was held has been put down, maybe by an earlier command."""
+        done, self._put_down = self._put_down, None
+        assert done
+        assert done.placed
+        self._set_hold(None)
+        self._results.append(done)
+        if done.number == self._number:
+            self._achieved = done
+        if self._seen_as is not None:  # others have a place by their mission
+            self._put = PutDown(name=done.placed[0], solid=done.placed[1], state=state)
+
+    def _achieve(self, hold: Hold | None) -> None:
+        """Record that the command has done its work, and what the gripper holds."""
         self._set_hold(hold)
-        self._achieved = StepOutcome(
+        self._achieved = self._success(hold)
+
+    def _success(self, hold: Hold | None, placed: tuple[str, Solid] | None = None) -> StepOutcome:
+        return StepOutcome(
             number=self._number,
             state="done",
             reason=f"it holds {hold.thing.name}" if hold else "",
@@ -526,12 +542,8 @@ class Manipulator:
         return intent, replace(outcome, number=self._number)
 
     def _interrupt(self) -> None:
-        """Forget the plan, but not that the hand is at a thing that it does not hold yet."""
-        left, phase = self._left, self._run.phase if self._run else None
-        if phase and phase.name in ("descend", "close", "press"):
-            left = self._plan
-        elif phase and phase.name == "retreat":
-            left = left or self._plan  # from what was put down
+        """Forget the plan, but not that the hand may be at its thing; see `is_at`."""
+        left = self._left or (self._plan if self._run else None)
         self._drop()
         self._left = left
 

@@ -107,6 +107,42 @@ def test_another_task_first_leaves_what_was_put_down(rig: Rig) -> None:
     assert rig.phases.index("retreat") < rig.phases.index("move")
 
 
+@pytest.mark.parametrize("cancelled", [False, True])
+def test_another_task_first_leaves_what_the_gripper_has_begun_to_let_go_of(
+    rig: Rig, cancelled: bool
+) -> None:
+    rig.give(PLACE)
+    until(rig, "lift")
+    pause(rig)  # at the place of a thing that it holds
+    until(rig, "traverse")
+    until(rig, "open")
+    for _ in range(15):
+        rig.tick()
+    if cancelled:
+        rig.queue.cancel("", "ann")
+        rig.tick()
+    rig.phases = []
+    assert rig.carry_out("do: [{posture: {shoulder_pan: -0.5}}]").state == "succeeded"
+    assert rig.arm.thing()[:2] == pytest.approx(ELSEWHERE, abs=0.012)
+    assert rig.phases.index("retreat") < rig.phases.index("move")
+
+
+@pytest.mark.parametrize("ticks", [1, 15, 30])
+@pytest.mark.parametrize("other", ["", "do: [{posture: home}]"])
+def test_a_thing_is_put_down_whenever_letting_go_is_interrupted(
+    rig: Rig, other: str, ticks: int
+) -> None:
+    rig.give(PLACE)
+    until(rig, "traverse")
+    until(rig, "open")
+    for _ in range(ticks):
+        rig.tick()
+    preempt(rig, other) if other else pause(rig)
+    task = rig.carry_on()
+    assert (task.state, task.reason) == ("succeeded", "")
+    assert rig.arm.thing()[:2] == pytest.approx(ELSEWHERE, abs=0.012)
+
+
 def test_a_command_that_fails_at_a_thing_leaves_the_next_one_to_go_back(rig: Rig) -> None:
     rig.give(PLACE)
     until(rig, "descend")
