@@ -29,7 +29,7 @@ from gigabrain_zenoh.cli import app
 from gigabrain_zenoh.config import loading, renames
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import behaviours
-from gigabrain_zenoh.decision.tasks import mission
+from gigabrain_zenoh.decision.tasks import mission_files
 from gigabrain_zenoh.diagnostics import doctor, why
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate import causes, gate
@@ -194,7 +194,7 @@ def _wrong_files() -> Iterator[str]:
 def _wrong_missions() -> Iterator[str]:
     for title, text in BAD_MISSIONS.items():
         try:
-            mission.loads(text, "evening.yaml")
+            mission_files.loads(text, "evening.yaml")
         except ConfigError as error:
             yield f"{title}: {error}"
     yield ""

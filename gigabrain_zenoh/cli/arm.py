@@ -313,7 +313,8 @@ def hold(*, at: RobotAddress = LOCAL) -> None:
 
 
 def _carry_out(at: RobotAddress, mission: "Mission", mode: Mode, wait: bool) -> None:
-    from gigabrain_zenoh.decision.tasks.mission import loads, text_of
+    from gigabrain_zenoh.decision.tasks.mission import text_of
+    from gigabrain_zenoh.decision.tasks.mission_files import loads
 
     text, label = text_of(mission), describe(mission.arm_actions[0])
     loads(text, "arm")  # refuse wrong numbers before connecting

@@ -113,7 +113,8 @@ def patrol(
         file: YAML file: `points: [[1, 2], [3, 0.5, 1.57]]`, or names of its `places`.
         loops: Number of rounds. Default: no limit.
     """
-    from gigabrain_zenoh.decision.tasks.mission import MAX_LOOPS, load_patrol, patrol_mission
+    from gigabrain_zenoh.decision.tasks.mission import MAX_LOOPS, patrol_mission
+    from gigabrain_zenoh.decision.tasks.mission_files import load_patrol
 
     if loops is not None and not 1 <= loops <= MAX_LOOPS:
         raise ConfigError(f"--loops: expected 1 to {MAX_LOOPS}, got {loops}")
@@ -138,7 +139,8 @@ def mission(
         file: YAML file; docs/how-to/missions.md describes it.
         check: Only check the file; no robot is needed.
     """
-    from gigabrain_zenoh.decision.tasks.mission import load, map_places
+    from gigabrain_zenoh.decision.tasks.mission import map_places
+    from gigabrain_zenoh.decision.tasks.mission_files import load
 
     loaded, _ = load(file)  # refuse a wrong file before connecting
     if check:

@@ -127,7 +127,7 @@ class Tasks:
         for an invalid mission, and Refused.
         """
         self._listen()
-        from gigabrain_zenoh.decision.tasks.mission import load, refuse_long
+        from gigabrain_zenoh.decision.tasks.mission_files import load, refuse_long
 
         if isinstance(mission, Path) or FILE_NAME.fullmatch(mission):
             label = Path(mission).stem

@@ -34,7 +34,7 @@ from gigabrain_zenoh.decision.drive_kernels import DriveKernels
 from gigabrain_zenoh.decision.node import InputSource
 from gigabrain_zenoh.decision.seen_things import SeenThings
 from gigabrain_zenoh.decision.task_server import StartMission, TaskServer
-from gigabrain_zenoh.decision.tasks import arm_steps
+from gigabrain_zenoh.decision.tasks import arm_steps, mission_files
 from gigabrain_zenoh.decision.tasks import mission as missions
 from gigabrain_zenoh.decision.zones import ZoneSource
 from gigabrain_zenoh.errors import GigabrainError, Refused
@@ -310,7 +310,7 @@ def _first_mission(config: NavigationConfig) -> StartMission | None:
     """Return what a robot does by itself. Raises ConfigError."""
     if config.mission:
         path = expanded(config.mission)
-        return StartMission(*missions.load(path), label=path.stem, source=str(path))
+        return StartMission(*mission_files.load(path), label=path.stem, source=str(path))
     if config.start != "explore":
         return None
     roaming = missions.explore_mission()

@@ -36,7 +36,7 @@ from gigabrain_zenoh.decision.behaviours import (
 )
 from gigabrain_zenoh.decision.context import ContextSource
 from gigabrain_zenoh.decision.known_objects import ObjectSource, Sought, Wanted, named, sought
-from gigabrain_zenoh.decision.tasks import arm_steps
+from gigabrain_zenoh.decision.tasks import arm_steps, mission_files
 from gigabrain_zenoh.decision.tasks import mission as missions
 from gigabrain_zenoh.decision.tasks.arm_steps import HeldThing
 from gigabrain_zenoh.decision.tasks.mission import Mission
@@ -169,7 +169,7 @@ class TaskServer:
             self._refuse_impossible(start.mission)
             if any(missions.map_places(start.mission)) and self._zones.maps_loaded(*now) is None:
                 return False
-            mission = missions.loads(start.text, start.source, self._zones.at(*now).places)
+            mission = mission_files.loads(start.text, start.source, self._zones.at(*now).places)
             self._queue.add_mission(mission, start.label, "queue", "itself")
         except GigabrainError as error:
             _log_refusal("mission", "itself", error)
@@ -279,7 +279,9 @@ class TaskServer:
             # a long one takes a tenth of a second to parse, which no scan should wait for
             with self._in_one_map():
                 places = self._zones.newest.places
-                mission = await asyncio.to_thread(missions.loads, request.mission, label, places)
+                mission = await asyncio.to_thread(
+                    mission_files.loads, request.mission, label, places
+                )
                 self._refuse_impossible(mission)
                 if mission.drives:
                     await self._check(None)

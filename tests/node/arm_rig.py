@@ -18,7 +18,7 @@ from gigabrain_schemas.objects import SeenSolid
 from gigabrain_schemas.tasks import Task
 from gigabrain_zenoh.decision.behaviours import ArmCommand, StepOutcome
 from gigabrain_zenoh.decision.manipulator import Manipulator
-from gigabrain_zenoh.decision.tasks.mission import loads
+from gigabrain_zenoh.decision.tasks.mission_files import loads
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskQueue
 from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner
 from gigabrain_zenoh.qa.bench.hands import ArmInMemory

@@ -10,7 +10,7 @@ from gigabrain_schemas.base import Pose
 from gigabrain_schemas.brain import Intent, JointTarget
 from gigabrain_schemas.safety import JointCap
 from gigabrain_zenoh.decision.manipulator import HOLD_UPS
-from gigabrain_zenoh.decision.tasks.mission import loads
+from gigabrain_zenoh.decision.tasks.mission_files import loads
 from tests.node.arm_rig import ELSEWHERE, THERE, THINGS, Rig
 
 PLACE = THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]}]"

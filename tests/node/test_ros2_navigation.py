@@ -12,7 +12,7 @@ from gigabrain_schemas.base import Pose
 from gigabrain_schemas.brain import OccupancyGrid, PoseInMap
 from gigabrain_schemas.tasks import Goal, GoalReply, MissionReply, Task, TaskReply, TaskStatus
 from gigabrain_schemas.topics import BODY, GOAL, MAP, MISSION, POSE, STATE, TASK, TASK_CHANGE
-from gigabrain_zenoh.decision.tasks.mission import loads
+from gigabrain_zenoh.decision.tasks.mission_files import loads
 from gigabrain_zenoh.gateway.navigation import (
     EndState,
     Navigator,

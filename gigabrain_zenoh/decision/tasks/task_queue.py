@@ -29,7 +29,8 @@ from gigabrain_zenoh.decision.tasks.behaviour_tree import (
 )
 from gigabrain_zenoh.decision.tasks.conditions import Read
 from gigabrain_zenoh.decision.tasks.leaves import Hand, MissionContext, seek_nothing
-from gigabrain_zenoh.decision.tasks.mission import Mission, find_mission, goal_mission, restored
+from gigabrain_zenoh.decision.tasks.mission import Mission, find_mission, goal_mission
+from gigabrain_zenoh.decision.tasks.mission_files import restored
 from gigabrain_zenoh.decision.tasks.scripts import RunningScripts, StartScript
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file, too_large

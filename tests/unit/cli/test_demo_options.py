@@ -7,7 +7,7 @@ import pytest
 
 from gigabrain_drivers.driver.catalog import robot_path
 from gigabrain_zenoh.cli.demo import RobotOptions
-from gigabrain_zenoh.decision.tasks.mission import loads
+from gigabrain_zenoh.decision.tasks.mission_files import loads
 from gigabrain_zenoh.errors import UnknownName
 
 

@@ -23,7 +23,7 @@ from gigabrain_schemas.topics import GOAL, MISSION, STATE, TASK, TASK_CHANGE, To
 from gigabrain_zenoh.decision.behaviours import DriveCommand, StepOutcome
 from gigabrain_zenoh.decision.context import ContextSource
 from gigabrain_zenoh.decision.task_server import TaskServer
-from gigabrain_zenoh.decision.tasks import mission as missions
+from gigabrain_zenoh.decision.tasks import mission_files
 from gigabrain_zenoh.decision.tasks.mission import Script
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskQueue
 from gigabrain_zenoh.decision.zones import ZoneSource
@@ -63,7 +63,7 @@ class Robot:
         self.outcome: StepOutcome | None = None
 
     def carry_out(self, text: str, how: Any = "replace") -> str:
-        return self.tasks.add_mission(missions.loads(PLACES + text, "m"), "m", how, "ann")
+        return self.tasks.add_mission(mission_files.loads(PLACES + text, "m"), "m", how, "ann")
 
     def step(self, seconds: float = 0.1) -> float | str | None:
         """One step; where the robot is wanted: x of a goal, `explore`, or nowhere."""

@@ -16,7 +16,7 @@ from gigabrain_zenoh.decision.tasks.arm_steps import (
     Reach,
     TakePosture,
 )
-from gigabrain_zenoh.decision.tasks.mission import loads
+from gigabrain_zenoh.decision.tasks.mission_files import loads
 from gigabrain_zenoh.errors import ConfigError, GigabrainError, Refused
 
 ARM = load_robot("so101").description()

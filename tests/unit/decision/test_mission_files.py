@@ -7,6 +7,7 @@ import pytest
 from gigabrain_schemas.tasks import Goal
 from gigabrain_schemas.zones import Place
 from gigabrain_zenoh.decision.tasks import mission as missions
+from gigabrain_zenoh.decision.tasks import mission_files
 from gigabrain_zenoh.errors import ConfigError
 
 
@@ -113,7 +114,7 @@ def test_a_mission_that_cannot_be_carried_out_is_refused_with_its_line(
     text: str, problem: str
 ) -> None:
     with pytest.raises(ConfigError) as refused:
-        missions.loads(text, "m")
+        mission_files.loads(text, "m")
     assert problem in str(refused.value)
 
 
@@ -130,18 +131,18 @@ def test_a_patrol_beyond_all_maps_is_refused_with_its_line(
     file = tmp_path / "round.yaml"
     file.write_text(text)
     with pytest.raises(ConfigError) as refused:
-        missions.load_patrol(file)
+        mission_files.load_patrol(file)
     assert problem in str(refused.value)
 
 
 def test_a_goal_may_be_anywhere_that_a_message_can_hold() -> None:
     goal = Goal(x=1e5, y=-1e5, yaw=-1e6)
-    mission = missions.loads(missions.text_of(missions.goal_mission(goal)), "m")
+    mission = mission_files.loads(missions.text_of(missions.goal_mission(goal)), "m")
     assert mission == missions.goal_mission(goal)
 
 
 def test_a_field_that_another_program_has_written_as_null_is_left_out() -> None:
-    mission = missions.loads('{"do": [{"goto": [1, 2], "explore": null}]}', "m")
+    mission = mission_files.loads('{"do": [{"goto": [1, 2], "explore": null}]}', "m")
     assert missions.text_of(mission) == '{"do":[{"goto":[1.0,2.0]}]}'
 
 
@@ -149,7 +150,7 @@ def test_trees_that_multiply_are_refused() -> None:
     trees = "".join(f"  t{i}: [{{tree: t{i + 1}}}, {{tree: t{i + 1}}}]\n" for i in range(30))
     text = f"trees:\n{trees}  t30: [{{wait: 1}}]\ndo: [{{tree: t0}}]"
     with pytest.raises(ConfigError, match="more than 2000 steps once every tree is written out"):
-        missions.loads(text, "m")
+        mission_files.loads(text, "m")
 
 
 @pytest.mark.long
@@ -159,23 +160,24 @@ def test_trees_that_lead_deeper_than_can_be_carried_out_are_refused(order: int) 
         inner = [f"  t{i}: [{{tree: t{i + 1}}}]\n" for i in range(count)][::order]
         return f"trees:\n{''.join(inner)}  t{count}: [{{wait: 1}}]\ndo: [{{tree: t0}}]"
 
-    assert missions.loads(chain(48), "m").drives is False
+    assert mission_files.loads(chain(48), "m").drives is False
     for count in (49, 1900):
         with pytest.raises(ConfigError, match="more than 50 nested steps"):
-            missions.loads(chain(count), "m")
+            mission_files.loads(chain(count), "m")
 
 
 def test_a_file_says_which_mission_and_which_programs_it_needs(tmp_path: Path) -> None:
     file = tmp_path / "m.yaml"
     file.write_text("do: [{script: {run: beep}}, {wait: 3}]")
-    mission, text = missions.load(file)
+    mission, text = mission_files.load(file)
     assert list(mission.scripts) == ["beep"]
     assert not mission.drives
     assert text == file.read_text()
     file.write_text(f"# {'x' * 60_000}\ndo: [{{wait: 3}}]")
     with pytest.raises(ConfigError, match=r"m\.yaml: 60018 bytes; expected at most 60000"):
-        missions.load(file)
+        mission_files.load(file)
     file.write_text("do: [{goto: b}, {patrol: {points: [a, c]}}]\nplaces: {a: [1, 2]}")
-    assert sorted(missions.map_places(missions.load(file)[0])) == ["b", "c"]  # the map may have it
+    places = missions.map_places(mission_files.load(file)[0])
+    assert sorted(places) == ["b", "c"]  # the map may have it
     with pytest.raises(ConfigError, match=r"x:1: do\[0\].goto: no place 'b'"):
-        missions.loads(file.read_text(), "x", [Place(name="c", x=1.0, y=0.0)])
+        mission_files.loads(file.read_text(), "x", [Place(name="c", x=1.0, y=0.0)])

@@ -9,7 +9,7 @@ from gigabrain_zenoh.decision.behaviours import ArmCommand, DriveCommand, StepOu
 from gigabrain_zenoh.decision.known_objects import Seek, Sought
 from gigabrain_zenoh.decision.tasks.arm_steps import HeldThing, Solid
 from gigabrain_zenoh.decision.tasks.leaves import seek_nothing
-from gigabrain_zenoh.decision.tasks.mission import loads
+from gigabrain_zenoh.decision.tasks.mission_files import loads
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskQueue
 
 CAN = Target(name="can", x=1.0, y=2.0, radius=0.03, away=0.3)

@@ -7,7 +7,7 @@ import pytest
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.objects import MapObject, MapTag, ObjectMap
 from gigabrain_zenoh.decision.known_objects import Sought, Wanted, named, sought
-from gigabrain_zenoh.decision.tasks.mission import loads
+from gigabrain_zenoh.decision.tasks.mission_files import loads
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskQueue
 from gigabrain_zenoh.errors import ConfigError
 from tests.unit.decision.sites import Robot

@@ -17,7 +17,7 @@ from gigabrain_schemas.topics import POSE, REQUEST_LOG, ZONES
 from gigabrain_schemas.zones import Place, Zones
 from gigabrain_zenoh.decision import task_server
 from gigabrain_zenoh.decision.behaviours import StepOutcome
-from gigabrain_zenoh.decision.tasks import mission, task_queue
+from gigabrain_zenoh.decision.tasks import mission_files, task_queue
 from gigabrain_zenoh.decision.tasks.mission import Mission
 from gigabrain_zenoh.decision.tasks.task_queue import TaskFile
 from gigabrain_zenoh.testing.samples import BOOT, state
@@ -56,11 +56,9 @@ async def test_the_loop_goes_on_while_a_mission_is_read(
 
     def loads(text: str, source: str, places: tuple[Place, ...]) -> Mission:
         readers.append(threading.current_thread() is threading.main_thread())
-        return mission.loads(text, source, places)
+        return mission_files.loads(text, source, places)
 
-    monkeypatch.setattr(
-        task_server, "missions", SimpleNamespace(**{**vars(mission), "loads": loads})
-    )
+    monkeypatch.setattr(task_server, "mission_files", SimpleNamespace(loads=loads))
     await site.step()
     assert (await site.carry_out("do: [{wait: 5}]")).ok
     assert readers == [False]

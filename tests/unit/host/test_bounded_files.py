@@ -21,7 +21,7 @@ from gigabrain_drivers.links.tcp_link import written
 from gigabrain_drivers.sim.body import MujocoOptions, sim_body
 from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.config.loading import located
-from gigabrain_zenoh.decision.tasks import mission
+from gigabrain_zenoh.decision.tasks import mission_files
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile
 from gigabrain_zenoh.diagnostics import log_reader
 from gigabrain_zenoh.errors import ConfigError
@@ -43,7 +43,7 @@ def read_deployment(path: Path) -> object:
 
 
 def read_mission(path: Path) -> object:
-    return mission.load(path)
+    return mission_files.load(path)
 
 
 def read_name(path: Path) -> object:
