@@ -1,6 +1,7 @@
 """The lease by which one commander has the body."""
 
 from gigabrain_schemas.body import GateStatus, RobotState
+from gigabrain_zenoh.gate.state import BRAIN
 
 MISSED_TICKS = 25  # without a state, hence without a command, after which the gate has let go of it
 
@@ -9,9 +10,9 @@ class ControlLease:
     """Tracks whether one commander has the body, from the gate's states.
 
     A passing stop, as for an obstacle, does not end the lease, nor does a time in which the script
-    was stopped. It is lost when another commander takes over, a person presses the e-stop, the gate
-    latches or the driver restarts. Then the script must ask again: it must not
-    take the body back from the person who has just stopped it.
+    was stopped, even if the brain goes on by itself meanwhile. It is lost when another commander
+    takes over, a person presses the e-stop, the gate latches or the driver restarts. Then the
+    script must ask again: it must not take the body back from the person who has just stopped it.
     """
 
     def __init__(self, source: str) -> None:
@@ -33,7 +34,8 @@ class ControlLease:
         has, gate = self.has(state), state.gate
         missed, self._tick = state.tick - self._tick > MISSED_TICKS, state.tick
         pressed, self._estops = gate.estop_generation > self._estops, gate.estop_generation
-        taken = self._had and not missed and gate.commander not in ("", self._source)
+        others = ("", self._source) if self._had and not missed else ("", self._source, BRAIN)
+        taken = gate.commander not in others
         ended = taken or pressed or gate.mode == "latched" or self.restarted(state)
         self.lost = not has and (self.lost or ended)
         self._had = has

@@ -65,6 +65,13 @@ def test_somebody_who_takes_it_over_has_it_for_good() -> None:
     assert after(*taken, state("idle", "", 5), state("enabled", "control", 6)) == (False, True)
 
 
+def test_nobody_but_the_brain_goes_on_meanwhile_without_having_it_for_good() -> None:
+    stopped = (state("stopping", "script", 4), state("idle", "", 4))
+    assert after(*stopped, state("enabled", "other script", 5)) == (False, True)
+    mine = state("enabled", "script", 4, tick=100)
+    assert after(mine, state("enabled", "other script", 5, tick=2000)) == (False, True)
+
+
 def test_a_latch_loses_it_until_it_asks_anew() -> None:
     lease = granted()
     for each in (state("latched", "", 4), state("idle", "", 4)):
