@@ -28,7 +28,7 @@ from gigabrain_zenoh.vision.obstacle_contours import ObstacleContours, OwnPoints
 from gigabrain_zenoh.vision.pictures import decoded
 
 if TYPE_CHECKING:
-    from gigabrain_zenoh.perception.solid_keeper import SolidKeeper
+    from gigabrain_zenoh.perception.solid_publisher import SolidPublisher
     from gigabrain_zenoh.vision.solid_fit import SolidFit
 
 SILENT_PERIODS, SILENT_S = 2.5, 0.4  # without a picture, whichever is longer
@@ -110,7 +110,7 @@ class CameraContours:
         self._busy, self._looks = False, 0
         self._view = View()
         self._history = PoseHistory()
-        self._solids = _solid_keeper(bus, description)
+        self._solids = _solid_publisher(bus, description)
         self._ends = [
             bus.subscribe(CAMERA, self._on_info),
             bus.subscribe(STATE, lambda _, state: self._on_state(state)),
@@ -234,10 +234,10 @@ def _look(
     return _Look(refused, view, seen, find(seen))
 
 
-def _solid_keeper(bus: Bus, description: BodyDescription) -> "SolidKeeper | None":
+def _solid_publisher(bus: Bus, description: BodyDescription) -> "SolidPublisher | None":
     """Return who finds things near an arm, for a body that has one."""
     if description.arm is None:
         return None
-    from gigabrain_zenoh.perception.solid_keeper import SolidKeeper  # imports OpenCV
+    from gigabrain_zenoh.perception.solid_publisher import SolidPublisher  # imports OpenCV
 
-    return SolidKeeper(bus, description)
+    return SolidPublisher(bus, description)

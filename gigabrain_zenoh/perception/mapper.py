@@ -38,10 +38,10 @@ from gigabrain_zenoh.mapping.static_map import RobotMap, StaticMap
 from gigabrain_zenoh.mapping.zone_file import ZoneFile
 from gigabrain_zenoh.perception.node import LOCALIZE_KERNELS, MAP_KERNELS
 from gigabrain_zenoh.perception.pose_hints import PoseHints
-from gigabrain_zenoh.perception.zone_keeper import ZoneKeeper
+from gigabrain_zenoh.perception.zone_server import ZoneServer
 
 if TYPE_CHECKING:
-    from gigabrain_zenoh.perception.object_keeper import ObjectKeeper  # for cameras only
+    from gigabrain_zenoh.perception.object_server import ObjectServer  # for cameras only
 
 log = logging.getLogger(__name__)
 
@@ -109,10 +109,10 @@ class Mapper:
         self._early = False  # the first scan arrived without its odometry
         self._took_ms = NewestValues(TIMED)
         self._saving = asyncio.Lock()  # concurrent saves would write to the same files
-        self._zones = ZoneKeeper(bus, config.state_dir, lambda: self._tick)
+        self._zones = ZoneServer(bus, config.state_dir, lambda: self._tick)
         found = zone_file.load(map_file.path_of(config.map)) if config.map else ZoneFile()
         self._zones.use_map(config.map, config.mapping, found, loaded=False)
-        self._objects: ObjectKeeper | None = None  # of a body with cameras
+        self._objects: ObjectServer | None = None  # of a body with cameras
         self._hints = PoseHints(bus, lambda: self._last, lambda why: self._chart.lose(why))
         bus.serve(MAP_SAVE, self._save)
         bus.serve(MAP_LOAD, self._load)
@@ -183,9 +183,9 @@ class Mapper:
     def _watch(self, boot: int, body: BodyDescription, *, resumed: bool) -> None:
         """Remember what the cameras of a body see, if it has some."""
         if self._objects is None and body.cameras:
-            from gigabrain_zenoh.perception.object_keeper import ObjectKeeper  # as above
+            from gigabrain_zenoh.perception.object_server import ObjectServer  # as above
 
-            self._objects = ObjectKeeper(self._bus, self._config.state_dir, lambda: self._fusion)
+            self._objects = ObjectServer(self._bus, self._config.state_dir, lambda: self._fusion)
             self._objects.use_map(self._config.map, self._config.mapping)
             if resumed:
                 self._objects.restore(boot)

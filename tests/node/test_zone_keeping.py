@@ -26,7 +26,7 @@ from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.mapping import map_file, zone_file
 from gigabrain_zenoh.mapping.zone_file import ZoneFile
-from gigabrain_zenoh.perception.zone_keeper import ZoneKeeper
+from gigabrain_zenoh.perception.zone_server import ZoneServer
 from gigabrain_zenoh.testing.in_memory import Net
 from tests.node.mapping_robot import Robot
 
@@ -189,7 +189,7 @@ async def test_maps_are_listed_and_loaded_while_it_runs(tmp_path: Path) -> None:
 
 async def test_zones_move_with_the_keyframe_beside_them() -> None:
     net = Net()
-    keeper = ZoneKeeper(net.one, "", lambda: 0)
+    keeper = ZoneServer(net.one, "", lambda: 0)
     keeper.use_map("", "slam", ZoneFile(zones=(LAB,), places=(KITCHEN,)), loaded=False)
     poses = np.array(((0.0, 0.0, 0.0), (3.0, 2.0, 0.0)))
     keeper.follow(0, poses)
@@ -214,7 +214,7 @@ async def test_zones_of_a_map_that_grows_on_stay_in_its_file_as_they_fit_its_ima
     saved = ZoneFile(zones=(LAB,))
     zone_file.save(map_file.saved_map_path("house"), saved)
     net = Net()
-    keeper = ZoneKeeper(net.one, "", lambda: 0)
+    keeper = ZoneServer(net.one, "", lambda: 0)
     keeper.use_map("house" if loaded else "", "slam", saved, loaded=loaded)
     if not loaded:
         keeper.saved_as("house")
@@ -283,7 +283,7 @@ CORNERS = ((0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (2.0003, 1.0003), (0.0, 1.0))
 )
 async def test_a_zone_that_could_not_be_read_again_is_refused(zone: Zone, why: str) -> None:
     net = Net()
-    ZoneKeeper(net.one, "", lambda: 0)
+    ZoneServer(net.one, "", lambda: 0)
     reply = (await net.two.ask(ZONES_CHANGE, ZonesRequest(zone=zone)))[0]
     assert reply.text.startswith(f"zone 'lab': {why}")
 
@@ -292,7 +292,7 @@ async def test_a_narrow_zone_that_has_moved_with_the_map_can_be_read_again() -> 
     slit = ((0, 0), (3, 0), (3, 3), (0, 3), (0, 0.001), (1, 0.001), (1, 2), (2, 2), (2, 0.001))
     lane = Zone(name="lane", kind="one_way", lane_width=1, points=((0, 0), (0.001, 0)))
     net = Net()
-    keeper = ZoneKeeper(net.one, "", lambda: 0)
+    keeper = ZoneServer(net.one, "", lambda: 0)
     for zone in (Zone(name="slit", kind="keepout", points=slit), lane):
         assert (await net.two.ask(ZONES_CHANGE, ZonesRequest(zone=zone)))[0].ok
     keeper.follow(0, np.zeros((1, 3)))
@@ -333,7 +333,7 @@ async def test_a_damaged_state_of_zones_is_left_out_with_one_line(
     spoil: Callable[[Path], object], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     spoil(tmp_path / "zones.json")
-    assert ZoneKeeper(Net().one, str(tmp_path), lambda: 0).restore(7) is None
+    assert ZoneServer(Net().one, str(tmp_path), lambda: 0).restore(7) is None
     assert len(caplog.messages) == 1
     assert str(tmp_path / "zones.json") in caplog.messages[0]
 
@@ -341,7 +341,7 @@ async def test_a_damaged_state_of_zones_is_left_out_with_one_line(
 async def test_zones_that_could_not_be_written_are_once_there_is_room(tmp_path: Path) -> None:
     folder, net = tmp_path / "full", Net()
     folder.write_text("no folder can be made here")
-    keeper = ZoneKeeper(net.one, str(folder), lambda: 0)
+    keeper = ZoneServer(net.one, str(folder), lambda: 0)
     keeper.set_boot(7)
     await net.two.ask(ZONES_CHANGE, ZonesRequest(zone=LAB))
     await keeper.finish_writing()
@@ -350,7 +350,7 @@ async def test_zones_that_could_not_be_written_are_once_there_is_room(tmp_path: 
     keeper.publish(500)
     await keeper.finish_writing()
     assert not keeper.problems()
-    kept = ZoneKeeper(Net().one, str(folder), lambda: 0).restore(7)
+    kept = ZoneServer(Net().one, str(folder), lambda: 0).restore(7)
     assert kept
     assert [one.zone for one in kept.items] == [LAB]
 

@@ -13,7 +13,7 @@ from gigabrain_zenoh.mapping import map_file, object_file
 from gigabrain_zenoh.mapping.localizer import Place
 from gigabrain_zenoh.mapping.object_file import ObjectFile
 from gigabrain_zenoh.mapping.odometry import OdometryFusion, OdometrySample
-from gigabrain_zenoh.perception.object_keeper import ObjectKeeper
+from gigabrain_zenoh.perception.object_server import ObjectServer
 from gigabrain_zenoh.perception.surroundings import Surroundings
 from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.samples import WAFFLE
@@ -27,9 +27,9 @@ def _own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
 
 
-def keeper(folder: Path, boot: int, *, restored: bool = False) -> ObjectKeeper:
+def keeper(folder: Path, boot: int, *, restored: bool = False) -> ObjectServer:
     """Return that of a process which begins with a map that grows."""
-    new = ObjectKeeper(Net().one, str(folder), OdometryFusion)
+    new = ObjectServer(Net().one, str(folder), OdometryFusion)
     new.use_map("", "slam")
     if restored:
         new.restore(boot)
@@ -37,7 +37,7 @@ def keeper(folder: Path, boot: int, *, restored: bool = False) -> ObjectKeeper:
     return new
 
 
-def knowing(folder: Path) -> ObjectKeeper:
+def knowing(folder: Path) -> ObjectServer:
     """Return that of a process which has seen a can and a tag."""
     new = keeper(folder, 7)
     new.memory.restore([(CAN, None)])
@@ -46,7 +46,7 @@ def knowing(folder: Path) -> ObjectKeeper:
     return new
 
 
-def known(found: ObjectKeeper) -> list[str | int]:
+def known(found: ObjectServer) -> list[str | int]:
     return [*(one.label for one in found.present.objects), *(one.id for one in found.present.tags)]
 
 
@@ -103,7 +103,7 @@ async def test_what_could_not_be_written_is_written_once_there_is_room(tmp_path:
     assert b'"can"' in (folder / "objects.json").read_bytes()
 
 
-def scan(found: ObjectKeeper, tick: int, *, localized: bool) -> None:
+def scan(found: ObjectServer, tick: int, *, localized: bool) -> None:
     """Let the robot stand at the origin of the map, where it sees nothing."""
     still = np.zeros(3)
     seen = Surroundings(
@@ -126,7 +126,7 @@ async def test_what_a_person_forgot_is_not_back_when_the_robot_is_lost_right_aft
     asked: ObjectsRequest, left: list[str | int]
 ) -> None:
     net = Net()
-    found = ObjectKeeper(net.one, "", OdometryFusion)
+    found = ObjectServer(net.one, "", OdometryFusion)
     found.restart(7)
     found.memory.restore([(CAN, None)])
     found.tags.restore([(TAG, None)])

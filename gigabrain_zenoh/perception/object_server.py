@@ -1,4 +1,4 @@
-"""Keeper of the memory of things and tags: takes detections, publishes, saves and forgets.
+"""Remembers things and tags: takes detections, publishes, saves and forgets.
 
 Only a body with cameras has one. Pictures are placed at the next scan, by the odometry of their
 exposure, so that the work a scan takes is bounded.
@@ -96,7 +96,7 @@ Write = tuple[ObjectState, Path | None, ObjectFile]  # and where the latter is w
 Copy = tuple[list[tuple[MapObject, Anchor | None]], list[tuple[MapTag, Anchor | None]]]
 
 
-class ObjectKeeper:
+class ObjectServer:
     """Publisher of `robot/objects`, and server of `robot/objects_change`."""
 
     def __init__(self, bus: Bus, state_dir: str, fusion: Callable[[], OdometryFusion]) -> None:

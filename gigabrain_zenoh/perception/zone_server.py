@@ -1,4 +1,4 @@
-"""Keeper of the zones and places of the map: loads, changes, saves and publishes them.
+"""Loads, changes, saves and publishes the zones and places of the map.
 
 Zones are fixed to the keyframe that is nearest to their middle. When a loop corrects the map, they
 move with the walls around them.
@@ -70,7 +70,7 @@ class ZoneState(Struct, frozen=True, kw_only=True):
     items: tuple[Anchored, ...] = ()
 
 
-class ZoneKeeper:
+class ZoneServer:
     """Publisher of `robot/zones`, and server of `robot/zones_change`."""
 
     def __init__(self, bus: Bus, state_dir: str, basis: Callable[[], int]) -> None:

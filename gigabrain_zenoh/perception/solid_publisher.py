@@ -1,4 +1,4 @@
-"""Keeper of what stands near the arm of a body with a depth camera; publishes `robot/solids`."""
+"""Publishes what stands near the arm of a body with a depth camera: `robot/solids`."""
 
 import logging
 import math
@@ -27,7 +27,7 @@ LATE_TICKS = 3  # joints move no farther than the mask's margin meanwhile
 log = logging.getLogger(__name__)
 
 
-class SolidKeeper:
+class SolidPublisher:
     """Remembers what stands near an arm, on the loop."""
 
     def __init__(self, bus: Bus, description: BodyDescription) -> None:
