@@ -96,7 +96,7 @@ def test_its_clock_stands_still_while_its_body_does() -> None:
     assert report.milliseconds == 10
 
 
-def test_it_walks_as_told_and_says_which_command_that_was() -> None:
+def test_it_walks_as_commanded_and_says_which_command_that_was() -> None:
     firmware = Firmware()
     firmware.walk(41)
     state = firmware.step(10)

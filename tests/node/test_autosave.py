@@ -274,7 +274,7 @@ async def test_two_maps_and_the_zones_are_all_that_the_disk_holds(tmp_path: Path
     assert names == {"map_0.npz", "map_1.npz", "zones.json"}
 
 
-async def test_a_disk_that_fills_up_is_told_once_and_mapping_goes_on(
+async def test_a_disk_that_fills_up_is_reported_once_and_mapping_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with Walking(tmp_path) as robot:
@@ -296,7 +296,7 @@ async def test_a_disk_that_fills_up_is_told_once_and_mapping_goes_on(
     assert len(told) == 1
 
 
-async def test_a_disk_that_hangs_is_told_after_30_s_and_holds_nobody_up(
+async def test_a_disk_that_hangs_is_reported_after_30_s_and_holds_nobody_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hangs, real = threading.Event(), autosave.make_folder

@@ -139,7 +139,7 @@ def test_in_mujoco_it_turns_less_than_its_wheels_say_on_the_spot_and_more_at_spe
     assert abs(slow.y) < 0.1
 
 
-def test_in_mujoco_it_is_as_fast_as_told_after_delay_and_lag() -> None:
+def test_in_mujoco_it_is_as_fast_as_commanded_after_delay_and_lag() -> None:
     body = jackal()
     told(body, 0.1, 1.0, 0.0)
     assert abs(body.velocity.linear_x) < 0.01

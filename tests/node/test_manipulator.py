@@ -279,7 +279,7 @@ def test_a_gripper_that_is_late_is_not_taken_for_one_that_holds_something(tmp_pa
     rig.manipulator.close()
 
 
-def test_what_slips_out_of_the_gripper_is_told(rig: Rig) -> None:
+def test_what_slips_out_of_the_gripper_is_reported(rig: Rig) -> None:
     rig.give(THINGS + "do: [{pick: cube}, {place: [0.1388, 0.15, 0.015]}]")
     while rig.outcome is None or rig.outcome.reason != "traverse":
         rig.tick()
@@ -335,7 +335,7 @@ def test_what_an_operator_has_let_go_of_is_not_put_down(rig: Rig, wide: float) -
 
 
 @pytest.mark.parametrize("step", ["place: [0.1388, 0.15, 0.015]", "posture: home"])
-def test_what_is_lost_before_the_arm_moves_on_is_told(rig: Rig, step: str) -> None:
+def test_what_is_lost_before_the_arm_moves_on_is_reported(rig: Rig, step: str) -> None:
     assert rig.carry_out(THINGS + "do: [{pick: cube}]").state == "succeeded"
     for _ in range(SOON):
         rig.tick()

@@ -85,7 +85,7 @@ async def test_the_map_comes_once_a_second_and_only_when_it_has_changed() -> Non
     assert 0 <= cells[row, column] < 20  # it has driven there
 
 
-async def test_bad_scans_are_left_out_and_told_once(caplog: pytest.LogCaptureFixture) -> None:
+async def test_bad_scans_are_left_out_and_reported_once(caplog: pytest.LogCaptureFixture) -> None:
     async with Robot() as robot:
         robot.say()
         robot.drive(2)
@@ -119,7 +119,7 @@ async def test_one_scan_may_come_before_its_odometry(
     assert len([r for r in caplog.records if "no odometry for its tick" in r.message]) == told
 
 
-async def test_a_jump_of_the_odometry_is_told_and_the_robot_found_again(
+async def test_a_jump_of_the_odometry_is_reported_and_the_robot_found_again(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     async with Robot() as robot:
@@ -162,7 +162,7 @@ async def test_after_a_new_start_of_the_driver_the_map_stays_and_the_robot_is_fo
     assert (pose.x, pose.y) == pytest.approx((0.0, 0.0), abs=0.05)
 
 
-async def test_a_robot_that_is_lost_for_long_is_told_with_the_command_that_helps(
+async def test_a_robot_that_is_lost_for_long_is_reported_with_the_command_that_helps(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     async with Robot() as robot:
@@ -187,7 +187,7 @@ async def test_a_robot_that_is_lost_for_long_is_told_with_the_command_that_helps
     assert caplog.messages.count(f"{late[0].text}: {late[0].remedy}") == 1
 
 
-async def test_a_map_that_may_grow_no_more_is_told_once_and_in_the_health(
+async def test_a_map_that_may_grow_no_more_is_reported_once_and_in_the_health(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(occupancy_grid, "MAX_CELLS", 100)
@@ -213,7 +213,7 @@ def test_a_map_for_nothing_is_refused_with_its_line() -> None:
     assert config.loads('mapping: "off"', PerceptionConfig, "f") == PerceptionConfig()
 
 
-def test_a_map_that_is_missing_or_not_named_is_told_at_the_start(own_maps: Path) -> None:
+def test_a_map_that_is_missing_or_not_named_is_reported_at_the_start(own_maps: Path) -> None:
     with pytest.raises(ConfigError, match="expected a saved map, as mapping is 'localize'"):
         chart_of(PerceptionConfig(mapping="localize"))
     with pytest.raises(ConfigError, match=r"gone\.yaml: no such file"):

@@ -94,7 +94,7 @@ def compiled(own: str, folder: Path) -> None:
     compile_scene(body, load_world("arena", 0))
 
 
-def test_a_model_whose_wheels_are_others_is_told(
+def test_a_model_whose_wheels_are_others_is_reported(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     compiled(mine(tmp_path), tmp_path)

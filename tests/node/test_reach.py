@@ -88,7 +88,7 @@ def test_an_arm_that_lies_on_the_table_with_closed_fingers_leaves_it() -> None:
         ("{at: [0.25, 0.1, 0.03], pitch: 0.0}", "the orientation is not possible there", False),
     ],
 )
-def test_the_nearest_point_is_told_where_it_is_another(
+def test_the_nearest_point_is_named_where_it_is_another(
     tmp_path: Path, goal: str, why: str, tells: bool
 ) -> None:
     rig = Rig(tmp_path)

@@ -143,7 +143,7 @@ async def test_a_body_without_a_simulated_world_says_so(
     assert not sent(network, SIM_SCENE.key)
 
 
-async def test_time_that_stands_still_is_told(
+async def test_time_that_stands_still_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gigabrain_drivers.sim.live_world.ANSWER_S", 0.05)

@@ -9,7 +9,7 @@ from gigabrain_zenoh.qa.conformance.driver_checks import CheckedRobot
 from gigabrain_zenoh.qa.judging import Finding, summary
 
 
-def test_the_worst_and_the_median_of_each_time_are_told() -> None:
+def test_the_worst_and_the_median_of_each_time_are_reported() -> None:
     found = [
         Finding(True, "", {"known": known, "at rest": rest})
         for known, rest in ((20.0, 160.0), (60.0, 140.0), (40.0, 150.0))

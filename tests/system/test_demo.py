@@ -61,7 +61,7 @@ async def run(home: Home, *options: str) -> tuple[CommandProcess, dict[str, Any]
         (("safety: late", "decision: late"), "decision: late"),
     ],
 )
-def test_the_fault_that_is_told_is_the_drivers_newest_or_the_newest(
+def test_the_reported_fault_is_the_drivers_newest_or_the_newest(
     texts: tuple[str, ...], newest: str
 ) -> None:
     assert newest_fault(texts) == newest
@@ -217,7 +217,7 @@ def test_a_run_is_judged_by_contacts_motion_and_deaths() -> None:
     assert (report.rejected_messages, report.turns, report.sim_seconds) == (3, 1, 9.0)
 
 
-def test_of_a_robot_that_maps_the_area_and_its_tasks_are_told_instead_of_turns() -> None:
+def test_of_a_robot_that_maps_the_area_and_its_tasks_are_reported_instead_of_turns() -> None:
     told = {
         "distance_m": 4.0, "contacts": 0, "min_clearance_m": 0.4, "stale_commands_executed": 0,
         "scan_to_cmd_p50_ms": 20.0, "scan_to_cmd_p99_ms": 30.0, "lockstep_timeouts": 0,
@@ -239,7 +239,7 @@ def test_of_a_robot_that_maps_the_area_and_its_tasks_are_told_instead_of_turns()
     assert ", 34 m² mapped, 0 contacts" in summary(make_report(told, replace(seen, tasks=None)))
 
 
-def test_a_run_whose_driver_did_not_answer_in_the_end_is_told_as_far_as_it_is_known() -> None:
+def test_a_run_whose_driver_did_not_answer_in_the_end_is_reported_as_far_as_it_is_known() -> None:
     figures = {"scan_to_cmd_p50": 30.0, "scan_to_cmd_p99": 148.0}
     health = replace(DRIVER_HEALTH, latency_ms=figures, counters={"others": 3})
     seen = Observed(

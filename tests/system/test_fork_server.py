@@ -93,7 +93,7 @@ async def test_a_fork_that_dies_is_started_again_by_itself() -> None:
         ("pass", "one ended with exit code 0; next start in 0.01 s"),
     ],
 )
-async def test_how_a_fork_ends_is_told_with_its_output(code: str, text: str) -> None:
+async def test_how_a_fork_ends_is_reported_with_its_output(code: str, text: str) -> None:
     async with running(forked("one", code), forked("two")) as (_, records):
         await until(lambda: records.texts("died"))
         assert records.texts("died")[0].startswith(text)

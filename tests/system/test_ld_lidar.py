@@ -136,7 +136,7 @@ async def test_scans_come_over_a_pty_and_again_after_an_unplugged_cable(tmp_path
         await until(lambda: not listener.source.problem)
 
 
-async def test_silence_is_told_in_one_line_and_ends_by_itself(tmp_path: Path) -> None:
+async def test_silence_is_reported_in_one_line_and_ends_by_itself(tmp_path: Path) -> None:
     async with (
         emulated(LdDevice, options(tmp_path)) as station,
         Listener(Ld19(options(tmp_path), LIDAR, Clock())) as listener,

@@ -55,7 +55,7 @@ def test_its_outline_is_that_of_its_file(simulation: Simulation) -> None:
     assert max(y for _, y in corners) == pytest.approx(outline.half_width, abs=0.003)
 
 
-def test_it_drives_as_it_is_told_within_a_percent(simulation: Simulation) -> None:
+def test_it_drives_as_commanded_within_a_percent(simulation: Simulation) -> None:
     simulation.command(0.3, 0.6)
     run(simulation, 2.0)
     assert simulation.truth.speed() == pytest.approx((0.3, 0.6), rel=0.01)

@@ -132,7 +132,7 @@ async def test_another_lidar_on_the_port_is_named_once(
         assert len(caplog.records) == 1
 
 
-async def test_a_wrong_model_means_a_wrong_baud_rate_and_so_silence_which_is_told(
+async def test_a_wrong_model_means_a_wrong_baud_rate_and_so_silence_which_is_reported(
     tmp_path: Path,
 ) -> None:
     its = options(tmp_path, model="a1")
@@ -147,7 +147,7 @@ async def test_a_wrong_model_means_a_wrong_baud_rate_and_so_silence_which_is_tol
             )
 
 
-async def test_another_model_than_the_file_names_is_told_in_one_line(
+async def test_another_model_than_the_file_names_is_reported_in_one_line(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)

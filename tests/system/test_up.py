@@ -157,7 +157,7 @@ def small_disk(tmp_path: Path) -> Iterator[Home]:
 
 
 @pytest.mark.slow
-async def test_a_full_disk_is_told_once_and_stops_nobody(small_disk: Home) -> None:
+async def test_a_full_disk_is_reported_once_and_stops_nobody(small_disk: Home) -> None:
     file = small_disk.deployment(resume="auto")
     up = small_disk.start("up", str(file), "--level", "debug")
     async with probing(endpoint_of(file)) as robot:

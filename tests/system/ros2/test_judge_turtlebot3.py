@@ -57,7 +57,7 @@ def test_it_publishes_what_a_turtlebot3_does(judge: Judge) -> None:
     assert {("odom", "base_footprint"), ("base_link", "base_scan")} <= pairs
 
 
-def test_it_drives_as_told_and_counts_it(judge: Judge) -> None:
+def test_it_drives_as_commanded_and_counts_it(judge: Judge) -> None:
     robot = judge.start("turtlebot3", walls=ROOM)
     drive = judge.start("drive")
     drive.ask("drive", linear=0.209)

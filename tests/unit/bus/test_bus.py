@@ -106,7 +106,7 @@ async def test_garbage_on_any_key_is_dropped_counted_and_handed_to_who_asked(
     assert len(seen) == 1
 
 
-async def test_a_fault_is_told_once_and_its_end_once(
+async def test_a_fault_is_reported_once_and_its_end_once(
     net: Net, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -226,7 +226,7 @@ async def test_an_exception_in_a_subscriber_ends_its_process_and_no_other(net: N
     assert not net.two.failed.done()
 
 
-async def test_the_first_exception_is_the_one_that_is_told(net: Net) -> None:
+async def test_the_first_exception_is_the_one_that_is_raised(net: Net) -> None:
     def fail(twist: Twist) -> None:
         raise ValueError(str(twist.linear_x))
 

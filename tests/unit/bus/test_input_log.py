@@ -114,7 +114,7 @@ async def test_work_that_counts_when_it_is_done_is_said_before_it_counts() -> No
     assert entries == [("robot/state", 7), (FINISHED, 1), ("robot/state", 8)]
 
 
-def test_a_replay_counts_the_oldest_work_where_it_is_told_and_waits_for_it() -> None:
+def test_a_replay_counts_the_oldest_work_where_it_is_logged_and_waits_for_it() -> None:
     past, counted = ReplayedInputLogger(), list[int]()
     for number in (1, 2):
         past.when_done(finished(), lambda _, number=number: counted.append(number))

@@ -38,7 +38,7 @@ def test_a_network_of_ros_that_is_named_needs_no_robot(
         (partial(ros2.pass_, "/a", "b", "c"), ros2.RosLinkOptions),
     ],
 )
-def test_a_wrong_namespace_of_ros_is_told_by_its_own_option(
+def test_a_wrong_namespace_of_ros_is_refused_by_its_own_option(
     command: Callable[..., object], made: Callable[..., object]
 ) -> None:
     robot = ros2.RobotAddress(connect="tcp/127.0.0.1:7447")

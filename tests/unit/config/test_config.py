@@ -223,7 +223,7 @@ def test_a_missing_field_is_named_with_what_it_should_be() -> None:
     assert refusal("robot_type: waffle\n") == said
 
 
-def test_the_first_fault_in_the_order_of_the_file_is_told() -> None:
+def test_the_first_fault_in_the_order_of_the_file_is_reported() -> None:
     assert refusal("lamps: a\nturm: 1\n").startswith("robot.yaml:1: lamps: expected a whole")
     assert refusal("turm: 1\nlamps: a\n").startswith("robot.yaml:1: unknown field 'turm'")
 

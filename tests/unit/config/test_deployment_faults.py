@@ -99,7 +99,7 @@ def only_begun(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("only_begun")
 @pytest.mark.parametrize("named", ["beeps", "a_file"])
-def test_a_folder_of_scripts_that_is_not_there_is_told_at_the_start(
+def test_a_folder_of_scripts_that_is_not_there_is_reported_at_the_start(
     tmp_path: Path, named: str
 ) -> None:
     (tmp_path / "a_file").touch()
@@ -172,7 +172,7 @@ def test_a_button_may_be_at_any_port(port: str) -> None:
     assert ButtonConfig(port=port).port == port
 
 
-def test_a_button_whose_adapter_is_missing_is_told_of_before_there_is_a_robot(
+def test_a_button_whose_adapter_is_missing_is_reported_before_there_is_a_robot(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("gigabrain_zenoh.cli.processes.run_process", lambda config: 0)

@@ -167,7 +167,7 @@ def test_settings_that_are_saved_keep_what_the_file_held(tmp_path: Path) -> None
     )
 
 
-def test_limits_are_told_from_other_changes_of_a_robots_file() -> None:
+def test_limits_are_told_apart_from_other_changes_of_a_robots_file() -> None:
     changes = {"max_linear_speed": 0.1, "thresholds": {"stop_margin": 0.2, "late": 0.1}, "x": 1}
     settings, rest = split(changes)
     assert settings == {"max_linear_speed": 0.1, "thresholds.stop_margin": 0.2}

@@ -28,7 +28,7 @@ def test_turning_is_ramped_as_well() -> None:
     )
 
 
-def test_a_car_is_told_to_turn_only_as_it_drives() -> None:
+def test_a_car_is_commanded_to_turn_only_as_it_drives() -> None:
     car = replace(WAFFLE, drive_type="ackermann", min_turning_radius=0.5)
     drive = Drive(car)
     for twist in (want(w=1.0), want(0.2, 1.0)):

@@ -60,12 +60,12 @@ def test_turning_on_the_spot_it_keeps_to_the_heading() -> None:
 
 
 @pytest.mark.parametrize("gain", [0.8, 1.2])
-def test_a_body_that_goes_slower_or_faster_than_told_is_corrected(gain: float) -> None:
+def test_a_body_that_goes_slower_or_faster_than_commanded_is_corrected(gain: float) -> None:
     assert max(errors(Course(ess, 11.0), Plant(gain=gain), 8.0)) < 0.07
 
 
 @pytest.mark.parametrize("slip", [0.6, 0.8, 1.1])
-def test_a_body_that_slips_as_it_turns_is_told_to_turn_more(slip: float) -> None:
+def test_a_body_that_slips_as_it_turns_is_commanded_to_turn_more(slip: float) -> None:
     response, course = replace(SLOW, turn_gain=slip), Course(ess, 11.0)
     assert max(errors(course, Plant(slip=slip), 8.0, response=response)) < 0.02
     assert max(errors(course, Plant(slip=slip), 8.0, response=SLOW)) < 0.12

@@ -232,7 +232,7 @@ def test_it_makes_room_when_somebody_stays_where_it_is_to_go() -> None:
     assert goes.version != leaves.version
 
 
-def test_what_stays_at_the_goal_for_ever_is_made_room_for_twice_and_then_told() -> None:
+def test_what_stays_at_the_goal_for_ever_is_made_room_for_twice_and_then_reported() -> None:
     guide = RoutePlanner()
     ask = functools.partial(think, guide, goal=Goal(x=5.0, y=3.0), x=4.0, y=3.0)
     ask(ROOM, tick=1)

@@ -144,7 +144,7 @@ def test_the_order_of_messages_within_a_few_ticks_does_not_matter() -> None:
     assert early.estimator.response.turn_gain == late.estimator.response.turn_gain
 
 
-def test_it_remembers_what_the_body_was_told_of_late() -> None:
+def test_it_remembers_what_the_body_was_commanded_of_late() -> None:
     plant = Plant()
     plant.drive(0.5, 0.0, 20)
     sent = plant.estimator.sent(17, 19)
@@ -168,7 +168,7 @@ def told(tick: int, v: float = 0.0, source: str = "control", seq: int = 0) -> Cm
     return CmdVel(linear_x=v, source=source, boot=BOOT, tick=tick, seq=seq)
 
 
-def test_what_others_than_the_commander_say_was_not_told_to_the_body() -> None:
+def test_what_others_than_the_commander_send_does_not_count_as_commanded() -> None:
     estimator = ActuationEstimator()
     estimator.add_state(state(10))
     estimator.add_command(told(10, 0.2))

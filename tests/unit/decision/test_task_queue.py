@@ -38,7 +38,7 @@ def test_goals_wait_in_a_queue_or_go_first_or_stand_in_for_all(robot: Robot) -> 
     assert robot.last == ("cancelled", "replaced by goal-4")
 
 
-def test_how_a_task_ended_is_told_in_words(robot: Robot) -> None:
+def test_how_a_task_ended_is_reported_in_words(robot: Robot) -> None:
     robot.carry_out("do: [{goto: a}]")
     robot.carry_out("do: [{goto: b}]")
     robot.step()

@@ -30,7 +30,7 @@ async def site(tmp_path: Path) -> Site:
     return Site(tmp_path)
 
 
-async def test_a_goal_is_accepted_with_its_way_and_told_from_then_on(site: Site) -> None:
+async def test_a_goal_is_accepted_with_its_way_and_reported_from_then_on(site: Site) -> None:
     await site.step()
     reply = await site.go(3.0)
     assert reply == GoalReply(ok=True, text="goal-1: on the way, 4.2 m", goal="goal-1")
@@ -65,7 +65,7 @@ async def test_the_loop_goes_on_while_a_mission_is_read(
     await site.end()
 
 
-async def test_it_is_told_five_times_a_second_of_the_robots_time(site: Site) -> None:
+async def test_it_is_reported_five_times_a_second_of_the_robots_time(site: Site) -> None:
     await site.step()
     before = len(site.told)
     for _ in range(20):
@@ -267,7 +267,7 @@ async def test_tasks_of_another_start_of_the_robot_wait_for_a_person(
 @pytest.mark.parametrize(
     "content", [b'{"type":"gigabrain tasks","co', b'{"jobs": 3}', b"", b"\xff"]
 )
-async def test_a_file_that_is_cut_or_foreign_is_set_aside_and_told(
+async def test_a_file_that_is_cut_or_foreign_is_set_aside_and_reported(
     tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "tasks.json").write_bytes(content)
@@ -281,7 +281,7 @@ async def test_a_file_that_is_cut_or_foreign_is_set_aside_and_told(
     assert len(TaskFile(str(tmp_path)).read()[0].jobs) == 1
 
 
-async def test_a_disk_that_cannot_be_written_is_told_and_the_robot_goes_on(
+async def test_a_disk_that_cannot_be_written_is_reported_and_the_robot_goes_on(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "file").touch()
@@ -324,7 +324,7 @@ async def test_a_task_that_is_cancelled_while_the_disk_is_full_does_not_come_bac
     ]
 
 
-async def test_what_was_granted_is_told_with_the_tick_and_the_world_from_which_it_counts(
+async def test_what_was_granted_is_published_with_the_tick_and_the_world_from_which_it_counts(
     site: Site,
 ) -> None:
     told: list[AcceptedRequest] = []

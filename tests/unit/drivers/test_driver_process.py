@@ -110,7 +110,7 @@ async def test_another_description_of_the_body_is_replaced_at_the_next_tick(
 
 
 @pytest.mark.long
-async def test_a_state_says_what_the_body_was_told_last(tmp_path: Path) -> None:
+async def test_a_state_has_what_the_body_was_commanded_last(tmp_path: Path) -> None:
     async with RobotInMemory(tmp_path) as robot:
         for _ in range(200):
             await robot.go(1)
@@ -120,7 +120,7 @@ async def test_a_state_says_what_the_body_was_told_last(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-async def test_what_comes_just_before_a_tick_counts_as_told_before_it(tmp_path: Path) -> None:
+async def test_what_comes_just_before_a_tick_counts_as_commanded_before_it(tmp_path: Path) -> None:
     async with RobotInMemory(tmp_path) as robot:
         await robot.go(200)
         brain, read = robot.operator, robot.body.read_state

@@ -53,7 +53,7 @@ async def test_a_start_lets_down_nothing_that_is_held() -> None:
         assert furthest(held, rig.positions()) < HALF_A_DEGREE
 
 
-async def test_joints_go_where_they_are_told_within_their_limits() -> None:
+async def test_joints_go_where_commanded_within_their_limits() -> None:
     rig = Rig()
     async with opened(rig):
         await rig.go(2000, shoulder_pan=0.5, gripper=9.0, wrist_roll=-9.0)

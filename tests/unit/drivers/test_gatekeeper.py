@@ -146,7 +146,7 @@ async def test_a_disk_that_hangs_holds_up_the_confirmation_and_no_tick(
 
 
 @pytest.mark.long
-async def test_a_disk_that_takes_nothing_stops_no_e_stop_and_is_told(tmp_path: Path) -> None:
+async def test_a_disk_that_takes_nothing_stops_no_e_stop_and_is_reported(tmp_path: Path) -> None:
     async with RobotInMemory(tmp_path) as robot:
         await driving(robot)
         (tmp_path / ".latch.json.new").mkdir()  # where the file would be written first

@@ -10,14 +10,14 @@ from gigabrain_schemas.base import Velocity
 BASE = Differential(0.033, 0.287)
 
 
-def test_whole_radians_a_second_are_what_the_body_is_told_and_what_is_returned() -> None:
+def test_whole_radians_a_second_are_what_the_body_is_sent_and_what_is_returned() -> None:
     command = LineCommand(Template("W,{wheel_left:d},{wheel_right:d}\n", COMMAND), BASE)
     wanted = Velocity(linear_x=0.1)  # 3.03 rad/s
     assert command.line(wanted, 0) == b"W,3,3\n"
     assert command.sent(wanted).linear_x == pytest.approx(0.099)
 
 
-def test_a_car_may_be_told_its_speed_and_its_steering_angle() -> None:
+def test_a_car_may_be_sent_its_speed_and_its_steering_angle() -> None:
     template = Template("C,{linear_x:.1f},{wheel_steering|deg:d}\n", COMMAND)
     command = LineCommand(template, Ackermann(0.05, 0.5))
     wanted = Velocity(linear_x=0.52, angular_z=0.5)  # atan(0.5 * 0.5 / 0.52) = 25.7 degrees

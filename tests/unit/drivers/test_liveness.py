@@ -40,7 +40,7 @@ async def test_it_is_alive_for_as_long_as_its_word_is_fresh() -> None:
     assert not body.liveness.received
 
 
-async def test_a_line_that_opens_and_is_dropped_again_and_again_is_told_once(
+async def test_a_line_that_opens_and_is_dropped_again_and_again_is_reported_once(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     body = Body()
@@ -59,7 +59,7 @@ async def test_what_the_line_says_is_not_prefixed_with_its_own_name(
     assert caplog.messages == ["no USB device usb:0483:5740: is it plugged in?"]
 
 
-async def test_the_end_of_a_silence_is_told_as_well(caplog: pytest.LogCaptureFixture) -> None:
+async def test_the_end_of_a_silence_is_reported_as_well(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     body = Body("/dev/ttyUSB9")
     await body.alive_after(501)

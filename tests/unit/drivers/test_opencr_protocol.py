@@ -49,7 +49,7 @@ def test_the_heartbeat_counts_in_one_byte() -> None:
     ("wanted", "sent"),
     [(0.009, 0.01), (-0.009, -0.01), (0.004, 0.0), (0.2549, 0.25), (1e9, 100.0), (-1e9, -100.0)],
 )
-def test_speeds_are_rounded_to_hundredths_and_what_was_sent_is_told(
+def test_speeds_are_rounded_to_hundredths_and_what_was_sent_is_returned(
     wanted: float, sent: float
 ) -> None:
     assert opencr.velocity(wanted, wanted).linear_x == pytest.approx(sent)

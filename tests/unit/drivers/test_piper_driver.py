@@ -230,7 +230,7 @@ async def test_after_a_loss_it_starts_from_where_the_arm_is(rig: Rig) -> None:
     assert not (await rig.driver.read_state()).limp
 
 
-async def test_a_loss_between_two_looks_is_told_once(rig: Rig) -> None:
+async def test_a_loss_between_two_looks_is_reported_once(rig: Rig) -> None:
     rig.cable.drop("unplugged")
     rig.cable.plug()
     await rig.wait(100)

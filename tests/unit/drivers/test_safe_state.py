@@ -95,7 +95,7 @@ async def test_a_body_that_never_rests_is_not_waited_for_longer_than_braking_tak
     assert arm.done == ["stop", *["look"] * 40, "limp", "close"]
 
 
-async def test_a_body_that_is_lost_meanwhile_is_told_and_closed(
+async def test_a_body_that_is_lost_meanwhile_is_reported_and_closed(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     arm = Arm("park")

@@ -55,7 +55,7 @@ def test_what_the_gate_lets_out_keeps_the_accelerations_straight_on_and_turning(
 
 
 @pytest.mark.long
-async def test_a_simulated_base_is_told_just_that() -> None:
+async def test_a_simulated_base_is_sent_just_that() -> None:
     for body in ("turtlebot3_burger", "mycustombot", "alpha"):
         async with driver_of(body) as driver:
             for now in outputs(body):
@@ -64,7 +64,7 @@ async def test_a_simulated_base_is_told_just_that() -> None:
 
 
 @pytest.mark.parametrize("body", ["turtlebot3_burger", "turtlebot3_waffle"])
-def test_an_opencr_is_told_that_to_within_half_of_its_unit(body: str) -> None:
+def test_an_opencr_is_sent_that_to_within_half_of_its_unit(body: str) -> None:
     base = wheels_of(catalog.load_robot(body))
     assert base
     for now in outputs(body):
@@ -75,7 +75,7 @@ def test_an_opencr_is_told_that_to_within_half_of_its_unit(body: str) -> None:
         assert told == pytest.approx((now.linear_x, now.angular_z), abs=0.005 + ROUNDING)
 
 
-def test_a_line_base_is_told_that_to_within_half_of_its_last_digit() -> None:
+def test_a_line_base_is_sent_that_to_within_half_of_its_last_digit() -> None:
     command = LineCommand(Template("V,{linear_x:.3f},{angular_z:.3f}\n", COMMAND), None)
     for now in outputs("mycustombot"):
         assert axes(command.sent(now)) == pytest.approx(axes(now), abs=0.0005 + ROUNDING)

@@ -100,7 +100,7 @@ def test_bytes_that_are_no_frame_are_shown_as_they_are() -> None:
     assert Wording().lines("tx", b"\x01\xff") == ["tx 01 ff"]
 
 
-def test_a_command_is_told_as_received_and_as_converted() -> None:
+def test_a_command_is_reported_as_received_and_as_converted() -> None:
     asked, sent = Velocity(linear_x=0.123, angular_z=-0.456), Velocity(linear_x=0.12)
     assert describe_command(asked, sent) == (
         "command linear_x 0.1230 m/s, linear_y 0.0000 m/s, angular_z -0.4560 rad/s -> "

@@ -208,7 +208,7 @@ def test_what_the_driver_finds_wrong_stops_it() -> None:
     assert rig.state.output == Velocity(linear_x=0.16)
 
 
-def test_all_that_is_wrong_is_told() -> None:
+def test_all_that_is_wrong_is_reported() -> None:
     rig = driving(0.2)
     rig.tick(5)
     rig.send(0.2)

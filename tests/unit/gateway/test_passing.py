@@ -269,7 +269,7 @@ async def test_the_reader_takes_what_publishers_offer(ends: Ends) -> None:
     assert fitting_qos(made, ()) == Qos(reliable=False, depth=10)
 
 
-async def test_another_type_on_the_topic_is_told_once(
+async def test_another_type_on_the_topic_is_reported_once(
     ends: Ends, caplog: pytest.LogCaptureFixture
 ) -> None:
     ends.node.publisher("/chatter", LASER)

@@ -27,7 +27,7 @@ def test_a_single_pose_moves_as_one_of_many(yaw: float) -> None:
         assert inverse(b) == pytest.approx(inverse(b[None])[0], abs=1e-12)
 
 
-def test_angles_are_told_within_a_half_turn() -> None:
+def test_angles_are_within_a_half_turn() -> None:
     assert wrap(np.array((3 * np.pi / 2, -3 * np.pi / 2, 0.5))) == pytest.approx(
         (-np.pi / 2, np.pi / 2, 0.5)
     )

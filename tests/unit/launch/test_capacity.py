@@ -18,12 +18,12 @@ def run(
     return capacity.problem
 
 
-def test_time_that_keeps_being_lost_is_told_after_5_s() -> None:
+def test_time_that_keeps_being_lost_is_reported_after_5_s() -> None:
     assert run(Capacity(), 0.6, 4) == ""
     assert run(Capacity(), 0.6, 6) == SMALL
 
 
-def test_what_was_told_stays_told() -> None:
+def test_what_was_reported_stays_reported() -> None:
     capacity = Capacity()
     run(capacity, 0.6, 6)
     assert run(capacity, 1.0, 20, begin_s=6) == SMALL
@@ -45,7 +45,7 @@ def test_a_clock_that_stands_still_is_another_fault() -> None:
     assert run(Capacity(), 0.0, 60) == ""
 
 
-def test_a_brain_that_gets_too_little_time_is_told_though_the_clock_goes_on() -> None:
+def test_a_brain_that_gets_too_little_time_is_reported_though_the_clock_goes_on() -> None:
     assert "the brain is late" in run(Capacity(), 1.0, 6, held=True)
 
 

@@ -190,7 +190,9 @@ def test_a_run_folder_that_cannot_be_written_is_refused_in_one_line(tmp_path: Pa
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
-def test_a_full_disk_is_told_once_and_loses_no_console_line(tmp_path: Path, stderr: Said) -> None:
+def test_a_full_disk_is_reported_once_and_loses_no_console_line(
+    tmp_path: Path, stderr: Said
+) -> None:
     (tmp_path / "control.jsonl").symlink_to("/dev/full")
     logs.setup("control", tmp_path, json_console=True)
     for text in ("one", "two", "three"):

@@ -62,7 +62,7 @@ def test_it_grows_to_all_sides_and_keeps_what_was_drawn() -> None:
     assert all(side % 64 == 0 for side in grid.log_odds.shape)
 
 
-def test_what_would_not_fit_into_a_message_is_left_out_and_told() -> None:
+def test_what_would_not_fit_into_a_message_is_left_out_and_reported() -> None:
     grid = LogOddsGrid()
     grid.draw(at(0, 0), points((1.0, 0.0)), NONE)
     assert not grid.full
@@ -91,7 +91,7 @@ def test_near_the_limit_a_beam_that_is_too_far_does_not_keep_the_grid_from_growi
     assert percent(grid, 129.0, 0.025) < 50
 
 
-def test_what_fits_exactly_is_drawn_and_not_told() -> None:
+def test_what_fits_exactly_is_drawn_and_not_reported() -> None:
     grid = LogOddsGrid()
     grid.draw(at(0.025, 0.025), points((139.95, 0.0)), NONE)
     assert not grid.full

@@ -342,7 +342,7 @@ def test_a_scan_that_comes_twice_changes_nothing() -> None:
     assert again == obstacles
 
 
-def test_of_very_many_things_the_nearest_are_told() -> None:
+def test_of_very_many_things_the_nearest_are_reported() -> None:
     bearings = [math.tau * i / 80 for i in range(80)]
     many = [((2 + a / 10) * math.cos(a), (2 + a / 10) * math.sin(a), 0.04) for a in bearings]
     lidar = Lidar(beams=2880, rate_hz=10, range_min=0.1, range_max=12.0)

@@ -52,7 +52,7 @@ def test_it_says_for_which_robot_the_machine_is_too_small(slow: FleetRobot, why:
     assert not found.ok
 
 
-def test_a_robot_that_fails_is_told_and_alone_says_nothing_of_the_machine() -> None:
+def test_a_robot_that_fails_is_reported_and_alone_says_nothing_of_the_machine() -> None:
     failed = FleetRobot(number=2, problem="a process died")
     found = result(FAST, failed)
     assert found.verdict == "1 of these 2 robots failed: robot 2: a process died"

@@ -110,7 +110,7 @@ def test_where_the_system_does_not_say_nothing_was_waited_for(
     assert this_process.stolen_ns_by_core() == {}
 
 
-def test_what_a_host_keeps_from_a_virtual_machine_is_told_by_core(
+def test_what_a_host_keeps_from_a_virtual_machine_is_reported_by_core(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lines = ("cpu  9 9 9 9 9 9 9 7 0 0", "cpu0 1 2 3 4 5 6 7 5 9 9", "cpu1 1 2 3 4 5 6 7 2 9 9")

@@ -140,7 +140,7 @@ async def test_every_start_and_every_stop_counts() -> None:
     assert never.starts_and_stops(never.states[0], 60) == 0
 
 
-async def test_measured_reversals_are_judged_where_the_body_was_told_one_way_before() -> None:
+async def test_measured_reversals_are_judged_where_the_body_was_commanded_one_way_before() -> None:
     probe = drive(["enabled"] * 60, [])
     for n, one in enumerate(probe.states):
         told = 0.02 * (n % 2) if n < 20 else 0.02 * (n - 20)
@@ -173,7 +173,7 @@ def turned(*pairs: tuple[float, float]) -> list[RobotState]:
     ]
 
 
-def test_a_body_disobeys_from_when_it_turns_unlike_all_it_was_told_of_late() -> None:
+def test_a_body_disobeys_from_when_it_turns_unlike_all_it_was_commanded_of_late() -> None:
     straight, swings = (0.0, 0.0), (0.0, 0.9)
     assert first_disobeyed(turned(*[straight] * 3, *[swings] * 5)) == 3
     # it was told so a while ago, and may still turn for its own lag of 15 ticks

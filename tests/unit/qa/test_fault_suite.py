@@ -68,7 +68,7 @@ def test_a_criterion_says_figure_limit_unit_and_clock() -> None:
     assert pressed.criterion == "answer <= 50 ms wall, slope <= 1 MB/h long, lost <= 0"
 
 
-def test_the_worst_of_all_runs_is_told() -> None:
+def test_the_worst_of_all_runs_is_reported() -> None:
     runs = [{"brakes after": 100.0, "travel": 0.09}, {"brakes after": 120.0, "travel": 0.05}]
     assert worst_of(FAULT, runs) == {"brakes after": 120.0, "travel": 0.09}
 
@@ -293,7 +293,7 @@ async def _well(_: Rig) -> dict[Figure, float]:
     return well()
 
 
-async def test_the_longest_wait_of_one_thread_between_two_looks_is_told(
+async def test_the_longest_wait_of_one_thread_between_two_looks_is_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     looks = iter([{"1": 5_000_000, "2": 0}, {"1": 6_000_000, "2": 31_000_000, "3": 90_000_000}])

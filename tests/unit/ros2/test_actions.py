@@ -208,7 +208,7 @@ async def test_a_new_goal_preempts_the_running_one(world: World) -> None:
     await world.tells([S.ABORTED, S.EXECUTING])
 
 
-async def test_the_states_of_many_goals_are_told_a_few_times(world: World) -> None:
+async def test_the_states_of_many_goals_are_reported_a_few_times(world: World) -> None:
     told: list[int] = []
     loop = asyncio.get_running_loop()
     world.client.node.subscribe(

@@ -86,7 +86,7 @@ def test_two_definitions_of_one_type_are_named_on_either_transport() -> None:
         assert (kind, text) == ("hash", f"/a and /b have different definitions of {SCAN}")
 
 
-def test_troubles_of_others_are_left_out_if_asked_and_each_is_told_once() -> None:
+def test_troubles_of_others_are_left_out_if_asked_and_each_is_reported_once() -> None:
     others = endpoint("/a", "publisher", qos=SENSOR_DATA), endpoint("/b", "subscriber")
     assert troubles(DDS, others, ours_only=True) == []
     assert len(troubles(DDS, (*others, *others))) == 1

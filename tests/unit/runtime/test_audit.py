@@ -90,13 +90,13 @@ def test_what_follows_a_step_back_of_the_clock_is_the_newest(tmp_path: Path) -> 
     assert texts(read_audit(tmp_path, 2)) == ["4", "5"]
 
 
-def test_a_place_that_cannot_be_written_is_told_and_does_not_raise(tmp_path: Path) -> None:
+def test_a_place_that_cannot_be_written_is_reported_and_does_not_raise(tmp_path: Path) -> None:
     (tmp_path / "audit").write_text("")
     problem = AuditFile(tmp_path, "driver").append([entry(1)])
     assert problem == f"cannot write the audit log in {tmp_path / 'audit'}: File exists"
 
 
-async def test_an_entry_is_told_at_once_written_and_can_be_asked_for(tmp_path: Path) -> None:
+async def test_an_entry_is_published_at_once_written_and_can_be_asked_for(tmp_path: Path) -> None:
     rig = Rig(tmp_path)
     rig.bus.time.boot, rig.bus.time.tick = 7, 205
     rig.trail.note("take", "ann", "ann drives, taken over from control")
@@ -130,7 +130,7 @@ async def test_what_happens_again_within_a_second_is_counted(tmp_path: Path) -> 
     await rig.trail.close()
 
 
-async def test_who_keeps_trying_is_told_once_a_minute(tmp_path: Path) -> None:
+async def test_who_keeps_trying_is_reported_once_a_minute(tmp_path: Path) -> None:
     rig = Rig(tmp_path)
     for _ in range(59):
         rig.trail.note("refused", "script", "control drives", code="commander", ok=False)
@@ -141,7 +141,7 @@ async def test_who_keeps_trying_is_told_once_a_minute(tmp_path: Path) -> None:
     await rig.trail.close()
 
 
-async def test_a_crowd_is_told_as_others(tmp_path: Path) -> None:
+async def test_a_crowd_is_reported_as_others(tmp_path: Path) -> None:
     rig = Rig(tmp_path)
     for number in range(10_000):
         rig.trail.note("refused", f"source-{number}", ok=False)

@@ -36,7 +36,7 @@ def test_a_denial_is_two_lines_of_one_thread() -> None:
     ]
 
 
-def test_who_is_turned_away_is_told_and_what_is_not_zenohs_is_left_out() -> None:
+def test_who_is_turned_away_is_reported_and_what_is_not_zenohs_is_left_out() -> None:
     line = (
         "2026-11-21T02:53:18.4Z \x1b[33m WARN\x1b[0m acc-0 ThreadId(05) zenoh_link_tls::unicast: "
         "peer sent no certificates. Hint: increase the system open file limit."
@@ -92,7 +92,7 @@ async def test_40000_denials_are_one_record_a_minute_and_push_out_no_estop(tmp_p
 
 
 @pytest.mark.long
-async def test_why_strangers_are_turned_away_is_told_without_what_they_choose(
+async def test_why_strangers_are_turned_away_is_reported_without_what_they_choose(
     tmp_path: Path,
 ) -> None:
     rig = Rig(tmp_path)

@@ -98,7 +98,7 @@ def look(process: ManagedProcess, times: int) -> list[int]:
     return process.child.signals
 
 
-async def test_a_process_without_progress_for_5_s_is_killed_once_and_told() -> None:
+async def test_a_process_without_progress_for_5_s_is_killed_once_and_reported() -> None:
     said: list[str] = []
     process = process_of(said)
     assert look(process, 19) == []

@@ -237,7 +237,7 @@ def test_nothing_moves_before_the_second_scan() -> None:
     assert step(bare, SafetyMemory(), SafetyInputs(state=state(1)))[1] == SafetyState(verdict="ok")
 
 
-def test_with_the_first_scan_it_is_told_who_has_not_been_heard_yet() -> None:
+def test_with_the_first_scan_it_reports_who_has_not_published_yet() -> None:
     """Later it is known whether there is a brain at all, which a script need not wait for."""
     everybody, memory, found = ("perception", "decision", "control"), SafetyMemory(), []
     for tick, basis in ((1, 0), (2, 2), (5, 2), (7, 7)):

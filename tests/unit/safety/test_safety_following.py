@@ -47,7 +47,7 @@ def test_what_moves_or_turns_at_command_zero_runs_away(moves: Velocity) -> None:
     assert patrol.verdict.causes[0].latching
 
 
-def test_a_body_that_goes_on_when_told_to_stop_runs_away() -> None:
+def test_a_body_that_goes_on_when_commanded_to_stop_runs_away() -> None:
     patrol = under_way()
     ticks = patrol.ticks_until("runaway", 60, told=REST, moves=AHEAD)
     assert ticks <= 40  # the ramp of 0.2 s, the 0.3 s that explain it, and 0.3 s of patience
@@ -87,7 +87,7 @@ def test_a_body_that_coasts_to_rest_as_it_can_is_left_alone() -> None:
         assert patrol.go(told=REST, moves=Velocity(linear_x=max(0.0, 0.2 - 0.012 * tick))) == []
 
 
-def test_a_body_that_is_much_slower_than_told_is_found() -> None:
+def test_a_body_that_is_much_slower_than_commanded_is_found() -> None:
     patrol = under_way()
     assert patrol.ticks_until("not_following", 40, told=AHEAD, moves=Velocity(linear_x=0.08)) == 15
     assert not patrol.verdict.causes[0].latching

@@ -98,7 +98,7 @@ async def test_a_scan_that_overtakes_the_state_of_its_tick_waits_for_it() -> Non
         assert [(v.tick, v.basis) for v in chain.sent(SAFETY)] == [(5, 5)]
 
 
-async def test_a_change_is_told_at_once() -> None:
+async def test_a_change_is_published_at_once() -> None:
     async with Chain() as chain:
         await started(chain)
         await chain.go(1)
@@ -108,7 +108,7 @@ async def test_a_change_is_told_at_once() -> None:
 
 
 @pytest.mark.parametrize("tick", [23, 24])  # the state of tick 25 comes with a scan
-async def test_a_knock_is_told_for_a_while_as_a_busy_gate_may_miss_a_verdict(tick: int) -> None:
+async def test_a_knock_is_reported_for_a_while_as_a_busy_gate_may_miss_a_verdict(tick: int) -> None:
     knock = replace(example(Imu), linear_acceleration=(60.0, 0.0, 9.8), boot=BOOT, tick=tick)
     async with Chain() as chain:
         await started(chain)

@@ -141,7 +141,7 @@ def room(body: BodyDescription, post: Floats) -> float:
     return float(depth(edges(body.footprint), post))
 
 
-def test_the_zone_goes_by_the_larger_of_measured_and_told() -> None:
+def test_the_zone_goes_by_the_larger_of_measured_and_commanded() -> None:
     values = near(0, 0.22)  # 0.145 m free: enough at rest, not at 0.2 m/s
     at_rest, coasting, starting = Patrol(), Patrol(), Patrol()
     assert at_rest.go(5, values=values) == []

@@ -58,7 +58,7 @@ def test_tags_are_found_where_they_are_within_1_cm_and_2_degrees_by_depth(model)
 
 
 @pytest.mark.long
-def test_without_depth_what_is_told_is_within_3_cm_and_what_is_open_is_left_out():
+def test_without_depth_what_is_reported_is_within_3_cm_and_what_is_open_is_left_out():
     rng, finder, told = np.random.default_rng(4), TagFinder(), 0
     for _ in range(40):
         plate = any_plate(rng, MODEL)
