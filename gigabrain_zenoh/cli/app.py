@@ -210,13 +210,11 @@ def main() -> None:
         from gigabrain_zenoh.host.signals import interrupts
         from gigabrain_zenoh.host.this_process import multiply_in_one_thread
 
+        _open_standard_streams()
         interrupts.install()
         multiply_in_one_thread()
     except KeyboardInterrupt:
         os._exit(130)
-    for stream in ("stdout", "stderr"):
-        if getattr(sys, stream) is None:  # closed, as by `gigabrain up FILE >&-`
-            setattr(sys, stream, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
     try:
         code = _call(sys.argv[1:])
         with suppress(BrokenPipeError):
@@ -232,6 +230,15 @@ def main() -> None:
     with suppress(OSError):  # the reader is gone, or the disk is full
         sys.stdout.flush()
     os._exit(code if isinstance(code, int) else 0)  # without waiting for Zenoh's threads
+
+
+def _open_standard_streams() -> None:
+    """Open the closed ones, as of `gigabrain up FILE >&-`, before anything takes 0, 1 or 2."""
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(number, True)
+    os.close(number)
+    sys.stdout = sys.stdout or os.fdopen(1, "w")
+    sys.stderr = sys.stderr or os.fdopen(2, "w")
 
 
 def _report_full_disk(error: Exception) -> bool:

@@ -1,5 +1,6 @@
 """The `gigabrain` command: help, names that are nearly right, and what it costs to ask."""
 
+import asyncio
 import json
 import os
 import re
@@ -102,6 +103,20 @@ def test_a_command_runs_with_a_closed_stream(stream: int, words: str, code: int)
     assert command.returncode == code
     assert "Traceback" not in command.stderr
     assert bool(command.stdout) is (stream == 2 and code == 0)
+
+
+@pytest.mark.parametrize("closed", [(2,), (0, 1, 2)])
+async def test_a_robot_runs_with_closed_streams(closed: tuple[int, ...], tmp_path: Path) -> None:
+    report = tmp_path / "report.json"
+    argv = [
+        *GIGABRAIN,
+        *["demo", "--headless", "--behaviour", "avoid", "--seconds", "2", "--speed", "5"],
+    ]
+    argv += ["--report", str(report)]
+    closing = f"import os, sys; [os.close(n) for n in {closed}]; os.execv(sys.executable, {argv})"
+    process = await asyncio.create_subprocess_exec(sys.executable, "-c", closing)
+    assert await process.wait() == 0
+    assert json.loads(report.read_text())["sim_seconds"] == 2.0
 
 
 async def test_robots_and_worlds_are_listed(home: Home) -> None:
