@@ -84,8 +84,17 @@ class OpenCvCamera(CameraSource):
 
     @property
     def _shown(self) -> str:
-        """Return the device for messages: of an address, which may hold a password, the host."""
-        return re.sub(r"://(?:.*@)?([^/?#]*).*", r"://\1", self.options.device)
+        """Return the device for messages: of an address, which may hold a password, the host.
+
+        Where it is not clear which part that is, not even the host.
+        """
+        address = re.fullmatch(
+            r"(.*?://)(?:[^/?#]*@)?([^/?#]*)(.*)", self.options.device, re.DOTALL
+        )
+        if address is None:
+            return self.options.device
+        start, host, rest = address.groups()
+        return f"{start}…" if "@" in rest else start + host
 
     def _next(self, capture: cv2.VideoCapture) -> NDArray[Any] | None:
         """Return the next picture, a file's next whole one; None if there is none."""

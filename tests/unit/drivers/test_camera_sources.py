@@ -171,11 +171,19 @@ def test_a_pipe_and_a_folder_are_no_cameras(tmp_path: Path, make: Callable[[str]
         camera(tmp_path, "pictures").open()
 
 
-def test_a_stream_is_named_by_its_host_alone(tmp_path: Path) -> None:
-    source = camera(tmp_path, "rtsp://admin:secret@127.0.0.1:9/live?token=secret")
+@pytest.mark.parametrize(
+    ("address", "shown"),
+    [
+        ("rtsp://admin:secret@127.0.0.1:9/live?token=secret", "rtsp://127.0.0.1:9"),
+        ("http://127.0.0.1:9?to=me@x.org&pw=secret", "http://…"),
+        ("rtsp://admin:se/cret@127.0.0.1:9/live", "rtsp://…"),
+    ],
+)
+def test_a_stream_is_named_by_its_host_alone(tmp_path: Path, address: str, shown: str) -> None:
+    source = camera(tmp_path, address)
     with pytest.raises(CameraLost) as caught:
         source.open()
-    assert str(caught.value) == "rtsp://127.0.0.1:9 cannot be opened"
+    assert str(caught.value) == f"{shown} cannot be opened"
 
 
 def test_grey_pictures_get_three_channels_and_enormous_ones_are_refused() -> None:
