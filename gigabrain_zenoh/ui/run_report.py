@@ -47,6 +47,7 @@ class RunMonitor(SampledView):
         self.distance_m = 0.0  # by odometry
         self.turns = 0  # turns on the spot that the brain decided on
         self._turning = False
+        self._boot = self._tick = self._ticks_before = 0  # those of earlier starts of the driver
         self._last: RobotState | None = None
         super().__init__(bus)
         self.map = bus.latest(MAP)
@@ -55,6 +56,7 @@ class RunMonitor(SampledView):
         """Decode the newest messages, and count. Called ten times a second."""
         for topic in self.sampled.values():
             topic.poll()
+        self._count_ticks()
         self._add_distance(self.state.newest)
         self._count_turn(self.intent.newest)
         self._note_start_times()
@@ -67,8 +69,10 @@ class RunMonitor(SampledView):
 
     @property
     def seconds(self) -> float:
-        """Return the robot's time since its driver started [s]."""
-        return self.bus.time.tick * TICK_S
+        """Return the robot's time since the first start of its driver [s]."""
+        time = self.bus.time
+        before = self._ticks_before + (self._tick if time.boot != self._boot else 0)
+        return (before + time.tick) * TICK_S
 
     @property
     def drives(self) -> bool:
@@ -129,6 +133,12 @@ class RunMonitor(SampledView):
         turning = twist is not None and twist.angular_z != 0.0 and twist.linear_x == 0.0
         self.turns += turning and not self._turning
         self._turning = turning
+
+    def _count_ticks(self) -> None:
+        time = self.bus.time
+        if time.boot != self._boot:
+            self._ticks_before += self._tick
+        self._boot, self._tick = time.boot, time.tick
 
     def _add_distance(self, state: RobotState | None) -> None:
         last, self._last = self._last, state

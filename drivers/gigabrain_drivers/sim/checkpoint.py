@@ -1,6 +1,8 @@
 """Checkpoints of a simulation: a body stays where it is when its driver dies and starts again."""
 
+import asyncio
 import contextlib
+import logging
 import os
 import struct
 import zlib
@@ -13,6 +15,8 @@ from msgspec import Struct
 from gigabrain_schemas.sim import Thing
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.errors import ConfigError
+
+log = logging.getLogger(__name__)
 
 HEAD = struct.Struct("<II")  # length of the content, and its CRC-32
 BINARY = getattr(os, "O_BINARY", 0)  # on Windows
@@ -46,6 +50,8 @@ class CheckpointFiles:
     def __init__(self, path: Path) -> None:
         self._paths = [Path(f"{path}.{number}") for number in range(2)]
         self._turns = cycle(self._paths)
+        self._saving: asyncio.Future[None] | None = None
+        self._ended = False  # a write has failed, or they were discarded
 
     def read(self) -> Checkpoint | None:
         """Return the newest checkpoint; None for none. Raises OSError.
@@ -66,6 +72,32 @@ class CheckpointFiles:
             os.write(file, HEAD.pack(len(text), zlib.crc32(text)) + text)
         finally:
             os.close(file)
+
+    def save(self, checkpoint: Checkpoint) -> asyncio.Future[None]:
+        """Write it in a thread, unless the last one is still being written; return what ends then.
+
+        So a disk that hangs holds up no tick.
+        """
+        if self._saving is None or self._saving.done():
+            self._saving = asyncio.ensure_future(asyncio.to_thread(self._save, checkpoint))
+        return self._saving
+
+    async def discard(self) -> None:
+        """Remove all checkpoints, also one that is being written."""
+        self._ended = True
+        if self._saving:
+            await self._saving
+        self.clear()
+
+    def _save(self, checkpoint: Checkpoint) -> None:
+        if self._ended:
+            return
+        try:
+            self.write(checkpoint)
+        except OSError as error:
+            log.warning("the simulation will begin at its start after a crash: %s", error)
+            self._ended = True
+            self.clear()
 
     def clear(self) -> None:
         """Remove all checkpoints."""

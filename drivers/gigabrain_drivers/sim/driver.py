@@ -17,7 +17,7 @@ from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.sim import STEP_NS, STEP_S, Pace
 from gigabrain_drivers.sim.body import MujocoOptions, sim_body
-from gigabrain_drivers.sim.checkpoint import CheckpointFiles
+from gigabrain_drivers.sim.checkpoint import Checkpoint, CheckpointFiles
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.arrays import ranges_bytes
 from gigabrain_schemas.base import TICK_NS, Message, Pose, Velocity
@@ -76,6 +76,7 @@ class Reading(NamedTuple):
     scan: LaserScan | None = None  # when the lidar has finished a turn, between two states
     state: RobotState | None = None  # with the last step of a tick
     news: Sequence[tuple[Topic[Any], Message]] = ()  # of the world, for viewers
+    checkpoint: Checkpoint | None = None  # to be written
 
 
 class MujocoDriver(Driver):
@@ -100,7 +101,8 @@ class MujocoDriver(Driver):
         self._scan_ticks = period_ns / TICK_NS
         self._next_scan = self._scan_ticks
         self._ticks = 0  # since this driver began, like those of the robot's clock
-        self._last_ticks = round(run.seconds * 1e9 / TICK_NS) if run.seconds else None
+        left_ns = (run.seconds or math.inf) * 1e9 - self._simulation.time_ns
+        self._last_ticks = max(0, round(left_ns / TICK_NS)) if run.seconds else None
         self._commanded_ns = 0
         self._physics_s = 0.0  # CPU time of physics and lidar
         self._permits = threading.Semaphore(0)
@@ -153,7 +155,7 @@ class MujocoDriver(Driver):
         self._simulation.command(0.0, 0.0)
 
     async def park(self) -> None:
-        """Stop: the physics ends with this process, and the body with it."""
+        """Stop: the physics ends with this process."""
         await self.stop()
 
     async def limp(self) -> None:
@@ -174,8 +176,14 @@ class MujocoDriver(Driver):
                 self.finished = True
                 return
             if isinstance(reading, Exception):
+                if self._checkpoints:
+                    await self._checkpoints.discard()  # it would fall or diverge again
                 raise reading
             self._publish(reading)
+            if self._checkpoints and reading.checkpoint:
+                saving = self._checkpoints.save(reading.checkpoint)
+                if self.lockstep:
+                    await saving
             if reading.state:
                 yield 1
                 self._permits.release()
@@ -228,8 +236,6 @@ class MujocoDriver(Driver):
         try:
             self._simulate()
         except Exception as error:  # noqa: BLE001 - handed on whole, to end the driver's process
-            if self._checkpoints:
-                self._checkpoints.clear()  # it would fall or diverge again
             self._post(error)
 
     def _simulate(self) -> None:
@@ -259,24 +265,14 @@ class MujocoDriver(Driver):
         news = self._world.step()
         if last:
             self._account = self._simulation.report(self.robot, self.run)
-            if self._ticks % CHECKPOINT_TICKS == 0:
-                self._save()
-            return Reading(self._imu(), state=self._read_state(), news=news)
+            saves = self._checkpoints is not None and self._ticks % CHECKPOINT_TICKS == 0
+            checkpoint = self._simulation.checkpoint() if saves else None
+            return Reading(self._imu(), None, self._read_state(), news, checkpoint)
         # a lidar is not synchronous with the states; between two of them the cores are idle
         due = self._ticks >= self._next_scan
         if due:
             self._next_scan += self._scan_ticks
         return Reading(self._imu(), scan=self._scan() if due else None, news=news)
-
-    def _save(self) -> None:
-        if self._checkpoints is None:
-            return
-        try:
-            self._checkpoints.write(self._simulation.checkpoint())
-        except OSError as error:
-            log.warning("the simulation will begin at its start after a crash: %s", error)
-            self._checkpoints.clear()
-            self._checkpoints = None
 
     def _timed(self, work: Callable[[], T]) -> T:
         """Run a piece of physics and add its CPU time to the report."""

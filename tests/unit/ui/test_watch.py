@@ -96,6 +96,16 @@ async def test_each_look_adds_the_way_since_the_last_and_counts_turns_that_begin
     assert watch.start_times.metre_s is None
 
 
+async def test_its_time_goes_on_over_a_new_start_of_the_driver() -> None:
+    net = Net()
+    watch = RunMonitor(net.one)
+    for boot, tick, seconds in ((1, 100, 2.0), (1, 150, 3.0), (2, 1, 3.02), (2, 50, 4.0)):
+        net.one.time.boot, net.one.time.tick = boot, tick
+        assert watch.seconds == pytest.approx(seconds)
+        watch.look()
+        assert watch.seconds == pytest.approx(seconds)
+
+
 NASTY = "avoid [left], [/], \x1b[2J"  # markup of rich, and a control sequence of the terminal
 SHOWN = r"avoid [left], [/], \x1b[2J"
 
