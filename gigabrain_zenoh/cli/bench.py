@@ -265,7 +265,7 @@ def plan(
         size: Cells per side of the map; may be given again.
         queries: Number of paths, each about three quarters of the map's side.
         seed: Random seed of the maps and the queries.
-        png: Draw the last map and its paths to this file.
+        png: Draw the last map and its paths to this PNG file.
     """
     from gigabrain_zenoh.qa.bench.plan import measure_plan
 
@@ -273,6 +273,7 @@ def plan(
     if any(one < MIN_CELLS for one in size):
         raise ConfigError(f"--size: expected at least {MIN_CELLS}, got {min(size)}")
     files.check_result_path(json)
+    files.check_picture_path(png)
     result = measure_plan(size, queries, seed, png, print_progress)
     finish(_plan_table(result), result, json)
     return 0 if result.ok else 1

@@ -55,10 +55,11 @@ def slam(
         world: Simulated worlds to explore instead; see `gigabrain worlds`.
         minutes: Time in each world [min of robot time].
         seed: Random seed of the start pose and the sensor noise in a world.
-        png: Draw the maps to this file.
+        png: Draw the maps to this PNG file.
     """
     if bool(log) == bool(world):
         raise ConfigError("expected either --log with .npz files, or --world with names of worlds")
+    files.check_picture_path(png)
     if world:
         return _slam_worlds(world, minutes, body, seed, png, json)
     return _slam_logs(log, png, json)

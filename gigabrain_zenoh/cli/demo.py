@@ -30,7 +30,7 @@ from gigabrain_zenoh.config.loading import beside, located
 from gigabrain_zenoh.config.settings import LinkName, PageConfig, Resume
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.files import check_result_path
+from gigabrain_zenoh.host.files import check_picture_path
 from gigabrain_zenoh.host.signals import run_async
 from gigabrain_zenoh.launch.deployment import (
     Deployment,
@@ -262,6 +262,6 @@ def render(
     """
     from gigabrain_drivers.sim.picture import portray
 
-    check_result_path(file)
+    check_picture_path(file)
     portray(body, world, seed, file)
     print(file)

@@ -18,7 +18,7 @@ from gigabrain_zenoh.cli.options import (
     print_table,
 )
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused, unknown
-from gigabrain_zenoh.host.files import check_result_path, replace_file
+from gigabrain_zenoh.host.files import check_picture_path, check_result_path, replace_file
 
 if TYPE_CHECKING:
     from gigabrain_schemas.requests import ParamReply
@@ -75,13 +75,14 @@ def graph(
     Args:
         dot: Print a Graphviz file.
         mermaid: Print a Mermaid flowchart.
-        png: Draw a picture to this file.
+        png: Draw a picture to this PNG file.
         everything: Also show health, log and audit, which every process sends.
     """
     from gigabrain_zenoh.diagnostics import discovery
 
     if dot + mermaid + (png is not None) > 1:
         raise ConfigError("choose only one of --dot, --mermaid and --png")
+    check_picture_path(png)
     processes = _find(at)
     flows = discovery.flows(processes.described.values(), processes.health)
     shown = discovery.chain_flows(flows, everything=everything)

@@ -168,9 +168,9 @@ def view(*, picture: Path | None = None, at: RobotAddress = LOCAL) -> None:
     """
     from gigabrain_drivers.sim.window import check_display, show
     from gigabrain_zenoh.cli.options import on_bus
-    from gigabrain_zenoh.host.files import check_result_path
+    from gigabrain_zenoh.host.files import check_picture_path
 
-    check_result_path(picture)
+    check_picture_path(picture)
     if picture is None:
         check_display()
     on_bus(at, lambda bus: show(bus, picture, print_line), "view")

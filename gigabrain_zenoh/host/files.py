@@ -153,6 +153,13 @@ def check_result_path(path: Path | None) -> None:
         raise ConfigError(f"cannot write {path}: it is a folder")
 
 
+def check_picture_path(path: Path | None) -> None:
+    """Raise ConfigError where no PNG can be written to `path`, or its name says another format."""
+    check_result_path(path)
+    if path and path.suffix.lower() != ".png":
+        raise ConfigError(f"cannot write {path}: it would be a PNG; expected a name like x.png")
+
+
 def write_result(results: object, path: Path | None) -> None:
     """Write `results` as JSON, if a path is given. Raises ConfigError if that fails."""
     if path is None:

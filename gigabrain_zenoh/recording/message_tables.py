@@ -16,7 +16,7 @@ from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import TOPICS
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import ConfigError, unknown
-from gigabrain_zenoh.host.files import replacing
+from gigabrain_zenoh.host.files import check_picture_path, replacing
 from gigabrain_zenoh.recording.bag_reader import Bag, Sample, samples
 
 Value = float | int | str | bool | None
@@ -166,6 +166,7 @@ def plot(path: Path, fields: Sequence[str], to: Path) -> Path:
         raise ConfigError("no field to plot; name one, such as cmd_vel.linear_x")
     if to.exists() and path.exists() and to.samefile(path):
         raise ConfigError(f"{to} is the recording; name another file")
+    check_picture_path(to)
     drawn = read_series(path, fields)
     figure = Figure(figsize=(10, 5), layout="constrained")
     axes = figure.subplots()
