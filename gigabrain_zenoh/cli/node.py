@@ -15,6 +15,7 @@ from gigabrain_zenoh.cli.options import (
     on_bus,
     print_json,
     print_line,
+    print_progress,
     print_table,
 )
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused, unknown
@@ -149,14 +150,22 @@ async def _print_once(feed: "Feed") -> None:
         print_table(plain_table(columns, texts, left=columns[:1]))
 
 
-def list_params(process: ProcessOrAll = "", /, *, at: RobotAddress = LOCAL) -> None:
+def list_params(process: ProcessOrAll = "", /, *, at: RobotAddress = LOCAL) -> int:
     """List the parameters that can be changed at run time: value, and what is accepted.
 
     Example: gigabrain param list decision
+
+    Exit code 1 if a process refuses; the others are listed.
     """
-    for name, reply in sorted(ask_params(at, process).items()):
+    refusals = 0
+    for name, reply in sorted(_param_answers(at, process, "", "").items()):
+        if isinstance(reply, Refused):
+            refusals += 1
+            print_progress(str(reply))
+            continue
         for one in reply.params:
             print_line(f"{name:<12} {one.name:<24} {one.value:<10} {one.expected}")
+    return int(refusals > 0)
 
 
 def get_param(process: Process, name: str, /, *, at: RobotAddress = LOCAL) -> None:
@@ -230,7 +239,19 @@ def save_params(file: Path, /, *, at: RobotAddress = LOCAL) -> None:
 def ask_params(
     at: RobotAddress, process: str = "", name: str = "", value: str = ""
 ) -> "dict[str, ParamReply]":
-    """Return the replies of one process, or of all without a name."""
+    """Return the replies of one process, or of all without a name. Raises Refused for any."""
+    replies = {}
+    for each, reply in _param_answers(at, process, name, value).items():
+        if isinstance(reply, Refused):
+            raise reply
+        replies[each] = reply
+    return replies
+
+
+def _param_answers(
+    at: RobotAddress, process: str, name: str, value: str
+) -> "dict[str, ParamReply | Refused]":
+    """Return the reply or the refusal of each process that was asked, by name."""
     from gigabrain_schemas.requests import ParamRequest
     from gigabrain_schemas.topics import PARAM
     from gigabrain_zenoh.diagnostics.discovery import discover
@@ -238,12 +259,18 @@ def ask_params(
 
     request = ParamRequest(name=name, value=value, source=user_name())
 
-    async def ask(bus: "Bus") -> "dict[str, ParamReply]":
+    async def ask_one(bus: "Bus", each: str) -> "list[ParamReply] | list[Refused]":
+        try:
+            return await bus.ask(PARAM, request, name=each)
+        except Refused as error:
+            return [Refused(f"{each}: {error}")]
+
+    async def ask(bus: "Bus") -> "dict[str, ParamReply | Refused]":
         known = await discover(bus)
         if process and process not in known:
             raise unknown("process", process, known)
         asked = [process] if process else list(known)
-        answers = await asyncio.gather(*(bus.ask(PARAM, request, name=each) for each in asked))
+        answers = await asyncio.gather(*(ask_one(bus, each) for each in asked))
         return {each: some[0] for each, some in zip(asked, answers, strict=True) if some}
 
     replies = on_bus(at, ask)
