@@ -61,14 +61,19 @@ def why(*, at: RobotAddress = LOCAL, json: bool = False) -> int:
         print_line(f"  note: {note}")
     if broken:
         moves = "It still moves, but not for long." if verdict.moves else "It does not move."
-        print_line(f"{moves} {broken.link}: {broken.text}.")
+        print_line(f"{moves} {broken.link}: {_ended(broken.text)}")
         print_line(f"What to do: {broken.remedy}.")
     elif waits and not verdict.moves:
-        print_line(f"It stands, and no link is broken: {waits.text}.")
+        print_line(f"It stands, and no link is broken: {_ended(waits.text)}")
         print_line(f"What to do: {waits.remedy}.")
     else:
         print_line("It moves.")
     return verdict.exit_code
+
+
+def _ended(sentence: str) -> str:
+    """Return a sentence with its full stop; a question has its own end."""
+    return sentence if sentence.endswith("?") else f"{sentence}."
 
 
 def _chain_facts(at: RobotAddress) -> "ChainFacts":

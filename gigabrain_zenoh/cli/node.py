@@ -80,6 +80,7 @@ def graph(
         everything: Also show health, log and audit, which every process sends.
     """
     from gigabrain_zenoh.diagnostics import discovery
+    from gigabrain_zenoh.diagnostics.why import START_ROUTER
 
     if dot + mermaid + (png is not None) > 1:
         raise ConfigError("choose only one of --dot, --mermaid and --png")
@@ -87,6 +88,8 @@ def graph(
     processes = _find(at)
     flows = discovery.flows(processes.described.values(), processes.health)
     shown = discovery.chain_flows(flows, everything=everything)
+    if not shown:
+        raise BodyLost(f"no process sends to another here; {START_ROUTER}")
     if png:
         discovery.write_graph_png(shown, png)
         print_line(str(png))
