@@ -168,14 +168,14 @@ def make_app(chosen: "Sequence[str]" = ()) -> "App":
 
     from cyclopts import App, Parameter
 
-    from gigabrain_zenoh.cli.options import default_text, refuse_fractions
+    from gigabrain_zenoh.cli.options import check_numbers, default_text
 
     app = App(
         name="gigabrain",
         help="A robot brain of three systems that any body can wear.",
         help_format="plaintext",  # the default, Markdown, takes twice as long to start
         version=_version,
-        config=refuse_fractions,
+        config=check_numbers,
         default_parameter=Parameter(negative=(), show_default=default_text),
     )
     groups = {name: App(name=name, help=about) for name, about in GROUPS.items()}

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from gigabrain_schemas.body import BodyDescription, Joint, JointDescription, RobotState
 from gigabrain_schemas.requests import GateReply
-from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, Take, angle, check_finite, print_line
+from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, Take, print_line
 from gigabrain_zenoh.cli.task import Mode, Wait, send
 from gigabrain_zenoh.client.arm import held_posture
 from gigabrain_zenoh.client.robot import Robot
@@ -68,7 +68,6 @@ def jog(joint: str, distance: Distance, /, *, take: Take = False, at: RobotAddre
         distance: Distance from the last commanded position, of a limp joint from the measured one;
             may be negative.
     """
-    check_finite("distance", distance)
 
     async def move(robot: Robot) -> None:
         body = await _arm(robot)
@@ -129,7 +128,7 @@ def goto(
     from gigabrain_zenoh.decision.tasks.arm_steps import Reach
     from gigabrain_zenoh.decision.tasks.mission import Mission, Step
 
-    down = angle("pitch", pitch)
+    down = _radians(pitch)
     _carry_out(at, Mission(do=(Step(reach=Reach(at=(x, y, z), pitch=down)),)), mode, wait)
 
 
@@ -166,9 +165,6 @@ def pick(
     shapes = sum(one is not None for one in (box, cylinder, sphere))
     if shapes != 1:
         raise ConfigError(f"arm pick: expected --box, --cylinder or --sphere, got {shapes} of them")
-    for name, value in (("sphere", sphere), ("yaw", yaw)):
-        if value is not None:
-            check_finite(name, value)
     thing = Solid(box=box, cylinder=cylinder, sphere=sphere, at=(x, y, z), yaw=math.radians(yaw))
     name = f"the thing at {describe_point((x, y, z))}"  # another one than what it may hold
     _carry_out(at, Mission(things={name: thing}, do=(Step(pick=name),)), mode, wait)
@@ -251,7 +247,7 @@ def press(
     from gigabrain_zenoh.decision.tasks.arm_steps import Press
     from gigabrain_zenoh.decision.tasks.mission import Mission, Step
 
-    down = angle("pitch", pitch)
+    down = _radians(pitch)
     what = Press(at=(x, y, z), pitch=down, depth=depth, force=force, seconds=seconds)
     _carry_out(at, Mission(do=(Step(press=what),)), mode, wait)
 
@@ -279,7 +275,7 @@ def hand_over(
     from gigabrain_zenoh.decision.tasks.arm_steps import HandOver
     from gigabrain_zenoh.decision.tasks.mission import Mission, Step
 
-    down = angle("pitch", pitch)
+    down = _radians(pitch)
     what = HandOver(at=to, pitch=down, seconds=seconds)
     _carry_out(at, Mission(do=(Step(hand_over=what),)), mode, wait)
 
@@ -310,6 +306,10 @@ def hold(*, at: RobotAddress = LOCAL) -> None:
     Example: gigabrain arm hold
     """
     _ask(at, lambda robot: robot.hold())
+
+
+def _radians(degrees: float | None) -> float | None:
+    return None if degrees is None else math.radians(degrees)
 
 
 def _carry_out(at: RobotAddress, mission: "Mission", mode: Mode, wait: bool) -> None:

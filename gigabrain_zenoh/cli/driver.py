@@ -12,7 +12,6 @@ from gigabrain_zenoh.cli.options import (
     Body,
     Seed,
     World,
-    check_finite,
     check_positive,
     checked,
     print_line,
@@ -118,8 +117,6 @@ def trace(
     """
     check_positive(seconds=seconds)
     speeds = {"linear_x": linear_x, "linear_y": linear_y, "angular_z": angular_z}
-    for option, speed in speeds.items():
-        check_finite(option, speed)
     received = _print_trace(name, link, part, seconds, speeds)
     if not received:
         print("nothing was received", file=sys.stderr)

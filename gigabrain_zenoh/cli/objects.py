@@ -8,7 +8,6 @@ from cyclopts import Parameter
 from gigabrain_zenoh.cli.options import (
     LOCAL,
     RobotAddress,
-    check_finite,
     on_bus,
     print_json,
     print_line,
@@ -68,9 +67,6 @@ def pose(x: Number, y: Number, yaw: Number | None = None, /, *, at: RobotAddress
     """
     from gigabrain_zenoh.client.objects import set_pose
 
-    for name, value in (("x", x), ("y", y), ("yaw", yaw)):
-        if value is not None:
-            check_finite(name, value)
     found = on_bus(at, lambda bus: set_pose(bus, x, y, yaw), _name())
     print_line(f"localized at ({found.x:.2f}, {found.y:.2f}), {found.yaw:.2f} rad")
 

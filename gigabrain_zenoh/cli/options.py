@@ -197,21 +197,6 @@ def checked(
         raise ConfigError(f"{option}: {text}" if name else text) from None
 
 
-def check_finite(name: str, value: float) -> None:
-    """Raise ConfigError if the option `name` is not a finite number."""
-    if not math.isfinite(value):
-        shown = name.replace("_", "-")
-        raise ConfigError(f"--{shown}: expected a number, got {value:g}")
-
-
-def angle(name: str, degrees: float | None) -> float | None:
-    """Return the angle [rad] of the option `name`, if given. Raises as `check_finite` does."""
-    if degrees is None:
-        return None
-    check_finite(name, degrees)
-    return math.radians(degrees)
-
-
 def check_positive(**options: float | None) -> None:
     """Raise ConfigError for the first option not above 0, or too large; None is one not given."""
     for name, value in options.items():
@@ -268,14 +253,17 @@ def _shown(argument: Argument) -> str:
     return name.lstrip("-").upper() if argument.field_info.is_positional else name
 
 
-def refuse_fractions(_app: App, _command: tuple[str, ...], arguments: ArgumentCollection) -> None:
-    """Raise ConfigError for a fraction where an option is a whole number; cyclopts would round."""
+def check_numbers(_app: App, _command: tuple[str, ...], arguments: ArgumentCollection) -> None:
+    """Raise ConfigError for NaN and infinity, and for a fraction where cyclopts would round it."""
     for argument in arguments:
-        if _is_whole(argument.hint):
-            for token in argument.tokens:
-                if _is_fraction(token.value):
-                    got = f"expected a whole number, got {token.value}"
-                    raise ConfigError(f"{argument.name}: {got}")
+        whole = _holds(argument.hint, int)
+        if not whole and not _holds(argument.hint, float):
+            continue
+        for token in argument.tokens:
+            value = _number(token.value)
+            if not math.isfinite(value) or (whole and not value.is_integer()):
+                expected = "a whole number" if whole else "a number"
+                raise ConfigError(f"{_shown(argument)}: expected {expected}, got {token.value}")
 
 
 def default_text(value: object) -> str | None:
@@ -285,16 +273,17 @@ def default_text(value: object) -> str | None:
     return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
-def _is_whole(hint: Any) -> bool:
-    """Return whether a type is int, or a union or a collection of int."""
-    return hint is int or any(_is_whole(part) for part in get_args(hint))
+def _holds(hint: Any, number: type) -> bool:
+    """Return whether a type is `number`, or a union or a collection of it."""
+    return hint is number or any(_holds(part, number) for part in get_args(hint))
 
 
-def _is_fraction(text: str) -> bool:
+def _number(text: str) -> float:
+    """Return the number of a text; 0 for one that cyclopts judges, as a hexadecimal one."""
     try:
-        return not float(text).is_integer()
-    except ValueError:  # hexadecimal, or no number: cyclopts reports it
-        return False
+        return float(text)
+    except ValueError:
+        return 0.0
 
 
 def print_line(line: str) -> None:

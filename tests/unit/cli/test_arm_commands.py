@@ -1,7 +1,7 @@
 """Tests the positions that `gigabrain arm` sends and shows."""
 
 import math
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -11,8 +11,8 @@ from msgspec.structs import replace
 from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.body import BodyDescription, Joint, RobotState
 from gigabrain_schemas.examples import example
-from gigabrain_zenoh.cli.arm import goto, hand_over, jog, lines, pick, press
-from gigabrain_zenoh.errors import BodyLost, ConfigError
+from gigabrain_zenoh.cli.arm import jog, lines
+from gigabrain_zenoh.errors import BodyLost
 
 ARM = load_robot("so101").description()
 TURNED = tuple(Joint(name=joint.name, position=math.radians(40)) for joint in ARM.joints)
@@ -64,27 +64,3 @@ def test_a_joint_that_is_not_measured_is_not_jogged() -> None:
 def test_limp_joints_are_shown_without_where_they_were_sent_before() -> None:
     assert "+10.0°" in lines(ARM, STATE)[2]
     assert "+10.0°" not in lines(ARM, replace(STATE, limp=True))[2]
-
-
-@pytest.mark.parametrize("angle", [math.nan, math.inf])
-@pytest.mark.parametrize(
-    "command",
-    [
-        lambda angle, arm: goto(0.2, 0.0, 0.1, pitch=angle, at=arm),
-        lambda angle, arm: press(0.2, 0.0, 0.1, pitch=angle, at=arm),
-        lambda angle, arm: hand_over(pitch=angle, at=arm),
-    ],
-)
-def test_a_pitch_that_is_not_finite_is_not_taken_for_any_pitch(
-    command: Callable[[float, Any], None], angle: float
-) -> None:
-    with pytest.raises(ConfigError, match=f"^--pitch: expected a number, got {angle:g}$"):
-        command(angle, Arm(STATE))
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-@pytest.mark.parametrize("option", ["sphere", "yaw"])
-def test_what_is_not_finite_of_a_thing_is_named(option: str, value: float) -> None:
-    given: Any = {"sphere": 0.02, option: value}
-    with pytest.raises(ConfigError, match=f"^--{option}: expected a number, got {value:g}$"):
-        pick(0.2, 0.0, 0.02, **given)
