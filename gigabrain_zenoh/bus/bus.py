@@ -90,6 +90,7 @@ class Bus:
         # whether work was done since the last call; by default that the loop runs
         self.progress: Callable[[], bool] = lambda: True
         self._refusing_ns = self._refused_ns = 0  # since when, and when last
+        self.closed = False
         self._kept: dict[str, bytes] = {}
         self._fetching: set[asyncio.Task[None]] = set()
 
@@ -252,6 +253,7 @@ class Bus:
 
     async def close(self) -> None:
         """Leave the network."""
+        self.closed = True
         for task in self._fetching:
             task.cancel()
         await self.transport.close()

@@ -15,7 +15,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.listening import arrival
 from gigabrain_zenoh.client.arm import JointStream
 from gigabrain_zenoh.client.lease import ControlLease
-from gigabrain_zenoh.client.requests import ANSWER_S, enable, press_estop, release
+from gigabrain_zenoh.client.requests import ANSWER_S, enable, press_estop, release, still_open
 from gigabrain_zenoh.errors import BodyLost, NotConfirmed, Refused, StillStopping
 from gigabrain_zenoh.gate.gate import STILL_TICKS
 from gigabrain_zenoh.geometry.limits import ZERO, at_rest
@@ -30,7 +30,7 @@ class Commander:
     """Asks the gate for a body, and repeats the newest commands to it with each state."""
 
     def __init__(self, bus: Bus, *, take: bool = False, keys: str = "") -> None:
-        self._bus, self._take, self._keys = bus, take, keys
+        self._given_bus, self._take, self._keys = bus, take, keys
         self._states = bus.latest(STATE, self._repeat)
         self._bodies = bus.latest(BODY)
         self._target: Velocity | None = None
@@ -41,12 +41,18 @@ class Commander:
         self._arrived = asyncio.Event()
 
     @property
+    def _bus(self) -> Bus:
+        """The bus. Raises BusError once it is closed."""
+        return still_open(self._given_bus)
+
+    @property
     def state(self) -> RobotState | None:
         """The newest state; None while the robot is silent."""
         return self._states.fresh()
 
     async def read_state(self) -> RobotState:
         """Return the newest state. Raises BodyLost if none arrives within a second."""
+        still_open(self._given_bus)
         if self._states.fresh() is None:
             await self._ticks(1)
         state = self._states.fresh()
@@ -56,6 +62,7 @@ class Commander:
 
     async def read_body(self) -> BodyDescription:
         """Return the body's description: limits, footprint, sensors. Raises BodyLost."""
+        still_open(self._given_bus)
         for _ in range(BODY_TICKS):
             if body := self._bodies.current:
                 return body.description

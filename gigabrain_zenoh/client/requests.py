@@ -33,7 +33,14 @@ from gigabrain_schemas.topics import (
     Service,
 )
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.errors import BodyLost, ConfigError, NotConfirmed, Refused, StillStopping
+from gigabrain_zenoh.errors import (
+    BodyLost,
+    BusError,
+    ConfigError,
+    NotConfirmed,
+    Refused,
+    StillStopping,
+)
 from gigabrain_zenoh.runtime.audit import in_order
 from gigabrain_zenoh.security.identity_files import may_not_ask
 
@@ -49,6 +56,21 @@ LAST_LOOK_S = 0.05  # for answers that arrived while this process was blocked
 BY_HAND = "press the hardware e-stop or cut the robot's power"
 
 Asks = set[asyncio.Task[list[GateReply]]]
+
+
+def still_open(bus: Bus) -> Bus:
+    """Return the bus. Raises BusError if it is closed, as after the block of a connection."""
+    if bus.closed:
+        raise closed("async with")
+    return bus
+
+
+def closed(block: str) -> BusError:
+    """Return the error for a robot that is used after its block, `with` or `async with`."""
+    return BusError(
+        f"the connection is closed; use `{block} gigabrain_zenoh.connect() as robot:` again, and "
+        "the robot inside it"
+    )
 
 
 async def ask_gate(

@@ -17,9 +17,9 @@ from gigabrain_schemas.requests import GateReply
 from gigabrain_schemas.tasks import How, Task, TaskStatus
 from gigabrain_schemas.topics import Topic
 from gigabrain_zenoh.client.motion import Reached
+from gigabrain_zenoh.client.requests import closed
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.client.tasks import OnStatus, Tasks
-from gigabrain_zenoh.errors import BusError
 
 M = TypeVar("M", bound=Message)
 T = TypeVar("T")
@@ -77,10 +77,7 @@ class EventLoopThread:
         """
         if self._loop.is_closed():
             coroutine.close()
-            raise BusError(
-                "the connection is closed; use `with gigabrain_zenoh.connect() as robot:` again, "
-                "and the robot inside it"
-            )
+            raise closed("with")
         begun, ended = threading.Event(), threading.Event()
 
         async def work() -> T:

@@ -21,7 +21,7 @@ from gigabrain_schemas.tasks import (
 from gigabrain_schemas.topics import GOAL, MISSION, TASK, TASK_CHANGE, Service
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.listening import arrival
-from gigabrain_zenoh.client.requests import ANSWER_S
+from gigabrain_zenoh.client.requests import ANSWER_S, still_open
 from gigabrain_zenoh.errors import BodyLost, ConfigError, GigabrainError, Refused
 from gigabrain_zenoh.security.identity_files import may_not_ask
 
@@ -67,13 +67,18 @@ class Tasks:
         The callback `on_wait` receives a text when it starts to wait. After `silent_s` without a
         task status, or `plan_s` without an answer to a goal, BodyLost is raised.
         """
-        self._bus, self._keys = bus, keys
+        self._given_bus, self._keys = bus, keys
         self._on_wait, self._starting_s, self._silent_s = on_wait, starting_s, silent_s
         self._plan_s = plan_s
         self._arrived = asyncio.Event()
         self._newest: TaskStatus | None = None
         self._newest_ns = 0  # when it came
         self._subscribed = False
+
+    @property
+    def _bus(self) -> Bus:
+        """The bus. Raises BusError once it is closed."""
+        return still_open(self._given_bus)
 
     async def go_to(
         self, x: float, y: float, yaw: float | None = None, *, how: How = "replace"
@@ -245,6 +250,7 @@ class Tasks:
                 await self.cancel(reply.task)
 
     def _listen(self) -> None:
+        still_open(self._given_bus)
         if not self._subscribed:
             self._subscribed = True
             self._bus.subscribe(TASK, self._on_status)
