@@ -129,6 +129,8 @@ class Robot(Commander):
         Raises what `set_base_velocity` raises.
         """
         check_finite({"seconds": seconds})
+        if seconds < 0:
+            raise ConfigError(f"seconds: expected 0 or more, got {seconds:g}")
         start = (await self.read_state()).tick
         last = start + round(seconds * 50)
         with self._halting():

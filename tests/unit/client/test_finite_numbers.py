@@ -36,6 +36,7 @@ async def called(call: Callable[[], None]) -> None:
         lambda robot: robot.drive(NAN, seconds=1.0),
         lambda robot: robot.drive(0.1, seconds=NAN),
         lambda robot: robot.drive(0.1, seconds=INF),
+        lambda robot: robot.drive(0.1, seconds=-1.0),
         lambda robot: robot.move(NAN),
         lambda robot: robot.move(-INF),
         lambda robot: robot.move(1.0, speed=NAN),
@@ -54,7 +55,7 @@ async def test_it_is_refused_and_nothing_is_sent(
     net.one.publish(BODY, Body(description=load_robot("mock").description(), link="sim"))
     gate = GateStatus(mode="enabled", commander=net.two.process)
     net.one.publish(STATE, replace(example(RobotState), gate=gate))
-    with pytest.raises(ConfigError, match=r"^[a-z_]+: expected .*, got (nan|-?inf)$"):
+    with pytest.raises(ConfigError, match=r"^[a-z_]+: expected .*, got (nan|-?inf|-1)$"):
         await asyncio.wait_for(command(robot), 5.0)
     assert sent == []
 
