@@ -28,10 +28,15 @@ LONGEST_S = 600.0  # of a trajectory
 HELD_BACK_TICKS = 100  # without progress, after which joints are not waited for any longer
 
 
-def checked_positions(body: BodyDescription, positions: Positions) -> dict[str, float]:
-    """Return positions [rad] or [m]. Raises Unsupported, UnknownName and ConfigError."""
+def check_joints(body: BodyDescription) -> None:
+    """Raise Unsupported for a body without joints."""
     if not body.joints:
         raise Unsupported(f"{body.robot_type} has no joint that can be positioned")
+
+
+def checked_positions(body: BodyDescription, positions: Positions) -> dict[str, float]:
+    """Return positions [rad] or [m]. Raises Unsupported, UnknownName and ConfigError."""
+    check_joints(body)
     prepare(len(body.joints))
     known = {joint.name: joint for joint in body.joints}
     if not positions:

@@ -15,7 +15,7 @@ from gigabrain_schemas.tasks import Task
 from gigabrain_schemas.topics import SAFETY, Topic
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.listening import listen, topic_named
-from gigabrain_zenoh.client.arm import JointPath, JointStream, checked_positions
+from gigabrain_zenoh.client.arm import JointPath, JointStream, check_joints, checked_positions
 from gigabrain_zenoh.client.commander import HOLD_TICKS, Commander
 from gigabrain_zenoh.client.motion import OdometryMotion, Reached
 from gigabrain_zenoh.client.objects import known_objects
@@ -157,15 +157,19 @@ class Robot(Commander):
     async def limp(self) -> GateReply:
         """Let go of all joints, so that a person can move them; an arm may fall.
 
-        Raises Refused while somebody moves it, or where its driver cannot, and BodyLost.
+        Raises Refused while somebody moves it, or where its driver cannot, Unsupported for a body
+        without joints, and BodyLost.
         """
+        check_joints(await self.read_body())
         return await let_go(self._bus, True, self._keys)
 
     async def hold(self) -> GateReply:
         """Hold limp joints again, where they are.
 
-        Raises Refused with the reason where they do not hold, and BodyLost.
+        Raises Refused with the reason where they do not hold, Unsupported for a body without
+        joints, and BodyLost.
         """
+        check_joints(await self.read_body())
         return await let_go(self._bus, False, self._keys)
 
     async def _carry_out(self, distance: float, angle: float, speed: float | None) -> Reached:
