@@ -16,6 +16,7 @@ from gigabrain_zenoh.host.files import expanded
 if TYPE_CHECKING:
     from msgspec import Struct
 
+    from gigabrain_schemas.body import BodyDescription
     from gigabrain_zenoh.config.layers import Row
     from gigabrain_zenoh.config.settings import LinkName
     from gigabrain_zenoh.launch.deployment import Deployment
@@ -102,7 +103,7 @@ def rows_of(
 ) -> tuple["Row", ...]:
     """Return all settings of a deployment with their sources, those of the robot's file too.
 
-    Raises ConfigError, also for settings of the robot that cannot be.
+    Raises ConfigError, also for settings of the robot that cannot be, or do not fit its body.
     """
     from gigabrain_drivers.driver.catalog import (
         link_type,
@@ -128,10 +129,28 @@ def rows_of(
     own = robot_layers(path)
     if made.robot:
         own.add(part(layers.root, ("robot",)), layers.place)
-    load_layers(path, own, Run(folder=Path(), link=made.link))  # which refuses what is unsafe
+    found, *_ = load_layers(path, own, Run(folder=Path(), link=made.link))  # refuses what is unsafe
+    _check_fits(made, found.description())
     whole = own.convert(link_type(made.body, made.link))
     rows += [row._replace(key=f"robot.{row.key}") for row in own.rows(whole)]
     return tuple(rows)
+
+
+def _check_fits(deployment: "Deployment", body: "BodyDescription") -> None:
+    """Raise ConfigError for a map or a behaviour that is of no use to the body."""
+    if deployment.perception.map and not body.has_base:
+        raise ConfigError(
+            f"perception.map: {body.robot_type} has no base, so it cannot localize in a map; leave "
+            "the map out",
+            value=deployment.perception.map,
+        )
+    decides = any("decision" in processes for processes in deployment.hosts.values())
+    if decides and deployment.decision.behaviour == "avoid" and body.turning_radius:
+        raise ConfigError(
+            f"behaviour avoid turns on the spot, and {body.robot_type} cannot: its tightest turn "
+            f"has a radius of {body.turning_radius:.2f} m; use the behaviour navigate",
+            value="avoid",
+        )
 
 
 def robot_type(body: str, link: "LinkName") -> "type[Struct]":
