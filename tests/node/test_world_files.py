@@ -115,9 +115,9 @@ def test_a_robot_drives_in_it_among_all_its_people(tmp_path: Path) -> None:
         ("size: [6, 4]\npeople:\n  - path: [[1, 1], [1, 1]]\n", r":3: people\[0\].path: 0 m round"),
         ("size: [6, 4]\nwall_height: 0\n", r":2: wall_height: expected a number >= 0.05"),
         ("size: [6, 4]\nmaterials: {floor: [0, 0, 0]}\n", r":2: materials: 'floor' is there"),
-        ("size: [1, 1]\n", "found no place for the robot"),
-        ("size: [6, 4]\nmap: none.yaml\n", "none.yaml: no such file"),
-        ("size: [6, 4]\nmodel: none.xml\n", "none.xml: the world's model: No such file"),
+        ("size: [1, 1]\n", r"bad.yaml:1: found no place for the robot"),
+        ("size: [6, 4]\nmap: none.yaml\n", r":2: map: .*none.yaml: no such file"),
+        ("size: [6, 4]\nmodel: none.xml\n", r":2: model: .*none.xml: the world's model: No such"),
     ],
 )
 def test_a_bad_world_file_is_refused_in_one_line(text: str, complaint: str, tmp_path: Path) -> None:
@@ -128,17 +128,31 @@ def test_a_bad_world_file_is_refused_in_one_line(text: str, complaint: str, tmp_
 
 def test_a_start_within_a_box_is_refused(tmp_path: Path) -> None:
     text = "size: [6, 4]\nstart: [0, 0, 0]\nboxes:\n  - {at: [0, 0], size: [1, 1, 1]}\n"
-    with pytest.raises(ConfigError, match="touches something at its start"):
+    with pytest.raises(ConfigError, match=r"full.yaml:2: the robot touches something at its start"):
         simulated(written(tmp_path / "full.yaml", text))
 
 
 @pytest.mark.parametrize("place", ["50, 0", "0, -2.1"])
 def test_a_start_outside_the_walls_is_refused(place: str, tmp_path: Path) -> None:
     world = written(tmp_path / "small.yaml", f"size: [6, 4]\nstart: [{place}, 0]\n")
-    expected = r"small: .* outside its walls.* x from -3 to 3, and y from -2 to 2"
+    expected = r"small.yaml:2: .* outside its walls.* x from -3 to 3, and y from -2 to 2"
     with pytest.raises(ConfigError, match=expected):
         load_world(world, 0)
     assert load_world(written(Path(world), Path(world).read_text() + "outer_walls: false\n"), 0)
+
+
+@pytest.mark.parametrize("head", ["", '<?xml version="1.0"?>\n<!-- <mujoco> -->\n'])
+def test_a_urdf_is_no_world(head: str, tmp_path: Path) -> None:
+    world = written(tmp_path / "x.xml", f'{head}<robot name="x"/>\n')
+    line = head.count("\n") + 1
+    with pytest.raises(ConfigError, match=rf"x.xml:{line}: a URDF; expected an MJCF model"):
+        load_world(world, 0)
+
+
+def test_a_model_without_room_names_its_file(tmp_path: Path) -> None:
+    text = '<mujoco><worldbody><geom type="box" size="1.5 1.5 0.5"/></worldbody></mujoco>'
+    with pytest.raises(ConfigError, match=r"full.xml:1: found no place for the robot"):
+        load_world(written(tmp_path / "full.xml", text), 0)
 
 
 @pytest.mark.parametrize("part", WorldFile.__struct_fields__)

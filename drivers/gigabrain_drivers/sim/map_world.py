@@ -46,6 +46,7 @@ def map_world(path: Path, wall_height: float) -> World:
         shapes=tuple(boxes),
         wall_height=wall_height,
         free=_places(grid, free),
+        file=path,
     )
 
 

@@ -21,6 +21,8 @@ log = logging.getLogger(__name__)
 
 FLOOR_NAME = re.compile(r"(^|/)(floor|ground)\d*$")  # of geoms that a robot stands on
 COUNT = re.compile(rb"\bcount\s*=\s*[\"']([\d\s]{1,60})[\"']")  # of replicated parts
+# with what may stand before its first tag; atomic, as a hostile file would take for ever
+URDF = re.compile(rb"(?>[^<]|<!--.*?-->|<\?.*?\?>|<![^-].*?>)*+<robot\b", re.DOTALL)
 PLANE, BOX = mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX
 
 
@@ -29,6 +31,9 @@ def load_model(path: Path) -> mujoco.MjSpec:
     mujoco.set_mju_user_warning(log.warning)  # instead of a file
     try:
         text = read_bounded(path, MAX_MODEL_BYTES)
+        if urdf := URDF.match(text):
+            line = urdf[0].count(b"\n") + 1
+            raise ConfigError(f"{path}:{line}: a URDF; expected an MJCF model, with <mujoco>")
         counts = [int(number) for each in COUNT.findall(text) for number in each.split()]
         if math.prod(counts) > MAX_GEOMS:
             raise ConfigError(f"{path}: it repeats parts more than {MAX_GEOMS} times")

@@ -75,7 +75,7 @@ class Simulation:
         self.things = Things(self.model, self.data, world, self.truth, self._set_walking)
         if world.start_fixed and self.truth.touching:
             raise ConfigError(
-                f"world {world.name}: the robot touches something at its start "
+                f"{world.start_place()}: the robot touches something at its start "
                 f"({world.start.x:g}, {world.start.y:g}); expected a `start` with room round it"
             )
         yaw = world.start.yaw

@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gigabrain_zenoh.config.loading import line_in
+
 WALL_HEIGHT = 0.6  # [m], well above the plane of any lidar here
 WALL_HALF = 0.05  # [m]
 WALKING_SPEED = 0.8  # [m/s]
@@ -190,6 +192,14 @@ class World:
     # (n, 2), where a start may be; None: anywhere
     model: Path | None = None  # MJCF file that is part of this world
     outlines: tuple[Shape, ...] = ()  # of the things in it
+    file: Path | None = field(default=None, compare=False)  # that describes it
+
+    def start_place(self) -> str:
+        """Return the file and the line of the start, or the world's name; for errors."""
+        if self.file is None:
+            return f"world {self.name}"
+        line = None if self.file == self.model else line_in(self.file, ("start",))
+        return f"{self.file}:{line or 1}"
 
     def walls(self) -> tuple[Box, ...]:
         """The four outer walls."""

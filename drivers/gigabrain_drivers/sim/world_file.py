@@ -1,7 +1,8 @@
 """World files: YAML with walls, boxes, doors, people and lights, made into a World."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -325,6 +326,16 @@ def slab(
     )
 
 
+@contextmanager
+def errors_at(path: Path, place: Sequence[str], shown: str) -> Iterator[None]:
+    """Name the file and the line of a part in the ConfigErrors of the block."""
+    try:
+        yield
+    except ConfigError as error:
+        line = config.line_in(path, place) or 1
+        raise ConfigError(f"{path}:{line}: {shown}: {error}") from None
+
+
 def read_world(path: Path) -> World:
     """Return the world of a YAML file. Raises ConfigError, with its line."""
     return build_world(config.load(path, WorldFile), path)
@@ -338,11 +349,8 @@ def build_world(file: WorldFile, path: Path) -> World:
     shapes += [part.shape() for part in file.balls]
     shapes += [shape for part in file.cans for shape in part.shapes()]
     for number, tag in enumerate(file.tags):
-        try:
+        with errors_at(path, ("tags", str(number)), f"tags[{number}]"):
             shapes += tag.shapes()
-        except ConfigError as error:
-            line = config.line_in(path, ("tags", str(number))) or 1
-            raise ConfigError(f"{path}:{line}: tags[{number}]: {error}") from None
     size = file.size or (2.0, 2.0)  # grown by the map or the model
     world = World(
         name=path.stem,
@@ -360,9 +368,11 @@ def build_world(file: WorldFile, path: Path) -> World:
         start=Pose(*(file.start or (0.0, 0.0, 0.0))),
         start_fixed=file.start is not None,
         model=path.parent / expanded(file.model) if file.model else None,
+        file=path,
     )
     if file.map:
-        extruded = map_world(path.parent / expanded(file.map), file.wall_height)
+        with errors_at(path, ("map",), "map"):
+            extruded = map_world(path.parent / expanded(file.map), file.wall_height)
         world = replace(
             extruded,
             name=world.name,
@@ -377,6 +387,7 @@ def build_world(file: WorldFile, path: Path) -> World:
             start=world.start,
             start_fixed=world.start_fixed,
             model=world.model,
+            file=path,
         )
     if len(world.shapes) > MAX_SHAPES:
         raise ConfigError(f"{path}: {len(world.shapes)} shapes; expected at most {MAX_SHAPES}")

@@ -25,7 +25,7 @@ from gigabrain_drivers.sim.world import (
     clearance,
     generator,
 )
-from gigabrain_drivers.sim.world_file import read_world
+from gigabrain_drivers.sim.world_file import errors_at, read_world
 from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.config.loading import beside, names_file
 from gigabrain_zenoh.errors import ConfigError, UnknownName, unknown
@@ -141,7 +141,7 @@ def load_world(name: str, seed: int) -> World:
 
     Raises UnknownName, and ConfigError with the file and the line.
     """
-    return _with_start(_build(name), seed, name)
+    return _with_start(_build(name), seed)
 
 
 def _build(name: str) -> World:
@@ -171,12 +171,15 @@ def _of_file(path: Path) -> World:
     if path.suffix in (".xml", ".mjcf"):
         return _with_model(World(
             name=path.stem, description=f"the model {path.name}", half_x=0.0, half_y=0.0,
-            shapes=(), outer_walls=False, model=path,
+            shapes=(), outer_walls=False, model=path, file=path,
         ))  # fmt: skip
     if re.search(r"^image\s*:", config.read(path), re.MULTILINE):
         return map_world(path, WALL_HEIGHT)
     world = read_world(path)
-    return _with_model(world) if world.model else world
+    if not world.model:
+        return world
+    with errors_at(path, ("model",), "model"):
+        return _with_model(world)
 
 
 def _with_model(world: World) -> World:
@@ -185,7 +188,7 @@ def _with_model(world: World) -> World:
     return measured(world)
 
 
-def _with_start(world: World, seed: int, name: str) -> World:
+def _with_start(world: World, seed: int) -> World:
     """Draw the robot's pose until it is clear of everything, and the people's places."""
     random, shapes = generator(seed, Stream.START), world.obstacles()
     share = float(random.uniform(0, 1))  # of the first path; drawn without one as well
@@ -206,8 +209,8 @@ def _with_start(world: World, seed: int, name: str) -> World:
         if far and clearance(shapes, x, y) >= START_CLEARANCE_M:
             return replace(world, start=Pose(x, y, yaw))
     raise ConfigError(
-        f"world {name}: found no place for the robot {START_CLEARANCE_M:g} m from everything; "
-        "name one with `start: [x, y, yaw]` in a world file, or make room"
+        f"{world.start_place()}: found no place for the robot {START_CLEARANCE_M:g} m from "
+        "everything; name one with `start: [x, y, yaw]` in a world file, or make room"
     )
 
 
@@ -217,8 +220,8 @@ def _check_start(world: World) -> None:
     inside = abs(x - east) < world.half_x and abs(y - north) < world.half_y
     if world.outer_walls and not inside:
         raise ConfigError(
-            f"world {world.name}: the robot starts outside its walls, at ({x:g}, {y:g}); expected "
-            f"a `start` with x from {east - world.half_x:g} to {east + world.half_x:g}, "
+            f"{world.start_place()}: the robot starts outside its walls, at ({x:g}, {y:g}); "
+            f"expected a `start` with x from {east - world.half_x:g} to {east + world.half_x:g}, "
             f"and y from {north - world.half_y:g} to {north + world.half_y:g}"
         )
 
