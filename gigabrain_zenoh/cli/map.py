@@ -82,7 +82,7 @@ def info(name: str, /) -> None:
     print_line(f"{path}: {map_file.in_words(saved)}, {saved.resolution:g} m per cell")
     zones = zone_file.load(path)
     if zones.zones or zones.places:
-        print_line(zone_file.listed(zones.zones, zones.places))
+        print_line(zone_file.listed(len(zones.zones), len(zones.places)))
     if not path.with_suffix(map_file.GRAPH).exists():
         print_line("no pose graph: usable for localization, not to continue mapping")
         return

@@ -51,4 +51,4 @@ def as_line(one: SavedMapInfo) -> str:
         return f"{one.name:<16} cannot be used: {one.problem}"
     size = f"{one.width * one.resolution:.1f} x {one.height * one.resolution:.1f} m"
     graph = "mapping can continue" if one.graph else "for localization"
-    return f"{one.name:<16} {size}, {graph}, {one.zones} zones, {one.places} places"
+    return f"{one.name:<16} {size}, {graph}, {zone_file.listed(one.zones, one.places)}"

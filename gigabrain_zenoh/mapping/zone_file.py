@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
-from gigabrain_schemas.zones import Place, PlaceList, Zone, ZoneList, check_zones
+from gigabrain_schemas.zones import PlaceList, Zone, ZoneList, check_zones
 from gigabrain_zenoh.config import loading
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.geometry import polygon
@@ -108,8 +108,6 @@ def _quoted(name: str) -> str:
     return json.dumps(name, ensure_ascii=False)
 
 
-def listed(zones: tuple[Zone, ...], places: tuple[Place, ...]) -> str:
+def listed(zones: int, places: int) -> str:
     """Return the numbers of zones and places as text."""
-    parts = [f"{len(zones)} zones"] if len(zones) != 1 else ["1 zone"]
-    parts.append(f"{len(places)} places" if len(places) != 1 else "1 place")
-    return " and ".join(parts)
+    return f"{zones} zone{'s' * (zones != 1)} and {places} place{'s' * (places != 1)}"

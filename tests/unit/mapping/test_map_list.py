@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_schemas.zones import MapListReply
+from gigabrain_schemas.zones import MapListReply, SavedMapInfo
 from gigabrain_zenoh.client.zones import load_map, save_map
 from gigabrain_zenoh.codec import encode
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.mapping.map_list import saved_maps
+from gigabrain_zenoh.mapping.map_list import as_line, saved_maps
 from gigabrain_zenoh.testing.in_memory import Net
 
 LATIN_1 = os.fsdecode(b"K\xfcche")  # "Küche", as an archive of another system may hold it
@@ -30,3 +30,14 @@ async def test_a_name_that_is_no_text_is_refused_in_one_line() -> None:
         await load_map(bus, LATIN_1)
     with pytest.raises(ConfigError, match=told):
         await save_map(bus, LATIN_1, replace=False)
+
+
+@pytest.mark.parametrize(
+    ("zones", "places", "end"),
+    [(0, 1, "0 zones and 1 place"), (1, 2, "1 zone and 2 places")],
+)
+def test_a_map_is_listed_with_the_numbers_of_its_zones_and_places(
+    zones: int, places: int, end: str
+) -> None:
+    one = SavedMapInfo(name="a", width=20, height=10, resolution=0.05, zones=zones, places=places)
+    assert as_line(one).split(maxsplit=1)[1] == f"1.0 x 0.5 m, for localization, {end}"
