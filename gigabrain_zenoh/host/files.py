@@ -147,10 +147,19 @@ def unwritable(folder: str | Path, error: OSError, remedy: str) -> ConfigError:
 
 def check_result_path(path: Path | None) -> None:
     """Raise ConfigError where `path` cannot be written; call this before a long run."""
-    if path and not os.path.isdir(path.parent):
+    if path is None:
+        return
+    if not os.path.isdir(path.parent):
         raise ConfigError(f"cannot write {path}: no such folder")
-    if path and os.path.isdir(path):
+    if os.path.isdir(path):
         raise ConfigError(f"cannot write {path}: it is a folder")
+    if os.path.exists(path):  # a FIFO would end for its reader once it is closed
+        return
+    try:
+        path.touch()
+        os.unlink(os.path.realpath(path))  # of a link that leads nowhere the file, not the link
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error.strerror}") from None
 
 
 def check_picture_path(path: Path | None) -> None:
