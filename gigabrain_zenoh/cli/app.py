@@ -208,11 +208,12 @@ def main() -> None:
         from contextlib import suppress
 
         from gigabrain_zenoh.host.signals import interrupts
-        from gigabrain_zenoh.host.this_process import multiply_in_one_thread
+        from gigabrain_zenoh.host.this_process import multiply_in_one_thread, open_no_window
 
         _open_standard_streams()
         interrupts.install()
         multiply_in_one_thread()
+        open_no_window()
     except KeyboardInterrupt:
         os._exit(130)
     try:

@@ -22,7 +22,7 @@ REAP_S = 0.2  # a killed process ends at once, unless the kernel waits for a dev
 def supervised_environment() -> dict[str, str]:
     """Return the environment of a process that this one starts and supervises."""
     ours = {this_process.SUPERVISOR_VARIABLE: str(os.getpid()), "PYTHONUNBUFFERED": "1"}
-    return os.environ | ours
+    return this_process.environment_for_others() | ours
 
 
 def as_record(line: bytes, process: str) -> dict[str, Any]:

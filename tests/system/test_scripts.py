@@ -14,6 +14,7 @@ from gigabrain_zenoh.decision.tasks.scripts import LEASHED, Run, Scripts
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.host import this_process
+from gigabrain_zenoh.runtime.child import supervised_environment
 from gigabrain_zenoh.testing.waiting import until
 
 
@@ -92,6 +93,34 @@ print(chosen_graphics(), "mujoco.osmesa" in sys.modules)
     env = {**os.environ, "MUJOCO_GL": chosen}
     made = subprocess.check_output([sys.executable, "-c", code], text=True, env=env)
     assert made == f"{chosen} False\n"
+
+
+@pytest.mark.parametrize("chosen", ["osmesa", "nonsense"])
+def test_a_command_that_draws_without_its_graphics_ends_in_one_line(
+    tmp_path: Path, chosen: str
+) -> None:
+    command = [sys.executable, "-c", "from gigabrain_zenoh.cli.app import main; main()"]
+    ended = subprocess.run(
+        [*command, "render", str(tmp_path / "x.png"), "--world", "arena"],
+        env={**os.environ, "MUJOCO_GL": chosen},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if ended.returncode:  # no other graphics, or none at all
+        assert (ended.returncode, ended.stderr.count("\n")) == (2, 1)
+        assert "apt-get install" in ended.stderr
+    else:
+        assert (tmp_path / "x.png").exists()
+
+
+def test_a_process_of_ones_own_has_the_graphics_that_were_chosen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    monkeypatch.setenv("GIGABRAIN_MUJOCO_GL", "")  # so that it is put back afterwards
+    this_process.open_no_window()
+    assert supervised_environment()["MUJOCO_GL"] == "osmesa"
 
 
 async def test_a_program_that_fails_says_why(tmp_path: Path) -> None:
