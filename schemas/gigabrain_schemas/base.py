@@ -30,6 +30,7 @@ Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Tick = Annotated[int, Meta(ge=0, le=2**38)]  # 170 years; in nanoseconds it still is 64 bits
 Milliseconds = Annotated[float, Meta(ge=0.0, le=1e12)]  # of a line that has been silent for years
 Name = Annotated[str, Meta(max_length=64)]
+JointName = Annotated[str, Meta(min_length=1, max_length=64)]
 Text = Annotated[str, Meta(max_length=500)]
 Key = Annotated[str, Meta(max_length=256)]  # on the bus, or the name of a figure
 

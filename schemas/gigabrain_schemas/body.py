@@ -9,6 +9,7 @@ from gigabrain_schemas.base import (
     AccelerationLimit,
     Causes,
     Count,
+    JointName,
     Message,
     Milliseconds,
     Name,
@@ -63,7 +64,7 @@ MIN_SPEED = 0.001  # [m/s], [rad/s]
 class Joint(Record, frozen=True, kw_only=True):
     """One joint as measured."""
 
-    name: Name
+    name: JointName
     position: JointPosition  # [rad], or [m] for a sliding joint
     velocity: JointSpeed = 0.0  # [rad/s] or [m/s]
     effort: Effort | None = None  # [N m] or [N]; None where it is not measured
@@ -93,7 +94,7 @@ Tolerance = Annotated[float, Meta(ge=0.0, le=100.0)]  # [rad] or [m]
 class JointDescription(Record, frozen=True, kw_only=True):
     """A joint that can be commanded: how far, how fast and how hard it may move."""
 
-    name: Name
+    name: JointName
     part: Literal["arm", "gripper"] = "arm"
     unit: Literal["rad", "m"] = "rad"  # m: it slides
     lower: JointPosition  # [rad], or [m] for a sliding joint

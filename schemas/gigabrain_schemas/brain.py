@@ -13,6 +13,7 @@ from gigabrain_schemas.base import (
     Distance,
     Finite,
     Fraction,
+    JointName,
     LinearSpeed,
     Message,
     Name,
@@ -192,7 +193,7 @@ class ActuationModel(Record, frozen=True, kw_only=True):
 class JointTarget(Record, frozen=True, kw_only=True):
     """The wanted position of one joint."""
 
-    name: Name
+    name: JointName
     position: JointPosition  # [rad] or [m]
 
 
@@ -205,7 +206,7 @@ class JointTrajectory(Record, frozen=True, kw_only=True):
     Between the points positions are interpolated; after the last one the joints stay there.
     """
 
-    name: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MAX_ARM_JOINTS)]
+    name: Annotated[tuple[JointName, ...], Meta(min_length=1, max_length=MAX_ARM_JOINTS)]
     start: Tick  # of the first point, by the robot's clock
     period: Annotated[float, Meta(ge=0.001, le=1.0)]  # [s] from point to point
     positions: Annotated[bytes, array_meta(12 * 1024, "float32", ("n", "joints"), "rad")]
@@ -285,7 +286,7 @@ class Twist(Message, frozen=True, kw_only=True):
 class JointSpeeds(Message, frozen=True, kw_only=True):
     """Velocities of joints that an operator asks for; other joints are held."""
 
-    name: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MAX_ARM_JOINTS)]
+    name: Annotated[tuple[JointName, ...], Meta(min_length=1, max_length=MAX_ARM_JOINTS)]
     velocity: Annotated[tuple[JointSpeed, ...], Meta(max_length=MAX_ARM_JOINTS)]  # [rad/s] or [m/s]
     source: Name = ""  # who asks, as in Twist
 
@@ -312,7 +313,7 @@ class JointCommand(Message, frozen=True, kw_only=True):
     Positions alone are to be reached and kept; velocities alone are kept up.
     """
 
-    name: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MAX_ARM_JOINTS)]
+    name: Annotated[tuple[JointName, ...], Meta(min_length=1, max_length=MAX_ARM_JOINTS)]
     position: Annotated[tuple[JointPosition, ...], Meta(max_length=MAX_ARM_JOINTS)] = ()
     # [rad] or [m]
     velocity: Annotated[

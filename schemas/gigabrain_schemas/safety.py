@@ -8,6 +8,7 @@ from gigabrain_schemas.base import (
     Cause,
     Causes,
     Count,
+    JointName,
     Key,
     Message,
     Name,
@@ -38,7 +39,7 @@ class SpeedCaps(Record, frozen=True, kw_only=True):
 class JointCap(Record, frozen=True, kw_only=True):
     """Greatest speeds of a joint each way now, away from and towards what it must not touch."""
 
-    name: Name
+    name: JointName
     rise: SpeedCap | None = None  # [rad/s] or [m/s]; None for no limit
     fall: SpeedCap | None = None  # [rad/s] or [m/s], of a position that decreases
 

@@ -7,8 +7,8 @@ import msgspec
 import pytest
 from msgspec import inspect
 
-from gigabrain_schemas.body import Body
-from gigabrain_schemas.brain import CmdVel, OccupancyGrid
+from gigabrain_schemas.body import Body, RobotState
+from gigabrain_schemas.brain import CmdVel, JointCommand, OccupancyGrid
 from gigabrain_schemas.topics import messages
 from gigabrain_zenoh.qa.faults.hostile import as_map, replaced
 
@@ -64,10 +64,12 @@ def test_every_field_is_bounded(where: str, of: Any) -> None:
         (Body, ("description", "max_linear_deceleration"), (2.5, 1000.0), (1e-9, 1e9)),
         (Body, ("description", "lidar", "rate_hz"), (0.1, 1000.0), (1e-9, 1e9)),
         (Body, ("description", "max_angular_speed"), (0.3, 100.0), (1e-9, 101.0)),
+        (RobotState, ("joints", 0, "name"), ("a", "x" * 64), ("", "x" * 65)),
+        (JointCommand, ("name", 0), ("a", "x" * 64), ("", "x" * 65)),
     ],
 )
-def test_lengths_speeds_and_ticks_have_the_bounds_of_their_kind(
-    message: Any, path: tuple[str | int, ...], good: tuple[float, ...], bad: tuple[float, ...]
+def test_lengths_speeds_ticks_and_names_have_the_bounds_of_their_kind(
+    message: Any, path: tuple[str | int, ...], good: tuple[Any, ...], bad: tuple[Any, ...]
 ) -> None:
     whole = as_map(message)
     for value in good:
