@@ -34,5 +34,6 @@ class RestoringPublisher:
             self.publish(*self._own[key], basis=basis)
 
     def _on_message(self, key: str, message: Message) -> None:
-        if replace(message, **NO_HEADER) != self._own[key][1]:
+        valid = message.boot in (0, self._bus.time.boot)  # receivers ignore another start's
+        if not valid or replace(message, **NO_HEADER) != self._own[key][1]:
             self._replaced.add(key)
