@@ -1,6 +1,5 @@
 """Moves the arm: plans each command in a worker thread, and carries it out from tick to tick."""
 
-import dataclasses
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -9,24 +8,21 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.base import TICK_S, Pose
 from gigabrain_schemas.body import BodyDescription, RobotState
-from gigabrain_schemas.brain import Intent, JointTarget
+from gigabrain_schemas.brain import Intent
 from gigabrain_schemas.objects import SeenSolid
 from gigabrain_schemas.topics import ARM_MODEL
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.decision.arm_readings import (
     begins_at,
     gripper_moves,
-    gripper_place,
     holds,
     is_at,
     measured_posture,
     off_from,
     pace,
     rest_of_place,
-    sent_place,
     sent_posture,
     sent_to,
-    still_held,
 )
 from gigabrain_zenoh.decision.arm_touch import Touch
 from gigabrain_zenoh.decision.arm_work import (
@@ -46,8 +42,6 @@ from gigabrain_zenoh.decision.behaviours import (
 from gigabrain_zenoh.decision.grip import Grip
 from gigabrain_zenoh.decision.held_things import (
     floor_of,
-    held_thing,
-    hold_of,
     placed,
     thing_of,
 )
@@ -70,9 +64,9 @@ from gigabrain_zenoh.decision.tasks.arm_steps import (
     TakePosture,
 )
 from gigabrain_zenoh.errors import GigabrainError
-from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold, Plan
+from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Plan
 from gigabrain_zenoh.manipulation.collision import Thing
-from gigabrain_zenoh.manipulation.phases import Phase, PhaseRun
+from gigabrain_zenoh.manipulation.phases import PhaseRun
 from gigabrain_zenoh.manipulation.pick_place import NoWay
 
 TRIES = 3  # to pick a thing up, each with another grasp
@@ -89,7 +83,7 @@ GRIPPER_STAYS = "so the gripper stays; `place` and `gripper` let go of it"
 
 
 class Manipulator:
-    """Carries out one command for the arm at a time, and knows what its gripper holds."""
+    """Carries out one command for the arm at a time."""
 
     def __init__(self, bus: Bus, behaviour: str, held: HeldThing | None = None) -> None:
         """Prepare for an arm; `held` is what its gripper held before a restart."""
@@ -102,10 +96,7 @@ class Manipulator:
         self._planning: Future[Planned] | None = None
         self._plan = Plan(phases=())
         self._run: PhaseRun | None = None
-        self._hold: Hold | None = None
-        self._held: HeldThing | None = None  # the same, for the file of tasks
-        self._grip = Grip()
-        self._recalls = held  # it does not know yet whether the gripper still holds it
+        self._grip = Grip(held)
         self._number = 0  # of the present command, or of the last one
         self._misses = 0  # grasps of it that caught nothing
         self._hold_ups = 0  # of it, by a joint that did not follow
@@ -120,7 +111,6 @@ class Manipulator:
         self._touch: Touch | None = None  # while it presses, or offers something
         self._lookout = Lookout()
         self._seen_as: int | None = None  # number by which a camera knew what is held
-        self._gripped = 0  # tick since which it is held
         self._target: Thing | None = None  # to be picked up, where it stands
         self._put: PutDown | None = None  # what a camera knew, and has not seen since
 
@@ -140,10 +130,9 @@ class Manipulator:
         """
         intent, outcome = self._step(state, body, command, idle, held, seen)
         if self._planner and not self._run and not held:
-            intent = replace(intent, joints=self._keep_grip(self._planner, body, state))
+            intent = replace(intent, joints=self._grip.follow(self._planner, body, state))
         self._display.show(self._planner, self._plan if self._run else None)
-        holds = self._recalls or self._held
-        return intent, replace(outcome, holds=holds, placed=self._achieved.placed)
+        return intent, replace(outcome, holds=self._grip.held, placed=self._achieved.placed)
 
     def _step(
         self,
@@ -168,8 +157,8 @@ class Manipulator:
         if self._run:
             self._base = state.pose
         measured = {joint.name for joint in body.joints} <= {joint.name for joint in state.joints}
-        if self._recalls and planner and measured and not held:
-            self._recall(planner, body, state, self._recalls)
+        if planner and measured and not held:
+            self._grip.recall(planner, body, state)
         if command is None:
             self._interrupt()
             self._lookout.reset()
@@ -210,40 +199,11 @@ class Manipulator:
             self._made_for, self._planner = wanted, None
             if known is None or (known[0], known[1].joints) != (model.mjcf, body.joints):
                 self._left = None
-                self._set_hold(None)
+                self._grip.release()
             self._making = self._pool.submit(ArmPlanner, *wanted)
         if self._planner is None and self._making and self._in_time(self._making, 0.0):
             self._planner = self._making.result()  # raises as long as there is no other model
         return self._planner
-
-    def _recall(
-        self,
-        planner: ArmPlanner,
-        body: BodyDescription,
-        state: RobotState,
-        held: HeldThing,
-    ) -> None:
-        """Believe that something is held since before a restart, if the gripper agrees."""
-        self._recalls = None
-        if planner.arm.gripper and (hold := still_held(planner, body, state, hold_of(held))):
-            self._set_hold(hold)
-            self._grip.hold_by(sent_place(planner, body, state, hold.grip))
-
-    def _set_hold(self, hold: Hold | None) -> None:
-        """Record what the gripper holds."""
-        if hold or self._hold:
-            self._grip.hold_by(hold.grip if hold else None)
-        self._hold, self._held = hold, held_thing(hold) if hold else None
-
-    def _keep_grip(
-        self, planner: ArmPlanner, body: BodyDescription, state: RobotState
-    ) -> tuple[JointTarget, ...]:
-        """Return what keeps the grip of an arm that is still."""
-        targets = self._grip.keep(planner, body, state)
-        if self._hold and self._grip.place not in (None, self._hold.grip):
-            self._hold = dataclasses.replace(self._hold, grip=self._grip.place)
-            self._held = held_thing(self._hold)
-        return targets
 
     def _carry_out(
         self,
@@ -253,35 +213,34 @@ class Manipulator:
         command: ArmCommand,
         seen: tuple[SeenSolid, ...],
     ) -> StepResult:
-        if self._hold and not (self._run or self._planning or self._grip.moves):
-            kept = still_held(planner, body, state, self._hold)
-            self._let_go(state) if self._put_down and not kept else self._set_hold(kept)
-        do, hold = command.do, self._hold
+        still = not (self._run or self._planning or self._grip.moves)
+        if still and self._grip.hold and not self._grip.keeps(planner, body, state):
+            self._let_go(state) if self._put_down else self._grip.release()
+        do, hold = command.do, self._grip.hold
         if isinstance(do, Pick) and self._run is None and hold and hold.thing.name == do.thing:
-            self._achieve(hold)
+            self._achieved = self._success(self._grip.text)
             return self._still(Idle("done", self._achieved.reason), self._achieved)
-        if self._hold and still_stands(seen, self._seen_as, state.tick - self._gripped):
-            name = self._hold.thing.name
-            self._set_hold(None)
-            return self._fail(f"{name} is not in the gripper: it is seen where it was")
+        if hold and still_stands(seen, self._seen_as, state.tick - self._grip.firm_tick):
+            self._grip.release()
+            return self._fail(f"{hold.thing.name} is not in the gripper: it is seen where it was")
         if isinstance(do, AwaitTaken):
             return self._offer(planner, body, state)
-        if self._run is None and self._left and not self._hold:
+        if self._run is None and self._left and not hold:
             self._back_off(planner, body, state, self._left)
         elif self._run is None:
             if self._planning is None:
-                held, floor = self._seen_as if self._hold else None, floor_of(body)
+                held, floor = self._seen_as if hold else None, floor_of(body)
                 things, numbers = located(command.things, seen, held, floor)
                 if self._put and (solid := self._put.at(state, seen)):
                     things[f"{self._put.name} put down"] = solid
                 else:
                     self._put = None
-                if isinstance(command.do, Pick) and not self._hold:
-                    self._seen_as = numbers.get(command.do.thing)
-                missing = None if self._hold else unseen(command.do, command.things, things)
+                if isinstance(do, Pick) and not hold:
+                    self._seen_as = numbers.get(do.thing)
+                missing = None if hold else unseen(do, command.things, things)
                 if missing:
                     return self._look_for(missing, command, planner, state, body, things)
-                work = self._work(planner, state, body, command.do, things)
+                work = self._work(planner, state, body, do, things)
                 if isinstance(work, str):
                     return self._fail(work)
                 self._planning = self._pool.submit(work)
@@ -349,18 +308,20 @@ class Manipulator:
             self._target = thing_of(do.thing, things[do.thing])
         drives = body.has_base and self._seen_as is not None  # others do not stay behind
         now = WorkInputs(
-            state=state, body=body, things=things, hold=self._hold, misses=self._misses,
+            state=state, body=body, things=things, hold=self._grip.hold, misses=self._misses,
             drives=drives,
         )  # fmt: skip
         return work_for(planner, do, now)
 
     def _offer(self, planner: ArmPlanner, body: BodyDescription, state: RobotState) -> StepResult:
         """Hold still until somebody pulls at what the gripper holds, or has taken it."""
-        hold, self._touch = self._hold, self._touch or Touch(planner)
+        hold, self._touch = self._grip.hold, self._touch or Touch(planner)
         pulled = self._touch.is_pulled(body, state)
         if hold and holds(planner, hold, state) and not pulled:
             return self._still(Idle("offering", OFFERING.format(hold.thing.name)))
-        self._achieve(hold if pulled else None)
+        if not pulled:
+            self._grip.release()
+        self._achieved = self._success(self._grip.text)
         return self._still(Idle("done", ""), replace(self._achieved, reason=""))
 
     def _back_off(
@@ -381,8 +342,7 @@ class Manipulator:
         if over or (pressure and pressure.reaches(do.force)):
             touched = pressure is not None and pressure.touched
             if touched:
-                self._achieve(None)
-                self._achieved = replace(self._achieved, reason=str(pressure))
+                self._achieved = self._success(str(pressure))
                 self._results.append(self._achieved)
             else:
                 self._why_not = f"nothing was touched, {do.depth * 100:g} cm behind that place"
@@ -396,14 +356,14 @@ class Manipulator:
         gripper = planner.arm.gripper
         self._plan, self._put_down = plan, None
         self._run = PhaseRun(plan.phases, gripper.name if gripper else "", state.tick)
-        if self._hold:
-            self._squeeze(planner, self._run, self._hold, state)
+        if self._grip.hold:
+            self._grip.make_firm(planner, self._run, state)
 
     def _follow(
         self, planner: ArmPlanner, state: RobotState, body: BodyDescription, command: ArmCommand
     ) -> StepResult:
         """Go on with the present plan by one step."""
-        run, plan, hold = self._run, self._plan, self._hold
+        run, plan, hold = self._run, self._plan, self._grip.hold
         assert run
         if hold and run.phase and run.phase.name in CARRYING and not holds(planner, hold, state):
             return self._missed(planner, body, state)
@@ -421,19 +381,21 @@ class Manipulator:
             closed = sent_to(planner, body, state, plan.hold.grip)  # unless safety holds it back
             if not (closed and holds(planner, plan.hold, state)):
                 return self._missed(planner, body, state)
-            hold = self._caught(planner, plan.hold, state)
+            assert self._target
+            posture = measured_posture(planner, state)
+            self._grip.take(hold := planner.gripped(plan.hold, self._target, posture))
+            self._achieved = self._success(self._grip.text)
         if over and over.name in ("close", "squeeze") and hold:
             if not holds(planner, hold, state):
                 return self._missed(planner, body, state)
-            self._squeeze(planner, run, hold, state)
+            self._grip.make_firm(planner, run, state)
         if over and over.name == "lower" and hold:
             thing = placed(planner, measured_posture(planner, state), command.do, hold, body)
-            self._put_down = self._success(None, placed=thing)
+            self._put_down = self._success(placed=thing)
         if over and over.name == "open" and hold:
             self._let_go(state)
         if over and over.name == "grip":
-            self._set_hold(None)
-            self._grip.hold_by(over.gripper)
+            self._grip.close_at(over.gripper)
         if run.phase is None:
             return self._end(body, state, run, command.do)
         return self._moving(state)
@@ -443,29 +405,14 @@ class Manipulator:
 
         A command that does not pick fails: what it moves was held before, and is lost.
         """
-        lost = self._hold
-        self._set_hold(None)
+        lost = self._grip.hold
+        self._grip.release()
         if lost and self._plan.grasp is None:
             return self._fail(f"{lost.thing.name} has slipped out of the gripper")
         self._misses += 1
         self._achieved = StepOutcome()
         self._back_off(planner, body, state, self._plan)
         return self._moving(state)
-
-    def _caught(self, planner: ArmPlanner, hold: Hold, state: RobotState) -> Hold:
-        """Record and return what the gripper holds from now on."""
-        assert self._target
-        held = planner.gripped(hold, self._target, measured_posture(planner, state))
-        self._achieve(held)
-        return held
-
-    def _squeeze(self, planner: ArmPlanner, run: PhaseRun, hold: Hold, state: RobotState) -> None:
-        """Have the gripper squeeze as hard as it should while the arm moves; it may spring back."""
-        self._gripped = state.tick
-        place = planner.squeeze(gripper_place(planner, state, hold.grip), hold.grip, moving=True)
-        if place != hold.grip:
-            run.insert(Phase(name="squeeze", gripper=place))
-            self._set_hold(dataclasses.replace(hold, grip=place))
 
     def _held_up(self, why: str) -> StepResult:
         """Plan again from where the joints are, as something held them up."""
@@ -480,23 +427,18 @@ class Manipulator:
         done, self._put_down = self._put_down, None
         assert done
         assert done.placed
-        self._set_hold(None)
+        self._grip.release()
         self._results.append(done)
         if done.number == self._number:
             self._achieved = done
         if self._seen_as is not None:  # others have a place by their mission
             self._put = PutDown(name=done.placed[0], solid=done.placed[1], state=state)
 
-    def _achieve(self, hold: Hold | None) -> None:
-        """Record that the command has done its work, and what the gripper holds."""
-        self._set_hold(hold)
-        self._achieved = self._success(hold)
-
-    def _success(self, hold: Hold | None, placed: tuple[str, Solid] | None = None) -> StepOutcome:
+    def _success(self, reason: str = "", placed: tuple[str, Solid] | None = None) -> StepOutcome:
         return StepOutcome(
             number=self._number,
             state="done",
-            reason=f"it holds {hold.thing.name}" if hold else "",
+            reason=reason,
             progress=1.0,
             placed=placed,
         )
@@ -516,10 +458,10 @@ class Manipulator:
             self._drop()
             return self._fail(why) if why else self._still(PLANNING)
         if not self._achieved.number:
-            self._achieve(self._hold)
-            if self._hold and names_gripper(body, do):
-                text = f"{self._achieved.reason}, {GRIPPER_STAYS}"
-                self._achieved = replace(self._achieved, reason=text)
+            text = self._grip.text
+            if text and names_gripper(body, do):
+                text = f"{text}, {GRIPPER_STAYS}"
+            self._achieved = self._success(text)
         self._drop()
         return self._still(Idle("done", self._achieved.reason), self._achieved)
 

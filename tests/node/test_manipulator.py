@@ -311,7 +311,7 @@ def test_a_posture_that_does_not_open_the_gripper_says_so(rig: Rig) -> None:
         "succeeded",
         "it holds cube, so the gripper stays; `place` and `gripper` let go of it",
     )
-    assert rig.manipulator._hold
+    assert rig.manipulator._grip.hold
     assert rig.carry_out("do: [{posture: {shoulder_pan: 0.0}}]").reason == "it holds cube"
     assert rig.carry_out("do: [{gripper: 1.0}]").reason == ""
     assert rig.carry_out("do: [{posture: {shoulder_pan: 0.2, gripper: 0.5}}]").reason == ""

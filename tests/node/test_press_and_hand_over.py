@@ -122,7 +122,7 @@ def let_go(rig: Rig) -> bool:
     assert rig.arm.description.arm
     home = rig.arm.description.arm.home[:5]
     measured = [rig.arm.measured(name) for name in rig.planner.arm.names]
-    return rig.manipulator._hold is None and measured == pytest.approx(home, abs=0.05)
+    return rig.manipulator._grip.hold is None and measured == pytest.approx(home, abs=0.05)
 
 
 def test_what_is_pulled_at_is_let_go_of(offering: Rig) -> None:
