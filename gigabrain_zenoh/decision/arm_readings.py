@@ -115,6 +115,13 @@ def still_held(
     return replace(hold, grip=grip) if held else None
 
 
+def squeezes(planner: ArmPlanner, body: BodyDescription, state: RobotState, place: float) -> bool:
+    """Return whether something stops the gripper short of where it was sent, towards `place`."""
+    sent = sent_place(planner, body, state, place)
+    measured = gripper_place(planner, state, sent)
+    return planner.holds(measured, sent) and (sent - measured) * (place - measured) > 0.0
+
+
 def gripper_moves(
     planner: ArmPlanner, state: RobotState, body: BodyDescription, phase: Phase
 ) -> bool:

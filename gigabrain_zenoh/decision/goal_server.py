@@ -145,7 +145,7 @@ class GoalServer(InputSource):
                 drive=lambda wanted: navigator.drive(wanted, idle),
             )
         )
-        if body and (isinstance(command, ArmCommand) or self._manipulator or self._tasks.held):
+        if body and (isinstance(command, ArmCommand) or self._manipulator or self._may_hold(body)):
             moved, done = self._move_arm(state, body, command, idle)
             if isinstance(command, ArmCommand):
                 outcome = done

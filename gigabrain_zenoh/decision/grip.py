@@ -2,9 +2,14 @@
 
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import JointTarget
-from gigabrain_zenoh.decision.arm_readings import gripper_place, sent_place, still_held
+from gigabrain_zenoh.decision.arm_readings import (
+    gripper_place,
+    sent_place,
+    squeezes,
+    still_held,
+)
 from gigabrain_zenoh.decision.held_things import held_thing, hold_of
-from gigabrain_zenoh.decision.tasks.arm_steps import HeldThing
+from gigabrain_zenoh.decision.tasks.arm_steps import Held, HeldThing
 from gigabrain_zenoh.manipulation.arm_planner import ArmPlanner, Hold
 from gigabrain_zenoh.manipulation.collision import Thing
 from gigabrain_zenoh.manipulation.phases import Phase, PhaseRun
@@ -21,7 +26,7 @@ class Grip:
     It keeps the gripper from squeezing too hard for long, and from letting a thing creep out.
     """
 
-    def __init__(self, recalled: HeldThing | None = None) -> None:
+    def __init__(self, recalled: Held | None = None) -> None:
         """Begin with nothing, until `recall` tells whether it holds what it held at a restart."""
         self.moves = False  # it was not sent all the way there yet
         self.firm_tick = 0  # at which it was last made firm for an arm that moves
@@ -39,10 +44,12 @@ class Grip:
         return Hold(thing=self._thing, grip=self._place, opening=self._opening)
 
     @property
-    def held(self) -> HeldThing | None:
+    def held(self) -> Held | None:
         """Return what the gripper holds, or held before a restart, for the file of tasks."""
+        if self._recalled is not None:
+            return self._recalled
         hold = self.hold
-        return self._recalled or (held_thing(hold) if hold else None)
+        return held_thing(hold) if hold else self._place
 
     @property
     def text(self) -> str:
@@ -54,23 +61,29 @@ class Grip:
         self._thing, self._opening = hold.thing, hold.opening
         self._send(hold.grip)
 
-    def close_at(self, place: float | None) -> None:
-        """Record where a command has moved the gripper, maybe round something."""
-        self._thing = None
-        self._send(place)
+    def close_at(self, planner: ArmPlanner, state: RobotState, place: float) -> None:
+        """Record that a command has moved the gripper, which holds what stops it on the way."""
+        self.release()
+        if planner.holds(gripper_place(planner, state, place), place):
+            self._send(place)
 
     def release(self) -> None:
         """Record that the gripper holds nothing."""
-        self.close_at(None)
+        self._thing = None
+        self._send(None)
 
     def recall(self, planner: ArmPlanner, body: BodyDescription, state: RobotState) -> None:
         """Take what the gripper held before a restart, once, if it agrees."""
         recalled, self._recalled = self._recalled, None
-        if recalled and planner.arm.gripper:
-            hold = still_held(planner, body, state, hold_of(recalled))
-            if hold:
+        if recalled is None or planner.arm.gripper is None:
+            return
+        if isinstance(recalled, HeldThing):
+            if hold := still_held(planner, body, state, hold_of(recalled)):
                 self.take(hold)
-                self._send(sent_place(planner, body, state, hold.grip))
+        elif squeezes(planner, body, state, recalled):
+            self._send(recalled)
+        if self._place is not None:
+            self._send(sent_place(planner, body, state, self._place))
 
     def keeps(self, planner: ArmPlanner, body: BodyDescription, state: RobotState) -> bool:
         """Return whether the thing is still held, maybe where the gripper was sent meanwhile."""

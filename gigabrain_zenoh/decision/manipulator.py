@@ -57,7 +57,7 @@ from gigabrain_zenoh.decision.seen_things import (
 from gigabrain_zenoh.decision.tasks.arm_steps import (
     ArmAction,
     AwaitTaken,
-    HeldThing,
+    Held,
     Pick,
     Press,
     Solid,
@@ -85,7 +85,7 @@ GRIPPER_STAYS = "so the gripper stays; `place` and `gripper` let go of it"
 class Manipulator:
     """Carries out one command for the arm at a time."""
 
-    def __init__(self, bus: Bus, behaviour: str, held: HeldThing | None = None) -> None:
+    def __init__(self, bus: Bus, behaviour: str, held: Held | None = None) -> None:
         """Prepare for an arm; `held` is what its gripper held before a restart."""
         self._behaviour, self._in_time = behaviour, bus.input_log.in_time
         self._models, self._display = bus.latest(ARM_MODEL), PlanDisplay(bus)
@@ -395,7 +395,8 @@ class Manipulator:
         if over and over.name == "open" and hold:
             self._let_go(state)
         if over and over.name == "grip":
-            self._grip.close_at(over.gripper)
+            assert over.gripper is not None
+            self._grip.close_at(planner, state, over.gripper)
         if run.phase is None:
             return self._end(body, state, run, command.do)
         return self._moving(state)

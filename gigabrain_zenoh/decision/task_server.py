@@ -38,7 +38,7 @@ from gigabrain_zenoh.decision.context import ContextSource
 from gigabrain_zenoh.decision.known_objects import ObjectSource, Sought, Wanted, named, sought
 from gigabrain_zenoh.decision.tasks import arm_steps, mission_files
 from gigabrain_zenoh.decision.tasks import mission as missions
-from gigabrain_zenoh.decision.tasks.arm_steps import HeldThing
+from gigabrain_zenoh.decision.tasks.arm_steps import Held
 from gigabrain_zenoh.decision.tasks.mission import Mission
 from gigabrain_zenoh.decision.tasks.scripts import Scripts
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile, TaskQueue
@@ -110,8 +110,8 @@ class TaskServer:
             self.publish_starting()
 
     @property
-    def held(self) -> HeldThing | None:
-        """Return the thing in the gripper, as far as decision knows."""
+    def held(self) -> Held | None:
+        """Return what the gripper holds, as far as decision knows."""
         return self._queue.held
 
     def unused(self, boot: int) -> bool:

@@ -82,6 +82,19 @@ async def test_a_grip_is_followed_after_a_restart_of_decision(
         assert STILL[0] < plane.lag < STILL[-1]
 
 
+async def test_what_gripper_close_grips_is_kept_over_a_restart_of_decision(tmp_path: Path) -> None:
+    async with Carrier(DecisionConfig(behaviour="navigate", state_dir=str(tmp_path))) as plane:
+        mission = MissionRequest(mission="do: [{gripper: close}, {goto: [4.0, 0.8]}]")
+        assert (await plane.ask(MISSION, mission)).ok
+        await drive(plane, 0.3)
+        await plane.restart()
+        await drive(plane, 0.6)
+        plane.width -= 0.01
+        assert not STILL[0] < plane.lag < STILL[-1]
+        await drive(plane, 1.3)
+        assert STILL[0] < plane.lag < STILL[-1]
+
+
 async def test_what_is_held_is_not_forgotten_while_an_arm_gets_ready(tmp_path: Path) -> None:
     config = DecisionConfig(behaviour="navigate", state_dir=str(tmp_path))
     async with Carrier(config) as plane:

@@ -20,6 +20,7 @@ from gigabrain_schemas.safety import JointCap
 from gigabrain_zenoh.cli import arm
 from gigabrain_zenoh.decision.behaviours import ArmCommand, Idle
 from gigabrain_zenoh.decision.grip import REST_TICKS
+from gigabrain_zenoh.decision.tasks.arm_steps import HeldThing
 from gigabrain_zenoh.manipulation.arm_planner import MOVING, STILL, ArmPlanner
 from gigabrain_zenoh.safety.arm_shape import MujocoArm
 from gigabrain_zenoh.safety.step import SafetyInputs, SafetyMemory, step
@@ -96,7 +97,7 @@ def test_a_grip_follows_what_creeps_while_the_arm_is_still(rig: Rig, way: float)
     (target,) = intent.joints
     assert target.name == "gripper"
     assert abs(target.position - crept) == pytest.approx(STILL[1] * (GRIPPER.upper - GRIPPER.lower))
-    assert outcome.holds
+    assert isinstance(outcome.holds, HeldThing)
     assert outcome.holds.grip == target.position
 
 
@@ -252,6 +253,31 @@ def test_what_was_lost_during_a_restart_is_not_believed(rig: Rig, opened: bool) 
     task = rig.carry_on()
     assert task.state == "failed"
     assert task.reason.endswith("the gripper holds nothing")
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_what_gripper_close_grips_is_believed_after_a_restart_if_it_is_still_there(
+    rig: Rig, lost: bool
+) -> None:
+    assert rig.carry_out(THINGS + "do: [{pick: cube}, {gripper: close}]").state == "succeeded"
+    for _ in range(SOON):
+        rig.tick()
+    if lost:
+        rig.take_away()
+    rig.restart()
+    rig.tick()
+    state = rig.arm.state()
+    crept = state.joints[-1].position + 0.01
+    joints = (*state.joints[:-1], replace(state.joints[-1], position=crept))
+    now = replace(state, joints=joints, tick=state.tick + REST_TICKS)
+    intent, outcome = rig.manipulator.step(now, rig.arm.description, None, NO_TASK, "")
+    assert (outcome.holds is None) is lost
+    assert (intent.joints == ()) is lost
+
+
+def test_a_gripper_that_closes_on_nothing_holds_nothing(rig: Rig) -> None:
+    assert rig.carry_out("do: [{gripper: open}, {gripper: close}]").state == "succeeded"
+    assert rig.queue.saved.held is None
 
 
 def test_a_model_that_cannot_be_used_fails_the_command_in_one_line(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import Goal, Task
 from gigabrain_zenoh.config import loading
 from gigabrain_zenoh.config.settings import DecisionConfig
-from gigabrain_zenoh.decision.tasks.arm_steps import ArmAction, HeldThing, Solid
+from gigabrain_zenoh.decision.tasks.arm_steps import ArmAction, Held, Solid
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import expanded
 from gigabrain_zenoh.plugins import load_plugin, plugin_names
@@ -85,7 +85,7 @@ class StepOutcome(Struct, frozen=True, kw_only=True):
     path: tuple[tuple[float, float], ...] = ()  # [m] in the map, for drawing
     position_error: float | None = None  # [m] from the requested place
     heading_error: float | None = None  # [rad] from the requested heading
-    holds: HeldThing | None = None  # what the gripper holds after a command that is done
+    holds: Held | None = None  # what the gripper holds after a command that is done
     placed: tuple[str, Solid] | None = None  # by this command: a thing, and where it was put down
     approach: Target | None = None  # a thing that the body has to stand nearer to
     seek: str = ""  # the class of a thing that it has to look for elsewhere

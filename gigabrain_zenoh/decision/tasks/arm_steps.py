@@ -62,6 +62,9 @@ class HeldThing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     opening: JointPlace  # [rad] or [m], where it goes to let go
 
 
+Held = HeldThing | JointPlace  # or something unknown, and where the gripper was sent to hold it
+
+
 class Reach(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """Move the tool to a point."""
 

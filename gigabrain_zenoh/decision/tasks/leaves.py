@@ -25,6 +25,7 @@ from gigabrain_zenoh.decision.known_objects import Seek, Sought, Wanted, named
 from gigabrain_zenoh.decision.tasks.arm_steps import (
     ArmAction,
     AwaitTaken,
+    Held,
     HeldThing,
     Pick,
     Solid,
@@ -50,7 +51,7 @@ def seek_nothing(_wanted: Wanted, _without: Collection[int], _preferred: int | N
 class Hand:
     """Holds what the gripper is believed to hold, over all tasks."""
 
-    held: HeldThing | None = None
+    held: Held | None = None
 
 
 @dataclass
@@ -156,10 +157,12 @@ class ArmNode(Leaf):
         assert self._command
         if outcome and outcome.number == self._command.number:
             lost, self.context.hand.held = self.context.hand.held, outcome.holds
-            if outcome.holds:
+            if isinstance(outcome.holds, HeldThing):
                 self.context.things.pop(outcome.holds.name, None)
-            elif lost and (given := self.context.given.get(lost.name)) and given.at is None:
-                self.context.things[lost.name] = given  # it stands somewhere, to be seen
+            elif isinstance(lost, HeldThing):
+                given = self.context.given.get(lost.name)
+                if given and given.at is None:
+                    self.context.things[lost.name] = given  # it stands somewhere, to be seen
             if outcome.placed:  # at once, as the way back may be cut short
                 name, solid = outcome.placed
                 given = self.context.given.get(name, solid)
@@ -199,7 +202,7 @@ class OfferNode(ArmNode):
         if self.context.free_s > self._until_s:
             self.context.command = None
             held = self.context.hand.held
-            name = held.name if held else "it"
+            name = held.name if isinstance(held, HeldThing) else "it"
             return self.failed(
                 f"nobody took {name} within {self._seconds:g} s; the gripper holds it still"
             )

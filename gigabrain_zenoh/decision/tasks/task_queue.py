@@ -20,7 +20,7 @@ from gigabrain_zenoh.decision.behaviours import (
     describe_goal,
 )
 from gigabrain_zenoh.decision.known_objects import Seek, Wanted, named
-from gigabrain_zenoh.decision.tasks.arm_steps import HeldThing, Solid
+from gigabrain_zenoh.decision.tasks.arm_steps import Held, Solid
 from gigabrain_zenoh.decision.tasks.behaviour_tree import (
     Progress,
     TreeBuilder,
@@ -109,7 +109,7 @@ class Saved(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="
     boot: int = 0  # start of the driver in which they were begun
     count: int = 0  # of all tasks so far
     jobs: tuple[SavedJob, ...] = ()  # the active one first
-    held: HeldThing | None = None  # what the gripper holds
+    held: Held | None = None  # what the gripper holds
     map: Name = ""  # the one that they are for, see Zones
     maps_loaded: int | None = None  # None while that is not known
 
@@ -218,8 +218,8 @@ class TaskQueue:
         return not self._jobs and self._boot != boot
 
     @property
-    def held(self) -> HeldThing | None:
-        """Return the thing in the gripper, as far as decision knows."""
+    def held(self) -> Held | None:
+        """Return what the gripper holds, as far as decision knows."""
         return self._hand.held
 
     @property
