@@ -203,12 +203,20 @@ NO_WINDOW = "disable"
 def open_no_window() -> None:
     """Have MuJoCo import nothing for windows, which takes 0.2 s and 6 MB; before it is imported.
 
-    It also fails to be imported where what MUJOCO_GL names is not installed. What draws pictures
-    chooses its own graphics: see `chosen_graphics`.
+    MUJOCO_GL in the environment is respected, unless MuJoCo could not be imported with it. What
+    draws pictures chooses its own graphics: see `chosen_graphics`.
     """
-    if os.environ.get(GRAPHICS) != NO_WINDOW:
-        os.environ[CHOSEN] = os.environ.get(GRAPHICS, "")
+    chosen = os.environ.get(GRAPHICS, "")
+    if chosen != NO_WINDOW and not _can_draw(chosen.lower()):
+        os.environ[CHOSEN] = chosen
         os.environ[GRAPHICS] = NO_WINDOW
+
+
+def _can_draw(graphics: str) -> bool:
+    from ctypes.util import find_library  # which starts a program, for those that chose graphics
+
+    library = {"egl": "EGL", "osmesa": "OSMesa"}.get(graphics)
+    return bool(library and find_library(library))
 
 
 def chosen_graphics() -> str:

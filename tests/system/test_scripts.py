@@ -81,8 +81,10 @@ print("glfw" in sys.modules)
 
 
 @pytest.mark.parametrize("chosen", ["osmesa", "nonsense"])
-def test_a_process_of_ours_does_not_import_the_graphics_that_were_chosen(chosen: str) -> None:
+def test_a_process_of_ours_does_not_import_missing_graphics_that_were_chosen(chosen: str) -> None:
     code = """
+import ctypes.util
+ctypes.util.find_library = lambda name: None
 from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
 from gigabrain_zenoh.launch.processes import load_process
 load_process(ProcessConfig(name="safety", endpoint=Endpoint()))
@@ -121,6 +123,19 @@ def test_a_process_of_ones_own_has_the_graphics_that_were_chosen(
     monkeypatch.setenv("GIGABRAIN_MUJOCO_GL", "")  # so that it is put back afterwards
     this_process.open_no_window()
     assert supervised_environment()["MUJOCO_GL"] == "osmesa"
+
+
+@pytest.mark.parametrize(("library", "then"), [("libEGL.so.1", "egl"), (None, "disable")])
+def test_graphics_that_are_installed_are_left_to_those_who_draw(
+    monkeypatch: pytest.MonkeyPatch, library: str | None, then: str
+) -> None:
+    monkeypatch.setattr("ctypes.util.find_library", {"EGL": library}.get)
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.setenv("GIGABRAIN_MUJOCO_GL", "")
+    monkeypatch.delenv("GIGABRAIN_MUJOCO_GL")
+    this_process.open_no_window()
+    assert os.environ["MUJOCO_GL"] == then
+    assert this_process.chosen_graphics() == "egl"
 
 
 async def test_a_program_that_fails_says_why(tmp_path: Path) -> None:
