@@ -61,7 +61,7 @@ CAUSES = _causes(
     (
         "telemetry_frozen",
         "the body repeats the same values although it should move",
-        "check its link, then restart its controller or push it until a value changes",
+        "check its link, then restart its controller or push it until its pose changes",
     ),
     (
         "round_trip",
