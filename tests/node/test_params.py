@@ -197,7 +197,7 @@ async def test_what_the_present_behaviour_does_not_read_is_refused_with_what_can
 def test_a_speed_limit_is_set_without_forgetting_what_was_seen() -> None:
     """The way round a wall is longer, also once no beam hits the wall any more."""
     drive = Drive(WAFFLE, Goal(x=3.0, y=0.0), wall((1.0, -1.0), (1.0, 1.0)))
-    seen = drive.moment()
+    seen = drive.request()
     unseen = dataclasses.replace(seen, hits=np.empty((0, 2)))
     drive.planner.plan(seen)
     drive.planner.configure(WAFFLE, structs.replace(QUICK, linear_speed=0.2))

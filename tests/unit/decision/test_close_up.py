@@ -55,9 +55,9 @@ class Stopped(Drive):
 
     def go(self, seconds: float) -> LocalPlan:
         for _ in range(round(seconds / 0.1)):
-            plan = self.planner.plan(self.moment())
+            plan = self.planner.plan(self.request())
             if self.stops and self.bars and plan.twist.linear_x > 0.0:
-                plan = self.planner.plan(barred(self.moment(), self.body))
+                plan = self.planner.plan(barred(self.request(), self.body))
             if plan.arrived:
                 break
             twist = plan.twist
