@@ -50,7 +50,7 @@ async def brain(network: LocalNetwork) -> AsyncIterator[list["asyncio.Future[Non
 
 
 async def drive(network: LocalNetwork, folder: Path, seconds: float) -> dict[str, object]:
-    """Have the brain drive for some seconds, then let the driver die."""
+    """Have the brain drive until this second of the run, then let the driver die."""
     run = Run(
         folder=Path(), world=WORLD, speed=100.0, seconds=seconds, checkpoint=str(folder / "cp")
     )
@@ -79,7 +79,7 @@ async def test_the_robot_is_found_in_its_map_again_and_drives_on(tmp_path: Path)
         before = await drive(network, tmp_path, 8.0)
         assert poses[-1].localized
         boot = poses[-1].boot
-        after = await drive(network, tmp_path, 6.0)
+        after = await drive(network, tmp_path, 14.0)
     found = [pose for pose in poses if pose.boot != boot and pose.localized]
     assert len(found) > 30  # of six seconds
     began = load_world(WORLD, 0).start
