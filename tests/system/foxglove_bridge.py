@@ -62,9 +62,14 @@ async def bridged(folder: Path) -> AsyncIterator[Bridge]:
         await serving
 
 
-async def hold(viewer: Viewer, content: object, done: Callable[[], object]) -> None:
-    """Say it again and again, as the Teleop panel does while a button is held."""
-    async with asyncio.timeout(PATIENCE_S):
+async def hold(
+    viewer: Viewer, content: object, done: Callable[[], object], seconds: float = PATIENCE_S
+) -> None:
+    """Publish it again and again, as the Teleop panel does while a button is held.
+
+    Raises TimeoutError if it is not done after these seconds.
+    """
+    async with asyncio.timeout(seconds):
         while True:
             await viewer.publish(content)
             await asyncio.sleep(0.04)
