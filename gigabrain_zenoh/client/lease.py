@@ -11,20 +11,20 @@ class ControlLease:
 
     A passing stop, as for an obstacle, does not end the lease, nor does a time in which the script
     was stopped, even if the brain goes on by itself meanwhile. It is lost when another commander
-    takes over, a person presses the e-stop, the gate latches or the driver restarts. Then the
-    script must ask again: it must not take the body back from the person who has just stopped it.
+    takes over, the gate latches, as by an e-stop, or the driver restarts. Then the script must ask
+    again: it must not take the body back from the person who has just stopped it.
     """
 
     def __init__(self, source: str) -> None:
         self._source = source
         self._boot = self._enables = 0  # of the gate when it granted the body
-        self._tick = self._estops = 0  # of the last state
+        self._tick = self._latches = 0  # of the last state
         self._had = False  # in the last state
         self.lost = False
 
     def granted(self, boot: int, gate: GateStatus) -> None:
         """Record that the gate has granted the body."""
-        self._boot, self._enables, self._estops = boot, gate.enables, gate.estop_generation
+        self._boot, self._enables, self._latches = boot, gate.enables, gate.latches
         self._had, self.lost = True, False
 
     def update(self, state: RobotState) -> None:
@@ -33,10 +33,10 @@ class ControlLease:
             return
         has, gate = self.has(state), state.gate
         missed, self._tick = state.tick - self._tick > MISSED_TICKS, state.tick
-        pressed, self._estops = gate.estop_generation > self._estops, gate.estop_generation
+        latched, self._latches = gate.latches > self._latches, gate.latches
         others = ("", self._source) if self._had and not missed else ("", self._source, BRAIN)
         taken = gate.commander not in others
-        ended = taken or pressed or gate.mode == "latched" or self.restarted(state)
+        ended = taken or latched or gate.mode == "latched" or self.restarted(state)
         self.lost = not has and (self.lost or ended)
         self._had = has
 

@@ -115,6 +115,8 @@ def step(config: GateConfig, state: GateState, event: Event) -> tuple[GateState,
     if after.mode == "enabled":
         found = stop_reasons(config, after, after.commander)
         after = _stop(after, found) if found else after
+    if after.mode == "latched" and state.mode != "latched":
+        after = replace(after, latches=state.latches + 1)
     output = _output(config, after)
     return replace(after, output=output, joints=joints.output(config, after, _calm(after))), outcome
 

@@ -37,6 +37,7 @@ class GateState(msgspec.Struct, frozen=True, kw_only=True):
     by_hand: bool = False  # released from a latch: no automatic resume
     commander: str = ""
     enables: int = 0
+    latches: int = 0
     enabled_tick: int = -1000  # when the present commander was enabled
     command: CmdVel | None = None  # last valid one of the commander
     command_tick: int = 0  # of its arrival
@@ -138,6 +139,7 @@ def status(state: GateState) -> GateStatus:
         estop_generation=state.estop_generation,
         commander=state.commander,
         enables=state.enables,
+        latches=state.latches,
     )
 
 

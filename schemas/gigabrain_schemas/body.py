@@ -179,6 +179,7 @@ class GateStatus(Record, frozen=True, kw_only=True):
     estop_generation: Count = 0  # how often an e-stop was pressed; a release must name it
     commander: Name = ""  # whose commands pass; empty for none
     enables: Count = 0  # how often it was enabled since this boot
+    latches: Count = 0  # how often it has latched since this boot
 
 
 class RobotState(Message, frozen=True, kw_only=True):

@@ -11,7 +11,7 @@ def state(
     enables: int = 1,
     boot: int = 7,
     tick: int = 0,
-    estops: int = 0,
+    latches: int = 0,
 ) -> RobotState:
     return RobotState(
         boot=boot,
@@ -19,7 +19,7 @@ def state(
         robot_type="waffle",
         pose=Pose(x=0.0, y=0.0, yaw=0.0),
         velocity=Velocity(),
-        gate=GateStatus(mode=mode, commander=commander, enables=enables, estop_generation=estops),
+        gate=GateStatus(mode=mode, commander=commander, enables=enables, latches=latches),
     )
 
 
@@ -94,8 +94,8 @@ def test_a_script_that_was_stopped_for_a_while_may_ask_for_the_body_again() -> N
     assert after(mine, state("enabled", "control", 5, tick=2000)) == (False, False)
 
 
-def test_an_e_stop_that_it_missed_meanwhile_loses_it() -> None:
+def test_a_latch_that_it_missed_meanwhile_loses_it() -> None:
     mine = state("enabled", "script", 4, tick=100)
-    pressed = state("enabled", "control", 5, tick=2000, estops=1)
-    assert after(mine, pressed) == (False, True)
-    assert after(mine, pressed, state("idle", "", 5, tick=2001, estops=1)) == (False, True)
+    latched = state("enabled", "control", 5, tick=2000, latches=1)
+    assert after(mine, latched) == (False, True)
+    assert after(mine, latched, state("idle", "", 5, tick=2001, latches=1)) == (False, True)

@@ -50,6 +50,7 @@ def test_the_status_shows_who_drives_and_what_has_happened() -> None:
             ),
         ),
         estop_generation=1,
+        latches=1,
         enables=1,
     )
 

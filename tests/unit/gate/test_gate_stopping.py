@@ -54,6 +54,15 @@ def test_what_latches_while_it_stops_is_kept_until_a_release() -> None:
     assert (rig.mode, rig.state.causes) == ("latched", (CRASHED,))
 
 
+def test_each_latch_counts_once() -> None:
+    rig = driving()
+    booted = rig.state.latches
+    rig.tick(faults=(CRASHED,))
+    rig.live(20)
+    rig.live(20)
+    assert (rig.mode, rig.state.latches) == ("latched", booted + 1)
+
+
 def test_a_cause_that_comes_to_latch_is_not_taken_for_the_one_that_did_not() -> None:
     rig = driving()
     rig.tick(faults=(Cause(code="collision", text="a bump"),))
