@@ -112,6 +112,7 @@ def rows_of(
         robot_path,
     )
     from gigabrain_drivers.driver.robot import Run
+    from gigabrain_zenoh.config.layers import DEFAULT
     from gigabrain_zenoh.config.loading import part
     from gigabrain_zenoh.decision import behaviours
     from gigabrain_zenoh.launch.merging import SETTINGS
@@ -130,14 +131,15 @@ def rows_of(
     if made.robot:
         own.add(part(layers.root, ("robot",)), layers.place)
     found, *_ = load_layers(path, own, Run(folder=Path(), link=made.link))  # refuses what is unsafe
-    _check_fits(made, found.description())
+    chosen = any(row.key == "decision.behaviour" and row.source != DEFAULT for row in rows)
+    _check_fits(made, found.description(), chosen=chosen)
     whole = own.convert(link_type(made.body, made.link))
     rows += [row._replace(key=f"robot.{row.key}") for row in own.rows(whole)]
     return tuple(rows)
 
 
-def _check_fits(deployment: "Deployment", body: "BodyDescription") -> None:
-    """Raise ConfigError for a map or a behaviour that is of no use to the body."""
+def _check_fits(deployment: "Deployment", body: "BodyDescription", *, chosen: bool) -> None:
+    """Raise ConfigError for a map, or a `chosen` behaviour, that is of no use to the body."""
     if deployment.perception.map and not body.has_base:
         raise ConfigError(
             f"perception.map: {body.robot_type} has no base, so it cannot localize in a map; leave "
@@ -145,7 +147,8 @@ def _check_fits(deployment: "Deployment", body: "BodyDescription") -> None:
             value=deployment.perception.map,
         )
     decides = any("decision" in processes for processes in deployment.hosts.values())
-    if decides and deployment.decision.behaviour == "avoid" and body.turning_radius:
+    avoids = chosen and deployment.decision.behaviour == "avoid"
+    if decides and avoids and body.turning_radius:
         raise ConfigError(
             f"behaviour avoid turns on the spot, and {body.robot_type} cannot: its tightest turn "
             f"has a radius of {body.turning_radius:.2f} m; use the behaviour navigate",

@@ -70,6 +70,10 @@ def test_a_body_that_cannot_do_as_it_is_told_is_refused(
     assert rows_of(merged_values(values | {"body": "skid_rover"}, (), ()))
 
 
+def test_a_car_that_others_drive_needs_no_behaviour() -> None:
+    assert rows_of(merged_values({"body": "ackermann_car"}, (), ()))
+
+
 def test_a_host_without_decision_has_no_behaviour() -> None:
     hosts = {"robot": ["router", "driver"]}
     values = {"body": "ackermann_car", "decision": {"behaviour": "avoid"}, "hosts": hosts}
