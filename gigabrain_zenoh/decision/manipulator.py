@@ -173,8 +173,8 @@ class Manipulator:
         if not measured:
             return self._still(NOT_MEASURED)
         near = self._left and is_at(self._left, self._base, planner, body, state)
-        if self._run is None and not near:  # the base has driven off, or an operator has moved it
-            self._left = None
+        if self._run is None and self._left and not near:  # the base, or an operator, has moved it
+            self._left = self._put_down = None
         if self._run is None and self._achieved.number and not self._left:
             return self._still(Idle("done", self._achieved.reason), self._achieved)
         try:

@@ -196,3 +196,24 @@ def test_an_arm_that_an_operator_has_moved_away_from_a_thing_does_not_go_back(
     else:
         assert rig.carry_out("do: [{posture: {shoulder_pan: 1.0}}]").state == "succeeded"
         assert "retreat" not in rig.phases
+
+
+def test_a_thing_that_an_operator_takes_elsewhere_was_not_put_down_where_planned(rig: Rig) -> None:
+    rig.give(PLACE)
+    until(rig, "traverse")
+    until(rig, "open")
+    rig.tick()
+    rig.queue.pause("", "ann")
+    rig.tick()
+    let_go, recorded = rig.manipulator._let_go, []
+    rig.manipulator._let_go = lambda state: recorded.append(let_go(state))  # type: ignore[method-assign]
+    away = dict.fromkeys(rig.planner.arm.names, 0.3)
+    gripped = {one.name: one.position for one in rig.arm.state().joints}["gripper"]
+    for gripper in (gripped, 1.0):
+        goals = (away | {"gripper": gripper}).items()
+        joints = tuple(JointTarget(name=name, position=position) for name, position in goals)
+        for _ in range(200):
+            rig.arm.step(Intent(joints=joints, behaviour="test", reason="jog"))
+    rig.queue.resume("")
+    assert rig.carry_on().state == "failed"
+    assert recorded == []
