@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import logging
 import os
 import signal
 from collections.abc import AsyncIterator, Callable
@@ -12,6 +13,8 @@ from gigabrain_zenoh.decision.tasks.mission import Script
 from gigabrain_zenoh.errors import GigabrainError, Refused, unknown
 from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.host.files import expanded
+
+log = logging.getLogger(__name__)
 
 MAX_OUTPUT = 200  # bytes of a program's output that its result shows, the last ones
 LINGER_S = 1.0  # for the rest of its output, once it has ended
@@ -124,8 +127,12 @@ class Run:
 
     def _signal(self, number: signal.Signals) -> None:
         assert self._program
-        with contextlib.suppress(ProcessLookupError):
+        try:
             os.killpg(self._program.get_pid(), number)
+        except ProcessLookupError:
+            pass
+        except PermissionError as error:  # it runs as another user, as by sudo
+            log.warning("a script cannot be sent %s: %s", number.name, error)
 
 
 StartScript = Callable[[Script], Run]
