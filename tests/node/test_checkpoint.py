@@ -198,9 +198,9 @@ async def test_the_next_driver_of_a_run_goes_on_where_the_last_one_died(tmp_path
     async with second:
         assert (await second.read_state()).pose.x == 0.0
     left = [tick async for tick in driver(path, seconds=2.2).ticks(Clock())]  # they count on
-    assert 5 <= len(left) <= 15
+    assert 10 <= len(left) <= 20  # and for as long as a checkpoint may be newer than a state
     third = driver(path, seconds=1.0)
-    assert [tick async for tick in third.ticks(Clock())] == []
+    assert len([tick async for tick in third.ticks(Clock())]) == 5
     assert third.finished
     other = await drive(driver(tmp_path / "another run"), 1)
     assert other["sim_seconds"] == 0.02

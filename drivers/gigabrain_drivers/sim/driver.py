@@ -101,8 +101,7 @@ class MujocoDriver(Driver):
         self._scan_ticks = period_ns / TICK_NS
         self._next_scan = self._scan_ticks
         self._ticks = 0  # since this driver began, like those of the robot's clock
-        left_ns = (run.seconds or math.inf) * 1e9 - self._simulation.time_ns
-        self._last_ticks = max(0, round(left_ns / TICK_NS)) if run.seconds else None
+        self._last_ticks = self._ticks_left(run.seconds) if run.seconds else None
         self._commanded_ns = 0
         self._physics_s = 0.0  # CPU time of physics and lidar
         self._permits = threading.Semaphore(0)
@@ -113,6 +112,16 @@ class MujocoDriver(Driver):
         self._account = self._simulation.report(robot, run)  # as of the newest tick
         self._state: RobotState | None = None
         self.sensors = dict.fromkeys(("imu", "scan") if robot.lidar else ("imu",))
+
+    def _ticks_left(self, seconds: float) -> int:
+        """Return the ticks that are left of a run of `seconds`.
+
+        One that was resumed goes on a bit longer: others count from the last state that they got,
+        which may be older than the checkpoint.
+        """
+        done = self._simulation.time_ns
+        left = round((seconds * 1e9 - done) / TICK_NS)
+        return max(0, left) + CHECKPOINT_TICKS * (done > 0)
 
     def _begin(self) -> "Simulation":
         """Go on where an earlier driver of this run has died, or begin at the world's start."""
