@@ -207,16 +207,19 @@ def open_no_window() -> None:
     draws pictures chooses its own graphics: see `chosen_graphics`.
     """
     chosen = os.environ.get(GRAPHICS, "")
-    if chosen != NO_WINDOW and not _can_draw(chosen.lower()):
+    if chosen != NO_WINDOW and not _can_draw(chosen.lower().strip()):
         os.environ[CHOSEN] = chosen
         os.environ[GRAPHICS] = NO_WINDOW
 
 
 def _can_draw(graphics: str) -> bool:
     from ctypes.util import find_library  # which starts a program, for those that chose graphics
+    from importlib.util import find_spec
 
+    if graphics == "glfw":
+        return find_spec("glfw") is not None
     library = {"egl": "EGL", "osmesa": "OSMesa"}.get(graphics)
-    return bool(library and find_library(library))
+    return graphics in ("cgl", "wgl") or bool(library and find_library(library))
 
 
 def chosen_graphics() -> str:

@@ -125,17 +125,19 @@ def test_a_process_of_ones_own_has_the_graphics_that_were_chosen(
     assert supervised_environment()["MUJOCO_GL"] == "osmesa"
 
 
-@pytest.mark.parametrize(("library", "then"), [("libEGL.so.1", "egl"), (None, "disable")])
+@pytest.mark.parametrize("chosen", ["egl", "glfw"])
+@pytest.mark.parametrize("found", [True, False])
 def test_graphics_that_are_installed_are_left_to_those_who_draw(
-    monkeypatch: pytest.MonkeyPatch, library: str | None, then: str
+    monkeypatch: pytest.MonkeyPatch, chosen: str, found: bool
 ) -> None:
-    monkeypatch.setattr("ctypes.util.find_library", {"EGL": library}.get)
-    monkeypatch.setenv("MUJOCO_GL", "egl")
+    for finder in ("ctypes.util.find_library", "importlib.util.find_spec"):
+        monkeypatch.setattr(finder, lambda name: name if found else None)
+    monkeypatch.setenv("MUJOCO_GL", chosen)
     monkeypatch.setenv("GIGABRAIN_MUJOCO_GL", "")
     monkeypatch.delenv("GIGABRAIN_MUJOCO_GL")
     this_process.open_no_window()
-    assert os.environ["MUJOCO_GL"] == then
-    assert this_process.chosen_graphics() == "egl"
+    assert os.environ["MUJOCO_GL"] == (chosen if found else "disable")
+    assert this_process.chosen_graphics() == chosen
 
 
 async def test_a_program_that_fails_says_why(tmp_path: Path) -> None:
@@ -218,6 +220,22 @@ async def test_a_program_that_is_paused_can_be_ended(tmp_path: Path) -> None:
     run.stop()
     await until(run._task.done)
     assert _gone(pid)
+
+
+async def test_a_program_of_another_user_that_cannot_be_paused_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuse(_group: int, _number: int) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    run = Scripts(program(tmp_path, f"echo $$ > {tmp_path}/pid; sleep 1")).start(Script(run="beep"))
+    await written(tmp_path / "pid")
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "killpg", refuse)
+        run.pause()
+        run.resume()
+    assert "cannot be sent SIGSTOP: [Errno 1] Operation not permitted" in caplog.text
+    assert await ended(run) == (True, "ended well")
 
 
 def test_a_program_whose_decision_died_before_it_began_does_not_begin() -> None:
