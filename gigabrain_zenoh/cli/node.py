@@ -88,8 +88,10 @@ def graph(
     processes = _find(at)
     flows = discovery.flows(processes.described.values(), processes.health)
     shown = discovery.chain_flows(flows, everything=everything)
-    if not shown:
+    if not processes.described.keys() - {"router"}:
         raise BodyLost(f"no process sends to another here; {START_ROUTER}")
+    if not shown:
+        print_progress("no process sends to another yet")
     if png:
         discovery.write_graph_png(shown, png)
         print_line(str(png))

@@ -165,7 +165,7 @@ def check_result_path(path: Path | None) -> None:
 def check_picture_path(path: Path | None) -> None:
     """Raise ConfigError where no PNG can be written to `path`, or its name says another format."""
     check_result_path(path)
-    if path and path.suffix.lower() != ".png":
+    if path and path.suffix.lower() != ".png" and (path.is_file() or not path.exists()):
         raise ConfigError(f"cannot write {path}: it would be a PNG; expected a name like x.png")
 
 

@@ -20,6 +20,15 @@ def test_a_graph_without_messages_says_what_to_do(
         node.graph(**options)
 
 
+def test_a_graph_of_a_driver_alone_says_so(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    alone = replace(example(Description), process="driver", subscribes=())
+    monkeypatch.setattr(node, "_find", lambda _: Processes({"driver": alone}, {}))
+    node.graph()
+    assert capsys.readouterr() == ("", "no process sends to another yet\n")
+
+
 @pytest.mark.parametrize(
     ("text", "sentence"), [("no router answers", "no router answers."), ("is it on?", "is it on?")]
 )
