@@ -157,7 +157,7 @@ class Robot(Commander):
     async def limp(self) -> GateReply:
         """Let go of all joints, so that a person can move them; an arm may fall.
 
-        Raises Refused while somebody moves it, or where its driver cannot, Unsupported for a body
+        Raises Refused while it is commanded or where its driver cannot, Unsupported for a body
         without joints, and BodyLost.
         """
         check_joints(await self.read_body())

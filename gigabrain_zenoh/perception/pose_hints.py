@@ -19,7 +19,7 @@ from gigabrain_zenoh.perception import FIND_IT
 
 log = logging.getLogger(__name__)
 
-LOST_S = 10.0  # after which a person is told
+LOST_S = 10.0  # without localization, until `not_localized` is reported
 LOST_TICKS = round(LOST_S * 1e9 / TICK_NS)
 COUNTS_TICKS = round(2e9 / TICK_NS)  # for how long a hint counts while the robot is not found
 PERSON_M, PERSON_RAD = 0.3, 0.25  # deviation of what a person says

@@ -1,4 +1,4 @@
-"""What commands print where no robot runs."""
+"""Commands print what to do where no robot runs."""
 
 import pytest
 from msgspec.structs import replace

@@ -1,4 +1,4 @@
-"""A body without joints cannot be limp, and a script is told so."""
+"""`limp` and `hold` say that a body has no joints."""
 
 from collections.abc import Awaitable, Callable
 
