@@ -111,6 +111,38 @@ def test_a_scene_whose_numbers_name_nothing_is_refused() -> None:
             SceneModel(msgspec.structs.replace(scene, **changes))
 
 
+@pytest.mark.parametrize("number", [np.inf, -np.inf, np.nan])
+@pytest.mark.parametrize("field", ["sizes", "places"])
+def test_a_shape_of_no_finite_size_or_place_is_refused(field: str, number: float) -> None:
+    scene = EXAMPLES["SimScene"]
+    values = np.frombuffer(getattr(scene, field), "<f4").copy()
+    for at in range(0, len(values), 3):  # of each kind of shape
+        changed = values.copy()
+        changed[at] = number
+        with pytest.raises(ConfigError, match="size or a place that is not finite"):
+            SceneModel(msgspec.structs.replace(scene, **{field: changed.tobytes()}))
+
+
+@pytest.mark.parametrize("corner", [3, 2**31, 2**32 - 1])
+def test_a_mesh_whose_faces_name_no_vertex_is_refused(corner: int) -> None:
+    scene = EXAMPLES["SimScene"]
+    assert isinstance(scene, SimScene)
+    faces = np.frombuffer(scene.meshes[0].faces, "<u4").copy()
+    faces[0] = corner
+    wrong = msgspec.structs.replace(scene.meshes[0], faces=faces.tobytes())
+    with pytest.raises(ConfigError, match="mesh 0 has faces at vertices that it has not"):
+        SceneModel(msgspec.structs.replace(scene, meshes=(wrong,)))
+
+
+def test_poses_that_are_not_finite_are_not_taken() -> None:
+    scene, poses = sent(live("turtlebot3_waffle", "arena")[1])
+    made = SceneModel(scene)
+    values = np.frombuffer(poses.poses, "<f4").copy()
+    values[3] = np.nan
+    assert made.place(poses)
+    assert not made.place(msgspec.structs.replace(poses, poses=values.tobytes()))
+
+
 def test_a_scene_of_more_meshes_than_a_message_may_carry_shows_the_rest_as_boxes() -> None:
     corners = "0 0 0 1 0 0 0 1 0 0 0 1"
     meshes = [f'<mesh name="m{n}" vertex="{corners}" scale=".1 .1 .1"/>' for n in range(1010)]

@@ -1,5 +1,6 @@
 """A scene that was received, made into a MuJoCo model: for a window, and for pictures."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,11 +40,13 @@ class SceneShape(NamedTuple):
 
 
 def shapes_of(scene: SimScene) -> list[SceneShape]:
-    """Return the shapes of a scene. Raises ValueError where a number names nothing."""
+    """Return the shapes of a scene. Raises ValueError for numbers that name or measure nothing."""
     owners = np.frombuffer(scene.owners, "<u2")
     sizes = np.frombuffer(scene.sizes, "<f4").reshape(-1, 3).astype(float)
     places = np.frombuffer(scene.places, "<f4").reshape(-1, 7).astype(float)
     colours = np.frombuffer(scene.colours, np.uint8).reshape(-1, 4) / 255
+    if not (np.isfinite(sizes).all() and np.isfinite(places).all()):
+        raise ValueError("a shape has a size or a place that is not finite")
     try:
         return [
             SceneShape(SHAPE_KINDS[kind], scene.bodies[owner], tuple(size), tuple(at), tuple(rgba))
@@ -54,6 +57,15 @@ def shapes_of(scene: SimScene) -> list[SceneShape]:
         ]  # fmt: skip
     except IndexError:
         raise ValueError("a shape of an unknown kind, or on an unknown body") from None
+
+
+def _triangles(scene: SimScene) -> Iterator[tuple[list[float], list[int]]]:
+    """Yield vertices and faces of each mesh. Raises ValueError for a face without its vertices."""
+    for number, mesh in enumerate(scene.meshes):
+        vertices, faces = np.frombuffer(mesh.vertices, "<f4"), np.frombuffer(mesh.faces, "<u4")
+        if (faces >= len(vertices) // 3).any():
+            raise ValueError(f"mesh {number} has faces at vertices that it has not")
+        yield vertices.tolist(), faces.tolist()
 
 
 class SceneModel:
@@ -78,9 +90,11 @@ class SceneModel:
         return self._fixed == before
 
     def place(self, poses: SimPoses) -> bool:
-        """Move the bodies; return False for poses of another version of the scene."""
+        """Move the bodies; return False for poses of another scene, or that are not finite."""
         values = np.frombuffer(poses.poses, "<f4").reshape(-1, 7).astype(float)
         if poses.version != self.scene.version or len(values) != len(self.scene.bodies) - 1:
+            return False
+        if not np.isfinite(values).all():
             return False
         self._poses = dict(zip(self.scene.bodies[1:], values, strict=True))
         for name, pose in self._poses.items():
@@ -147,13 +161,11 @@ class SceneModel:
         add_lights(spec, World(
             name="", description="", half_x=0, half_y=0, shapes=(), lights=(SUN,),
         ))  # fmt: skip
-        for number, mesh in enumerate(self.scene.meshes):
+        for number, (vertices, faces) in enumerate(_triangles(self.scene)):
             spec.add_mesh(
-                name=f"mesh{number}",
-                uservert=np.frombuffer(mesh.vertices, "<f4").tolist(),
-                userface=np.frombuffer(mesh.faces, "<u4").tolist(),
+                name=f"mesh{number}", uservert=vertices, userface=faces,
                 inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
-            )
+            )  # fmt: skip
         fixed, names, *_ = self._fixed
         bodies = {names[0]: spec.worldbody}
         bodies |= {name: spec.worldbody.add_body(name=name, mocap=True) for name in names[1:]}
