@@ -10,7 +10,7 @@ import contextlib
 import math
 import sys
 import tempfile
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -28,8 +28,11 @@ from gigabrain_schemas.topics import (
     ESTOP,
     ESTOP_SAID,
     GOAL,
+    MAP_LOAD,
     MISSION,
     PARAM,
+    POSE,
+    POSE_SET,
     SAFETY,
     TASK_CHANGE,
     TELEOP,
@@ -37,8 +40,10 @@ from gigabrain_schemas.topics import (
     Topic,
 )
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
-from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.client.objects import set_pose
+from gigabrain_zenoh.errors import BodyLost, Refused
 from gigabrain_zenoh.gate.state import BRAIN
+from gigabrain_zenoh.geometry.pose import relative
 from gigabrain_zenoh.host.files import read_bounded
 from gigabrain_zenoh.qa.faults.hostile import ExtremeMessage, all_extremes, chosen_extremes
 from gigabrain_zenoh.qa.faults.rig import DRIVES_AGAIN_WALL, MEMORY_GROWN, Options, Rig
@@ -46,15 +51,17 @@ from gigabrain_zenoh.qa.faults.rows.goal_recovery import (
     PLACES,
     in_map,
     needs_navigation,
+    true_pose,
     waiting_robot,
 )
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, fault_row
 from gigabrain_zenoh.qa.probe import moving, until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest, rss_mb
 
-# messages that may stop, take or cancel by their purpose: they are undone as a person would
+# messages that may stop, take, cancel or misplace by their purpose: undone as a person would
 UNDONE = (
     ESTOP, ESTOP_SAID, BUTTON, SAFETY, ENABLE, TELEOP, GOAL, MISSION, TASK_CHANGE, PARAM,
+    MAP_LOAD, POSE_SET,
 )  # fmt: skip
 ACCIDENTS = {"collision", "tilted"}
 LOOK_TICKS = 7  # until a message has gone the whole way: more than a scan
@@ -131,7 +138,7 @@ async def sending(robot: RobotUnderTest) -> AsyncIterator["ExtremeSender"]:
     """Join the robot's network, and wait until the robot drives."""
     transport = await ZenohTransport.open(robot.endpoint)
     try:
-        sender = ExtremeSender(robot, transport)
+        sender = ExtremeSender(robot, transport, await robot.truth())
         await sender.begin()
         yield sender
     finally:
@@ -141,13 +148,17 @@ async def sending(robot: RobotUnderTest) -> AsyncIterator["ExtremeSender"]:
 class ExtremeSender:
     """Sends extreme messages to one robot, and observes their effects."""
 
-    def __init__(self, robot: RobotUnderTest, transport: ZenohTransport) -> None:
+    def __init__(
+        self, robot: RobotUnderTest, transport: ZenohTransport, start: Mapping[str, Any]
+    ) -> None:
         self._robot, self._probe, self._transport = robot, robot.probe, transport
         self._newest: dict[str, bytes] = {}  # the robot's own newest message, by key
         self._sent = b""
         self._mission = ""  # in YAML
         self._params: dict[str, str] = {}
         self._commands = robot.probe.bus.latest(CMD_VEL)
+        self._poses = robot.probe.bus.latest(POSE)
+        self._start = start  # the truth where the map has its origin
         self._asking: set[asyncio.Task[Any]] = set()
 
     async def begin(self) -> None:
@@ -155,8 +166,7 @@ class ExtremeSender:
         bus = self._probe.bus
         for topic in TOPICS:
             bus.tap(topic.at("*"), self._keep)
-        truth = await self._robot.truth()
-        places = [in_map(truth, place) for place in PLACES]
+        places = [in_map(self._start, place) for place in PLACES]
         steps = "\n".join(
             f"      - fallback: [{{goto: [{x:.2f}, {y:.2f}]}}, {{wait: 0.2}}]" for x, y in places
         )
@@ -265,7 +275,7 @@ class ExtremeSender:
             await until(condition, "as before", within_s)
 
     async def _undo(self) -> None:
-        """Release, enable, reset parameters and restart the mission, as a person would."""
+        """Release, enable, localize, reset parameters, restart the mission, as a person would."""
         robot, bus = self._robot, self._probe.bus
         with contextlib.suppress(TimeoutError, Refused):
             async with asyncio.timeout(AGAIN_S):
@@ -274,10 +284,19 @@ class ExtremeSender:
                 request = EnableRequest(source=BRAIN, take=True, by="a person")
                 while not any(one.ok for one in await bus.ask(ENABLE, request)):
                     await self._probe.ticks(2)
+        await self._localize()
         for name, value in self._params.items():
             with contextlib.suppress(Refused):
                 await bus.ask(PARAM, ParamRequest(name=name, value=value), name="decision")
         await self._start_mission()
+
+    async def _localize(self) -> None:
+        """Set the robot's true pose where perception does not know it."""
+        pose = self._poses.current
+        if pose is None or not pose.localized:
+            here = relative(true_pose(self._start), true_pose(await self._robot.truth()))
+            with contextlib.suppress(BodyLost, Refused):
+                await set_pose(self._probe.bus, here.x, here.y, here.yaw)
 
     async def _start_mission(self) -> None:
         with contextlib.suppress(Refused):

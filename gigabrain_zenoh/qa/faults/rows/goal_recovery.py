@@ -151,5 +151,9 @@ def _distance(truth: Mapping[str, Any], place: tuple[float, float]) -> float:
 
 def in_map(truth: Mapping[str, Any], place: tuple[float, float]) -> tuple[float, float]:
     """Return a place of the world in the map, whose origin is where the body now is."""
-    body = Pose(x=truth["true_x"], y=truth["true_y"], yaw=truth["true_yaw"])
-    return to_frame(body, *place)
+    return to_frame(true_pose(truth), *place)
+
+
+def true_pose(truth: Mapping[str, Any]) -> Pose:
+    """Return the body's pose in the world, by the physics."""
+    return Pose(x=truth["true_x"], y=truth["true_y"], yaw=truth["true_yaw"])
