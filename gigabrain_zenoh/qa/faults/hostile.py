@@ -18,6 +18,7 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import (
+    ARM_MODEL,
     BODY,
     CMD_VEL,
     DESCRIBE,
@@ -30,6 +31,7 @@ from gigabrain_schemas.topics import (
     SAFETY,
     SCAN,
     SERVICES,
+    SIM_SCENE,
     STATE,
     TOPICS,
     WORLD,
@@ -83,6 +85,7 @@ KNOWN = (
     (MAP, "1 x 1 of 100 at 1 m"), (WORLD, "hits nan"), (WORLD, "hits largest"),
     (WORLD, "obstacles longest"), (WORLD, "tick most"), (POSE, "x most"), (POSE, "tick most"),
     (INTENT, "tick most"), (SAFETY, "tick most"), (IMU, "tick most"),
+    (ARM_MODEL, "mjcf empty"), (SIM_SCENE, "sizes inf"),
 )  # fmt: skip
 FLOATS = {"zeros": 0.0, "nan": math.nan, "inf": math.inf, "largest": 3.4e38}
 NAMES = {PARAM.key: "decision", DESCRIBE.key: "safety"}  # process to ask, where there are many
