@@ -33,6 +33,7 @@ SLIPPING = 5.0  # so much more uncertain is what the wheels say then
 LAG_S = 0.02  # standard deviation of the time between odometry and a scan of its tick
 
 JUMP_FACTOR, JUMP_M, JUMP_RAD = 2.0, 0.2, 0.5  # more than the body can do is no motion
+GLITCH_RATE = 5.0  # [rad/s], of a gyro beyond what the body can do, even if it is turned by hand
 
 
 class OdometrySample(NamedTuple):
@@ -69,7 +70,7 @@ class OdometryFusion:
         pose = from_pose(state.pose)
         last = self.newest
         if last is None:
-            self._rate = self._turn_rate(state)
+            self._rate = self._turn_rate(state, body)
             self._moments.append(OdometrySample(state.tick, pose, pose, slipping=False, jumps=0))
             return
         if state.tick <= last.tick:
@@ -78,10 +79,10 @@ class OdometryFusion:
         step = between(last.odometry, pose)
         fused, jumps, unaided, rate = last.fused, last.jumps, last.unaided, 0.0
         if jumped(step, ticks * TICK_NS / 1e9, body):
-            self._rate, self._rest = self._turn_rate(state), 0
+            self._rate, self._rest = self._turn_rate(state, body), 0
             jumps += 1
         else:
-            turn = self._turn(state, step, ticks)
+            turn = self._turn(self._turn_rate(state, body), step, ticks)
             unaided += turn is None
             turn = float(step[2]) if turn is None else turn
             fused, rate = advanced(fused, step, turn), turn / (ticks * TICK_NS / 1e9)
@@ -120,12 +121,17 @@ class OdometryFusion:
             after.rate,
         )
 
-    def _turn_rate(self, state: RobotState) -> float | None:
-        return state.imu.angular_velocity[2] - self.bias if state.imu else None
+    def _turn_rate(self, state: RobotState, body: BodyDescription) -> float | None:
+        """Return the gyro's reading without its bias [rad/s]; None for none, or for a glitch."""
+        if state.imu is None:
+            return None
+        rate = state.imu.angular_velocity[2] - self.bias
+        glitch = abs(rate) > JUMP_FACTOR * body.max_angular_speed + GLITCH_RATE
+        return None if glitch else rate
 
-    def _turn(self, state: RobotState, step: Floats, ticks: int) -> float | None:
+    def _turn(self, rate: float | None, step: Floats, ticks: int) -> float | None:
         """Return the turn since the last state by the gyro [rad]."""
-        before, self._rate = self._rate, self._turn_rate(state)
+        before, self._rate = self._rate, rate
         if before is None or self._rate is None or ticks > GYRO_TICKS:
             return None
         if self._learn_bias(step, self._rate):

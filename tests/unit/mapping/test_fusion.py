@@ -102,6 +102,16 @@ def test_a_robot_that_somebody_turns_by_hand_has_turned() -> None:
     assert fusion.bias == pytest.approx(0.0)
 
 
+@pytest.mark.parametrize("glitch", [10.0, -35.0, 1000.0])
+def test_a_single_impossible_reading_of_the_gyro_turns_nothing(glitch: float) -> None:
+    rates = [0.5] * 10 + [glitch] + [0.5] * 10
+    fusion = fused(*(seen(1 + k, (0, 0, 0.01 * k), rate) for k, rate in enumerate(rates)))
+    moment = fusion.at(len(rates))
+    assert moment
+    assert moment.fused[2] == pytest.approx(0.01 * 20, abs=0.01)
+    assert not moment.slipping
+
+
 def test_wheels_and_gyro_that_disagree_mean_slip() -> None:
     agree = fused(*(seen(1 + k, (0, 0, 0.01 * k), 0.5) for k in range(50)))
     assert not agree.slipping
