@@ -60,6 +60,7 @@ class Simulation:
         self._digest = _digest(self.model)
         body = with_motors(body, self.model)
         self.data = mujoco.MjData(self.model)
+        self._divergences = [self.data.warning[kind] for kind in DIVERGED]  # counted by MuJoCo
         self._steps, self._substeps = 0, body.substeps
         self._locomotion = make_locomotion(body, self.model, self.data)
         self._base = self.model.body(f"{ROBOT}base").id
@@ -270,7 +271,7 @@ class Simulation:
         """A diverging simulation shows as a warning of MuJoCo, or as a robot that flies away."""
         x, y, z = self.data.xpos[self._base].tolist()
         far = EDGE_OF_THE_WORLD_M
-        lost = any(self.data.warning[kind].number for kind in DIVERGED)
+        lost = any(warning.number for warning in self._divergences)
         if lost or not (abs(x) < far and abs(y) < far and abs(z) < 1):
             raise BodyLost(f"the simulation diverged after {self.time_ns / 1e9:.2f} s")
 

@@ -40,16 +40,17 @@ class Truth:
         if not self.fixed:
             self._place = model.joint(f"{ROBOT}free").qposadr[0]
             self._velocity = model.joint(f"{ROBOT}free").dofadr[0]
-        self._is_robot = model.body_rootid[model.geom_bodyid] == self._base
-        self._must_not_touch = self._is_robot & ~np.isin(model.geom_bodyid, _hand(model))
+        is_robot = model.body_rootid[model.geom_bodyid] == self._base
+        may_touch = np.isin(model.geom_bodyid, _hand(model))
+        self._must_not_touch = set(np.flatnonzero(is_robot & ~may_touch).tolist())
         floor = np.array([is_floor(model, geom) for geom in range(model.ngeom)])
-        self._may_be_obstacle = ~self._is_robot & ~floor
+        self._may_be_obstacle = ~is_robot & ~floor
         self._hull = [
             geom for geom in range(model.ngeom) if model.geom(geom).name.startswith(f"{ROBOT}hull_")
         ]
         self._last_touch: dict[int, int] = {}
         self._steps = 0
-        self._parts = np.flatnonzero(self._is_robot)
+        self._parts = np.flatnonzero(is_robot)
         self.contacts, self.touching = 0, False
         self.falls, self._fallen = 0, False
         self.min_clearance_m, self.distance_m = MAX_CLEARANCE_M, 0.0
@@ -75,8 +76,8 @@ class Truth:
     def find_obstacles(self) -> None:
         """Look again at what can be touched, after a change of the model."""
         model = self._model
-        self._is_obstacle = self._may_be_obstacle & (model.geom_contype != 0)
-        self._obstacles = np.flatnonzero(self._is_obstacle)
+        self._obstacles = np.flatnonzero(self._may_be_obstacle & (model.geom_contype != 0))
+        self._obstacle_geoms = set(self._obstacles.tolist())
         self._half_sizes = _half_sizes(model, self._obstacles)
         upright = np.abs(self._data.geom_xmat[self._obstacles, 8]) > UPRIGHT
         boxes = np.isin(model.geom_type[self._obstacles], MEASURED)
@@ -125,15 +126,16 @@ class Truth:
 
     def _touch(self) -> None:
         """Count contacts between the robot and obstacles that begin in this step."""
-        pairs = self._data.contact.geom
-        # things of an MJCF world touch each other and the floor, too
-        with_obstacle = self._is_obstacle[pairs] & self._must_not_touch[pairs[:, ::-1]]
-        self.touching = bool(with_obstacle.any())
-        if not self.touching:
-            return
-        self.min_clearance_m = 0.0
-        for pair in pairs[with_obstacle.any(axis=1)]:
-            thing = int(pair[self._is_obstacle[pair]][0])
+        touched = {
+            thing
+            for pair in self._data.contact.geom.tolist()
+            for thing, part in (pair, pair[::-1])  # things of an MJCF world touch each other, too
+            if thing in self._obstacle_geoms and part in self._must_not_touch
+        }
+        self.touching = bool(touched)
+        if touched:
+            self.min_clearance_m = 0.0
+        for thing in touched:
             if self._steps - self._last_touch.get(thing, -NEW_CONTACT_STEPS) >= NEW_CONTACT_STEPS:
                 self.contacts += 1
             self._last_touch[thing] = self._steps
