@@ -127,8 +127,8 @@ class WorldModel(Message, frozen=True, kw_only=True):
         import numpy as np
 
         points = np.frombuffer(self.hits, "<f4").reshape(-1, 2)
-        near = (np.abs(points) <= FARTHEST_HIT).all(axis=1)
-        return points if near.all() else points[near]
+        near = np.abs(points) <= FARTHEST_HIT
+        return points if near.all() else points[near.all(axis=1)]
 
 
 class PoseInMap(Message, frozen=True, kw_only=True):
