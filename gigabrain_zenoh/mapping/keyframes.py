@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.geometry.scan import median
 from gigabrain_zenoh.kernels.jit import kernel
 
 Points = NDArray[np.float32]
@@ -109,9 +110,7 @@ def normals(points: Points) -> Points:
     if len(points) < MIN_POINTS:
         return np.zeros_like(points)
     bearings = np.arctan2(points[:, 1], points[:, 0])
-    apart = np.sort(np.abs(np.diff(bearings)))
-    median = (apart[(len(apart) - 1) // 2] + apart[len(apart) // 2]) / 2
-    return _normals(points, float(median))
+    return _normals(points, median(np.abs(np.diff(bearings))))
 
 
 @kernel

@@ -17,6 +17,7 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_S, Pose
 from gigabrain_schemas.body import Lidar
 from gigabrain_zenoh.geometry.pose import compose
+from gigabrain_zenoh.geometry.scan import median
 
 Bools = NDArray[np.bool_]
 Indices = NDArray[np.intp]
@@ -120,7 +121,7 @@ def _breaks(
     empty = turned > MISSING_BEAMS * spacing
     least = max(MIN_GAP_M, NOISE_GAP_SIGMAS * _roughness(ranges))
     ended = empty & ((apart > max(LOST_GAP_M, least)) | (turned > LOST_BEAMS * spacing))
-    return ended | (apart > np.clip(most, least, MAX_GAP_M)), empty
+    return ended | (apart > np.minimum(np.maximum(most, least), MAX_GAP_M)), empty
 
 
 def _roughness(ranges: Floats) -> float:
@@ -131,7 +132,7 @@ def _roughness(ranges: Floats) -> float:
     if len(ranges) < MIN_CLUSTER_HITS:
         return 0.0
     bends = np.abs(ranges[:-2] - 2 * ranges[1:-1] + ranges[2:])
-    return float(np.median(bends)) * TO_DEVIATION
+    return median(bends) * TO_DEVIATION
 
 
 def _in_front(ranges: Floats, empty: Bools, first: Indices, last: Indices, reach: float) -> Bools:
@@ -172,7 +173,7 @@ def _disc_of_cluster(
     """Return the disc between two tangents: sin(half the angle) = r / (near + r)."""
     count = len(ranges)
     third = count // 3
-    near = float(ranges[third : count - third].mean())
+    near = float(ranges[third : count - third].sum()) / (count - 2 * third)
     sine = math.sin(min((ends - begins + spacing) / 2, 1.0))
     radius = min(near * sine / (1.0 - sine), MAX_RADIUS_M)
     return Cluster(
@@ -271,7 +272,7 @@ class PastScan:
         """Sorted bearings with their ranges, padded at both ends by the opposite end."""
         bearings, ranges = self._polar(self.points)
         order = np.argsort(bearings)
-        ends = [*order[-1:], *order, *order[:1]]
+        ends = np.concatenate((order[-1:], order, order[:1]))
         bearings = bearings[ends]
         bearings[:1] -= math.tau
         bearings[-1:] += math.tau
@@ -378,4 +379,4 @@ def _near(points: Floats, x: float, y: float, radius: float) -> Floats:
 
 
 def _share(of: Bools) -> float:
-    return float(of.mean()) if len(of) else 0.0
+    return np.count_nonzero(of) / len(of) if len(of) else 0.0

@@ -4,6 +4,7 @@ Both axes have the same noise, so that one 2 x 2 covariance serves both.
 """
 
 import math
+import statistics
 from dataclasses import dataclass
 
 import numpy as np
@@ -316,7 +317,7 @@ class ObstacleTracker:
         sizes = [track.radius for track in self._tracks if track.moves_quickly]
         if not sizes:
             return
-        radius = float(np.median(sizes))
+        radius = statistics.median(sizes)
         eye = compose(pose, Pose(x=lidar.x, y=lidar.y, yaw=0.0))
         for x, y, noise in discs_of(_beside(points, self._tracks), (eye.x, eye.y), radius):
             if not any(track.covers((x, y)) for track in self._tracks):
