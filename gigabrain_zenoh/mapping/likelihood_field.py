@@ -68,7 +68,7 @@ def field_of(
     Distances are capped at `farthest` [m]; for a `contradiction` alone, CONTRADICTED_M is enough.
     """
     reach = math.ceil(farthest / cell) + 1
-    walls = np.where(cells >= OCCUPIED, np.int8(100), np.int8(0))
+    walls = (cells >= OCCUPIED) * np.int8(100)
     distance = np.sqrt(squared_distance(walls, reach)) * np.float32(cell)
     metres = np.minimum(distance, np.float32(farthest))
     free = (cells >= 0) & (cells <= FREE)

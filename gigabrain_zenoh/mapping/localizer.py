@@ -51,6 +51,7 @@ ELSEWHERE = "a tag says that it is elsewhere, and so does the scan"
 SEARCH_DEADLINE_SCANS = 8  # after which what a search has found is taken
 
 JUDGED_RADIUS_M = 5.0  # round the robot, beams that end farther off are not judged
+JUDGED_STEP_M = 0.5  # from one place to the next at which the map round the robot is looked at
 SUDDEN_INCREASE = 0.3  # so many more of all beams than before
 USUAL_GAIN = 0.1  # of a new scan in what is usual
 KIDNAPPED_SCANS = 3  # in a row, then it is certain
@@ -358,6 +359,8 @@ class KidnapDetector:
 
     def __init__(self) -> None:
         self._usual = 0.0  # share of beams that the map rules out
+        self._field: LikelihoodField | None = None  # None where the map is empty
+        self._made_of: tuple[LogOddsGrid, int, float, float] | None = None
         self.scans = 0  # in a row that do not belong here
 
     @property
@@ -367,10 +370,9 @@ class KidnapDetector:
 
     def look(self, grid: LogOddsGrid, view: View, pose: Floats) -> bool:
         """Return whether the scan does not belong at `pose`, where odometry has the robot."""
-        cells, corner = grid.around(float(pose[0]), float(pose[1]), JUDGED_RADIUS_M)
-        if not cells.size:
+        field = self._field_around(grid, pose)
+        if field is None:
             return False
-        field = field_of(cells, CELL, corner, CONTRADICTED_M)
         share = contradiction(field, view.beams, pose)
         if share > self._usual + SUDDEN_INCREASE:
             self.scans += 1
@@ -378,3 +380,13 @@ class KidnapDetector:
         self._usual += USUAL_GAIN * (share - self._usual)
         self.scans = 0
         return False
+
+    def _field_around(self, grid: LogOddsGrid, pose: Floats) -> LikelihoodField | None:
+        """Return the field around `pose`, which is made again once a scan was drawn in the grid."""
+        x, y = (round(v / JUDGED_STEP_M) * JUDGED_STEP_M for v in pose[:2].tolist())
+        made_of = grid, grid.scans, x, y
+        if made_of != self._made_of:
+            cells, corner = grid.around(x, y, JUDGED_RADIUS_M)
+            self._field = field_of(cells, CELL, corner, CONTRADICTED_M) if cells.size else None
+            self._made_of = made_of
+        return self._field

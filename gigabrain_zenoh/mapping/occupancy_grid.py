@@ -43,7 +43,7 @@ class LogOddsGrid:
         self.origin_x = self.origin_y = 0.0  # [m], the corner of cell (0, 0)
         self.log_odds: Cells = np.zeros((0, 0), np.int8)
         self._stamps: Stamps = np.zeros((0, 0), np.int32)  # the newest scan of each cell; 0: none
-        self._scans = 0
+        self.scans = 0  # that were drawn
         self.full = False  # whether something was left out because the grid may grow no more
 
     @classmethod
@@ -54,7 +54,7 @@ class LogOddsGrid:
         grid = cls()
         grid.origin_x, grid.origin_y = origin
         grid.log_odds = np.array(log_odds, np.int8)
-        grid._stamps, grid._scans = known.astype(np.int32), 1
+        grid._stamps, grid.scans = known.astype(np.int32), 1
         return grid
 
     def still(self) -> "LogOddsGrid":
@@ -72,11 +72,11 @@ class LogOddsGrid:
         ends, clear = transform(sensor, hits), transform(sensor, free)
         around = np.vstack((sensor[None, :2], ends, clear))
         self._cover(around.min(axis=0), around.max(axis=0), sensor[:2])
-        self._scans += 1
+        self.scans += 1
         corner = np.array((self.origin_x, self.origin_y))
         start = ((sensor[:2] - corner) / CELL).astype(np.int64)
         cells, far = _cells(ends, corner), _cells(clear, corner)
-        _draw(self.log_odds, self._stamps, self._scans, start, cells, far)
+        _draw(self.log_odds, self._stamps, self.scans, start, cells, far)
 
     def known(self) -> NDArray[np.bool_]:
         """Return which cells a beam has touched (height, width)."""
