@@ -24,6 +24,9 @@ def wrap(angle: Floats) -> Floats:
 
 def wrapped(pose: Floats) -> Floats:
     """Return the same poses, their yaw within -pi to pi."""
+    if pose.ndim == 1:
+        x, y, yaw = pose.tolist()
+        return np.array((x, y, _wrapped(yaw)))
     return np.concatenate((pose[..., :2], wrap(pose[..., 2:])), axis=-1)
 
 

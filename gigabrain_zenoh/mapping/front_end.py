@@ -3,6 +3,7 @@
 It closes no loops. Its own frame is smooth and drifts, and a correction never moves it.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -14,7 +15,6 @@ from gigabrain_zenoh.geometry.se2 import (
     between,
     compose,
     inverse_of,
-    rotation,
     turned,
     wrapped,
 )
@@ -94,6 +94,11 @@ class DriftSinceMatch:
         """The covariance of odometry since then; generous, as wheels slip."""
         away, turn = 0.1 + 0.2 * self.travel, 0.1 + 0.3 * self.turn
         return np.diag((away**2, away**2, turn**2))
+
+    @property
+    def information(self) -> Floats:
+        """The inverse of the covariance."""
+        return inverse_of(self.covariance)
 
     @property
     def broken(self) -> bool:
@@ -177,7 +182,8 @@ class FrontEnd:
         `about` is where the scan lies among them, and how uncertain that is.
         """
         local = build(scans, np.array(poses), about.pose, CELL, SIGMA, self._spare)
-        fit = _fit(local, scan, about.pose, about.pose, about.covariance)
+        prior = inverse_of(about.covariance)
+        fit = _fit(local, scan, about.pose, about.pose, prior)
         x, y, yaw = wrapped(fit.pose - about.pose).tolist()
         if np.hypot(x, y) > SETTLED[0] or abs(yaw) > SETTLED[1]:
             return None
@@ -186,7 +192,7 @@ class FrontEnd:
         self._scans, self._poses, self._local = list(scans), list(poses), local
         self._room, self._spare = self._spare, self._room
         self.pose = wrapped(fit.pose)
-        covariance = inverse_of(fit.information + inverse_of(about.covariance))
+        covariance = inverse_of(fit.information + prior)
         return replace(about, pose=self.pose, covariance=covariance, inliers=fit.inliers)
 
     @property
@@ -197,15 +203,15 @@ class FrontEnd:
     def _match(self, local: LocalMap, scan: Scan, guess: Floats) -> ScanMatch:
         if len(scan.points) < MIN_POINTS:
             return ScanMatch(guess, self._adrift.covariance, "odometry", 0.0, 0.0)
-        covariance = self._adrift.covariance
         found = search(local.image, scan.points, guess, self._adrift.window)
         if self._noise is not None:
-            known = turned(self._noise, float(guess[2]))
-            fit = _fit(local, scan, found.pose, guess, known)
-            if fit.inliers >= INLIERS and _likely(fit.pose - guess, known):
-                return replace(_matched(fit, found, known, "matched"), guided=True)
-        fit = _fit(local, scan, found.pose, guess, covariance)
-        match = _plain(fit, found, covariance)
+            prior = inverse_of(turned(self._noise, float(guess[2])))
+            fit = _fit(local, scan, found.pose, guess, prior)
+            if fit.inliers >= INLIERS and _likely(fit.pose - guess, prior):
+                return _matched(fit, found, prior, "matched", guided=True)
+        prior = self._adrift.information
+        fit = _fit(local, scan, found.pose, guess, prior)
+        match = _plain(fit, found, prior, self._adrift.covariance)
         if match and match.score > CLEAR:
             return match
         return self._doubted(local, scan, guess, found, match)
@@ -250,31 +256,31 @@ class FrontEnd:
 
         A small turn puts distant points out of ICP's reach, and makes beams pass through walls.
         """
-        covariance = self._adrift.covariance
-        turn = float(np.sqrt(covariance[2, 2]))
+        prior = self._adrift.information
+        turn = float(np.sqrt(self._adrift.covariance[2, 2]))
         starts = (found.pose, *(np.add(guess, (0.0, 0.0, share * turn)) for share in TURNS))
         best, least = None, wrong
         for start in starts:
-            fit = _fit(local, scan, start, guess, covariance)
+            fit = _fit(local, scan, start, guess, prior)
             through = seen_through(local.buckets.points, scan.points, fit.pose)
             if not through < WRONG or _apart(fit.pose, guess) > MOVED:
                 continue
             least = min(through, least)
             if fit.inliers >= max(best.inliers if best else 0.0, MIN_TURNED_INLIERS):
                 best = fit
-        return (_matched(best, found, covariance, "matched") if best else None), least
+        return (_matched(best, found, prior, "matched") if best else None), least
 
     def _led(
         self, local: LocalMap, scan: Scan, guess: Floats, found: SearchResult
     ) -> ScanMatch | None:
         """Match where odometry leads; None if the scan contradicts it or shows little known."""
-        covariance = self._adrift.covariance
-        fit = _fit(local, scan, guess, guess, covariance)
+        prior = self._adrift.information
+        fit = _fit(local, scan, guess, guess, prior)
         if fit.inliers < MIN_INLIERS or _apart(fit.pose, guess) > MOVED:
             return None
         if not seen_through(local.buckets.points, scan.points, fit.pose) < WRONG:
             return None
-        return _matched(fit, found, covariance, "matched")
+        return _matched(fit, found, prior, "matched")
 
     def _recover(
         self, local: LocalMap, scan: Scan, guess: Floats, least: float, wrong: float
@@ -289,12 +295,13 @@ class FrontEnd:
         found = max(places, key=lambda place: place.score)
         if found.score < least:
             return None
-        fit = _fit(local, scan, found.pose, found.pose, UNKNOWN)
+        prior = inverse_of(UNKNOWN)
+        fit = _fit(local, scan, found.pose, found.pose, prior)
         if fit.inliers < WIDE_INLIERS or _apart(fit.pose, found.pose) > MOVED:
             return None
         if seen_through(local.buckets.points, scan.points, fit.pose) > wrong - CLEARER:
             return None
-        return _matched(fit, found, UNKNOWN, "recovered")
+        return _matched(fit, found, prior, "recovered")
 
     def _lost(self, scan: Scan, guess: Floats, found: SearchResult) -> ScanMatch:
         """Continue by odometry alone, until the sequence counts as broken."""
@@ -311,51 +318,53 @@ class FrontEnd:
         before, pose = self._missed
         local = build([before], pose[None], pose, CELL, SIGMA)
         found = search(local.image, scan.points, guess, self._adrift.window)
-        fit = _fit(local, scan, found.pose, guess, self._adrift.covariance)
+        fit = _fit(local, scan, found.pose, guess, self._adrift.information)
         return fit.inliers >= WIDE_INLIERS
 
     def _summed(self, noise: Floats | None, delta: Floats) -> Floats | None:
         """Return the covariance of odometry since the last match, in the present pose's axes."""
         if noise is None or self._noise is None:
             return None
-        turn = rotation(-float(delta[2]))
-        lever = np.eye(3)
-        lever[0, 2], lever[1, 2] = -delta[1], delta[0]
-        return np.asarray(turn @ (lever @ self._noise @ lever.T + noise) @ turn.T)
+        if self._noise is not UNMOVED:
+            lever = np.eye(3)
+            lever[0, 2], lever[1, 2] = -delta[1], delta[0]
+            noise = lever @ self._noise @ lever.T + noise
+        return turned(noise, -float(delta[2]))
 
     def _far_enough(self) -> bool:
         if not self._poses:
             return True
-        x, y, yaw = between(self._poses[-1], self.pose)
-        return bool(np.hypot(x, y) > self._spacing.travel or abs(yaw) > self._spacing.turn)
+        x, y, yaw = between(self._poses[-1], self.pose).tolist()
+        return math.hypot(x, y) > self._spacing.travel or abs(yaw) > self._spacing.turn
 
 
-def _likely(off: Floats, covariance: Floats) -> bool:
-    """Return whether odometry of this covariance may be `off` by that much, in the same axes."""
+def _likely(off: Floats, prior: Floats) -> bool:
+    """Return whether odometry of this information may be `off` by that much, in the same axes."""
     off = wrapped(off)
-    return bool(off @ inverse_of(covariance) @ off < CONTRADICTED)
+    return bool(off @ prior @ off < CONTRADICTED)
 
 
-def _fit(
-    local: LocalMap, scan: Scan, start: Floats, guess: Floats, covariance: Floats
-) -> IcpResult:
-    points = thinned(scan.points, POINTS)
-    return icp(local.buckets, points, start, GATE, inverse_of(covariance), guess)
+def _fit(local: LocalMap, scan: Scan, start: Floats, guess: Floats, prior: Floats) -> IcpResult:
+    return icp(local.buckets, thinned(scan.points, POINTS), start, GATE, prior, guess)
 
 
-def _plain(fit: IcpResult, found: SearchResult, covariance: Floats) -> ScanMatch | None:
+def _plain(
+    fit: IcpResult, found: SearchResult, prior: Floats, covariance: Floats
+) -> ScanMatch | None:
     """Return the match by search and ICP, or None if both have failed."""
     near = found.score > MIN_SCORE and _apart(fit.pose, found.pose) <= MOVED
     if near and fit.inliers >= INLIERS:
-        return _matched(fit, found, covariance, "matched")
+        return _matched(fit, found, prior, "matched")
     if found.score > SCORE:
         return ScanMatch(wrapped(found.pose), covariance, "searched", found.score, fit.inliers)
     return None
 
 
-def _matched(fit: IcpResult, found: SearchResult, prior: Floats, kind: Kind) -> ScanMatch:
-    covariance = inverse_of(fit.information + inverse_of(prior))
-    return ScanMatch(wrapped(fit.pose), covariance, kind, found.score, fit.inliers)
+def _matched(
+    fit: IcpResult, found: SearchResult, prior: Floats, kind: Kind, *, guided: bool = False
+) -> ScanMatch:
+    covariance = inverse_of(fit.information + prior)
+    return ScanMatch(wrapped(fit.pose), covariance, kind, found.score, fit.inliers, guided)
 
 
 def _apart(one: Floats, other: Floats) -> float:

@@ -5,6 +5,7 @@ only those that may beat the best known one are searched. A. Censi, An ICP varia
 to-line metric, ICRA 2008.
 """
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -76,8 +77,8 @@ def search(
     """
     if not len(points):
         return SearchResult(guess, 0.0)
-    steps = int(np.ceil(window.away / image.cell))
-    turns = int(np.ceil(window.turn / window.step))
+    steps = math.ceil(window.away / image.cell)
+    turns = math.ceil(window.turn / window.step)
     lattice, few = Lattice(steps, turns, window.step), thinned(points, most)
     hits = _placed(few, guess, image, lattice)
     bounds = _bounds(image.coarse, hits, len(few), lattice)
