@@ -33,7 +33,7 @@ def wrapped(pose: Floats) -> Floats:
 def compose(first: Floats, second: Floats) -> Floats:
     """Transform pose `second` from the frame `first` to the parent frame."""
     if first.ndim == second.ndim == 1:
-        return np.array(_composed(*first.tolist(), *second.tolist()))
+        return np.array(composed(*first.tolist(), *second.tolist()))
     cos, sin = np.cos(first[..., 2]), np.sin(first[..., 2])
     x = first[..., 0] + cos * second[..., 0] - sin * second[..., 1]
     y = first[..., 1] + sin * second[..., 0] + cos * second[..., 1]
@@ -57,9 +57,10 @@ def _wrapped(angle: float) -> float:
     return (angle + math.pi) % math.tau - math.pi
 
 
-def _composed(
+def composed(
     x: float, y: float, yaw: float, x2: float, y2: float, yaw2: float
 ) -> tuple[float, float, float]:
+    """Transform the second pose from the frame of the first to the parent frame."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     return x + cos * x2 - sin * y2, y + sin * x2 + cos * y2, _wrapped(yaw + yaw2)
 
@@ -72,7 +73,7 @@ def _inverted(x: float, y: float, yaw: float) -> tuple[float, float, float]:
 def between(first: Floats, second: Floats) -> Floats:
     """Return `second` relative to `first`, both given in the same frame."""
     if first.ndim == second.ndim == 1:
-        return np.array(_composed(*_inverted(*first.tolist()), *second.tolist()))
+        return np.array(composed(*_inverted(*first.tolist()), *second.tolist()))
     return compose(inverse(first), second)
 
 

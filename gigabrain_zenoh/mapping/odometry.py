@@ -15,7 +15,7 @@ import numpy as np
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_NS
 from gigabrain_schemas.body import BodyDescription, RobotState
-from gigabrain_zenoh.geometry.se2 import between, compose, from_pose
+from gigabrain_zenoh.geometry.se2 import between, compose, composed, from_pose
 
 KEPT = 250  # states, so 5 s
 GAP_TICKS = 25  # no pose is made up between states that lie farther apart,
@@ -76,7 +76,7 @@ class OdometryFusion:
         if state.tick <= last.tick:
             return
         ticks = state.tick - last.tick
-        step = between(last.odometry, pose)
+        step = between(last.odometry, pose).tolist()
         fused, jumps, unaided, rate = last.fused, last.jumps, last.unaided, 0.0
         if jumped(step, ticks * TICK_NS / 1e9, body):
             self._rate, self._rest = self._turn_rate(state, body), 0
@@ -84,7 +84,7 @@ class OdometryFusion:
         else:
             turn = self._turn(self._turn_rate(state, body), step, ticks)
             unaided += turn is None
-            turn = float(step[2]) if turn is None else turn
+            turn = step[2] if turn is None else turn
             fused, rate = advanced(fused, step, turn), turn / (ticks * TICK_NS / 1e9)
         self._moments.append(
             OdometrySample(state.tick, pose, fused, self.slipping, jumps, unaided, rate)
@@ -129,7 +129,7 @@ class OdometryFusion:
         glitch = abs(rate) > JUMP_FACTOR * body.max_angular_speed + GLITCH_RATE
         return None if glitch else rate
 
-    def _turn(self, rate: float | None, step: Floats, ticks: int) -> float | None:
+    def _turn(self, rate: float | None, step: list[float], ticks: int) -> float | None:
         """Return the turn since the last state by the gyro [rad]."""
         before, self._rate = self._rate, rate
         if before is None or self._rate is None or ticks > GYRO_TICKS:
@@ -138,12 +138,12 @@ class OdometryFusion:
             return 0.0
         seconds = ticks * TICK_NS / 1e9
         turn = (before + self._rate) / 2 * seconds
-        self._slip += SLIP_SHARE * ((float(step[2]) - turn) / seconds - self._slip)
+        self._slip += SLIP_SHARE * ((step[2] - turn) / seconds - self._slip)
         return turn
 
-    def _learn_bias(self, step: Floats, rate: float) -> bool:
+    def _learn_bias(self, step: list[float], rate: float) -> bool:
         """Learn the gyro's bias at rest; return whether the body is at rest."""
-        if step.any():
+        if any(step):
             self._rest = self._quiet = 0
             return False
         self._rest += 1
@@ -174,20 +174,20 @@ def way(last: OdometrySample, moment: OdometrySample) -> tuple[Floats, Floats]:
     return step, noise
 
 
-def jumped(step: Floats, seconds: float, body: BodyDescription) -> bool:
-    """Return whether `step` (3,) within `seconds` is more than this body can do."""
+def jumped(step: list[float], seconds: float, body: BodyDescription) -> bool:
+    """Return whether `step` (x, y, yaw) within `seconds` is more than this body can do."""
     fastest = max(body.max_linear_speed, body.max_lateral_speed)
-    far = math.hypot(float(step[0]), float(step[1])) > JUMP_FACTOR * fastest * seconds + JUMP_M
-    return far or abs(float(step[2])) > JUMP_FACTOR * body.max_angular_speed * seconds + JUMP_RAD
+    far = math.hypot(step[0], step[1]) > JUMP_FACTOR * fastest * seconds + JUMP_M
+    return far or abs(step[2]) > JUMP_FACTOR * body.max_angular_speed * seconds + JUMP_RAD
 
 
-def advanced(pose: Floats, step: Floats, turn: float) -> Floats:
+def advanced(pose: Floats, step: list[float], turn: float) -> Floats:
     """Return `pose` after a small `step` of the wheels while the body turned by `turn` [rad].
 
     The step's direction is that at the middle of the turn.
     """
-    along = compose(np.array((0.0, 0.0, (turn - float(step[2])) / 2)), step)
-    return compose(pose, np.array((along[0], along[1], turn)))
+    x, y, _ = composed(0.0, 0.0, (turn - step[2]) / 2, *step)
+    return compose(pose, np.array((x, y, turn)))
 
 
 def uncertainty(step: Floats, *, slipping: bool, gyro: bool = False) -> Floats:
