@@ -42,7 +42,8 @@ class Scan:
         Hits beyond REACH_M are left out: no map could be loaded with them.
         """
         kept = pairs("points", points)
-        kept = kept[(np.abs(kept) <= REACH_M).all(axis=1)]
+        near = np.abs(kept) <= REACH_M
+        kept = kept if near.all() else kept[near.all(axis=1)]
         ends = np.empty((0, 2), np.float32) if free is None else pairs("free", free)
         return cls(kept, normals(kept), ends)
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_NS
@@ -24,7 +25,7 @@ from gigabrain_zenoh.bus.bus import Bus, Latest
 from gigabrain_zenoh.bus.input_log import log_accepted
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.errors import ConfigError, Refused
-from gigabrain_zenoh.geometry.scan import beams, hits
+from gigabrain_zenoh.geometry.scan import beams
 from gigabrain_zenoh.host.bounded import NewestValues
 from gigabrain_zenoh.host.threads import InTime, done
 from gigabrain_zenoh.kernels.precompile import ensure_compiled
@@ -79,16 +80,15 @@ def _loaded(config: PerceptionConfig, in_time: InTime) -> tuple[RobotMap, ZoneFi
     return chart_of(config, in_time), zone_file.load(map_file.path_of(config.map))
 
 
-def view_of(lidar: Lidar, scan: LaserScan, ignore_below: float) -> View:
-    """Convert a scan to hit points and the ends of free beams, in the body's frame [m]."""
+def view_of(lidar: Lidar, scan: LaserScan, hits: NDArray[np.floating]) -> View:
+    """Return the `hits` (n, 2) of a scan and the ends of free beams, in the body's frame [m]."""
     values = scan.ranges_m
-    points = np.column_stack(hits(lidar, scan, ignore_below))
     cosines, sines = beams(len(values), scan.angle_min, scan.angle_increment, lidar.yaw)
     sensor = np.array((lidar.x, lidar.y))
     clear = values == np.inf if lidar.no_return == "free" else np.zeros(len(values), np.bool_)
     reach = min(scan.range_max - SHORT_M, FREE_M)
     free = sensor + reach * np.column_stack((cosines[clear], sines[clear]))
-    return View(Scan.of(points, free), sensor)
+    return View(Scan.of(hits, free), sensor)
 
 
 class Mapper:
@@ -238,7 +238,7 @@ class Mapper:
         if body is None or body.description.lidar is None:
             return
         began = time.perf_counter()
-        view = view_of(body.description.lidar, scan, self._config.ignore_below)
+        view = view_of(body.description.lidar, scan, world.points())
         before = self._last
         motion = self._motion(moment)
         self._suggest(moment)

@@ -17,6 +17,7 @@ from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.geometry.scan import hits
 from gigabrain_zenoh.geometry.se2 import between, compose, inverse
 from gigabrain_zenoh.mapping.likelihood_field import OCCUPIED
 from gigabrain_zenoh.mapping.odometry import OdometryFusion, OdometrySample, way
@@ -197,8 +198,9 @@ class _MappingRun:
         moment = self.fusion.at(scan.basis)
         if moment is None:
             return
+        ends = np.column_stack(hits(lidar, scan, PerceptionConfig().ignore_below))
         began = time.thread_time()
-        view = view_of(lidar, scan, PerceptionConfig().ignore_below)
+        view = view_of(lidar, scan, ends)
         place = self.chart.step(view, *way(self._last or moment, moment))
         self.took_ms.append((time.thread_time() - began) * 1e3)
         self._last = moment
