@@ -35,7 +35,7 @@ REST_TICKS = 50  # without motion commands, after which nothing is known
 SPEED_TICKS, MIN_SPEED_TICKS = 40, 20  # of measured speeds
 SPEED_DELAYS = 31  # candidates, a tick apart: 0 to 0.6 s
 MIN_SPEED_DELAYS = 15  # while there are fewer commands than the longest delay needs
-SPEED_SCALE = (0.05, 0.05, 0.3)  # [m/s, m/s, rad/s], as tolerances of tracking_error
+SPEED_SCALE: Floats = np.array([[0.05], [0.05], [0.3]])  # as tolerances of tracking_error
 MIN_SPEED_CHANGE = 2.0  # in units of that; smaller changes are noise
 SPEED_PERIOD_TICKS = 4  # between estimates
 
@@ -106,29 +106,42 @@ class SpeedDelay(DelayEstimate, frozen=True, kw_only=True):
             return None
         if len(self.commanded) < len(self.measured) + MIN_SPEED_DELAYS - 1:
             return None
-        changes = zip(zip(*self.measured, strict=True), SPEED_SCALE, strict=True)
-        if max(max(axis) / unit - min(axis) / unit for axis, unit in changes) < MIN_SPEED_CHANGE:
+        measured = _by_axis(self.measured)
+        if float((measured.max(axis=1) - measured.min(axis=1)).max()) < MIN_SPEED_CHANGE:
             return None
-        commanded = np.array(self.commanded) / SPEED_SCALE
-        measured = np.array(self.measured) / SPEED_SCALE
-        left, whole = _unexplained(commanded, measured)
+        left, whole = _unexplained(_by_axis(self.commanded), measured)
         best = int(np.argmin(left))
         sure = left[best] <= MAX_UNEXPLAINED * whole and _refutes_shorter(left, best)
         return best if sure else None
 
 
+def _by_axis(speeds: tuple[Speeds, ...]) -> Floats:
+    """Return speeds in units of SPEED_SCALE, (axes, ticks)."""
+    return np.array(tuple(zip(*speeds, strict=True))) / SPEED_SCALE
+
+
 def _unexplained(commanded: Floats, measured: Floats) -> tuple[Floats, float]:
     """Return what each delay leaves of the squared speed changes, (delays,), and their sum."""
-    views = np.lib.stride_tricks.sliding_window_view(commanded, len(measured), axis=0)
-    views = views[::-1][:SPEED_DELAYS]
+    ticks = measured.shape[1]
+    views = _windows(commanded, ticks)[::-1][:SPEED_DELAYS]
     models = views - views.mean(axis=2, keepdims=True)  # (delays, axes, ticks)
-    changes = (measured - measured.mean(axis=0)).T  # (axes, ticks)
+    changes = measured - measured.mean(axis=1, keepdims=True)  # (axes, ticks)
     both = np.einsum("dat,at->da", models, changes)
     size = np.maximum(np.einsum("dat,dat->da", models, models), 1e-9)
     whole = np.einsum("at,at->a", changes, changes)
     gains = np.clip(both / size, 0.5, 1.5)
     left = np.maximum(whole - 2 * gains * both + gains * gains * size, 0.0).sum(axis=1)
-    return left + 1e-3 * len(measured), float(whole.sum())
+    return left + 1e-3 * ticks, float(whole.sum())
+
+
+def _windows(values: Floats, length: int) -> Floats:
+    """Return all windows of `length` of the last axis, (windows, ..., length), as views.
+
+    numpy's `sliding_window_view` does the same, but its checks take longer than the estimates.
+    """
+    shape = (values.shape[-1] - length + 1, *values.shape[:-1], length)
+    strides = (values.itemsize, *values.strides)
+    return np.ndarray(shape, values.dtype, values, strides=strides)
 
 
 class TurnDelay(DelayEstimate, frozen=True, kw_only=True):
@@ -168,8 +181,9 @@ def _turn(before: LaserScan, now: LaserScan) -> float | None:
         return None
     most = min(math.ceil(MAX_TURN / step), beams // 2 - 1)
     around = np.concatenate([then[beams - most :], then, then[:most]])
-    apart = np.lib.stride_tricks.sliding_window_view(around, beams) - newest  # (shifts, beams)
-    np.multiply(apart, apart, out=apart)
+    apart = _windows(around, beams).copy()  # (shifts, beams)
+    apart -= newest
+    apart *= apart
     np.minimum(apart, MAX_RANGE_DIFFERENCE_M * MAX_RANGE_DIFFERENCE_M, out=apart)
     unlike = np.add.reduce(apart, axis=1) / beams
     best = int(unlike.argmin())
@@ -193,7 +207,7 @@ def _turn_delay(turns: tuple[tuple[int, int, float], ...], history: PoseHistory)
     if len(turns) < MIN_TURNS:
         return None
     begins, ends, seen = (np.array(part, dtype=np.float64) for part in zip(*turns, strict=True))
-    if float(np.ptp(seen)) < MIN_TURN_CHANGE or not history.ticks:
+    if float(seen.max() - seen.min()) < MIN_TURN_CHANGE or not history.ticks:
         return None
     known = np.array(history.ticks, dtype=np.float64)
     if known[0] > begins[0] - TURN_DELAYS:
