@@ -88,31 +88,34 @@ def straight(footprint: Corners, points: Floats, margin: float) -> tuple[float |
     front, rear, left, right = box(footprint)
     x, y = points[:, 0], points[:, 1]
     return (
-        _along(x, y, (rear, front), (right, left), margin),
-        _along(-x, y, (-front, -rear), (right, left), margin),
-        _along(y, x, (right, left), (rear, front), margin),
-        _along(-y, x, (-left, -right), (rear, front), margin),
+        *_both_ways(x, y, (rear, front), (right, left), margin),
+        *_both_ways(y, x, (right, left), (rear, front), margin),
     )
 
 
-def _along(
-    ahead: Floats,
+def _both_ways(
+    along: Floats,
     across: Floats,
     length: tuple[float, float],
     width: tuple[float, float],
     margin: float,
-) -> float | None:
-    """Return the shortest distance from the body's front to a point in the strip ahead of it.
+) -> tuple[float | None, float | None]:
+    """Return the shortest distances from a body to a point in its strip, ahead of it and behind it.
 
     The body covers `length` along the strip and `width` across. A point inside the footprint counts
     as ahead or behind, by the half that it is in.
     """
     (rear, front), (low, high) = length, width
     strip = (across >= low - margin) & (across <= high + margin)
-    inside = (ahead > 0) & (ahead <= front) & (across >= low) & (across <= high)
-    inside &= ahead >= rear
-    way = ahead[(strip & (ahead > front)) | inside] - front
-    return max(0.0, float(way.min())) if way.size else None
+    along, across = along[strip], across[strip]
+    inside = (along >= rear) & (along <= front) & (across >= low) & (across <= high)
+    ahead = along[(along > front) | (inside & (along > 0))] - front
+    behind = rear - along[(along < rear) | (inside & (along < 0))]
+    return _least(ahead), _least(behind)
+
+
+def _least(ways: Floats) -> float | None:
+    return max(0.0, float(ways.min())) if ways.size else None
 
 
 def turning(
