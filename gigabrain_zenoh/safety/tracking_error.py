@@ -13,7 +13,7 @@ from gigabrain_schemas.body import BodyDescription, Joint, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_schemas.sensors import ImuData
-from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of, ramp
+from gigabrain_zenoh.geometry.limits import ZERO, Limits, clamp, limits_of, ramp
 from gigabrain_zenoh.geometry.pose import axes, velocity_of
 from gigabrain_zenoh.safety.catalogue import cause, lasting, ticks_of
 
@@ -22,7 +22,6 @@ MAX_LATE_TICKS = 30  # added to that where data are known to be late
 WATCH_TICKS = 100  # after it was last enabled; later a person may push it
 
 Axes = tuple[float, float, float]
-Bands = tuple[Axes, ...]  # least, greatest, tolerance; per axis
 Telemetry = tuple[Pose, Velocity, tuple[Joint, ...], ImuData | None]
 
 
@@ -30,7 +29,7 @@ class TrackingError(Struct, frozen=True, kw_only=True):
     """Compares commanded and measured motion."""
 
     commanded: Velocity = ZERO  # present output of the gate
-    recent: tuple[Velocity, ...] = ()  # those of the newest ticks
+    recent: tuple[Axes, ...] = ()  # those of the newest ticks
     telemetry: Telemetry | None = None
     watch_ticks: int = 0  # for which motion is still judged
     runaway_ticks: int = 0
@@ -41,7 +40,7 @@ class TrackingError(Struct, frozen=True, kw_only=True):
     @classmethod
     def start(cls, state: RobotState) -> "TrackingError":
         """Return the monitor for a first state, whose motion is taken as the commanded one."""
-        return cls(commanded=state.velocity, recent=(state.velocity,))
+        return cls(commanded=state.velocity, recent=(axes(state.velocity),))
 
     def then(
         self,
@@ -55,10 +54,10 @@ class TrackingError(Struct, frozen=True, kw_only=True):
         """Return the monitor after one more state, whose data are `late_ticks` late."""
         if not elapsed:
             return self
-        target = _target(body, state, command, caps)
-        commanded = ramp(self.commanded, target, limits_of(body), elapsed * TICK_S)
-        recent = (*self.recent, commanded)[-WINDOW_TICKS - MAX_LATE_TICKS :]
-        bands = _bands(body, recent[-WINDOW_TICKS - min(late_ticks, MAX_LATE_TICKS) :])
+        limits = limits_of(body)
+        target = _target(limits, state, command, caps)
+        commanded = ramp(self.commanded, target, limits, elapsed * TICK_S)
+        recent = (*self.recent, axes(commanded))[-WINDOW_TICKS - MAX_LATE_TICKS :]
         active = state.gate.mode in ("enabled", "stopping")
         watch = WATCH_TICKS if active else max(0, self.watch_ticks - elapsed)
         now = replace(self, commanded=commanded, recent=recent, watch_ticks=watch)
@@ -67,14 +66,14 @@ class TrackingError(Struct, frozen=True, kw_only=True):
         telemetry = (state.pose, state.velocity, state.joints, state.imu)
         moving = _moves(body, commanded)
         stuck = active and moving and _rests(body, state.velocity)
-        fast = bool(watch) and _too_fast(bands, state.velocity)
-        slow = active and _too_slow(bands, state.velocity)
+        outputs = recent[-WINDOW_TICKS - min(late_ticks, MAX_LATE_TICKS) :]
+        fast, slow = _disobeys(body, outputs, state.velocity)
         same = telemetry == self.telemetry or self._odometry_repeats(body, state)
         return replace(
             now,
             telemetry=telemetry,
-            runaway_ticks=lasting(self.runaway_ticks, fast, elapsed),
-            slow_ticks=lasting(self.slow_ticks, slow, elapsed),
+            runaway_ticks=lasting(self.runaway_ticks, fast and bool(watch), elapsed),
+            slow_ticks=lasting(self.slow_ticks, slow and active, elapsed),
             stuck_ticks=lasting(self.stuck_ticks, stuck, elapsed),
             frozen_ticks=self.frozen_ticks + elapsed * moving if same else 0,
         )
@@ -103,13 +102,11 @@ class TrackingError(Struct, frozen=True, kw_only=True):
         return tuple(cause(code) for code, ticks, limit_s in found if ticks >= ticks_of(limit_s))
 
 
-def _target(
-    body: BodyDescription, state: RobotState, command: CmdVel | None, caps: SpeedCaps
-) -> Velocity:
+def _target(limits: Limits, state: RobotState, command: CmdVel | None, caps: SpeedCaps) -> Velocity:
     gate = state.gate
     if gate.mode != "enabled" or command is None or command.source != gate.commander:
         return ZERO
-    return clamp(velocity_of(command), limits_of(body), caps)
+    return clamp(velocity_of(command), limits, caps)
 
 
 def _tolerances(body: BodyDescription) -> Axes:
@@ -127,30 +124,20 @@ def _rests(body: BodyDescription, measured: Velocity) -> bool:
     return all(abs(value) < tolerance / 2 for value, tolerance in pairs)
 
 
-def _bands(body: BodyDescription, recent: tuple[Velocity, ...]) -> Bands:
-    """Return the range of recent outputs per axis, and the tolerance around it.
+def _disobeys(
+    body: BodyDescription, recent: tuple[Axes, ...], measured: Velocity
+) -> tuple[bool, bool]:
+    """Return whether the body moves or turns farther from rest than commanded, and less.
 
-    Control corrects a body that is too slow or too fast, so a share of the speed is no fault.
+    Less counts where it is less than all recent outputs. Control corrects a body that is too slow
+    or too fast, so a share of the speed is no fault.
     """
     share = body.control.max_correction
-    ranges = ((min(values), max(values)) for values in zip(*map(axes, recent), strict=True))
-    return tuple(
-        (least, most, tolerance + share * max(abs(least), abs(most)))
-        for (least, most), tolerance in zip(ranges, _tolerances(body), strict=True)
-    )
-
-
-def _too_fast(bands: Bands, measured: Velocity) -> bool:
-    """Return whether the body moves or turns farther from rest than commanded."""
-    return any(
-        value > max(most, 0.0) + margin or value < min(least, 0.0) - margin
-        for (least, most, margin), value in zip(bands, axes(measured), strict=True)
-    )
-
-
-def _too_slow(bands: Bands, measured: Velocity) -> bool:
-    """Return whether the body moves or turns less than commanded all the time."""
-    return any(
-        0 <= value < least - margin or 0 >= value > most + margin
-        for (least, most, margin), value in zip(bands, axes(measured), strict=True)
-    )
+    fast = slow = False
+    each = zip(zip(*recent, strict=True), _tolerances(body), axes(measured), strict=True)
+    for outputs, tolerance, value in each:
+        least, most = min(outputs), max(outputs)
+        margin = tolerance + share * max(abs(least), abs(most))
+        fast |= value > max(most, 0.0) + margin or value < min(least, 0.0) - margin
+        slow |= 0 <= value < least - margin or 0 >= value > most + margin
+    return fast, slow
