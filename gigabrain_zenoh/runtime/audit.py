@@ -1,7 +1,7 @@
 """The audit trail of one process: on `robot/audit`, on disk, and for requests for its history.
 
-On disk it is JSON lines, appended and synced; never overwritten, bounded in size. What people have
-done has files of its own, so that nothing else that is logged or refused can push it out.
+On disk it is JSON lines, appended and synced; never overwritten, bounded in size. Acts of people
+are in files of their own, so that a flood of other entries cannot remove them.
 """
 
 import asyncio
@@ -26,22 +26,21 @@ from gigabrain_zenoh.host.files import read_bounded
 from gigabrain_zenoh.host.threads import BackgroundWriter
 from gigabrain_zenoh.logs import Fault
 
-MAX_BYTES = 1_000_000  # of one file; then the next one is begun
-KEPT = 8  # files of a kind per process; the oldest is removed
-FOLDER = "audit"  # within the folder of what a robot remembers
+MAX_FILE_BYTES = 1_000_000  # of one file; then the next one is started
+MAX_FILES = 8  # of acts, and of events, per process; the oldest is removed
+FOLDER = "audit"  # within a robot's state folder
 ACTS: tuple[What, ...] = ("boot", "end", "estop", "release", "enable", "take")
-EVENTS = "-events"  # at the end of the name of the files with everything else
+EVENTS = "-events"  # appended to the process in the names of files with all other entries
 
 
 class AuditFile:
     """One process's part of the log, in `audit/`, newest last.
 
-    `<process>-<number>.jsonl` has what people have done, `<process>-events-<number>.jsonl` the
-    rest.
+    `<process>-<number>.jsonl` has the acts of people, `<process>-events-<number>.jsonl` the rest.
     """
 
     def __init__(
-        self, folder: Path, process: str, *, max_bytes: int = MAX_BYTES, kept: int = KEPT
+        self, folder: Path, process: str, *, max_bytes: int = MAX_FILE_BYTES, kept: int = MAX_FILES
     ) -> None:
         self._folder, self._process = folder / FOLDER, process
         self._max_bytes, self._kept = max_bytes, kept
@@ -66,17 +65,17 @@ class AuditFile:
         if not records:
             return
         lines = b"".join(msgspec.json.encode(record) + b"\n" for record in records)
-        path = self._place(name, len(lines))
-        torn = _torn(path)
+        path = self._file_for(name, len(lines))
+        torn = _ends_in_line(path)
         with path.open("ab") as file:
             file.write(b"\n" * torn + lines)
             file.flush()
             os.fsync(file.fileno())
 
-    def _place(self, name: str, more: int) -> Path:
-        """Return the file to append to; if it is full, begin a new one and remove the oldest."""
+    def _file_for(self, name: str, added_bytes: int) -> Path:
+        """Return the file to append to; if it is full, a new one, and remove the oldest."""
         files = _files(self._folder, name)
-        if files and files[-1].stat().st_size + more <= self._max_bytes:
+        if files and files[-1].stat().st_size + added_bytes <= self._max_bytes:
             return files[-1]
         number = _number(files[-1]) + 1 if files else 1
         for old in files[: max(0, len(files) + 1 - self._kept)]:
@@ -87,30 +86,30 @@ class AuditFile:
 def read_audit(folder: Path, count: int, process: str = "") -> tuple[AuditRecord, ...]:
     """Return the last `count` entries in a robot's folder, in order of time.
 
-    A line that a power cut has torn is left out. Raises ConfigError.
+    A line that a power cut left incomplete is skipped. Raises ConfigError.
     """
     names = {process, process + EVENTS}
     if not process:
-        names = {path.name.rpartition("-")[0] for path in _all(folder / FOLDER)}
-    found = []
-    for name in sorted(names):  # of one moment acts come first
-        mine: list[AuditRecord] = []
+        names = {path.name.rpartition("-")[0] for path in _all_files(folder / FOLDER)}
+    logs = []
+    for name in sorted(names):  # at equal times, acts precede events
+        records: list[AuditRecord] = []
         for path in reversed(_files(folder / FOLDER, name)):
             try:
-                text = read_bounded(path, 2 * MAX_BYTES)
+                text = read_bounded(path, 2 * MAX_FILE_BYTES)
             except OSError as error:
                 raise ConfigError(f"cannot read {path}: {error.strerror}") from None
-            mine = [*_records(text.splitlines()), *mine]
-            if len(mine) >= count:
+            records = [*_records(text.splitlines()), *records]
+            if len(records) >= count:
                 break
-        found.append(mine[-count:])
-    return in_order(found)[-count:]
+        logs.append(records[-count:])
+    return in_order(logs)[-count:]
 
 
 def in_order(logs: Iterable[Sequence[AuditRecord]]) -> tuple[AuditRecord, ...]:
-    """Several processes' logs as one, by wall time; each keeps its own order.
+    """Merge the logs of several processes by wall time; each keeps its own order.
 
-    The newest are put in order first, as the clock may have stepped back before them.
+    The merge starts at the newest entries, as the clock may have stepped back before them.
     """
     backwards = [_with_latest_time(log) for log in reversed(list(logs))]
     merged = heapq.merge(*backwards, key=lambda timed: timed[0], reverse=True)
@@ -118,7 +117,7 @@ def in_order(logs: Iterable[Sequence[AuditRecord]]) -> tuple[AuditRecord, ...]:
 
 
 def _with_latest_time(log: Sequence[AuditRecord]) -> Iterator[tuple[int, AuditRecord]]:
-    """Yield the entries, newest first, each with a time that is no later than of any after it."""
+    """Yield the entries, newest first, each with the earliest time of itself and all newer ones."""
     time_ns = 2**63
     for record in reversed(log):
         time_ns = min(time_ns, record.stamp_ns)
@@ -133,21 +132,21 @@ def _records(lines: Iterable[bytes]) -> Iterator[AuditRecord]:
             continue
 
 
-def _all(folder: Path) -> list[Path]:
+def _all_files(folder: Path) -> list[Path]:
     return [path for path in folder.glob("*.jsonl") if re.search(r"-\d+\.jsonl$", path.name)]
 
 
 def _files(folder: Path, process: str) -> list[Path]:
-    mine = [path for path in _all(folder) if path.name.rpartition("-")[0] == process]
-    return sorted(mine, key=_number)
+    found = [path for path in _all_files(folder) if path.name.rpartition("-")[0] == process]
+    return sorted(found, key=_number)
 
 
 def _number(path: Path) -> int:
     return int(path.stem.rpartition("-")[2])
 
 
-def _torn(path: Path) -> bool:
-    """Return whether the file ends in the middle of a line, as after a power cut."""
+def _ends_in_line(path: Path) -> bool:
+    """Return whether the last line has no newline, as after a power cut."""
     if not path.exists() or not path.stat().st_size:
         return False
     with path.open("rb") as file:
@@ -155,7 +154,7 @@ def _torn(path: Path) -> bool:
         return file.read(1) != b"\n"
 
 
-WIDTH = 8  # of the widest word for what has happened
+WIDTH = 8  # characters of the longest of What
 
 
 def readable(record: AuditRecord) -> str:
@@ -177,27 +176,27 @@ def as_json(record: AuditRecord) -> str:
 
 
 log = logging.getLogger(__name__)
-AGAIN_NS = 1_000_000_000  # repetitions within this time are only counted
-LASTING_NS = 60_000_000_000  # the same for refusals that go on
-LASTING: tuple[What, ...] = ("refused", "stranger")
-MAX_SOURCES = 100  # entries counted apart within that time, of granted and of refused requests
-MAX_CODES = 20  # that one entry counts apart
-MAX_WAITING = 1000  # entries that may wait for the disk
-OTHERS, OTHER = "others", "other"
-Key = tuple[What, str, str]  # what, source, code; no code where all codes of a source are one entry
+REPEAT_NS = 1_000_000_000  # repetitions within this time are only counted
+REFUSAL_REPEAT_NS = 60_000_000_000  # the same for refusals
+REFUSALS: tuple[What, ...] = ("refused", "stranger")
+MAX_SOURCES = 100  # counted separately within that time, for granted and for refused requests
+MAX_CODES = 20  # counted separately in one entry
+MAX_QUEUED = 1000  # entries that may wait for the disk
+OTHER_SOURCES, OTHER_CODES = "others", "other"
+Key = tuple[What, str, str]  # what, source, code; no code where a source has one entry for all
 
 
 @dataclass
 class _Recent:
     """Events of one source since its last entry, by code."""
 
-    told_ns: int
+    written_ns: int  # time of that entry
     codes: Counter[str] = field(default_factory=Counter)
     text: str = ""
 
     def add(self, code: str, text: str) -> None:
         known = code in self.codes or len(self.codes) < MAX_CODES
-        self.codes[code if known else OTHER] += 1
+        self.codes[code if known else OTHER_CODES] += 1
         self.text = text
 
 
@@ -211,11 +210,11 @@ class AuditTrail:
         self._bus = bus
         self._file = AuditFile(folder, bus.process)
         self._writer: BackgroundWriter[AuditRecord] = BackgroundWriter(
-            self._file.append, MAX_WAITING
+            self._file.append, MAX_QUEUED
         )
         self._recent: dict[bool, dict[Key, _Recent]] = {True: {}, False: {}}  # by `ok`
         self._unwritable = Fault(log)
-        self._reading = asyncio.Lock()  # many threads that decode would hold up the loop
+        self._reading = asyncio.Lock()  # several decoding threads would delay the event loop
         bus.serve(AUDIT_LOG, self._history)
 
     def note(
@@ -223,20 +222,20 @@ class AuditTrail:
     ) -> None:
         """Write an entry about an event and its source.
 
-        A source has one entry of refusals a minute, whatever their codes.
+        All refusals of a source in one minute share an entry.
         """
         now_ns = self._bus.clock.now_ns()
         source, code, text = source[:64], code[:64], text[:500]
         known = self._recent[ok]
         key: Key = (what, source, "" if what == "refused" else code)
         if key not in known and len(known) >= MAX_SOURCES:
-            key = (what, OTHERS, "")
+            key = (what, OTHER_SOURCES, "")
         recent = known.get(key)
         new = recent is None
         if recent is None:
             recent = known[key] = _Recent(now_ns)
         recent.add(code, text)
-        if new or now_ns - recent.told_ns >= _quiet_ns(key):
+        if new or now_ns - recent.written_ns >= _repeat_ns(key):
             self._write_entry(key, recent, ok)
 
     def flush(self) -> None:
@@ -244,14 +243,14 @@ class AuditTrail:
         now_ns = self._bus.clock.now_ns()
         for ok, known in self._recent.items():
             for key, recent in list(known.items()):
-                age_ns = now_ns - recent.told_ns
-                if recent.codes and age_ns >= _quiet_ns(key):
+                age_ns = now_ns - recent.written_ns
+                if recent.codes and age_ns >= _repeat_ns(key):
                     self._write_entry(key, recent, ok)
-                elif age_ns >= LASTING_NS:
+                elif age_ns >= REFUSAL_REPEAT_NS:
                     del known[key]
 
     async def close(self) -> None:
-        """Write down what is still waiting."""
+        """Write the entries that are still waiting."""
         for ok, known in self._recent.items():
             for key, recent in known.items():
                 if recent.codes:
@@ -262,17 +261,17 @@ class AuditTrail:
     def _write_entry(self, key: Key, recent: _Recent, ok: bool) -> None:
         what, source, _ = key
         (code, _), *others = recent.codes.most_common()
-        kinds = f"; {_tally(recent.codes)}" if others else ""
+        counts = f"; {_counts(recent.codes)}" if others else ""
         record = AuditRecord(
             process=self._bus.process,
             what=what,
             source=source,
             ok=ok,
             code=code,
-            text=recent.text[: 500 - len(kinds)] + kinds,
+            text=recent.text[: 500 - len(counts)] + counts,
             times=recent.codes.total(),
         )
-        recent.told_ns, recent.codes = self._bus.clock.now_ns(), Counter()
+        recent.written_ns, recent.codes = self._bus.clock.now_ns(), Counter()
         written = self._writer.put(self._bus.publish(AUDIT, record))
         written.add_done_callback(self._written)
 
@@ -289,11 +288,11 @@ class AuditTrail:
         return AuditPage(records=records)
 
 
-def _quiet_ns(key: Key) -> int:
+def _repeat_ns(key: Key) -> int:
     what, source, _ = key
-    return LASTING_NS if what in LASTING or source == OTHERS else AGAIN_NS
+    return REFUSAL_REPEAT_NS if what in REFUSALS or source == OTHER_SOURCES else REPEAT_NS
 
 
-def _tally(codes: Counter[str]) -> str:
-    """Return `put robot/cmd_vel 199, query robot/release 1`, as far as there is room."""
+def _counts(codes: Counter[str]) -> str:
+    """Return `put robot/cmd_vel 199, query robot/release 1`, cut at 200 characters."""
     return ", ".join(f"{code} {times}" for code, times in codes.most_common())[:200]

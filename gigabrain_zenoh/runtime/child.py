@@ -15,7 +15,8 @@ from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.host.terminal import LineSplitter
 from gigabrain_zenoh.logs import is_time, level_named
 
-_DRAIN_S = 0.2  # what a dead child has written arrives at once; someone else may hold its pipe
+# The last output of a dead child arrives at once, but another process may keep its pipe open.
+_DRAIN_TIMEOUT_S = 0.2
 REAP_S = 0.2  # a killed process ends at once, unless the kernel waits for a device
 
 
@@ -34,15 +35,15 @@ def as_record(line: bytes, process: str) -> dict[str, Any]:
     with contextlib.suppress(msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         found = msgspec.json.decode(line)
         if isinstance(found, dict) and isinstance(found.get("event"), str):
-            fit = {k: v for k, v in found.items() if type(v) is type(known.get(k, v))}
-            record = known | fit
+            valid = {k: v for k, v in found.items() if type(v) is type(known.get(k, v))}
+            record = known | valid
             t = record["t"] if is_time(record["t"]) else known["t"]
             return record | {"t": t, "level": level_named(record["level"])}
     return known | {"level": "error", "text": line.decode(errors="replace").rstrip()}
 
 
 class Child(asyncio.SubprocessProtocol):
-    """A running process. Its pipes are always drained, whatever comes out of them."""
+    """A running process. Its pipes are always drained, so that it never waits to write."""
 
     def __init__(self, name: str, on_record: Callable[[dict[str, Any]], None]) -> None:
         self._name, self._on_record = name, on_record
@@ -59,7 +60,7 @@ class Child(asyncio.SubprocessProtocol):
         env: Mapping[str, str],
         on_record: Callable[[dict[str, Any]], None],
     ) -> "Child":
-        """Start a process; raises OSError when that cannot be done."""
+        """Start a process. Raises OSError."""
         _, child = await asyncio.get_running_loop().subprocess_exec(
             lambda: cls(name, on_record),
             *argv,
@@ -87,23 +88,23 @@ class Child(asyncio.SubprocessProtocol):
             self._drained.set()
 
     def process_exited(self) -> None:
-        """Kill what the process has started, once it is reaped (asyncio calls this)."""
-        self._signal_group(signal.SIGKILL)  # and all that it has started
+        """Kill the descendants of the process, once it is reaped (asyncio calls this)."""
+        self._signal_group(signal.SIGKILL)
         self._ended.set()
 
     def send_signal(self, number: int) -> None:
-        """Send a signal to the process and all that it has started, unless it has ended."""
+        """Send a signal to the process and its descendants, unless it has ended."""
         if not self._ended.is_set():
             self._signal_group(number)
 
     def show_stack(self) -> None:
-        """Have the process print where it is; see `this_process.show_stack_on_request`."""
+        """Make the process print its stack; see `this_process.show_stack_on_request`."""
         if this_process.STACK_SIGNAL and not self._ended.is_set():
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.kill(self.pid, this_process.STACK_SIGNAL)
 
     def _signal_group(self, number: int) -> None:
-        # macOS answers EPERM where Linux answers ESRCH for a group that is gone
+        # for a group that has ended, macOS returns EPERM and Linux ESRCH
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self.pid, number)
 
@@ -111,7 +112,7 @@ class Child(asyncio.SubprocessProtocol):
         """Wait for its end and last output; return the exit code, or minus the signal's number."""
         await self._ended.wait()
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(_DRAIN_S):
+            async with asyncio.timeout(_DRAIN_TIMEOUT_S):
                 await self._drained.wait()
         return self._close()
 

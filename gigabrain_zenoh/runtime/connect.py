@@ -1,4 +1,4 @@
-"""The one way onto a robot's bus, for its processes as for tools, scripts and tests."""
+"""Connects to a robot's bus: for its own processes, and for tools, scripts and tests."""
 
 import asyncio
 import contextlib
@@ -26,15 +26,15 @@ from gigabrain_zenoh.security.identity_files import identity_in, no_router
 
 log = logging.getLogger("gigabrain")
 MakeBus = Callable[[Transport, Clock, str], Bus]
-PATIENCE_S = 1.0  # how long the router may be missing before a warning is logged
-AGAIN_S = 1.0  # between attempts to resolve a host name
-ROUTER_S = 3.0  # how long a router may take to answer
+WARN_AFTER_S = 1.0  # without a router, before a warning is logged
+RETRY_S = 1.0  # pause between attempts to resolve a host name
+ROUTER_TIMEOUT_S = 3.0
 
 
 class Where(Struct, frozen=True, kw_only=True):
-    """A robot's address as people give it."""
+    """A robot's address, as options and scripts give it."""
 
-    connect: str | None = None  # its router; without it, the only robot that runs here
+    connect: str | None = None  # endpoint of its router; None is the only robot on this machine
     namespace: str = ""
     keys: str = ""  # folder of an identity
 
@@ -44,15 +44,15 @@ async def connect(
     where: Where | Endpoint,
     name: str,
     *,
-    timeout_s: float | None = ROUTER_S,
+    timeout_s: float | None = ROUTER_TIMEOUT_S,
     looks_on: bool = False,
     make_bus: MakeBus = Bus,
 ) -> AsyncIterator[Bus]:
     """Connect to a robot's bus as `name`, and disconnect at the end.
 
-    With `timeout_s` None it waits as long as it takes, and logs what it waits for. With `looks_on`
-    messages are delivered in batches, and the robot's own processes go first. Raises BusError
-    without a router, and ConfigError for keys that are invalid.
+    With `timeout_s` None it waits without limit, and logs the reason. With `looks_on` messages are
+    delivered in batches, and the robot's own processes have priority. Raises BusError without a
+    router, and ConfigError for invalid keys.
     """
     if isinstance(where, Where):
         endpoint = find_endpoint(where.connect, where.namespace, where.keys)
@@ -74,7 +74,7 @@ async def connect(
 
 
 async def open_session(endpoint: Endpoint) -> ZenohTransport:
-    """Open the session. Log a warning once if the router is missing for longer than PATIENCE_S.
+    """Open the session. Log a warning once if the router is missing for longer than WARN_AFTER_S.
 
     Raises BusError when a router cannot listen. Raises ConfigError for errors that waiting cannot
     fix, such as invalid keys of this process.
@@ -84,7 +84,7 @@ async def open_session(endpoint: Endpoint) -> ZenohTransport:
     await _wait_for_addresses(endpoint.listen)
     opening = asyncio.ensure_future(ZenohTransport.open(endpoint))
     try:
-        done, _ = await asyncio.wait((opening,), timeout=PATIENCE_S)
+        done, _ = await asyncio.wait((opening,), timeout=WARN_AFTER_S)
         if not done:
             if endpoint.keys:  # a router rejects invalid keys without an error
                 await asyncio.to_thread(identity_in, Path(endpoint.keys))
@@ -97,8 +97,8 @@ async def open_session(endpoint: Endpoint) -> ZenohTransport:
 async def unknown_host(endpoints: Iterable[str]) -> str:
     """Return the first host in these endpoints whose name cannot be resolved, or an empty text.
 
-    Resolves in a daemon thread: a resolver may take many seconds, and must not delay the process's
-    exit.
+    Resolves in a daemon thread: a resolver may take many seconds, and must not delay the exit of
+    the process.
     """
     hosts = [host for host, _ in map(host_and_port, endpoints) if host and not is_ip(host)]
     if not hosts:
@@ -111,7 +111,7 @@ async def unknown_host(endpoints: Iterable[str]) -> str:
             found.set_result(unknown)
 
     def work() -> None:
-        unknown = next((host for host in hosts if not _known(host)), "")
+        unknown = next((host for host in hosts if not _resolves(host)), "")
         with contextlib.suppress(RuntimeError):  # the loop is closed
             loop.call_soon_threadsafe(settle, unknown)
 
@@ -119,7 +119,7 @@ async def unknown_host(endpoints: Iterable[str]) -> str:
     return await found
 
 
-def _known(host: str) -> bool:
+def _resolves(host: str) -> bool:
     try:
         socket.getaddrinfo(host, None)
     except (OSError, UnicodeError):
@@ -137,7 +137,7 @@ async def _wait_for_names(listen: Iterable[str]) -> None:
         if host != reported:
             _warn(_unknown_name(host))
         reported = host
-        await asyncio.sleep(AGAIN_S)
+        await asyncio.sleep(RETRY_S)
 
 
 async def _wait_for_addresses(listen: Iterable[str]) -> None:
@@ -147,7 +147,7 @@ async def _wait_for_addresses(listen: Iterable[str]) -> None:
         if missing != reported:
             _warn(f"this host has no address {missing}; waiting for it (is it this host's own?)")
         reported = missing
-        await asyncio.sleep(AGAIN_S)
+        await asyncio.sleep(RETRY_S)
 
 
 def _missing_address(endpoints: Iterable[str]) -> str:

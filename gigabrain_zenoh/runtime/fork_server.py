@@ -5,15 +5,15 @@ supervisor, not of the server, so it goes on when the server ends:
 
     supervisor   the levels of imports, with a connection for each      -> fork server
     fork server  its pid, once it has imported                          -> supervisor
-    supervisor   a request, with the ends of its output and of a pipe   -> fork server
-    fork server  forks, and the fork forks: the first one ends          -> the fork
+    supervisor   a request, with the ends of three pipes                -> fork server
+    fork server  forks twice; the process between them ends             -> the fork
     the fork     its pid, once the supervisor is its parent             -> supervisor
-    supervisor   a byte in the pipe; if it has given up, it closes it   -> the fork, which runs
+    supervisor   a byte in the third pipe, or closes it: do not run     -> the fork, which runs
 
-`gigabrain up` starts the server first, which imports while the command reads what to run. The
-servers end when all is started: what starts later does so by itself, as after a failure.
-A server that goes on to import copies the pages that it writes to, and shares less with those that
-it has forked before. So there is one for each level of imports, a fork of the one before.
+`gigabrain up` starts the server first, which imports while the command reads its files. The servers
+end when all processes are started; a process that is restarted later imports by itself.
+If a server imported more after a fork, it would copy pages and share fewer with that fork. So each
+level of imports has its own server, forked from the server of the level before.
 """
 
 import contextlib
@@ -32,10 +32,10 @@ from msgspec import Struct
 from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.plugins import find
 
-MAX_BYTES = 128 * 1024  # of a request
+MAX_REQUEST_BYTES = 128 * 1024
 MAX_LEVELS = 8
-ADOPTION_S = 5.0  # until a fork has become a child of the supervisor
-ADOPTION_LOOK_S = 0.0002
+ADOPTION_TIMEOUT_S = 5.0  # for a fork to become a child of the supervisor
+ADOPTION_POLL_S = 0.0002
 
 
 class ForkRequest(Struct, frozen=True):
@@ -50,13 +50,13 @@ class ForkRequest(Struct, frozen=True):
 def main() -> NoReturn:
     """Serve the requests of a supervisor, until it ends or closes the connections.
 
-    The arguments are the file descriptor of the first connection, and what to import at once.
+    The arguments are the file descriptor of the first connection, and modules to import at once.
     """
     supervisor = os.getppid()
     this_process.set_up()
     first = socket.socket(fileno=int(sys.argv[1]))
     _import(sys.argv[2:])
-    data, ends, _, _ = socket.recv_fds(first, MAX_BYTES, MAX_LEVELS)
+    data, ends, _, _ = socket.recv_fds(first, MAX_REQUEST_BYTES, MAX_LEVELS)
     if not data:
         os._exit(0)
     levels = msgspec.json.decode(data, type=list[tuple[str, ...]])
@@ -64,7 +64,7 @@ def main() -> NoReturn:
     for modules in levels:
         _import(modules)
         gc.collect()
-        gc.freeze()  # a later collection in a fork writes to none of what it shares
+        gc.freeze()  # later collections in a fork do not write to shared pages
         this = os.getpid()
         if len(connections) == 1 or os.fork():
             break
@@ -84,7 +84,7 @@ def _import(modules: Sequence[str]) -> None:
 def _serve(connection: socket.socket, supervisor: int) -> NoReturn:
     connection.send(str(os.getpid()).encode())
     while True:
-        data, ends, _, _ = socket.recv_fds(connection, MAX_BYTES, 3)
+        data, ends, _, _ = socket.recv_fds(connection, MAX_REQUEST_BYTES, 3)
         if not data:
             os._exit(0)
         if first := os.fork():
@@ -104,19 +104,19 @@ def _become(
     from setproctitle import setproctitle  # installed on Linux only
 
     os.setsid()
-    deadline_s = time.monotonic() + ADOPTION_S
+    deadline_s = time.monotonic() + ADOPTION_TIMEOUT_S
     while os.getppid() != supervisor:
         if time.monotonic() > deadline_s:
             os._exit(1)
-        time.sleep(ADOPTION_LOOK_S)
+        time.sleep(ADOPTION_POLL_S)
     this_process.die_with_parent(supervisor)
     out, err, go = ends
     try:
         connection.send(str(os.getpid()).encode())
-        wanted = os.read(go, 1)
+        started = os.read(go, 1)
     except OSError:
-        wanted = b""
-    if not wanted:
+        started = b""
+    if not started:
         os._exit(1)
     os.dup2(out, 1)
     os.dup2(err, 2)

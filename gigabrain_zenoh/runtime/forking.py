@@ -17,12 +17,12 @@ from typing import Any
 import msgspec
 
 from gigabrain_zenoh.runtime.child import REAP_S, Child, supervised_environment
-from gigabrain_zenoh.runtime.fork_server import MAX_BYTES, ForkRequest
+from gigabrain_zenoh.runtime.fork_server import MAX_REQUEST_BYTES, ForkRequest
 
 COMMAND = (sys.executable, "-P", "-m", "gigabrain_zenoh.runtime.fork_server")
-IMPORT_S = 15.0  # until a fork server has imported
-FORK_S = 5.0  # until a fork answers
-LOOK_S = 0.5  # between looks whether a fork server is stopped
+IMPORT_TIMEOUT_S = 15.0  # for the imports of a fork server
+FORK_TIMEOUT_S = 5.0  # for the pid of a fork
+STOPPED_CHECK_S = 0.5  # pause between checks that a signal has not stopped a fork server
 PR_SET_CHILD_SUBREAPER = 36  # prctl(2)
 FAILED = "the fork server {}; processes start without it, with more memory"
 
@@ -39,7 +39,7 @@ _early: list[Server] = []
 def start_early(*modules: str) -> None:
     """Start a fork server that the next supervisor takes over, and have it import `modules`.
 
-    It imports while this process reads what to run.
+    It imports while this process reads its configuration.
     """
     if works_here():
         with contextlib.suppress(OSError):  # the supervisor tries again, and reports it
@@ -76,20 +76,22 @@ def _end(server: subprocess.Popen[bytes]) -> None:
 
 
 class ForkServers:
-    """Fork the processes of a supervisor once; then they end, as they hold memory of their own.
+    """Fork each process of a supervisor once. Then the servers end, to free their memory.
 
-    When one of them fails they end as well.
+    When one server fails, all of them end.
     """
 
     def __init__(self, forks: Mapping[str, ForkRequest], on_failure: Callable[[str], None]) -> None:
-        """Take all processes by name; call `on_failure` with the reason if a server fails."""
+        """Take all requests by process; call `on_failure` with the reason if a server fails."""
         self._missing = {*forks}
         levels = itertools.zip_longest(*(fork.imports for fork in forks.values()), fillvalue=())
         self._levels = [tuple(dict.fromkeys(itertools.chain(*level))) for level in levels]
         self._on_failure = on_failure
         self._first: subprocess.Popen[bytes] | None = None
         self._connections: list[socket.socket] = []
-        self._imported: list[asyncio.Task[int]] = []  # of each level
+        self._imported: list[
+            asyncio.Task[int]
+        ] = []  # one per level; its result is the server's pid
 
     def open(self) -> None:
         """Start the servers, in a running event loop."""
@@ -109,11 +111,12 @@ class ForkServers:
                 ends.append(closing.enter_context(theirs).fileno())
             socket.send_fds(first, [msgspec.json.encode(self._levels)], ends)
         self._imported = [
-            asyncio.create_task(self._answer(one, IMPORT_S)) for one in self._connections
+            asyncio.create_task(self._receive_pid(connection, IMPORT_TIMEOUT_S))
+            for connection in self._connections
         ]
 
     def close(self) -> None:
-        """End the servers. What they have forked goes on."""
+        """End the servers. The forked processes continue."""
         if self._first:
             _end(self._first)  # the others die with it
         for task in self._imported:
@@ -124,16 +127,16 @@ class ForkServers:
         self._first, self._connections, self._imported = None, [], []
 
     async def imported(self, request: ForkRequest) -> None:
-        """Wait until the server that forks a process can do so, or has failed."""
+        """Wait until the server for `request` has imported, or has failed."""
         if self._imported:
             await asyncio.wait([self._imported[len(request.imports) - 1]])
 
     async def start(
         self, name: str, request: ForkRequest, on_record: Callable[[dict[str, Any]], None]
     ) -> Child | None:
-        """Have a process started; return None where the servers have ended."""
+        """Start a process; return None if the servers have ended."""
         data = msgspec.json.encode(request)
-        if not self._connections or len(data) > MAX_BYTES:
+        if not self._connections or len(data) > MAX_REQUEST_BYTES:
             return None
         level = len(request.imports) - 1
         connection = self._connections[level]
@@ -143,7 +146,9 @@ class ForkServers:
                 with _adoption:
                     await self._imported[level]
                     socket.send_fds(connection, [data], [out[1], err[1], go[0]])
-                    child = ForkedChild(name, on_record, await self._answer(connection, FORK_S))
+                    child = ForkedChild(
+                        name, on_record, await self._receive_pid(connection, FORK_TIMEOUT_S)
+                    )
             except (OSError, TimeoutError) as error:
                 self._fail(str(error) or "does not answer")
                 return None
@@ -158,7 +163,7 @@ class ForkServers:
         self.close()
         self._on_failure(FAILED.format(why))
 
-    async def _answer(self, connection: socket.socket, within_s: float) -> int:
+    async def _receive_pid(self, connection: socket.socket, within_s: float) -> int:
         """Return the pid of a server, or of a fork. Raises TimeoutError and ConnectionError."""
         loop, answered = asyncio.get_running_loop(), asyncio.Event()
         deadline_s = loop.time() + within_s
@@ -166,7 +171,7 @@ class ForkServers:
         try:
             while True:
                 with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(LOOK_S):
+                    async with asyncio.timeout(STOPPED_CHECK_S):
                         await answered.wait()
                 if answered.is_set():
                     break
@@ -175,7 +180,7 @@ class ForkServers:
         finally:
             loop.remove_reader(connection)
         pid = b""
-        with contextlib.suppress(ConnectionResetError):  # it has not read all
+        with contextlib.suppress(ConnectionResetError):  # it ended before it read the whole request
             pid = connection.recv(64)
         if not pid:
             raise ConnectionError("has ended")
@@ -183,29 +188,29 @@ class ForkServers:
 
     def _any_stopped(self) -> bool:
         """Return whether a signal has stopped a server."""
-        import psutil  # costs 20 ms; most answers come before the first look
+        import psutil  # takes 20 ms; most answers arrive before the first check
 
         assert self._first
         try:
             first = psutil.Process(self._first.pid)
-            states = [one.status() for one in (first, *first.children())]
-        except psutil.Error:  # it ends, which the connection tells
+            states = [server.status() for server in (first, *first.children())]
+        except psutil.Error:  # a server ended; its connection reports that
             return False
         return psutil.STATUS_STOPPED in states
 
 
 class ForkedChild(Child):
-    """A process that a fork server has started: a child of this one all the same."""
+    """A process that a fork server forked, and that this process adopted as its child."""
 
     def __init__(self, name: str, on_record: Callable[[dict[str, Any]], None], pid: int) -> None:
-        """Take the pid of a child. Raises OSError for one that is gone."""
+        """Take the pid of a child. Raises OSError if it has ended."""
         super().__init__(name, on_record)
         self.pid, self._code = pid, 0
         self._pidfd = os.pidfd_open(pid)
         self._pipes: list[asyncio.ReadTransport] = []
 
     async def attend(self, out: int, err: int) -> None:
-        """Read its output from these ends of pipes, and wait for its end."""
+        """Read its output from these pipe ends, and reap it when it ends."""
         loop = asyncio.get_running_loop()
         for number, end in enumerate((out, err), 1):
             pipe, _ = await loop.connect_read_pipe(
@@ -254,7 +259,7 @@ class _Output(asyncio.Protocol):
 
 
 def _pipe(closing: contextlib.ExitStack) -> tuple[int, int]:
-    """Return the ends of a pipe, to read and to write, which `closing` closes."""
+    """Return the read end and the write end of a pipe; `closing` closes both."""
     ends = os.pipe()
     for end in ends:
         closing.callback(os.close, end)
@@ -262,9 +267,9 @@ def _pipe(closing: contextlib.ExitStack) -> tuple[int, int]:
 
 
 class _Adoption:
-    """While it is entered, this process becomes the parent of descendants that lose theirs.
+    """While it is entered, this process adopts descendants whose parent ends.
 
-    Several supervisors of one process may have entered it at once.
+    Several supervisors in one process may enter it at the same time.
     """
 
     def __init__(self) -> None:

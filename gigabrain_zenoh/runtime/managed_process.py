@@ -18,19 +18,19 @@ from gigabrain_zenoh.runtime.forking import ForkServers
 
 @dataclass(frozen=True)
 class Backoff:
-    """Pauses after a death, and the number of deaths at which a process is given up."""
+    """Pauses before restarts, and the number of deaths after which a process is given up."""
 
     first_s: float = 0.2
     factor: float = 2.0
     longest_s: float = 5.0
-    deaths: int = 5  # this many ...
-    window_s: float = 60.0  # ... within this time, and it is given up
-    reset_after_s: float = 10.0  # up this long, and the next wait is the first again
+    deaths: int = 5  # given up after this many ...
+    window_s: float = 60.0  # ... within this time
+    reset_after_s: float = 10.0  # after this long ready, the next pause is `first_s` again
 
 
-# own code: tenacity retries a call; a process that ran well for 10 s begins at 0.2 s again
+# own code: tenacity retries calls, and does not reset the pause after 10 s without failure
 class RestartPolicy:
-    """Decides when one process is started again, and when it is given up."""
+    """Decides when a process is restarted, and when it is given up."""
 
     def __init__(self, backoff: Backoff) -> None:
         self._backoff = backoff
@@ -38,7 +38,7 @@ class RestartPolicy:
         self._next_s = backoff.first_s
 
     def died(self, now_s: float, up_s: float) -> float | None:
-        """Return the seconds before the next start, None to give up; `up_s` is since ready."""
+        """Return the pause before the next start [s], None to give up; `up_s` counts from ready."""
         backoff = self._backoff
         self._deaths.append(now_s)
         while now_s - self._deaths[0] > backoff.window_s:
@@ -50,7 +50,7 @@ class RestartPolicy:
         return delay_s
 
 
-_STACK_S = 0.2  # how long a stuck process has to print where it is
+_STACK_PRINT_S = 0.2  # a stuck process has this long to print its stack
 
 State = Literal["waiting", "starting", "ready", "backing off", "given up", "stopped"]
 OnRecord = Callable[[str, Mapping[str, Any]], None]
@@ -58,22 +58,22 @@ OnRecord = Callable[[str, Mapping[str, Any]], None]
 
 @dataclass(frozen=True)
 class ProcessSpec:
-    """One process to keep running: what to run, and after which others are ready."""
+    """One process to keep running, and the processes that must be ready before it starts."""
 
     name: str
     argv: tuple[str, ...]
     after: tuple[str, ...] = ()
     ready_timeout_s: float = 10.0
-    stop_last: bool = False  # what the others need in order to end well, such as the router
-    optional: bool = False  # the robot goes on without it, also where its settings are wrong
-    shows_stack: bool = False  # prints where it is on `this_process.STACK_SIGNAL`
+    stop_last: bool = False  # others need it for a clean end, as they need the router
+    optional: bool = False  # the robot runs without it, also if its settings are wrong
+    shows_stack: bool = False  # prints its stack on `this_process.STACK_SIGNAL`
     beats: bool = False  # reports progress once a second, and is killed without it
     fork: ForkRequest | None = None  # the same as `argv`, for a fork server
 
 
 @dataclass
 class ProcessStatus:
-    """State of a process now."""
+    """Current state of a process."""
 
     name: str
     pid: int | None = None
@@ -89,7 +89,7 @@ class Shared:
 
     on_record: OnRecord
     backoff: Backoff
-    keep_stuck: bool = False  # processes without progress are left alone, for a debugger
+    keep_stuck: bool = False  # do not kill processes without progress, for a debugger
     fork_servers: ForkServers | None = None
     halt: asyncio.Event = field(default_factory=asyncio.Event)
     # held while a process is being started, so that a stop misses none
@@ -103,7 +103,7 @@ class Death:
     text: str  # "ended with exit code 1"
     code: int | None = None  # None: it could not even be started
     up_s: float = 0.0  # since it was ready
-    hopeless: str = ""  # why trying again would end the same way
+    hopeless: str = ""  # why a restart would fail the same way
 
 
 class ManagedProcess:
@@ -112,11 +112,11 @@ class ManagedProcess:
     def __init__(self, spec: ProcessSpec, shared: Shared) -> None:
         self.spec, self.status, self.deaths = spec, ProcessStatus(spec.name), 0
         self.child: Child | None = None
-        # ready, given up or stopping: processes after this one need not wait any longer
+        # ready, given up or stopping: processes that start after this one stop waiting
         self.settled = asyncio.Event()
-        self._shared, self._patience = shared, RestartPolicy(shared.backoff)
+        self._shared, self._restarts = shared, RestartPolicy(shared.backoff)
         self._started_s, self._silence = 0.0, heartbeat.Silence()
-        self.stuck = False  # it runs and makes no progress
+        self.stuck = False  # runs without progress
         self.was_ready = False  # at least once, with the same configuration
 
     async def run(self, after: Sequence["ManagedProcess"]) -> None:
@@ -124,11 +124,11 @@ class ManagedProcess:
         await self._wait_for(after)
         halt = self._shared.halt
         while not halt.is_set():
-            death = await self._live()
+            death = await self._run_once()
             if halt.is_set():
                 break
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(self._judge(death)):
+                async with asyncio.timeout(self._next_start_s(death)):
                     await halt.wait()
             self.status.restarts += not halt.is_set()
         if self.status.state != "given up":
@@ -142,29 +142,29 @@ class ManagedProcess:
             self._report("error", "not started", f"is not started without {lost[0]}")
             await self._shared.halt.wait()
 
-    async def _live(self) -> Death:
-        """Run the process once, from start to end."""
+    async def _run_once(self) -> Death:
+        """Run the process from start to end."""
         loop, status = asyncio.get_running_loop(), self.status
         status.state, status.ready_after_s, self._started_s = "starting", None, loop.time()
         try:
             child = await self._start()
         except (FileNotFoundError, PermissionError) as error:
             return Death(f"could not be started ({error})", hopeless="it cannot run here")
-        except OSError as error:  # out of processes or memory: that may pass
+        except OSError as error:  # no more processes or memory for now
             return Death(f"could not be started ({error})")
         if child is None:
             return Death("was not started")
-        late = loop.call_later(self.spec.ready_timeout_s, self._late)
+        ready_timer = loop.call_later(self.spec.ready_timeout_s, self._kill_if_not_ready)
         try:
             code = await child.wait()
         finally:
-            late.cancel()
+            ready_timer.cancel()
         self.child = status.pid = None
         self.stuck, status.last_exit = False, code
         ready_after_s = status.ready_after_s
         up_s = 0.0 if ready_after_s is None else loop.time() - self._started_s - ready_after_s
-        bad = "what it was given is wrong" if self.misconfigured else ""
-        return Death(f"ended with {_in_words(code)}", code, up_s, bad)
+        hopeless = "what it was given is wrong" if self.misconfigured else ""
+        return Death(f"ended with {_in_words(code)}", code, up_s, hopeless)
 
     @property
     def misconfigured(self) -> bool:
@@ -194,20 +194,20 @@ class ManagedProcess:
             return
         before, self.stuck = self.stuck, self._silence.add(passed_s)
         if self.stuck and not before and self.child:
-            what = "is left alone" if self._shared.keep_stuck else "is killed"
+            action = "is left alone" if self._shared.keep_stuck else "is killed"
             limit_s = heartbeat.STALL_S
-            self._report("error", "stuck", f"has made no progress for {limit_s:g} s and {what}")
+            self._report("error", "stuck", f"has made no progress for {limit_s:g} s and {action}")
             if not self._shared.keep_stuck:
                 self._kill_stuck(self.child)
 
     def _kill_stuck(self, child: Child) -> None:
-        """Kill a process that hangs; it first prints where."""
+        """Kill a process that hangs; if it can, it first prints its stack."""
         if not self.spec.shows_stack:
             child.send_signal(signal.SIGKILL)
             return
         child.show_stack()
         later = asyncio.get_running_loop().call_later
-        later(_STACK_S, child.send_signal, signal.SIGKILL)
+        later(_STACK_PRINT_S, child.send_signal, signal.SIGKILL)
 
     def _handle_record(self, record: dict[str, Any]) -> None:
         if record["event"] == heartbeat.EVENT:
@@ -224,17 +224,17 @@ class ManagedProcess:
         self._silence.end()
         self.stuck = False
 
-    def _late(self) -> None:
+    def _kill_if_not_ready(self) -> None:
         if self.status.state == "starting" and self.child and not self._shared.halt.is_set():
             limit_s = self.spec.ready_timeout_s
             self._report("error", "not ready", f"was not ready within {limit_s:g} s and is killed")
             self.child.send_signal(signal.SIGKILL)
 
-    def _judge(self, death: Death) -> float | None:
-        """Return the seconds until the next start; None to give up."""
+    def _next_start_s(self, death: Death) -> float | None:
+        """Return the pause before the next start [s]; None to give up."""
         self.deaths += 1
         now_s, backoff = asyncio.get_running_loop().time(), self._shared.backoff
-        delay_s = None if death.hopeless else self._patience.died(now_s, death.up_s)
+        delay_s = None if death.hopeless else self._restarts.died(now_s, death.up_s)
         if delay_s is not None:
             self.status.state = "backing off"
             self.settled.clear()
@@ -242,10 +242,10 @@ class ManagedProcess:
                 "warning", "died", f"{death.text}; next start in {delay_s:g} s", death.code
             )
             return delay_s
-        why = death.hopeless or f"{backoff.deaths} deaths within {backoff.window_s:g} s"
+        reason = death.hopeless or f"{backoff.deaths} deaths within {backoff.window_s:g} s"
         self.status.state = "given up"
         self.settled.set()
-        self._report("error", "given up", f"{death.text} and is given up: {why}", death.code)
+        self._report("error", "given up", f"{death.text} and is given up: {reason}", death.code)
         return None
 
     def _report(self, level: str, event: str, text: str, exit_code: int | None = None) -> None:
@@ -255,12 +255,12 @@ class ManagedProcess:
         self._shared.on_record(name, record | about)
 
     def ask_to_end(self) -> None:
-        """Send SIGTERM to the process and all that it has started."""
+        """Send SIGTERM to the process and its descendants."""
         if self.child:
             self.child.send_signal(signal.SIGTERM)
 
     def force_to_end(self) -> None:
-        """Send SIGKILL, which also ends a process that is stopped."""
+        """Send SIGKILL to the process and its descendants, also if they are stopped."""
         if self.child:
             self._report("warning", "killed", "did not end when asked and is killed")
             self.child.send_signal(signal.SIGKILL)

@@ -28,17 +28,17 @@ from gigabrain_zenoh.runtime.running import SOCKET
 from gigabrain_zenoh.security.identity_files import identity_in
 
 log = logging.getLogger(__name__)
-FILES = 65536  # one per possible link, including links that never send a message
+MAX_OPEN_FILES = 65536  # one per possible link, including links that never send a message
 FLUSH_NS = 1_000_000_000
 
 
 async def run(config: RouterConfig, bus: Bus, ready: Callable[[], None]) -> None:
     """Run access control, if keys are configured; the session itself does the routing."""
-    _make_room()
+    _raise_file_limit()
     watch = ProcessWatch(bus, config.watches)
     if not config.knows:
         ready()
-        await _keep(bus, watch.look)
+        await _call_every_second(bus, watch.look)
         return
     trail = AuditTrail(bus, Path(config.state_dir))
     access = AccessAudit(trail, config.knows)
@@ -46,30 +46,30 @@ async def run(config: RouterConfig, bus: Bus, ready: Callable[[], None]) -> None
         with zenoh_log(access.note_denial):
             bus.links(access.note_link)
             ready()
-            await _keep(bus, watch.look, trail.flush)
+            await _call_every_second(bus, watch.look, trail.flush)
     finally:
         await trail.close()
 
 
-async def _keep(bus: Bus, *work: Callable[[], object]) -> None:
-    """Do `work` once a second until the bus fails."""
+async def _call_every_second(bus: Bus, *functions: Callable[[], object]) -> None:
+    """Call `functions` once a second until the bus fails; raise its error."""
     async for _ in bus.clock.every(FLUSH_NS):
-        for do in work:
-            do()
+        for function in functions:
+            function()
         if bus.failed.done():
             bus.failed.result()
 
 
-def _make_room() -> None:
+def _raise_file_limit() -> None:
     """Raise the limit of open files, so that silent connections do not exhaust it."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = FILES if hard == resource.RLIM_INFINITY else min(hard, FILES)
+    wanted = MAX_OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, MAX_OPEN_FILES)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         with contextlib.suppress(ValueError, OSError):  # some systems allow less than they report
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
-PATIENCE_S = 1.0  # how long the router may be missing before a warning is logged
+WARN_AFTER_S = 1.0  # without a router, before a warning is logged
 
 
 class RouterLink:
@@ -96,22 +96,22 @@ async def run_relay(config: RelayConfig, bus: Bus, ready: Callable[[], None]) ->
 
     Raises ConfigError if the link fails because the host's own keys are invalid.
     """
-    way = RouterLink(config.router)
-    bus.links(way.update)
+    link = RouterLink(config.router)
+    bus.links(link.update)
     try:
-        await asyncio.wait_for(way.open.wait(), PATIENCE_S)
+        await asyncio.wait_for(link.open.wait(), WARN_AFTER_S)
     except TimeoutError:
         if config.keys:  # a router rejects invalid keys without an error
             await asyncio.to_thread(identity_in, Path(config.keys))
         text = "no router at %s yet; waiting for it (start one with: gigabrain router)"
         log.warning(text, config.router, extra={"data": {"event": "waiting"}})
-        await way.open.wait()
+        await link.open.wait()
     ready()
     await bus.failed
 
 
-# Zenoh denies without an answer, and reports it only in its log: for access control in two lines of
-# one thread, of which the second makes the first count (zenoh 1.10, net/routing/interceptor).
+# Zenoh denies without a reply, and reports it only in its log. Access control logs two lines from
+# one thread; only the second confirms the denial (zenoh 1.10, net/routing/interceptor).
 DIRECTIVES = "zenoh::net::routing::interceptor=trace,zenoh_link_tls=warn"
 DENIED = re.compile(
     r"(?:: |Using cached result: )(\w+)(?: on \S+)? is unauthorized to (.+?) \(ingress\) on (.+)"
@@ -119,16 +119,16 @@ DENIED = re.compile(
 TURNED_AWAY = re.compile(r" WARN .*zenoh_link_tls::unicast: (.+?)(?:\. Hint: .*)?$")
 THREAD = re.compile(rb"ThreadId\(\d+\)")
 COLOUR = re.compile(rb"\x1b\[[0-9;]*m")
-LONGEST = 64 * 1024  # bytes of a line; what is longer is no line of Zenoh's
-THREADS = 100  # whose first line is remembered
+MAX_LINE_BYTES = 64 * 1024  # Zenoh's own lines are shorter
+MAX_THREADS = 100  # whose first line is remembered
 
 
 @dataclass(frozen=True)
 class Denied:
-    """A client with a session sent something that it may not send."""
+    """A client with a session sent a message that it may not send."""
 
     zid: str
-    what: str  # in Zenoh's words, such as Put
+    what: str  # Zenoh's word for the kind of message, such as Put
     key: str
 
 
@@ -136,20 +136,20 @@ class Denied:
 class TurnedAway:
     """A client did not get a session. Zenoh does not log its name or address."""
 
-    why: str
+    why: str  # Zenoh's text
 
 
 class ZenohLog:
-    """Finds the denials in the log."""
+    """Finds denials in Zenoh's log."""
 
     def __init__(self) -> None:
         self._rest = b""
-        self._last: dict[bytes, bytes] = {}  # by thread
+        self._unconfirmed: dict[bytes, bytes] = {}  # first lines, by thread
 
     def feed(self, data: bytes) -> Iterator[Denied | TurnedAway]:
-        """Yield the denials in more bytes of the log."""
+        """Yield the denials that these next bytes of the log complete."""
         *lines, self._rest = (self._rest + data).split(b"\n")
-        if len(self._rest) > LONGEST:
+        if len(self._rest) > MAX_LINE_BYTES:
             self._rest = b""
         for line in lines:
             if seen := self._read(line):
@@ -160,16 +160,16 @@ class ZenohLog:
         if thread is None:
             return None
         if b" is unauthorized to " in line:
-            if len(self._last) >= THREADS:
-                self._last.clear()
-            self._last[thread[0]] = line
+            if len(self._unconfirmed) >= MAX_THREADS:
+                self._unconfirmed.clear()
+            self._unconfirmed[thread[0]] = line
             return None
         if b"Msg intercepted!" in line:
-            denied = DENIED.search(_text(self._last.pop(thread[0], b"")))
+            denied = DENIED.search(_text(self._unconfirmed.pop(thread[0], b"")))
             return Denied(denied[1], denied[2], denied[3]) if denied else None
-        self._last.pop(thread[0], None)
-        away = TURNED_AWAY.search(_text(line)) if b"zenoh_link_tls" in line else None
-        return TurnedAway(away[1]) if away else None
+        self._unconfirmed.pop(thread[0], None)
+        found = TURNED_AWAY.search(_text(line)) if b"zenoh_link_tls" in line else None
+        return TurnedAway(found[1]) if found else None
 
 
 def _text(line: bytes) -> str:
@@ -179,9 +179,9 @@ def _text(line: bytes) -> str:
 
 
 STDOUT, CHUNK_BYTES, PIPE_BYTES = 1, 1 << 16, 1 << 20
-WAITING = 1000  # denials that may wait for the loop
-PARTICULAR = re.compile(r"\S*\d\S*")  # words with a digit: addresses, ports, numbers
-TABLE = {*(topic.key for topic in TOPICS), *(service.key for service in SERVICES)}
+MAX_QUEUED = 1000  # denials that may wait for the event loop
+WITH_DIGITS = re.compile(r"\S*\d\S*")  # words such as addresses, ports, numbers
+KNOWN_KEYS = {*(topic.key for topic in TOPICS), *(service.key for service in SERVICES)}
 Seen = Denied | TurnedAway
 
 
@@ -193,7 +193,7 @@ class AccessAudit:
         self._links: dict[str, Link] = {}
 
     def note_link(self, link: Link) -> None:
-        """Log that a client has come or gone; note one without rights."""
+        """Log that a client connected or left; add one without rights to the audit trail."""
         name = link.name or "a local process"
         if not link.there:
             if self._links.pop(link.zid, None):
@@ -208,10 +208,10 @@ class AccessAudit:
             log.info("%s has come from %s", name, link.address)
 
     def note_denial(self, seen: Seen) -> None:
-        """Note a denial."""
+        """Add a denial to the audit trail."""
         if isinstance(seen, TurnedAway):
             text = f"a client was refused a session: {seen.why}"
-            code = PARTICULAR.sub("…", seen.why)
+            code = WITH_DIGITS.sub("…", seen.why)
             self._trail.note("stranger", "unknown", text, code=code, ok=False)
             return
         link = self._links.get(seen.zid)
@@ -219,27 +219,27 @@ class AccessAudit:
         where = link.address if link else "an unknown address"
         verb = seen.what.lower()
         text = f"{name} at {where} may not {verb} {seen.key}"
-        code = f"{verb} {_of_table(seen.key)}"
+        code = f"{verb} {_known_key(seen.key)}"
         self._trail.note("refused", name, text, code=code, ok=False)
 
 
-def _of_table(key: str) -> str:
-    """Return the topic or service that a key belongs to, of any robot; senders choose keys."""
+def _known_key(key: str) -> str:
+    """Return the topic or service of a key, without the namespace; "other" for an unknown one."""
     parts = key.split("/")
-    known = ("/".join(parts[at : at + 2]) for at in (0, 1))
-    return next((each for each in known if each in TABLE), "other")
+    candidates = ("/".join(parts[at : at + 2]) for at in (0, 1))
+    return next((each for each in candidates if each in KNOWN_KEYS), "other")
 
 
 @contextmanager
 def zenoh_log(on_seen: Callable[[Seen], None]) -> Iterator[None]:
     """Read Zenoh's log while the block runs; `on_seen` is called on the loop's thread.
 
-    Zenoh writes it to standard output, which a pipe replaces for good; nothing else may be written
-    there, since strangers choose what the log quotes. A thread empties the pipe, so that Zenoh
-    never waits; while the loop is busy, the newest denials wait.
+    Zenoh writes it to standard output, which a pipe replaces permanently. The log must not reach
+    the real output, since it quotes texts of unknown clients. A thread empties the pipe, so that
+    Zenoh never waits; while the event loop is busy, the newest denials are queued.
     """
     bridge = Bridge()
-    mailbox = Mailbox(bridge, on_seen, WAITING)
+    mailbox = Mailbox(bridge, on_seen, MAX_QUEUED)
     reads, writes = os.pipe()
     with contextlib.suppress(OSError, AttributeError):  # other systems have smaller pipes
         fcntl.fcntl(writes, fcntl.F_SETPIPE_SZ, PIPE_BYTES)

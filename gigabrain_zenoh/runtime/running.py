@@ -20,7 +20,7 @@ from gigabrain_zenoh.host.posix import fcntl
 from gigabrain_zenoh.security.identity_files import check_files
 
 SOCKET = "unixsock-stream"
-NOTE_BYTES = 65536  # maximum size of a note
+MAX_NOTE_BYTES = 65536
 
 Pid = Annotated[int, Meta(ge=1, le=2**31 - 1)]  # 0 and negative pids address process groups
 
@@ -57,20 +57,20 @@ def announced(label: str, endpoint: Endpoint, run_dir: Path | None = None) -> It
     run = str(run_dir) if run_dir else ""
     robot = Running(pid=os.getpid(), label=label, endpoint=endpoint, run_dir=run)
     try:
-        for place in (note.parent.parent, note.parent):
-            place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for directory in (note.parent.parent, note.parent):
+            directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         _check_private(note.parent)
-        file = _written(note, msgspec.json.encode(robot))
+        file = _write_locked(note, msgspec.json.encode(robot))
     except OSError as error:
         raise ConfigError(f"cannot write {note}: {error.strerror}; set XDG_RUNTIME_DIR") from None
     with file:
         try:
             yield note
         finally:
-            _forget(note)
+            _remove(note)
 
 
-def _written(note: Path, text: bytes) -> BinaryIO:
+def _write_locked(note: Path, text: bytes) -> BinaryIO:
     """Write and lock the note, and return its open file. The note appears atomically."""
     fresh = note.with_suffix(".new")
     file = fresh.open("wb")
@@ -87,21 +87,21 @@ def _written(note: Path, text: bytes) -> BinaryIO:
 
 def _check_private(place: Path) -> None:
     """Raise ConfigError where another user could put notes into the folder, or replace it."""
-    for one in (place, place.parent):
+    for path in (place, place.parent):
         with contextlib.suppress(FileNotFoundError):
-            try:  # a symbolic link of another user may lead to a folder of this one
-                owners = {one.lstat().st_uid, one.stat().st_uid}
-            except PermissionError:  # its parent is closed, so it is of another user
+            try:  # a symbolic link of another user may point to a folder of this user
+                owners = {path.lstat().st_uid, path.stat().st_uid}
+            except PermissionError:  # this user may not enter its parent, so another user owns it
                 owners = set()
-            if owners != {os.getuid()} or one.stat().st_mode & 0o022:
+            if owners != {os.getuid()} or path.stat().st_mode & 0o022:
                 raise ConfigError(
-                    f"{one} belongs to another user, or others may write it, so it cannot show "
+                    f"{path} belongs to another user, or others may write it, so it cannot show "
                     "which robots run; set XDG_RUNTIME_DIR to a folder of your own, of mode 0700"
                 )
 
 
-def _forget(note: Path) -> None:
-    """Remove a note, and the socket that its router may have left."""
+def _remove(note: Path) -> None:
+    """Remove a note, and the socket that its router may have left behind."""
     for path in (note, note.with_suffix(".sock"), note.with_suffix(".sock.lock")):
         path.unlink(missing_ok=True)
 
@@ -121,10 +121,10 @@ def _read(note: Path) -> Running | None:
     try:
         with open_regular(note) as file:
             if _locked(file):
-                return msgspec.json.decode(file.read(NOTE_BYTES), type=Running)
+                return msgspec.json.decode(file.read(MAX_NOTE_BYTES), type=Running)
     except (OSError, ConfigError, *DECODE_ERRORS):
         pass
-    _forget(note)
+    _remove(note)
     return None
 
 
@@ -142,7 +142,7 @@ def find_endpoint(connect: str | None, namespace: str = "", keys: str = "") -> E
 
     Raises BusError where there is no robot, Ambiguous where there are several, and ConfigError.
     `keys` is the folder of the client's identity, for a router that requires one. A client that
-    names its identity is limited to its role: it then does not use the local socket, which has the
+    names its identity is limited to its role. It does not use the local socket, which has the
     robot's rights.
     """
     identity = str(expanded(keys).absolute()) if keys else ""
@@ -152,7 +152,7 @@ def find_endpoint(connect: str | None, namespace: str = "", keys: str = "") -> E
     if identity and endpoint.connect[-1].startswith(SECURE):
         return structs.replace(endpoint, connect=endpoint.connect[-1:], keys=identity)
     if identity and not os.path.isdir(identity):
-        check_files(Path(identity))  # not needed here, but a typo is one everywhere
+        check_files(Path(identity))  # not used here, but report a mistyped path
     return endpoint
 
 
@@ -168,17 +168,17 @@ def find_running(namespace: str = "") -> Running:
         )
     if not robots:
         raise BusError("no robot runs here; start one with `gigabrain demo`, or set `connect`")
-    nearest = {_place(robot): robot for robot in sorted(robots, key=_ways)}
-    if len(nearest) > 1:
-        where = ", ".join(f"{r.endpoint.connect[-1]} ({r.label})" for r in nearest.values())
+    by_address = {_address(robot): robot for robot in sorted(robots, key=_endpoint_count)}
+    if len(by_address) > 1:
+        where = ", ".join(f"{r.endpoint.connect[-1]} ({r.label})" for r in by_address.values())
         raise Ambiguous(f"several robots run here; choose one with --connect: {where}")
-    return next(iter(nearest.values()))
+    return next(iter(by_address.values()))
 
 
-def _place(robot: Running) -> tuple[str, str]:
+def _address(robot: Running) -> tuple[str, str]:
     """Return the address and namespace, which two hosts of one robot on this machine share."""
     return robot.endpoint.connect[-1], robot.endpoint.namespace
 
 
-def _ways(robot: Running) -> int:
+def _endpoint_count(robot: Running) -> int:
     return len(robot.endpoint.connect)

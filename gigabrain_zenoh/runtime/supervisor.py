@@ -1,4 +1,4 @@
-"""Runs the processes of one host: starts them in readiness order, and stops them all."""
+"""Runs the processes of one host: starts them in order of dependency, and stops them all."""
 
 import asyncio
 import contextlib
@@ -23,13 +23,13 @@ from gigabrain_zenoh.runtime.managed_process import (
 
 __all__ = ["Backoff", "OnRecord", "ProcessSpec", "ProcessStatus", "State", "Supervisor"]
 
-# Fractions of the time limit of a stop, after which processes are killed, and then abandoned to
-# the kernel. The router stops last, so the others get less time where there is one.
-_FIRST, _REAPED, _LAST = 0.55, 0.65, 0.85
+# Fractions of the time limit of a stop. Where processes stop last, as the router does, the others
+# are killed after _KILL_FIRST and no longer awaited after _LEAVE_FIRST.
+_KILL_FIRST, _LEAVE_FIRST, _KILL_LAST = 0.55, 0.65, 0.85
 
 
 class Supervisor:
-    """Runs processes until stopped; used once. However it ends, no processes remain."""
+    """Runs processes until stopped; used once. No process remains, also after an error."""
 
     def __init__(
         self,
@@ -42,7 +42,7 @@ class Supervisor:
         _check(specs)
         self._shared = Shared(on_record, backoff or Backoff(), keep_stuck)
         forks = {spec.name: spec.fork for spec in specs if spec.fork}
-        if len(forks) > 1 and forking.works_here():  # a single one would share with none
+        if len(forks) > 1 and forking.works_here():  # one process would share nothing
             self._shared.fork_servers = forking.ForkServers(forks, self._on_fork_failure)
         else:
             forking.end_early()
@@ -55,7 +55,7 @@ class Supervisor:
 
     @property
     def deaths(self) -> int:
-        """Return how often a process has ended unexpectedly."""
+        """Return how often processes ended unexpectedly."""
         return sum(process.deaths for process in self._processes.values())
 
     @property
@@ -75,7 +75,7 @@ class Supervisor:
 
     @property
     def stuck(self) -> tuple[str, ...]:
-        """Return the names of processes that run and make no progress."""
+        """Return the names of processes that run without progress."""
         return tuple(name for name, process in self._processes.items() if process.stuck)
 
     async def __aenter__(self) -> Self:
@@ -95,8 +95,8 @@ class Supervisor:
         halted = asyncio.create_task(self._shared.halt.wait())
         watching = asyncio.create_task(self._watch())
         try:
-            # a process ends only when all are stopped, or with an exception; one whose process the
-            # kernel does not let go may never end
+            # a task ends only when all are stopped, or with an exception; it may never end if the
+            # kernel does not release its process
             ends = [halted, watching, *self._tasks.values()]
             await asyncio.wait(ends, return_when="FIRST_COMPLETED")
         finally:
@@ -114,12 +114,12 @@ class Supervisor:
     async def _watch(self) -> None:
         """Check for processes without progress, until all are stopped."""
         loop, halt = asyncio.get_running_loop(), self._shared.halt
-        looked_s = loop.time()
+        checked_s = loop.time()
         while not halt.is_set():
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(heartbeat.LOOK_S):
                     await halt.wait()
-            passed_s, looked_s = loop.time() - looked_s, loop.time()
+            passed_s, checked_s = loop.time() - checked_s, loop.time()
             for process in self._processes.values():
                 process.check_progress(passed_s)
 
@@ -135,13 +135,17 @@ class Supervisor:
         for process in processes:
             process.settled.set()
         try:
-            async with self._shared.starting:  # a starting process has its pid after this
+            async with self._shared.starting:  # wait until a process being started has its pid
                 running = [process for process in processes if process.child]
             last = [process for process in running if process.spec.stop_last]
             first = [process for process in running if not process.spec.stop_last]
             if last:
-                await self._end(first, begin_s + _FIRST * within_s, begin_s + _REAPED * within_s)
-            await self._end(last or first, begin_s + _LAST * within_s, begin_s + within_s)
+                kill_s, leave_s = (
+                    begin_s + _KILL_FIRST * within_s,
+                    begin_s + _LEAVE_FIRST * within_s,
+                )
+                await self._end(first, kill_s, leave_s)
+            await self._end(last or first, begin_s + _KILL_LAST * within_s, begin_s + within_s)
             for task in self._tasks.values():
                 if task.done():
                     task.result()

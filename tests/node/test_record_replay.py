@@ -51,7 +51,7 @@ from gigabrain_zenoh.recording.process_replay import (
     with_requests,
 )
 from gigabrain_zenoh.recording.recorder import Recorder
-from gigabrain_zenoh.runtime.replay import ASKED, Event, record, replay
+from gigabrain_zenoh.runtime.replay import REQUEST_KEYS, Event, record, replay
 from gigabrain_zenoh.runtime.services import serve_params
 from gigabrain_zenoh.testing.in_memory import BRAIN, RobotInMemory
 from tests.node.plane import ROOM, Plane, drawn
@@ -263,7 +263,7 @@ async def test_a_decision_that_was_sent_to_a_place_does_the_same_again() -> None
     own = (INTENT.key, TASK.key)
     then = [(key, data) for _, key, data in events if key in own]
     received = with_requests([event for event in events if event[1] not in own])
-    assert [key for _, key, _ in received if key in ASKED] == [GOAL.key, *2 * (TASK_CHANGE.key,)]
+    assert [key for _, key, _ in received if key in REQUEST_KEYS] == [GOAL.key, *2 * (TASK_CHANGE.key,)]
     node = functools.partial(decision.run, DecisionConfig(behaviour="navigate"))
     now = [(key, data) for key, data in await replay(node, received) if key in own]
     assert plane.travelled > 0.3

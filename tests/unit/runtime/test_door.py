@@ -107,4 +107,4 @@ def test_a_flood_of_threads_in_zenohs_log_takes_no_memory() -> None:
     line = f"{ACCESS}::access_control: {WHO} is unauthorized to Put (ingress) on robot/cmd_vel\n"
     for thread in range(1000):
         assert list(log.feed(line.replace("(11)", f"({thread})").encode())) == []
-    assert len(log._last) <= 100
+    assert len(log._unconfirmed) <= 100
