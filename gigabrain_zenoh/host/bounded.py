@@ -19,25 +19,25 @@ def percentile(ordered: Sequence[float], share: float) -> float | None:
 
 # 0.25 µs a percentile of 1000 values; numpy.percentile takes 125 µs
 class NewestValues:
-    """The newest `most` values, kept sorted so that a percentile query does not block the loop."""
+    """The newest `max_count` values, kept sorted so that a percentile takes no time."""
 
-    def __init__(self, most: int) -> None:
-        self._most = most
-        self._arrived: deque[float] = deque()
+    def __init__(self, max_count: int) -> None:
+        self._max_count = max_count
+        self._by_arrival: deque[float] = deque()
         self._ordered: list[float] = []
 
     def __len__(self) -> int:
         return len(self._ordered)
 
     def add(self, value: float) -> None:
-        """Add a value; drop the oldest if there are more than `most`."""
-        if len(self._arrived) == self._most:
-            del self._ordered[bisect_left(self._ordered, self._arrived.popleft())]
-        self._arrived.append(value)
+        """Add a value; drop the oldest if there are more than `max_count`."""
+        if len(self._by_arrival) == self._max_count:
+            del self._ordered[bisect_left(self._ordered, self._by_arrival.popleft())]
+        self._by_arrival.append(value)
         insort(self._ordered, value)
 
     def percentile(self, share: float) -> float | None:
-        """Return the value that `share` of the kept values do not exceed; None without values."""
+        """Return the smallest value that at least `share` of the values do not exceed, or None."""
         return percentile(self._ordered, share)
 
 
@@ -45,9 +45,9 @@ K = TypeVar("K")
 V = TypeVar("V")
 
 
-def put_newest(held: dict[K, V], key: K, value: V, most: int) -> None:
-    """Set `held[key]`, as its newest entry of at most `most`."""
-    held.pop(key, None)
-    held[key] = value
-    if len(held) > most:
-        del held[next(iter(held))]
+def put_newest(entries: dict[K, V], key: K, value: V, max_count: int) -> None:
+    """Set `entries[key]` as the newest entry; drop the oldest beyond `max_count`."""
+    entries.pop(key, None)
+    entries[key] = value
+    if len(entries) > max_count:
+        del entries[next(iter(entries))]

@@ -1,4 +1,4 @@
-"""Escapes the control characters of texts that come from elsewhere."""
+"""Escapes the control characters of texts from outside this process."""
 
 import json
 

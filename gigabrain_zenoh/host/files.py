@@ -1,4 +1,4 @@
-"""Files: written durably, read with a bounded size, and results of long runs."""
+"""Files: durable writes, reads of bounded size, and results of long runs."""
 
 import errno
 import os
@@ -35,7 +35,7 @@ def open_regular(path: Path, most_bytes: int | None = None) -> BinaryIO:
 
     Raises ConfigError for other kinds of files, and for more than `most_bytes`.
     """
-    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a FIFO opens at once so
+    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a FIFO then opens at once
     try:
         about = os.fstat(fd)
         for is_kind, name in KINDS:
@@ -52,19 +52,19 @@ def open_regular(path: Path, most_bytes: int | None = None) -> BinaryIO:
 def read_bounded(path: Path, most_bytes: int) -> bytes:
     """Return the content of a regular file. Raises OSError, and ConfigError like `open_regular`."""
     with open_regular(path, most_bytes) as file:
-        data = file.read(most_bytes + 1)  # a file of /proc has no size, and another may grow
+        data = file.read(most_bytes + 1)  # files of /proc report no size, and a file may grow
     if len(data) > most_bytes:
         raise ConfigError(too_large(path, len(data), most_bytes))
     return data
 
 
-def too_large(path: Path, there: int, most_bytes: int) -> str:
+def too_large(path: Path, size_bytes: int, most_bytes: int) -> str:
     """Return the error text for a file that is too large."""
-    return f"{path}: {there / 1e6:.1f} MB; expected at most {most_bytes / 1e6:g} MB"
+    return f"{path}: {size_bytes / 1e6:.1f} MB; expected at most {most_bytes / 1e6:g} MB"
 
 
 # own code: python-atomicwrites, archived 2022, fails where a file system syncs no folders
-NOT_SYNCED = (errno.EINVAL, errno.ENOTSUP)  # from file systems that cannot sync a folder
+CANNOT_SYNC = (errno.EINVAL, errno.ENOTSUP)  # from file systems that cannot sync a folder
 
 
 def replace_file(path: Path, data: bytes, mode: int = 0o644) -> None:
@@ -82,13 +82,13 @@ def replacing(path: Path, mode: int = 0o644) -> Iterator[BinaryIO]:
             yield file
         draft.replace(path)
     except BaseException:
-        draft.unlink(missing_ok=True)  # a full disk would stay full
+        draft.unlink(missing_ok=True)  # frees its space on a full disk
         raise
     sync_folder(path.parent)
 
 
 def create_file(path: Path, data: bytes) -> None:
-    """Write the new private file `path`, durably and at once; of several writers one wins.
+    """Write the new private file `path`, durably and atomically; one of several writers succeeds.
 
     Raises FileExistsError where it exists, and OSError.
     """
@@ -101,7 +101,7 @@ def create_file(path: Path, data: bytes) -> None:
 
 
 def write_synced(path: Path, data: bytes, mode: int = 0o644) -> None:
-    """Write a file's content to disk; its name is there once the folder is synced."""
+    """Write a file's content to disk; sync its folder to make its name durable too."""
     with _synced(path, mode) as file:
         file.write(data)
 
@@ -124,12 +124,12 @@ def make_folder(path: Path) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Bring the names in a folder to disk. Raises OSError."""
+    """Write the names in a folder to disk. Raises OSError."""
     fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(fd)
     except OSError as error:
-        if error.errno not in NOT_SYNCED:
+        if error.errno not in CANNOT_SYNC:
             raise
     finally:
         os.close(fd)
@@ -153,17 +153,17 @@ def check_result_path(path: Path | None) -> None:
         raise ConfigError(f"cannot write {path}: no such folder")
     if os.path.isdir(path):
         raise ConfigError(f"cannot write {path}: it is a folder")
-    if os.path.exists(path):  # a FIFO would end for its reader once it is closed
+    if os.path.exists(path):  # do not open it: the reader of a FIFO would see its end
         return
     try:
         path.touch()
-        os.unlink(os.path.realpath(path))  # of a link that leads nowhere the file, not the link
+        os.unlink(os.path.realpath(path))  # of a dangling link remove the new file, not the link
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error.strerror}") from None
 
 
 def check_picture_path(path: Path | None) -> None:
-    """Raise ConfigError where no PNG can be written to `path`, or its name says another format."""
+    """Raise ConfigError if no PNG can be written to `path`, or its suffix is not `.png`."""
     check_result_path(path)
     if path and path.suffix.lower() != ".png" and (path.is_file() or not path.exists()):
         raise ConfigError(f"cannot write {path}: it would be a PNG; expected a name like x.png")

@@ -11,13 +11,13 @@ IP_ENDPOINT = re.compile(
 )
 LOCAL_ENDPOINT = re.compile(r"unixsock-stream/.+")
 LABEL = re.compile(r"[a-z0-9_](?:[a-z0-9_-]{0,61}[a-z0-9_])?", re.IGNORECASE | re.ASCII)
-LONGEST_NAME = 253  # characters (RFC 1035, 2.3.4)
+MAX_NAME_CHARS = 253  # RFC 1035, 2.3.4
 
 
 def host_and_port(endpoint: str) -> tuple[str, int]:
     """Return the host of a Zenoh endpoint, without brackets, and its port; "" and 0 for a socket.
 
-    Raises ValueError for an endpoint that Zenoh would wait for in vain.
+    Raises ValueError for an endpoint to which Zenoh could never connect.
     """
     if LOCAL_ENDPOINT.fullmatch(endpoint):
         return "", 0
@@ -43,16 +43,16 @@ def is_host(text: str) -> bool:
     """Return whether `text` is an IP address or a possible host name (RFC 1123, 2.1)."""
     labels = text.removesuffix(".").split(".")
     named = all(LABEL.fullmatch(label) for label in labels) and not labels[-1].isdecimal()
-    return is_ip(text) or (named and len(text) <= LONGEST_NAME)
+    return is_ip(text) or (named and len(text) <= MAX_NAME_CHARS)
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this machine reaches the address; of names, only `localhost` is."""
+    """Return whether the address is a loopback address, or the name `localhost`."""
     return host == "localhost" or (is_ip(host) and ipaddress.ip_address(host).is_loopback)
 
 
 def reached_at(endpoint: str) -> str:
-    """Return the endpoint at which this machine reaches a listener: loopback for all addresses."""
+    """Return an endpoint to connect to from this machine: loopback for a wildcard address."""
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
@@ -71,9 +71,9 @@ def exposed(endpoints: Iterable[str]) -> str:
 def reserve_port(host: str, port: int = 0) -> int:
     """Reserve `port` of `host`, an IP address without brackets; with 0 any free one.
 
-    On Linux a socket that is bound but does not listen holds it until this process ends: others may
-    listen there if they name the port, but are never given it as a free one. Elsewhere the port is
-    only known to have been free. Raises OSError if the port is in use.
+    On Linux a bound socket that does not listen reserves it until this process ends: others may
+    listen there if they name the port, but never get it as a free one. Other systems do not reserve
+    it. Raises OSError if the port is in use.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as holder:

@@ -1,6 +1,6 @@
-"""Modules of Python that only POSIX systems have. Elsewhere their use raises Unsupported.
+"""Modules of Python that only POSIX systems have. On other systems their use raises Unsupported.
 
-Everything else imports them from here, so that the package imports on Windows.
+All other modules import them from here, so that the package imports on Windows.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -20,22 +20,22 @@ log = logging.getLogger(__name__)
 MAX_RUNS = 50
 MAX_BYTES = 1_000_000_000  # of all folders together
 REMEDY = "make it writable, or set XDG_STATE_HOME to a folder that is"
-LOCK = ".in_use"  # locked by the supervisor for as long as it runs; holds the run's number
+LOCK = ".in_use"  # locked by the supervisor while it runs; contains the run's number
 
 
 def hold(folder: Path, number: int = 0) -> None:
     """Mark a folder as in use until this process ends, and number it. Raises OSError."""
     lock = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o600)
     fcntl.flock(lock, fcntl.LOCK_EX)
-    with contextlib.suppress(OSError):  # on a full disk it has no number
+    with contextlib.suppress(OSError):  # on a full disk it stays without a number
         os.write(lock, str(number).encode())
 
 
 def past_runs(base: Path) -> list[Path]:
     """Return all run folders, oldest first.
 
-    They are numbered, as the clock may have stepped back since. Those without a number, of earlier
-    versions, come first and in the order of their names.
+    They are numbered because the clock may step back. Folders of earlier versions have no number:
+    they come first, sorted by name.
     """
     return sorted((p for p in base.glob("*") if p.is_dir()), key=lambda p: (_number(p), p.name))
 
@@ -142,7 +142,7 @@ def new_run_dir(base: Path | None, label: str) -> Path:
         with tidied(base):
             for n in itertools.count(1):
                 path = base / (name if n == 1 else f"{name}-{n}")
-                if not path.exists():  # by an earlier run of this process in this second
+                if not path.exists():  # an earlier run of this process in this second has it
                     break
             number = max(map(_number, past_runs(base)), default=0) + 1
             path.mkdir()
@@ -154,7 +154,7 @@ def new_run_dir(base: Path | None, label: str) -> Path:
 
 def state_dir() -> Path:
     """Return the folder in which runs and robots keep their state. Raises ConfigError."""
-    from platformdirs import user_state_path  # 10 ms, of which not every command has need
+    from platformdirs import user_state_path  # takes 10 ms, and few commands need it
 
     try:
         return user_state_path("gigabrain")

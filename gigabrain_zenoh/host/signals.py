@@ -1,4 +1,4 @@
-"""SIGINT, SIGTERM and SIGHUP of a command: none is lost, from its first line to its last.
+"""SIGINT, SIGTERM and SIGHUP of a command: none is lost, from its start to its end.
 
 An entry point calls `interrupts.install` first, so this module imports nothing heavy. The effect of
 a signal depends on the command's progress (see `reacting`). Only the first one counts.
@@ -20,32 +20,32 @@ if TYPE_CHECKING:
 
 HANGUP = getattr(signal, "SIGHUP", None)  # Windows has none
 SIGNALS = (signal.SIGINT, signal.SIGTERM, *([HANGUP] if HANGUP else ()))
-LIMIT_S = 1.8  # from the first signal to the end by force
+LIMIT_S = 1.8  # from the first signal until the process is killed
 RESEND_S = 0.05
 React = Callable[[], object]
 
 
 class Interrupts:
-    """The signals of this process. There is one of these, `interrupts`."""
+    """The signals of this process. The only instance is `interrupts`."""
 
     def __init__(self) -> None:
         self.received = 0  # the number of the first signal
         self.limit_s = LIMIT_S
-        self._pending = False  # received, and nothing has reacted to it
+        self._pending = False  # received, without a reaction so far
         self._react: React | None = self._exit
         self._installed = False
         self._wake_fd = -1
 
     @property
     def exit_code(self) -> int:
-        """Return the exit code of a command that a signal has ended, as shells do."""
+        """Return the exit code of a command that a signal ended, as shells do."""
         return 128 + self.received
 
     def install(self) -> None:
         """Handle the signals until the process ends; before `reacting` they end it at once.
 
-        SIGHUP stays ignored where it is (nohup). SIGINT does not: a shell without job control
-        starts `command &` with SIGINT ignored, and `kill -INT` has to end it nevertheless.
+        A SIGHUP that is ignored stays ignored (nohup). SIGINT does not: a shell without job control
+        starts `command &` with SIGINT ignored, but `kill -INT` must still end it.
         """
         self._installed = True
         self._set_handlers()
@@ -59,7 +59,7 @@ class Interrupts:
     def installed(self) -> Iterator[None]:
         """Handle the signals while the block runs, where `install` was not called.
 
-        After a signal they stay handled: what is left to do is not cut short by another one.
+        After a signal they stay handled, so that a second one does not interrupt the clean-up.
         """
         if self._installed:
             yield
@@ -76,9 +76,9 @@ class Interrupts:
 
     @contextlib.contextmanager
     def reacting(self, react: React | None) -> Iterator[None]:
-        """Have the first signal call `react`, in the main thread between any two bytecodes.
+        """Call `react` at the first signal, in the main thread between any two bytecodes.
 
-        None leaves it to whatever reacts next: inside the block, or after it.
+        None defers the signal to the next `reacting`, inside the block or after it.
         """
         before, self._react = self._react, react
         try:
@@ -89,7 +89,7 @@ class Interrupts:
             self._settle()
 
     def raising(self) -> contextlib.AbstractContextManager[None]:
-        """Have the first signal raise KeyboardInterrupt, for code that has to clean up."""
+        """Raise KeyboardInterrupt at the first signal, for code that has to clean up."""
         return self.reacting(_raise)
 
     def _set_handlers(self) -> dict[signal.Signals, Any]:
@@ -116,10 +116,10 @@ class Interrupts:
         os._exit(self.exit_code)
 
     def _watch(self, read_fd: int) -> None:
-        """Bring the signal before the main thread; end the process when its time is over.
+        """Send the signal to the main thread until it is handled; after `limit_s` end the process.
 
-        A signal that came just before a system call, or to another thread, does not interrupt the
-        call: it is sent again until the main thread has run its handler.
+        A signal just before a system call, or to another thread, does not interrupt the call. So it
+        is sent again until the main thread runs its handler.
         """
         number = 0
         while number not in SIGNALS:  # others may be handled as well, such as SIGWINCH
@@ -132,15 +132,15 @@ class Interrupts:
         os._exit(128 + number)
 
     def _unraisable(self, args: "sys.UnraisableHookArgs") -> None:
-        """Raise a KeyboardInterrupt again that was raised where no code can catch it."""
+        """Repeat a KeyboardInterrupt that was raised where no code can catch it."""
         if not (self.received and isinstance(args.exc_value, KeyboardInterrupt)):
             sys.__unraisablehook__(args)
             return
-        self._pending = True  # so that the thread above sends it again
+        self._pending = True  # so `_watch` sends the signal again
 
 
 def end_on_interrupt() -> None:
-    """Have Ctrl-C end this process at once, without a traceback: for a worker of another."""
+    """Make Ctrl-C end this process at once, without a traceback; for worker processes."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
@@ -191,8 +191,7 @@ def run_async(work: Coroutine[Any, Any, T]) -> T:
     """Run a command's coroutine until it ends; the first signal cancels it.
 
     Raises KeyboardInterrupt if a signal ended it. Unlike `asyncio.run`, it also does so for SIGTERM
-    and SIGHUP, and never interrupts asyncio's own code. It also receives SIGINT where a shell has
-    set it to be ignored.
+    and SIGHUP, also if a shell ignores SIGINT, and never interrupts asyncio's own code.
     """
 
     import asyncio

@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 from typing import Generic, Self, TextIO, TypeVar
 
 T = TypeVar("T")
-LINES = 1000  # may wait; more are dropped
-MAX_LINE_BYTES = 256 * 1024  # a longer line comes in pieces
-LAST_WORDS_S = 0.5  # until a display that hangs is left behind
+LINES = 1000  # that may wait for a display; more are dropped
+MAX_LINE_BYTES = 256 * 1024  # a longer line is split
+CLOSE_TIMEOUT_S = 0.5  # then a display that hangs is abandoned
 
 
 class Display(Generic[T]):
@@ -33,8 +33,8 @@ class Display(Generic[T]):
 
     def __exit__(self, *_: object) -> None:
         with contextlib.suppress(queue.Full):
-            self._waiting.put(None, timeout=LAST_WORDS_S)
-        self._thread.join(LAST_WORDS_S)
+            self._waiting.put(None, timeout=CLOSE_TIMEOUT_S)
+        self._thread.join(CLOSE_TIMEOUT_S)
 
     def put(self, item: T) -> None:
         """Queue an item. Never blocks."""
@@ -47,20 +47,20 @@ class Display(Generic[T]):
 
 
 def writer(stream: TextIO) -> Callable[[str], None]:
-    """Return a function that writes to a stream until its reader has gone.
+    """Return a function that writes to a stream until its reader is gone.
 
-    It bypasses the stream's buffer: at exit, Python would wait for the lock of that.
+    It bypasses the stream's buffer, as Python waits for that buffer's lock at exit.
     """
-    file, encoding, read = stream.fileno(), stream.encoding, True
+    fd, encoding, has_reader = stream.fileno(), stream.encoding, True
 
     def write(text: str) -> None:
-        nonlocal read
+        nonlocal has_reader
         data = text.encode(encoding, errors="backslashreplace")
         try:
-            while read and data:
-                data = data[os.write(file, data) :]
-        except OSError as error:  # the pager has ended, or the terminal; a disk may have room again
-            read = error.errno == errno.ENOSPC
+            while has_reader and data:
+                data = data[os.write(fd, data) :]
+        except OSError as error:  # the pager or terminal is gone; but a full disk may get space
+            has_reader = error.errno == errno.ENOSPC
 
     return write
 
@@ -88,14 +88,14 @@ class LineSplitter:
 
 
 @contextlib.contextmanager
-def typed_lines(take: Callable[[str], None]) -> Iterator[None]:
-    """Call `take` with each line of standard input; does nothing if input is a file."""
+def typed_lines(on_line: Callable[[str], None]) -> Iterator[None]:
+    """Call `on_line` with each line of standard input; does nothing if input is a file."""
     loop, fd, lines = asyncio.get_running_loop(), sys.stdin.fileno(), LineSplitter()
 
     def readable() -> None:
         data = os.read(fd, READ_BYTES)
         for line in lines.feed(data):
-            take(line.decode(errors="replace"))
+            on_line(line.decode(errors="replace"))
         if not data:
             loop.remove_reader(fd)
 
@@ -111,9 +111,9 @@ def typed_lines(take: Callable[[str], None]) -> Iterator[None]:
 
 
 async def typed_text() -> str | None:
-    """Wait for a line of standard input, which may be empty; None at its end.
+    """Wait for a line of standard input and return it stripped; None at its end.
 
-    It may be cancelled; a line that is typed later is then left for the next call.
+    It may be cancelled; the next call then reads the next line.
     """
     loop = asyncio.get_running_loop()
     fd, text = sys.stdin.fileno(), b""

@@ -1,4 +1,4 @@
-"""Work in threads beside the event loop: results due at a fixed scan, and writes to slow disks."""
+"""Work in threads beside the event loop: results due at a given scan, and writes to slow disks."""
 
 import asyncio
 import concurrent.futures
@@ -9,10 +9,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Generic, TypeVar
 
 Job = Future[Any]
-PATIENCE_S = 0.1  # how long a scan waits for a result that is due
-Take = Callable[[], None]  # makes the result count, in the scans' own thread
-Work = Callable[[], Take]
-InTime = Callable[[Future[Any], float], bool]  # whether work is done after so long [s]
+PATIENCE_S = 0.1  # a scan waits this long for a result that is due
+Take = Callable[[], None]  # uses the result, in the thread of `at_scan`
+Work = Callable[[], Take]  # called in the worker thread
+InTime = Callable[[Future[Any], float], bool]  # returns whether work is done within a time [s]
 
 
 def done(job: Job, patience_s: float | None) -> bool:
@@ -22,14 +22,14 @@ def done(job: Job, patience_s: float | None) -> bool:
 
 
 class ScheduledWorker:
-    """One thread, and at most one piece of work at a time."""
+    """One thread, with at most one piece of work at a time."""
 
     def __init__(self, patience_s: float = PATIENCE_S, in_time: InTime = done) -> None:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="mapping")
         self._job: Future[Take] | None = None
-        self._left = 0  # scans until the result is due
+        self._scans_left = 0  # until the result is due
         self._patience_s, self._in_time = patience_s, in_time
-        self.late = 0  # how often a result was due and not ready
+        self.late = 0  # number of scans at which a result was due but not ready
 
     @property
     def idle(self) -> bool:
@@ -38,23 +38,23 @@ class ScheduledWorker:
 
     @property
     def overdue(self) -> int:
-        """Return for how many scans a result has been due."""
-        return max(0, -self._left) if self._job else 0
+        """Return the number of scans since the result was due; 0 if none is."""
+        return max(0, -self._scans_left) if self._job else 0
 
     def start(self, work: Work, scans: int) -> None:
         """Start `work`, whose result is due in `scans` scans."""
-        self._job, self._left = self._pool.submit(work), scans
+        self._job, self._scans_left = self._pool.submit(work), scans
 
     def hasten(self, scans: int) -> None:
-        """Make the result due in `scans` at most, if there is work under way."""
-        self._left = min(self._left, scans)
+        """Make the result of work in progress due in at most `scans` scans."""
+        self._scans_left = min(self._scans_left, scans)
 
     def at_scan(self) -> None:
-        """Use the result, if it is due at this scan and ready. Raises what the work raised."""
+        """Use the result, if it is due at this scan and ready. Raises the error of the work."""
         if self._job is None:
             return
-        self._left -= 1
-        if self._left > 0:
+        self._scans_left -= 1
+        if self._scans_left > 0:
             return
         if not self._in_time(self._job, self._patience_s):
             self.late += 1
@@ -80,8 +80,8 @@ T = TypeVar("T")
 class BackgroundWriter(Generic[T]):
     """Queue whose items are passed to `write` in a worker thread, in order and in batches.
 
-    The function `write` returns a problem in one line, or an empty text once all is on disk. When
-    more than `room` items wait, the oldest are dropped.
+    The function `write` returns a problem in one line, or an empty text once all items are on disk.
+    When more than `room` items wait, the oldest are dropped.
     """
 
     def __init__(self, write: Callable[[Sequence[T]], str], room: int) -> None:
