@@ -21,11 +21,11 @@ from gigabrain_zenoh.geometry.joint_ramp import (
 )
 
 Positions = Mapping[str, float]  # [rad] or [m] by joint
-LOST_TICKS = 3  # by whose motion the joints may be away from where they were sent
-ARRIVED = 1e-4  # [rad] or [m], off a goal
-SENT = 2e-3  # [rad] or [m], off a goal, as servos round what they are sent
-LONGEST_S = 600.0  # of a trajectory
-HELD_BACK_TICKS = 100  # without progress, after which joints are not waited for any longer
+MAX_LAG_TICKS = 3  # joints may lag behind their commands by this time at full speed
+ARRIVED_TOLERANCE = 1e-4  # [rad] or [m], of the command from a goal
+HELD_TOLERANCE = 2e-3  # [rad] or [m], of the held position from a goal: servos round it
+MAX_DURATION_S = 600.0  # of a trajectory
+HELD_BACK_TICKS = 100  # without progress; then motions no longer wait for the joints
 
 
 def check_joints(body: BodyDescription) -> None:
@@ -51,16 +51,16 @@ def checked_positions(body: BodyDescription, positions: Positions) -> dict[str, 
 def _check_position(joint: JointDescription, position: float) -> None:
     if isinstance(position, bool) or not isinstance(position, numbers.Real):
         raise ConfigError(f"{joint.name}: expected a number, got {position!r}")
-    if not joint.lower <= position <= joint.upper:  # NaN as well
+    if not joint.lower <= position <= joint.upper:  # also true for NaN
         raise ConfigError(
             f"{joint.name}: expected {joint.lower:g} to {joint.upper:g}, got {position:g}"
         )
 
 
 def held_posture(body: BodyDescription, state: RobotState) -> tuple[JointPoint, ...]:
-    """Return the posture that joints were sent to, or are in. Raises BodyLost where one is missing.
+    """Return the posture in which the gate holds the joints, see `held`.
 
-    See `held`.
+    Raises BodyLost where a joint is not measured.
     """
     posture = held(body, state)
     if not posture:
@@ -69,7 +69,7 @@ def held_posture(body: BodyDescription, state: RobotState) -> tuple[JointPoint, 
 
 
 class JointPath:
-    """Points in time and positions [rad] or [m], from the present posture on."""
+    """Points, each a time [s] and positions [rad] or [m], that begin at a given posture."""
 
     def __init__(
         self, body: BodyDescription, points: Sequence[tuple[float, Positions]], start: Positions
@@ -83,10 +83,10 @@ class JointPath:
             if set(positions) != names:
                 raise ConfigError(f"trajectory: point {number} has other joints than the first")
             before = self._times[-1]
-            if not (math.isfinite(t) and before < t <= LONGEST_S):
+            if not (math.isfinite(t) and before < t <= MAX_DURATION_S):
                 raise ConfigError(
                     f"trajectory: point {number}: expected a time above {before:g} s, "
-                    f"up to {LONGEST_S:g} s, got {t:g}"
+                    f"up to {MAX_DURATION_S:g} s, got {t:g}"
                 )
             row = {**self._rows[-1], **checked_positions(body, positions)}
             self._check_speeds(body, row, t, number)
@@ -95,7 +95,7 @@ class JointPath:
 
     @property
     def end(self) -> dict[str, float]:
-        """The posture at its end."""
+        """Return the last posture."""
         return self._rows[-1]
 
     @property
@@ -110,7 +110,7 @@ class JointPath:
             return self.end
         share = (t - self._times[i - 1]) / (self._times[i] - self._times[i - 1])
         before, after = self._rows[i - 1], self._rows[i]
-        return {name: place + share * (after[name] - place) for name, place in before.items()}
+        return {name: start + share * (after[name] - start) for name, start in before.items()}
 
     def _check_speeds(self, body: BodyDescription, row: Positions, t: float, number: int) -> None:
         for joint in body.joints:
@@ -123,50 +123,51 @@ class JointPath:
 
 
 class JointStream:
-    """Commands for joints, one for each state, from where they were sent to where they should be.
+    """Commands for joints, one for each state, from the held posture to the goals.
 
-    The joints that are not named stay where they were sent.
+    Joints without a goal are held.
     """
 
     def __init__(self, body: BodyDescription, state: RobotState, source: str) -> None:
-        """Start where the joints are. Nothing moves before `go` or `follow`.
+        """Start at the held posture. Nothing moves before `go` or `follow`.
 
-        Raises BodyLost where one is not measured.
+        Raises BodyLost where a joint is not measured.
         """
         self._body, self._source = body, source
         self._now = held_posture(body, state)
         self._tick, self._sent = state.tick, self._now
-        self._postures = (self._now, self._now)  # where the gate held the joints, newest last
-        self._ends: dict[str, float] = {}
+        self._held_postures = (self._now, self._now)  # held by the gate, newest last
+        self._goals: dict[str, float] = {}
         self._speed: float | None = None
         self._path: JointPath | None = None
-        self._path_tick = 0  # when it began
-        self._least, self._progress_tick = math.inf, state.tick  # way to the goals, [rad] or [m]
+        self._path_tick = 0  # of its start
+        # smallest sum of the distances to the goals, [rad] or [m], and its tick
+        self._least_left, self._progress_tick = math.inf, state.tick
 
     @property
     def posture(self) -> dict[str, float]:
-        """Return the positions that the joints should have by now [rad] or [m]."""
+        """Return the newest commanded positions [rad] or [m]."""
         names = (joint.name for joint in self._body.joints)
         return dict(zip(names, (point.position for point in self._now), strict=True))
 
     def go(self, positions: Positions, speed: float | None) -> None:
         """Move joints to `positions` [rad] or [m] from now on."""
         self._path, self._speed = None, speed
-        self._ends |= positions
-        self._least = math.inf
+        self._goals |= positions
+        self._least_left = math.inf
 
     def follow(self, path: JointPath) -> None:
         """Follow a path from now on."""
         self._path, self._path_tick = path, self._tick
-        self._ends, self._speed = path.end, None
+        self._goals, self._speed = path.end, None
 
     def rest(self) -> None:
-        """Brake, and stay where that ends."""
-        self._ends, self._path = {}, None
+        """Brake to rest, and stay there."""
+        self._goals, self._path = {}, None
 
     def give_up(self) -> None:
-        """Stay where the gate holds the joints."""
-        self._now = self._postures[-1]
+        """Stay in the posture in which the gate holds the joints."""
+        self._now = self._held_postures[-1]
         self.rest()
 
     def step(self, state: RobotState) -> JointCommand | None:
@@ -174,17 +175,17 @@ class JointStream:
         posture = held(self._body, state)
         if not posture:
             return None
-        self._postures = (self._postures[1], posture)
-        if self._lost(posture):
+        self._held_postures = (self._held_postures[1], posture)
+        if self._lags(posture):
             self._now = posture
         passed = max(0, state.tick - self._tick)
-        ticks = min(passed, LOST_TICKS)
-        self._path_tick += passed - ticks  # it waits, as the gate does without commands
+        ticks = min(passed, MAX_LAG_TICKS)
+        self._path_tick += passed - ticks  # the path pauses, as the gate does without commands
         self._progress_tick += passed - ticks
         self._tick = state.tick
         self._watch_progress(posture)
         if ticks:
-            self._now = self._moved(ticks)
+            self._now = self._next(ticks)
         self._sent = self._now
         return JointCommand(
             name=tuple(joint.name for joint in self._body.joints),
@@ -193,7 +194,7 @@ class JointStream:
             source=self._source,
         )
 
-    def _moved(self, ticks: int) -> tuple[JointPoint, ...]:
+    def _next(self, ticks: int) -> tuple[JointPoint, ...]:
         joints, dt = self._body.joints, ticks * TICK_S
         if self._path:
             t = (self._tick - self._path_tick) * TICK_S
@@ -201,57 +202,57 @@ class JointStream:
             path = [[row[joint.name] for joint in joints] for row in rows]
             return along(self._now, path, joints, dt)
         goals = [
-            JointGoal(self._ends[joint.name], max_speed=self._speed)
-            if joint.name in self._ends
+            JointGoal(self._goals[joint.name], max_speed=self._speed)
+            if joint.name in self._goals
             else REST
             for joint in joints
         ]
         return ramp(self._now, goals, joints, dt)
 
-    def _lost(self, posture: tuple[JointPoint, ...]) -> bool:
-        """Return whether the gate holds the joints elsewhere: then they start from there."""
+    def _lags(self, posture: tuple[JointPoint, ...]) -> bool:
+        """Return whether the held posture is too far from the commands; then restart from it."""
         return any(
-            abs(sent.position - point.position) > LOST_TICKS * TICK_S * joint.max_speed
+            abs(sent.position - point.position) > MAX_LAG_TICKS * TICK_S * joint.max_speed
             for sent, point, joint in zip(self._sent, posture, self._body.joints, strict=True)
         )
 
     def _watch_progress(self, posture: tuple[JointPoint, ...]) -> None:
-        places = zip(self._body.joints, posture, strict=True)
-        left = sum(abs(p.position - self._ends.get(j.name, p.position)) for j, p in places)
-        if not self._over or left < self._least - ARRIVED:
-            self._least, self._progress_tick = left, self._tick
+        joints = zip(self._body.joints, posture, strict=True)
+        left = sum(abs(p.position - self._goals.get(j.name, p.position)) for j, p in joints)
+        if not self._path_ended or left < self._least_left - ARRIVED_TOLERANCE:
+            self._least_left, self._progress_tick = left, self._tick
 
     @property
-    def _over(self) -> bool:
-        """Return whether the time of the path is over, or there is none."""
+    def _path_ended(self) -> bool:
+        """Return whether the duration of the path has passed, or there is no path."""
         return self._path is None or (self._tick - self._path_tick) * TICK_S >= self._path.seconds
 
     @property
     def held_back(self) -> bool:
-        """Return whether the gate has not sent the joints nearer to their goals for a while."""
+        """Return whether the held posture makes no progress towards the goals."""
         return not self.arrived and self._tick - self._progress_tick > HELD_BACK_TICKS
 
     @property
     def arrived(self) -> bool:
-        """Return whether all joints have been sent to their goals."""
-        return self._over and all(
-            abs(self.posture[name] - place) < ARRIVED for name, place in self._ends.items()
+        """Return whether the newest command has all joints at their goals."""
+        return self._path_ended and all(
+            abs(self.posture[name] - goal) < ARRIVED_TOLERANCE for name, goal in self._goals.items()
         )
 
     def reached(self, state: RobotState) -> bool:
-        """Return whether all joints are where they should get, as sent and as measured.
+        """Return whether all joints are at their goals, as held and as measured.
 
-        They were sent there twice: in passing, they would go on when the commands end.
+        The last two held postures must be there: after only one, joints may still be moving.
         """
-        here = measured(self._body, state)
-        if not (here and self.arrived):
+        now = measured(self._body, state)
+        if not (now and self.arrived):
             return False
         return all(
-            abs(before.position - end) <= SENT
-            and abs(now.position - end) <= SENT
-            and abs(point.position - end) <= (joint.goal_tolerance or math.inf)
-            for joint, before, now, point in zip(
-                self._body.joints, *self._postures, here, strict=True
+            abs(older.position - goal) <= HELD_TOLERANCE
+            and abs(newer.position - goal) <= HELD_TOLERANCE
+            and abs(point.position - goal) <= (joint.goal_tolerance or math.inf)
+            for joint, older, newer, point in zip(
+                self._body.joints, *self._held_postures, now, strict=True
             )
-            if (end := self._ends.get(joint.name)) is not None
+            if (goal := self._goals.get(joint.name)) is not None
         )

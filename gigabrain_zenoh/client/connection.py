@@ -11,8 +11,8 @@ from gigabrain_zenoh.client.sync_robot import EventLoopThread, SyncRobot
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.runtime.running import find_endpoint
 
-ROBOT = frozenset(dir(SyncRobot)) | {"tasks"}
-# of the robot itself: the gate would take the commands of a script of that name for theirs
+ROBOT_ATTRIBUTES = frozenset(dir(SyncRobot)) | {"tasks"}
+# names that a script may not use: the gate could not tell its commands from the robot's own
 PROCESSES = (
     "router", "emulator", "driver", "camera", "perception", "recognition", "decision", "relay",
     "control", "safety", "page", "foxglove", "ros2", "recorder", "button",
@@ -30,12 +30,16 @@ class Connection:
         self._opening: AbstractAsyncContextManager[Robot] | None = None
         self._thread: EventLoopThread | None = None
 
-    if not TYPE_CHECKING:  # a checker knows that it has no other attributes
+    if not TYPE_CHECKING:  # type checkers then still report unknown attributes
 
         def __getattr__(self, name: str) -> None:
-            """Raise AttributeError; for what only a connected robot has, say how to connect."""
-            how = "; use `with gigabrain_zenoh.connect() as robot:`" if name in ROBOT else ""
-            raise AttributeError(f"a connection has no {name!r}{how}", name=name, obj=self)
+            """Raise AttributeError; for an attribute of a robot, with a hint how to connect."""
+            hint = (
+                "; use `with gigabrain_zenoh.connect() as robot:`"
+                if name in ROBOT_ATTRIBUTES
+                else ""
+            )
+            raise AttributeError(f"a connection has no {name!r}{hint}", name=name, obj=self)
 
     async def __aenter__(self) -> Robot:
         self._opening = self._open_robot()
@@ -74,11 +78,11 @@ def connect(
     """Connect to a robot, with `async with` or, in a script without asyncio, with `with`.
 
     `connect` is its router's Zenoh endpoint; by default the only robot on this machine. `keys` is
-    the folder of this script's identity, if the router requires one. `source` names this script to
-    the gate, by a name that no process of the robot has; with `take` it takes the body over from
-    another commander. With `wait=False` the first state is not awaited, so that an e-stop reaches a
-    silent body. Raises BusError without a router, ConfigError for invalid keys or such a name, and
-    BodyLost without a driver.
+    the folder of this script's identity, if the router requires one. `source` is this script's name
+    for the gate; it must not be the name of a process of the robot. With `take` the script takes
+    over the body from another commander. With `wait=False` the first state is not awaited, so that
+    an e-stop reaches a silent body. Raises BusError without a router, ConfigError for invalid keys
+    or a wrong `source`, and BodyLost without a driver.
     """
     if len(source) > MAX_SOURCE_CHARS:
         expected = f"expected at most {MAX_SOURCE_CHARS} characters"
@@ -93,7 +97,7 @@ def connect(
 async def _open(
     connect: str | None, namespace: str, keys: str, source: str, take: bool, wait: bool
 ) -> AsyncIterator[Robot]:
-    # imported only when used, since Zenoh takes a while
+    # imported late, as Zenoh takes long to import
     from gigabrain_zenoh.runtime.connect import connect as connect_bus
 
     endpoint = find_endpoint(connect, namespace, keys)

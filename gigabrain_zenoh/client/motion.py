@@ -10,13 +10,13 @@ from gigabrain_zenoh.errors import Unsupported
 from gigabrain_zenoh.geometry.limits import ZERO, at_rest
 
 GAIN = 2.0  # [1/s], speed per remaining distance near the goal
-BRAKE_SHARE = 0.5  # of the body's deceleration that is planned with
+BRAKE_SHARE = 0.5  # share of the body's deceleration to brake with
 POSITION_TOLERANCE, ANGLE_TOLERANCE = 0.01, math.radians(1.0)  # [m], [rad]
-MIN_LINEAR, MIN_ANGULAR = 0.02, 0.05  # [m/s], [rad/s], so that a motion ends
+MIN_LINEAR, MIN_ANGULAR = 0.02, 0.05  # [m/s], [rad/s], so that a motion reaches its goal
 HEADING_GAIN = 2.0  # [1/s]
-STALL_TICKS = 10 * 50  # without progress
-REST_TICKS = 50  # how long the end of a motion waits until the body is at rest
-MISSED_TICKS = 25  # between two states, from which a motion was not gone on with
+STALL_TICKS = 10 * 50  # without progress; then the motion gives up
+REST_TICKS = 50  # timeout for the body to come to rest at the end of a motion
+MISSED_TICKS = 25  # between two states; a longer gap does not count as a stall
 
 
 class Reached(Struct, frozen=True, kw_only=True):
@@ -25,12 +25,12 @@ class Reached(Struct, frozen=True, kw_only=True):
     distance: float  # [m] along the heading at the start
     angle: float  # [rad]
     pose: Pose  # odometry, at the end
-    ok: bool  # within tolerance of what was wanted
-    held_back: tuple[str, ...] = ()  # codes of what stopped the body on the way
+    ok: bool  # within tolerance of the goal
+    held_back: tuple[str, ...] = ()  # codes of the causes that stopped or slowed the body
 
 
 class OdometryMotion:
-    """One motion: gives the velocity for each state, until `done`.
+    """One motion: computes the velocity for each state, until `done`.
 
     Raises Unsupported for a turn of a body that cannot turn on the spot.
     """
@@ -44,21 +44,21 @@ class OdometryMotion:
         self._body, self._start, self._last = body, start.pose, start
         self._distance, self._angle = distance, angle
         self._turned, self._yaw = 0.0, start.pose.yaw
-        self._best, self._best_tick = math.inf, start.tick
-        self._end_tick = 0  # when the goal was reached, or given up
-        self._held: dict[str, None] = {}
+        self._least_left, self._progress_tick = math.inf, start.tick
+        self._end_tick = 0  # at which the goal was reached or given up
+        self._held_back: dict[str, None] = {}
 
     def step(self, state: RobotState, speed: float | None = None, safety: Causes = ()) -> Velocity:
         """Return the velocity to send for `state`; zero once the goal is reached or given up.
 
-        `safety` has the causes of safety's verdict: an obstacle limits only motion towards it.
+        `safety` contains the causes of safety's verdict; only the one in this direction counts.
         """
         self._turned += math.remainder(state.pose.yaw - self._yaw, math.tau)
         if (passed := state.tick - self._last.tick) > MISSED_TICKS:
-            self._best_tick += passed
+            self._progress_tick += passed
         self._yaw, self._last = state.pose.yaw, state
-        self._held.update(dict.fromkeys(one.code for one in state.gate.causes))
-        self._held.update({one.code: None for one in safety if one.code == self._zone})
+        self._held_back.update(dict.fromkeys(cause.code for cause in state.gate.causes))
+        self._held_back.update({cause.code: None for cause in safety if cause.code == self._zone})
         linear_left, angle_left = self._left()
         self._watch_progress(state, linear_left, angle_left)
         if self._end_tick:
@@ -80,7 +80,7 @@ class OdometryMotion:
         return at_rest(self._last.velocity) or self._last.tick > self._end_tick + REST_TICKS
 
     def result(self) -> Reached:
-        """Return what odometry has measured so far."""
+        """Return the measurements of odometry so far."""
         linear_left, angle_left = self._left()
         ok = abs(linear_left) <= 2 * POSITION_TOLERANCE and abs(angle_left) <= 2 * ANGLE_TOLERANCE
         return Reached(
@@ -88,11 +88,11 @@ class OdometryMotion:
             angle=self._turned,
             pose=self._last.pose,
             ok=ok,
-            held_back=tuple(self._held),
+            held_back=tuple(self._held_back),
         )
 
     def _left(self) -> tuple[float, float]:
-        """Return the distance [m] and the angle [rad] that are left."""
+        """Return the remaining distance [m] and angle [rad]."""
         start, pose = self._start, self._last.pose
         along = (pose.x - start.x) * math.cos(start.yaw) + (pose.y - start.y) * math.sin(start.yaw)
         return self._distance - along if self._distance else 0.0, self._angle - self._turned
@@ -100,21 +100,21 @@ class OdometryMotion:
     def _watch_progress(self, state: RobotState, linear_left: float, angle_left: float) -> None:
         left = abs(linear_left) if self._distance else abs(angle_left)
         tolerance = POSITION_TOLERANCE if self._distance else ANGLE_TOLERANCE
-        if left < self._best - tolerance:
-            self._best, self._best_tick = left, state.tick
-        stalled = state.tick - self._best_tick > STALL_TICKS
+        if left < self._least_left - tolerance:
+            self._least_left, self._progress_tick = left, state.tick
+        stalled = state.tick - self._progress_tick > STALL_TICKS
         if not self._end_tick and (left <= tolerance or stalled):
             self._end_tick = state.tick
 
     @property
     def _zone(self) -> str:
-        """The code of an obstacle in the direction of the motion."""
+        """Return safety's code for an obstacle in the direction of the motion."""
         if self._distance:
             return "zone_ahead" if self._distance > 0 else "zone_behind"
         return "zone_turn_left" if self._angle > 0 else "zone_turn_right"
 
 
-def _approach(left: float, limit: float, deceleration: float, slowest: float) -> float:
-    """Return a speed that comes to rest after `left`, with its sign."""
+def _approach(left: float, limit: float, deceleration: float, min_speed: float) -> float:
+    """Return a speed from which the body stops within `left`, with the sign of `left`."""
     braking = math.sqrt(2.0 * BRAKE_SHARE * deceleration * abs(left))
-    return math.copysign(min(limit, braking, max(GAIN * abs(left), slowest)), left)
+    return math.copysign(min(limit, braking, max(GAIN * abs(left), min_speed)), left)

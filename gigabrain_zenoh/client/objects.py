@@ -1,4 +1,4 @@
-"""Requests about things, tags and the robot's pose, as the page and the command line make them."""
+"""Requests about things, tags and the robot's pose, for the page and the command line."""
 
 import asyncio
 import math
@@ -16,9 +16,9 @@ from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.config.name_words import plain
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 
-FOUND_S = 4.0  # within which a robot is found where somebody says that it is
-THERE_M = 1.2  # from where somebody says that it is
-UNDERWAY_S = 0.1  # for which poses of before the request may still arrive
+LOCALIZE_TIMEOUT_S = 4.0  # for the scan to confirm a pose
+MAX_POSE_ERROR_M = 1.2  # between the given and the confirmed pose
+OLD_POSES_S = 0.1  # poses from before the request may still arrive this long
 NO_OBJECTS = (
     "no process remembers things; the robot needs a camera (--cameras), and perception a map "
     "(mapping: slam or localize)"
@@ -35,7 +35,10 @@ async def known_objects(bus: Bus) -> ObjectMap:
 
 
 async def forget_objects(bus: Bus, **fields: Any) -> str:
-    """Forget `ids`, `tags` or `everything`; return the reply as text. Raises as below."""
+    """Forget `ids`, `tags` or `everything`; return the reply as text.
+
+    Raises ConfigError for fields that are not valid, BodyLost and Refused.
+    """
     request = _request(ObjectsRequest, {"source": bus.process[:64], **fields})
     replies = await bus.ask(OBJECTS_CHANGE, request, timeout_s=ANSWER_S)
     if not replies:
@@ -46,7 +49,7 @@ async def forget_objects(bus: Bus, **fields: Any) -> str:
 
 
 async def set_pose(bus: Bus, x: float, y: float, yaw: float | None = None) -> PoseInMap:
-    """Set the robot's pose [m, m, rad]; return it once the robot's scan has confirmed it.
+    """Set the robot's pose [m, m, rad]; return it once the robot's scan confirms it.
 
     Raises ConfigError for numbers that are not valid, BodyLost, and Refused if the scan does not
     fit there.
@@ -57,7 +60,7 @@ async def set_pose(bus: Bus, x: float, y: float, yaw: float | None = None) -> Po
         raise BodyLost(NO_MAPPING)
     if not replies[0].ok:
         raise Refused(replies[0].text)
-    await asyncio.sleep(UNDERWAY_S)
+    await asyncio.sleep(OLD_POSES_S)
     found: asyncio.Future[PoseInMap] = asyncio.get_running_loop().create_future()
 
     def on_pose(_key: str, pose: PoseInMap) -> None:
@@ -66,7 +69,7 @@ async def set_pose(bus: Bus, x: float, y: float, yaw: float | None = None) -> Po
 
     close = bus.subscribe(POSE, on_pose)
     try:
-        pose = await asyncio.wait_for(found, FOUND_S)
+        pose = await asyncio.wait_for(found, LOCALIZE_TIMEOUT_S)
     except TimeoutError:
         raise Refused(
             f"not found: the scan does not tell its place round ({x:.2f}, {y:.2f}); "
@@ -74,7 +77,7 @@ async def set_pose(bus: Bus, x: float, y: float, yaw: float | None = None) -> Po
         ) from None
     finally:
         close()
-    if math.hypot(pose.x - x, pose.y - y) > THERE_M:
+    if math.hypot(pose.x - x, pose.y - y) > MAX_POSE_ERROR_M:
         raise Refused(
             f"the scan does not fit round ({x:.2f}, {y:.2f}); the robot is localized at "
             f"({pose.x:.2f}, {pose.y:.2f})"

@@ -1,4 +1,4 @@
-"""Requests to a robot: of its gate, its e-stop and its audit log."""
+"""Requests to a robot: its gate, e-stop, parameters, simulated world and audit log."""
 
 import asyncio
 import math
@@ -46,13 +46,13 @@ from gigabrain_zenoh.security.identity_files import may_not_ask
 
 Q = TypeVar("Q", bound=Message)
 
-ANSWER_S = 1.0  # timeout of an answer
-WORLD_ANSWER_S = 3.0  # time may stand still for 2 s before the driver gives up
+ANSWER_S = 1.0  # timeout of a reply
+WORLD_ANSWER_S = 3.0  # timeout; simulated time may stand still for 2 s first
 
-FIRST_S, AGAIN_S = 0.15, 0.05  # until the e-stop request is repeated, and between repetitions
-GIVE_UP_S = 2.0
+FIRST_S, REPEAT_S = 0.15, 0.05  # pause before the first repeated e-stop request, and the next
+GIVE_UP_S = 2.0  # without a confirmation of an e-stop
 MAX_SOURCE_CHARS, MAX_TEXT_BYTES = 64, 500  # of an e-stop request
-LAST_LOOK_S = 0.05  # for answers that arrived while this process was blocked
+LAST_WAIT_S = 0.05  # for replies that arrived while this process was blocked
 BY_HAND = "press the hardware e-stop or cut the robot's power"
 
 Asks = set[asyncio.Task[list[GateReply]]]
@@ -78,8 +78,8 @@ async def ask_gate(
 ) -> GateReply:
     """Return the granted request's reply.
 
-    Raises Refused with the gate's reason, StillStopping if that will pass, and BodyLost without an
-    answer, which may be for lack of rights of `keys`.
+    Raises Refused with the gate's reason, StillStopping while the gate brakes, and BodyLost without
+    a reply, perhaps because `keys` lack the right.
     """
     replies = await bus.ask(service, request, timeout_s=ANSWER_S)
     if not replies:
@@ -99,7 +99,7 @@ async def enable(bus: Bus, source: str, *, take: bool = False, keys: str = "") -
 
 
 async def release(bus: Bus, estop_generation: int, keys: str = "") -> GateReply:
-    """Release the gate from the e-stop of that number. Raises Refused and BodyLost."""
+    """Release the gate from e-stops up to that number. Raises Refused and BodyLost."""
     request = ReleaseRequest(estop_generation=estop_generation, source=bus.process)
     return await ask_gate(bus, RELEASE, request, keys)
 
@@ -110,9 +110,9 @@ async def let_go(bus: Bus, limp: bool, keys: str = "") -> GateReply:
 
 
 def jog(bus: Bus, speeds: Mapping[str, float]) -> None:
-    """Publish the velocities of joints [rad/s or m/s] that an operator wants.
+    """Publish an operator's velocities of joints [rad/s or m/s].
 
-    Raises ConfigError for one that is not finite.
+    Raises ConfigError for a velocity that is not finite.
     """
     check_finite(speeds)
     names, values = tuple(speeds), tuple(speeds.values())
@@ -120,13 +120,13 @@ def jog(bus: Bus, speeds: Mapping[str, float]) -> None:
 
 
 async def params(bus: Bus, process: str) -> tuple[Param, ...]:
-    """Return the parameters of a process; none if it does not answer."""
+    """Return the parameters of a process; none if it does not reply. Raises Refused."""
     replies = await bus.ask(PARAM, ParamRequest(), timeout_s=ANSWER_S, name=process)
     return replies[0].params if replies else ()
 
 
 class ParamTable:
-    """Parameters of all processes. One that does not answer keeps those that it had."""
+    """Parameters of all processes. Those of a process that does not reply stay as they were."""
 
     def __init__(self, bus: Bus, processes: Callable[[], Iterable[str]]) -> None:
         self._bus, self._processes = bus, processes
@@ -135,17 +135,17 @@ class ParamTable:
     async def read(self) -> Mapping[str, tuple[Param, ...]]:
         """Ask all processes; return their parameters by process."""
         names = sorted(self._processes())
-        answers = await asyncio.gather(*map(self._ask, names))
+        answers = await asyncio.gather(*map(self._read_one, names))
         self._known = {
             name: found or self._known.get(name, ())
             for name, found in zip(names, answers, strict=True)
         }
         return self._known
 
-    async def _ask(self, name: str) -> tuple[Param, ...]:
+    async def _read_one(self, name: str) -> tuple[Param, ...]:
         try:
             return await params(self._bus, name)
-        except Refused:  # it is busy
+        except Refused:  # the process is busy
             return ()
 
 
@@ -161,16 +161,16 @@ async def set_param(bus: Bus, process: str, name: str, value: str) -> str:
 
 
 def steer(bus: Bus, wanted: Velocity) -> None:
-    """Publish the velocity that an operator wants of the robot's own control.
+    """Publish an operator's velocity for the robot's own control.
 
-    Raises ConfigError for one that is not finite.
+    Raises ConfigError for a number that is not finite.
     """
     check_finite(asdict(wanted))
     bus.publish(TELEOP, Twist(**asdict(wanted), source=bus.session))
 
 
 def check_finite(numbers: Mapping[str, float]) -> None:
-    """Raise ConfigError for the first that is NaN or infinite."""
+    """Raise ConfigError for the first number that is NaN or infinite."""
     for name, number in numbers.items():
         if not math.isfinite(number):
             raise ConfigError(f"{name}: expected a finite number, got {number}")
@@ -183,7 +183,7 @@ def check_speed(speed: float | None) -> None:
 
 
 async def change_world(bus: Bus, request: SimRequest, keys: str = "") -> SimReply:
-    """Change a simulated world, or list what was put in. Raises Refused and BodyLost."""
+    """Change a simulated world, or list its added objects. Raises Refused and BodyLost."""
     replies = await bus.ask(SIM_CHANGE, request, timeout_s=WORLD_ANSWER_S)
     if not replies:
         doubt = may_not_ask(keys) or "; a simulation starts with `gigabrain demo`"
@@ -204,21 +204,21 @@ async def audit_log(bus: Bus, newest: int) -> tuple[AuditRecord, ...]:
 async def press_estop(bus: Bus, reason: str = "", *, within_s: float = GIVE_UP_S) -> GateReply:
     """Press the e-stop until a body confirms that it is latched. Raises NotConfirmed.
 
-    A `reason` that is too long is cut, as a request that is not valid would not stop the body.
+    A `reason` that is too long is cut, as an invalid request would not stop the body.
     """
     loop = asyncio.get_running_loop()
-    source = _text(bus.process or "anonymous")[:MAX_SOURCE_CHARS]
-    request = EstopRequest(source=source, reason=_text(reason))
+    source = _shortened(bus.process or "anonymous")[:MAX_SOURCE_CHARS]
+    request = EstopRequest(source=source, reason=_shortened(reason))
     end_s, pause_s, refused = loop.time() + within_s, FIRST_S, ""
     asks: Asks = set()
     try:
         while (left_s := end_s - loop.time()) > 0:
             asks.add(asyncio.create_task(bus.ask(ESTOP, request, timeout_s=left_s)))
-            reply, refusal = await _answer(asks, min(pause_s, left_s))
+            reply, refusal = await _wait_for_latched(asks, min(pause_s, left_s))
             if reply:
                 return reply
-            refused, pause_s = refusal or refused, AGAIN_S
-        reply, refusal = await _answer(asks, LAST_LOOK_S)
+            refused, pause_s = refusal or refused, REPEAT_S
+        reply, refusal = await _wait_for_latched(asks, LAST_WAIT_S)
         if reply:
             return reply
         refused = refusal or refused
@@ -226,16 +226,16 @@ async def press_estop(bus: Bus, reason: str = "", *, within_s: float = GIVE_UP_S
         for ask in asks:
             ask.cancel()
         await asyncio.gather(*asks, return_exceptions=True)
-    why = refused or "no driver answers"
-    raise NotConfirmed(f"NOT CONFIRMED: {why}; {BY_HAND}")
+    problem = refused or "no driver answers"
+    raise NotConfirmed(f"NOT CONFIRMED: {problem}; {BY_HAND}")
 
 
-def _text(given: object) -> str:
-    """Return what is given as a text that an e-stop request has room for."""
-    return str(given).encode(errors="replace")[:MAX_TEXT_BYTES].decode(errors="ignore")
+def _shortened(value: object) -> str:
+    """Return `value` as valid text of at most MAX_TEXT_BYTES."""
+    return str(value).encode(errors="replace")[:MAX_TEXT_BYTES].decode(errors="ignore")
 
 
-async def _answer(asks: Asks, within_s: float) -> tuple[GateReply | None, str]:
+async def _wait_for_latched(asks: Asks, within_s: float) -> tuple[GateReply | None, str]:
     """Return the first confirmation within the time, or None and the newest refusal."""
     loop = asyncio.get_running_loop()
     end_s, refused = loop.time() + within_s, ""

@@ -46,9 +46,9 @@ class Robot(Commander):
     async def move(self, distance: float, *, speed: float | None = None) -> Reached:
         """Drive straight by `distance` [m]; backwards if it is negative.
 
-        `speed` [m/s] is an upper limit. Returns what odometry has measured and what has held the
-        body back. Cutting this call short, as with Ctrl-C or a timeout, stops the body. Raises
-        Refused if the gate does not grant the body, and BodyLost.
+        `speed` [m/s] is an upper limit. Returns the measurements of odometry, and the causes that
+        held the body back. Interrupting this call, as with Ctrl-C or a timeout, stops the body.
+        Raises Refused if the gate does not grant the body, and BodyLost.
         """
         return await self._carry_out(distance, 0.0, speed)
 
@@ -71,9 +71,9 @@ class Robot(Commander):
     ) -> Task:
         """Send the robot to a pose [m, m, rad] or a named place; return the task once it has ended.
 
-        Instead of these, `object` is the class of a thing to drive before, and `tag` the number of
-        a tag; the robot looks for one that it does not know. Cancelling this call cancels the goal.
-        `tasks` has missions, the queue and progress. Raises Refused, and BodyLost if no process
+        Instead of a pose, `object` is the class of a thing to drive to, and `tag` the number of a
+        tag; the robot searches for an unknown one. Cancelling this call cancels the goal. For
+        missions, the queue and progress use `tasks`. Raises Refused, and BodyLost if no process
         serves goals.
         """
         if sum((x is not None, bool(object), tag is not None)) != 1:
@@ -124,19 +124,19 @@ class Robot(Commander):
         return wanted
 
     async def drive(self, linear_x: float = 0.0, angular_z: float = 0.0, *, seconds: float) -> None:
-        """Drive for `seconds` of the robot's time, then stop; also when this call is cut short.
+        """Drive for `seconds` of the robot's time, then stop; also if this call is interrupted.
 
-        Raises what `set_base_velocity` raises.
+        Raises the errors of `set_base_velocity`.
         """
         check_finite({"seconds": seconds})
         if seconds < 0:
             raise ConfigError(f"seconds: expected 0 or more, got {seconds:g}")
         start = (await self.read_state()).tick
         last = start + round(seconds * 50)
-        with self._halting():
+        with self._braking_on_error():
             while (left := last - self._bus.time.tick) > 0:
                 await self.set_base_velocity(linear_x, 0.0, angular_z)
-                await self._ticks(min(left, HOLD_TICKS // 2))
+                await self._wait_ticks(min(left, HOLD_TICKS // 2))
         await self.stop()
 
     def steer(self, wanted: Velocity) -> None:
@@ -150,15 +150,15 @@ class Robot(Commander):
     def jog(self, speeds: Mapping[str, float]) -> None:
         """Publish an operator's velocities of joints [rad/s or m/s]; repeat at 20 Hz.
 
-        Joints that are not named are held. Control obeys as it does for `steer`.
+        Other joints are held. Control obeys as it does for `steer`.
         """
         jog(self._bus, speeds)
 
     async def limp(self) -> GateReply:
         """Let go of all joints, so that a person can move them; an arm may fall.
 
-        Raises Refused while it is commanded or where its driver cannot, Unsupported for a body
-        without joints, and BodyLost.
+        Raises Refused while the arm is commanded or if its driver cannot do it, Unsupported for a
+        body without joints, and BodyLost.
         """
         check_joints(await self.read_body())
         return await let_go(self._bus, True, self._keys)
@@ -166,8 +166,8 @@ class Robot(Commander):
     async def hold(self) -> GateReply:
         """Hold limp joints again, where they are.
 
-        Raises Refused with the reason where they do not hold, Unsupported for a body without
-        joints, and BodyLost.
+        Raises Refused with the reason if they cannot hold, Unsupported for a body without joints,
+        and BodyLost.
         """
         check_joints(await self.read_body())
         return await let_go(self._bus, False, self._keys)
@@ -176,13 +176,13 @@ class Robot(Commander):
         check_finite({"distance": distance, "angle": angle})
         check_speed(speed)
         motion = OdometryMotion(await self.read_body(), await self.read_state(), distance, angle)
-        with self._halting():
+        with self._braking_on_error():
             while not motion.done:
                 verdict = self._safety.fresh()
                 causes = verdict.causes if verdict else ()
                 wanted = motion.step(await self.read_state(), speed, causes)
                 await self.set_base_velocity(wanted.linear_x, 0.0, wanted.angular_z)
-                await self._ticks(1)
+                await self._wait_ticks(1)
         await self.stop()
         return motion.result()
 
@@ -199,7 +199,7 @@ class Robot(Commander):
     ) -> float:
         """Move one joint to a position [rad or m]; return the measured one.
 
-        It raises what `set_joint_positions` raises.
+        Raises the errors of `set_joint_positions`.
         """
         positions = {joint_name: position}
         return (await self.set_joint_positions(positions, speed=speed, wait=wait))[joint_name]
@@ -209,37 +209,37 @@ class Robot(Commander):
     ) -> dict[str, float]:
         """Move joints together to positions [rad or m]; return those of all joints, as measured.
 
-        The others are held. `speed` [rad/s or m/s] is an upper limit. The first call asks the gate
-        for the body, which this script then keeps. With `wait`, it returns once the joints are
-        there within their tolerance, or rest as near as they get, and cutting it short stops them;
-        without, it returns at once.
+        Other joints are held. `speed` [rad/s or m/s] is an upper limit. The first call asks the
+        gate for the body, which this script then keeps. With `wait`, the call returns once the
+        joints are within their tolerance, or rest as near as they can get; interrupting it stops
+        them. Without `wait`, it returns at once.
 
-        Raises Unsupported for a body without joints, UnknownName and ConfigError for a joint or a
-        position that it does not have, Refused as `set_base_velocity` does, and BodyLost.
+        Raises Unsupported for a body without joints, UnknownName for an unknown joint, ConfigError
+        for a position out of its range, Refused as `set_base_velocity` does, and BodyLost.
         """
         body = await self.read_body()
         positions = checked_positions(body, positions)
         check_speed(speed)
         stream = await self._joint_stream(body)
         stream.go(positions, speed)
-        return await self._joints_there(body, stream, wait)
+        return await self._wait_for_joints(body, stream, wait)
 
     async def track_joint_positions(
         self, positions: Mapping[str, float], *, speed: float | None = None
     ) -> dict[str, float]:
-        """Have joints follow positions [rad or m] that change all the time, as of a leading arm.
+        """Make joints follow positions [rad or m] that change all the time, as of a leading arm.
 
-        It returns where the joints were sent, at the next state: then call it again. They are on
-        the fastest way to rest at the newest positions, so they lag by about a tenth of a second,
-        and do not shoot over. `speed` [rad/s or m/s] is an upper limit. It raises what
-        `set_joint_positions` raises.
+        Returns the commanded positions at the next state; then call it again. The joints take the
+        fastest way to rest at the newest positions, so they lag by about a tenth of a second, and
+        do not overshoot. `speed` [rad/s or m/s] is an upper limit. Raises the errors of
+        `set_joint_positions`.
         """
         body = await self.read_body()
         positions = checked_positions(body, positions)
         check_speed(speed)
         stream = await self._joint_stream(body)
         stream.go(positions, speed)
-        await self._ticks(1)
+        await self._wait_ticks(1)
         return stream.posture
 
     async def set_joint_trajectory(
@@ -255,7 +255,7 @@ class Robot(Commander):
             checked_positions(body, positions)
         stream = await self._joint_stream(body)
         stream.follow(JointPath(body, points, stream.posture))
-        return await self._joints_there(body, stream, wait)
+        return await self._wait_for_joints(body, stream, wait)
 
     async def get_sensor_data(self, sensor_name: str) -> Message:
         """Return the next message of `scan`, `imu` or another topic. Raises BodyLost after 1 s."""
@@ -271,29 +271,29 @@ class Robot(Commander):
     def topic(self, topic: Topic[M] | str, *, timeout: float | None = None) -> AsyncIterator[M]:
         """Yield each message on a topic: `async for scan in robot.topic("scan", timeout=5)`.
 
-        Without a `timeout` [s] it waits for ever, also for a driver that has died. Raises BodyLost
-        after one without a message, and UnknownName for a topic that is not in the table.
+        Without a `timeout` [s] it waits for ever, also for a driver that died. Raises BodyLost
+        after a `timeout` without a message, and UnknownName for an unknown topic.
         """
         if timeout is not None and not timeout > 0:
             raise ConfigError(f"timeout: expected more than 0, got {timeout:g}")
         wanted = topic_named(topic) if isinstance(topic, str) else topic
         return listen(self._bus, wanted, timeout)
 
-    async def _joints_there(
+    async def _wait_for_joints(
         self, body: BodyDescription, stream: JointStream, wait: bool
     ) -> dict[str, float]:
-        """Wait until the joints are where they were sent, or as near as they get.
+        """Wait until the joints reach their goals, or rest as near as they can get.
 
-        Those that safety holds back stay there, also once they are free again.
+        Joints that safety held back stay there, also when the way is free again.
         """
         assert body.arm
-        left = round(body.arm.goal_time / TICK_S)
-        with self._halting():
-            while wait and left and not stream.reached(state := await self.read_state()):
+        ticks_left = round(body.arm.goal_time / TICK_S)  # after the last command
+        with self._braking_on_error():
+            while wait and ticks_left and not stream.reached(state := await self.read_state()):
                 if not self._lease.has(state):
                     await self._acquire()
-                await self._ticks(1)
-                left -= stream.arrived
+                await self._wait_ticks(1)
+                ticks_left -= stream.arrived
                 if stream.held_back:
                     stream.give_up()
         return {joint.name: joint.position for joint in await self.get_joint_states()}

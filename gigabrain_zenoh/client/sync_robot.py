@@ -24,7 +24,7 @@ from gigabrain_zenoh.client.tasks import OnStatus, Tasks
 M = TypeVar("M", bound=Message)
 T = TypeVar("T")
 
-CLEAN_UP_S = 10.0  # within which a call that was cut short has ended
+CLEAN_UP_TIMEOUT_S = 10.0  # for a cancelled call to end
 
 
 class EventLoopThread:
@@ -40,7 +40,7 @@ class EventLoopThread:
     def run(self, coroutine: Coroutine[Any, Any, T]) -> T:
         """Run `coroutine` and return its result.
 
-        An interrupt cancels it, and waits until it has ended, as it may cancel a goal then.
+        An interrupt cancels it and waits until it ends, as its clean-up may cancel a goal.
         """
         with self._running(coroutine) as future:
             return future.result()
@@ -50,38 +50,38 @@ class EventLoopThread:
         start: Callable[[Callable[[M], None]], Coroutine[Any, Any, T]],
         call: Callable[[M], None],
     ) -> T:
-        """Run the coroutine that `start` makes of a callback, and return its result.
+        """Run the coroutine that `start` creates from a callback, and return its result.
 
-        What the callback is given is passed to `call` in the present thread; it gets the newest.
+        The newest message given to the callback is passed to `call` in the calling thread.
         """
-        newest, came = deque[M](maxlen=1), threading.Event()
+        newest, arrived = deque[M](maxlen=1), threading.Event()
 
-        def take(message: M) -> None:
+        def on_message(message: M) -> None:
             newest.append(message)
-            came.set()
+            arrived.set()
 
-        with self._running(start(take)) as future:
-            future.add_done_callback(lambda _: came.set())
+        with self._running(start(on_message)) as future:
+            future.add_done_callback(lambda _: arrived.set())
             while not future.done():
-                came.wait()
-                came.clear()
+                arrived.wait()
+                arrived.clear()
                 if newest:
                     call(newest.pop())
             return future.result()
 
     @contextlib.contextmanager
     def _running(self, coroutine: Coroutine[Any, Any, T]) -> Iterator[Future[T]]:
-        """Run `coroutine` while a block waits for it, and cancel it if the block is cut short.
+        """Run `coroutine` while a block waits for it, and cancel it if the block is interrupted.
 
-        Raises BusError once the loop is closed, as in a notebook's cell after that of the `with`.
+        Raises BusError if the loop is closed, as in a notebook's cell after the `with` block.
         """
         if self._loop.is_closed():
             coroutine.close()
             raise closed("with")
-        begun, ended = threading.Event(), threading.Event()
+        started, ended = threading.Event(), threading.Event()
 
         async def work() -> T:
-            begun.set()
+            started.set()
             try:
                 return await coroutine
             finally:
@@ -91,12 +91,12 @@ class EventLoopThread:
         try:
             yield future
         except BaseException:
-            if future.cancel() and begun.is_set():
-                ended.wait(CLEAN_UP_S)
+            if future.cancel() and started.is_set():
+                ended.wait(CLEAN_UP_TIMEOUT_S)
             raise
 
     def close(self) -> None:
-        """Cancel what still runs, and stop the loop and its thread."""
+        """Cancel all tasks, and stop the loop and its thread."""
         self.run(_cancel_others())
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
@@ -132,7 +132,7 @@ class SyncTasks:
         return self._run(self._tasks.carry_out(mission, how=how, label=label))
 
     def go_to_object(self, label: str = "", *, tag: int | None = None, how: How = "replace") -> str:
-        """Send the robot before a thing of a class, or before a tag; return the task's name."""
+        """Send the robot to a thing of a class, or to a tag; return the task's name."""
         return self._run(self._tasks.go_to_object(label, tag=tag, how=how))
 
     def explore(self, *, how: How = "replace") -> str:
@@ -162,7 +162,7 @@ class SyncTasks:
         """
         if on_status is None:
             return self._run(self._tasks.result(task))
-        return self._run_calling(lambda take: self._tasks.result(task, take), on_status)
+        return self._run_calling(lambda callback: self._tasks.result(task, callback), on_status)
 
 
 class SyncRobot:
@@ -276,7 +276,7 @@ class SyncRobot:
     def track_joint_positions(
         self, positions: Mapping[str, float], *, speed: float | None = None
     ) -> dict[str, float]:
-        """Have joints follow positions [rad or m] that change; return where they were sent."""
+        """Make joints follow changing positions [rad or m]; return the commanded ones."""
         return self._run(self._robot.track_joint_positions(positions, speed=speed))
 
     def set_joint_trajectory(

@@ -25,16 +25,16 @@ from gigabrain_zenoh.client.requests import ANSWER_S, still_open
 from gigabrain_zenoh.errors import BodyLost, ConfigError, GigabrainError, Refused
 from gigabrain_zenoh.security.identity_files import may_not_ask
 
-FILE_NAME = re.compile(r".+\.ya?ml")  # and no text of a mission, which has more lines or brackets
+FILE_NAME = re.compile(r".+\.ya?ml")  # does not match a mission's text: it has more lines
 MAX_NAME_CHARS = 64
 MAX_TAG = 1_000_000
-LARGEST = 1e5  # limit of coordinates on the bus [m]
-PLAN_S = 5.0  # how long path planning in a large map may take
+MAX_COORDINATE = 1e5  # [m], of goals on the bus
+PLAN_S = 5.0  # path planning in a large map may take this long
 SILENT_S = 5.0  # after this long without a task status, the robot counts as lost
-STALE_NS = 1_000_000_000  # the age up to which a status is given: it comes five times a second
-STARTING_S = 3.0  # how long a starting robot may take until it serves goals
-AGAIN_S = 0.2
-MAX_WITHOUT = 5  # statuses without a task: those from before it was accepted may still arrive
+STALE_NS = 1_000_000_000  # maximum age of a status: five are published a second
+STARTING_S = 3.0  # a starting robot may take this long to serve goals
+RETRY_S = 0.2
+MAX_STATUSES_WITHOUT = 5  # older statuses, without a new task, may still arrive
 OnStatus = Callable[[TaskStatus], None]
 Q = TypeVar("Q", bound=Message)
 R = TypeVar("R", bound=Message)
@@ -42,7 +42,7 @@ OnWait = Callable[[str], None]
 
 
 def late(timeout_s: float) -> str:
-    """Return what is known of a request that was not answered in time."""
+    """Return the error text for a request without a reply in time."""
     return (
         f"no answer within {timeout_s:g} s; `gigabrain task list` shows whether the robot has "
         "accepted it"
@@ -64,15 +64,15 @@ class Tasks:
     ) -> None:
         """Create a client that waits up to `starting_s` for a process that serves goals.
 
-        The callback `on_wait` receives a text when it starts to wait. After `silent_s` without a
-        task status, or `plan_s` without an answer to a goal, BodyLost is raised.
+        The callback `on_wait` receives a text when this wait begins. After `silent_s` without a
+        task status, or `plan_s` without a reply to a goal, calls raise BodyLost.
         """
         self._given_bus, self._keys = bus, keys
         self._on_wait, self._starting_s, self._silent_s = on_wait, starting_s, silent_s
         self._plan_s = plan_s
         self._arrived = asyncio.Event()
         self._newest: TaskStatus | None = None
-        self._newest_ns = 0  # when it came
+        self._newest_ns = 0  # time of its arrival
         self._subscribed = False
 
     @property
@@ -88,9 +88,9 @@ class Tasks:
         Raises ConfigError for numbers that are not valid, and Refused.
         """
         given = (x, y) if yaw is None else (x, y, yaw)
-        if not all(abs(value) <= LARGEST for value in given):
+        if not all(abs(value) <= MAX_COORDINATE for value in given):
             numbers = " ".join(f"{value:g}" for value in given)
-            raise ConfigError(f"a goal takes numbers up to {LARGEST:g}, got {numbers}")
+            raise ConfigError(f"a goal takes numbers up to {MAX_COORDINATE:g}, got {numbers}")
         return await self._go(GoalRequest(x=x, y=y, yaw=yaw, how=how, source=self._bus.process))
 
     async def go_to_place(
@@ -105,9 +105,9 @@ class Tasks:
     async def go_to_object(
         self, label: str = "", *, tag: int | None = None, how: How = "replace"
     ) -> str:
-        """Send the robot before the nearest thing of a class, or before a tag; it looks for one.
+        """Send the robot to the nearest thing of a class, or to a tag; it looks for an unknown one.
 
-        Return the task's name. Raises ConfigError for a name or number that cannot be, and Refused.
+        Returns the task's name. Raises ConfigError for an invalid name or number, and Refused.
         """
         if tag is not None and not 0 <= tag <= MAX_TAG:
             raise ConfigError(f"a tag has a number from 0 to {MAX_TAG}, got {tag}")
@@ -170,7 +170,7 @@ class Tasks:
 
     @property
     def newest(self) -> TaskStatus | None:
-        """The newest status that came, if any has since the first request."""
+        """Return the newest status received since the first request; None without one."""
         return self._newest
 
     async def status(self) -> TaskStatus:
@@ -184,19 +184,20 @@ class Tasks:
     async def result(self, task: str, on_status: OnStatus | None = None) -> Task:
         """Wait until a task has ended, and return it. Raises BodyLost, also for an unknown task.
 
-        Meanwhile `on_status` is called with each status.
+        Until then `on_status` is called with each status.
         """
         self._listen()
-        without = 0
+        missing = 0  # statuses in sequence without the task
         while True:
             status = self._newest
             if status:
-                for one in status.done:
-                    if one.id == task:
-                        return one
-                waiting = (status.current, *status.queue)
-                without = 0 if any(one and one.id == task for one in waiting) else without + 1
-                if without == MAX_WITHOUT:
+                for ended in status.done:
+                    if ended.id == task:
+                        return ended
+                open_tasks = (status.current, *status.queue)
+                known = any(each and each.id == task for each in open_tasks)
+                missing = 0 if known else missing + 1
+                if missing == MAX_STATUSES_WITHOUT:
                     raise BodyLost(
                         f"the robot does not know {task} (any more); "
                         "`gigabrain task list` shows what it knows"
@@ -206,16 +207,18 @@ class Tasks:
             await self._next_status()
 
     async def _ask(self, service: Service[Q, R], request: Q, timeout_s: float) -> R:
-        """Return the first answer; retry while no process serves tasks, as on a starting robot."""
+        """Return the first reply; retry while no process serves tasks, as on a starting robot."""
         now = asyncio.get_running_loop().time
-        until, waits = now() + self._starting_s, False
+        until, waiting = now() + self._starting_s, False
         while True:
             asked, losses = now(), self._bus.transport.losses
             replies = await self._ask_once(service, request, timeout_s)
             if replies:
                 return replies[0]
             took = now() - asked
-            await asyncio.sleep(AGAIN_S)  # a lost link may be known only after the query has ended
+            await asyncio.sleep(
+                RETRY_S
+            )  # the loss of a link may be reported only after the query ended
             if self._bus.transport.losses != losses:
                 raise BodyLost(
                     "the link was lost before the answer; `gigabrain task list` shows whether the "
@@ -226,23 +229,23 @@ class Tasks:
                 raise BodyLost(f"{late(timeout_s)}{doubt}")
             if now() >= until or doubt:
                 raise self._no_server()
-            if self._on_wait and not waits:
+            if self._on_wait and not waiting:
                 self._on_wait(
                     "waiting: no process serves goals yet; the robot may still be starting"
                 )
-            waits = True
+            waiting = True
 
     async def _ask_once(self, service: Service[Q, R], request: Q, timeout_s: float) -> list[R]:
-        """Return every answer. If this call is cancelled, a task that it has begun is as well."""
+        """Return all replies. If this call is cancelled, cancel a task that it started as well."""
         asking = asyncio.ensure_future(self._bus.ask(service, request, timeout_s=timeout_s))
         try:
             return await asyncio.shield(asking)
         except asyncio.CancelledError:
             with contextlib.suppress(GigabrainError):
-                await self._cancel_begun(await asking)
+                await self._cancel_started(await asking)
             raise
 
-    async def _cancel_begun(self, replies: list[R]) -> None:
+    async def _cancel_started(self, replies: list[R]) -> None:
         for reply in replies:
             if isinstance(reply, GoalReply) and reply.ok:
                 await self.cancel(reply.goal)

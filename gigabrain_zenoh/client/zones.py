@@ -1,4 +1,4 @@
-"""Requests about maps, zones and places, as the page and the command line make them."""
+"""Requests about maps, zones and places, for the page and the command line."""
 
 from typing import Any, TypeVar
 
@@ -17,8 +17,8 @@ from gigabrain_schemas.zones import (
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 
-ANSWER_S = 5.0
-LARGE_MAP_S = 20.0  # a large map takes long to write and to read
+ANSWER_S = 5.0  # timeout of a reply
+LARGE_MAP_S = 20.0  # timeout where a large map is written or read
 NO_MAPPING = (
     "no process makes or uses a map; set perception: {mapping: slam} or {mapping: localize}, "
     "and check that your keys may ask"
@@ -46,7 +46,7 @@ async def save_map(bus: Bus, name: str, *, replace: bool, source: str = "") -> s
 
 
 async def load_map(bus: Bus, name: str, *, mapping: str = "localize", source: str = "") -> str:
-    """Use a saved map from now on; return the reply as text. Raises as `save_map` does."""
+    """Load a saved map; return the reply as text. Raises the errors of `save_map`."""
     fields = {"name": name, "mapping": mapping, "source": source or bus.process}
     reply = await _ask(bus, MAP_LOAD, _request(MapLoadRequest, fields), LARGE_MAP_S)
     return _text(reply)

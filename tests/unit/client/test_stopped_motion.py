@@ -100,15 +100,15 @@ async def test_a_base_does_not_drive_on_after_the_driver_has_started_anew(
 ) -> None:
     robot = Robot(net.two)
     await robot.set_base_velocity(0.1)
-    await robot._ticks(5)
+    await robot._wait_ticks(5)
     assert driver.commands[-1].linear_x == 0.1
     driver.bus.time.boot, driver.bus.time.tick = 8, 0
     driver.gate = GateStatus(mode=mode)  # type: ignore[arg-type]
-    await robot._ticks(5)
+    await robot._wait_ticks(5)
     await robot.release()
     await robot.enable()
     driver.commands.clear()
-    await robot._ticks(20)
+    await robot._wait_ticks(20)
     assert [one for one in driver.commands if one.linear_x] == []
 
 
@@ -128,16 +128,16 @@ async def test_a_motion_ends_when_the_driver_has_started_anew(
 ) -> None:
     robot = Robot(net.two)
     moving = asyncio.ensure_future(begin(robot))
-    await robot._ticks(25)
+    await robot._wait_ticks(25)
     driver.bus.time.boot, driver.bus.time.tick = 8, 0
     source = net.two.process if mode == "enabled" else ""
     driver.gate = GateStatus(mode=mode, commander=source)
-    await robot._ticks(3)
+    await robot._wait_ticks(3)
     driver.commands.clear()
     stopped = driver.joints[JOINT.name]
     with pytest.raises(Refused, match=r"the driver was restarted; ask again with enable"):
         await asyncio.wait_for(moving, PATIENCE_S)
-    await robot._ticks(25)
+    await robot._wait_ticks(25)
     assert [one for one in driver.commands if one.linear_x] == []
     assert driver.joints[JOINT.name] == stopped
     assert driver.gate.enables == 0
@@ -148,14 +148,14 @@ async def test_an_arm_does_not_go_on_after_an_e_stop_by_somebody_else(
 ) -> None:
     robot = Robot(net.two)
     moving = asyncio.ensure_future(robot.set_joint_positions({JOINT.name: GOAL}))
-    await robot._ticks(25)
+    await robot._wait_ticks(25)
     driver.gate = GateStatus(mode="latched", enables=1, estop_generation=1)
     with pytest.raises(Refused, match="an e-stop has the body"):
         await moving
     stopped = driver.joints[JOINT.name]
     await robot.release()
     await robot.enable()
-    await robot._ticks(50)
+    await robot._wait_ticks(50)
     assert 0.0 < driver.joints[JOINT.name] == stopped < 0.9 * GOAL
     await robot.set_joint_positions({JOINT.name: GOAL})
     assert driver.joints[JOINT.name] == pytest.approx(GOAL, abs=0.01)
@@ -172,7 +172,7 @@ async def test_joints_that_safety_holds_back_are_not_waited_for_and_stay_there(
     found = await asyncio.wait_for(moving, PATIENCE_S)
     assert found[JOINT.name] == pytest.approx(0.5 * GOAL)
     driver.most = math.inf
-    await robot._ticks(50)
+    await robot._wait_ticks(50)
     assert driver.joints[JOINT.name] == pytest.approx(0.5 * GOAL, abs=0.05 * GOAL)
 
 
@@ -181,7 +181,7 @@ async def test_a_speed_that_is_none_moves_no_joint(net: Net, driver: Driver, spe
     robot = Robot(net.two)
     with pytest.raises(ConfigError, match=r"^speed: expected more than 0, got "):
         await robot.track_joint_positions({JOINT.name: GOAL}, speed=speed)
-    await robot._ticks(25)
+    await robot._wait_ticks(25)
     assert driver.joints[JOINT.name] == 0.0
 
 
