@@ -1,4 +1,4 @@
-"""Bags: recording into MCAP files, reading, playing, converting and replaying them.
+"""Bags, which are MCAP files: records, reads, plays, converts and replays them.
 
 It may import bus, config, gate, geometry, host, logs, runtime and safety.
 Diagnostics, ui, launch, commands and qa may import it.

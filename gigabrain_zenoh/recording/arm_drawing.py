@@ -12,7 +12,7 @@ from gigabrain_zenoh.geometry.link_model import LinkModel, Place, Quaternion, Sh
 from gigabrain_zenoh.recording.drawn import BASE, BLUE, Drawn, KnownEntities, as_drawn, stamp
 
 log = logging.getLogger(__name__)
-LINKS = "arm/"  # begins the names of the links' frames
+LINKS = "arm/"  # prefix of the names of the links' frames
 PATH_M, ARROW_M, ARROW_WIDTH_M = 0.004, 0.05, 0.006
 GREY = fox.Color(r=0.5, g=0.5, b=0.5, a=0.6)
 
@@ -25,7 +25,7 @@ class ArmDrawing:
         self._drawn, self._planned = KnownEntities(), KnownEntities()
 
     def draw_model(self, model: ArmModel, _: str) -> Iterable[Drawn]:
-        """Draw the shapes of each link in its own frame; a model that cannot be read is logged."""
+        """Draw the shapes of each link in its own frame; log a model that cannot be read."""
         try:
             self._model = LinkModel(model.mjcf)
         except ConfigError as error:
@@ -40,7 +40,7 @@ class ArmDrawing:
         yield as_drawn("arm", self._drawn.update(model, entities))
 
     def draw_joints(self, state: RobotState) -> Iterable[Drawn]:
-        """Draw the frame of each link in that of its parent, by the joints as measured."""
+        """Draw the frame of each link in the frame of its parent, at the measured positions."""
         if self._model is None or not state.joints:
             return
         places = self._model.places({joint.name: joint.position for joint in state.joints})
@@ -64,7 +64,7 @@ class ArmDrawing:
             type=fox.LinePrimitiveLineType.LineStrip, thickness=PATH_M, points=points, color=BLUE
         )
         colours = [BLUE, *[GREY] * len(plan.grasps)]
-        arrows = [_arrow(one, colour) for one, colour in zip(plan.grasps, colours, strict=False)]
+        arrows = [_arrow(*each) for each in zip(plan.grasps, colours, strict=False)]
         entity = fox.SceneEntity(
             timestamp=stamp(plan), frame_id=BASE, id="arm plan", arrows=arrows,
             lines=[line] if points else [],
@@ -77,26 +77,28 @@ class ArmDrawing:
 
 
 def _entity(at: ArmModel, frame: str, shapes: list[Shape]) -> fox.SceneEntity:
-    """Draw the shapes of a link; they move with its frame."""
+    """Draw the shapes of a link, in its frame."""
     return fox.SceneEntity(
         timestamp=stamp(at), frame_id=frame, id=frame, frame_locked=True,
         cubes=[
-            fox.CubePrimitive(pose=_pose(one.place), size=_doubled(*one.size), color=_colour(one))
-            for one in shapes if one.kind == "box"
+            fox.CubePrimitive(
+                pose=_pose(shape.place), size=_doubled(*shape.size), color=_colour(shape)
+            )
+            for shape in shapes if shape.kind == "box"
         ],
         cylinders=[
-            _cylinder(one) for one in shapes if one.kind in ("cylinder", "capsule")
+            _cylinder(shape) for shape in shapes if shape.kind in ("cylinder", "capsule")
         ],
-        spheres=[ball for one in shapes for ball in _balls(one)],
+        spheres=[sphere for shape in shapes for sphere in _spheres(shape)],
     )  # fmt: skip
 
 
 def _arrow(grasp: GraspPose, colour: fox.Color) -> fox.ArrowPrimitive:
     """Draw an arrow along the approach that ends at the tool."""
     x, y, z, w = grasp.orientation
-    ahead = rotated((w, x, y, z), (ARROW_M, 0.0, 0.0))
+    along = rotated((w, x, y, z), (ARROW_M, 0.0, 0.0))
     tail = fox.Vector3(**{
-        axis: at - way for axis, at, way in zip("xyz", grasp.position, ahead, strict=True)
+        axis: tip - step for axis, tip, step in zip("xyz", grasp.position, along, strict=True)
     })  # fmt: skip
     return fox.ArrowPrimitive(
         pose=fox.Pose(position=tail, orientation=_quaternion((w, x, y, z))),
@@ -105,25 +107,25 @@ def _arrow(grasp: GraspPose, colour: fox.Color) -> fox.ArrowPrimitive:
     )  # fmt: skip
 
 
-def _cylinder(one: Shape) -> fox.CylinderPrimitive:
-    radius, half, _ = one.size
+def _cylinder(shape: Shape) -> fox.CylinderPrimitive:
+    radius, half, _ = shape.size
     return fox.CylinderPrimitive(
-        pose=_pose(one.place), size=_doubled(radius, radius, half), color=_colour(one),
+        pose=_pose(shape.place), size=_doubled(radius, radius, half), color=_colour(shape),
         top_scale=1.0, bottom_scale=1.0,
     )  # fmt: skip
 
 
-def _balls(one: Shape) -> Iterable[fox.SpherePrimitive]:
-    """Yield a ball, an ellipsoid, or both ends of a capsule."""
-    radius, half, _ = one.size
+def _spheres(shape: Shape) -> Iterable[fox.SpherePrimitive]:
+    """Yield a sphere, an ellipsoid, or both ends of a capsule; nothing for other shapes."""
+    radius, half, _ = shape.size
     size, places = _doubled(radius, radius, radius), list[Place]()
-    if one.kind == "capsule":
-        places = [one.place @ Place((0.0, 0.0, end)) for end in (-half, half)]
-    elif one.kind in ("sphere", "ellipsoid"):
-        places = [one.place]
-        size = size if one.kind == "sphere" else _doubled(*one.size)
+    if shape.kind == "capsule":
+        places = [shape.place @ Place((0.0, 0.0, end)) for end in (-half, half)]
+    elif shape.kind in ("sphere", "ellipsoid"):
+        places = [shape.place]
+        size = size if shape.kind == "sphere" else _doubled(*shape.size)
     for place in places:
-        yield fox.SpherePrimitive(pose=_pose(place), size=size, color=_colour(one))
+        yield fox.SpherePrimitive(pose=_pose(place), size=size, color=_colour(shape))
 
 
 def _pose(place: Place) -> fox.Pose:
@@ -142,6 +144,6 @@ def _doubled(x: float, y: float, z: float) -> fox.Vector3:
     return fox.Vector3(x=2 * x, y=2 * y, z=2 * z)
 
 
-def _colour(one: Shape) -> fox.Color:
-    r, g, b, a = one.colour
+def _colour(shape: Shape) -> fox.Color:
+    r, g, b, a = shape.colour
     return fox.Color(r=r, g=g, b=b, a=a)

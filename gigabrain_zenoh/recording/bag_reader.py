@@ -1,9 +1,8 @@
-"""Reads a bag from its first byte to its last, however it ended, and reports what is damaged.
+"""Reads a bag from its first byte to its last, also if it is damaged or cut off; reports damage.
 
-The library parses single records. Its readers end at the first damaged byte, and return a message
-that was cut off as if it were whole. They allocate the size that a chunk claims (400 MB for one of
-13 kB).
-The walk from record to record, and the limits, are therefore ours.
+The mcap library parses single records. Its own readers end at the first damaged byte, return
+messages that are cut off as whole ones, and allocate as much memory as a chunk claims to need.
+So this module goes from record to record itself, with limits.
 """
 
 import contextlib
@@ -48,8 +47,8 @@ MALFORMED = (McapError, struct.error, UnicodeDecodeError)
 FOOTER_BYTES = HEAD.size + 20
 ZSTD_NAME = b"\x04\x00\x00\x00zstd"
 BYTES_BEFORE_NAME = HEAD.size + 28  # from a chunk's opcode to the name of its compression
-PIECE_BYTES = 1 << 16
-MAX_RECORD_BYTES = 48 << 20  # also of a decompressed chunk; writers use chunks of 1 MB
+READ_BYTES = 1 << 16
+MAX_RECORD_BYTES = 48 << 20  # also of a decompressed chunk; usual chunks have 1 MB
 MAX_WINDOW_BYTES = 1 << 25  # memory of a decompressor
 
 
@@ -71,7 +70,7 @@ class Sample(NamedTuple):
 
     log_ns: int  # Unix time of reception
     key: str
-    encoding: str  # Zenoh's
+    encoding: str  # Zenoh's encoding
     schema: str
     payload: bytes
 
@@ -86,7 +85,7 @@ class Bag:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.damages: list[BagDamage] = []  # these four are filled while the bag is read
+        self.damages: list[BagDamage] = []  # reading the bag sets this and the next three
         self.finished = False
         self.index_ok = False
         self.notes: dict[str, Mapping[str, str]] = {}  # named tables of texts
@@ -143,7 +142,7 @@ def samples(path: Path) -> Iterator[Sample]:
 
 
 def check_magic(path: Path) -> None:
-    """Raise ConfigError if the file is not a bag, and name what it is instead."""
+    """Raise ConfigError if the file is not a bag, with the reason."""
     try:
         with open_regular(path) as file:
             head = file.read(len(MAGIC))
@@ -159,16 +158,16 @@ def check_magic(path: Path) -> None:
 
 
 def read_records(path: Path) -> Iterator[McapRecord | BagDamage | BagEnd]:
-    """Iterate over all records in order, chunks unpacked. Raises ConfigError."""
+    """Iterate over all records in order, also those in chunks. Raises ConfigError."""
     check_magic(path)
     with open_regular(path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        yield from _walk(data)
+        yield from _records(data)
 
 
-def _walk(data: mmap.mmap) -> Iterator[McapRecord | BagDamage | BagEnd]:
+def _records(data: mmap.mmap) -> Iterator[McapRecord | BagDamage | BagEnd]:
     at, end = len(MAGIC), len(data)
     summary = _summary(data)
-    if summary:  # repeats the declarations of damaged chunks
+    if summary:  # declares also the channels and schemas of damaged chunks
         yield from (item for item in _parse(summary, at) if isinstance(item, Schema | Channel))
     while at < end:
         opcode, after = _head(data, at)
@@ -185,14 +184,14 @@ def _walk(data: mmap.mmap) -> Iterator[McapRecord | BagDamage | BagEnd]:
             after = chunk
         else:
             if opcode == Opcode.CHUNK:
-                yield from _torn_chunk(data[at : at + MAX_RECORD_BYTES])
+                yield from _cut_off_chunk(data[at : at + MAX_RECORD_BYTES])
             break
         at = after
     yield BagDamage(at, "the file is cut off here")
 
 
 def _head(data: mmap.mmap, at: int) -> tuple[int, int]:
-    """Return opcode and end of the record at `at`; opcode 0 without a record."""
+    """Return opcode and end offset of the record at `at`; opcode 0 without a record."""
     if at + HEAD.size > len(data):
         return 0, at
     opcode, length = HEAD.unpack_from(data, at)
@@ -201,7 +200,7 @@ def _head(data: mmap.mmap, at: int) -> tuple[int, int]:
 
 
 def _next_chunk(data: mmap.mmap, at: int) -> int:
-    """Return where the next chunk begins, by the name of its compression; -1 without one."""
+    """Return the offset of the next chunk, found by the name of its compression; -1 without one."""
     name = data.find(ZSTD_NAME, at + BYTES_BEFORE_NAME)
     while name > 0:
         opcode, after = _head(data, name - BYTES_BEFORE_NAME)
@@ -227,7 +226,7 @@ def _summary(data: mmap.mmap) -> bytes | None:
 
 
 def _unpacked(record: bytes, at: int) -> Iterator[McapRecord | BagDamage]:
-    """Parse one record; of a chunk yield everything inside, or nothing if its checksum is wrong."""
+    """Parse one record; for a chunk yield its records, or only damage if its checksum is wrong."""
     for item in _parse(record, at):
         if not isinstance(item, Chunk):
             yield item
@@ -240,8 +239,8 @@ def _unpacked(record: bytes, at: int) -> Iterator[McapRecord | BagDamage]:
             yield BagDamage(at, f"a chunk of {len(record) - HEAD.size} bytes is damaged")
 
 
-def _torn_chunk(record: bytes) -> Iterator[McapRecord]:
-    """Parse the beginning of a chunk whose end was never written."""
+def _cut_off_chunk(record: bytes) -> Iterator[McapRecord]:
+    """Parse the start of a chunk whose end is missing."""
     with contextlib.suppress(*MALFORMED):
         chunk = Chunk.read(ReadDataStream(BytesIO(record[HEAD.size :])))
         for item in _parse(_decompressed(chunk)[0], 0):
@@ -250,13 +249,13 @@ def _torn_chunk(record: bytes) -> Iterator[McapRecord]:
 
 
 def _decompressed(chunk: Chunk) -> tuple[bytes, bool]:
-    """Return as much as can be decompressed within the limits, and whether that is all."""
+    """Return the content that decompresses within the limits, and whether it is complete."""
     if chunk.compression == "":
         return chunk.data, True
     records = bytearray()
     try:
         reader = _decompressor(chunk)
-        while len(records) < MAX_RECORD_BYTES and (piece := reader.read(PIECE_BYTES)):
+        while len(records) < MAX_RECORD_BYTES and (piece := reader.read(READ_BYTES)):
             records += piece
     except (zstandard.ZstdError, RuntimeError, EOFError):
         return bytes(records), False
@@ -273,7 +272,7 @@ def _decompressor(chunk: Chunk) -> IO[bytes]:
 
 
 def _parse(records: bytes, offset: int) -> Iterator[McapRecord | BagDamage]:
-    """Parse a row of records; report each malformed one as damage at `offset`, and go on."""
+    """Parse consecutive records; report each malformed one as damage at `offset`, and continue."""
     at = 0
     while at + HEAD.size <= len(records):
         opcode, length = HEAD.unpack_from(records, at)
@@ -292,10 +291,10 @@ def _parse(records: bytes, offset: int) -> Iterator[McapRecord | BagDamage]:
 
 
 class _StrictStream(ReadDataStream):
-    """Content of one record. Raises EndOfFile where the library would return less than asked."""
+    """Content of one record. Raises EndOfFile where the library would return too few bytes."""
 
     def read(self, length: int) -> bytes:
-        if length > MAX_RECORD_BYTES:  # more than a stream may be asked for
+        if length > MAX_RECORD_BYTES:  # a stream would allocate it
             raise EndOfFile
         data = super().read(length)
         if len(data) < length:
@@ -304,7 +303,7 @@ class _StrictStream(ReadDataStream):
 
 
 PICTURE_KEYS = (f"{IMAGE.key}/", f"{DEPTH.key}/")
-PICTURES_NOTE = "pictures"  # of a recording that leaves pictures out: their rate
+PICTURES_NOTE = "pictures"  # name of the note with the rate of a thinned recording
 TABLE_HEAD = (
     f"{'key':<28} {'message':<14} {'messages':>8} {'hz':>7} {'kB':>9} {'missing':>8} "
     f"{'restarts':>9} {'longest gap':>11}"
@@ -318,9 +317,9 @@ class KeyInfo(Struct, frozen=True, kw_only=True):
     message: str  # name of its type
     messages: int
     bytes: int
-    hz: float  # between the first and the last
-    missing: int  # by the sender's count
-    restarts: int  # of that count
+    hz: float  # between the first and the last message
+    missing: int  # according to the sender's numbers
+    restarts: int  # of the sender's numbers
     longest_gap_s: float  # between two messages
 
 
@@ -332,7 +331,7 @@ class BagInfo(Struct, frozen=True, kw_only=True):
     start_ns: int  # Unix time of the first message
     seconds: float
     messages: int
-    finished: bool  # its writer came to the end, and its index is intact
+    finished: bool  # it has its end and an intact index
     damages: tuple[str, ...]
     keys: tuple[KeyInfo, ...]
     notes: dict[str, dict[str, str]]
@@ -390,7 +389,7 @@ def _leaves_out_pictures(bag: Bag) -> bool:
 
 
 def faults(info: BagInfo) -> list[str]:
-    """Describe everything wrong with a recording, a sentence each; empty if it is whole."""
+    """Return a sentence for each fault of a recording; empty if it has none."""
     found = list(info.damages)
     if not info.finished and not info.damages:
         found.append("its index is damaged")

@@ -28,12 +28,12 @@ from gigabrain_zenoh.recording.drawn import Drawn, json_schema
 log = logging.getLogger(__name__)
 
 PROFILE, LIBRARY = "gigabrain", "gigabrain-zenoh"
-VIEW = "view"  # kind of a channel, in its metadata; that of recorded messages is RAW
+VIEW = "view"  # kind of a channel of drawings; channels of recorded messages are RAW
 MIN_DRAWN_INTERVAL_NS = {
     STATE.key: 30_000_000,
     CMD_VEL.key: 30_000_000,
-    TASK.key: 450_000_000,  # holds the whole path to the goal
-    DEPTH.key: 450_000_000,  # of each camera; viewers take it uncompressed
+    TASK.key: 450_000_000,  # contains the whole path to the goal
+    DEPTH.key: 450_000_000,  # for each camera; drawings are uncompressed
 }
 TYPE_BY_ENCODING = {encoding_of(topic.type): topic.type for topic in TOPICS}
 _fdatasync = getattr(os, "fdatasync", os.fsync)  # macOS has no fdatasync
@@ -44,16 +44,16 @@ class ReceivedMessage(NamedTuple):
 
     log_ns: int  # Unix time of reception; strictly increasing
     key: str
-    encoding: str  # Zenoh's
+    encoding: str  # Zenoh's encoding
     payload: bytes
     header: Header
 
 
 class AppendOnlyFile:
-    """New file, locked while it is open, that an interrupted append leaves as it was.
+    """New file, locked while it is open, which a failed append does not change.
 
-    `write` only collects data, and `flush` appends all of it or nothing: a chunk that a full disk
-    cuts off would otherwise stay in the file. Raises ConfigError if the file exists.
+    `write` only collects data. `flush` appends all of it or nothing, so that a full disk leaves no
+    incomplete chunk. Raises ConfigError if the file exists.
     """
 
     def __init__(self, path: Path) -> None:
@@ -67,7 +67,7 @@ class AppendOnlyFile:
             raise ConfigError(f"{error.filename} exists; choose another file") from None
         except OSError as error:
             raise ConfigError(f"cannot write {path}: {error.strerror}") from None
-        fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)  # keeps recovery off this file
+        fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)  # recovery then skips this file
 
     def write(self, data: bytes) -> int:
         """Collect data for the next `flush`."""
@@ -119,13 +119,13 @@ class _Channel(NamedTuple):
     """Channel for messages of one key and encoding."""
 
     id: int
-    drawn: Topic[Any] | None  # None if viewers draw nothing of this key
+    drawn: Topic[Any] | None  # None if there are no drawings of this key
 
 
 class BagWriter:
     """Recording in progress.
 
-    Raises ConfigError if the file cannot be created, OSError if the disk accepts no more.
+    Raises ConfigError if the file cannot be created, and OSError if the disk is full.
     """
 
     def __init__(self, path: Path, *, viewers: bool, notes: Mapping[str, str]) -> None:
@@ -150,9 +150,9 @@ class BagWriter:
         self.pending: Counter[str] = Counter()  # messages per key that are not on the disk yet
         self.written = 0  # messages on the disk
         self.first_ns = 0
-        self.repeated_bytes = 0  # on the disk, of messages of earlier files
-        self.index_entries = 0  # held in memory until the end: one of each chunk and channel in it
-        self._in_chunk: set[int] = set()  # channels of the messages since the last chunk
+        self.repeated_bytes = 0  # on the disk, of messages repeated from earlier files
+        self.index_entries = 0  # in memory until the end: one per chunk and channel in it
+        self._in_chunk: set[int] = set()  # channels of the messages in the current chunk
 
     @property
     def path(self) -> Path:
@@ -173,15 +173,15 @@ class BagWriter:
         return self._file.is_deleted()
 
     def add(self, message: ReceivedMessage, *, repeated: bool = False) -> None:
-        """Append one message, and what viewers draw of it.
+        """Append one message, and its drawings for viewers.
 
-        A `repeated` message is in an earlier file already, and is not counted again.
+        A `repeated` message is already in an earlier file, and is not counted again.
         """
         log_ns, key, encoding, payload, header = message
         kind = key, encoding, is_json(payload)
         try:
             channel = self._channels.get(kind) or self._add_channel(kind)
-        finally:  # where the disk is full, the message is lost
+        finally:  # counted also if the disk is full: then the message is lost
             self.pending[key] += not repeated
         self.first_ns = self.first_ns or log_ns
         stamp_ns = header.stamp_ns or log_ns
@@ -192,7 +192,7 @@ class BagWriter:
         self._store()
 
     def repeat(self, messages: Iterable[ReceivedMessage], log_ns: int) -> None:
-        """Begin with messages of earlier files, and bring them to the disk."""
+        """Write messages of earlier files first, and sync them to the disk."""
         before = self.size
         for message in messages:
             self.add(message._replace(log_ns=log_ns), repeated=True)
@@ -200,7 +200,7 @@ class BagWriter:
         self.repeated_bytes = self.size - before
 
     def flush(self) -> None:
-        """Bring all messages to the disk."""
+        """Sync all messages to the disk."""
         self._writer.flush()
         self._store()
         self._file.sync()
@@ -222,7 +222,7 @@ class BagWriter:
         self._file.close()
 
     def _store(self) -> None:
-        """Append the chunk that the library has finished, if any: it holds all messages so far."""
+        """Append the chunk that the library finished, if any: it contains all messages so far."""
         self._file.flush()
         if self._file.size != self._stored_bytes:
             self._stored_bytes = self._file.size
@@ -256,8 +256,8 @@ class BagWriter:
         return self._schemas[of.name]
 
     def _declare_again(self, record: Channel | RecordedSchema) -> None:
-        """Append a declaration beside the chunks: else a damaged chunk may cost all after it."""
-        self._store()  # a large schema may finish the chunk before the message is in it
+        """Append a declaration outside the chunks, so that it survives a damaged chunk."""
+        self._store()  # a large schema may finish the chunk before its message
         builder = RecordBuilder()
         record.write(builder)
         self._file.write(builder.end())
@@ -276,7 +276,7 @@ class BagWriter:
             self._writer.add_message(channel, received.log_ns, drawn.data, stamp_ns)
 
     def _is_worth_drawing(self, topic: Topic[Any], message: ReceivedMessage) -> bool:
-        """Return whether it shows more than the one before; decided before it is decoded."""
+        """Return whether a drawing would show something new; called before decoding."""
         key, header = message.key, message.header
         if key == INTENT.key:  # repeated with every tick
             before, self._last_intent = self._last_intent, (header.boot, header.basis)

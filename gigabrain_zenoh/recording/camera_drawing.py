@@ -1,8 +1,7 @@
-"""Drawings of cameras for viewers: pictures, calibration, what was recognised, and contours.
+"""Drawings of cameras for viewers: pictures, calibration, detections, objects and contours.
 
-Foxglove and Rerun join a picture to its calibration by the frame of the lens, by ROS (REP-103): z
-looks ahead, x to the right of the picture and y down. It hangs below `base_link`, or a link of the
-arm.
+Foxglove and Rerun match a picture with its calibration by the optical frame (REP-103): z points
+ahead, x to the right of the picture and y down. Its parent is `base_link`, or a link of the arm.
 """
 
 import math
@@ -38,15 +37,15 @@ from gigabrain_zenoh.recording.drawn import (
 )
 from gigabrain_zenoh.vision.pictures import check_jpeg
 
-OPTICAL = (-0.5, 0.5, -0.5, 0.5)  # x, y, z, w: from the lens's frame to one that looks along x
+OPTICAL = (-0.5, 0.5, -0.5, 0.5)  # x, y, z, w: from the optical frame to one with x ahead
 RAW_ENCODINGS = {"depth16": "16UC1", "depth32f": "32FC1"}
 WHITE, DARK = fox.Color(r=1.0, g=1.0, b=1.0, a=1.0), fox.Color(r=0.0, g=0.0, b=0.0, a=0.6)
 THING_COLOUR = fox.Color(r=1.0, g=0.76, b=0.03, a=1.0)
 TAG_COLOUR = fox.Color(r=0.2, g=0.85, b=0.95, a=1.0)
 TEXT_PX, LINE_PX = 12.0, 2.0
-OVERHANG_M = 0.1  # below what begins higher, there is free space
-HOLE_M = -0.01
-FADE_S, MIN_ALPHA = 10.0, 0.15  # a contour fades from the time on when it was last seen
+OVERHANG_M = 0.1  # a contour whose bottom is higher is an overhang
+HOLE_M = -0.01  # a contour whose bottom is lower is a hole
+FADE_S, MIN_ALPHA = 10.0, 0.15  # a contour fades while it is not seen
 CONTOUR_COLOURS = {
     "low": (0.64, 0.15, 0.5),
     "overhang": (0.42, 0.31, 0.63),
@@ -57,12 +56,12 @@ OUTLINE_M, PLATE_M = 0.02, 0.01
 
 
 def optical_frame(camera: str) -> str:
-    """Return the name of the frame of a camera's lens."""
+    """Return the name of a camera's optical frame."""
     return f"{camera}_optical_frame"
 
 
 def picture(image: Image, camera: str) -> Iterable[Drawn]:
-    """Draw a picture; none of a JPEG that is broken or not of its message's size."""
+    """Draw a picture; skip a JPEG that is broken or has another size than its message."""
     when, frame = stamp(image), optical_frame(camera)
     if image.encoding == "jpeg":
         try:
@@ -81,7 +80,7 @@ def picture(image: Image, camera: str) -> Iterable[Drawn]:
 
 
 def depth(message: DepthImage, camera: str) -> Iterable[Drawn]:
-    """Draw depth as a picture of millimetres; none of a broken one."""
+    """Draw depth as a picture in millimetres; skip a broken message."""
     try:
         data = message.array().astype("<u2").tobytes()
     except ValueError:
@@ -94,7 +93,7 @@ def depth(message: DepthImage, camera: str) -> Iterable[Drawn]:
 
 
 def calibration(info: CameraInfo, _: str) -> Iterable[Drawn]:
-    """Draw a camera's calibration, and the frame of its lens."""
+    """Draw a camera's calibration, and its optical frame."""
     camera = info.camera
     fx, fy, cx, cy = camera.pinhole
     given = camera.distortion
@@ -112,13 +111,14 @@ def calibration(info: CameraInfo, _: str) -> Iterable[Drawn]:
     place = fox.FrameTransform(
         timestamp=stamp(info), child_frame_id=optical_frame(camera.name),
         parent_frame_id=f"{LINKS}{camera.link}" if camera.link else BASE,
-        translation=fox.Vector3(x=camera.x, y=camera.y, z=camera.z), rotation=_lens(camera),
+        translation=fox.Vector3(x=camera.x, y=camera.y, z=camera.z),
+        rotation=_optical_rotation(camera),
     )  # fmt: skip
     yield as_drawn("tf", place)
 
 
-def _lens(camera: Camera) -> fox.Quaternion:
-    """Return the rotation from the frame of the lens to that in which the camera is mounted."""
+def _optical_rotation(camera: Camera) -> fox.Quaternion:
+    """Return the rotation from the optical frame to the frame in which the camera is mounted."""
     (sr, cr), (sp, cp), (sy, cy) = (
         (math.sin(angle / 2), math.cos(angle / 2))
         for angle in (camera.roll, camera.pitch, camera.yaw)
@@ -156,7 +156,7 @@ def recognised(found: Detections, _: str) -> Iterable[Drawn]:
 
 
 def thing_label(thing: Detection) -> str:
-    """Return class, confidence, and distance where it is known."""
+    """Return the text of a detection: class, confidence, and distance if it is known."""
     text = f"{thing.label} {100 * thing.confidence:.0f} %"
     if thing.position:
         text += f"  {math.hypot(*thing.position[:2]):.1f} m"
@@ -180,43 +180,46 @@ def _text(when: fox.Timestamp, u: float, v: float, text: str) -> fox.TextAnnotat
 
 
 def contours(world: WorldModel) -> Iterable[Drawn]:
-    """Draw contours as prisms; nothing before a camera has been seen."""
+    """Draw contours as prisms; nothing if there is no camera."""
     if world.contours or world.cameras:
-        entities = [_prism(world, number, one) for number, one in enumerate(world.contours)]
+        entities = [_prism(world, *each) for each in enumerate(world.contours)]
         yield as_drawn("contours", fox.SceneUpdate(entities=entities))
 
 
-def contour_kind(one: Contour) -> str:
+def contour_kind(contour: Contour) -> str:
     """Return whether a contour is `low`, an `overhang` or a `hole`."""
-    if one.bottom < HOLE_M:
+    if contour.bottom < HOLE_M:
         return "hole"
-    return "overhang" if one.bottom > OVERHANG_M else "low"
+    return "overhang" if contour.bottom > OVERHANG_M else "low"
 
 
-def _prism(world: WorldModel, number: int, one: Contour) -> fox.SceneEntity:
+def _prism(world: WorldModel, number: int, contour: Contour) -> fox.SceneEntity:
     """Draw the sides of a contour from bottom to top, and its outlines."""
-    red, green, blue = CONTOUR_COLOURS[contour_kind(one)]
-    alpha = max(MIN_ALPHA, one.confidence * max(0.0, 1.0 - one.age / FADE_S))
+    red, green, blue = CONTOUR_COLOURS[contour_kind(contour)]
+    alpha = max(MIN_ALPHA, contour.confidence * max(0.0, 1.0 - contour.age / FADE_S))
     loops = [
         fox.LinePrimitive(
             type=fox.LinePrimitiveLineType.LineLoop, thickness=OUTLINE_M,
-            points=[fox.Point3(x=x, y=y, z=z) for x, y in one.polygon],
+            points=[fox.Point3(x=x, y=y, z=z) for x, y in contour.polygon],
             color=fox.Color(r=red, g=green, b=blue, a=alpha),
         )
-        for z in sorted({one.bottom, one.top})
+        for z in sorted({contour.bottom, contour.top})
     ]  # fmt: skip
     sides = []
-    for (ax, ay), (bx, by) in zip(one.polygon, (*one.polygon[1:], one.polygon[0]), strict=True):
-        low_a, low_b = (ax, ay, one.bottom), (bx, by, one.bottom)
-        high_a, high_b = (ax, ay, one.top), (bx, by, one.top)
+    for (ax, ay), (bx, by) in zip(
+        contour.polygon, (*contour.polygon[1:], contour.polygon[0]), strict=True
+    ):
+        low_a, low_b = (ax, ay, contour.bottom), (bx, by, contour.bottom)
+        high_a, high_b = (ax, ay, contour.top), (bx, by, contour.top)
         sides += [low_a, low_b, high_b, low_a, high_b, high_a]
     faces = fox.TriangleListPrimitive(
         points=[fox.Point3(x=x, y=y, z=z) for x, y, z in sides],
         color=fox.Color(r=red, g=green, b=blue, a=alpha / 2),
     )
     return fox.SceneEntity(
-        timestamp=stamp(world), frame_id=BASE, id=str(one.track or f"new {number}"),
-        lifetime=CONTOUR_LIFETIME, lines=loops, triangles=[faces] if one.top > one.bottom else [],
+        timestamp=stamp(world), frame_id=BASE, id=str(contour.track or f"new {number}"),
+        lifetime=CONTOUR_LIFETIME, lines=loops,
+        triangles=[faces] if contour.top > contour.bottom else [],
     )  # fmt: skip
 
 
@@ -228,73 +231,73 @@ class ObjectMapDrawing:
 
     def draw(self, stored: ObjectMap, _: str) -> Iterable[Drawn]:
         """Draw each object as a cylinder and each tag as a plate, with their names."""
-        entities = {f"{one.label} {one.id}": _object(stored, one) for one in stored.objects}
-        entities |= {f"tag {one.id}": _tag(stored, one) for one in stored.tags}
+        entities = {f"{each.label} {each.id}": _object(stored, each) for each in stored.objects}
+        entities |= {f"tag {each.id}": _tag(stored, each) for each in stored.tags}
         yield as_drawn("objects", self._known.update(stored, entities))
 
 
-def _object(stored: ObjectMap, one: MapObject) -> fox.SceneEntity:
-    width, height = max(one.size[0], PLATE_M), max(one.size[1], PLATE_M)
+def _object(stored: ObjectMap, thing: MapObject) -> fox.SceneEntity:
+    width, height = max(thing.size[0], PLATE_M), max(thing.size[1], PLATE_M)
     body = fox.CylinderPrimitive(
-        pose=pose_of(one.x, one.y, 0.0, one.z),
+        pose=pose_of(thing.x, thing.y, 0.0, thing.z),
         size=fox.Vector3(x=width, y=width, z=height), bottom_scale=1.0, top_scale=1.0,
         color=fox.Color(r=0.04, g=0.37, b=0.49, a=0.6),
     )  # fmt: skip
-    name = label(one.x, one.y, f"{one.label} {one.id}", one.z + height)
+    name = label(thing.x, thing.y, f"{thing.label} {thing.id}", thing.z + height)
     return fox.SceneEntity(
-        timestamp=stamp(stored), frame_id=MAP, id=f"{one.label} {one.id}", cylinders=[body],
+        timestamp=stamp(stored), frame_id=MAP, id=f"{thing.label} {thing.id}", cylinders=[body],
         texts=[name],
     )  # fmt: skip
 
 
-def _tag(stored: ObjectMap, one: MapTag) -> fox.SceneEntity:
-    """Draw a plate, and an arrow where its face looks."""
-    pose = pose_of(one.x, one.y, one.yaw, one.z)
+def _tag(stored: ObjectMap, tag: MapTag) -> fox.SceneEntity:
+    """Draw a plate, and an arrow in the direction of its face."""
+    pose = pose_of(tag.x, tag.y, tag.yaw, tag.z)
     plate = fox.CubePrimitive(
-        pose=pose, size=fox.Vector3(x=PLATE_M, y=one.size, z=one.size), color=DARK
+        pose=pose, size=fox.Vector3(x=PLATE_M, y=tag.size, z=tag.size), color=DARK
     )
     arrow = fox.ArrowPrimitive(
-        pose=pose, shaft_length=one.size, shaft_diameter=0.02, head_length=0.05,
+        pose=pose, shaft_length=tag.size, shaft_diameter=0.02, head_length=0.05,
         head_diameter=0.05, color=BLUE,
     )  # fmt: skip
     return fox.SceneEntity(
-        timestamp=stamp(stored), frame_id=MAP, id=f"tag {one.id}", cubes=[plate], arrows=[arrow],
-        texts=[label(one.x, one.y, f"tag {one.id}", one.z + one.size)],
+        timestamp=stamp(stored), frame_id=MAP, id=f"tag {tag.id}", cubes=[plate], arrows=[arrow],
+        texts=[label(tag.x, tag.y, f"tag {tag.id}", tag.z + tag.size)],
     )  # fmt: skip
 
 
 class SolidsDrawing:
-    """Draws what stands near an arm."""
+    """Draws the solids near an arm."""
 
     def __init__(self) -> None:
         self._known = KnownEntities()
 
     def draw(self, seen: Solids, _: str) -> Iterable[Drawn]:
-        """Draw each thing by its shape, with its class and its number."""
-        entities = {f"solid {one.id}": _solid(seen, one) for one in seen.solids}
+        """Draw each solid with its class and its number."""
+        entities = {f"solid {each.id}": _solid(seen, each) for each in seen.solids}
         yield as_drawn("solids", self._known.update(seen, entities))
 
 
-def _solid(seen: Solids, one: SeenSolid) -> fox.SceneEntity:
-    x, y, z = one.position
-    pose, colour = pose_of(x, y, one.yaw, z), fox.Color(r=0.85, g=0.45, b=0.1, a=0.6)
+def _solid(seen: Solids, solid: SeenSolid) -> fox.SceneEntity:
+    x, y, z = solid.position
+    pose, colour = pose_of(x, y, solid.yaw, z), fox.Color(r=0.85, g=0.45, b=0.1, a=0.6)
     shape: dict[str, Any] = {}
-    if one.shape == "box":
-        long, wide, tall = one.size
+    if solid.shape == "box":
+        long, wide, tall = solid.size
         size = fox.Vector3(x=long, y=wide, z=tall)
         shape["cubes"] = [fox.CubePrimitive(pose=pose, size=size, color=colour)]
-    elif one.shape == "cylinder":
-        size = fox.Vector3(x=2 * one.size[0], y=2 * one.size[0], z=one.size[1])
+    elif solid.shape == "cylinder":
+        size = fox.Vector3(x=2 * solid.size[0], y=2 * solid.size[0], z=solid.size[1])
         shape["cylinders"] = [
             fox.CylinderPrimitive(
                 pose=pose, size=size, bottom_scale=1.0, top_scale=1.0, color=colour
             )
         ]
     else:
-        wide = 2 * one.size[0]
+        wide = 2 * solid.size[0]
         size = fox.Vector3(x=wide, y=wide, z=wide)
         shape["spheres"] = [fox.SpherePrimitive(pose=pose, size=size, color=colour)]
-    text = label(x, y, f"{one.label} {one.id}".strip(), z + one.size[-1])
+    text = label(x, y, f"{solid.label} {solid.id}".strip(), z + solid.size[-1])
     return fox.SceneEntity(
-        timestamp=stamp(seen), frame_id=BASE, id=f"solid {one.id}", texts=[text], **shape
+        timestamp=stamp(seen), frame_id=BASE, id=f"solid {solid.id}", texts=[text], **shape
     )

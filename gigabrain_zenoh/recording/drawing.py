@@ -1,7 +1,7 @@
-"""Converts messages into those that Foxglove, Lichtblick and Rerun draw.
+"""Converts messages into drawings for Foxglove, Lichtblick and Rerun.
 
-The recorder and the live bridge share this table. Frames by REP-105: map → odom → base_link → the
-lidar's own frame, and the links of an arm.
+The recorder and the live bridge share this table. Frames follow REP-105: map → odom → base_link →
+frame of the lidar, and the links of an arm.
 """
 
 import functools
@@ -57,7 +57,7 @@ CELL_COLOURS = np.array(  # red, green, blue and alpha as one number; unknown is
     ],
     np.uint8,
 ).view("<u4")[:, 0]
-PATH_STEP = 2  # every second point of a trajectory is drawn: five for each second of it
+PATH_STEP = 2  # every second point of a trajectory is drawn: five per second
 LOG_LEVELS = {
     "debug": fox.LogLevel.Debug,
     "info": fox.LogLevel.Info,
@@ -75,15 +75,15 @@ ZONE_COLOURS = {
 PLACE_LENGTH_M = 0.4
 OBSTACLE_HEIGHT_M = 0.3
 LINE_WIDTH_M = 0.08
-ARROW_TIME_S = 1.0  # an arrow reaches to where an obstacle will be then
+ARROW_TIME_S = 1.0  # an arrow ends at the obstacle's place after this time
 MIN_ARROW_SPEED = 0.05  # [m/s]
-MIN_WALL_RADIUS_M = 0.3  # larger obstacles at rest are drawn as the points seen of them
-MAX_POINT_GAP_M = 0.25  # between two neighbouring points on one obstacle
+MIN_WALL_RADIUS_M = 0.3  # larger obstacles at rest are drawn as lines along the scan's points
+MAX_POINT_GAP_M = 0.25  # between neighbouring points of one obstacle
 OBSTACLE_LIFETIME = fox.Duration(sec=1)
 
 
 def _numbers(topic: Topic[Any], message: Message) -> Drawn:
-    """Return the numbers of a message for plots, without what is drawn otherwise."""
+    """Return the numbers of a message for plots, without the parts that have drawings."""
     if isinstance(message, WorldModel):
         message = msgspec.structs.replace(message, hits=b"", obstacles=(), contours=())
     elif isinstance(message, Intent):
@@ -124,13 +124,13 @@ class Drawer:
         }
 
     def draws(self, topic: Topic[Any]) -> bool:
-        """Return whether viewers draw anything of a topic."""
+        """Return whether there are drawings or plots of a topic."""
         return topic.plotted or topic.drawing is not None
 
     def draw(self, topic: Topic[Any], message: Message, name: str = "") -> Iterable[Drawn]:
-        """Yield the messages that viewers draw of `message`; `name` is that of a camera.
+        """Yield the drawings of `message`; `name` is the last part of its key, such as a camera.
 
-        Of a message with a later stamp than viewers accept, there are none.
+        Yields nothing if the stamp is later than viewers accept.
         """
         if message.stamp_ns > LAST_STAMP_NS:
             return
@@ -142,7 +142,7 @@ class Drawer:
             yield _numbers(topic, message)
 
     def _is_new(self, intent: Intent) -> bool:
-        """Return whether an intent is new; it is repeated with every tick."""
+        """Return whether an intent is new, as each is repeated with every tick."""
         before, self._last_intent = self._last_intent, (intent.boot, intent.basis)
         return before != self._last_intent
 
@@ -176,7 +176,7 @@ class Drawer:
         yield as_drawn("map", drawn)
 
     def _zones(self, zones: Zones, _: str) -> Iterable[Drawn]:
-        """Draw the edges of zones, the direction of lanes, and the places, each with its name."""
+        """Draw zones, the direction of lanes, and places, each with its name."""
         entities = {one.name: _zone_entity(zones, one) for one in zones.zones}
         entities |= {one.name: _place_entity(zones, one) for one in zones.places}
         yield as_drawn("zones", self._zones_drawn.update(zones, entities))
@@ -203,7 +203,7 @@ class Drawer:
         yield from camera_drawing.contours(world)
 
     def _perceived(self, found: Objects, name: str) -> Iterable[Drawn]:
-        """Draw what a perceptor has found, with its labels."""
+        """Draw a perceptor's objects with their labels."""
         entities = [_cylinder(found, one, one.label) for one in found.objects]
         yield as_drawn(f"perceived/{name}", fox.SceneUpdate(entities=entities))
 
@@ -251,26 +251,28 @@ class Drawer:
 def obstacle_entities(world: WorldModel, odometry: Pose) -> list[fox.SceneEntity]:
     """Draw all obstacles: cylinders in `odom`, large ones at rest as points in `base_link`.
 
-    `odometry` is the pose of the robot when it saw them.
+    `odometry` is the robot's pose at the time of `world`.
     """
     return [
-        _wall(world, one, odometry)
-        if one.radius > MIN_WALL_RADIUS_M and _speed(one) <= MIN_ARROW_SPEED and world.hits
-        else _cylinder(world, one)
-        for one in world.obstacles
+        _wall(world, obstacle, odometry)
+        if obstacle.radius > MIN_WALL_RADIUS_M
+        and _speed(obstacle) <= MIN_ARROW_SPEED
+        and world.hits
+        else _cylinder(world, obstacle)
+        for obstacle in world.obstacles
     ]
 
 
-def _speed(one: Obstacle) -> float:
-    return math.hypot(one.velocity_x, one.velocity_y)
+def _speed(obstacle: Obstacle) -> float:
+    return math.hypot(obstacle.velocity_x, obstacle.velocity_y)
 
 
-def _wall(world: WorldModel, one: Obstacle, odometry: Pose) -> fox.SceneEntity:
-    """Draw lines along the points that beams hit."""
+def _wall(world: WorldModel, obstacle: Obstacle, odometry: Pose) -> fox.SceneEntity:
+    """Draw lines along the scan's points on an obstacle."""
     hits = world.points()
-    x, y = to_frame(odometry, one.x, one.y)
-    off = np.hypot(hits[:, 0] - x, hits[:, 1] - y)
-    near = hits[off < one.radius + MAX_POINT_GAP_M]
+    x, y = to_frame(odometry, obstacle.x, obstacle.y)
+    distances = np.hypot(hits[:, 0] - x, hits[:, 1] - y)
+    near = hits[distances < obstacle.radius + MAX_POINT_GAP_M]
     joined = np.hypot(*np.diff(near, axis=0).T) < MAX_POINT_GAP_M
     ends = np.hstack((near[:-1], near[1:]))[joined].reshape(-1, 2).tolist()
     lines = fox.LinePrimitive(
@@ -279,13 +281,13 @@ def _wall(world: WorldModel, one: Obstacle, odometry: Pose) -> fox.SceneEntity:
         thickness=LINE_WIDTH_M, color=AMBER,
     )  # fmt: skip
     return fox.SceneEntity(
-        timestamp=stamp(world), frame_id=BASE, id=str(one.id), lifetime=OBSTACLE_LIFETIME,
+        timestamp=stamp(world), frame_id=BASE, id=str(obstacle.id), lifetime=OBSTACLE_LIFETIME,
         lines=[lines],
     )  # fmt: skip
 
 
 def _zone_entity(zones: Zones, zone: Zone) -> fox.SceneEntity:
-    """Draw the edges of a zone, or the middle of a lane with an arrow at its end."""
+    """Draw the edges of a zone, or the centre line of a lane with an arrow at its end."""
     lane, colour = zone.kind == "one_way", ZONE_COLOURS[zone.kind]
     kind = fox.LinePrimitiveLineType.LineStrip if lane else fox.LinePrimitiveLineType.LineLoop
     line = fox.LinePrimitive(
@@ -321,22 +323,22 @@ def _arrow(x: float, y: float, yaw: float, length: float) -> fox.ArrowPrimitive:
     )  # fmt: skip
 
 
-def _cylinder(at: Message, one: Obstacle, text: str = "") -> fox.SceneEntity:
-    """Draw a cylinder, an arrow to where it will be, and a text."""
-    here = pose_of(one.x, one.y, 0.0)
-    wide = 2 * max(one.radius, 0.01)
+def _cylinder(at: Message, obstacle: Obstacle, text: str = "") -> fox.SceneEntity:
+    """Draw an obstacle as a cylinder, with an arrow along its velocity and a text."""
+    here = pose_of(obstacle.x, obstacle.y, 0.0)
+    width = 2 * max(obstacle.radius, 0.01)
     body = fox.CylinderPrimitive(
-        pose=here, size=fox.Vector3(x=wide, y=wide, z=OBSTACLE_HEIGHT_M), color=AMBER,
+        pose=here, size=fox.Vector3(x=width, y=width, z=OBSTACLE_HEIGHT_M), color=AMBER,
         top_scale=1.0, bottom_scale=1.0,
     )  # fmt: skip
-    speed = _speed(one)
+    speed = _speed(obstacle)
     arrow = fox.ArrowPrimitive(
-        pose=pose_of(one.x, one.y, math.atan2(one.velocity_y, one.velocity_x)),
+        pose=pose_of(obstacle.x, obstacle.y, math.atan2(obstacle.velocity_y, obstacle.velocity_x)),
         shaft_length=ARROW_TIME_S * speed, shaft_diameter=0.03,
         head_length=0.08, head_diameter=0.08, color=AMBER,
     )  # fmt: skip
     return fox.SceneEntity(
-        timestamp=stamp(at), frame_id=ODOM, id=str(one.id), lifetime=OBSTACLE_LIFETIME,
+        timestamp=stamp(at), frame_id=ODOM, id=str(obstacle.id), lifetime=OBSTACLE_LIFETIME,
         cylinders=[body], arrows=[arrow] if speed > MIN_ARROW_SPEED else [],
-        texts=[label(one.x, one.y, text, OBSTACLE_HEIGHT_M)] if text else [],
+        texts=[label(obstacle.x, obstacle.y, text, OBSTACLE_HEIGHT_M)] if text else [],
     )  # fmt: skip

@@ -11,7 +11,7 @@ from foxglove import messages as fox
 from gigabrain_schemas.base import Message
 
 MAP, ODOM, BASE = "map", "odom", "base_link"
-LIDAR = "base_scan"  # as LaserScan has it
+LIDAR = "base_scan"  # as in LaserScan
 BLUE = fox.Color(r=0.04, g=0.37, b=0.49, a=1.0)
 LABEL_SIZE_M = 0.25
 LAST_STAMP_NS = 2**32 * 1_000_000_000 - 1  # Foxglove's seconds have 32 bits
@@ -31,12 +31,12 @@ class Drawn(NamedTuple):
 
 
 def as_drawn(topic: str, message: Any) -> Drawn:
-    """Return a message of Foxglove's schemas as it is recorded and sent."""
+    """Encode a message of Foxglove's schemas for a recording or a viewer."""
     return Drawn(f"/viz/{topic}", "protobuf", type(message).get_schema, message.encode())
 
 
 def stamp(message: Message) -> fox.Timestamp:
-    """Return the time of validity of `message`."""
+    """Return the stamp of `message`."""
     return fox.Timestamp(message.stamp_ns // 1_000_000_000, message.stamp_ns % 1_000_000_000)
 
 
@@ -58,13 +58,13 @@ def label(x: float, y: float, text: str, z: float = 0.0) -> fox.TextPrimitive:
 
 
 class KnownEntities:
-    """Remembers which entities of a scene are drawn, so that those that are gone are deleted."""
+    """Remembers the entities of a scene, to delete those that are gone."""
 
     def __init__(self) -> None:
         self._ids: set[str] = set()
 
     def update(self, at: Message, entities: dict[str, fox.SceneEntity]) -> fox.SceneUpdate:
-        """Return the scene with `entities`, by id, and without the others drawn before."""
+        """Return an update that draws `entities` (by id), and deletes the other known ones."""
         gone = [
             fox.SceneEntityDeletion(
                 timestamp=stamp(at), type=fox.SceneEntityDeletionType.MatchingId, id=name
@@ -95,7 +95,7 @@ def flat_schema(message: type[msgspec.Struct]) -> bytes:
 def _flat(
     part: dict[str, Any], parts: dict[str, Any], depth: int, *, item: bool
 ) -> dict[str, Any] | None:
-    """Return one property; None if it has to be left out."""
+    """Return the flat schema of one property; None if viewers would refuse it."""
     if depth > MAX_SCHEMA_DEPTH:
         return None
     if "$ref" in part:

@@ -1,7 +1,7 @@
-"""Converts a recording into a LeRobot dataset: format version 3.0, as lerobot 0.4 reads it.
+"""Converts a recording into a LeRobot dataset: format version 3.0, which lerobot 0.4 reads.
 
-A frame is a tenth of a second of the robot's time, and a twenty-fifth where there is an arm. An
-episode lasts while the gate is enabled without a gap. Pictures and depth become videos.
+It has 10 frames per second of the robot's time, and 25 for an arm. An episode lasts while the gate
+is enabled without a gap. Pictures and depth become videos.
 """
 
 import json
@@ -41,48 +41,48 @@ STATE, SCAN, ACTION = "observation.state", "observation.environment_state", "act
 BASE_STATE = ("x", "y", "yaw", "linear_x", "linear_y", "angular_z")
 BASE_ACTION = ("linear_x", "linear_y", "angular_z")
 LATERAL = "linear_y"
-OPEN = 100.0  # of a gripper that is open, as LeRobot has it; 0 is closed
+GRIPPER_OPEN = 100.0  # [%], in LeRobot's convention; 0 is closed
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 FILE = "chunk-000/file-000.parquet"
 Floats = NDArray[np.float32]
 
 
 class Layout(Struct, frozen=True, kw_only=True):
-    """The parts of a body that a dataset holds."""
+    """The parts of a body that a dataset contains."""
 
     robot_type: str | None = None
     base: bool = True
-    lateral: bool = True  # it can move to the side
+    lateral: bool = True  # the base can move sideways
     joints: tuple[JointDescription, ...] = ()
 
     @property
     def ticks(self) -> int:
-        """Ticks of a frame."""
+        """Return the length of a frame [ticks]."""
         return ARM_TICKS_PER_FRAME if self.joints else TICKS_PER_FRAME
 
     @property
     def hz(self) -> int:
-        """Frames a second."""
+        """Return the frame rate."""
         return round(1 / (self.ticks * TICK_S))
 
     @property
     def joint_names(self) -> list[str]:
-        """Names of the joints' values, as LeRobot's robots call them."""
+        """Return the names of the joints' values, in LeRobot's convention."""
         return [f"{joint.name}.pos" for joint in self.joints]
 
     def of_base(self, names: Sequence[str]) -> list[str]:
-        """Return those of the base's values that the dataset has."""
+        """Return those `names` of the base's values that the dataset contains."""
         return [name for name in names if self.base and (self.lateral or name != LATERAL)]
 
     def degrees(self, places: Sequence[float]) -> list[float]:
-        """Return positions of all joints [rad] or [m] as LeRobot has them.
+        """Return positions of all joints, given in [rad] or [m], in LeRobot's units.
 
-        Joints are in degrees, those that slide in millimetres, and a gripper in per cent.
+        These are degrees, millimetres for joints that slide, and per cent for a gripper.
         """
         found = []
         for joint, place in zip(self.joints, places, strict=True):
             if joint.part == "gripper":
-                found.append(OPEN * (place - joint.lower) / (joint.upper - joint.lower))
+                found.append(GRIPPER_OPEN * (place - joint.lower) / (joint.upper - joint.lower))
             else:
                 found.append(place * 1e3 if joint.unit == "m" else math.degrees(place))
         return found
@@ -94,14 +94,14 @@ class LeRobotFrame(Struct, frozen=True, kw_only=True):
     boot: int
     tick: int
     state: Floats  # see Layout and BASE_STATE
-    scan: Floats  # (n,), [m]; the lidar's range where nothing was hit, 0 where unknown
-    action: Floats  # of the base, [m/s], [m/s], [rad/s], then where the joints were sent
+    scan: Floats  # (n,), [m]; the lidar's range for beams without a hit, 0 for unknown ones
+    action: Floats  # of the base [m/s], [m/s], [rad/s], then commanded positions of the joints
 
 
 def frames(path: Path, layout: Layout | None = None) -> Iterator[LeRobotFrame]:
     """Iterate over the states of an enabled gate, with the newest scan and command.
 
-    The command is that of the gate's commander; others may publish as well.
+    Only the command of the gate's commander counts; others may publish as well.
     """
     layout = layout or layout_of(path)
     scan, command, commander = np.empty(0, np.float32), Velocity(), ""
@@ -127,7 +127,7 @@ def frames(path: Path, layout: Layout | None = None) -> Iterator[LeRobotFrame]:
 def _values(
     layout: Layout, state: RobotState, command: Velocity
 ) -> tuple[list[float], list[float]] | None:
-    """Return what is observed, and the command; None where joints are missing."""
+    """Return the observation and the action; None if a joint is missing."""
     pose, speed = state.pose, state.velocity
     base = {
         "x": pose.x, "y": pose.y, "yaw": pose.yaw,
@@ -145,7 +145,7 @@ def _values(
 
 
 def episodes(path: Path, layout: Layout | None = None) -> list[list[LeRobotFrame]]:
-    """Return the frames in unbroken rows of two or more. Raises ConfigError if there are none."""
+    """Return gapless sequences of two or more frames. Raises ConfigError if there are none."""
     rows: list[list[LeRobotFrame]] = []
     layout = layout or layout_of(path)
     for frame in frames(path, layout):
@@ -180,7 +180,7 @@ def columns(row: list[LeRobotFrame], episode: int, first: int, hz: int) -> dict[
 
 
 def features(layout: Layout, beams: int) -> dict[str, dict[str, Any]]:
-    """Return the format's description of the columns."""
+    """Return the description of the columns for `meta/info.json`."""
     state, action = (
         layout.of_base(names) + layout.joint_names for names in (BASE_STATE, BASE_ACTION)
     )
@@ -214,7 +214,7 @@ def statistics(data: Mapping[str, NDArray[Any]]) -> dict[str, dict[str, list[flo
 def convert(path: Path, folder: Path) -> str:
     """Write the dataset into a new folder; return a summary in words. Raises ConfigError.
 
-    Where it fails, the folder is removed again.
+    If it fails, the folder is removed.
     """
     layout = layout_of(path)
     rows, tables, first = episodes(path, layout), [], 0
@@ -255,13 +255,13 @@ def convert(path: Path, folder: Path) -> str:
 @contextmanager
 def _new_folder(folder: Path) -> Iterator[None]:
     """Make a folder, and remove it if the block fails. Raises ConfigError for an OSError."""
-    made = False
+    created = False
     try:
         folder.mkdir(parents=True)
-        made = True
+        created = True
         yield
     except BaseException as error:
-        if made:
+        if created:
             shutil.rmtree(folder, ignore_errors=True)
         if isinstance(error, OSError):
             raise ConfigError(f"cannot write {folder}: {error.strerror or error}") from None
@@ -269,7 +269,7 @@ def _new_folder(folder: Path) -> Iterator[None]:
 
 
 def layout_of(path: Path) -> Layout:
-    """Return what a dataset of the recorded body holds."""
+    """Return the layout of a dataset of the recorded body."""
     robot_type = None
     for sample in Bag(path):
         message = message_of(sample) if sample.key in (BODY.key, STATE_TOPIC.key) else None

@@ -1,8 +1,8 @@
 """Pictures and depth of a recording as the videos of a LeRobot dataset (format version 3.0).
 
-Each frame of the dataset has the newest exposure that is not younger. Where no new one came, the
-last one is repeated, and counted. Colour is H.264. Depth is 12 bits on a logarithmic scale, in
-HEVC without loss, as lerobot 0.6 reads it; unknown depth becomes the least one, 1 cm.
+Each frame of the dataset gets the newest picture that was exposed up to its tick. Without a new
+picture, the last one is repeated, and counted. Colour is H.264. Depth is lossless HEVC, with 12
+bits on a logarithmic scale, which lerobot 0.6 reads; unknown depth becomes the minimum, 1 cm.
 """
 
 import math
@@ -27,25 +27,25 @@ from gigabrain_zenoh.recording.bag_reader import Bag
 from gigabrain_zenoh.recording.message_tables import message_of
 from gigabrain_zenoh.vision.pictures import check_jpeg
 
-Frame = Any  # av.VideoFrame; PyAV is imported where there are pictures only
+Frame = Any  # av.VideoFrame; PyAV is imported only if there are pictures
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 COLOUR_OPTIONS = {"g": "2", "bf": "0", "crf": "20"}  # every second picture is a key frame
 DEPTH_OPTIONS = {"g": "2", "x265-params": "lossless=1:log-level=error"}
 DEPTH_MAX_CODE = 4095
-DEPTH_MIN_M, DEPTH_MAX_M, DEPTH_SHIFT_M = 0.01, 10.0, 3.5  # of lerobot's own scale
+DEPTH_MIN_M, DEPTH_MAX_M, DEPTH_SHIFT_M = 0.01, 10.0, 3.5  # of lerobot's scale
 RAW_FORMATS = {"rgb8": "rgb24", "bgr8": "bgr24", "mono8": "gray"}
-CAMERA_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,31}")  # others are no cameras of ours
+CAMERA_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,31}")  # of our cameras; others are skipped
 LIMITED_RANGE, BT601 = 1, 5  # of FFmpeg's AVColorRange and AVColorSpace
 JPEG_END, JPEG_TAIL_BYTES = b"\xff\xd9", 64
-SAMPLE_STEP = 4  # of the pixels that statistics are made of, in rows and columns
-SAMPLE_EVERY = 10  # pictures
+SAMPLE_STEP = 4  # statistics use every fourth row and column ...
+SAMPLE_EVERY = 10  # ... of every tenth picture
 
 
 class VideoFeature(Struct, frozen=True, kw_only=True):
     """One video of the dataset."""
 
     key: str
-    feature: dict[str, Any]  # as meta/info.json has it
+    feature: dict[str, Any]  # for meta/info.json
     statistics: dict[str, Any]
     summary: str  # for people
 
@@ -68,17 +68,17 @@ def write_videos(
 ) -> list[VideoFeature]:
     """Write a video for each camera of a recording; `ticks` has boot and tick of each frame.
 
-    Raises ConfigError without PyAV where there are pictures.
+    Raises ConfigError if there are pictures, but PyAV is missing.
     """
     tracks: dict[str, _Track] = {}
-    places = _Places(ticks)
+    numbers = _FrameNumbers(ticks)
     for key, message, boot, tick in _exposures(path):
         if not find_spec("av"):
             raise ConfigError("videos need PyAV: pip install 'gigabrain-zenoh[lerobot]'")
         if key not in tracks and len(tracks) >= 2 * MAX_CAMERAS:
             continue
         if key not in tracks:
-            tracks[key] = _Track(key, places, folder / _file_of(key), hz)
+            tracks[key] = _Track(key, numbers, folder / _file_of(key), hz)
         tracks[key].take(message, boot, tick)
     finished = [tracks[key].finish() for key in sorted(tracks)]
     return [each for each in finished if each]
@@ -90,7 +90,7 @@ def _file_of(key: str) -> str:
 
 def _exposures(path: Path) -> Iterator[tuple[str, Message, int, int]]:
     """Yield pictures and depth with the names of their features, and boot and tick of exposure."""
-    boot = tick = 0  # of the newest state, for pictures that have none
+    boot = tick = 0  # of the newest state, for pictures without them
     for sample in Bag(path):
         if sample.key == STATE.key:
             boot, tick = sample.header.boot, sample.header.tick
@@ -104,8 +104,8 @@ def _exposures(path: Path) -> Iterator[tuple[str, Message, int, int]]:
             yield key, message, message.boot or boot, exposure
 
 
-class _Places:
-    """Places of exposures in the row of a dataset's frames."""
+class _FrameNumbers:
+    """Finds the first frame of a dataset for an exposure."""
 
     def __init__(self, ticks: Sequence[tuple[int, int]]) -> None:
         self.count = len(ticks)
@@ -115,8 +115,8 @@ class _Places:
             self._first.setdefault(boot, number)
             self._ticks.setdefault(boot, []).append(tick)
 
-    def of(self, boot: int, tick: int) -> int | None:
-        """Return the number of the first frame that is not before an exposure; None if unknown."""
+    def at(self, boot: int, tick: int) -> int | None:
+        """Return the number of the first frame from an exposure on; None for an unknown boot."""
         if boot not in self._first:
             return None
         return self._first[boot] + bisect_left(self._ticks[boot], tick)
@@ -125,27 +125,27 @@ class _Places:
 class _Track:
     """The video of one camera while it is written."""
 
-    def __init__(self, key: str, places: _Places, path: Path, hz: int) -> None:
-        self._key, self._places, self._path, self._hz = key, places, path, hz
-        self._waiting: Message | None = None  # the newest picture; decoded when it is needed
-        self._exposed = 0, -1
+    def __init__(self, key: str, numbers: _FrameNumbers, path: Path, hz: int) -> None:
+        self._key, self._numbers, self._path, self._hz = key, numbers, path, hz
+        self._waiting: Message | None = None  # the newest picture, decoded when it is needed
+        self._exposed = 0, -1  # its boot and tick
         self._frame: Frame = None
         self._video: _Video | None = None
         self._written = self._new = self._broken = 0
 
     def take(self, message: Message, boot: int, tick: int) -> None:
-        """Take the next picture; write those of the frames before it."""
-        place = self._places.of(boot, tick)
+        """Keep the next picture, after writing the frames before it."""
+        number = self._numbers.at(boot, tick)
         same_boot = self._exposed[0] == boot
-        if place is None or (same_boot and tick < self._exposed[1]):
+        if number is None or (same_boot and tick < self._exposed[1]):
             return
         if self._waiting is not None or self._frame is not None:
-            self._fill(place)
+            self._fill(number)
         self._waiting, self._exposed = message, (boot, tick)
 
     def finish(self) -> VideoFeature | None:
         """Write the rest of the frames; return None if no picture could be read."""
-        self._fill(self._places.count)
+        self._fill(self._numbers.count)
         if self._video is None:
             return None
         self._video.close()
@@ -164,7 +164,7 @@ class _Track:
         while self._written < end:
             self._decode()
             if self._frame is None:
-                return  # those frames get the first one that can be read
+                return  # these frames get the first picture that can be read
             if self._video is None:
                 self._video = _Video(self._path, self._frame, self._hz)
             self._video.write(self._frame, self._written)
@@ -187,7 +187,7 @@ class _Track:
 
 
 def _frame_of(message: Message) -> Frame:
-    """Return a picture as the encoder takes it. Raises ValueError if it is broken."""
+    """Return a picture in the encoder's format. Raises ValueError if it is broken."""
     import av
 
     if isinstance(message, DepthImage):
@@ -201,7 +201,7 @@ def _frame_of(message: Message) -> Frame:
     else:
         raise ValueError(f"{message.encoding} is no picture in colours")
     even = frame.width - frame.width % 2, frame.height - frame.height % 2
-    # JPEG uses all 256 levels; without a word players take video for limited (ITU-R BT.601)
+    # JPEG uses all 256 levels, but players expect the limited range (ITU-R BT.601)
     return frame.reformat(*even, format="yuv420p", dst_color_range=LIMITED_RANGE)
 
 
@@ -255,12 +255,12 @@ class _Video:
         self._container.mux(self._stream.encode(frame))
 
     def close(self) -> None:
-        """Write what the encoder still holds, and the index."""
+        """Write the frames that the encoder still holds, and the index."""
         self._container.mux(self._stream.encode())
         self._container.close()
 
     def sample(self, frame: Frame) -> None:
-        """Take a picture into the statistics: colours from 0 to 1, depth in millimetres."""
+        """Add a picture to the statistics: colours from 0 to 1, depth in millimetres."""
         if self._is_depth:
             codes = frame.to_ndarray(format="gray12le")[::SAMPLE_STEP, ::SAMPLE_STEP]
             pixels: Any = 1000.0 * dequantized(codes)[..., None]
@@ -271,7 +271,7 @@ class _Video:
         self._sampled += 1
 
     def feature(self) -> dict[str, Any]:
-        """Return the format's description of the video."""
+        """Return the description of the video for `meta/info.json`."""
         width, height = self._stream.width, self._stream.height
         channels = 1 if self._is_depth else 3
         info: dict[str, Any] = {
@@ -296,10 +296,10 @@ class _Video:
         return {"dtype": "video", "shape": [height, width, channels], "names": names, "info": info}
 
     def statistics(self) -> dict[str, Any]:
-        """Return the statistics as the format wants them, (channels, 1, 1) each."""
-        least, most, means, squares = np.stack(self._samples, axis=1)
+        """Return the statistics in the dataset's format, (channels, 1, 1) each."""
+        minima, maxima, means, squares = np.stack(self._samples, axis=1)
         mean = means.mean(0)
         deviation = np.sqrt(np.maximum(squares.mean(0) - mean**2, 0.0))
-        values = {"min": least.min(0), "max": most.max(0), "mean": mean, "std": deviation}
+        values = {"min": minima.min(0), "max": maxima.max(0), "mean": mean, "std": deviation}
         found = {name: value.reshape(-1, 1, 1).tolist() for name, value in values.items()}
         return found | {"count": [self._sampled]}

@@ -35,7 +35,7 @@ def message_of(sample: Sample) -> Message | None:
 
 
 def row(message: Message) -> dict[str, Value]:
-    """Return all values by dotted name; of bytes only their number, except for a scan's ranges."""
+    """Return all values by dotted name; for bytes only their length, except for a scan's ranges."""
     values = dict(_flat("", msgspec.to_builtins(message, builtin_types=(bytes,))))
     if isinstance(message, LaserScan):
         del values["ranges"]
@@ -59,7 +59,7 @@ def _flat(name: str, value: Any) -> Iterator[tuple[str, Value]]:
 def write_csv(path: Path, folder: Path) -> list[Path]:
     """Write one file per key with a row per message; return the files. Raises ConfigError.
 
-    The files appear once all are whole. Messages that a recorder appends meanwhile are left out.
+    The files appear when all are complete. Messages that a recorder appends meanwhile are left out.
     """
     columns: dict[str, dict[str, None]] = {}  # in order of first appearance
     count = 0
@@ -86,7 +86,7 @@ def write_csv(path: Path, folder: Path) -> list[Path]:
 
 
 def _paths(folder: Path, keys: Iterable[str]) -> dict[str, Path]:
-    """Return a file per key; `a/b` and `a_b` do not share one."""
+    """Return a path per key; `a/b` and `a_b` get different ones."""
     paths: dict[str, Path] = {}
     for key in keys:
         name = key.replace("/", "_")

@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 ALL_KEYS = "robot/**"
 HEALTH_INTERVAL_S = 0.5
 STATUS_INTERVAL_S = 0.5
-CLOSE_S = 10.0  # time that a slow disk has for the rest of a recording
+CLOSE_S = 10.0  # a slow disk may take this long to finish a recording
 
 
 def key_filter(names: tuple[str, ...]) -> Callable[[str], bool]:
@@ -87,7 +87,7 @@ async def _fetch_kept(bus: Bus, recorder: Recorder, expressions: list[str]) -> N
 
 
 def _recover_in_background(folder: Path, config: RecorderConfig) -> None:
-    """Recover recordings that were interrupted earlier, in a thread."""
+    """Recover interrupted recordings, in a thread."""
     work = functools.partial(recover_all, folder, keep_free_mb=config.keep_free_mb)
     threading.Thread(target=work, daemon=True).start()
 
@@ -129,7 +129,7 @@ async def _count(bus: Bus, recorder: Recorder) -> None:
 async def record(config: RecorderConfig, where: Where, seconds: float | None) -> int:
     """Record until Ctrl-C or for `seconds`; return the exit code. Raises GigabrainError."""
     path = recording_path(config)
-    key_expressions(config.topics)  # refused before a file is made
+    key_expressions(config.topics)  # raises before a file is created
     async with connect(where, "record", looks_on=True) as bus:
         recorder = Recorder(path, config)
         recorder.begin()
@@ -145,7 +145,7 @@ async def record(config: RecorderConfig, where: Where, seconds: float | None) ->
 
 
 async def _show_status(recorder: Recorder, stop: asyncio.Event, seconds: float | None) -> None:
-    from rich.console import Console  # 0.3 s that the process does not need to start
+    from rich.console import Console  # takes 0.3 s, and the process does not need it
     from rich.live import Live
     from rich.text import Text
 
@@ -163,7 +163,7 @@ async def _show_status(recorder: Recorder, stop: asyncio.Event, seconds: float |
 
 
 def _has_failed(recorder: Recorder) -> bool:
-    """Return whether the writer has ended early; raise its error if so."""
+    """Return whether the writer ended early; raise its error, if any."""
     done = recorder.done
     if done is None or not done.done():
         return False

@@ -21,13 +21,13 @@ from gigabrain_zenoh.recording.bag_reader import Bag, Sample, check_magic
 from gigabrain_zenoh.recording.node import key_filter
 from gigabrain_zenoh.runtime.connect import Where, connect
 
-DISCOVERY_S = 0.5  # until all subscribers are known, before the first message is sent
-ASK_S = 0.3
-MIN_ROUND_S = 0.1  # of a loop, in the recording's time; a single message has no rate
+DISCOVERY_S = 0.5  # for the discovery of subscribers, before the first message
+REPLY_TIMEOUT_S = 0.3
+MIN_ROUND_S = 0.1  # of a loop, in the recording's time; a single message has no duration
 
 
 class PlayOptions(Struct, frozen=True, kw_only=True):
-    """Selection of what is played, and how."""
+    """Selection of messages to play, and their rate and keys."""
 
     rate: float = 1.0  # times the recorded rate
     start_s: float = 0.0  # from the first message
@@ -43,7 +43,7 @@ class Player:
         self._path, self._options, self._transport = path, options, transport
         self._topics: dict[str, Topic[Message]] = {}
         self._kept: dict[str, Sample] = {}  # newest of topics kept for late subscribers
-        self._count: int | None = None  # of messages to play, once they were read
+        self._count: int | None = None  # of messages to play; None before they are counted
         self._round_end_s = 0.0  # earliest end of this round
         self.sent = 0
         self.late_s = 0.0  # greatest delay of a message
@@ -51,7 +51,7 @@ class Player:
     async def play(self) -> None:
         """Play to the end, or for ever with `loop`.
 
-        Raises ConfigError if it is not a bag, or has nothing to play.
+        Raises ConfigError if the file is not a bag, or has no message to play.
         """
         self._declare()
         await asyncio.sleep(DISCOVERY_S)
@@ -61,7 +61,7 @@ class Player:
             await self._play_once()
 
     def _samples(self) -> Iterable[Sample]:
-        """Iterate over the chosen messages, later without those that a recorder has appended."""
+        """Iterate over the chosen messages, without those that a recorder appends meanwhile."""
         wanted = key_filter(self._options.topics)
         return islice((sample for sample in Bag(self._path) if wanted(sample.key)), self._count)
 
@@ -109,7 +109,7 @@ class Player:
             self.sent += 1
 
     async def _due_samples(self) -> AsyncIterator[Sample]:
-        """Yield every message when it is due; first the kept ones of the part that is skipped."""
+        """Yield every message when it is due; first the kept ones of the skipped part."""
         start_s, first_ns, started = 0.0, 0, False
         skipped: dict[str, Sample] = {}
         for sample in self._samples():
@@ -134,13 +134,13 @@ class Player:
         if now_s < due_s:
             await asyncio.sleep(due_s - now_s)
         elif self.sent % 64 == 0:
-            await asyncio.sleep(0)  # queries are answered however late the player is
+            await asyncio.sleep(0)  # lets queries be answered, also when the player is late
         self.late_s = max(self.late_s, now_s - due_s)
 
 
 async def check_no_driver(bus: Bus) -> None:
     """Raise Refused if a driver runs on this bus."""
-    replies = await bus.ask(DESCRIBE, DescribeRequest(), timeout_s=ASK_S, name="driver")
+    replies = await bus.ask(DESCRIBE, DescribeRequest(), timeout_s=REPLY_TIMEOUT_S, name="driver")
     if replies:
         raise Refused(
             f"a driver runs on this bus (pid {replies[0].pid}): its robot would receive "

@@ -1,9 +1,9 @@
 """Feeds recorded input to a node in fake time, and compares its output with the recording.
 
-Not compared are the time of sending (`stamp_ns`), the message number (`seq`), sentences for people
-(the codes and values beside them are), and warnings of safety about its computer. Of several
-messages on one key for one tick and basis only the last is compared: the number of repetitions
-depends on the order of two inputs within a tick.
+These are not compared: the time of sending (`stamp_ns`), the message number (`seq`), sentences for
+people (but their codes and values are), and safety's warnings about its computer. Of several
+messages on one key for one tick and basis only the last is compared, as their number depends on
+the order of two inputs within a tick.
 """
 
 import re
@@ -54,10 +54,10 @@ OUTPUTS: dict[str, tuple[Topic[Any], ...]] = {
     "safety": (SAFETY,),
 }
 NOT_COMPARED = ("stamp_ns", "seq")
-SENTENCE = re.compile(r"(.*\.)?(text|remedy|reason)")  # field for people, beside codes and numbers
+SENTENCE = re.compile(r"(.*\.)?(text|remedy|reason)")  # fields with sentences for people
 PROCESSES_WITH_SETTINGS = ("perception", "decision")
-# A process that is busy for a tick skips a state; a replay never is.
-MAX_UNMATCHED_SHARE = 0.1  # of outputs that only the recording or only the replay has
+# A process that is busy for a tick skips a state, but a replay does not.
+MAX_UNMATCHED_SHARE = 0.1  # of outputs that only the recording or only the replay contains
 
 NodeOf = Callable[[ProcessConfig], Node]
 OutputId = tuple[str, int, int, int]  # key, boot, tick, basis
@@ -86,24 +86,25 @@ class ReplayResult(Struct, frozen=True, kw_only=True):
     only_recorded: int  # outputs
     only_replayed: int
     difference: Difference | None
-    begun_late: bool = False  # the process had sent messages before the recording began
-    real_time: bool = False  # neither in lock-step, nor with a log of inputs that gives their order
-    lost: int = 0  # inputs of the process that the recording does not hold
+    begun_late: bool = False  # the process sent messages before the recording began
+    real_time: bool = False  # not in lock-step, and without a log of the order of inputs
+    lost: int = 0  # inputs of the process that are not in the recording
 
     @property
     def same(self) -> bool:
         """Return whether the process behaves as recorded."""
-        most = MAX_UNMATCHED_SHARE * (self.compared + self.only_recorded)
-        return self.difference is None and max(self.only_recorded, self.only_replayed) <= most
+        max_unmatched = MAX_UNMATCHED_SHARE * (self.compared + self.only_recorded)
+        unmatched = max(self.only_recorded, self.only_replayed)
+        return self.difference is None and unmatched <= max_unmatched
 
 
 class RecordedInputs(Struct, frozen=True, kw_only=True):
-    """Inputs of one life of a process, in its own order, as far as they were recorded."""
+    """Inputs of a process since its last start, in its own order, as far as they were recorded."""
 
     events: list[Event]
-    start_ns: int  # Unix time of the first of them, by the clock of the process
-    end_ns: int  # Unix time of the process's last log of inputs
-    lost: int  # inputs that the recording does not hold
+    start_ns: int  # Unix time of the process's first log of inputs
+    end_ns: int  # Unix time of its last one
+    lost: int  # inputs that are not in the recording
 
 
 class RecordedRun(Struct, frozen=True, kw_only=True):
@@ -111,13 +112,13 @@ class RecordedRun(Struct, frozen=True, kw_only=True):
 
     inputs: list[Event]
     outputs: dict[OutputId, Message]
-    exact: bool  # the process itself has logged its inputs and their order
-    lost: int = 0  # inputs that the recording does not hold
-    begun_late: bool  # the process had sent messages before
+    exact: bool  # the process logged its inputs and their order
+    lost: int = 0  # inputs that are not in the recording
+    begun_late: bool  # the process sent messages before the recording began
 
 
 def _outputs_of(path: Path, process: str) -> tuple[Topic[Any], ...]:
-    """Return the topics of a process in a recording, whose body may obey a key of its own."""
+    """Return the output topics of a process; the recorded body may have its own command topic."""
     bodies = (message_of(sample) for sample in Bag(path) if sample.key == BODY.key)
     body = next((body for body in bodies if isinstance(body, Body)), None)
     return tuple(
@@ -172,9 +173,9 @@ def _without_computer(message: Message) -> Message:
 
 
 def logged_inputs(recorded: Sequence[Sample], process: str) -> RecordedInputs | None:
-    """Return the inputs of the last life of `process`; None if it did not log them."""
+    """Return the inputs of `process` since its last start; None if it did not log them."""
     key = INPUT_LOG.at(process)
-    logs = _last_life(_input_log.decode(one.payload) for one in recorded if one.key == key)
+    logs = _since_last_start(_input_log.decode(one.payload) for one in recorded if one.key == key)
     if not logs:
         return None
     by_number = _by_number(recorded, process)
@@ -195,10 +196,10 @@ def logged_inputs(recorded: Sequence[Sample], process: str) -> RecordedInputs | 
     )
 
 
-def _last_life(logs: Iterable[InputLog]) -> list[InputLog]:
+def _since_last_start(logs: Iterable[InputLog]) -> list[InputLog]:
     found: list[InputLog] = []
     for each in logs:
-        if found and each.seq <= found[-1].seq:  # the process has restarted
+        if found and each.seq <= found[-1].seq:  # the process restarted
             found = []
         found.append(each)
     return found
@@ -216,7 +217,7 @@ def _entries(logs: Iterable[InputLog]) -> Iterator[tuple[int, str, int]]:
 def _by_number(
     recorded: Iterable[Sample], process: str
 ) -> dict[tuple[str, int], list[tuple[int, bytes]]]:
-    """Return time and payload of messages by key and number, without other processes' requests."""
+    """Return times and payloads by key and number, without the requests of other processes."""
     found: dict[tuple[str, int], list[tuple[int, bytes]]] = defaultdict(list)
     for sample in recorded:
         header = header_of(sample.payload)
@@ -226,7 +227,7 @@ def _by_number(
 
 
 def _nearest(same_number: Sequence[tuple[int, bytes]], at_ns: int) -> bytes | None:
-    """Return the message nearest in time; a sender that restarts uses its numbers again."""
+    """Return the payload nearest in time, as a restarted sender reuses its numbers."""
     nearest = min(same_number, key=lambda one: abs(one[0] - at_ns), default=None)
     return nearest[1] if nearest else None
 
@@ -241,8 +242,8 @@ def _as_request(at_ns: int, key: str, payload: bytes) -> Event:
 def with_requests(inputs: Sequence[Event]) -> list[Event]:
     """Replace records of accepted requests by the requests, each where it took effect.
 
-    That is before the first message that its process had not received by then; on the wire the two
-    travel separately. For recordings in which the process did not log its inputs.
+    This is before the first message that the process received after it; the recorded order may
+    differ. For recordings in which the process did not log its inputs.
     """
     order = [((i, 1), event) for i, event in enumerate(inputs)]
     for i, (_, key, payload) in enumerate(inputs):
@@ -302,7 +303,7 @@ def _difference(key: str, recorded: Message, replayed: Message) -> Difference | 
 async def replay_process(
     path: Path, process: str, settings: dict[str, Any], node_of: NodeOf
 ) -> ReplayResult:
-    """Replay a recording to a process. Raises ConfigError, and what the process raises."""
+    """Replay a recording to a process. Raises ConfigError, and the errors of the process."""
     run = load_run(path, process)
     node = node_of(ProcessConfig(name=process, endpoint=Endpoint(), settings=settings))
     decoders = {
@@ -328,9 +329,9 @@ def read_notes(path: Path) -> Mapping[str, str]:
 
 
 def settings_for(path: Path, process: str, settings: dict[str, Any] | None) -> dict[str, Any]:
-    """Return the settings of a process for a replay: those given, or those of the recording.
+    """Return the settings of a process for a replay: `settings`, or those of the recording.
 
-    Raises ConfigError if the process has settings and neither holds them.
+    Raises ConfigError if neither contains the settings that the process needs.
     """
     if settings is None:
         notes = read_notes(path)
@@ -344,7 +345,7 @@ def settings_for(path: Path, process: str, settings: dict[str, Any] | None) -> d
 
 
 def _without_side_effects(settings: dict[str, Any], process: str) -> dict[str, Any]:
-    """Return the settings for a replay, which runs no programs and saves nothing."""
+    """Return settings with which a replay runs no programs and saves nothing."""
     if process in PROCESSES_WITH_SETTINGS:
         settings = settings | {"state_dir": ""}
     behaviour = settings.get("settings", {})
@@ -356,7 +357,7 @@ def _without_side_effects(settings: dict[str, Any], process: str) -> dict[str, A
 async def replay_file(
     path: Path, process: str, settings: dict[str, Any] | None, node_of: NodeOf
 ) -> int:
-    """Replay and print the result; return 0 if the process does what it did, else 1.
+    """Replay and print the result; return 0 if the process behaves as recorded, else 1.
 
     Without `settings` the process gets those of the recording.
     """

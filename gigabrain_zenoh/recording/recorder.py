@@ -27,12 +27,12 @@ from gigabrain_zenoh.recording.bag_writer import BagWriter, ReceivedMessage
 log = logging.getLogger(__name__)
 
 MB = 1_000_000
-WRITE_INTERVAL_S = 0.3  # at most; shorter intervals cost more CPU time, for cold caches
+WRITE_INTERVAL_S = 0.3  # maximum; shorter intervals take more CPU time, due to cold caches
 RETRY_S = 1.0  # between two attempts to write to a full disk
-MAX_CHANNELS = 1000  # pairs of key and encoding; any client may make up more
-MAX_INDEX_ENTRIES = 1_000_000  # of one file: they take 80 MB of memory, and 13 MB at its end
-OTHER_KEYS = "others"  # counts messages beyond those
-MAX_BATCH_NS = round(LONGEST_S * 1e9)  # within it a message's own stamp is its time of reception
+MAX_CHANNELS = 1000  # pairs of key and encoding; a client may invent any number
+MAX_INDEX_ENTRIES = 1_000_000  # of one file: 80 MB of memory, and 13 MB in the file
+OTHER_KEYS = "others"  # name of the count of messages beyond MAX_CHANNELS
+MAX_BATCH_NS = round(LONGEST_S * 1e9)  # newer stamps count as the time of reception
 
 
 def unused_path(path: Path, number: int = 0) -> Path:
@@ -49,12 +49,12 @@ class _Exposure(NamedTuple):
 
     boot: int
     at: float  # [ticks]
-    due: float  # [ticks], when the next one is chosen
-    topics: tuple[str, ...]  # of which it has been recorded
+    due: float  # [ticks], earliest next exposure
+    topics: tuple[str, ...]  # recorded of this exposure: picture, depth
 
 
 class PictureThinning:
-    """Chooses exposures of each camera at a rate of the robot's time; depth comes with its picture.
+    """Chooses exposures of each camera at a rate, by the robot's time; both picture and depth.
 
     A rate of 0 chooses none.
     """
@@ -64,7 +64,7 @@ class PictureThinning:
         self._chosen: dict[str, _Exposure] = {}  # by camera
 
     def is_left_out(self, key: str, header: Header, now_ns: int) -> bool:
-        """Return whether the exposure of a picture or of depth is left out."""
+        """Return whether to leave out a picture or depth message."""
         if not self._period:
             return True
         topic, _, camera = key.rpartition("/")
@@ -84,10 +84,10 @@ class PictureThinning:
 
 
 class Intake:
-    """Bounded queue from any thread to the writer. It never makes the bus wait.
+    """Bounded queue from any thread to the writer. It never delays the bus.
 
-    Messages beyond its size, or on more channels than any robot has, are dropped and counted.
-    `hurry` is called when a quarter of it is full.
+    Messages beyond its size or beyond MAX_CHANNELS are dropped and counted. It calls `hurry` when a
+    quarter of it is full.
     """
 
     def __init__(
@@ -146,7 +146,7 @@ class Intake:
         return True
 
     def _is_known(self, key: str, encoding: str) -> bool:
-        """Return whether a key is recorded in an encoding; the first MAX_CHANNELS are."""
+        """Return whether a key and encoding are among the first MAX_CHANNELS."""
         channel = key, encoding
         if channel not in self._channels and len(self._channels) < MAX_CHANNELS:
             self._channels.add(channel)
@@ -160,7 +160,7 @@ class Intake:
         return batch
 
     def release(self, batch: list[ReceivedMessage]) -> None:
-        """Release the space of a batch that has been written."""
+        """Release the space of a written batch."""
         with self._lock:
             self._held_bytes -= sum(len(message.payload) for message in batch)
 
@@ -175,7 +175,7 @@ class Intake:
             return self.seen.total(), self.dropped.total(), self.gaps.missing.total()
 
     def _parse(self) -> None:
-        """Read the headers of waiting messages; many in a row cost less than each alone."""
+        """Read the headers of waiting messages; together this takes less time than one by one."""
         newest_ns, parsed, count = self._newest_ns, self._parsed, self.gaps.count
         for taken_ns, key, encoding, payload in self._waiting:
             header = header_of(payload)
@@ -199,11 +199,11 @@ class Status(Struct, frozen=True, kw_only=True):
     written: int  # of these, on the disk
     dropped: int  # of these, lost because the disk was too slow or full
     missing: int  # messages never received, by their senders' count
-    fault: str  # present fault of the disk, or an empty text
+    fault: str  # current fault of the disk, or an empty text
 
 
 class Recorder:
-    """One recording, of one file or several in a row. Used as a context manager."""
+    """One recording, in one or several consecutive files. Used as a context manager."""
 
     def __init__(
         self,
@@ -228,12 +228,12 @@ class Recorder:
         self._flushed_s, self._retry_s = time.monotonic(), 0.0
         self._fault_text, self._fault = "", Fault(log, logging.ERROR)
         self._pool = ThreadPoolExecutor(1, "recorder")
-        self.done: Future[None] | None = None  # ends early only by a programming error
+        self.done: Future[None] | None = None  # ends early only after a programming error
 
     def begin(self) -> None:
         """Create the file now, so that an error is raised at once.
 
-        Without this call it is created with the first message, and retried every second.
+        Without this call the file is created at the first message, with retries every second.
         Raises ConfigError.
         """
         self._file = self._open_file(self._path)
@@ -249,7 +249,7 @@ class Recorder:
         self._pool.shutdown()
 
     def status(self) -> Status:
-        """Return the present progress."""
+        """Return the current progress."""
         seen, dropped, missing = self.intake.counts()
         file = self._file
         return Status(
@@ -271,7 +271,7 @@ class Recorder:
         return BagWriter(path, viewers=self._config.viewers, notes=notes)
 
     def _open_file(self, path: Path) -> BagWriter:
-        """Create the next file of the row. Raises ConfigError."""
+        """Create the next file. Raises ConfigError."""
         file = self._open(path)
         self._files += 1
         return file
@@ -310,7 +310,7 @@ class Recorder:
 
     def _is_full(self, file: BagWriter, message: ReceivedMessage) -> bool:
         split_mb, split_s = self._config.split_mb, self._config.split_s
-        new_bytes = file.size - file.repeated_bytes  # a map may be larger than a small `split_mb`
+        new_bytes = file.size - file.repeated_bytes  # repeated maps may exceed a small `split_mb`
         return (
             file.index_entries >= MAX_INDEX_ENTRIES
             or (split_mb is not None and new_bytes >= split_mb * MB)
@@ -334,7 +334,7 @@ class Recorder:
             self._abandon(file, f"cannot write {file.path}: {error.strerror}")
 
     def _finish(self) -> None:
-        """End the present file with its index; if that fails it is left to be recovered."""
+        """Finish the current file with its index; if that fails, recovery can repair it later."""
         file = self._file
         if file is None:
             return
@@ -356,7 +356,7 @@ class Recorder:
         file.close()
 
     def _abandon(self, file: BagWriter, text: str) -> None:
-        """Count messages that have not reached the disk as lost; keep those that have."""
+        """Count messages that are not on the disk as lost; keep the file with the others."""
         self.intake.add_lost(file.pending)
         self._close(file)
         if not file.written:
@@ -368,8 +368,8 @@ class Recorder:
         return file.free_bytes() < self._config.keep_free_mb * MB
 
     def _low_text(self) -> str:
-        least = f"{self._config.keep_free_mb:g} MB"
-        return f"not recording: less than {least} are free on the disk of {self._path}"
+        limit = f"{self._config.keep_free_mb:g} MB"
+        return f"not recording: less than {limit} are free on the disk of {self._path}"
 
     def _report(self, text: str) -> None:
         self._fault_text = text
@@ -377,7 +377,7 @@ class Recorder:
         self._fault.begin(f"{text}; messages are lost until there is space")
 
     def _reopen(self, message: ReceivedMessage) -> BagWriter | None:
-        """Begin a new file with the newest kept messages; None while the disk is full."""
+        """Start a new file with the newest kept messages; return None while the disk is full."""
         if time.monotonic() < self._retry_s:
             return None
         try:

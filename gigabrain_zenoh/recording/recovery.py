@@ -18,7 +18,7 @@ from gigabrain_zenoh.recording.bag_writer import LIBRARY, PROFILE, VIEW, AppendO
 
 log = logging.getLogger(__name__)
 
-OWN_PROFILE = struct.pack("<I", len(PROFILE)) + PROFILE.encode()  # begins the first record
+OWN_PROFILE = struct.pack("<I", len(PROFILE)) + PROFILE.encode()  # start of the first record
 HEAD_BYTES = len(MAGIC) + HEAD.size + len(OWN_PROFILE)
 
 
@@ -78,10 +78,10 @@ class _Copier:
 def recover(path: Path, to: Path) -> Recovered:
     """Write everything readable of `path` into the new file `to`.
 
-    Where it fails or is interrupted, `to` is removed again. Raises ConfigError if `path` is not a
-    bag, or `to` cannot be written.
+    If it fails or is interrupted, `to` is removed. Raises ConfigError if `path` is not a bag, or
+    `to` cannot be written.
     """
-    check_magic(path)  # before a file is made
+    check_magic(path)  # before a file is created
     bag, file = Bag(path), AppendOnlyFile(to)
     copier = _Copier(file)
     try:
@@ -107,7 +107,7 @@ def is_being_written(path: Path) -> bool:
 
 
 def is_unfinished(path: Path) -> bool:
-    """Return whether `path` is a recording of ours that was cut off, and is not being written."""
+    """Return whether `path` is a recording of ours that was cut off, and no process writes it."""
     with open_regular(path) as file:
         head = file.read(HEAD_BYTES)
         if not head.startswith(MAGIC) or not head.endswith(OWN_PROFILE):
@@ -118,17 +118,17 @@ def is_unfinished(path: Path) -> bool:
 
 
 def recover_all(folder: Path, *, keep_free_mb: float) -> None:
-    """Recover every unfinished recording of ours in `folder` in place; log those that cannot be.
+    """Recover every unfinished recording of ours in `folder` in place; log failures.
 
-    A file whose copy would leave less than `keep_free_mb` of the disk free stays as it is, and so
-    does one that changes meanwhile, as a file that is being copied.
+    A file stays as it is if its copy would leave less than `keep_free_mb` free, or if it changes
+    meanwhile, as a file that is being copied does.
     """
     for path in sorted(folder.glob("*.mcap")):
         try:
             if not is_unfinished(path):
                 continue
             with path.open("r+b") as file:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # keeps other recorders off it
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # other recorders then skip it
                 _recover_in_place(path, os.fstat(file.fileno()), keep_free_mb)
         except BlockingIOError:  # another recorder was faster
             continue
@@ -145,7 +145,7 @@ def _recover_in_place(path: Path, before: os.stat_result, keep_free_mb: float) -
         )  # fmt: skip
         return
     part = path.with_suffix(".recovering")
-    part.unlink(missing_ok=True)  # of an earlier attempt that was interrupted
+    part.unlink(missing_ok=True)  # left by an interrupted attempt
     done, now = recover(path, part), path.stat()
     if (now.st_ino, now.st_size) != (before.st_ino, before.st_size):
         part.unlink()

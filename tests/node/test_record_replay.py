@@ -263,7 +263,8 @@ async def test_a_decision_that_was_sent_to_a_place_does_the_same_again() -> None
     own = (INTENT.key, TASK.key)
     then = [(key, data) for _, key, data in events if key in own]
     received = with_requests([event for event in events if event[1] not in own])
-    assert [key for _, key, _ in received if key in REQUEST_KEYS] == [GOAL.key, *2 * (TASK_CHANGE.key,)]
+    requests = [key for _, key, _ in received if key in REQUEST_KEYS]
+    assert requests == [GOAL.key, *2 * (TASK_CHANGE.key,)]
     node = functools.partial(decision.run, DecisionConfig(behaviour="navigate"))
     now = [(key, data) for key, data in await replay(node, received) if key in own]
     assert plane.travelled > 0.3

@@ -41,7 +41,7 @@ def test_the_frame_of_a_lens_looks_along_its_z_axis_with_y_down(
     angles: tuple[float, float, float],
 ) -> None:
     roll, pitch, yaw = angles
-    lens = turned(camera_drawing._lens(replace(FRONT, roll=roll, pitch=pitch, yaw=yaw)))
+    lens = turned(camera_drawing._optical_rotation(replace(FRONT, roll=roll, pitch=pitch, yaw=yaw)))
     mount = rotation(roll, pitch, yaw)
     ahead, left, up = mount.T
     assert lens[:, 2] == pytest.approx(ahead)
