@@ -1,4 +1,4 @@
-"""The demo: a whole robot on this machine, watched until it is stopped or its time is over."""
+"""The demo: a whole robot on this machine, watched until a person or its time limit ends it."""
 
 import asyncio
 import contextlib
@@ -41,62 +41,65 @@ from gigabrain_zenoh.ui.run_report import (
     truth_in_health,
 )
 
-CAPACITY_LOOK_S = 1.0
-SHORT_LOOKS = 5  # in a row, because a pause of the machine passes
-KEPT = 0.95  # share of real time that a simulation keeps on a machine that can carry it
+CAPACITY_CHECK_S = 1.0  # period of checks
+MAX_SLOW_CHECKS = 5  # in sequence, as a short pause of the machine is no problem
+KEPT = 0.95  # share of real time that a simulation reaches on a sufficient machine
 
 
 class Capacity:
-    """Judges a run in real time by the robot's clock, and by why it stands."""
+    """Detects a machine that is too slow, by the robot's clock and the brain's delays."""
 
     def __init__(self) -> None:
-        self.problem = ""  # for people; stays once it is there
-        self._began: tuple[float, float] | None = None  # of a row of bad looks: wall, robot [s]
+        self.problem = ""  # for people; never reset
+        # wall and robot time [s] before the first of consecutive slow checks, and at the last check
+        self._slow_since: tuple[float, float] | None = None
         self._last: tuple[float, float] | None = None
-        self._short, self._held = 0, False
+        self._slow_checks, self._held = 0, False
 
     def restart(self) -> None:
-        """Count from the next look on: a process is starting, and time may wait for it."""
-        self._last, self._short, self._held = None, 0, False
+        """Measure from the next `compare` on: while a process starts, time may stand still."""
+        self._last, self._slow_checks, self._held = None, 0, False
 
     def compare(self, now_s: float, robot_s: float, *, held: bool) -> None:
-        """Compare the wall clock with the robot's.
+        """Compare the wall clock with the robot's [s].
 
-        With `held` the brain is held back while the processors have no time to spare.
+        With `held` the brain is late because the processors are busy.
         """
         if self._last is None:
-            self._last = self._began = now_s, robot_s
+            self._last = self._slow_since = now_s, robot_s
         self._held |= held
         passed_s, gained_s = now_s - self._last[0], robot_s - self._last[1]
-        if passed_s < CAPACITY_LOOK_S:
+        if passed_s < CAPACITY_CHECK_S:
             return
-        lost = 0.0 < gained_s < KEPT * passed_s  # a clock that stands still is another fault
-        if not (lost or self._held):
-            self._began, self._short = (now_s, robot_s), 0
+        slow = 0.0 < gained_s < KEPT * passed_s  # a clock that stands still is another fault
+        if not (slow or self._held):
+            self._slow_since, self._slow_checks = (now_s, robot_s), 0
         else:
-            self._short += 1
+            self._slow_checks += 1
         self._last, self._held = (now_s, robot_s), False
-        if self._short >= SHORT_LOOKS and not self.problem:
+        if self._slow_checks >= MAX_SLOW_CHECKS and not self.problem:
             self.problem = self._in_words(now_s, robot_s)
 
     def _in_words(self, now_s: float, robot_s: float) -> str:
-        assert self._began
-        share = (robot_s - self._began[1]) / (now_s - self._began[0])
-        what = f"its time runs at {share:.0%} of real time" if share < KEPT else "the brain is late"
+        assert self._slow_since
+        share = (robot_s - self._slow_since[1]) / (now_s - self._slow_since[0])
+        symptom = (
+            f"its time runs at {share:.0%} of real time" if share < KEPT else "the brain is late"
+        )
         return (
-            f"this machine is too small for the robot, or too busy: {what}; "
+            f"this machine is too small for the robot, or too busy: {symptom}; "
             "run fewer robots on it, or end what else needs its processors"
         )
 
 
 SYSTEMS = ("perception", "decision", "control")
-LOOK_S = 0.1  # period of checks
+CHECK_S = 0.1  # period of checks
 RELEASE_FIRST = (
     "a real body drives only after a person has released and enabled it: while the demo runs, in "
     "another terminal, `gigabrain release` and `gigabrain enable`"
 )
-STALLED_S = 60.0  # without a tick of the robot's clock
-ANSWER_S, HASTY_S = 5.0, 0.2  # how long the truth may take; and once a person wants it to end
+STALL_TIMEOUT_S = 60.0  # without a tick of the robot's clock
+REPORT_TIMEOUT_S, SHORT_TIMEOUT_S = 5.0, 0.2  # for processes' reports; the second after Ctrl-C
 
 
 class DemoOptions(Struct, frozen=True, kw_only=True):
@@ -105,16 +108,16 @@ class DemoOptions(Struct, frozen=True, kw_only=True):
     seconds: float | None = None  # of the robot's time; None for until Ctrl-C
     headless: bool = False
     report: Path | None = None
-    page: str = ""  # where the operator page is, or how to get it
+    page: str = ""  # address of the operator page, or how to install it
     rows: tuple[Row, ...] = ()  # the settings and their sources, for `gigabrain config`
-    keep_stuck: bool = False  # processes without progress are left alone, for a debugger
+    keep_stuck: bool = False  # do not kill processes without progress, for a debugger
 
 
 def with_page(deployment: Deployment, port: int, *, login: bool = False) -> tuple[Deployment, str]:
     """Return the deployment with a page on its first host, and the page's address.
 
-    Without the page's libraries return the deployment as it is, and how to install them. With
-    `login` the address contains the operator's token. Raises ConfigError.
+    Without the page's libraries it returns the deployment unchanged, and how to install them.
+    With `login` the address contains the operator's token. Raises ConfigError.
     """
     if not installed():
         return deployment, INSTALL
@@ -134,7 +137,7 @@ def only_host(deployment: Deployment) -> str:
 
 
 class Demo:
-    """One run."""
+    """One run of a demo."""
 
     def __init__(self, deployment: Deployment, options: DemoOptions) -> None:
         self._deployment, self._options = with_free_port(deployment), options
@@ -151,19 +154,19 @@ class Demo:
         self._log = SupervisorLog(self._run_dir)
         self._supervisor = Supervisor(specs, self._record, keep_stuck=options.keep_stuck)
         self._decisions: list[tuple[float, str]] = []
-        self._failures: list[tuple[str, str]] = []  # of which process, and what
-        self._compiling: set[str] = set()  # processes that reported it
+        self._failures: list[tuple[str, str]] = []  # process and text
+        self._compiling: set[str] = set()  # processes that compile now
         self._mismatches: dict[str, None] = {}  # between model and robot file, in order
-        self._refusals: dict[str, str] = {}  # by process, the last error with which it ended
-        self._faults: deque[tuple[float, str]] = deque(maxlen=4)  # when [s], and what
+        self._refusals: dict[str, str] = {}  # last error, by process
+        self._faults: deque[tuple[float, str]] = deque(maxlen=4)  # time [s] and text
         self._capacity = Capacity()
-        self._disk_full = False  # and the driver waits for space
-        self._last_fault = ""  # before all were asked to end, the driver's first
+        self._disk_full = False  # the driver waits for space
+        self._last_fault = ""  # before the end of the run; the driver's take precedence
 
     async def run(self) -> int:
         """Run it; return 0 for a run with motion, without contact, with all processes alive.
 
-        A run that a person ends is not judged. Raises GigabrainError if it cannot start.
+        A run that a person ends counts as good. Raises GigabrainError if it cannot start.
         """
         label = f"{self._deployment.body} in {self._deployment.world}"
         endpoint = client_endpoint(self._deployment)
@@ -175,9 +178,9 @@ class Demo:
                     watch = RunMonitor(bus) if bus else None
                     if watch:
                         await self._watch(watch, stop)
-                    # what comes only later has not ended the run
-                    stopped, why = stop.is_set(), self._why()
-                    report = await self._ask_for_truth(watch, stop) if watch else None
+                    # later events are not the reason for the end of the run
+                    stopped, reason = stop.is_set(), self._failure()
+                    report = await self._make_report(watch, stop) if watch else None
                 finally:
                     closing = asyncio.ensure_future(bus.close()) if bus else None
                     await self._supervisor.stop(STOP_S)
@@ -185,21 +188,21 @@ class Demo:
                     if closing:
                         await closing
         self._log.close()
-        return self._finish(report, why, stopped=stopped)
+        return self._finish(report, reason, stopped=stopped)
 
     async def _join(self, stop: asyncio.Event) -> Bus | None:
-        """Open a session; return None if the run ends before there is a router."""
+        """Connect to the robot; return None if the run ends before there is a router."""
         endpoint = structs.replace(client_endpoint(self._deployment), nap_s=NAP_S)
         opening = asyncio.ensure_future(ZenohTransport.open(endpoint))
         while not (opening.done() or stop.is_set() or self._supervisor.lost):
-            await asyncio.wait((opening,), timeout=LOOK_S)
+            await asyncio.wait((opening,), timeout=CHECK_S)
         if not opening.done():
             opening.cancel()
             return None
         return Bus(opening.result(), Clock(), "demo")
 
     async def _watch(self, watch: RunMonitor, stop: asyncio.Event) -> None:
-        """Look on until the end."""
+        """Watch and show the run until its end."""
         view = self._view(watch)
         loop = asyncio.get_running_loop()
         moved_s, seconds = loop.time(), watch.seconds
@@ -208,23 +211,23 @@ class Demo:
                 watch.look()
                 view.show()
                 with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(stop.wait(), LOOK_S)
-                self._look_at_capacity(watch, view)
+                    await asyncio.wait_for(stop.wait(), CHECK_S)
+                self._check_capacity(watch, view)
                 if watch.problem:
                     self._failures.append(("demo", watch.problem))
                     break
                 if watch.seconds != seconds or self._starting:
                     moved_s, seconds = loop.time(), watch.seconds
-                elif loop.time() - moved_s > STALLED_S:
-                    stall = f"the robot's clock stood still for {STALLED_S:.0f} s"
+                elif loop.time() - moved_s > STALL_TIMEOUT_S:
+                    stall = f"the robot's clock stood still for {STALL_TIMEOUT_S:.0f} s"
                     self._failures.append(("demo", stall))
                     break
             watch.look()
             view.show()
         self._last_fault = newest_fault(text for _, text in self._faults)
 
-    def _look_at_capacity(self, watch: RunMonitor, view: DemoView) -> None:
-        """Report once that this machine is too small; in lock-step, time may wait for the brain."""
+    def _check_capacity(self, watch: RunMonitor, view: DemoView) -> None:
+        """Report once if this machine is too slow; only in real time, without lock-step."""
         capacity, known = self._capacity, self._capacity.problem
         if self._starting or self._compiling or self._deployment.speed != 1.0:
             capacity.restart()
@@ -236,20 +239,21 @@ class Demo:
 
     @property
     def _starting(self) -> bool:
-        """Return whether a process is starting; the very first start compiles."""
+        """Return whether a process is starting."""
         statuses = self._supervisor.statuses.values()
         return any(status.state in ("waiting", "starting") for status in statuses)
 
     def _starting_up(self) -> str:
-        """Return which of the three systems is starting, and why it takes long; empty for none."""
+        """Return a text about the systems that are starting; empty if there are none."""
         statuses = self._supervisor.statuses
-        late = [one for one in SYSTEMS if one in statuses and statuses[one].state == "starting"]
-        if not late:
+        names = [name for name in SYSTEMS if name in statuses]
+        names = [name for name in names if statuses[name].state == "starting"]
+        if not names:
             return ""
-        why = ", compiling, once per installation" if self._compiling & set(late) else ""
-        return f"{' and '.join(late)} {'is' if len(late) == 1 else 'are'} starting up{why}"
+        reason = ", compiling, once per installation" if self._compiling & set(names) else ""
+        return f"{' and '.join(names)} {'is' if len(names) == 1 else 'are'} starting up{reason}"
 
-    def _served(self) -> str:
+    def _page_text(self) -> str:
         """Return the address of the operator page once it runs, or how to install it."""
         status = self._supervisor.statuses.get("page")
         return self._options.page if status is None or status.state == "ready" else ""
@@ -266,10 +270,10 @@ class Demo:
     def _view(self, watch: RunMonitor) -> DemoView:
         seconds, page = self._options.seconds, self._options.page
         if not self._live:
-            return HeadlessView(watch, seconds, self._served, self._starting_up)
-        made = self._deployment
-        speed = "" if made.speed == 1.0 else f" · ×{made.speed:g}"
-        title = f"{made.body} · {made.world} · seed {made.seed}{speed}"
+            return HeadlessView(watch, seconds, self._page_text, self._starting_up)
+        run = self._deployment
+        speed = "" if run.speed == 1.0 else f" · ×{run.speed:g}"
+        title = f"{run.body} · {run.world} · seed {run.seed}{speed}"
         return LiveView(
             watch, self._supervisor, title, self._faults, seconds, page, self._starting_up
         )
@@ -277,7 +281,7 @@ class Demo:
     async def _ask_all(
         self, watch: RunMonitor, stop: asyncio.Event
     ) -> dict[str, Mapping[str, Any]]:
-        """Return what processes report of the run, by name; hardly wait once `stop` is set."""
+        """Return the processes' reports of the run; wait less once `stop` is set."""
         statuses = self._supervisor.statuses
         answers: dict[str, Mapping[str, Any]] = {}
 
@@ -289,20 +293,20 @@ class Demo:
             silent = [n for n, s in statuses.items() if s.state == "ready" and n not in answers]
             await asyncio.gather(*(ask(name, within_s) for name in silent))
 
-        await run_until(stop, ask_all(ANSWER_S))
+        await run_until(stop, ask_all(REPORT_TIMEOUT_S))
         if stop.is_set():
-            await ask_all(HASTY_S)
+            await ask_all(SHORT_TIMEOUT_S)
         return answers
 
-    async def _ask_for_truth(self, watch: RunMonitor, stop: asyncio.Event) -> Report | None:
+    async def _make_report(self, watch: RunMonitor, stop: asyncio.Event) -> Report | None:
         answers, statuses = await self._ask_all(watch, stop), self._supervisor.statuses
         state = watch.state.newest
         if "driver" not in answers and state is None:
             return None
-        told_of_all = truth_in_health(watch.health.get("driver"))
+        truth = truth_in_health(watch.health.get("driver"))
         for answer in answers.values():
-            told_of_all |= answer
-        seen = Observed(
+            truth |= answer
+        observed = Observed(
             body=state.robot_type if state else self._deployment.body,
             answered="driver" in answers,
             world=self._deployment.world,
@@ -321,7 +325,7 @@ class Demo:
             problem=watch.problem,
             rejected=sum(int(report.get("rejected_messages") or 0) for report in answers.values()),
         )
-        return make_report(told_of_all, seen)  # the truth is the simulator's, wherever it runs
+        return make_report(truth, observed)  # the truth comes from the process with the simulator
 
     def _record(self, name: str, record: Mapping[str, Any]) -> None:
         """Process a log record of a process."""
@@ -330,7 +334,7 @@ class Demo:
         if event == "decision":
             decided = round(record["tick"] * TICK_S, 2), str(record["reason"])
             if self._decisions and self._decisions[-1][0] == decided[0]:
-                self._decisions.pop()  # the last word of a tick counts
+                self._decisions.pop()  # only the last decision of a tick counts
             self._decisions.append(decided)
         if event == "compiling":
             self._compiling.add(str(record["process"]))
@@ -347,12 +351,13 @@ class Demo:
             text = printable(f"{record['process']}: {record.get('text', '')}")
             self._faults.append((time.monotonic(), text))
 
-    def _why(self) -> str:
-        """Return why the run has failed: the newest failure, of a lost process if there is one."""
+    def _failure(self) -> str:
+        """Return the newest failure, of a lost process if there is one; empty without failures."""
         lost = [text for name, text in self._failures if name in self._supervisor.lost]
         return (lost or [text for _, text in self._failures] or [""])[-1]
 
-    def _finish(self, report: Report | None, why: str, *, stopped: bool) -> int:
+    def _finish(self, report: Report | None, reason: str, *, stopped: bool) -> int:
+        """Print the result; return the exit code. `reason` is the failure that ended the run."""
         if self._capacity.problem and self._live:
             print(self._capacity.problem, file=sys.stderr)
         if report:
@@ -360,19 +365,19 @@ class Demo:
             files.write_result(report, self._options.report)
         for text in self._mismatches:
             print(f"warning: {text}", file=sys.stderr)
-        closing = f"{why}; logs in {self._run_dir}" if why else f"logs in {self._run_dir}"
+        closing = f"{reason}; logs in {self._run_dir}" if reason else f"logs in {self._run_dir}"
         if stopped and report is None:
             print("ended; the driver did not answer, so there is no report", file=sys.stderr)
         if stopped:
-            if why:
+            if reason:
                 print(closing, file=sys.stderr)
             return 0
-        if report and report.ok and not why:
+        if report and report.ok and not reason:
             return 0
         if wrong := self._supervisor.misconfigured:
-            raise ConfigError(self._refusals.get(wrong[0], why))
+            raise ConfigError(self._refusals.get(wrong[0], reason))
         if report is None:
-            raise BodyLost(f"no report: {'' if why else 'the driver did not answer; '}{closing}")
+            raise BodyLost(f"no report: {'' if reason else 'the driver did not answer; '}{closing}")
         if self._last_fault:
             print(f"newest fault: {self._last_fault}", file=sys.stderr)
         if self._deployment.link == "real":
@@ -382,6 +387,6 @@ class Demo:
 
 
 def newest_fault(texts: Iterable[str]) -> str:
-    """Return the driver's newest fault, else the newest of all: the likeliest reason."""
+    """Return the driver's newest fault, else the newest of all, as the likeliest reason."""
     newest = list(texts)[::-1]
     return next((text for text in newest if text.startswith("driver:")), "".join(newest[:1]))

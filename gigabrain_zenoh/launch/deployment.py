@@ -53,7 +53,7 @@ from gigabrain_zenoh.security.identity_files import (
 )
 
 MAX_HOSTS = 64
-ROBOT = tuple(name for name, one in PROCESSES.items() if one.default)
+ROBOT = tuple(name for name, row in PROCESSES.items() if row.default)
 
 
 class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -63,29 +63,29 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     link: LinkName = "sim"  # simulated, the real driver on an emulator, or the hardware
     world: str = "arena"  # of the simulation: a known world, or the path of a world file
     seed: Seed = 0  # of the start pose and the sensor noise in the simulation
-    speed: Speed = 1.0  # simulated over real time; not 1: time waits for the brain
-    lockstep_timeout_s: LockstepTimeout = 0.15  # longer: the same decisions on a slow machine, too
-    resume: Resume = "manual"  # who drives on after a stop: a person, or `auto` in simulation
-    namespace: str = ""  # the robot's own part of the key space, where one router serves several
-    router: str = "tcp/127.0.0.1:7447"  # where it listens; port 0 for any, where all is on one host
-    keys: str = ""  # the folder of this host's identity, or of one for each host: TLS for all
+    speed: Speed = 1.0  # simulated over real time; other than 1: time waits for the brain
+    lockstep_timeout_s: LockstepTimeout = 0.15  # a slow machine needs more, for the same decisions
+    resume: Resume = "manual"  # after a stop a person resumes; `auto`: the robot, in simulation
+    namespace: str = ""  # prefix of the robot's keys; required where one router serves several
+    router: str = "tcp/127.0.0.1:7447"  # its endpoint; port 0: any free one, on a single host
+    keys: str = ""  # folder of this host's identity, or with a subfolder for each host; needs TLS
     fleet: tuple[str, ...] = ()  # namespaces of other robots that this one's router serves
     insecure: bool = False  # allow a router that other machines can reach, without keys
-    # the processes of each host, by its name
+    # processes by host
     hosts: dict[str, tuple[str, ...]] = msgspec.field(default_factory=lambda: {"robot": ROBOT})
-    cameras: bool = False  # on: the cameras of the body's file are used, by the process `camera`
-    recognition: bool = True  # off: what cameras see is not recognised
+    cameras: bool = False  # use the cameras of the body's file, in the process `camera`
+    recognition: bool = True  # recognise things and tags in pictures
     recognizer: RecognizerConfig = RecognizerConfig()
     tags: TagConfig = TagConfig()
-    button: ButtonConfig | None = None  # an e-stop button; without its word nothing moves
-    robot: dict[str, Any] = {}  # fields of the body's file that are other here, never less safe
+    button: ButtonConfig | None = None  # an e-stop button; while it is silent, nothing moves
+    robot: dict[str, Any] = {}  # replaces fields of the body's file, but never less safely
     perception: PerceptionConfig = PerceptionConfig()
     decision: DecisionConfig = DecisionConfig()
     recorder: RecorderConfig = RecorderConfig()
     page: PageConfig = PageConfig()
     foxglove: FoxgloveConfig = FoxgloveConfig()
-    ros2: Ros2Config | None = None  # the gateway to ROS 2, beside the driver unless `hosts` has it
-    # of one's own; where there is one host, it runs those that `hosts` does not name
+    ros2: Ros2Config | None = None  # gateway to ROS 2, beside the driver unless `hosts` names it
+    # processes of the user's own; a single host also runs those that `hosts` does not name
     processes: dict[OwnName, OwnProcess] = {}
     perceptors: dict[OwnName, OwnPerceptor] = {}
 
@@ -125,19 +125,19 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             raise ValueError("speed is for the simulation; other links run in real time")
 
     def _place_own(self) -> None:
-        """Check the processes of one's own, and put those that have no host on the only one."""
+        """Check the user's own processes, and place those without a host on the only one."""
         check_entries(self.processes, self.perceptors, PROCESSES)
         placed = {name for names in self.hosts.values() for name in names}
-        left = [one for one in (*self.processes, *self.perceptors) if one not in placed]
-        if left and len(self.hosts) > 1:
+        unplaced = [name for name in (*self.processes, *self.perceptors) if name not in placed]
+        if unplaced and len(self.hosts) > 1:
             where = ", ".join(self.hosts)
-            raise ValueError(f"hosts: {left[0]} is on none; name it in one of: {where}")
-        if left:
+            raise ValueError(f"hosts: {unplaced[0]} is on none; name it in one of: {where}")
+        if unplaced:
             ((host, names),) = self.hosts.items()
-            structs.force_setattr(self, "hosts", {host: (*names, *left)})
+            structs.force_setattr(self, "hosts", {host: (*names, *unplaced)})
 
     def settings(self, process: str) -> Struct | dict[str, Any]:
-        """Return the part of the file for `process`; empty where it has none."""
+        """Return the part of the file for `process`; empty if there is none."""
         part = getattr(self, process, None)
         return part if isinstance(part, Struct) else {}
 
@@ -157,27 +157,27 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def _is_namespace(text: str) -> bool:
-    """Return whether a text can begin keys of the bus, and name a folder of a robot's state."""
+    """Return whether a text can be a prefix of keys, and the name of a robot's state folder."""
     return not {"", ".", ".."} & {*text.split("/")} and not {*"*$#?"} & {*text}
 
 
 def deployment_type(own: Iterable[str] = ()) -> type[Deployment]:
     """Return the type of a deployment file, with the processes and parts that packages offer.
 
-    `own` are the names of its own processes and perceptors, which `hosts` may name as well.
+    `own` are the names of the user's own processes and perceptors, which `hosts` may name too.
     """
-    types = {name: one for name, one in process_types().items() if one.named}
-    broken = set(plugin_names({}, GROUP)) - set(types)  # its error comes where it is to run
+    rows = {name: row for name, row in process_types().items() if row.named}
+    broken = set(plugin_names({}, GROUP)) - set(rows)  # their errors appear at their start
     literal, some, by_name = cast(Any, Literal), cast(Any, tuple), cast(Any, dict)
-    names = by_name[str, some[literal[(*types, *sorted(broken), *own)], ...]]
+    names = by_name[str, some[literal[(*rows, *sorted(broken), *own)], ...]]
     hosts = ("hosts", names, msgspec.field(default_factory=lambda: {"robot": ROBOT}))
     known = Deployment.__struct_fields__
     parts = [
-        _part(name, one.settings)
-        for name, one in types.items()
-        if one.settings and not one.derive and name not in known
+        _part(name, row.settings)
+        for name, row in rows.items()
+        if row.settings and not row.derive and name not in known
     ]
-    made: Any = msgspec.defstruct(
+    file_type: Any = msgspec.defstruct(
         "Deployment",
         [hosts, *parts],
         bases=(Deployment,),
@@ -185,11 +185,11 @@ def deployment_type(own: Iterable[str] = ()) -> type[Deployment]:
         kw_only=True,
         forbid_unknown_fields=True,
     )
-    return made  # type: ignore[no-any-return]
+    return file_type  # type: ignore[no-any-return]
 
 
 def _part(name: str, settings: type[Struct]) -> tuple[str, Any, Any]:
-    """Return the field of a deployment file for settings; null where they have no defaults."""
+    """Return the field of a deployment file for settings; null by default if one is required."""
     if any(field.required for field in structs.fields(settings)):
         return name, settings | None, None
     return name, settings, msgspec.field(default_factory=settings)
@@ -218,7 +218,7 @@ def deployment_path(name: str) -> Path:
 
 
 def load_deployment(path: Path, keys: str = "") -> Deployment:
-    """Read a deployment file; the files it names lie beside it, unless `keys` replaces its keys.
+    """Read a deployment file; its paths are relative to its folder. `keys` replaces its keys.
 
     Raises ConfigError with file, line and what was expected.
     """
@@ -228,52 +228,52 @@ def load_deployment(path: Path, keys: str = "") -> Deployment:
 
 
 def with_files(root: Node, folder: Path) -> Node:
-    """Return settings in which the files that they name are taken from `folder`."""
+    """Return settings whose paths of files are made absolute, relative to `folder`."""
 
     def beside(name: str) -> str:
         return config.beside(name, folder)
 
-    def there(name: str) -> str:
+    def inside(name: str) -> str:
         return str(folder.absolute() / expanded(name)) if name else name
 
     root = _placed(root, (), ("body", "world"), beside)
-    root = _placed(root, (), ("keys",), there)
+    root = _placed(root, (), ("keys",), inside)
     root = _placed(root, ("perception",), ("map",), beside)
-    root = _placed(root, ("recorder",), ("folder", "file"), there)
-    root = _placed(root, ("recognizer",), ("onnx", "labels"), there)
-    root = _placed(root, ("page",), ("certificate", "certificate_key", "tokens"), there)
-    root = _placed(root, ("foxglove",), ("secret",), there)
-    root = _placed(root, ("ros2",), ("types",), there)
-    return _placed(root, ("decision", "settings"), ("mission", "scripts"), there)
+    root = _placed(root, ("recorder",), ("folder", "file"), inside)
+    root = _placed(root, ("recognizer",), ("onnx", "labels"), inside)
+    root = _placed(root, ("page",), ("certificate", "certificate_key", "tokens"), inside)
+    root = _placed(root, ("foxglove",), ("secret",), inside)
+    root = _placed(root, ("ros2",), ("types",), inside)
+    return _placed(root, ("decision", "settings"), ("mission", "scripts"), inside)
 
 
 def _placed(
     root: Node, parts: Sequence[str], names: Container[str], place: Callable[[str], str]
 ) -> Node:
-    """Return settings with `place` of the settings `names` of a part."""
+    """Return settings with `place` applied to the settings `names` of the section `parts`."""
 
-    def placed(one: Entry) -> Entry:
-        if parts and one.key == parts[0] and one.node.entries is not None:
-            return replace(one, node=_placed(one.node, parts[1:], names, place))
-        if parts or one.key not in names:
-            return one
-        return replace(one, node=_with_place(one.node, place))
+    def placed(entry: Entry) -> Entry:
+        if parts and entry.key == parts[0] and entry.node.entries is not None:
+            return replace(entry, node=_placed(entry.node, parts[1:], names, place))
+        if parts or entry.key not in names:
+            return entry
+        return replace(entry, node=_with_place(entry.node, place))
 
-    entries = tuple(placed(one) for one in root.entries or ())
-    return replace(root, entries=entries, value={one.key: one.node.value for one in entries})
+    entries = tuple(placed(entry) for entry in root.entries or ())
+    return replace(root, entries=entries, value={entry.key: entry.node.value for entry in entries})
 
 
 def _with_place(node: Node, place: Callable[[str], str]) -> Node:
-    """Return a text, or a list of texts, with `place` of each."""
+    """Return a text, or a list of texts, with `place` applied to each."""
     if node.items is not None:
-        items = tuple(_with_place(one, place) for one in node.items)
-        return replace(node, items=items, value=[one.value for one in items])
+        items = tuple(_with_place(item, place) for item in node.items)
+        return replace(node, items=items, value=[item.value for item in items])
     return replace(node, value=place(node.value)) if isinstance(node.value, str) else node
 
 
 def own_names(root: Node) -> list[str]:
-    """Return the names of the processes of one's own in a file, which may still be invalid."""
-    parts = (one.node for one in root.entries or () if one.key in (MODULES, PERCEPTORS))
+    """Return the names of the user's own processes in a file, which need not be valid."""
+    parts = (each.node for each in root.entries or () if each.key in (MODULES, PERCEPTORS))
     return [entry.key for part in parts for entry in part.entries or ()]
 
 
@@ -308,12 +308,12 @@ def client_endpoint(deployment: Deployment, host: str = "") -> Endpoint:
 
 
 def local_endpoint(deployment: Deployment, host: str) -> Endpoint:
-    """Return the endpoint for `host` itself: with keys the Unix socket of its own router, if any.
+    """Return the endpoint for processes on `host`: with keys its own router's Unix socket, if any.
 
-    No other machine can interfere there. Raises ConfigError.
+    No other machine can reach that socket. Raises ConfigError.
     """
-    near = deployment.keys and "router" in deployment.hosts[host]
-    connect = (local_socket(), deployment.router) if near else (deployment.router,)
+    has_socket = deployment.keys and "router" in deployment.hosts[host]
+    connect = (local_socket(), deployment.router) if has_socket else (deployment.router,)
     return _endpoint(deployment, host, *connect)
 
 
@@ -326,7 +326,7 @@ def check_keys(deployment: Deployment, host: str) -> None:
     """Check that the identity of `host` permits its processes. Raises ConfigError."""
     if not deployment.keys:
         return
-    local_endpoint(deployment, host)  # refuse an address for which no keys would do
+    local_endpoint(deployment, host)  # raises for an address that cannot have keys
     folder = identity_folder(deployment.keys, host)
     rows = {name: deployed_type(deployment, name) for name in deployment.hosts[host]}
     ours = {name: row.roles for name, row in rows.items() if not row.own}
@@ -337,6 +337,6 @@ def check_keys(deployment: Deployment, host: str) -> None:
 
 
 def recorded(path: Path) -> dict[str, Any]:
-    """Return the fields of a deployment that records itself into one file, for a replay."""
+    """Return the fields of a deployment that records into the file `path`, for a replay."""
     recorder = {"file": str(path.absolute()), "viewers": False}
     return {"hosts": {"robot": (*ROBOT, "recorder")}, "recorder": recorder}

@@ -1,4 +1,4 @@
-"""A deployment as it is started: its file, then settings files, then `--set`."""
+"""Merges a deployment file, settings files and `--set` into one deployment."""
 
 import contextlib
 import logging
@@ -26,19 +26,19 @@ from gigabrain_zenoh.launch.deployment import (
 log = logging.getLogger(__name__)
 ROWS_FILE, MAX_ROWS_BYTES = "config.json", 1_000_000
 SETTINGS = "decision.settings"
-FIRST = "body", "link"  # which need one another, and on which it depends what else can be set
+SET_FIRST = "body", "link"  # they depend on each other, and other keys depend on them
 # returns the type of a robot's file, for its name or path and the link
 RobotType = Callable[[str, LinkName], type[Struct]]
 
 
 class MergedDeployment(NamedTuple):
-    """A deployment, and where each of its values comes from."""
+    """A deployment, and the sources of its values."""
 
     layers: Layers
     deployment: Deployment
 
     def check_behaviour(self) -> None:
-        """Raise ConfigError or UnknownName if the behaviour cannot run so, with the place."""
+        """Raise ConfigError or UnknownName, with the place, for a behaviour that cannot run."""
         kind = behaviours.load(self.deployment.decision.behaviour).Config
         self.layers.convert(kind, SETTINGS.split("."))
         behaviours.check(self.deployment.decision)
@@ -65,26 +65,26 @@ def merge(
     robot_type: RobotType,
     keys: str = "",
 ) -> MergedDeployment:
-    """Lay settings files and `--set KEY=VALUE` over a deployment; `keys` replaces its keys.
+    """Merge settings files and `--set KEY=VALUE` into a deployment; `keys` replaces its keys.
 
     Raises ConfigError and UnknownName, with the place of the value.
     """
     for file in files:
         _add_file(layers, file)
-    for text in sorted(sets, key=lambda text: assignment(text).key not in FIRST):
-        one = assignment(text)
-        first = one.key in FIRST
-        key = one.key if first else full_key(one.key, _keys(layers, robot_type), SETTINGS)
-        value = with_files(one._replace(key=key).nested(), Path())
+    for text in sorted(sets, key=lambda text: assignment(text).key not in SET_FIRST):
+        given = assignment(text)
+        first = given.key in SET_FIRST
+        key = given.key if first else full_key(given.key, _keys(layers, robot_type), SETTINGS)
+        value = with_files(given._replace(key=key).nested(), Path())
         layers.add(value, lambda _, text=text: f"--set {text}")  # type: ignore[misc]
     deployment = layers.convert(_type_of(layers))
     return MergedDeployment(layers, structs.replace(deployment, keys=keys or deployment.keys))
 
 
 def write_rows(run_dir: Path, rows: Sequence[Row]) -> None:
-    """Keep the settings of a run, and where they come from, in its folder.
+    """Write the settings of a run and their sources into its folder.
 
-    Only `gigabrain config` reads them, so a robot starts without them on a full disk.
+    Only `gigabrain config` reads them, so on a full disk the robot starts without the file.
     """
     try:
         if rows:
@@ -94,7 +94,7 @@ def write_rows(run_dir: Path, rows: Sequence[Row]) -> None:
 
 
 def read_rows(run_dir: Path) -> list[Row]:
-    """Return the settings of a run. Raises ConfigError where they are not kept."""
+    """Return the settings of a run. Raises ConfigError without a valid file."""
     path = run_dir / ROWS_FILE
     try:
         return msgspec.json.decode(read_bounded(path, MAX_ROWS_BYTES), type=list[Row])
@@ -114,7 +114,7 @@ def _type_of(layers: Layers) -> type[Deployment]:
 
 
 class _Choices(Struct, frozen=True, kw_only=True):
-    """The settings on which it depends which others there are."""
+    """The settings that determine which other settings exist."""
 
     body: str = Deployment().body
     link: LinkName = Deployment().link
@@ -122,9 +122,9 @@ class _Choices(Struct, frozen=True, kw_only=True):
 
 
 def _keys(layers: Layers, robot_type: RobotType) -> list[str]:
-    """Return all keys that may be set; the settings need not fit one another yet."""
-    kind, now = _type_of(layers), layers.convert(_Choices)
-    known = {"robot": robot_type(now.body, now.link)}
+    """Return all keys that may be set; the settings may still contradict each other."""
+    kind, choices = _type_of(layers), layers.convert(_Choices)
+    known = {"robot": robot_type(choices.body, choices.link)}
     with contextlib.suppress(UnknownName):  # its package may be on another host
-        known[SETTINGS] = behaviours.load(now.decision.behaviour).Config
+        known[SETTINGS] = behaviours.load(choices.decision.behaviour).Config
     return list(keys_of(kind, known))

@@ -1,7 +1,7 @@
-"""Processes of one's own: modules and perceptors that a deployment file names.
+"""The user's own processes: modules and perceptors that a deployment file names.
 
-They run in the same frame as ours. Their code is imported by their own process alone, so that a
-module that raises or hangs costs nobody else anything.
+They run in the same frame as ours. Only their own process imports their code, so a module that
+raises or hangs affects no other process.
 """
 
 import functools
@@ -39,7 +39,7 @@ def check_entries(
     perceptors: Mapping[str, OwnPerceptor],
     known: Collection[str],
 ) -> None:
-    """Raise ValueError, which begins with the place in the file, for entries that do not fit."""
+    """Raise ValueError, which begins with the place in the file, for invalid entries."""
     names = [*processes, *perceptors]
     if len(names) > MAX_OWN:
         raise ValueError(f"processes: {len(names)} of one's own; expected at most {MAX_OWN}")
@@ -56,7 +56,7 @@ def check_entries(
 
 
 def own_type(deployment: "Deployment", name: str) -> ProcessType | None:
-    """Return the row of a process of one's own that the deployment file names, else None."""
+    """Return the row of one of the user's own processes; None for another name."""
     if entry := deployment.processes.get(name):
         return ProcessType(entry.module, writes=entry.writes)
     if name in deployment.perceptors:
@@ -65,7 +65,7 @@ def own_type(deployment: "Deployment", name: str) -> ProcessType | None:
 
 
 def own_config(deployment: "Deployment", name: str, file: str) -> dict[str, Any]:
-    """Return the fields of a ProcessConfig that say what a process of one's own runs."""
+    """Return the fields of a ProcessConfig for one of the user's own processes; else none."""
     if entry := deployment.processes.get(name):
         return {"module": entry.module, "settings": entry.settings, "file": file}
     if perceptor := deployment.perceptors.get(name):
@@ -78,7 +78,7 @@ def own_config(deployment: "Deployment", name: str, file: str) -> dict[str, Any]
 
 
 def unknown_to_router(deployment: "Deployment", host: str, shipped: Collection[str]) -> str:
-    """Return a warning for processes that another robot's router may not know, or an empty text."""
+    """Return a warning for processes that the router may not know, or an empty text."""
     here = [name for name in deployment.hosts[host] if name not in shipped]
     routes = any("router" in names for names in deployment.hosts.values())
     if routes or not deployment.keys or not here:
@@ -108,7 +108,7 @@ def check_installed(deployment: "Deployment", host: str, file: str) -> None:
 
 
 def _exists(module: str) -> bool:
-    """Return whether a module can be found. Its package is not imported."""
+    """Return whether a module exists, without importing its package."""
     top, *parts = module.split(".")
     try:
         spec = find_spec(top)
@@ -124,13 +124,13 @@ def _exists(module: str) -> bool:
 
 
 def load_own(config: ProcessConfig) -> tuple[ProcessType, Node]:
-    """Return the row and the node of a process of one's own. Raises ConfigError."""
+    """Return the row and the node of one of the user's own processes. Raises ConfigError."""
     if config.perceptor:
         from gigabrain_zenoh.perception import perceptors
 
         perceptor = perceptors.load(config.perceptor)
-        made = _settings(config, perceptor.Config, (PERCEPTORS, config.name, "settings"))
-        return OWN, functools.partial(perceptors.run, perceptor(made))
+        settings = _settings(config, perceptor.Config, (PERCEPTORS, config.name, "settings"))
+        return OWN, functools.partial(perceptors.run, perceptor(settings))
     path, _, function = config.module.partition(":")
     function = function or "run"
     place = (MODULES, config.name, "module")
@@ -144,14 +144,14 @@ def load_own(config: ProcessConfig) -> tuple[ProcessType, Node]:
     if not callable(node):
         raise wrong
     kind = getattr(module, "Config", NoSettings)
-    made = _settings(config, kind, (MODULES, config.name, "settings"))
-    return OWN, functools.partial(_run, made, node, wrong)
+    settings = _settings(config, kind, (MODULES, config.name, "settings"))
+    return OWN, functools.partial(_run, settings, node, wrong)
 
 
 async def _run(
     config: Struct, node: Callable[..., Any], wrong: ConfigError, bus: Bus, ready: Ready
 ) -> None:
-    """Run the node of a module; raise `wrong` if it is no coroutine."""
+    """Run the node of a module; raise `wrong` if it is not a coroutine function."""
     running = node(config, bus, ready)
     if not inspect.isawaitable(running):
         raise wrong
@@ -159,9 +159,9 @@ async def _run(
 
 
 def failing_on_bus(load: Callable[[], Node]) -> Node:
-    """Return the node that `load` makes, or one that raises the error of `load`.
+    """Return the node from `load`, or a node that raises the error of `load`.
 
-    So the process is on the bus by then, and `why` and `doctor` say what is wrong with it.
+    The process is then on the bus before the error, so that `why` and `doctor` can show it.
     """
     try:
         return load()
@@ -183,7 +183,7 @@ def _settings(config: ProcessConfig, kind: type[Struct], place: tuple[str, ...])
         return msgspec.convert(config.settings, kind)
     except msgspec.ValidationError as error:
         text = f"{'.'.join(place)}: {error}"
-    if config.file:  # the same, with the line
+    if config.file:  # raises the same error with its line
         loading.loads(loading.read(Path(config.file)), kind, config.file, at=place)
     raise ConfigError(text)
 

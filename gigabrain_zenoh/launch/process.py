@@ -49,7 +49,7 @@ class ProcessPlace:
 
     endpoint: Endpoint
     run_dir: Path  # folder of this run's logs
-    state_dir: Path  # folder of what the robot remembers
+    state_dir: Path  # folder of the robot's state
     seconds: float | None = None  # [s] of simulated time; None for no limit
 
     @property
@@ -65,10 +65,10 @@ class ProcessPlace:
 
 @dataclass(frozen=True)
 class ProcessType:
-    """One row of the table of processes: how a process is started, placed, set up and identified.
+    """One row of the table of processes: start, place, settings and identity of a process.
 
-    Its settings are the part of a deployment file that has its name, or what `derive` makes of the
-    whole deployment. A field `state_dir` of them gets the robot's folder.
+    Its settings are the part of a deployment file with its name, or the result of `derive`. Their
+    field `state_dir`, if they have one, is set to the robot's folder.
     """
 
     run: str  # "module:function" of its node, imported only when it runs
@@ -76,20 +76,21 @@ class ProcessType:
     derive: Callable[["Deployment", ProcessPlace], Struct] | None = None
     default: bool = False  # runs if a deployment names no hosts
     named: bool = True  # `hosts` may name it
-    joins: Callable[["Deployment", set[str]], bool] | None = None  # added to such a host by itself
-    after: tuple[str, ...] = ("router", "relay")  # which of these must be ready before it starts
+    # returns whether a host with these processes runs it, also if `hosts` does not name it
+    joins: Callable[["Deployment", set[str]], bool] | None = None
+    after: tuple[str, ...] = ("router", "relay")  # processes that must be ready before it starts
     compiles: Callable[["Deployment"], bool] | None = None  # its first start takes minutes
-    forks: bool = False  # its module leaves no thread running, so a fork server may import it
-    stop_last: bool = False  # the others need it in order to end well
+    forks: bool = False  # a fork server may import its module, which leaves no thread running
+    stop_last: bool = False  # others need it for a clean end
     stops: bool = False  # carries commands and stops: gets a higher priority where permitted
-    repeats: bool = False  # can be replayed, so it publishes which input it used
-    optional: bool = False  # the robot goes on without it, also where its settings are wrong
-    looks_on: bool = False  # not needed by the robot: naps, and runs at low priority
+    repeats: bool = False  # can be replayed, so it publishes a log of its inputs
+    optional: bool = False  # the robot runs without it, also if its settings are wrong
+    looks_on: bool = False  # the robot does not need it: receives in batches, at low priority
     prompt: bool = False  # carries requests for others: runs at normal priority, though `own`
-    # identities with which a host may run it; `process` is one of its own, in a subfolder of the
-    # host's that has the name of the process
+    # roles of the identity of a host that may run it; with `process` it has its own identity, in
+    # a subfolder of the host's identity with the name of the process
     roles: tuple[Role, ...] = ("process",)
-    writes: tuple[str, ...] = ()  # keys that an identity of its own may publish, ask or serve
+    writes: tuple[str, ...] = ()  # keys that its own identity may publish, ask or serve
 
     def __post_init__(self) -> None:
         for key in self.writes:
@@ -101,7 +102,7 @@ class ProcessType:
         return "process" in self.roles
 
     def node(self, settings: Mapping[str, Any]) -> Node:
-        """Return the process's node with its settings filled in. Raises ValidationError."""
+        """Return the process's node bound to its settings. Raises ValidationError."""
         node = find(self.run)
         if self.settings is None:
             return node  # type: ignore[no-any-return]
@@ -120,7 +121,7 @@ Load = Callable[[ProcessConfig], tuple[ProcessType, Node]]
 
 
 class _ReportedError(Exception):
-    """An error that ended the node, and is logged already."""
+    """An error that ended the node and is already logged."""
 
     def __init__(self, exit_code: int) -> None:
         super().__init__()
@@ -130,7 +131,7 @@ class _ReportedError(Exception):
 def run(config: ProcessConfig, load: Load, make_bus: MakeBus = Bus) -> int:
     """Run one process until it ends, and return its exit code.
 
-    `load` returns its row, and its node with the settings filled in.
+    `load` returns its row, and its node bound to its settings.
     """
     gc.disable()  # until ready: objects from imports and set-up are not garbage
     try:
@@ -138,13 +139,13 @@ def run(config: ProcessConfig, load: Load, make_bus: MakeBus = Bus) -> int:
         logs.setup(config.name, run_dir, json_console=config.json_console, level=config.level)
         process_type, node = load(config)
         if process_type.stops:
-            go_first()  # like the other branches, before any thread starts: threads inherit it
+            go_first()  # each branch sets priorities before threads start, which inherit them
         elif process_type.looks_on or (process_type.own and not process_type.prompt):
             step_aside()
         else:
             start_first()
         with (
-            interrupts.reacting(None),  # before `stop_signals` there is nothing to stop
+            interrupts.reacting(None),  # `stop_signals` handles a signal that arrives before it
             asyncio.Runner(loop_factory=loop_factory()) as runner,
         ):
             runner.run(_run(config, process_type, node, make_bus))
@@ -159,7 +160,7 @@ def run(config: ProcessConfig, load: Load, make_bus: MakeBus = Bus) -> int:
 
 
 def _report(error: Exception) -> int:
-    """Log what ends the process; return its exit code."""
+    """Log the error that ends the process; return its exit code."""
     first = _first(error)
     if isinstance(first, GigabrainError):
         invalid = {"value": first.value} if isinstance(first, ConfigError) and first.value else {}
@@ -220,7 +221,7 @@ async def _work(
                     tasks.create_task(beat(bus.clock, lambda: bus.progress(), out))
                 tasks.create_task(_failure(bus))
                 tasks.create_task(_node(bus, node, process_type))
-        except Exception as error:  # noqa: BLE001 - logged while the bus still takes it
+        except Exception as error:  # noqa: BLE001 - logged while the bus is still open
             bus.restore_traceback(_first(error))
             raise _ReportedError(_report(error)) from None
         finally:
@@ -238,7 +239,7 @@ async def _node(bus: Bus, node: Node, process_type: ProcessType) -> None:
 
 
 def _ready(process_type: ProcessType) -> None:
-    if not process_type.stops:  # what stops the robot waits for no disk
+    if not process_type.stops:  # processes that stop the robot must not wait for the disk
         join_in()
         unmap_code()
     gc.collect()

@@ -1,8 +1,8 @@
-"""The table of processes: one row holds all that launching, settings and rights need.
+"""The table of processes: one row contains the data for start, settings and rights of a process.
 
 A supervisor starts each as `python -m gigabrain_zenoh.launch.processes CONFIG`, with a
-ProcessConfig in JSON. Packages offer theirs as entry points of the group `gigabrain.processes`,
-each a ProcessType.
+ProcessConfig in JSON. Packages offer processes as entry points of the group
+`gigabrain.processes`; each is a ProcessType.
 """
 
 import contextlib
@@ -63,22 +63,22 @@ if TYPE_CHECKING:
 
 GROUP = "gigabrain.processes"
 OPERATED: tuple[Role, ...] = ("robot", "operator")
-MEET = {"perception", "decision"}  # each runs once per robot, so there is one relay at most
+RELAYED = {"perception", "decision"}  # each runs once per robot, so there is at most one relay
 ROS_WRITES = tuple(
-    one.key
-    for one in (
+    each.key
+    for each in (
         CMD_VEL, ESTOP, RELEASE, ENABLE, GOAL, MISSION, TASK_CHANGE, POSE_SET, MAP_SAVE,
     )
 ) + FLEET_KEYS  # fmt: skip
-NAME_FOR_FLEET = (
+NEEDS_NAMESPACE = (
     "ros2: free_fleet needs the robot's namespace; set `namespace:` in the deployment file, "
     "or leave free_fleet off"
 )
-ROUTER_FOR_ROS = (
+NO_ROS_IDENTITY = (
     "ros2: nodes of ROS have no identity at a router with keys; name another one as "
     "`router:`, or use `transport: dds`"
 )
-AT_THE_ROBOT = {"router", "driver"}  # no relay between them: a body without its router must stop
+NEVER_RELAYED = {"router", "driver"}  # a relay would hide the loss of the router from the body
 
 
 def _router(deployment: "Deployment", place: ProcessPlace) -> RouterConfig:
@@ -135,9 +135,9 @@ def _recognition(deployment: "Deployment", _: ProcessPlace) -> RecognitionConfig
 
 
 def _recorder(deployment: "Deployment", _: ProcessPlace) -> RecorderConfig:
-    """Return the recorder's settings, with notes on the other processes that a replay needs."""
-    about = {"perception": deployment.perception, "decision": deployment.decision}
-    notes = {name: msgspec.json.encode(settings).decode() for name, settings in about.items()}
+    """Return the recorder's settings, with notes for replays: settings of the other processes."""
+    replayed = {"perception": deployment.perception, "decision": deployment.decision}
+    notes = {name: msgspec.json.encode(settings).decode() for name, settings in replayed.items()}
     plain = {"body": deployment.body, "link": deployment.link, "world": deployment.world}
     plain["speed"] = f"{deployment.speed:g}"
     notes |= plain | deployment.recorder.notes
@@ -151,11 +151,10 @@ def _ros2(deployment: "Deployment", place: ProcessPlace) -> Ros2Config:
 def gateway_config(config: Ros2Config, endpoint: Endpoint) -> Ros2Config:
     """Return the gateway's settings for the robot at an endpoint.
 
-    Raises ConfigError as `with_ros_router` does, and for a robot without the name that free_fleet
-    needs.
+    Raises ConfigError as `with_ros_router` does, and for free_fleet without a namespace.
     """
     if config.free_fleet and not endpoint.namespace:
-        raise ConfigError(NAME_FOR_FLEET)
+        raise ConfigError(NEEDS_NAMESPACE)
     return with_ros_router(config, endpoint)
 
 
@@ -165,17 +164,17 @@ L = TypeVar("L", bound=Ros2Link)
 def with_ros_router(config: L, endpoint: Endpoint) -> L:
     """Return settings for ROS with the robot's own router, unless they name another one.
 
-    Raises ConfigError where that router has keys.
+    Raises ConfigError if the robot's router has keys.
     """
     if config.transport != "rmw_zenoh" or config.router:
         return config
     if endpoint.keys:
-        raise ConfigError(ROUTER_FOR_ROS)
+        raise ConfigError(NO_ROS_IDENTITY)
     return structs.replace(config, router=endpoint.connect[-1])
 
 
 def _needs_ros2(deployment: "Deployment", here: set[str]) -> bool:
-    """Return whether the gateway to ROS runs beside the driver: unless `hosts` places it."""
+    """Return whether the gateway to ROS runs on the driver's host: unless `hosts` names it."""
     placed = any("ros2" in names for names in deployment.hosts.values())
     return deployment.ros2 is not None and "driver" in here and not placed
 
@@ -185,7 +184,7 @@ def _needs_relay(_: "Deployment", here: set[str]) -> bool:
 
     A relay needs Unix sockets.
     """
-    return sys.platform != "win32" and here >= MEET and not here & AT_THE_ROBOT
+    return sys.platform != "win32" and here >= RELAYED and not here & NEVER_RELAYED
 
 
 def _needs_emulator(deployment: "Deployment", here: set[str]) -> bool:
@@ -193,19 +192,19 @@ def _needs_emulator(deployment: "Deployment", here: set[str]) -> bool:
 
 
 def _needs_button(deployment: "Deployment", here: set[str]) -> bool:
-    """Return whether an e-stop button runs beside the driver: unless `hosts` places it."""
+    """Return whether an e-stop button runs on the driver's host: unless `hosts` names it."""
     placed = any("button" in names for names in deployment.hosts.values())
     return deployment.button is not None and "driver" in here and not placed
 
 
 def _needs_camera(deployment: "Deployment", here: set[str]) -> bool:
-    """Return whether the cameras' process runs beside the driver: unless `hosts` places it."""
+    """Return whether the camera process runs on the driver's host: unless `hosts` names it."""
     placed = any("camera" in names for names in deployment.hosts.values())
     return deployment.cameras and "driver" in here and not placed
 
 
 def _needs_recognition(deployment: "Deployment", here: set[str]) -> bool:
-    """Return whether pictures are recognised beside perception: unless `hosts` places it."""
+    """Return whether recognition runs on perception's host: unless `hosts` names it."""
     placed = any("recognition" in names for names in deployment.hosts.values())
     wanted = deployment.cameras and deployment.recognition
     return wanted and "perception" in here and not placed
@@ -216,7 +215,7 @@ def _maps(deployment: "Deployment") -> bool:
 
 
 def _navigates(deployment: "Deployment") -> bool:
-    from gigabrain_zenoh.decision.behaviours import needs_map  # not needed in each process
+    from gigabrain_zenoh.decision.behaviours import needs_map  # few processes need it
 
     return needs_map(deployment.decision.behaviour)
 
@@ -362,7 +361,7 @@ def process_type(name: str) -> ProcessType:
 
 
 def process_types() -> dict[str, ProcessType]:
-    """Return all rows by name, also those that packages offer; a broken package is left out."""
+    """Return all rows by name, also those of packages; skip broken packages."""
     rows = {}
     for name in plugin_names(PROCESSES, GROUP):
         with contextlib.suppress(ConfigError):  # raised again where a deployment names it
@@ -371,7 +370,7 @@ def process_types() -> dict[str, ProcessType]:
 
 
 def deployed_type(deployment: "Deployment", name: str) -> ProcessType:
-    """Return the row of a process that `hosts` of a deployment names, also of one's own.
+    """Return the row of a process that `hosts` of a deployment names, also the user's own.
 
     Raises UnknownName and ConfigError.
     """
@@ -379,14 +378,14 @@ def deployed_type(deployment: "Deployment", name: str) -> ProcessType:
 
 
 def own_processes(deployment: "Deployment") -> dict[str, ProcessType]:
-    """Return the processes of one's own that run on any host of a deployment, by name."""
+    """Return the processes with their own identity on any host of a deployment, by name."""
     placed = (name for names in deployment.hosts.values() for name in names)
     rows = {name: deployed_type(deployment, name) for name in placed}
     return {name: row for name, row in rows.items() if row.own}
 
 
 def grants(deployment: "Deployment | None" = None) -> dict[str, tuple[str, ...]]:
-    """Return the keys that processes of one's own write, by name: of packages, and of the file."""
+    """Return the keys that processes with their own identity write, by name."""
     rows = {name: row for name, row in process_types().items() if row.own}
     if deployment:
         rows |= own_processes(deployment)
@@ -394,16 +393,16 @@ def grants(deployment: "Deployment | None" = None) -> dict[str, tuple[str, ...]]
 
 
 def names_by_role() -> dict[str, tuple[str, ...]]:
-    """Return the names under which an identity of each role may run a process."""
+    """Return the names of the processes that an identity of each role may run."""
     names: dict[str, tuple[str, ...]] = {}
-    for name, one in process_types().items():
-        for role in one.roles:
+    for name, row in process_types().items():
+        for role in row.roles:
             names[role] = (*names.get(role, ()), name)
     return names
 
 
 def node_of(config: ProcessConfig) -> Node:
-    """Return the node of a process with its settings filled in. Raises ValidationError."""
+    """Return the node of a process bound to its settings. Raises ValidationError."""
     settings: dict[str, Any] = renamed_settings(config.settings, config.name)
     return process_type(config.name).node(settings)
 

@@ -1,4 +1,4 @@
-"""Imported by a fork server: its forks share what each of them would load."""
+"""Imported by a fork server, so that its forks share the memory of these imports."""
 
 import numpy.ma  # noqa: F401 - np.unique loads it, 9 MB
 
@@ -8,4 +8,4 @@ from gigabrain_zenoh.plugins import offered, package_version
 
 loop_factory()
 package_version()
-offered("")  # finds what all packages offer
+offered("")  # caches the entry points of all packages

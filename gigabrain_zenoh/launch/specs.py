@@ -25,8 +25,9 @@ from gigabrain_zenoh.runtime.running import local_socket
 COMMAND = (sys.executable, "-P", "-m", "gigabrain_zenoh.launch.processes")
 SHARED, KERNELS = "gigabrain_zenoh.launch.shared", "gigabrain_zenoh.kernels.shared"
 FORKED = "gigabrain_zenoh.launch.processes:run_supervised"
-LATER_S, SOON_S = 3600.0, 30.0  # a router on another host may start later
-COMPILING_S = 600.0  # mapping and navigation compile their kernels at the first start
+READY_TIMEOUT_S = 30.0
+ROUTER_TIMEOUT_S = 3600.0  # a router on another host may start later
+COMPILE_TIMEOUT_S = 600.0  # mapping and navigation compile their kernels at the first start
 
 
 def process_specs(
@@ -39,9 +40,9 @@ def process_specs(
     level: str = "info",
     file: str = "",
 ) -> list[ProcessSpec]:
-    """Build the specs of the processes of `host`, in readiness order: the router or relay first.
+    """Build the specs of the processes of `host`, in the order of their starts: the router first.
 
-    `file` is the deployment file, for errors of processes of one's own.
+    `file` is the deployment file, for errors of the user's own processes.
     """
     names = _names(deployment, host)
     specs = []
@@ -68,28 +69,30 @@ def process_specs(
                 shows_stack=True,
                 stop_last=row.stop_last,
                 optional=row.own or row.optional,
-                ready_timeout_s=(COMPILING_S if compiles else SOON_S) if after else LATER_S,
+                ready_timeout_s=(COMPILE_TIMEOUT_S if compiles else READY_TIMEOUT_S)
+                if after
+                else ROUTER_TIMEOUT_S,
             )
         )
     return specs
 
 
 def _fork(row: ProcessType, process: ProcessConfig, *, compiles: bool) -> ForkRequest | None:
-    """Return how a fork server starts a process; None for one that none may start."""
+    """Return the request to fork a process; None if a fork server may not start it."""
     if not row.forks:
         return None
-    brief = msgspec.json.encode({"name": process.name, "run_dir": process.run_dir}).decode()
-    light = SHARED, row.run.partition(":")[0]
+    about = msgspec.json.encode({"name": process.name, "run_dir": process.run_dir}).decode()
+    modules = SHARED, row.run.partition(":")[0]
     return ForkRequest(
         run=FORKED,
         argument=msgspec.json.encode(process).decode(),
-        title=f"{FORKED} {brief}",
-        imports=(light, (KERNELS,)) if compiles else (light,),
+        title=f"{FORKED} {about}",
+        imports=(modules, (KERNELS,)) if compiles else (modules,),
     )
 
 
 def _names(deployment: Deployment, host: str) -> list[str]:
-    """Return the processes of `host`, including those that deployment files need not name."""
+    """Return the processes of `host`, including those that join without being named."""
     here, types = set(deployment.hosts[host]), process_types()
     joining = {name for name, row in types.items() if row.joins and row.joins(deployment, here)}
     order = list(types)
@@ -111,7 +114,7 @@ def _endpoint(deployment: Deployment, host: str, name: str, names: list[str]) ->
             names=names_by_role() if endpoint.keys else {},
             grants=grants(deployment),
         )
-    if name == "relay":  # it listens on the socket, and connects to the robot's router
+    if name == "relay":  # listens on the socket, and connects to the robot's router
         return structs.replace(endpoint, listen=(local_socket(),))
     if endpoint.keys and deployed_type(deployment, name).own:
         keys = Path(endpoint.keys) / name
@@ -124,7 +127,7 @@ def _endpoint(deployment: Deployment, host: str, name: str, names: list[str]) ->
 def _after(deployment: Deployment, name: str, names: list[str]) -> tuple[str, ...]:
     """Return the processes that must be ready before this one starts."""
     first = deployed_type(deployment, name).after
-    if name == "driver" and deployment.recorder.file:  # to record the driver from its first tick
+    if name == "driver" and deployment.recorder.file:  # records the driver's first tick as well
         first = (*first, "recorder")
     return tuple(other for other in first if other in names and other != name)
 
@@ -132,8 +135,8 @@ def _after(deployment: Deployment, name: str, names: list[str]) -> tuple[str, ..
 def _settings(
     deployment: Deployment, name: str, row: ProcessType, place: ProcessPlace
 ) -> dict[str, Any]:
-    made = row.derive(deployment, place) if row.derive else deployment.settings(name)
-    settings: dict[str, Any] = msgspec.to_builtins(made)
+    part = row.derive(deployment, place) if row.derive else deployment.settings(name)
+    settings: dict[str, Any] = msgspec.to_builtins(part)
     if "state_dir" in settings:
         settings["state_dir"] = str(place.state_dir)
     if deployment.speed != 1.0 and "compile_first" in settings:  # time waits in lock-step

@@ -1,4 +1,4 @@
-"""The supervisor's log file: starts, deaths and hangs of processes, and output that is no log."""
+"""The supervisor's log file: starts, deaths and hangs of processes, and their other output."""
 
 import logging
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ OUTPUT = "output"  # event of a line that a process printed
 
 
 class SupervisorLog:
-    """Writes what only the supervisor knows beside the logs of the processes."""
+    """Writes the records that are in no log of a process."""
 
     def __init__(self, run_dir: Path) -> None:
         self._sink = file_sink(NAME, run_dir)
@@ -25,10 +25,10 @@ class SupervisorLog:
         about = {key: value for key, value in record.items() if key not in known}
         child = {} if record["process"] == NAME else {"child": record["process"]}
         level = getattr(logging, str(record["level"]).upper(), logging.INFO)
-        made = logging.LogRecord(NAME, level, "", 0, "%s", (record.get("text", ""),), None)
-        made.data = about | child
-        self._sink.handle(made)
+        entry = logging.LogRecord(NAME, level, "", 0, "%s", (record.get("text", ""),), None)
+        entry.data = about | child
+        self._sink.handle(entry)
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the queued records, and close the file."""
         self._sink.close()

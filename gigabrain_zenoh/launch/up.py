@@ -30,12 +30,12 @@ from gigabrain_zenoh.launch.supervisor_log import SupervisorLog
 from gigabrain_zenoh.runtime.running import announced
 from gigabrain_zenoh.runtime.supervisor import Supervisor
 
-SHARE = 0.4  # fraction of the watchdog's timeout between two keep-alives
+KEEP_ALIVE_SHARE = 0.4  # of the watchdog's timeout between two keep-alives
 
 
-# own code: sdnotify 0.3.2 sends blocking and in Latin-1, and leaves NOTIFY_SOCKET to children
+# own code: sdnotify 0.3.2 blocks, sends Latin-1, and does not hide NOTIFY_SOCKET from children
 class Notifier:
-    """Sends one service's state to its manager. Errors are ignored: the robot continues."""
+    """Sends the state of this service to its manager. It ignores errors: the robot continues."""
 
     def __init__(
         self,
@@ -45,7 +45,7 @@ class Notifier:
     ) -> None:
         self._address = "\0" + address[1:] if address.startswith("@") else address
         self._watchdog_s, self._now_s = watchdog_s, now_s
-        self._fed_s: float | None = None
+        self._fed_s: float | None = None  # time of the last keep-alive
         self._status, self._ready = "", False
 
     @classmethod
@@ -53,9 +53,9 @@ class Notifier:
         """Create a notifier from the service manager's variables, and unset them."""
         address = os.environ.pop("NOTIFY_SOCKET", "")
         microseconds = os.environ.pop("WATCHDOG_USEC", "")
-        meant = os.environ.pop("WATCHDOG_PID", "") or str(os.getpid())
-        fed = microseconds.isdecimal() and meant == str(os.getpid())
-        return cls(address, int(microseconds) / 1e6 if fed else None)
+        watched_pid = os.environ.pop("WATCHDOG_PID", "") or str(os.getpid())
+        watched = microseconds.isdecimal() and watched_pid == str(os.getpid())
+        return cls(address, int(microseconds) / 1e6 if watched else None)
 
     def ready(self) -> None:
         """Report that the service is ready; sent only once."""
@@ -78,7 +78,7 @@ class Notifier:
         now_s = self._now_s()
         if self._watchdog_s is None:
             return
-        if self._fed_s is None or now_s - self._fed_s >= SHARE * self._watchdog_s:
+        if self._fed_s is None or now_s - self._fed_s >= KEEP_ALIVE_SHARE * self._watchdog_s:
             self._fed_s = now_s
             self._send("WATCHDOG=1")
 
@@ -94,11 +94,11 @@ class Notifier:
             out.sendto(line.encode(), self._address)
 
 
-STOP_S = 1.5  # until processes that do not end are killed
-LIMIT_S = STOP_S + 2.0  # until the supervisor itself is ended by force
-LOOK_S = 0.1
-RETRY_S = 1.0  # between looks whether the clock is set, or the disk has space
-ROUTERS = {"router", "relay"}  # without one of them no message is delivered on the host
+STOP_S = 1.5  # then processes that do not end are killed
+LIMIT_S = STOP_S + 2.0  # then the supervisor itself is killed
+CHECK_S = 0.1  # period of checks
+RETRY_S = 1.0  # pause between checks of the clock or of disk space
+ROUTERS = {"router", "relay"}  # without them no message is delivered on the host
 
 
 async def up(
@@ -111,9 +111,9 @@ async def up(
     file: str = "",
     rows: Sequence[Row] = (),
 ) -> None:
-    """Keep a host's processes running until Ctrl-C, also where some are given up.
+    """Keep a host's processes running until Ctrl-C, also if some are given up.
 
-    A process without progress is restarted, or with `keep_stuck` left to a debugger. `file` is the
+    A process without progress is restarted, or with `keep_stuck` left for a debugger. `file` is the
     deployment file, for errors; `rows` are the settings and their sources, for `gigabrain config`.
     Raises ConfigError for wrong settings and for a folder that cannot be written, and BusError if
     the router cannot run.
@@ -125,13 +125,13 @@ async def up(
         behaviours.check(deployment.decision)
     deployment = with_free_port(deployment)
     label = deployment.namespace or deployment.body.replace("/", "-")
-    remembers = state_dir() / "robots" / label
+    robot_dir = state_dir() / "robots" / label
     space = Waiting("space on the disk", DiskFull, print_line, notifier)
     with contextlib.ExitStack() as held:
-        await space.until_done(lambda: held.enter_context(state_locked(remembers, label, host)))
+        await space.until_done(lambda: held.enter_context(state_locked(robot_dir, label, host)))
         run_dir = await space.until_done(lambda: new_run_dir(None, label))
         write_rows(run_dir, rows)
-        specs = process_specs(deployment, host, run_dir, remembers, level=level, file=file)
+        specs = process_specs(deployment, host, run_dir, robot_dir, level=level, file=file)
         names = ", ".join(spec.name for spec in specs)
         print_line(f"{deployment.body} on {host}: {names}; logs in {run_dir}")
         if unknown := unknown_to_router(deployment, host, PROCESSES):
@@ -146,13 +146,13 @@ async def up(
 async def _supervise(
     supervisor: Supervisor, records: "_Records", notifier: Notifier, note: Path, stop: asyncio.Event
 ) -> None:
-    """Run the processes until a signal, or until there is nothing left to keep running."""
+    """Run the processes until a signal, or until a restart cannot help."""
     running = asyncio.ensure_future(supervisor.run())
     while not stop.is_set() and not running.done() and not _hopeless(supervisor):
         _report(supervisor, notifier, note)
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(stop.wait(), LOOK_S)
-    stopped = stop.is_set()  # if only later, it has ended by itself
+            await asyncio.wait_for(stop.wait(), CHECK_S)
+    stopped = stop.is_set()  # a later signal is not the reason for the end
     notifier.stopping()
     await supervisor.stop(STOP_S)
     await running
@@ -164,7 +164,7 @@ async def _supervise(
 async def _check_keys(
     deployment: Deployment, host: str, print_line: Callable[[str], None], notifier: Notifier
 ) -> None:
-    """Check the keys of a host. Wait while its clock is before them, as at boot without a battery.
+    """Check the keys of a host. Wait while they are not yet valid, as before the clock is set.
 
     Raises ConfigError.
     """
@@ -177,7 +177,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Waiting:
-    """Retries what cannot be done yet, and says so once."""
+    """Retries an action that cannot succeed yet, and reports that once."""
 
     what: str
     error: type[ConfigError]
@@ -185,7 +185,7 @@ class Waiting:
     notifier: Notifier
 
     async def until_done(self, act: Callable[[], T]) -> T:
-        """Return what `act` does, once it no longer raises the error."""
+        """Call `act` until it no longer raises the error, and return its result."""
         printed = False
         while True:
             try:
@@ -200,11 +200,11 @@ class Waiting:
 
 
 class _Records:
-    """Logs and prints what processes report, and keeps why they refused to start."""
+    """Logs and prints the records of processes, and keeps the reasons of failed starts."""
 
     def __init__(self, run_dir: Path, print_line: Callable[[str], None]) -> None:
         self._log, self._print_line = SupervisorLog(run_dir), print_line
-        # by process: the last one, and the invalid value that it names
+        # by process: text of the last failure, and the invalid value in it
         self._refusals: dict[str, tuple[str, str | None]] = {}
 
     def add(self, name: str, record: Mapping[str, Any]) -> None:
@@ -214,7 +214,7 @@ class _Records:
             record = dict(record)
             refusal = str(record.get("text", "")), record.pop("value", None)
             before, self._refusals[name] = self._refusals.get(name), refusal
-            if refusal == before:  # printed already, at the first try
+            if refusal == before:  # already printed
                 return
         self._print_line(logs.readable(record, colour=False))
 
@@ -227,12 +227,12 @@ class _Records:
             raise BusError(text)
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the queued records, and close the log."""
         self._log.close()
 
 
 def _hopeless(supervisor: Supervisor) -> list[str]:
-    """Return the processes given up without which there is nothing left to keep running."""
+    """Return the processes given up that no restart can help: misconfigured ones and routers."""
     routers = [name for name in supervisor.given_up if name in ROUTERS]
     return [*supervisor.misconfigured, *routers]
 
@@ -249,12 +249,12 @@ def _report(supervisor: Supervisor, notifier: Notifier, note: Path) -> None:
         "stuck": supervisor.stuck,
         "not ready": tuple(not_yet),
     }
-    problem_texts = [f"{what}: {', '.join(names)}" for what, names in problems.items() if names]
+    problem_texts = [f"{state}: {', '.join(names)}" for state, names in problems.items() if names]
     notifier.status("; ".join(problem_texts) or f"all ready: {', '.join(states)}")
     if not not_yet:
         notifier.ready()
     if not supervisor.stuck:
         notifier.alive()
     if not problem_texts:
-        with contextlib.suppress(OSError):  # removed meanwhile
+        with contextlib.suppress(OSError):  # another process removed it
             os.utime(note)

@@ -291,7 +291,7 @@ async def test_a_clock_that_stands_still_ends_the_demo_but_not_while_a_process_i
 ) -> None:
     """The very first start compiles, which may take minutes on a busy machine."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    monkeypatch.setattr(demo_module, "STALLED_S", 1.0)
+    monkeypatch.setattr(demo_module, "STALL_TIMEOUT_S", 1.0)
     net, stop = Net(), asyncio.Event()
     demo = Demo(Deployment(router="tcp/127.0.0.1:0"), DemoOptions(headless=True))
     statuses = demo._supervisor.statuses
@@ -303,7 +303,7 @@ async def test_a_clock_that_stands_still_ends_the_demo_but_not_while_a_process_i
     statuses["decision"].state = "ready"
     async with asyncio.timeout(60):
         await watching
-    assert demo._why() == "the robot's clock stood still for 1 s"
+    assert demo._failure() == "the robot's clock stood still for 1 s"
     await net.one.close()
     await net.two.close()
 

@@ -62,7 +62,7 @@ def stop(monkeypatch: pytest.MonkeyPatch) -> asyncio.Event:
 @pytest.fixture
 def demo(monkeypatch: pytest.MonkeyPatch) -> Demo:
     """A demo of three seconds, whose processes are ready; none really runs."""
-    monkeypatch.setattr(demo_module, "LOOK_S", 0.001)
+    monkeypatch.setattr(demo_module, "CHECK_S", 0.001)
     made = Demo(DEPLOYMENT, DemoOptions(headless=True, seconds=3.0))
     for status in made._supervisor.statuses.values():
         status.state = "ready"
@@ -107,7 +107,7 @@ def joined(demo: Demo, watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
         return watch.bus
 
     monkeypatch.setattr(demo, "_join", join)
-    monkeypatch.setattr(demo_module, "ANSWER_S", 0.0)
+    monkeypatch.setattr(demo_module, "REPORT_TIMEOUT_S", 0.0)
     monkeypatch.setattr(demo_module, "RunMonitor", lambda _: watch)
 
 
@@ -149,9 +149,9 @@ async def test_a_demo_does_not_wait_for_space_on_the_disk_of_its_driver(
     waits = {"process": "driver", "level": "warning", "text": "no space"}
     demo._record("driver", waits | {"event": "disk full"})
     await demo._watch(watch, asyncio.Event())
-    assert (watch.seconds, demo._why()) == (1.0, "no space")
+    assert (watch.seconds, demo._failure()) == (1.0, "no space")
     with pytest.raises(BodyLost, match=r"^no report: no space; logs in "):
-        demo._finish(None, demo._why(), stopped=False)
+        demo._finish(None, demo._failure(), stopped=False)
 
 
 def test_a_report_that_cannot_be_written_is_still_printed(
@@ -208,10 +208,10 @@ async def test_a_demo_that_a_person_ends_is_not_judged_and_tells_what_failed(
 async def test_a_signal_cuts_the_wait_for_the_truth_short(
     demo: Demo, watch: Watch, stop: asyncio.Event, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(demo_module, "ANSWER_S", 1000.0)
+    monkeypatch.setattr(demo_module, "REPORT_TIMEOUT_S", 1000.0)
     asyncio.get_running_loop().call_later(0.01, stop.set)
     async with asyncio.timeout(60):
-        assert await demo._ask_for_truth(watch, stop) is None
+        assert await demo._make_report(watch, stop) is None
 
 
 @pytest.mark.parametrize("name", ["decision", "router", "mine"])

@@ -71,7 +71,7 @@ async def test_keys_that_are_valid_later_are_waited_for_until_the_clock_is_set(
 ) -> None:
     own = Path(shutil.copytree(fleet, tmp_path / "fleet"))
     with monkeypatch.context() as set_back:  # of this host's clock, by a year
-        set_back.setattr(authority, "EARLY", -datetime.timedelta(days=365))
+        set_back.setattr(authority, "BACKDATED", -datetime.timedelta(days=365))
         early = authority.issue(own, "robot", name="early", days=700)
     deployment, printed = Deployment(keys=str(early)), list[str]()
 
