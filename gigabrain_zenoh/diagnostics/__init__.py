@@ -1,4 +1,4 @@
-"""Figures of a running robot for the tools: topics, processes, logs, and why it stands still.
+"""Facts about a running robot for the tools: topics, processes, logs, and why it stands still.
 
 It may import bus, client, config, gate, geometry, host, logs, runtime and security.
 Ui, commands and qa may import it.

@@ -23,7 +23,7 @@ from gigabrain_zenoh.errors import BodyLost, ConfigError, UnknownName, unknown
 from gigabrain_zenoh.host.escaping import printable
 
 PREFIX = "robot/"
-COMMAND_OF_SERVICE = {  # services that people take for topics, and the commands that call them
+COMMAND_OF_SERVICE = {  # services that users mistake for topics, and their commands
     "estop": "estop", "release": "release", "enable": "enable", "limp": "arm limp",
     "goal": "goto X Y",
     "mission": "mission FILE", "task_change": "task", "map_save": "map save",
@@ -34,15 +34,15 @@ COMMAND_OF_SERVICE = {  # services that people take for topics, and the commands
 INSTALL_MATPLOTLIB = "for pictures install: pip install 'gigabrain-zenoh[record]'"
 INK, PLAIN = "#1e293b", {"facecolor": "white", "edgecolor": "none", "pad": 1}
 BOX = {"facecolor": "#e0f2fe", "edgecolor": "#0369a1"}
-ORDER = ("driver", "perception", "decision", "control", "safety")  # along the chain
-COMMON = ("health", "log", "audit")  # every process sends these: too much for a picture
+ORDER = ("driver", "perception", "decision", "control", "safety")  # of the chain
+COMMON = ("health", "log", "audit")  # every process sends these: too many for a picture
 TEXT_COLUMNS = {"process", "host", "latency", "topic", "message", "from", "to"}
 DESCRIBE_TIMEOUT_S = 1.2
 HEALTH_WINDOW_S = 1.3  # health is published once a second
 
 
 class TopicPattern(Struct, frozen=True):
-    """A key expression to subscribe to, and the topic of the table that it belongs to.
+    """A key expression to subscribe to, and its topic in the table.
 
     Raises ConfigError for a pattern that is not a key expression.
     """
@@ -55,15 +55,15 @@ class TopicPattern(Struct, frozen=True):
 
 
 def short_name(key: str) -> str:
-    """Return a key as people type it, without `robot/`."""
+    """Return a key in its short form, without `robot/`."""
     return key.removeprefix(PREFIX)
 
 
 def topic_pattern(name: str, live_keys: Iterable[str] = ()) -> TopicPattern | None:
-    """Return the topic or keys that `name` stands for; None for an unknown name.
+    """Return the pattern for a name; None for an unknown one.
 
-    It may be `scan`, `robot/scan`, `health/driver`, a live key, or a key expression. Raises
-    ConfigError for a wrong one.
+    The name may be `scan`, `robot/scan`, `health/driver`, a live key, or a key expression. Raises
+    ConfigError for an invalid key expression.
     """
     key = current_key(PREFIX + short_name(name))
     for topic in TOPICS:
@@ -90,7 +90,7 @@ class Flow(Struct, frozen=True, order=True):
     sender: str
     key: str
     receiver: str
-    hz: float = field(default=0.0)  # as the sender last reported
+    hz: float = field(default=0.0)  # in the sender's newest health
 
 
 class Processes(Struct, frozen=True):
@@ -109,11 +109,11 @@ async def discover(bus: Bus, timeout_s: float = DESCRIBE_TIMEOUT_S) -> dict[str,
     replies = await bus.ask(
         DESCRIBE, DescribeRequest(), timeout_s=timeout_s, name="*", skip_refusals=True
     )
-    return {one.process: one for one in sorted(replies, key=lambda one: one.process)}
+    return {reply.process: reply for reply in sorted(replies, key=lambda reply: reply.process)}
 
 
 async def find_processes(bus: Bus, seconds: float = HEALTH_WINDOW_S) -> Processes:
-    """Return all processes with their health. Raises BodyLost where there are none."""
+    """Return all processes with their health. Raises BodyLost if there are none."""
     health = ProcessHealth(bus)
     described, _ = await asyncio.gather(discover(bus), asyncio.sleep(seconds))
     health.close()
@@ -123,23 +123,23 @@ async def find_processes(bus: Bus, seconds: float = HEALTH_WINDOW_S) -> Processe
 
 
 def senders(key: str, processes: Iterable[Description]) -> list[str]:
-    """Return the processes that have sent on `key`."""
-    return [one.process for one in processes if any(matches(key, sent) for sent in one.publishes)]
+    """Return the processes that sent on `key`."""
+    return [each.process for each in processes if any(matches(key, k) for k in each.publishes)]
 
 
 def receivers(key: str, processes: Iterable[Description]) -> list[str]:
     """Return the processes that subscribe to `key`."""
     return [
-        one.process
-        for one in processes
-        if any(matches(wanted, key) or matches(key, wanted) for wanted in one.subscribes)
+        each.process
+        for each in processes
+        if any(matches(wanted, key) or matches(key, wanted) for wanted in each.subscribes)
     ]
 
 
 def flows(processes: Iterable[Description], health: Mapping[str, Health]) -> list[Flow]:
     """Return every flow of messages, from senders to receivers.
 
-    A key that its sender reports at 0 Hz is no flow. Keys whose last value is kept are flows.
+    A key whose sender reports 0 Hz is not a flow, unless its last value is kept.
     """
     processes, found = tuple(processes), set()
     for sender in processes:
@@ -161,11 +161,11 @@ def chain_flows(flows: Iterable[Flow], *, everything: bool = False) -> list[Flow
 
 
 def graph_as_text(flows: Iterable[Flow]) -> Iterator[str]:
-    """Yield each process, with its keys, their rates and their receivers."""
-    for sender, of in groupby(sorted(flows), key=lambda flow: flow.sender):
+    """Yield the lines for each process, with its keys, their rates and their receivers."""
+    for sender, sent in groupby(sorted(flows), key=lambda flow: flow.sender):
         yield sender
-        for key, same in groupby(of, key=lambda flow: flow.key):
-            group = list(same)
+        for key, same_key in groupby(sent, key=lambda flow: flow.key):
+            group = list(same_key)
             to = ", ".join(flow.receiver for flow in group)
             yield f"  {short_name(key):<12} {group[0].hz:>5.1f} Hz  -> {to}"
 
@@ -216,9 +216,9 @@ def write_graph_png(flows: Iterable[Flow], path: Path) -> None:
                 shrinkA=42, shrinkB=42, color="#64748b",
             )
         )  # fmt: skip
-        bow = 0.15  # to the side to which the arrow bends
-        x = (a[0] + b[0]) / 2 + (b[1] - a[1]) * bow / 2
-        y = (a[1] + b[1]) / 2 - (b[0] - a[0]) * bow / 2
+        bend = 0.15  # moves the label to the outer side of the bent arrow
+        x = (a[0] + b[0]) / 2 + (b[1] - a[1]) * bend / 2
+        y = (a[1] + b[1]) / 2 - (b[0] - a[0]) * bend / 2
         _text(axes, (x, y), "\n".join(labels), 8, PLAIN)
     for name, place in places.items():
         _text(axes, place, name, 12, {"boxstyle": "round,pad=0.7", **BOX})
@@ -233,7 +233,7 @@ def _text(axes: Any, place: tuple[float, float], text: str, size: int, box: dict
 
 
 def graph_positions(names: Iterable[str]) -> dict[str, tuple[float, float]]:
-    """Return places on a circle, clockwise from the left, in the order of the chain."""
+    """Return positions on an ellipse, clockwise from the left, in the order of the chain."""
     order = {name: i for i, name in enumerate(ORDER)}
     found = sorted(names, key=lambda name: (order.get(name, len(order)), name))
     places = {}
@@ -252,7 +252,7 @@ def plain_table(
 ) -> Table:
     """Return a table without lines; columns named in `left` are texts, others are numbers.
 
-    Cells are shown as they are, without markup: a process may have any name.
+    Cells are shown without markup, as a process may have any name.
     """
     table = Table(box=None, pad_edge=False, header_style="dim")
     for name in columns:
@@ -264,7 +264,7 @@ def plain_table(
 
 
 def plain(cell: str) -> Text:
-    """Return a cell of any origin as it is: neither as markup nor with control characters."""
+    """Return a cell without markup, and with control characters escaped."""
     return Text(printable(cell))
 
 
@@ -276,8 +276,8 @@ def process_table(processes: Processes) -> Table:
 
 
 def _row(name: str, processes: Processes) -> tuple[str, ...]:
-    one, health = processes.described.get(name), processes.health.get(name)
-    place = one or health
+    description, health = processes.described.get(name), processes.health.get(name)
+    place = description or health
     assert place
     if health is None:
         return (name, str(place.pid), place.host, "-", "-", "-", "-", "reports no health")
@@ -295,26 +295,28 @@ def _row(name: str, processes: Processes) -> tuple[str, ...]:
 
 def describe(processes: Processes, name: str) -> Iterator[str]:
     """Yield lines that describe one process. Raises UnknownName."""
-    one, health = processes.described.get(name), processes.health.get(name)
-    if one is None and health is None:
+    description, health = processes.described.get(name), processes.health.get(name)
+    if description is None and health is None:
         raise unknown("process", name, processes.names())
-    if one is None:
+    if description is None:
         yield f"{name}: reports its health, but does not answer"
     else:
-        yield f"{name}: version {one.version}, pid {one.pid} on {one.host}"
+        yield f"{name}: version {description.version}, pid {description.pid} on {description.host}"
     if health:
         memory = f"{health.rss_bytes / 1e6:.0f} MB"
         yield f"  up {health.uptime_s:.0f} s, {health.cpu:.1%} of a core, {memory}"
-    yield from _rates("sends", one.publishes if one else (), health.sent_hz if health else {})
+    yield from _rates(
+        "sends", description.publishes if description else (), health.sent_hz if health else {}
+    )
     received_hz = health.received_hz if health else {}
-    yield from _rates("receives", one.subscribes if one else (), received_hz)
+    yield from _rates("receives", description.subscribes if description else (), received_hz)
     if health:
-        yield from (f"  problem: {one.text} ({one.remedy})" for one in health.problems)
+        yield from (f"  problem: {cause.text} ({cause.remedy})" for cause in health.problems)
         yield from _values("rejected", health.rejected)
         yield from _values("latency [ms]", health.latency_ms)
         yield from _values("counters", health.counters)
-    if one:
-        yield from _values("report", one.report)
+    if description:
+        yield from _values("report", description.report)
 
 
 def _rates(title: str, keys: tuple[str, ...], hz: Mapping[str, float]) -> Iterator[str]:

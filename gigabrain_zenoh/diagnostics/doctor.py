@@ -47,13 +47,13 @@ from gigabrain_zenoh.security.identity_files import identity_in
 
 Grade = Literal["ok", "hint", "bad"]
 SYSTEMS = ("router", "driver", "perception", "decision", "control", "safety")
-LIBRARIES: Mapping[str, tuple[int, ...]] = {  # with the lowest version
+LIBRARIES: Mapping[str, tuple[int, ...]] = {  # name and lowest version
     "eclipse-zenoh": (1, 10), "msgspec": (0, 19), "numpy": (1, 26), "pyserial": (), "pyyaml": (),
     "cyclopts": (5, 0), "rich": (), "mujoco-core": (), "ruckig": (0, 17), "cryptography": (),
     "mcap": (), "textual": (), "uvloop": (), "rosbags": (0, 11), "xxhash": (3,),
     "cyclonedds": (11,),
 }  # fmt: skip
-EXTRAS = {  # optional libraries, and the extra of the package that installs each
+EXTRAS = {  # optional libraries, and the extras of the package that install them
     "mujoco-core": "sim", "ruckig": "arm", "cryptography": "keys", "mcap": "record",
     "textual": "view", "uvloop": "fast", "rosbags": "ros2", "xxhash": "ros2", "cyclonedds": "dds",
 }  # fmt: skip
@@ -65,9 +65,9 @@ MIN_PYTHON = (3, 11)
 MIN_FREE_MB = 500.0
 MIN_KEY_DAYS = 30.0
 MAX_CLOCK_OFFSET_MS = 500.0
-MIN_RATE = 0.5  # of the promised rate
-MAX_CPU = 0.9  # of one core
-WINDOW_S = 2.5  # every process reports its health twice
+MIN_RATE = 0.5  # share of the promised rate
+MAX_CPU = 0.9  # share of one core
+WINDOW_S = 2.5  # in which every process reports its health twice
 
 
 class Diagnosis(Struct, frozen=True, kw_only=True):
@@ -110,7 +110,7 @@ class MachineFacts(Struct, frozen=True, kw_only=True):
 
     python: tuple[int, int, int]
     system: str
-    libraries: Mapping[str, str | None]  # version; None where it is not installed
+    libraries: Mapping[str, str | None]  # version by name; None if it is not installed
     folders: tuple[Folder, ...]
     ports: tuple[Port, ...]
     multicast: bool  # whether sessions search for others by multicast
@@ -119,16 +119,16 @@ class MachineFacts(Struct, frozen=True, kw_only=True):
 
 
 class RobotFacts(Struct, frozen=True, kw_only=True):
-    """State of the robot, or why it cannot be reached."""
+    """State of the robot, or the problem in reaching it."""
 
     problem: str = ""
     router: str = ""
-    port_open: bool = False  # whether anything listens at `router`, where it does not answer
+    port_open: bool = False  # another program listens at `router`
     described: Mapping[str, Description] = {}
     health: Mapping[str, Health] = {}  # newest, by process
-    lead_ms: Mapping[str, float] = {}  # by host: smallest offset by which its clock is behind ours
-    control_topic: str = CMD_VEL.key  # which the body obeys
-    unneeded: frozenset[str] = frozenset()  # keys of what the body has no use for
+    lead_ms: Mapping[str, float] = {}  # smallest lead of our clock over a host's, by host
+    control_topic: str = CMD_VEL.key  # key that the body obeys
+    unneeded: frozenset[str] = frozenset()  # keys that the body does not need
     pace: float | None = None  # robot's time over real time
 
 
@@ -144,7 +144,7 @@ def examine(machine: MachineFacts, robot: RobotFacts) -> list[Diagnosis]:
 
 def exit_code(results: Sequence[Diagnosis]) -> int:
     """Return 1 if any result is bad; hints do not count."""
-    return int(any(one.grade == "bad" for one in results))
+    return int(any(result.grade == "bad" for result in results))
 
 
 def _ok(about: str, text: str) -> Diagnosis:
@@ -222,15 +222,16 @@ def _multicast(machine: MachineFacts) -> Iterator[Diagnosis]:
 
 
 def _certificate(machine: MachineFacts) -> Iterator[Diagnosis]:
-    mine = machine.certificate
-    if mine is None:
+    certificate = machine.certificate
+    if certificate is None:
         return
     cure = "issue a new identity with `gigabrain keys issue`, and copy its folder here"
-    if mine.problem:
-        yield _bad("keys", mine.problem, cure)
+    if certificate.problem:
+        yield _bad("keys", certificate.problem, cure)
         return
-    text = f"{mine.name} in {mine.folder}: {mine.days_left:.0f} days left"
-    yield _bad("keys", text, cure) if mine.days_left < MIN_KEY_DAYS else _ok("keys", text)
+    text = f"{certificate.name} in {certificate.folder}: {certificate.days_left:.0f} days left"
+    expires_soon = certificate.days_left < MIN_KEY_DAYS
+    yield _bad("keys", text, cure) if expires_soon else _ok("keys", text)
 
 
 def _router(robot: RobotFacts) -> Iterator[Diagnosis]:
@@ -253,16 +254,17 @@ def _processes(robot: RobotFacts) -> Iterator[Diagnosis]:
         if name not in robot.described:
             cure = f"start it, or read its log: gigabrain log --process {name}"
             yield _bad(name, "does not answer", cure)
-    for name, one in robot.described.items():
+    for name, description in robot.described.items():
         health = robot.health.get(name)
         if health is None:
             cure = f"it may hang; read its log: gigabrain log --process {name}"
-            yield _bad(name, f"pid {one.pid} on {one.host} reports no health", cure)
+            place = f"pid {description.pid} on {description.host}"
+            yield _bad(name, f"{place} reports no health", cure)
         else:
             memory = f"{health.rss_bytes / 1e6:.0f} MB"
-            text = f"{one.version}, pid {one.pid} on {one.host}, {health.cpu:.1%}, {memory}"
-            yield _ok(name, text)
-    versions = {one.version for one in robot.described.values()}
+            place = f"pid {description.pid} on {description.host}"
+            yield _ok(name, f"{description.version}, {place}, {health.cpu:.1%}, {memory}")
+    versions = {description.version for description in robot.described.values()}
     if len(versions) > 1:
         cure = "install the same version on all hosts"
         yield _bad("versions", f"the processes differ: {', '.join(sorted(versions))}", cure)
@@ -343,7 +345,7 @@ def _version(name: str) -> str | None:
 
 def _folder(path: Path) -> Folder:
     existing = path
-    while not os.path.exists(existing):  # or may not be looked at
+    while not os.path.exists(existing):  # also false without permission
         existing = existing.parent
     free_mb = shutil.disk_usage(existing).free / 1e6
     return Folder(path=str(path), writable=os.access(existing, os.W_OK), free_mb=free_mb)
@@ -352,7 +354,7 @@ def _folder(path: Path) -> Folder:
 def _ports() -> Iterator[Port]:
     for port in sorted(list_ports.comports(), key=lambda port: str(port.device)):
         if port.vid is None:
-            continue  # built into the computer, so no robot
+            continue  # built into the computer, so it is not a robot
         usable = os.access(port.device, os.R_OK | os.W_OK)
         usb, about = f"{port.vid:04x}:{port.pid:04x}", str(port.description or "")
         yield Port(path=port.device, about=about, usb=usb, usable=usable)
@@ -368,7 +370,7 @@ def _load_certificate(keys: str) -> Certificate:
 
 
 async def inspect_robot(where: Where, seconds: float = WINDOW_S) -> tuple[RobotFacts, str]:
-    """Return the state of the robot, and the folder of the identity that reaches it."""
+    """Return the state of the robot, and the folder of the identity used to connect."""
     try:
         endpoint = running.find_endpoint(where.connect, where.namespace, where.keys)
     except (BusError, ConfigError) as error:
@@ -383,7 +385,7 @@ async def inspect_robot(where: Where, seconds: float = WINDOW_S) -> tuple[RobotF
 
 
 async def _port_open(endpoint: str) -> bool:
-    """Return whether anything accepts connections at an endpoint such as tcp/127.0.0.1:7447."""
+    """Return whether a program accepts connections at an endpoint such as tcp/127.0.0.1:7447."""
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     if not port.isdigit():
         return False
@@ -428,7 +430,7 @@ def _control_topic(body: Body | None) -> str:
 
 
 def _unneeded(body: Body | None) -> frozenset[str]:
-    """Return the keys of scans and worlds for an arm that is fixed and has no lidar."""
+    """Return the keys of scans and worlds if the body is a fixed arm without a lidar."""
     fixed = body is not None and not body.description.has_base and not body.description.lidar
     return frozenset((SCAN.key, WORLD.key)) if fixed else frozenset()
 

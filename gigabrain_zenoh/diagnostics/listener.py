@@ -1,4 +1,4 @@
-"""Finds the topic that a name stands for, and receives its messages."""
+"""Finds a topic by name, and receives its messages."""
 
 import asyncio
 import os
@@ -24,14 +24,14 @@ from gigabrain_zenoh.runtime.connect import Where, connect
 from gigabrain_zenoh.runtime.running import find_endpoint
 
 SNAPSHOT_S = 1.2  # long enough for topics of 1 Hz
-MAX_QUEUED = 256  # messages that wait to be shown; beyond it the oldest is dropped
+MAX_QUEUED = 256  # messages waiting for display; then the oldest is dropped
 CLIENT_NAME = "tool"
 ALL_KEYS, ROBOT_KEYS = "**", "robot/**"
-STDOUT: Final = 1  # the descriptor; sys.stdout may be replaced
+STDOUT: Final = 1  # file descriptor; sys.stdout may be replaced
 
 
 class RawMessage(Struct, frozen=True):
-    """One message as it arrived."""
+    """One received message, not decoded."""
 
     key: str
     payload: bytes
@@ -46,13 +46,13 @@ class Snapshot(Struct, frozen=True):
 
     @property
     def live_keys(self) -> set[str]:
-        """Return the keys on which anything was sent."""
-        published = {key for one in self.processes.values() for key in one.publishes}
+        """Return the keys on which a message was sent."""
+        published = {key for each in self.processes.values() for key in each.publishes}
         return published | set(self.monitor.streams())
 
 
 def widest_pattern(where: Where) -> str:
-    """Return the widest key expression allowed; with keys a router permits only the robot's."""
+    """Return the widest allowed key expression; with keys a router permits only the robot's."""
     keys = find_endpoint(where.connect, where.namespace, where.keys).keys
     return ROBOT_KEYS if keys else ALL_KEYS
 
@@ -69,7 +69,7 @@ async def snapshot(bus: Bus, pattern: str = ALL_KEYS, seconds: float = SNAPSHOT_
 async def open_topic(
     where: Where, name: str, *, looks_on: bool = False
 ) -> AsyncIterator[tuple[Bus, TopicPattern]]:
-    """Connect, and find the topic that `name` stands for. Raises BusError and ConfigError."""
+    """Connect, and find the topic `name`. Raises BusError and ConfigError."""
     async with connect(where, CLIENT_NAME, looks_on=looks_on) as bus:
         found = topic_pattern(name)
         if found is None:
@@ -81,9 +81,9 @@ async def open_topic(
 
 
 async def messages(bus: Bus, wanted: TopicPattern) -> AsyncIterator[RawMessage | int]:
-    """Yield messages as they arrive, the kept value first; an int is a number of dropped ones.
+    """Yield messages as they arrive, the kept value first; an int counts dropped messages.
 
-    They are queued in Zenoh's own thread, as the output may block the loop for as long as it likes.
+    Zenoh's thread queues them, as the output may block the event loop for any time.
     """
     loop, arrived = asyncio.get_running_loop(), asyncio.Event()
     queue: deque[RawMessage] = deque(maxlen=MAX_QUEUED)
@@ -120,7 +120,7 @@ async def messages(bus: Bus, wanted: TopicPattern) -> AsyncIterator[RawMessage |
 def stop_on_broken_pipe(stop: asyncio.Event) -> Iterator[None]:
     """Set `stop` as soon as the other end of the pipe on stdout is closed.
 
-    Otherwise `gigabrain log --follow | head -1` ends only with the next line, which may never come.
+    Otherwise `gigabrain log --follow | head -1` would end only at the next line.
     """
     loop = asyncio.get_running_loop()
     if not stat.S_ISFIFO(os.fstat(STDOUT).st_mode):
@@ -131,7 +131,7 @@ def stop_on_broken_pipe(stop: asyncio.Event) -> Iterator[None]:
         loop.remove_reader(STDOUT)
         stop.set()
 
-    loop.add_reader(STDOUT, closed)  # the writing end is never readable: only closing wakes us
+    loop.add_reader(STDOUT, closed)  # the writing end is never readable, so this runs only on close
     try:
         yield
     finally:

@@ -1,4 +1,4 @@
-"""Reads the logs of a run from its files, and those on the bus in the same form."""
+"""Reads logs of a run from its files, and from the bus in the same form."""
 
 import asyncio
 import heapq
@@ -34,7 +34,7 @@ class LogFilter(msgspec.Struct, frozen=True, kw_only=True):
     """Selects the log lines to show."""
 
     process: str = ""  # empty for all
-    level: str = "debug"  # lowest
+    level: str = "debug"  # lowest level to show
     since_ns: int = 0  # Unix time
 
     def __post_init__(self) -> None:
@@ -44,7 +44,8 @@ class LogFilter(msgspec.Struct, frozen=True, kw_only=True):
     def accepts(self, line: Line) -> bool:
         """Return whether to show a line."""
         return (
-            self.process in ("", line["process"], line.get("child"))  # as the supervisor saw it
+            self.process
+            in ("", line["process"], line.get("child"))  # or the supervisor's line about it
             and LEVELS.index(line["level"]) >= LEVELS.index(self.level)
             and line["t"] >= self.since_ns
         )
@@ -61,7 +62,7 @@ def ago_ns(text: str, now_ns: int) -> int:
 def run_folder(name: str = "") -> Path:
     """Return the folder of a run, by path or part of its name.
 
-    Without a name it is the newest of those that run now, or else the newest of all. Raises
+    Without a name it is the newest run that is still running, else the newest of all. Raises
     ConfigError and UnknownName.
     """
     if name and Path(name).is_dir():
@@ -89,8 +90,10 @@ def read(folder: Path, wanted: LogFilter, newest: int) -> list[Line]:
         raise unknown("log of a process", wanted.process, names)
     try:
         lines = (line for path in files for line in _lines(path) if wanted.accepts(line))
-        # of all lines of a long run only the newest are held in memory
-        numbered = heapq.nlargest(newest, enumerate(lines), key=lambda one: (one[1]["t"], one[0]))
+        # keeps only the newest lines of a long run in memory
+        numbered = heapq.nlargest(
+            newest, enumerate(lines), key=lambda each: (each[1]["t"], each[0])
+        )
     except OSError as error:
         raise ConfigError(f"cannot read {error.filename}: {error.strerror}") from None
     return [line for _, line in reversed(numbered)]
@@ -131,7 +134,7 @@ def as_line(record: LogRecord) -> Line:
 
 
 def _identity(line: Line) -> tuple[str, int]:
-    """Return what a line from a file and the record of it on the bus have in common."""
+    """Return the key by which a line from a file equals its record from the bus."""
     return line["process"][:64], line["t"]
 
 
@@ -140,8 +143,8 @@ async def follow_log(
 ) -> None:
     """Pass the `logged` lines to `show`, then new ones, until a signal or a broken pipe.
 
-    `logged` is called in a thread, and only once all processes know of the subscription. So no line
-    is lost in between, and none comes twice.
+    It calls `logged` in a thread, after all processes know of the subscription. So no line is lost
+    or shown twice.
     """
     early: deque[Line] = deque(maxlen=MAX_EARLY)
     known: set[tuple[str, int]] | None = None
@@ -158,7 +161,7 @@ async def follow_log(
     bus.subscribe(LOG, receive)
     with stop_signals() as stop, stop_on_broken_pipe(stop):
         stopped = asyncio.ensure_future(stop.wait())
-        reading = asyncio.ensure_future(_read_behind(bus, logged))
+        reading = asyncio.ensure_future(_read_after_subscribing(bus, logged))
         waiting = (stopped, bus.failed)
         await asyncio.wait((*waiting, reading), return_when=asyncio.FIRST_COMPLETED)
         if reading.done():
@@ -171,10 +174,10 @@ async def follow_log(
         reading.cancel()
         stopped.cancel()
     if bus.failed.done():
-        bus.failed.result()  # raises, as where the reader of the pipe is gone
+        bus.failed.result()  # raises its error, such as a broken pipe
 
 
-async def _read_behind(bus: Bus, logged: Callable[[], list[Line]]) -> list[Line]:
-    """Read the files after each process has answered, and so knows of the subscription."""
+async def _read_after_subscribing(bus: Bus, logged: Callable[[], list[Line]]) -> list[Line]:
+    """Read the files after each process replied, and so knows of the subscription."""
     await discover(bus)
     return await asyncio.to_thread(logged)

@@ -18,12 +18,12 @@ from gigabrain_zenoh.codec import DECODE_ERRORS, Codec
 from gigabrain_zenoh.errors import unknown
 from gigabrain_zenoh.host import escaping
 
-MAX_LISTED = 8  # numbers; longer lists are summarised
+MAX_LISTED = 8  # numbers of a list; longer lists are summarised
 MAX_RAW_BYTES = 64  # shown of a payload that cannot be decoded
 
 
 class Summary(Struct, frozen=True, kw_only=True):
-    """Statistics of an array: minimum, median and maximum are of its finite values."""
+    """Statistics of an array; minimum, median and maximum of its finite values."""
 
     count: int
     min: float | None = None
@@ -38,7 +38,7 @@ class Summary(Struct, frozen=True, kw_only=True):
             value = getattr(self, name)
             if value is not None:
                 parts.append(f"{name} {value:.6g}")
-        parts += [f"{n} {what}" for n, what in ((self.nan, "nan"), (self.inf, "inf")) if n]
+        parts += [f"{n} {kind}" for n, kind in ((self.nan, "nan"), (self.inf, "inf")) if n]
         return ", ".join(parts)
 
 
@@ -57,7 +57,7 @@ def summary(values: Sequence[float] | NDArray[np.generic]) -> Summary:
 
 
 def array_of(message: Message) -> tuple[str, NDArray[np.generic]] | None:
-    """Return the name and the content of a message's array field; None where it has none."""
+    """Return the name and the content of a message's array field; None without one."""
     if isinstance(message, LaserScan):
         return "ranges", message.ranges_m
     if isinstance(message, OccupancyGrid):
@@ -77,7 +77,7 @@ def _json_number(value: float) -> float | str | None:
 def read(key: str, payload: bytes, *, whole: bool) -> Any:
     """Decode a payload to a tree of plain values.
 
-    Arrays are summarised unless `whole`; images always are.
+    Arrays are summarised unless `whole`; images always.
     """
     topic = topic_of(key)
     if topic is None:
@@ -122,7 +122,7 @@ def _foreign(payload: bytes) -> Any:
 
 
 def _raw(payload: bytes) -> str:
-    """Return the first bytes as ASCII, or as hex where they are not ASCII."""
+    """Return the first bytes as ASCII, or as hex if they are not ASCII."""
     more = "" if len(payload) <= MAX_RAW_BYTES else f" … {len(payload)} bytes"
     try:
         return payload[:MAX_RAW_BYTES].decode("ascii") + more
@@ -173,7 +173,7 @@ def in_a_line(value: Any) -> str:
 def pick(value: Mapping[str, Any], fields: Sequence[str]) -> dict[str, Any]:
     """Return the fields at dotted paths such as `velocity.linear_x` or `joints.0.name`.
 
-    A field without a value now, such as the charge of a body without a battery, is None. Raises
+    A field without a value, such as the charge of a body without a battery, is None. Raises
     UnknownName for a field that does not exist.
     """
     return {field: _at(value, field) for field in fields}

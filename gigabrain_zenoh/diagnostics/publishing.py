@@ -22,11 +22,11 @@ from gigabrain_zenoh.runtime.connect import Where
 
 M = TypeVar("M", bound=Message)
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
-SUBSCRIBERS_S = 0.5  # until routers know all subscribers, before the first message
+DISCOVERY_S = 0.5  # for the discovery of subscribers, before the first message
 
 
 def parse_message(topic: Topic[M], words: Sequence[str]) -> M:
-    """Return the message of a JSON object, or of words such as `linear_x=0.1 pose.x=2`.
+    """Build a message from a JSON object, or from words such as `linear_x=0.1 pose.x=2`.
 
     Raises ConfigError, and UnknownName for a field.
     """
@@ -64,7 +64,7 @@ def _tree(words: Sequence[str]) -> dict[str, Any]:
 
 
 def _value(text: str) -> Any:
-    """Return a number, or a JSON value; else the text itself."""
+    """Parse a number or a JSON value; return any other text unchanged. Raises ConfigError."""
     if NUMBER.fullmatch(text):
         return int(text) if re.fullmatch(r"[-+]?\d+", text) else float(text)
     if text in ("true", "false", "null") or text[:1] in '[{"':
@@ -83,24 +83,24 @@ async def publish(
     count: int | None,
     name: str = "",
 ) -> int:
-    """Publish a message once, `count` times, or at `rate` [Hz] until Ctrl-C; return how often."""
+    """Publish a message once, `count` times, or at `rate` [Hz] until Ctrl-C; return the count."""
     wanted = count if count is not None else (None if rate else 1)
     sent = 0
     with stop_signals() as stop:
-        await asyncio.sleep(SUBSCRIBERS_S)
+        await asyncio.sleep(DISCOVERY_S)
         async for _ in bus.clock.every(round(1e9 / (rate or 10.0))):
             if stop.is_set() or wanted == sent:
                 break
             bus.publish(topic, message, name=name)
             sent += 1
-        await bus.clock.sleep_ns(50_000_000)  # for the last one to leave
+        await bus.clock.sleep_ns(50_000_000)  # lets the last message leave
     return sent
 
 
 async def drive(
     where: Where, name: str, words: Sequence[str], seconds: float | None, *, take: bool
 ) -> str:
-    """Drive by cmd_vel, or by the control topic of this body; return the result as text.
+    """Drive with a velocity of cmd_vel or the body's control topic; return the result as text.
 
     Raises UnknownName for any other topic, ConfigError and Refused.
     """
@@ -145,7 +145,7 @@ async def _send_velocity(robot: Robot, command: CmdVel, seconds: float | None) -
 
 
 async def _return_body(robot: Robot, commander: str) -> str:
-    """Enable the brain again if it drove before; for any other commander silence idles the gate."""
+    """Enable the brain again if it drove before; otherwise the gate becomes idle by itself."""
     if commander != BRAIN:
         return "the robot is idle now"
     try:

@@ -1,4 +1,4 @@
-"""Newest messages of a robot, for all that show it or judge it."""
+"""Newest messages of a robot, for tools that show or check it."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -27,7 +27,7 @@ from gigabrain_zenoh.host.bounded import put_newest
 
 M = TypeVar("M", bound=Message)
 
-MAX_PROCESSES = 64  # whose health is kept
+MAX_PROCESSES = 64  # with kept health
 
 
 class ProcessHealth:
@@ -35,7 +35,7 @@ class ProcessHealth:
 
     def __init__(self, bus: Bus, on_new: Callable[[Health], None] = lambda _: None) -> None:
         self.newest: dict[str, Health] = {}
-        self.arrived_ns: dict[str, int] = {}  # by the bus's clock
+        self.arrived_ns: dict[str, int] = {}  # times of the bus's clock
         self._clock, self._on_new = bus.clock, on_new
         self.close = bus.subscribe(HEALTH, self._add)
 
@@ -77,7 +77,7 @@ class RobotView:
 
 
 class SampledView(RobotView):
-    """The same, but messages of busy topics are decoded when they are read."""
+    """Newest messages of a robot; those of busy topics are decoded when they are read."""
 
     def __init__(self, bus: Bus) -> None:
         self.sampled: dict[Topic[Any], Sampled[Any]] = {}

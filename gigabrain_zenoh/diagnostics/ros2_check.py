@@ -1,6 +1,6 @@
-"""The usual mistakes with ROS 2: settings of this shell against those of the gateway. Pure.
+"""Common mistakes with ROS 2: compares settings of this shell with those of the gateway. Pure.
 
-What the gateway itself sees of the ROS graph is among the problems in its health.
+Problems that the gateway itself finds in the ROS graph are in its health.
 """
 
 import os
@@ -21,15 +21,15 @@ RMW_ZENOH = "rmw_zenoh_cpp"
 
 
 class Shell(Struct, frozen=True, kw_only=True):
-    """State of this shell and of its computer that nodes of ROS started here would use."""
+    """Settings of this shell and computer that affect ROS nodes started here."""
 
-    variables: Mapping[str, str] = {}  # those of VARIABLES that are set
+    variables: Mapping[str, str] = {}  # the set ones of VARIABLES
     host: str = ""
-    multicast: tuple[str, ...] = ()  # network interfaces that can, other than the loopback
+    multicast: tuple[str, ...] = ()  # network interfaces with multicast, without the loopback
 
 
 class Point(NamedTuple):
-    """One result."""
+    """Result of one check."""
 
     grade: Literal["ok", "hint", "bad"]
     text: str
@@ -51,7 +51,7 @@ def inspect_shell() -> Shell:
 
 
 def check_ros2(gateway: Description, shell: Shell) -> Iterator[Point]:
-    """Yield what is right and wrong between a running gateway and nodes of this shell."""
+    """Compare a running gateway with the settings for nodes of this shell; yield the results."""
     report = gateway.report
     transport, domain = report.get("transport"), report.get("domain")
     others = report.get("other_nodes")
@@ -60,7 +60,7 @@ def check_ros2(gateway: Description, shell: Shell) -> Iterator[Point]:
         yield Point("ok", f"{known}, other nodes: {others}")
     else:
         yield Point("hint", f"{known}, no other node is found", str(report.get("to_check", "")))
-    if shell.variables:  # else nobody starts nodes of ROS here
+    if shell.variables:  # without them, no ROS nodes are started here
         yield from _domain(domain, shell)
         yield from _middleware(transport, shell)
         yield from _distribution(transport, report.get("distro"), shell)
@@ -91,12 +91,12 @@ def _distribution(transport: object, distro: object, shell: Shell) -> Iterator[P
     if (here == "humble") == (distro == "humble"):
         return
     text = f"ROS here is {here}, the gateway is set to {distro}: Humble has no type hashes"
-    # over DDS only the names of nodes are missing
+    # over DDS this only loses the names of nodes
     yield Point("bad" if transport == "rmw_zenoh" else "hint", text, f"set distro: {here}")
 
 
 def _reach(gateway: Description, shell: Shell) -> Iterator[Point]:
-    """Yield what keeps DDS from finding nodes: on one machine, or between two."""
+    """Yield settings that keep DDS from finding nodes, on one machine or between two."""
     here, variables = gateway.host == shell.host, shell.variables
     local = next((text for name, value in variables.items() if (text := _local(name, value))), "")
     if variables.get("ROS_AUTOMATIC_DISCOVERY_RANGE") == "OFF":
@@ -116,7 +116,7 @@ def _reach(gateway: Description, shell: Shell) -> Iterator[Point]:
 
 
 def _local(name: str, value: str) -> str:
-    """Return a setting that keeps nodes to their machine; empty for another one."""
+    """Return a setting that limits nodes to their machine; empty for other settings."""
     only = {"ROS_LOCALHOST_ONLY": ("1",), "ROS_AUTOMATIC_DISCOVERY_RANGE": ("LOCALHOST", "OFF")}
     return f"{name}={value}" if value in only.get(name, ()) else ""
 

@@ -14,13 +14,13 @@ from gigabrain_zenoh.host.escaping import printable
 
 BARS = "▁▂▃▄▅▆▇█"
 MAX_BARS = 20
-SILENT_AFTER_S = 3.0  # a process that reports no health
+SILENT_AFTER_S = 3.0  # without a health report
 Cell = str | float
 Rows = dict[str, tuple[Cell, ...]]
 
 
-# the latency is the largest that a process measures; delays are by stamp, their median;
-# jitter is the standard deviation of the gaps; "latency" and "delay" are sparklines
+# "latency ms" is the largest that a process measures; "delay ms" is the median since the stamps;
+# "jitter ms" is the standard deviation of the gaps; "latency" and "delay" are sparklines
 PROCESS_COLUMNS = ("process", "state", "CPU %", "MB", "sends Hz", "receives Hz", "rejected",
                    "latency ms", "latency", "up s")  # fmt: skip
 TOPIC_COLUMNS = ("topic", "Hz", "promised", "kB/s", "bytes", "delay ms", "delay", "jitter ms",
@@ -46,7 +46,7 @@ def process_cells(health: Health, age_s: float, latencies: str = "") -> tuple[Ce
 def topic_cells(
     key: str, stats: StreamStats | None, age_s: float, missing: int, delays: str = ""
 ) -> tuple[Cell, ...]:
-    """Return the row of a key; `stats` is None where nothing arrived."""
+    """Return the row of a key; `stats` is None if nothing arrived."""
     topic = topic_of(key)
     promised_hz: Cell = topic.hz if topic else ""
     if stats is None:
@@ -77,13 +77,13 @@ def sorted_rows(
 ) -> list[tuple[str, tuple[Cell, ...]]]:
     """Return rows sorted by one column; empty cells come last in both directions."""
     empty = [item for item in rows.items() if item[1][column] == ""]
-    rest = [item for item in rows.items() if item[1][column] != ""]
-    rest.sort(key=lambda item: (isinstance(item[1][column], str), item[1][column]), reverse=down)
-    return rest + empty
+    filled = [item for item in rows.items() if item[1][column] != ""]
+    filled.sort(key=lambda item: (isinstance(item[1][column], str), item[1][column]), reverse=down)
+    return filled + empty
 
 
 class History:
-    """Newest values by name, as sparklines."""
+    """Newest values by name, for sparklines."""
 
     def __init__(self) -> None:
         self._values: dict[str, deque[float]] = {}

@@ -61,7 +61,7 @@ class TopApp(App[None]):
         for name, columns in COLUMNS.items():
             table = self._table(name)
             for i, label in enumerate(columns):
-                table.add_column(f"{label}  ", key=str(i))  # room for the arrow
+                table.add_column(f"{label}  ", key=str(i))  # spaces for the arrow
         self._table("processes").focus()
         self._refresh()
         self.set_interval(PERIOD_S, self._refresh)
@@ -129,7 +129,7 @@ def _text(cell: Cell) -> Text:
 
 
 async def watch(feed: Feed) -> None:
-    """Show the tables until the user quits, or a signal."""
+    """Show the tables until the user quits or a signal arrives."""
     app = TopApp(feed)
     with stop_signals() as stop:
         running = asyncio.ensure_future(app.run_async())

@@ -20,7 +20,7 @@ from gigabrain_zenoh.bus.headers import SequenceGaps, header_of
 M = TypeVar("M", bound=Message)
 
 MAX_ARRIVALS = 2000  # kept per key
-MAX_KEYS = 1000  # counted; any client may publish on new ones
+MAX_KEYS = 1000  # a client may publish on any number of keys
 HOPS: tuple[Topic[Any], ...] = (SCAN, WORLD, INTENT, CMD_VEL)
 CHAIN: tuple[Topic[Any], ...] = (*HOPS, STATE, BODY)
 
@@ -30,11 +30,11 @@ class Arrival(Struct, frozen=True):
 
     at_ns: int  # monotonic
     size: int  # [bytes]
-    delay_ns: int | None  # since it was stamped, by this host's clock; None without a stamp
+    delay_ns: int | None  # since its stamp, by this host's clock; None without a stamp
 
 
 class StreamStats(Struct, frozen=True, kw_only=True):
-    """Statistics of one key over some time. Gaps are between neighbouring arrivals [ms]."""
+    """Statistics of one key over some time. Gaps are times between consecutive arrivals."""
 
     count: int
     hz: float
@@ -55,26 +55,26 @@ class Stream:
         self.arrivals: deque[Arrival] = deque(maxlen=MAX_ARRIVALS)
 
     def add(self, size: int, stamp_ns: int, at_ns: int, unix_ns: int) -> None:
-        """Add a message; `stamp_ns` is 0 where its sender has not stamped it."""
+        """Add a message; `stamp_ns` is 0 for a message without a stamp."""
         delay_ns = unix_ns - stamp_ns if stamp_ns else None
         self.arrivals.append(Arrival(at_ns, size, delay_ns))
 
     def stats(self, since_ns: int, now_ns: int) -> StreamStats | None:
         """Return statistics of the arrivals after `since_ns`; None without any."""
         newest = itertools.takewhile(lambda a: a.at_ns > since_ns, reversed(self.arrivals))
-        some = [a for a in newest if a.at_ns <= now_ns][::-1]
-        if not some:
+        arrivals = [a for a in newest if a.at_ns <= now_ns][::-1]
+        if not arrivals:
             return None
-        times = [a.at_ns for a in some]
+        times = [a.at_ns for a in arrivals]
         gaps = [(b - a) / 1e6 for a, b in itertools.pairwise(times)]
-        delays = [a.delay_ns / 1e6 for a in some if a.delay_ns is not None]
+        delays = [a.delay_ns / 1e6 for a in arrivals if a.delay_ns is not None]
         span_s = (times[-1] - times[0]) / 1e9
         seconds = max((now_ns - since_ns) / 1e9, 1e-9)
         return StreamStats(
-            count=len(some),
-            hz=len(gaps) / span_s if span_s else len(some) / seconds,
-            bytes_s=sum(a.size for a in some) / seconds,
-            size=round(statistics.median(a.size for a in some)),
+            count=len(arrivals),
+            hz=len(gaps) / span_s if span_s else len(arrivals) / seconds,
+            bytes_s=sum(a.size for a in arrivals) / seconds,
+            size=round(statistics.median(a.size for a in arrivals)),
             gap_min_ms=min(gaps, default=None),
             gap_max_ms=max(gaps, default=None),
             gap_std_ms=statistics.pstdev(gaps) if gaps else None,
@@ -89,7 +89,7 @@ class Stream:
 
 
 class TopicMonitor:
-    """Streams by key. Filled in Zenoh's thread, read in that of the event loop."""
+    """Streams by key. Zenoh's thread adds to them, the event loop's thread reads them."""
 
     def __init__(
         self,
@@ -125,14 +125,14 @@ class TopicMonitor:
         return {key: stats for key, stats in sorted(found.items()) if stats}
 
     def missing(self, key: str) -> int:
-        """Return how many messages were sent on `key` and have not arrived."""
+        """Return the number of messages that were sent on `key` but did not arrive."""
         with self._lock:
             return self._gaps.missing[key]
 
 
 @contextmanager
 def monitored(bus: Bus, pattern: str) -> Iterator[TopicMonitor]:
-    """Count what arrives on `pattern` while the block runs."""
+    """Count the messages on `pattern` while the block runs."""
     monitor = TopicMonitor()
     close = bus.tap(pattern, monitor.add)
     try:
@@ -142,14 +142,14 @@ def monitored(bus: Bus, pattern: str) -> Iterator[TopicMonitor]:
 
 
 class ChainMonitor:
-    """Newest message per topic of the chain, and the time of the first one of each tick."""
+    """Newest message per topic of the chain, and the stamp of the first one for each basis."""
 
     def __init__(self) -> None:
         self._newest: dict[str, Message] = {}
         self._sent_ns: dict[str, dict[int, int]] = {topic.key: {} for topic in HOPS}
 
     def add(self, key: str, message: Message) -> None:
-        """Add a message. All processes of the chain stamp by the clock of one host."""
+        """Add a message. All processes of the chain must use the clock of one host."""
         self._newest[key] = message
         if key in self._sent_ns:
             self._sent_ns[key].setdefault(message.basis, message.stamp_ns)
@@ -157,8 +157,8 @@ class ChainMonitor:
     @property
     def complete(self) -> bool:
         """Return whether each topic has a message, and one scan has passed all hops."""
-        followed = set.intersection(*(set(sent) for sent in self._sent_ns.values()))
-        return bool(followed) and all(topic.key in self._newest for topic in CHAIN)
+        passed_all = set.intersection(*(set(sent) for sent in self._sent_ns.values()))
+        return bool(passed_all) and all(topic.key in self._newest for topic in CHAIN)
 
     def get(self, topic: Topic[M]) -> M:
         """Return the newest message on `topic`."""

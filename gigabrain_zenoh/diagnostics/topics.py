@@ -31,7 +31,7 @@ from gigabrain_zenoh.errors import BodyLost
 from gigabrain_zenoh.host.escaping import printable
 from gigabrain_zenoh.host.signals import stop_signals
 
-SILENCE_NOTICE_S = 2.0  # without a message, until the user gets a notice
+SILENCE_NOTICE_S = 2.0  # without a message, before the user gets a notice
 REPORT_PERIOD_S = 1.0
 Quantity = Literal["hz", "bw", "delay"]
 
@@ -40,7 +40,7 @@ class TopicRow(Struct, frozen=True, kw_only=True):
     """One key of `topic list`."""
 
     key: str
-    type: str | None  # of the table; None for keys of other projects
+    type: str | None  # name of its type; None for keys of other projects
     hz: float
     promised_hz: float | None
     size: int | None  # [bytes], median
@@ -53,27 +53,27 @@ def rows(found: Snapshot, now_ns: int, *, all_topics: bool = False) -> list[Topi
     """Return every key with a sender or a receiver, and with `all_topics` the rest of the table."""
     processes = tuple(found.processes.values())
     stats, streams = found.monitor.stats(found.start_ns), found.monitor.streams()
-    keys = found.live_keys | {k for one in processes for k in one.subscribes if "*" not in k}
+    keys = found.live_keys | {k for each in processes for k in each.subscribes if "*" not in k}
     if all_topics:
         keys |= {topic.key for topic in TOPICS if not topic.many}
-    made = []
+    result = []
     for key in sorted(keys):
-        topic, one = topic_of(key), stats.get(key)
+        topic, stream = topic_of(key), stats.get(key)
         if topic is None and key not in streams:
             continue  # a service, not a topic
-        made.append(
+        result.append(
             TopicRow(
                 key=key,
                 type=topic.type.__name__ if topic else None,
-                hz=round(one.hz, 2) if one else 0.0,
+                hz=round(stream.hz, 2) if stream else 0.0,
                 promised_hz=topic.hz if topic else None,
-                size=one.size if one else None,
+                size=stream.size if stream else None,
                 age_s=streams[key].age_s(now_ns) if key in streams else None,
                 senders=tuple(senders(key, processes)),
                 receivers=tuple(receivers(key, processes)),
             )
         )
-    return made
+    return result
 
 
 def topic_table(found: list[TopicRow]) -> Table:
@@ -114,10 +114,10 @@ def describe(wanted: TopicPattern, found: Snapshot, now_ns: int) -> Iterator[str
             yield from _measured(row)
     if topic:
         yield "  fields:"
-        types = get_type_hints(topic.type)  # without their bounds
-        for one in msgspec.structs.fields(topic.type):
-            optional = "" if one.required else "  (optional)"
-            yield f"    {one.name}: {_type_name(types[one.name])}{optional}"
+        types = get_type_hints(topic.type)  # without bounds
+        for field in msgspec.structs.fields(topic.type):
+            optional = "" if field.required else "  (optional)"
+            yield f"    {field.name}: {_type_name(types[field.name])}{optional}"
 
 
 def _measured(row: TopicRow) -> Iterator[str]:
@@ -129,21 +129,21 @@ def _measured(row: TopicRow) -> Iterator[str]:
 
 
 def _type_name(kind: Any) -> str:
-    """Return a type without modules."""
+    """Return the name of a type, without modules."""
     return re.sub(r"[\w.]+\.(?=\w)", "", inspect.formatannotation(kind))
 
 
 class EchoOptions(Struct, frozen=True, kw_only=True):
-    """Form of the output of `topic echo`, and its end."""
+    """Format and limits of the output of `topic echo`."""
 
     json: bool = False
     fields: tuple[str, ...] = ()
-    count: int | None = None  # messages until it ends
-    within_s: float | None = None  # limit for the first message; exit code 1 after it
+    count: int | None = None  # number of messages to print
+    within_s: float | None = None  # time limit for the first message; then exit code 1
 
 
 def message_lines(message: RawMessage, options: EchoOptions) -> Iterator[str]:
-    """Yield the lines of one message. Raises UnknownName for a field that it does not have."""
+    """Yield the lines of one message. Raises UnknownName for an unknown field."""
     value = read(message.key, message.payload, whole=options.json)
     if options.fields and "invalid" not in value:
         value = pick(value, options.fields)
@@ -159,7 +159,7 @@ def message_lines(message: RawMessage, options: EchoOptions) -> Iterator[str]:
 async def echo(
     bus: Bus, wanted: TopicPattern, options: EchoOptions, out: Callable[[str], None]
 ) -> int:
-    """Print messages as they arrive. Raises BodyLost where the first one comes too late."""
+    """Print messages as they arrive. Raises BodyLost if the first one is too late."""
     left = options.count
     first = asyncio.Event()
 
@@ -242,7 +242,7 @@ async def _report_silence(
 
 
 async def _until_stopped(work: Coroutine[Any, Any, None], watch: Coroutine[Any, Any, None]) -> int:
-    """Run both until `work` is done, either raises, a signal comes or stdout is closed."""
+    """Run both until `work` is done, one raises, a signal arrives or stdout is closed."""
     tasks = [asyncio.ensure_future(work), asyncio.ensure_future(watch)]
     with stop_signals() as stop, stop_on_broken_pipe(stop):
         stopped = asyncio.ensure_future(stop.wait())

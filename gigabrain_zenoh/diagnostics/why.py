@@ -1,6 +1,6 @@
-"""`gigabrain why`: follows one command along the chain, to the link that stops the robot.
+"""`gigabrain why`: checks the chain from router to body, and finds the link that stops the robot.
 
-`ChainWatcher` collects the facts, and `judge`, which is pure, draws the conclusion.
+`ChainWatcher` collects the facts; `judge` is pure, and returns the verdict.
 """
 
 import asyncio
@@ -42,7 +42,7 @@ Link = Literal[
 LINKS: tuple[Link, ...] = get_args(Link)
 FIRST_CODE = 10  # exit code for a broken router; each further link has the next code
 WINDOW_S = 1.5
-SILENT_NS = 500_000_000  # wall time: also for a simulation that runs slowly
+SILENT_NS = 500_000_000  # wall time, also in a slow simulation
 
 START_ROUTER = (
     "start the robot with `gigabrain up` or `gigabrain demo`, or name its router with --connect"
@@ -54,24 +54,24 @@ CHECK_LIDAR = "check the lidar's power and cable"
 
 
 class ChainFacts(Struct, frozen=True, kw_only=True):
-    """State of the chain. None for a message that has not arrived, or is stale."""
+    """State of the chain. Messages are None if they did not arrive or are stale."""
 
-    router: str = ""  # why it cannot be reached; empty where it answers
-    described: Mapping[str, Description] = {}  # processes that answer, by name
+    router: str = ""  # reason why it cannot be reached; empty if it answers
+    described: Mapping[str, Description] = {}  # processes that reply, by name
     state: RobotState | None = None
     body: Body | None = None
     scan_age_ms: float | None = None  # by the robot's clock
     world: WorldModel | None = None
     intent: Intent | None = None
-    command: CmdVel | None = None  # of the robot's own control
-    joint_command: JointCommand | None = None  # the same, for joints
+    command: CmdVel | None = None  # from the robot's own control
+    joint_command: JointCommand | None = None  # from the robot's own control
     fastest: Velocity = ZERO  # largest of the commander's commands, per axis
     strangers: tuple[str, ...] = ()  # other senders of commands
     safety: SafetyState | None = None
-    tasks: TaskStatus | None = None  # None where decision has no tasks
-    problems: tuple[Cause, ...] = ()  # that the processes report
+    tasks: TaskStatus | None = None  # None if decision has no tasks
+    problems: tuple[Cause, ...] = ()  # in the health of processes
     hz: Mapping[str, float] = {}  # measured, by key
-    after_ms: Mapping[str, float] = {}  # from the hop before to this one, median, by key
+    after_ms: Mapping[str, float] = {}  # median time since the previous hop, by key
 
 
 class LinkStatus(Struct, frozen=True, kw_only=True):
@@ -81,25 +81,26 @@ class LinkStatus(Struct, frozen=True, kw_only=True):
     ok: bool
     text: str
     remedy: str = ""
-    waits: bool = False  # works and stands: as it should where `ok`, else for the given reason
+    waits: bool = False  # works, but the robot stands: as intended if `ok`
 
 
 class Verdict(Struct, frozen=True, kw_only=True):
-    """Status of every link that can be judged, and the conclusion."""
+    """Status of every link that can be checked, and the conclusion."""
 
     findings: tuple[LinkStatus, ...]
     notes: tuple[str, ...] = ()
 
     @property
     def broken(self) -> LinkStatus | None:
-        """Return the first broken link; one that only waits comes after all others."""
-        broken = [one for one in self.findings if not one.ok]
-        return min(broken, key=lambda one: one.waits, default=None)
+        """Return the first broken link; links that only wait come last."""
+        broken = [status for status in self.findings if not status.ok]
+        return min(broken, key=lambda status: status.waits, default=None)
 
     @property
     def waits(self) -> LinkStatus | None:
-        """Return the first link that stands as it should, if none is broken."""
-        return None if self.broken else next((one for one in self.findings if one.waits), None)
+        """Return the first link that waits as intended, if none is broken."""
+        waiting = (status for status in self.findings if status.waits)
+        return None if self.broken else next(waiting, None)
 
     @property
     def moves(self) -> bool:
@@ -114,7 +115,7 @@ class Verdict(Struct, frozen=True, kw_only=True):
 
 
 def judge(facts: ChainFacts) -> Verdict:
-    """Return the verdict on `facts`. Behind a broken router or driver nothing can be judged."""
+    """Return the verdict on `facts`. After a broken router or driver no link can be checked."""
     if facts.router:
         return Verdict(findings=(_broken("router", facts.router, START_ROUTER),))
     findings = [_ok("router", "answers")]
@@ -234,9 +235,9 @@ def _wants_to_move(facts: ChainFacts) -> bool:
 
 
 def _idle(tasks: TaskStatus | None) -> LinkStatus | None:
-    """Return that there is nowhere to drive to now; None where there is."""
+    """Return the status if there is no goal to drive to now; else None."""
     if tasks is None:
-        return None  # a behaviour without tasks drives by itself
+        return None  # a behaviour without tasks drives without a goal
     task = tasks.current
     if task is None:
         return _waits("intent", "waiting for a goal", "send a goal, as in `gigabrain goto 1 2`")
@@ -258,8 +259,8 @@ def _control(facts: ChainFacts) -> LinkStatus:
     if command is None:
         return _silent(facts, "control", "control", "command")
     gate = facts.state.gate if facts.state else None
-    still = gate is not None and gate.mode == "enabled" and at_rest(facts.fastest)
-    if still and command.operator:
+    zero_sent = gate is not None and gate.mode == "enabled" and at_rest(facts.fastest)
+    if zero_sent and command.operator:
         text = "an operator holds the robot still"
         remedy = "let the brain drive with `gigabrain enable`"
         if _wants_to_move(facts):
@@ -268,7 +269,7 @@ def _control(facts: ChainFacts) -> LinkStatus:
     free = facts.safety is not None and facts.safety.verdict != "stop"
     caps = facts.safety.caps if facts.safety else NO_CAPS
     wanted = intent.twist if intent and intent.twist else ZERO
-    if still and free and not at_rest(wanted) and not _capped_to_rest(wanted, caps):
+    if zero_sent and free and not at_rest(wanted) and not _capped_to_rest(wanted, caps):
         remedy = "read its log with `gigabrain log --process control`"
         return _broken("control", "control sends zero, but decision sends motion", remedy)
     operator = "an operator drives: " if command.operator else ""
@@ -337,7 +338,7 @@ def _after(facts: ChainFacts, key: str, before: str) -> str:
 
 
 def _in_words(causes: tuple[Cause, ...]) -> tuple[str, str]:
-    """Return the texts and the remedies of causes, each joined."""
+    """Return the joined texts and the joined remedies of causes."""
     text = "; ".join(cause.text for cause in causes)
     return text, "; ".join(dict.fromkeys(cause.remedy for cause in causes if cause.remedy))
 
@@ -353,7 +354,7 @@ def _notes(facts: ChainFacts) -> tuple[str, ...]:
 
 
 def _capped_to_rest(wanted: Velocity, caps: SpeedCaps) -> bool:
-    """Return whether the caps of safety leave nothing of a wanted motion."""
+    """Return whether the caps of safety reduce a wanted motion to zero."""
     axes = (
         (wanted.linear_x, caps.forward, caps.backward),
         (wanted.linear_y, caps.left, caps.right),
@@ -375,7 +376,7 @@ class ChainWatcher(RobotView):
     """Subscribes to the whole chain, and collects its facts."""
 
     def __init__(self, bus: Bus) -> None:
-        self._commands: dict[str, list[tuple[int, CmdVel]]] = {}  # by sender, with their arrival
+        self._commands: dict[str, list[tuple[int, CmdVel]]] = {}  # with arrival [ns], by sender
         self._joint_commands = bus.latest(JOINT_CMD)
         super().__init__(bus)
         self._monitor = monitor_chain(bus)
@@ -417,13 +418,13 @@ class ChainWatcher(RobotView):
             problems=tuple(cause for one in self.health.values() for cause in one.problems),
             hz={
                 key: round((bus.received[key] - counts[key]) / 2 / elapsed_s, 1)
-                for key in (STATE.key, SCAN.key)  # received twice, by the monitor as well
+                for key in (STATE.key, SCAN.key)  # counted twice: the monitor receives them too
             },
             after_ms=_latencies(self._monitor),
         )
 
     def _newest(self, source: str) -> CmdVel | None:
-        """Return the newest command of `source`, unless it is silent now."""
+        """Return the newest command of `source`; None if `source` is silent now."""
         commands = self._commands.get(source)
         if not commands or self.bus.clock.now_ns() - commands[-1][0] > SILENT_NS:
             return None
