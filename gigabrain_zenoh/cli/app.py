@@ -1,6 +1,6 @@
 """The table of commands. `gigabrain --help` imports this module alone, so it stays light."""
 
-# only what Python has imported already: the signal handlers are to be installed first
+# these two are already loaded: signal handlers must be installed before slow imports
 import os
 import sys
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 MODULES = "gigabrain_zenoh.cli"
 
-# command -> its function, and its help in one line
+# command: its function, and one line of help
 COMMANDS = {
     "demo": ("demo:demo", "Run a simulated robot on this machine, until Ctrl-C."),
     "up": ("demo:up", "Run the processes of a deployment file on this host, until Ctrl-C."),
@@ -153,16 +153,16 @@ GROUPS = {
     "schema": "Export message definitions.",
 }
 SUPERVISING = {"demo", "up"}  # these start a robot's processes
-# commands that have others below them
+# commands with subcommands
 PARENTS = COMMANDS.keys() & {command.rpartition(" ")[0] for command in COMMANDS}
 
 
 def make_app(chosen: "Sequence[str]" = ()) -> "App":
     """Return the app with all commands.
 
-    A command whose name is among the words `chosen` shows its own help. The others keep their line
-    of the table, so that their modules are not imported. A command of PARENTS takes options of its
-    own only if it is chosen.
+    A command whose name is among the words `chosen` shows its full help. The others show their line
+    of the table, so that their modules are not imported. A command of PARENTS gets its own options
+    only if it is chosen.
     """
     from importlib import import_module
 
@@ -203,7 +203,7 @@ def _version() -> str:
 
 
 def main() -> None:
-    """Run the `gigabrain` command, and end the process with its exit code."""
+    """Run the `gigabrain` command, and exit with its exit code."""
     try:
         from contextlib import suppress
 
@@ -224,7 +224,7 @@ def main() -> None:
         code = interrupts.exit_code
     except BrokenPipeError:  # the reader is gone, as in `gigabrain robots | head -1`
         code = 1
-    except Exception as error:  # an error that a signal caused is not shown
+    except Exception as error:  # after a signal, errors are not shown
         if not interrupts.received and not _report_full_disk(error):
             raise
         code = interrupts.exit_code if interrupts.received else 1
@@ -234,7 +234,7 @@ def main() -> None:
 
 
 def _open_standard_streams() -> None:
-    """Open the closed ones, as of `gigabrain up FILE >&-`, before anything takes 0, 1 or 2."""
+    """Open closed streams, as of `gigabrain up FILE >&-`, before other files get their numbers."""
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(number, True)
     os.close(number)
@@ -243,7 +243,7 @@ def _open_standard_streams() -> None:
 
 
 def _report_full_disk(error: Exception) -> bool:
-    """Print that the disk of the output is full; return False if `error` is another one."""
+    """Print a message if the disk of the output is full; return False for any other `error`."""
     from gigabrain_zenoh.host.files import FULL
 
     if not isinstance(error, OSError) or error.errno not in FULL:
@@ -253,7 +253,7 @@ def _report_full_disk(error: Exception) -> bool:
 
 
 def _call(words: "Sequence[str]") -> object:
-    """Parse and run a command. Signals raise only after its imports, so they break none off."""
+    """Parse and run a command. Signals raise only after its imports, so they interrupt none."""
     from cyclopts import CycloptsError
 
     from gigabrain_zenoh.config.renames import renamed_arguments

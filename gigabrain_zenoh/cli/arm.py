@@ -1,4 +1,4 @@
-"""`gigabrain arm`: the joints of an arm, by hand. People read and type degrees."""
+"""`gigabrain arm`: shows and moves the joints of an arm. Angles are in degrees."""
 
 import asyncio
 import math
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 Metres = Annotated[float, Parameter(allow_leading_hyphen=True)]
 Distance = Annotated[float, Parameter(allow_leading_hyphen=True)]
-BAR = 20  # characters of a joint's range
-WATCH_S = 0.2
+BAR_CHARS = 20  # width of the bar of a joint's range
+WATCH_PERIOD_S = 0.2
 MAX_LABEL_CHARS = 64
-SLOW = math.radians(45)  # [rad/s], of an arm that a person sends somewhere
+HAND_SPEED = math.radians(45)  # [rad/s], speed limit of motions by hand
 LIMP_PROMPT = "all joints are let go of, and the arm may fall; hold it, and type yes: "
 
 
@@ -53,7 +53,7 @@ def state(*, watch: bool = False, at: RobotAddress = LOCAL) -> None:
             while True:
                 table = "\n".join(lines(body, await robot.read_state()))
                 live.update(Text(table), refresh=True)
-                await asyncio.sleep(WATCH_S)
+                await asyncio.sleep(WATCH_PERIOD_S)
 
     _with_robot(at, "", show)
 
@@ -71,18 +71,19 @@ def jog(joint: str, distance: Distance, /, *, take: Take = False, at: RobotAddre
 
     async def move(robot: Robot) -> None:
         body = await _arm(robot)
-        known = [one.name for one in body.joints]
-        if joint not in known:
-            raise unknown("joint", joint, known)
-        one, posture = body.joints[known.index(joint)], held_posture(body, await robot.read_state())
-        scale, unit = shown_in(one)
-        place = posture[known.index(joint)].position + distance / scale
-        if not one.lower <= place <= one.upper:
-            low, high, there = (scale * at for at in (one.lower, one.upper, place))
+        names = [each.name for each in body.joints]
+        if joint not in names:
+            raise unknown("joint", joint, names)
+        index, posture = names.index(joint), held_posture(body, await robot.read_state())
+        limits = body.joints[index]
+        scale, unit = shown_in(limits)
+        goal = posture[index].position + distance / scale
+        if not limits.lower <= goal <= limits.upper:
+            low, high, wanted = (scale * at for at in (limits.lower, limits.upper, goal))
             raise ConfigError(
-                f"{joint}: it goes from {low:.1f} to {high:.1f} {unit}, not to {there:.1f}"
+                f"{joint}: it goes from {low:.1f} to {high:.1f} {unit}, not to {wanted:.1f}"
             )
-        await _move(robot, take, {joint: place})
+        await _move(robot, take, {joint: goal})
 
     _with_robot(at, "arm", move)
 
@@ -162,11 +163,11 @@ def pick(
     from gigabrain_zenoh.decision.tasks.arm_steps import Solid
     from gigabrain_zenoh.decision.tasks.mission import Mission, Step
 
-    shapes = sum(one is not None for one in (box, cylinder, sphere))
+    shapes = sum(shape is not None for shape in (box, cylinder, sphere))
     if shapes != 1:
         raise ConfigError(f"arm pick: expected --box, --cylinder or --sphere, got {shapes} of them")
     thing = Solid(box=box, cylinder=cylinder, sphere=sphere, at=(x, y, z), yaw=math.radians(yaw))
-    name = f"the thing at {describe_point((x, y, z))}"  # another one than what it may hold
+    name = f"the thing at {describe_point((x, y, z))}"  # differs from a thing in the gripper
     _carry_out(at, Mission(things={name: thing}, do=(Step(pick=name),)), mode, wait)
 
 
@@ -294,7 +295,7 @@ def limp(*, yes: bool = False, at: RobotAddress = LOCAL) -> None:
         if not sys.stdin.isatty():
             raise ConfigError("arm limp asks a person first; give --yes where nobody can answer")
         print(LIMP_PROMPT, end="", flush=True)
-        if sys.stdin.readline().strip().lower() != "yes":  # at Ctrl-D it is empty
+        if sys.stdin.readline().strip().lower() != "yes":  # empty at Ctrl-D
             print_line("nothing is done")
             return
     _ask(at, lambda robot: robot.limp())
@@ -317,7 +318,7 @@ def _carry_out(at: RobotAddress, mission: "Mission", mode: Mode, wait: bool) -> 
     from gigabrain_zenoh.decision.tasks.mission_files import loads
 
     text, label = text_of(mission), describe(mission.arm_actions[0])
-    loads(text, "arm")  # refuse wrong numbers before connecting
+    loads(text, "arm")  # raises for wrong numbers, before connecting
     send(at, lambda tasks: tasks.carry_out(text, how=mode, label=label), wait)
 
 
@@ -347,10 +348,10 @@ async def _arm(robot: Robot) -> BodyDescription:
 
 
 async def _move(robot: Robot, take: bool, positions: dict[str, float]) -> None:
-    """Move the joints, and print where they are."""
+    """Move the joints, and print their measured positions."""
     if take:
         await robot.enable(take=True)
-    found = await robot.set_joint_positions(positions, speed=SLOW)
+    found = await robot.set_joint_positions(positions, speed=HAND_SPEED)
     for joint in (await robot.read_body()).joints:
         if joint.name in positions:
             scale, unit = shown_in(joint)
@@ -358,15 +359,15 @@ async def _move(robot: Robot, take: bool, positions: dict[str, float]) -> None:
 
 
 def shown_in(joint: JointDescription) -> tuple[float, str]:
-    """Return the factor and the unit in which people read a joint's positions."""
+    """Return the factor to the unit in which a joint's positions are shown, and that unit."""
     return (1e3, "mm") if joint.unit == "m" else (math.degrees(1.0), "°")
 
 
 def lines(body: BodyDescription, state: RobotState) -> list[str]:
-    """Return a table of the joints, in degrees, or millimetres of those that slide."""
+    """Return the lines of a table of the joints, in degrees, or in millimetres if they slide."""
     measured = {joint.name: joint for joint in state.joints}
-    places = () if state.limp else state.joints_sent  # nothing holds limp joints there
-    sent = dict(zip((joint.name for joint in body.joints), places, strict=False))
+    positions = () if state.limp else state.joints_sent  # limp joints are not held there
+    sent = dict(zip((joint.name for joint in body.joints), positions, strict=False))
     gate = state.gate
     limp = ", limp" if state.limp else ""
     rows = [f"{state.robot_type}: {gate.mode}, commander {gate.commander or 'none'}{limp}"]
@@ -398,7 +399,7 @@ def _row(joint: JointDescription, found: Joint, sent: float | None) -> str:
 
 
 def bar(joint: JointDescription, position: float) -> str:
-    """Return a joint's range with its place in it."""
+    """Return a bar of a joint's range, with a mark at its position."""
     share = (position - joint.lower) / (joint.upper - joint.lower)
-    place = round(max(0.0, min(1.0, share)) * (BAR - 1))
-    return "─" * place + "●" + "─" * (BAR - 1 - place)
+    place = round(max(0.0, min(1.0, share)) * (BAR_CHARS - 1))
+    return "─" * place + "●" + "─" * (BAR_CHARS - 1 - place)

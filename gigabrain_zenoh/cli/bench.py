@@ -1,4 +1,4 @@
-"""`gigabrain bench chain`, `stack`, `robots`, `estop`, `bodies`, `plan`: what this machine does."""
+"""`gigabrain bench chain`, `stack`, `robots`, `estop`, `bodies`, `plan`: measures this machine."""
 
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from gigabrain_zenoh.qa.bench.plan import PlanResult
 
 MAX_SCAN_HZ = 50.0  # one scan per tick of the robot's clock
-MIN_CELLS = 400  # a smaller map has no path of the wanted length
-PUBLISHED_MS = (  # from the documents of Nav2
+MIN_CELLS = 400  # per side; smaller maps have no path of the required length
+PUBLISHED_MS = (  # from the documentation of Nav2
     ("Nav2 NavFn, about 75 m", 146.0),
     ("Nav2 Smac 2D A*, about 75 m", 243.0),
     ("Nav2 Smac Hybrid-A*, about 75 m", 144.0),
@@ -48,7 +48,7 @@ def finish(page: RenderableType, result: object, json: Path | None) -> None:
 def side_by_side(
     title: str, caption: str, names: Sequence[str], rows: Mapping[str, Sequence[str]]
 ) -> Table:
-    """Return a table with one column per name, and one row per figure, which fits a terminal."""
+    """Return a table with one column per name, and one row per figure."""
     table = Table("", title=title, caption=caption)
     for name in names:
         table.add_column(name, justify="right")
@@ -85,7 +85,7 @@ def chain(
         if not 0 < rate <= MAX_SCAN_HZ:
             raise ConfigError(f"--rates: expected above 0, at most {MAX_SCAN_HZ:g}, got {rate:g}")
     frameworks = installed() if peers else ()
-    missing = set(COMMANDS) - {one.name for one in frameworks} if peers else set()
+    missing = set(COMMANDS) - {each.name for each in frameworks} if peers else set()
     for name in sorted(missing):
         print_progress(f"{name} is left out: there is no command {COMMANDS[name]!r}")
     result = run_async(measure_chain(seconds, rounds, rates, print_progress, frameworks))
@@ -235,9 +235,9 @@ def _bodies_table(result: "BodiesResult") -> Table:
     return side_by_side(
         f"link {result.link}, {result.world}, seed {result.seed}",
         f"one brain: {brain}; restarts {result.brain_restarts}",
-        [one.body for one in result.bodies],
+        [body.body for body in result.bodies],
         {
-            title: [_figure(getattr(one, field)) for one in result.bodies]
+            title: [_figure(getattr(body, field)) for body in result.bodies]
             for title, field in rows.items()
         },
     )
@@ -284,12 +284,14 @@ def _plan_table(result: "PlanResult") -> Table:
 
     table = table_of("map", "what", "n", "p50 [ms]", "p95 [ms]", "CPU p50 [ms]", left=2)
     table.caption = "Published figures are of other maps on other machines."
-    for one in result.sizes:
-        for timing in one.timings:
+    for map_ in result.sizes:
+        for timing in map_.timings:
             times = (timing.p50_ms, timing.p95_ms, timing.cpu_p50_ms)
-            what = timing.what.replace("office", f"office, {one.path_m:.0f} m")
-            table.add_row(f"{one.size}²", what, str(timing.n), *(f"{ms:.1f}" for ms in times))
-        table.add_row(f"{one.size}²", "cost over Dijkstra's, worst", "", f"{one.ratio:.6f}", "", "")
+            what = timing.what.replace("office", f"office, {map_.path_m:.0f} m")
+            table.add_row(f"{map_.size}²", what, str(timing.n), *(f"{ms:.1f}" for ms in times))
+        table.add_row(
+            f"{map_.size}²", "cost over Dijkstra's, worst", "", f"{map_.ratio:.6f}", "", ""
+        )
         table.add_section()
     for what, ms in PUBLISHED_MS:
         table.add_row("published", what, "", f"{ms:g}", "", "")

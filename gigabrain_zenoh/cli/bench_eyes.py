@@ -1,4 +1,4 @@
-"""`gigabrain bench eyes`, `cameras`, `clutter`, `objects`: what cameras give and cost."""
+"""`gigabrain bench eyes`, `cameras`, `clutter`, `objects`: benefits and costs of cameras."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -61,28 +61,28 @@ def eyes(
 
 
 def _eyes_table(result: "EyesResult") -> Table:
-    all_ = result.figures
+    figures = result.figures
     return side_by_side(
         "Contours against the truth",
-        f"{all_[0].worlds} worlds from seed {result.seed}. CPU time is of one picture, unpacking "
-        "and contours included. By colour: of a camera without depth.",
-        [f"{one.camera}\n{one.sensor}" for one in all_],
+        f"{figures[0].worlds} worlds from seed {result.seed}. CPU time is of one picture, "
+        "unpacking and contours included. By colour: of a camera without depth.",
+        [f"{one.camera}\n{one.sensor}" for one in figures],
         {
-            "error p50, p95 [cm]": [_cm(one.error_p50_m, one.error_p95_m) for one in all_],
-            "beyond the truth p95 [cm]": [_cm(one.beyond_p95_m) for one in all_],
-            "not covered p95 [cm]": [_cm(one.missed_p95_m) for one in all_],
-            "pits p50, p95 [cm]": [_cm(one.pit_p50_m, one.pit_p95_m) for one in all_],
-            "pits, found": [f"{one.pits}, {one.pits_found:.3f}" for one in all_],
-            "things within 2 m": [str(one.things) for one in all_],
-            "recall": [f"{one.recall:.3f}" for one in all_],
-            "... in the first picture": [f"{one.recall_first:.3f}" for one in all_],
-            "false contours in clutter": [str(one.false_in_clutter) for one in all_],
-            "false on empty floors [1/min]": [f"{one.false_per_min:g}" for one in all_],
-            "... by colour [1/min]": [f"{one.colour_per_min:.3g}" for one in all_],
-            "... pictures": [str(one.empty_pictures) for one in all_],
-            "ghosts p50, max [s]": [f"{one.ghost_p50_s:g}, {one.ghost_max_s:g}" for one in all_],
-            "... things gone": [str(one.ghosts) for one in all_],
-            "CPU p50, p99 [ms]": [f"{one.cpu_p50_ms:.1f}, {one.cpu_p99_ms:.1f}" for one in all_],
+            "error p50, p95 [cm]": [_cm(one.error_p50_m, one.error_p95_m) for one in figures],
+            "beyond the truth p95 [cm]": [_cm(one.beyond_p95_m) for one in figures],
+            "not covered p95 [cm]": [_cm(one.missed_p95_m) for one in figures],
+            "pits p50, p95 [cm]": [_cm(one.pit_p50_m, one.pit_p95_m) for one in figures],
+            "pits, found": [f"{one.pits}, {one.pits_found:.3f}" for one in figures],
+            "things within 2 m": [str(one.things) for one in figures],
+            "recall": [f"{one.recall:.3f}" for one in figures],
+            "... in the first picture": [f"{one.recall_first:.3f}" for one in figures],
+            "false contours in clutter": [str(one.false_in_clutter) for one in figures],
+            "false on empty floors [1/min]": [f"{one.false_per_min:g}" for one in figures],
+            "... by colour [1/min]": [f"{one.colour_per_min:.3g}" for one in figures],
+            "... pictures": [str(one.empty_pictures) for one in figures],
+            "ghosts p50, max [s]": [f"{one.ghost_p50_s:g}, {one.ghost_max_s:g}" for one in figures],
+            "... things gone": [str(one.ghosts) for one in figures],
+            "CPU p50, p99 [ms]": [f"{one.cpu_p50_ms:.1f}, {one.cpu_p99_ms:.1f}" for one in figures],
         },
     )
 

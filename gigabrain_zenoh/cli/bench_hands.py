@@ -1,4 +1,4 @@
-"""`gigabrain bench hands`, `fetch`, `reach` and `joints`: where arms go, and what they bring."""
+"""`gigabrain bench hands`, `fetch`, `reach` and `joints`: measures arms, in simulation."""
 
 from collections import Counter
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""`gigabrain bench slam`, `barn` and `goals`: maps, avoidance and goals against the truth."""
+"""`gigabrain bench slam`, `barn` and `goals`: compares maps, avoidance and goals with the truth."""
 
 import math
 from collections.abc import Sequence
@@ -71,7 +71,7 @@ def _slam_logs(paths: tuple[Path, ...], png: Path | None, json: Path | None) -> 
     files.check_result_path(json)
     logs = [load(path) for path in paths]
     for one in logs:
-        relations(one)  # refuse a wrong log before the long run
+        relations(one)  # raises for a wrong log, before the long run
     drives = _map_logs(logs)
     result = total([judge_log(one, driven) for one, driven in drives])
     if png:
@@ -197,7 +197,7 @@ class BarnOptions:
     "Number of trials at the same time."
 
     def check(self) -> None:
-        """Raise ConfigError for options that do not go together."""
+        """Raise ConfigError for options that exclude each other."""
         check_positive(trials=self.trials, samples=self.samples, jobs=self.jobs)
         if self.dynamic and self.plant == "mujoco":
             raise ConfigError("--plant mujoco has no moving obstacles; leave out --dynamic")

@@ -1,4 +1,4 @@
-"""The terminal of `gigabrain driver calibrate`: questions, and a table of the joints' ranges."""
+"""Questions of `gigabrain driver calibrate`, and its table of the joints' ranges."""
 
 import math
 from collections.abc import Mapping
@@ -15,14 +15,14 @@ REFRESH_HZ = 5
 
 
 class Terminal:
-    """Asks the person at the arm."""
+    """Terminal of the person at the arm."""
 
     def __init__(self) -> None:
         self._console = Console()
         self._live: Live | None = None
 
     async def ask(self, text: str) -> str:
-        """Print a request, and return the line that is typed. Raises ConfigError at the end."""
+        """Print a request, and return the typed line. Raises ConfigError at the end of input."""
         self._console.print(text, markup=False, soft_wrap=True)
         try:
             line = await typed_text()
@@ -35,7 +35,7 @@ class Terminal:
         return line
 
     def show(self, ranges: Mapping[str, JointRange]) -> None:
-        """Show how far each joint has been moved."""
+        """Show the range over which each joint was moved."""
         if self._live is None:
             self._live = Live(console=self._console, refresh_per_second=REFRESH_HZ)
             self._live.start()
@@ -46,8 +46,8 @@ def _table(ranges: Mapping[str, JointRange]) -> Table:
     table = Table()
     for title in ("joint", "least", "now", "most", "missing"):
         table.add_column(title, justify="left" if title == "joint" else "right")
-    for name, its in ranges.items():
-        missing = f"{math.degrees(its.missing):.0f} deg" if its.missing else "nothing"
-        ticks = map(str, (its.lower, its.ticks, its.upper))
+    for name, moved in ranges.items():
+        missing = f"{math.degrees(moved.missing):.0f} deg" if moved.missing else "nothing"
+        ticks = map(str, (moved.lower, moved.ticks, moved.upper))
         table.add_row(name, *ticks, missing)
     return table

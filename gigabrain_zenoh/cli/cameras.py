@@ -1,4 +1,4 @@
-"""Cameras of a robot that is about to start: whether it has them, and what they need."""
+"""Checks the cameras of a robot before its start: graphics, packages and recognition."""
 
 import importlib.util
 import subprocess
@@ -11,15 +11,15 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.launch.deployment import Deployment
 from gigabrain_zenoh.recognition.node import INSTALL
 
-CHECK_S = 30.0
-CHECK = (sys.executable, "-P", "-m", "gigabrain_drivers.sim.graphics")
+CHECK_TIMEOUT_S = 30.0
+CHECK_COMMAND = (sys.executable, "-P", "-m", "gigabrain_drivers.sim.graphics")
 
 
 def with_cameras(deployment: Deployment, host: str) -> Deployment:
-    """Return the deployment, without cameras where nothing can be drawn; one line says why.
+    """Return the deployment, without cameras if this host cannot render; then print the reason.
 
     Raises ConfigError for cameras that the robot does not have, that need more packages, or that
-    cannot follow the simulation's speed.
+    run only in real time.
     """
     here = deployment.hosts.get(host, ())
     placed = any("camera" in names for names in deployment.hosts.values())
@@ -31,13 +31,13 @@ def with_cameras(deployment: Deployment, host: str) -> Deployment:
 
     changes = split(deployment.robot)[1]
     cameras = cameras_of(deployment.body, deployment.link, changes)
-    read = [one for one in cameras if one.options.source != RENDERED]
-    if read and deployment.speed != 1.0:
+    physical = [camera for camera in cameras if camera.options.source != RENDERED]
+    if physical and deployment.speed != 1.0:
         raise ConfigError(
-            f"camera {read[0].camera.name!r} runs in real time, as its source is "
-            f"{read[0].options.source!r}; leave out --speed"
+            f"camera {physical[0].camera.name!r} runs in real time, as its source is "
+            f"{physical[0].options.source!r}; leave out --speed"
         )
-    if len(read) == len(cameras):
+    if len(physical) == len(cameras):
         return deployment
     problem = _graphics_problem()
     if not problem:
@@ -47,7 +47,7 @@ def with_cameras(deployment: Deployment, host: str) -> Deployment:
 
 
 def check_recognizer(deployment: Deployment, host: str) -> None:
-    """Raise ConfigError for a net of one's own that `host` is to run, and cannot."""
+    """Raise ConfigError for a recognition net of the user's own that `host` cannot run."""
     here, wanted = deployment.hosts.get(host, ()), deployment.recognizer
     placed = any("recognition" in names for names in deployment.hosts.values())
     runs = "recognition" in here or ("perception" in here and not placed)
@@ -62,9 +62,11 @@ def check_recognizer(deployment: Deployment, host: str) -> None:
 
 
 def _graphics_problem() -> str:
-    """Return why nothing can be drawn here, in one line; another process tries it."""
+    """Return the reason in one line why this host cannot render; tried in a child process."""
     try:
-        tried = subprocess.run(CHECK, capture_output=True, text=True, timeout=CHECK_S, check=False)
+        tried = subprocess.run(
+            CHECK_COMMAND, capture_output=True, text=True, timeout=CHECK_TIMEOUT_S, check=False
+        )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise ConfigError(f"cannot check for OpenGL: {error}") from None
     if tried.returncode == 0:

@@ -30,7 +30,7 @@ SettingsFiles = Annotated[
     tuple[Path, ...],
     Parameter(help="File with further settings, as `param save` writes; may be given again."),
 ]
-MAX_WIDTH = 60  # of a column
+MAX_COLUMN_CHARS = 60
 
 
 def config(
@@ -59,16 +59,16 @@ def config(
     else:
         rows = _running_rows(at)
     cells = [
-        (row.key, json.dumps(row.value, ensure_ascii=False), _near(row.source))
+        (row.key, json.dumps(row.value, ensure_ascii=False), _relative(row.source))
         for row in sorted(rows, key=lambda row: row.key)
     ]
-    widths = [min(MAX_WIDTH, max(len(cell[i]) for cell in cells)) for i in range(2)]
+    widths = [min(MAX_COLUMN_CHARS, max(len(cell[i]) for cell in cells)) for i in range(2)]
     for key, value, source in cells:
         print_line(f"{key:<{widths[0]}}  {value:<{widths[1]}}  {source}")
 
 
-def _near(source: str) -> str:
-    """Return a place with its file as seen from the present folder."""
+def _relative(source: str) -> str:
+    """Return a source, with a file in the current folder as a relative path."""
     path = Path(source)
     if path.is_absolute() and path.is_relative_to(Path.cwd()):
         return str(path.relative_to(Path.cwd()))
@@ -78,7 +78,7 @@ def _near(source: str) -> str:
 def merged_file(
     name: str, files: Sequence[Path], sets: Sequence[str], keys: Path | None = None
 ) -> "MergedDeployment":
-    """Return a deployment file with what is laid over it. Raises ConfigError."""
+    """Merge a deployment file with settings files and `--set`. Raises ConfigError."""
     from gigabrain_zenoh.launch.deployment import deployment_path
     from gigabrain_zenoh.launch.merging import file_layers, merge
 
@@ -90,7 +90,7 @@ def merged_file(
 def merged_values(
     values: Mapping[str, Any], files: Sequence[Path], sets: Sequence[str]
 ) -> "MergedDeployment":
-    """Return the deployment of a demo with what is laid over it. Raises ConfigError."""
+    """Merge the deployment of a demo with settings files and `--set`. Raises ConfigError."""
     from gigabrain_zenoh.launch.merging import merge, value_layers
 
     merged = merge(value_layers(values, "gigabrain demo"), files, sets, robot_type)
@@ -101,9 +101,9 @@ def merged_values(
 def rows_of(
     merged: "MergedDeployment", deployment: "Deployment | None" = None, *, robot: bool = True
 ) -> tuple["Row", ...]:
-    """Return all settings of a deployment with their sources, those of the robot's file too.
+    """Return all settings of a deployment and of the robot's file, with their sources.
 
-    Raises ConfigError, also for settings of the robot that cannot be, or do not fit its body.
+    Raises ConfigError, also for invalid settings of the robot, or ones that its body cannot use.
     """
     from gigabrain_drivers.driver.catalog import (
         link_type,
@@ -117,29 +117,30 @@ def rows_of(
     from gigabrain_zenoh.decision import behaviours
     from gigabrain_zenoh.launch.merging import SETTINGS
 
-    layers, made = merged.layers, deployment or merged.deployment
-    rows = [row for row in layers.rows(made) if not row.key.startswith("robot")]
+    layers, final = merged.layers, deployment or merged.deployment
+    rows = [row for row in layers.rows(final) if not row.key.startswith("robot")]
     with suppress(UnknownName):  # its package may be on another host
-        kind = behaviours.load(made.decision.behaviour).Config
+        kind = behaviours.load(final.decision.behaviour).Config
         settings = layers.convert(kind, SETTINGS.split("."))
         rows = [row for row in rows if not row.key.startswith(SETTINGS)]
         rows += layers.rows(settings, SETTINGS.split("."))
     if not robot:
         return tuple(rows)
-    path = robot_path(made.body)
+    path = robot_path(final.body)
     own = robot_layers(path)
-    if made.robot:
+    if final.robot:
         own.add(part(layers.root, ("robot",)), layers.place)
-    found, *_ = load_layers(path, own, Run(folder=Path(), link=made.link))  # refuses what is unsafe
+    # raises for unsafe settings
+    found, *_ = load_layers(path, own, Run(folder=Path(), link=final.link))
     chosen = any(row.key == "decision.behaviour" and row.source != DEFAULT for row in rows)
-    _check_fits(made, found.description(), chosen=chosen)
-    whole = own.convert(link_type(made.body, made.link))
+    _check_fits(final, found.description(), chosen=chosen)
+    whole = own.convert(link_type(final.body, final.link))
     rows += [row._replace(key=f"robot.{row.key}") for row in own.rows(whole)]
     return tuple(rows)
 
 
 def _check_fits(deployment: "Deployment", body: "BodyDescription", *, chosen: bool) -> None:
-    """Raise ConfigError for a map, or a `chosen` behaviour, that is of no use to the body."""
+    """Raise ConfigError for a map, or a `chosen` behaviour, that the body cannot use."""
     if deployment.perception.map and not body.has_base:
         raise ConfigError(
             f"perception.map: {body.robot_type} has no base, so it cannot localize in a map; leave "
@@ -174,17 +175,18 @@ def _running_rows(at: RobotAddress) -> list["Row"]:
         raise ConfigError(f"{robot.label} was not started by `up` or `demo`; see `param list`")
     rows = {row.key: row for row in read_rows(Path(robot.run_dir))}
     for reply in ask_params(at).values():
-        for one in reply.params:
-            if one.key in rows and one.value != one.initial:
-                source = f"param, was {one.initial}"
-                rows[one.key] = rows[one.key]._replace(value=_value(one.value), source=source)
+        for param in reply.params:
+            if param.key in rows and param.value != param.initial:
+                source = f"param, was {param.initial}"
+                row = rows[param.key]
+                rows[param.key] = row._replace(value=_value(param.value), source=source)
     return list(rows.values())
 
 
 def with_values(path: Path, values: Mapping[str, str]) -> str:
-    """Return the YAML of a settings file with other values, given as text by dotted key.
+    """Return the YAML of a settings file with some `values` replaced (texts by dotted key).
 
-    Raises ConfigError for a file that holds no settings, or comments, which would be lost.
+    Raises ConfigError for a file without settings, or with comments, which would be lost.
     """
     import yaml
 

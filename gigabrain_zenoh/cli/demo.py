@@ -1,4 +1,4 @@
-"""Whole robots on this machine: `demo`, `up`, and what can be simulated."""
+"""`gigabrain demo`, `up`, `robots`, `worlds` and `render`: whole robots on this machine."""
 
 import json
 import sys
@@ -69,7 +69,7 @@ class RobotOptions:
     "Resume after a stop once its cause is gone. Default: auto; manual with --link real."
 
     def check(self) -> None:
-        """Raise ConfigError or UnknownName for a value that does not fit."""
+        """Raise ConfigError or UnknownName for an invalid value."""
         behaviours.load(self.behaviour)
         check_names([self.body], [self.world] if self.world else [])
         check_positive(seconds=self.seconds)
@@ -203,7 +203,9 @@ def up(
     from gigabrain_zenoh.launch.up import up as run
 
     if map:
-        quoted = json.dumps(checked_map(map), ensure_ascii=False)  # a map called 2 is no number
+        quoted = json.dumps(
+            checked_map(map), ensure_ascii=False
+        )  # quoted, so that a map called 2 is not read as a number
         set = (*set, "perception.mapping=localize", f"perception.map={quoted}")
     set = (*set, "cameras=true") if cameras else set
     merged = merged_file(deployment, settings, set, keys)

@@ -1,4 +1,4 @@
-"""`gigabrain why`, `doctor` and `log`: what is wrong, and what to do about it."""
+"""`gigabrain why`, `doctor` and `log`: find faults of a robot, and their remedies."""
 
 import time
 from typing import TYPE_CHECKING, Annotated
@@ -54,9 +54,9 @@ def why(*, at: RobotAddress = LOCAL, json: bool = False) -> int:
         }
         print_json(summary)
         return verdict.exit_code
-    for one in verdict.findings:
-        word = "BROKEN" if not one.ok else "waits" if one.waits else "ok"
-        print_line(f"  {one.link:<8} {word:<6}  {one.text}")
+    for status in verdict.findings:
+        word = "BROKEN" if not status.ok else "waits" if status.waits else "ok"
+        print_line(f"  {status.link:<8} {word:<6}  {status.text}")
     for note in verdict.notes:
         print_line(f"  note: {note}")
     if broken:
@@ -72,7 +72,7 @@ def why(*, at: RobotAddress = LOCAL, json: bool = False) -> int:
 
 
 def _ended(sentence: str) -> str:
-    """Return a sentence with its full stop; a question has its own end."""
+    """Return a sentence with a full stop, unless it ends with a question mark."""
     return sentence if sentence.endswith("?") else f"{sentence}."
 
 
@@ -81,7 +81,7 @@ def _chain_facts(at: RobotAddress) -> "ChainFacts":
 
     try:
         return on_bus(at, lambda bus: ChainWatcher(bus).collect())
-    except Ambiguous:  # no link is broken: the robot is not chosen
+    except Ambiguous:  # not a broken link: the user did not choose a robot
         raise
     except BusError as error:
         return ChainFacts(router=str(error))
@@ -103,13 +103,13 @@ def doctor(*, at: RobotAddress = LOCAL, json: JsonLines = False) -> int:
 
     robot, keys = run_async(inspect_robot(at.where()))
     results = examine(inspect_machine(keys), robot)
-    for one in results:
+    for result in results:
         if json:
-            print_json(one)
+            print_json(result)
             continue
-        print_line(f"{GRADES[one.grade]}  {one.about:<14} {one.text}")
-        if one.cure:
-            print_line(f"      {'':<14} -> {one.cure}")
+        print_line(f"{GRADES[result.grade]}  {result.about:<14} {result.text}")
+        if result.cure:
+            print_line(f"      {'':<14} -> {result.cure}")
     return exit_code(results)
 
 

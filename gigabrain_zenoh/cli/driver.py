@@ -1,4 +1,4 @@
-"""`gigabrain driver test`, `new` and `trace`, and `emulate`: tools for authors of drivers."""
+"""`gigabrain driver` and `emulate`: tools for authors of drivers."""
 
 import logging
 import os
@@ -21,7 +21,7 @@ from gigabrain_zenoh.host.signals import run_async
 
 
 class _WarningCounter(logging.Handler):
-    """Counts the warnings of the driver under test, instead of printing them. Used as `with`."""
+    """Counts the warnings of the driver under test inside `with`, instead of printing them."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -197,7 +197,7 @@ def calibrate(
 def _print_trace(
     name: str, link: LinkName, part: str, seconds: float, speeds: dict[str, float]
 ) -> bool:
-    """Print the bytes; return whether the robot sent any, or the reader closed the pipe."""
+    """Print the bytes; return True if the robot sent any, or if the reader closed the pipe."""
     from gigabrain_schemas.base import Velocity
     from gigabrain_zenoh.qa.conformance import authoring
 

@@ -1,4 +1,4 @@
-"""`gigabrain faults` and `proxy`: break the robot or its network on purpose."""
+"""`gigabrain faults` and `proxy`: inject faults into a robot or its network."""
 
 import asyncio
 import logging
@@ -57,7 +57,7 @@ class SuiteOptions:
     "Run the long variants, as before a release: soak, load, all kill orders."
 
     def check(self) -> None:
-        """Raise ConfigError if the suite cannot run with these."""
+        """Raise ConfigError if the suite cannot run with these options."""
         from gigabrain_drivers.driver.catalog import load_robot, simulated
 
         check_names(worlds=[self.world])
@@ -70,7 +70,7 @@ class SuiteOptions:
             raise ConfigError(f"--body {self.body}: not simulated in MuJoCo; choose one of: {able}")
 
     def options(self) -> "Options":
-        """Return the options in the form that the suite takes."""
+        """Return the options for the suite."""
         from gigabrain_zenoh.qa.faults.rig import Options
 
         return Options(self.body, self.world, self.behaviour, self.cameras, self.long)
@@ -131,28 +131,28 @@ def _run(
     from gigabrain_zenoh.diagnostics.discovery import plain
     from gigabrain_zenoh.qa.faults.suite import RunsFile, run_suite
 
-    # warnings about the messages that the suite itself forges
+    # hides warnings about messages that the suite itself forges
     logging.getLogger("gigabrain_zenoh").addHandler(logging.NullHandler())
     console, file = Console(), RunsFile(into, options) if into else None
     earlier = file.read() if file else {}
     with tempfile.TemporaryDirectory(prefix="gb-") as folder, console.status("") as status:
 
-        def begun(fault: "FaultRow") -> None:
+        def on_start(fault: "FaultRow") -> None:
             status.update(f"{chosen.index(fault) + 1} of {len(chosen)}: {fault.name}")
 
-        def ended(fault: "FaultRow", run: "FaultRun") -> None:
+        def on_end(fault: "FaultRow", run: "FaultRun") -> None:
             console.print(plain(_line(fault, run)), soft_wrap=True)
             if file:
                 file.append(fault, run)
 
-        suite = run_suite(chosen, options, Path(folder), repeat, begun, ended, earlier)
+        suite = run_suite(chosen, options, Path(folder), repeat, on_start, on_end, earlier)
         return run_async(suite)
 
 
 def _line(fault: "FaultRow", run: "FaultRun") -> str:
-    why = f": {run.reason}" if run.reason else ""
+    reason = f": {run.reason}" if run.reason else ""
     disturbed = f", disturbed: waited {run.waited_ms:g} ms for a core" if run.disturbed else ""
-    return f"{fault.number:>2} {fault.name}: {run.verdict}{why} ({run.seconds:g} s{disturbed})"
+    return f"{fault.number:>2} {fault.name}: {run.verdict}{reason} ({run.seconds:g} s{disturbed})"
 
 
 def _plan(chosen: "Sequence[FaultRow]") -> "Table":
@@ -193,9 +193,9 @@ def _table(results: "Sequence[FaultResult]", chosen: "Sequence[FaultRow]") -> "T
 
 
 def _tries(tries: "Sequence[FaultRun]") -> str:
-    """Return how many runs passed: `9 of 10, disturbed: 1 of 2`."""
-    counted = [one.verdict == "passed" for one in tries if not one.disturbed]
-    disturbed = [one.verdict == "passed" for one in tries if one.disturbed]
+    """Return the count of passed runs: `9 of 10, disturbed: 1 of 2`."""
+    counted = [run.verdict == "passed" for run in tries if not run.disturbed]
+    disturbed = [run.verdict == "passed" for run in tries if run.disturbed]
     also = f", disturbed: {sum(disturbed)} of {len(disturbed)}" if disturbed else ""
     return f"{sum(counted)} of {len(counted)}{also}"
 
@@ -226,20 +226,20 @@ def proxy(
         seed: Random seed of the faults.
         insecure: Listen beyond loopback: others on the network can then reach the robot.
     """
-    begin = parse_command(chaos)
+    first = parse_command(chaos)
     if to.startswith("/"):
         from gigabrain_zenoh.qa.proxy.serial import LineProxy
 
-        made: FaultyLine = LineProxy(to, _path(listen), baud=baud, seed=seed)
+        line: FaultyLine = LineProxy(to, _path(listen), baud=baud, seed=seed)
     else:
-        made = TcpProxy(_address(to), _own(listen, insecure), seed=seed)
-    run_async(_run_proxy(made, begin, to))
+        line = TcpProxy(_address(to), _own(listen, insecure), seed=seed)
+    run_async(_run_proxy(line, first, to))
     return 0
 
 
-async def _run_proxy(proxy: "FaultyLine", begin: ProxyCommand, to: str) -> None:
+async def _run_proxy(proxy: "FaultyLine", first: ProxyCommand, to: str) -> None:
     async with proxy:
-        await obey(proxy, begin)
+        await obey(proxy, first)
         print_line(f"{proxy} forwards to {to}")
         print_line(f"type [{'|'.join(WAYS)}] {' '.join(CALM.__struct_fields__)}; "
                    "cut[=rst] unplug plug figures; off ends it")  # fmt: skip
@@ -253,7 +253,7 @@ async def _run_proxy(proxy: "FaultyLine", begin: ProxyCommand, to: str) -> None:
 
 
 async def obey(proxy: "FaultyLine", command: ProxyCommand) -> None:
-    """Execute a typed line."""
+    """Execute a command that was typed."""
     if command.cut:
         proxy.cut(reset=command.cut == "rst")
     if command.unplugged is not None:

@@ -1,4 +1,4 @@
-"""`gigabrain estop`, `release` and `enable`: requests to the gate; `audit`: their log."""
+"""`gigabrain estop`, `release` and `enable`: requests to the gate; `audit`: shows their log."""
 
 import os
 import time
@@ -49,7 +49,7 @@ def estop(*, at: RobotAddress = LOCAL, reason: str = "") -> None:
         _ask(at, lambda robot: robot.estop(reason), "CONFIRMED by ", wait=False)
     except NotConfirmed:
         raise
-    except GigabrainError as error:  # anything that prevents the request
+    except GigabrainError as error:  # any error means that no robot confirmed
         raise NotConfirmed(f"NOT CONFIRMED: {error}; {BY_HAND}") from None
 
 
@@ -121,7 +121,7 @@ def audit(
 async def _print_live(
     at: RobotAddress, newest: int, follow: bool, to_text: "Callable[[AuditRecord], str]"
 ) -> None:
-    """Print the log of a running robot, and with `follow` its new entries."""
+    """Print the log of a running robot, and with `follow` new entries until Ctrl-C."""
     async with at.robot(wait=False) as robot:
         new_entries = robot.topic("audit") if follow else None
         for record in await robot.audit(newest):
@@ -137,7 +137,7 @@ def _audit_folder(robot: str) -> Path:
     from gigabrain_zenoh.runtime.audit import FOLDER
 
     robots = state_dir() / "robots"
-    logs = robots.glob(f"*/**/{FOLDER}/*.jsonl")  # a namespace may have parts
+    logs = robots.glob(f"*/**/{FOLDER}/*.jsonl")  # a namespace may contain slashes
     folders = {path.parent.parent for path in logs}
     known = {folder.relative_to(robots).as_posix(): folder for folder in folders}
     if robot in known:

@@ -164,7 +164,7 @@ def zenohd(
 
 
 def _first_use(role: Role, robot: str, folder: Path) -> str:
-    """Return the command that uses a new identity."""
+    """Return an example of a command that uses a new identity."""
     keys, namespace = _quoted(folder), f" --namespace {robot}" if robot else ""
     if role == "router":
         return f"gigabrain router --listen tls/0.0.0.0:7447 --fleet NAMESPACE --keys {keys}"
@@ -182,7 +182,7 @@ def _quoted(path: Path) -> str:
 
 @contextlib.contextmanager
 def _needs_cryptography() -> Iterator[None]:
-    """Raise ConfigError with the way to install it if the library is missing."""
+    """Raise ConfigError with the pip command if the library is missing."""
     try:
         yield
     except ModuleNotFoundError as error:

@@ -114,7 +114,7 @@ async def _compile_all() -> None:
 
     print_line("compiling, which takes up to two minutes")
     links = can_link()
-    await asyncio.gather(  # they share no kernel
+    await asyncio.gather(  # these share no kernel
         _compile("mapping", MAP_KERNELS, LOCALIZE_KERNELS, links=links),
         _compile("driving", DRIVE_KERNELS, CAR_KERNELS, ARM_KERNELS, links=links),
     )

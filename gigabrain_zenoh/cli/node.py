@@ -1,4 +1,4 @@
-"""`gigabrain node`, `graph`, `top` and `param`: the processes of a robot."""
+"""`gigabrain node`, `graph`, `top` and `param`: show and configure the processes of a robot."""
 
 import asyncio
 from pathlib import Path
@@ -210,7 +210,7 @@ def set_param(
 
     check_result_path(save)
     if save:
-        with_values(save, {})  # refuse a file that holds something else
+        with_values(save, {})  # raises if the file is not a settings file
     reply = ask_params(at, process, name, value)[process]
     if not reply.ok:
         raise Refused(f"{process}: {reply.text}")
@@ -244,7 +244,7 @@ def save_params(file: Path, /, *, at: RobotAddress = LOCAL) -> None:
 def ask_params(
     at: RobotAddress, process: str = "", name: str = "", value: str = ""
 ) -> "dict[str, ParamReply]":
-    """Return the replies of one process, or of all without a name. Raises Refused for any."""
+    """Return the replies of one process, or of all without a name. Raises the first Refused."""
     replies = {}
     for each, reply in _param_answers(at, process, name, value).items():
         if isinstance(reply, Refused):
@@ -256,7 +256,7 @@ def ask_params(
 def _param_answers(
     at: RobotAddress, process: str, name: str, value: str
 ) -> "dict[str, ParamReply | Refused]":
-    """Return the reply or the refusal of each process that was asked, by name."""
+    """Return the reply or the refusal of each process, by name."""
     from gigabrain_schemas.requests import ParamRequest
     from gigabrain_schemas.topics import PARAM
     from gigabrain_zenoh.diagnostics.discovery import discover
@@ -276,7 +276,7 @@ def _param_answers(
             raise unknown("process", process, known)
         asked = [process] if process else list(known)
         answers = await asyncio.gather(*(ask_one(bus, each) for each in asked))
-        return {each: some[0] for each, some in zip(asked, answers, strict=True) if some}
+        return {each: found[0] for each, found in zip(asked, answers, strict=True) if found}
 
     replies = on_bus(at, ask)
     if not replies:

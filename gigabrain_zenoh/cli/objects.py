@@ -1,4 +1,4 @@
-"""`gigabrain objects` and `gigabrain pose`: what the robot knows of things and of its place."""
+"""`gigabrain objects` and `gigabrain pose`: remembered things and tags, and the robot's pose."""
 
 import time
 from typing import TYPE_CHECKING, Annotated
@@ -72,7 +72,7 @@ def pose(x: Number, y: Number, yaw: Number | None = None, /, *, at: RobotAddress
 
 
 def lines(found: "ObjectMap", now_s: float) -> list[str]:
-    """Return the table of things and tags, at a Unix time [s]."""
+    """Return the lines of a table of things and tags; `now_s` is the Unix time [s]."""
     if not found.objects and not found.tags:
         return ["no things and no tags" + ("" if found.recognizing else NOBODY_LOOKS)]
     table = [
@@ -97,7 +97,7 @@ NOBODY_LOOKS = "; nothing is recognised now: `gigabrain node list` shows whether
 
 
 def ago(seen_ns: int, now_s: float) -> str:
-    """Return how long ago something was seen, as text."""
+    """Return the time since Unix time `seen_ns` as text, such as `5 min ago`."""
     seconds = max(0.0, now_s - seen_ns / 1e9)
     if seconds < 120:
         return f"{seconds:.0f} s ago"

@@ -39,8 +39,8 @@ T = TypeVar("T", bound="Struct")
 R = TypeVar("R")
 
 COMPLETION_TIMEOUT_S = 0.3  # a shell waits for the names
-PIPE_COLUMNS = 160  # width of tables where the output has none
-UNIT = re.compile("_(s|mb)$")  # part of a setting's name, but not of its option's
+PIPE_COLUMNS = 160  # width of tables in a pipe
+UNIT = re.compile("_(s|mb)$")  # suffix of settings that their options do not have
 
 
 @Parameter(name="*")
@@ -69,7 +69,7 @@ class RobotAddress:
         )
 
     def where(self) -> "Where":
-        """Return the address in the form that the tools take."""
+        """Return the address for `connect`."""
         from gigabrain_zenoh.runtime.connect import Where
 
         return Where(connect=self.connect, namespace=self.namespace, keys=self.folder)
@@ -79,7 +79,7 @@ LOCAL = RobotAddress()  # the only robot on this machine
 
 
 def on_bus(at: RobotAddress, do: Callable[["Bus"], Awaitable[R]], name: str = "") -> R:
-    """Run `do` on the bus of a robot, under the name of the tools if none is given."""
+    """Connect to a robot as `name`, call `do` with the bus, and return its result."""
     from gigabrain_zenoh.diagnostics.listener import CLIENT_NAME
     from gigabrain_zenoh.runtime.connect import connect
 
@@ -104,21 +104,21 @@ def completion(shell: Literal["bash", "zsh", "fish"]) -> None:
 
 
 def _live_topics(_: object) -> list[str]:
-    """Return the topics that a running robot publishes, or all known ones if none runs."""
+    """Return the topics that a running robot publishes; without a robot all known ones."""
     from gigabrain_schemas.topics import TOPICS
     from gigabrain_zenoh.bus.listening import topic_of
     from gigabrain_zenoh.diagnostics.discovery import short_name
 
-    published = {key for one in _live_processes() for key in one.publishes if topic_of(key)}
+    published = {key for each in _live_processes() for key in each.publishes if topic_of(key)}
     return sorted(map(short_name, published or {topic.key for topic in TOPICS}))
 
 
 def _live_process_names(_: object) -> list[str]:
-    return [one.process for one in _live_processes()]
+    return [each.process for each in _live_processes()]
 
 
 def _live_processes() -> list["Description"]:
-    """Return the processes that answer at once; empty on any error, since a shell waits."""
+    """Return the processes that reply at once; empty on any error."""
     from gigabrain_zenoh.diagnostics.discovery import discover
 
     try:
@@ -172,12 +172,12 @@ KeepStuck = Annotated[
 def checked(
     values: Mapping[str, object], type: type[T], options: Mapping[str, str] | None = None
 ) -> T:
-    """Return `values` as a `type`. Raises ConfigError, which names the option that does not fit.
+    """Convert `values` to a `type`. Raises ConfigError, which names the invalid option.
 
     Args:
         values: Settings by their names.
-        type: What they are settings of.
-        options: Names of options that differ from those of their settings.
+        type: Struct of the settings.
+        options: Names of options that differ from the names of their settings.
     """
     import msgspec
 
@@ -198,7 +198,7 @@ def checked(
 
 
 def check_positive(**options: float | None) -> None:
-    """Raise ConfigError for the first option not above 0, or too large; None is one not given."""
+    """Raise ConfigError for the first option that is not above 0 or too large; None is allowed."""
     for name, value in options.items():
         if value is not None and not 0 < value < 1e9:
             shown = name.replace("_", "-")
@@ -218,7 +218,7 @@ def check_names(robots: Iterable[str] = (), worlds: Iterable[str] = ()) -> None:
 
 
 def usage_error(error: CycloptsError) -> str:
-    """Return one line on arguments that cannot be parsed: what is wrong, and what is right."""
+    """Return an error in one line for arguments that cannot be parsed, with what is expected."""
     from gigabrain_zenoh.config.loading import expected, nearest
 
     command = " ".join(("gigabrain", *(error.command_chain or ())))
@@ -254,7 +254,7 @@ def _shown(argument: Argument) -> str:
 
 
 def check_numbers(_app: App, _command: tuple[str, ...], arguments: ArgumentCollection) -> None:
-    """Raise ConfigError for NaN and infinity, and for a fraction where cyclopts would round it."""
+    """Raise ConfigError for NaN and infinity, and for fractions that cyclopts would round."""
     for argument in arguments:
         whole = _holds(argument.hint, int)
         if not whole and not _holds(argument.hint, float):
@@ -267,7 +267,7 @@ def check_numbers(_app: App, _command: tuple[str, ...], arguments: ArgumentColle
 
 
 def default_text(value: object) -> str | None:
-    """Return a default as the help shows it; None for a switch that is off, or nothing."""
+    """Return a default as the help shows it; None for False or an empty value."""
     if value is None or value is False or value in ("", ()):
         return None
     return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
@@ -279,7 +279,7 @@ def _holds(hint: Any, number: type) -> bool:
 
 
 def _number(text: str) -> float:
-    """Return the number of a text; 0 for one that cyclopts judges, as a hexadecimal one."""
+    """Return the number in a text; 0 for one that only cyclopts can parse, such as 0x10."""
     try:
         return float(text)
     except ValueError:
@@ -287,7 +287,7 @@ def _number(text: str) -> float:
 
 
 def print_line(line: str) -> None:
-    """Print a line with control characters escaped, and flush it, for pipes."""
+    """Print a line with control characters escaped, and flush it."""
     print(printable(line), flush=True)
 
 
@@ -300,14 +300,14 @@ def print_json(value: object, *, indent: int = -1) -> None:
 
 
 def print_progress(line: str) -> None:
-    """Print a line to stderr, so that stdout holds the result alone."""
+    """Print a line to stderr, so that stdout contains only the result."""
     import sys
 
     print(printable(line), file=sys.stderr, flush=True)
 
 
 def print_table(table: "Table") -> None:
-    """Print a table as wide as the terminal; in a pipe as wide as it needs."""
+    """Print a table in the width of the terminal; in a pipe in PIPE_COLUMNS."""
     import sys
 
     from rich.console import Console

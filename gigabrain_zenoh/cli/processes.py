@@ -75,7 +75,7 @@ class ProcessOptions(HostOptions):
     def run(self, name: str, settings: dict[str, Any]) -> int:
         """Connect, and run the process `name` until a signal; return its exit code."""
         endpoint = find_endpoint(self.connect, self.namespace, self.folder)
-        session_config(endpoint)  # refuse a wrong address before starting
+        session_config(endpoint)  # raises for a wrong address, before starting
         return self.run_at(endpoint, name, settings)
 
 
@@ -108,11 +108,11 @@ def router(
     if not keys and not insecure:
         _refuse_exposed(listen)
     settings = router_config(endpoint, run_folders.state_dir() / "robots" / (namespace or "router"))
-    near = reached_at(endpoint.listen[0])
-    if keys:  # clients with keys take no IPv6 address
-        near = near.replace("/[::1]:", "/localhost:")
-    here = Endpoint(connect=(near,), namespace=namespace, keys=keys)
-    with announced(namespace or "router", here):
+    local = reached_at(endpoint.listen[0])
+    if keys:  # clients with keys accept no IPv6 address
+        local = local.replace("/[::1]:", "/localhost:")
+    client = Endpoint(connect=(local,), namespace=namespace, keys=keys)
+    with announced(namespace or "router", client):
         return process.run_at(endpoint, "router", msgspec.to_builtins(settings))
 
 
@@ -189,7 +189,7 @@ def decision(
         settings=values,
         state_dir=_state_folder(state_dir, process.namespace or "decision"),
     )
-    behaviours.check(settings)  # refuse a wrong name before connecting
+    behaviours.check(settings)  # raises for a wrong name, before connecting
     return process.run("decision", msgspec.to_builtins(settings))
 
 
@@ -252,7 +252,7 @@ def driver(
     settings = checked(values, DriverConfig)
     load_link(
         name, Run(folder=Path(), link=link, cameras=cameras)
-    )  # refuse a wrong name before connecting
+    )  # raises for a wrong name, before connecting
     return process.run("driver", msgspec.to_builtins(settings))
 
 
@@ -267,7 +267,7 @@ def button(*, port: str, process: ProcessOptions = LOCAL) -> int:
     from gigabrain_drivers.links.serial_link import describe_absent
 
     settings = checked({"port": port}, ButtonConfig)
-    if problem := describe_absent(port):  # the process itself reports it only once a robot is there
+    if problem := describe_absent(port):  # the process itself reports it only after connecting
         print_progress(f"gigabrain: {problem} Waiting for it.")
     return process.run("button", msgspec.to_builtins(settings))
 

@@ -1,4 +1,4 @@
-"""`gigabrain ros2`: the gateway to ROS 2 by hand, what ROS sees, and topics without code."""
+"""`gigabrain ros2`: runs the gateway to ROS 2, lists topics of ROS, and passes messages."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +27,7 @@ from gigabrain_zenoh.runtime.running import find_endpoint
 if TYPE_CHECKING:
     from gigabrain_zenoh.gateway.topic_list import TopicRow
 
-RENAMED = {"namespace": "ros_namespace"}  # settings whose options have other names
+RENAMED = {"namespace": "ros_namespace"}  # option by setting, where they differ
 
 
 @Parameter(name="*")
@@ -53,7 +53,7 @@ class RosLinkOptions:
     "File of ROS types, or folder of them; may be given again."
 
     def given(self) -> dict[str, Any]:
-        """Return the settings as a deployment file has them."""
+        """Return the settings by their names in a deployment file."""
         given = {name: getattr(self, name) for name in self.__dataclass_fields__}
         types = tuple(str(expanded(file).absolute()) for file in self.types)
         return given | {"types": types, "namespace": given.pop(RENAMED["namespace"])}
@@ -128,7 +128,7 @@ def topics(
 
 
 async def _listed(link: Ros2Link, *, all_topics: bool) -> "list[TopicRow]":
-    """Join ROS for a while. Raises BusError where no other node is there."""
+    """Join ROS for a while, and list its topics. Raises BusError if there is no other node."""
     from gigabrain_zenoh.gateway.topic_list import rows
     from gigabrain_zenoh.ros2.graph import discovered, unreached
     from gigabrain_zenoh.ros2.opening import ROUTER_S, load_types, open_transport

@@ -1,4 +1,4 @@
-"""`gigabrain goto`, `explore`, `patrol`, `mission` and `task`: the tasks of a robot."""
+"""`gigabrain goto`, `explore`, `patrol`, `mission` and `task`: send and control tasks."""
 
 import asyncio
 import sys
@@ -142,7 +142,7 @@ def mission(
     from gigabrain_zenoh.decision.tasks.mission import map_places
     from gigabrain_zenoh.decision.tasks.mission_files import load
 
-    loaded, _ = load(file)  # refuse a wrong file before connecting
+    loaded, _ = load(file)  # raises for a wrong file, before connecting
     if check:
         needs = ", ".join(sorted(set(map_places(loaded))))
         print_line(f"{file}: valid{f'; the map must have the places {needs}' if needs else ''}")
@@ -159,8 +159,9 @@ def list_(*, at: RobotAddress = LOCAL) -> None:
     async def show(tasks: "Tasks") -> None:
         status = await tasks.status()
         rows = (*((status.current,) if status.current else ()), *status.queue, *status.done)
-        for one in rows:
-            print_line(f"{one.id:<12} {one.state:<10} {one.source:<14} {one.label}  {one.reason}")
+        for task in rows:
+            about = f"{task.id:<12} {task.state:<10} {task.source:<14} {task.label}"
+            print_line(f"{about}  {task.reason}")
         if not rows:
             print_line("no tasks")
 
@@ -204,7 +205,7 @@ def _with_tasks(at: RobotAddress, do: "Callable[[Tasks], Awaitable[None]]") -> N
 
 
 def send(at: RobotAddress, give: "Callable[[Tasks], Awaitable[str]]", wait: bool) -> None:
-    """Give a robot a task, and show its progress to the end. Raises Refused where it fails."""
+    """Send a task to a robot, and show its progress until its end. Raises Refused if it fails."""
 
     async def run(tasks: "Tasks") -> None:
         from gigabrain_zenoh.decision.behaviours import describe_end
@@ -229,11 +230,11 @@ def send(at: RobotAddress, give: "Callable[[Tasks], Awaitable[str]]", wait: bool
 
 
 class ProgressLine:
-    """Progress of a task, in one line of a terminal; in a pipe one line per step."""
+    """Shows the progress of a task: in one line of a terminal, or in a pipe one line per step."""
 
     def __init__(self) -> None:
         self._terminal = sys.stdout.isatty()
-        self._step: str | None = None  # that was printed last
+        self._step: str | None = None  # the last one printed
 
     def show(self, name: str, status: TaskStatus) -> None:
         """Show the progress of the task `name`."""

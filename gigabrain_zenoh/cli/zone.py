@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 Number = Annotated[float | None, Parameter(allow_leading_hyphen=True)]
 Numbers = Annotated[list[float], Parameter(allow_leading_hyphen=True)]
-WAIT_S = 3.0  # for the robot's pose
+POSE_TIMEOUT_S = 3.0
 
 
 def list_(*, at: RobotAddress = LOCAL) -> None:
@@ -138,7 +138,7 @@ async def _here(bus: "Bus") -> dict[str, Any]:
     found: asyncio.Future[PoseInMap] = asyncio.get_running_loop().create_future()
     bus.subscribe(POSE, lambda _key, pose: None if found.done() else found.set_result(pose))
     try:
-        pose = await asyncio.wait_for(found, WAIT_S)
+        pose = await asyncio.wait_for(found, POSE_TIMEOUT_S)
     except TimeoutError:
         raise BodyLost("no pose in a map from the robot; give x and y") from None
     if not pose.localized:
@@ -147,7 +147,7 @@ async def _here(bus: "Bus") -> dict[str, Any]:
 
 
 async def _ask(bus: "Bus", fields: dict[str, Any]) -> str:
-    """Ask for a change; return the answer as text. Raises ConfigError, BodyLost and Refused."""
+    """Request a change; return the reply as text. Raises ConfigError, BodyLost and Refused."""
     import msgspec
 
     from gigabrain_schemas.zones import ZonesRequest
