@@ -131,8 +131,8 @@ async def test_without_a_server_processes_start_by_themselves(
 ) -> None:
     """Its import never ends; one that is only slow is given up after a while."""
     if fault is left_alone:
-        monkeypatch.setattr(forking, "IMPORT_S", 0.2)
-        monkeypatch.setattr(forking, "LOOK_S", 0.1)
+        monkeypatch.setattr(forking, "IMPORT_TIMEOUT_S", 0.2)
+        monkeypatch.setattr(forking, "STOPPED_CHECK_S", 0.1)
     specs = forked("one", imports=NEVER), forked("two", imports=NEVER)
     async with running(*specs) as (supervisor, records):
         await until(servers)

@@ -37,8 +37,8 @@ def resolver(monkeypatch: pytest.MonkeyPatch) -> Resolver:
     """No name leaves this machine."""
     made = Resolver()
     monkeypatch.setattr(socket, "getaddrinfo", made)
-    monkeypatch.setattr(connect, "AGAIN_S", 0.01)
-    monkeypatch.setattr(connect, "PATIENCE_S", 0.01)
+    monkeypatch.setattr(connect, "RETRY_S", 0.01)
+    monkeypatch.setattr(connect, "WARN_AFTER_S", 0.01)
     return made
 
 
@@ -71,7 +71,7 @@ async def test_a_router_waits_for_its_own_name_and_says_so_once(
 async def test_a_router_waits_for_its_own_address_and_says_so_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(connect, "AGAIN_S", 0.01)
+    monkeypatch.setattr(connect, "RETRY_S", 0.01)
     here, bind, asked = free_endpoint(), socket.socket.bind, list[object]()
 
     def late(self: socket.socket, address: tuple[str, int]) -> None:

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from gigabrain_zenoh.host.this_process import FIRST_NICE
+from gigabrain_zenoh.host.this_process import HIGH_PRIORITY_NICE
 from gigabrain_zenoh.qa.probe import probing
 from gigabrain_zenoh.testing.processes import Home, endpoint_of
 
@@ -42,8 +42,8 @@ def told_of(session: str, nice: int) -> bool:
 @needs_rights
 def test_whoever_goes_first_does_so_with_all_of_its_session() -> None:
     nice, session = going_first()
-    assert nice == FIRST_NICE
-    assert told_of(session, FIRST_NICE)
+    assert nice == HIGH_PRIORITY_NICE
+    assert told_of(session, HIGH_PRIORITY_NICE)
 
 
 STARTING = """
@@ -61,14 +61,14 @@ def test_the_brain_goes_first_until_it_is_ready() -> None:
         start_new_session=True, capture_output=True, text=True, check=True,
     )  # fmt: skip
     first, then = done.stdout.splitlines()
-    assert told_of(first, FIRST_NICE)
+    assert told_of(first, HIGH_PRIORITY_NICE)
     assert told_of(then, 0)
 
 
 @needs_rights
 def test_a_session_that_it_shares_with_others_stays_as_it_is() -> None:
     nice, session = going_first(of_its_own=False)
-    assert nice == FIRST_NICE
+    assert nice == HIGH_PRIORITY_NICE
     assert told_of(session, 0)
 
 
@@ -88,6 +88,6 @@ async def test_of_a_robot_what_stops_it_goes_first(home: Home) -> None:
             for name in ("driver", "perception", "decision", "control", "safety")
         }
     assert found == {
-        "driver": FIRST_NICE, "perception": 0, "decision": 0,
-        "control": FIRST_NICE, "safety": FIRST_NICE,
+        "driver": HIGH_PRIORITY_NICE, "perception": 0, "decision": 0,
+        "control": HIGH_PRIORITY_NICE, "safety": HIGH_PRIORITY_NICE,
     }  # fmt: skip
