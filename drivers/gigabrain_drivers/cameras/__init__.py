@@ -1,5 +1,5 @@
-"""Cameras: the process that publishes their pictures, its sources, and a model of their errors.
+"""Cameras: the process that publishes pictures, its sources, and a model of depth errors.
 
-Imports `driver` and, in the sources that simulate, `sim`. Sources are found by name, through
-`CAMERAS` of the package above.
+Imports `driver`; rendered sources also import `sim`. `CAMERAS` of the package above lists the
+sources by name.
 """

@@ -1,4 +1,4 @@
-"""The base of every camera's source, and how a link of a robot's file names the sources."""
+"""The base class of camera sources, and their options in a robot's file."""
 
 import abc
 from collections.abc import Mapping
@@ -15,23 +15,23 @@ from gigabrain_schemas.body import BodyDescription, Camera
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.plugins import load_plugin
 
-GROUP = "gigabrain.cameras"  # of entry points
+GROUP = "gigabrain.cameras"  # entry points of packages with camera sources
 Picture = NDArray[np.uint8]  # (height, width, 3), blue, green, red
-Depth = NDArray[np.uint16]  # (height, width) [mm], 0 is unknown
+Depth = NDArray[np.uint16]  # (height, width) [mm]; 0 is unknown
 
 
 class CameraOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A camera in a link of a robot's file; sources add their own fields."""
 
-    source: str  # one of gigabrain_drivers.CAMERAS, or of a package's
-    encoding: Literal["jpeg", "bgr8"] = "jpeg"  # of its pictures on the bus
-    quality: Annotated[int, Meta(ge=1, le=100)] = 80  # of a JPEG
-    repeat: bool = False  # whether a film or a recording begins again at its end
-    repeats: bool = False  # a still scene may give the same picture twice, as in strong compression
+    source: str  # name in gigabrain_drivers.CAMERAS, or of a package's source
+    encoding: Literal["jpeg", "bgr8"] = "jpeg"  # of pictures on the bus
+    quality: Annotated[int, Meta(ge=1, le=100)] = 80  # of JPEG compression
+    repeat: bool = False  # play a film or a recording again after its end
+    repeats: bool = False  # equal pictures are no fault: strong compression of a still scene
 
 
 class CameraLost(GigabrainError):
-    """A camera gives no pictures now; its source is opened again."""
+    """A camera gives no pictures now. The camera process opens its source again."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -40,26 +40,26 @@ class Frame:
 
     picture: Picture | None
     depth: Depth | None = None
-    tick: int = 0  # of the exposure, by the robot's clock; 0: the newest one when it came
-    stamp_ns: int = 0  # of the exposure [Unix time]; 0: when it came
+    tick: int = 0  # of the exposure; 0: the robot's tick when it arrived
+    stamp_ns: int = 0  # of the exposure [Unix time]; 0: the time when it arrived
 
 
 @dataclass(frozen=True)
 class CameraSite:
-    """The folder and the seed that a source works with."""
+    """A source's folder and random seed."""
 
-    folder: str  # of the robot's file, to which paths in it are relative
+    folder: str  # of the robot's file; paths in that file are relative to it
     seed: int = 0
 
 
 class CameraSource(abc.ABC):
     """Takes the pictures of one camera, in a thread of its own.
 
-    `open` and `read` may wait; after CameraLost, the source is closed, and soon opened again.
+    `open` and `read` may block. After CameraLost the process closes the source and opens it again.
     """
 
-    Options: ClassVar[type[CameraOptions]] = CameraOptions  # its part of a robot's file
-    gives_depth: ClassVar[bool] = True  # or may do so
+    Options: ClassVar[type[CameraOptions]] = CameraOptions  # its fields in a robot's file
+    gives_depth: ClassVar[bool] = True  # False: never
 
     def __init__(self, options: Any, camera: Camera, site: CameraSite) -> None:
         self.options, self.camera, self.site = options, camera, site
@@ -74,11 +74,11 @@ class CameraSource(abc.ABC):
 
     @abc.abstractmethod
     def close(self) -> None:
-        """Let go of the camera; any number of times, in any state."""
+        """Free the camera. May be called several times, in any state."""
 
 
 def source_class(name: str) -> type[CameraSource]:
-    """Return the source called `name`: one of ours, or one that a package offers.
+    """Return the source called `name`, shipped or from an installed package.
 
     Raises UnknownName listing the known ones, and ConfigError where it cannot be imported.
     """
@@ -86,15 +86,15 @@ def source_class(name: str) -> type[CameraSource]:
 
 
 def camera_options(robot: BodyDescription, part: Any) -> Any:
-    """Return the type of the part `cameras` of a link: a field for each camera of the body.
+    """Return the type of a link's `cameras`: one field for each camera of the body.
 
-    Raises UnknownName and ConfigError for a source that is not there.
+    Raises UnknownName for an unknown source, and ConfigError for one that cannot be imported.
     """
-    named = part if isinstance(part, Mapping) else {}
+    entries = part if isinstance(part, Mapping) else {}
     fields = []
     for camera in robot.cameras:
-        one = named.get(camera.name)
-        source = one.get("source") if isinstance(one, Mapping) else None
+        entry = entries.get(camera.name)
+        source = entry.get("source") if isinstance(entry, Mapping) else None
         kind = source_class(source).Options if isinstance(source, str) else CameraOptions
         fields.append((camera.name, kind | None, None))
     return msgspec.defstruct(

@@ -1,4 +1,4 @@
-"""Cameras of a robot on a link, each with its source, by the robot's file."""
+"""The cameras of a robot on a link, with the source of each, as its file says."""
 
 import importlib.util
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ INSTALL = "cameras need OpenCV; install it with: pip install 'gigabrain-zenoh[ey
 
 
 class LinkedCamera(NamedTuple):
-    """A camera of a robot, and what gives its pictures."""
+    """A camera of a robot, and the options of its source."""
 
     camera: Camera
     options: CameraOptions
@@ -28,7 +28,7 @@ class LinkedCamera(NamedTuple):
 def cameras_of(body: str, link: LinkName, changes: Mapping[str, Any]) -> list[LinkedCamera]:
     """Return the cameras of a robot (a name or a file) on a link.
 
-    Where its file names no source, those of a simulated world are rendered. Raises ConfigError.
+    Cameras of a simulated world without a source in the file are rendered. Raises ConfigError.
     """
     if not importlib.util.find_spec("cv2"):
         raise ConfigError(INSTALL)

@@ -1,4 +1,4 @@
-"""Errors of a depth camera, as a rendered picture has none: noise, holes, mixed pixels, mounting.
+"""Errors of a depth camera, added to rendered depth: noise, holes, mixed pixels, mounting.
 
 The camera process, benchmarks and tests share this model. Pure: the same seed gives the same bits.
 """
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gigabrain_drivers.sim.world import Stream
 from gigabrain_schemas.body import Camera
 
-EDGE_M, EDGE_SHARE = 0.03, 0.03  # a step of depth from pixel to pixel: more than both
+EDGE_M, EDGE_SHARE = 0.03, 0.03  # at an edge, depth jumps by more than both
 NEAR_M, FAR_M = 1e-3, 1e4
 PATCH_PX = 4  # side of a hole that is more than one pixel
 
@@ -23,11 +23,11 @@ PATCH_PX = 4  # side of a hole that is more than one pixel
 class DepthErrors:
     """Errors of a depth camera: noise, holes, edges and mounting."""
 
-    sigma_at_1m: float = 0.0015  # [m], standard deviation; grows with the square of the depth
-    holes: float = 0.02  # share of pixels without depth: half of them alone, half in patches
-    mixed: float = 0.5  # share of pixels at an edge that measure something between both sides
-    mounting_m: float = 0.005  # most that the camera is displaced, along each axis
-    mounting_rad: float = math.radians(0.5)  # most that it is turned, about each axis
+    sigma_at_1m: float = 0.0015  # [m], standard deviation at 1 m; grows with depth squared
+    holes: float = 0.02  # share of pixels without depth: half of them single, half in patches
+    mixed: float = 0.5  # share of the pixels at an edge that measure a depth between both sides
+    mounting_m: float = 0.005  # largest displacement of the camera along each axis
+    mounting_rad: float = math.radians(0.5)  # largest rotation of the camera about each axis
 
 
 SENSOR = DepthErrors()
@@ -35,25 +35,25 @@ NO_ERRORS = DepthErrors(sigma_at_1m=0.0, holes=0.0, mixed=0.0, mounting_m=0.0, m
 
 
 class DepthSensor:
-    """A depth camera with errors that `seed` (a whole number >= 0) draws, its name as well."""
+    """A depth camera with random errors, drawn from `seed` (>= 0) and the camera's name."""
 
     def __init__(self, camera: Camera, seed: int, errors: DepthErrors = SENSOR) -> None:
         self._camera, self._errors = camera, errors
         self._key = (seed, Stream.CAMERA, zlib.crc32(camera.name.encode()))
         self.mounted = _displaced(camera, errors, np.random.default_rng(self._key))
-        # where it really sits: render from there; everybody else knows only its file
+        # the true mounting, for the renderer only; others know the one in the robot's file
         self.random = self.begin(0)
 
     def begin(self, exposure: int) -> np.random.Generator:
-        """Draw the errors of one exposure from now on, by its number; return what draws them."""
+        """Start the random errors of the exposure with this number; return their generator."""
         self.random = np.random.Generator(np.random.SFC64([*self._key, 1 + exposure]))
         return self.random
 
     def measure(self, depth: NDArray[np.floating]) -> NDArray[np.uint16]:
-        """Return what the camera measures [mm], (height, width); 0 is unknown.
+        """Return the measured depth [mm], (height, width); 0 is unknown.
 
-        `depth` [m] is the true one, (height, width), along the camera's axis x. Every call draws
-        new errors, always the same number of them.
+        `depth` [m] is the true depth, (height, width), along the camera's x axis. Every call draws
+        new errors, and always equally many random numbers.
         """
         errors, camera = self._errors, self._camera
         true = np.fmax(np.fmin(depth, FAR_M), NEAR_M).astype(np.float32, order="C")  # NaN: far
@@ -77,7 +77,7 @@ class DepthSensor:
 
 
 def _displaced(camera: Camera, errors: DepthErrors, random: np.random.Generator) -> Camera:
-    """Return the camera where it really sits."""
+    """Return the camera at its true mounting, with random errors."""
     x, y, z = (errors.mounting_m * random.uniform(-1, 1, 3)).tolist()
     roll, pitch, yaw = (errors.mounting_rad * random.uniform(-1, 1, 3)).tolist()
     return replace(
@@ -94,7 +94,7 @@ def _displaced(camera: Camera, errors: DepthErrors, random: np.random.Generator)
 def _mixed(
     depth: NDArray[np.float32], random: np.random.Generator, share: float
 ) -> NDArray[np.float32]:
-    """Return the depth with pixels at edges that see both sides, and so measure neither."""
+    """Return the depth with mixed pixels: at edges, a pixel may see both sides."""
     drawn = random.random((2, depth.size), np.float32)
     true, mixed = depth.reshape(-1), depth.flatten()
     for axis, step in ((0, depth.shape[1]), (1, 1)):
@@ -108,10 +108,10 @@ def _mixed(
 
 
 def _edges(depth: NDArray[np.float32], axis: int) -> NDArray[np.intp]:
-    """Return the pixels, as numbers by row, from which depth jumps to the next one along an axis.
+    """Return the flat indices of pixels whose next pixel along `axis` is across an edge.
 
-    Inverse depth changes evenly across a plane, however steeply it is seen. So an edge is where it
-    changes unlike on both sides. Pixels at the border of the picture are left out.
+    Inverse depth changes evenly across a plane, at any angle. So an edge is where its step differs
+    from the steps on both sides. Pixels at the border of the picture are left out.
     """
     step = depth.shape[1] if axis == 0 else 1
     steep = np.abs(np.diff(depth, axis=axis)) > EDGE_M
@@ -122,7 +122,7 @@ def _edges(depth: NDArray[np.float32], axis: int) -> NDArray[np.intp]:
     flat = depth.reshape(-1)
     before, one, other, after = (1.0 / flat[here + shift * step] for shift in (-1, 0, 1, 2))
     jump = other - one
-    unlike = np.minimum(np.abs(jump - (one - before)), np.abs(jump - (after - other)))
+    difference = np.minimum(np.abs(jump - (one - before)), np.abs(jump - (after - other)))
     near, far = 1.0 / np.maximum(one, other), 1.0 / np.minimum(one, other)
-    edges: NDArray[np.intp] = here[unlike * near * far > np.maximum(EDGE_M, EDGE_SHARE * near)]
+    edges: NDArray[np.intp] = here[difference * near * far > np.maximum(EDGE_M, EDGE_SHARE * near)]
     return edges

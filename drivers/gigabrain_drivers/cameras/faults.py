@@ -1,4 +1,4 @@
-"""Faults that a simulated camera is given on purpose, as the parameter `NAME_fault`."""
+"""Faults of simulated cameras, for tests; set by the parameter `NAME_fault`."""
 
 from typing import Literal, get_args
 
@@ -9,11 +9,11 @@ from gigabrain_drivers.cameras.base import Frame
 CameraFault = Literal["none", "frozen", "repeats", "covered", "dark", "bright", "unplugged"]
 FAULTS: tuple[CameraFault, ...] = get_args(CameraFault)
 DARK_GREY, BRIGHT_GREY = 6, 252  # of 255
-MIRRORED = 3  # pictures in a row that are one and the same, where they repeat
+REPEATS = 3  # equal pictures in a row, for the fault `repeats`
 
 
 class FaultyCamera:
-    """Spoils exposures. `fault` may be set at any time."""
+    """Applies a fault to exposures. `fault` may be set at any time."""
 
     def __init__(self) -> None:
         self.fault: CameraFault = "none"
@@ -21,7 +21,7 @@ class FaultyCamera:
         self._count = 0
 
     def put(self, name: str) -> None:
-        """Have this fault from now on. Raises ValueError for an unknown one."""
+        """Set the fault. Raises ValueError for an unknown one."""
         if name not in FAULTS:
             raise ValueError(name)
         self.fault = name
@@ -32,7 +32,7 @@ class FaultyCamera:
         fault, last = self.fault, self._last
         if fault == "unplugged":
             return None
-        if last and (fault == "frozen" or (fault == "repeats" and self._count % MIRRORED)):
+        if last and (fault == "frozen" or (fault == "repeats" and self._count % REPEATS)):
             return Frame(last.picture, last.depth, frame.tick, frame.stamp_ns)
         self._last = frame
         if fault in ("covered", "dark"):
@@ -41,7 +41,7 @@ class FaultyCamera:
 
 
 def _flat(frame: Frame, grey: int, *, covered: bool) -> Frame:
-    """Return an exposure of one grey, with the noise of its picture; without depth if covered."""
+    """Return a uniformly grey exposure with the picture's noise; without depth if covered."""
     picture, depth = frame.picture, frame.depth
     if picture is not None:
         noise = picture % 4

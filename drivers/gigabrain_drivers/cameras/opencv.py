@@ -1,4 +1,4 @@
-"""Anything that OpenCV opens: USB cameras (v4l2), network streams (RTSP, HTTP), and video files."""
+"""Cameras through OpenCV: USB (v4l2), network streams (RTSP, HTTP), and video files."""
 
 import math
 import re
@@ -13,33 +13,33 @@ from numpy.typing import NDArray
 from gigabrain_drivers.cameras.base import CameraLost, CameraOptions, CameraSource, Frame, Picture
 from gigabrain_zenoh.host.files import expanded
 
-TIMEOUT_MS = 3000  # of opening a stream, and of reading from it
-ASPECT = 0.01  # by which the shape of a scaled picture may differ
-MAX_PIXELS = 16_000_000  # of a picture that is scaled
-MAX_BROKEN = 1000  # pictures in a row: behind so many a film has ended
+TIMEOUT_MS = 3000  # for opening a stream, and for reading from it
+ASPECT_TOLERANCE = 0.01  # relative difference of the aspect ratios of two pictures
+MAX_PIXELS = 16_000_000  # of a picture before scaling
+MAX_BROKEN = 1000  # after this many broken pictures in a row, a film has ended
 
 
 class OpenCvOptions(CameraOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Fields of a camera that OpenCV opens."""
 
-    device: str  # /dev/video0, its number, rtsp://..., http://..., or a file beside the robot's
+    device: str  # /dev/video0, 0, rtsp://..., http://..., or a file beside the robot's file
 
 
 class OpenCvCamera(CameraSource):
-    """A camera without depth, by cv2.VideoCapture. Pictures of another size are scaled."""
+    """A camera without depth, read by cv2.VideoCapture. Pictures of other sizes are scaled."""
 
     Options = OpenCvOptions
     options: OpenCvOptions
     gives_depth = False
 
     _capture: cv2.VideoCapture | None = None
-    _file = False
-    _ended = False  # a file that does not repeat
-    _due_s = 0.0  # of a file's next picture
-    _reads = 0  # of a file since its start, also of broken pictures
+    _file = False  # the device is a video file
+    _ended = False  # a file without `repeat` has ended
+    _due_s = 0.0  # time of a file's next picture
+    _reads = 0  # pictures read since a file's start, including broken ones
 
     def open(self) -> None:
-        """Open the device. Raises CameraLost, and ConfigError without the home of a `~`."""
+        """Open the device. Raises CameraLost, and ConfigError if `~` has no home folder."""
         if self._ended:
             raise CameraLost(f"{self._shown} has ended")
         target, backend = self._target()
@@ -51,7 +51,7 @@ class OpenCvCamera(CameraSource):
         if not capture.isOpened():
             raise CameraLost(f"{self._shown} cannot be opened")
         if not self._file and not network:
-            capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # an old picture is worse than none
+            capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # prefer no picture to an old one
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, self.camera.width)
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self.camera.height)
             capture.set(cv2.CAP_PROP_FPS, self.camera.rate_hz)
@@ -71,7 +71,7 @@ class OpenCvCamera(CameraSource):
             self._reads = 0
             picture = self._next(capture)
         if picture is None:
-            self._ended = self._file and not self.options.repeat  # not all can be rewound
+            self._ended = self._file and not self.options.repeat  # some files cannot be rewound
             end = "has ended" if self._file else "gives no picture"
             raise CameraLost(f"{self._shown} {end}")
         return Frame(fitted(picture, self.camera.width, self.camera.height))
@@ -84,9 +84,9 @@ class OpenCvCamera(CameraSource):
 
     @property
     def _shown(self) -> str:
-        """Return the device for messages: of an address, which may hold a password, the host.
+        """Return the device for messages; without the user and password of an address.
 
-        Where it is not clear which part that is, not even the host.
+        Where the host cannot be found with certainty, it is left out too.
         """
         address = re.fullmatch(
             r"(.*?://)(?:[^/?#]*@)?([^/?#]*)(.*)", self.options.device, re.DOTALL
@@ -97,12 +97,12 @@ class OpenCvCamera(CameraSource):
         return f"{start}…" if "@" in rest else start + host
 
     def _next(self, capture: cv2.VideoCapture) -> NDArray[Any] | None:
-        """Return the next picture, a file's next whole one; None if there is none."""
+        """Return the next picture, or None; a file's broken pictures are skipped."""
         count = capture.get(cv2.CAP_PROP_FRAME_COUNT) if self._file else 0
         for _ in range(MAX_BROKEN):
-            came, picture = capture.read()
+            ok, picture = capture.read()
             self._reads += 1
-            if came:
+            if ok:
                 return np.asarray(picture)
             if self._reads >= count:
                 break
@@ -132,7 +132,7 @@ def fitted(picture: NDArray[Any], width: int, height: int) -> Picture:
         picture = np.asarray(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR), np.uint8)
     if (wide, tall) == (width, height):
         return np.asarray(picture, np.uint8)
-    if not math.isclose(wide / tall, width / height, rel_tol=ASPECT):
+    if not math.isclose(wide / tall, width / height, rel_tol=ASPECT_TOLERANCE):
         raise CameraLost(
             f"gives pictures of {wide} x {tall} pixels; the body's file says {width} x {height}"
         )

@@ -1,4 +1,4 @@
-"""One camera on the bus: its exposures are judged, packed and published, or withheld."""
+"""One camera on the bus: checks, packs and publishes its exposures, or withholds them."""
 
 import logging
 from collections.abc import Callable
@@ -18,22 +18,22 @@ from gigabrain_zenoh.vision import camera_health
 from gigabrain_zenoh.vision.camera_health import CameraHealth
 
 log = logging.getLogger(__name__)
-LOOK_NS = 50_000_000  # between two looks at a camera's health
-INFO_LOOKS = 20  # of these, between two messages of a camera that stays as it is
-STARTUP_NS = 5_000_000_000  # in which a camera that is silent is only starting
+CHECK_PERIOD_NS = 50_000_000  # between two checks of a camera's health
+INFO_CHECKS = 20  # checks between two messages about a camera without changes
+STARTUP_NS = 5_000_000_000  # a silent camera counts as starting for this long
 REMEDIES = {
     camera_health.COVERED: "uncover the lens, or clean it",
     camera_health.DARK: "uncover the lens, or switch a light on",
     camera_health.UNDEREXPOSED: "switch a light on, or set the camera's exposure",
     camera_health.OVEREXPOSED: "turn it away from the light, or set the camera's exposure",
 }
-HEADER_BYTES = 1024  # of a message, beside its pixels
+HEADER_BYTES = 1024  # reserved in a message for all but its pixels
 RECONNECT = "check its cable, or connect it again"
 CHECK_SOURCE = "check its source in the robot's file, then its cable"
 
 
 class Packed(NamedTuple):
-    """An exposure, and its messages."""
+    """An exposure with its messages."""
 
     frame: Frame
     picture: Image | None
@@ -42,7 +42,7 @@ class Packed(NamedTuple):
 
 
 class CameraOutput:
-    """Publishes what a camera measures. `pack` runs in any thread, all else on the loop's."""
+    """Publishes a camera's exposures. `pack` may run in any thread, the rest on the loop's."""
 
     def __init__(
         self,
@@ -57,8 +57,8 @@ class CameraOutput:
         self._repeats = repeats
         self._health = CameraHealth(camera, repeats=repeats)
         self._lost, self._problem = "", camera_health.SILENT
-        self._fault, self._began_ns, self._looks = Fault(log), bus.clock.now_ns(), 0
-        self.exposures = 0  # that came, believed or not
+        self._fault, self._began_ns, self._checks = Fault(log), bus.clock.now_ns(), 0
+        self.exposures = 0  # received, published or not
 
     def pack(self, frame: Frame) -> Packed:
         """Compress an exposure."""
@@ -86,14 +86,14 @@ class CameraOutput:
         return Packed(frame, picture, depth, _too_large(picture, depth))
 
     def put(self, packed: Packed) -> None:
-        """Judge an exposure, and publish it if it can be believed."""
+        """Check an exposure, and publish it if the camera is healthy."""
         self.exposures += 1
         bus, frame, name = self._bus, packed.frame, self.camera.name
         self._lost = packed.problem
         tick = frame.tick or bus.time.tick
         stamp_ns = frame.stamp_ns or bus.clock.unix_ns()
         usable = self._health.take(self._now_s(), frame.picture, frame.depth)
-        self._look()
+        self._check()
         if not usable or self._problem or packed.problem:
             bus.counters[f"{name}_withheld"] += 1
             bus.publish(CAMERA, self._info(), basis=tick, name=name)
@@ -105,32 +105,32 @@ class CameraOutput:
             bus.publish(IMAGE, packed.picture, **header)
 
     def lose(self, problem: str) -> None:
-        """Note why there are no pictures; those of another start are judged by themselves."""
+        """Note why there are no pictures, and restart the health check."""
         self.restart()
         self._lost = problem
-        self._look()
+        self._check()
 
     def restart(self) -> None:
-        """Judge what comes from now on: time has begun again."""
+        """Restart the health check, because the robot's time starts again."""
         self._health = CameraHealth(self.camera, repeats=self._repeats)
 
     def look(self) -> None:
-        """Publish how the camera is: once a second, and when that changes."""
-        self._looks += 1
-        if not self._look() and self._looks % INFO_LOOKS == 1:
+        """Check the camera's health; publish it once a second, and when it changes."""
+        self._checks += 1
+        if not self._check() and self._checks % INFO_CHECKS == 1:
             self._bus.publish(CAMERA, self._info(), name=self.camera.name)
 
     @property
     def cause(self) -> Cause | None:
-        """Return what is wrong, for the process's health."""
+        """Return the camera's problem for the process's health."""
         if not self._problem:
             return None
         text = f"camera {self.camera.name}: {self._problem}"[:500]
         remedy = CHECK_SOURCE if self._lost else REMEDIES.get(self._problem, RECONNECT)
         return Cause(code="camera", text=text, remedy=remedy)
 
-    def _look(self) -> bool:
-        """Look for a problem; return whether it is another one than before, and published."""
+    def _check(self) -> bool:
+        """Check for a problem; publish it and return True if it has changed."""
         before, problem = self._problem, self._health.problem(self._now_s())
         self._problem = problem = self._lost or problem
         name = self.camera.name
@@ -153,7 +153,7 @@ class CameraOutput:
 
 
 def _too_large(picture: Image | None, depth: DepthImage | None) -> str:
-    """Return why messages exceed the limits of their topics; empty if they do not."""
+    """Return which message exceeds the limit of its topic; empty if none does."""
     sizes = (
         ("a picture", len(picture.data) if picture else 0, IMAGE.max_bytes),
         ("a depth picture", sum(map(len, depth.planes)) if depth else 0, DEPTH.max_bytes),

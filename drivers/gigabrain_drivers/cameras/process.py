@@ -1,4 +1,4 @@
-"""The camera process: the pictures of all cameras of a robot, from their sources onto the bus."""
+"""The camera process: publishes the pictures of all cameras of a robot."""
 
 import asyncio
 import contextlib
@@ -19,7 +19,7 @@ from gigabrain_drivers.cameras.base import (
 )
 from gigabrain_drivers.cameras.catalog import RENDERED, LinkedCamera, cameras_of
 from gigabrain_drivers.cameras.faults import FAULTS, FaultyCamera
-from gigabrain_drivers.cameras.output import LOOK_NS, CameraOutput
+from gigabrain_drivers.cameras.output import CHECK_PERIOD_NS, CameraOutput
 from gigabrain_drivers.sim import exposes
 from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import Camera
@@ -34,13 +34,13 @@ from gigabrain_zenoh.runtime.heartbeat import Progress
 if TYPE_CHECKING:
     from gigabrain_drivers.cameras.rendered import Renderer
 
-AGAIN_S = 0.5  # until a source that was lost is opened again
-EARLY = 0.75  # of a period: without ticks, a camera is due this soon
-END_S = 0.5  # that a thread may take to end; one that hangs in a device is left
+REOPEN_PAUSE_S = 0.5  # before a lost source is opened again
+MIN_PERIOD_SHARE = 0.75  # without ticks, a camera is due after this share of its period
+THREAD_END_TIMEOUT_S = 0.5  # a thread that hangs in a device is left running
 
 
 class CameraProcess:
-    """All cameras of one robot. Used as `async with`; its threads run inside."""
+    """All cameras of one robot. Its threads run inside its `async with` block."""
 
     def __init__(self, config: CameraConfig, bus: Bus) -> None:
         """Read the robot's file. Raises ConfigError."""
@@ -58,7 +58,7 @@ class CameraProcess:
     async def __aenter__(self) -> "CameraProcess":
         self._bridge = Bridge()
         bus, drawn = self._bus, []
-        bus.latest(STATE)  # moves this process's clock, by which a silent camera is known
+        bus.latest(STATE)  # advances this process's clock, which detects silent cameras
         for one in self._cameras:
             if one.options.source == RENDERED:
                 drawn.append(one)
@@ -78,12 +78,12 @@ class CameraProcess:
         if self._rendered:
             self._rendered.wake()
         for thread in self._threads:
-            await asyncio.to_thread(thread.join, END_S)
+            await asyncio.to_thread(thread.join, THREAD_END_TIMEOUT_S)
         self._bridge.close()
 
     async def watch(self) -> None:
-        """Look after the cameras' health until cancelled. Raises what ended a thread."""
-        async for _ in self._bus.clock.every(LOOK_NS):
+        """Check the cameras' health until cancelled. Raises the error that ended a thread."""
+        async for _ in self._bus.clock.every(CHECK_PERIOD_NS):
             if self.failed.done():
                 await self.failed
             for output in self.outputs.values():
@@ -92,19 +92,19 @@ class CameraProcess:
             self._bus.problems = tuple(cause for cause in causes if cause)
 
     def put(self, name: str, frame: Frame) -> None:
-        """Take an exposure, from any thread."""
+        """Pack an exposure and hand it to the loop. May be called in any thread."""
         spoilt = self._faults[name].spoil(frame)
         if spoilt:
             self._bridge.post(self.outputs[name].put, self.outputs[name].pack(spoilt))
 
     def lose(self, names: Iterable[str], problem: str) -> None:
-        """Note why some cameras give no pictures, from any thread."""
+        """Note why some cameras give no pictures. May be called in any thread."""
         for name in names:
             self._bridge.post(self.outputs[name].lose, problem)
 
     @property
     def halted(self) -> bool:
-        """Return whether the threads are to end."""
+        """Return whether the threads should end."""
         return self._halt.is_set()
 
     def now_ns(self) -> int:
@@ -117,16 +117,16 @@ class CameraProcess:
         return self._bus.time.tick
 
     def count(self, name: str) -> None:
-        """Count something in the process's health, from any thread."""
+        """Increment a counter of the process's health. May be called in any thread."""
         self._bridge.post(lambda _: self._bus.counters.update((name,)), None)
 
     def restart(self) -> None:
-        """Judge all cameras from now on: the robot's time has begun again."""
+        """Restart all health checks, because the robot's time starts again."""
         for output in self.outputs.values():
             output.restart()
 
     def _output(self, one: LinkedCamera) -> CameraOutput:
-        """Return the output of a camera; a rendered one is judged by the robot's time."""
+        """Return the output of a camera; rendered ones use the robot's time."""
         bus, drawn = self._bus, one.options.source == RENDERED
         repeats = one.options.repeats or one.options.repeat
 
@@ -169,7 +169,7 @@ class CameraProcess:
                 self.lose((name,), f"no picture: {error}")
             finally:
                 source.close()
-            self._halt.wait(AGAIN_S)
+            self._halt.wait(REOPEN_PAUSE_S)
 
     def _take_all(self, name: str, source: CameraSource) -> None:
         source.open()
@@ -178,9 +178,9 @@ class CameraProcess:
 
 
 class RenderThread:
-    """Draws the cameras of a simulated robot, always the newest poses that came.
+    """Draws the cameras of a simulated robot, always at the newest poses.
 
-    `show` and `expose` are called on the loop's thread, `run` is the thread itself.
+    The loop's thread calls `show` and `expose`; `run` is the thread's own function.
     """
 
     def __init__(
@@ -190,27 +190,27 @@ class RenderThread:
         self._cameras = {one.camera.name: one.camera for one in cameras}
         self._changed = threading.Condition()
         self._scene: SimScene | None = None
-        self._due: dict[str, SimPoses] = {}  # by the name of a camera
+        self._due: dict[str, SimPoses] = {}  # by camera name
         self._drawn: dict[str, int] = {}  # tick of each camera's newest picture in this boot
-        self._taken_ns: dict[str, int] = {}  # when each was last due, by this process's clock
+        self._taken_ns: dict[str, int] = {}  # when each was last due, in this process's time
         self._boot, self._count, self._rounds = -1, 0, 0
-        self._cpu_s = 0.0  # that drawing has taken
+        self._cpu_s = 0.0  # CPU time of drawing
 
     def show(self, scene: SimScene) -> None:
-        """Draw this scene from now on."""
+        """Set the scene to draw."""
         with self._changed:
             self._scene = scene
             self._changed.notify()
 
     def expose(self, poses: SimPoses) -> None:
-        """Have those cameras take a picture that are due in this tick."""
+        """Request pictures from the cameras that are due in this tick."""
         if poses.boot != self._boot:
             self._boot = poses.boot
             self._drawn.clear()
             self._process.restart()
         has_tick = poses.tick > 0
         with self._changed:
-            if not has_tick:  # of an emulated world, which has none: it is of the newest one
+            if not has_tick:  # an emulated world has no ticks: use the newest tick of the robot
                 poses = replace(poses, tick=self._process.tick)
             for name, camera in self._cameras.items():
                 if name in self._drawn and not self._is_due(camera, poses.tick if has_tick else 0):
@@ -223,27 +223,27 @@ class RenderThread:
             self._changed.notify()
 
     def _is_due(self, camera: Camera, tick: int) -> bool:
-        """Return whether a camera takes a picture now; an emulated world has no ticks."""
-        if tick:  # the first tick of lock-step is sent until it is answered
+        """Return whether a camera takes a picture now. In an emulated world `tick` is 0."""
+        if tick:  # lock-step repeats its first tick until it is answered
             return exposes(camera.rate_hz, tick) and tick != self._drawn.get(camera.name)
         since_ns = self._process.now_ns() - self._taken_ns.get(camera.name, 0)
-        return since_ns >= EARLY * 1e9 / camera.rate_hz
+        return since_ns >= MIN_PERIOD_SHARE * 1e9 / camera.rate_hz
 
     def wake(self) -> None:
-        """Have the thread look whether it is to end."""
+        """Wake the thread, so that it sees `halted`."""
         with self._changed:
             self._changed.notify()
 
     def came(self) -> tuple[object, ...]:
-        """Return what changes with each input, for the heartbeat."""
+        """Return a value that changes with each input, for the heartbeat."""
         return (self._count,) if self._drawn else ()
 
     def done(self) -> int:
-        """Return what changes with each piece of work, for the heartbeat."""
+        """Return the number of finished rounds, for the heartbeat."""
         return self._rounds
 
     def report(self) -> dict[str, float | int | str | None]:
-        """Return the CPU time of drawing, for the process's description."""
+        """Return the CPU time of drawing [s], for the process's description."""
         return {"render_cpu_s": round(self._cpu_s, 3)}
 
     def run(self) -> None:
@@ -261,7 +261,7 @@ class RenderThread:
                 if scene is not None and scene is not shown:
                     shown = scene
                     self._show(renderer, scene)
-                for poses, names in _together(due):
+                for poses, names in _group_by_poses(due):
                     began_s = time.thread_time()
                     frames = renderer.expose(poses, names)
                     self._cpu_s += time.thread_time() - began_s
@@ -272,14 +272,14 @@ class RenderThread:
                 self._rounds += 1
 
     def _show(self, renderer: "Renderer", scene: SimScene) -> None:
-        """Draw a scene from now on; one that cannot be drawn gives no pictures."""
+        """Set the renderer's scene; a scene that cannot be drawn gives no pictures."""
         try:
             renderer.show(scene)
         except ConfigError as error:
             self._process.lose(self._cameras, f"no picture: {error}")
 
     def _next(self) -> tuple[SimScene | None, Mapping[str, SimPoses]]:
-        """Wait for something to draw."""
+        """Wait for due cameras; return the scene and their poses."""
         with self._changed:
             while not self._due and not self._process.halted:
                 self._changed.wait()
@@ -287,8 +287,8 @@ class RenderThread:
             return self._scene, due
 
 
-def _together(due: Mapping[str, SimPoses]) -> list[tuple[SimPoses, list[str]]]:
-    """Return the cameras that see the same poses, so that these are set once."""
+def _group_by_poses(due: Mapping[str, SimPoses]) -> list[tuple[SimPoses, list[str]]]:
+    """Group cameras with the same poses, so that each pose is set once."""
     groups: dict[int, tuple[SimPoses, list[str]]] = {}
     for name, poses in due.items():
         groups.setdefault(id(poses), (poses, []))[1].append(name)

@@ -1,4 +1,4 @@
-"""Cameras of a simulated robot: what its driver simulates, drawn from the poses that it sends."""
+"""Cameras of a simulated robot, rendered from the scene and poses that its driver publishes."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -22,18 +22,18 @@ from gigabrain_schemas.body import Camera
 from gigabrain_schemas.sim import SimPoses, SimScene
 from gigabrain_zenoh.errors import ConfigError, Unsupported
 
-NEAR_M, FAR_M = 0.01, 60.0  # of what is drawn
+NEAR_M, FAR_M = 0.01, 60.0  # clipping planes
 COSTLY = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)
-STEEPEST = 4.0  # of a ray, sideways for each metre ahead
-MIN_SEEN = 0.5  # share of the pixels that light reaches through a lens
-NOWHERE = -9.0  # column and row of what the others show
+MAX_RAY_SLOPE = 4.0  # sideways for each metre ahead
+MIN_LIT_SHARE = 0.5  # of the pixels, those that light reaches through the lens
+OUTSIDE = -9.0  # column and row of pixels that no light reaches
 UNDISTORT = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 1e-9)
 PIXEL_NOISE = 2.0  # standard deviation, of 255
-NOISE_MARGIN = 256  # [px], by which a table of noise is larger than a picture
+NOISE_MARGIN = 256  # [px], extra size of the noise table, to shift it randomly
 
 
 class RenderedCamera(CameraSource):
-    """A camera that MuJoCo renders. All of a robot share one `Renderer`, which does the work."""
+    """A camera that MuJoCo renders. One `Renderer` draws all cameras of a robot."""
 
     Options = CameraOptions
 
@@ -62,9 +62,9 @@ class View:
         self.lens = Lens(camera)
 
     def exposure(self, colours: Picture, depth: NDArray[np.float32], number: int) -> Frame:
-        """Return what the camera measures of ideal colours (height, width, 3) and depth [m].
+        """Return the exposure for ideal colours (height, width, 3) and depth [m].
 
-        The same `number` of an exposure has the same errors.
+        Exposures with the same `number` have the same errors.
         """
         camera = self.camera
         down, right = self.sensor.begin(number).integers(0, NOISE_MARGIN, 2).tolist()
@@ -77,7 +77,7 @@ class View:
 
 
 class Lens:
-    """Pictures of a camera with any intrinsics, from pictures of an ideal one that is drawn."""
+    """Turns pictures of an ideal camera, as drawn, into those of a camera with any intrinsics."""
 
     def __init__(self, camera: Camera) -> None:
         fx, fy, cx, cy = camera.pinhole
@@ -96,21 +96,21 @@ class Lens:
         rays = cv2.undistortPoints(pixels, matrix, coefficients, None, plain, plain, UNDISTORT)
         ahead = np.column_stack([rays[:, 0], np.ones(len(rays))])
         back, _ = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), matrix, coefficients)
-        seen = ((np.abs(rays) < STEEPEST) & (np.abs(back - pixels) < 1.0)).all(axis=(1, 2))
-        if seen.mean() < MIN_SEEN:
+        lit = ((np.abs(rays) < MAX_RAY_SLOPE) & (np.abs(back - pixels) < 1.0)).all(axis=(1, 2))
+        if lit.mean() < MIN_LIT_SHARE:
             raise ConfigError(
                 f"camera {camera.name!r}: its distortion folds the picture; "
                 "expected the k1, k2, p1, p2, k3 of its calibration"
             )
         self.focal = max(fx, fy)
-        x, y = rays[seen, 0].T
+        x, y = rays[lit, 0].T
         left, top = -np.floor(self.focal * x.min()), -np.floor(self.focal * y.min())
         self.centre = float(left), float(top)
         self.width = int(left + np.ceil(self.focal * x.max())) + 1
         self.height = int(top + np.ceil(self.focal * y.max())) + 1
         shape = camera.height, camera.width
         column, row = (
-            np.where(seen, self.focal * ways + middle, NOWHERE).reshape(shape).astype(np.float32)
+            np.where(lit, self.focal * ways + middle, OUTSIDE).reshape(shape).astype(np.float32)
             for ways, middle in ((rays[:, 0, 0], left), (rays[:, 0, 1], top))
         )
         self._maps = column, row
@@ -118,9 +118,9 @@ class Lens:
     def bend(
         self, colours: Picture, depth: NDArray[np.float32]
     ) -> tuple[Picture, NDArray[np.float32]]:
-        """Return the pictures as the lens shows them, from the ideal ones.
+        """Return the ideal pictures as the lens shows them.
 
-        Pixels that no light reaches are black, with NaN as their depth.
+        Pixels that no light reaches are black, and their depth is NaN.
         """
         if self._maps is None:
             return colours, depth
@@ -131,7 +131,7 @@ class Lens:
 
 
 class Renderer:
-    """Draws all cameras of one robot. Made, used and closed in one thread.
+    """Draws all cameras of one robot. Create, use and close it in one thread.
 
     Raises ConfigError where nothing can be drawn.
     """
@@ -144,10 +144,10 @@ class Renderer:
         self._scene: SceneModel | None = None
         self._drawn: mujoco.MjvScene | None = None
         self._context: mujoco.MjrContext | None = None
-        self._rest_height: float | None = None  # [m], of the base's origin above the floor
+        self._rest_height: float | None = None  # [m], of the base's origin at rest
 
     def show(self, scene: SimScene) -> None:
-        """Draw this scene from now on, or none: raises ConfigError if it cannot be drawn."""
+        """Set the scene. Raises ConfigError if it cannot be drawn; then no scene is set."""
         before, self._scene = self._scene, None
         if before and before.update(scene):
             self._scene = before
@@ -159,18 +159,18 @@ class Renderer:
         model.vis.quality.offsamples, model.vis.quality.shadowsize = 0, 0
         self._scene, self._rest_height = made, None
         self._drawn = mujoco.MjvScene(model, maxgeom=max(1000, 2 * model.ngeom))
-        for costly in COSTLY:  # three quarters of the time
+        for costly in COSTLY:  # they would take three quarters of the time
             self._drawn.flags[costly] = 0
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR.value
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
 
     def expose(self, poses: SimPoses, names: Sequence[str]) -> dict[str, Frame]:
-        """Return what some cameras measure; nothing for poses of another version of the scene."""
+        """Return exposures by camera name; none for poses of another version of the scene."""
         scene, drawn, context = self._scene, self._drawn, self._context
         if scene is None or drawn is None or context is None or not scene.place(poses):
             return {}
-        if self._rest_height is None:  # the first poses are those of a body at rest
+        if self._rest_height is None:  # at the first poses the body is at rest
             self._rest_height = float(scene.pose_of(BASE)[2])
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(
@@ -196,7 +196,7 @@ class Renderer:
         self._scene = self._drawn = self._context = None
 
     def _aim(self, drawn: mujoco.MjvScene, view: View, scene: SceneModel) -> None:
-        """Put both eyes of MuJoCo's camera where the robot's camera really sits."""
+        """Put both eyes of MuJoCo's camera at the true mounting of the robot's camera."""
         camera, lens = view.sensor.mounted, view.lens
         body = scene.pose_of(f"{ROBOT}{camera.link}" if camera.link else BASE)
         turn, height = rotation(body[3:]), 0.0 if camera.link else self._rest_height or 0.0
@@ -213,7 +213,7 @@ class Renderer:
             eye.orthographic = 0
 
     def _draw(self, lens: Lens) -> tuple[Picture, NDArray[np.float32]]:
-        """Return colours (height, width, 3) and depth [m]; far away where there is nothing."""
+        """Return colours (height, width, 3) and depth [m]; FAR_M where there is nothing."""
         whole = mujoco.MjrRect(0, 0, lens.width, lens.height)
         colours = np.empty((lens.height, lens.width, 3), np.uint8)
         raw = np.empty((lens.height, lens.width), np.float32)
@@ -232,7 +232,7 @@ def rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def mounting(camera: Camera) -> NDArray[np.float64]:
-    """Return the axes of a camera where it is mounted (3, 3): by roll, then pitch, then yaw."""
+    """Return the axes of a mounted camera (3, 3): rotated by roll, then pitch, then yaw."""
     (sr, sp, sy), (cr, cp, cy) = (
         function([camera.roll, camera.pitch, camera.yaw]) for function in (np.sin, np.cos)
     )

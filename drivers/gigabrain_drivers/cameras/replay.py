@@ -1,4 +1,4 @@
-"""A camera whose pictures come from a recording (`gigabrain record`), at their own pace."""
+"""A camera that plays back a recording (`gigabrain record`) at the recorded pace."""
 
 import time
 from collections.abc import Iterator
@@ -16,18 +16,18 @@ from gigabrain_zenoh.host.files import expanded
 from gigabrain_zenoh.recording.bag_reader import samples
 from gigabrain_zenoh.vision.pictures import decoded
 
-LONGEST_WAIT_S = 1.0  # between two pictures of a recording
+MAX_WAIT_S = 1.0  # between two pictures; longer gaps in a recording are shortened
 
 
 class ReplayOptions(CameraOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The file of the recording, and the camera in it."""
 
-    file: str  # beside the robot's file
-    camera: str = ""  # of the recording; empty: the one of this name
+    file: str  # relative to the robot's file
+    camera: str = ""  # name in the recording; empty: the same name
 
 
 class Recorded(NamedTuple):
-    """Messages of one exposure."""
+    """The recorded messages of one exposure."""
 
     stamp_ns: int
     picture: Image | None
@@ -35,19 +35,19 @@ class Recorded(NamedTuple):
 
 
 class ReplayedCamera(CameraSource):
-    """Pictures and depth of a recording. Needs the extra `record`."""
+    """Pictures and depth from a recording. Needs the extra `record`."""
 
     Options = ReplayOptions
     options: ReplayOptions
 
     _exposures: Iterator[Recorded] | None = None
     _ended = False
-    _last: tuple[int, float] | None = None  # stamp of the newest exposure, and when it was given
+    _last: tuple[int, float] | None = None  # newest exposure: stamp [ns], time of return [s]
 
     def open(self) -> None:
-        """Begin at the start of the recording, once unless it repeats. Raises CameraLost.
+        """Open the recording at its start. Raises CameraLost after the end, without `repeat`.
 
-        Raises ConfigError without the home of a `~`.
+        Raises ConfigError if `~` has no home folder.
         """
         if self._ended:
             raise CameraLost(f"{self.options.file} has ended")
@@ -56,7 +56,7 @@ class ReplayedCamera(CameraSource):
         self._last = None
 
     def read(self) -> Frame:
-        """Return the next whole exposure when its time has come. Raises CameraLost."""
+        """Wait until the next valid exposure is due, and return it. Raises CameraLost."""
         if self._exposures is None:
             raise CameraLost("the recording is not open")
         broken = ""
@@ -80,21 +80,21 @@ class ReplayedCamera(CameraSource):
         raise CameraLost(f"{self.options.file} {end}")
 
     def close(self) -> None:
-        """Let go of the recording."""
+        """Close the recording."""
         self._exposures = None
 
     def _wait(self, stamp_ns: int) -> None:
-        """Wait as long as the recorded camera did."""
+        """Wait as long as the recorded camera did, at most MAX_WAIT_S."""
         now_s = time.monotonic()
         if self._last:
             before_ns, given_s = self._last
-            pause_s = min(max((stamp_ns - before_ns) / 1e9, 0.0), LONGEST_WAIT_S)
+            pause_s = min(max((stamp_ns - before_ns) / 1e9, 0.0), MAX_WAIT_S)
             time.sleep(max(0.0, given_s + pause_s - now_s))
             now_s = max(now_s, given_s + pause_s)
         self._last = stamp_ns, now_s
 
     def _frame(self, one: Recorded) -> Frame:
-        """Return an exposure. Raises ValueError for a broken one, CameraLost for another size."""
+        """Decode an exposure. Raises ValueError if it is broken, CameraLost for another size."""
         camera = self.camera
         picture = None if one.picture is None else decoded(one.picture)
         depth = one.depth.array() if one.depth and camera.depth else None
@@ -104,9 +104,9 @@ class ReplayedCamera(CameraSource):
 
 
 def recorded(path: Path, name: str) -> Iterator[Recorded]:
-    """Iterate over the exposures of a camera in a recording. Raises ConfigError.
+    """Yield the exposures of a camera in a recording. Raises ConfigError.
 
-    A picture and a depth picture of the same tick are one exposure.
+    A picture and a depth picture of the same tick form one exposure.
     """
     keys: dict[str, Codec[Any]] = {
         topic.at(name): Codec(topic.type, topic.max_bytes) for topic in (IMAGE, DEPTH)
@@ -118,18 +118,18 @@ def recorded(path: Path, name: str) -> Iterator[Recorded]:
             continue
         try:
             message = keys[sample.key].decode(sample.payload)
-        except ValueError:  # damaged
+        except ValueError:  # a damaged message
             continue
         if message.basis != basis and waiting:
-            yield _together(waiting)
+            yield _one_exposure(waiting)
             waiting = {}
         basis = message.basis
         waiting[type(message)] = message
     if waiting:
-        yield _together(waiting)
+        yield _one_exposure(waiting)
 
 
-def _together(messages: dict[type, Any]) -> Recorded:
+def _one_exposure(messages: dict[type, Any]) -> Recorded:
     picture, depth = messages.get(Image), messages.get(DepthImage)
     stamp_ns = max(one.stamp_ns for one in messages.values())
     return Recorded(stamp_ns, picture, depth)
