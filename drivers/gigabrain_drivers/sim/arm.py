@@ -12,11 +12,11 @@ from gigabrain_drivers.sim.locomotion import Motor, MotorHeat
 from gigabrain_drivers.sim.scene import ROBOT
 
 SLIDES = mujoco.mjtJoint.mjJNT_SLIDE
-METRES_PER_TICK = 1e-5  # of a sliding joint's encoder
+METRES_PER_TICK = 1e-5  # encoder resolution of sliding joints
 
 
 class SimArm:
-    """Servos that hold what they were last told. It sees no more than its encoders do."""
+    """Servos that hold their newest goals. They measure by their encoders only."""
 
     def __init__(self, body: SimModel, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         self._data = data
@@ -32,29 +32,29 @@ class SimArm:
         ]
         self._heat = [MotorHeat(servo) for servo in servos]
         step = model.opt.timestep
-        self._kept = np.array(
+        self._smoothing = np.array(
             [math.exp(-step / s.smoothing) if s.smoothing else 0.0 for s in servos]
         )
-        self._half_play = np.array([servo.backlash / 2 for servo in servos])
+        self._half_backlash = np.array([servo.backlash / 2 for servo in servos])
         self._amperes = [0.0] * len(joints)
         data.qpos[self._places] = body.posture
         self._now = self._before = self._measured()
         self._model = model
         ranges = model.actuator_forcerange[self._motors]
-        self._strongest = dict(zip(self.names, ranges[:, 1].tolist(), strict=True))
+        self._max_efforts = dict(zip(self.names, ranges[:, 1].tolist(), strict=True))
         self._gains = model.actuator_gainprm[self._motors].copy()
         self._biases = model.actuator_biasprm[self._motors].copy()
         self._aims = dict(zip(self.names, self._at_rest(body.posture), strict=True))
-        self._sent = np.array(self.targets)  # to the motors
+        self._smoothed = np.array(self.targets)  # goals, as the motors get them
         self.limp = self._was_limp = False
         self.act()
-        mujoco.mj_forward(model, data)  # for the torques with which they hold
+        mujoco.mj_forward(model, data)  # computes the holding torques
 
     def restore(self, aims: tuple[float, ...], *, limp: bool) -> None:
-        """Be at rest where the physics has the joints, with these goals [rad] or [m]."""
+        """Rest at the physics' joint positions, with the goals `aims` [rad] or [m]."""
         self._now = self._before = self._measured()
         self._aims = dict(zip(self.names, aims, strict=True))
-        self._sent, self.limp = np.array(aims), limp
+        self._smoothed, self.limp = np.array(aims), limp
         self.act()
 
     @property
@@ -63,21 +63,21 @@ class SimArm:
         return tuple(self._aims[name] for name in self.names)
 
     def truth(self) -> tuple[list[float], list[float]]:
-        """Return positions [rad] or [m] and speeds of the joints, by the physics."""
+        """Return the true positions [rad] or [m] and speeds of the joints."""
         data = self._data
         return data.qpos[self._places].tolist(), data.qvel[self._dofs].tolist()
 
     def aim(self, positions: Mapping[str, float]) -> None:
-        """Have servos go to positions [rad] or [m], and hold them; limp ones hold again."""
+        """Set goals of servos [rad] or [m]; switch on limp servos."""
         self._aims = {**self._aims, **positions}
         self.limp = False
 
     def limit(self, efforts: Mapping[str, float]) -> None:
-        """Have servos pull with no more than `efforts` [N m] or [N], within what they can."""
+        """Limit servos to `efforts` [N m] or [N], at most their own maximum."""
         for name, motor in zip(self.names, self._motors, strict=True):
             if name in efforts:
-                most = min(efforts[name], self._strongest[name])
-                self._model.actuator_forcerange[motor] = -most, most
+                limit = min(efforts[name], self._max_efforts[name])
+                self._model.actuator_forcerange[motor] = -limit, limit
 
     def let_go(self) -> None:
         """Switch all servos off."""
@@ -91,23 +91,23 @@ class SimArm:
             self._model.actuator_gainprm[self._motors] = on * self._gains
             self._model.actuator_biasprm[self._motors] = on * self._biases
         now, goals = self._data.qpos[self._places], np.array(self.targets)
-        self._sent = goals + self._kept * ((now if self.limp else self._sent) - goals)
-        free = np.clip(self._sent - now, -self._half_play, self._half_play)
-        self._data.ctrl[self._motors] = self._sent - free
+        self._smoothed = goals + self._smoothing * ((now if self.limp else self._smoothed) - goals)
+        free = np.clip(self._smoothed - now, -self._half_backlash, self._half_backlash)
+        self._data.ctrl[self._motors] = self._smoothed - free
 
     def sense(self) -> None:
         """Read the encoders after a step."""
         self._before, self._now = self._now, self._measured()
 
     def wear(self) -> float:
-        """Warm the motors by the torque of the step; return the current [A] that it took."""
+        """Heat the motors by the step's torque; return the current that it took [A]."""
         self._amperes = [
             heat.warm(0.0, effort) for heat, effort in zip(self._heat, self._efforts(), strict=True)
         ]
         return sum(self._amperes)
 
     def motors(self) -> tuple[Motor, ...]:
-        """Return all joints as their servos report them."""
+        """Return the servos' reports of all joints."""
         return tuple(
             Motor(name, now, (now - before) / STEP_S, effort, heat.celsius, amperes)
             for name, now, before, effort, heat, amperes in zip(
@@ -122,7 +122,7 @@ class SimArm:
         )
 
     def _at_rest(self, posture: tuple[float, ...]) -> list[float]:
-        """Return the targets with which servos hold a posture against gravity."""
+        """Return targets that hold a posture against gravity."""
         mujoco.mj_forward(self._model, self._data)
         weight = self._data.qfrc_bias[self._dofs]
         held: list[float] = (np.asarray(posture) + weight / self._gains[:, 0]).tolist()

@@ -1,4 +1,4 @@
-"""Ground truth of an emulated arm: when its joints came to rest, and what it holds."""
+"""Ground truth of an emulated arm: when its joints last moved, and what it carries."""
 
 import math
 
@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 from gigabrain_drivers.sim.arm import SimArm
 from gigabrain_drivers.sim.scene import ROBOT
 
-MOVES = math.radians(2.0)  # [rad] or [m], how far an arm that rests may sag
+MAX_SAG = math.radians(2.0)  # [rad] or [m], of an arm at rest
 HISTORY_STEPS = 200  # 2 s
 
 
 class ArmTruth:
-    """`update` once a step.
+    """Truth of an arm. Call `update` once a step.
 
-    joints_moved_s: until when a joint was more than 2 deg from where it is now. carried: how many
-    things that can move touch the robot and nothing else.
+    joints_moved_s: last time when a joint was more than 2 deg from its present position. carried:
+    number of movable things that touch only the robot.
     """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, arm: SimArm) -> None:
@@ -31,17 +31,17 @@ class ArmTruth:
         self._things = [int(body) for body in free if model.body_rootid[body] != self._own]
 
     def update(self, now_ns: int) -> None:
-        """Account for the step that was just simulated."""
+        """Add the newest step."""
         row = self._steps % HISTORY_STEPS
         self._steps += 1
         self._times[row], self._places[row] = now_ns, self._arm.truth()[0]
-        away = np.abs(self._places - self._places[row]).max(axis=1) > MOVES
+        away = np.abs(self._places - self._places[row]).max(axis=1) > MAX_SAG
         self._moved_ns = max(self._moved_ns, int(self._times[away].max(initial=0)))
         pairs = self._roots[self._data.contact.geom]
         self._carried = sum(self._is_carried(thing, pairs) for thing in self._things)
 
     def _is_carried(self, thing: int, pairs: NDArray[np.int32]) -> bool:
-        """Return whether a thing touches the robot alone; `pairs` (n, 2) touch each other."""
+        """Return whether a thing touches only the robot; `pairs` (n, 2) of bodies in contact."""
         touching = pairs[(pairs == thing).any(axis=1)]
         others = touching[touching != thing]
         return bool(len(others)) and bool((others == self._own).all())

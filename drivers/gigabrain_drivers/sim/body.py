@@ -1,4 +1,4 @@
-"""Bodies for the simulation: a model and the figures of its parts, from a robot's file."""
+"""Simulated bodies: a MuJoCo model and its parameters, from a robot's file."""
 
 import math
 from collections.abc import Mapping
@@ -27,15 +27,15 @@ from gigabrain_schemas.body import JointDescription
 from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.host.files import read_bounded
 
-WHEELS = {  # drive types on wheels, and the driven parts of their models
+WHEELS = {  # the driven parts of a model, by drive type
     "differential": ("wheel_left", "wheel_right"),
     "skid_steer": tuple(f"wheel_{name}" for name in SkidSteer.wheels),
     "mecanum": tuple(f"wheel_{name}" for name in Mecanum.wheels),
     "omni": tuple(f"wheel_{name}" for name in Omni.wheels),
     "ackermann": ("wheel_rear_left", "wheel_rear_right", "steer_left", "steer_right"),
 }
-ROLLERS = ("mecanum", "omni")  # wheels with rollers on them
-SPARE_WHEEL_SPEED = 1.25  # times what the body's largest speeds, all at once, ask of a wheel
+ROLLERS = ("mecanum", "omni")  # drive types whose wheels have rollers
+SPARE_WHEEL_SPEED = 1.25  # factor on the wheel speed at the body's largest speeds together
 MAX_MODEL_BYTES = 10_000_000
 ARM_SUBSTEPS = 5  # of 2 ms: fingers must not let go of what they hold
 
@@ -49,8 +49,8 @@ class SimLidar:
     range_min: float = 0.12  # [m]
     range_max: float = 3.5  # [m]
     noise_m: float = 0.01  # standard deviation of a range
-    mount: tuple[float, float, float] | None = None  # x, y [m] and yaw [rad], by the robot's file
-    height: float | None = None  # [m] above the floor, for a model without a site for it
+    mount: tuple[float, float, float] | None = None  # x, y [m], yaw [rad], from the robot's file
+    height: float | None = None  # [m] above the floor, for a model without the site
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,12 +63,12 @@ class SimBattery:
     empty_voltage: float = 9.9
     internal_resistance_ohm: float = 0.1
     idle_current_a: float = 0.6  # computer, lidar and board
-    drive_current_a: float = 0.8  # on top of that, all wheels at full speed without load
+    drive_current_a: float = 0.8  # additional, with all wheels at full speed without load
     percentage: float = 100.0  # at the start, 0-100
 
 
 class SimMotor(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One wheel's gear motor as seen at the wheel; the defaults are a Dynamixel XL430-W250."""
+    """A wheel's gear motor, measured at the wheel; default: a Dynamixel XL430-W250."""
 
     torque_per_ampere: Positive = 1.07  # [N m/A], stall: 1.5 N m at 1.4 A
     resistance_ohm: Positive = 8.6  # 12 V at 1.4 A
@@ -78,53 +78,53 @@ class SimMotor(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class SimServo(SimMotor, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One joint's servo; the defaults are a Feetech STS3215 of 7.4 V."""
+    """A joint's servo; default: a Feetech STS3215 of 7.4 V."""
 
     torque_per_ampere: Positive = 0.8  # [N m/A] or [N/A], stall: 1.9 N m at 2.4 A
     resistance_ohm: Positive = 3.1
     heat_capacity: Positive = 30.0  # [J/K]
     encoder_ticks: Annotated[int, Meta(ge=1)] = 4096  # per turn
-    smoothing: NonNegative = 0.0  # [s], time constant with which it goes to a new goal
-    backlash: NonNegative = 0.0  # [rad] or [m] that the joint is free to move between its gears
+    smoothing: NonNegative = 0.0  # [s], time constant of its motion to a new goal
+    backlash: NonNegative = 0.0  # [rad] or [m], free play of the gears
 
 
 class JointServos(SimServo, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The servos of some joints, which are alike."""
+    """Equal servos of some joints."""
 
     joints: tuple[str, ...]
 
 
 class PartNames(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The names of a moving part in a model. Empty ones are found by its joint."""
+    """The names of a moving part in a model. Empty ones are found through its joint."""
 
     joint: str
     actuator: str = ""
-    geom: str = ""  # by which a wheel rolls
+    geom: str = ""  # that touches the floor, of a wheel
 
 
 @dataclass(frozen=True, kw_only=True)
 class SimModel:
-    """The figures of every body. Its model's base body is `base`, with the free joint `free`.
+    """Parameters of any body. Its model's base body is `base`, with the free joint `free`.
 
-    Geoms of the base that are called `hull_...` make up the body's outline.
+    Geoms of the base with names `hull_...` form the body's outline.
     """
 
     model: str  # MJCF
-    path: str = "the model"  # where it came from, for people
-    named_by: str = ""  # the value by which the robot's file names the model
+    path: str = "the model"  # of its file, for messages
+    named_by: str = ""  # the model's name in the robot's file
     names: Mapping[str, str | PartNames] = field(default_factory=dict)  # of parts in the model
-    footprint: tuple[tuple[float, float], ...] = ()  # [m], by the robot's file
+    footprint: tuple[tuple[float, float], ...] = ()  # [m], from the robot's file
     lidar: SimLidar | None = field(default_factory=SimLidar)
     battery: SimBattery = field(default_factory=SimBattery)
     motor: SimMotor = field(default_factory=SimMotor)
-    substeps: int = 2  # substeps in a step of 10 ms; wheels roll as well on 5 ms as on 1 ms
+    substeps: int = 2  # per step of 10 ms; for wheels, 5 ms are as good as 1 ms
     joints: tuple[JointDescription, ...] = ()  # of its arm; each has a position servo
     posture: tuple[float, ...] = ()  # of the arm at the start [rad] or [m]
-    servos: Mapping[str, SimServo] = field(default_factory=dict)  # by joint, others by default
-    fixed: bool = False  # its base is screwed to the floor
+    servos: Mapping[str, SimServo] = field(default_factory=dict)  # by joint; default: SimServo()
+    fixed: bool = False  # the base is screwed to the floor
 
     def parts(self) -> tuple[tuple[str, str], ...]:
-        """(kind, name) of what the model has to have besides base, sensors and lidar."""
+        """(kind, name) of required parts of the model besides base, sensors and lidar."""
         return tuple(
             part for one in self.joints for part in (("joint", one.name), ("actuator", one.name))
         )
@@ -132,38 +132,38 @@ class SimModel:
 
 @dataclass(frozen=True, kw_only=True)
 class SimBody(SimModel):
-    """A body on wheels for the simulation.
+    """A simulated body on wheels.
 
-    The base's origin is that of its  Each name of `wheels` is a body, an actuator and,
-    with `_joint` after it, a joint; those of wheels are geoms as well. `wheel_radius` and
-    `wheel_separation` are what the base's own kinematics believes; the truth is in the model.
+    The base's origin is that of its kinematics. Each name in `wheels` is a body and an actuator,
+    with `_joint` appended a joint, and for a wheel also a geom. `wheel_radius` and
+    `wheel_separation` are those of the base's own kinematics; the true ones are in the model.
     """
 
     wheel_radius: float  # [m], turns commands into wheel speeds
     wheel_separation: float  # [m]
-    wheel_base: float = 0.0  # [m], by the robot's file
+    wheel_base: float = 0.0  # [m], from the robot's file
     base: Base | None = None  # None: differential
     odometry_wheel_radius: float | None = None  # [m], turns encoder ticks into metres
     wheel_scale: float = 1.0  # true wheel radius / radius in the model: worn or swollen tyres
     max_wheel_speed: float = 9.0  # [rad/s]
-    needed_wheel_speed: float = 0.0  # [rad/s], which its largest speeds ask for, one at a time
+    needed_wheel_speed: float = 0.0  # [rad/s], at the largest of its speeds, one at a time
     max_wheel_acceleration: float = 60.0  # [rad/s2]
     wheels: tuple[str, ...] = WHEELS["differential"]
-    gyro_heading: bool = False  # odometry turns by the gyroscope, as scrubbing wheels cannot say
+    gyro_heading: bool = False  # odometry takes its heading from the gyroscope: wheels scrub
     encoder_ticks: int = 4096  # per turn
 
     @property
     def kinematics(self) -> Base:
-        """The base's own"""
+        """The base's own kinematics."""
         return self.base or Differential(self.wheel_radius, self.wheel_separation)
 
     @property
     def rolling(self) -> tuple[str, ...]:
-        """Those of `wheels` that roll."""
+        """The names in `wheels` of parts that roll, not steer."""
         return tuple(name for name in self.wheels if name.startswith("wheel"))
 
     def parts(self) -> tuple[tuple[str, str], ...]:
-        """Wheels, and what steers."""
+        """(kind, name) of wheels and steering."""
         wheels = tuple(
             part
             for name in self.wheels
@@ -184,7 +184,7 @@ LEG_BATTERY = SimBattery(
     empty_voltage=21.0,
     internal_resistance_ohm=0.05,
     idle_current_a=1.2,
-    drive_current_a=0.0,  # legs draw what they need to bear the weight
+    drive_current_a=0.0,  # legs draw current by the torque that bears the weight
 )
 LEG_MOTOR = SimMotor(
     torque_per_ampere=1.4,
@@ -196,44 +196,44 @@ LEG_MOTOR = SimMotor(
 
 @dataclass(frozen=True, kw_only=True)
 class SimQuadruped(SimModel):
-    """A body on four legs of three joints for the simulation.
+    """A simulated body on four legs of three joints.
 
-    The base's origin lies on the hips' axes. Each of `legs.geometry.JOINT_NAMES` is a joint and
-    its position servo; each leg has a touch sensor `..._contact` on its foot.
+    The base's origin lies on the hips' axes. Each name in JOINT_NAMES is a joint and its position
+    servo; each leg has a touch sensor `..._contact` on its foot.
     """
 
-    substeps: int = 3  # feet that meet the ground ask for finer steps than wheels do
+    substeps: int = 3  # feet that hit the ground need finer steps than wheels
     geometry: LegGeometry = field(default_factory=LegGeometry)
     walker: Walker = WALKER  # turns velocities into gaits
     encoder_ticks: int = 65536  # per turn of a joint
-    contact_n: float = 8.0  # [N], from which on a foot counts as bearing weight
+    contact_n: float = 8.0  # [N], minimal force of a foot that bears weight
     battery: SimBattery = LEG_BATTERY
     motor: SimMotor = LEG_MOTOR
 
     def parts(self) -> tuple[tuple[str, str], ...]:
-        """Legs."""
+        """(kind, name) of legs."""
         joints = [part for name in JOINT_NAMES for part in (("joint", name), ("actuator", name))]
         return (*joints, *(("sensor", f"{leg}_contact") for leg in LEGS))
 
 
 class MujocoOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The simulator's part of a robot's file."""
+    """The simulator's fields in a robot's file."""
 
     model: str = "model.xml"  # MJCF, beside the robot's file
     names: Mapping[str, str | PartNames] = msgspec.field(
         default_factory=dict
-    )  # of parts that the model calls by other names
+    )  # of parts that have other names in the model
     lidar_height: Positive | None = None  # [m] above the floor, for a model without a lidar's site
     battery_capacity: Positive = 1.8  # [Ah]
     battery_percentage: Percentage = 100.0  # [%], at the start
     lidar_noise: NonNegative = 0.01  # [m], standard deviation
     wheel_scale: Annotated[float, Meta(ge=0.5, le=2.0)] = 1.0  # true wheel radius / wheel_radius
-    odometry_wheel_radius: Positive | None = None  # [m], where odometry is calibrated by itself
-    servos: tuple[JointServos, ...] = ()  # of an arm, where they are other than SimServo's
+    odometry_wheel_radius: Positive | None = None  # [m], if odometry has its own calibration
+    servos: tuple[JointServos, ...] = ()  # of an arm, if they differ from SimServo's defaults
 
 
 def sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimModel:
-    """The body as the simulation wants it. Raises ConfigError when there is no model."""
+    """Return the simulated body of a robot. Raises ConfigError without a model."""
     path = run.folder / options.model
     try:
         model = read_bounded(path, MAX_MODEL_BYTES).decode()
@@ -283,7 +283,7 @@ def sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimModel:
 
 
 def _servos(robot: RobotFile, options: MujocoOptions) -> dict[str, SimServo]:
-    """Return the servos by joint. Raises UnknownName for a joint that the robot does not have."""
+    """Return the servos by joint. Raises UnknownName for an unknown joint."""
     known = [joint.name for joint in robot.joints]
     found = {name: servo for servo in options.servos for name in servo.joints}
     for name in found:

@@ -1,4 +1,4 @@
-"""Checkpoints of a simulation: a body stays where it is when its driver dies and starts again."""
+"""Checkpoints of a simulation, so that a body keeps its place when its driver restarts."""
 
 import asyncio
 import contextlib
@@ -18,21 +18,21 @@ from gigabrain_zenoh.errors import ConfigError
 
 log = logging.getLogger(__name__)
 
-HEAD = struct.Struct("<II")  # length of the content, and its CRC-32
-BINARY = getattr(os, "O_BINARY", 0)  # on Windows
+HEADER = struct.Struct("<II")  # length of the content, and its CRC-32
+BINARY = getattr(os, "O_BINARY", 0)  # exists only on Windows
 
 
 class Checkpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A simulation at the end of a step; another one goes on from there, at rest."""
+    """A simulation at the end of a step. Another one continues from it, at rest."""
 
     model: bytes  # digest of the MuJoCo model of body and world
     steps: int
     physics: bytes  # float64, MuJoCo's mjSTATE_FULLPHYSICS
-    charge_ah: float  # left in the battery
+    charge_ah: float  # remaining in the battery
     aims: tuple[float, ...]  # of the arm's servos [rad] or [m]
     limp: bool
     things: tuple[Thing, ...]  # put in by hand
-    walked: tuple[float, ...]  # [m], of each person who walks: the world's own come first
+    walked: tuple[float, ...]  # [m], by each walking person; the world's own come first
     person_stood: int
     contacts: int
     falls: int
@@ -41,20 +41,20 @@ class Checkpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class CheckpointFiles:
-    """The newest checkpoints of a run, in two files that are written in turn.
+    """The newest checkpoints of a run, written to two files in turn.
 
-    A process that is killed while it writes leaves the other one. They are not synced to disk: a
-    run does not outlive the machine.
+    A process that is killed while it writes leaves the other file intact. The files are not synced
+    to disk, because a run ends with its machine.
     """
 
     def __init__(self, path: Path) -> None:
         self._paths = [Path(f"{path}.{number}") for number in range(2)]
         self._turns = cycle(self._paths)
         self._saving: asyncio.Future[None] | None = None
-        self._ended = False  # a write has failed, or they were discarded
+        self._ended = False  # a write failed, or the checkpoints were discarded
 
     def read(self) -> Checkpoint | None:
-        """Return the newest checkpoint; None for none. Raises OSError.
+        """Return the newest checkpoint, or None without files. Raises OSError.
 
         Raises ConfigError if both are damaged.
         """
@@ -65,25 +65,25 @@ class CheckpointFiles:
         return max(found, key=lambda one: one.steps, default=None)
 
     def write(self, checkpoint: Checkpoint) -> None:
-        """Write over the older one. Raises OSError."""
+        """Overwrite the older file. Raises OSError."""
         text = msgspec.msgpack.encode(checkpoint)
         file = os.open(next(self._turns), os.O_WRONLY | os.O_CREAT | BINARY, 0o600)
         try:
-            os.write(file, HEAD.pack(len(text), zlib.crc32(text)) + text)
+            os.write(file, HEADER.pack(len(text), zlib.crc32(text)) + text)
         finally:
             os.close(file)
 
     def save(self, checkpoint: Checkpoint) -> asyncio.Future[None]:
-        """Write it in a thread, unless the last one is still being written; return what ends then.
+        """Write it in a thread, unless a write is in progress; return that write's future.
 
-        So a disk that hangs holds up no tick.
+        So a disk that hangs delays no tick.
         """
         if self._saving is None or self._saving.done():
             self._saving = asyncio.ensure_future(asyncio.to_thread(self._save, checkpoint))
         return self._saving
 
     async def discard(self) -> None:
-        """Remove all checkpoints, also one that is being written."""
+        """Remove all checkpoints, after a write in progress."""
         self._ended = True
         if self._saving:
             await self._saving
@@ -102,15 +102,15 @@ class CheckpointFiles:
     def clear(self) -> None:
         """Remove all checkpoints."""
         for path in self._paths:
-            with contextlib.suppress(OSError):  # there is none, or the disk fails
+            with contextlib.suppress(OSError):  # no such file, or the disk fails
                 path.unlink()
 
 
 def _decoded(data: bytes) -> Checkpoint | None:
-    if len(data) < HEAD.size:
+    if len(data) < HEADER.size:
         return None
-    length, crc = HEAD.unpack_from(data)
-    text = data[HEAD.size : HEAD.size + length]
+    length, crc = HEADER.unpack_from(data)
+    text = data[HEADER.size : HEADER.size + length]
     if len(text) != length or zlib.crc32(text) != crc:
         return None
     try:

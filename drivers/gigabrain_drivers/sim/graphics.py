@@ -1,4 +1,4 @@
-"""OpenGL without a window: EGL, else OSMesa. `python -m` this, to check for it."""
+"""OpenGL without a window: EGL, else OSMesa. Run with `python -m` to check for it."""
 
 import importlib
 import logging
@@ -17,10 +17,9 @@ MISSING = (
 
 
 def open_graphics(width: int, height: int) -> Any:
-    """Return an OpenGL context of this size [px], current in this thread; it has `free`.
+    """Return an OpenGL context of this size [px], current in this thread. Call its `free`.
 
-    MUJOCO_GL may choose one of `egl` and `osmesa`. Raises ConfigError naming the packages that are
-    missing.
+    MUJOCO_GL may choose `egl` or `osmesa`. Raises ConfigError naming the missing packages.
     """
     logging.getLogger("OpenGL.acceleratesupport").setLevel(logging.WARNING)
     chosen = this_process.chosen_graphics().lower()
@@ -37,7 +36,7 @@ def open_graphics(width: int, height: int) -> Any:
 
 
 def _forget() -> None:
-    """Let PyOpenGL choose another platform, which it does once, on import."""
+    """Unload PyOpenGL: it chooses its platform only on import."""
     os.environ.pop("PYOPENGL_PLATFORM", None)
     for module in list(sys.modules):
         if module.split(".")[0] == "OpenGL" or module in ("mujoco.egl", "mujoco.osmesa"):
@@ -45,7 +44,7 @@ def _forget() -> None:
 
 
 def main() -> None:
-    """Exit with the code 2 and one line if nothing can be drawn."""
+    """Exit with code 2 and one line if nothing can be drawn."""
     try:
         open_graphics(64, 64).free()
     except ConfigError as error:

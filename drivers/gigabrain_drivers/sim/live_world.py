@@ -1,4 +1,4 @@
-"""A simulated world for people: what viewers see of it, and what is changed while it runs."""
+"""A running simulated world: its messages for viewers, and requests that change it."""
 
 import asyncio
 import contextlib
@@ -17,58 +17,58 @@ from gigabrain_zenoh.errors import Refused
 
 POSES_STEPS = 100_000_000 // STEP_NS
 ANSWER_S = 2.0
-MAX_WAITING = 32  # requests
+MAX_REQUESTS = 32  # waiting for a step
 News = list[tuple[Topic[Any], Message]]
 
 
 class LiveWorld:
     """Changes a world between two steps of its physics, and describes it.
 
-    `step` belongs into the physics thread, `change` onto the loop; `scene` into whichever begins.
+    Call `step` in the physics thread and `change` on the loop; `scene` before both start.
     """
 
     def __init__(self, simulation: Simulation, world: str, cameras: Sequence[Camera] = ()) -> None:
-        """Describe a world to viewers, and to the cameras that are rendered from it."""
+        """Prepare the messages for viewers and for rendered `cameras`."""
         self._simulation, self._cameras = simulation, cameras
         self._writer = SceneWriter(simulation.model, simulation.data, world)
         self._waiting: deque[tuple[SimRequest, asyncio.Future[SimReply]]] = deque()
-        self._steps, self._shown = 0, -1  # the newest version that viewers know
+        self._steps, self._published = 0, -1  # newest version of the scene that was published
 
     def scene(self) -> News:
-        """Return the whole scene, and the poses in it."""
+        """Return the messages of the whole scene and its poses."""
         things = self._simulation.things
-        self._shown = things.version
+        self._published = things.version
         scene = self._writer.scene(things.version, things.all(), things.bodies())
         return [(SIM_SCENE, scene), (SIM_POSES, self._writer.poses(things.version))]
 
     def step(self) -> News:
-        """Carry out what was asked for; return the messages of this step."""
+        """Carry out waiting requests; return the messages of this step."""
         while self._waiting:
             request, future = self._waiting.popleft()
             reply = self._carry_out(request)
             future.get_loop().call_soon_threadsafe(_answer, future, reply)
         self._steps += 1
-        if self._simulation.things.version != self._shown:
+        if self._simulation.things.version != self._published:
             return self.scene()
         if self._steps % POSES_STEPS == 0 or self._exposes():
-            return [(SIM_POSES, self._writer.poses(self._shown))]
+            return [(SIM_POSES, self._writer.poses(self._published))]
         return []
 
     def _exposes(self) -> bool:
-        """Return whether a camera takes a picture after this step, with which a tick ends."""
+        """Return whether a camera takes a picture after this step, the last of a tick."""
         tick, rest = divmod(self._steps * STEP_NS, TICK_NS)
         return rest == 0 and any(exposes(camera.rate_hz, tick) for camera in self._cameras)
 
     async def change(self, request: SimRequest) -> SimReply:
-        """Carry out a request between two steps. Raises Refused if time stands still."""
-        if len(self._waiting) >= MAX_WAITING:
+        """Have `step` carry out a request. Raises Refused if time stands still."""
+        if len(self._waiting) >= MAX_REQUESTS:
             raise Refused("too many requests to the world are waiting; try again")
         future = asyncio.get_running_loop().create_future()
         self._waiting.append((request, future))
         try:
             return await asyncio.wait_for(future, ANSWER_S)
         except TimeoutError:
-            with contextlib.suppress(ValueError):  # it is being carried out
+            with contextlib.suppress(ValueError):  # `step` is carrying it out
                 self._waiting.remove((request, future))
             raise Refused("the simulation stands still, so its world cannot be changed") from None
 

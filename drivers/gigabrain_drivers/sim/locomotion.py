@@ -19,7 +19,7 @@ from gigabrain_zenoh.errors import Unsupported
 
 HOUR_S = 3600.0
 
-VELOCITY_TICKS = 5  # velocity is measured over 50 ms: a finer one would be encoder noise
+VELOCITY_TICKS = 5  # velocity is a mean over 50 ms; shorter ones show encoder noise
 REST = Twist(0.0, 0.0, 0.0)
 
 
@@ -32,7 +32,7 @@ class Charge(NamedTuple):
 
 
 class Battery:
-    """Counts charge; the voltage falls along two straight lines, less the drop inside the cells."""
+    """Counts charge. The open-circuit voltage is two straight lines of the charge."""
 
     def __init__(self, config: SimBattery) -> None:
         self._config = config
@@ -45,7 +45,7 @@ class Battery:
         self.left_ah = max(self.left_ah - self._current * STEP_S / HOUR_S, 0.0)
 
     def read(self) -> Charge:
-        """Return what the board reports."""
+        """Return the board's report."""
         config, share = self._config, self.left_ah / self._config.capacity_ah
         if share > 0.5:
             rest = config.nominal_voltage
@@ -59,7 +59,7 @@ class Battery:
 
 
 class MotorHeat:
-    """One motor's temperature: heated by its current squared, cooled by the air."""
+    """A motor's temperature: heated by its current squared, cooled by the air."""
 
     def __init__(self, config: SimMotor) -> None:
         self._config = config
@@ -76,14 +76,14 @@ class MotorHeat:
 
 
 class Motor(NamedTuple):
-    """One driven joint as its motor reports it."""
+    """A motor's report of its joint."""
 
     name: str  # of its joint
     position: float  # [rad]
     velocity: float  # [rad/s]
     effort: float  # [N m]
     temperature: float  # [deg C]
-    current: float | None = None  # [A], of servos that measure it
+    current: float | None = None  # [A], if the servo measures it
 
 
 class OdometryReading(NamedTuple):
@@ -97,9 +97,9 @@ class OdometryReading(NamedTuple):
 
 
 class Locomotion(abc.ABC):
-    """The body's own firmware: commands to motors, sensors to odometry. It never sees the truth.
+    """The body's own firmware: commands to motors, sensors to odometry, without the truth.
 
-    In each step of 10 ms `act` comes before the physics, `sense` and `wear` after it.
+    In each step of 10 ms, call `act` before the physics, `sense` and `wear` after it.
     """
 
     fallen = False  # whether the body lies on the floor
@@ -118,11 +118,11 @@ class Locomotion(abc.ABC):
 
     @abc.abstractmethod
     def sense(self, imu: ImuSample) -> None:
-        """Read what encoders and inertial unit measured in the step."""
+        """Read encoders and inertial unit after the step."""
 
     @abc.abstractmethod
     def wear(self) -> float:
-        """Warm the motors by the work of the step; return the current [A] that it took."""
+        """Heat the motors by the step's work; return the current that it took [A]."""
 
     @abc.abstractmethod
     def odometry(self) -> OdometryReading:
@@ -172,9 +172,9 @@ class Fixed(Locomotion):
 
 
 class Wheels(Locomotion):
-    """Motors of wheels, and of their steering, with encoders; nothing limits how they slip.
+    """Motors with encoders of wheels and steering. Wheels may slip.
 
-    Wheels get to what is commanded at their greatest acceleration.
+    Wheels reach the commanded speed at their largest acceleration.
     """
 
     def __init__(self, body: SimBody, model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -184,16 +184,16 @@ class Wheels(Locomotion):
         self._motors = [int(model.actuator(f"{ROBOT}{n}").id) for n in body.wheels]
         self._heat = [MotorHeat(body.motor) for _ in body.wheels]
         self._angle_per_tick = math.tau / body.encoder_ticks
-        self._rolling = len(body.rolling)  # they come first; what steers after them
+        self._rolling = len(body.rolling)  # wheels come first, steering last
         data.qpos[self._angles[: self._rolling]] = 0.0  # where their encoders begin
         angles = data.qpos[self._angles].tolist()
-        self._target = self._speed = tuple(angles)  # [rad/s], at rest; [rad] of what steers
+        self._target = self._speed = tuple(angles)  # [rad/s] of wheels; [rad] of steering
         self._counts = tuple(self._counted(angle, 0) for angle in angles)
         self._past = deque([self._counts] * (VELOCITY_TICKS + 1), maxlen=VELOCITY_TICKS + 1)
         self._x = self._y = self._yaw = 0.0
 
     def command(self, twist: Twist) -> Twist:
-        """Aim for a velocity; all wheels slow down alike if one would be too fast."""
+        """Aim for a velocity; if a wheel would be too fast, all are scaled down."""
         wheels = self._kinematics.to_wheels(twist)
         speeds = wheels[: self._rolling]
         scale = max(map(abs, speeds)) / self._body.max_wheel_speed
@@ -223,11 +223,11 @@ class Wheels(Locomotion):
         self._past.append(self._counts)
 
     def _counted(self, angle: float, count: int) -> int:
-        """The new count; it moves by whole ticks only, so a wheel at rest does not flicker."""
+        """Return the new count; with hysteresis, so that a wheel at rest does not flicker."""
         return count + math.trunc(angle / self._angle_per_tick - count)
 
     def wear(self) -> float:
-        """Return the current that the motors draw by their speed and by their torque."""
+        """Return the motors' current, from speed and torque [A]."""
         config, effort, current = self._body, self._data.actuator_force.tolist(), 0.0
         share = config.battery.drive_current_a / len(self._heat) / config.max_wheel_speed
         wheels = zip(self._heat, self._motors, self._speeds(self._angle_per_tick), strict=True)
@@ -236,7 +236,7 @@ class Wheels(Locomotion):
         return current
 
     def motors(self) -> tuple[Motor, ...]:
-        """Return all wheels, and what steers."""
+        """Return the motors of wheels and steering."""
         effort = self._data.actuator_force
         speeds = self._speeds(self._angle_per_tick)
         parts = zip(self._body.wheels, self._counts, speeds, self._motors, self._heat, strict=True)
@@ -252,7 +252,7 @@ class Wheels(Locomotion):
         )
 
     def _speeds(self, per_tick: float) -> tuple[float, ...]:
-        """The speed of all motors, in units of `per_tick` a second."""
+        """Return the speed of all motors, in units of `per_tick` a second."""
         per_second = per_tick / (VELOCITY_TICKS * STEP_S)
         pairs = zip(self._counts, self._past[0], strict=True)
         return tuple((now - then) * per_second for now, then in pairs)
@@ -291,7 +291,7 @@ class Rolling(Wheels):
 
 
 class FreeRolling(Wheels):
-    """Any other base on wheels, by its kinematics; the gyroscope turns one whose wheels scrub."""
+    """Any other base on wheels; if its wheels scrub, the gyroscope gives the heading."""
 
     def __init__(self, body: SimBody, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         super().__init__(body, model, data)
@@ -312,7 +312,7 @@ class FreeRolling(Wheels):
         self._yaw += turn
 
     def odometry(self) -> OdometryReading:
-        """Return pose and velocity by encoders, and the gyroscope where it counts."""
+        """Return pose and velocity by encoders, and by the gyroscope if wheels scrub."""
         velocity = self.velocity()
         return OdometryReading(self._x, self._y, self._yaw, velocity.linear_x, velocity.angular_z)
 
@@ -325,7 +325,7 @@ class FreeRolling(Wheels):
         return moved._replace(angular_z=turn)
 
     def _body_motion(self, since: tuple[int, ...], seconds: float) -> Twist:
-        """Return the motion since the counts `since`, over `seconds`; what steers has its angle."""
+        """Return the mean velocity since the counts `since`, over `seconds`."""
         first, unit = self._rolling, self._angle_per_tick
         pairs = zip(self._counts[:first], since[:first], strict=True)
         rolled = [(now - then) * unit * self._scale / seconds for now, then in pairs]
@@ -334,7 +334,7 @@ class FreeRolling(Wheels):
 
 
 class Walking(Locomotion):
-    """Trots on what the body itself measures; stands at the start."""
+    """Trots, controlled by the body's own sensors. Stands at the start."""
 
     def __init__(self, body: SimQuadruped, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         self._body, self._data = body, data
@@ -362,7 +362,7 @@ class Walking(Locomotion):
         return self._trot.fallen
 
     def command(self, twist: Twist) -> Twist:
-        """Aim for the walker's gait for a velocity."""
+        """Aim for a velocity, by the walker's gait."""
         self._gait = self._body.walker.to_gait(twist)
         return self._body.walker.to_body(self._gait)
 
@@ -377,7 +377,7 @@ class Walking(Locomotion):
         self._data.ctrl[self._motors] = by_joint(self._targets)
 
     def sense(self, imu: ImuSample) -> None:
-        """Encoders, feet and inertial unit become one sample."""
+        """Combine encoders, feet and inertial unit into one sample."""
         angles = self._data.qpos[self._angles].tolist()
         counts = [round(angle / self._radians) for angle in angles]
         steps = zip(counts, self._counts, strict=True)

@@ -1,4 +1,4 @@
-"""Occupancy maps of ROS (map_server) made into worlds: occupied cells become boxes."""
+"""Worlds from ROS maps (map_server): occupied cells become boxes."""
 
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,13 @@ from gigabrain_zenoh.host.files import read_bounded
 
 MAX_BOXES = 4000
 MAX_PNG_BYTES = 16_000_000
-MAX_STARTS = 100_000  # free cells that a start is drawn from
+MAX_STARTS = 100_000  # free cells to draw a start from
 
 
 def map_world(path: Path, wall_height: float) -> World:
     """Return the world of a map's YAML file. Raises ConfigError.
 
-    Its frame is that of the map. A robot starts where the map is free.
+    Its frame is that of the map. Robots start in free cells.
     """
     grid = map_image.load(path, _read_image)
     occupied = grid.cells == 100
@@ -50,18 +50,18 @@ def map_world(path: Path, wall_height: float) -> World:
     )
 
 
-def merge_cells(occupied: NDArray[np.bool_], most: int) -> list[tuple[int, int, int, int]] | None:
+def merge_cells(occupied: NDArray[np.bool_], limit: int) -> list[tuple[int, int, int, int]] | None:
     """Return rectangles (row, column, rows, columns) that cover `occupied` (h, w) exactly.
 
-    From each first cell, in rows, the larger of two greedy rectangles is taken. None for more than
-    `most` of them.
+    From each first cell, in row order, it takes the larger of two greedy rectangles. Returns None
+    for more than `limit` rectangles.
     """
     left = occupied.copy()
     found: list[tuple[int, int, int, int]] = []
     for row, column in np.argwhere(occupied).tolist():
         if not left[row, column]:
             continue
-        if len(found) == most:
+        if len(found) == limit:
             return None
         below = left[row:, column:]
         wide, high = _run(below[:1].all(axis=0)), _run(below[:, :1].all(axis=1))
@@ -74,7 +74,7 @@ def merge_cells(occupied: NDArray[np.bool_], most: int) -> list[tuple[int, int, 
 
 
 def _run(cells: Any) -> int:
-    """Return how many cells of an array (n,) are True before the first that is not."""
+    """Return the number of True cells at the start of an array (n,)."""
     stop = int(cells.argmin())
     return len(cells) if cells[stop] else stop
 
@@ -87,7 +87,7 @@ def _box(grid: SavedMap, row: int, column: int, rows: int, columns: int, height:
 
 
 def _places(grid: SavedMap, free: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the middles of free cells (n, 2) [m]."""
+    """Return the centres of free cells (n, 2) [m]."""
     cells = np.argwhere(free)
     cells = cells[:: max(1, len(cells) // MAX_STARTS)]
     origin = np.array([grid.origin_x, grid.origin_y])

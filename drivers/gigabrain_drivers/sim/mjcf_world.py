@@ -1,4 +1,4 @@
-"""MJCF models as worlds, or as parts of worlds: loaded, bounded and measured."""
+"""MJCF models as worlds or parts of worlds: loads, checks and measures them."""
 
 import logging
 import math
@@ -15,20 +15,20 @@ from gigabrain_zenoh.host.files import read_bounded
 
 MAX_MODEL_BYTES = 10_000_000
 MAX_GEOMS, MAX_BODIES, MAX_EXTENT_M = 10_000, 800, 400.0
-LOW_M, HIGH_M = 0.02, 1.0  # what stands between them is in a robot's way
-UPRIGHT = 0.999  # cosine of the tilt up to which a thing stands upright
+LOW_M, HIGH_M = 0.02, 1.0  # above the floor; geoms between them are obstacles
+UPRIGHT = 0.999  # minimal cosine of the tilt of an upright geom
 log = logging.getLogger(__name__)
 
-FLOOR_NAME = re.compile(r"(^|/)(floor|ground)\d*$")  # of geoms that a robot stands on
+FLOOR_NAME = re.compile(r"(^|/)(floor|ground)\d*$")  # names of floor geoms
 COUNT = re.compile(rb"\bcount\s*=\s*[\"']([\d\s]{1,60})[\"']")  # of replicated parts
-# with what may stand before its first tag; atomic, as a hostile file would take for ever
+# after comments and declarations; atomic groups, or a hostile file would take for ever
 URDF = re.compile(rb"(?>[^<]|<!--.*?-->|<\?.*?\?>|<![^-].*?>)*+<robot\b", re.DOTALL)
 PLANE, BOX = mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX
 
 
 def load_model(path: Path) -> mujoco.MjSpec:
-    """Return the MJCF of a world. Raises ConfigError, with the line where MuJoCo names it."""
-    mujoco.set_mju_user_warning(log.warning)  # instead of a file
+    """Load a world's MJCF. Raises ConfigError, with the line if MuJoCo names it."""
+    mujoco.set_mju_user_warning(log.warning)  # not to MuJoCo's log file
     try:
         text = read_bounded(path, MAX_MODEL_BYTES)
         if urdf := URDF.match(text):
@@ -45,14 +45,14 @@ def load_model(path: Path) -> mujoco.MjSpec:
 
 
 def model_error(path: Path, error: ValueError) -> ConfigError:
-    """Return MuJoCo's complaint in one line, with the line of the file if it is named."""
+    """Return MuJoCo's error as one line, with the file's line if it is named."""
     text = " ".join(str(error).split())[:300]
     line = re.search(r"[Ll]ine(?: number=|:? )(\d+)", text)
     return ConfigError(f"{path}{f':{line[1]}' if line else ''}: not a usable MJCF model: {text}")
 
 
 def measured(world: World) -> World:
-    """Return the world with the outlines of its model's things, and grown to hold them.
+    """Return the world with the outlines of its model's obstacles, enlarged to contain them.
 
     Raises ConfigError.
     """
@@ -92,18 +92,18 @@ def measured(world: World) -> World:
 
 
 def is_floor(model: mujoco.MjModel, geom: int) -> bool:
-    """Return whether a geom is floor: a plane, or called floor or ground."""
+    """Return whether a geom is floor: a plane, or named floor or ground."""
     name = model.geom(geom).name
     return bool(model.geom_type[geom] == PLANE or FLOOR_NAME.search(name))
 
 
 def has_floor(spec: mujoco.MjSpec) -> bool:
-    """Return whether a model brings its own floor."""
+    """Return whether a model has its own floor."""
     return any(geom.type == PLANE or FLOOR_NAME.search(geom.name) for geom in spec.geoms)
 
 
 def _floor_heights(model: mujoco.MjModel, data: mujoco.MjData) -> list[float]:
-    """Return the heights of all level floors [m]; none where one is no plane or box."""
+    """Return the heights of all level floors [m]; none unless all are planes or boxes."""
     floors = [
         (geom, kind)
         for geom, kind in enumerate(model.geom_type.tolist())
@@ -119,7 +119,7 @@ def _floor_heights(model: mujoco.MjModel, data: mujoco.MjData) -> list[float]:
 
 
 def _outlines(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Shape, ...]:
-    """Return a box round each thing that is in a robot's way."""
+    """Return a box round each obstacle."""
     found = []
     for geom in range(model.ngeom):
         if not (model.geom_contype[geom] or model.geom_conaffinity[geom]) or is_floor(model, geom):
@@ -141,7 +141,7 @@ def _outlines(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Shape, ...]:
 
 
 def _bounds(shape: Shape) -> tuple[float, float, float, float]:
-    """Return the least and greatest x and y that a box may reach: x, y, x, y."""
+    """Return the bounds of a box: min x, min y, max x, max y [m]."""
     assert isinstance(shape, Box)
     cos, sin = abs(np.cos(shape.yaw)), abs(np.sin(shape.yaw))
     reach_x = float(cos * shape.half_x + sin * shape.half_y)

@@ -1,4 +1,4 @@
-"""Compares a robot's MJCF model with the measures in the robot's file."""
+"""Compares a robot's MJCF model with the dimensions in the robot's file."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -11,14 +11,14 @@ from gigabrain_drivers.kinematics.wheels import Omni
 from gigabrain_drivers.sim.body import SimBody, SimModel
 from gigabrain_zenoh.errors import ConfigError
 
-MAX_SHARE = 0.05  # by which two lengths differ that should be the same
-MAX_OFF_M, MAX_OFF_RAD = 0.02, 0.05  # the same of places and angles
+MAX_RELATIVE_ERROR = 0.05  # between lengths in the model and in the file
+MAX_ERROR_M, MAX_ERROR_RAD = 0.02, 0.05  # between positions, and between angles
 IMU_SENSORS = ("gyro", "accelerometer", "attitude")
-UPRIGHT = 0.7  # cosine from which an axis counts as along another
+UPRIGHT = 0.7  # minimal cosine between parallel axes
 
 
 class ModelMeasures:
-    """Places of a model's parts in the frame of its base, at rest. Parts have the usual names."""
+    """Positions of a model's parts at rest, in its base's frame. Parts have our names."""
 
     def __init__(self, spec: mujoco.MjSpec) -> None:
         self._model = spec.copy().compile()
@@ -33,7 +33,7 @@ class ModelMeasures:
         return np.asarray(self._data.xaxis[self._model.joint(name).id] @ self._axes)
 
     def geom(self, name: str) -> NDArray[np.float64]:
-        """Return the middle of a geom (3,) [m]."""
+        """Return the centre of a geom (3,) [m]."""
         return self._placed(self._data.geom_xpos[self._model.geom(name).id])
 
     def body(self, name: str) -> NDArray[np.float64]:
@@ -41,27 +41,27 @@ class ModelMeasures:
         return self._placed(self._data.xpos[self._model.body(name).id])
 
     def site(self, name: str) -> tuple[float, float, float]:
-        """Return place [m] and yaw [rad] of a site."""
+        """Return x, y [m] and yaw [rad] of a site."""
         x, y, _ = self.place(name).tolist()
         axes = self._data.site_xmat[self._model.site(name).id].reshape(3, 3)
         ahead = self._axes.T @ axes[:, 0]
         return x, y, math.atan2(ahead[1], ahead[0])
 
     def is_level(self, name: str) -> bool:
-        """Return whether a site has the axes of the base."""
+        """Return whether a site's axes are those of the base."""
         turned = self._axes.T @ self._data.site_xmat[self._model.site(name).id].reshape(3, 3)
         return bool(np.allclose(turned, np.eye(3), atol=1e-3))
 
     def place(self, name: str) -> NDArray[np.float64]:
-        """Return the place of a site (3,) [m]."""
+        """Return the position of a site (3,) [m]."""
         return self._placed(self._data.site_xpos[self._model.site(name).id])
 
     def radius(self, name: str) -> float:
-        """Return the radius of a wheel's geom [m], of a mesh too."""
+        """Return the radius of a wheel's geom, which may be a mesh [m]."""
         return float(self._model.geom_aabb[self._model.geom(name).id, 3:].max())
 
     def reach(self, name: str) -> tuple[float, float]:
-        """Return the range of an actuator's control; infinite without limits."""
+        """Return the control range of an actuator; infinite without limits."""
         number = self._model.actuator(name).id
         if not self._model.actuator_ctrllimited[number]:
             return -math.inf, math.inf
@@ -69,9 +69,9 @@ class ModelMeasures:
         return low, high
 
     def outline(self, arm: Sequence[str] = ()) -> tuple[float, float, float, float]:
-        """Return front, rear, left and right edge of all that can touch things [m].
+        """Return the front, rear, left and right edges of all geoms with contacts [m].
 
-        What the joints of an arm move does not count.
+        Parts that the joints `arm` move are left out.
         """
         model = self._model
         carried = np.zeros(model.nbody, bool)
@@ -93,9 +93,9 @@ class ModelMeasures:
 
 
 def align(spec: mujoco.MjSpec, body: SimModel) -> None:
-    """Turn inertial sensors into the base's frame, wheels' axes to the left, steering upwards.
+    """Align inertial sensors with the base, wheels' axes to the left, steering upwards.
 
-    Raises ConfigError for one that lies otherwise.
+    Raises ConfigError for an axis in another direction.
     """
     measures = ModelMeasures(spec)
     _level(spec, measures)
@@ -117,7 +117,7 @@ def align(spec: mujoco.MjSpec, body: SimModel) -> None:
 
 
 def _level(spec: mujoco.MjSpec, measures: ModelMeasures) -> None:
-    """Read inertial sensors that are mounted at an angle as the base's own, at the same place."""
+    """Level inertial sensors that are mounted at an angle, at the same position."""
     for name in IMU_SENSORS:
         sensor = spec.sensor(name)
         if sensor.objtype != mujoco.mjtObj.mjOBJ_SITE or measures.is_level(sensor.objname):
@@ -128,7 +128,7 @@ def _level(spec: mujoco.MjSpec, measures: ModelMeasures) -> None:
 
 
 def mismatches(spec: mujoco.MjSpec, body: SimModel) -> Iterator[str]:
-    """Yield what the model and the robot's file say differently, with both numbers."""
+    """Yield the differences between model and robot's file, with both numbers."""
     measures = ModelMeasures(spec)
     if isinstance(body, SimBody):
         yield from _wheels(measures, body)
@@ -139,7 +139,7 @@ def mismatches(spec: mujoco.MjSpec, body: SimModel) -> Iterator[str]:
         edges = ("front", max(x)), ("rear", min(x)), ("left side", max(y)), ("right side", min(y))
         outline = measures.outline([joint.name for joint in body.joints])
         for (edge, stated), is_in_model in zip(edges, outline, strict=True):
-            if abs(is_in_model) > abs(stated) + MAX_OFF_M:  # a wider footprint is only careful
+            if abs(is_in_model) > abs(stated) + MAX_ERROR_M:  # a larger footprint is safe
                 yield _differs(f"the {edge} of the footprint", is_in_model, stated)
 
 
@@ -154,14 +154,14 @@ def _wheels(measures: ModelMeasures, body: SimBody) -> Iterator[str]:
         along = [measures.body(name)[0] for name in body.wheels]
         lengths.append(("wheel_base", body.wheel_base, max(along) - min(along)))
     for name, stated, is_in_model in lengths:
-        if abs(stated / is_in_model - 1.0) > MAX_SHARE:
+        if abs(stated / is_in_model - 1.0) > MAX_RELATIVE_ERROR:
             yield _differs(name, is_in_model, stated)
     middle = float(np.mean([place[0] for place in places.values()]))
-    if abs(middle) > MAX_OFF_M:
+    if abs(middle) > MAX_ERROR_M:
         yield f"the wheels are {middle:.3f} m ahead of the base's origin; expected them at 0 m"
     for name in body.rolling:
         low, high = measures.reach(name)
-        if body.needed_wheel_speed > min(-low, high) * (1 + MAX_SHARE):
+        if body.needed_wheel_speed > min(-low, high) * (1 + MAX_RELATIVE_ERROR):
             yield (
                 f"the actuator of {name} ends at {min(-low, high):.3g} rad/s, and the largest "
                 f"speeds of the robot's file ask for {body.needed_wheel_speed:.3g} rad/s"
@@ -172,9 +172,9 @@ def _wheels(measures: ModelMeasures, body: SimBody) -> Iterator[str]:
 def _lidar(measures: ModelMeasures, mount: tuple[float, float, float]) -> Iterator[str]:
     x, y, yaw = measures.site("lidar")
     for name, stated, is_in_model in (("lidar: x", mount[0], x), ("lidar: y", mount[1], y)):
-        if abs(stated - is_in_model) > MAX_OFF_M:
+        if abs(stated - is_in_model) > MAX_ERROR_M:
             yield _differs(name, is_in_model, stated)
-    if abs(math.remainder(mount[2] - yaw, math.tau)) > MAX_OFF_RAD:
+    if abs(math.remainder(mount[2] - yaw, math.tau)) > MAX_ERROR_RAD:
         yield _differs("lidar: yaw", yaw, mount[2], "rad")
 
 

@@ -1,7 +1,7 @@
-"""Fits a robot's MJCF model to the simulator: finds its parts by name, and adds what it lacks.
+"""Fits a robot's MJCF model to the simulator: finds parts by name, adds missing ones.
 
-The simulator knows parts by names of its own (`base`, `wheel_left_joint`). The table `names` of a
-robot's file says what they are called in the model, which stays as it is on disk.
+The simulator has its own names for parts (`base`, `wheel_left_joint`). The table `names` of a
+robot's file maps them to the names in the model. The file of the model is not changed.
 """
 
 import difflib
@@ -35,15 +35,15 @@ IMU_SENSORS = {
 }
 ROBOT_GROUP = 2  # of geoms that the lidar does not see
 HULL = "hull_"
-HULL_BOTTOM_M, HULL_TOP_M = 0.02, 0.4  # above the floor, of a hull that is made of the footprint
+HULL_BOTTOM_M, HULL_TOP_M = 0.02, 0.4  # above the floor, of a hull made of the footprint
 SERVO_GAIN, GRIP = 100.0, 0.8  # [1/s] of a wheel's servo, and friction that its torque overcomes
 GRAVITY = 9.81  # [m/s2]
-SHARE_AT_FULL_TORQUE = 0.1  # of the largest wheel speed, by which a motor's servo is off then
-UPRIGHT = 0.7  # cosine from which an axis counts as along another
+SHARE_AT_FULL_TORQUE = 0.1  # speed error at full torque, as a share of the largest wheel speed
+UPRIGHT = 0.7  # minimal cosine between parallel axes
 
 
 class PartFinder:
-    """Finds the parts of one model, and collects what is missing."""
+    """Finds the parts of one model, and collects the missing ones."""
 
     def __init__(self, spec: mujoco.MjSpec, body: SimModel) -> None:
         self._spec, self._body = spec, body
@@ -52,7 +52,7 @@ class PartFinder:
         self._value = ""  # the first name in the robot's file that is wrong
 
     def fit(self) -> None:
-        """Name the parts as the simulator does. Raises ConfigError with all that is missing."""
+        """Rename the parts to our names. Raises ConfigError listing all missing parts."""
         spec, body = self._spec, self._body
         _leave_out_scene(spec)
         self._check_keys()
@@ -89,7 +89,7 @@ class PartFinder:
         self._value = self._value or value
 
     def _named(self, key: str) -> PartNames:
-        """Return the names that a part has in the model, by the robot's file or as usual."""
+        """Return a part's names in the model, from the robot's file or by default."""
         given = self._body.names.get(key)
         if isinstance(given, str):
             return PartNames(joint=given)
@@ -119,7 +119,7 @@ class PartFinder:
                 self._problem(f"one name for {key}, not a joint and an actuator", given.joint)
 
     def _base(self) -> Any:
-        """Return the body of the base, which is free to move."""
+        """Return the body of the base, which has a free joint."""
         spec, top = self._spec, list(self._spec.worldbody.bodies)
         name = self._text("base")
         base = spec.body(name)
@@ -173,7 +173,7 @@ class PartFinder:
         self._rename("joint", joint, f"{key}_joint" if "body" in needed else key)
 
     def _geom(self, part: PartNames, joint: Any, key: str) -> Any:
-        """Return the geom by which a wheel rolls: the named one, or the only one that touches."""
+        """Return a wheel's geom on the floor: the named one, or the only one with contacts."""
         geoms = list(joint.parent.geoms)
         named = {one.name: one for one in geoms if one.name}
         if part.geom or key in named:
@@ -182,7 +182,7 @@ class PartFinder:
                 self._missing("geom", part.geom, key, named)
             return geom
         touching = [one for one in geoms if one.contype or one.conaffinity]
-        if not touching and geoms and joint.parent.bodies:  # its rollers touch
+        if not touching and geoms and joint.parent.bodies:  # its rollers have the contacts
             return max(geoms, key=lambda one: float(one.size[0]))
         if len(touching) != 1:
             what = "several geoms that touch" if touching else "no geom that touches"
@@ -210,7 +210,7 @@ class PartFinder:
         return found
 
     def _drive(self, actuator: Any) -> None:
-        """Make a velocity servo of a wheel's actuator, of the same torque, if it is none."""
+        """Turn a wheel's actuator into a velocity servo of the same torque, unless it is one."""
         gear = float(actuator.gear[0]) or 1.0
         gain, bias = float(actuator.gainprm[0]), float(actuator.biasprm[2])
         low, high = map(float, actuator.forcerange)
@@ -220,9 +220,9 @@ class PartFinder:
             gain *= gear * gear
             torque = high * abs(gear) if high > low else 0.0
         else:
-            turn, most = map(float, actuator.ctrlrange)
-            torque = min(high, most * abs(gear)) if high > low else most * abs(gear)
-            torque = torque if most > turn else 0.0
+            min_control, max_control = map(float, actuator.ctrlrange)
+            torque = min(high, max_control * abs(gear)) if high > low else max_control * abs(gear)
+            torque = torque if max_control > min_control else 0.0
             fastest = self._body.max_wheel_speed if isinstance(self._body, SimBody) else 1.0
             gain = torque / (SHARE_AT_FULL_TORQUE * fastest) if torque else 0.0
         if not gain:
@@ -242,7 +242,7 @@ class PartFinder:
         return float(self._unchanged.compile().body_mass.sum())
 
     def _sensors(self, base: Any) -> None:
-        """Find the sensors; an inertial unit that is not there is added to the base."""
+        """Find the sensors; add a missing inertial unit to the base."""
         spec, body = self._spec, self._body
         for key in [one for one in self._others() if one not in ("base", "lidar")]:
             name = self._text(key)
@@ -258,7 +258,7 @@ class PartFinder:
                 self._missing("sensor", name, key, (one.name for one in spec.sensors))
 
     def _lidar(self, base: Any) -> None:
-        """Find the lidar's site; a body will do, or its height above the floor."""
+        """Find the lidar's site, or make one from a body or a height above the floor."""
         body, spec, name = self._body, self._spec, self._text("lidar")
         lidar = body.lidar
         if lidar is None:
@@ -279,7 +279,7 @@ class PartFinder:
                 self._problem("no height for it either: `lidar_height`, above the floor, adds it")
 
     def _rename(self, kind: str, element: Any, name: str) -> None:
-        """Give an element its name, also where others refer to it."""
+        """Rename an element, and all references to it."""
         if element.name == name:
             return
         other = getattr(self._spec, kind)(name)
@@ -294,19 +294,19 @@ class PartFinder:
 
 
 def _of(name: str, key: str) -> bool:
-    """Return whether a needed name belongs to a part."""
+    """Return whether a required name belongs to a part."""
     return name in (key, f"{key}_joint")
 
 
 def _refer(spec: mujoco.MjSpec, kind: str, before: str, now: str) -> None:
-    """Change a name wherever a model refers to it by text."""
+    """Change a name in all references of a model to it."""
     for element, field in _references(spec, kind):
         if getattr(element, field) == before:
             setattr(element, field, now)
 
 
 def _check_tendons(spec: mujoco.MjSpec, before: str, now: str) -> None:
-    """Raise ValueError for a tendon over an element: it would not follow its new name."""
+    """Raise ValueError for a tendon over an element, whose references cannot be renamed."""
     for tendon in spec.tendons:
         wraps = [tendon.path[i] for i in range(len(tendon.path))]
         if any(getattr(wrap.target, "name", None) == before for wrap in wraps):
@@ -314,7 +314,7 @@ def _check_tendons(spec: mujoco.MjSpec, before: str, now: str) -> None:
 
 
 def _references(spec: mujoco.MjSpec, kind: str) -> Iterator[tuple[Any, str]]:
-    """Yield all elements that may refer to one of a kind, and the field with its name."""
+    """Yield elements that may refer to one of `kind`, and the field with that name."""
     for actuator in spec.actuators:
         if TARGETS.get(actuator.trntype, "joint") == kind:
             yield actuator, "target"
@@ -343,19 +343,19 @@ def _leave_out_scene(spec: mujoco.MjSpec) -> None:
 
 
 def _hide(spec: mujoco.MjSpec) -> None:
-    """Put all geoms into the robot's group; those for contacts are not drawn over others."""
+    """Put all geoms into the robot's group; hide collision geoms if there are visual ones."""
     geoms = list(spec.geoms)
     if all(geom.group == ROBOT_GROUP for geom in geoms):
         return
-    looks = any(not one.contype and not one.conaffinity for one in geoms)
+    has_visuals = any(not one.contype and not one.conaffinity for one in geoms)
     for geom in geoms:
-        if looks and (geom.contype or geom.conaffinity):
+        if has_visuals and (geom.contype or geom.conaffinity):
             geom.rgba = np.zeros(4, np.float32)
         geom.group = ROBOT_GROUP
 
 
 def _add_hull(base: Any, footprint: tuple[tuple[float, float], ...]) -> None:
-    """Add the rectangle round a footprint: it touches nothing, and only distances know it."""
+    """Add a box round the footprint, for distances only: it touches nothing."""
     x, y = zip(*footprint, strict=True)
     middle = (HULL_BOTTOM_M + HULL_TOP_M) / 2 - base.pos[2]
     base.add_geom(

@@ -39,7 +39,7 @@ from gigabrain_drivers.sim.world import Stream, World, generator
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
 
 GRAVITY = 9.81  # [m/s2]
-STALL_AMPERES, STALL_SHARE = 1.4, 4.0  # of the usual motor; times its gear's friction
+STALL_AMPERES, STALL_SHARE = 1.4, 4.0  # stall current of the default motor; factor on friction
 EDGE_OF_THE_WORLD_M = 1e3
 PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
 DIVERGED = (
@@ -70,7 +70,7 @@ class Simulation:
             self.model.body(f"{PERSON}{number + 1 if number else ''}").id: Person(walk)
             for number, walk in enumerate(world.people)
         }
-        self._stood_before = 0  # times that people stood who are gone
+        self._stood_before = 0  # stops of people who were removed
         self._place_people()
         self.truth = Truth(self.model, self.data)
         self.things = Things(self.model, self.data, world, self.truth, self._set_walking)
@@ -113,7 +113,7 @@ class Simulation:
         )
 
     def _resume(self, checkpoint: Checkpoint, body: SimModel) -> None:
-        """Go on at rest; the body's own sensors begin at zero. Raises ConfigError."""
+        """Continue from a checkpoint at rest; odometry begins at zero. Raises ConfigError."""
         if checkpoint.model != self._digest:
             raise ConfigError("the checkpoint is of another body or world")
         physics = np.frombuffer(checkpoint.physics)
@@ -143,12 +143,12 @@ class Simulation:
         return self._steps * STEP_NS
 
     def people(self) -> tuple[Person, ...]:
-        """Return those who walk in this world."""
+        """Return the walking people."""
         return tuple(self._people.values())
 
     @property
     def person_stood(self) -> int:
-        """The number of times that people had to stand for the robot."""
+        """The number of times that people stopped for the robot."""
         return self._stood_before + sum(person.stood for person in self._people.values())
 
     def command(self, linear_x: float, angular_z: float) -> tuple[float, float]:
@@ -157,9 +157,9 @@ class Simulation:
         return twist.linear_x, twist.angular_z
 
     def drive(self, linear_x: float, linear_y: float, angular_z: float) -> Twist:
-        """Aim for a velocity [m/s, m/s, rad/s]; returns the one that the body can have.
+        """Aim for a velocity [m/s, m/s, rad/s]; return the nearest possible one.
 
-        The body gets there as fast as it can.
+        The body accelerates as fast as it can.
         """
         return self._locomotion.command(Twist(linear_x, linear_y, angular_z))
 
@@ -231,7 +231,7 @@ class Simulation:
         return self._battery.read()
 
     def bumper(self) -> bool:
-        """Return whether the robot, but for its hand, touches anything but the floor right now."""
+        """Return whether the robot, without its hand, touches anything but the floor."""
         return self.truth.touching
 
     def report(self, robot: RobotFile, run: Run) -> dict[str, Any]:
@@ -255,7 +255,7 @@ class Simulation:
         }
 
     def _set_walking(self, body: int, person: Person | None) -> None:
-        """Have a spare body walk, or no longer."""
+        """Make a spare body walk like `person`; None stops it."""
         if person:
             self._people[body] = person
         elif body in self._people:
@@ -268,7 +268,7 @@ class Simulation:
             self.data.mocap_quat[place] = yaw_quaternion(person.pose)
 
     def _check(self) -> None:
-        """A diverging simulation shows as a warning of MuJoCo, or as a robot that flies away."""
+        """Raise BodyLost if the simulation diverges: MuJoCo warns, or the robot flies away."""
         x, y, z = self.data.xpos[self._base].tolist()
         far = EDGE_OF_THE_WORLD_M
         lost = any(warning.number for warning in self._divergences)
@@ -284,7 +284,7 @@ def _digest(model: mujoco.MjModel) -> bytes:
 
 
 def with_motors(body: SimModel, model: mujoco.MjModel) -> SimModel:
-    """Return a body of somebody else's model with motors for its weight and its gears' friction."""
+    """Return a body of a foreign model with motors sized for its weight and friction."""
     if not body.names or not isinstance(body, SimBody):
         return body
     mass = float(model.body_subtreemass[model.body(f"{ROBOT}base").id])

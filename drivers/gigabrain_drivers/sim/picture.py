@@ -20,12 +20,12 @@ from gigabrain_drivers.sim.world import Pose, World, clearance
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_zenoh.errors import ConfigError, Unsupported
 
-DISTANCE_M, HEIGHT_M = 1.0, 0.50  # of the camera, from the robot and above the floor
-AIM_HEIGHT_M = 0.22  # above the robot, so that the room is in the picture
+DISTANCE_M, HEIGHT_M = 1.0, 0.50  # of the camera: from the robot, and above the floor
+AIM_HEIGHT_M = 0.22  # aim above the robot, to have the room in the picture
 FIELD_OF_VIEW_DEG = 44.0
-SHADOW_REACH_M = 3.5  # shadows are drawn this far round the robot: fewer metres, finer edges
-SUN_M = 4.0  # from the robot to the sun: far enough for the tallest thing near it
-SUPERSAMPLING = 2  # drawn this many times as large, then averaged
+SHADOW_REACH_M = 3.5  # radius of shadows round the robot; smaller ones have finer edges
+SUN_DISTANCE_M = 4.0  # from the robot, beyond the tallest thing near it
+SUPERSAMPLING = 2  # drawn larger by this factor, then averaged
 
 
 def render(
@@ -51,7 +51,7 @@ def save_picture(
     width: int = 1280,
     height: int = 720,
 ) -> None:
-    """Write what a camera sees to a PNG; `add` adds shapes of its own.
+    """Write a camera's view as a PNG; `add` may add shapes to the scene.
 
     Raises ConfigError where nothing can be drawn, or the file cannot be written.
     """
@@ -70,16 +70,16 @@ def save_picture(
 
 
 def _light(model: mujoco.MjModel, robot: Pose) -> None:
-    """Put the sun over the robot and spend the whole shadow map there."""
+    """Put the sun over the robot, and use the whole shadow map there."""
     model.vis.quality.shadowsize = 8192
     model.vis.map.shadowclip = SHADOW_REACH_M / model.stat.extent
     suns = model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
-    model.light_pos[suns] = np.array([robot.x, robot.y, 0]) - SUN_M * model.light_dir[suns]
+    model.light_pos[suns] = np.array([robot.x, robot.y, 0]) - SUN_DISTANCE_M * model.light_dir[suns]
 
 
 @contextmanager
 def _graphics(width: int, height: int) -> Iterator[None]:
-    """An off-screen OpenGL context. Raises ConfigError naming the packages that are missing."""
+    """Keep an off-screen OpenGL context. Raises ConfigError naming the missing packages."""
     context = open_graphics(width, height)
     try:
         yield
@@ -111,11 +111,11 @@ def _draw(
 
 
 def _camera(world: World, robot: Pose) -> mujoco.MjvCamera:
-    """Three-quarter from the front, on the side where the view is free and the room is deep."""
+    """Return a camera obliquely in front of the robot, on the side with the most room."""
     shapes = world.everything()
 
     def room(angle: float) -> float:
-        """The least clearance on the line from the robot to the camera, and a bit behind it."""
+        """Return the least clearance on the line from robot to camera, and just behind it."""
         cos, sin = math.cos(robot.yaw + angle), math.sin(robot.yaw + angle)
         reaches = (0.4, 0.7, 1.0, DISTANCE_M, DISTANCE_M + 0.2)
         return min(clearance(shapes, robot.x + cos * r, robot.y + sin * r) for r in reaches)

@@ -1,4 +1,4 @@
-"""PNG images: written from pixels, and read by MuJoCo's decoder after checks of their size."""
+"""PNG images: encodes pixels, and decodes files with MuJoCo after a check of their size."""
 
 import struct
 import zlib
@@ -14,7 +14,7 @@ SAMPLES = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # of a pixel, by the header's colour t
 
 
 def png(pixels: NDArray[np.uint8]) -> bytes:
-    """An image (height, width, 3) as a PNG file, each row stored as what differs from the last."""
+    """Return an image (height, width, 3) as a PNG file, with rows as differences."""
     height, width, _ = pixels.shape
     rows = pixels.reshape(height, width * 3)
     above = np.vstack([np.zeros_like(rows[:1]), rows[:-1]])
@@ -33,13 +33,13 @@ def _chunk(kind: bytes, content: bytes) -> bytes:
     return struct.pack(">I", len(content)) + kind + content + check
 
 
-def read_png(data: bytes, source: str, most_pixels: int) -> NDArray[np.uint8]:
+def read_png(data: bytes, source: str, max_pixels: int) -> NDArray[np.uint8]:
     """Return the grey values (height, width) of a PNG, the top row first.
 
     Colours are averaged, transparency is ignored. Raises ConfigError, which names `source`.
     """
     try:
-        _check_size(data, most_pixels)
+        _check_size(data, max_pixels)
         spec = mujoco.MjSpec()
         spec.add_texture(name="map", type=mujoco.mjtTexture.mjTEXTURE_2D, file="map.png")
         spec.assets = {"map.png": data}
@@ -51,8 +51,8 @@ def read_png(data: bytes, source: str, most_pixels: int) -> NDArray[np.uint8]:
     return np.asarray(model.tex_data.reshape(shape).mean(axis=2).round(), np.uint8)
 
 
-def _check_size(data: bytes, most_pixels: int) -> None:
-    """Raise ValueError for too many pixels, also if only the compressed data holds them."""
+def _check_size(data: bytes, max_pixels: int) -> None:
+    """Raise ValueError for too many pixels, in the header or in the compressed data."""
     chunks: dict[bytes, list[bytes]] = {b"IHDR": [], b"IDAT": []}
     at = len(SIGNATURE)
     while at + 8 <= len(data):
@@ -61,10 +61,10 @@ def _check_size(data: bytes, most_pixels: int) -> None:
             chunks[kind].append(data[at + 8 : at + 8 + length])
         at += length + 12
     width, height, bits, colour = struct.unpack_from(">IIBB", b"".join(chunks[b"IHDR"]))
-    if not 0 < width * height <= most_pixels:
-        raise ValueError(f"{width} x {height} pixels; expected 1 to {most_pixels} in all")
+    if not 0 < width * height <= max_pixels:
+        raise ValueError(f"{width} x {height} pixels; expected 1 to {max_pixels} in all")
     row = (width * SAMPLES.get(colour, 4) * bits + 7) // 8 + 1
-    most_bytes = 2 * height * row + 64  # passes of an interlaced one have more, shorter rows
+    max_bytes = 2 * height * row + 64  # interlaced images have more, shorter rows
     stream = zlib.decompressobj()
-    if len(stream.decompress(b"".join(chunks[b"IDAT"]), most_bytes + 1)) > most_bytes:
+    if len(stream.decompress(b"".join(chunks[b"IDAT"]), max_bytes + 1)) > max_bytes:
         raise ValueError(f"it unpacks to more than its {width} x {height} pixels")

@@ -31,15 +31,15 @@ log = logging.getLogger(__name__)
 SUN = Light((0.62, 0.60, 0.56), direction=(0.30, 0.38, -0.87))
 PERSON_RADIUS_M = 0.25
 PERSON_GAP_M = 0.5  # from the person's side to the robot's outer edge
-NEW_MEETING_M = 1.0  # walked since it last stood: standing again is another meeting
-WORLDS_OWN = ("option", "njmax", "nconmax", "memory")  # parts of a model
-ROBOT = "robot/"  # prefix of all names of the robot's model
-MODEL = "world/"  # prefix of all names of the world's own model
-PERSON = "person"  # body of the first; the others have a number behind it
-WORLD_GROUP = 1  # of what would be in the robot's
-SPARE = "spare/"  # prefix of what people may put in while it runs
+NEW_MEETING_M = 1.0  # after this path, another stop counts as a new meeting
+WORLD_SETTINGS = ("option", "njmax", "nconmax", "memory")  # of MjSpec
+ROBOT = "robot/"  # prefix of names in the robot's model
+MODEL = "world/"  # prefix of names in the world's own model
+PERSON = "person"  # body of the first person; others have a number appended
+WORLD_GROUP = 1  # for the world's geoms that are in the robot's group
+SPARE = "spare/"  # prefix of bodies for things that people add while it runs
 SPARE_THINGS, SPARE_PEOPLE = 12, 4  # each costs time in every step
-SPARE_M = 0.01  # size of a spare that is not in use
+UNUSED_M = 0.01  # of a spare body that is not in use
 PERSON_HEIGHT_M = 1.45  # to the shoulders
 
 
@@ -57,7 +57,7 @@ def add_sky(spec: mujoco.MjSpec) -> None:
 
 
 def add_materials(spec: mujoco.MjSpec, world: World) -> None:
-    """Sky, the floor's checks, and a material for each colour that a shape may name."""
+    """Add sky, the floor's checks, and a material for each colour name."""
     add_sky(spec)
     spec.add_texture(
         name=FLOOR,
@@ -68,7 +68,7 @@ def add_materials(spec: mujoco.MjSpec, world: World) -> None:
         width=128,
         height=128,
     )
-    repeat = (0.5 / world.check[0], 0.5 / world.check[1])  # a texture holds two checks each way
+    repeat = (0.5 / world.check[0], 0.5 / world.check[1])  # a texture has two checks each way
     floor = spec.add_material(name=FLOOR, texrepeat=repeat, texuniform=True, reflectance=0.04)
     floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = FLOOR
     for name, colour in (MATERIALS | dict(world.materials)).items():
@@ -76,7 +76,7 @@ def add_materials(spec: mujoco.MjSpec, world: World) -> None:
 
 
 def add_lights(spec: mujoco.MjSpec, world: World) -> None:
-    """Add the world's lights, or a low sun that casts shadows; and soft light from the camera."""
+    """Add the world's lights, or a low sun with shadows, and a soft light at the camera."""
     spec.visual.headlight.ambient = (0.45, 0.45, 0.46)
     spec.visual.headlight.diffuse = (0.30, 0.30, 0.30)
     spec.visual.headlight.specular = (0.1, 0.1, 0.1)
@@ -96,20 +96,20 @@ def add_lights(spec: mujoco.MjSpec, world: World) -> None:
 
 
 class Person:
-    """Walks a closed path, and stands while one more step would come too close to the robot."""
+    """Walks a closed path, and stands still where a step would be too close to the robot."""
 
     def __init__(self, walk: WalkingPath) -> None:
         self._path, self._step_m = ClosedPath(walk.corners), walk.speed * STEP_S
         self.go_to(walk.start)
-        self.stood = 0  # how often it had to, for the robot
+        self.stood = 0  # number of stops for the robot
         self._since_m = NEW_MEETING_M
 
     def go_to(self, walked: float) -> None:
-        """Be at this place along the path [m]."""
+        """Set the position along the path [m]."""
         self.walked, self.pose = walked, self._path.at(walked)
 
     def advance(self, robot_distance: Callable[[float, float], float]) -> Pose:
-        """Walk for one step; `robot_distance(x, y)` is from a point to the robot's edge [m]."""
+        """Walk for one step; `robot_distance(x, y)` returns a point's distance to the robot [m]."""
         walked = (self.walked + self._step_m) % self._path.length
         ahead = self._path.at(walked)
         gap = robot_distance(ahead.x, ahead.y)
@@ -123,17 +123,17 @@ class Person:
 
 
 def compile_scene(body: SimModel, world: World) -> mujoco.MjModel:
-    """The model of `body` at the start of `world`. Raises ConfigError for a bad robot model."""
-    mujoco.set_mju_user_warning(log.warning)  # instead of a file
+    """Return the model of `body` at the start of `world`. Raises ConfigError."""
+    mujoco.set_mju_user_warning(log.warning)  # not to MuJoCo's log file
     spec = world_spec(world)
     spec.option.timestep = STEP_S / body.substeps
-    if body.joints:  # so that fingers do not let go of what they hold
+    if body.joints:  # so that fingers do not lose their grip
         spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10.0
         spec.option.noslip_iterations = 10
     start = world.start
     try:
         robot = _robot_spec(body)
-        for name in WORLDS_OWN:  # those of the robot do not count
+        for name in WORLD_SETTINGS:  # ignore the robot's
             setattr(robot, name, getattr(spec, name))
         frame = spec.worldbody.add_frame(pos=(start.x, start.y, 0), quat=yaw_quaternion(start))
         spec.attach(robot, prefix=ROBOT, frame=frame)
@@ -146,13 +146,13 @@ def compile_scene(body: SimModel, world: World) -> mujoco.MjModel:
 
 
 def yaw_quaternion(pose: Pose) -> tuple[float, float, float, float]:
-    """The heading as a quaternion (w, x, y, z)."""
+    """Return the heading as a quaternion (w, x, y, z)."""
     return math.cos(pose.yaw / 2), 0.0, 0.0, math.sin(pose.yaw / 2)
 
 
 def _robot_spec(body: SimModel) -> mujoco.MjSpec:
-    """The robot's own model; worn wheels are smaller and hang lower, so the base stays level."""
-    on_disk = Path(body.path).is_file()  # where its meshes and includes are found
+    """Return the robot's model; scaled wheels are moved down, so the base stays level."""
+    on_disk = Path(body.path).is_file()  # then meshes and includes are found beside it
     spec = mujoco.MjSpec.from_file(body.path) if on_disk else mujoco.MjSpec.from_string(body.model)
     PartFinder(spec, body).fit()
     align(spec, body)
@@ -170,7 +170,7 @@ def _robot_spec(body: SimModel) -> mujoco.MjSpec:
 
 
 def world_spec(world: World) -> mujoco.MjSpec:
-    """The world alone, not compiled, for one robot to be attached to. Raises ConfigError."""
+    """Return the world without a robot, not compiled. Raises ConfigError."""
     spec = mujoco.MjSpec()
     spec.modelname = world.name
     _set_options(spec)
@@ -188,7 +188,7 @@ def world_spec(world: World) -> mujoco.MjSpec:
 
 
 def _attach_model(spec: mujoco.MjSpec, path: Path) -> bool:
-    """Attach the world's own model; return whether it brings a floor. Raises ConfigError."""
+    """Attach the world's own model; return whether it has a floor. Raises ConfigError."""
     child = load_model(path)
     for key in list(child.keys):
         child.delete(key)
@@ -204,13 +204,13 @@ def _attach_model(spec: mujoco.MjSpec, path: Path) -> bool:
 
 
 def _add_spares(spec: mujoco.MjSpec, world: World) -> None:
-    """Add bodies that no sensor sees and nothing touches, for what people put in later."""
+    """Add invisible bodies without contacts, for things that people add later."""
     middle = (*world.middle, 0.0)
     for number in range(SPARE_THINGS):
         name = f"{SPARE}thing{number}"
         body = spec.worldbody.add_body(name=name, mocap=True, pos=middle)
         body.add_geom(
-            name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=(SPARE_M, SPARE_M, SPARE_M),
+            name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=(UNUSED_M, UNUSED_M, UNUSED_M),
             rgba=(0, 0, 0, 0), contype=0, conaffinity=0,
         )  # fmt: skip
     for number in range(SPARE_PEOPLE):
@@ -218,11 +218,11 @@ def _add_spares(spec: mujoco.MjSpec, world: World) -> None:
 
 
 def _set_options(spec: mujoco.MjSpec) -> None:
-    """The solver's settings; the robots' models have none, or they would be ignored."""
+    """Set the solver's options; those in robots' models are ignored."""
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10
-    # Without this a simulation that diverges goes back to its start silently.
+    # Otherwise a diverging simulation silently returns to its start.
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
 
 
@@ -253,9 +253,9 @@ FIGURE = ("blue", "skin", "dark_wood")  # colours of a person's parts
 def _add_person(
     spec: mujoco.MjSpec, name: str, spare_at: tuple[float, float, float] | None = None
 ) -> None:
-    """A figure as wide at the floor as at the hips, so that a low lidar sees what can be hit.
+    """Add a figure as wide at the floor as at the hips, so that a low lidar sees its width.
 
-    Nobody sees or touches a spare one before it is used.
+    At `spare_at` it is a spare: invisible and without contacts until it is used.
     """
     person = spec.worldbody.add_body(name=name, mocap=True, pos=spare_at or (0, 0, 0))
     look: Any = {"rgba": (0, 0, 0, 0), "contype": 0, "conaffinity": 0}

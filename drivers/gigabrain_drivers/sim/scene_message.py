@@ -1,4 +1,4 @@
-"""A compiled scene as a message for viewers, and the poses of its bodies."""
+"""Messages for viewers: a compiled scene, and the poses of its bodies."""
 
 from collections.abc import Collection, Mapping
 from typing import NamedTuple
@@ -32,38 +32,39 @@ SHOWN_GROUPS = 3  # MuJoCo's viewers draw geom groups 0 to 2
 
 
 class _Rows(NamedTuple):
-    """Shapes, one a row of each array."""
+    """Shapes, one in each row of the arrays."""
 
     kinds: NDArray[np.uint8]
-    bodies: NDArray[np.int64]  # MuJoCo's numbers
+    bodies: NDArray[np.int64]  # ids in MuJoCo
     sizes: NDArray[np.float32]
     places: NDArray[np.float32]
     colours: NDArray[np.uint8]
 
 
 class SceneWriter:
-    """Writes what viewers draw. Shapes of other types, such as height fields, are left out."""
+    """Writes scenes and poses. Shapes of other types, such as height fields, are left out."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, world: str) -> None:
         self._model, self._data, self._world = model, data, world
         moving = (model.body_weldid != 0) | (model.body_mocapid >= 0)
-        for body in range(1, model.nbody):  # what is fixed to a mocap body moves with it
+        for body in range(1, model.nbody):  # bodies fixed to a mocap body move with it
             moving[body] |= moving[model.body_parentid[body]]
-            moving[body] |= model.body(body).name == BASE  # of an arm: viewers draw its plan there
+            # viewers draw an arm's plan on its base, even if that is fixed
+            moving[body] |= model.body(body).name == BASE
         spare = [model.body(body).name.startswith(SPARE) for body in range(model.nbody)]
         self._moving, self._spare = moving, np.array(spare)
         self._bodies = self._moving_bodies(())
         self._meshes: list[SceneMesh] = []
         self._mesh_numbers: dict[int, int] = {}
         self._mesh_bytes = 0
-        self._means: dict[int, NDArray[np.float64]] = {}  # colours of textures
+        self._means: dict[int, NDArray[np.float64]] = {}  # mean colours of textures
         owner_is_spare = self._spare[model.geom_bodyid]
         self._lasting = self._rows(np.flatnonzero(~owner_is_spare).tolist())
 
     def scene(self, version: int, things: tuple[Thing, ...], used: Mapping[int, str]) -> SimScene:
-        """Return the scene with the spare bodies `used`, and have `poses` tell of these bodies.
+        """Return the scene with the spare bodies `used`; `poses` then includes them.
 
-        A body in use has the name of its thing. Only the shapes of things are looked at again.
+        A used body has the name of its thing. Only the shapes of things are read again.
         """
         model = self._model
         self._bodies = self._moving_bodies(used)
@@ -88,7 +89,7 @@ class SceneWriter:
         )
 
     def poses(self, version: int) -> SimPoses:
-        """Return where the moving bodies of the last scene are now."""
+        """Return the poses of the last scene's moving bodies."""
         data, bodies = self._data, self._bodies
         poses = np.hstack((data.xpos[bodies], data.xquat[bodies])).astype("<f4")
         return SimPoses(version=version, poses=poses.tobytes())
@@ -103,7 +104,7 @@ class SceneWriter:
         return str(self._model.body(body).name[:128]) or f"body {body}"
 
     def _rows(self, geoms: list[int]) -> "_Rows":
-        """Return the shapes of those geoms that are drawn."""
+        """Return the visible shapes among `geoms`."""
         found = [(geom, *shape) for geom in geoms if (shape := self._shape(geom))]
         drawn = [geom for geom, _, _ in found]
         return _Rows(
@@ -115,7 +116,7 @@ class SceneWriter:
         )
 
     def _shape(self, geom: int) -> tuple[int, list[float]] | None:
-        """Return kind and sizes; None for what is not drawn."""
+        """Return kind and sizes; None for a shape that is not drawn."""
         model = self._model
         kind = TYPES.get(mujoco.mjtGeom(int(model.geom_type[geom])))
         if kind is None or model.geom_group[geom] >= SHOWN_GROUPS or self._colour(geom)[3] == 0:
@@ -130,7 +131,7 @@ class SceneWriter:
         return SHAPE_KINDS.index(kind), sizes
 
     def _mesh(self, mesh: int) -> int | None:
-        """Return a mesh's number in the scene; None for one too many, or too large."""
+        """Return a mesh's number in the scene; None beyond the limits of count or size."""
         model = self._model
         if mesh not in self._mesh_numbers:
             vertex, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
@@ -147,7 +148,7 @@ class SceneWriter:
         return self._mesh_numbers[mesh]
 
     def _place(self, geom: int) -> NDArray[np.float64]:
-        """Return the pose of a geom on its body, or in the world where that does not move."""
+        """Return the pose of a geom relative to its body, or to the world if that is fixed."""
         model, data = self._model, self._data
         if self._moving[model.geom_bodyid[geom]]:
             return np.concatenate((model.geom_pos[geom], model.geom_quat[geom]))
@@ -159,12 +160,12 @@ class SceneWriter:
         model, material = self._model, int(self._model.geom_matid[geom])
         colour = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
         texture = -1 if material < 0 else int(model.mat_texid[material].max())
-        if texture >= 0:  # viewers draw plain colours
+        if texture >= 0:  # viewers draw no textures
             colour = np.append(colour[:3] * self._mean(texture), colour[3])
         return np.asarray(np.clip(colour * 255, 0, 255).round(), np.uint8)
 
     def _mean(self, texture: int) -> NDArray[np.float64]:
-        """Return the mean colour of a texture, of 0 to 1."""
+        """Return the mean colour of a texture, 0 to 1."""
         if texture in self._means:
             return self._means[texture]
         model = self._model

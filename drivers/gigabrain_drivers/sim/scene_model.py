@@ -1,4 +1,4 @@
-"""A scene that was received, made into a MuJoCo model: for a window, and for pictures."""
+"""A MuJoCo model made from a received scene, for a window and for pictures."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,7 +25,7 @@ GEOMS = {
 }
 BASE = "robot/base"
 DISTANCE_M, ELEVATION_DEG, AZIMUTH_DEG = 4.0, -38.0, 130.0  # of the camera, from the robot
-STILL = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+IDENTITY = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 Pose = NDArray[np.float64]  # (7,): x, y, z, and a quaternion w, x, y, z
 
 
@@ -35,12 +35,12 @@ class SceneShape(NamedTuple):
     kind: ShapeKind
     body: str
     size: tuple[float, ...]
-    place: tuple[float, ...]  # on its body: x, y, z, and a quaternion w, x, y, z
-    colour: tuple[float, ...]  # red, green, blue, alpha of 0 to 1
+    place: tuple[float, ...]  # pose on its body: x, y, z, and a quaternion w, x, y, z
+    colour: tuple[float, ...]  # red, green, blue, alpha, 0 to 1
 
 
 def shapes_of(scene: SimScene) -> list[SceneShape]:
-    """Return the shapes of a scene. Raises ValueError for numbers that name or measure nothing."""
+    """Return the shapes of a scene. Raises ValueError for invalid indices or sizes."""
     owners = np.frombuffer(scene.owners, "<u2")
     sizes = np.frombuffer(scene.sizes, "<f4").reshape(-1, 3).astype(float)
     places = np.frombuffer(scene.places, "<f4").reshape(-1, 7).astype(float)
@@ -60,7 +60,7 @@ def shapes_of(scene: SimScene) -> list[SceneShape]:
 
 
 def _triangles(scene: SimScene) -> Iterator[tuple[list[float], list[int]]]:
-    """Yield vertices and faces of each mesh. Raises ValueError for a face without its vertices."""
+    """Yield vertices and faces of each mesh. Raises ValueError for a missing vertex."""
     for number, mesh in enumerate(scene.meshes):
         vertices, faces = np.frombuffer(mesh.vertices, "<f4"), np.frombuffer(mesh.faces, "<u4")
         if (faces >= len(vertices) // 3).any():
@@ -69,7 +69,7 @@ def _triangles(scene: SimScene) -> Iterator[tuple[list[float], list[int]]]:
 
 
 class SceneModel:
-    """A scene as a model that is not simulated; things put in by hand are drawn beside it."""
+    """A model of a scene, for drawing only. Things added by people are drawn separately."""
 
     def __init__(self, scene: SimScene) -> None:
         """Make the model. Raises ConfigError for a scene that cannot be drawn."""
@@ -84,13 +84,13 @@ class SceneModel:
         mujoco.mj_forward(self.model, self.data)
 
     def update(self, scene: SimScene) -> bool:
-        """Take the things of a newer scene; return False if more than those has changed."""
+        """Use the things of a newer scene; return False if anything else changed."""
         before = self._fixed
         self._take(scene)
         return self._fixed == before
 
     def place(self, poses: SimPoses) -> bool:
-        """Move the bodies; return False for poses of another scene, or that are not finite."""
+        """Move the bodies; return False for poses of another scene, or not finite ones."""
         values = np.frombuffer(poses.poses, "<f4").reshape(-1, 7).astype(float)
         if poses.version != self.scene.version or len(values) != len(self.scene.bodies) - 1:
             return False
@@ -105,11 +105,11 @@ class SceneModel:
         return True
 
     def add_things(self, drawn: mujoco.MjvScene) -> None:
-        """Add what people put in to what a renderer draws."""
+        """Add the things that people added to a renderer's scene."""
         for shape in self._shapes:
             if shape.body not in self._things or drawn.ngeom >= drawn.maxgeom:
                 continue
-            body = self._poses.get(shape.body, STILL)
+            body = self._poses.get(shape.body, IDENTITY)
             position, turn, matrix = np.empty(3), np.empty(4), np.empty(9)
             mujoco.mju_mulPose(
                 position, turn, body[:3], body[3:], np.array(shape.place[:3]),
@@ -123,11 +123,11 @@ class SceneModel:
             drawn.ngeom += 1
 
     def pose_of(self, body: str) -> Pose:
-        """Return where a body is, or the origin."""
-        return self._poses.get(body, STILL)
+        """Return the pose of a body, or the identity if unknown."""
+        return self._poses.get(body, IDENTITY)
 
     def robot_place(self) -> tuple[float, float]:
-        """Return where the robot is, or the origin."""
+        """Return x, y of the robot, or the origin if unknown."""
         pose = self.pose_of(BASE)
         return float(pose[0]), float(pose[1])
 

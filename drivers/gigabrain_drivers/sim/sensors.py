@@ -1,4 +1,4 @@
-"""Simulated sensors: a planar lidar and an inertial unit, with noise of their own."""
+"""Simulated sensors with noise: a planar lidar and an inertial unit."""
 
 import math
 from typing import NamedTuple
@@ -11,18 +11,18 @@ from gigabrain_drivers.kinematics import Quaternion, Vector
 from gigabrain_drivers.sim.body import SimLidar
 from gigabrain_drivers.sim.scene import ROBOT
 
-GYRO_NOISE = 0.002  # [rad/s], standard deviations for a sample at 100 Hz
+GYRO_NOISE = 0.002  # [rad/s]; standard deviations of samples at 100 Hz
 ACCELEROMETER_NOISE = 0.02  # [m/s2]
 ATTITUDE_NOISE = 0.001  # [rad]
 
 
-SEES_GROUPS = np.array([1, 1, 0, 1, 1, 1], np.uint8)  # robots are geom group 2
+VISIBLE_GROUPS = np.array([1, 1, 0, 1, 1, 1], np.uint8)  # not 2, the robots' geom group
 
 
 class ImuSample(NamedTuple):
     """One sample in the base's frame."""
 
-    orientation: Quaternion  # x, y, z, w; from the frame of the start
+    orientation: Quaternion  # x, y, z, w, in the frame of the start
     angular_velocity: Vector  # [rad/s]
     linear_acceleration: Vector  # [m/s2], 9.81 upwards at rest
 
@@ -40,7 +40,7 @@ class Imu:
         self._attitude = int(model.sensor(f"{ROBOT}attitude").adr[0])
 
     def sample(self) -> ImuSample:
-        """Measure once; every call draws new noise."""
+        """Return a sample; every call draws new noise."""
         values, noise = self._data.sensordata.tolist(), self._noise.standard_normal(9).tolist()
         gyro = _noisy(values, self._gyro, noise[0:3], GYRO_NOISE)
         acceleration = _noisy(values, self._accelerometer, noise[3:6], ACCELEROMETER_NOISE)
@@ -59,7 +59,7 @@ def _noisy(values: list[float], at: int, noise: list[float], sigma: float) -> Ve
 
 
 def _shaken(attitude: Quaternion, noise: list[float]) -> Quaternion:
-    """The attitude (w, x, y, z) after a small random rotation, as (x, y, z, w)."""
+    """Rotate the attitude (w, x, y, z) by a small random rotation; return (x, y, z, w)."""
     w, x, y, z = attitude
     a, b, c = (ATTITUDE_NOISE / 2 * value for value in noise)
     turned = (
@@ -73,7 +73,7 @@ def _shaken(attitude: Quaternion, noise: list[float]) -> Quaternion:
 
 
 class Lidar:
-    """A lidar at a site of the model, with Gaussian noise of its own generator."""
+    """A lidar at a site of the model, with Gaussian noise."""
 
     def __init__(
         self, config: SimLidar, model: mujoco.MjModel, site: str, noise: np.random.Generator
@@ -85,14 +85,14 @@ class Lidar:
         self._directions = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
 
     def scan(self, data: mujoco.MjData) -> NDArray[np.float32]:
-        """Ranges (beams,) [m], counter-clockwise from straight ahead; inf: nothing in range.
+        """Return ranges (beams,) [m], counter-clockwise from straight ahead; inf: nothing in range.
 
-        What is nearer than the sensor can measure is reported at its least range, not as free.
+        Anything nearer than the least range is reported at that range, not as free.
         """
         return self.cast(data, self._directions)
 
     def cast(self, data: mujoco.MjData, directions: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Ranges (n,) [m] along `directions` (n, 3) in the sensor's frame, as in `scan`."""
+        """Return ranges (n,) [m] along `directions` (n, 3) in the sensor's frame, as in `scan`."""
         config, count = self._config, len(directions)
         mujoco.mj_kinematics(self._model, data)  # sites lag one step behind, mocap bodies too
         rays = directions @ data.site_xmat[self._site].reshape(3, 3).T
@@ -102,7 +102,7 @@ class Lidar:
             data,
             data.site_xpos[self._site],
             rays.reshape(-1),
-            SEES_GROUPS,
+            VISIBLE_GROUPS,
             True,
             self._body,
             hit,

@@ -1,4 +1,4 @@
-"""AprilTags on plates, made of boxes: viewers and cameras that know no textures show them too."""
+"""AprilTags on plates, made of boxes, because viewers and cameras draw no textures."""
 
 import importlib.util
 import math
@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from gigabrain_drivers.sim.world import Box, Pose
 from gigabrain_zenoh.errors import ConfigError
 
-PLATE_M, STEP_M = 0.01, 0.001  # thickness of the plate, and by which each layer stands out
+PLATE_M, LAYER_M = 0.01, 0.001  # thickness of the plate, and of each layer on it
 INSTALL = "tags need OpenCV; install it with: pip install 'gigabrain-zenoh[eyes]'"
 
 
 def tag_plate(tag: int, family: str, face: Pose, height: float, size: float) -> list[Box]:
-    """Return a white plate with a tag whose face looks along the yaw of `face`.
+    """Return a white plate with a tag, facing along the yaw of `face`.
 
-    `height` is that of its middle [m], `size` that of its black square. Raises ConfigError.
+    `height` is that of its centre, `size` that of its black square [m]. Raises ConfigError.
     """
     if not importlib.util.find_spec("cv2"):
         raise ConfigError(INSTALL)
@@ -29,12 +29,12 @@ def tag_plate(tag: int, family: str, face: Pose, height: float, size: float) -> 
         raise ConfigError(str(error)) from None
     count = len(white)
     cell = size / count
-    edge = (count + 2) * cell / 2  # one white cell all round
+    edge = (count + 2) * cell / 2  # with a border of one white cell
 
     def box(left: float, right: float, low: float, high: float, layer: int, colour: str) -> Box:
-        """Return a box on the plate, by its edges from the middle as one sees it [m]."""
-        back = PLATE_M / 2 + 2 * STEP_M if not layer else (2.5 - layer) * STEP_M
-        half = PLATE_M / 2 if not layer else STEP_M / 2
+        """Return a box on the plate, by its edges from the centre, as seen from the front [m]."""
+        back = PLATE_M / 2 + 2 * LAYER_M if not layer else (2.5 - layer) * LAYER_M
+        half = PLATE_M / 2 if not layer else LAYER_M / 2
         across = (left + right) / 2
         x = face.x - back * math.cos(face.yaw) - across * math.sin(face.yaw)
         y = face.y - back * math.sin(face.yaw) + across * math.cos(face.yaw)

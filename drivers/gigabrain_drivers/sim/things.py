@@ -1,4 +1,4 @@
-"""Things and people put into a simulated world while it runs, in spare bodies of its model."""
+"""Things and people added to a running simulated world, as spare bodies of its model."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -11,9 +11,9 @@ from msgspec.structs import replace
 from gigabrain_drivers.sim.scene import (
     PERSON_GAP_M,
     SPARE,
-    SPARE_M,
     SPARE_PEOPLE,
     SPARE_THINGS,
+    UNUSED_M,
     Person,
     yaw_quaternion,
 )
@@ -23,11 +23,11 @@ from gigabrain_drivers.sim.world_file import MATERIALS
 from gigabrain_schemas.sim import Thing
 from gigabrain_zenoh.errors import Refused
 
-GAP_M = 0.02  # from the robot's outline to what is put in
-MARGIN_M = 1.0  # outside the floor, where things may still be
+MIN_GAP_M = 0.02  # between the robot's outline and a new thing
+MARGIN_M = 1.0  # things may stand this far outside the floor
 COLOURS = {"box": MATERIALS["orange"], "cylinder": MATERIALS["teal"]}
 FIGURE = tuple(MATERIALS[name] for name in ("blue", "skin", "dark_wood"))
-GONE: Colour = (0.0, 0.0, 0.0)
+HIDDEN: Colour = (0.0, 0.0, 0.0)
 MIN_WALK_M = 0.2
 
 
@@ -40,9 +40,9 @@ class Used:
 
 
 class Things:
-    """All that is put in. To be used in the physics thread, between two steps.
+    """All added things. Use it in the physics thread, between two steps.
 
-    `walk` has a body walk as a Person does, and stops it again.
+    `walk(body, person)` makes a body walk like `person`; None stops it.
     """
 
     def __init__(
@@ -63,15 +63,15 @@ class Things:
         self.version = 0  # counts changes
 
     def all(self) -> tuple[Thing, ...]:
-        """Return what is in the world, where it was put."""
+        """Return all things, at the places where they were added."""
         return tuple(used.thing for used in self._used.values())
 
     def bodies(self) -> dict[int, str]:
-        """Return the names of things by the numbers of their bodies."""
+        """Return the names of things by body id."""
         return {used.body: name for name, used in self._used.items()}
 
     def add(self, thing: Thing) -> Thing:
-        """Put something in; return it with its name. Raises Refused."""
+        """Add a thing; return it with its name. Raises Refused."""
         thing = replace(thing, name=self._name(thing))
         self._check_place(thing)
         spare = self._spares(thing)
@@ -82,7 +82,7 @@ class Things:
         body = spare[0]
         self._show(body, thing)
         gap = self._gap(body)
-        needed = PERSON_GAP_M if thing.kind == "person" else GAP_M
+        needed = PERSON_GAP_M if thing.kind == "person" else MIN_GAP_M
         if gap < needed:
             self._hide(body)
             raise Refused(
@@ -93,7 +93,7 @@ class Things:
         return thing
 
     def restore(self, things: Iterable[Thing]) -> None:
-        """Put in things of an earlier simulation, however near the robot they are."""
+        """Add things of an earlier simulation, at any distance from the robot."""
         for thing in things:
             body = self._spares(thing).pop(0)
             self._show(body, thing)
@@ -106,11 +106,11 @@ class Things:
         self._changed()
 
     def _spares(self, thing: Thing) -> list[int]:
-        """Return the bodies that are left for things like this."""
+        """Return the unused bodies for things of this kind."""
         return self._free["person" if thing.kind == "person" else "thing"]
 
     def remove(self, name: str) -> Thing:
-        """Take something out. Raises Refused with what there is."""
+        """Remove a thing. Raises Refused listing the existing ones."""
         if name not in self._used:
             known = ", ".join(self._used) or "none"
             raise Refused(f"nothing called {name!r} was put in; there is: {known}")
@@ -148,12 +148,12 @@ class Things:
             raise Refused(f"the way of the person is shorter than {MIN_WALK_M:g} m")
 
     def _gap(self, body: int) -> float:
-        """Return the distance from the robot to a body that was just placed [m]."""
+        """Return the distance from the robot to a newly placed body [m]."""
         mujoco.mj_kinematics(self._model, self._data)
         return self._truth.distance_to(int(self._model.body_geomadr[body]))
 
     def _show(self, body: int, thing: Thing) -> None:
-        """Place a spare body, and give it size, colour and substance."""
+        """Place a spare body, and set its size and colour; make it solid."""
         model, place = self._model, int(self._model.body_mocapid[body])
         geoms = self._geoms(body)
         person = thing.kind == "person"
@@ -177,7 +177,7 @@ class Things:
         self._set_solid(body, geoms[0], True)
 
     def _resize(self, body: int, geom: int, kind: mujoco.mjtGeom, half: list[float]) -> None:
-        """Change type and size, with all that MuJoCo has computed of them."""
+        """Change type and size, and the values that MuJoCo computed from them."""
         model = self._model
         model.geom_type[geom] = kind
         round_one = kind == mujoco.mjtGeom.mjGEOM_CYLINDER
@@ -189,12 +189,12 @@ class Things:
         model.bvh_aabb[model.body_bvhadr[body]] = bounds
 
     def _hide(self, body: int) -> None:
-        """Make a body spare again: nothing sees or touches it."""
+        """Make a body spare again: invisible and without contacts."""
         geoms = self._geoms(body)
         for geom in geoms:
-            self._model.geom_rgba[geom] = (*GONE, 0.0)
+            self._model.geom_rgba[geom] = (*HIDDEN, 0.0)
         if len(geoms) == 1:
-            self._resize(body, geoms[0], mujoco.mjtGeom.mjGEOM_BOX, [SPARE_M] * 3)
+            self._resize(body, geoms[0], mujoco.mjtGeom.mjGEOM_BOX, [UNUSED_M] * 3)
         self._set_solid(body, geoms[0], False)
         self._data.mocap_pos[self._model.body_mocapid[body]] = (*self._world.middle, 0.0)
 

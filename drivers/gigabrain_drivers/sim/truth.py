@@ -1,4 +1,4 @@
-"""Ground truth of a run, by the physics: for reports and tests, never for the robot."""
+"""Ground truth of a run from the physics, for reports and tests, never for the robot."""
 
 import math
 
@@ -11,26 +11,25 @@ from gigabrain_drivers.sim.mjcf_world import UPRIGHT, is_floor
 from gigabrain_drivers.sim.scene import ROBOT
 from gigabrain_drivers.sim.world import Footprint, Pose
 
-NEW_CONTACT_STEPS = 500_000_000 // STEP_NS  # contact again after half a second is a new contact
+NEW_CONTACT_STEPS = 500_000_000 // STEP_NS  # after this pause, a contact counts as new
 CLEARANCE_STEPS = 100_000_000 // STEP_NS
-MEASURED = [  # types whose sizes along x and y are known
+MEASURED = [  # types whose sizes along x and y can be read
     mujoco.mjtGeom.mjGEOM_BOX.value, mujoco.mjtGeom.mjGEOM_CYLINDER.value,
     mujoco.mjtGeom.mjGEOM_CAPSULE.value, mujoco.mjtGeom.mjGEOM_SPHERE.value,
 ]  # fmt: skip
-FALL_TILT = math.cos(math.radians(12))  # cosine of a tilt beyond which the body has fallen
-MAX_CLEARANCE_M = 10.0  # larger clearances count as this
+FALL_TILT = math.cos(math.radians(12))  # cosine of the largest tilt of a body that stands
+MAX_CLEARANCE_M = 10.0  # larger clearances are reported as this
 
 
 class Truth:
-    """Contacts, clearance and path of the robot. `update` once a step.
+    """Contacts, clearance and path of the robot. Call `update` once a step.
 
-    contacts: how often the robot, but for its hand, touched something else than the floor;
-    sliding along one thing is one contact, touching it again half a second later another.
-    touching: right now.
+    contacts: how often the robot, without its hand, touched anything but the floor. Sliding along
+    a thing is one contact; touching it again after half a second is another.
+    touching: in contact in the newest step.
     min_clearance_m: the least distance from the robot's outline to anything, sampled at 10 Hz,
-    0 in contact. falls: how often the robot tipped over, or a part of it sank below the level of
-    the floor on which it began; sampled at 10 Hz. distance_m: the length of the path of the base's
-    origin.
+    0 in contact. falls: how often the robot tipped over, or a part of it sank below the floor of
+    its start, sampled at 10 Hz. distance_m: the length of the base's path.
     """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -67,14 +66,14 @@ class Truth:
     def restore(
         self, *, contacts: int, falls: int, min_clearance_m: float, distance_m: float
     ) -> None:
-        """Go on with an earlier account, from where the robot is now."""
+        """Continue earlier counts, from the robot's present place."""
         self._position = self.pose()
-        self._touch()  # which is no new contact
+        self._touch()  # a contact at the start is not counted
         self.contacts, self.falls = contacts, falls
         self.min_clearance_m, self.distance_m = min_clearance_m, distance_m
 
     def find_obstacles(self) -> None:
-        """Look again at what can be touched, after a change of the model."""
+        """Update the obstacles after a change of the model."""
         model = self._model
         self._obstacles = np.flatnonzero(self._may_be_obstacle & (model.geom_contype != 0))
         self._obstacle_geoms = set(self._obstacles.tolist())
@@ -87,7 +86,7 @@ class Truth:
     def distance_to(self, geom: int) -> float:
         """Return the distance from the robot's outline to a geom [m], at most 1; 0 if it touches.
 
-        Positions in the data must be those of now.
+        Positions in the data must be up to date.
         """
         gaps = (
             mujoco.mj_geomDistance(self._model, self._data, hull, geom, 1.0, None)
@@ -114,7 +113,7 @@ class Truth:
         return math.cos(yaw) * x + math.sin(yaw) * y, turning
 
     def update(self) -> None:
-        """Account for the step that was just simulated."""
+        """Add the newest step."""
         self._steps += 1
         pose = self.pose()
         self.distance_m += math.hypot(pose.x - self._position.x, pose.y - self._position.y)
@@ -141,14 +140,14 @@ class Truth:
             self._last_touch[thing] = self._steps
 
     def _fall(self) -> None:
-        """Count falls that begin."""
+        """Count the start of a fall."""
         tipped = self._data.xmat[self._base, 8] < FALL_TILT
         fallen = bool(tipped or self._data.geom_xpos[self._parts, 2].min() < 0.0)
         self.falls += fallen and not self._fallen
         self._fallen = fallen
 
     def _clear(self) -> None:
-        """Measure what may be nearer than the nearest so far, exactly."""
+        """Measure exactly those obstacles that may be nearer than any before."""
         for thing in self._obstacles[self._lower_bounds() < self.min_clearance_m]:
             for hull in self._hull:
                 limit = self.min_clearance_m
@@ -156,7 +155,7 @@ class Truth:
                 self.min_clearance_m = max(min(gap, limit), 0.0)
 
     def _lower_bounds(self) -> NDArray[np.float64]:
-        """Return a lower bound of each obstacle's distance [m], by boxes and a circle."""
+        """Return a lower bound of each obstacle's distance [m], from boxes and a circle."""
         things = self._obstacles
         offset = self._data.xpos[self._base, :2] - self._data.geom_xpos[things, :2]
         axes = self._data.geom_xmat[things].reshape(-1, 3, 3)[:, :2, :2]
@@ -165,7 +164,7 @@ class Truth:
         return np.asarray(np.hypot(beside[:, 0], beside[:, 1]) - self._reach)
 
     def _measure_footprint(self) -> Footprint:
-        """The rectangle round the hull in the base's frame."""
+        """Return the rectangle round the hull in the base's frame."""
         model, boxes = self._model, [_half_sizes(self._model, [geom])[0] for geom in self._hull]
         middles = [model.geom_pos[geom] for geom in self._hull]
         pairs = list(zip(middles, boxes, strict=True))
@@ -175,7 +174,7 @@ class Truth:
 
 
 def _hand(model: mujoco.MjModel) -> list[int]:
-    """Return the bodies whose pads touch what the robot holds."""
+    """Return the bodies of the gripper's pads."""
     pads = "pad_fixed", "pad_moving"  # with a prefix, where the arm stands on a base
     names = [str(model.geom(geom).name) for geom in range(model.ngeom)]
     mine = [name.startswith(ROBOT) and name.endswith(pads) for name in names]
@@ -184,7 +183,7 @@ def _hand(model: mujoco.MjModel) -> list[int]:
 
 
 def _half_sizes(model: mujoco.MjModel, geoms: NDArray[np.int64] | list[int]) -> NDArray[np.float64]:
-    """Half the size of each upright geom along its own x and y (n, 2) [m]."""
+    """Return half the size of each upright geom along its own x and y (n, 2) [m]."""
     size = model.geom_size[geoms][:, :2].copy()
     round_ones = model.geom_type[geoms] != mujoco.mjtGeom.mjGEOM_BOX.value
     size[round_ones, 1] = size[round_ones, 0]

@@ -1,4 +1,4 @@
-"""A live window of a running simulation, in a process of its own, fed over the bus."""
+"""A live window of a running simulation, in its own process, fed over the bus."""
 
 import asyncio
 import os
@@ -16,8 +16,8 @@ from gigabrain_zenoh.bus.freshness import Latest
 from gigabrain_zenoh.errors import BodyLost, ConfigError
 
 FRAME_S = 0.04
-WAIT_S = 5.0  # for the scene
-SILENT_S = 5.0
+WAIT_S = 5.0  # for the scene, and for the first poses
+SILENT_S = 5.0  # without poses, before a warning
 ELSEWHERE = (
     "use the 3-D view of the operator page, or `gigabrain view --picture FILE`, or run this "
     "where there is a display, with --connect"
@@ -29,7 +29,7 @@ NO_SCENE = (
 
 
 def check_display() -> None:
-    """Check that a window can be opened. Raises ConfigError that says what else to do."""
+    """Check that a window can be opened. Raises ConfigError naming the alternatives."""
     try:
         import glfw
     except ImportError as error:
@@ -41,7 +41,7 @@ def check_display() -> None:
     if sys.platform.startswith("linux") and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
         raise ConfigError(f"there is no display here; {ELSEWHERE}")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # GLFW's errors, which are told below
+        warnings.simplefilter("ignore")  # GLFW's errors are reported below
         window = None
         if glfw.init():
             glfw.window_hint(glfw.VISIBLE, glfw.FALSE)
@@ -77,7 +77,7 @@ async def _first(scenes: Latest[SimScene]) -> SimScene:
 
 
 async def _placed(made: SceneModel, scenes: Latest[SimScene], poses: Latest[SimPoses]) -> None:
-    """Wait until the bodies are where they are now."""
+    """Wait for the first poses, and apply them."""
     end_s = asyncio.get_running_loop().time() + WAIT_S
     while not (poses.newest and made.place(poses.newest)):
         if asyncio.get_running_loop().time() > end_s:

@@ -1,4 +1,4 @@
-"""Worlds: upright shapes in a walled rectangle, and a place to start. Metres and radians."""
+"""Worlds: upright shapes in a walled rectangle, and a start. Metres and radians."""
 
 import bisect
 import math
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gigabrain_zenoh.config.loading import line_in
 
-WALL_HEIGHT = 0.6  # [m], well above the plane of any lidar here
+WALL_HEIGHT = 0.6  # [m], well above the lidar of any shipped robot
 WALL_HALF = 0.05  # [m]
 WALKING_SPEED = 0.8  # [m/s]
 Corners = tuple[tuple[float, float], ...]
@@ -90,7 +90,7 @@ Shape = Box | Cylinder | Ball
 
 
 def clearance(shapes: Iterable[Shape], x: float, y: float) -> float:
-    """The distance from a point to the nearest shape that stands on the floor [m]."""
+    """Return the distance from a point to the nearest shape that stands on the floor [m]."""
     return min((s.distance(x, y) for s in shapes if s.bottom == 0), default=math.inf)
 
 
@@ -103,7 +103,7 @@ class Footprint:
     half_width: float  # [m]
 
     def distance(self, pose: Pose, x: float, y: float) -> float:
-        """Return the distance of a point of the world from the robot's edge [m]; 0 inside."""
+        """Return the distance of a world point from the robot's edge [m]; 0 inside."""
         dx, dy = x - pose.x, y - pose.y
         cos, sin = math.cos(pose.yaw), math.sin(pose.yaw)
         ahead, left = cos * dx + sin * dy, cos * dy - sin * dx
@@ -112,7 +112,7 @@ class Footprint:
 
 
 class ClosedPath:
-    """A closed polyline that is walked by arc length, in the order of its corners."""
+    """A closed polyline, parametrized by arc length, in the order of its corners."""
 
     def __init__(self, corners: Sequence[tuple[float, float]]) -> None:
         self._corners = list(corners)
@@ -126,7 +126,7 @@ class ClosedPath:
             self.length += math.hypot(dx, dy)
 
     def at(self, distance: float) -> Pose:
-        """The pose `distance` metres along the path; it wraps round."""
+        """Return the pose `distance` metres along the path; it wraps round."""
         distance %= self.length
         leg = bisect.bisect_right(self._starts, distance) - 1
         (x, y), along, yaw = self._corners[leg], distance - self._starts[leg], self._headings[leg]
@@ -134,7 +134,7 @@ class ClosedPath:
 
 
 class Stream(IntEnum):
-    """The use of a random stream. A new use gets a new number, so that old runs stay the same."""
+    """The purpose of a random stream. Do not reuse numbers, so that old runs stay the same."""
 
     LAYOUT = 0
     START = 1
@@ -144,7 +144,7 @@ class Stream(IntEnum):
 
 
 def generator(seed: int, stream: Stream) -> np.random.Generator:
-    """The generator of one stream of `seed` (a whole number >= 0)."""
+    """Return the random generator of one stream of `seed` (>= 0)."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
 
 
@@ -153,7 +153,7 @@ ORIGIN = Pose(0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class WalkingPath:
-    """The way of a person, round and round a closed path."""
+    """The closed path of a person, who walks it again and again."""
 
     corners: Corners
     speed: float = WALKING_SPEED  # [m/s]
@@ -162,7 +162,7 @@ class WalkingPath:
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """A lamp at `position`, or a sun from anywhere in `direction`."""
+    """A lamp at `position`, or without one a sun that shines along `direction`."""
 
     colour: Colour
     position: tuple[float, float, float] | None = None  # [m]
@@ -178,31 +178,31 @@ class World:
     half_x: float  # of the floor, to the inner face of the outer walls
     half_y: float
     middle: tuple[float, float] = (0.0, 0.0)  # of the floor
-    shapes: tuple[Shape, ...]  # all but the outer walls
+    shapes: tuple[Shape, ...]  # without the outer walls
     outer_walls: bool = True
     wall_height: float = WALL_HEIGHT
     floor: tuple[Colour, Colour] = ((0.62, 0.66, 0.70), (0.58, 0.62, 0.66))  # its two checks
-    check: tuple[float, float] = (0.5, 0.5)  # size of one
-    materials: Mapping[str, Colour] = field(default_factory=dict)  # beside those of every world
+    check: tuple[float, float] = (0.5, 0.5)  # size of a check
+    materials: Mapping[str, Colour] = field(default_factory=dict)  # besides those of all worlds
     people: tuple[WalkingPath, ...] = ()
     lights: tuple[Light, ...] = ()  # none: a low sun
     start: Pose = ORIGIN  # of the robot
-    start_fixed: bool = False  # by the world's file; else a seed draws it
+    start_fixed: bool = False  # the start is from the world's file, not random
     free: NDArray[np.float64] | None = field(default=None, compare=False)
-    # (n, 2), where a start may be; None: anywhere
+    # (n, 2) possible starts; None: anywhere
     model: Path | None = None  # MJCF file that is part of this world
-    outlines: tuple[Shape, ...] = ()  # of the things in it
-    file: Path | None = field(default=None, compare=False)  # that describes it
+    outlines: tuple[Shape, ...] = ()  # of the obstacles in the model
+    file: Path | None = field(default=None, compare=False)  # of the world
 
     def start_place(self) -> str:
-        """Return the file and the line of the start, or the world's name; for errors."""
+        """Return the file and the line of the start, or the world's name, for errors."""
         if self.file is None:
             return f"world {self.name}"
         line = None if self.file == self.model else line_in(self.file, ("start",))
         return f"{self.file}:{line or 1}"
 
     def walls(self) -> tuple[Box, ...]:
-        """The four outer walls."""
+        """Return the four outer walls."""
         if not self.outer_walls:
             return ()
         x, y, half, height = self.half_x, self.half_y, WALL_HALF, self.wall_height
@@ -215,9 +215,9 @@ class World:
         )
 
     def everything(self) -> tuple[Shape, ...]:
-        """Return all shapes, the outer walls included."""
+        """Return all shapes, including the outer walls."""
         return (*self.walls(), *self.shapes)
 
     def obstacles(self) -> tuple[Shape, ...]:
-        """Return everything that a robot may bump into, with the outlines of the model's things."""
+        """Return all shapes that a robot may hit, including the model's outlines."""
         return (*self.everything(), *self.outlines)

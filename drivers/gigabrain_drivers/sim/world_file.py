@@ -1,4 +1,4 @@
-"""World files: YAML with walls, boxes, doors, people and lights, made into a World."""
+"""World files: YAML with walls, boxes, doors, people and lights; read as a World."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -35,7 +35,7 @@ MAX_DISTANCE_M = 400.0  # from the origin to anything in a world
 MAX_THINGS, MAX_TAGS = 200, 50
 MAX_SHAPES, MAX_PEOPLE, MAX_LIGHTS, MAX_CORNERS = 4000, 16, 8, 100
 MIN_PATH_M = 0.5
-LEAF_HALF = 0.02  # [m], of a closed door
+HALF_DOOR_M = 0.02  # half the thickness of a closed door
 FLOOR = "floor"  # name of the floor's geom, material and texture
 
 Place = Annotated[float, Meta(ge=-MAX_DISTANCE_M, le=MAX_DISTANCE_M)]  # [m]
@@ -73,11 +73,11 @@ class _Part(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class DoorPart(_Part, frozen=True, kw_only=True):
-    """An opening in a wall, with a leaf of wood in it if it is closed."""
+    """An opening in a wall; if closed, with a wooden door in it."""
 
     at: Annotated[
         float, Meta(ge=0.0, le=2 * MAX_DISTANCE_M)
-    ]  # its middle, from the wall's begin [m]
+    ]  # distance of its middle from the wall's `from` [m]
     width: Annotated[float, Meta(ge=0.1, le=100.0)] = 1.0  # [m]
     closed: bool = False
 
@@ -88,7 +88,7 @@ class WallPart(_Part, frozen=True, kw_only=True):
     begin: Point = field(name="from")
     end: Point = field(name="to")
     thickness: Annotated[float, Meta(ge=0.01, le=5.0)] = 2 * WALL_HALF  # [m]
-    height: WallHeight | None = None  # [m], of all walls of the file where it has none
+    height: WallHeight | None = None  # [m]; default: the file's `wall_height`
     material: Material = "wall"
     doors: Annotated[tuple[DoorPart, ...], Meta(max_length=50)] = ()
 
@@ -113,7 +113,7 @@ class WallPart(_Part, frozen=True, kw_only=True):
         return math.dist(self.begin, self.end)
 
     def shapes(self, height: float) -> Iterator[Box]:
-        """Yield the pieces between the doors, and the leaves of closed ones."""
+        """Yield the pieces between the doors, and the closed doors."""
         top = height if self.height is None else self.height
         reached = 0.0
         for door in self.doors:
@@ -121,7 +121,7 @@ class WallPart(_Part, frozen=True, kw_only=True):
             if left - reached > 1e-6:
                 yield self._piece(reached, left, self.thickness / 2, top, self.material)
             if door.closed:
-                yield self._piece(left, right, LEAF_HALF, top, "wood")
+                yield self._piece(left, right, HALF_DOOR_M, top, "wood")
             reached = right
         if self.length - reached > 1e-6:
             yield self._piece(reached, self.length, self.thickness / 2, top, self.material)
@@ -129,7 +129,7 @@ class WallPart(_Part, frozen=True, kw_only=True):
     def _piece(self, start: float, stop: float, half: float, top: float, material: str) -> Box:
         """Return the box from `start` to `stop` [m] along the wall."""
         (x, y), (to_x, to_y) = self._point(start), self._point(stop)
-        if x == to_x:  # exact for walls along the axes
+        if x == to_x:  # exact numbers for walls along the axes
             return slab((x - half, x + half), (min(y, to_y), max(y, to_y)), top, material)
         if y == to_y:
             return slab((min(x, to_x), max(x, to_x)), (y - half, y + half), top, material)
@@ -219,7 +219,7 @@ class CanPart(_Part, frozen=True, kw_only=True):
     material: Material = "orange"  # of its label
 
     def shapes(self) -> Iterator[Cylinder]:
-        """Yield its cylinders; the one that stands on the floor is its core."""
+        """Yield its cylinders; only the core stands on the floor."""
         rim = min(0.3 * self.radius, 0.2 * self.height)
         yield Cylinder(*self.at, 0.8 * self.radius, self.height, "metal")
         label = self.height - 2 * rim
@@ -229,23 +229,23 @@ class CanPart(_Part, frozen=True, kw_only=True):
 
 
 class TagPart(_Part, frozen=True, kw_only=True):
-    """An AprilTag on a white plate that hangs upright. It is decoration only."""
+    """An AprilTag on an upright white plate. It is decoration only."""
 
     id: Annotated[int, Meta(ge=0, le=10_000)]
-    at: Point  # the middle of its face
-    yaw: Angle = 0.0  # where its face looks [rad]
+    at: Point  # the centre of its face
+    yaw: Angle = 0.0  # direction that it faces [rad]
     z: Annotated[float, Meta(ge=0.02, le=20.0)] = 0.3  # its middle, above the floor [m]
     size: Annotated[float, Meta(ge=0.01, le=10.0)] = 0.16  # of its black square [m]
     family: Literal["36h11", "36h10", "25h9", "16h5"] = "36h11"
 
     def shapes(self) -> list[Box]:
-        """Return the boxes of plate and tag. Raises ConfigError for a tag that is none."""
+        """Return the boxes of plate and tag. Raises ConfigError for an unknown tag."""
         face = Pose(self.at[0], self.at[1], self.yaw)
         return tag_plate(self.id, self.family, face, self.z, self.size)
 
 
 class PersonPart(_Part, frozen=True, kw_only=True):
-    """A person who walks round a closed path; of two points, there and back."""
+    """A person who walks round a closed path; with two points, back and forth."""
 
     path: Annotated[tuple[Point, ...], Meta(min_length=2, max_length=MAX_CORNERS)]
     speed: Annotated[float, Meta(ge=0.05, le=3.0)] = WALKING_SPEED  # [m/s]
@@ -257,7 +257,7 @@ class PersonPart(_Part, frozen=True, kw_only=True):
 
 
 class LightPart(_Part, frozen=True, kw_only=True):
-    """A lamp at a place, or a sun that shines in a direction."""
+    """A lamp at a point, or a sun that shines in a direction."""
 
     at: tuple[Place, Place, Place] | None = None
     direction: tuple[Place, Place, Place] | None = None
@@ -278,11 +278,11 @@ class FloorPart(_Part, frozen=True, kw_only=True):
     """The look of the floor."""
 
     colours: tuple[Rgb, Rgb] = World.floor  # of its two checks
-    check: tuple[Size, Size] = World.check  # size of one [m]
+    check: tuple[Size, Size] = World.check  # size of a check [m]
 
 
 class WorldFile(_Part, frozen=True, kw_only=True):
-    """A whole world file. The origin is in the middle of the floor; x is east, y north."""
+    """A world file. The origin is the middle of the floor; x is east, y north."""
 
     description: Annotated[str, Meta(max_length=200)] = ""
     size: tuple[Size, Size] | None = None  # of the floor inside the outer walls [m]
@@ -328,7 +328,7 @@ def slab(
 
 @contextmanager
 def errors_at(path: Path, place: Sequence[str], shown: str) -> Iterator[None]:
-    """Name the file and the line of a part in the ConfigErrors of the block."""
+    """Add the file and the line of a part to ConfigErrors of the block."""
     try:
         yield
     except ConfigError as error:
@@ -337,12 +337,12 @@ def errors_at(path: Path, place: Sequence[str], shown: str) -> Iterator[None]:
 
 
 def read_world(path: Path) -> World:
-    """Return the world of a YAML file. Raises ConfigError, with its line."""
+    """Return the world of a YAML file. Raises ConfigError with the line."""
     return build_world(config.load(path, WorldFile), path)
 
 
 def build_world(file: WorldFile, path: Path) -> World:
-    """Return the world that a file describes; what it names lies beside `path`."""
+    """Return the world that a file describes; files that it names are relative to `path`."""
     shapes: list[Shape] = [box for wall in file.walls for box in wall.shapes(file.wall_height)]
     shapes += [part.shape() for part in file.boxes]
     shapes += [part.shape() for part in file.cylinders]
@@ -351,7 +351,7 @@ def build_world(file: WorldFile, path: Path) -> World:
     for number, tag in enumerate(file.tags):
         with errors_at(path, ("tags", str(number)), f"tags[{number}]"):
             shapes += tag.shapes()
-    size = file.size or (2.0, 2.0)  # grown by the map or the model
+    size = file.size or (2.0, 2.0)  # the map or the model enlarges it
     world = World(
         name=path.stem,
         description=file.description,

@@ -1,7 +1,7 @@
-"""Worlds by name or file: shipped ones, random layouts, and people's own.
+"""Worlds by name or file: shipped ones, random layouts, and users' own.
 
-In those that are shipped, free passages are at least 1.1 m wide (doors 1.0 m) and everything else
-is flush, so a robot that only looks a metre ahead and turns right can roam without end.
+In shipped worlds, passages are at least 1.1 m wide (doors 1.0 m) and there are no other gaps. So
+a robot that looks only a metre ahead and turns right can roam for ever.
 """
 
 import math
@@ -31,20 +31,20 @@ from gigabrain_zenoh.config.loading import beside, names_file
 from gigabrain_zenoh.errors import ConfigError, UnknownName, unknown
 
 RANDOM_HALF_M = 3.5
-PASSAGE_M = 1.15  # the least gap that a robot may find; narrower ones are closed
-MAX_FREE, MAX_BY_WALL = 8, 5  # obstacles, at most
+PASSAGE_M = 1.15  # least gap between obstacles
+MAX_FREE, MAX_BY_WALL = 8, 5  # obstacles
 MIN_OBSTACLES = 10
 LAYOUT_ATTEMPTS = 400  # for one layout
 OBSTACLE_MATERIALS = ("orange", "teal", "yellow", "blue", "green", "clay")
-Placed = tuple[Shape, float]  # a shape and the radius of the circle round it
-START_CLEARANCE_M = 0.6  # from the robot's origin to anything that stands
-PERSON_CLEARANCE_M = 1.5  # from the robot's origin to the person's middle
-MIN_ATTEMPTS, MAX_LOOKS = 300, 400_000  # at a start, and at a shape in all of them
+Placed = tuple[Shape, float]  # a shape, and the radius of its outer circle [m]
+START_CLEARANCE_M = 0.6  # from the robot's origin to any obstacle
+PERSON_CLEARANCE_M = 1.5  # from the robot's origin to a person's middle
+MIN_ATTEMPTS, MAX_DISTANCE_CHECKS = 300, 400_000  # for a start
 RANDOM = "random:"
 
 
 def random_world(seed: int) -> World:
-    """Return 10 to 13 obstacles in 7 x 7 m, with gaps of none or at least 1.15 m."""
+    """Return 10 to 13 obstacles in 7 x 7 m, with no gap or at least 1.15 m between them."""
     random = generator(seed, Stream.LAYOUT)
     placed = _layout(random)
     while len(placed) < MIN_OBSTACLES:
@@ -60,7 +60,7 @@ def random_world(seed: int) -> World:
 
 
 def _layout(random: np.random.Generator) -> list[Placed]:
-    """Place as many obstacles as fit within the attempts; those by the walls first."""
+    """Place obstacles until all attempts are used; those at the walls first."""
     placed: list[Placed] = []
     for attempt in range(LAYOUT_ATTEMPTS):
         by_wall = attempt < LAYOUT_ATTEMPTS // 4
@@ -73,12 +73,12 @@ def _layout(random: np.random.Generator) -> list[Placed]:
 
 
 def _gap(shape: Shape, radius: float, other: Shape, other_radius: float) -> float:
-    """Return a lower bound of the gap between two shapes [m], by the circles round them."""
+    """Return a lower bound of the gap between two shapes [m], from their outer circles."""
     return math.hypot(shape.x - other.x, shape.y - other.y) - radius - other_radius
 
 
 def _free(random: np.random.Generator) -> Placed:
-    """A pillar or a box, turned anyhow, with a passage all round it."""
+    """Return a pillar or a box at any yaw, with a passage round it."""
     size, height = float(random.uniform(0.12, 0.22)), float(random.uniform(0.4, 0.8))
     material = str(random.choice(OBSTACLE_MATERIALS))
     reach = RANDOM_HALF_M - PASSAGE_M - 0.22 * math.sqrt(2)
@@ -90,7 +90,7 @@ def _free(random: np.random.Generator) -> Placed:
 
 
 def _by_wall(random: np.random.Generator) -> Placed:
-    """A cupboard with its back to one of the walls, clear of the corners."""
+    """Return a cupboard with its back to one of the walls, not in a corner."""
     width, depth = (float(value) for value in random.uniform((0.25, 0.15), (0.45, 0.25)))
     height, material = float(random.uniform(0.5, 0.9)), str(random.choice(OBSTACLE_MATERIALS))
     reach = RANDOM_HALF_M - PASSAGE_M - width
@@ -109,7 +109,7 @@ NAMED_WORLDS = ("arena", "house", "kitchen", "playroom", "table", "warehouse")
 
 
 def world_names() -> dict[str, str]:
-    """Return one line about each world, by name."""
+    """Return a description of one line for each world, by name."""
     names = {name: read_world(shipped_world(name)).description for name in NAMED_WORLDS}
     return {
         **names,
@@ -124,7 +124,7 @@ def shipped_world(name: str) -> Path:
 
 
 def mission_file(name: str, folder: Path) -> str:
-    """Return the file of a mission: a shipped one, or one beside the robot's file, in `folder`.
+    """Return the file of a mission: a shipped one, or one in the robot's folder `folder`.
 
     Raises UnknownName.
     """
@@ -137,7 +137,7 @@ def mission_file(name: str, folder: Path) -> str:
 
 
 def load_world(name: str, seed: int) -> World:
-    """Return the world of a name or a file, with the start poses that `seed` (>= 0) gives.
+    """Return the world of a name or a file, with start poses drawn from `seed` (>= 0).
 
     Raises UnknownName, and ConfigError with the file and the line.
     """
@@ -189,9 +189,9 @@ def _with_model(world: World) -> World:
 
 
 def _with_start(world: World, seed: int) -> World:
-    """Draw the robot's pose until it is clear of everything, and the people's places."""
+    """Draw people's places, and the robot's pose until it is clear of everything."""
     random, shapes = generator(seed, Stream.START), world.obstacles()
-    share = float(random.uniform(0, 1))  # of the first path; drawn without one as well
+    share = float(random.uniform(0, 1))  # of the first path; drawn even without paths
     people, places = [], []
     for walk in world.people:
         path = ClosedPath(walk.corners)
@@ -202,7 +202,7 @@ def _with_start(world: World, seed: int) -> World:
     if world.start_fixed:
         _check_start(world)
         return world
-    for _ in range(max(MIN_ATTEMPTS, MAX_LOOKS // max(1, len(shapes)))):
+    for _ in range(max(MIN_ATTEMPTS, MAX_DISTANCE_CHECKS // max(1, len(shapes)))):
         x, y = _any_place(world, random)
         yaw = float(random.uniform(-math.pi, math.pi))
         far = all(math.hypot(x - one.x, y - one.y) >= PERSON_CLEARANCE_M for one in places)
