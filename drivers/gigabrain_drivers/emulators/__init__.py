@@ -1,4 +1,4 @@
-"""Bodies that are not there: real bytes on a pty or a TCP port, with physics behind them.
+"""Emulated bodies: real bytes on a pty, TCP port or CAN bus, with simulated physics behind them.
 
-May import every room here but bodies. The emulators of bodies and lidars import `base`.
+May import every room of this package except bodies. Emulators of bodies and lidars import `base`.
 """

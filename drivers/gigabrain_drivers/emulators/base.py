@@ -1,4 +1,4 @@
-"""A body in MuJoCo that runs in real time, and the base of the devices connected to it."""
+"""A body in MuJoCo in real time, and the base class of its devices."""
 
 import abc
 import asyncio
@@ -39,7 +39,7 @@ MAX_SAMPLES_S = 0.5  # samples are kept for this long when no device reads them
 class Snapshot(NamedTuple):
     """Measurements of the body's parts at the end of a step of 10 ms."""
 
-    time_ns: int  # by the electronics' own clock
+    time_ns: int  # of the electronics' own clock
     odometry: OdometryReading
     wheels: tuple[Motor, ...]  # left, right; or all joints of legs; then those of an arm
     imu: ImuSample
@@ -50,35 +50,35 @@ class Snapshot(NamedTuple):
 
 
 class Broken(NamedTuple):
-    """Faults of the body itself, whatever its electronics do."""
+    """Faults of the body itself, not of its electronics."""
 
-    runaway: float = 0.0  # [m/s], of the wheels, whatever is commanded
-    stuck_wheel: bool = False  # the first one does not turn
-    frozen_values: bool = False  # what it measures no longer changes
+    runaway: float = 0.0  # [m/s], of the wheels, regardless of commands
+    stuck_wheel: bool = False  # the first wheel does not turn
+    frozen_values: bool = False  # measurements no longer change
 
 
 class EmulatedBody:
-    """A body in MuJoCo, in a thread of its own, 10 ms a step. All methods belong on the loop.
+    """A body in MuJoCo, in its own thread, 10 ms a step. Call all methods on the loop.
 
-    `command` sets the motors' targets; stopping when no commands come is up to the devices.
+    `command` sets the motors' targets. The devices stop the body when commands end.
     """
 
     def __init__(self, robot: RobotFile, simulation: Simulation, run: Run) -> None:
         self.robot, self.run = robot, run
-        self.lost = ""  # why the physics has ended, if it has
+        self.lost = ""  # why the physics ended; empty while it runs
         self.on_step: list[Callable[[Snapshot], None]] = []  # called in the physics thread
         self._simulation = simulation
         self._halt = threading.Event()
         self._thread: threading.Thread | None = None
-        self._pace: Pace | None = None  # once time has begun
+        self._pace: Pace | None = None  # after the start of time
         self._commanded = (0.0, 0.0, 0.0)
-        self._gait: Gait | None = None  # instead of a velocity
-        self._aims: Mapping[str, float] | None = {}  # of its arm's servos; None: they are off
-        self._efforts: Mapping[str, float] = {}  # [N m] or [N], with which they pull at most
-        self.hand = Hand(robot.joints)  # of a person who moves its arm while they are off
+        self._gait: Gait | None = None  # replaces the velocity
+        self._aims: Mapping[str, float] | None = {}  # of its arm's servos; None: switched off
+        self._efforts: Mapping[str, float] = {}  # [N m] or [N], maxima of the servos
+        self.hand = Hand(robot.joints)  # of a person who moves the arm while its servos are off
         self._cpu_s = 0.0
         self._moved_ns = 0  # time of the last command to move
-        self._faulted_ns = 0  # when what is wrong with it last changed
+        self._faulted_ns = 0  # time of the last change of its faults
         self._broken = Broken()
         arm = simulation.arm
         self._arm_truth = ArmTruth(simulation.model, simulation.data, arm) if arm else None
@@ -87,19 +87,19 @@ class EmulatedBody:
         self._untaken: deque[Snapshot] = deque(maxlen=MAX_SNAPSHOTS)
 
     def start(self) -> None:
-        """Let time begin."""
+        """Start the physics."""
         self._thread = threading.Thread(target=self._work, name="physics", daemon=True)
         self._thread.start()
 
     async def close(self) -> None:
-        """End the physics. Any number of times."""
+        """End the physics. May be called several times."""
         self._halt.set()
         thread, self._thread = self._thread, None
         if thread:
             await asyncio.to_thread(thread.join)
 
     def command(self, linear_x: float, linear_y: float, angular_z: float) -> None:
-        """Set the velocity that the motors aim for from the next step on."""
+        """Set the velocity that the motors aim for, from the next step on."""
         self._commanded, self._gait = (linear_x, linear_y, angular_z), None
 
     def walk(self, gait: Gait) -> None:
@@ -109,15 +109,15 @@ class EmulatedBody:
     def aim(
         self, positions: Mapping[str, float], efforts: Mapping[str, float] | None = None
     ) -> None:
-        """Set where its arm's servos go from the next step on [rad] or [m].
+        """Set the goals of its arm's servos [rad] or [m], from the next step on.
 
-        They pull with `efforts` [N m] or [N] at most; without, with all they can.
+        `efforts` [N m] or [N] limits them; by default they use all their torque.
         """
         self._aims = {**(self._aims or {}), **positions}
         self._efforts = efforts or {}
 
     def let_go(self) -> None:
-        """Switch its arm's servos off from the next step on, until they are aimed again."""
+        """Switch off its arm's servos from the next step on, until the next `aim`."""
         self._aims = None
 
     @property
@@ -132,7 +132,7 @@ class EmulatedBody:
 
     @property
     def commanded(self) -> tuple[float, float, float]:
-        """The velocity that the motors aim for; of a gait, that of its steps."""
+        """The velocity that the motors aim for; for a gait, the velocity of its steps."""
         gait = self._gait
         if gait is None:
             return self._commanded
@@ -140,25 +140,25 @@ class EmulatedBody:
         return linear_x, linear_y, angular_z
 
     def take_snapshots(self) -> list[Snapshot]:
-        """Return the snapshots since the last call, oldest first, of a quarter of a second.
+        """Return the snapshots since the last call, oldest first, of at most 0.25 s.
 
-        A device that reports every step must not leave out those in which the loop was held up.
+        So a device that reports every step omits none while the loop is delayed.
         """
         return [self._untaken.popleft() for _ in range(len(self._untaken))]
 
     def set_broken(self, broken: "Broken") -> None:
-        """Have its motors or sensors fail from the next step on; `Broken()` mends them."""
+        """Set faults of its motors and sensors, from the next step on; `Broken()` for none."""
         self._broken, self._faulted_ns = broken, self._simulation.time_ns
 
     @property
     def clock_ns(self) -> int:
-        """Time by the electronics' own clock: where the host drops simulated time, it goes on."""
+        """Time of the electronics' own clock; includes simulated time that the host dropped."""
         dropped_s = self._pace.dropped_s if self._pace else 0.0
         return self._simulation.time_ns + round(dropped_s * 1e9)
 
     @property
     def simulation(self) -> Simulation:
-        """The physics; to be touched in `on_step` only."""
+        """The physics. Use it in `on_step` only."""
         return self._simulation
 
     def report(self) -> Mapping[str, float | int | str | None]:
@@ -184,7 +184,7 @@ class EmulatedBody:
             except BodyLost as error:
                 self.lost = str(error)
                 return
-            except Exception as error:  # whatever it is, the process ends with its physics
+            except Exception as error:  # any error of the physics ends the process
                 log.exception("the physics has ended")
                 self.lost = f"{type(error).__name__}: {error}"
                 return
@@ -209,8 +209,8 @@ class EmulatedBody:
         if not broken.frozen_values:
             self.snapshot = snapshot
             self._untaken.append(snapshot)
-        for tell in self.on_step:
-            tell(snapshot)
+        for callback in self.on_step:
+            callback(snapshot)
 
     def _drive_arm(self) -> None:
         arm, aims = self._simulation.arm, self._aims
@@ -227,7 +227,7 @@ class EmulatedBody:
             arm.aim(aims)
 
     def _faulty_velocity(self, commanded: tuple[float, float, float]) -> tuple[float, float, float]:
-        """Return the velocity of broken motors under this command."""
+        """Return the velocity that broken motors give for a command."""
         base = wheels_of(self.robot)
         if self._broken.runaway or base is None:
             return self._broken.runaway, 0.0, 0.0
@@ -256,39 +256,39 @@ class Wire(Protocol):
 
 
 class Port(Wire, Protocol):
-    """The device's end of a link, which may be there or not."""
+    """The device's end of a link. It exists only while it is plugged in."""
 
     on_bytes: Callable[[bytes], None]  # set by the owner
 
     def plug(self) -> None:
-        """Make it appear. Nothing if it is there."""
+        """Create it. Does nothing if it exists."""
 
     def unplug(self) -> None:
-        """Make it disappear, even while it is in use. Nothing if it is gone."""
+        """Remove it, even while it is in use. Does nothing if it is gone."""
 
 
 class Device(abc.ABC):
-    """The electronics on one link: answers bytes, moves the body, reports what it measures.
+    """The electronics on one link: answers bytes, moves the body, reports measurements.
 
-    Everything is called on the loop. There is no clock inside: `step` gets the time.
+    Call all methods on the loop. It has no clock: `step` gets the time.
     """
 
-    Options: ClassVar[type[Struct]]  # those of the driver or scan source that it answers
+    Options: ClassVar[type[Struct]]  # options of its driver or scan source
     baud: ClassVar[int | None] = None  # of its line; None: as fast as the host
     period_s: ClassVar[float] = 0.01  # between two steps
-    watchdog_ns = 150_000_000  # from the last command until its motors stop
-    goes_on: ClassVar[bool] = False  # whether they do not stop by themselves at all
-    promised_in = "the rule for firmware"  # where its makers say so
+    watchdog_ns = 150_000_000  # from the last command to the stop of its motors
+    goes_on: ClassVar[bool] = False  # it has no watchdog: its motors never stop by themselves
+    promised_in = "the rule for firmware"  # the source of `watchdog_ns`
 
     def __init__(self, body: EmulatedBody, options: Any, wire: Wire) -> None:
         self.body, self.options, self.wire = body, options, wire
-        self.sag_volts = 0.0  # brown-out: by how much the supply has fallen [V]
-        self.silent_servo = 0  # the id of one that neither hears nor answers
-        self.halted = False  # frozen or unplugged: for devices with a processor beside the board
+        self.sag_volts = 0.0  # brown-out: drop of the supply [V]
+        self.silent_servo = 0  # id of a servo that neither receives nor answers
+        self.halted = False  # frozen or unplugged: for devices with a second processor
 
     @classmethod
     def port(cls, options: Any) -> Port:
-        """Return the port that it is plugged into: the pty in its driver's options."""
+        """Return its port: by default the pty in its driver's options."""
         return Pty(Path(options.port), cls.baud)
 
     @abc.abstractmethod
@@ -297,24 +297,24 @@ class Device(abc.ABC):
 
     @abc.abstractmethod
     def step(self, now_ns: int) -> None:
-        """Do what the firmware does every `period_s`: telemetry, and its watchdog."""
+        """Run the firmware's loop once per `period_s`: telemetry and watchdog."""
 
     @abc.abstractmethod
     def reset(self) -> None:
-        """Power on: all as at the start, motors at rest, the banner where it has one."""
+        """Power on: state as at the start, motors at rest, then the banner if it has one."""
 
 
 class Sample(NamedTuple):
     """One measurement."""
 
     angle: float  # [deg], clockwise from ahead, 0 to 360
-    distance: float  # [mm], 0 where nothing is in range
+    distance: float  # [mm]; 0: nothing in range
 
 
 class Sweep:
-    """Casts in the physics thread, each step of 10 ms the rays of the angle swept meanwhile.
+    """A turning lidar. Each step of 10 ms, it casts rays over the angle turned in that step.
 
-    So a scan is bent by the robot's motion just as a real one is.
+    It works in the physics thread. The robot's motion distorts its scans, as with a real lidar.
     """
 
     def __init__(self, body: EmulatedBody, range_min: float, range_max: float) -> None:
@@ -327,7 +327,7 @@ class Sweep:
         body.on_step.append(self._measure)
 
     def start(self, rate_hz: float, turn_hz: float) -> None:
-        """Measure `rate_hz` samples a second from now on, at `turn_hz` turns a second."""
+        """Start measuring `rate_hz` samples a second, at `turn_hz` turns a second."""
         self._samples = deque(maxlen=math.ceil(rate_hz * MAX_SAMPLES_S))
         self.turn_hz, self._rate_hz = turn_hz, rate_hz
 
@@ -337,7 +337,7 @@ class Sweep:
         self._samples.clear()
 
     def next_samples(self, count: int) -> list[Sample]:
-        """Return the next `count` samples, or none when there are not enough yet."""
+        """Return the next `count` samples, or an empty list if there are fewer."""
         samples = self._samples
         return [samples.popleft() for _ in range(count)] if len(samples) >= count else []
 

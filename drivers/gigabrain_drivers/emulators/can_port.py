@@ -1,4 +1,4 @@
-"""The emulated end of a CAN bus: UDP multicast that stays on this machine."""
+"""The emulated end of a CAN bus, by UDP multicast on this machine only."""
 
 import asyncio
 import contextlib
@@ -21,11 +21,11 @@ from gigabrain_drivers.links.can_link import (
 )
 from gigabrain_drivers.links.link import LinkProblem
 
-GROUPS = "239.255.{}.{}"  # of organisations' own use, RFC 2365
+GROUPS = "239.255.{}.{}"  # the local scope of RFC 2365
 
 
 class CanPort:
-    """The device's end; the file `path` names the bus, which is a new one each time it appears."""
+    """The device's end. Each `plug` creates a new bus, and writes its address to `path`."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -33,7 +33,7 @@ class CanPort:
         self._bus: can.BusABC | None = None
 
     def plug(self) -> None:
-        """Make the bus appear. Nothing if it is there. Raises OSError."""
+        """Create the bus. Does nothing if it exists. Raises OSError."""
         if self._bus is not None:
             return
         group, port = GROUPS.format(random.randrange(256), random.randrange(1, 255)), _free_port()
@@ -48,7 +48,7 @@ class CanPort:
         os.replace(fresh, self.path)
 
     def unplug(self) -> None:
-        """Make the bus disappear, even while it is in use. Nothing if it is gone."""
+        """Remove the bus, even while it is in use. Does nothing if it is gone."""
         bus, self._bus = self._bus, None
         if bus:
             asyncio.get_running_loop().remove_reader(bus.fileno())
@@ -74,7 +74,7 @@ class CanPort:
 
 
 def _free_port() -> int:
-    """Return a UDP port that nothing uses now: on a shared one, buses would hear each other."""
+    """Return an unused UDP port: on a shared port, two buses would receive each other's frames."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("", 0))
         port: int = probe.getsockname()[1]

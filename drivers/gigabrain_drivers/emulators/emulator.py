@@ -1,4 +1,4 @@
-"""An emulated robot: one body in MuJoCo, and a device on its port for each of its links."""
+"""An emulated robot: one body in MuJoCo, and for each link a device on its port."""
 
 import asyncio
 import contextlib
@@ -31,9 +31,9 @@ BASE, SCAN = "base", "scan"
 
 
 def emulated_body(name: str, run: Run) -> EmulatedBody:
-    """Return the robot called `name` in MuJoCo, by the `sim` part of its file.
+    """Return the robot called `name` in MuJoCo, from the `sim` part of its file.
 
-    Its battery has the voltages that its real link expects. Raises ConfigError.
+    Its battery has the voltages of its real link. Raises ConfigError.
     """
     robot, _, options, folder = catalog.load_link(name, replace(run, link="sim"))
     if not isinstance(options, MujocoOptions):
@@ -48,12 +48,12 @@ def emulated_body(name: str, run: Run) -> EmulatedBody:
         body = dataclasses.replace(body, battery=_charged(body.battery, *volts))
     try:
         return EmulatedBody(robot, Simulation(body, world, run.seed), run)
-    except ConfigError as error:  # of the model that the file names
+    except ConfigError as error:  # in the model that the file names
         raise located(catalog.robot_path(name), error) from None
 
 
 def _charged(battery: SimBattery, empty: float, full: float) -> SimBattery:
-    """Return the battery between the voltages that the real link's driver expects."""
+    """Return the battery with the voltages [V] that the real link's driver expects."""
     nominal = (empty + full) / 2
     return dataclasses.replace(
         battery, empty_voltage=empty, nominal_voltage=nominal, full_voltage=full
@@ -79,12 +79,12 @@ def claimed(folder: Path) -> Iterator[None]:
 
 
 def ports_error(folder: Path, error: OSError) -> ConfigError:
-    """Return the error for ports that cannot be made."""
+    """Return the error for ports that cannot be created."""
     return ConfigError(f"cannot create ports in {folder}: {error.strerror}; expected a folder")
 
 
 class Station:
-    """Plugs a device in and runs it. `device` may be looked at, `faults` set at any time."""
+    """Plugs in a device and runs it. `device` is for reading; `set` changes its faults."""
 
     def __init__(self, make: Callable[[Wire], Device], port: Port, clock: Clock) -> None:
         self._port, self._clock = port, clock
@@ -92,7 +92,7 @@ class Station:
         self.device = make(self._wire)
         self.faults = NO_FAULTS
         self._task: asyncio.Task[None] | None = None
-        port.on_bytes = self._take
+        port.on_bytes = self._received
 
     def start(self) -> None:
         """Switch it on."""
@@ -101,7 +101,7 @@ class Station:
         self._task = asyncio.create_task(self._run())
 
     async def close(self) -> None:
-        """Switch it off and take the port away. Any number of times."""
+        """Switch it off and remove the port. May be called several times."""
         task, self._task = self._task, None
         if task:
             task.cancel()
@@ -109,7 +109,7 @@ class Station:
         self._port.unplug()
 
     def set(self, faults: Faults) -> None:
-        """Have these faults and no others from now on."""
+        """Replace all faults."""
         before, self.faults, self._wire.faults = self.faults, faults, faults
         self.device.sag_volts = faults.brown_out
         self.device.silent_servo = faults.silent_servo
@@ -118,12 +118,12 @@ class Station:
             self._port.unplug()
         else:
             self._port.plug()
-        if before.reboot != faults.reboot:  # into reset, with the motors off; or out of it
+        if before.reboot != faults.reboot:  # enter or leave reset, with the motors off
             self.device.reset()
         if before.frozen and not faults.frozen:
-            self._take(b"")
+            self._received(b"")
 
-    def _take(self, data: bytes) -> None:
+    def _received(self, data: bytes) -> None:
         if data := self._wire.incoming(data):
             self.device.feed(data)
 
@@ -134,7 +134,7 @@ class Station:
 
 
 class Emulator:
-    """The emulated robot called `name`. Used as `async with`; its ports exist inside.
+    """The emulated robot called `name`. Its ports exist inside its `async with` block.
 
     `run` names the world, the seed, and the folder of its ports.
     """
@@ -174,7 +174,7 @@ class Emulator:
         self._claim.close()
 
     def set(self, faults: Mapping[str, Faults]) -> None:
-        """Have these faults, by station, and no others."""
+        """Replace all faults, by station."""
         for name, station in self.stations.items():
             wanted = faults.get(name, NO_FAULTS)
             if wanted != station.faults:
@@ -183,18 +183,18 @@ class Emulator:
         self.body.set_broken(Broken(body.runaway, body.stuck_wheel, body.frozen_values))
 
     def report(self) -> Mapping[str, float | int | str | None]:
-        """The truth of the run so far, and whether this machine has kept the body waiting."""
+        """The truth of the run so far, and delays by this machine."""
         return self.body.report()
 
     def describe_faults(self) -> str:
-        """The faults that it has now, in the words of `parse_faults`."""
+        """Return the present faults, in the words of `parse_faults`."""
         parts = [f"{name} {s.faults}" for name, s in self.stations.items() if s.faults != NO_FAULTS]
         return "; ".join(parts) or "none"
 
     def parse_faults(self, words: str) -> dict[str, Faults]:
-        """The faults in `[STATION] FAULT[=VALUE] ...`; for all stations where none is named.
+        """Return the faults in `[STATION] FAULT[=VALUE] ...`; without a station, for all.
 
-        Nothing, or `off`, is no fault. Raises ConfigError naming what there is.
+        An empty text or `off` means no fault. Raises ConfigError naming the known words.
         """
         named = words.split()
         wanted = list(self.stations)
@@ -206,9 +206,9 @@ class Emulator:
 
 
 def device_class(driver: str) -> type[Device]:
-    """The device that answers a driver or a scan source, ours or an installed package's.
+    """Return the device class for a driver or a scan source, ours or an installed package's.
 
-    Packages offer theirs in the group `gigabrain.emulators`. Raises UnknownName.
+    Packages name theirs in the entry points `gigabrain.emulators`. Raises UnknownName.
     """
     shipped = shipped_emulators()
     device = load_plugin("emulator for driver", driver, shipped, "gigabrain.emulators")
@@ -216,7 +216,7 @@ def device_class(driver: str) -> type[Device]:
 
 
 def wire_kind(name: str) -> Literal["serial", "tcp", ""]:
-    """Return the kind of line to an emulated robot's base; empty where there is none of bytes.
+    """Return the kind of line to an emulated robot's base; empty if it is no line of bytes.
 
     Raises ConfigError, and UnknownName.
     """

@@ -1,4 +1,4 @@
-"""Faults on demand, between a device and its wire."""
+"""Faults for tests, between a device and its wire."""
 
 import random
 from collections.abc import Iterable
@@ -14,9 +14,9 @@ from gigabrain_zenoh.errors import ConfigError, unknown
 Natural = Annotated[int, Meta(ge=0, le=255)]
 Chance = Annotated[float, Meta(ge=0.0, le=1.0)]
 
-MAX_GARBAGE_BYTES = 64  # bytes
+MAX_GARBAGE_BYTES = 64
 
-VALUE_HINTS = {  # what is expected of those that take one
+VALUE_HINTS = {  # expected values, by fault
     "garbage": "from 0 to 1, such as garbage=0.1",
     "bit_errors": "from 0 to 1, such as bit_errors=0.001",
     "half_frames": "from 0 to 1, such as half_frames=0.1",
@@ -29,22 +29,22 @@ VALUE_HINTS = {  # what is expected of those that take one
 class Faults(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The present faults of a device. Written as JSON, or as words such as `silence`."""
 
-    silence: bool = False  # nothing that it sends arrives; it still receives
-    deaf: bool = False  # nothing that is sent to it arrives; it still talks
-    frozen: bool = False  # its line hangs: no answer, bytes pile up; the motors' watchdog goes on
-    garbage: Chance = 0.0  # of each piece that it sends to be preceded by random bytes
-    bit_errors: Chance = 0.0  # of each byte, both ways, to arrive with one bit flipped
-    half_frames: Chance = 0.0  # of each piece that it sends to be cut in two and lose the rest
-    unplugged: bool = False  # the port is gone
+    silence: bool = False  # its bytes are lost; it still receives
+    deaf: bool = False  # bytes to it are lost; it still sends
+    frozen: bool = False  # its line hangs and bytes queue up; the motors' watchdog still works
+    garbage: Chance = 0.0  # that random bytes precede a piece that it sends
+    bit_errors: Chance = 0.0  # that a bit of a byte is flipped, in both directions
+    half_frames: Chance = 0.0  # that the second half of a piece that it sends is lost
+    unplugged: bool = False  # the port does not exist
     reboot: bool = False  # held in reset, motors off; afterwards it boots and sends its banner
-    brown_out: NonNegative = 0.0  # [V], by which its supply has fallen
-    frozen_values: bool = False  # it reports as ever, but what it measures no longer changes
-    runaway: Finite = 0.0  # [m/s], of the wheels, whatever is commanded
-    stuck_wheel: bool = False  # the first one does not turn
-    silent_servo: Natural = 0  # the id of one on a bus that neither hears nor answers
+    brown_out: NonNegative = 0.0  # [V], drop of its supply
+    frozen_values: bool = False  # it still reports, but its measurements no longer change
+    runaway: Finite = 0.0  # [m/s], of the wheels, regardless of commands
+    stuck_wheel: bool = False  # the first wheel does not turn
+    silent_servo: Natural = 0  # id of a servo that neither receives nor answers
 
     def __str__(self) -> str:
-        """The words for those that there are."""
+        """Return the present faults in words."""
         words = []
         for name in self.__struct_fields__:
             value = getattr(self, name)
@@ -76,13 +76,13 @@ def faults_in(words: Iterable[str], stations: Iterable[str]) -> Faults:
 
 
 class FaultyWire:
-    """Between a device and its wire: hands bytes on, or does with them what the faults say."""
+    """Passes bytes between a device and its wire, and applies the faults to them."""
 
     def __init__(self, wire: Wire, seed: int = 0) -> None:
         self.faults = NO_FAULTS
         self._wire = wire
         self._random = random.Random(seed)
-        self._waiting = bytearray()  # what came while the device stood still
+        self._waiting = bytearray()  # received while the device was frozen
 
     def write(self, data: bytes) -> bool:
         """Send from the device to the host."""
@@ -96,7 +96,7 @@ class FaultyWire:
         return self._wire.write(self._flipped(data))
 
     def incoming(self, data: bytes) -> bytes:
-        """Return the bytes that reach the device, with those that had to wait."""
+        """Return the bytes that reach the device, including those that waited."""
         faults = self.faults
         if faults.deaf or faults.reboot:
             return b""

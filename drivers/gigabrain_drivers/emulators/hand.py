@@ -1,4 +1,4 @@
-"""The hand of a person who holds the limp joints of an emulated arm, and moves them."""
+"""The hand of a person who holds and moves the limp joints of an emulated arm."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -7,12 +7,12 @@ from gigabrain_drivers.sim import STEP_S
 from gigabrain_schemas.body import JointDescription
 from gigabrain_zenoh.errors import ConfigError, unknown
 
-SPEED = 1.0  # [rad/s]; of a joint that slides, a tenth of it in [m/s]
-SLIDING_SPEED = 0.1
+SPEED = 1.0  # [rad/s]
+SLIDING_SPEED = 0.1  # [m/s]
 
 
 class Hand:
-    """Brings joints to where they are wanted, and holds all of them meanwhile."""
+    """Moves some joints to their targets, and holds all others."""
 
     def __init__(self, joints: Sequence[JointDescription]) -> None:
         self._speeds = {j.name: SLIDING_SPEED if j.unit == "m" else SPEED for j in joints}
@@ -20,27 +20,27 @@ class Hand:
         self._held: dict[str, float] = {}
 
     def move(self, positions: Mapping[str, float]) -> None:
-        """Bring joints to positions [rad] or [m] from the next step on; none lets go of all."""
+        """Set target positions [rad] or [m]; an empty mapping releases all joints."""
         self._wanted = {**self._wanted, **positions} if positions else {}
 
     def step(self, measured: Mapping[str, float], limp: bool) -> Mapping[str, float]:
-        """Return where it holds all joints after a step of 10 ms; none where it holds nothing."""
+        """Return the positions of all joints after a step of 10 ms; empty if it holds none."""
         wanted = self._wanted
         if not limp or not wanted:
             self._held = {}
             return {}
         held = self._held or dict(measured)
-        for name, place in wanted.items():
-            most = self._speeds[name] * STEP_S
-            held[name] += max(-most, min(most, place - held[name]))
+        for name, target in wanted.items():
+            max_step = self._speeds[name] * STEP_S
+            held[name] += max(-max_step, min(max_step, target - held[name]))
         self._held = held
         return held
 
 
 def posture_in(words: Iterable[str], joints: Sequence[JointDescription]) -> dict[str, float]:
-    """Return positions [rad] or [m] of words such as `elbow_flex=30`, in degrees or millimetres.
+    """Parse words such as `elbow_flex=30` (degrees or mm) to positions [rad] or [m].
 
-    `off`, or nothing, is none. Raises ConfigError.
+    `off`, or no word, gives no positions. Raises ConfigError.
     """
     known = {joint.name: joint for joint in joints}
     found = {}

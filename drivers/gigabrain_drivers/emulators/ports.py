@@ -1,4 +1,4 @@
-"""A serial port or a TCP server for an emulated body: each can be unplugged."""
+"""Serial ports and TCP servers for emulated bodies. They can be unplugged."""
 
 import asyncio
 import contextlib
@@ -14,19 +14,19 @@ from gigabrain_zenoh.host.posix import tty
 BITS_PER_BYTE = 10  # 8N1: start, eight, stop
 READ_BYTES = 4096
 HOST = "127.0.0.1"  # an emulated body is for this machine only
-CLIENT_TIMEOUT_NS = 1_000_000_000  # a client that is silent for longer gives way to another
+CLIENT_TIMEOUT_NS = 1_000_000_000  # another client may replace one that is silent for longer
 
 
 class Pty:
-    """The device's end. Both ways take the time that a wire of `baud` takes, or none without."""
+    """The device's end of a pty, as slow as a line of `baud`; None for no delay."""
 
     def __init__(self, path: Path, baud: int | None = None) -> None:
-        self.path = path  # what the host opens
+        self.path = path  # that the host opens
         self.on_bytes: Callable[[bytes], None] = lambda data: None
-        self.lost_bytes = 0  # that the host did not read in time; a UART loses them as well
+        self.lost_bytes = 0  # not read by the host in time; a UART loses them too
         self._byte_s = BITS_PER_BYTE / baud if baud else 0.0
-        self._out_free = self._in_free = 0.0  # when the wire will be free again [loop time]
-        self._plugged = 0  # how often: what was on the wire before it was unplugged is gone
+        self._out_free = self._in_free = 0.0  # when the wire is free again [loop time]
+        self._plug_count = 0  # bytes that were on the wire at an earlier count are lost
         self._master: int | None = None
         self._slave: int | None = None
 
@@ -36,10 +36,10 @@ class Pty:
         return self._master is not None
 
     def plug(self) -> None:
-        """Make the port appear, with nothing old in it. Nothing if it is there."""
+        """Create the port, with empty buffers. Does nothing if it exists."""
         if self._master is not None:
             return
-        self._plugged += 1
+        self._plug_count += 1
         self._master, self._slave = os.openpty()  # the slave stays open: no EIO between clients
         for end in (self._master, self._slave):
             tty.setraw(end)
@@ -52,16 +52,16 @@ class Pty:
             )
         fresh = self.path.with_name(f".{self.path.name}.new")
         fresh.unlink(missing_ok=True)
-        fresh.symlink_to(_lasting(self._slave))
+        fresh.symlink_to(_path_of_terminal(self._slave))
         os.replace(fresh, self.path)
 
     def unplug(self) -> None:
-        """Make the port disappear, even while it is open. Nothing if it is gone."""
+        """Remove the port, even while it is open. Does nothing if it is gone."""
         if self._master is None or self._slave is None:
             return
         asyncio.get_running_loop().remove_reader(self._master)
-        if self.path.is_symlink() and os.readlink(self.path) == _lasting(self._slave):
-            self.path.unlink(missing_ok=True)  # another's, by now, is left
+        if self.path.is_symlink() and os.readlink(self.path) == _path_of_terminal(self._slave):
+            self.path.unlink(missing_ok=True)  # not if another process owns it now
         os.close(self._master)
         os.close(self._slave)
         self._master = self._slave = None
@@ -75,17 +75,17 @@ class Pty:
         return True
 
     def _after(self, free: float, act: Callable[[int, bytes], None], data: bytes) -> float:
-        """Act once the bytes have been on the wire; returns when it is free again."""
+        """Call `act` after the time of the bytes on the wire; return when it is free again."""
         if not self._byte_s:
-            act(self._plugged, data)
+            act(self._plug_count, data)
             return free
         loop = asyncio.get_running_loop()
         free = max(free, loop.time()) + len(data) * self._byte_s
-        loop.call_at(free, act, self._plugged, data)
+        loop.call_at(free, act, self._plug_count, data)
         return free
 
-    def _send(self, plugged: int, data: bytes) -> None:
-        if plugged != self._plugged or self._master is None:  # unplugged meanwhile
+    def _send(self, plug_count: int, data: bytes) -> None:
+        if plug_count != self._plug_count or self._master is None:  # unplugged meanwhile
             return
         sent = 0
         with contextlib.suppress(BlockingIOError, OSError):
@@ -99,17 +99,17 @@ class Pty:
             data = os.read(self._master, READ_BYTES)
         except (BlockingIOError, OSError):
             return
-        self._in_free = self._after(self._in_free, self._take, data)
+        self._in_free = self._after(self._in_free, self._deliver, data)
 
-    def _take(self, plugged: int, data: bytes) -> None:
-        if plugged == self._plugged and self._master is not None:
+    def _deliver(self, plug_count: int, data: bytes) -> None:
+        if plug_count == self._plug_count and self._master is not None:
             self.on_bytes(data)
 
 
-def _lasting(terminal: int) -> str:
-    """Return a path of the terminal that is dead once this process is, where there is one.
+def _path_of_terminal(terminal: int) -> str:
+    """Return a path of the terminal; on Linux, one that becomes invalid with this process.
 
-    The name of a terminal is reused: a driver must not write to another user's shell.
+    Names of terminals are reused: a driver must not write to another user's shell.
     """
     of_process = f"/proc/{os.getpid()}/fd/{terminal}"  # Linux
     return of_process if os.path.exists(of_process) else os.ttyname(terminal)
@@ -118,13 +118,13 @@ def _lasting(terminal: int) -> str:
 class TcpPort:
     """The device's end of a TCP connection; the file `path` holds its HOST:PORT.
 
-    It listens on the usual `port` where that is free, and on any other where it is not.
+    It listens on the usual `port` if that is free, else on any other.
     """
 
     def __init__(self, path: Path, port: int) -> None:
         self.path = path
         self.on_bytes: Callable[[bytes], None] = lambda data: None
-        self.refused = 0  # clients who came while another was there
+        self.refused = 0  # connections refused because another client was connected
         self._usual, self._clock = port, Clock()
         self._server: socket.socket | None = None
         self._client: socket.socket | None = None
@@ -132,14 +132,14 @@ class TcpPort:
 
     @property
     def address(self) -> tuple[str, int] | None:
-        """(host, port) where it listens, or None while it is unplugged."""
+        """(host, port) on which it listens, or None while it is unplugged."""
         if self._server is None:
             return None
         host, port = self._server.getsockname()
         return host, port
 
     def plug(self) -> None:
-        """Listen. Nothing if it does."""
+        """Listen. Does nothing if it already does."""
         if self._server is not None:
             return
         self._server = _listening(self._usual)
@@ -150,7 +150,7 @@ class TcpPort:
         os.replace(fresh, self.path)
 
     def unplug(self) -> None:
-        """Drop the client and listen no more. Nothing if it is unplugged."""
+        """Drop the client and stop listening. Does nothing if it is unplugged."""
         self._drop()
         server, self._server = self._server, None
         if server:
@@ -159,7 +159,7 @@ class TcpPort:
             self.path.unlink(missing_ok=True)
 
     def write(self, data: bytes) -> bool:
-        """Send to the client. False when there is none. A client that does not read is dropped."""
+        """Send to the client; return False without one. Drops a client that does not read."""
         if self._client is None:
             return False
         sent = 0
@@ -211,7 +211,7 @@ class TcpPort:
 
 
 def _listening(port: int) -> socket.socket:
-    """A server on `port`, or on any free one."""
+    """Return a server on `port`, or on any free port."""
     server = socket.socket()
     try:
         server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -1,4 +1,4 @@
-"""The emulator's process: beside a driver under a supervisor, or by itself."""
+"""The emulator's process: with a driver under a supervisor, or alone."""
 
 import asyncio
 import logging
@@ -25,13 +25,13 @@ from gigabrain_zenoh.runtime.heartbeat import Progress
 
 log = logging.getLogger(__name__)
 
-POLL_S = 0.05  # between two looks at the file with the faults
-MOVE = "move"  # the word before positions of joints
+POLL_S = 0.05  # period of checking the file with the faults
+MOVE = "move"  # command before positions of joints
 FAULTS_FILE = "faults.json"  # {STATION: {FAULT: VALUE}}, in the folder of the ports
 
 
 async def run(config: EmulatorConfig, bus: Bus, ready: Callable[[], None]) -> None:
-    """Be the body until the process ends; its truth is in `describe`."""
+    """Run the emulator until the process ends; the truth is in its description."""
     async with make_emulator(config) as emulator:
         bus.report = emulator.report
         physics = emulator.body.simulation
@@ -42,7 +42,7 @@ async def run(config: EmulatorConfig, bus: Bus, ready: Callable[[], None]) -> No
 
 
 def show_world(emulator: Emulator, name: str, bus: Bus) -> LiveWorld:
-    """Publish the emulated world for viewers, from the physics thread on."""
+    """Publish the emulated world for viewers, after each step of the physics thread."""
     world, loop = (
         LiveWorld(emulator.body.simulation, name, emulator.body.robot.cameras),
         asyncio.get_running_loop(),
@@ -64,7 +64,7 @@ def show_world(emulator: Emulator, name: str, bus: Bus) -> LiveWorld:
 
 
 async def emulate(config: EmulatorConfig, say: Callable[[str], None]) -> None:
-    """Be the body until it is asked to end; faults are read from standard input, line by line."""
+    """Run the emulator until a stop signal; read faults from standard input, line by line."""
     with stop_signals() as stop:
         async with make_emulator(config) as emulator:
             await _until(stop, _serve_terminal(emulator, config, say))
@@ -73,7 +73,7 @@ async def emulate(config: EmulatorConfig, say: Callable[[str], None]) -> None:
 async def _serve_terminal(
     emulator: Emulator, config: EmulatorConfig, say: Callable[[str], None]
 ) -> None:
-    """Apply faults that are typed, until cancelled. Raises BodyLost with the physics."""
+    """Apply typed faults until cancelled. Raises BodyLost if the physics ends."""
     for name, port in emulator.ports.items():
         say(f"{config.body} in {config.world}: {name} at {where(port)}")
     say(f"faults, one line each: [{'|'.join(emulator.stations)}] "
@@ -98,13 +98,13 @@ async def _until(stop: asyncio.Event, work: Coroutine[None, None, None]) -> None
 
 
 def where(port: str) -> str:
-    """Return what to connect to: the port itself, or the address that its file holds."""
+    """Return the address to connect to: the port itself, or the content of its file."""
     path = Path(port)
     return path.read_text(encoding="ascii").strip() if path.is_file() else port
 
 
 def make_emulator(config: EmulatorConfig) -> Emulator:
-    """The emulated robot of the settings. Raises ConfigError."""
+    """Return the emulated robot of the settings. Raises ConfigError."""
     return Emulator(
         config.body,
         Run(
@@ -120,13 +120,13 @@ def make_emulator(config: EmulatorConfig) -> Emulator:
 
 
 async def watch(emulator: Emulator, path: Path) -> None:
-    """Apply the faults in the file whenever it changes. Raises BodyLost with the physics."""
+    """Apply the faults in the file whenever it changes. Raises BodyLost if the physics ends."""
     seen = None
     while not emulator.body.lost:
         stamp = _changed_ns(path)
         if stamp != seen:
             seen = stamp
-            _from_file(emulator, path)
+            _apply_file(emulator, path)
         await asyncio.sleep(POLL_S)
     raise BodyLost(emulator.body.lost)
 
@@ -138,7 +138,7 @@ def _changed_ns(path: Path) -> int | None:
         return None
 
 
-def _from_file(emulator: Emulator, path: Path) -> None:
+def _apply_file(emulator: Emulator, path: Path) -> None:
     try:
         faults = msgspec.json.decode(path.read_bytes(), type=dict[str, Faults])
         for name in faults:
