@@ -1,6 +1,6 @@
-"""Bytes to and from bodies: serial lines, TCP connections and CAN buses, reopened after every loss.
+"""Bytes to and from bodies: serial lines, TCP connections and CAN buses. They reconnect.
 
-Imports no other room of this package and no bus. Drivers, lidars and packages of authors use it.
+Imports no other room of this package and no bus. Drivers, lidars and other packages import it.
 """
 
 from gigabrain_drivers.links.link import Link, LinkProblem

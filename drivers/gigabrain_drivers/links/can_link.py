@@ -1,7 +1,7 @@
 """CAN buses, through python-can: SocketCAN on a robot, UDP multicast for emulated bodies.
 
-A link carries bytes, so frames travel as records of 16 bytes: those of Linux's `struct can_frame`.
-The hardware checks frames; a record of another form is not a frame that was received.
+A link carries bytes, so each frame is a record of 16 bytes, as in Linux's `struct can_frame`. The
+hardware checks frames, so a record of another form cannot be a received frame.
 """
 
 import re
@@ -19,15 +19,15 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.host.files import read_bounded
 
 BITRATE = 1_000_000  # [bit/s]
-QUIET_NS = 200_000_000  # without a frame, after which the bus is opened again
-MAX_FRAMES = 256  # that are read at once
+QUIET_NS = 200_000_000  # the bus is opened again after this time without a frame
+MAX_FRAMES = 256  # read at once
 MAX_ID, MAX_BYTES = 0x7FF, 8  # of classic CAN with standard identifiers
-HOPS = 0  # of multicast: none, so frames do not leave this machine
-ARPHRD_CAN = 280  # type of a CAN interface in sysfs
+HOPS = 0  # of multicast: frames do not leave this machine
+ARPHRD_CAN = 280  # type of CAN interfaces in sysfs
 IFF_UP = 1
 SYS_NET = Path("/sys/class/net")
-WORDS = ("type", "flags")  # files of an interface there
-MAX_ADDRESS_BYTES = 256  # of a file with an address
+SYS_FILES = ("type", "flags")  # of an interface in SYS_NET
+MAX_ADDRESS_BYTES = 256  # size of a file with an address
 _RECORD = struct.Struct("<IB3x8s")
 _INTERFACE = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,14}")
 _ADDRESS = re.compile(r"udp (\d+\.\d+\.\d+\.\d+) (\d{1,5})")
@@ -40,7 +40,7 @@ class CanFrame(NamedTuple):
     data: bytes
 
     def record(self) -> bytes:
-        """Return the 16 bytes by which it travels."""
+        """Return its record of 16 bytes."""
         return _RECORD.pack(self.id, len(self.data), self.data)
 
 
@@ -50,13 +50,13 @@ def records(frames: Iterable[CanFrame]) -> bytes:
 
 
 class CanDecoder:
-    """Finds the frames in the bytes of a link. `errors` counts records that are none."""
+    """Finds the frames in the bytes of a link. `errors` counts invalid records."""
 
     def __init__(self) -> None:
         self.errors = 0
 
     def feed(self, data: bytes) -> list[CanFrame]:
-        """Return the frames in whole records; a record cut short is an error and forgotten."""
+        """Return the frames in whole records; drop a partial record, as an error."""
         whole = len(data) - len(data) % _RECORD.size
         self.errors += whole != len(data)
         frames = list[CanFrame]()
@@ -69,13 +69,13 @@ class CanDecoder:
 
 
 class CanSpelling(Spelling):
-    """One direction of a bus in words: identifier, bytes, and what they mean."""
+    """One direction of a bus in words: identifier, bytes, and their meaning."""
 
     def __init__(self, describe: Callable[[CanFrame], str]) -> None:
         super().__init__(CanDecoder().feed, describe)
 
     def spell(self, data: bytes) -> list[str]:
-        """Return a line of text for each frame, which begins as `candump` shows it."""
+        """Return a line of text for each frame, in the format of `candump`."""
         return [
             f"{frame.id:03x}#{frame.data.hex()}  {self._describe(frame)}"
             for frame in CanDecoder().feed(data)
@@ -83,16 +83,16 @@ class CanSpelling(Spelling):
 
 
 def check_can_port(port: str) -> None:
-    """Raise ValueError, as `port: ...`, for what is neither a CAN interface nor a file."""
+    """Raise ValueError, as `port: ...`, unless it is a CAN interface or a file."""
     if "/" not in port and not _INTERFACE.fullmatch(port):
         raise ValueError(f"port: expected a CAN interface such as can0, got {port!r}")
 
 
 def describe_interface(name: str, folder: Path = SYS_NET) -> str:
-    """Return why a CAN interface cannot be used, in one line; empty where it can."""
+    """Return why a CAN interface cannot be used, in one line; empty if it can."""
     entry = folder / name
     try:
-        kind, flags = ((entry / one).read_text(encoding="ascii").strip() for one in WORDS)
+        kind, flags = ((entry / one).read_text(encoding="ascii").strip() for one in SYS_FILES)
     except OSError:
         others = [path.parent.name for path in folder.glob("*/type") if _is_can(path)]
         has = f"; there is {', '.join(sorted(others))}" if others else ""
@@ -112,7 +112,7 @@ def _is_can(path: Path) -> bool:
 
 
 def open_multicast(group: str, port: int) -> can.BusABC:
-    """Open a CAN bus of this machine by UDP multicast. Raises LinkProblem."""
+    """Open a CAN bus on this machine, by UDP multicast. Raises LinkProblem."""
     try:
         return UdpMulticastBus(group, port=port, hop_limit=HOPS, fd=False)
     except (can.CanError, OSError) as error:
@@ -127,9 +127,9 @@ def describe_can(error: Exception) -> str:
 
 
 class CanLink(Link):
-    """A SocketCAN interface, or the bus that a file names and an emulator has made.
+    """A SocketCAN interface, or an emulator's bus whose address is in a file.
 
-    `ids`: those frames alone are received; the others cost nothing on SocketCAN.
+    Only frames with `ids` are received; on SocketCAN, the others cost nothing.
     """
 
     def __init__(
@@ -139,13 +139,13 @@ class CanLink(Link):
         self._port, self.quiet_ns = port, quiet_ns
         self._filters: list[Any] = [{"can_id": each, "can_mask": MAX_ID} for each in ids]
         self._bus: can.BusABC | None = None
-        self.lost_frames = 0  # that were no data frames, such as reports of errors on the wire
+        self.lost_frames = 0  # received, but not data frames: such as error frames
 
     def __str__(self) -> str:
         return self._port
 
     def write(self, data: bytes) -> bool:
-        """Send all frames now. Return whether they were taken. Never block or raise."""
+        """Send all frames now; return whether all were sent. Never blocks or raises."""
         if self._fd is None or self._bus is None:
             return False
         try:
@@ -180,10 +180,10 @@ class CanLink(Link):
             bus.shutdown()
 
     def _cut_short(self) -> None:
-        """Nothing is ever sent in part: a frame goes out whole or not at all."""
+        """Do nothing: frames are sent whole or not at all."""
 
     def _read(self, fd: int) -> bool:
-        """Read what has come; return whether anything had."""
+        """Read the waiting frames; return whether there were any."""
         if self._bus is None:
             return False
         try:
@@ -202,9 +202,9 @@ class CanLink(Link):
 
 
 def receive(bus: can.BusABC) -> tuple[list[CanFrame], int]:
-    """Return the frames that wait on a bus, and how many are no data frames of classic CAN.
+    """Return the waiting data frames of a bus, and the number of other frames.
 
-    Raises OSError where the bus has gone.
+    Raises OSError if the bus is gone.
     """
     frames, wrong = list[CanFrame](), 0
     for _ in range(MAX_FRAMES):
@@ -225,7 +225,7 @@ def receive(bus: can.BusABC) -> tuple[list[CanFrame], int]:
 
 
 def message_of(frame: CanFrame) -> can.Message:
-    """Return a frame as python-can has it."""
+    """Return a frame as a message of python-can."""
     return can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False)
 
 

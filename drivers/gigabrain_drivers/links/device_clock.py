@@ -1,30 +1,30 @@
-"""Lateness of a device's data, by the stamps of its own clock or by what it echoes. Pure.
+"""Delay of a device's data, from the stamps of its own clock or from its echoes. Pure.
 
-Where the two clocks began does not matter: the quickest data so far show their offset, and what
-comes later than that is late. Lateness that was there from the first byte on cannot be seen; what
-grows by less than MAX_DRIFT cannot be told from two clocks that differ.
+The fastest data so far give the offset of the two clocks; slower data are late. A delay that is
+present from the first byte on cannot be detected. A delay that grows by less than MAX_DRIFT looks
+the same as clock drift.
 """
 
 from collections import deque
 
-MAX_UNANSWERED = 64  # messages whose echo is waited for
-WINDOW_NS = 300_000_000  # data are late by what all of this window are,
-MIN_WINDOW_SHARE = 0.8  # once this share of it has been seen
-SILENCE_MS = 500.0  # without data, after which the device may have restarted,
-RESTART_MS = 1000.0  # and was, if they would else be later by more than this
-LATE_MS = 50.0  # from which on data are late, and show nothing of the clocks' drift
-MAX_DRIFT = 0.01  # of two clocks against each other; an RC oscillator is no better
-EARLY_MS = 100.0  # by which data may come too early, after a host that was held up
-MAX_ODD = 3  # stamps in a row that cannot be, until the clock counts as a new one
+MAX_UNANSWERED = 64  # messages that wait for their echo
+WINDOW_NS = 300_000_000  # the delay is the least one of this window,
+MIN_WINDOW_SHARE = 0.8  # after at least this share of it
+SILENCE_MS = 500.0  # after this silence, the device may have restarted;
+RESTART_MS = 1000.0  # it did if its data would otherwise be later by more than this
+LATE_MS = 50.0  # data with a longer delay are not used to measure drift
+MAX_DRIFT = 0.01  # between two clocks; an RC oscillator is no better
+EARLY_MS = 100.0  # data may arrive this much too early, after a delay of the host
+MAX_INVALID = 3  # after this many impossible stamps in a row, the clock counts as new
 SAMPLE_NS, SAMPLES = 1_000_000_000, 120  # of the drift, while nothing is late
 MIN_DRIFT_SAMPLES = 10
 
 
 class Window:
-    """Keeps the values of the last 0.3 s, to give the least of them."""
+    """The minimum of the values of the last 0.3 s."""
 
     def __init__(self) -> None:
-        self._seen = deque[tuple[int, float]]()  # when [ns], and what may still be the least
+        self._seen = deque[tuple[int, float]]()  # time [ns] and value, of possible minima
         self._began_ns = 0
         self.newest = 0.0
 
@@ -41,34 +41,34 @@ class Window:
 
     @property
     def least(self) -> float:
-        """The least of the window, and no less than 0; 0 until the window is full."""
+        """The minimum of the window, at least 0; 0 until the window is full."""
         if not self._seen or self._seen[-1][0] - self._began_ns < MIN_WINDOW_SHARE * WINDOW_NS:
             return 0.0
         return max(0.0, self._seen[0][1])
 
 
 class EchoClock:
-    """Lateness of a device that echoes the number of the newest message to it.
+    """Delay of a device that echoes the number of the newest message to it.
 
-    The round trip beyond `usual_ms` counts, including what was late from the start.
+    The delay is the round trip minus `usual_ms`; it includes delays that exist from the start.
     """
 
     def __init__(self, usual_ms: float) -> None:
         self._usual_ms = usual_ms
-        self._sent = deque[tuple[int, int]](maxlen=MAX_UNANSWERED)  # number, and when [ns]
+        self._sent = deque[tuple[int, int]](maxlen=MAX_UNANSWERED)  # number, and time [ns]
         self._late = Window()
 
     @property
     def late_ms(self) -> float:
-        """The delay beyond the usual that all echoes of the last 0.3 s had [ms]."""
+        """The least delay of all echoes of the last 0.3 s, beyond the usual one [ms]."""
         return self._late.least
 
     def sent(self, number: int, now_ns: int) -> None:
-        """Note that a message was sent."""
+        """Record a sent message."""
         self._sent.append((number, now_ns))
 
     def echoed(self, number: int, now_ns: int) -> None:
-        """Note data that echo this message; only the first echo of each is timed."""
+        """Record data that echo a message; only its first echo counts."""
         numbers = [waiting for waiting, _ in self._sent]
         if number not in numbers:
             return
@@ -78,10 +78,10 @@ class EchoClock:
 
 
 class DeviceClock:
-    """Lateness by the stamps of a device's clock, which wraps at `wrap_ms`.
+    """Delay from the stamps of a device's clock, which wraps at `wrap_ms`.
 
-    Jitter does not count: of 0.3 s the quickest data do. While data are late, the clocks are
-    assumed to drift as they did before.
+    The fastest data of 0.3 s count, so jitter does not. While data are late, the clocks are assumed
+    to drift as before.
     """
 
     def __init__(self, wrap_ms: int) -> None:
@@ -89,20 +89,20 @@ class DeviceClock:
         self.clear()
 
     def clear(self) -> None:
-        """Start again: another device, or a restart of the same."""
-        self._last: tuple[int, int] | None = None  # newest stamp [ms], and when it came [ns]
-        self._device_ms = self._floor_ms = 0.0  # the unwrapped count; least offset of the clocks
+        """Start again, for another device, or for one that restarted."""
+        self._last: tuple[int, int] | None = None  # newest stamp [ms], and its arrival [ns]
+        self._device_ms = self._floor_ms = 0.0  # unwrapped stamp; least offset of the clocks
         self._odd = 0
-        self._excess = Window()  # by how much data come too late [ms]
+        self._excess = Window()  # delay of data [ms]
         self._floors = deque[tuple[int, float]](maxlen=SAMPLES)
 
     @property
     def late_ms(self) -> float:
-        """The delay of all data of the last 0.3 s against the quickest ever [ms]."""
+        """The least delay of the data of the last 0.3 s, relative to the fastest data ever [ms]."""
         return self._excess.least
 
     def arrived(self, stamp_ms: int, now_ns: int) -> None:
-        """Note data with this stamp."""
+        """Record data with this stamp."""
         if self._last is None:
             self._begin(stamp_ms, now_ns)
             return
@@ -113,7 +113,7 @@ class DeviceClock:
             self._begin(stamp_ms, now_ns)
         elif passed_ms > silent_ms + self._excess.newest + EARLY_MS:
             self._odd += 1
-            if self._odd >= MAX_ODD:
+            if self._odd >= MAX_INVALID:
                 self._begin(stamp_ms, now_ns)
         else:
             self._odd, self._last = 0, (stamp_ms, now_ns)
@@ -134,7 +134,7 @@ class DeviceClock:
             self._floors.append((now_ns, self._floor_ms))
 
     def _drift(self) -> float:
-        """The drift of the device's clock against the host's, 0 until it is known."""
+        """The drift of the device's clock against the host's; 0 until it is known."""
         if len(self._floors) < MIN_DRIFT_SAMPLES:
             return 0.0
         (then_ns, then_ms), (now_ns, now_ms) = self._floors[0], self._floors[-1]

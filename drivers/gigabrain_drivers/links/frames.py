@@ -1,4 +1,4 @@
-"""Frames in a stream of bytes: found by binary protocols, and described for the log."""
+"""Frames in a stream of bytes: finds them for binary protocols, and describes them for the log."""
 
 import abc
 import functools
@@ -10,9 +10,9 @@ from gigabrain_schemas.base import Velocity
 
 Frame = TypeVar("Frame")
 
-MAX_UNFRAMED_BYTES = 512  # bytes without a frame, after which they are shown as they are
-Feed = Callable[[bytes], Sequence[Any]]  # of a protocol's decoder
-Describe = Callable[[Any], str]  # a frame of that decoder
+MAX_UNFRAMED_BYTES = 512  # after this many bytes without a frame, they are logged as they are
+Feed = Callable[[bytes], Sequence[Any]]  # `feed` of a protocol's decoder
+Describe = Callable[[Any], str]  # describes a frame of that decoder
 
 
 def xor_of(data: bytes) -> int:
@@ -21,7 +21,7 @@ def xor_of(data: bytes) -> int:
 
 
 def crc_table(polynomial: int, bits: int) -> tuple[int, ...]:
-    """Return the table, for a byte at a time, of a CRC of 8 or 16 bits that is not reflected."""
+    """Return the bytewise table of a CRC of 8 or 16 bits that is not reflected."""
     top, table = 1 << bits - 1, []
     for byte in range(256):
         value = byte << bits - 8
@@ -34,18 +34,18 @@ def crc_table(polynomial: int, bits: int) -> tuple[int, ...]:
 class FrameDecoder(abc.ABC, Generic[Frame]):
     """Finds frames by their header, length and check. `errors` counts skipped stretches.
 
-    A broken frame costs no more than itself: the search goes on inside it.
+    After a broken frame the search continues inside it, so no other frame is lost.
     """
 
     HEADER: ClassVar[bytes]
 
     def __init__(self) -> None:
         self._buffer = bytearray()
-        self._lost = False  # inside a stretch that was counted
+        self._lost = False  # inside a stretch that is already counted
         self.errors = 0
 
     def clear(self) -> None:
-        """Forget a frame that has begun to arrive."""
+        """Drop a partial frame."""
         self._buffer.clear()
         self._lost = False
 
@@ -59,7 +59,7 @@ class FrameDecoder(abc.ABC, Generic[Frame]):
                 break
             frame = self._frame(bytes(buffer[:size])) if size else None
             if frame is None:
-                self._skip(1)  # a header may begin inside a header
+                self._skip(1)  # a header may start inside a header
                 continue
             frames.append(frame)
             del buffer[:size]
@@ -68,14 +68,14 @@ class FrameDecoder(abc.ABC, Generic[Frame]):
 
     @abc.abstractmethod
     def _size(self, buffer: bytearray) -> int | None:
-        """Return the size of the frame that begins here; 0 if none does, None if unknown."""
+        """Return the size of the frame at the start; 0 if there is none, None if not yet known."""
 
     @abc.abstractmethod
     def _frame(self, data: bytes) -> Frame | None:
-        """Return the frame in these bytes, or None where its check is wrong."""
+        """Return the frame in these bytes, or None if its check is wrong."""
 
     def _at_header(self) -> bool:
-        """Drop what is before the next header; return whether there is one."""
+        """Drop the bytes before the next header; return whether there is one."""
         at = self._buffer.find(self.HEADER)
         if at < 0:
             at = len(self._buffer) - self._begun()
@@ -84,7 +84,7 @@ class FrameDecoder(abc.ABC, Generic[Frame]):
         return len(self._buffer) >= len(self.HEADER)
 
     def _begun(self) -> int:
-        """Return how many bytes at the end may be the beginning of a header."""
+        """Return the number of bytes at the end that may be the start of a header."""
         parts = range(len(self.HEADER) - 1, 0, -1)
         return next((n for n in parts if self._buffer.endswith(self.HEADER[:n])), 0)
 
@@ -95,9 +95,9 @@ class FrameDecoder(abc.ABC, Generic[Frame]):
 
 
 class Spelling:
-    """One direction of a line. The decoder gets byte after byte, so that a frame's own are known.
+    """Describes one direction of a line. It feeds single bytes, to know those of each frame.
 
-    A decoder that waits for what follows a frame shows it with those bytes.
+    A decoder that waits for bytes after a frame shows the frame with those bytes.
     """
 
     def __init__(self, feed: Feed, describe: Describe) -> None:
@@ -119,13 +119,13 @@ class Spelling:
 
 
 class Wording:
-    """Both directions of a line in words; without spellings, bytes alone."""
+    """Describes both directions of a line; without spellings, as bytes only."""
 
     def __init__(self, sent: Spelling | None = None, received: Spelling | None = None) -> None:
         self._ways = {"tx": sent, "rx": received}
 
     def lines(self, way: str, data: bytes) -> list[str]:
-        """Return lines of text for bytes that were sent (`tx`) or received (`rx`)."""
+        """Return lines of text for sent (`tx`) or received (`rx`) bytes."""
         spelling = self._ways[way]
         return [f"{way} {line}" for line in (spelling.spell(data) if spelling else [data.hex(" ")])]
 
@@ -136,7 +136,7 @@ def as_one_frame(data: bytes) -> list[bytes]:
 
 
 def describe_command(asked: Velocity, sent: Velocity) -> str:
-    """Describe a command as it was received, and as it was sent to the body."""
+    """Describe a command as received, and as sent to the body."""
     return f"command {_speeds(asked)} -> sent {_speeds(sent)}"
 
 

@@ -1,11 +1,11 @@
-"""A process that stops motors over a serial line when their driver has died or hangs.
+"""A process that stops motors over a serial line when their driver dies or hangs.
 
-Motors without a watchdog turn on for ever when their commands end. So the driver starts this
-process, which shares its line, and tells it of each command: moving, or at rest. When moving
-commands stop coming, or the driver is gone, the process writes a frame that stops the motors. It
-cannot help where the line itself is cut, or the computer is off.
+Motors without a watchdog keep turning when their commands end. So the driver starts this process,
+which shares its line, and reports each command to it: moving, or at rest. When reports of moving
+motors end, or the driver is gone, the process writes a frame that stops the motors. It cannot help
+if the line itself is cut, or the computer is off.
 
-The process loads nothing but this file, and of that the standard library alone.
+The process loads only this file and the standard library.
 """
 
 import contextlib
@@ -17,24 +17,24 @@ import sys
 import time
 
 MOVING, AT_REST, QUIT = b"m", b"0", b"q"
-SILENCE_NS = 100_000_000  # after the last word of moving motors, until they are stopped,
-STOPS_NS = 200_000_000  # for so long, as a single frame may get lost
+SILENCE_NS = 100_000_000  # from the last report of moving motors to their stop
+STOPS_NS = 200_000_000  # stop frames are repeated this long, as a single one may get lost
 PERIOD_NS = 20_000_000
 CLOSE_S = 1.0
 
 
 class GuardState:
-    """Decides when motors are stopped. Pure."""
+    """Decides when to stop motors. Pure."""
 
     def __init__(self, silence_ns: int = SILENCE_NS, stops_ns: int = STOPS_NS) -> None:
-        """Take the silence of a moving driver, and for how long motors are told to stop [ns]."""
-        self.gone = False  # whether the driver is
+        """Set the allowed silence of a moving driver, and the duration of stop frames [ns]."""
+        self.gone = False  # the driver has ended
         self._silence_ns, self._stops_ns = silence_ns, stops_ns
-        self._moving_ns: int | None = None  # when it last said that the motors move
-        self._stop_ns: int | None = None  # since when they are stopped
+        self._moving_ns: int | None = None  # time of the last report of moving motors
+        self._stop_ns: int | None = None  # start of stopping them
 
     def take(self, words: bytes, now_ns: int) -> None:
-        """Take what the driver has said; nothing means that it has ended."""
+        """Handle the driver's reports; no bytes mean that it has ended."""
         if not words:
             self.gone = True
             return
@@ -45,7 +45,7 @@ class GuardState:
         self._stop_ns = None
 
     def stops(self, now_ns: int) -> bool:
-        """Return whether motors are to be stopped now."""
+        """Return whether to stop the motors now."""
         since = self._moving_ns
         begins = since is not None and (self.gone or now_ns - since >= self._silence_ns)
         if begins and self._stop_ns is None:
@@ -53,26 +53,26 @@ class GuardState:
         return self._stop_ns is not None and now_ns - self._stop_ns <= self._stops_ns
 
     def ended(self, now_ns: int) -> bool:
-        """Return whether there is nothing left to do."""
+        """Return whether the process may end."""
         return self.gone and not self.stops(now_ns)
 
 
 class LineGuard:
-    """The driver's end: starts the process, and again if it ends."""
+    """The driver's end: starts the process, and restarts it if it ends."""
 
     def __init__(self, frame: bytes) -> None:
         """`frame` stops the motors."""
         self._frame = frame
         self._process: subprocess.Popen[bytes] | None = None
-        self._fd: int | None = None  # of the line that it shares
+        self._fd: int | None = None  # of the shared line
 
     @property
     def pid(self) -> int | None:
-        """The process, where there is one."""
+        """The id of the process, if it runs."""
         return self._process.pid if self._process else None
 
     def tell(self, fd: int | None, *, moving: bool) -> None:
-        """Tell it of a command that was sent over the line `fd`; None for a line that is cut."""
+        """Report a command that was sent over the line `fd`; None if the line is cut."""
         if fd is None:
             self.close()
             return
@@ -82,7 +82,7 @@ class LineGuard:
         self._write(MOVING if moving else AT_REST)
 
     def close(self) -> None:
-        """End it; nothing is left to guard."""
+        """End the process without stopping the motors."""
         process, self._process = self._process, None
         if process is None:
             return
@@ -103,7 +103,7 @@ class LineGuard:
             (sys.executable, "-S", "-E", __file__, str(fd), self._frame.hex()),
             stdin=subprocess.PIPE,
             pass_fds=(fd,),
-            start_new_session=True,  # what ends the driver's group must not end it
+            start_new_session=True,  # signals to the driver's group must not end it
         )
         assert self._process.stdin
         os.set_blocking(self._process.stdin.fileno(), False)
@@ -111,22 +111,22 @@ class LineGuard:
     def _write(self, word: bytes) -> None:
         assert self._process
         assert self._process.stdin
-        with contextlib.suppress(OSError):  # it has ended, or hangs: it is replaced, or left alone
+        with contextlib.suppress(OSError):  # an ended process is restarted, one that hangs is left
             os.write(self._process.stdin.fileno(), word)
 
 
 def guard(fd: int, frame: bytes) -> None:
-    """Guard the motors on a line until the driver ends, and a moment longer."""
+    """Guard the motors on a line until the driver has ended and they are stopped."""
     state, words = GuardState(), sys.stdin.fileno()
     while not state.ended(time.monotonic_ns()):
         waits_for = [] if state.gone else [words]
         if select.select(waits_for, [], [], PERIOD_NS / 1e9)[0]:
             state.take(os.read(words, 4096), time.monotonic_ns())
         if state.stops(time.monotonic_ns()):
-            with contextlib.suppress(OSError):  # the line is gone
+            with contextlib.suppress(OSError):  # the line is cut
                 os.write(fd, frame)
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the driver, whose end ends it
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends it through the driver
     guard(int(sys.argv[1]), bytes.fromhex(sys.argv[2]))

@@ -1,4 +1,4 @@
-"""Links: bytes out, bytes in, and a port that is reopened until it is closed."""
+"""Links: send and receive bytes on a port that is reopened after every loss."""
 
 import abc
 import asyncio
@@ -23,30 +23,30 @@ MAX_RETRY_NS = 1_000_000_000
 AGE_CHECK_S = 0.02  # between two checks of the age of the newest bytes
 READ_BYTES = 65536
 
-LOG_AFTER_NS = 500_000_000  # of silence, before it is logged
+LOG_AFTER_NS = 500_000_000  # silence is logged after this time
 
 
 class LinkProblem(Exception):
-    """The reason why a port cannot be opened, in one line for people."""
+    """The reason why a port cannot be opened, as one line for users."""
 
 
 class Link(abc.ABC):
-    """Bytes to and from a body. Once opened it keeps itself open until it is closed.
+    """Bytes to and from a body. After `open` it reconnects by itself until `close`.
 
-    A subclass knows how to connect; everything else is here. All callbacks run on the loop.
+    Subclasses implement the connection. All callbacks run on the loop.
     """
 
-    quiet_ns: int | None = None  # without a byte, after which the peer counts as lost
-    gather_s = 0.0  # bytes within this time are read together; each wake-up costs
+    quiet_ns: int | None = None  # the peer counts as lost after this time without a byte
+    gather_s = 0.0  # bytes within this time are read together, to save wake-ups
 
     def __init__(self, clock: Clock) -> None:
         self.on_bytes: Callable[[bytes], None] = _ignore
         self.on_open: Callable[[], None] = _nothing
         self.on_lost: Callable[[str], None] = _ignore
         self.trace: Trace | None = None  # ("tx" or "rx", bytes)
-        self.wording = Wording()  # for the log at debug level; the owner puts its protocol's here
+        self.wording = Wording()  # for the debug log; the owner sets that of its protocol
         self.problem = "not opened"
-        self.errors = 0  # frames that the owner threw away
+        self.errors = 0  # frames that the owner dropped
         self.reconnects = 0
         self._clock = clock
         self._received_ns = clock.now_ns()
@@ -59,17 +59,17 @@ class Link(abc.ABC):
 
     @property
     def connected(self) -> bool:
-        """True while the port is open, which does not mean that the body answers."""
+        """True while the port is open; the body need not answer."""
         return self._fd is not None
 
     @property
     def fd(self) -> int | None:
-        """The descriptor of the open port, for a process that shares it."""
+        """The descriptor of the open port, for processes that share it."""
         return self._fd
 
     @property
     def age_ns(self) -> int:
-        """Time since the newest bytes, or since the link was opened [ns]."""
+        """Time since the newest bytes, or since the connection [ns]."""
         return self._clock.now_ns() - self._received_ns
 
     @property
@@ -89,7 +89,7 @@ class Link(abc.ABC):
             self._task = asyncio.create_task(self._keep_open(), name=f"link {self}")
 
     def write(self, data: bytes) -> bool:
-        """Send now or not at all. Return whether all was sent. Never block or raise."""
+        """Send now or not at all; return whether all was sent. Never blocks or raises."""
         if self._fd is None:
             return False
         try:
@@ -106,7 +106,7 @@ class Link(abc.ABC):
         return True
 
     def drop(self, reason: str) -> None:
-        """Close the present connection, discard what is queued in it, and connect again."""
+        """Close the connection, discard its queued bytes, and connect again."""
         if self._fd is None:
             return
         fd, self._fd, self.problem = self._fd, None, reason
@@ -129,15 +129,15 @@ class Link(abc.ABC):
 
     @abc.abstractmethod
     async def _connect(self) -> int:
-        """Open the port: a descriptor that does not block. Raises LinkProblem and OSError."""
+        """Open the port; return a non-blocking descriptor. Raises LinkProblem and OSError."""
 
     @abc.abstractmethod
     def _shut(self) -> None:
-        """Close what `_connect` opened, discarding what is still to be sent. Never raises."""
+        """Close the port and discard unsent bytes. Never raises."""
 
     @abc.abstractmethod
     def _cut_short(self) -> None:
-        """Make sure that the rest of a write that went out in part is never sent."""
+        """Discard the rest of a partial write, so that it is never sent."""
 
     def _trace(self, way: str, data: bytes) -> None:
         if self.trace:
@@ -167,7 +167,7 @@ class Link(abc.ABC):
             await self._clock.sleep_ns(retry_ns)
 
     def _call(self, callback: Callable[[T], None], value: T) -> None:
-        """Call the owner; if that fails, drop the connection and open a new one."""
+        """Call the owner; if it raises, drop the connection and open a new one."""
         try:
             callback(value)
         except Exception as error:  # noqa: BLE001 - its fault must not end the link
@@ -175,7 +175,7 @@ class Link(abc.ABC):
             self.drop(f"received data could not be handled: {describe_error(error)}")
 
     def _report(self, error: Exception) -> None:
-        """Log an exception that is a fault of a program and not of a port, once each."""
+        """Log an exception that is a programming error, once for each."""
         text = f"{type(error).__name__}: {error}"
         if not isinstance(error, (LinkProblem, OSError)) and text not in self._reported:
             self._reported.add(text)
@@ -213,7 +213,7 @@ class Link(abc.ABC):
         self._gathering = loop.call_later(self.gather_s, self._gathered)
 
     def _gathered(self) -> None:
-        """Read what has come, and go on while something does."""
+        """Read the waiting bytes, and gather again while bytes arrive."""
         if self._fd is None:
             return
         if self._read(self._fd):
@@ -222,7 +222,7 @@ class Link(abc.ABC):
             asyncio.get_running_loop().add_reader(self._fd, self._readable)
 
     def _read(self, fd: int) -> bool:
-        """Read once; return whether anything came."""
+        """Read once; return whether there were bytes."""
         try:
             data = os.read(fd, READ_BYTES)
         except BlockingIOError:
@@ -230,7 +230,7 @@ class Link(abc.ABC):
         except OSError as error:
             self.drop(describe_error(error))
             return False
-        if not data:  # the other end is gone; left in the loop, this would spin
+        if not data:  # the other end is gone; its reader would be called for ever
             self.drop("the other end is gone: unplugged?")
             return False
         self._received_ns = self._clock.now_ns()
@@ -240,7 +240,7 @@ class Link(abc.ABC):
 
 
 def describe_error(error: Exception) -> str:
-    """Describe an exception in words; asyncio puts its own before the system's."""
+    """Describe an exception in words, without asyncio's prefix."""
     if isinstance(error, OSError) and error.errno:
         return os.strerror(error.errno)
     return str(error) or type(error).__name__
@@ -255,10 +255,10 @@ def _nothing() -> None:
 
 
 class Liveness:
-    """Watches whether a body that reports by itself still does; logs each change once.
+    """Watches whether a body still sends its reports; logs each change once.
 
-    It counts as lost after `silent_ns` without a message. `senseless` is logged where the line
-    itself is in order. Silence of a moment is not logged; the gate reports it.
+    The body counts as lost after `silent_ns` without a message. The text `senseless` is logged if
+    the line itself works. Short silence is not logged; the gate reports it.
     """
 
     def __init__(
@@ -266,30 +266,30 @@ class Liveness:
     ) -> None:
         self._link, self._clock = link, clock
         self._silent_ns, self._senseless = silent_ns, senseless
-        self._received_ns: int | None = None  # None since the line was opened or lost
-        self._hoping_ns = clock.now_ns()  # since when there is nothing
-        self._lost = False  # whether a loss has been reported since the newest message
+        self._received_ns: int | None = None  # None: no message since the line was opened or lost
+        self._silent_since_ns = clock.now_ns()
+        self._lost = False  # a loss was reported since the newest message
         self._fault = Fault(log)
 
     @property
     def received(self) -> bool:
-        """True if a message has come since the line was opened."""
+        """True after the first message since the line was opened."""
         return self._received_ns is not None
 
     def mark_received(self) -> bool:
-        """Note a message; return whether it is the first on this line, or after a loss."""
+        """Record a message; return whether it is the first on this line, or after a loss."""
         first = self._received_ns is None or self._lost
         self._received_ns, self._lost = self._clock.now_ns(), False
         return first
 
     def reset(self) -> None:
-        """Forget all messages: the line is lost or new."""
+        """Forget all messages, because the line is lost or new."""
         if self._received_ns is not None:
-            self._received_ns, self._hoping_ns = None, self._clock.now_ns()
+            self._received_ns, self._silent_since_ns = None, self._clock.now_ns()
 
     def alive(self) -> bool:
         """Return whether the newest message is recent enough."""
-        silent_ns = self._clock.now_ns() - (self._received_ns or self._hoping_ns)
+        silent_ns = self._clock.now_ns() - (self._received_ns or self._silent_since_ns)
         alive = self._received_ns is not None and silent_ns <= self._silent_ns
         self._lost = self._lost or not alive
         if alive:

@@ -1,6 +1,6 @@
-"""Serial lines: opened by pyserial, read and written by the event loop; and how ports are named.
+"""Serial lines, opened by pyserial and used by the event loop; and the names of ports.
 
-A robot's file names a port by a path, `usb:VID:PID[:SERIAL]`, or `auto`.
+A port's name is a path, `usb:VID:PID[:SERIAL]`, or `auto`.
 """
 
 import asyncio
@@ -22,13 +22,13 @@ AUTO = "auto"
 USB = "usb:"
 _ID = re.compile(r"[0-9A-Fa-f]{1,4}")
 
-NO_PORT = (errno.ENOTTY, errno.EINVAL, errno.EISDIR)  # a file, a folder, another device
+NO_PORT = (errno.ENOTTY, errno.EINVAL, errno.EISDIR)  # errors of files, folders, other devices
 Probe = Callable[[serial.Serial], bool]
-NO_MODEM_LINES = (errno.ENOTTY, errno.EINVAL)  # ptys have none, nor have some USB adapters
+NO_MODEM_LINES = (errno.ENOTTY, errno.EINVAL)  # errors of ptys and some USB adapters
 
 
 def check_port(name: str) -> None:
-    """Raise ValueError, as `port: ...`, for what cannot be a serial port."""
+    """Raise ValueError, as `port: ...`, unless it may be a serial port."""
     if not name.strip() or "://" in name:
         raise ValueError(
             f"port: expected a path such as /dev/ttyUSB0, usb:VID:PID or auto, got {name!r}"
@@ -55,7 +55,7 @@ def usb_id(port: str) -> tuple[int, int, str]:
 
 
 def candidate_paths(port: str) -> list[str]:
-    """Return the paths that `port` (a path, `usb:VID:PID[:SERIAL]`, `auto`) may stand for."""
+    """Return the possible paths of `port` (a path, `usb:VID:PID[:SERIAL]`, `auto`)."""
     if port == AUTO:
         return sorted(p.device for p in list_ports.comports() if p.vid is not None)
     if not port.startswith(USB):
@@ -69,7 +69,7 @@ def candidate_paths(port: str) -> list[str]:
 
 
 def describe_missing(port: str) -> str:
-    """Return the text for a device that is not there."""
+    """Return the text for a missing device."""
     if port == AUTO:
         return "no serial port at all: is it plugged in?"
     what = "USB device " if port.startswith(USB) else ""
@@ -77,14 +77,14 @@ def describe_missing(port: str) -> str:
 
 
 def describe_absent(port: str) -> str:
-    """Return the text for a port that is not there, empty where it is. Raises ValueError."""
+    """Return the text for a missing port; empty if it exists. Raises ValueError."""
     return (
         "" if any(Path(path).exists() for path in candidate_paths(port)) else describe_missing(port)
     )
 
 
 def describe_refusal(path: str, error: OSError) -> str:
-    """Return the text for a device that is there but cannot be opened."""
+    """Return the text for a device that exists but cannot be opened."""
     if error.errno in (errno.EACCES, errno.EPERM):
         return (
             f"no permission to open {path}; add yourself to its group (dialout on Debian), or "
@@ -93,7 +93,7 @@ def describe_refusal(path: str, error: OSError) -> str:
     if error.errno in (errno.EAGAIN, errno.EBUSY):
         holders = ", ".join(map(str, _holders(path)))
         return f"{path} is in use{f' by pid {holders}' if holders else ''}"
-    cause = error.__context__  # of pyserial's errors without a number
+    cause = error.__context__  # for pyserial's errors without errno
     number = cause.args[0] if isinstance(cause, termios.error) else error.errno
     if number in NO_PORT:
         return f"{path} is not a serial port"
@@ -101,36 +101,36 @@ def describe_refusal(path: str, error: OSError) -> str:
 
 
 def _holders(path: str) -> list[int]:
-    """Return the processes that have the device open, as far as we may look (Linux)."""
+    """Return the ids of processes that have the device open, as far as visible (Linux)."""
     device, found = os.path.realpath(path), []
     for entry in Path("/proc").glob("[0-9]*/fd/*"):
         try:
             if os.readlink(entry) == device:
                 found.append(int(entry.parts[2]))
         except OSError:
-            continue  # not ours to look at, or gone meanwhile
+            continue  # no permission, or gone meanwhile
     return sorted(set(found))
 
 
 class SerialLink(Link):
     """A serial line. `port` is a path, `usb:VID:PID[:SERIAL]`, or `auto` with a probe.
 
-    The probe gets an open port with a short read timeout, in a thread, and returns whether it is
-    the right one. Half of a line that could not be sent is discarded, not sent later.
+    The probe runs in a thread. It gets an open port with a short read timeout, and returns whether
+    it is the right one. The rest of a partial write is discarded, not sent later.
     """
 
     def __init__(self, port: str, baud: int, clock: Clock, *, probe: Probe | None = None) -> None:
         super().__init__(clock)
-        self.baud = baud  # holds from the next connection on
+        self.baud = baud  # used from the next connection on
         self._port, self._probe = port, probe
         self._serial: serial.Serial | None = None
-        self.path = ""  # of the device that was opened last
+        self.path = ""  # of the newest opened device
 
     def __str__(self) -> str:
         return self._port
 
     def set_dtr(self, on: bool) -> None:
-        """Set the data-terminal-ready line, where there is one."""
+        """Set the data-terminal-ready line, if there is one."""
         if self._serial is None:
             return
         try:
@@ -170,7 +170,7 @@ class SerialLink(Link):
         found = False
         try:
             found = self._probe is not None and self._probe(port)
-        except (OSError, termios.error):  # it is gone, or no terminal
+        except (OSError, termios.error):  # it is gone, or not a terminal
             pass
         finally:
             if not found:
@@ -180,7 +180,7 @@ class SerialLink(Link):
     def _shut(self) -> None:
         if self._serial:
             with contextlib.suppress(OSError, termios.error):
-                termios.tcflush(self._serial.fileno(), termios.TCIOFLUSH)  # or closing waits
+                termios.tcflush(self._serial.fileno(), termios.TCIOFLUSH)  # else closing waits
             with contextlib.suppress(OSError):
                 self._serial.close()
             self._serial = None
@@ -197,14 +197,14 @@ def open_port(path: str, baud: int) -> serial.Serial:
         raise LinkProblem(describe_missing(path))
     try:
         return serial.Serial(path, baud, timeout=0.2, write_timeout=0.2, exclusive=True)
-    except OSError as error:  # serial.SerialException is one
+    except OSError as error:  # includes serial.SerialException
         raise LinkProblem(describe_refusal(path, error)) from None
     except (ValueError, termios.error) as error:
         raise LinkProblem(f"{path}: {error}") from None
 
 
 def ready(port: serial.Serial) -> serial.Serial:
-    """Prepare an open port for the event loop: nothing old in it, and unplugging ends a read.
+    """Prepare an open port for the event loop: empty its buffers; unplugging will end a read.
 
     Raises LinkProblem, with the port closed.
     """
@@ -212,7 +212,7 @@ def ready(port: serial.Serial) -> serial.Serial:
         fd = port.fileno()
         os.set_blocking(fd, False)
         settings = termios.tcgetattr(fd)
-        settings[6][termios.VMIN] = 1  # at 0, no data and no device would both read as b""
+        settings[6][termios.VMIN] = 1  # with 0, both no data and no device would read as b""
         termios.tcsetattr(fd, termios.TCSANOW, settings)
         termios.tcflush(fd, termios.TCIOFLUSH)
     except (OSError, termios.error) as error:

@@ -1,4 +1,4 @@
-"""A body behind a TCP port, whose address may be written in a file."""
+"""TCP connections to a body, whose address may be in a file."""
 
 import asyncio
 import contextlib
@@ -14,16 +14,16 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import read_bounded
 
-CONNECT_TIMEOUT_S = 1.0  # for all addresses of a name, in equal parts
-QUIET_NS = 200_000_000  # a frozen peer goes on acknowledging; only its own bytes show it alive
+CONNECT_TIMEOUT_S = 1.0  # shared equally by all addresses of a name
+QUIET_NS = 200_000_000  # a frozen peer's kernel still acknowledges: only bytes prove it alive
 LINGER_DISCARD = struct.pack("ii", 1, 0)  # linger on, for 0 s: unsent bytes are dropped
-MAX_ADDRESS_BYTES = 256  # of a file with an address
+MAX_ADDRESS_BYTES = 256  # size of a file with an address
 
-AddressInfo = tuple[socket.AddressFamily, socket.SocketKind, int, str, Any]  # of getaddrinfo
+AddressInfo = tuple[socket.AddressFamily, socket.SocketKind, int, str, Any]  # from getaddrinfo
 
 
 class TcpLink(Link):
-    """A TCP connection. A peer that sends nothing for `quiet_ns` is dropped."""
+    """A TCP connection. It is dropped after `quiet_ns` without bytes of the peer."""
 
     def __init__(
         self, host: str, port: int, clock: Clock, *, quiet_ns: int | None = QUIET_NS
@@ -64,9 +64,9 @@ class TcpLink(Link):
 
 
 class AddressLink(TcpLink):
-    """A TCP connection to `HOST:PORT`, or to what a file holds, read for every connection.
+    """A TCP connection to `HOST:PORT`, or to the address in a file, read for each connection.
 
-    An emulator uses whichever port is free, and another one after a restart.
+    After a restart, an emulator may use another port.
     """
 
     def __init__(self, where: str, clock: Clock) -> None:
@@ -85,7 +85,7 @@ class AddressLink(TcpLink):
 
 
 async def _connected(found: Sequence[AddressInfo], within_s: float) -> socket.socket:
-    """Return a socket that is connected to the first address that answers. Raises OSError."""
+    """Return a socket connected to the first address that answers. Raises OSError."""
     loop, problem = asyncio.get_running_loop(), OSError(errno.EADDRNOTAVAIL, "no address")
     for family, kind, protocol, _, where in found:
         tried = socket.socket(family, kind, protocol)
@@ -93,7 +93,7 @@ async def _connected(found: Sequence[AddressInfo], within_s: float) -> socket.so
         try:
             async with asyncio.timeout(within_s):
                 await loop.sock_connect(tried, where)
-        except OSError as error:  # a timeout, too
+        except OSError as error:  # includes timeouts
             tried.close()
             problem = error
         except asyncio.CancelledError:
@@ -113,7 +113,7 @@ def address(text: str) -> tuple[str, int]:
 
 
 def written(path: Path) -> tuple[str, int]:
-    """Return (host, port) in a file. Raises LinkProblem."""
+    """Read (host, port) from a file. Raises LinkProblem."""
     try:
         return address(read_bounded(path, MAX_ADDRESS_BYTES).decode("ascii"))
     except OSError:
