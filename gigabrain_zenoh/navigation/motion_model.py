@@ -115,23 +115,31 @@ def step_toward(before: float, target: float, up: float, down: float) -> float:
 
 
 @lean_kernel
+def no_faster_aslant(model: MotionModel, vx: float, vy: float) -> tuple[float, float]:
+    """Return a velocity of a body that strafes, no faster aslant than straight on."""
+    vx = max(-model.backward, min(model.forward, vx))
+    vy = max(-model.lateral, min(model.lateral, vy))
+    along = vx / (model.forward if vx > 0.0 else max(model.backward, SLOWEST))
+    slant = math.sqrt(along * along + (vy / model.lateral) ** 2)
+    return (vx / slant, vy / slant) if slant > 1.0 else (vx, vy)
+
+
+@lean_kernel
 def feasible(
     model: MotionModel,
     before: tuple[float, float, float],
     target: tuple[float, float, float],
     dt: float,
 ) -> tuple[float, float, float]:
-    """Return the command nearest to `target` that the body can obey `dt` [s] after `before`."""
+    """Return the command nearest to `target` that the body can obey `dt` [s] after `before`.
+
+    See `no_faster_aslant` for a body that strafes.
+    """
     up, down = model.acceleration * dt, model.deceleration * dt
     turn = model.angular_acceleration * dt
     vx = max(-model.backward, min(model.forward, target[0]))
     vy = max(-model.lateral, min(model.lateral, target[1]))
     w = max(-model.turning, min(model.turning, target[2]))
-    if model.strafes:  # no faster aslant than straight on
-        along = vx / (model.forward if vx > 0.0 else max(model.backward, SLOWEST))
-        slant = math.sqrt(along * along + (vy / model.lateral) ** 2)
-        if slant > 1.0:
-            vx, vy = vx / slant, vy / slant
     rim = abs(vx) + abs(w) * model.half_track
     if rim > model.rim:
         vx, w = vx * model.rim / rim, w * model.rim / rim
@@ -192,6 +200,11 @@ def make_feasible(model: MotionModel, start: InitialState, dt: float, plans: Flo
     """
     turning = model.turning * min(1.0, start.gain)
     flat = plans.reshape(-1)
+    for t in range(plans.shape[0] if model.strafes else 0):  # apart: it takes as long as the rest
+        one = flat[t * COMMAND : (t + 1) * COMMAND]
+        for lane in range(LANES):
+            slower = no_faster_aslant(model, one[lane], one[LANES + lane])
+            one[lane], one[LANES + lane] = slower
     for lane in range(LANES):
         wanted = max(-turning, min(turning, flat[2 * LANES + lane]))
         first = feasible(model, start.before, (flat[lane], flat[LANES + lane], wanted), dt)

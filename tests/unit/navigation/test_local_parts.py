@@ -22,14 +22,17 @@ from gigabrain_zenoh.navigation.footprint import (
 )
 from gigabrain_zenoh.navigation.local_costmap import Chamfer, LocalCostmap, Pose2D, fill_disc
 from gigabrain_zenoh.navigation.motion_model import (
+    LANES,
+    InitialState,
     delayed_model,
     feasible,
     first_order_lag,
     lagged_step,
+    make_feasible,
     model_of,
 )
 from gigabrain_zenoh.navigation.mppi import mean_past_commands
-from tests.unit.navigation.drives import CAR, WAFFLE, wall
+from tests.unit.navigation.drives import CAR, OMNI, WAFFLE, wall
 
 NOBODY = np.empty((0, 6))
 NOTHING = np.empty((0, 2))
@@ -58,6 +61,15 @@ def test_a_wheel_is_never_planned_to_be_faster_than_it_can_be() -> None:
     assert vx + 0.14 * w == pytest.approx(0.26)
     assert w / vx == pytest.approx(7.0)
     assert feasible(model, (0.0, 0.0, 0.0), (0.26, 0.0, 0.0), 9.0) == (0.26, 0.0, 0.0)
+
+
+def test_no_body_is_planned_to_be_faster_aslant_than_straight_on() -> None:
+    still, plans = (0.0, 0.0, 0.0), np.full((2, 3, LANES), 0.6)
+    lag = first_order_lag(0.0, 9.0)
+    start = InitialState(*still, *still, still, np.zeros((1, 3)), 0.0, lag, 1.0)
+    make_feasible(model_of(OMNI), start, 9.0, plans)
+    assert np.hypot(plans[:, 0], plans[:, 1]) == pytest.approx(0.6)
+    assert plans[:, 0] == pytest.approx(plans[:, 1])
 
 
 def test_a_slower_speed_can_be_asked_for() -> None:
