@@ -16,9 +16,9 @@ from gigabrain_zenoh.geometry.limits import SentCommand
 from gigabrain_zenoh.geometry.se2 import from_pose, transform
 from gigabrain_zenoh.navigation import dynamic_obstacles
 from gigabrain_zenoh.navigation.car_track import no_track, track_of
-from gigabrain_zenoh.navigation.cost import SECOND, cost_to_go_at
+from gigabrain_zenoh.navigation.cost import SECOND
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
-from gigabrain_zenoh.navigation.footprint import Placement, clearance, outline_of
+from gigabrain_zenoh.navigation.footprint import outline_of
 from gigabrain_zenoh.navigation.local_costmap import LocalCostmap, Pose2D
 from gigabrain_zenoh.navigation.looked_ground import LookedGround
 from gigabrain_zenoh.navigation.motion_model import (
@@ -294,10 +294,7 @@ class LocalPlanner:
         return InitialState(*place, *_axes(v), before, past, share, lag, gain)
 
     def _answer(self, request: PlanRequest, scene: Scene, planned: SampledPlan) -> LocalPlan:
-        place = request.pose
-        at = Placement(place.x, place.y, math.cos(place.yaw), math.sin(place.yaw))
-        room = clearance(scene.grid, self._outline, at)
-        left = cost_to_go_at(scene.field, place.x, place.y)
+        room, left = planned.room, planned.left
         blocked = self._stuck(request)
         kind = classify_plan(self._model, planned.track, self._sampler.dt, request.goal)
         vx, vy, w = planned.commands[0].tolist()

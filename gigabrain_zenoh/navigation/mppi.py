@@ -11,7 +11,12 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import NONE, kernel, lean_kernel
-from gigabrain_zenoh.navigation.cost import evaluate_surroundings, fill_clearances, price
+from gigabrain_zenoh.navigation.cost import (
+    cost_to_go_at,
+    evaluate_surroundings,
+    fill_clearances,
+    price,
+)
 from gigabrain_zenoh.navigation.footprint import Outline
 from gigabrain_zenoh.navigation.motion_model import (
     LANES,
@@ -106,8 +111,8 @@ class SampledPlan(NamedTuple):
 
     commands: Floats  # (T, 3)
     track: Floats  # (T + 1, 6): x, y, yaw, vx, vy, w at the end of each step
-    cost: float
-    standing_cost: float  # of braking and staying
+    room: float  # [m], of the body where it is, see `clearance_of`
+    left: float  # [m of free way], cost to go from there
 
 
 class Samples(NamedTuple):
@@ -155,13 +160,13 @@ class Sampler:
 
     def shift(self, seconds: float) -> None:
         """Let time pass: the last plan begins so much later."""
-        self.last = _resampled(self.last, np.arange(len(self.last)) + seconds / self.dt)
+        self.last = _resampled(self.last, seconds / self.dt, 1.0)
 
     def step_by(self, dt: float) -> None:
         """Plan in as many steps of this length [s] from now on."""
         if dt != self.dt:
-            steps = np.arange(len(self.last))
-            self.last, self.dt = _resampled(self.last, (steps + 0.5) * dt / self.dt - 0.5), dt
+            step = dt / self.dt
+            self.last, self.dt = _resampled(self.last, 0.5 * step - 0.5, step), dt
 
     def plan(
         self,
@@ -176,17 +181,17 @@ class Sampler:
         self._turn = (self._turn + 1) % NOISE_SETS
         problem = Problem(model, outline, weights, scene, self.dt)
         samples = Samples(self.last, noise, simple)
-        commands, track, cost, standing = _search(problem, start, samples, self._work)
-        self.last = commands
-        return SampledPlan(commands, track, cost, standing)
+        found = SampledPlan(*_search(problem, start, samples, self._work))
+        self.last = found.commands
+        return found
 
 
 @kernel
-def _resampled(plan: Floats, steps: NDArray[np.floating]) -> Floats:
-    """Interpolate `plan` (T, 3) at `steps` (T,); beyond its ends it is constant."""
+def _resampled(plan: Floats, begin: float, step: float) -> Floats:
+    """Interpolate `plan` (T, 3) from `begin` on, by `step`; beyond its ends it is constant."""
     found = np.empty_like(plan)
     for n in range(len(plan)):
-        inside = min(max(steps[n], 0.0), len(plan) - 1.0)
+        inside = min(max(begin + n * step, 0.0), len(plan) - 1.0)
         before = min(int(inside), len(plan) - 2)
         for axis in range(plan.shape[1]):
             first, second = plan[before, axis], plan[before + 1, axis]
@@ -198,7 +203,7 @@ def _resampled(plan: Floats, steps: NDArray[np.floating]) -> Floats:
 def _search(
     problem: Problem, start: InitialState, samples: Samples, work: SamplerBuffers
 ) -> tuple[Floats, Floats, float, float]:
-    """Return the best commands (T, 3), their track (T + 1, 6), their cost, and that of standing.
+    """Return the fields of a SampledPlan.
 
     Plans whose last pose alone makes them worthless beside an earlier one are dropped. The others
     are kept together, and priced when they fill a block. In the end the draft becomes the weighted
@@ -226,7 +231,8 @@ def _search(
     _evaluate(problem, start, draft, math.inf, states, rooms, found[:2])
     taken = best if found[mean] > found[best] + MEAN_MARGIN else mean
     commands, track = _lane_result(draft, states, taken)
-    return commands, track, found[taken], costs[0, BRAKING_LANE]
+    left = cost_to_go_at(problem.scene.field, start.x, start.y)
+    return commands, track, rooms[0], left
 
 
 @kernel
