@@ -59,13 +59,13 @@ class CostToGo:
             self._raise_costs(avoid, cell, (grid.x, grid.y))
         self._padded.fill(round(FARTHEST / UNIT))
         inner = self._padded[:, 1:-1]
-        found = seed(inner, cell, (grid.x, grid.y), goal, path)
+        found = seed(inner, cell, (grid.x, grid.y), np.array([goal]) if path is None else path)
         if ways is not None:
             _scale_costs(self._halves, cell, grid.x - ways.price.x, grid.y - ways.price.y, ways)
             if not found:
                 _seed_rim(inner, cell, grid.x - ways.price.x, grid.y - ways.price.y, ways)
         sweep(self._halves, self._padded, self._spans)
-        np.multiply(self._padded[:, 1:-1], np.float32(UNIT), out=self._field, casting="unsafe")
+        _in_metres(self._padded, self._field)
         return DistanceGrid(self._field, cell, grid.x, grid.y)
 
     def _raise_costs(
@@ -81,26 +81,37 @@ class CostToGo:
             np.maximum(inner, least, out=inner, where=mask > 0)
 
 
-def seed(
-    known: Units, cell: float, corner: tuple[float, float], goal: tuple[float, float],
-    path: Floats | None,
-) -> bool:  # fmt: skip
+@kernel
+def seed(known: Units, cell: float, corner: tuple[float, float], points: Floats) -> bool:
     """Put what is known from the start into `known` (side, side), in units; elsewhere stays.
 
-    Whether the goal, or a part of the path, is inside.
+    Return whether a part of the path `points` (n, 2) [m], or the goal alone, is inside.
     """
     side = len(known)
-    points = np.array([goal]) if path is None else path
     last = _way_out(points, cell, corner, side)
     if last >= 0:
-        column, row = np.floor((points[last] - corner) / cell).astype(np.int64)
-        known[row, column] = 0
+        x, y = points[last]
+        known[math.floor((y - corner[1]) / cell), math.floor((x - corner[0]) / cell)] = 0
         return True
-    x, y = (np.add.outer(corner, (np.arange(side) + 0.5) * cell).T - points[-1]).T
-    for end in (0, -1):
-        known[end] = np.minimum(np.hypot(x, y[end]), FARTHEST) / UNIT
-        known[:, end] = np.minimum(np.hypot(x[end], y), FARTHEST) / UNIT
+    x, y = points[len(points) - 1]
+    for i in range(side):
+        step = 1 if i in (0, side - 1) else side - 1
+        for j in range(0, side, step):
+            right = corner[0] + (j + 0.5) * cell - x
+            away = math.hypot(right, corner[1] + (i + 0.5) * cell - y)
+            known[i, j] = np.int32(min(away, FARTHEST) / UNIT)
     return False
+
+
+@kernel
+def _in_metres(units: Units, metres: Singles) -> None:
+    """Fill `metres` (side, side) from `units` (side, side + 2)."""
+    unit = np.float64(np.float32(UNIT))
+    for row in range(len(metres)):
+        out = metres[row]
+        known = units[row, 1 : len(out) + 1]
+        for column in range(len(out)):
+            out[column] = np.float32(known[column] * unit)
 
 
 @kernel

@@ -142,7 +142,7 @@ class TrafficMap:
         self._halves[0, :, 1:-1] = price * (0.5 * CELL_M / UNIT)
         self._halves[1, :, 1:-1] = price * (0.5 * math.sqrt(2.0) * CELL_M / UNIT)
         self._padded.fill(round(FARTHEST / UNIT))
-        seed(self._padded[:, 1:-1], CELL_M, corner, goal, None)
+        seed(self._padded[:, 1:-1], CELL_M, corner, np.array([goal]))
         sweep(self._halves, self._padded, self._spans)
         field = (self._padded[:, 1:-1] * UNIT).astype(np.float32)
         return Ways(DistanceGrid(price, CELL_M, *corner), DistanceGrid(field, CELL_M, *corner))
