@@ -146,7 +146,6 @@ class WindowCells(NamedTuple):
 @kernel
 def observe(
     cells: WindowCells,
-    marked: NDArray[np.int64],
     place: Pose2D,
     lidar: tuple[float, float],
     hits: Floats,
@@ -172,7 +171,7 @@ def observe(
         if reach[k] < 0.0 or r < reach[k]:
             reach[k] = r
     (rows, columns), passed = level.shape, _passed(reach)
-    for n in marked:
+    for n in _marked(level):
         i, j = n // columns, n % columns
         x = cells.x + (j + 0.5) * CELL_M
         y = cells.y + (i + 0.5) * CELL_M
@@ -189,6 +188,21 @@ def observe(
                 cells.since[row, column] = tick
             level[row, column] = MARK_LEVEL
             seen[row, column] = tick
+
+
+@kernel
+def _marked(level: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Return the indices of the marked cells (n,), row by row."""
+    flat, count = level.reshape(-1), 0
+    words = flat[: len(flat) // WORD * WORD].view(np.uint64)
+    found = np.empty(len(flat), np.int64)
+    for word in range(len(words) + 1):
+        if word < len(words) and words[word] == 0:
+            continue
+        for n in range(word * WORD, min(len(flat), (word + 1) * WORD)):
+            if flat[n]:
+                found[count], count = n, count + 1
+    return found[:count]
 
 
 @kernel
@@ -290,7 +304,7 @@ class LocalCostmap:
     def see(self, tick: int, place: Pose2D, lidar: tuple[float, float], hits: Floats) -> None:
         """Take in a scan: `hits` (n, 2) [m] in the body's frame, the `lidar` at (x, y) in it."""
         self._follow(place)
-        observe(self._held, _marked(self._held), place, lidar, hits, (tick, tick - self._memory))
+        observe(self._held, place, lidar, hits, (tick, tick - self._memory))
 
     def moving(self, tick: int, discs: Floats) -> Floats:
         """Return the `discs` (n, 6), with x, y [m] first and the radius fifth, that really move.
@@ -396,15 +410,10 @@ def _nothing(side: int) -> WindowCells:
     return WindowCells(np.zeros((side, side), dtype=np.uint8), ticks[0], ticks[1], 0.0, 0.0)
 
 
-def _marked(cells: WindowCells) -> NDArray[np.int64]:
-    """Return the indices of the marked cells (n,), row by row."""
-    return np.flatnonzero(cells.level > 0)
-
-
 def _carry(cells: WindowCells, to: WindowCells, down: int, right: int) -> None:
     """Fill `to` with what a window over `cells` sees that has moved on by so many of them."""
     side = len(cells.level)
-    at = np.array(divmod(_marked(cells), side))
+    at = np.array(divmod(_marked(cells.level), side))
     then = at - np.array([[down], [right]])
     stays = ((then >= 0) & (then < side)).all(axis=0)
     (i, j), (row, column) = at[:, stays], then[:, stays]
