@@ -312,6 +312,8 @@ class LocalCostmap:
         A moving disc hits cells that were free a moment ago. Posts and corners mistaken for one
         another seem to move, but keep hitting the same cells.
         """
+        if not len(discs):
+            return discs
         held, long_ago = self._held, tick - STATIC_TICKS
         return discs[[stays(held, disc, tick, long_ago) <= MAX_STATIC_SHARE for disc in discs]]
 

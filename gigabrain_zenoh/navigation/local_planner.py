@@ -259,8 +259,9 @@ class LocalPlanner:
 
     def _scene(self, request: PlanRequest, discs: Floats) -> Scene:
         goal = request.goal
-        body = transform(from_pose(request.pose), self._rim)
         seen = dynamic_obstacles.standing(request.contours, discs)
+        inside = request.keepouts or seen  # then the body may be in one of them
+        body = transform(from_pose(request.pose), self._rim) if inside else None
         grid = self._window.grid(request.tick, request.known, discs, request.keepouts, body, seen)
         place = Pose2D(request.pose.x, request.pose.y, request.pose.yaw)
         if self._stuck(request):

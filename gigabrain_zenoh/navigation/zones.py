@@ -151,6 +151,8 @@ class ZoneMap:
         planner knows no directions, and would take the shorter way through it.
         """
         found: list[Floats] = []
+        if not self.lanes:
+            return ()
         path = path[(np.abs(path - (x, y)) <= reach).all(axis=1)]
         for area in self.lanes:
             assert area.zone.lane_width
