@@ -341,7 +341,7 @@ class Navigator:
     def _local_planner(self, context: NavigationContext) -> local_planner.LocalPlanner:
         body, config = context.body, self._config
         assert body
-        if self._local and self._body and body == self._body:
+        if self._local and (body is self._body or body == self._body):
             return self._local
         settings, before, self._body = _local_settings(config, body), self._body, body
         if self._local and before and _same_shape(before, body):
@@ -436,9 +436,9 @@ def _rest_of(points: Floats, here: Pose) -> Floats:
 
 def _thinned(points: Floats) -> tuple[tuple[float, float], ...]:
     """Return few enough points to be drawn, with the first and the last."""
-    count = min(len(points), MAX_POINTS)
-    chosen = np.linspace(0, len(points) - 1, count).round().astype(int)
-    return tuple((x, y) for x, y in points[chosen].round(3).tolist())
+    if len(points) > MAX_POINTS:
+        points = points[np.linspace(0, len(points) - 1, MAX_POINTS).round().astype(int)]
+    return tuple(map(tuple, points.round(3).tolist()))
 
 
 def warm_up() -> None:
