@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.geometry.sweep import Corners, box
-from gigabrain_zenoh.kernels.jit import NONE, lean_kernel
+from gigabrain_zenoh.kernels.jit import lean_kernel
 
 SPACING = 0.05  # [m], between points on the outline at most,
 MAX_POINTS = 500  # unless there were more than so many: those of a long outline are farther apart
@@ -101,22 +101,14 @@ def between(distance: Singles, u: float, v: float) -> float:
 
 
 @lean_kernel
-def clearance(grid: DistanceGrid, outline: Outline, at: Placement) -> float:
-    """Return the distance of the outline to the nearest obstacle [m]; below 0 with one inside.
-
-    More than MAX_CLEARANCE_M counts as MAX_CLEARANCE_M.
-    """
-    return clearance_of(grid, outline, at, middle_of(grid, outline, at), int(NONE))[0]
-
-
-@lean_kernel
 def clearance_of(
     grid: DistanceGrid, outline: Outline, at: Placement, middle: float, first: int
 ) -> tuple[float, int]:
-    """Return the clearance, and the group of points that has it.
+    """Return the clearance [m], and the group of points that has it.
 
-    Groups are compared from `first` on, so that a good guess spares others. `middle` is the result
-    of `middle_of`.
+    The clearance is the distance of the outline to the nearest obstacle, below 0 with one inside,
+    and MAX_CLEARANCE_M at most. Groups are compared from `first` on, so that a good guess spares
+    others. `middle` is the result of `middle_of`.
     """
     if middle >= outline.outer + MAX_CLEARANCE_M:
         return MAX_CLEARANCE_M, first

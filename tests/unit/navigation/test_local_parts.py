@@ -10,11 +10,12 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.body import BodyDescription
+from gigabrain_zenoh.kernels.jit import NONE
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
 from gigabrain_zenoh.navigation.footprint import (
     DistanceGrid,
+    Outline,
     Placement,
-    clearance,
     clearance_of,
     free_ahead,
     middle_of,
@@ -36,6 +37,10 @@ from tests.unit.navigation.drives import CAR, OMNI, WAFFLE, wall
 
 NOBODY = np.empty((0, 6))
 NOTHING = np.empty((0, 2))
+
+
+def clearance(grid: DistanceGrid, outline: Outline, at: Placement) -> float:
+    return clearance_of(grid, outline, at, middle_of(grid, outline, at), int(NONE))[0]
 
 
 @pytest.mark.long
