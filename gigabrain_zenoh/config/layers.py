@@ -1,4 +1,4 @@
-"""Settings from several places laid over one another; each value keeps the place it comes from."""
+"""Merges settings from several sources; each value keeps its source."""
 
 import difflib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -18,7 +18,7 @@ DEFAULT = "default"
 
 
 class Row(NamedTuple):
-    """One setting as it is, and where its value comes from."""
+    """One setting, with its value and the source of the value."""
 
     key: str  # dotted
     value: Any
@@ -26,42 +26,42 @@ class Row(NamedTuple):
 
 
 class Layers:
-    """A tree of settings. Mappings of a later layer are merged in; other values replace."""
+    """A tree of settings. A later layer merges its mappings, and replaces other values."""
 
     def __init__(self, source: str) -> None:
         self.root = Node(0, {}, entries=())
-        self._places = [source]  # by the number that stands for a line in the merged tree
+        self._places = [source]  # texts of places; a node's `line` is its index here
 
     def add(self, root: Node, place: Callable[[int], str]) -> None:
-        """Lay a tree over the others; `place` returns the words for one of its lines."""
+        """Merge a tree into the others; `place` returns the text of one of its lines."""
         self.root = _merged(self.root, self._numbered(root, place))
 
     def add_values(self, values: Mapping[str, Any], source: str) -> None:
-        """Lay plain values over the others."""
+        """Merge plain values into the others."""
         self.add(_tree(values), lambda _: source)
 
     def convert(self, type_: type[T], at: Sequence[str] = ()) -> T:
-        """Return the `type_` that a section describes. Raises ConfigError with its place."""
+        """Convert a section to a `type_`. Raises ConfigError with the place."""
         return loading.converted(loading.part(self.root, at), type_, self.place)
 
     def value(self, *at: str) -> Any:
-        """Return the value at a path; None where there is none."""
+        """Return the value at a path; None without one."""
         node = self._find(at)
         return node.value if node else None
 
     def rows(self, settings: Struct, at: Sequence[str] = ()) -> Iterator[Row]:
-        """Yield every value of `settings`, which a section describes, with its source."""
+        """Yield every value of `settings`, the converted section `at`, with its source."""
         prefix = "".join(f"{name}." for name in at)
         for path, value in _leaves(msgspec.json.decode(msgspec.json.encode(settings))):
             yield Row(prefix + ".".join(path), value, self.source_of((*at, *path)))
 
     def place(self, number: int) -> str:
-        """Return the words for a number that stands for a line in the merged tree."""
+        """Return the text of the place that a node of the merged tree has as its `line`."""
         return self._places[number]
 
     def source_of(self, path: Sequence[str]) -> str:
-        """Return where the value at a path comes from."""
-        for end in range(len(path), 0, -1):  # a whole mapping or list may be given at once
+        """Return the source of the value at a path."""
+        for end in range(len(path), 0, -1):  # a source may give a whole list at once
             node = self._find(path[:end])
             if node and (node.entries is None or end == len(path)):
                 return self._places[node.line]
@@ -75,19 +75,20 @@ class Layers:
         return node
 
     def _numbered(self, node: Node, place: Callable[[int], str]) -> Node:
-        """Return the tree with numbers of places instead of lines."""
+        """Return the tree with indices of places instead of lines."""
 
         def number(line: int) -> int:
-            words = place(line)
-            if self._places[-1] != words:
-                self._places.append(words)
+            text = place(line)
+            if self._places[-1] != text:
+                self._places.append(text)
             return len(self._places) - 1
 
         def numbered(node: Node) -> Node:
             line = number(node.line)
             if node.entries is not None:
                 entries = tuple(
-                    Entry(one.key, number(one.line), numbered(one.node)) for one in node.entries
+                    Entry(entry.key, number(entry.line), numbered(entry.node))
+                    for entry in node.entries
                 )
                 return replace(node, line=line, entries=entries)
             if node.items is not None:
@@ -111,31 +112,31 @@ def _merged(under: Node, over: Node) -> Node:
 
 def _tree(value: Any) -> Node:
     if isinstance(value, Mapping):
-        entries = tuple(Entry(key, 0, _tree(one)) for key, one in value.items())
-        return Node(0, {one.key: one.node.value for one in entries}, entries=entries)
+        entries = tuple(Entry(key, 0, _tree(inner)) for key, inner in value.items())
+        return Node(0, {entry.key: entry.node.value for entry in entries}, entries=entries)
     if isinstance(value, (list, tuple)):
         items = tuple(map(_tree, value))
-        return Node(0, [one.value for one in items], items=items)
+        return Node(0, [item.value for item in items], items=items)
     return Node(0, value, text="" if value is None else str(value))
 
 
 def _leaves(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield all values that are no mappings, with their paths; an empty mapping is a value."""
+    """Yield all paths and values, without mappings; but an empty mapping is a value."""
     if isinstance(value, Mapping) and (value or not path):
-        for key, one in value.items():
-            yield from _leaves(one, (*path, key))
+        for key, inner in value.items():
+            yield from _leaves(inner, (*path, key))
     else:
         yield path, value
 
 
 class Assignment(NamedTuple):
-    """A setting given as KEY=VALUE."""
+    """A setting from KEY=VALUE."""
 
     key: str
     node: Node
 
     def nested(self) -> Node:
-        """Return a tree with this value alone."""
+        """Return a tree with only this value."""
         node = self.node
         for name in reversed(self.key.split(".")):
             node = Node(0, {name: node.value}, entries=(Entry(name, 0, node),))
@@ -143,7 +144,7 @@ class Assignment(NamedTuple):
 
 
 def assignment(text: str) -> Assignment:
-    """Parse KEY=VALUE, with the value as in YAML. Raises ConfigError."""
+    """Parse KEY=VALUE, with a YAML value. Raises ConfigError."""
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise ConfigError(f"--set: expected KEY=VALUE, got {text!r}")
@@ -152,33 +153,34 @@ def assignment(text: str) -> Assignment:
 
 
 def keys_of(type_: Any, known: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """Yield the dotted keys of a Struct, its sections too.
+    """Yield the dotted keys of a Struct and its sections.
 
-    `known` has the types of sections that are free mappings, by key. A key that ends with `.` is a
-    mapping with names of one's own.
+    `known` contains the types of sections that are free mappings, by key. A key that ends with `.`
+    is a mapping with any names.
     """
     for field in msgspec.structs.fields(type_):
         key = f"{prefix}{field.encode_name}"
         yield key
         types = [known[key]] if key in known else members_of(field.type)
-        for one in types:
-            if is_struct(one):
-                yield from keys_of(one, known, f"{key}.")
-            elif is_mapping(one):
+        for member in types:
+            if is_struct(member):
+                yield from keys_of(member, known, f"{key}.")
+            elif is_mapping(member):
                 yield f"{key}."
 
 
 def full_key(name: str, keys: Iterable[str], preferred: str) -> str:
-    """Return the key that `name` means: itself, or the only one that ends with it.
+    """Return the key for `name`: the same, or the only key that ends with it.
 
-    Of several, the one in the section `preferred`. Raises UnknownName with the nearest key.
+    Among several it is the key in the section `preferred`. Raises UnknownName with the nearest key,
+    and ConfigError for an ambiguous name.
     """
     known = list(keys)
-    if name in known or any(one.endswith(".") and name.startswith(one) for one in known):
+    if name in known or any(key.endswith(".") and name.startswith(key) for key in known):
         return name
-    found = [one for one in known if one.endswith(f".{name}")]
+    found = [key for key in known if key.endswith(f".{name}")]
     if len(found) > 1:
-        found = [one for one in found if one == f"{preferred}.{name}"] or found
+        found = [key for key in found if key == f"{preferred}.{name}"] or found
     if len(found) == 1:
         return found[0]
     if found:
@@ -187,7 +189,7 @@ def full_key(name: str, keys: Iterable[str], preferred: str) -> str:
 
 
 def _hint(name: str, known: Sequence[str]) -> str:
-    last = {one.rstrip(".").rpartition(".")[2]: one.rstrip(".") for one in known}
+    last = {key.rstrip(".").rpartition(".")[2]: key.rstrip(".") for key in known}
     whole = difflib.get_close_matches(name, known, 1, 0.8)
     close = difflib.get_close_matches(name.rpartition(".")[2], last, 1, 0.6)
     meant = whole[0] if whole else last[close[0]] if close else ""

@@ -1,7 +1,7 @@
 """Configuration: a YAML file becomes a frozen msgspec Struct, or an error of one line.
 
-Own code: msgspec, like pydantic, names a path and no line, and under a dict not even a path. This
-walks the document beside the type and finds the line.
+Own code: msgspec, like pydantic, reports a path but no line, and inside a dict not even a path.
+This module compares the document with the type, and finds the line.
 """
 
 import difflib
@@ -30,7 +30,7 @@ from gigabrain_zenoh.config.yaml_text import Entry, Node
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import expanded, read_bounded
 
-_LONGEST = 60  # characters of a value that are shown
+_MAX_SHOWN_CHARS = 60  # of a value in an error
 _NAMES: tuple[tuple[tuple[type, ...], str], ...] = (
     ((mi.IntType,), "a whole number"),
     ((mi.FloatType,), "a number"),
@@ -52,7 +52,7 @@ _LIMITS = {
 
 
 def expected(type_: Any) -> str:
-    """Return words for the values of `type_`, with its limits."""
+    """Return a text for the values of `type_`, with its limits, such as `a number >= 0`."""
     return _words(mi.type_info(type_))
 
 
@@ -99,14 +99,15 @@ def one_of(values: Sequence[Any]) -> str:
 
 
 def got(node: Node) -> str:
-    """Return the content of the file as it is written there."""
+    """Return a text for a node's content as it is written in the file."""
     if node.entries is not None:
         return "a mapping"
     if node.items is not None:
         return f"a list of {len(node.items)}"
     if node.value is None:
         return node.text or "nothing"
-    text = node.text if len(node.text) <= _LONGEST else node.text[: _LONGEST - 3] + "..."
+    longest = _MAX_SHOWN_CHARS
+    text = node.text if len(node.text) <= longest else node.text[: longest - 3] + "..."
     if isinstance(node.value, bool) and text in ("on", "off"):
         return f"{text}, which is read as {str(node.value).lower()}; quote it for a text"
     return repr(text) if isinstance(node.value, str) else text
@@ -121,14 +122,14 @@ def nearest(name: object, known: Iterable[Any]) -> str:
 
 @dataclass(frozen=True)
 class FieldFault:
-    """One line for people about one line of a file (from 1)."""
+    """An error text of one line, with the line number in the file (from 1)."""
 
     line: int
     text: str
 
 
 def find_fault(root: Node, type_: Any) -> FieldFault | None:
-    """Return the first fault, in the order of the file, that keeps `root` from being a `type_`."""
+    """Return the first fault in `root`, in the order of the file; None for a valid `type_`."""
     return _find(root, type_, "", root.line)
 
 
@@ -144,7 +145,7 @@ def _find(node: Node, type_: Any, path: str, key_line: int) -> FieldFault | None
         line = key_line if node.entries or node.items else node.line
         if structs and (fault := _no_value(node.entries or (), structs, path)):
             return fault
-        if structs:  # its fields are valid, so its own __post_init__ refused it
+        if structs:  # its fields are valid, so its __post_init__ raised the error
             return _own_fault(node, path, line, re.sub(r" - at `[^`]*`$", "", str(error)))
         hint = nearest(node.value, choices(type_)) or _as_field(node.value, structs_in(type_))
         return FieldFault(line, _at(path, f"expected {expected(type_)}, got {got(node)}{hint}"))
@@ -152,30 +153,33 @@ def _find(node: Node, type_: Any, path: str, key_line: int) -> FieldFault | None
 
 
 def _no_value(entries: tuple[Entry, ...], structs: list[Any], path: str) -> FieldFault | None:
-    """Return the fault of the first field if none has a value, as where `explore:` stands alone."""
-    of = {field.encode_name: field.type for field in msgspec.structs.fields(structs[0])}
+    """Return the fault of the first field if no field has a value, as in `explore:` alone."""
+    field_types = {field.encode_name: field.type for field in msgspec.structs.fields(structs[0])}
     first = next(iter(entries), None)
-    if first is None or first.key not in of or any(one.node.value is not None for one in entries):
+    if first is None or first.key not in field_types:
         return None
-    wanted = expected(of[first.key]).removesuffix(" or null")
+    if any(entry.node.value is not None for entry in entries):
+        return None
+    wanted = expected(field_types[first.key]).removesuffix(" or null")
     text = f"expected {wanted}, got {got(first.node)}{_as_field(first.key, structs)}"
     return FieldFault(first.line, _at(_join(path, first.key), text))
 
 
 def _as_field(name: object, structs: list[Any]) -> str:
     """Return `; write `explore: {}`` if one of the Structs has a field of that name."""
-    for field in (one for struct in structs for one in msgspec.structs.fields(struct)):
+    for field in (each for struct in structs for each in msgspec.structs.fields(struct)):
         if field.encode_name == name:
-            inner = [msgspec.structs.fields(one) for one in structs_in(field.type)]
-            bare = any(not any(one.required for one in fields) for fields in inner)
-            return f"; write `{name}: {'{}' if bare else '...'}`"
+            inner = [msgspec.structs.fields(struct) for struct in structs_in(field.type)]
+            may_be_empty = any(not any(each.required for each in fields) for fields in inner)
+            return f"; write `{name}: {'{}' if may_be_empty else '...'}`"
     return ""
 
 
 def _own_fault(node: Node, path: str, line: int, text: str) -> FieldFault:
-    """Return the line of a Struct's own error, which may begin with a path: `FIELD.PART[2]: `.
+    """Return the fault for an error of a Struct's __post_init__.
 
-    Otherwise it is the line of the first field of the file that the error names.
+    The text may begin with a path: `FIELD.PART[2]: `. Otherwise the line is that of the first field
+    in the text, else `line`.
     """
     match = re.match(r"(\w+(?:\.\w+|\[\d+\])*): ", text)
     if match and (at := line_of(node, re.findall(r"\w+", match[1]))):
@@ -186,10 +190,10 @@ def _own_fault(node: Node, path: str, line: int, text: str) -> FieldFault:
 
 
 def line_of(node: Node, path: Sequence[str]) -> int | None:
-    """Return the line of the last part of `path` that the document has; None if it has none."""
+    """Return the line of the last part of `path` that exists in the document, or None."""
     found = None
     for part in path:
-        entry = next((one for one in node.entries or () if one.key == part), None)
+        entry = next((each for each in node.entries or () if each.key == part), None)
         if entry:
             found, node = entry.line, entry.node
         elif node.items and part.isdecimal() and int(part) < len(node.items):
@@ -201,7 +205,7 @@ def line_of(node: Node, path: Sequence[str]) -> int | None:
 
 
 def line_in(path: Path, place: Sequence[str]) -> int | None:
-    """Return the line of a part of a YAML file, or of the nearest part around it that is there."""
+    """Return the line of a part of a YAML file, or of the nearest part around it."""
     return line_of(yaml_text.read(read(path)), place)
 
 
@@ -220,9 +224,9 @@ def _wrong_tag(node: Node, structs: list[Any], path: str, key_line: int) -> Fiel
 
 
 def _inside(node: Node, of: Any, path: str, key_line: int) -> Iterator[FieldFault]:
-    type_ = _meant(of, node)
+    type_ = _matching_member(of, node)
     if node.entries is not None and is_struct(type_):
-        others = [one for one in members_of(of) if not is_struct(one) and one is not types.NoneType]
+        others = [t for t in members_of(of) if not is_struct(t) and t is not types.NoneType]
         instead = f"; without fields: {' or '.join(map(expected, others))}" if others else ""
         yield from _in_struct(node, node.entries, type_, path, key_line, instead)
     elif node.entries is not None and is_mapping(type_):
@@ -271,8 +275,8 @@ def _item_types(type_: Any, node: Node) -> list[Any]:
     return [arguments[0]] * len(node.value)
 
 
-def _meant(type_: Any, node: Node) -> Any:
-    """Return the member of an Annotated, Optional or Union type that fits a value like `node`."""
+def _matching_member(type_: Any, node: Node) -> Any:
+    """Return the member of an Annotated, Optional or Union type that matches the kind of `node`."""
     members = members_of(type_)
     if node.entries is not None and (structs := structs_in(type_)):
         name = structs[0].__struct_config__.tag_field
@@ -291,13 +295,13 @@ def _at(path: str, text: str) -> str:
 
 
 T = TypeVar("T")
-MAX_BYTES = 256 * 1024  # a hundred times what a large robot's file holds
+MAX_BYTES = 256 * 1024  # a hundred times the size of a large robot's file
 
 
 def load(path: Path, type: type[T]) -> T:
-    """Return the `type` that a YAML file describes.
+    """Read a YAML file as a `type`.
 
-    Raises ConfigError, whose one line reads `FILE:LINE: what is wrong; what was expected`.
+    Raises ConfigError, with one line: `FILE:LINE: what is wrong; what was expected`.
     """
     return loads(read(path), type, str(path))
 
@@ -306,12 +310,12 @@ FILE_ENDINGS = (".yaml", ".yml", ".xml", ".mjcf", ".png", ".pgm")
 
 
 def names_file(name: str) -> bool:
-    """Return whether a setting that is a name or a file is a file."""
+    """Return whether a setting, which may be a name or a file, is a file."""
     return name.endswith(FILE_ENDINGS)
 
 
 def beside(name: str, folder: Path) -> str:
-    """Return a setting with its path, if it is one, taken from `folder`."""
+    """Return a setting; if it is a path, make it absolute, relative to `folder`."""
     return str(folder.absolute() / expanded(name)) if names_file(name) else name
 
 
@@ -331,16 +335,17 @@ def read(path: Path) -> str:
 
 
 def loads(text: str, type: type[T], source: str, at: Sequence[str] = ()) -> T:
-    """Return the `type` that a YAML text describes; `source` is the file name in errors.
+    """Read a YAML text as a `type`; `source` is the file name in errors.
 
-    With `at`, such as ("decision", "settings"), only that section is read; missing ones are empty.
+    With `at`, such as ("decision", "settings"), only that section is read. A missing section is
+    empty.
     """
     root = part(document(text, source), at)
     return converted(root, type, lambda line: f"{source}:{line}")
 
 
 def document(text: str, source: str) -> Node:
-    """Return the tree of a YAML text, in present words. Raises ConfigError with its line."""
+    """Return the tree of a YAML text, in current words. Raises ConfigError with the line."""
     try:
         return renamed_fields(yaml_text.read(text), source)
     except yaml_text.YamlFault as fault:
@@ -356,7 +361,7 @@ def part(root: Node, at: Sequence[str]) -> Node:
 
 
 def converted(root: Node, type: type[T], place: Callable[[int], str]) -> T:
-    """Return the `type` that a tree describes; `place` returns the words for one of its lines.
+    """Convert a tree to a `type`; `place` returns the text of one of its lines.
 
     Raises ConfigError.
     """
@@ -372,8 +377,8 @@ def _error(place: str, text: str) -> ConfigError:
 
 
 def _nearest(path: Path) -> str:
-    there = path.parent.iterdir() if path.parent.is_dir() else ()
-    names = {each.stem: each.name for each in there}
+    siblings = path.parent.iterdir() if path.parent.is_dir() else ()
+    names = {each.stem: each.name for each in siblings}
     close = difflib.get_close_matches(path.stem, names, 1)
     if not close:
         return "; expected a YAML file"
@@ -381,7 +386,7 @@ def _nearest(path: Path) -> str:
 
 
 def located(path: Path, error: ConfigError) -> ConfigError:
-    """Return `error` with the line of its invalid value in the file, if that is found."""
+    """Return `error` with the line of its invalid value in the file, if it is found."""
     if error.value is not None:
         for node in _scalars(yaml_text.read(read(path))):
             if node.value == error.value:

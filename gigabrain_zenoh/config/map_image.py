@@ -15,9 +15,9 @@ from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import read_bounded
 
-MAX_PIXELS, MAX_SIDE = 8_000_000, 100_000  # what a message may carry
-MAX_COORDINATE_M = 100_000.0  # likewise
-MAX_HEADER_BYTES = 100_000  # bytes, with all its comments
+MAX_PIXELS, MAX_SIDE = 8_000_000, 100_000  # limits of a message [pixels]
+MAX_COORDINATE_M = 100_000.0  # limit of a message
+MAX_HEADER_BYTES = 100_000  # with comments
 PGM_GAP = rb"(?:\s|#[^\n]*\n)+"  # white space and comments
 PGM_HEADER = re.compile(rb"P5" + (PGM_GAP + rb"(\d{1,9})") * 3 + rb"\s")
 
@@ -30,7 +30,7 @@ class MapYaml(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     image: Annotated[str, Meta(pattern=r"^[^\0]+$")]
     resolution: Annotated[float, Meta(ge=0.001, le=1.0)]  # [m] per pixel
     origin: tuple[Finite, Finite, Finite]  # x, y [m] of the lower left corner, yaw [rad]
-    negate: Annotated[int, Meta(ge=0, le=1)] = 0  # 1 where white is occupied
+    negate: Annotated[int, Meta(ge=0, le=1)] = 0  # 1: white is occupied
     occupied_thresh: Fraction = 0.65
     free_thresh: Fraction = 0.196
     mode: Literal["trinary", "scale"] = "trinary"  # both are read as trinary
@@ -38,7 +38,7 @@ class MapYaml(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, slots=True)
 class SavedMap:
-    """A grid as it lies on disk."""
+    """A grid read from disk."""
 
     cells: Cells  # (height, width), the lowest row first: 0 free, 100 occupied, -1 unknown
     resolution: float  # [m]
@@ -55,15 +55,15 @@ def read_pgm(file: Path) -> NDArray[np.uint8]:
     header = PGM_HEADER.match(data)
     if header is None:
         raise ConfigError(f"{file}: no binary PGM; expected a header such as 'P5 640 480 255'")
-    width, height, most = (int(number) for number in header.groups())
-    if most != 255:
-        raise ConfigError(f"{file}: a maxval of {most}; expected 255")
+    width, height, maxval = (int(number) for number in header.groups())
+    if maxval != 255:
+        raise ConfigError(f"{file}: a maxval of {maxval}; expected 255")
     if not 0 < width * height <= MAX_PIXELS:
         raise ConfigError(f"{file}: {width} x {height} pixels; expected 1 to {MAX_PIXELS} in all")
-    there = len(data) - header.end()
-    if there != width * height:
-        what = "cut" if there < width * height else "of another size"
-        raise ConfigError(f"{file}: {what}: {there} of {width} x {height} pixels are there")
+    pixels = len(data) - header.end()
+    if pixels != width * height:
+        problem = "cut" if pixels < width * height else "of another size"
+        raise ConfigError(f"{file}: {problem}: {pixels} of {width} x {height} pixels are there")
     return np.frombuffer(data, np.uint8, offset=header.end()).reshape(height, width)
 
 
@@ -88,7 +88,7 @@ def load(path: Path, read_image: Callable[[Path], NDArray[np.uint8]] = read_pgm)
 
 
 def _check_bounds(path: Path, about: MapYaml, shape: tuple[int, ...]) -> None:
-    """Raise ConfigError for a map that no message may hold."""
+    """Raise ConfigError for a map beyond the limits of a message."""
     height, width = shape
     if max(shape) > MAX_SIDE:
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""Words for the patterns of names, which errors show instead of regular expressions."""
+"""Descriptions of the patterns of names; errors show them instead of regular expressions."""
 
 import re
 
@@ -18,7 +18,7 @@ _QUOTED = {repr(pattern): words for pattern, words in NAME_WORDS.items()}
 
 
 def words_of(pattern: str) -> str:
-    """Return words for the strings that match a pattern."""
+    """Return a description of the strings that match a pattern."""
     return NAME_WORDS.get(pattern, f"matching {pattern}")
 
 

@@ -1,6 +1,6 @@
-"""Old words of YAML files and of the command line that still work, each with a one-line notice.
+"""Old words of YAML files and of the command line, which still work and print a notice.
 
-A row is removed in the release that `REMOVED_IN` names. Until then the old word means the new one.
+The rows are removed in the release `REMOVED_IN`.
 """
 
 import sys
@@ -22,12 +22,12 @@ class Rename:
 
     In YAML, `old` ends with the field and the mappings around it (`decision.begin`), and `new` is
     relative to the same mapping (`start`, or `avoid.turn` for a field that moved one level down).
-    With `when`, the row holds only where it returns True for the mapping that has the field. An
-    empty `new` drops a field that has no effect there.
+    With `when`, the row applies only if it returns True for the mapping that has the field. An
+    empty `new` drops a field without effect.
 
     On the command line, `old` is a command (`warm`, `task list`), an option of a command
-    (`goto --how`) or an option of every command (`--remember`); `new` is the new words. Where an
-    option has another name and `values`, those are all values that it takes.
+    (`goto --how`) or an option of every command (`--remember`); `new` is the replacement. If a
+    renamed option has `values`, it accepts no others.
     """
 
     old: str
@@ -36,7 +36,7 @@ class Rename:
     when: Callable[[Mapping[str, Any]], bool] | None = None
 
     def holds_for(self, mapping: Mapping[str, Any]) -> bool:
-        """Return whether the row holds for a field of `mapping`."""
+        """Return whether the row applies to a field of `mapping`."""
         return self.when is None or self.when(mapping)
 
 
@@ -96,7 +96,7 @@ _printed: set[str] = set()
 def renamed_fields(root: "Node", source: str, table: Sequence[Rename] = YAML_WORDS) -> "Node":
     """Return a YAML document with the current words, and print a notice for each old one.
 
-    Where a file has both words the old one stays, so that reading it names the unknown field.
+    If a file has both words the old one stays, so that reading it reports the unknown field.
     """
     return _renamed_node(root, "", source, table) if table else root
 
@@ -106,7 +106,7 @@ def renamed_settings(
 ) -> dict[str, Any]:
     """Return the settings of one part of a deployment, such as `decision`, with current words.
 
-    For settings that a recording keeps; prints nothing.
+    Used for settings in a recording; prints nothing.
     """
     result = dict(settings)
     for rename in table:
@@ -217,7 +217,7 @@ def _found(
 
 
 def _with(node: "Node", key: str, line: int, value: "Node", *, whole: bool = False) -> "Node":
-    """Return mapping `node` with `value` at `key`; a dotted key leads into inner mappings."""
+    """Return mapping `node` with `value` at `key`; a dotted key addresses inner mappings."""
     from gigabrain_zenoh.config.yaml_text import Entry, Node
 
     entries = node.entries or ()
@@ -226,7 +226,7 @@ def _with(node: "Node", key: str, line: int, value: "Node", *, whole: bool = Fal
     if rest:
         outer = same.node if same else Node(line, {}, entries=())
         value = _with(outer, rest, line, value)
-    elif same:  # mapping that an earlier, dotted rename began
+    elif same:  # an earlier, dotted rename created this mapping
         for entry in same.node.entries or ():
             value = _with(value, entry.key, entry.line, entry.node, whole=True)
     kept = tuple(entry for entry in entries if entry is not same)

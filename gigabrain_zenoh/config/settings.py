@@ -1,4 +1,4 @@
-"""Settings of the processes. Kept separate, so that reading a deployment file needs no numpy."""
+"""Settings of the processes. This module needs no numpy, so deployment files are read fast."""
 
 import re
 from typing import Annotated, Any, Literal
@@ -22,18 +22,18 @@ class Endpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     namespace: str = ""  # the robot's prefix in the key space
     keys: str = ""  # folder of an identity; without it there is no authentication
     fleet: tuple[str, ...] = ()  # namespaces of other robots that a router serves
-    names: dict[str, tuple[str, ...]] = {}  # of processes, by role: what a router lets publish
-    grants: dict[str, tuple[str, ...]] = {}  # keys that processes of one's own write, by name
-    nap_s: float = 0.0  # [s], how long tapped messages may gather before delivery
-    stamps: bool = False  # samples carry Zenoh's time, by which late readers of ROS order them
+    names: dict[str, tuple[str, ...]] = {}  # processes by role, for the rights that a router grants
+    grants: dict[str, tuple[str, ...]] = {}  # keys that the user's own processes write, by name
+    nap_s: float = 0.0  # [s], longest delay of tapped messages, which arrive in batches
+    stamps: bool = False  # samples carry Zenoh's time, by which ROS nodes order them
 
 
 class RouterConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of the router process."""
 
     state_dir: str = ""  # folder of its log of rejected clients
-    knows: tuple[str, ...] = ()  # common names that have rights; without keys there is no check
-    watches: tuple[str, ...] = ()  # processes of one's own, whose silence it reports
+    knows: tuple[str, ...] = ()  # common names with rights; empty without keys: no check
+    watches: tuple[str, ...] = ()  # the user's own processes; it reports silent ones
 
 
 class RelayConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -49,12 +49,12 @@ MappingMode = Literal["off", "slam", "localize"]
 class PerceptionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings in the `perception` part of a deployment file."""
 
-    sector_deg: Annotated[float, Meta(gt=0, le=360)] = 30.0  # [deg], the cone that counts as ahead
+    sector_deg: Annotated[float, Meta(gt=0, le=360)] = 30.0  # [deg], angle of the cone ahead
     ahead: Positive = 1.0  # [m], length of that cone
     ignore_below: NonNegative = 0.1  # [m], nearer hits are the lidar's own housing
-    corridor: NonNegative = 0.45  # [m], length of the strip ahead that must be free to turn in
+    corridor: NonNegative = 0.45  # [m], length of the strip ahead that must be free for a turn
     turning_room: NonNegative = 0.04  # [m], clearance around the circle that a turning body sweeps
-    sectors: Annotated[int, Meta(ge=4, le=360)] = 12  # in the full circle, the first centred ahead
+    sectors: Annotated[int, Meta(ge=4, le=360)] = 12  # of the full circle; the first is ahead
     mapping: MappingMode = "off"  # build a map, or localize in a saved one
     map: str = ""  # YAML file of a saved map to localize in; `slam` extends it
     state_dir: str = ""  # folder where `slam` saves the map every few seconds; empty: no saves
@@ -82,15 +82,15 @@ class DriverConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     world: str = "arena"
     seed: Seed = 0
     speed: Speed = 1.0
-    lockstep_timeout_s: LockstepTimeout = 0.15  # how long a tick waits for the brain (speed not 1)
-    seconds: Positive | None = None  # [s] of simulated time, then the body stays at rest
+    lockstep_timeout_s: LockstepTimeout = 0.15  # a tick waits this long for the brain (speed not 1)
+    seconds: Positive | None = None  # [s] of simulated time; then the body stays at rest
     resume: Resume = "manual"
     state_dir: str  # folder where it saves the causes that latched it
     emulator: str = ""  # folder of the emulator's ports, if the link is `emulated`
-    checkpoint: str = ""  # path of a simulation's checkpoints in this run; empty: it keeps none
+    checkpoint: str = ""  # path of a simulation's checkpoints in this run; empty: none
     button: bool = False  # an e-stop button must be present
-    cameras: bool = False  # the body's cameras are used; otherwise it counts as one without
-    robot: dict[str, Any] = {}  # fields of the body's file that are other here
+    cameras: bool = False  # use the body's cameras
+    robot: dict[str, Any] = {}  # replaces fields of the body's file
 
 
 class ButtonConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -131,8 +131,8 @@ class EmulatorConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     world: str = "arena"
     seed: Seed = 0
     folder: str  # folder where its ports appear
-    cameras: bool = False  # the emulated world is sent as often as its cameras need
-    robot: dict[str, Any] = {}  # fields of the body's file that are other here
+    cameras: bool = False  # send the emulated world as often as the cameras need it
+    robot: dict[str, Any] = {}  # replaces fields of the body's file
 
 
 class CameraConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -141,30 +141,30 @@ class CameraConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     body: str
     link: LinkName = "sim"
     seed: Seed = 0  # of the cameras' errors in the simulation
-    errors: bool = True  # rendered pictures have a sensor's noise, holes and mounting
-    robot: dict[str, Any] = {}  # fields of the body's file that are other here
+    errors: bool = True  # rendered pictures have noise, holes and mounting errors of a sensor
+    robot: dict[str, Any] = {}  # replaces fields of the body's file
 
 
 class RecognizerConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings in the `recognizer` part of a deployment file: the net that recognises things."""
 
-    onnx: str = ""  # file of a net of one's own; empty: the shipped one
-    labels: str = ""  # file with one class a line, in the order of the net's outputs
-    layout: Literal["things", "yolo", "detr"] = "things"  # of the net's outputs
+    onnx: str = ""  # file of the user's own net; empty: the shipped one
+    labels: str = ""  # file with one class per line, in the order of the net's outputs
+    layout: Literal["things", "yolo", "detr"] = "things"  # format of the net's outputs
     min_confidence: Annotated[float, Meta(ge=0.01, le=0.99)] = 0.4
-    rate_hz: Annotated[float, Meta(ge=0.1, le=60)] = 5.0  # pictures of each camera, at most
+    rate_hz: Annotated[float, Meta(ge=0.1, le=60)] = 5.0  # maximum for each camera
 
 
-TagSize = Annotated[float, Meta(ge=0.005, le=10.0)]  # [m], of its black square
+TagSize = Annotated[float, Meta(ge=0.005, le=10.0)]  # [m], side of the black square
 TagNumber = Annotated[str, Meta(pattern=r"^\d{1,6}$")]
 
 
 class TagConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings in the `tags` part of a deployment file: the AprilTags that are looked for."""
+    """Settings in the `tags` part of a deployment file: AprilTags to detect."""
 
     family: Literal["36h11", "36h10", "25h9", "16h5"] = "36h11"
     size: TagSize = 0.16  # [m]
-    sizes: dict[TagNumber, TagSize] = {}  # [m], of those that have another, by number
+    sizes: dict[TagNumber, TagSize] = {}  # [m], of tags with another size, by number
 
 
 class RecognitionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -181,12 +181,12 @@ class RecorderConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     file: str = ""  # name of a single file, instead of `folder`
     topics: tuple[str, ...] = ()  # names or key expressions; empty: all
     pictures: Annotated[float, Meta(ge=0, le=120)] | None = None
-    # [Hz], pictures and depth of each camera; 0: none; without it all
+    # [Hz], rate of pictures and depth of each camera; 0: none; null: all
     viewers: bool = True  # also record the messages that Foxglove, Lichtblick and Rerun draw
     split_mb: Annotated[float, Meta(gt=0)] | None = None  # start a new file after this size [MB]
     split_s: Annotated[float, Meta(gt=0)] | None = None  # or after this time [s]
-    flush_s: Annotated[float, Meta(gt=0, le=10)] = 0.25  # most that a crash may lose [s]
-    queue_mb: Annotated[float, Meta(gt=0)] = 32  # queue for a slow disk [MB]; then messages drop
+    flush_s: Annotated[float, Meta(gt=0, le=10)] = 0.25  # [s], maximum loss in a crash
+    queue_mb: Annotated[float, Meta(gt=0)] = 32  # [MB], queue for a slow disk; then messages drop
     keep_free_mb: Annotated[float, Meta(ge=0)] = 200  # disk space left for other uses [MB]
     notes: dict[str, str] = {}  # stored in the file, for replay
 
@@ -201,26 +201,26 @@ class Ros2Link(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings with which a process joins ROS 2 as a node."""
 
     transport: Literal["rmw_zenoh", "dds"] = "rmw_zenoh"
-    domain: Annotated[int, Meta(ge=0, le=232)] = 0  # ROS_DOMAIN_ID of the others
+    domain: Annotated[int, Meta(ge=0, le=232)] = 0  # ROS_DOMAIN_ID of the other nodes
     namespace: RosNamespace = "/"  # of the node, and of topics without a leading slash
     node: RosName = "gigabrain"  # name of the node
     router: str = ""  # Zenoh endpoint of a ROS router; empty: the deployment's own router
-    distro: Literal["humble", "iron", "jazzy", "kilted", "rolling"] = "jazzy"  # of the others
-    localhost: bool = False  # DDS talks to nodes of this host only
-    types: tuple[str, ...] = ()  # .msg, .srv and .action files of one's own, or folders of them
+    distro: Literal["humble", "iron", "jazzy", "kilted", "rolling"] = "jazzy"  # of the other nodes
+    localhost: bool = False  # DDS connects only to nodes on this host
+    types: tuple[str, ...] = ()  # further .msg, .srv and .action files, or folders of them
 
 
 DRIVER_NODE = "gigabrain_driver"  # name of the node of a driver whose body is a ROS 2 robot
-FREE_FLEET = ("tf", "battery_state", "navigate_to_pose")  # topics and actions of ROS that it uses
+FREE_FLEET = ("tf", "battery_state", "navigate_to_pose")  # topics and actions that it uses
 
 
 class Ros2Config(Ros2Link, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings in the `ros2` part of a deployment file: the gateway to ROS 2."""
 
     take: bool = False  # take the body from another commander with the first command
-    cmd_vel_timeout: Annotated[float, Meta(gt=0, le=0.2)] = 0.2  # [s], a command counts at most
-    leave_out: tuple[str, ...] = ()  # ROS topics and services that are not offered
-    free_fleet: bool = False  # also offer what Open-RMF's free_fleet adapter uses
+    cmd_vel_timeout: Annotated[float, Meta(gt=0, le=0.2)] = 0.2  # [s], a command stays valid
+    leave_out: tuple[str, ...] = ()  # ROS topics and services not to offer
+    free_fleet: bool = False  # also offer topics and actions for Open-RMF's free_fleet adapter
 
     def __post_init__(self) -> None:
         for name in self.leave_out:
@@ -233,11 +233,11 @@ ModuleName = Annotated[str, Meta(pattern=r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*(:[A-Za
 
 
 class OwnProcess(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One entry of `processes` in a deployment file: a process of one's own."""
+    """One entry of `processes` in a deployment file: one of the user's own processes."""
 
-    module: ModuleName  # with a coroutine `run(config, bus, ready)`; another one: MODULE:NAME
+    module: ModuleName  # with a coroutine `run(config, bus, ready)`, or MODULE:COROUTINE
     settings: dict[str, Any] = {}  # of the module; see its Config
-    writes: tuple[str, ...] = ()  # keys that it may publish, ask or serve, where the robot has keys
+    writes: tuple[str, ...] = ()  # keys that it may publish, ask or serve at a router with keys
 
 
 class OwnPerceptor(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -256,6 +256,6 @@ class ProcessConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     run_dir: str | None = None  # folder of its log file; without it there is no log file
     json_console: bool = False  # JSON log lines on the console, for a supervisor to read
     level: str = "info"
-    module: str = ""  # of a process of one's own, instead of a row of the table of processes
-    perceptor: str = ""  # of a process that runs one
+    module: str = ""  # of one of the user's own processes; empty: a row of the process table
+    perceptor: str = ""  # name of one of the user's own perceptors
     file: str = ""  # deployment file with the settings of either, for errors

@@ -1,4 +1,4 @@
-"""The members of the type of a field, and their kinds."""
+"""Members of the type of a field, and their kinds."""
 
 import types
 import typing

@@ -1,7 +1,7 @@
-"""YAML without its surprises: one document of plain values, each with its line.
+"""Strict YAML: one document of plain values, each with its line.
 
-YAML 1.1 reads `12:30` as 750, `010` as 8, `no` as false and the last of two equal keys as the
-only one. A robot's limits must not hold surprises, so all of this is refused.
+YAML 1.1 reads `12:30` as 750, `010` as 8 and `no` as false, and ignores the first of two equal
+keys. That is dangerous in a robot's limits, so all of these are errors.
 """
 
 import math
@@ -14,9 +14,9 @@ import yaml
 # libyaml's loader is nine times faster than the Python one; not every platform's wheel has it.
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _BOOLEANS = {"true": True, "on": True, "false": False, "off": False}
-_DEEPEST = 32  # libyaml's composer recurses in C and overruns the stack on deep nesting
-_TOO_DEEP = f"nested too deeply; expected at most {_DEEPEST} levels"
-_LONGEST_NUMBER = 64  # characters
+_MAX_DEPTH = 32  # libyaml's composer recurses in C; deep nesting overflows the stack
+_TOO_DEEP = f"nested too deeply; expected at most {_MAX_DEPTH} levels"
+_MAX_NUMBER_CHARS = 64
 _NUMBER = re.compile(r"[-+]?(?:(?:0|[1-9][0-9]*)(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 
 
@@ -30,7 +30,7 @@ class YamlFault(Exception):
 
 @dataclass(frozen=True)
 class Entry:
-    """One `key: value` of a mapping, with the key's own line (from 1)."""
+    """One `key: value` of a mapping, with the line of the key (from 1)."""
 
     key: str
     line: int
@@ -58,7 +58,7 @@ def read(text: str) -> Node:
         raise YamlFault(line, f"not YAML: {error.reason}") from None
     except yaml.MarkedYAMLError as error:
         line = _line(error.problem_mark or error.context_mark)
-        if "nesting depth" in (error.problem or ""):  # libyaml 0.2.6 scans ahead to level 1000
+        if "nesting depth" in (error.problem or ""):  # libyaml 0.2.6 itself stops at level 1000
             raise YamlFault(line, _TOO_DEEP) from None
         raise YamlFault(line, f"not YAML: {error.problem or error.context}") from None
     if root is None:
@@ -67,7 +67,7 @@ def read(text: str) -> Node:
 
 
 def comment_line(text: str) -> int | None:
-    """Return the line of the first comment in a valid text; None where there is none."""
+    """Return the line of the first comment in a valid text; None without comments."""
     end = 0
     for token in yaml.scan(text, Loader=yaml.SafeLoader):
         at = text.find("#", end, token.start_mark.index)
@@ -78,7 +78,8 @@ def comment_line(text: str) -> int | None:
 
 
 def _refuse_indirections(text: str) -> None:
-    """Check the events first: they need no recursion, and show aliases and tags."""
+    """Raise YamlFault for aliases, tags, deep nesting, or several documents."""
+    # checked by events, which need no recursion
     depth = documents = 0
     for event in yaml.parse(text, Loader=_LOADER):
         line = _line(event.start_mark)
@@ -87,7 +88,7 @@ def _refuse_indirections(text: str) -> None:
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if documents > 1:
             raise YamlFault(line, "a second document begins here; expected one")
-        if depth > _DEEPEST:
+        if depth > _MAX_DEPTH:
             raise YamlFault(line, _TOO_DEEP)
         if isinstance(event, yaml.AliasEvent):
             raise YamlFault(line, f"alias '*{event.anchor}' is not allowed; write the value out")
@@ -134,7 +135,7 @@ def _entries(node: yaml.MappingNode) -> tuple[Entry, ...]:
 
 
 def _scalar(node: yaml.ScalarNode, line: int) -> str | float | bool | None:
-    """Return the value of one scalar; its tag is the resolver's, as explicit tags are refused."""
+    """Return the value of one scalar. Its tag is implicit, as explicit tags are errors."""
     kind = node.tag.rsplit(":", 1)[1]
     text: str = node.value
     if kind == "null":
@@ -145,19 +146,19 @@ def _scalar(node: yaml.ScalarNode, line: int) -> str | float | bool | None:
                 line, f"{text!r} is read as a boolean; write true or false, or quote it"
             )
         return _BOOLEANS[text]
-    # `1e3` has no dot, so YAML 1.1 takes it for a string; here it is a number
-    bare = kind == "str" and not node.style and _NUMBER.fullmatch(text) is not None
-    if kind in ("int", "float") or bare:
+    # YAML 1.1 reads `1e3` as a string, as it has no dot; here it is a number
+    unquoted_number = kind == "str" and not node.style and _NUMBER.fullmatch(text) is not None
+    if kind in ("int", "float") or unquoted_number:
         return _number(text, kind == "int", line)
-    return text  # also dates and `=`, which are text here
+    return text  # dates and `=` are text as well
 
 
 def _number(text: str, whole: bool, line: int) -> float:
     if text.lower().lstrip("+-") in (".nan", ".inf"):
         raise YamlFault(line, f"{text} is not allowed; expected a finite number")
-    if len(text) > _LONGEST_NUMBER or not _NUMBER.fullmatch(text):
+    if len(text) > _MAX_NUMBER_CHARS or not _NUMBER.fullmatch(text):
         raise YamlFault(
-            line, f"{text[:_LONGEST_NUMBER]!r}: write it as a plain decimal or quote it"
+            line, f"{text[:_MAX_NUMBER_CHARS]!r}: write it as a plain decimal or quote it"
         )
     if whole:
         return int(text)
