@@ -1,7 +1,7 @@
-"""The roles, and the router's access rules that follow from the table of topics.
+"""Roles, and the router's access rules, which follow from the table of topics.
 
-The router that a message enters checks its right. Every identity may subscribe to all of its own
-robot; without an identity there is no session.
+The first router on the way of a message checks its rights. Every identity may subscribe to all keys
+of its robot; without an identity there is no session.
 """
 
 import re
@@ -25,7 +25,7 @@ from gigabrain_schemas.topics import (
 from gigabrain_zenoh.errors import ConfigError, unknown
 
 ROLES: tuple[Role, ...] = get_args(Role)
-SERVERS: tuple[Role, ...] = ("robot", "router")  # only they may be a router
+SERVERS: tuple[Role, ...] = ("robot", "router")  # only these may run a router
 MAX_NAME_LENGTH = 64  # characters of a common name (RFC 5280, ub-common-name)
 NAMESPACE = re.compile(r"[\w.-]+(/[\w.-]+)*", re.ASCII)
 
@@ -36,8 +36,8 @@ PROCESS_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}", re.ASCII)
 def common_name(role: Role, robot: str = "", generation: int = 1, process: str = "") -> str:
     """Return the common name of a certificate, from which a router derives all rights.
 
-    A process of one's own has an identity of its own, such as process.lamp@red. Raises ConfigError
-    for an invalid name of a robot or a process.
+    Each of the user's own processes has its own identity, such as process.lamp@red. Raises
+    ConfigError for an invalid name of a robot or a process.
     """
     if (role == "process") != bool(process):
         raise ConfigError("an identity of role process, and no other, takes --process NAME")
@@ -46,21 +46,21 @@ def common_name(role: Role, robot: str = "", generation: int = 1, process: str =
             f"process {process!r}: expected a lower-case letter, then lower-case letters, digits "
             "and '_', at most 32 characters"
         )
-    who = f"{role}.{process}" if process else role
+    holder = f"{role}.{process}" if process else role
     if not robot:
-        return of_generation(who, generation)
-    name = of_generation(f"{who}@{robot}", generation)
+        return of_generation(holder, generation)
+    name = of_generation(f"{holder}@{robot}", generation)
     if not NAMESPACE.fullmatch(robot) or len(name) > MAX_NAME_LENGTH:
-        most = MAX_NAME_LENGTH - len(name) + len(robot)
+        limit = MAX_NAME_LENGTH - len(name) + len(robot)
         raise ConfigError(
             f"robot {robot!r}: expected its namespace, letters, digits, '_', '-' and '.', "
-            f"of at most {most} characters"
+            f"of at most {limit} characters"
         )
     return name
 
 
 def of_generation(name: str, generation: int) -> str:
-    """Return a common name of the first generation in another one."""
+    """Return a common name, given in the first generation, in another generation."""
     return name if generation == 1 else f"{name}~{generation}"
 
 
@@ -70,48 +70,48 @@ class CommonName(NamedTuple):
     role: Role
     robot: str
     generation: int
-    process: str  # of the role process; else empty
+    process: str  # for the role `process`; else empty
 
 
 def parse(name: str) -> CommonName:
     """Return the parts of a common name. Raises UnknownName."""
     name, _, generation = name.partition("~")
-    who, _, robot = name.partition("@")
-    role, _, process = who.partition(".")
+    holder, _, robot = name.partition("@")
+    role, _, process = holder.partition(".")
     number = int(generation) if generation.isdecimal() else 1
     return CommonName(role_named(role), robot, number, process)
 
 
 def role_named(role: str) -> Role:
     """Return the role of that name. Raises UnknownName."""
-    for one in ROLES:
-        if one == role:
-            return one
+    for known in ROLES:
+        if known == role:
+            return known
     raise unknown("role", role, ROLES)
 
 
 EVERYTHING = "robot/**"  # all keys of one robot
-# beside these, what Open-RMF's free_fleet adapter uses of it: an identity of the role dispatcher
+# keys outside `robot/` for Open-RMF's free_fleet adapter, which has the role dispatcher
 FLEET_ACTION = "navigate_to_pose/_action/*"
 FLEET_KEYS = ("tf", "battery_state", FLEET_ACTION)
 TO_LISTENERS = ("put", "query", "reply", "declare_queryable")
 FIRST: Mapping[str, int] = {}  # no identity is revoked
-LOCAL = "local"  # clients of the router's Unix socket, which only this user can open
+LOCAL = "local"  # subject of clients on the router's Unix socket, which only this user can open
 
 
-FLEET_WIDE: tuple[Role, ...] = ("operator", "viewer", "dispatcher")  # where no robot is named
+FLEET_WIDE: tuple[Role, ...] = ("operator", "viewer", "dispatcher")  # if they name no robot
 OF_ONE_ROBOT: tuple[Role, ...] = ("robot", "brain", "operator", "viewer", "dispatcher")
 PUBLISHED: tuple[Topic[Any], ...] = (*TOPICS, ESTOP_SAID)
 Rule = dict[str, Any]
 
 
-Grants = Mapping[str, Sequence[str]]  # keys that a process of one's own writes, by its name
+Grants = Mapping[str, Sequence[str]]  # keys that the user's own processes write, by process
 NO_GRANTS: Grants = {}
 OWN_KEY_BYTES = 1024 * 1024
 
 
 def check_write(key: str) -> None:
-    """Raise ValueError for a key that no process of one's own can be granted."""
+    """Raise ValueError for a key that the user's own processes cannot get."""
     if key in FLEET_KEYS:
         return
     first, *rest = key.removeprefix("robot/").split("/")
@@ -121,29 +121,29 @@ def check_write(key: str) -> None:
         )
     if not PROCESS_NAME.fullmatch(first):
         raise ValueError(f"expected a name after robot/, got {key!r}")
-    one = _of_table(key)
-    fits = one is None or (len(rest) == 1 and rest[0] != "**" if one.many else not rest)
-    if not fits:
-        below = f"{one.key}/NAME" if one and one.many else f"robot/{first}"
-        raise ValueError(f"expected {below}, got {key!r}")
+    known = _in_table(key)
+    valid = known is None or (len(rest) == 1 and rest[0] != "**" if known.many else not rest)
+    if not valid:
+        form = f"{known.key}/NAME" if known and known.many else f"robot/{first}"
+        raise ValueError(f"expected {form}, got {key!r}")
 
 
 OWN_PART = re.compile(r"[\w-]+|\*|\*\*", re.ASCII)
 
 
-def _of_table(key: str) -> Topic[Any] | Service[Any, Any] | None:
-    """Return the topic or service that a key belongs to; None for another key."""
+def _in_table(key: str) -> Topic[Any] | Service[Any, Any] | None:
+    """Return the topic or service of a key; None for a key outside the table."""
     table: tuple[Topic[Any] | Service[Any, Any], ...] = (*PUBLISHED, *SERVICES)
-    return next((one for one in table if _covers(one, key)), None)
+    return next((entry for entry in table if _covers(entry, key)), None)
 
 
-def _covers(one: Topic[Any] | Service[Any, Any], key: str) -> bool:
-    return key == one.key or key.startswith(f"{one.key}/")
+def _covers(entry: Topic[Any] | Service[Any, Any], key: str) -> bool:
+    return key == entry.key or key.startswith(f"{entry.key}/")
 
 
 def own_topics(grants: Grants) -> tuple[Topic[Any], ...]:
-    """Return the keys outside the table that processes write, with the limits of ordinary data."""
-    keys = {key for keys in grants.values() for key in keys if _of_table(key) is None}
+    """Return topics for the keys outside the table that processes write, with default limits."""
+    keys = {key for keys in grants.values() for key in keys if _in_table(key) is None}
     return tuple(
         Topic(key.removesuffix("/**"), Message, 10, max_bytes=OWN_KEY_BYTES) for key in sorted(keys)
     )
@@ -151,57 +151,61 @@ def own_topics(grants: Grants) -> tuple[Topic[Any], ...]:
 
 @dataclass(frozen=True)
 class Table:
-    """The topics and services whose rights a router grants, and the names of processes by role."""
+    """The topics, services, processes and grants from which a router's access rules follow."""
 
-    names: Mapping[str, Sequence[str]]  # where a key ends in the name of a process
+    names: Mapping[str, Sequence[str]]  # processes by role, for keys that end with a process
     topics: Sequence[Topic[Any]] = PUBLISHED
     services: Sequence[Service[Any, Any]] = SERVICES
     grants: Grants = field(default_factory=dict)
 
     @property
     def holders(self) -> tuple[tuple[Role, str], ...]:
-        """Return each role that has rights at one robot, with the process where it is of one."""
+        """Return each role with rights at one robot; with the process for the role `process`."""
         own: tuple[tuple[Role, str], ...] = tuple(("process", name) for name in self.grants)
         return (*((role, "") for role in OF_ONE_ROBOT), *own)
 
     def keys_of_process(self, name: str) -> tuple[list[str], list[str], list[str]]:
-        """Return the keys on which a process of one's own may publish, query, and answer.
+        """Return the keys on which one of the user's own processes may publish, query, and reply.
 
-        It reports on itself, and beyond that does only what it declares to write.
+        These are the keys about itself, and the keys that it declares to write.
         """
         puts, queries = [HEALTH.at(name), LOG.key], [DESCRIBE.at("*"), *self._kept()]
         served = [PARAM.at(name), DESCRIBE.at(name)]
         for key in self.grants[name]:
-            topics = [one for one in self.topics if _covers(one, key)]
-            services = [one for one in self.services if _covers(one, key)]
+            topics = [entry for entry in self.topics if _covers(entry, key)]
+            services = [entry for entry in self.services if _covers(entry, key)]
             other = not topics and not services
             puts += [key] if topics or other else []
             queries += [key] if services or other else []
-            served += [key] if other or any(one.keep for one in topics) else []
+            served += [key] if other or any(entry.keep for entry in topics) else []
         return puts, queries, served
 
     def _kept(self) -> list[str]:
-        """Return the keys that late joiners ask for."""
+        """Return the keys whose kept values late subscribers query."""
         return [topic.key for topic in self.topics if topic.keep]
 
     def keys(self, role: Role) -> tuple[list[str], list[str], list[str]]:
-        """Return the keys on which a role may publish, query, and answer.
+        """Return the keys on which a role may publish, query, and reply.
 
-        The robot itself may do everything below its own name.
+        The robot itself may use all keys of its namespace.
         """
         if role == "robot":
-            every = [EVERYTHING, *FLEET_KEYS]
-            return every, every, every
+            all_keys = [EVERYTHING, *FLEET_KEYS]
+            return all_keys, all_keys, all_keys
         if role == "dispatcher":
             return [], [FLEET_ACTION], []
         kept = self._kept()
-        puts = [k for one in self.topics if role in one.publishers for k in self._own(one, role)]
-        queries = [*kept, *(one.at("*") for one in self.services if role in one.callers)]
-        served = [k for one in self.services if role in one.servers for k in self._own(one, role)]
+        puts = [
+            k for entry in self.topics if role in entry.publishers for k in self._own(entry, role)
+        ]
+        queries = [*kept, *(entry.at("*") for entry in self.services if role in entry.callers)]
+        served = [
+            k for entry in self.services if role in entry.servers for k in self._own(entry, role)
+        ]
         return puts, queries, [*(key for key in puts if key in kept), *served]
 
-    def _own(self, one: Topic[Any] | Service[Any, Any], role: Role) -> list[str]:
-        return [one.at(name) for name in self.names.get(role, ())] if one.many else [one.key]
+    def _own(self, entry: Topic[Any] | Service[Any, Any], role: Role) -> list[str]:
+        return [entry.at(name) for name in self.names.get(role, ())] if entry.many else [entry.key]
 
 
 def access_control(
@@ -212,28 +216,28 @@ def access_control(
 ) -> dict[str, Any]:
     """Return Zenoh's `access_control` for a router of these robots (namespaces); deny by default.
 
-    Of each name only one generation has rights: that in `generations`, else the first. A client of
-    the Unix socket has the rights of the robot `own`: only the user who runs it can connect, and
-    could read its key as well. At a router of no robot it is an operator of all.
+    Only one generation of each name has rights: the one in `generations`, else the first. A client
+    of the Unix socket has the rights of the robot `own`, as only its user can connect, who can read
+    its key as well. At a router without a robot such a client is an operator of all robots.
     """
-    of = {
+    rules_of = {
         common_name(role, robot, process=process): list(_rules(role, robot, table, process))
         for robot in robots
         for role, process in table.holders
     }
-    rules = [FLEET_LISTENS, *(rule for each in of.values() for rule in each)]
+    rules = [FLEET_LISTENS, *(rule for each in rules_of.values() for rule in each)]
     subjects, policies = [], []
     for name, own_names in _known(robots, table.grants):
-        ids = [rule["id"] for own_name in own_names for rule in of[own_name]]
+        ids = [rule["id"] for own_name in own_names for rule in rules_of[own_name]]
         if name in FLEET_WIDE:
             ids.append(FLEET_LISTENS["id"])
-        subjects.append({"id": name, "cert_common_names": [_good(name, generations)]})
+        subjects.append({"id": name, "cert_common_names": [_current(name, generations)]})
         policies.append({"subjects": [name], "rules": ids})
     subjects.append({"id": LOCAL, "link_protocols": ["unixsock-stream"]})
-    near = [common_name("operator", robot) for robot in robots]
+    local_rights = [common_name("operator", robot) for robot in robots]
     if own in robots:
-        near = [common_name("robot", own)]
-    ids = [rule["id"] for name in near for rule in of[name]]
+        local_rights = [common_name("robot", own)]
+    ids = [rule["id"] for name in local_rights for rule in rules_of[name]]
     policies.append({"subjects": [LOCAL], "rules": ids})
     return {
         "enabled": True,
@@ -248,15 +252,16 @@ def known_names(
     robots: Sequence[str], generations: Mapping[str, int] = FIRST, grants: Grants = NO_GRANTS
 ) -> tuple[str, ...]:
     """Return the common names that have rights at a router of these robots."""
-    return tuple(_good(name, generations) for name, _ in _known(robots, grants))
+    return tuple(_current(name, generations) for name, _ in _known(robots, grants))
 
 
-def _good(name: str, generations: Mapping[str, int]) -> str:
+def _current(name: str, generations: Mapping[str, int]) -> str:
+    """Return a common name in the generation that is not revoked."""
     return of_generation(name, generations.get(name, 1))
 
 
 def _known(robots: Sequence[str], grants: Grants) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Yield each common name with those of one robot whose rights it combines."""
+    """Yield each common name, and the common names whose rights it has, each of one robot."""
     for role in OF_ONE_ROBOT:
         if role in FLEET_WIDE:
             yield role, tuple(common_name(role, robot) for robot in robots)
@@ -271,20 +276,20 @@ def _known(robots: Sequence[str], grants: Grants) -> Iterator[tuple[str, tuple[s
 
 def _rules(role: Role, robot: str, table: Table, process: str) -> Iterator[Rule]:
     """Yield one role's rules for one robot."""
-    who = common_name(role, robot, process=process)
+    holder = common_name(role, robot, process=process)
     everything = under(robot, FLEET_KEYS if role == "dispatcher" else (EVERYTHING, *FLEET_KEYS))
     puts, queries, replies = table.keys_of_process(process) if process else table.keys(role)
-    yield _rule(f"{who} hears", "egress", TO_LISTENERS, everything)
-    # subscriptions are no secret: a fleet's operator may subscribe to `**`
-    yield _rule(f"{who} is heard", "egress", ["declare_subscriber"], ["**"])
-    yield _rule(f"{who} listens", "ingress", ["declare_subscriber"], everything)
+    yield _rule(f"{holder} hears", "egress", TO_LISTENERS, everything)
+    # all may see subscriptions: a fleet's operator may subscribe to `**`
+    yield _rule(f"{holder} is heard", "egress", ["declare_subscriber"], ["**"])
+    yield _rule(f"{holder} listens", "ingress", ["declare_subscriber"], everything)
     for verb, messages, keys in (
         ("says", ["put"], puts),
         ("asks", ["query"], queries),
         ("answers", ["declare_queryable", "reply"], replies),
     ):
         if keys:
-            yield _rule(f"{who} {verb}", "ingress", messages, under(robot, keys))
+            yield _rule(f"{holder} {verb}", "ingress", messages, under(robot, keys))
 
 
 def _rule(name: str, flow: str, messages: Sequence[str], keys: Sequence[str]) -> Rule:
@@ -301,5 +306,5 @@ FLEET_LISTENS = _rule("the fleet listens", "ingress", ["declare_subscriber"], ["
 
 
 def under(robot: str, keys: Iterable[str]) -> list[str]:
-    """Return the keys as the router has them."""
+    """Return the keys with the robot's namespace."""
     return [f"{robot}/{key}" if robot else key for key in keys]

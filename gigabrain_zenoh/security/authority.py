@@ -1,7 +1,7 @@
-"""A fleet's own certificate authority: identities are issued, read, checked and revoked.
+"""A fleet's certificate authority: issues, reads, checks and revokes identities.
 
 Certificates are X.509 v3 with EC P-256 keys (RFC 5280); the common name names a role and a robot.
-Routers read revocations from their identity's folder, as Zenoh has none for certificates.
+Routers read revocations from the folder of their identity, as Zenoh has no revocation lists.
 """
 
 import datetime
@@ -38,8 +38,8 @@ from gigabrain_zenoh.security.identity_files import (
     unreadable,
 )
 
-CA_DAYS, DAYS = 3650, 365
-EARLY = datetime.timedelta(days=1)  # clocks of hosts differ
+CA_DAYS, IDENTITY_DAYS = 3650, 365  # validity
+BACKDATED = datetime.timedelta(days=1)  # start of validity, as clocks of hosts differ
 LOCAL = ("localhost", "127.0.0.1", "::1")
 
 
@@ -62,8 +62,8 @@ def new_fleet(fleet: str, folder: Path) -> None:
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(public), critical=False)
         .sign(key, hashes.SHA256())
     )
-    with _new_folder(folder) as made:
-        _write(made, {CA_KEY: _pem(key), CA: _text(certificate)})
+    with _new_folder(folder) as draft:
+        _write(draft, {CA_KEY: _pem(key), CA: _text(certificate)})
 
 
 def issue(
@@ -74,16 +74,16 @@ def issue(
     process: str = "",
     name: str = "",
     hosts: Sequence[str] = (),
-    days: int = DAYS,
+    days: int = IDENTITY_DAYS,
 ) -> Path:
-    """Create an identity; return its folder, which has to be copied to its host.
+    """Create an identity; return its folder, which must be copied to its host.
 
-    `hosts` are the addresses and names under which a router is reached. `process` is the name of
-    the process of one's own that an identity of the role process is for. Raises ConfigError.
+    `hosts` are the addresses and names of a router. `process` names the process of an identity with
+    the role `process`. Raises ConfigError.
     """
     if hosts and role not in SERVERS:
         raise ConfigError(f"--host: only a {' or a '.join(SERVERS)} is connected to")
-    if name and (name == ".." or name != Path(name).name):  # revocations look nowhere else
+    if name and (name == ".." or name != Path(name).name):  # `revoke` finds only such folders
         raise ConfigError(f"--name {name!r}: expected the name of a folder, without '/'")
     generations = generations_in(fleet_folder)
     first = common_name(role, robot, process=process)
@@ -95,10 +95,10 @@ def issue(
     names.append(x509.NameAttribute(NameOID.COMMON_NAME, subject))
     usages = [ExtendedKeyUsageOID.CLIENT_AUTH]
     builder = _builder(x509.Name(names), authority.subject, key.public_key(), days)
-    if role in SERVERS:  # a client with this could pass for a router
+    if role in SERVERS:  # with this usage, a client could pretend to be a router
         usages.append(ExtendedKeyUsageOID.SERVER_AUTH)
-        places = [_place(host) for host in dict.fromkeys((*LOCAL, *hosts))]
-        builder = builder.add_extension(x509.SubjectAlternativeName(places), critical=False)
+        alt_names = [_general_name(host) for host in dict.fromkeys((*LOCAL, *hosts))]
+        builder = builder.add_extension(x509.SubjectAlternativeName(alt_names), critical=False)
     certificate = (
         builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(_usage(authority=False), critical=True)
@@ -106,11 +106,11 @@ def issue(
         .sign(read_key(fleet_folder / CA_KEY), hashes.SHA256())
     )
     folder = fleet_folder / (name or subject.replace("/", "-").replace("~", "-"))
-    with _new_folder(folder) as made:
+    with _new_folder(folder) as draft:
         contents = {KEY: _pem(key), CERTIFICATE: _text(certificate), CA: _text(authority)}
-        _write(made, contents)
+        _write(draft, contents)
         if role in SERVERS and generations:
-            write_list(made, generations)
+            write_list(draft, generations)
     return folder
 
 
@@ -124,7 +124,7 @@ def _builder(
         .issuer_name(issuer)
         .public_key(key)
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - EARLY)
+        .not_valid_before(now - BACKDATED)
         .not_valid_after(now + datetime.timedelta(days=days))
     )
 
@@ -156,19 +156,19 @@ def _usage(*, authority: bool) -> x509.KeyUsage:
     )
 
 
-def _place(host: str) -> x509.GeneralName:
+def _general_name(host: str) -> x509.GeneralName:
     bare = host.strip("[]")
     if is_ip(bare):
         return x509.IPAddress(ipaddress.ip_address(bare))
     if is_host(host):
         return x509.DNSName(host)
-    for endpoint in (host, f"tcp/{host}"):  # what others connect to, or that without its protocol
+    for endpoint in (host, f"tcp/{host}"):  # an endpoint, with or without its protocol
         try:
-            alone, _ = host_and_port(endpoint)
+            address, _ = host_and_port(endpoint)
         except ValueError:
             continue
-        if alone:
-            raise ConfigError(f"--host {host}: give the address alone: {alone}")
+        if address:
+            raise ConfigError(f"--host {host}: give the address alone: {address}")
     raise ConfigError(f"--host {host!r}: expected an IP address or a host name")
 
 
@@ -187,22 +187,22 @@ def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 @contextmanager
 def _new_folder(folder: Path) -> Iterator[Path]:
     """Yield a folder that appears complete or not at all. Raises ConfigError if it exists."""
-    taken = ConfigError(f"{folder} exists already; keys are never overwritten: move it away first")
+    exists = ConfigError(f"{folder} exists already; keys are never overwritten: move it away first")
     if folder.exists():
-        raise taken
+        raise exists
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        made = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))  # mode 0700
+        draft = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))  # mode 0700
         try:
-            yield made
-            sync_folder(made)
-            made.rename(folder)
+            yield draft
+            sync_folder(draft)
+            draft.rename(folder)
             sync_folder(folder.parent)
         except BaseException:
-            shutil.rmtree(made, ignore_errors=True)
+            shutil.rmtree(draft, ignore_errors=True)
             raise
     except FileExistsError:
-        raise taken from None
+        raise exists from None
     except OSError as error:
         raise ConfigError(f"cannot write {folder}: {error.strerror}") from None
 
@@ -214,9 +214,10 @@ def _write(folder: Path, contents: Mapping[str, bytes]) -> None:
 
 
 def revoke(fleet_folder: Path, role: Role, robot: str = "", process: str = "") -> tuple[Path, ...]:
-    """Revoke all identities issued under a common name; return the lists for the routers.
+    """Revoke all identities of a common name; return the paths of the lists for the routers.
 
-    Raises ConfigError for roles that may be a router (none checks those) and for closed folders.
+    Raises ConfigError for roles that may run a router, as clients check no list, and for folders
+    that cannot be read.
     """
     if role in SERVERS:
         raise ConfigError(
@@ -232,13 +233,13 @@ def revoke(fleet_folder: Path, role: Role, robot: str = "", process: str = "") -
 
 
 def _routers(fleet_folder: Path) -> Iterator[Path]:
-    """Yield the folders of identities that may be a router, also without their keys."""
+    """Yield the folders of identities that may run a router, also those without a key."""
     for folder in sorted(fleet_folder.iterdir()):
         try:
             (folder / CERTIFICATE).stat()
         except PermissionError:
             raise unreadable(folder) from None
-        except OSError:  # it is no identity
+        except OSError:  # not an identity
             continue
         certificate = read_certificate(folder / CERTIFICATE)
         if parse(_attribute(certificate, NameOID.COMMON_NAME)).role in SERVERS:
@@ -246,7 +247,7 @@ def _routers(fleet_folder: Path) -> Iterator[Path]:
 
 
 def write_list(folder: Path, generations: Mapping[str, int]) -> None:
-    """Replace the list in a folder. Raises ConfigError."""
+    """Write the list of revocations in a folder. Raises ConfigError."""
     content = msgspec.json.format(msgspec.json.encode(generations)) + b"\n"
     try:
         replace_file(folder / LIST, content)
@@ -255,7 +256,7 @@ def write_list(folder: Path, generations: Mapping[str, int]) -> None:
 
 
 EXPIRES_SOON_DAYS = 30
-MAX_BYTES = 100_000  # of a key or a certificate
+MAX_PEM_BYTES = 100_000  # of a key or a certificate
 
 
 class Identity(Struct, frozen=True, kw_only=True):
@@ -265,14 +266,14 @@ class Identity(Struct, frozen=True, kw_only=True):
     fleet: str
     name: str  # the common name, such as robot@red
     role: Role
-    robot: str  # its namespace; empty for the only one, or for all
-    process: str  # that a `process` identity is for; else empty
-    generation: int  # rises with each revocation
-    hosts: tuple[str, ...]  # where it can be connected to
+    robot: str  # namespace; empty for the only robot, or for all robots
+    process: str  # for the role `process`; else empty
+    generation: int  # increases with each revocation
+    hosts: tuple[str, ...]  # addresses and names of a router
     expires: datetime.datetime
 
     def days_left(self, now: datetime.datetime) -> float:
-        """Return the days until it expires; negative afterwards."""
+        """Return the number of days until it expires; negative if it has expired."""
         return (self.expires - now) / datetime.timedelta(days=1)
 
 
@@ -347,7 +348,7 @@ def read_key(path: Path) -> ec.EllipticCurvePrivateKey:
 
 def _bytes(path: Path) -> bytes:
     try:
-        return read_bounded(path, MAX_BYTES)
+        return read_bounded(path, MAX_PEM_BYTES)
     except PermissionError:
         raise unreadable(path) from None
     except OSError as error:
@@ -361,39 +362,42 @@ def _attribute(certificate: x509.Certificate, oid: x509.ObjectIdentifier) -> str
 
 def _hosts(certificate: x509.Certificate) -> tuple[str, ...]:
     try:
-        places = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:
         return ()
-    return tuple(str(place.value) for place in places)
+    return tuple(str(name.value) for name in names)
 
 
-def _first(one: Identity) -> str:
-    """Return its common name in the first generation."""
-    return common_name(one.role, one.robot, process=one.process)
+def _first_name(identity: Identity) -> str:
+    """Return the common name of an identity in the first generation."""
+    return common_name(identity.role, identity.robot, process=identity.process)
 
 
 def list_identities(folder: Path) -> Iterator[tuple[str, bool]]:
-    """Yield a line for each identity in a fleet's folder, or in its own, and if it is valid."""
-    places = [folder] if (folder / CERTIFICATE).exists() else sorted(folder.iterdir())
+    """Yield a line for each identity in `folder`, or for `folder` itself, and if it is valid."""
+    folders = [folder] if (folder / CERTIFICATE).exists() else sorted(folder.iterdir())
     now, generations = datetime.datetime.now(datetime.UTC), generations_in(folder)
-    for place in places:
+    for place in folders:
         try:
             (place / CERTIFICATE).stat()
         except PermissionError:
             yield f"{place.name:<20} {unreadable(place)}", False
             continue
-        except OSError:  # it is no identity
+        except OSError:  # not an identity
             continue
         try:
-            one = load(place, now)
+            identity = load(place, now)
         except ConfigError as error:
             yield f"{place.name:<20} {error}", False
             continue
-        if one.generation < generations.get(_first(one), 1):
-            yield f"{place.name:<20} {one.name} was revoked; delete it", False
+        if identity.generation < generations.get(_first_name(identity), 1):
+            yield f"{place.name:<20} {identity.name} was revoked; delete it", False
             continue
-        days_left = one.days_left(now)
+        days_left = identity.days_left(now)
         soon = "  SOON" if days_left < EXPIRES_SOON_DAYS else ""
-        hosts = f"  ({', '.join(one.hosts)})" if one.hosts else ""
-        expires = f"expires {one.expires:%Y-%m-%d}, in {days_left:.0f} days{soon}"
-        yield f"{place.name:<20} {f'{one.name} of {one.fleet}':<28} {expires}{hosts}", True
+        hosts = f"  ({', '.join(identity.hosts)})" if identity.hosts else ""
+        expires = f"expires {identity.expires:%Y-%m-%d}, in {days_left:.0f} days{soon}"
+        yield (
+            f"{place.name:<20} {f'{identity.name} of {identity.fleet}':<28} {expires}{hosts}",
+            True,
+        )

@@ -1,4 +1,4 @@
-"""Files of an identity, checked without reading certificates, and what a host may run with it."""
+"""Checks the files of an identity, and the processes that a host may run with it."""
 
 import logging
 import os
@@ -26,7 +26,7 @@ from gigabrain_zenoh.security.acl import common_name
 log = logging.getLogger(__name__)
 CA, CA_KEY = "ca.crt", "ca.key"
 CERTIFICATE, KEY = "identity.crt", "identity.key"
-MAX_SECRET_BYTES = 65_536  # of a file that `made_once` makes
+MAX_SECRET_BYTES = 65_536  # of a file of `made_once`
 REMEDY = "copy the whole folder that `gigabrain keys issue` made"
 
 
@@ -57,9 +57,9 @@ def check_private(path: Path) -> None:
 
 
 def made_once(path: Path, content: bytes) -> tuple[bytes, bool]:
-    """Return a private file's content, and whether it was created with `content`.
+    """Read a private file, or create it with `content`; return the content, and if it is new.
 
-    Of several processes that create it one wins, and none reads it unfinished. An empty file, as
+    If several processes create it, one succeeds, and all read the complete file. An empty file, as
     after a crash, is replaced. Raises ConfigError.
     """
     try:
@@ -73,7 +73,7 @@ def made_once(path: Path, content: bytes) -> tuple[bytes, bool]:
         except FileExistsError:
             check_private(path)
         with open_regular(path, MAX_SECRET_BYTES) as old:
-            fcntl.flock(old, fcntl.LOCK_EX)  # of several processes that replace it one does
+            fcntl.flock(old, fcntl.LOCK_EX)  # only one process replaces it
             found = read_bounded(path, MAX_SECRET_BYTES)
             if not found:
                 log.warning("%s was empty; replaced it", path)
@@ -89,7 +89,7 @@ def unreadable(path: Path) -> ConfigError:
 
 
 def identity_folder(keys: str, host: str = "") -> Path:
-    """Return the folder of the identity: `keys`, or its subfolder for `host` if it has several."""
+    """Return the folder of the identity: `keys`, or its subfolder for `host`."""
     folder = expanded(keys)
     of_host = folder / host
     if host and not os.path.exists(folder / CERTIFICATE) and os.path.isdir(of_host):
@@ -104,7 +104,7 @@ INSTALL = "keys need more: pip install 'gigabrain-zenoh[keys]'"
 
 def identity_in(folder: Path) -> "Identity":
     """Return the identity in a folder. Raises ConfigError if it cannot be used."""
-    try:  # 150 ms, needed only to read certificates
+    try:  # takes 150 ms, and only certificates need it
         from gigabrain_zenoh.security.authority import load
     except ModuleNotFoundError as error:
         raise ConfigError(f"{error}; {INSTALL}") from None
@@ -116,8 +116,8 @@ def check_identity(
 ) -> None:
     """Check that a host with this identity may run `processes` of the robot `namespace`.
 
-    `processes` holds the roles that may run each. Raises ConfigError, which names the identity
-    that it takes.
+    `processes` contains the roles that may run each process. Raises ConfigError, which names the
+    required identity.
     """
     identity = identity_in(folder)
     for process, roles in processes.items():
@@ -138,7 +138,7 @@ def check_identity(
 
 
 def check_own_identity(folder: Path, process: str, namespace: str) -> None:
-    """Check that a process of one's own has its identity in `folder`. Raises ConfigError."""
+    """Check that `folder` is the identity of the user's own process. Raises ConfigError."""
     wanted = common_name("process", namespace, process=process)
     if not folder.is_dir():
         robot = f" --robot {namespace}" if namespace else ""
@@ -153,7 +153,7 @@ def check_own_identity(folder: Path, process: str, namespace: str) -> None:
 
 
 def no_router(endpoint: Endpoint) -> BusError:
-    """Return the error for a silent router. Raises ConfigError for invalid own keys."""
+    """Return the error for a router that does not answer. Raises ConfigError for invalid keys."""
     where, doubt = endpoint.connect[-1], "is the robot running, and without keys?"
     if endpoint.keys:
         identity = identity_in(Path(endpoint.keys))
@@ -162,7 +162,7 @@ def no_router(endpoint: Endpoint) -> BusError:
 
 
 def may_not_ask(keys: str) -> str:
-    """Return another possible reason for silence: a router does not report denials."""
+    """Return the missing right as a possible reason for no reply; routers do not report denials."""
     return f"; or {identity_in(Path(keys)).name} may not ask for it" if keys else ""
 
 
