@@ -4,16 +4,16 @@ GigabrainError
 ├── ConfigError       a file or an option is wrong (exit code 2)
 │   ├── UnknownName   no such robot, world, driver, process or behaviour
 │   ├── NotYetValid   keys that are valid only later: is the clock right?
-│   └── DiskFull      a disk without room for what a robot has to keep (exit code 1)
+│   └── DiskFull      a disk without space for a robot's files (exit code 1)
 ├── BusError          the router is missing, or its port is taken
-│   └── Ambiguous     several robots run here, and none is named
+│   └── Ambiguous     several robots run here, and none was chosen
 ├── Refused           the robot refused a request, with the reason
 ├── Unsupported       the body has no such primitive
 ├── BodyLost          the body no longer answers
 ├── ClockLost         a process's robot time does not match any state
-├── BadPayload        a ROS 2 message that cannot be decoded, or JSON that is none of its type
+├── BadPayload        a ROS 2 message that cannot be decoded, or JSON of another type
 ├── NoAnswer          no ROS 2 node answered a service in time
-└── NotConfirmed      no body has confirmed an e-stop (exit code 3)
+└── NotConfirmed      no body confirmed an e-stop (exit code 3)
 """
 
 import difflib
@@ -21,18 +21,18 @@ from collections.abc import Iterable
 
 
 class GigabrainError(Exception):
-    """Anything that this project raises on purpose. `str()` is one line for people."""
+    """Base of all errors of this project. `str()` is one line for people."""
 
     exit_code = 1
 
 
 class ConfigError(GigabrainError):
-    """A configuration that cannot be used; names the file, the line and what was expected."""
+    """An invalid configuration; the text names the file, the line and the expected value."""
 
     exit_code = 2
 
     def __init__(self, text: str, *, value: str | None = None) -> None:
-        """Create an error; `value` is the invalid value, by which its line in a file is found."""
+        """Create an error; `value` is the invalid value, used to find its line in a file."""
         super().__init__(text)
         self.value = value
 
@@ -42,11 +42,11 @@ class UnknownName(ConfigError):
 
 
 class NotYetValid(ConfigError):
-    """Keys whose validity has not begun; it may once the clock is set."""
+    """Keys that are not valid yet; they may be once the clock is set."""
 
 
 class DiskFull(ConfigError):
-    """A folder that cannot be written for now; there may be space later."""
+    """A folder that cannot be written while its disk is full."""
 
     exit_code = 1
 
@@ -56,7 +56,7 @@ class BusError(GigabrainError):
 
 
 class Ambiguous(BusError):
-    """Several robots run on this machine, and none is named."""
+    """Several robots run on this machine, and none was chosen."""
 
 
 class Refused(GigabrainError):
@@ -72,11 +72,11 @@ class Unsupported(GigabrainError):
 
 
 class BodyLost(GigabrainError):
-    """The body no longer answers. The process ends; its supervisor starts it again."""
+    """The body no longer answers. The process ends, and its supervisor restarts it."""
 
 
 class ClockLost(GigabrainError):
-    """The robot's time in this process is wrong. It ends; its supervisor starts it again."""
+    """The robot's time in this process is wrong. It ends, and its supervisor restarts it."""
 
 
 class BadPayload(GigabrainError):
@@ -103,5 +103,5 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownName:
     close = difflib.get_close_matches(name, parts, n=1, cutoff=0.6)
     hint = f"; did you mean {parts[close[0]]!r}?" if close else ";"
     text = f"no {kind} {name!r}{hint} known: {', '.join(names) or 'none'}"
-    text = text.encode(errors="replace").decode()  # names of files may be any bytes
+    text = text.encode(errors="replace").decode()  # file names may contain any bytes
     return UnknownName(text, value=name)

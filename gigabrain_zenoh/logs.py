@@ -38,7 +38,7 @@ def level_of(record: logging.LogRecord) -> str:
 
 
 def level_named(name: str) -> str:
-    """Return the one of LEVELS that `WARN` or `Fatal` stands for; info for an unknown name."""
+    """Return the level of LEVELS for names such as `WARN` or `Fatal`; info for unknown names."""
     return _level(logging.getLevelNamesMapping().get(name.upper(), logging.INFO))
 
 
@@ -49,7 +49,8 @@ def _level(number: int) -> str:
 def fields(record: logging.LogRecord, process: str) -> dict[str, Any]:
     """Return `{"t": unix_ns, "level", "process", "event", "text"}` and the record's own `data`.
 
-    `data` is passed as `extra={"data": {...}}`; it names the event, and overwrites nothing else.
+    `data` is passed as `extra={"data": {...}}`. Its key `event` names the event; other keys cannot
+    replace the fields above.
     """
     data = getattr(record, "data", {})
     known: dict[str, Any] = {
@@ -67,17 +68,17 @@ def fields(record: logging.LogRecord, process: str) -> dict[str, Any]:
 def _text_of(record: logging.LogRecord) -> str:
     try:
         return record.getMessage()
-    except (TypeError, ValueError, KeyError):  # a library's arguments do not fit its own format
+    except (TypeError, ValueError, KeyError):  # a library's arguments do not match its format
         return f"{record.msg} {record.args}"
 
 
-# own code: json.dumps, as in structlog, raises on cycles and writes NaN, which is no JSON
+# own code: json.dumps, as in structlog, raises on cycles and writes NaN, which is not JSON
 def encode(record: Mapping[str, Any]) -> bytes:
-    """Return one line of JSON without its newline, whatever the values are; NaN becomes null."""
+    """Return one line of JSON without a newline, for any values; NaN becomes null."""
     try:
         return _ENCODER.encode(record)
     except (TypeError, ValueError, OverflowError, RecursionError):
-        # a cycle, a lone surrogate or an odd key: the line matters more than its looks
+        # a cycle, a lone surrogate or an unusual key: write the line in a simpler form
         return _ENCODER.encode({ascii(key)[1:-1]: _safe(value) for key, value in record.items()})
 
 
@@ -116,15 +117,15 @@ def _value(value: object) -> str:
 
 _ENCODER = msgspec.json.Encoder(enc_hook=_plain)
 log = logging.getLogger(__name__)
-QUEUED_RECORDS = 1000  # for each of file and console; more are dropped and counted
-QUIET_NS = 1_000_000_000  # without a QuietFault, after which it has ended
-LAST_WORDS_S = 0.5  # how long the end of a process waits until they are written
-FILE_BYTES = 10_000_000  # of one log file; then the next is begun
-OLD_FILES = 2  # of a process, beside the one that is written
+QUEUED_RECORDS = 1000  # per file and console; more are dropped and counted
+QUIET_NS = 1_000_000_000  # without the fault; then a QuietFault ends
+LAST_WORDS_S = 0.5  # the end of a process waits this long for its last records
+FILE_BYTES = 10_000_000  # of one log file; then the next is started
+OLD_FILES = 2  # kept per process, besides the current one
 
 
 class Fault:
-    """Something that is wrong for a while: logged once when it begins and once when it ends."""
+    """A fault that lasts: logged once when it begins and once when it ends."""
 
     def __init__(self, log: logging.Logger, level: int = logging.WARNING) -> None:
         self._log, self._level = log, level
@@ -132,7 +133,7 @@ class Fault:
 
     @property
     def active(self) -> bool:
-        """Return whether the fault has begun and not ended."""
+        """Return whether the fault is present."""
         return self._times > 0
 
     def begin(self, text: str, data: Mapping[str, Any] | None = None) -> None:
@@ -151,18 +152,18 @@ class Fault:
 
 
 class QuietFault:
-    """A fault that ends only after a second without it, as good and bad messages may alternate."""
+    """A fault that ends after a second without it, as good and bad messages may alternate."""
 
     def __init__(self, log: logging.Logger) -> None:
         self._fault, self._last_ns = Fault(log), 0
 
     def begin(self, text: str, now_ns: int) -> None:
-        """Log the fault, unless it goes on."""
+        """Log the fault, unless it is already present."""
         self._last_ns = now_ns
         self._fault.begin(text)
 
     def end(self, text: str, now_ns: int) -> None:
-        """Log the end of the fault, if it has not come for a second."""
+        """Log the end of the fault, if it did not occur for a second."""
         if self._fault.active and now_ns - self._last_ns >= QUIET_NS:
             self._fault.end(text)
 
@@ -188,7 +189,7 @@ class BusHandler(logging.Handler):
             self.lost += 1
 
     def _send(self, record: logging.LogRecord) -> None:
-        if self._busy:  # publishing logs something in its turn
+        if self._busy:  # publishing itself logs a record
             return
         self._busy = True
         try:
@@ -200,9 +201,9 @@ class BusHandler(logging.Handler):
 
 
 def _message(record: logging.LogRecord, process: str) -> LogRecord:
-    """Return the record, shortened to the bounds of its message; the file has all of it.
+    """Return the record, shortened to the limits of its message; the file contains all of it.
 
-    It has the time of its line in the file, by which both are known as one.
+    It has the same time as its line in the file, so that readers can match them.
     """
     known = fields(record, process)
     text = str(known.pop("text"))
@@ -244,7 +245,7 @@ class _ReadableFormatter(logging.Formatter):
 
 
 class _File(RotatingFileHandler):
-    """A log file that reports a full disk once, and once more when there is room."""
+    """A log file that reports a full disk once, and its end once."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, maxBytes=FILE_BYTES, backupCount=OLD_FILES, encoding="utf-8")
@@ -262,7 +263,7 @@ class _File(RotatingFileHandler):
 
 
 class QueuedHandler(QueueHandler):
-    """Formats records where they are logged; `sink` writes them in a thread of its own.
+    """Formats records in the thread that logs them; `sink` writes them in its own thread.
 
     So a full disk, or a blocked console, delays neither the event loop nor the end of the process.
     When `QUEUED_RECORDS` wait, more are dropped; their number is logged later.
@@ -288,14 +289,14 @@ class QueuedHandler(QueueHandler):
             self.lost += 1
 
     def _loss(self) -> logging.LogRecord:
-        """Build a record for this sink alone: logging it would take the locks of the others."""
+        """Build a record about lost records for this sink; logging it would lock the others."""
         text, lost = f"{self.lost} records did not reach the {self._name}", self.lost
         record = logging.LogRecord(log.name, logging.WARNING, "", 0, text, None, None)
         record.data = {"event": "log records lost", "lost": lost}
         return self.prepare(record)  # type: ignore[no-any-return]
 
     def flush(self) -> None:
-        """Wait until all is written, at most `LAST_WORDS_S`."""
+        """Wait until all records are written, at most `LAST_WORDS_S`."""
         waiting = self._records
         with waiting.all_tasks_done:
             waiting.all_tasks_done.wait_for(lambda: not waiting.unfinished_tasks, LAST_WORDS_S)
@@ -307,12 +308,12 @@ class QueuedHandler(QueueHandler):
         if not self._closed and not self._records.unfinished_tasks:
             self._closed = True
             self._listener.stop()
-            with contextlib.suppress(OSError):  # what a full disk still owed
+            with contextlib.suppress(OSError):  # buffered data on a full disk
                 self._sink.close()
 
 
 def setup(process: str, run_dir: Path | None, *, json_console: bool, level: str = "info") -> None:
-    """Log to `<run_dir>/<process>.jsonl` and to stderr; a second call replaces the first.
+    """Log to `<run_dir>/<process>.jsonl` and to stderr; a later call replaces an earlier one.
 
     Raises ConfigError if the folder cannot be written, and UnknownName for an unknown level.
     """
@@ -337,7 +338,7 @@ def flush() -> None:
 
 
 def _sinks() -> list[QueuedHandler]:
-    return [one for one in logging.getLogger().handlers if isinstance(one, QueuedHandler)]
+    return [sink for sink in logging.getLogger().handlers if isinstance(sink, QueuedHandler)]
 
 
 def file_sink(process: str, run_dir: Path) -> QueuedHandler:

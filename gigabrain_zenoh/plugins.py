@@ -1,4 +1,4 @@
-"""Objects named by a string "module:name" or offered by packages, and this package's version."""
+"""Imports objects by "module:name" or from entry points; and returns this package's version."""
 
 import importlib
 import os
@@ -32,28 +32,28 @@ def package_version() -> str:
 
 def offered(group: str) -> "EntryPoints":
     """Return the entry points of a group that installed packages offer."""
-    places = tuple((place, _changed_ns(place or ".")) for place in sys.path)
-    points: EntryPoints = _entry_points(places).select(group=group)
+    folders = tuple((folder, _changed_ns(folder or ".")) for folder in sys.path)
+    points: EntryPoints = _entry_points(folders).select(group=group)
     return points
 
 
-def _changed_ns(place: str) -> int:
+def _changed_ns(folder: str) -> int:
     try:
-        return os.stat(place).st_mtime_ns
+        return os.stat(folder).st_mtime_ns
     except OSError:
         return 0
 
 
 @lru_cache(maxsize=1)
-def _entry_points(_places: tuple[tuple[str, int], ...]) -> Any:  # its type varies with Python's
-    """Return all entry points until a package comes or goes. It takes 20 ms for 100 packages."""
-    from importlib.metadata import entry_points  # 1 MB in each process, which few need
+def _entry_points(_folders: tuple[tuple[str, int], ...]) -> Any:  # its type depends on Python
+    """Return all entry points, cached while no package changes. Takes 20 ms for 100 packages."""
+    from importlib.metadata import entry_points  # takes 1 MB, and few processes need it
 
     return entry_points()
 
 
 def plugin_names(shipped: Mapping[str, Any], group: str) -> list[str]:
-    """Return the names in a table of shipped objects and of the entry points of a group."""
+    """Return the names of the shipped objects and of the entry points of a group."""
     return list(dict.fromkeys((*shipped, *(point.name for point in offered(group)))))
 
 
@@ -62,8 +62,8 @@ def load_plugin(
 ) -> Any:
     """Return the object called `name`: a shipped one, or an entry point of `group`.
 
-    The table of shipped objects holds them, or strings "module:name". Raises UnknownName with all
-    names, and ConfigError if its import fails in any way, or if it lacks an attribute of `parts`.
+    The values of `shipped` are objects, or strings "module:name". Raises UnknownName with all
+    names, and ConfigError if the import fails, or if the object lacks an attribute of `parts`.
     """
     if name in shipped:
         found = shipped[name]
@@ -75,8 +75,8 @@ def load_plugin(
     try:
         found = points[name].load()
     except Exception as error:  # noqa: BLE001 - a package may raise anything
-        what = error if isinstance(error, ImportError | AttributeError) else repr(error)
-        raise ConfigError(f"{where}: {what}") from None
+        text = error if isinstance(error, ImportError | AttributeError) else repr(error)
+        raise ConfigError(f"{where}: {text}") from None
     if missing := [part for part in parts if not hasattr(found, part)]:
         text = f"a {type(found).__name__} without {missing[0]}; see docs/how-to/your_own_process.md"
         raise ConfigError(f"{where}: {text}")
