@@ -1,5 +1,5 @@
-"""Bodies: a folder each, with `robot.yaml`, its model, and both ends of its wire.
+"""Bodies: one folder each, with `robot.yaml`, model, driver and emulator.
 
 Drivers import `driver.base`, `lidars.base`, `links` and `kinematics`, emulators also `emulators`.
-Nothing imports a body; it is found by name, through `DRIVERS`.
+Nothing imports a body. `DRIVERS` of the package above lists them by name.
 """

@@ -1,7 +1,7 @@
-"""Alpha on its real link: a quadruped behind a TCP port that gets a gait fifty times a second.
+"""Alpha on its real link: a quadruped on TCP that gets a gait fifty times a second.
 
-The driver sends only what is commanded: when commands end, the stream ends, and the firmware stops
-the body 100 ms later (docs/reference/firmware_alpha.md).
+The driver sends only commands that it receives. When they end, the firmware stops the body 100 ms
+later (docs/reference/firmware_alpha.md).
 """
 
 import logging
@@ -37,9 +37,9 @@ from gigabrain_zenoh.logs import Fault
 log = logging.getLogger(__name__)
 
 NO_VALID_FRAME = "no valid frame comes: is this the right port?"
-STATE_TIMEOUT_NS = 100_000_000  # without a state, and the body counts as lost
-FLUSH_NS = 10_000_000  # for the last command to arrive before the connection is closed
-MILLISECONDS = 1 << 32  # after which the firmware's clock wraps
+STATE_TIMEOUT_NS = 100_000_000  # the body counts as lost after this time without a state
+FLUSH_NS = 10_000_000  # for the last command to arrive before the connection closes
+CLOCK_WRAP_MS = 1 << 32  # of the firmware's clock
 USUAL_ROUND_TRIP_MS = 30.0  # from a command to the state that echoes it
 
 
@@ -50,7 +50,7 @@ class AlphaOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 class AlphaDriver(Driver):
-    """Sends nothing until the body reports; its first command is to stop, as after a loss."""
+    """Sends nothing until the body reports. Its first command is a stop, also after a loss."""
 
     Options = AlphaOptions
 
@@ -66,25 +66,25 @@ class AlphaDriver(Driver):
         self.link.on_lost = self._lost
         self._decoder, self._odometry = AlphaDecoder(), LegOdometry(LegGeometry())
         self._sequence = 0  # of the newest command
-        self._unsound = 0  # whole frames without sense
+        self._invalid_frames = 0  # complete frames with invalid content
         self._last: tuple[int, int] | None = None  # sequence and milliseconds of the newest state
         self._state: State | None = None
         self._liveness = Liveness(self.link, self._clock, STATE_TIMEOUT_NS, NO_VALID_FRAME, log)
-        self._stamps, self._echoes = DeviceClock(MILLISECONDS), EchoClock(USUAL_ROUND_TRIP_MS)
-        self._unreported = False  # whether a loss has not been reported yet
+        self._stamps, self._echoes = DeviceClock(CLOCK_WRAP_MS), EchoClock(USUAL_ROUND_TRIP_MS)
+        self._unreported = False  # a loss was not reported yet
         self._open = self._parked = False
         self._fall = Fault(log)
         self.sensors = dict.fromkeys(("imu", "scan") if options.scan else ("imu",))
         self._lidar: ScanSource | None = None
 
     async def open(self) -> None:
-        """Begin to look for the body and its lidar; neither has to be there yet."""
+        """Start connecting to the body and its lidar; both may appear later."""
         self._open = True
         self.link.open()
         self._lidar = open_lidar(self, self._clock)
 
     async def close(self) -> None:
-        """Stop, and let go of the connection."""
+        """Stop the body, and close the connection."""
         if self._open:
             await self.stop()
             if self.link.connected:
@@ -95,13 +95,13 @@ class AlphaDriver(Driver):
             await self._lidar.close()
 
     async def stop(self) -> None:
-        """Come to rest and stand; a body that lies goes on lying."""
+        """Come to rest and stand; a body that lies stays down."""
         if self._liveness.received:
             encode = alpha.encode_park if self._parked else alpha.encode_stop
             self.link.write(encode(self._next()))
 
     async def park(self) -> None:
-        """Lie down; only a step gets it up again."""
+        """Lie down. Only a command to walk makes it stand up."""
         if not self._liveness.received:
             raise BodyLost(f"{self.link}: {self.link.problem or 'the body is silent'}")
         self._parked = True
@@ -110,10 +110,10 @@ class AlphaDriver(Driver):
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
     ) -> Velocity:
-        """Walk; a value that is not a number is zero for all, and so is all while it is lost."""
+        """Walk. All speeds are zero if one is not a number, or while the body is lost."""
         if not self._open:
             raise BodyLost("the connection is not open")
-        if not self._liveness.received:  # it may still be starting
+        if not self._liveness.received:  # the firmware may still be starting
             return ZERO
         to = self.bounded(linear_x, linear_y, angular_z)
         if self._unreported or self._fallen:
@@ -129,7 +129,7 @@ class AlphaDriver(Driver):
         return Velocity(**WALKER.to_body(gait)._asdict())
 
     async def read_state(self) -> RobotState:
-        """Return the body's newest report; `link` tells whether it is recent."""
+        """Return the body's newest report; its `link` shows whether it is recent."""
         velocity = self._odometry.velocity if self._liveness.received else Twist(0.0, 0.0, 0.0)
         state = RobotState(
             robot_type=self.robot.robot_type,
@@ -149,7 +149,7 @@ class AlphaDriver(Driver):
         return self._sequence
 
     def _opened(self) -> None:
-        """A new connection: nothing from before counts."""
+        """Reset all state for a new connection."""
         self._decoder.clear()
         self._liveness.reset()
         self._last = None
@@ -162,13 +162,13 @@ class AlphaDriver(Driver):
         for frame in self._decoder.feed(data):
             state = alpha.decode_state(frame) if frame.type == alpha.STATE else None
             if state is None:
-                self._unsound += 1
+                self._invalid_frames += 1
             else:
                 self._take(frame, state)
-        self.link.errors = self._decoder.errors + self._unsound
+        self.link.errors = self._decoder.errors + self._invalid_frames
 
     def _take(self, frame: AlphaFrame, state: State) -> None:
-        """Handle one report. Its own clock tells how much time has passed since the last."""
+        """Handle one report. The firmware's clock gives the time since the last one."""
         last, self._last = self._last, (frame.sequence, state.milliseconds)
         if last and not alpha.is_newer(frame.sequence, last[0]):
             self._last = last
@@ -179,7 +179,7 @@ class AlphaDriver(Driver):
         self._stamps.arrived(state.milliseconds, now_ns)
         self._echoes.echoed(state.echo, now_ns)
         if last:
-            passed = (state.milliseconds - last[1]) % MILLISECONDS
+            passed = (state.milliseconds - last[1]) % CLOCK_WRAP_MS
             self._odometry.update(state.senses, passed / 1000)
         if first:  # a body that lies stays down until a command to walk
             self._parked = bool(state.flags & alpha.PARKED)
@@ -200,7 +200,7 @@ class AlphaDriver(Driver):
     def _health(self) -> LinkHealth:
         """Return the connection's health; connected means that reports come.
 
-        A loss is reported at least once, however soon the body is back.
+        A loss is reported at least once, even if the body is back at once.
         """
         alive = self._liveness.alive()
         reported, self._unreported = not self._unreported, False
@@ -209,7 +209,7 @@ class AlphaDriver(Driver):
 
 
 def _with(state: RobotState, now: State) -> RobotState:
-    """Return `state` with what the body has reported."""
+    """Return `state` with the values of the body's report."""
     senses = now.senses
     positions, rates = by_joint(senses.joints), by_joint(senses.rates)
     each = zip(JOINT_NAMES, positions, rates, now.torques, now.temperatures, strict=True)

@@ -1,4 +1,4 @@
-"""Alpha's firmware, as docs/reference/firmware_alpha.md asks it to be: a TCP server, and a trot."""
+"""Alpha's firmware, as in docs/reference/firmware_alpha.md: a TCP server, and a trot."""
 
 from collections import deque
 from pathlib import Path
@@ -12,18 +12,18 @@ from gigabrain_drivers.emulators.ports import TcpPort
 from gigabrain_drivers.kinematics.legs import WALKER, Gait, Senses, by_leg, is_sound
 from gigabrain_drivers.kinematics.wheels import Twist
 
-LYING_M = 0.13  # height of the hips of a body that lies
+LYING_M = 0.13  # height of the hips of a lying body
 REST = WALKER.to_gait(Twist(0.0, 0.0, 0.0))
 RISE_NS = 1_800_000_000  # from lying to standing
 LYING = REST._replace(height=LYING_M)
-BROWN_OUT_SHARE = 0.6  # of the battery's voltage, below which the firmware is off
-MAX_EXECUTED = 1000  # commands, for tests to look at
+BROWN_OUT_SHARE = 0.6  # of the battery's voltage; below it the firmware is off
+MAX_EXECUTED = 1000  # commands that are kept for tests
 
 
 class Alpha(Device):
-    """Obeys sound commands newer than the last; stops by itself; reports each step of its body.
+    """Obeys valid commands newer than the last; stops by itself; reports each step of its body.
 
-    After silence the first sound command begins a new count.
+    After silence the first valid command starts a new sequence.
     """
 
     Options = AlphaOptions
@@ -38,7 +38,7 @@ class Alpha(Device):
 
     @classmethod
     def port(cls, options: Any) -> Port:
-        """A TCP port, the usual one where it is free; its address in the file of the options."""
+        """Return a TCP port, the usual one if free; the file in the options gets its address."""
         return TcpPort(Path(options.port), alpha.PORT)
 
     def reset(self) -> None:
@@ -46,9 +46,9 @@ class Alpha(Device):
         self._decoder = AlphaDecoder()
         self._echo = self._sent = self._refused = 0
         self._last: int | None = None  # sequence of the newest command
-        self._obeyed_ns: int | None = None  # when it came
+        self._obeyed_ns: int | None = None  # time of that command
         self._now_ns = 0
-        self.body.take_snapshots()  # what was measured before is none of its business
+        self.body.take_snapshots()  # drop old measurements
         self._began_ns = self.body.snapshot.time_ns
         self._silent, self._on = True, True
         self._gait, self._up_ns = REST, 0
@@ -56,11 +56,11 @@ class Alpha(Device):
 
     @property
     def parked(self) -> bool:
-        """True while it lies, or is on its way down."""
+        """True while it lies, or lies down."""
         return self._gait == LYING
 
     def feed(self, data: bytes) -> None:
-        """Obey commands, or collect parts of them."""
+        """Obey commands; keep partial ones."""
         if not self._on:
             return
         errors = self._decoder.errors
@@ -90,7 +90,7 @@ class Alpha(Device):
             self.wire.write(alpha.encode_state(self._report(sample), self._sent))
 
     def _requested_gait(self, frame: AlphaFrame) -> Gait | None:
-        """Return the gait that a frame asks for, None unless it is sound, new and fresh."""
+        """Return the gait of a command that is valid, new and fresh; else None."""
         if frame.type == alpha.STOP:
             return REST
         if frame.type == alpha.PARK:
@@ -104,7 +104,7 @@ class Alpha(Device):
         return None if alpha.is_stale(command.seen, now_ms) else command.gait
 
     def _milliseconds(self, sample: Snapshot) -> int:
-        """The firmware's clock is the body's: it stands still where a busy host holds both up."""
+        """Return the firmware's clock [ms]. It is the body's: a busy host delays both."""
         return max(0, sample.time_ns - self._began_ns) // 1_000_000
 
     def _execute(self, gait: Gait, sequence: int) -> None:
@@ -114,7 +114,7 @@ class Alpha(Device):
         self._walk(gait)
 
     def _walk(self, gait: Gait) -> None:
-        """Have the legs do it; a body that lies stands up before the first step."""
+        """Command the legs; a lying body stands up before its first step."""
         if self.parked and gait != LYING:
             self._up_ns = self._now_ns + RISE_NS
         if gait != LYING and self._now_ns < self._up_ns:

@@ -1,12 +1,12 @@
-"""Alpha's protocol: gaits to the body, its state back, in frames with a CRC-32.
+"""Alpha's protocol: gaits to the body, states from it, in frames with a CRC-32.
 
-docs/reference/firmware_alpha.md is for those who write the firmware. Numbers are little-endian:
+docs/reference/firmware_alpha.md describes it for firmware authors. Numbers are little-endian:
 
     0   2  magic a5 5a          4   1  type                  6   4  sequence, counts up, wraps
     2   2  bytes of payload     5   1  version, 1           10   n  payload, then 4 of CRC-32
 
-A frame is believed when its CRC is right, its type known, of that type's length, and all numbers
-in it are numbers. Encoders and decoders for both ends, pure.
+A frame is valid if its CRC, type and length are right, and no value is NaN or infinite. Encoders
+and decoders for both ends, pure.
 """
 
 import math
@@ -18,25 +18,25 @@ from gigabrain_drivers.kinematics.legs import Gait, Senses, by_joint, by_leg
 from gigabrain_drivers.links.frames import FrameDecoder
 
 PORT = 8080
-SILENCE_NS = 100_000_000  # without a sound command, after which the body stops
-STALE_MS = 150  # a command that rests on an older state than this is refused
+SILENCE_NS = 100_000_000  # the body stops after this time without a valid command
+STALE_MS = 150  # a command based on an older state is refused
 STATE_HZ = 100
 MAGIC, VERSION = b"\xa5\x5a", 1
 WALK, STOP, PARK, STATE = 0x01, 0x02, 0x03, 0x81
 SEQUENCES = 1 << 32
 
-WALKING, SILENT, FALLEN, PARKED = 1, 2, 4, 8  # flags: feet step; stopped by silence; fell; lies
+WALKING, SILENT, FALLEN, PARKED = 1, 2, 4, 8  # flags: steps; stopped by silence; fell; lies
 
 _HEADER = struct.Struct("<2sHBBI")
 _CRC = struct.Struct("<I")
 _GAIT = struct.Struct("<I10f")
 _STATE = struct.Struct("<III B B 3f 4f3f3f 36f 12h")
 _LENGTHS = {WALK: _GAIT.size, STOP: 0, PARK: 0, STATE: _STATE.size}
-_FASTEST = 1e4  # beyond which, either way, no number in a state is a measurement
+_MAX_VALUE = 1e4  # larger absolute values in a state are no measurements
 
 
 class AlphaFrame(NamedTuple):
-    """One frame; what its payload holds depends on its type."""
+    """One frame. Its type determines the content of its payload."""
 
     type: int
     sequence: int
@@ -46,16 +46,16 @@ class AlphaFrame(NamedTuple):
 class Walk(NamedTuple):
     """A command to walk."""
 
-    seen: int  # [ms], the body's own clock in the newest state that the sender knows
+    seen: int  # [ms], stamp of the newest state that the sender received
     gait: Gait
 
 
 class State(NamedTuple):
     """The body's report, 100 times a second."""
 
-    milliseconds: int  # since the firmware began, wraps
-    echo: int  # sequence of the newest command that was obeyed; 0 for none
-    refused: int  # how many frames were no sound command
+    milliseconds: int  # since the start of the firmware, wraps
+    echo: int  # sequence of the newest obeyed command; 0 for none
+    refused: int  # number of frames without a valid command
     flags: int
     voltage: float  # [V]
     current: float  # [A], positive while it drains
@@ -66,7 +66,7 @@ class State(NamedTuple):
 
 
 def encode(frame: AlphaFrame) -> bytes:
-    """The bytes of a frame on the wire."""
+    """Return the bytes of a frame on the wire."""
     length, sequence = len(frame.payload), frame.sequence % SEQUENCES
     head = _HEADER.pack(MAGIC, length, frame.type, VERSION, sequence)
     body = head + frame.payload
@@ -81,17 +81,17 @@ def encode_walk(command: Walk, sequence: int) -> bytes:
 
 
 def encode_stop(sequence: int) -> bytes:
-    """A command to come to rest and stand."""
+    """Return a command to come to rest and stand."""
     return encode(AlphaFrame(STOP, sequence))
 
 
 def encode_park(sequence: int) -> bytes:
-    """A command to come to rest and lie down, and to stay so until the next step is asked for."""
+    """Return a command to come to rest and lie down, until the next command to walk."""
     return encode(AlphaFrame(PARK, sequence))
 
 
 def decode_walk(frame: AlphaFrame) -> Walk | None:
-    """The command in a frame, or None where it holds what is not a number."""
+    """Return the command in a frame, or None if a value is NaN or infinite."""
     seen, x, y, turn, frequency, duty, a, b, c, d, height = _GAIT.unpack(frame.payload)
     if not all(map(math.isfinite, (x, y, turn, frequency, duty, a, b, c, d, height))):
         return None
@@ -99,7 +99,7 @@ def decode_walk(frame: AlphaFrame) -> Walk | None:
 
 
 def is_stale(seen: int, now: int) -> bool:
-    """Return whether a command with this `seen` time [ms] is too old at `now`, across the wrap."""
+    """Return whether a command's `seen` time [ms] is too old at `now`; handles the wrap."""
     return (now - seen) % SEQUENCES > STALE_MS
 
 
@@ -128,10 +128,10 @@ def encode_state(now: State, sequence: int) -> bytes:
 
 
 def decode_state(frame: AlphaFrame) -> State | None:
-    """The report in a frame, or None where it holds what cannot have been measured."""
+    """Return the report in a frame, or None if a value is impossible."""
     milliseconds, echo, refused, flags, feet, *rest = _STATE.unpack(frame.payload)
     numbers, temperatures = rest[:49], rest[49:]
-    if not all(abs(value) < _FASTEST for value in numbers):
+    if not all(abs(value) < _MAX_VALUE for value in numbers):
         return None
     voltage, current, percentage, *rest = numbers
     (x, y, z, w), rate, acceleration, joints = rest[:4], rest[4:7], rest[7:10], rest[10:]
@@ -161,12 +161,12 @@ def decode_state(frame: AlphaFrame) -> State | None:
 
 
 def is_newer(sequence: int, than: int) -> bool:
-    """Return whether one sequence number comes after another, across the wrap."""
+    """Return whether `sequence` comes after `than`; handles the wrap."""
     return 0 < (sequence - than) % SEQUENCES < SEQUENCES // 2
 
 
 def describe(frame: AlphaFrame) -> str:
-    """A frame in words."""
+    """Describe a frame for the log."""
     if frame.type == WALK and (command := decode_walk(frame)):
         gait = command.gait
         return (
@@ -188,7 +188,7 @@ def describe(frame: AlphaFrame) -> str:
 
 
 class AlphaDecoder(FrameDecoder[AlphaFrame]):
-    """Finds frames in whatever comes in."""
+    """Finds frames in a stream of bytes."""
 
     HEADER = MAGIC
 

@@ -1,4 +1,4 @@
-"""Switches the servos of an arm on, once they are known to be the right ones: nothing moves."""
+"""Switches on an arm's servos after checking that they are the right ones. Nothing moves."""
 
 import math
 from collections.abc import Collection
@@ -17,25 +17,25 @@ from gigabrain_drivers.bodies.feetech.protocol import (
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import ConfigError
 
-SETTLED_TICKS = 6  # 0.5 deg: by no more may it move while it is switched on
+SETTLED_TICKS = 6  # 0.5 deg, largest motion of a servo while it is switched on
 ARM_ATTEMPTS = 10
-VOLTS = {7.4: (4.5, 8.7), 12.0: (9.0, 14.5)}  # that a supply may have, by the servos' variant
-VARIANT_LIMIT = 100  # 0.1 V, between the greatest voltages that the two variants take
+VOLTS = {7.4: (4.5, 8.7), 12.0: (9.0, 14.5)}  # range of the supply, by the servos' variant
+VARIANT_LIMIT = 100  # 0.1 V, between the maximal voltages of the two variants
 
 
 class Arming:
-    """Checks servos, and has them hold."""
+    """Checks servos, and switches them on where they are."""
 
     def __init__(self, bus: HostBus, clock: Clock, calibrated: str, voltage: float) -> None:
         """`voltage` is that of the servos' variant, 7.4 or 12.
 
-        `calibrated` is what `gigabrain driver calibrate` is called with for them.
+        `calibrated` is the argument of `gigabrain driver calibrate` for them.
         """
         self._bus, self._clock = bus, clock
         self._calibrated, self._voltage = calibrated, voltage
 
     async def check(self, joint: ServoJoint) -> None:
-        """Raise ConfigError for another servo than was calibrated, or another variant."""
+        """Raise ConfigError if the servo is not the calibrated one, or another variant."""
         memory, voltage = await self.recognise(joint), self._voltage
         if (memory.max_voltage > VARIANT_LIMIT) != (voltage > VARIANT_LIMIT / 10):
             raise ConfigError(
@@ -44,7 +44,7 @@ class Arming:
             )
 
     async def recognise(self, joint: ServoJoint) -> ServoMemory:
-        """Return what a servo keeps. Raises ConfigError where it was not the calibrated one."""
+        """Return a servo's EEPROM values. Raises ConfigError if it is not the calibrated one."""
         data = await self._bus.confirm(joint.id, 0, feetech.EEPROM_SIZE)
         if data is None:
             raise ConfigError(f"{self._bus.link}: {joint} does not answer any more")
@@ -59,9 +59,9 @@ class Arming:
         return memory
 
     async def arm(self, joints: Collection[ServoJoint]) -> str:
-        """Have all servos hold, without a motion; return why not, or an empty text.
+        """Switch on all servos without motion; return why that failed, or an empty text.
 
-        Raises ConfigError where the supply is not that of the servos.
+        Raises ConfigError if the supply's voltage does not fit the servos.
         """
         for joint in joints:
             first, now = await self.block(joint.id), await self.block(joint.id)
@@ -82,7 +82,7 @@ class Arming:
         return "the arm moves while it is switched on: let go of it"
 
     async def measure(self, joints: Collection[ServoJoint]) -> str:
-        """Believe where servos are, and switch none on; return why not, or an empty text."""
+        """Read positions without switching on; return why that failed, or an empty text."""
         for joint in joints:
             if (now := await self.block(joint.id)) is None:
                 return f"{joint} answers only at times"
@@ -90,7 +90,7 @@ class Arming:
         return ""
 
     async def _switched_on(self, joints: Collection[ServoJoint]) -> bool:
-        """Give each servo its goal, and torque once it is seen to be there."""
+        """Send each servo its goal, and then switch on its torque."""
         now_ns = self._clock.now_ns()
         parts = {j.id: j.settings(now_ns).frame_part(j.goal) for j in joints}
         await self._bus.send(feetech.sync_write(feetech.ACCELERATION.address, parts))
@@ -111,7 +111,7 @@ class Arming:
         return True
 
     async def block(self, servo: int) -> ServoReadings | None:
-        """Read what a cycle reads, or None where no answer came."""
+        """Read the block of a cycle; None without an answer."""
         data = await self._bus.read(servo, FIRST, LENGTH)
         return feetech.decode_readings(data) if data else None
 
@@ -136,7 +136,7 @@ def _other_arm(calibrated: str, joint: ServoJoint, memory: ServoMemory) -> str:
 
 
 def _outside(joint: ServoJoint, now: ServoReadings) -> float:
-    """Return by how much it is where switching it on would move it [rad], 0 where it is not."""
+    """Return how far it is outside the range, so that switching on would move it [rad]; or 0."""
     its, at = joint.calibration, now.position
     slack = round(OUTSIDE / RADIANS_PER_TICK)
     lower = max(its.min_position - SETTLED_TICKS, its.lower - slack)

@@ -1,4 +1,4 @@
-"""The host's end of a servo bus: one question at a time, and answers that are matched to it."""
+"""The host's end of a servo bus: sends one question at a time, and matches its answers."""
 
 import asyncio
 from collections.abc import Sequence
@@ -9,17 +9,17 @@ from gigabrain_drivers.links.frames import Spelling, Wording
 from gigabrain_drivers.links.link import Link
 from gigabrain_zenoh.clock import Clock
 
-ANSWER_TIMEOUT_NS = 3_000_000  # of a cycle's, for each servo; USB adds 1 ms each way
-PATIENT_TIMEOUT_NS = 60_000_000  # of an answer that must come, on a host that is busy
+ANSWER_TIMEOUT_NS = 3_000_000  # per servo, in a cycle; USB adds 1 ms each way
+PATIENT_TIMEOUT_NS = 60_000_000  # for important questions, on a busy host
 
-ATTEMPTS = 4  # of a question that must be answered
+ATTEMPTS = 4  # for important questions
 
 
 class HostBus:
     """Asks servos over a link. Calls may overlap: each waits until the line is free.
 
-    An answer counts while its question waits, if it has the right id and length; others are
-    dropped, as is what a servo sends twice.
+    An answer counts only while its question waits, with the right id and length. Others, and
+    duplicates, are dropped.
     """
 
     def __init__(self, link: Link, clock: Clock) -> None:
@@ -29,17 +29,17 @@ class HostBus:
             Spelling(FeetechDecoder().feed, feetech.describe_received),
         )
         self.link.on_bytes, self.link.on_lost = self._take, self._lost
-        self.unanswered = 0  # answers that did not come
+        self.unanswered = 0  # missing answers
         self._decoder = FeetechDecoder()
         self._line = asyncio.Lock()
         self._waiting: set[int] = set()
         self._answers: dict[int, FeetechPacket] = {}
-        self._garbled = False  # bytes came that are no answer
+        self._garbled = False  # received bytes that are no answer
         self._complete = asyncio.Event()
 
     @property
     def errors(self) -> int:
-        """Stretches of bytes that were thrown away."""
+        """Number of dropped stretches of bytes."""
         return self._decoder.errors
 
     @property
@@ -48,7 +48,7 @@ class HostBus:
         return self._line.locked()
 
     async def send(self, frame: bytes) -> bool:
-        """Send what has no answer, when the line is free; return whether it went out."""
+        """Send a frame without an answer, when the line is free; return whether it was sent."""
         async with self._line:
             return self.link.write(frame)
 
@@ -59,7 +59,7 @@ class HostBus:
         length: int,
         timeout_ns: int = PATIENT_TIMEOUT_NS,
     ) -> dict[int, bytes]:
-        """Ask servos for `length` bytes each; return what came in time, by id.
+        """Ask servos for `length` bytes each; return the answers in time, by id.
 
         The first byte of each answer is its error.
         """
@@ -82,7 +82,7 @@ class HostBus:
         """Return whether a servo is `there`, `missing`, or answers `garbled`."""
         garbled = False
         for _ in range(ATTEMPTS):
-            # two servos ping alike; what they measure differs
+            # two servos with one id answer a ping alike, but their measurements differ
             if await self.ask(
                 feetech.read(servo, feetech.FIRST, feetech.LENGTH), [servo], feetech.LENGTH
             ):
@@ -91,7 +91,7 @@ class HostBus:
         return "garbled" if garbled else "missing"
 
     async def read(self, servo: int, address: int, length: int) -> bytes | None:
-        """Return bytes of a control table, or None where no answer came."""
+        """Return bytes of a control table, or None without an answer."""
         for _ in range(ATTEMPTS):
             answers = await self.ask(feetech.read(servo, address, length), [servo], length)
             if servo in answers:
@@ -99,9 +99,9 @@ class HostBus:
         return None
 
     async def confirm(self, servo: int, address: int, length: int) -> bytes | None:
-        """Return bytes of a control table that were read twice alike, or None.
+        """Return bytes of a control table that two reads agree on, or None.
 
-        A sum of 8 bits lets some wrong answers through.
+        A checksum of 8 bits does not detect all wrong answers.
         """
         before = None
         for _ in range(ATTEMPTS):
@@ -121,7 +121,7 @@ class HostBus:
         return False
 
     async def _until_complete(self, timeout_ns: int) -> None:
-        """Wait for all answers, but no longer than they may take."""
+        """Wait for all answers, at most `timeout_ns`."""
         if self._complete.is_set():
             return
         timeout = asyncio.create_task(self._time_out(timeout_ns))

@@ -29,18 +29,18 @@ from gigabrain_zenoh.errors import ConfigError
 
 SAMPLE_S = 0.02
 MIDDLE = TICKS // 2
-HELD_TICKS = 12  # 1 deg, between two readings of a joint that is held still
-LIMIT_MARGIN = 12  # ticks, 1 deg, that a servo may go beyond the range that was seen
+HELD_TICKS = 12  # 1 deg, largest difference between two readings of a joint that is held still
+LIMIT_MARGIN_TICKS = 12  # 1 deg, of a servo's limits beyond the measured range
 
 
 class Dialogue(Protocol):
     """The person at the arm."""
 
     async def ask(self, text: str) -> str:
-        """Print a request, and return the line that is typed then."""
+        """Print a request, and return the line that the person types."""
 
     def show(self, ranges: Mapping[str, JointRange]) -> None:
-        """Show how far each joint has been moved."""
+        """Show the range through which each joint was moved."""
 
 
 async def calibrate(
@@ -51,9 +51,9 @@ async def calibrate(
     *,
     leader: bool = False,
 ) -> None:
-    """Make the calibration of the arm on the port of the options, and write it to `path`.
+    """Calibrate the arm on the port of the options, and write the calibration to `path`.
 
-    The gripper of a `leader` is a trigger, whose range is its own. Raises ConfigError.
+    The gripper of a `leader` is a trigger with its own range. Raises ConfigError.
     """
     check_writable(path)
     link = SerialLink(options.port, feetech.BAUD, clock := Clock())
@@ -109,7 +109,7 @@ class Calibrator:
         return Calibration(joints=joints)
 
     async def _ranges(self) -> dict[str, JointRange]:
-        """Watch the joints being moved until each has been through its whole range."""
+        """Watch while the person moves each joint through its whole range."""
         now = {name: await self._held(servo) for name, servo in self._servos.items()}
         ranges = {
             name: JointRange(
@@ -140,7 +140,7 @@ class Calibrator:
         return ranges
 
     async def _finish(self, servo: int, its: JointRange, *, consents: bool) -> ServoCalibration:
-        """Return the calibration of a servo; with consent it gets its limits."""
+        """Return the calibration of a servo; with consent, write its limits."""
         name = its.joint.name
         if its.wraps and not its.endless:
             raise ConfigError(
@@ -149,7 +149,7 @@ class Calibrator:
             )
         made = its.calibrated(servo, -1 if name in self._options.inverted else 1)
         if consents:
-            lower, upper = made.lower - LIMIT_MARGIN, made.upper + LIMIT_MARGIN
+            lower, upper = made.lower - LIMIT_MARGIN_TICKS, made.upper + LIMIT_MARGIN_TICKS
             await self._keep(servo, feetech.MIN_POSITION, max(0, lower))
             await self._keep(servo, feetech.MAX_POSITION, min(TICKS - 1, upper))
         memory = await self._memory(servo)
@@ -161,7 +161,7 @@ class Calibrator:
         )
 
     async def _centre(self, servo: int) -> None:
-        """Have a servo count from the middle posture."""
+        """Set a servo's offset, so that it counts from the middle posture."""
         await self._keep(servo, feetech.MIN_POSITION, 0)
         await self._keep(servo, feetech.MAX_POSITION, TICKS - 1)
         memory, now = await self._memory(servo), await self._held(servo)
@@ -185,7 +185,7 @@ class Calibrator:
         return feetech.decode_memory(_answered(servo, data))
 
     async def _held(self, servo: int) -> int:
-        """Return where a joint is held still, as two readings in a row have it."""
+        """Return the position at which two readings in a row agree."""
         before = await self._position(servo)
         for _ in range(ATTEMPTS):
             now = await self._position(servo)

@@ -1,7 +1,7 @@
-"""The calibration of an arm: from the ticks of its servos to the angles of its joints, and back.
+"""The calibration of an arm: converts between ticks of servos and angles of joints.
 
-It is made by `gigabrain driver calibrate`, and kept in a YAML file. The servos' own offsets and
-limits are in it too, as the mark by which the arm is known again.
+`gigabrain driver calibrate` creates it, as a YAML file. It also contains the servos' own offsets
+and limits, which identify the arm.
 """
 
 import errno
@@ -23,23 +23,24 @@ from gigabrain_zenoh.host.files import expanded, make_folder, replace_file
 from gigabrain_zenoh.host.run_folders import state_dir
 
 Tick = Annotated[int, Meta(ge=0, le=TICKS - 1)]
-CALIBRATION_BYTES = 4096  # for which the disk has to have room
+CALIBRATION_BYTES = 4096  # free space that the disk must have
 MAX_OFFSET = 2047  # ticks, in 11 bits
-SPAN_TOLERANCE = 0.17  # [rad], by which a joint's range may differ from that in the robot's file
+SPAN_TOLERANCE = 0.17  # [rad], between a joint's measured range and that in the robot's file
 TRIGGER_SPAN = 0.35  # [rad], the least range of a leader's trigger
-OUTSIDE = 0.17  # [rad], by which a joint may be outside its range as it is switched on
+OUTSIDE = 0.17  # [rad], how far outside its range a joint may be switched on
 
 
 class ServoCalibration(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One joint: the servo that moves it, and what its ticks mean."""
+    """One joint: its servo, and the conversion of its ticks."""
 
     id: Annotated[int, Meta(ge=0, le=MAX_ID)]
-    direction: Literal[1, -1] = 1  # of the joint as the ticks go up
+    direction: Literal[1, -1] = 1  # of the joint while the ticks increase
     zero: Annotated[int, Meta(ge=-TICKS, le=2 * TICKS)]  # ticks at which the joint is at 0 rad
-    lower: Tick  # ticks, the range through which it was moved
+    lower: Tick  # ticks, the range through which the person moved it
     upper: Tick
-    offset: Annotated[int, Meta(ge=-MAX_OFFSET, le=MAX_OFFSET)]  # that the servo keeps, and
-    min_position: Tick  # its limits: both as read when the calibration was made
+    # the servo's own offset and limits, as read at the calibration:
+    offset: Annotated[int, Meta(ge=-MAX_OFFSET, le=MAX_OFFSET)]
+    min_position: Tick
     max_position: Tick
 
     def __post_init__(self) -> None:
@@ -51,24 +52,24 @@ class ServoCalibration(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         return self.direction * (ticks - self.zero) * RADIANS_PER_TICK
 
     def to_ticks(self, radians: float) -> int:
-        """Return the nearest place of the servo within the calibrated range."""
+        """Return the servo's nearest position within the calibrated range."""
         ticks = round(self.zero + self.direction * radians / RADIANS_PER_TICK)
         return max(self.lower, min(self.upper, ticks))
 
     def is_of(self, memory: ServoMemory) -> bool:
-        """Return whether a servo keeps what the calibrated one kept."""
+        """Return whether a servo has the offset and limits of the calibrated one."""
         here = (memory.offset, memory.min_position, memory.max_position)
         return here == (self.offset, self.min_position, self.max_position)
 
 
 class Calibration(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A whole arm, by the names of its joints."""
+    """The calibration of an arm, by joint."""
 
     joints: dict[str, ServoCalibration]
 
 
 def calibration_path(robot_type: str, name: str, folder: Path) -> Path:
-    """Return the file that a robot's file names, or the one where calibrations are kept.
+    """Return the file that a robot's file names, or the default one.
 
     Raises ConfigError without a home folder.
     """
@@ -82,7 +83,7 @@ def load_calibration(
 ) -> Calibration:
     """Read the calibration of an arm with these joints on these servos.
 
-    Raises ConfigError, also for that of another kind of arm.
+    Raises ConfigError, also for a calibration of another kind of arm.
     """
     if not path.exists():
         raise ConfigError(
@@ -104,7 +105,7 @@ def load_calibration(
 
 
 def check_writable(path: Path) -> None:
-    """Raise ConfigError where no calibration can be written; call this before one is made."""
+    """Raise ConfigError if no calibration can be written. Call this before calibrating."""
     try:
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
@@ -130,18 +131,18 @@ def _unwritable(path: Path, error: OSError) -> ConfigError:
 
 
 class JointRange:
-    """The range of one joint while a person moves it, unwrapped from its middle posture on."""
+    """The range of a joint that a person moves, unwrapped from the middle posture."""
 
     def __init__(self, joint: JointDescription, middle: int, *, trigger: bool = False) -> None:
-        """The range of a `trigger` is its own, and not that of the gripper that it leads."""
+        """A `trigger` has its own range, not that of the gripper that it leads."""
         self.joint, self._trigger = joint, trigger
         self.middle = self.ticks = self.lower = self.upper = self._newest = middle
 
     def add(self, ticks: int) -> None:
-        """Take a reading; from one to the next it turns less than a quarter of a turn.
+        """Add a reading, less than a quarter of a turn after the last one.
 
-        The range reaches as far as two readings in a row do: a sum of 8 bits lets some wrong ones
-        through.
+        Only two readings in a row extend the range, because a checksum of 8 bits does not detect
+        all wrong ones.
         """
         half = TICKS // 2
         before, now = self._newest, self.ticks + (ticks - self.ticks + half) % TICKS - half
@@ -152,7 +153,7 @@ class JointRange:
 
     @property
     def missing(self) -> float:
-        """The rest of its range that it has not been moved through [rad]; 0 for none."""
+        """The part of its range that it has not passed yet [rad]; 0 if none."""
         whole = self.joint.upper - self.joint.lower - SPAN_TOLERANCE
         return max(0.0, (TRIGGER_SPAN if self._trigger else whole) - self._span)
 
@@ -162,20 +163,20 @@ class JointRange:
 
     @property
     def wraps(self) -> bool:
-        """True where the servo's count jumps inside the range."""
+        """True if the servo's count wraps inside the range."""
         return self.lower < 0 or self.upper >= TICKS
 
     @property
     def endless(self) -> bool:
-        """True where it turned further than the robot's file says, so that it has no ends."""
+        """True if it turned further than the robot's file says: it has no end stops."""
         whole = self.joint.upper - self.joint.lower + SPAN_TOLERANCE
         return not self._trigger and self._span > whole
 
     def calibrated(self, servo: int, direction: Literal[1, -1]) -> ServoCalibration:
-        """Return the calibration of a servo that keeps no offset and has no limits.
+        """Return the calibration of a servo without its own offset and limits.
 
-        The middle between both ends is that of the robot's file; of an endless joint, the middle
-        posture is.
+        The middle of the range is that of the robot's file; for an endless joint it is the middle
+        posture.
         """
         centre = (self.joint.lower + self.joint.upper) / 2
         middle = self.middle if self.endless else (self.lower + self.upper) / 2

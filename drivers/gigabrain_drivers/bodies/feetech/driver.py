@@ -1,8 +1,8 @@
-"""An arm on a bus of Feetech STS servos, and the wheels of a base where it is on one.
+"""An arm on a bus of Feetech STS servos, and the wheels of its base if it has one.
 
-The servos hold their goals by themselves: should the driver die, the arm stays where it is. Wheels
-would turn on, so a guard stops them then. No start moves an arm: a servo that holds keeps its goal,
-another gets the place where it is.
+The servos hold their goals by themselves: if the driver dies, the arm stays where it is. Wheels
+would keep turning, so a guard stops them. A start never moves the arm: a servo that holds keeps its
+goal, another one gets its present position as goal.
 """
 
 import asyncio
@@ -39,26 +39,26 @@ log = logging.getLogger(__name__)
 
 NO_ANSWER = "is open, but no servo answers: right port, power on?"
 CONNECT_S = 3.0
-FIRST_ANSWER_NS = 1_500_000_000  # that a start waits for the arm
+FIRST_ANSWER_NS = 1_500_000_000  # wait for the arm at a start
 RETRY_NS = 200_000_000  # between two attempts to find it
-COMMAND_TIMEOUT_NS = 80_000_000  # without a command; wheels then stand by 100 ms
+COMMAND_TIMEOUT_NS = 80_000_000  # after this time without a command, so that wheels stop by 100 ms
 YIELD_NS = 500_000_000  # between two attempts to end an overload
 ServoId = Annotated[int, Meta(ge=0, le=feetech.MAX_ID)]
 Share = Annotated[float, Meta(ge=0.05, le=1.0)]
 
 
 class FeetechOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The bus's part of a robot's file."""
+    """The bus's fields in a robot's file."""
 
     port: str = f"usb:{feetech.USB_ID}"  # a path, or usb:VID:PID[:SERIAL]
     servos: dict[Name, ServoId]  # by the joint's name
     wheels: Mapping[Name, ServoId] = msgspec.field(default_factory=dict)  # by the wheel's name
-    inverted: tuple[Name, ...] = ()  # joints and wheels that turn backward as the ticks go up
+    inverted: tuple[Name, ...] = ()  # joints and wheels whose ticks decrease in forward motion
     voltage: float = 7.4  # [V], of the servos' variant: 7.4 or 12
-    calibration: str = ""  # file, beside the robot's; empty: where calibrate keeps it
+    calibration: str = ""  # file, relative to the robot's; empty: the default of calibrate
     rate_hz: Annotated[float, Meta(ge=50.0, le=200.0)] = 100.0  # of reading and writing
     torque_limit: Share = 1.0  # of the stall torque
-    grip_torque: Share = 0.4  # of the stall torque, once the gripper touches something
+    grip_torque: Share = 0.4  # of the stall torque, while the gripper touches something
 
     def __post_init__(self) -> None:
         check_port(self.port)
@@ -83,7 +83,7 @@ class FeetechDriver(Driver):
         clock: Clock | None = None,
         link: Link | None = None,
     ) -> None:
-        """`link` instead of the serial port that the options name."""
+        """`link` replaces the serial port in the options."""
         super().__init__(robot, options, run)
         self._clock = clock or Clock()
         self.link = link or SerialLink(options.port, feetech.BAUD, self._clock)
@@ -93,8 +93,8 @@ class FeetechDriver(Driver):
         self._wheels = self._base.wheels if self._base else []
         self._joints: dict[str, ServoJoint] = {}
         self._armed = self._limp = False
-        self._complaint = "not opened"  # while it is not armed, or does not hold again
-        self._found: dict[ServoJoint | ServoWheel, str] = {}  # how each answered the last time
+        self._complaint = "not opened"  # why it is not armed, or does not hold again
+        self._found: dict[ServoJoint | ServoWheel, str] = {}  # results of the search
         self._failure: GigabrainError | None = None
         self._fault = Fault(log)
         self._tried_ns = self._commanded_ns = 0
@@ -106,7 +106,7 @@ class FeetechDriver(Driver):
 
     @classmethod
     def check(cls, robot: RobotFile, options: FeetechOptions) -> None:
-        """Raises ValueError where the servos are not those of the body's joints."""
+        """Raise ValueError if the servos do not match the body's joints."""
         names = [joint.name for joint in robot.joints]
         if not names:
             raise ValueError("servos: this body has no joints; expected an arm on its servo bus")
@@ -129,7 +129,7 @@ class FeetechDriver(Driver):
         return self._trouble() or (self._complaint if self._limp else "")
 
     def _trouble(self) -> str:
-        """Return what is wrong with the line or a servo in one line, or an empty text."""
+        """Return the problem of the line or a servo as one line, or an empty text."""
         if self.link.problem:
             return line_problem(self.link)
         if not self._armed:
@@ -139,14 +139,14 @@ class FeetechDriver(Driver):
 
     @property
     def guard_ms(self) -> float | None:
-        """Within this time wheels are stopped if this process dies; an arm holds by itself."""
+        """Time to stop the wheels if this process dies; None for an arm, which holds by itself."""
         return SILENCE_NS / 1e6 if self._base else None
 
     def _servos(self) -> list[ServoJoint | ServoWheel]:
         return [*self._joints.values(), *self._wheels]
 
     async def open(self) -> None:
-        """Find the arm and have it hold; it may come later. Raises ConfigError for another one."""
+        """Find and switch on the arm; it may appear later. Raises ConfigError for another arm."""
         options = self.options
         path = calibration_path(self.robot.robot_type, options.calibration, self.run.folder)
         robot_type, joints = self.robot.robot_type, self.robot.joints
@@ -170,7 +170,7 @@ class FeetechDriver(Driver):
         self._cycles = asyncio.create_task(self._run(), name="servo bus")
 
     async def close(self) -> None:
-        """Let go of the ports; the arm holds what it was last told to, and wheels stand."""
+        """Stop the wheels and close the ports; the arm holds its last goal."""
         cycles, self._cycles = self._cycles, None
         if cycles:
             await self.hold()
@@ -178,7 +178,7 @@ class FeetechDriver(Driver):
             with contextlib.suppress(asyncio.CancelledError):
                 await cycles
             servo = next(iter(self._joints.values())).id
-            await self._bus.ask(feetech.ping(servo), [servo], 0)  # the goals have gone out before
+            await self._bus.ask(feetech.ping(servo), [servo], 0)  # answers after the goals
         self._armed = False
         if self._base:
             await self._base.close()
@@ -187,11 +187,11 @@ class FeetechDriver(Driver):
             await self._lidar.close()
 
     async def stop(self) -> None:
-        """Come to rest, and hold: an arm that is let go falls."""
+        """Come to rest, and hold: a limp arm would fall."""
         await self.hold()
 
     async def hold(self) -> None:
-        """Come to rest where it is, and stay there."""
+        """Come to rest, and hold the position."""
         for joint in self._joints.values():
             joint.hold()
         await self._send_goals()
@@ -200,7 +200,7 @@ class FeetechDriver(Driver):
             await self._base.send()
 
     async def limp(self) -> None:
-        """Let go of all joints, until they are sent somewhere. Raises BodyLost."""
+        """Switch off all joints, until their next positions. Raises BodyLost."""
         if not self._armed:
             raise BodyLost(self.problem)
         self._limp = True
@@ -209,10 +209,10 @@ class FeetechDriver(Driver):
                 raise BodyLost(f"{joint} does not let go")
 
     async def set_joint_positions(self, positions: Mapping[str, float]) -> Mapping[str, float]:
-        """Move joints [rad]; return what was sent, or what is measured where nothing can be.
+        """Move joints [rad]; return the sent positions, or the measured ones if it cannot send.
 
-        Joints that were let go of hold again where they are, before they move. Raises
-        UnknownName before anything is sent.
+        Limp joints first hold their position, before they move. Raises UnknownName before it sends
+        anything.
         """
         for name in positions:
             if name not in self._joints:
@@ -230,18 +230,18 @@ class FeetechDriver(Driver):
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
     ) -> Velocity:
-        """Drive, where there are wheels; nothing is sent while the robot has a problem."""
+        """Drive, if there are wheels. It sends nothing while the robot has a problem."""
         if self._base is None:
             return await super().set_base_velocity(linear_x, linear_y, angular_z)
         self._commanded_ns = self._clock.now_ns()
         wanted = ZERO if self._trouble() else self.bounded(linear_x, linear_y, angular_z)
         sent = self._base.command(wanted)
-        if self._bus.busy:  # the cycle sends it once its answers are there
+        if self._bus.busy:  # the cycle sends it after its answers
             return sent
         return sent if await self._base.send() else ZERO
 
     async def read_state(self) -> RobotState:
-        """Return the newest readings that are believed. Raises BodyLost, and ConfigError."""
+        """Return the newest accepted readings. Raises BodyLost, and ConfigError."""
         if self._failure:
             raise self._failure
         base, measured = self._base, (joint.measured() for joint in self._joints.values())
@@ -259,7 +259,7 @@ class FeetechDriver(Driver):
         return tuple(j.calibration.to_radians(j.goal) for j in self._joints.values())
 
     def report(self) -> Mapping[str, float | int | str | None]:
-        """Return how often the bus failed, and what the driver did about it."""
+        """Return counts of failures of the bus, and of corrections by the driver."""
         return {
             "bus_errors": self._bus.errors,
             "bus_unanswered": self._bus.unanswered,
@@ -317,7 +317,7 @@ class FeetechDriver(Driver):
             self._base.take(readings, now_ns)
 
     async def _keep_base(self, base: ServoBase, now_ns: int) -> None:
-        """Have the wheels turn as commanded, or stand while anything has a problem."""
+        """Turn the wheels as commanded, or stop them while there is a problem."""
         if self._trouble() or self._clock.now_ns() - self._commanded_ns > COMMAND_TIMEOUT_NS:
             base.stop()
         if base.overloaded and self._yields(base, now_ns):
@@ -326,12 +326,12 @@ class FeetechDriver(Driver):
         await base.send()
 
     async def _keep(self, now_ns: int) -> None:
-        """Have each servo hold its goal with the right settings, and see to those that fail."""
+        """Restore goals and settings of all servos, and handle failing ones."""
         for joint in self._joints.values():
             if joint.let_go and not joint.status:
                 await self._catch(joint)
             elif joint.status & feetech.OVERLOAD and self._yields(joint, now_ns):
-                joint.yield_to_load()  # a goal that gives way ends the protection
+                joint.yield_to_load()  # a goal at its position ends the protection
         if self._trouble():
             for joint in self._joints.values():
                 joint.hold()
@@ -339,14 +339,14 @@ class FeetechDriver(Driver):
         await self._send_goals()
 
     def _yields(self, overloaded: ServoJoint | ServoBase, now_ns: int) -> bool:
-        """Return whether it is time for an attempt to end its overload, and count it as made."""
+        """Return whether an attempt to end its overload is due; if so, record it."""
         due = now_ns - self._yielded_ns.get(overloaded, 0) >= YIELD_NS
         if due:
             self._yielded_ns[overloaded] = now_ns
         return due
 
     async def _catch(self, joint: ServoJoint) -> None:
-        """Have a servo that has started again hold where it is. Raises BodyLost always."""
+        """Switch on a restarted servo at its position. Always raises BodyLost."""
         joint.yield_to_load()
         settings = joint.settings(self._clock.now_ns()).frame_part(joint.goal)
         address = feetech.ACCELERATION.address
@@ -356,7 +356,7 @@ class FeetechDriver(Driver):
         raise BodyLost(f"{joint} had let go by itself, {text}: is its supply too weak?")
 
     async def _send_settings(self, now_ns: int) -> None:
-        """Write the settings of servos that do not have them, as after a disturbed write."""
+        """Write settings to servos that lack them, as after a disturbed write."""
         parts = {}
         for joint in self._joints.values():
             wanted = joint.settings(now_ns)
@@ -372,13 +372,13 @@ class FeetechDriver(Driver):
             await self._bus.send(feetech.sync_write(feetech.GOAL.address, goals))
 
     async def _find(self) -> bool:
-        """Look for the whole arm, and have it hold unless it is limp; return whether it is there.
+        """Find all servos, and switch them on unless limp; return whether all were found.
 
         Raises ConfigError.
         """
         if not self.link.connected:
             return False
-        if self._base:  # what ran before may have left its wheels turning
+        if self._base:  # an earlier process may have left its wheels turning
             self._base.stop()
             await self._base.send()
         before, self._found = (
@@ -388,7 +388,7 @@ class FeetechDriver(Driver):
         if set(self._found.values()) == {"missing"}:
             self._complaint = f"{self.link} {NO_ANSWER}"
             return False
-        if self._found != before:  # its power may just have been switched on
+        if self._found != before:  # its power may have been switched on just now
             self._complaint = f"{self.link}: the arm has just begun to answer"
             return False
         refuse_incomplete(str(self.link), {str(joint): how for joint, how in self._found.items()})
@@ -403,13 +403,13 @@ class FeetechDriver(Driver):
 
 
 def line_problem(link: Link) -> str:
-    """Return what is wrong with a line, with its name."""
+    """Return the problem of a line, with its name."""
     problem, name = link.problem, str(link)
     return problem if name in problem else f"{name}: {problem}"
 
 
 async def until_open(link: Link) -> None:
-    """Open a link, and wait for its port. Raises ConfigError where it cannot be opened."""
+    """Open a link, and wait for its port. Raises ConfigError if it cannot be opened."""
     opened = asyncio.Event()
     link.on_open = opened.set
     link.open()
@@ -420,7 +420,7 @@ async def until_open(link: Link) -> None:
 
 
 def refuse_incomplete(port: str, found: Mapping[str, str]) -> None:
-    """Raise ConfigError where a servo is missing, or two have the same id."""
+    """Raise ConfigError if a servo is missing, or two have the same id."""
     if set(found.values()) == {"missing"}:
         raise ConfigError(f"{port} {NO_ANSWER}")
     missing = ", ".join(servo for servo, how in found.items() if how == "missing")

@@ -17,15 +17,15 @@ from gigabrain_drivers.emulators.base import Device, EmulatedBody, Wire
 from gigabrain_drivers.kinematics.wheels import Twist, wheels_of
 from gigabrain_drivers.sim.locomotion import Motor
 
-MAX_STEP_S = 0.1  # of time at once; a machine that was held up longer drops the rest
+MAX_STEP_S = 0.1  # of simulated time at once; after a longer delay, the rest is dropped
 STIFFNESS = 17.8  # [N m/rad], of the position servos in the model
 
 
 class FeetechArm(Device):
-    """A bus of servos that move the joints of the simulated arm, and its wheels where it has some.
+    """A bus of servos that move the joints and wheels of the simulated body.
 
-    It begins as an arm that was switched on before, held where it is; a restart lets it fall. The
-    servos keep their last goals for ever, also the speeds of wheels: there is no watchdog.
+    It starts as an arm that is already switched on and holds; after a restart it is limp. There is
+    no watchdog: servos keep their last goals for ever, including the speeds of wheels.
     """
 
     Options = FeetechOptions
@@ -44,7 +44,7 @@ class FeetechArm(Device):
         self._started = False
 
     def reset(self) -> None:
-        """Power on; of a restart there is no torque, and each joint is where it was left."""
+        """Power on. After a restart there is no torque, and joints stay where they were."""
         self._decoder.clear()
         for servo, motor in zip(self.servos.values(), self.body.joints, strict=True):
             servo.step(0.0, motor.position, 0.0, 0.0)
@@ -64,13 +64,13 @@ class FeetechArm(Device):
                 self.wire.write(answers)
 
     def step(self, now_ns: int) -> None:
-        """Let all servos go on."""
+        """Simulate all servos."""
         before_ns = now_ns if self._stepped_ns is None else self._stepped_ns
         self._stepped_ns = now_ns
         seconds, aims, efforts = min(MAX_STEP_S, (now_ns - before_ns) / 1e9), {}, {}
         for servo, motor in zip(self.servos.values(), self.body.joints, strict=True):
             servo.supply = max(0.0, self.options.voltage - self.sag_volts)
-            pull = 0.0 if servo.target is None else motor.effort  # that of a hand is not its own
+            pull = 0.0 if servo.target is None else motor.effort  # a hand's effort is not its
             servo.step(seconds, motor.position, motor.velocity, pull)
             aims[motor.name] = motor.position if servo.target is None else servo.target
             efforts[motor.name] = servo.max_effort
@@ -89,7 +89,7 @@ class FeetechArm(Device):
         return next(one for one in self.body.wheels if one.name == joint)
 
     def _drive(self) -> None:
-        """Have the body aim for the velocity at which its servos turn."""
+        """Set the body's velocity from the speeds of its wheels' servos."""
         if self._base:
             speeds = tuple(self.wheels[name].speed for name in self._base.wheels)
             twist = self._base.to_body(speeds) if any(speeds) else Twist(0.0, 0.0, 0.0)
@@ -97,7 +97,7 @@ class FeetechArm(Device):
 
 
 def _servos(robot: RobotFile, options: FeetechOptions, folder: Path) -> dict[str, ServoModel]:
-    """Return servos as the calibration has left them, or as new ones where there is none."""
+    """Return calibrated servos, or factory-new ones without a calibration."""
     path = calibration_path(robot.robot_type, options.calibration, folder)
     if path.exists():
         calibration = load_calibration(path, robot.robot_type, robot.joints, options.servos)
@@ -106,7 +106,7 @@ def _servos(robot: RobotFile, options: FeetechOptions, folder: Path) -> dict[str
 
 
 def new_servos(ids: Mapping[str, int], options: FeetechOptions) -> dict[str, ServoModel]:
-    """Return servos as they leave the factory, each with its id."""
+    """Return factory-new servos, each with its id."""
     return {
         name: ServoModel(servo, options.voltage, direction=-1 if name in options.inverted else 1)
         for name, servo in ids.items()
@@ -114,7 +114,7 @@ def new_servos(ids: Mapping[str, int], options: FeetechOptions) -> dict[str, Ser
 
 
 def calibrated_servos(calibration: Calibration, voltage: float) -> dict[str, ServoModel]:
-    """Return servos that keep what the calibration says, and are mounted so."""
+    """Return servos with the EEPROM values and mounting of a calibration."""
     servos = {}
     for name, its in calibration.joints.items():
         centre = its.zero + its.offset

@@ -1,4 +1,4 @@
-"""One joint of an arm on a servo bus: what is believed of it, and where it is to go."""
+"""One joint of an arm on a servo bus: its accepted readings and its goal."""
 
 import math
 from typing import NamedTuple
@@ -8,19 +8,20 @@ from gigabrain_drivers.bodies.feetech.calibration import ServoCalibration
 from gigabrain_drivers.bodies.feetech.protocol import RADIANS_PER_TICK, ServoReadings
 from gigabrain_schemas.body import Joint, JointDescription
 
-LOST_NS = 100_000_000  # without an answer it counts as lost
-PUSHED_FACTOR = 2.0  # times as fast as it may move a joint may be pushed, and
-MAX_ACCELERATION = 150.0  # [rad/s2] of a joint that is pushed, or runs into something;
-JUMP_SLACK = math.radians(0.5)  # [rad] more between two readings; the rest is no motion
-VOLTAGE_STEP, TEMPERATURE_STEP = 5, 2  # 0.1 V, [deg C] that may lie between two readings
+LOST_NS = 100_000_000  # it counts as lost after this time without an answer
+# larger changes between two readings are no motion:
+PUSHED_FACTOR = 2.0  # factor on the maximal speed, for a joint that is pushed
+MAX_ACCELERATION = 150.0  # [rad/s2], of a joint that is pushed or hits something
+JUMP_SLACK = math.radians(0.5)  # [rad], added to both
+VOLTAGE_STEP, TEMPERATURE_STEP = 5, 2  # 0.1 V, [deg C]
 AT_REST = 0.05  # [rad/s]
-CONTACT = math.radians(4.0)  # [rad] that a gripper stops short of its goal where it holds something
-CONTACT_NS = 200_000_000  # for which it does
-SPEED_MARGIN = 1.2  # of the servo's own speed limit over the joint's
+CONTACT = math.radians(4.0)  # [rad], a gripper that stops this far from its goal holds something
+CONTACT_NS = 200_000_000  # after this time
+SPEED_MARGIN = 1.2  # servo's speed limit / joint's speed limit
 
 
 class Settings(NamedTuple):
-    """Values in the servo's RAM beside the goal."""
+    """Values in the servo's RAM besides the goal."""
 
     acceleration: int
     velocity: int  # ticks/s
@@ -39,7 +40,7 @@ class Settings(NamedTuple):
 
 
 class ServoJoint:
-    """A joint, its servo and its calibration. Positions are radians, places are ticks."""
+    """A joint, its servo and its calibration. Positions are in radians, goals in ticks."""
 
     pushed_factor, pushed_acceleration = PUSHED_FACTOR, MAX_ACCELERATION
     lost_after_ns = LOST_NS
@@ -56,17 +57,17 @@ class ServoJoint:
         self.description, self.calibration = description, calibration
         self.id = calibration.id
         self.goal = 0  # ticks
-        self.refused = 0  # readings that were not believed
-        self.position = 0.0  # [rad], the newest that is believed
-        self.newest: ServoReadings | None = None
-        self.received_ns = 0  # when the newest one was asked for
+        self.refused = 0  # rejected readings
+        self.position = 0.0  # [rad], newest accepted
+        self.newest: ServoReadings | None = None  # accepted
+        self.received_ns = 0  # when the newest was requested
         self._stall_torque = stall_torque
         self._full = round(torque_limit * 1000)
         self._gentle = min(self._full, round(grip_torque * 1000))
-        self._last: ServoReadings | None = None  # believed or not
-        self._speed = 0.0  # [rad/s] between the two newest that are believed
+        self._last: ServoReadings | None = None  # newest, accepted or not
+        self._speed = 0.0  # [rad/s], between the two newest accepted readings
         self._held = False
-        self._contact_ns: int | None = None  # since when something has been between its fingers
+        self._contact_ns: int | None = None  # start of contact with a thing between its fingers
 
     def __str__(self) -> str:
         return f"servo {self.id} ({self.description.name})"
@@ -79,7 +80,7 @@ class ServoJoint:
 
     @property
     def let_go(self) -> bool:
-        """True where it has no torque any more, whatever was sent."""
+        """True if it has no torque, regardless of commands."""
         return self.newest is not None and not self.newest.torque
 
     @property
@@ -88,9 +89,9 @@ class ServoJoint:
         return self.newest.status if self.newest else 0
 
     def begin(self, now: ServoReadings, asked_ns: int) -> None:
-        """Believe a reading whatever was before, and take it for the goal.
+        """Accept a reading without checks, and use its position as the goal.
 
-        A servo that holds already keeps what it holds: any other goal would move it.
+        A servo that already holds keeps its goal: any other goal would move it.
         """
         self.newest = self._last = now
         self.received_ns, self._speed = asked_ns, 0.0
@@ -100,10 +101,10 @@ class ServoJoint:
         self.goal, self._held = (now.goal if holds else now.position), True
 
     def take(self, now: ServoReadings, asked_ns: int) -> None:
-        """Believe a reading that motion explains, and that agrees with the one before it.
+        """Accept a reading that is a possible motion, and agrees with the one before.
 
-        A sum of 8 bits lets some wrong ones through. So what seldom changes, such as torque,
-        settings and status, has to be read twice.
+        A checksum of 8 bits does not detect all wrong readings. So values that seldom change, such
+        as torque, settings and status, must be the same twice.
         """
         position = self.calibration.to_radians(now.position)
         passed_s = (asked_ns - self.received_ns) / 1e9
@@ -119,9 +120,9 @@ class ServoJoint:
         self.newest, self.position, self.received_ns = now, position, asked_ns
 
     def command(self, position: float) -> float:
-        """Go to a position [rad] within its limits; return the one that a tick stands for.
+        """Go to a position [rad] within its limits; return it rounded to a tick.
 
-        Where it is not a number, the joint stays where it is.
+        If it is not a number, the joint stays where it is.
         """
         if math.isfinite(position):
             lower, upper = self.description.lower, self.description.upper
@@ -130,9 +131,9 @@ class ServoJoint:
         return self.calibration.to_radians(self.goal)
 
     def hold(self) -> None:
-        """Come to rest: at its goal, or sooner where that is further than it takes to brake.
+        """Come to rest at its goal, or earlier if braking needs less way.
 
-        At rest it keeps its goal, so that neither its load nor what it grips is let down.
+        At rest it keeps its goal, so that neither its load nor a gripped thing drops.
         """
         if self._held:
             return
@@ -146,12 +147,12 @@ class ServoJoint:
             self.goal = self.calibration.to_ticks(self.position + brakes)
 
     def yield_to_load(self) -> None:
-        """Take the place where it is for the goal, so that it pulls at nothing."""
+        """Set the goal to the present position, so that the servo gives way."""
         if self.newest:
             self.goal, self._held = self.newest.position, True
 
     def settings(self, now_ns: int) -> Settings:
-        """Return what its servo has to hold; a gripper is gentle once it touches something."""
+        """Return the servo's settings; with less torque for a gripper that touches something."""
         limit = self._gentle if self._grips(now_ns) else self._full
         speed = SPEED_MARGIN * self.description.max_speed / RADIANS_PER_TICK
         return Settings(feetech.MAX_ACCELERATION, round(speed), limit)
@@ -167,14 +168,14 @@ class ServoJoint:
         return now_ns - self._contact_ns >= CONTACT_NS
 
     def holds(self, wanted: Settings) -> bool:
-        """Return whether its servo has these settings, by its newest reading."""
+        """Return whether its newest reading has these settings."""
         now = self.newest
         return now is not None and wanted == Settings(
             now.acceleration, now.goal_velocity, now.torque_limit
         )
 
     def problem(self, now_ns: int) -> str:
-        """Return what is wrong with it in one line, or an empty text."""
+        """Return its problem as one line, or an empty text."""
         if lost := self.lost(now_ns):
             return lost
         if status := feetech.faults_of(self.status):
@@ -182,12 +183,12 @@ class ServoJoint:
         return ""
 
     def lost(self, now_ns: int) -> str:
-        """Return that it answers no more, or an empty text."""
+        """Return a text if it no longer answers, else an empty one."""
         silent = now_ns - self.received_ns > self.lost_after_ns
         return f"{self} answers no more: cable, power?" if silent else ""
 
     def measured(self) -> Joint | None:
-        """Return it as measured, or None before the first reading."""
+        """Return its measured state, or None before the first reading."""
         now = self.newest
         if now is None:
             return None
@@ -203,7 +204,7 @@ class ServoJoint:
 
 
 def _agree(before: ServoReadings, now: ServoReadings) -> bool:
-    """Return whether two readings in a row tell the same about what seldom changes."""
+    """Return whether two readings in a row agree on the values that seldom change."""
     return (
         abs(now.voltage - before.voltage) <= VOLTAGE_STEP
         and abs(now.temperature - before.temperature) <= TEMPERATURE_STEP

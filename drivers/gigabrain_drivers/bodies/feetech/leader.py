@@ -1,6 +1,6 @@
-"""An arm that leads another one: a person moves it by hand, and it is read.
+"""A leader arm: a person moves it by hand, another arm follows.
 
-It is never moved: its motors are switched off, and nothing else is written to its servos.
+It never moves by itself: the motors are switched off, and nothing else is written to its servos.
 """
 
 from collections.abc import Mapping
@@ -28,14 +28,14 @@ LEADER = "so101"
 
 
 class LeaderJoint(ServoJoint):
-    """A joint that a hand moves, faster than a motor would."""
+    """A joint that a hand moves, faster than a motor."""
 
     pushed_factor, pushed_acceleration = 8.0, 1000.0  # [rad/s2]
-    lost_after_ns = 500_000_000  # it moves nothing, and the other arm waits where it is
+    lost_after_ns = 500_000_000  # long is safe: the other arm waits meanwhile
 
     @property
     def leads_to(self) -> float:
-        """Return the target of the other arm's joint [rad]; a trigger takes a gripper's range."""
+        """Return the target of the follower's joint [rad]; a trigger is scaled to the gripper's."""
         its, joint = self.calibration, self.description
         if joint.part != "gripper" or self.newest is None:
             return self.position
@@ -45,7 +45,7 @@ class LeaderJoint(ServoJoint):
 
 
 class LeaderArm:
-    """A second SO-101, whose motors are off while it is used, as `async with`."""
+    """A second SO-101. Its motors are off inside its `async with` block."""
 
     def __init__(
         self,
@@ -55,10 +55,10 @@ class LeaderArm:
         clock: Clock | None = None,
         link: Link | None = None,
     ) -> None:
-        """Check its calibration; `link` stands for a port. Raises ConfigError.
+        """Check its calibration; `link` replaces the port. Raises ConfigError.
 
-        `calibration` is a file, here or beside the robot's; by default the one that
-        `gigabrain driver calibrate so101 --leader` has written.
+        `calibration` is a file, here or beside the robot's. Default: the one that
+        `gigabrain driver calibrate so101 --leader` writes.
         """
         robot, options, path = leader_file(port, calibration)
         self._clock = clock or Clock()
@@ -78,7 +78,7 @@ class LeaderArm:
             )
             for joint in robot.joints
         ]
-        self.let_go = False  # whether motors had to be switched off
+        self.let_go = False  # motors were on, and were switched off
 
     async def __aenter__(self) -> Self:
         """Find all servos, and switch their motors off. Raises ConfigError."""
@@ -109,7 +109,7 @@ class LeaderArm:
             joint.begin(now, self._clock.now_ns())
 
     async def read(self) -> Mapping[str, float]:
-        """Return its posture [rad] by joint. Raises ConfigError where it is lost."""
+        """Return its posture [rad] by joint. Raises ConfigError if it is lost."""
         for _ in range(ATTEMPTS):
             await self._ask()
             now_ns = self._clock.now_ns()
@@ -129,7 +129,7 @@ class LeaderArm:
 
 
 def leader_file(port: str, calibration: str = "") -> tuple[RobotFile, FeetechOptions, Path]:
-    """Return the robot's file of a leader, its bus at `port`, and the file of its calibration.
+    """Return a leader's robot file, its options for `port`, and its calibration's path.
 
     Raises ConfigError.
     """

@@ -1,7 +1,7 @@
 """Feetech's servo bus: packets, the control table of the STS3215, and the units of its values.
 
-A packet is `FF FF | id | length | instruction or error | parameters | sum`; the sum is of 8 bits.
-Words are little-endian, and signed ones keep their sign in a bit of its own. Source: the vendor's
+A packet is `FF FF | id | length | instruction or error | parameters | sum`; the sum has 8 bits.
+Words are little-endian; signed ones have a sign bit (sign and magnitude). Source: the vendor's
 `ftservo-python-sdk` 2.0.1 and its memory table of the STS3215.
 """
 
@@ -16,7 +16,7 @@ HEADER = b"\xff\xff"
 PING, READ, WRITE, REG_WRITE, ACTION, SYNC_READ, SYNC_WRITE = 1, 2, 3, 4, 5, 0x82, 0x83
 BROADCAST = 0xFE
 MAX_ID = 0xFD
-MAX_LENGTH = 250  # of the length field, as the vendor's SDK has it
+MAX_LENGTH = 250  # of the length field, as in the vendor's SDK
 
 MODEL = 777  # of an STS3215
 USB_ID = "1a86:55d3"  # of the CH343 on the usual adapters
@@ -36,10 +36,10 @@ class Register(NamedTuple):
 
     address: int
     size: int = 1  # bytes
-    sign: int | None = None  # the bit that holds its sign
+    sign: int | None = None  # number of its sign bit
 
     def encode(self, value: int) -> bytes:
-        """Return the bytes of a value. Raises OverflowError where it does not fit."""
+        """Return the bytes of a value. Raises OverflowError if it does not fit."""
         if self.sign is None:
             return value.to_bytes(self.size, "little")
         if abs(value) >= 1 << self.sign:
@@ -52,33 +52,33 @@ class Register(NamedTuple):
 
 
 def signed(raw: int, sign: int | None) -> int:
-    """Return the value of a word whose sign is in a bit of its own."""
+    """Return the value of a word with a sign bit."""
     if sign is None:
         return raw
     magnitude = raw & (1 << sign) - 1
     return -magnitude if raw >> sign & 1 else magnitude
 
 
-# EEPROM: nothing but the calibration writes it, and only when a person has agreed
+# EEPROM: only the calibration writes it, and only if the person agrees
 MODEL_NUMBER = Register(3, 2)
 ID = Register(5)
 MIN_POSITION, MAX_POSITION = Register(9, 2), Register(11, 2)
 MAX_TEMPERATURE, MAX_VOLTAGE, MIN_VOLTAGE = Register(13), Register(14), Register(15)
 MAX_TORQUE = Register(16, 2)
 P_GAIN = Register(21)
-OFFSET = Register(31, 2, 11)  # homing offset: the position is the encoder's less this
+OFFSET = Register(31, 2, 11)  # homing offset: position = encoder - offset
 MODE = Register(33)  # 0 position, 1 velocity, 2 PWM, 3 steps
 PROTECTIVE_TORQUE, PROTECTION_TIME, OVERLOAD_TORQUE = Register(34), Register(35), Register(36)
 EEPROM_SIZE = 40
 # RAM
 TORQUE, ACCELERATION = Register(40), Register(41)
 GOAL, GOAL_VELOCITY, TORQUE_LIMIT = Register(42, 2, 15), Register(46, 2, 15), Register(48, 2)
-LOCK = Register(55)  # 1: what is written to the EEPROM is lost with the power
+LOCK = Register(55)  # 1: values written to the EEPROM are lost at power-off
 POSITION, VELOCITY, LOAD = Register(56, 2, 15), Register(58, 2, 15), Register(60, 2, 10)
 VOLTAGE, TEMPERATURE, STATUS, MOVING = Register(62), Register(63), Register(65), Register(66)
 CURRENT = Register(69, 2, 15)
 
-FAULTS = {  # bits of the status, and of the error in an answer
+FAULTS = {  # bits of the status, and of an answer's error
     0x01: "voltage",
     0x02: "position sensor",
     0x04: "temperature",
@@ -87,16 +87,16 @@ FAULTS = {  # bits of the status, and of the error in an answer
 }
 OVERLOAD = 0x20
 
-# what one read of a cycle fetches: the commands as they arrived, and the measurements
+# the block that a cycle reads: received commands, and measurements
 FIRST, LENGTH = TORQUE.address, 31
 _BLOCK = struct.Struct("<BBHHHH5xBHHHBBxBBxxH")
 assert _BLOCK.size == LENGTH
 
-_PREFIX = 4  # header, id, length: what the length does not count
+_PREFIX = 4  # header, id and length, which the length does not include
 
 
 class FeetechPacket(NamedTuple):
-    """An instruction, or an answer, which has an error in its place."""
+    """An instruction, or an answer with an error in its place."""
 
     id: int
     instruction: int
@@ -110,12 +110,12 @@ def encode(packet: FeetechPacket) -> bytes:
 
 
 def checksum(body: bytes) -> int:
-    """Return the check of all bytes between header and check."""
+    """Return the checksum of all bytes between header and checksum."""
     return ~sum(body) & 0xFF
 
 
 def ping(servo: int) -> bytes:
-    """Ask whether a servo is there; its answer has no parameters."""
+    """Return a ping; its answer has no parameters."""
     return encode(FeetechPacket(servo, PING))
 
 
@@ -125,17 +125,17 @@ def read(servo: int, address: int, length: int) -> bytes:
 
 
 def write(servo: int, address: int, data: bytes) -> bytes:
-    """Put bytes into a control table; the servo answers."""
+    """Write bytes into a control table; the servo answers."""
     return encode(FeetechPacket(servo, WRITE, bytes([address]) + data))
 
 
 def sync_read(servos: Sequence[int], address: int, length: int) -> bytes:
-    """Ask several servos for the same bytes; they answer one after the other."""
+    """Ask several servos for the same bytes; they answer in turn."""
     return encode(FeetechPacket(BROADCAST, SYNC_READ, bytes([address, length, *servos])))
 
 
 def sync_write(address: int, data: Mapping[int, bytes]) -> bytes:
-    """Put bytes of one length into several control tables at once; no servo answers."""
+    """Write bytes of one length into several control tables; no servo answers."""
     length = len(next(iter(data.values())))
     body = b"".join(bytes([servo]) + its for servo, its in data.items())
     return encode(FeetechPacket(BROADCAST, SYNC_WRITE, bytes([address, length]) + body))
@@ -147,13 +147,13 @@ def status(servo: int, data: bytes = b"", error: int = 0) -> bytes:
 
 
 class FeetechDecoder(FrameDecoder[FeetechPacket]):
-    """Finds packets in whatever comes in."""
+    """Finds packets in a stream of bytes."""
 
     HEADER = HEADER
 
     def __init__(self) -> None:
         super().__init__()
-        self.expected: int | None = None  # number of parameters; others are no packets. None: any
+        self.expected: int | None = None  # valid number of parameters; None: any
 
     def _size(self, buffer: bytearray) -> int | None:
         if len(buffer) < _PREFIX:
@@ -172,7 +172,7 @@ class FeetechDecoder(FrameDecoder[FeetechPacket]):
 
 
 class ServoReadings(NamedTuple):
-    """One read of a cycle, in the servo's own units."""
+    """The block that a cycle reads, in the servo's own units."""
 
     torque: bool
     acceleration: int
@@ -191,7 +191,7 @@ class ServoReadings(NamedTuple):
     current: int  # 6.5 mA
 
     def seldom(self) -> tuple[int, ...]:
-        """Return what is the same in nearly all readings."""
+        """Return the values that seldom change."""
         settings = self.acceleration, self.goal_time, self.goal_velocity, self.torque_limit
         return (self.torque, *settings, self.lock, self.status)
 
@@ -281,7 +281,7 @@ def _items(params: bytes) -> dict[int, bytes]:
 
 
 def sync_items(params: bytes) -> list[tuple[int, bytes]]:
-    """Return the servos of a sync write and what each gets; a wrong length gives none."""
+    """Return the ids and data of a sync write; empty for a wrong length."""
     size = params[1] + 1
     if len(params) < 2 + size or (len(params) - 2) % size:
         return []

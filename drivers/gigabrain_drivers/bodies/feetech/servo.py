@@ -1,7 +1,7 @@
-"""A model of the STS3215: control table, motion profile, protections, and a bus of several.
+"""A model of the STS3215: control table, motion profile, protections; and a bus of servos.
 
-It knows no physics: `step` takes how its joint moves, and says with which torque the motor holds
-which angle.
+It has no physics: `step` gets the joint's motion, and sets the angle and torque that the motor
+holds.
 """
 
 import math
@@ -13,15 +13,15 @@ from gigabrain_drivers.bodies.feetech.protocol import RADIANS_PER_TICK, FeetechP
 TABLE_SIZE = 71
 FIRMWARE = (3, 10)
 READ_ONLY = (*range(5), *range(50, 55), *range(56, TABLE_SIZE))
-VOLTAGES = {7.4: (80, 40), 12.0: (140, 95)}  # 0.1 V: most and least that a variant takes
+VOLTAGES = {7.4: (80, 40), 12.0: (140, 95)}  # 0.1 V: maximum and minimum, by variant
 VELOCITY_MODE = 1
 NO_LOAD_SPEED = 4.7  # [rad/s]
-DERIVATIVE_S = 0.02  # of its position loop, over the proportional gain
-MAX_LEAD = 0.15  # [rad] of the setpoint before the joint, which is more than its stall torque takes
+DERIVATIVE_S = 0.02  # derivative gain / proportional gain of its position loop
+MAX_LEAD = 0.15  # [rad] of the setpoint before the joint; the stall torque needs less
 AMPERES_AT_STALL = 2.7
 IDLE_AMPERES = 0.006
 SUPPLY_OHMS = 0.05  # of the cable
-BROWN_OUT_V = 4.0  # below which the processor starts again
+BROWN_OUT_V = 4.0  # below it the processor restarts
 AMBIENT = 25.0  # [deg C]
 STALL_WARMING = 0.6  # [K/s] of the winding at the stall torque
 COOLING_S = 180.0  # time constant
@@ -36,11 +36,11 @@ class ServoModel:
         self, servo: int, voltage: float = 7.4, *, centre: int = 2048, direction: int = 1
     ) -> None:
         self.stall_torque = feetech.STALL_TORQUE[voltage]  # [N m]
-        self.target: float | None = None  # [rad] that the motor holds; None: it holds nothing
-        self.speed = 0.0  # [rad/s] at which it turns in velocity mode
+        self.target: float | None = None  # [rad], angle that the motor holds; None: no torque
+        self.speed = 0.0  # [rad/s], in velocity mode
         self.max_effort = 0.0  # [N m]
         self.supply = voltage  # [V]
-        self.goals = 0  # how many goals were written
+        self.goals = 0  # number of written goals
         self._centre, self._direction = centre, direction
         self._eeprom = bytearray(feetech.EEPROM_SIZE)
         self._table = bytearray(TABLE_SIZE)
@@ -49,7 +49,7 @@ class ServoModel:
         self._setpoint = self._setpoint_speed = 0.0
         self._heat = AMBIENT
         self._overloaded_s, self._latched = 0.0, False
-        most, least = VOLTAGES[voltage]
+        max_voltage, min_voltage = VOLTAGES[voltage]
         self._table[0:2] = bytes(FIRMWARE)
         for register, value in (
             (feetech.MODEL_NUMBER, feetech.MODEL),
@@ -58,8 +58,8 @@ class ServoModel:
             (Register(8), 1),
             (feetech.MAX_POSITION, feetech.TICKS - 1),
             (feetech.MAX_TEMPERATURE, 70),
-            (feetech.MAX_VOLTAGE, most),
-            (feetech.MIN_VOLTAGE, least),
+            (feetech.MAX_VOLTAGE, max_voltage),
+            (feetech.MIN_VOLTAGE, min_voltage),
             (feetech.MAX_TORQUE, 1000),
             (feetech.P_GAIN, 32),
             (Register(22), 32),
@@ -77,7 +77,7 @@ class ServoModel:
         return feetech.signed(raw, register.sign)
 
     def __setitem__(self, register: Register, value: int) -> None:
-        """Set an item as the firmware does, without any of its rules."""
+        """Set an item without the firmware's checks."""
         data = register.encode(value)
         self._table[register.address : register.address + register.size] = data
 
@@ -88,17 +88,17 @@ class ServoModel:
 
     @property
     def kept(self) -> bytes:
-        """The EEPROM as it is without power."""
+        """The stored content of the EEPROM."""
         return bytes(self._eeprom)
 
     def keep(self, register: Register, value: int) -> None:
-        """Set an item of the EEPROM, as its maker or a calibration has left it."""
+        """Set an item of the EEPROM, as its maker or a calibration does."""
         self[register] = value
         self._eeprom[:] = self._table[: feetech.EEPROM_SIZE]
         self._measure()
 
     def power_on(self) -> None:
-        """Start: the EEPROM's values, no torque, and the place where it is for a goal."""
+        """Start with the EEPROM's values, no torque, and the present position as goal."""
         self._table[: feetech.EEPROM_SIZE] = self._eeprom
         self._table[feetech.EEPROM_SIZE :] = bytes(TABLE_SIZE - feetech.EEPROM_SIZE)
         self[feetech.TORQUE_LIMIT] = self[feetech.MAX_TORQUE]
@@ -109,18 +109,18 @@ class ServoModel:
         self[feetech.GOAL] = self[feetech.POSITION]
 
     def begin_holding(self, lead: float) -> None:
-        """Hold the joint as if it had long done so, its goal `lead` [rad] before the position."""
+        """Hold the joint in a steady state, with the goal `lead` [rad] before the position."""
         lead += math.copysign(BACKLASH / 2, lead)
         self[feetech.GOAL] += round(self._direction * lead / RADIANS_PER_TICK)
         self.write(feetech.TORQUE.address, b"\1")
         self._setpoint += lead
 
     def read(self, address: int, length: int) -> bytes:
-        """Return bytes of the table; what is behind its end is zero."""
+        """Return bytes of the table; beyond its end they are zero."""
         return bytes(self._table[address : address + length]).ljust(length, b"\0")
 
     def write(self, address: int, data: bytes) -> None:
-        """Write bytes, leaving out those that cannot be written."""
+        """Write bytes, except read-only ones."""
         torque = self[feetech.TORQUE]
         for place, value in enumerate(data, address):
             if place in READ_ONLY or place >= TABLE_SIZE:
@@ -132,7 +132,7 @@ class ServoModel:
         if feetech.GOAL.address in written:
             self.goals += 1
             if self._latched and (self.goal - self._position) * self._effort <= 0.0:
-                self._latched = False  # it is asked to give way
+                self._latched = False  # a new goal ends the protection
         if not torque and self[feetech.TORQUE]:
             self._setpoint, self._setpoint_speed = self._position, 0.0
         if not self[feetech.TORQUE]:
@@ -149,7 +149,7 @@ class ServoModel:
         self._queued = None
 
     def step(self, seconds: float, position: float, velocity: float, effort: float) -> None:
-        """Do what the firmware does meanwhile, its joint being so [rad, rad/s, N m]."""
+        """Run the firmware for `seconds`, with the joint's motion [rad, rad/s, N m]."""
         self._position, self._velocity, self._effort = position, velocity, effort
         load = abs(effort) / self.stall_torque
         self._heat += seconds * (STALL_WARMING * load**2 - (self._heat - AMBIENT) / COOLING_S)
@@ -174,7 +174,7 @@ class ServoModel:
         self.target, self.max_effort = self._setpoint - play + damps, share * self.stall_torque
 
     def _watch_load(self, load: float, seconds: float) -> None:
-        """Latch the overload protection after a while above its torque."""
+        """Latch the overload protection after its time above its torque."""
         if load < self[feetech.OVERLOAD_TORQUE] / 100:
             self._overloaded_s = 0.0
             return
@@ -191,31 +191,31 @@ class ServoModel:
         return self.angle(ticks)
 
     def angle(self, ticks: int) -> float:
-        """Return the angle of the joint [rad] where the servo measures `ticks`."""
+        """Return the angle of the joint [rad] for `ticks`."""
         return (ticks + self[feetech.OFFSET] - self._centre) * RADIANS_PER_TICK * self._direction
 
     def _follow_profile(self, seconds: float) -> None:
-        """Bring the setpoint nearer to the goal, within speed and acceleration."""
+        """Move the setpoint towards the goal, within speed and acceleration."""
         goal, at, speed = self.goal, self._setpoint, self._setpoint_speed
         if at == goal and not speed:
             return
         units = self[feetech.ACCELERATION] or feetech.MAX_ACCELERATION
         acceleration = units * feetech.ACCELERATION_UNIT * RADIANS_PER_TICK
-        most = abs(self[feetech.GOAL_VELOCITY]) * RADIANS_PER_TICK or NO_LOAD_SPEED
-        most, step = min(most, NO_LOAD_SPEED), acceleration * SUBSTEP_S
+        max_speed = abs(self[feetech.GOAL_VELOCITY]) * RADIANS_PER_TICK or NO_LOAD_SPEED
+        max_speed, step = min(max_speed, NO_LOAD_SPEED), acceleration * SUBSTEP_S
         for _ in range(round(seconds / SUBSTEP_S)):
             left = goal - at
             if abs(left) <= step * SUBSTEP_S and abs(speed) <= 2 * step:
                 at, speed = goal, 0.0
                 break
-            wanted = math.copysign(min(most, math.sqrt(2 * acceleration * abs(left))), left)
+            wanted = math.copysign(min(max_speed, math.sqrt(2 * acceleration * abs(left))), left)
             speed += max(-step, min(step, wanted - speed))
             at += speed * SUBSTEP_S if abs(speed * SUBSTEP_S) < abs(left) else left
         lead = max(-MAX_LEAD, min(MAX_LEAD, at - self._position))
         self._setpoint, self._setpoint_speed = self._position + lead, speed
 
     def _follow_speed(self) -> None:
-        """Turn at the goal's speed; there is no end to it. What it moves has a ramp of its own."""
+        """Turn at the goal's speed, without a ramp: the simulated body has its own."""
         wanted = self._direction * self[feetech.GOAL_VELOCITY] * RADIANS_PER_TICK
         wanted = 0.0 if self._latched else wanted
         self.target, self.max_effort = None, self.stall_torque
@@ -237,7 +237,7 @@ class ServoModel:
         self[feetech.STATUS] = self._status()
 
     def _status(self) -> int:
-        """Return the bits of what is wrong."""
+        """Return the bits of the present faults."""
         voltage = self[feetech.VOLTAGE]
         wrong = 0x20 if self._latched else 0
         if not self[feetech.MIN_VOLTAGE] <= voltage <= self[feetech.MAX_VOLTAGE] + 5:
@@ -248,11 +248,11 @@ class ServoModel:
 
 
 class ServoBus:
-    """The servos on one line: what they answer, and when all talk at once."""
+    """The servos on one line, with their answers and collisions."""
 
     def __init__(self, servos: Sequence[ServoModel]) -> None:
         self.servos = list(servos)
-        self.silent = 0  # the id of one that neither hears nor answers
+        self.silent = 0  # id of a servo that neither receives nor answers
 
     def execute(self, packet: FeetechPacket) -> bytes:
         """Execute an instruction; return the answers."""
@@ -276,7 +276,7 @@ class ServoBus:
         return [model for model in self.servos if model.id == servo != self.silent]
 
     def _asked(self, servo: int, packet: FeetechPacket) -> bytes:
-        """Return the answer of a servo; of two with one id, what is left when both talk."""
+        """Return the answer of a servo; of two with one id, the collision of both."""
         answer = b""
         for model in self._at(servo):
             data = _executed(model, packet)
@@ -288,7 +288,7 @@ class ServoBus:
 
 
 def _executed(model: ServoModel, packet: FeetechPacket) -> bytes | None:
-    """Return the parameters of the answer, or None where there is none."""
+    """Return the parameters of the answer, or None without an answer."""
     kind, params = packet.instruction, packet.params
     if kind == feetech.PING:
         return b""

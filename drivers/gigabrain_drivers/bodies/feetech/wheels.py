@@ -1,4 +1,4 @@
-"""A base whose wheels are turned by servos in velocity mode, on the bus of its arm."""
+"""A base with wheels on servos in velocity mode, on the bus of its arm."""
 
 from collections import deque
 from collections.abc import Mapping
@@ -17,15 +17,15 @@ from gigabrain_schemas.body import Joint
 from gigabrain_zenoh.errors import BodyLost, ConfigError
 
 VELOCITY_MODE = 1
-MAX_SPEED = 3000  # ticks/s, of an STS3215 under load, as LeRobot has it
-FASTEST = 1.5 * MAX_SPEED  # ticks/s that readings may show: it is pushed, or runs free
-SLACK = 8  # ticks more between two readings; the rest is no motion
-STOP_ATTEMPTS = 20  # at the end: a servo may wait for 250 bytes where a frame's length was hit
-WINDOW_NS = 50_000_000  # over which speeds are measured: a shorter one would be encoder noise
+MAX_SPEED = 3000  # ticks/s, of an STS3215 under load, as in LeRobot
+MAX_READ_SPEED = 1.5 * MAX_SPEED  # ticks/s, of a wheel that is pushed or runs free
+SLACK_TICKS = 8  # added to the largest motion between two readings
+STOP_ATTEMPTS = 20  # after a disturbed length field, a servo may wait for 250 bytes
+WINDOW_NS = 50_000_000  # for mean speeds; a shorter one shows encoder noise
 
 
 class WheelOptions(Protocol):
-    """The options of the driver that hold for wheels."""
+    """The driver's options for wheels."""
 
     @property
     def wheels(self) -> Mapping[str, int]:
@@ -33,7 +33,7 @@ class WheelOptions(Protocol):
 
     @property
     def inverted(self) -> tuple[str, ...]:
-        """Wheels that turn backward as the ticks go up."""
+        """Wheels whose ticks decrease in forward motion."""
 
     @property
     def voltage(self) -> float:
@@ -45,17 +45,17 @@ class WheelOptions(Protocol):
 
 
 class ServoWheel:
-    """A wheel and its servo. It counts the ticks by which it has turned."""
+    """A wheel and its servo. It counts the ticks of its motion."""
 
     def __init__(self, name: str, servo: int, *, direction: int, torque_limit: float) -> None:
         self.name, self.id = name, servo
         self.goal = 0  # ticks/s, as the servo counts them
         self.turned = 0  # ticks forward since the start
-        self.refused = 0  # readings that were not believed
-        self.received_ns = 0  # when the newest one was asked for
+        self.refused = 0  # rejected readings
+        self.received_ns = 0  # when the newest was requested
         self.newest: ServoReadings | None = None
         self._direction, self._torque_limit = direction, round(torque_limit * 1000)
-        self._last: ServoReadings | None = None  # believed or not
+        self._last: ServoReadings | None = None  # newest, accepted or not
         self._past: deque[tuple[int, int]] = deque()  # (time [ns], turned)
 
     def __str__(self) -> str:
@@ -63,7 +63,7 @@ class ServoWheel:
 
     @property
     def let_go(self) -> bool:
-        """True where it has no torque any more, whatever was sent."""
+        """True if it has no torque, regardless of commands."""
         return self.newest is not None and not self.newest.torque
 
     @property
@@ -80,25 +80,25 @@ class ServoWheel:
         return (now - before) * RADIANS_PER_TICK / ((now_ns - since_ns) / 1e9)
 
     def command(self, speed: float) -> float:
-        """Turn forward [rad/s]; return the speed that a whole number of ticks stands for."""
+        """Turn forward [rad/s]; return the speed rounded to ticks/s."""
         self.goal = self._direction * round(speed / RADIANS_PER_TICK)
         return self._direction * self.goal * RADIANS_PER_TICK
 
     def begin(self, now: ServoReadings, asked_ns: int) -> None:
-        """Believe a reading whatever was before."""
+        """Accept a reading without checks."""
         self.newest = self._last = now
         self.received_ns, self.goal = asked_ns, 0
         self._past.clear()
         self._past.append((asked_ns, self.turned))
 
     def take(self, now: ServoReadings, asked_ns: int) -> int:
-        """Count on by a reading; return the ticks that it turned forward.
+        """Add a reading; return its forward motion in ticks.
 
-        It is believed where motion explains it, and where what seldom changes was read twice.
+        It is accepted if it is a possible motion, and its seldom changing values were read twice.
         """
         before, last, self._last = self.newest or now, self._last or now, now
         moved = (now.position - before.position + TICKS // 2) % TICKS - TICKS // 2
-        furthest = FASTEST * (asked_ns - self.received_ns) / 1e9 + SLACK
+        furthest = MAX_READ_SPEED * (asked_ns - self.received_ns) / 1e9 + SLACK_TICKS
         if abs(moved) > furthest or _seldom(now) != _seldom(last):
             self.refused += 1
             return 0
@@ -112,7 +112,7 @@ class ServoWheel:
 
     @property
     def has_settings(self) -> bool:
-        """Return whether its servo has the settings of `frame_part`, by its newest reading."""
+        """Return whether its newest reading has the settings of `frame_part`."""
         now = self.newest
         wanted = feetech.MAX_ACCELERATION, self._torque_limit
         return now is not None and (now.acceleration, now.torque_limit) == wanted
@@ -128,7 +128,7 @@ class ServoWheel:
         return b"".join(parts)
 
     def problem(self, now_ns: int) -> str:
-        """Return what is wrong with it in one line, or an empty text."""
+        """Return its problem as one line, or an empty text."""
         if now_ns - self.received_ns > LOST_NS:
             return f"{self} answers no more: cable, power?"
         if status := feetech.faults_of(self.status):
@@ -136,7 +136,7 @@ class ServoWheel:
         return ""
 
     def measured(self, stall_torque: float) -> Joint | None:
-        """Return it as measured, or None before the first reading."""
+        """Return its measured state, or None before the first reading."""
         now = self.newest
         if now is None:
             return None
@@ -151,12 +151,12 @@ class ServoWheel:
 
 
 def _seldom(now: ServoReadings) -> tuple[int, ...]:
-    """Return what is the same in nearly all readings of a wheel."""
+    """Return the values of a wheel's readings that seldom change."""
     return now.torque, now.acceleration, now.torque_limit, now.lock, now.status
 
 
 class ServoBase:
-    """All wheels of a base: its velocity, and its odometry by how they turn."""
+    """All wheels of a base: commands its velocity, and integrates its odometry."""
 
     def __init__(
         self, robot: RobotFile, options: WheelOptions, bus: HostBus, arming: Arming
@@ -182,9 +182,9 @@ class ServoBase:
         self._guard = LineGuard(self._goals())
 
     async def close(self) -> None:
-        """Come to rest, and end the process that would stop the wheels if this one died.
+        """Come to rest, and end the guard process.
 
-        Nothing stops them later. So it is read back, until it has come through a disturbed line.
+        Nothing could stop the wheels later. So the stop is repeated until it is read back.
         """
         self.stop()
         for _ in range(STOP_ATTEMPTS):
@@ -193,7 +193,7 @@ class ServoBase:
         self._guard.close()
 
     async def _stands(self) -> bool:
-        """Return whether all servos have a speed of zero for their goal."""
+        """Return whether all servos have a goal of zero speed."""
         speed, servos = feetech.GOAL_VELOCITY, [wheel.id for wheel in self.wheels]
         question = feetech.sync_read(servos, speed.address, speed.size)
         answers = await self._bus.ask(question, servos, speed.size, len(servos) * ANSWER_TIMEOUT_NS)
@@ -201,7 +201,7 @@ class ServoBase:
         return goals == [0] * len(servos)
 
     def command(self, wanted: Velocity) -> Velocity:
-        """Drive; return what was sent. All wheels slow down alike if one would be too fast."""
+        """Drive; return the sent velocity. If a wheel would be too fast, all are scaled down."""
         speeds = self._base.to_wheels(Twist(wanted.linear_x, wanted.linear_y, wanted.angular_z))
         slower = max(1.0, max(map(abs, speeds)) / self._fastest)
         pairs = zip(self.wheels, speeds, strict=True)
@@ -220,11 +220,11 @@ class ServoBase:
         return Velocity(**self._base.to_body(speeds)._asdict()) if any(speeds) else Velocity()
 
     def joints(self) -> tuple[Joint, ...]:
-        """Return all wheels as measured."""
+        """Return the measured state of all wheels."""
         return tuple(filter(None, (wheel.measured(self._stall_torque) for wheel in self.wheels)))
 
     def take(self, readings: Mapping[int, ServoReadings], asked_ns: int) -> None:
-        """Move the pose on by what the wheels have turned."""
+        """Add the wheels' motion to the pose."""
         turned = [
             wheel.take(readings[wheel.id], asked_ns) if wheel.id in readings else 0
             for wheel in self.wheels
@@ -234,9 +234,9 @@ class ServoBase:
             self.pose = advance_pose(self.pose, moved)
 
     async def send(self) -> bool:
-        """Send all speeds; return whether they went out."""
+        """Send all speeds; return whether they were sent."""
         moving = any(wheel.goal for wheel in self.wheels)
-        if moving:  # the guard knows it before the wheels do
+        if moving:  # report it to the guard before the wheels move
             self._guard.tell(self._bus.link.fd, moving=True)
         sent = await self._bus.send(self._goals())
         if not moving:
@@ -248,9 +248,9 @@ class ServoBase:
         return feetech.sync_write(feetech.GOAL_VELOCITY.address, goals)
 
     async def start(self, now_ns: int) -> str:
-        """Have servos that were told to stop turn by speed; return why not, or an empty text.
+        """Switch stopped servos to velocity mode; return why that failed, or an empty text.
 
-        The mode is written while the EEPROM is locked, so it lasts until the power goes. Raises
+        The mode is written while the EEPROM is locked, so it is lost at power-off. Raises
         ConfigError for other servos.
         """
         for wheel in self.wheels:
@@ -282,9 +282,9 @@ class ServoBase:
         return still and await write(wheel.id, feetech.TORQUE, 1)
 
     async def keep(self) -> int:
-        """Write settings that servos have lost; return how many had.
+        """Restore settings that servos have lost; return the number of those servos.
 
-        Raises BodyLost where one has let go by itself: its mode is another then.
+        Raises BodyLost if a servo has lost its torque: then its mode has changed too.
         """
         parts = {wheel.id: wheel.frame_part() for wheel in self.wheels if not wheel.has_settings}
         if parts:
@@ -296,13 +296,13 @@ class ServoBase:
 
     @property
     def overloaded(self) -> bool:
-        """Return whether a servo protects itself from overload."""
+        """Return whether a servo's overload protection is active."""
         return any(wheel.status & feetech.OVERLOAD for wheel in self.wheels)
 
     async def end_overload(self) -> None:
-        """Switch servos that protect themselves from overload off and on: that ends it.
+        """End the overload protection of servos by switching them off and on.
 
-        They keep the speed that they had, so each gets zero before it is on.
+        They keep their old speed, so each gets zero speed before it is switched on.
         """
         write = self._bus.write
         for wheel in self.wheels:
@@ -313,7 +313,7 @@ class ServoBase:
 
 
 def check_wheels(robot: RobotFile, wheels: Mapping[str, int]) -> None:
-    """Raise ValueError where the servos of wheels are not those of the body's base."""
+    """Raise ValueError if the servos of wheels do not match the body's base."""
     base = wheels_of(robot)
     names = base.wheels if base else ()
     if set(wheels) != set(names):

@@ -1,4 +1,4 @@
-"""Converts velocities to the numbers of a command line, and state lines to a body's state."""
+"""Converts velocities to command lines, and state lines to a body's state."""
 
 import math
 from collections import deque
@@ -19,41 +19,41 @@ from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import Battery, BodyDescription, Joint
 
 WHEEL = "wheel_"
-EXPIRING = tuple(  # fields whose old values safety must not take for measured
+EXPIRING = tuple(  # fields whose old values must expire, so that safety does not use them
     name for name in STATE if name.startswith("battery_") or name.endswith("_temperature")
 )
 
-FLAGS_REPEATED = 10  # times in a row unchanged: it sends them at a rate, not only on changes
+FLAGS_REPEATED = 10  # after this many unchanged flags in a row, the firmware repeats them
 
-VELOCITY_S = 0.05  # a velocity from positions is taken over so much time: one line is noise
-MAX_STEP_FACTOR = 3.0  # a step this many times longer than the body can go is no step ...
-STEP_SLACK_M = 0.05  # ... but the lines' own unevenness is
-GAP_NS = 100_000_000  # without a line: the firmware may have restarted
-MAX_INTEGRATION_S = 0.2  # a speed is not integrated over a longer time
+VELOCITY_S = 0.05  # window for a velocity from positions; single lines show noise
+MAX_STEP_FACTOR = 3.0  # longer steps, relative to the maximal speed, are rejected,
+STEP_SLACK_M = 0.05  # with this tolerance for uneven lines
+GAP_NS = 100_000_000  # after this time without a line, the firmware may have restarted
+MAX_INTEGRATION_S = 0.2  # longest time over which a speed is integrated
 STILL = Twist(0.0, 0.0, 0.0)
 ORIGIN = Pose(x=0.0, y=0.0, yaw=0.0)
 
 
 class LineCommand:
-    """Writes velocities with a template, and knows what its digits leave of them."""
+    """Writes velocities with a template, and computes their rounding by its digits."""
 
     def __init__(self, template: Template, base: Base | None) -> None:
         self.template, self._base = template, base
         self._by_wheels = any(name.startswith(WHEEL) for name in template.names)
 
     def line(self, wanted: Velocity, seq: int) -> bytes:
-        """Return the line that asks for a velocity, rounded so that no limit is exceeded."""
+        """Return the command line for a velocity, rounded so that no limit is exceeded."""
         values = {**self._values(wanted), "seq": float(seq)}
         return self.template.encode(values, toward_zero=True)
 
     def sent(self, wanted: Velocity) -> Velocity:
-        """Return what the line's digits leave of a velocity."""
+        """Return a velocity as rounded by the line's digits."""
         values = self._values(wanted).items()
         names, sent = self.template.names, self.template.sent
         return self.means({name: sent(name, value) for name, value in values if name in names})
 
     def means(self, values: Mapping[str, float]) -> Velocity:
-        """Return the velocity that a line with these values commands; what it omits is 0."""
+        """Return the velocity that a line with these values commands; omitted values are 0."""
         twist = Twist(*(values.get(name, 0.0) for name in Twist._fields))
         if self._base and self._by_wheels:
             wheels = zip(self._base.wheels, self._base.to_wheels(twist), strict=True)
@@ -62,7 +62,7 @@ class LineCommand:
         return Velocity(**{name: value + 0.0 for name, value in twist._asdict().items()})  # no -0
 
     def _values(self, velocity: Velocity) -> dict[str, float]:
-        """Return all that a command line may contain of a velocity."""
+        """Return all values that a command line may contain for a velocity."""
         twist = Twist(velocity.linear_x, velocity.linear_y, velocity.angular_z)
         values = twist._asdict()
         if self._base:
@@ -72,7 +72,7 @@ class LineCommand:
 
 
 class SentWording:
-    """Describes what goes out on the line, byte after byte: commands and named strings."""
+    """Describes sent bytes: commands and named strings."""
 
     def __init__(self, template: Template, named: Mapping[bytes, str]) -> None:
         self._decoder, self._named = LineDecoder([template]), named
@@ -80,7 +80,7 @@ class SentWording:
         self._held = b""
 
     def feed(self, data: bytes) -> list[str]:
-        """Describe what `data` completes."""
+        """Describe the commands and strings that `data` completes."""
         self._held = (self._held + data)[-self._longest - 1 :]
         if name := self._named.get(self._held):
             self._held = b""
@@ -93,10 +93,10 @@ class SentWording:
 
 
 class LineReport:
-    """Takes line after line; has the newest of everything, and the pose by dead reckoning.
+    """Collects the newest values of all lines, and integrates the pose.
 
-    Counters that wrap go on; counters that jump, as after a restart of the firmware, count from
-    where they jumped to.
+    It unwraps counters. After a jump, as by a restart of the firmware, it counts from the new
+    value.
     """
 
     def __init__(self, options: LineOptions, body: BodyDescription, base: Base | None) -> None:
@@ -110,21 +110,21 @@ class LineReport:
         self._values: dict[str, float] = {}
         self._recent = {name: Recent[float]() for name in EXPIRING}
         self._flags, self._flags_unchanged = Recent[int](), 0  # lines in a row
-        self._angles: tuple[float, ...] | None = None  # the wheels', as reported last
-        self._pose: Pose | None = None  # as reported last
+        self._angles: tuple[float, ...] | None = None  # of the wheels, newest reported
+        self._pose: Pose | None = None  # newest reported
         self._now_ns = 0
         self._period_s, self._unspent_s = 1 / options.state_hz, 0.0
         self._turned = dict.fromkeys(self._wheels, 0.0)  # [rad], since the start
-        self._steps: deque[tuple[float, Twist]] = deque()  # (seconds, way) of the newest lines
+        self._steps: deque[tuple[float, Twist]] = deque()  # (seconds, motion) of the newest lines
         self.pose = ORIGIN  # since the start
 
     @property
     def flags(self) -> int:
-        """The bits that the firmware reports."""
+        """The firmware's flags, as bits."""
         return int(self._values.get("flags", 0))
 
     def flags_overdue(self, now_ns: int) -> bool:
-        """Return whether flags that were repeated come no more."""
+        """Return whether repeated flags are no longer received."""
         return self._flags_unchanged >= FLAGS_REPEATED and self._flags.get(now_ns) is None
 
     def update(self, values: Mapping[str, float], now_ns: int) -> None:
@@ -151,13 +151,13 @@ class LineReport:
             self._integrate(now_ns)
 
     def restart(self) -> None:
-        """Count from the next line on: the connection was cut."""
+        """Start counting at the next line, because the connection was cut."""
         self._angles = self._pose = None
         self._now_ns, self._unspent_s = 0, 0.0
         self._steps.clear()
 
     def velocity(self) -> Velocity:
-        """Return each part as reported, by the wheels' speeds, or by the position's change."""
+        """Return each part as reported, else from wheel speeds, else from positions."""
         own, (linear_x, linear_y, angular_z) = self._values, self._measured()
         return Velocity(
             linear_x=own.get("linear_x", linear_x),
@@ -166,7 +166,7 @@ class LineReport:
         )
 
     def joints(self, now_ns: int) -> tuple[Joint, ...]:
-        """The wheels of which anything is known."""
+        """Return the wheels that are reported."""
         found, known = [], {**self._values, **self._not_expired(now_ns)}
         for name in self._wheels:
             prefix = f"wheel_{name}_"
@@ -196,7 +196,7 @@ class LineReport:
         return {name: value for name, value in found if value is not None}
 
     def _measured(self) -> Twist:
-        """The velocity by the wheels' speeds, or by the way of the newest lines."""
+        """Return the velocity from the wheels' speeds, or from the motion of the newest lines."""
         if self._base and (speeds := _all_of(self._speeds, self._values)):
             return self._base.to_body(speeds)
         seconds = sum(took for took, _ in self._steps)
@@ -206,7 +206,7 @@ class LineReport:
         return _scaled(way, 1 / seconds)
 
     def _integrate(self, now_ns: int) -> None:
-        """Integrate the newest speeds, where the lines report nothing else."""
+        """Integrate the newest speeds, if the lines report neither pose nor positions."""
         seconds = min((now_ns - (self._now_ns or now_ns)) / 1e9, MAX_INTEGRATION_S)
         v = self.velocity()
         self._move(_scaled(Twist(v.linear_x, v.linear_y, v.angular_z), seconds), now_ns)
@@ -216,7 +216,7 @@ class LineReport:
             self._turned[name] = speed if name in ANGLES else turned
 
     def _roll(self, angles: tuple[float, ...], now_ns: int) -> None:
-        """The wheels stand at these angles."""
+        """Add the motion to these wheel angles [rad]."""
         assert self._base is not None
         last, self._angles = self._angles or angles, angles
         turned = self._differences(angles, last)
@@ -227,7 +227,7 @@ class LineReport:
                 self._turned[name] = angle if name in ANGLES else self._turned[name] + angle
 
     def _differences(self, now: tuple[float, ...], before: tuple[float, ...]) -> tuple[float, ...]:
-        """Return by how much each wheel turned; a steering wheel has an angle instead."""
+        """Return the rotation of each wheel, and the angles of steering wheels [rad]."""
         steps = []
         for name, angle, last, span in zip(self._wheels, now, before, self._spans, strict=True):
             way = angle if name in ANGLES else angle - last
@@ -237,14 +237,14 @@ class LineReport:
     def _after_gap(self, now_ns: int) -> bool:
         """Return whether the firmware may have restarted since the last line.
 
-        If so, the shorter way counts: from where it stopped, or from zero.
+        If so, the shorter motion counts: from the last value, or from zero.
         """
         return now_ns - (self._now_ns or now_ns) > GAP_NS
 
     def _move(self, step: Twist, now_ns: int) -> bool:
-        """The body has made a step since the last line, if it can have made it.
+        """Add a step since the last line to the pose, if it is possible; return whether it is.
 
-        Lines that were held up come at once. They share the time before the first of them.
+        Delayed lines arrive together. They share the time before the first of them.
         """
         seconds = (now_ns - (self._now_ns or now_ns)) / 1e9
         self._now_ns = now_ns
@@ -264,7 +264,7 @@ class LineReport:
 
 
 def _all_of(names: tuple[str, ...], values: Mapping[str, float]) -> tuple[float, ...]:
-    """The values of all these names, or nothing where one is missing."""
+    """Return the values of all these names, or an empty tuple if one is missing."""
     return tuple(values[n] for n in names) if all(n in values for n in names) else ()
 
 
@@ -277,7 +277,7 @@ def _scaled(twist: Twist, by: float) -> Twist:
 
 
 def _spans(options: LineOptions, wheels: tuple[str, ...]) -> tuple[float, ...]:
-    """After what angle [rad] each wheel's count wraps; 0 where it is no count."""
+    """Return the angle [rad] after which each wheel's counter wraps; 0 without a counter."""
     spans = dict.fromkeys(wheels, 0.0)
     for template in options.state_templates():
         for field in template.fields:

@@ -1,7 +1,7 @@
-"""A body without code: one text line out, text lines in, all described in the robot's file.
+"""A body without code: text lines to and from it, described in the robot's file.
 
-The driver sends only what is commanded: when commands end, the line falls silent, and the firmware
-stops the body (docs/reference/firmware_line.md).
+The driver sends only commands that it receives. When they end, the firmware stops the body
+(docs/reference/firmware_line.md).
 """
 
 import logging
@@ -36,22 +36,22 @@ from gigabrain_zenoh.logs import Fault
 
 log = logging.getLogger(__name__)
 
-MISSED_LINES = 3  # state lines in a row, and the body counts as lost
+MISSED_LINES = 3  # the body counts as lost after this many missing state lines in a row
 MIN_TIMEOUT_NS = 100_000_000
-MAX_TIMEOUT_NS = 500_000_000  # of a line that is slower than the others
-REPEAT_SHARE = 0.9  # of the repetition's period: ticks are not that even
+MAX_TIMEOUT_NS = 500_000_000  # of the slowest line
+REPEAT_SHARE = 0.9  # repeat after this share of the period, because ticks are uneven
 NO_VALID_LINE = (
     "no valid line comes, or one that is part of the velocity is missing: "
     "check firmware, baud rate and wiring"
 )
-BUMPER = "bumper"  # flags of such names are bumpers
-PROBE_S = 2.5  # an Arduino that opening has reset takes two seconds to say anything
-FLUSH_NS = 10_000_000  # and the time of what was written, before a port is closed
+BUMPER = "bumper"  # prefix of the names of bumper flags
+PROBE_S = 2.5  # opening the port resets an Arduino, which then takes two seconds to send
+FLUSH_NS = 10_000_000  # before a port is closed, plus the time of the written bytes
 SEQUENCES = 1 << 16
 
 
 class LineDriver(Driver):
-    """Sends nothing until the body reports; its first command is zero, as after a loss."""
+    """Sends nothing until the body reports. Its first command is zero, also after a loss."""
 
     Options = LineOptions
 
@@ -78,32 +78,32 @@ class LineDriver(Driver):
         }
         self._liveness = Liveness(self.link, self._clock, silent_ns, NO_VALID_LINE, log)
         self._repeat_ns = round(REPEAT_SHARE / options.command_hz * 1e9)
-        self._started = False  # whether start went out and no stop since: then a stop is owed
-        self._wanted = self._as_sent = self._sent = ZERO  # the second is what the line keeps of it
+        self._started = False  # the start string was sent, and no stop string since
+        self._wanted = self._as_sent = self._sent = ZERO  # the second is rounded by the line
         self._sent_ns = self._seq = 0
         self._open = False
         self._logged_flags = 0
-        self._overdue = Fault(log)  # flags that were repeated
+        self._overdue = Fault(log)  # of repeated flags
         self._flags = {bit: Fault(log) for bit in range(len(options.flags))}
         self._lidar: ScanSource | None = None
         self.sensors = {"scan": None} if robot.lidar else {}
 
     @classmethod
     def check(cls, robot: RobotFile, options: LineOptions) -> None:
-        """Raises ValueError where the lines do not fit the body."""
+        """Raise ValueError if the lines do not fit the body."""
         check_lines(options, robot)
 
     async def open(self) -> None:
-        """Begin to look for the body and its lidar; neither has to be there yet."""
+        """Start connecting to the body and its lidar; both may appear later."""
         self._open = True
         self.link.open()
         self._lidar = open_lidar(self, self._clock)
 
     async def close(self) -> None:
-        """Stop, and let go of the ports."""
+        """Stop the body, and close the ports."""
         if self._open:
             await self.stop()
-            if self.link.connected:  # what is still in the port when it is closed is lost
+            if self.link.connected:  # closing drops unsent bytes
                 await self._clock.sleep_ns(FLUSH_NS + self._longest_write_ns())
         self._open = False
         await self.link.close()
@@ -111,20 +111,20 @@ class LineDriver(Driver):
             await self._lidar.close()
 
     async def stop(self) -> None:
-        """A command of zero, and the stop string where the body has one and may be going."""
+        """Send zero, and the stop string if the body has one and may be started."""
         self._send_zero()
 
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
     ) -> Velocity:
-        """Drive; a value that is not a number is zero for all, and so is all while it is lost."""
+        """Drive. All speeds are zero if one is not a number, or while the body is lost."""
         if not self._open:
             raise BodyLost("the line is not open")
         self._send(self.bounded(linear_x, linear_y, angular_z))
         return self._sent
 
     async def read_state(self) -> RobotState:
-        """Return the newest values of the lines; `link` tells whether they are recent."""
+        """Return the newest values of the lines; its `link` shows whether they are recent."""
         report, now_ns = self._report, self._clock.now_ns()
         alive, overdue = self._liveness.alive(), report.flags_overdue(now_ns)
         if alive and overdue:
@@ -142,7 +142,7 @@ class LineDriver(Driver):
         )
 
     def _longest_write_ns(self) -> int:
-        """Return the time on the line of a command that starts the body, and of its stop."""
+        """Return the duration on the line of start string, command and stop string [ns]."""
         options: LineOptions = self.options
         command = self._command.template.longest()
         bits = (2 * command + len(options.start) + len(options.stop)) * BITS_PER_BYTE
@@ -155,8 +155,8 @@ class LineDriver(Driver):
             self._started = bool(stop) and not self.link.write(stop)
 
     def _send(self, wanted: Velocity) -> None:
-        """Write a command that is new, or due again; keep in `_sent` what the body executes."""
-        if not self._liveness.received:  # it may still be booting: nothing that could disturb it
+        """Write a command that is new or due; store the velocity that the body executes."""
+        if not self._liveness.received:  # do not disturb its boot
             self._sent = ZERO
             return
         now_ns = self._clock.now_ns()
@@ -176,7 +176,7 @@ class LineDriver(Driver):
         self._started = not start or self.link.write(start)
 
     def _opened(self) -> None:
-        """Start again on a new line; nothing is sent before the body reports."""
+        """Reset all state for a new line; send nothing before the body reports."""
         self._decoder.clear()
         self._report.restart()
         self._liveness.reset()
@@ -190,26 +190,26 @@ class LineDriver(Driver):
         for values in self._decoder.feed(data):
             self._report.update(values, now_ns)
             if self._is_whole(values, now_ns) and self._liveness.mark_received():
-                # after a boot or a loss: at rest, whatever was commanded
+                # after a boot or a loss it begins at rest
                 self._sent_ns = 0
                 self._send_zero()
             self._log_flags()
         self.link.errors = self._decoder.errors
 
     def _is_whole(self, values: Mapping[str, float], now_ns: int) -> bool:
-        """Return whether a line reports motion, and no other part of the velocity is overdue."""
+        """Return whether a line reports motion, and no part of the velocity is overdue."""
         own = self._parts.keys() & values.keys()
         for name in own:
             self._parts[name].put(values[name], now_ns)
         return bool(own) and all(part.get(now_ns) is not None for part in self._parts.values())
 
     def _bumpers(self) -> tuple[bool, ...]:
-        """The flags whose names begin with `bumper`."""
+        """Return the flags whose names begin with `bumper`."""
         names = enumerate(self.options.flags)
         return tuple(bool(self._report.flags >> bit & 1) for bit, name in names if BUMPER in name)
 
     def _log_flags(self) -> None:
-        """Say once when a flag is raised and once when it falls."""
+        """Log once when a flag is set, and once when it is cleared."""
         if self._report.flags == self._logged_flags:
             return
         self._logged_flags = self._report.flags
@@ -222,7 +222,7 @@ class LineDriver(Driver):
                 self._flags[bit].end(f"the firmware no longer reports: {name}")
 
     def _is_ours(self, port: serial.Serial) -> bool:
-        """Return whether a good line comes from this port. Runs in a thread."""
+        """Return whether this port sends a valid line. Runs in a thread."""
         decoder, until = LineDecoder(self.options.state_templates()), time.monotonic() + PROBE_S
         while time.monotonic() < until:
             if decoder.feed(port.read(max(1, port.in_waiting))):

@@ -1,6 +1,6 @@
-"""The firmware of a base on a text line, as docs/reference/firmware_line.md asks it to be.
+"""The firmware of a base on a text line, as in docs/reference/firmware_line.md.
 
-It is made from the same templates as the driver, read the other way round.
+It uses the driver's templates in the opposite direction.
 """
 
 import math
@@ -18,14 +18,14 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.geometry.limits import clamp, limits_of
 
 BOOT_NS = 300_000_000  # from power-on to the first state line
-BROWN_OUT_SHARE = 0.6  # of the battery's voltage; with less the board holds itself in reset
+BROWN_OUT_SHARE = 0.6  # of the battery's voltage; below it the board is in reset
 BANNER = b"\x00\xf8firmware of a base on a text line\r\nready\r\n"
-MAX_EXECUTED = 1000  # commands, for tests to look at
-WATCHDOG = "watchdog"  # the flag that is raised while the motors are stopped for silence
+MAX_EXECUTED = 1000  # commands that are kept for tests
+WATCHDOG = "watchdog"  # flag that is set while silence has stopped the motors
 
 
 class LineBase(Device):
-    """Boots stopped; obeys whole, right lines within the body's limits; stops by itself."""
+    """Boots stopped; obeys complete, valid lines within the body's limits; stops by itself."""
 
     Options = LineOptions
     period_s = 0.005
@@ -48,14 +48,14 @@ class LineBase(Device):
 
     @classmethod
     def port(cls, options: Any) -> Port:
-        """A pty as slow as the line."""
+        """Return a pty as slow as the line."""
         return Pty(Path(options.port), options.baud)
 
     def reset(self) -> None:
-        """Motors at rest, counters from where the wheels stand, a banner, and a moment of boot."""
+        """Boot: motors at rest, counters at the wheels' angles, then a banner."""
         self._rest = b""
         self._enabled = not self._start
-        self._obeyed_ns: int | None = None  # when the last command came; none yet
+        self._obeyed_ns: int | None = None  # time of the last command
         self._booted_ns: int | None = None
         self._next_ns = 0
         wheels = self.body.snapshot.wheels
@@ -63,7 +63,7 @@ class LineBase(Device):
         self.body.command(0.0, 0.0, 0.0)
 
     def feed(self, data: bytes) -> None:
-        """Lines, or parts of them; what is too long or wrong is dropped up to the next end."""
+        """Handle lines, also in pieces; drop too long or invalid ones up to their end."""
         *lines, rest = (self._rest + data).split(self._command.end)
         self._rest = rest if len(rest) <= MAX_LINE_BYTES else rest[-MAX_LINE_BYTES:]
         if self._booted_ns is None or self._now_ns < self._booted_ns:
@@ -133,7 +133,7 @@ class LineBase(Device):
         return sum(1 << bit for bit, name in names if conditions.get(name, False))
 
     def _wrapped(self, field: Field, value: float) -> float:
-        """Return the value as an encoder's counter of `tick_bits` has it."""
+        """Return the value as an encoder's counter of `tick_bits` wraps it."""
         if not field.unit.endswith("tick"):
             return value
         span = 1 << self._options.tick_bits
@@ -142,7 +142,7 @@ class LineBase(Device):
 
 
 def _sides(values: Mapping[str, float]) -> dict[str, float]:
-    """Return the means of all wheels of a side, where the board has one motor for them."""
+    """Return the mean of each side's wheels, for a board with one motor per side."""
     found = {}
     for side in SIDES:
         end = side.removeprefix("wheel")

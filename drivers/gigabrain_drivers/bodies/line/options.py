@@ -34,7 +34,7 @@ Rate = Annotated[float, Meta(ge=10, le=200)]
 
 BITS_PER_BYTE = 10  # 8N1
 
-MAX_STEP_SHARE = 0.1  # of the greatest speed: the largest step of a command
+MAX_STEP_SHARE = 0.1  # largest step of a command, as a share of the maximal speed
 WHEEL_PARTS = ("_position", "_velocity", "_effort", "_temperature")
 SIDES = ("wheel_left", "wheel_right")
 POSE = ("x", "y", "yaw")
@@ -45,15 +45,15 @@ class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
 
     port: str = AUTO  # a path, usb:VID:PID[:SERIAL], or auto
     baud: Annotated[int, Meta(ge=1200, le=4_000_000)] = 115200
-    command: Text  # a template: how a velocity is written
-    state: Annotated[tuple[Text, ...], Meta(min_length=1, max_length=8)]  # templates, any of which
-    start: Text = ""  # sent as it is before the first command, also after a stop
-    stop: Text = ""  # sent as it is when the body is stopped, after a command of zero
-    command_hz: Rate = 50.0  # how often an unchanged command is repeated; a new one goes at once
-    state_hz: Rate = 50.0  # what the firmware promises; three missing ones are a lost link
+    command: Text  # template of the command line
+    state: Annotated[tuple[Text, ...], Meta(min_length=1, max_length=8)]  # templates of state lines
+    start: Text = ""  # sent unchanged before the first command, also after a stop
+    stop: Text = ""  # sent unchanged when the body is stopped, after a command of zero
+    command_hz: Rate = 50.0  # repetition of an unchanged command; a new one is sent at once
+    state_hz: Rate = 50.0  # promised by the firmware; the link is lost after three missing lines
     ticks_per_turn: Positive | None = None  # of a wheel's encoder; for the unit `tick`
-    tick_bits: Literal[16, 32] = 32  # where its count wraps
-    battery_empty: Positive | None = None  # [V], 0 %; where the firmware reports the voltage alone
+    tick_bits: Literal[16, 32] = 32  # width of its counter
+    battery_empty: Positive | None = None  # [V], 0 %; for a firmware that reports only the voltage
     battery_full: Positive | None = None  # [V], 100 %
     flags: Annotated[tuple[Name, ...], Meta(max_length=32)] = ()  # names of the bits, from bit 0
 
@@ -70,7 +70,7 @@ class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
         self._check_baud(command, state)
 
     def battery_volts(self) -> tuple[float, float] | None:
-        """Return the voltages for 0 % and 100 %, where both are given."""
+        """Return the voltages for 0 % and 100 %, if both are given."""
         if self.battery_empty is None or self.battery_full is None:
             return None
         return self.battery_empty, self.battery_full
@@ -87,7 +87,7 @@ class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
         )
 
     def strings(self) -> dict[bytes, str]:
-        """Return the strings that are sent as they are, with their names."""
+        """Return the strings that are sent unchanged, with their names."""
         both = {self.start.encode(): "start", self.stop.encode(): "stop"}
         return {text: name for text, name in both.items() if text}
 
@@ -124,7 +124,7 @@ class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
 
     def _check_baud(self, command: Template, state: tuple[Template, ...]) -> None:
         for name, longest, rate in (
-            ("command", command.longest(), 2 * self.command_hz),  # a new one between two repeats
+            ("command", command.longest(), 2 * self.command_hz),  # new ones between repeated ones
             ("state", max(template.longest() for template in state), self.state_hz),
         ):
             needed = longest * rate * BITS_PER_BYTE
@@ -160,7 +160,7 @@ def check_lines(options: LineOptions, robot: RobotFile) -> None:
 
 
 def base_of(options: LineOptions, robot: RobotFile) -> Base | None:
-    """Return the wheels that the lines know; those of a side may be one to a skid-steered base."""
+    """Return the wheels in the lines; a skid-steered base may have one per side."""
     base = wheels_of(robot)
     templates = (options.command_template(), *options.state_templates())
     sides = any(name.startswith(SIDES) for template in templates for name in template.names)
@@ -170,17 +170,17 @@ def base_of(options: LineOptions, robot: RobotFile) -> Base | None:
 
 
 def speed_fields(base: Base) -> tuple[str, ...]:
-    """The state fields from which a base's velocity follows; a wheel that steers has an angle."""
+    """Return the state fields that give a base's velocity; for steering wheels, angles."""
     return tuple(f"wheel_{n}_{'position' if n in ANGLES else 'velocity'}" for n in base.wheels)
 
 
 def position_fields(base: Base) -> tuple[str, ...]:
-    """The state fields by which a base's way is reckoned."""
+    """Return the state fields that give a base's motion."""
     return tuple(f"wheel_{name}_position" for name in base.wheels)
 
 
 def velocity_fields(options: LineOptions, robot: RobotFile) -> frozenset[str]:
-    """The state fields from which the body's velocity follows, in whichever lines they stand."""
+    """Return the state fields that give the body's velocity, in all lines."""
     seen = frozenset[str]().union(*(template.names for template in options.state_templates()))
     ways, base = _ways(robot), base_of(options, robot)
     own = seen.intersection(ways)
@@ -248,7 +248,7 @@ def _check_steps(command: Template, robot: RobotFile, base: Base | None) -> None
 
 
 def _check_odometry(state: tuple[Template, ...], base: Base | None) -> None:
-    """Check that a pose, or all wheels' positions, stand in one line where there are any."""
+    """Check that a pose, or all wheels' positions, are in one line, if there are any."""
     for whole in (POSE, position_fields(base) if base else ()):
         telling = {
             n for n in whole if n.removeprefix("wheel_").removesuffix("_position") not in ANGLES
@@ -277,7 +277,7 @@ def _check_motion(state: tuple[Template, ...], robot: RobotFile, base: Base | No
 
 
 def _ways(robot: RobotFile) -> list[str]:
-    """The parts of a velocity that the body can have."""
+    """Return the parts of a velocity that the body can have."""
     return ["linear_x", *(["linear_y"] if robot.max_lateral_speed else []), "angular_z"]
 
 

@@ -1,9 +1,9 @@
-"""Lines of text with numbers in them, written and read by the same template.
+"""Lines of text with numbers; the same template writes and reads them.
 
-A template is the line as it is on the wire, with `{FIELD}`, `{FIELD|UNIT}` or
+A template is the line on the wire, with `{FIELD}`, `{FIELD|UNIT}` or
 `{FIELD|UNIT:FORMAT}` where the numbers are: `V,{linear_x:.3f},{angular_z:.3f}` and a newline. A
-checksum (`{crc16}`, see CHECKS) stands last and covers the text before it, as in NMEA 0183:
-without a `$` at the beginning and without a `*` right before the checksum.
+checksum (`{crc16}`, see CHECKS) comes last and covers the text before it. As in NMEA 0183, it does
+not cover a `$` at the start, nor a `*` right before the checksum.
 """
 
 import binascii
@@ -22,8 +22,8 @@ _CRC8_TABLE = crc_table(0x07, bits=8)
 
 DRIVES = (Differential, Mecanum, Omni, Ackermann)
 WHEELS = tuple(dict.fromkeys(name for drive in DRIVES for name in drive.wheels))
-ANGLES = ("steering",)  # of WHEELS, those whose command is an angle and not a speed
-IGNORED = "_"  # a number in a state line that means nothing to us
+ANGLES = ("steering",)  # names in WHEELS whose command is an angle, not a speed
+IGNORED = "_"  # name of ignored numbers in a state line
 UNITS = {
     "length": {"m": 1.0, "cm": 0.01, "mm": 0.001},
     "speed": {"m/s": 1.0, "cm/s": 0.01, "mm/s": 0.001},
@@ -66,17 +66,17 @@ STATE = {
 }
 DEFAULT_FORMATS = {"count": "d", "flags": "x"}
 _UNIT = re.compile(r"\s*([-+]?[0-9]*\.?[0-9]*)\s*([A-Za-z%].*?)?\s*")
-ROUNDING = 1e-6  # of a digit: what binary fractions miss
+ROUNDING = 1e-6  # of a digit: error of binary fractions
 _FORMAT = re.compile(r"\+?0?[0-9]{0,2}(?:(?:\.[0-9])?f|d|[xX])")
 _ANY_NUMBER = r" *[-+]?[0-9]{1,12}(?:\.[0-9]{0,9})?"
 MAX_LINE_BYTES = 256
-MAX_VALUE = 1e8  # in SI units; beyond, no number is a measurement. Counters may count on.
-DIGITS = "0123456789."  # what is no end of a number
+MAX_VALUE = 1e8  # in SI units; larger numbers are no measurements, except counters
+DIGITS = "0123456789."  # characters that continue a number
 _FIELD = re.compile(r"\{([^{}|:]*)(?:\|([^{}|:]*))?(?::([^{}]*))?\}")
 
 
 class Check(NamedTuple):
-    """A checksum and how many hexadecimal digits it has."""
+    """A checksum, and its number of hexadecimal digits."""
 
     of: Callable[[bytes], int]
     digits: int
@@ -109,7 +109,7 @@ CHECKS = {
 
 
 def factor(quantity: str, unit: str, ticks_per_turn: float | None) -> float:
-    """Return the factor from a number on the wire to SI units (volts, degrees C, percent).
+    """Return the factor from a number on the wire to SI units (also volts, degrees C, percent).
 
     A unit may have a number before it: in `0.1C` or `-tick`, the wire counts tenths of degrees, or
     ticks backwards. Raises ValueError naming what was expected.
@@ -141,24 +141,24 @@ class Field:
 
     name: str
     unit: str
-    factor: float  # wire * factor is in SI units
-    format: str  # of Python's format(); whole numbers and hexadecimals are rounded first
-    pattern: str  # of a regular expression
+    factor: float  # SI value / number on the wire
+    format: str  # for Python's format(); integers and hexadecimals are rounded first
+    pattern: str  # regular expression
 
     @property
     def counts(self) -> bool:
-        """True for a counter or a set of flags, which may be as large as they like."""
+        """True for a counter or flags, whose size is not limited."""
         return self.unit.endswith("tick") or self.format[-1] in "xX"
 
     @property
     def step(self) -> float:
-        """The least by which two values on the wire differ, in SI units."""
+        """The smallest difference of two values on the wire, in SI units."""
         if self.format[-1] != "f":
             return abs(self.factor)
         return abs(self.factor) * 10.0 ** -_places(self.format)
 
     def write(self, value: float, *, toward_zero: bool = False) -> str:
-        """The text for a value in SI units, rounded to its digits; zero has no sign."""
+        """Return the text for a value in SI units, rounded to its digits; zero has no sign."""
         wire = value / self.factor
         if toward_zero:
             places = 10.0 ** _places(self.format) if self.format[-1] == "f" else 1.0
@@ -169,7 +169,7 @@ class Field:
         return format(0.0, self.format) if float(text) == 0 else text
 
     def read(self, text: str) -> float:
-        """The value in SI units of a text that fits the pattern."""
+        """Return the value in SI units of a text that fits the pattern."""
         return (int(text, 16) if self.format[-1] in "xX" else float(text)) * self.factor + 0.0
 
 
@@ -198,13 +198,13 @@ def parse_field(
 
 
 def _places(form: str) -> int:
-    """The decimals that a format ending in `f` writes."""
+    """Return the number of decimals of a format ending in `f`."""
     _, dot, digits = form.rstrip("f").partition(".")
     return int(digits) if dot else 6
 
 
 def _pattern(form: str) -> str:
-    """Return the expression for numbers of this format, and nothing else."""
+    """Return the expression that matches exactly the numbers of this format."""
     sign = "[-+]" if form.startswith("+") else "-?"
     padding = " *" if len(form.rstrip("fdxX").partition(".")[0].lstrip("+0")) else ""
     if form[-1] in "xX":
@@ -216,9 +216,9 @@ def _pattern(form: str) -> str:
 
 
 class Template:
-    """One kind of line. Raises ValueError for a text that cannot be one.
+    """One kind of line. Raises ValueError for an invalid text.
 
-    `known` are the fields that it may have and their quantities.
+    `known` maps its possible fields to their quantities.
     """
 
     def __init__(
@@ -247,7 +247,7 @@ class Template:
         self._expression = re.compile(self._regular())
 
     def encode(self, values: Mapping[str, float], *, toward_zero: bool = False) -> bytes:
-        """The line for values in SI units; a field without a value is 0."""
+        """Return the line for values in SI units; a field without a value is 0."""
         text = self._texts[0]
         for field, after in zip(self.fields, self._texts[1:], strict=False):
             text += field.write(values.get(field.name, 0.0), toward_zero=toward_zero) + after
@@ -274,23 +274,23 @@ class Template:
         return {f.name: value for f, value in read}
 
     def sent(self, name: str, value: float) -> float:
-        """Return what is left of a commanded value [SI]: it is rounded towards zero."""
+        """Return a commanded value [SI] as rounded on the line, towards zero."""
         for field in self.fields:
             if field.name == name:
                 return field.read(field.write(value, toward_zero=True))
         return value
 
     def reads_all_of(self, other: "Template") -> bool:
-        """Return whether lines of the other template can be read as lines of this one."""
+        """Return whether this template matches all lines of the other one."""
         nothing = other.encode({}).strip(b"\r\n")
         return self.decode(nothing) is not None
 
     def longest(self) -> int:
-        """About how many bytes a line has."""
+        """Return the approximate number of bytes of a long line."""
         return len(self.encode({field.name: -5.0 * field.factor for field in self.fields}))
 
     def _check_gaps(self) -> None:
-        """Refuse fields whose numbers touch: they cannot be told apart."""
+        """Refuse adjacent fields: their numbers could not be separated."""
         pairs = zip(self.fields, self.fields[1:], self._texts[1:], strict=False)
         for before, after, between in pairs:
             if not between.strip(DIGITS) and not after.format.startswith("+"):
@@ -305,7 +305,7 @@ class Template:
         return format(check.of(covered), f"0{check.digits}X")
 
     def _regular(self) -> str:
-        """The expression of a whole line; its groups are the numbers."""
+        """Return the expression of a whole line; its groups are the numbers."""
         pattern = re.escape(self._texts[0])
         for field, after in zip(self.fields, self._texts[1:], strict=False):
             pattern += f"({field.pattern})" + re.escape(after)
@@ -325,7 +325,7 @@ def _check_text(text: str) -> None:
 
 
 def describe(values: Mapping[str, float]) -> str:
-    """The numbers of a line in words, in SI units, volts, degrees C and percent."""
+    """Describe the numbers of a line, in SI units, volts, degrees C and percent."""
     words = []
     for name, value in values.items():
         quantity = {**STATE, **COMMAND}[name]
@@ -336,10 +336,10 @@ def describe(values: Mapping[str, float]) -> str:
 
 
 class LineDecoder:
-    """Cuts bytes into lines and reads those that fit one of the templates.
+    """Splits bytes into lines and reads those that fit one of the templates.
 
-    `errors` counts the others, from the first good line on: what comes before is a boot banner.
-    At most LONGEST bytes are ever kept.
+    `errors` counts other lines after the first valid one: the lines before are a boot banner. It
+    buffers at most MAX_LINE_BYTES.
     """
 
     def __init__(self, templates: Sequence[Template]) -> None:
@@ -347,11 +347,11 @@ class LineDecoder:
         self._templates = templates
         self._end = templates[0].end
         self._rest = b""
-        self._skipping = False  # to the end of a line that is too long
+        self._skipping = False  # until the end of a too long line
         self._begun = False
 
     def feed(self, data: bytes) -> list[dict[str, float]]:
-        """The values of each good line that `data` completes."""
+        """Return the values of each valid line that `data` completes."""
         *lines, rest = (self._rest + data).split(self._end)
         found = []
         for line in lines:
@@ -366,7 +366,7 @@ class LineDecoder:
         return found
 
     def clear(self) -> None:
-        """Forget the beginning of a line; what comes next may be a banner."""
+        """Drop a partial line; the next lines may be a banner."""
         self._rest, self._skipping, self._begun = b"", False, False
 
     def _read(self, line: bytes) -> dict[str, float] | None:

@@ -1,4 +1,4 @@
-"""A body that exists only in memory, in the middle of an empty room: for tests and benchmarks."""
+"""A body in memory, in the middle of an empty room, for tests and benchmarks."""
 
 import math
 from collections.abc import AsyncIterator
@@ -17,17 +17,17 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost
 from gigabrain_zenoh.geometry.limits import ZERO
 
-ROOM_M = 3.0  # distance to the wall all round
+ROOM_M = 3.0  # distance to the round wall
 
 
 class MockOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The mock's part of a robot's file."""
 
-    gain: float = 1.0  # how much of the commanded speed the body really has
+    gain: float = 1.0  # true speed / commanded speed
 
 
 class MockBody(Driver):
-    """Moves at the commanded speed at once. Its room goes with it."""
+    """Moves at the commanded speed at once. Its room moves with it."""
 
     Options = MockOptions
 
@@ -41,10 +41,10 @@ class MockBody(Driver):
         self._noise = np.random.default_rng(run.seed)
         self._ticks = self._next_scan = 0
         self.sensors = {"scan": None}
-        self._lidar: ScanSource | None = None  # a real one, where its link has one
+        self._lidar: ScanSource | None = None  # a real one, if its link names one
 
     async def open(self) -> None:
-        """Connect to the lidar that it may carry; without one a scan is there at once."""
+        """Connect to a real lidar if it has one; otherwise take the first simulated scan."""
         self._open = True
         self._lidar = open_lidar(self, Clock())
         if self._lidar is None:
@@ -72,7 +72,7 @@ class MockBody(Driver):
             for _ in range(passed):
                 self._advance()
             yield passed
-            await clock.sleep_ns(TICK_NS // 2)  # a lidar keeps no step with the body's states
+            await clock.sleep_ns(TICK_NS // 2)  # scans come between the body's states
             self._turn()
 
     async def set_base_velocity(
@@ -90,7 +90,7 @@ class MockBody(Driver):
         return to
 
     async def read_state(self) -> RobotState:
-        """Return the pose that it has driven to."""
+        """Return the state with the integrated pose."""
         if not self._open:
             raise BodyLost("the mock is not open")
         return RobotState(
@@ -111,7 +111,7 @@ class MockBody(Driver):
         self._ticks += 1
 
     def _turn(self) -> None:
-        """Emit a scan whenever the lidar has finished a turn."""
+        """Emit a scan after each turn of the lidar."""
         lidar = None if self._lidar else self.robot.lidar
         if lidar and self._ticks >= self._next_scan:
             period = max(1, round(1 / (lidar.rate_hz * TICK_S)))

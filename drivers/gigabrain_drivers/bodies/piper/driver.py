@@ -1,7 +1,7 @@
 """AgileX Piper on its real link: six joints and a gripper on CAN.
 
-The arm keeps the last position that it was sent, so a dead driver leaves it where it is. Its own
-stop is never used: with that it sinks (see protocol.py).
+The arm holds the last position that it received, so it stays there if the driver dies. The driver
+never uses the arm's own stop, which lets it sink (see protocol.py).
 """
 
 import asyncio
@@ -35,11 +35,11 @@ from gigabrain_zenoh.logs import Fault
 
 log = logging.getLogger(__name__)
 
-LOST_NS = 100_000_000  # without a report of all joints, and the arm counts as lost
-CHECK_PERIOD_NS = 20_000_000  # between two looks at what it reports
+LOST_NS = 100_000_000  # the arm counts as lost after this time without reports of all joints
+CHECK_PERIOD_NS = 20_000_000  # between two checks of its reports
 ENABLE_PERIOD_NS = 100_000_000  # between two attempts to switch its motors on
-ENABLE_TIMEOUT_NS = 3_000_000_000  # until it is said that one does not switch on
-LOG_AFTER_NS = 500_000_000  # of a problem, before it is logged
+ENABLE_TIMEOUT_NS = 3_000_000_000  # then a motor that stays off is reported
+LOG_AFTER_NS = 500_000_000  # a problem is logged after this time
 NOTHING_COMES = "no arm reports: is its power on, and its CAN cable plugged in?"
 
 
@@ -48,14 +48,14 @@ class PiperOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields
 
     port: str = "can0"  # a SocketCAN interface
     gripper_torque: Annotated[float, Meta(gt=0.0, le=piper.MAX_GRIPPER_TORQUE)] = 1.0
-    # [N m], the most with which its motor squeezes
+    # [N m], maximum of its motor
 
     def __post_init__(self) -> None:
         check_can_port(self.port)
 
 
 class PiperDriver(Driver):
-    """Switches the motors on where the arm is, and sends positions as they come."""
+    """Switches on the motors at the arm's position, and sends positions at once."""
 
     Options = PiperOptions
 
@@ -68,7 +68,7 @@ class PiperDriver(Driver):
         clock: Clock | None = None,
         link: Link | None = None,
     ) -> None:
-        """`link` instead of the CAN bus that the options name."""
+        """`link` replaces the CAN bus in the options."""
         super().__init__(robot, options, run)
         self._clock = clock or Clock()
         self.link = link or CanLink(options.port, self._clock, piper.RECEIVED)
@@ -78,14 +78,14 @@ class PiperDriver(Driver):
         self._names = [joint.name for joint in robot.joints]
         self._decoder, self._feedback = CanDecoder(), Feedback(robot.joints)
         self._torque = options.gripper_torque
-        self._targets: list[float] | None = None  # of all joints; None: where they are
-        self._joints: tuple[Joint, ...] = ()  # as they were before the newest connection
-        self._hold_on = True  # whether its motors are to be on
+        self._targets: list[float] | None = None  # of all joints; None: their present positions
+        self._joints: tuple[Joint, ...] = ()  # measured before the newest connection
+        self._hold_on = True  # the motors should be on
         self._were_on = False
-        self._enabling_ns: int | None = None  # since when they are being switched on
+        self._enabling_ns: int | None = None  # start of switching them on
         self._asked_ns = 0
-        self._unreported = False  # whether a loss has not been reported yet
-        self._unplaced = True  # the gate does not know yet where a new connection has found it
+        self._unreported = False  # a loss was not reported yet
+        self._unplaced = True  # the gate does not yet know the position after a new connection
         self._open = False
         self._well_ns = self._clock.now_ns()
         self._fault, self._named = Fault(log), ""
@@ -93,7 +93,7 @@ class PiperDriver(Driver):
 
     @classmethod
     def check(cls, robot: RobotFile, options: Any) -> None:
-        """Raises ValueError where the joints are not those of a Piper."""
+        """Raise ValueError if the joints are not those of a Piper."""
         parts = [joint.part for joint in robot.joints]
         if parts not in (["arm"] * piper.JOINTS, ["arm"] * piper.JOINTS + ["gripper"]):
             raise ValueError("joints: expected the six of a Piper, and its gripper last if any")
@@ -114,13 +114,13 @@ class PiperDriver(Driver):
         return ""
 
     async def open(self) -> None:
-        """Begin to look for the arm, which does not have to be there yet; it will not move."""
+        """Start connecting to the arm, which may appear later. It does not move."""
         self._open = self._hold_on = True
         self.link.open()
         self._task = asyncio.create_task(self._watch(), name="piper watch")
 
     async def close(self) -> None:
-        """Leave the arm where it is, its motors as they are."""
+        """Disconnect; the arm holds its position, and motors stay as they are."""
         task, self._task = self._task, None
         await self.stop()
         if task:
@@ -131,12 +131,12 @@ class PiperDriver(Driver):
         await self.link.close()
 
     async def stop(self) -> None:
-        """Keep the position that it was sent last, or the one that it has."""
+        """Hold the last sent position, or the present one."""
         if self._movable():
             self._send(self._targets or self._feedback.positions)
 
     async def limp(self) -> None:
-        """Let go of all joints, which fall where nothing holds them; positions hold them again.
+        """Switch off all joints, so that the arm may fall, until the next positions.
 
         Raises BodyLost.
         """
@@ -152,9 +152,9 @@ class PiperDriver(Driver):
         self._targets = self._enabling_ns = None
 
     async def set_joint_positions(self, positions: Mapping[str, float]) -> Mapping[str, float]:
-        """Move joints together [rad] or [m]; one that is not a number has all stay.
+        """Move joints together [rad] or [m]; if one is not a number, all stay.
 
-        Returns where they were sent; while the arm cannot be moved, where it is to stay. Raises
+        Returns the sent positions; while the arm cannot move, those that it will hold. Raises
         Unsupported, and BodyLost before the arm has reported.
         """
         within = self.bounded_joints(positions)
@@ -170,9 +170,9 @@ class PiperDriver(Driver):
         return {name: held[name] for name in positions}
 
     async def read_state(self) -> RobotState:
-        """Return what the arm reports; `link` tells whether that is recent, and all well.
+        """Return the arm's reports; `link` shows whether they are recent and without faults.
 
-        The first state of a connection is limp in any case, so that the gate goes on from there.
+        The first state of a connection is always limp, so that the gate starts from its position.
         """
         limp = self._feedback.complete and (self._unplaced or not all(self._feedback.motors_on))
         self._unplaced = self._unplaced and not self._feedback.complete
@@ -187,7 +187,7 @@ class PiperDriver(Driver):
         )
 
     def _measured(self) -> tuple[Joint, ...]:
-        """Return the newest joints, of the connection before where there are none yet."""
+        """Return the newest joints, if necessary of the previous connection."""
         if not self._feedback.complete:
             return self._joints
         return self._feedback.joints(self._clock.now_ns())
@@ -198,16 +198,16 @@ class PiperDriver(Driver):
         return recent and self._feedback.complete and self.link.connected
 
     def _movable(self) -> bool:
-        """Return whether positions reach motors that hold, and still are to.
+        """Return whether positions reach motors that hold, and should hold.
 
-        A position would switch a gripper on that was just let go of.
+        Otherwise a position would switch on a limp gripper.
         """
         feedback = self._feedback
         holds = self._hold_on and all(feedback.motors_on)
         return holds and self._fresh() and not feedback.problem()
 
     def _quantised(self, positions: Mapping[str, float]) -> list[float]:
-        """Return where all joints go, in the arm's own units."""
+        """Return the targets of all joints, rounded to the arm's units."""
         now = self._targets or self._feedback.positions
         goals = []
         for joint, present in zip(self.robot.joints, now, strict=True):
@@ -216,7 +216,7 @@ class PiperDriver(Driver):
         return goals
 
     def _send(self, targets: Sequence[float], *more: CanFrame) -> None:
-        """Send positions of all joints, with the mode that obeys them."""
+        """Send positions of all joints, and the mode that follows them."""
         frames = [
             *piper.move(targets[: piper.JOINTS]),
             piper.mode(piper.BY_CAN, piper.MOVE_J, piper.FULL_SPEED),
@@ -226,7 +226,7 @@ class PiperDriver(Driver):
         self.link.write(records(frames))
 
     def _opened(self) -> None:
-        """A new connection: nothing from before counts."""
+        """Reset all state for a new connection."""
         self._joints = self._measured()
         self._feedback.clear()
         self._targets, self._enabling_ns, self._unplaced = None, None, True
@@ -246,7 +246,7 @@ class PiperDriver(Driver):
             self._log_problem(now_ns)
 
     def _supervise(self, now_ns: int) -> None:
-        """Switch motors on where they are, and notice those that switch themselves off."""
+        """Switch on motors at their positions, and notice those that switch off by themselves."""
         if not self._fresh():
             self._targets = None
             return
@@ -262,14 +262,14 @@ class PiperDriver(Driver):
             self._switch_on(now_ns)
 
     def _switch_on(self, now_ns: int) -> None:
-        """Send the arm where it is, and only then power; after a reset it wants that twice."""
+        """Send the present position, then switch on; after a reset the arm needs both twice."""
         self._enabling_ns = self._enabling_ns or now_ns
         if now_ns - self._asked_ns >= ENABLE_PERIOD_NS:
             self._asked_ns = now_ns
             self._send(self._feedback.positions, piper.enable(on=True))
 
     def _log_problem(self, now_ns: int) -> None:
-        """A problem that stays is logged once when it begins and once when it ends."""
+        """Log a lasting problem once when it begins, and once when it ends."""
         problem = self.problem
         if not problem:
             self._well_ns, self._named = now_ns, ""

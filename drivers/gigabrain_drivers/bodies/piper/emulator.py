@@ -1,8 +1,8 @@
-"""AgileX Piper's controller and drives, firmware V1.8, as its driver and the vendor's SDK see them.
+"""AgileX Piper's controller and drives, firmware V1.8, as seen by its driver and the SDK.
 
 Its servos follow their targets within speed and acceleration. It has no watchdog: without commands
-it goes to its last targets and stays there. It begins as an arm that was switched on before, held
-where it is; a restart lets it fall.
+it goes to its last targets and stays there. It starts as an arm that is already switched on and
+holds; after a restart it falls.
 """
 
 import math
@@ -18,9 +18,9 @@ from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Wire
 from gigabrain_drivers.emulators.can_port import CanPort
 from gigabrain_drivers.links.can_link import CanDecoder, CanFrame, records
 
-STEP_S = 0.01  # that of the physics; the real arm reports twice as often
-MAX_STEPS = 10  # that are made up for at once after the host was held up
-DRIVES_EVERY = 3  # steps, between two slow reports
+STEP_S = 0.01  # of the physics; the real arm reports twice as often
+MAX_STEPS = 10  # simulated at once after a delay of the host
+DRIVES_EVERY = 3  # steps between two slow reports
 LIMITS = (  # [rad], of the vendor's SDK
     (-2.6179, 2.6179), (0.0, 3.14), (-2.967, 0.0), (-1.745, 1.745), (-1.22, 1.22),
     (-2.09439, 2.09439),
@@ -47,9 +47,9 @@ class Servo:
         self._max_speed, self._acceleration = max_speed, acceleration
 
     def follow(self, share: float = 1.0) -> None:
-        """Move for a step at most at a share of the greatest speed."""
+        """Move for a step, at most at a share of the maximal speed."""
         error = self.target - self.position
-        braking = math.sqrt(1.8 * self._acceleration * abs(error))  # a little early
+        braking = math.sqrt(1.8 * self._acceleration * abs(error))  # brakes a little early
         wanted = min(self._max_speed * share, braking, abs(error) / STEP_S)
         most = self._acceleration * STEP_S
         change = math.copysign(wanted, error) - self.speed
@@ -60,11 +60,11 @@ class Servo:
         self._move(self.speed + torque / INERTIA * STEP_S)
 
     def sink(self) -> None:
-        """Go for a step towards rest, braked by the motor alone."""
+        """Slow down for a step, braked only by the motor's damping."""
         self._move(math.copysign(min(SINK_SPEED, abs(self.position) / STEP_S), -self.position))
 
     def stay(self, position: float) -> None:
-        """Be at a position, at rest."""
+        """Set the position, at rest."""
         self.position, self.speed = position, 0.0
 
     def _move(self, speed: float) -> None:
@@ -73,7 +73,7 @@ class Servo:
 
 
 class Piper(Device):
-    """Reports its joints 100 times a second, unasked; obeys targets, modes and its stop."""
+    """Reports its joints 100 times a second; obeys targets, modes and its stop."""
 
     Options = PiperOptions
     period_s = STEP_S
@@ -81,7 +81,7 @@ class Piper(Device):
 
     def __init__(self, body: EmulatedBody, options: Any, wire: Wire) -> None:
         super().__init__(body, options, wire)
-        self.faults = [0] * JOINTS  # bits of FAULT_TEXTS that its drives report
+        self.faults = [0] * JOINTS  # bits of FAULT_TEXTS, by drive
         self.joints = [Servo(MAX_SPEED, ACCELERATION) for _ in range(JOINTS)]
         self.gripper = Servo(GRIPPER_SPEED, GRIPPER_ACCELERATION)
         self._servos = (*self.joints, self.gripper)
@@ -105,7 +105,7 @@ class Piper(Device):
         return CanPort(Path(options.port))
 
     def reset(self) -> None:
-        """Power on; of a restart the motors are off, and nothing that was sent counts."""
+        """Power on. After a restart the motors are off, and earlier commands are forgotten."""
         if self._started:
             self._power_off()
         self._started = True
@@ -114,7 +114,7 @@ class Piper(Device):
     def _forget(self) -> None:
         self.status = ArmStatus()
         self._speed_share, self._by_torque = 1.0, False
-        self._swallowed = 0  # commands to switch motors on, that it still ignores
+        self._swallowed = 0  # number of commands to switch on that it will still ignore
         self._mit: dict[int, piper.MitCommand] = {}
         self._steps, self._stepped_ns = 0, 0
 
@@ -131,7 +131,7 @@ class Piper(Device):
                 self._mit[id_ - piper.MIT] = command
 
     def step(self, now_ns: int) -> None:
-        """Move for the time that has passed, and report."""
+        """Simulate the elapsed time, and report."""
         since = now_ns - self._stepped_ns if self._stepped_ns else 0
         due = max(1, min(MAX_STEPS, round(since / 1e9 / STEP_S)))
         self._stepped_ns = now_ns
@@ -212,7 +212,7 @@ class Piper(Device):
             self._speed_share, self._by_torque = speed / piper.FULL_SPEED, kind == piper.MIT_MODE
 
     def _move(self, first: int, data: bytes) -> None:
-        """Take two targets; they count in whichever mode it is, and are kept."""
+        """Store two targets, in any mode."""
         wrong = 0
         for at, angle in enumerate(piper.decode_pair(data), first):
             lower, upper = LIMITS[at]
@@ -262,7 +262,7 @@ class Piper(Device):
             self._send(CanFrame(piper.MAX_ACCELERATION, raw))
 
     def _send_version(self, data: bytes) -> None:
-        """Answer a question; on a bus that returns what is sent, the answer is none."""
+        """Answer a question; ignore an own answer that the bus returns."""
         if data != ASK_VERSION:
             return
         parts = (VERSION[at : at + 8] for at in range(0, len(VERSION), 8))

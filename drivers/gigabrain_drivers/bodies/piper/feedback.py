@@ -9,24 +9,24 @@ from gigabrain_drivers.links.can_link import CanFrame
 from gigabrain_drivers.links.recent import Recent
 from gigabrain_schemas.body import Joint, JointDescription
 
-JUMP_FACTOR = 1.5  # times its greatest speed may a joint have moved between two reports, and
-JUMP_SLACK = (0.05, 0.02)  # [rad] of a joint, [m] of a finger more
-JUMPS, WINDOW = 10, 100  # so many of so many reports contradict those before: two arms
-GRIPPER_SPEED_NS = 40_000_000  # over which the gripper's speed is measured
+JUMP_FACTOR = 1.5  # largest motion between two reports, relative to the maximal speed,
+JUMP_SLACK = (0.05, 0.02)  # plus [rad] of a joint, [m] of a finger
+JUMPS, WINDOW = 10, 100  # with this many jumps in a window of reports, there are two arms
+GRIPPER_SPEED_NS = 40_000_000  # window of the gripper's mean speed
 FRAME_BYTES = 8
 
 
 class Feedback:
-    """Takes the arm's frames. A position that no joint can have reached is not believed."""
+    """Collects the arm's frames, and rejects positions that no joint can have reached."""
 
     def __init__(self, joints: Sequence[JointDescription]) -> None:
-        """`joints`: those of the robot's file, six of the arm and perhaps a gripper."""
+        """`joints` are those of the robot's file: six of the arm, and optionally a gripper."""
         self._arm, self._hand = joints[:JOINTS], joints[JOINTS:]
-        self.errors = 0  # reports that were thrown away
+        self.errors = 0  # rejected reports
         self.clear()
 
     def clear(self) -> None:
-        """Forget everything: it may be another arm, or another time."""
+        """Forget everything: it may be another arm, or a restart."""
         self._stamps = dict[int, int]()  # of the newest frame of each identifier [ns]
         self._angles = [0.0] * JOINTS
         self._motors = [Motor(0.0, 0.0)] * JOINTS
@@ -39,12 +39,12 @@ class Feedback:
 
     @property
     def complete(self) -> bool:
-        """True once each part has reported."""
+        """True after reports of all parts."""
         needed = set(piper.RECEIVED) - (set() if self._hand else {piper.GRIPPER})
         return needed <= self._stamps.keys()
 
     def stamp_ns(self) -> int | None:
-        """Return when the oldest of the newest positions came [ns]; None before the first ones."""
+        """Return the arrival of the oldest current position [ns]; None until all are known."""
         names = [*range(piper.POSITIONS, piper.POSITIONS + 3)]
         names += [piper.GRIPPER] if self._hand else []
         stamps = [self._stamps.get(id_) for id_ in names]
@@ -53,18 +53,18 @@ class Feedback:
 
     @property
     def positions(self) -> tuple[float, ...]:
-        """All joints as measured [rad]; the gripper as the way of one finger [m]."""
+        """The measured positions of all joints [rad]; for the gripper, of one finger [m]."""
         return (*self._angles, *(self._gripper.width / 2 for _ in self._hand))
 
     @property
     def motors_on(self) -> tuple[bool, ...]:
-        """Return whether each motor holds: six of the arm, and the gripper's."""
+        """Return whether each motor holds: six of the arm, then the gripper's."""
         bits = [drive.status for drive in self._drives]
         bits += [self._gripper.status] if self._hand else []
         return tuple(bool(status & piper.ENABLED) for status in bits)
 
     def joints(self, now_ns: int) -> tuple[Joint, ...]:
-        """Return all joints as measured; of the gripper the torque of its motor [N m]."""
+        """Return all measured joints; the gripper's effort is its motor's torque [N m]."""
         arm = [
             Joint(
                 name=joint.name,
@@ -91,7 +91,7 @@ class Feedback:
         return (*arm, *hand)
 
     def take(self, frame: CanFrame, now_ns: int) -> None:
-        """Take a frame; those that are not the arm's are left alone."""
+        """Handle a frame; ignore those that are not the arm's."""
         id_, data = frame
         if id_ not in piper.RECEIVED:
             return
@@ -114,7 +114,7 @@ class Feedback:
             self._stamps[id_] = now_ns
 
     def problem(self) -> str:
-        """Return what the arm itself reports as wrong, or an empty text."""
+        """Return the fault that the arm reports, or an empty text."""
         if sum(self._jumps) >= JUMPS:
             return "its positions contradict each other: two arms on one bus?"
         status = self.status
@@ -157,7 +157,7 @@ class Feedback:
     def _impossible(
         self, way: float, joint: JointDescription, before_ns: int | None, now_ns: int, slack: float
     ) -> bool:
-        """Return whether a joint cannot have moved as far since its last report; count it."""
+        """Return whether a joint cannot have moved so far since its last report; count jumps."""
         if before_ns is None:
             return False
         most = JUMP_FACTOR * joint.max_speed * (now_ns - before_ns) / 1e9 + slack

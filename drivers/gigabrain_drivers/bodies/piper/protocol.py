@@ -1,8 +1,8 @@
 """AgileX Piper on CAN, 1 Mbit/s, standard identifiers, all numbers big endian.
 
-Facts are those of the vendor's `piper_sdk` 0.6.2, protocol V2 (firmware V1.5-2 and later):
-https://github.com/agilexrobotics/piper_sdk, `piper_msgs/msg_v2` and `protocol/protocol_v2`. That
-the stop of 0x150 lets the arm sink, and its reset lets it fall, is said in issue 66 there.
+Source: the vendor's `piper_sdk` 0.6.2, protocol V2 (firmware V1.5-2 and later):
+https://github.com/agilexrobotics/piper_sdk, `piper_msgs/msg_v2` and `protocol/protocol_v2`. Its
+issue 66 says that the stop of 0x150 lets the arm sink, and the reset lets it fall.
 """
 
 import math
@@ -14,7 +14,7 @@ from gigabrain_drivers.links.can_link import CanFrame
 
 JOINTS = 6
 
-# from the arm, 200 times a second but for DRIVES
+# from the arm, 200 times a second, except DRIVES
 STATUS, POSE, POSITIONS, GRIPPER = 0x2A1, 0x2A2, 0x2A5, 0x2A8  # POSE and POSITIONS: three each
 MOTORS = 0x251  # speed, current, position; one for each joint
 DRIVES = 0x261  # voltage, temperatures, faults; one for each joint
@@ -37,7 +37,7 @@ CLEAR = 0xAE
 GRIPPER_OFF, GRIPPER_ON, GRIPPER_CLEAR = 0x00, 0x01, 0x03
 
 NORMAL, STOPPED, OUT_OF_LIMITS = 0x00, 0x01, 0x04
-STATUS_TEXTS = {  # of the arm, with what a person can do
+STATUS_TEXTS = {  # of the arm, with remedies
     STOPPED: "its emergency stop is active, in which it sinks: support it, switch it off and on",
     0x02: "no solution for its target",
     0x03: "it is at a singularity",
@@ -129,7 +129,7 @@ class Gripper(NamedTuple):
 
 
 class MitCommand(NamedTuple):
-    """A joint's target in MIT mode, with gains for its errors and a torque on top of theirs."""
+    """A joint's target in MIT mode, with gains and an additional torque."""
 
     position: float  # [rad]
     speed: float  # [rad/s]
@@ -158,28 +158,28 @@ def decode_pair(data: bytes) -> tuple[float, float]:
 
 
 def mode(control: int, move: int, speed: int, kind: int = POSITION_MODE) -> CanFrame:
-    """Return the frame that sets how the arm moves, at `speed` [%] of its greatest speeds."""
+    """Return the frame that sets the arm's mode, and its speed [%] of the maximum."""
     return CanFrame(MODE, bytes((control, move, speed, kind, 0, 0, 0, 0)))
 
 
 def move(angles: Sequence[float]) -> list[CanFrame]:
-    """Return the frames by which six joints move to angles [rad]."""
+    """Return the frames that move six joints to angles [rad]."""
     return pairs(MOVE, angles)
 
 
 def move_gripper(width: float, torque: float, state: int = GRIPPER_ON) -> CanFrame:
-    """Return the frame by which the gripper opens to a width [m], with at most a torque [N m]."""
+    """Return the frame that moves the gripper to a width [m], with at most a torque [N m]."""
     most = round(min(max(torque, 0.0), MAX_GRIPPER_TORQUE) / TORQUE_UNIT)
     return CanFrame(MOVE_GRIPPER, _GRIPPER_COMMAND.pack(steps(width, WIDTH_UNIT), most, state, 0))
 
 
 def enable(*, on: bool, motor: int = ALL_MOTORS) -> CanFrame:
-    """Return the frame that switches motors on, or lets them go."""
+    """Return the frame that switches motors on or off."""
     return CanFrame(ENABLE, bytes((motor, 2 if on else 1, 0, 0, 0, 0, 0, 0)))
 
 
 def decode_status(data: bytes) -> ArmStatus:
-    """Return what a frame of STATUS holds."""
+    """Decode a frame of STATUS."""
     return ArmStatus(*_STATUS.unpack(data))
 
 
@@ -189,7 +189,7 @@ def encode_status(status: ArmStatus) -> CanFrame:
 
 
 def decode_motor(data: bytes) -> Motor:
-    """Return what a frame of MOTORS holds."""
+    """Decode a frame of MOTORS."""
     speed, current, _ = _MOTOR.unpack(data)
     return Motor(speed * SPEED_UNIT, current * CURRENT_UNIT)
 
@@ -202,7 +202,7 @@ def encode_motor(joint: int, motor: Motor) -> CanFrame:
 
 
 def decode_drive(data: bytes) -> Drive:
-    """Return what a frame of DRIVES holds."""
+    """Decode a frame of DRIVES."""
     volts, drive, motor, status, current = _DRIVE.unpack(data)
     return Drive(volts * VOLT_UNIT, drive, motor, status, current * CURRENT_UNIT)
 
@@ -217,7 +217,7 @@ def encode_drive(joint: int, drive: Drive) -> CanFrame:
 
 
 def decode_gripper(data: bytes) -> Gripper:
-    """Return what a frame of GRIPPER holds."""
+    """Decode a frame of GRIPPER."""
     width, torque, status = _GRIPPER.unpack_from(data)
     return Gripper(width * WIDTH_UNIT, torque * TORQUE_UNIT, status)
 
@@ -235,7 +235,7 @@ def decode_gripper_command(data: bytes) -> tuple[float, float, int, int]:
 
 
 def decode_mit(data: bytes) -> MitCommand | None:
-    """Return what a frame of MIT holds, or None where its check is wrong."""
+    """Decode a frame of MIT; None if its check is wrong."""
     check = 0
     for byte in data[:7]:
         check ^= byte

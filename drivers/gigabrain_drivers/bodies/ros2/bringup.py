@@ -1,6 +1,6 @@
-"""Compares a ROS 2 robot with its file: which topic is missing, and what to do. Pure.
+"""Compares a ROS 2 robot with its file: missing topics, and remedies. Pure.
 
-`explain` needs the graph alone, for the log of a driver; `findings` the messages too.
+`explain` needs only the graph, for a driver's log; `findings` also needs messages.
 """
 
 import difflib
@@ -18,9 +18,9 @@ from gigabrain_zenoh.ros2.graph import CLOCK_S, SYNCHRONISE, clock_text, unreach
 from gigabrain_zenoh.ros2.qos import Qos, mismatch
 from gigabrain_zenoh.ros2.transport import GraphEndpoint, absolute
 
-RATE_SHARE = 0.8  # of the rate in the robot's file
-PLACE_M, PLACE_RAD = 0.02, 0.05  # by which a mounting in the file may differ from /tf_static
-SIM_TIME_S = 1e8  # seconds since 1970 below which a stamp counts from a simulation's start
+MIN_RATE_SHARE = 0.8  # of the rate in the robot's file
+MAX_ERROR_M, MAX_ERROR_RAD = 0.02, 0.05  # of a mounting in the file, against /tf_static
+SIM_TIME_S = 1e8  # smaller stamps are simulated time, not Unix time
 MAX_NAMED = 4
 NO_TILT = (
     "it has no orientation (orientation_covariance[0] is -1), so tilt_stop cannot stop the robot"
@@ -37,8 +37,8 @@ class Finding(NamedTuple):
 
     what: str  # the topic, or the frames
     verdict: Verdict
-    text: str  # what was found
-    do: str = ""  # what to do about it
+    text: str  # the result
+    do: str = ""  # the remedy
 
 
 class Row(NamedTuple):
@@ -48,20 +48,20 @@ class Row(NamedTuple):
     topic: str  # with its namespace
     type: str
     qos: Qos
-    hz: float  # that the file expects; 0: any
+    hz: float  # expected by the file; 0: any
 
 
 @dataclass
 class TopicStatistics:
-    """Messages of a topic received while it was watched."""
+    """Statistics of a topic's messages during a watch."""
 
     count: int = 0
     seconds: float = 0.0  # from the first message to the last
-    offset_s: float | None = None  # of the newest stamp, behind this machine's clock
+    offset_s: float | None = None  # this machine's clock - newest stamp
     stamp_s: float = 0.0  # the newest stamp
     frame: str = ""
     child_frame: str = ""
-    tilt: bool = True  # false of an inertial unit without orientation
+    tilt: bool = True  # false: an inertial unit without orientation
     unreadable: str = ""  # why a message could not be decoded
     unusable: str = ""  # why the driver drops the newest message
 
@@ -71,7 +71,7 @@ class TopicStatistics:
         return (self.count - 1) / self.seconds if self.seconds else 0.0
 
     def take(self, message: Any, unix_ns: int, elapsed_s: float) -> None:
-        """Note a message that came so long after the first."""
+        """Add a message, `elapsed_s` after the first."""
         self.count += 1
         self.seconds = elapsed_s
         header = getattr(message, "header", None)
@@ -86,7 +86,7 @@ class TopicStatistics:
 
 @dataclass
 class Watched:
-    """All that a watch of the robot has brought."""
+    """The results of watching a robot."""
 
     endpoints: tuple[GraphEndpoint, ...] = ()
     statistics: dict[str, TopicStatistics] = field(default_factory=dict)  # by part
@@ -94,7 +94,7 @@ class Watched:
 
 
 def rows(options: Ros2Options, lidar: Lidar | None = None) -> list[Row]:
-    """Return the topics that the robot publishes by its file."""
+    """Return the topics that the robot's file expects."""
     topics = options.topics
     found = []
     for part, type, hz in (
@@ -114,7 +114,7 @@ def rows(options: Ros2Options, lidar: Lidar | None = None) -> list[Row]:
 
 
 def explain(options: Ros2Options, endpoints: Sequence[GraphEndpoint]) -> str:
-    """Return what is wrong in the graph and what to do, in one line; empty if nothing is."""
+    """Return the problem of the graph and its remedy as one line; empty without one."""
     wrong = [f for f in graph_findings(options, endpoints) if f.verdict == "error"]
     return "; ".join(f"{each.what}: {each.text}; {each.do}" for each in wrong[:2])
 
@@ -122,7 +122,7 @@ def explain(options: Ros2Options, endpoints: Sequence[GraphEndpoint]) -> str:
 def graph_findings(
     options: Ros2Options, endpoints: Sequence[GraphEndpoint], lidar: Lidar | None = None
 ) -> list[Finding]:
-    """Return what the graph says of each topic."""
+    """Return the findings of the graph for each topic."""
     others = [each for each in endpoints if not each.ours]
     if not others:
         router = str(options.router or options.port)
@@ -164,7 +164,7 @@ def _published(row: Row, others: Sequence[GraphEndpoint]) -> Finding:
 
 
 def _elsewhere(row: Row, others: Sequence[GraphEndpoint]) -> str:
-    """Return where topics of the type, or of a like name, are."""
+    """Return topics of the same type, or of a similar name."""
     publishers = [each for each in others if each.kind == "publisher"]
     same = sorted({each.topic for each in publishers if each.type == row.type})
     if same:
@@ -208,12 +208,12 @@ def _commanded(options: Ros2Options, others: Sequence[GraphEndpoint]) -> list[Fi
 
 
 def _guards(node: str, options: Ros2Options) -> bool:
-    """Return whether a node is a driver of ours or its guard."""
+    """Return whether a node is our driver or its guard."""
     return node.rpartition("/")[2] in (options.node, f"{options.node}_guard")
 
 
 def findings(options: Ros2Options, lidar: Lidar | None, watched: Watched) -> list[Finding]:
-    """Return all that is known after a watch: the graph, then messages, stamps and frames."""
+    """Return all findings after a watch: graph, then messages, stamps and frames."""
     found = graph_findings(options, watched.endpoints, lidar)
     bad = {each.what for each in found if each.verdict == "error"}
     if any(each.what == "graph" for each in found):
@@ -237,7 +237,7 @@ def _messages(row: Row, statistics: TopicStatistics) -> list[Finding]:
         do = "is its node alive, and the network between open for UDP both ways?"
         return [Finding(row.topic, "error", "its publisher is there, but no message came", do)]
     found = []
-    if row.hz and statistics.hz < RATE_SHARE * row.hz:
+    if row.hz and statistics.hz < MIN_RATE_SHARE * row.hz:
         where = "topics.odometry.hz" if row.part == "odometry" else "rate_hz of `lidar:`"
         do = f"write what it does as {where}, or have the robot send as often"
         text = f"{statistics.hz:.1f} messages a second; expected {row.hz:g}"
@@ -265,7 +265,7 @@ def _clock(row: Row, statistics: TopicStatistics) -> Finding | None:
 
 
 def _connected(options: Ros2Options, lidar: Lidar | None, watched: Watched) -> list[Finding]:
-    """Return which frames of messages do not lead to the base."""
+    """Return findings about frames of messages that are not connected to the base."""
     level: Verdict = "error" if options.mounting == "tf_static" else "warning"
     base, found = options.base_frame, list[Finding]()
     frame_of: dict[str, Callable[[TopicStatistics], str]] = {
@@ -289,7 +289,7 @@ def _connected(options: Ros2Options, lidar: Lidar | None, watched: Watched) -> l
         text = f"{name} at x {x:.3f} m, y {y:.3f} m, yaw {yaw:.3f} rad of {base}"
         if part == "scan" and lidar and options.mounting == "file":
             off = max(abs(x - lidar.x), abs(y - lidar.y)), abs(wrap_angle(yaw - lidar.yaw))
-            if off[0] > PLACE_M or off[1] > PLACE_RAD:
+            if off[0] > MAX_ERROR_M or off[1] > MAX_ERROR_RAD:
                 do = "correct x, y and yaw of `lidar:`, or write mounting: tf_static"
                 expected = f"the file says x {lidar.x:g}, y {lidar.y:g}, yaw {lidar.yaw:g}"
                 found.append(Finding("scan frame", "warning", f"{text}; {expected}", do))

@@ -1,6 +1,6 @@
-"""ROS messages as ours: scans, inertial units, batteries, joints; and our commands as theirs. Pure.
+"""Converts ROS messages to ours (scans, IMU, battery, joints), and our commands to ROS. Pure.
 
-What cannot be used raises Unusable with the reason, and nothing else.
+Raises only Unusable, with the reason.
 """
 
 import math
@@ -24,15 +24,15 @@ from gigabrain_zenoh.ros2.types import Types
 
 MAX_BEAMS = 20_000
 MAX_JOINTS = 64
-MAX_IMU_VALUE = 1000.0  # [m/s2] and [rad/s], beyond which an inertial unit is talking nonsense
-BEYOND_CHARGE = 0.1  # share by which a gauge may be beyond empty or full
+MAX_IMU_VALUE = 1000.0  # [m/s2] and [rad/s]; larger values are no measurements
+BEYOND_CHARGE = 0.1  # share by which a gauge may exceed empty or full
 NANO = 1_000_000_000
 NO_ORIENTATION = (0.0, 0.0, 0.0, 0.0)  # safety then knows no tilt
-CUT = 1e-6  # by which a speed lies beyond its step, so that a robot that truncates keeps it
+CUT = 1e-6  # added to a rounded speed, so that a robot that truncates keeps it
 
 
 class Unusable(Exception):
-    """A message whose values make no sense, with the reason."""
+    """A message with impossible values; the text is the reason."""
 
 
 def stamp_ns(stamp: Any) -> int:
@@ -53,8 +53,8 @@ def scan_of(
 ) -> LaserScan:
     """Return the scan in the bins of `lidar`. Raises Unusable.
 
-    `place` is where the sensor of the message sits in the body; None: where `lidar` says. A scan
-    from another place is moved there, beam by beam.
+    `place` is the mounting of the message's sensor; None: that of `lidar`. A scan from another
+    mounting is transformed, beam by beam.
     """
     ranges = np.asarray(message.ranges, np.float64)
     if not 1 <= len(ranges) <= MAX_BEAMS:
@@ -73,14 +73,14 @@ def scan_of(
 
 
 def _distances(ranges: np.ndarray, range_max: float, options: ScanTopic) -> np.ndarray:
-    """Return distances [m]: inf where nothing was hit, nan where it is not known."""
+    """Return distances [m]: inf for no return, nan for unknown."""
     found = ranges.copy()
     meanings = {"no_return": np.inf, "unknown": np.nan}
     found[np.isnan(ranges)] = meanings[options.nan]
     found[ranges == 0.0] = meanings[options.zero]
-    found[np.isneginf(ranges)] = 0.0  # by REP 117: too near to be measured
+    found[np.isneginf(ranges)] = 0.0  # REP 117: too near to measure
     found[found < 0.0] = np.nan
-    if range_max > 0.0:  # false for NaN as well
+    if range_max > 0.0:  # also false for NaN
         found[found > range_max] = np.inf
     return found
 
@@ -88,7 +88,7 @@ def _distances(ranges: np.ndarray, range_max: float, options: ScanTopic) -> np.n
 def _moved(
     angles: np.ndarray, ranges: np.ndarray, place: Transform, lidar: Lidar
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the beams as a lidar at its place in the robot's file would have measured them."""
+    """Return the beams as seen from the lidar's mounting in the robot's file."""
     directions = np.stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))], axis=1)
     directions = directions @ place.turn.T
     far = np.isinf(ranges)
@@ -100,14 +100,14 @@ def _moved(
 
 
 def has_orientation(message: Any) -> bool:
-    """Return whether a sensor_msgs/Imu holds an orientation: -1 in its covariance denies it."""
+    """Return whether a sensor_msgs/Imu has an orientation: -1 in its covariance means none."""
     return bool(message.orientation_covariance[0] != -1.0)
 
 
 def imu_of(message: Any, turn: np.ndarray | None = None) -> ImuData:
-    """Return the reading in the body's frame, in which `turn` (3, 3) places the unit.
+    """Return the reading in the body's frame; `turn` (3, 3) is the unit's rotation in it.
 
-    Its orientation is NO_ORIENTATION where the message holds none. Raises Unusable.
+    Its orientation is NO_ORIENTATION if the message has none. Raises Unusable.
     """
     rate, pull = message.angular_velocity, message.linear_acceleration
     rates = np.array([rate.x, rate.y, rate.z])
@@ -131,7 +131,7 @@ def imu_of(message: Any, turn: np.ndarray | None = None) -> ImuData:
 
 
 def _quaternion(turn: np.ndarray) -> tuple[float, float, float, float]:
-    """Return x, y, z, w of a rotation matrix: the axis of the largest part first."""
+    """Return x, y, z, w of a rotation matrix, computed from its largest component."""
     (xx, _, _), (_, yy, _), (_, _, zz) = turn.tolist()
     squares = [1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + xx + yy + zz]
     largest = squares.index(max(squares))
@@ -148,7 +148,7 @@ def _quaternion(turn: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def battery_of(message: Any, options: BatteryTopic) -> Battery:
-    """Return the battery. Raises Unusable where its charge is not known, or cannot be."""
+    """Return the battery. Raises Unusable if its charge is unknown or impossible."""
     volts, share = float(message.voltage), float(message.percentage)
     if not math.isfinite(volts) or not math.isfinite(share):
         raise Unusable("it has no voltage or no percentage")
@@ -160,7 +160,7 @@ def battery_of(message: Any, options: BatteryTopic) -> Battery:
     return Battery(
         voltage=max(volts, 0.0),
         percentage=min(max(100.0 * share / options.full, 0.0), 100.0),
-        current=-current if math.isfinite(current) else 0.0,  # in ROS it is negative as it drains
+        current=-current if math.isfinite(current) else 0.0,  # in ROS negative while it discharges
     )
 
 
@@ -187,7 +187,7 @@ def joints_of(message: Any, options: JointsTopic) -> tuple[Joint, ...]:
 
 
 def cut(velocity: Velocity, step: float) -> Velocity:
-    """Return the velocity that a robot with such a step does: the nearest multiple, towards 0."""
+    """Return the velocity that a robot with this step executes: truncated to a multiple."""
     if not step:
         return velocity
     parts = (velocity.linear_x, velocity.linear_y, velocity.angular_z)

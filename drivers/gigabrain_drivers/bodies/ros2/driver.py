@@ -1,8 +1,7 @@
-"""A ROS 2 robot as a body: its topics are the sensors, and one of them it obeys.
+"""A ROS 2 robot as a body: its topics are the sensors, and it obeys a command topic.
 
-The driver sends a command at once when it is new, and repeats it. While it is not told anything it
-sends zero; a robot that would drive on without commands gets a guard as well, for the case that the
-driver itself dies.
+The driver sends a new command at once, and repeats it. Without commands it sends zero. A robot that
+would keep driving without messages also gets a guard, for the case that the driver itself dies.
 """
 
 import asyncio
@@ -51,11 +50,11 @@ from gigabrain_zenoh.logs import Fault
 log = logging.getLogger(__name__)
 
 NUMBERS = re.compile(r"[\d.]+")
-COMMAND_TIMEOUT_NS = 80_000_000  # without a command; zero is then out by 100 ms
+COMMAND_TIMEOUT_NS = 80_000_000  # after this time without a command, so that zero is sent by 100 ms
 GUARD_PERIOD_NS = 20_000_000  # between two checks by the driver
-REST_NS = 800_000_000  # for which a closing driver sends zero, at most, until the robot stands
+REST_NS = 800_000_000  # longest time of sending zero at close, until the robot stands
 STAMP_WRAP_MS = 1 << 40
-LOG_AFTER_NS = 500_000_000  # of a problem, before it is logged
+LOG_AFTER_NS = 500_000_000  # a problem is logged after this time
 
 
 class Ros2Driver(Driver):
@@ -72,7 +71,7 @@ class Ros2Driver(Driver):
         clock: Clock | None = None,
         opener: Opener | None = None,
     ) -> None:
-        """`opener` instead of the transport that the options name; then there is no guard."""
+        """`opener` replaces the transport in the options; then there is no guard."""
         super().__init__(robot, options, run)
         self._clock = clock or Clock()
         topics = options.topics
@@ -93,7 +92,7 @@ class Ros2Driver(Driver):
         self._wanted = ZERO
         self._wanted_ns = self._sent_ns = self._well_ns = self._clock.now_ns()
         self._commanded_ns = self._clock.now_ns()
-        # a little early, as the check for it has a period of its own
+        # a little early, because checks are periodic
         self._repeat_ns = round(1e9 / topics.command.hz) - GUARD_PERIOD_NS // 2
         self._connected, self._found, self._reconnects = False, False, 0
         self._fault, self._named = Fault(log), ""
@@ -105,7 +104,7 @@ class Ros2Driver(Driver):
 
     @classmethod
     def check(cls, robot: RobotFile, options: Ros2Options) -> None:
-        """Raises ValueError where the topics do not fit the body."""
+        """Raise ValueError if the topics do not fit the body."""
         check_options(options, robot)
 
     @property
@@ -121,7 +120,7 @@ class Ros2Driver(Driver):
         return self._guard.problem if self._guard else ""
 
     async def open(self) -> None:
-        """Begin to join ROS 2; the robot does not have to be there yet."""
+        """Start joining ROS 2; the robot may appear later."""
         self.link.open()
         if self._guard:
             self._guard.open()
@@ -151,10 +150,10 @@ class Ros2Driver(Driver):
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
     ) -> Velocity:
-        """Drive, in the steps of the robot; where one value is not a number, all are zero."""
+        """Drive, in the robot's steps. All speeds are zero if one is not a number."""
         self._commanded_ns = self._clock.now_ns()
         wanted = cut(self.bounded(linear_x, linear_y, angular_z), self.options.topics.command.step)
-        if not self._found:  # nothing moves a robot that has not been seen
+        if not self._found:  # do not command a robot before its first message
             wanted = ZERO
         due = self._commanded_ns - self._sent_ns >= self._repeat_ns
         if wanted == self._wanted and not due:
@@ -162,7 +161,7 @@ class Ros2Driver(Driver):
         return wanted if self._send(wanted) else ZERO
 
     async def read_state(self) -> RobotState:
-        """Return the newest values; `link` tells whether they are recent."""
+        """Return the newest values; its `link` shows whether they are recent."""
         now_ns = self._clock.now_ns()
         self._judge(now_ns)
         return RobotState(
@@ -209,7 +208,7 @@ class Ros2Driver(Driver):
         return self.link.send(wanted)
 
     async def _repeat(self) -> None:
-        """Repeat the newest command; send zero while none comes."""
+        """Repeat the newest command; send zero while there is none."""
         async for now_ns in self._clock.every(GUARD_PERIOD_NS):
             if now_ns - self._commanded_ns >= COMMAND_TIMEOUT_NS and self._wanted != ZERO:
                 self._send(ZERO)
@@ -227,7 +226,7 @@ class Ros2Driver(Driver):
             self._judge(self._clock.now_ns())
 
     def _judge(self, now_ns: int) -> None:
-        """Find out whether the link is lost or found, and log it."""
+        """Check whether the link is lost or found, and log changes."""
         problem = self.problem
         if not problem:
             self._reconnects += self._found and not self._connected
@@ -238,7 +237,7 @@ class Ros2Driver(Driver):
         if self._connected:
             self._send(ZERO)
         self._connected = False
-        kind = NUMBERS.sub("", problem)  # how long it lasts makes no other problem of it
+        kind = NUMBERS.sub("", problem)  # another duration is the same problem
         if kind == self._named or now_ns - self._well_ns < LOG_AFTER_NS:
             return
         self._named = kind
@@ -275,7 +274,7 @@ class Ros2Driver(Driver):
         return se2.inverse(_pose(*place.planar))
 
     def _frame(self, frame: str) -> Transform:
-        """Return the place of a frame in the body's. Raises Unusable."""
+        """Return the pose of a frame in the body's frame. Raises Unusable."""
         base = self.options.base_frame
         place = self._frames.find(frame, base)
         if place is None:
@@ -329,7 +328,7 @@ def _pose(x: float, y: float, yaw: float) -> Floats:
 
 
 def _velocity(twist: Any) -> Velocity:
-    """Return the planar velocity of a twist; numbers that are none stay so, for the watch."""
+    """Return the planar velocity of a twist; keeps NaN, for the watch to detect."""
     return Velocity(
         linear_x=float(twist.linear.x),
         linear_y=float(twist.linear.y),
@@ -338,9 +337,9 @@ def _velocity(twist: Any) -> Velocity:
 
 
 def _moved(pose: Floats, velocity: Velocity, body: Floats) -> tuple[Floats, Velocity]:
-    """Return pose and velocity of the body, which sits at `body` in the measured frame.
+    """Return pose and velocity of the body, whose pose in the measured frame is `body`.
 
-    The pose is relative to where the body began.
+    The pose is relative to the body's start.
     """
     whole = se2.compose(se2.inverse(body), se2.compose(pose, body))
     turn = velocity.angular_z

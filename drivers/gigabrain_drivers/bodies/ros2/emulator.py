@@ -1,7 +1,7 @@
-"""A robot that speaks ROS 2: its nodes and its board, with the project's own physics behind them.
+"""An emulated ROS 2 robot: its nodes and its board, with simulated physics.
 
-It behaves as a TurtleBot3 does: a command holds until the next one, however long that takes, unless
-the robot's file promises a watchdog. Once the nodes are frozen or gone the board stops the motors.
+As with a TurtleBot3, a command holds until the next one, without a time limit, unless the robot's
+file promises a watchdog. If the nodes freeze or end, the board stops the motors.
 """
 
 import asyncio
@@ -37,21 +37,21 @@ from gigabrain_zenoh.ros2.transport import RosPublisher, RosTransport
 log = logging.getLogger(__name__)
 
 NODE = "emulated_robot"
-HEARTBEAT_NS = 500_000_000  # without its nodes, after which the board stops the motors
-END = b"\0"  # of a topic's name in a frame of the line between device and port
-QUEUE = 10  # commands that a frozen node keeps; older ones it loses
-DOMAINS = range(101, 200)  # for emulators; their ports lie below those that Linux gives to clients
+HEARTBEAT_NS = 500_000_000  # the board stops the motors after this time without its nodes
+END = b"\0"  # of a topic's name, in a frame between device and port
+QUEUE = 10  # newest commands that a frozen node keeps
+DOMAINS = range(101, 200)  # for emulators; their ports are below Linux's ephemeral ports
 BASE, ODOM, SCAN_FRAME, IMU_FRAME = "base_footprint", "odom", "base_scan", "imu_link"
 LIDAR_HEIGHT_M = 0.182
 
 
 def frame(topic: str, payload: bytes) -> bytes:
-    """Return a message as it goes between device and port."""
+    """Return a message as a frame between device and port."""
     return topic.encode() + END + payload
 
 
 class RosPort:
-    """The robot's nodes on a transport; the file `path` holds where they are."""
+    """The robot's nodes on a transport; the file `path` contains their address."""
 
     def __init__(self, path: Path, options: Ros2Options) -> None:
         self.path, self._options = path, options
@@ -63,14 +63,14 @@ class RosPort:
         self._endings: set[asyncio.Task[None]] = set()
 
     def plug(self) -> None:
-        """Start the nodes. Nothing if they run."""
+        """Start the nodes. Does nothing if they run."""
         if self._plugged:
             return
         self._plugged = True
         self._running = asyncio.create_task(self._run(self._running), name="emulated nodes")
 
     def unplug(self) -> None:
-        """End the nodes: nothing comes or goes from now on. Nothing if they are gone."""
+        """End the nodes. Does nothing if they are gone."""
         self._plugged = False
         self._publishers = {}
         if self._running and not self._running.done():
@@ -87,7 +87,7 @@ class RosPort:
         return self._plugged
 
     async def _run(self, before: "asyncio.Task[None] | None") -> None:
-        """Be the nodes until cancelled; `before` are those that may still be ending."""
+        """Run the nodes until cancelled, after the end of those `before`."""
         if before:
             await asyncio.wait((before,))
         fault = Fault(log)
@@ -144,7 +144,7 @@ class RosPort:
 
 
 def _free_address(options: Ros2Options) -> Address:
-    """Return where nobody else is; it stays the same when the nodes start again."""
+    """Return an unused address. It stays the same when the nodes restart."""
     if options.transport == "dds":
         return Address(domain=free_domain())
     with socket.socket() as probe:
@@ -170,7 +170,7 @@ def free_domain() -> int:
 
 
 def published(options: Ros2Options) -> list[tuple[str, str, Qos]]:
-    """Return topic, type and offered QoS of all that a robot publishes."""
+    """Return topic, type and offered QoS of everything that a robot publishes."""
     topics = options.topics
     found = [(topics.odometry.name, ros2.ODOMETRY, Qos())]
     if topics.scan:
@@ -214,13 +214,13 @@ class Ros2Robot(Device):
 
     @classmethod
     def port(cls, options: Any) -> Port:
-        """Nodes on the transport of the options; where they are stands in a file."""
+        """Return nodes on the transport of the options; a file contains their address."""
         return RosPort(Path(options.port), options)
 
     def reset(self) -> None:
         """Start: wheels at rest, odometry at zero."""
         self._obeyed_ns: int | None = None
-        self._alive_ns: int | None = None  # when the nodes last ran
+        self._alive_ns: int | None = None  # last time at which the nodes ran
         self._next_ns = self._static_ns = 0
         self._start = self.body.snapshot.odometry
         self.body.command(0.0, 0.0, 0.0)
@@ -229,7 +229,7 @@ class Ros2Robot(Device):
             self._sweep.start(beams * hz, hz)
 
     def feed(self, data: bytes) -> None:
-        """Obey commands; of many that have waited, the newest ten."""
+        """Obey commands; at most the ten newest of those that waited."""
         command = self._options.topics.command
         name = command.name.encode() + END
         for payload in data.split(name)[1:][-QUEUE:]:
@@ -249,7 +249,7 @@ class Ros2Robot(Device):
         self.body.command(wanted.linear_x, wanted.linear_y, wanted.angular_z)
 
     def step(self, now_ns: int) -> None:
-        """Watch the nodes and the commands, and publish what is due."""
+        """Watch nodes and commands, and publish due messages."""
         if not self.halted or self._alive_ns is None:
             self._alive_ns = now_ns
         silent = self._watchdog_ns and self._obeyed_ns
@@ -262,7 +262,7 @@ class Ros2Robot(Device):
             return
         self._next_ns = max(self._next_ns + self._state_ns, now_ns - self._state_ns)
         self._report()
-        if now_ns >= self._static_ns:  # for those that come late, were it not kept for them
+        if now_ns >= self._static_ns:  # for late subscribers without stored messages
             self._static_ns = now_ns + NANO
             self._send(ros2.TF_STATIC_TOPIC, ros2.TF, transforms=self._fixed())
 
@@ -334,7 +334,7 @@ class Ros2Robot(Device):
         )
 
     def _fixed(self) -> list[dict[str, Any]]:
-        """Return the transforms of frames that never move."""
+        """Return the transforms of static frames."""
         lidar = self._lidar
         places: dict[str, tuple[float, float, float, float]] = {IMU_FRAME: (0.0, 0.0, 0.068, 0.0)}
         if lidar:

@@ -1,6 +1,6 @@
-"""The node of a driver: joins ROS 2, listens to the robot's topics, and commands it.
+"""A driver's node: joins ROS 2, listens to the robot's topics, and commands it.
 
-It goes on joining until it is closed. Everything runs on the event loop.
+It tries to join again until it is closed. Everything runs on the event loop.
 """
 
 import asyncio
@@ -28,13 +28,13 @@ from gigabrain_zenoh.ros2.types import Types
 log = logging.getLogger(__name__)
 
 RETRY_NS = 200_000_000  # between two attempts to join
-MOVED_NS = 1_000_000_000  # between two looks at this host's addresses
-CLOSE_S = 1.0  # for leaving
-DEPTH = 5  # messages that wait where the loop is busy; the newest count
+ADDRESS_CHECK_NS = 1_000_000_000  # between two checks of this host's addresses
+CLOSE_S = 1.0  # timeout for leaving
+DEPTH = 5  # newest messages that wait for a busy loop
 STATIC_DEPTH = 100  # publishers of /tf_static keep one message each
 
 Opener = Callable[[], AbstractAsyncContextManager[RosTransport]]
-Take = Callable[[Any], None]  # of a message; may raise Unusable
+Take = Callable[[Any], None]  # handles a message; may raise Unusable
 
 
 @functools.cache
@@ -49,13 +49,13 @@ class RosLink:
     """A node on a transport, opened again whenever opening it fails."""
 
     def __init__(self, options: Ros2Options, clock: Clock, opener: Opener | None = None) -> None:
-        """`opener` instead of the transport that the options name."""
+        """`opener` replaces the transport in the options."""
         self._options, self._clock = options, clock
         self._opener = opener or self._open_transport
         self.trace: Trace | None = None  # ("tx" or "rx", payload)
         self.on_open: Callable[[], None] = _nothing
         self.problem = "not opened"
-        self.errors = 0  # messages that could not be used
+        self.errors = 0  # unusable messages
         self.transport: RosTransport | None = None
         self._topics: list[tuple[str, str, Qos, Take]] = []
         self._faults: dict[str, Fault] = {}
@@ -71,13 +71,13 @@ class RosLink:
 
     @property
     def readers(self) -> int:
-        """Number of nodes that take our commands."""
+        """Number of nodes that subscribe to our commands."""
         return self._command.readers if self._command else 0
 
     def listen(
         self, topic: str, type: str, take: Take, *, reliable: bool, kept: bool = False
     ) -> None:
-        """Have `take` called with each message; before `open`. `kept`: old ones as well."""
+        """Call `take` with each message; call this before `open`. `kept`: also stored ones."""
         qos = Qos(reliable, kept, STATIC_DEPTH if kept else DEPTH)
         self._topics.append((topic, type, qos, take))
 
@@ -98,7 +98,7 @@ class RosLink:
         self.problem = "closed"
 
     def send(self, to: Velocity) -> bool:
-        """Publish a command now; return whether a node takes it. Never blocks or raises."""
+        """Publish a command now; return whether a node receives it. Never blocks or raises."""
         if self._command is None or self._types is None:
             return False
         topic = self._options.topics.command
@@ -132,14 +132,14 @@ class RosLink:
                 await self._clock.sleep_ns(RETRY_NS)
 
     async def _until_moved(self) -> None:
-        """Return when this host has another network, and no robot is there.
+        """Return when this host has another network, and no robot is connected.
 
-        Cyclone DDS stays on the interface that it has joined on.
+        Cyclone DDS keeps the interface on which it joined.
         """
         if not self._options.bound:
             await asyncio.Event().wait()
         joined = outer_addresses()
-        async for _ in self._clock.every(MOVED_NS):
+        async for _ in self._clock.every(ADDRESS_CHECK_NS):
             now = outer_addresses()
             if now and not now & joined and not self.readers:
                 log.info("%s: the network has changed; joining again", self)

@@ -31,8 +31,8 @@ Factor = Annotated[float, Meta(ge=-1e6, le=1e6)]
 Seconds = Annotated[float, Meta(ge=0.05, le=60.0)]
 Reliability = Literal["best_effort", "reliable"]
 
-MAX_WATCHDOG_S = 0.2  # of a robot that needs no guard: it stops by itself soon enough
-MAX_ADDRESS_BYTES = 512  # of a file with an emulator's address
+MAX_WATCHDOG_S = 0.2  # of a robot that stops by itself early enough to need no guard
+MAX_ADDRESS_BYTES = 512  # size of a file with an emulator's address
 
 
 class _Part(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -45,7 +45,7 @@ class CommandTopic(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True)
     name: Topic = "cmd_vel"
     type: Literal["geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"]
     frame: Frame = "base_link"  # of TwistStamped
-    hz: Rate = 20.0  # how often an unchanged command is repeated; a new one goes at once
+    hz: Rate = 20.0  # repetition of an unchanged command; a new one is sent at once
     step: Step = (
         0.0  # [m/s] and [rad/s], to whose multiples the robot cuts its speeds; 0: it does not
     )
@@ -56,8 +56,8 @@ class OdometryTopic(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True
     """The topic with pose and velocity, of nav_msgs/msg/Odometry."""
 
     name: Topic = "odom"
-    hz: Rate = 20.0  # that the robot promises; two and a half periods without are a lost link
-    child_frame: Frame = ""  # that it must name; empty: any
+    hz: Rate = 20.0  # promised by the robot; the link is lost after 2.5 periods without a message
+    child_frame: Frame = ""  # that messages must have; empty: any
     x: Offset = 0.0  # [m], place of the child frame in the body's frame
     y: Offset = 0.0  # [m]
     yaw: Angle = 0.0  # [rad]
@@ -68,10 +68,10 @@ class ScanTopic(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The topic with the lidar's turns, of sensor_msgs/msg/LaserScan."""
 
     name: Topic = "scan"
-    clockwise: bool = False  # its beams run clockwise though its increment says otherwise
-    angle: Angle = 0.0  # [rad], added to all angles: where another start angle is meant
-    zero: Literal["no_return", "unknown"] = "no_return"  # what a range of 0 means
-    nan: Literal["no_return", "unknown"] = "unknown"  # what a range of NaN means
+    clockwise: bool = False  # beams run clockwise, contrary to the message's increment
+    angle: Angle = 0.0  # [rad], added to all angles, to correct a wrong start angle
+    zero: Literal["no_return", "unknown"] = "no_return"  # meaning of a range of 0
+    nan: Literal["no_return", "unknown"] = "unknown"  # meaning of a range of NaN
     qos: Reliability = "best_effort"
 
 
@@ -87,7 +87,7 @@ class BatteryTopic(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """The topic of the battery, of sensor_msgs/msg/BatteryState."""
 
     name: Topic = "battery_state"
-    full: Literal[1, 100] = 1  # what its percentage is at full charge: 1 by the rule of ROS
+    full: Literal[1, 100] = 1  # its percentage at full charge; by ROS convention 1
     qos: Reliability = "best_effort"
 
 
@@ -101,7 +101,7 @@ class JointsTopic(_Part, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Topics(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The robot's topics. Those that are left out it does not have."""
+    """The robot's topics. It does not have those that are omitted."""
 
     command: CommandTopic
     odometry: OdometryTopic = OdometryTopic()
@@ -112,7 +112,7 @@ class Topics(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Ros2Options(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A robot that is reached by ROS 2."""
+    """A robot with a ROS 2 interface."""
 
     transport: Literal["rmw_zenoh", "dds"]
     domain: Annotated[int, Meta(ge=0, le=232)] = 0  # ROS_DOMAIN_ID of the robot
@@ -120,11 +120,11 @@ class Ros2Options(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
     node: RosName = DRIVER_NODE  # name of the driver's node
     router: str = ""  # Zenoh endpoint of the robot's ROS router, for rmw_zenoh
     distro: Literal["humble", "iron", "jazzy", "kilted", "rolling"] = "jazzy"  # of the robot
-    localhost: bool = False  # DDS talks to nodes of this host only
+    localhost: bool = False  # DDS connects only to nodes of this host
     port: str = ""  # a file with an emulator's address, which replaces domain and router
     topics: Topics
-    watchdog: Seconds | Literal["none"]  # [s] without commands, after which the robot stops itself
-    mounting: Literal["file", "tf_static"] = "file"  # where sensors sit: by this file, or by ROS
+    watchdog: Seconds | Literal["none"]  # [s], the robot stops after this time without commands
+    mounting: Literal["file", "tf_static"] = "file"  # source of sensor mountings: this file, or ROS
     base_frame: Frame = "base_footprint"  # the body's frame in ROS
 
     def __post_init__(self) -> None:
@@ -141,16 +141,16 @@ class Ros2Options(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
 
     @property
     def needs_guard(self) -> bool:
-        """True where the robot would drive on for long if this driver died."""
+        """True if the robot would drive on for too long after this driver died."""
         return self.watchdog == "none" or self.watchdog > MAX_WATCHDOG_S
 
     @property
     def bound(self) -> bool:
-        """True where it reaches other hosts by the network interface that it has joined on."""
+        """True if it is bound to the network interface on which it joined."""
         return self.transport == "dds" and not (self.localhost or self.port)
 
     def link(self, node: str = "") -> Ros2Link:
-        """Return how to join ROS 2. Raises ConfigError while an emulator's address is not there."""
+        """Return how to join ROS 2. Raises ConfigError while an emulator's file is missing."""
         link = Ros2Link(
             transport=self.transport,
             domain=self.domain,
@@ -164,14 +164,14 @@ class Ros2Options(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class Address(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Address of an emulator, as written in the file of its port."""
+    """An emulator's address, in the file of its port."""
 
     domain: Annotated[int, Meta(ge=0, le=232)] = 0
     router: str = ""
 
 
 def at_address(link: Ros2Link, path: Path) -> Ros2Link:
-    """Return the link to the emulator whose address is in a file. Raises ConfigError."""
+    """Return the link with an emulator's address from a file. Raises ConfigError."""
     try:
         found = msgspec.json.decode(read_bounded(path, MAX_ADDRESS_BYTES), type=Address)
     except OSError as error:
@@ -183,7 +183,7 @@ def at_address(link: Ros2Link, path: Path) -> Ros2Link:
 
 
 def check_options(options: Ros2Options, robot: RobotFile) -> None:
-    """Raises ValueError where the topics do not fit the body."""
+    """Raise ValueError if the topics do not fit the body."""
     topics = options.topics
     if topics.scan and options.scan:
         raise ValueError(

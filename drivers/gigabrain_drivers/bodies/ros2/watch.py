@@ -1,7 +1,7 @@
-"""Judges a robot's odometry: whether it comes, is possible, and goes on. Pure.
+"""Checks that a robot's odometry arrives, is possible, and does not jump. Pure.
 
-A jump of the pose is taken out, so that our odometry goes on where it was: the map stays right. The
-link counts as lost for a moment all the same, as the robot may have been restarted.
+A jump of the pose is removed, so that our odometry continues and the map stays right. The link
+still counts as lost for a moment, because the robot may have restarted.
 """
 
 import math
@@ -13,13 +13,13 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_zenoh.geometry import se2
 
-LOST_PERIODS = 2.5  # without odometry, and the link is lost,
-MIN_TIMEOUT_NS = 100_000_000  # but not before
+LOST_PERIODS = 2.5  # the link is lost after this many periods without odometry,
+MIN_TIMEOUT_NS = 100_000_000  # but not before this time
 SETTLE_NS = 300_000_000  # of good odometry, after a fault in it
-PUSHED_FACTOR = 1.5  # times as fast as it can drive a body may be pushed, and
-MAX_FACTOR = 3.0  # times its greatest turn rate, beyond which a reported one is no measurement
-JUMP_M, JUMP_RAD = 0.1, 0.3  # more between two messages; what moves further has jumped
-BACK_NS = 20_000_000  # by which a stamp may be older than the last: two threads of a publisher
+PUSHED_FACTOR = 1.5  # factor on the maximal speed, for a body that is pushed
+MAX_FACTOR = 3.0  # factor on the maximal turn rate; larger rates are no measurements
+JUMP_M, JUMP_RAD = 0.1, 0.3  # tolerance; a larger motion between two messages is a jump
+BACK_NS = 20_000_000  # a stamp may be this much older than the last, if a publisher has two threads
 
 
 class OdometrySample(NamedTuple):
@@ -31,37 +31,37 @@ class OdometrySample(NamedTuple):
 
 
 class OdometryWatch:
-    """Keeps the newest odometry, and says what is wrong with it."""
+    """Keeps the newest odometry, and its present problem."""
 
     def __init__(self, topic: str, hz: float, max_speed: float, max_turn: float) -> None:
-        """`max_speed` [m/s] and `max_turn` [rad/s] are the body's greatest."""
+        """`max_speed` [m/s] and `max_turn` [rad/s] are the body's limits."""
         self.timeout_ns = max(round(LOST_PERIODS / hz * 1e9), MIN_TIMEOUT_NS)
-        self.errors = 0  # messages that were refused
+        self.errors = 0  # rejected messages
         self.velocity = Velocity()
         self._topic, self._speed, self._turn = topic, max_speed, max_turn
         self._pose: Floats = se2.IDENTITY  # ours, which never jumps
         self._last: OdometrySample | None = None
-        self._came_ns: int | None = None  # when the last good one did
-        self._fault, self._fault_ns = "", 0  # the newest, and when it was seen last
+        self._received_ns: int | None = None  # arrival of the last valid message
+        self._fault, self._fault_ns = "", 0  # the newest, and its last time
 
     @property
     def pose(self) -> Pose:
-        """The pose, from where odometry began."""
+        """The pose relative to the start of odometry."""
         x, y, yaw = map(float, self._pose)
         return Pose(x=x, y=y, yaw=yaw)
 
     def age_ns(self, now_ns: int) -> int | None:
-        """Return the age of the newest good message; None before the first."""
-        return None if self._came_ns is None else now_ns - self._came_ns
+        """Return the age of the newest valid message; None before the first."""
+        return None if self._received_ns is None else now_ns - self._received_ns
 
     def refuse(self, reason: str, now_ns: int) -> None:
-        """Note a message that cannot be used."""
+        """Record an unusable message."""
         self.errors += 1
         self._fault, self._fault_ns = f"{self._topic}: {reason}", now_ns
 
     def restart(self) -> None:
-        """Forget when the last message came: the transport is a new one."""
-        self._came_ns = None
+        """Forget the last arrival, because the transport is a new one."""
+        self._received_ns = None
 
     def add(self, sample: OdometrySample, now_ns: int) -> None:
         """Take a message."""
@@ -82,17 +82,17 @@ class OdometryWatch:
             self.refuse(
                 f"its stamps went back by {back:.3g} s: restarted, or two publishers?", now_ns
             )
-            self._last = sample  # from here on it counts again
+            self._last = sample  # accept odometry again from here
             return
         else:
             self._go_on(last, sample, now_ns)
             velocity = self._possible(last, sample)
-            self._last, self._came_ns, self.velocity = sample, now_ns, velocity
+            self._last, self._received_ns, self.velocity = sample, now_ns, velocity
             return
-        self._last, self._came_ns, self.velocity = sample, now_ns, sample.velocity
+        self._last, self._received_ns, self.velocity = sample, now_ns, sample.velocity
 
     def problem(self, now_ns: int) -> str:
-        """Return why the odometry cannot be relied on; empty if it can."""
+        """Return why the odometry is unreliable; empty if it is reliable."""
         age_ns = self.age_ns(now_ns)
         if self._fault and now_ns - self._fault_ns < SETTLE_NS:
             return self._fault
@@ -104,7 +104,7 @@ class OdometryWatch:
         return ""
 
     def _possible(self, last: OdometrySample, sample: OdometrySample) -> Velocity:
-        """Return the velocity, with a turn that cannot be taken from the pose instead.
+        """Return the velocity; an impossible turn rate is replaced by that of the poses.
 
         A TurtleBot3 reports -125 rad/s when its heading passes half a turn.
         """
@@ -118,8 +118,8 @@ class OdometryWatch:
     def _go_on(self, last: OdometrySample, sample: OdometrySample, now_ns: int) -> None:
         moved = se2.between(last.pose, sample.pose)
         passed_s = max(sample.stamp_ns - last.stamp_ns, 0) / 1e9
-        if self._came_ns is not None:  # a stamp may leap ahead; the time of arrival does not
-            passed_s = min(passed_s, max((now_ns - self._came_ns) / 1e9, 0.0) + 0.5)
+        if self._received_ns is not None:  # stamps may jump ahead, arrivals do not
+            passed_s = min(passed_s, max((now_ns - self._received_ns) / 1e9, 0.0) + 0.5)
         far, turned = math.hypot(moved[0], moved[1]), abs(float(moved[2]))
         if (
             far > PUSHED_FACTOR * self._speed * passed_s + JUMP_M

@@ -1,7 +1,7 @@
-"""TurtleBot3 on its real link: the OpenCR board on USB, and its lidar on a port of its own.
+"""TurtleBot3 on its real link: the OpenCR board on USB, and its lidar on another port.
 
-The vendor's stack lets the body drive on when the commands end (turtlebot3#1154). Here the driver
-stops it after 100 ms; should the driver itself die, the board does after 500 ms.
+With the vendor's stack the body drives on when commands end (turtlebot3#1154). This driver stops it
+after 100 ms. If the driver itself dies, the board stops it after 500 ms.
 """
 
 import asyncio
@@ -37,29 +37,29 @@ from gigabrain_zenoh.errors import BodyLost, ConfigError
 
 log = logging.getLogger(__name__)
 
-LOST_NS = 100_000_000  # without an answer it counts as lost,
-GIVE_UP_NS = 160_000_000  # and then its line is closed, with all that is still queued in it
-PING_PERIOD_NS = 100_000_000  # between two attempts to get an answer at all
-FIRST_ANSWER_TIMEOUT_NS = 1_000_000_000  # for the first answer, until the port is reopened
-LOG_AFTER_NS = 500_000_000  # of a problem, before it is logged
+LOST_NS = 100_000_000  # the board counts as lost after this time without an answer
+GIVE_UP_NS = 160_000_000  # then its line is closed, and queued bytes are dropped
+PING_PERIOD_NS = 100_000_000  # between two attempts to get a first answer
+FIRST_ANSWER_TIMEOUT_NS = 1_000_000_000  # then the port is reopened
+LOG_AFTER_NS = 500_000_000  # a problem is logged after this time
 ANSWER_TIMEOUT_S = 0.01  # for the answer to a question
 ANSWER_BYTES = 14  # of the answer to a ping
-WATCHDOG_FIRMWARE = 5  # before that, the byte of the debug mode was part of a clock
+WATCHDOG_FIRMWARE = 5  # in older versions, the debug mode's byte is part of a clock
 
 GUARD_PERIOD_NS = 20_000_000  # between two checks by the driver
-COMMAND_TIMEOUT_NS = 80_000_000  # without a command; zero is then out by 100 ms
+COMMAND_TIMEOUT_NS = 80_000_000  # after this time without a command, so that zero is sent by 100 ms
 FLUSH_S = 0.05  # for the last zero to arrive before the port is closed
 JOINTS = ("wheel_left_joint", "wheel_right_joint")
-PUSHED_FACTOR = 1.5  # times as fast as it can drive a body may be pushed, and
-TURN_SLACK_RAD = 0.1  # [rad] more between two readings; counters that jump further were reset
-MAX_IMU_VALUE = 1000.0  # [m/s2] and [rad/s], beyond which an inertial unit is talking nonsense
+PUSHED_FACTOR = 1.5  # factor on the maximal speed, for a body that is pushed
+TURN_SLACK_RAD = 0.1  # [rad], tolerance; a larger jump between two readings is a counter reset
+MAX_IMU_VALUE = 1000.0  # [m/s2] and [rad/s]; larger values are no measurements
 
 
 class Board:
-    """The OpenCR board on its line. Each question has a new heartbeat, which its answer returns.
+    """The OpenCR board on its line. Each question has a new heartbeat, and its answer returns it.
 
-    So a late answer is never taken for a fresh one; and nothing counts that came before the answer
-    to the first ping on a newly opened port. Every connection begins with zero velocity.
+    So a late answer never counts as fresh. Bytes before the answer to the first ping on a newly
+    opened port are ignored. Every connection begins with zero velocity.
     """
 
     def __init__(self, link: Link, clock: Clock) -> None:
@@ -73,11 +73,11 @@ class Board:
         self.on_readings: Callable[[Readings], None] = _ignore  # set by the owner
         self._clock = clock
         self._decoder = opencr.DynamixelDecoder()
-        self._firmware: int | None = None  # of the board that has answered since the port was open
+        self._firmware: int | None = None  # of the board on the open port, after its first answer
         self._beat = 0
         self._answered = asyncio.Event()
-        self._opened_ns = self._knocked_ns = self._asked_ns = self._fresh_ns = clock.now_ns()
-        self._waiting_ns: int | None = None  # since when questions have been without an answer
+        self._opened_ns = self._pinged_ns = self._asked_ns = self._fresh_ns = clock.now_ns()
+        self._waiting_ns: int | None = None  # time of the oldest unanswered question
         self._newest: Readings | None = None
         self._complaint = "not there yet"
         self._well_ns = clock.now_ns()
@@ -89,13 +89,13 @@ class Board:
 
     @property
     def health(self) -> LinkHealth:
-        """Connected means that it answers; the age is that of what it answered last."""
+        """The link's health: connected if the board answers; the age is that of its last answer."""
         age_ns = self._clock.now_ns() - self._fresh_ns
         return replace(
             self.link.health,
             connected=self.ready and age_ns <= LOST_NS and not self._fault(),
             age_ms=age_ns / 1e6,
-            late_ms=0.0,  # an answer that is late is thrown away
+            late_ms=0.0,  # late answers are dropped
         )
 
     @property
@@ -108,22 +108,22 @@ class Board:
         return self._fault()
 
     def halt(self) -> bool:
-        """Send zero velocity, whether or not a board has answered."""
+        """Send zero velocity, even before a board has answered."""
         return self.link.write(opencr.velocity(0.0, 0.0).frame)
 
     def release_motors(self) -> bool:
-        """Motors without torque, until the driver finds the board again."""
+        """Switch off the motors' torque, until the driver finds the board again."""
         return self.link.write(opencr.torque(on=False))
 
     def drive(self, linear_x: float, angular_z: float) -> tuple[float, float]:
-        """Send a velocity [m/s], [rad/s]; returns what was really sent."""
+        """Send a velocity [m/s], [rad/s]; return the one that was sent, rounded."""
         sent = opencr.velocity(linear_x, angular_z)
         if self.ready and self.link.write(sent.frame):
             return sent.linear_x, sent.angular_z
         return 0.0, 0.0
 
     async def ask(self, patience_s: float = ANSWER_TIMEOUT_S) -> None:
-        """Fetch the table and wait for it; `on_readings` gets it, now or a little later."""
+        """Request the table and wait for it; `on_readings` gets it, possibly later."""
         if not self.ready:
             return
         self._beat = self._beat + 1 & 0xFF
@@ -136,7 +136,7 @@ class Board:
                     await self._answered.wait()
 
     def supervise(self, now_ns: int) -> None:
-        """Knock where no board has answered, give up where none will. To be called often."""
+        """Ping a board that has not answered; reopen the port after a timeout. Call it often."""
         self._log_problem(now_ns)
         if not self.link.connected:
             return
@@ -144,11 +144,11 @@ class Board:
             self.link.drop("the OpenCR has stopped answering")
         elif not self.ready and now_ns - self._opened_ns > FIRST_ANSWER_TIMEOUT_NS:
             self.link.drop(self.problem)
-        elif not self.ready and now_ns - self._knocked_ns >= PING_PERIOD_NS:
-            self._knock()
+        elif not self.ready and now_ns - self._pinged_ns >= PING_PERIOD_NS:
+            self._ping()
 
     def _log_problem(self, now_ns: int) -> None:
-        """A problem that stays is logged once when it begins and once when it ends."""
+        """Log a lasting problem once when it begins, and once when it ends."""
         problem, before = self.problem, self._complaint
         if not problem:
             self._well_ns = now_ns
@@ -163,7 +163,7 @@ class Board:
             log.info("OpenCR on %s answers, firmware %s", self.link, self._firmware)
 
     def _fault(self) -> str:
-        """Return what the board itself reports as wrong, or an empty text."""
+        """Return the fault that the board reports, or an empty text."""
         newest = self._newest
         if newest and newest.device_status == opencr.MOTORS_SILENT:
             return "OpenCR reaches no motors: switch their power on, then press its reset button"
@@ -175,14 +175,14 @@ class Board:
         self._decoder.clear()
         self._firmware = self._waiting_ns = None
         self._opened_ns = self._clock.now_ns()
-        self._knock()
+        self._ping()
 
     def _lost(self, _why: str) -> None:
         self._firmware = self._waiting_ns = None
 
-    def _knock(self) -> None:
-        """Ping the board; zero goes first, and so ends whatever may still be queued there."""
-        self._knocked_ns = self._clock.now_ns()
+    def _ping(self) -> None:
+        """Send zero, then ping the board; so a queued old command cannot last."""
+        self._pinged_ns = self._clock.now_ns()
         self.halt()
         self.link.write(opencr.ping(opencr.ID))
 
@@ -206,7 +206,7 @@ class Board:
             self.link.write(opencr.torque(on=True))
 
     def _read(self, now: Readings) -> None:
-        if now.heartbeat != self._beat:  # the answer to a question that was given up
+        if now.heartbeat != self._beat:  # the answer to an abandoned question
             return
         self._fresh_ns, self._waiting_ns, self._newest = self._asked_ns, None, now
         self.on_readings(now)
@@ -235,7 +235,7 @@ class OpenCrOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_field
 
 
 class OpenCrDriver(Driver):
-    """Asks for the board's whole state once a tick, and sends commands as they come."""
+    """Requests the board's whole state once a tick, and sends commands at once."""
 
     Options = OpenCrOptions
 
@@ -248,7 +248,7 @@ class OpenCrDriver(Driver):
         clock: Clock | None = None,
         link: Link | None = None,
     ) -> None:
-        """`link` instead of the serial port that the options name."""
+        """`link` replaces the serial port in the options."""
         super().__init__(robot, options, run)
         base = wheels_of(robot)
         if not isinstance(base, Differential):
@@ -277,20 +277,20 @@ class OpenCrDriver(Driver):
         return self._board.problem
 
     async def open(self) -> None:
-        """Begin to look for the board and the lidar; neither has to be there yet."""
+        """Start connecting to the board and the lidar; both may appear later."""
         self._lidar = open_lidar(self, self._clock)
         self.link.open()
         self._guard = asyncio.create_task(self._guard_motion(), name="opencr guard")
 
     async def close(self) -> None:
-        """Stop, and let go of the ports."""
+        """Stop the body, and close the ports."""
         await self.stop()
         guard, self._guard = self._guard, None
         if guard:
             guard.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await guard
-            await self._board.ask(FLUSH_S)  # once it answers, it has read the zero too
+            await self._board.ask(FLUSH_S)  # its answer shows that it has read the zero
         await self.link.close()
         if self._lidar:
             await self._lidar.close()
@@ -301,18 +301,18 @@ class OpenCrDriver(Driver):
         self._board.halt()
 
     async def limp(self) -> None:
-        """Let the wheels turn freely; the next start of a driver holds them again."""
+        """Let the wheels turn freely, until the next start of a driver."""
         if not self._board.release_motors():
             raise BodyLost(self.problem or f"{self.link} takes no commands")
 
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
     ) -> Velocity:
-        """Drive, in hundredths; where one value is not a number, all are zero."""
+        """Drive, in steps of 0.01. All speeds are zero if one is not a number."""
         self._commanded_ns = self._clock.now_ns()
         to = self.bounded(linear_x, linear_y, angular_z)
         wanted = Twist(to.linear_x, 0.0, to.angular_z)
-        # the board slows down the faster wheel alone, which would bend the way
+        # the board would limit only the faster wheel, and so change the path
         too_fast = max(
             1.0, *(abs(w) / opencr.MAX_WHEEL_SPEED for w in self._base.to_wheels(wanted))
         )
@@ -320,12 +320,12 @@ class OpenCrDriver(Driver):
         return Velocity(linear_x=forward, angular_z=turn)
 
     async def read_state(self) -> RobotState:
-        """The board's state of this moment; without an answer the last one, and how old it is."""
+        """Return the board's present state; without an answer the last one, with its age."""
         await self._board.ask()
         return replace(self._state, link=self._board.health)
 
     async def _guard_motion(self) -> None:
-        """Send zero while no commands come, repeatedly: a single frame may get lost."""
+        """Send zero repeatedly while there are no commands: a single frame may get lost."""
         async for now_ns in self._clock.every(GUARD_PERIOD_NS):
             if now_ns - self._commanded_ns >= COMMAND_TIMEOUT_NS and self._board.ready:
                 self._board.halt()

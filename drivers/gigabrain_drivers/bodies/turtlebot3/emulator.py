@@ -11,11 +11,11 @@ from gigabrain_drivers.bodies.turtlebot3.protocol import DynamixelPacket
 from gigabrain_drivers.emulators.base import Device, EmulatedBody, Wire
 
 FIRMWARE = 5
-BUFFER_BYTES = 1024  # of the slave library; what does not fit into it is not answered
-CALIBRATION_NS = 5_000_000_000  # for which the board does nothing else
-BROWN_OUT_V = 7.0  # below which it is off
-MODELS = {"turtlebot3_burger": (1, 61), "turtlebot3_waffle": (2, 77)}  # number, greatest rpm
-WHEEL_RADIUS = 0.033  # [m], as the firmware has it
+BUFFER_BYTES = 1024  # of the slave library; longer packets are not answered
+CALIBRATION_NS = 5_000_000_000  # meanwhile the board does nothing else
+BROWN_OUT_V = 7.0  # below it the board is off
+MODELS = {"turtlebot3_burger": (1, 61), "turtlebot3_waffle": (2, 77)}  # number, maximal rpm
+WHEEL_RADIUS = 0.033  # [m], in the firmware
 WHEEL_UNITS = 1263.632956882  # of the motors per [m/s]
 MAX_UNITS = 337
 AMPERES_PER_NM = 1 / 1.07
@@ -39,7 +39,7 @@ ITEMS = {  # address -> type
 
 
 class ControlTable:
-    """Reads and writes as the vendor's slave library does: only whole items, gaps are zero."""
+    """Reads and writes like the vendor's slave library: only whole items; gaps are zero."""
 
     def __init__(self, items: Mapping[int, str]) -> None:
         """`items` by address, each a `struct` code of one value."""
@@ -68,7 +68,7 @@ class ControlTable:
         return bytes(answer)
 
     def write(self, address: int, data: bytes) -> list[int]:
-        """Do a WRITE; returns the addresses of the items that it reached."""
+        """Execute a WRITE; return the addresses of the written items."""
         reached = self._inside(address, len(data))
         for at in reached:
             size = self._codes[at].size
@@ -76,16 +76,16 @@ class ControlTable:
         return reached
 
     def _inside(self, address: int, length: int) -> list[int]:
-        """The items that lie wholly in a range."""
+        """Return the items that are wholly in a range."""
         end = address + length
         return [at for at, code in self._codes.items() if address <= at and at + code.size <= end]
 
 
 class OpenCr(Device):
-    """Answers ping, read and write; moves the wheels as long as the heartbeat goes on changing."""
+    """Answers ping, read and write; moves the wheels while the heartbeat changes."""
 
     Options = OpenCrOptions
-    period_s = 0.02  # both of the table's refresh and of the motors' control
+    period_s = 0.02  # of the table's refresh, and of the motors' control
     watchdog_ns = 500_000_000  # after the heartbeat's last change
     promised_in = "OpenCR's firmware"
 
@@ -93,21 +93,21 @@ class OpenCr(Device):
         super().__init__(body, options, wire)
         self._model, rpm = MODELS.get(body.robot.robot_type, MODELS["turtlebot3_burger"])
         self._separation = body.robot.wheel_separation
-        self._most_linear = WHEEL_RADIUS * math.tau * rpm / 60
-        self._most_angular = self._most_linear / (self._separation / 2)
+        self._max_linear = WHEEL_RADIUS * math.tau * rpm / 60
+        self._max_angular = self._max_linear / (self._separation / 2)
         self.reset()
 
     def reset(self) -> None:
-        """Start as after power-on; it sends nothing by itself."""
+        """Start as after power-on; it never sends by itself."""
         self._decoder = opencr.DynamixelDecoder(BUFFER_BYTES)
         self._table = ControlTable(ITEMS)
         self._goal = (0.0, 0.0)
         self._on = True
         self._began_ns: int | None = None
-        self._changed_ns = 0  # when the heartbeat did
+        self._changed_ns = 0  # last change of the heartbeat
         self._beat = 0.0
-        self._calibrating_ns = 0  # until when
-        self._waiting = bytearray()  # what came meanwhile
+        self._calibrating_ns = 0  # end of the calibration
+        self._waiting = bytearray()  # received during the calibration
         table = self._table
         table[MODEL], table[MODEL_INFO], table[6] = opencr.MODEL, self._model, FIRMWARE
         table[7], table[8], table[9] = opencr.ID, 3, 2
@@ -154,7 +154,7 @@ class OpenCr(Device):
         elif kind == opencr.WRITE and len(params) > 2:
             reached = self._table.write(params[0] | params[1] << 8, params[2:])
             if CALIBRATE in reached and self._table[CALIBRATE]:
-                self._calibrating_ns = -1  # from the next pass on; it answers when it is done
+                self._calibrating_ns = -1  # begins in the next pass; the answer follows at its end
                 return
             self._written(reached)
             self._answer()
@@ -162,16 +162,16 @@ class OpenCr(Device):
     def _written(self, reached: list[int]) -> None:
         forward, turn = self._goal
         if FORWARD in reached:
-            forward = _clamp(self._table[FORWARD] * 0.01, self._most_linear)
+            forward = _clamp(self._table[FORWARD] * 0.01, self._max_linear)
         if TURN in reached:
-            turn = _clamp(self._table[TURN] * 0.01, self._most_angular)
+            turn = _clamp(self._table[TURN] * 0.01, self._max_angular)
         self._goal = (forward, turn)
 
     def _answer(self, data: bytes = b"") -> None:
         self.wire.write(opencr.status(opencr.ID, data))
 
     def _watch_host(self, now_ns: int) -> None:
-        """Watch the heartbeat. Without a host there is no goal, whatever was written."""
+        """Watch the heartbeat; without a host the goal is zero."""
         table = self._table
         if table[opencr.HEARTBEAT] != self._beat:
             self._beat, self._changed_ns = table[opencr.HEARTBEAT], now_ns
@@ -189,7 +189,7 @@ class OpenCr(Device):
         self.body.command(speed, 0.0, (right - left) / WHEEL_UNITS / self._separation)
 
     def _calibrate(self, now_ns: int) -> None:
-        """The main loop stands still, and the wheels go on as they were."""
+        """Block the main loop during a calibration; the wheels keep their speed."""
         if self._calibrating_ns < 0:
             self._calibrating_ns = now_ns + CALIBRATION_NS
         elif now_ns >= self._calibrating_ns:
@@ -225,5 +225,5 @@ def _clamp(value: float, most: float) -> float:
 
 
 def _units(speed: float) -> int:
-    """A wheel's speed [m/s] as the motors take it, which the firmware truncates."""
+    """Return a wheel's speed [m/s] in the motors' units, truncated as by the firmware."""
     return int(_clamp(speed * WHEEL_UNITS, MAX_UNITS))

@@ -1,8 +1,8 @@
 """TurtleBot3's OpenCR board: Dynamixel Protocol 2.0 packets, and the board's control table.
 
 Packets have byte stuffing and CRC-16: https://emanual.robotis.com/docs/en/dxl/protocol2/
-The table is that of the firmware, OpenCR `libraries/turtlebot3_ros2`. Address 14 switches the
-firmware's watchdog off; nothing here can write it.
+The table is that of the firmware, OpenCR `libraries/turtlebot3_ros2`. Address 14 switches off the
+firmware's watchdog; this module never writes it.
 """
 
 import math
@@ -14,26 +14,26 @@ from gigabrain_drivers.links.frames import FrameDecoder, crc_table
 
 HEADER = b"\xff\xff\xfd\x00"
 PING, READ, WRITE, STATUS = 0x01, 0x02, 0x03, 0x55
-MAX_PACKET_LENGTH = 1024  # of the length field; nothing here sends as much, so more is noise
+MAX_PACKET_LENGTH = 1024  # of the length field; larger values are noise
 
-_PREFIX = len(HEADER) + 3  # header, id, length: what the length does not count
+_PREFIX = len(HEADER) + 3  # header, id and length, which the length does not include
 _CRC = 2
 _MARK, _STUFFED = b"\xff\xff\xfd", b"\xff\xff\xfd\xfd"
 
 ID = 200
-MODEL = 0x5000  # of the board; which TurtleBot3 it is stands at MODEL_INFO
+MODEL = 0x5000  # of the board; the TurtleBot3's model is at MODEL_INFO
 USB_ID = "0483:5740"
-BAUD = 1_000_000  # USB, so any does
-FIRST, LENGTH = 10, 172  # what one read per cycle fetches
+BAUD = 1_000_000  # any value works over USB
+FIRST, LENGTH = 10, 172  # block that a cycle reads
 HEARTBEAT, TORQUE, VELOCITY = 19, 149, 150
 RUNNING, MOTORS_SILENT = 0, -1  # device status; silent mostly means that their switch is off
 TICKS = 4096  # of a wheel's encoder per turn
 RADIANS_PER_TICK = math.tau / TICKS
 VELOCITY_UNIT = 0.229 * math.tau / 60  # [rad/s]
-MAX_WHEEL_SPEED = 337 * VELOCITY_UNIT  # [rad/s], beyond which the firmware cuts off
+MAX_WHEEL_SPEED = 337 * VELOCITY_UNIT  # [rad/s], limit of the firmware
 CURRENT_UNIT = 0.00269  # [A]
 SPEED_UNIT = 0.01  # [m/s] and [rad/s], of a command
-EMPTY_VOLTAGE = 10.5  # [V], below which the percentage stands still
+EMPTY_VOLTAGE = 10.5  # [V]; below it the percentage no longer changes
 _TABLE = struct.Struct(
     "<I??"  # 10 milliseconds; debug mode, host connected
     "?xbB"  # 16 manipulator, device status, heartbeat
@@ -47,7 +47,7 @@ Pair = tuple[int, int]
 
 
 class DynamixelPacket(NamedTuple):
-    """An instruction, or as STATUS an answer, whose first parameter is then its error."""
+    """An instruction, or with STATUS an answer, whose first parameter is its error."""
 
     id: int
     instruction: int
@@ -58,7 +58,7 @@ _CRC_TABLE = crc_table(0x8005, bits=16)
 
 
 def crc16(data: bytes) -> int:
-    """The check of `data`: polynomial 0x8005, from 0, nothing reflected."""
+    """Return the CRC of `data`: polynomial 0x8005, initial value 0, not reflected."""
     crc = 0
     for byte in data:
         crc = ((crc << 8) & 0xFFFF) ^ _CRC_TABLE[(crc >> 8) ^ byte]
@@ -84,7 +84,7 @@ def read(device: int, address: int, length: int) -> bytes:
 
 
 def write(device: int, address: int, data: bytes) -> bytes:
-    """Put `data` into the control table."""
+    """Write `data` into the control table."""
     return encode(DynamixelPacket(device, WRITE, struct.pack("<H", address) + data))
 
 
@@ -94,7 +94,7 @@ def status(device: int, data: bytes = b"", error: int = 0) -> bytes:
 
 
 class DynamixelDecoder(FrameDecoder[DynamixelPacket]):
-    """Finds packets in whatever comes in."""
+    """Finds packets in a stream of bytes."""
 
     HEADER = HEADER
 
@@ -131,7 +131,7 @@ class Readings(NamedTuple):
     milliseconds: int  # since the board's start, renewed every 20 ms
     watchdog_off: bool  # debug mode: the firmware would not stop by itself
     device_status: int
-    heartbeat: int  # as last written: an answer that holds the newest is none of an older question
+    heartbeat: int  # as last written; tells answers to old questions from new ones
     buttons: tuple[bool, bool]
     bumpers: tuple[bool, bool]
     voltage: float  # [V]
@@ -141,17 +141,17 @@ class Readings(NamedTuple):
     orientation: Quaternion  # x, y, z, w
     currents: tuple[float, float]  # [A]
     velocities: tuple[float, float]  # [rad/s]
-    ticks: Pair  # of the encoders, 4096 a turn, signed 32 bit that wrap
+    ticks: Pair  # of the encoders, 4096 a turn, signed 32 bit, wrap
     torque: bool
 
 
 def ask() -> bytes:
-    """The one read of a cycle."""
+    """Return the read request of a cycle."""
     return read(ID, FIRST, LENGTH)
 
 
 def decode_model(answer: bytes) -> tuple[int, int] | None:
-    """(model number, firmware version) in the answer to a ping; None: it is another answer."""
+    """Return (model number, firmware version) in the answer to a ping; None for others."""
     return (answer[0] | answer[1] << 8, answer[2]) if len(answer) == 3 else None
 
 
@@ -181,7 +181,7 @@ def decode_readings(data: bytes) -> Readings:
 
 
 class Sent(NamedTuple):
-    """A command as the board takes it."""
+    """A command in the board's units."""
 
     frame: bytes
     linear_x: float  # [m/s], rounded to the board's units
@@ -189,24 +189,24 @@ class Sent(NamedTuple):
 
 
 def velocity(linear_x: float, angular_z: float) -> Sent:
-    """Drive [m/s], [rad/s], both finite. The board knows hundredths, and cuts off what is more."""
+    """Return the command to drive [m/s], [rad/s], both finite; the board uses steps of 0.01."""
     forward, turn = _hundredths(linear_x), _hundredths(angular_z)
     data = struct.pack("<6i", forward, 0, 0, 0, 0, turn)
     return Sent(write(ID, VELOCITY, data), forward * SPEED_UNIT, turn * SPEED_UNIT)
 
 
 def heartbeat(count: int) -> bytes:
-    """A sign of life: the board stops 500 ms after the lowest 8 bits of `count` last changed."""
+    """Return a heartbeat: the board stops 500 ms after the low 8 bits of `count` last changed."""
     return write(ID, HEARTBEAT, bytes([count & 0xFF]))
 
 
 def torque(on: bool) -> bytes:
-    """Switch the motors on or off."""
+    """Return the command that switches the motors on or off."""
     return write(ID, TORQUE, bytes([on]))
 
 
 def describe(packet: DynamixelPacket) -> str:
-    """A packet between a host and the board, in words."""
+    """Describe a packet between a host and the board."""
     kind, params = packet.instruction, packet.params
     if kind == STATUS:
         return _answer_in_words(params)
