@@ -66,23 +66,29 @@ def _eyes_table(result: "EyesResult") -> Table:
         "Contours against the truth",
         f"{figures[0].worlds} worlds from seed {result.seed}. CPU time is of one picture, "
         "unpacking and contours included. By colour: of a camera without depth.",
-        [f"{one.camera}\n{one.sensor}" for one in figures],
+        [f"{figure.camera}\n{figure.sensor}" for figure in figures],
         {
-            "error p50, p95 [cm]": [_cm(one.error_p50_m, one.error_p95_m) for one in figures],
-            "beyond the truth p95 [cm]": [_cm(one.beyond_p95_m) for one in figures],
-            "not covered p95 [cm]": [_cm(one.missed_p95_m) for one in figures],
-            "pits p50, p95 [cm]": [_cm(one.pit_p50_m, one.pit_p95_m) for one in figures],
-            "pits, found": [f"{one.pits}, {one.pits_found:.3f}" for one in figures],
-            "things within 2 m": [str(one.things) for one in figures],
-            "recall": [f"{one.recall:.3f}" for one in figures],
-            "... in the first picture": [f"{one.recall_first:.3f}" for one in figures],
-            "false contours in clutter": [str(one.false_in_clutter) for one in figures],
-            "false on empty floors [1/min]": [f"{one.false_per_min:g}" for one in figures],
-            "... by colour [1/min]": [f"{one.colour_per_min:.3g}" for one in figures],
-            "... pictures": [str(one.empty_pictures) for one in figures],
-            "ghosts p50, max [s]": [f"{one.ghost_p50_s:g}, {one.ghost_max_s:g}" for one in figures],
-            "... things gone": [str(one.ghosts) for one in figures],
-            "CPU p50, p99 [ms]": [f"{one.cpu_p50_ms:.1f}, {one.cpu_p99_ms:.1f}" for one in figures],
+            "error p50, p95 [cm]": [
+                _cm(figure.error_p50_m, figure.error_p95_m) for figure in figures
+            ],
+            "beyond the truth p95 [cm]": [_cm(figure.beyond_p95_m) for figure in figures],
+            "not covered p95 [cm]": [_cm(figure.missed_p95_m) for figure in figures],
+            "pits p50, p95 [cm]": [_cm(figure.pit_p50_m, figure.pit_p95_m) for figure in figures],
+            "pits, found": [f"{figure.pits}, {figure.pits_found:.3f}" for figure in figures],
+            "things within 2 m": [str(figure.things) for figure in figures],
+            "recall": [f"{figure.recall:.3f}" for figure in figures],
+            "... in the first picture": [f"{figure.recall_first:.3f}" for figure in figures],
+            "false contours in clutter": [str(figure.false_in_clutter) for figure in figures],
+            "false on empty floors [1/min]": [f"{figure.false_per_min:g}" for figure in figures],
+            "... by colour [1/min]": [f"{figure.colour_per_min:.3g}" for figure in figures],
+            "... pictures": [str(figure.empty_pictures) for figure in figures],
+            "ghosts p50, max [s]": [
+                f"{figure.ghost_p50_s:g}, {figure.ghost_max_s:g}" for figure in figures
+            ],
+            "... things gone": [str(figure.ghosts) for figure in figures],
+            "CPU p50, p99 [ms]": [
+                f"{figure.cpu_p50_ms:.1f}, {figure.cpu_p99_ms:.1f}" for figure in figures
+            ],
         },
     )
 
@@ -233,21 +239,21 @@ def _clutter_table(result: "ClutterResult") -> Table:
 
 
 def _clutter_cells(runs: "Sequence[ClutterRun]") -> dict[str, str]:
-    goals, unharmed = sum(one.reached for one in runs), sum(one.unharmed for one in runs)
+    goals, unharmed = sum(run.reached for run in runs), sum(run.unharmed for run in runs)
     return {
         "worlds": str(len(runs)),
-        "contacts": str(sum(one.contacts for one in runs)),
-        "falls": str(sum(one.falls for one in runs)),
+        "contacts": str(sum(run.contacts for run in runs)),
+        "falls": str(sum(run.falls for run in runs)),
         "worlds without both": str(unharmed),
         "goals reached": f"{goals} of {10 * len(runs)}",
-        "worlds with 8 goals or more": str(sum(one.reached >= 8 for one in runs)),
-        "without contact and fall, and with 8 goals": str(sum(one.ok for one in runs)),
-        "least goals in a world": str(min(one.reached for one in runs)),
-        "least clearance [m]": f"{min(one.min_clearance_m for one in runs):.3f}",
+        "worlds with 8 goals or more": str(sum(run.reached >= 8 for run in runs)),
+        "without contact and fall, and with 8 goals": str(sum(run.ok for run in runs)),
+        "least goals in a world": str(min(run.reached for run in runs)),
+        "least clearance [m]": f"{min(run.min_clearance_m for run in runs):.3f}",
         "distance in a world, mean [m]": f"{_mean(runs, 'distance_m'):.1f}",
         "time in a world, mean [s]": f"{_mean(runs, 'seconds'):.0f}",
     }
 
 
 def _mean(runs: "Sequence[ClutterRun]", field: str) -> float:
-    return float(sum(getattr(one, field) for one in runs) / len(runs))
+    return float(sum(getattr(run, field) for run in runs) / len(runs))

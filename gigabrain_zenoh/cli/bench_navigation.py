@@ -70,10 +70,10 @@ def _slam_logs(paths: tuple[Path, ...], png: Path | None, json: Path | None) -> 
 
     files.check_result_path(json)
     logs = [load(path) for path in paths]
-    for one in logs:
-        relations(one)  # raises for a wrong log, before the long run
+    for log in logs:
+        relations(log)  # raises for a wrong log, before the long run
     drives = _map_logs(logs)
-    result = total([judge_log(one, driven) for one, driven in drives])
+    result = total([judge_log(log, driven) for log, driven in drives])
     if png:
         draw_logs(drives, png)
     finish(_logs_table(result), result, json)
@@ -88,10 +88,10 @@ def _map_logs(logs: "list[LaserLog]") -> "list[tuple[LaserLog, MappedLog]]":
         compiling = progress.add_task("compiling", total=None)
         warm_up()
         progress.remove_task(compiling)
-        tasks = [progress.add_task(one.name, total=len(one.ranges)) for one in logs]
+        tasks = [progress.add_task(log.name, total=len(log.ranges)) for log in logs]
         return [
-            (one, map_log(one, partial(progress.advance, task)))
-            for one, task in zip(logs, tasks, strict=True)
+            (log, map_log(log, partial(progress.advance, task)))
+            for log, task in zip(logs, tasks, strict=True)
         ]
 
 
@@ -101,19 +101,19 @@ def _logs_table(result: "SlamResult") -> Table:
         "Errors of relations: mean ± standard deviation",
         f"graph, mean of the logs {result.mean_m:.3f} m; memory at most "
         f"{result.peak_mb:.0f} MB. Times are CPU time.",
-        [one.log for one in logs],
+        [log.log for log in logs],
         {
-            "odometry [m]": [f"{one.odometry.mean_m:.2f}" for one in logs],
-            "front end [m]": [f"{one.front_end.mean_m:.2f}" for one in logs],
-            "graph [m]": [f"{one.graph.mean_m:.3f} ± {one.graph.std_m:.3f}" for one in logs],
-            "graph [°]": [f"{one.graph.mean_deg:.2f}" for one in logs],
-            "crispness": [f"{one.crispness:.3f}" for one in logs],
-            "scans, beams": [f"{one.scans}, {one.beams}" for one in logs],
-            "loops closed": [str(one.loops) for one in logs],
-            "scans not matched": [str(one.unmatched) for one in logs],
-            "breaks": [str(one.breaks) for one in logs],
-            "scan p50, p99 [ms]": [f"{one.scan.p50_ms:.1f}, {one.scan.p99_ms:.1f}" for one in logs],
-            "loop p99, max [ms]": [f"{one.loop.p99_ms:.1f}, {one.loop_max_ms:.1f}" for one in logs],
+            "odometry [m]": [f"{log.odometry.mean_m:.2f}" for log in logs],
+            "front end [m]": [f"{log.front_end.mean_m:.2f}" for log in logs],
+            "graph [m]": [f"{log.graph.mean_m:.3f} ± {log.graph.std_m:.3f}" for log in logs],
+            "graph [°]": [f"{log.graph.mean_deg:.2f}" for log in logs],
+            "crispness": [f"{log.crispness:.3f}" for log in logs],
+            "scans, beams": [f"{log.scans}, {log.beams}" for log in logs],
+            "loops closed": [str(log.loops) for log in logs],
+            "scans not matched": [str(log.unmatched) for log in logs],
+            "breaks": [str(log.breaks) for log in logs],
+            "scan p50, p99 [ms]": [f"{log.scan.p50_ms:.1f}, {log.scan.p99_ms:.1f}" for log in logs],
+            "loop p99, max [ms]": [f"{log.loop.p99_ms:.1f}, {log.loop_max_ms:.1f}" for log in logs],
         },
     )
 
@@ -143,21 +143,25 @@ def _worlds_table(worlds: "Sequence[WorldResult]") -> Table:
     return side_by_side(
         "Errors of poses against the simulator: mean, largest",
         f"{worlds[0].body}, seed {worlds[0].seed}. Times are CPU time.",
-        [one.world for one in worlds],
+        [world.world for world in worlds],
         {
-            "driven, in minutes": [f"{one.driven_m:g} m, {one.minutes:g}" for one in worlds],
-            "contacts": [str(one.contacts) for one in worlds],
-            "scans, not localized": [f"{one.scans}, {one.not_localized}" for one in worlds],
-            "keyframes": [str(one.keyframes) for one in worlds],
-            "loops closed, redrawn": [f"{one.loops}, {one.drawn_anew}" for one in worlds],
-            "odometry with gyro": [_error(one.fused) for one in worlds],
-            "map": [_error(one.slam) for one in worlds],
-            "map, last minute": [_error(one.last_minute) for one in worlds],
-            "scan p50, p99 [ms]": [f"{o.scan.p50_ms:.1f}, {o.scan.p99_ms:.1f}" for o in worlds],
-            "memory, largest": [f"{one.growth.most_mb:.0f} MB" for one in worlds],
-            "its slope after a quarter": [f"{o.growth.mb_an_hour:+.1f} MB/h" for o in worlds],
+            "driven, in minutes": [f"{world.driven_m:g} m, {world.minutes:g}" for world in worlds],
+            "contacts": [str(world.contacts) for world in worlds],
+            "scans, not localized": [f"{world.scans}, {world.not_localized}" for world in worlds],
+            "keyframes": [str(world.keyframes) for world in worlds],
+            "loops closed, redrawn": [f"{world.loops}, {world.drawn_anew}" for world in worlds],
+            "odometry with gyro": [_error(world.fused) for world in worlds],
+            "map": [_error(world.slam) for world in worlds],
+            "map, last minute": [_error(world.last_minute) for world in worlds],
+            "scan p50, p99 [ms]": [
+                f"{world.scan.p50_ms:.1f}, {world.scan.p99_ms:.1f}" for world in worlds
+            ],
+            "memory, largest": [f"{world.growth.most_mb:.0f} MB" for world in worlds],
+            "its slope after a quarter": [
+                f"{world.growth.mb_an_hour:+.1f} MB/h" for world in worlds
+            ],
             "occupied cells, by the hour": [
-                ", ".join(map(str, one.growth.walls)) for one in worlds
+                ", ".join(map(str, world.growth.walls)) for world in worlds
             ],
         },
     )
@@ -341,11 +345,11 @@ def _print_failures(result: "GoalsResult") -> None:
             soft_wrap=True,
         )
     for run in result.runs:
-        for one in run.failures:
-            after = f"after {one.seconds:.0f} s"
-            goal = describe_goal(one.goal)
-            failure = f"{run.body} in {run.world}, {goal} {after}: {one.reason}"
-            console.print(failure, markup=False, soft_wrap=True)
+        for failure in run.failures:
+            after = f"after {failure.seconds:.0f} s"
+            goal = describe_goal(failure.goal)
+            text = f"{run.body} in {run.world}, {goal} {after}: {failure.reason}"
+            console.print(text, markup=False, soft_wrap=True)
 
 
 def _goals_table(result: "GoalsResult") -> Table:

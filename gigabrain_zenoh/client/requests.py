@@ -99,7 +99,7 @@ async def enable(bus: Bus, source: str, *, take: bool = False, keys: str = "") -
 
 
 async def release(bus: Bus, estop_generation: int, keys: str = "") -> GateReply:
-    """Release the gate from e-stops up to that number. Raises Refused and BodyLost."""
+    """Release the gate from the e-stop of that number. Raises Refused and BodyLost."""
     request = ReleaseRequest(estop_generation=estop_generation, source=bus.process)
     return await ask_gate(bus, RELEASE, request, keys)
 

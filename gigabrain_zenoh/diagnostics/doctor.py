@@ -113,7 +113,7 @@ class MachineFacts(Struct, frozen=True, kw_only=True):
     libraries: Mapping[str, str | None]  # version by name; None if it is not installed
     folders: tuple[Folder, ...]
     ports: tuple[Port, ...]
-    multicast: bool  # whether sessions search for others by multicast
+    multicast: bool  # sessions search for others by multicast
     certificate: Certificate | None = None
     shell: Shell = Shell()
 

@@ -349,7 +349,7 @@ def _notes(facts: ChainFacts) -> tuple[str, ...]:
         names = ", ".join(facts.strangers)
         notes.append(f"the gate ignores further commands, from: {names}")
     warnings = facts.safety.warnings if facts.safety else ()
-    notes += [f"warning: {one.text} ({one.remedy})" for one in (*warnings, *facts.problems)]
+    notes += [f"warning: {cause.text} ({cause.remedy})" for cause in (*warnings, *facts.problems)]
     return tuple(notes)
 
 
@@ -415,7 +415,7 @@ class ChainWatcher(RobotView):
             strangers=tuple(sorted(set(self._commands) - {BRAIN, commander})),
             safety=self.safety.fresh(),
             tasks=self.task.fresh(),
-            problems=tuple(cause for one in self.health.values() for cause in one.problems),
+            problems=tuple(cause for health in self.health.values() for cause in health.problems),
             hz={
                 key: round((bus.received[key] - counts[key]) / 2 / elapsed_s, 1)
                 for key in (STATE.key, SCAN.key)  # counted twice: the monitor receives them too

@@ -19,7 +19,7 @@ def percentile(ordered: Sequence[float], share: float) -> float | None:
 
 # 0.25 µs a percentile of 1000 values; numpy.percentile takes 125 µs
 class NewestValues:
-    """The newest `max_count` values, kept sorted so that a percentile takes no time."""
+    """The newest `max_count` values, kept sorted so that percentile queries are fast."""
 
     def __init__(self, max_count: int) -> None:
         self._max_count = max_count

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 HANGUP = getattr(signal, "SIGHUP", None)  # Windows has none
 SIGNALS = (signal.SIGINT, signal.SIGTERM, *([HANGUP] if HANGUP else ()))
-LIMIT_S = 1.8  # from the first signal until the process is killed
+LIMIT_S = 1.8  # from the first signal until the process is ended by force
 RESEND_S = 0.05
 React = Callable[[], object]
 
@@ -78,7 +78,7 @@ class Interrupts:
     def reacting(self, react: React | None) -> Iterator[None]:
         """Call `react` at the first signal, in the main thread between any two bytecodes.
 
-        None defers the signal to the next `reacting`, inside the block or after it.
+        None defers the signal to the next reaction, inside the block or after it.
         """
         before, self._react = self._react, react
         try:
@@ -190,8 +190,9 @@ async def run_until(stop: "asyncio.Event", work: Coroutine[Any, Any, None]) -> N
 def run_async(work: Coroutine[Any, Any, T]) -> T:
     """Run a command's coroutine until it ends; the first signal cancels it.
 
-    Raises KeyboardInterrupt if a signal ended it. Unlike `asyncio.run`, it also does so for SIGTERM
-    and SIGHUP, also if a shell ignores SIGINT, and never interrupts asyncio's own code.
+    Raises KeyboardInterrupt if a signal ended it. Unlike `asyncio.run`, it also does so for
+    SIGTERM, for SIGHUP, and for SIGINT where a shell ignores it. It never interrupts asyncio's own
+    code.
     """
 
     import asyncio

@@ -111,7 +111,7 @@ def typed_lines(on_line: Callable[[str], None]) -> Iterator[None]:
 
 
 async def typed_text() -> str | None:
-    """Wait for a line of standard input and return it stripped; None at its end.
+    """Wait for a line of standard input and return it stripped; None at the end of input.
 
     It may be cancelled; the next call then reads the next line.
     """

@@ -29,7 +29,7 @@ def set_up() -> None:
 
 
 def user_name() -> str:
-    """Return the user's name for requests, or `user-<uid>` if it has none, as in a container."""
+    """Return the user's name for requests, or `user-<uid>` for a user without a name."""
     try:
         name = getpass.getuser()
     except (KeyError, OSError):
@@ -92,7 +92,7 @@ def _die() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-HIGH_PRIORITY_NICE = -10  # nine times the CPU share of a program at nice 0, see sched(7)
+HIGH_PRIORITY_NICE = -10  # nine times the weight of a program at nice 0, see sched(7)
 AUTOGROUP = Path("/proc/self/autogroup")
 
 
@@ -210,7 +210,7 @@ def open_no_window() -> None:
 
 
 def _can_draw(graphics: str) -> bool:
-    from ctypes.util import find_library  # its call starts a program
+    from ctypes.util import find_library  # calling it starts a program
     from importlib.util import find_spec
 
     if graphics == "glfw":

@@ -68,7 +68,7 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     resume: Resume = "manual"  # after a stop a person resumes; `auto`: the robot, in simulation
     namespace: str = ""  # prefix of the robot's keys; required where one router serves several
     router: str = "tcp/127.0.0.1:7447"  # its endpoint; port 0: any free one, on a single host
-    keys: str = ""  # folder of this host's identity, or with a subfolder for each host; needs TLS
+    keys: str = ""  # folder of this host's identity, or of those of all hosts; enables TLS
     fleet: tuple[str, ...] = ()  # namespaces of other robots that this one's router serves
     insecure: bool = False  # allow a router that other machines can reach, without keys
     # processes by host

@@ -177,8 +177,8 @@ class Drawer:
 
     def _zones(self, zones: Zones, _: str) -> Iterable[Drawn]:
         """Draw zones, the direction of lanes, and places, each with its name."""
-        entities = {one.name: _zone_entity(zones, one) for one in zones.zones}
-        entities |= {one.name: _place_entity(zones, one) for one in zones.places}
+        entities = {zone.name: _zone_entity(zones, zone) for zone in zones.zones}
+        entities |= {place.name: _place_entity(zones, place) for place in zones.places}
         yield as_drawn("zones", self._zones_drawn.update(zones, entities))
 
     def _pose(self, pose: PoseInMap, _: str) -> Iterable[Drawn]:
@@ -204,7 +204,7 @@ class Drawer:
 
     def _perceived(self, found: Objects, name: str) -> Iterable[Drawn]:
         """Draw a perceptor's objects with their labels."""
-        entities = [_cylinder(found, one, one.label) for one in found.objects]
+        entities = [_cylinder(found, each, each.label) for each in found.objects]
         yield as_drawn(f"perceived/{name}", fox.SceneUpdate(entities=entities))
 
     def _task(self, status: TaskStatus, _: str) -> Iterable[Drawn]:

@@ -20,7 +20,7 @@ from gigabrain_zenoh.host.files import check_picture_path, replacing
 from gigabrain_zenoh.recording.bag_reader import Bag, Sample, samples
 
 Value = float | int | str | bool | None
-NUMBER = int | float  # what can be plotted
+NUMBER = int | float  # types that can be plotted
 Series = tuple[list[float], list[float]]  # times since the first message [s], values
 DECODERS = {f"gigabrain.{t.type.__name__}": Codec(t.type, t.max_bytes).decode for t in TOPICS}
 

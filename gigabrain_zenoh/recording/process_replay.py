@@ -175,7 +175,7 @@ def _without_computer(message: Message) -> Message:
 def logged_inputs(recorded: Sequence[Sample], process: str) -> RecordedInputs | None:
     """Return the inputs of `process` since its last start; None if it did not log them."""
     key = INPUT_LOG.at(process)
-    logs = _since_last_start(_input_log.decode(one.payload) for one in recorded if one.key == key)
+    logs = _since_last_start(_input_log.decode(s.payload) for s in recorded if s.key == key)
     if not logs:
         return None
     by_number = _by_number(recorded, process)
@@ -228,7 +228,7 @@ def _by_number(
 
 def _nearest(same_number: Sequence[tuple[int, bytes]], at_ns: int) -> bytes | None:
     """Return the payload nearest in time, as a restarted sender reuses its numbers."""
-    nearest = min(same_number, key=lambda one: abs(one[0] - at_ns), default=None)
+    nearest = min(same_number, key=lambda message: abs(message[0] - at_ns), default=None)
     return nearest[1] if nearest else None
 
 

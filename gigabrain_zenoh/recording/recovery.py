@@ -36,7 +36,7 @@ class _Copier:
     def __init__(self, file: AppendOnlyFile) -> None:
         self._file, self._writer = file, Writer(file)  # type: ignore[arg-type]
         self._schemas: dict[int, int] = {}  # new number by old number
-        self._channels: dict[int, int] = {}  # likewise
+        self._channels: dict[int, int] = {}  # new number by old number
         self.messages = 0
 
     def copy(self, bag: Bag) -> None:

@@ -66,7 +66,7 @@ class AuditFile:
             return
         lines = b"".join(msgspec.json.encode(record) + b"\n" for record in records)
         path = self._file_for(name, len(lines))
-        torn = _ends_in_line(path)
+        torn = _ends_incomplete(path)
         with path.open("ab") as file:
             file.write(b"\n" * torn + lines)
             file.flush()
@@ -145,7 +145,7 @@ def _number(path: Path) -> int:
     return int(path.stem.rpartition("-")[2])
 
 
-def _ends_in_line(path: Path) -> bool:
+def _ends_incomplete(path: Path) -> bool:
     """Return whether the last line has no newline, as after a power cut."""
     if not path.exists() or not path.stat().st_size:
         return False
@@ -222,7 +222,7 @@ class AuditTrail:
     ) -> None:
         """Write an entry about an event and its source.
 
-        All refusals of a source in one minute share an entry.
+        A source gets at most one entry of refusals a minute, for all codes together.
         """
         now_ns = self._bus.clock.now_ns()
         source, code, text = source[:64], code[:64], text[:500]

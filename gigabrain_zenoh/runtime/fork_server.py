@@ -1,4 +1,4 @@
-"""Processes that import what others need, and fork them: they share its memory.
+"""Processes that import modules for others, and fork them, so that they share memory.
 
 A fork server holds no session and no keys, and runs no thread. A fork ends up as a child of the
 supervisor, not of the server, so it goes on when the server ends:

@@ -89,9 +89,7 @@ class ForkServers:
         self._on_failure = on_failure
         self._first: subprocess.Popen[bytes] | None = None
         self._connections: list[socket.socket] = []
-        self._imported: list[
-            asyncio.Task[int]
-        ] = []  # one per level; its result is the server's pid
+        self._imported: list[asyncio.Task[int]] = []  # pids of the servers, by level
 
     def open(self) -> None:
         """Start the servers, in a running event loop."""

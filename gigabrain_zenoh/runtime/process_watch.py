@@ -1,6 +1,6 @@
-"""Reports silent processes of this robot in the router's health, so that every tool can name them.
+"""Reports silent ones of the user's own processes, so that every tool can name them.
 
-The router has a list of all processes, and so also finds those that never sent a health report.
+The router has their list, and so also finds those that never sent a health report.
 """
 
 from collections.abc import Sequence

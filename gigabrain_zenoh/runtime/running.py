@@ -140,7 +140,7 @@ def _locked(file: BinaryIO) -> bool:
 def find_endpoint(connect: str | None, namespace: str = "", keys: str = "") -> Endpoint:
     """Return the endpoint given by `connect`, or that of the only robot on this machine.
 
-    Raises BusError where there is no robot, Ambiguous where there are several, and ConfigError.
+    Raises BusError without a robot, Ambiguous for several robots, and ConfigError.
     `keys` is the folder of the client's identity, for a router that requires one. A client that
     names its identity is limited to its role. It does not use the local socket, which has the
     robot's rights.
