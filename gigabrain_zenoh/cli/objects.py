@@ -75,9 +75,7 @@ def lines(found: "ObjectMap", now_s: float) -> list[str]:
     """Return the lines of a table of things and tags; `now_s` is the Unix time [s]."""
     if not found.objects and not found.tags:
         return ["no things and no tags" + ("" if found.recognizing else NOBODY_LOOKS)]
-    table = [
-        f"{'thing':<16} {'id':>4}  {'x, y, z [m]':<22} {'size [m]':<12} {'sure':>5}  last seen"
-    ]
+    table = [HEADER]
     for one in sorted(found.objects, key=lambda one: (one.label, one.id)):
         place = f"{one.x:.2f}, {one.y:.2f}, {one.z:.2f}"
         size = f"{one.size[0]:.2f} x {one.size[1]:.2f}"
@@ -92,7 +90,7 @@ def lines(found: "ObjectMap", now_s: float) -> list[str]:
     return table
 
 
-HEAD = f"{'thing':<16} {'id':>4}  {'x, y, z [m]':<22} {'size [m]':<12} {'sure':>5}  last seen"
+HEADER = f"{'thing':<16} {'id':>4}  {'x, y, z [m]':<22} {'size [m]':<12} {'sure':>5}  last seen"
 NOBODY_LOOKS = "; nothing is recognised now: `gigabrain node list` shows whether recognition runs"
 
 

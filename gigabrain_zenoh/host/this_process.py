@@ -73,8 +73,6 @@ def watch_parent(parent_pid: int, period_s: float = 0.2) -> threading.Thread:
 
 
 def _kill_on_parent_death() -> bool:
-    import ctypes  # takes 3 ms; only supervised processes need it
-
     libc = ctypes.CDLL(None)
     zero = ctypes.c_ulong(0)
     return bool(

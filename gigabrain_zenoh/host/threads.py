@@ -25,7 +25,7 @@ class ScheduledWorker:
     """One thread, with at most one piece of work at a time."""
 
     def __init__(self, patience_s: float = PATIENCE_S, in_time: InTime = done) -> None:
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="mapping")
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="scheduled")
         self._job: Future[Take] | None = None
         self._scans_left = 0  # until the result is due
         self._patience_s, self._in_time = patience_s, in_time
