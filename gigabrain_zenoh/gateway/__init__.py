@@ -1,5 +1,5 @@
-"""The process `ros2`: our messages as ROS 2 messages, and ROS commands as one commander of ours.
+"""The process `ros2`: publishes our messages to ROS 2, and commands the gate for ROS.
 
 It may import client, ros2, runtime and all below; only launch and commands may import it.
-If it ends, nothing else of the robot notices.
+Its end does not affect other processes of the robot.
 """

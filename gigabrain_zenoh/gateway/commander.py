@@ -1,9 +1,9 @@
-"""Commander for velocities from ROS: a pure state machine in front of the gate.
+"""Commander for velocities from ROS: a pure state machine before the gate.
 
-The first command that moves asks for the body. Each command goes to the gate at once, and again
-with each state of the robot for at most one period of its sender. Then the gate gets nothing, then
-zero, and 0.5 s after the last command the body is given back. A body that was lost, by a stop or
-to another commander, is asked for only after the sender has sent zero or has paused.
+The first non-zero command asks for the body. Each command is sent to the gate at once, and repeated
+with each state of the robot for at most one period of its sender. After that it sends nothing, then
+zero, and 0.5 s after the last command it gives the body back. If it loses the body, by a stop or to
+another commander, it asks again only after the sender has sent zero or has paused.
 """
 
 import math
@@ -20,16 +20,16 @@ from gigabrain_zenoh.ros2.transport import Received
 
 MS = 1_000_000
 TIMEOUT_NS = 200 * MS  # longest period of a sender
-BRAKE_NS = 60 * MS  # silence after the period before zero is sent; the gate bears 100 ms
+BRAKE_NS = 60 * MS  # silence after the period, before zero is sent; the gate tolerates 100 ms
 RELEASE_NS = 500 * MS  # after the last command
-AWAKE_NS = 100 * MS  # longest silence between two events; more is a freeze of this process
-AHEAD_NS = 100 * MS  # by which the clock of a stamp may be ahead of ours
-ASK_NS = 500 * MS  # from one request for the body to the next
-INTERVALS = 9  # of a sender, for their median
-WINDOW_NS = 10_000_000_000  # for which the shortest delay of a sender counts, at least
-BACK_NS = 20 * MS  # by which two threads of a sender may confuse their messages
+AWAKE_NS = 100 * MS  # longest silence between two events; a longer one is a freeze of this process
+AHEAD_NS = 100 * MS  # a stamp may be this far ahead of our clock
+ASK_NS = 500 * MS  # between two requests for the body
+INTERVALS = 9  # of a sender, for the median
+WINDOW_NS = 10_000_000_000  # shortest time for which a sender's shortest delay counts
+BACK_NS = 20 * MS  # a sender's two threads may reorder messages by this time
 MAX_SENDERS = 8
-FRAMES = ("", "base_link", "base_footprint")  # in which a body can be commanded
+FRAMES = ("", "base_link", "base_footprint")  # allowed frames of a command
 NO_ROBOT = "no state from the robot; check that its driver runs"
 NO_BASE = "the robot has no base to drive; move its joints by /joint_trajectory"
 HELD = "the network had held it back, or its sender's clock was set back"
@@ -45,35 +45,35 @@ class Config(Struct, frozen=True, kw_only=True):
 
 
 class Wanted(NamedTuple):
-    """A velocity as ROS sent it."""
+    """A velocity command from ROS."""
 
     linear: tuple[float, float, float]  # [m/s]
     angular: tuple[float, float, float]  # [rad/s]
     sender: bytes = b""
     frame: str = ""
     stamp_ns: int = 0  # of a TwistStamped, in ROS time; 0 for none
-    sent_ns: int | None = None  # Unix time by the sender's clock; None or 0: unknown
-    number: int | None = None  # of its sender's messages; None where only their order is known
+    sent_ns: int | None = None  # Unix time of the sender's clock; None or 0: unknown
+    number: int | None = None  # counts the sender's messages; None: only their order is known
 
 
 class Lateness(Struct, frozen=True):
     """Delay of messages beyond the shortest one of the last ten to twenty seconds.
 
-    Clocks need not agree: an offset is in all delays alike. What a network hands over after a
-    freeze is late, whatever its sender's clock says. Where the times of messages in order go back,
-    their sender's clock was set.
+    The clocks may differ, because all delays contain the same offset. Messages that a network
+    delivers after a freeze are late, even if the sender's clock was set meanwhile. If the times
+    of ordered messages go back, the sender's clock was set.
     """
 
     now_ns: int = 0  # of the newest message; 0 for one without a time
-    least_ns: int | None = None  # delay in this window, offset included
-    before_ns: int | None = None  # in the window before
-    began_ns: int = 0  # of this window
+    least_ns: int | None = None  # shortest delay in this window, including the offset
+    before_ns: int | None = None  # the same in the previous window
+    began_ns: int = 0  # start of this window
     sent_ns: int = 0  # of its first message, by the sender's clock
-    newest: tuple[int, int, int] = (0, 0, 0)  # when it was sent and arrived, and `clock_ns` then
+    newest: tuple[int, int, int] = (0, 0, 0)  # times of sending and arrival, and its `clock_ns`
 
     @property
     def shortest_ns(self) -> int | None:
-        """The shortest delay, offset included; None without a message with a time."""
+        """The shortest delay, including the offset; None before the first message with a time."""
         known = [ns for ns in (self.least_ns, self.before_ns) if ns is not None]
         return min(known, default=None)
 
@@ -81,16 +81,16 @@ class Lateness(Struct, frozen=True):
         self, sent_ns: int | None, arrived_ns: int, clock_ns: int, period_ns: int = 0, *,
         ordered: bool = True,
     ) -> "Lateness":  # fmt: skip
-        """Return the state after a message, sent and arrived by clocks that may differ.
+        """Return the state after a message; `sent_ns` and `arrived_ns` may be of different clocks.
 
-        `clock_ns` only goes forward; it ends the windows. `period_ns` is the sender's. A message
-        that is not `ordered` was sent before the last one.
+        `clock_ns` is monotonic and ends the windows. `period_ns` is the sender's. A message that is
+        not `ordered` was sent before the last one.
         """
-        if not sent_ns:  # Cyclone DDS has 0 for a message without a time
+        if not sent_ns:  # Cyclone DDS gives 0 for a message without a time
             return replace(self, now_ns=0)
         delay_ns, newest, fresh = arrived_ns - sent_ns, (sent_ns, arrived_ns, clock_ns), self
         age_ns = clock_ns - self.began_ns
-        # in a freeze of the network only our clock goes on between two messages
+        # in a freeze of the network only our clock advances between two messages
         paused_ns = min(age_ns, abs(sent_ns - self.sent_ns))
         if self.least_ns is None or paused_ns > 2 * WINDOW_NS:
             fresh = Lateness(0, None, None, clock_ns, sent_ns)
@@ -105,7 +105,7 @@ class Lateness(Struct, frozen=True):
         return replace(after, now_ns=delay_ns - (after.shortest_ns or 0))
 
     def _at_most(self, arrived_ns: int, clock_ns: int) -> tuple[int, int]:
-        """Return how late the last message was, and the time since: the next is no later."""
+        """Return the last message's delay and the time since; both bound the next delay."""
         sent_ns, last_ns, last_clock_ns = self.newest
         gap_ns = max(arrived_ns - last_ns, clock_ns - last_clock_ns)
         return last_ns - sent_ns - (self.shortest_ns or 0), gap_ns
@@ -114,10 +114,10 @@ class Lateness(Struct, frozen=True):
 class Now(NamedTuple):
     """The present time."""
 
-    ns: int  # by a clock that only goes forward
+    ns: int  # monotonic
     ros_ns: int  # ROS time: Unix time, or that of the simulation
     unix_ns: int  # of this host
-    boot_ns: int  # since this host's start: setting the clock does not change it; suspends count
+    boot_ns: int  # since this host's start, including suspends; not affected by setting the clock
 
 
 class Sender(Struct, frozen=True):
@@ -131,23 +131,23 @@ class Sender(Struct, frozen=True):
 
 
 class Silence(Struct, frozen=True):
-    """Time without a command, as far as this process was awake to hear one."""
+    """Time without a command, while this process was awake to receive one."""
 
-    heard_ns: int = RELEASE_NS
+    length_ns: int = RELEASE_NS
     until_ns: int = 0
 
     @property
     def is_pause(self) -> bool:
-        """Return whether the sender has paused, and may ask for a lost body again."""
-        return self.heard_ns >= RELEASE_NS
+        """True after a pause of the sender, which may then ask for a lost body again."""
+        return self.length_ns >= RELEASE_NS
 
     def then(self, now_ns: int) -> "Silence":
-        """Return the silence at a later time; a freeze of this process is none of the sender."""
-        return Silence(self.heard_ns + min(now_ns - self.until_ns, AWAKE_NS), now_ns)
+        """Return the silence at a later time; freezes of this process do not count."""
+        return Silence(self.length_ns + min(now_ns - self.until_ns, AWAKE_NS), now_ns)
 
     @staticmethod
     def broken(now_ns: int) -> "Silence":
-        """Return the silence after a command that comes now."""
+        """Return the silence after a command at this time."""
         return Silence(0, now_ns)
 
 
@@ -157,16 +157,16 @@ class Memory(Struct, frozen=True, kw_only=True):
     gate: GateStatus | None = None  # newest of a fresh state
     boot: int = 0
     granted: tuple[int, int] = (0, 0)  # boot, and the gate's count of enables, of the last grant
-    holds: bool = False  # the body, since the last grant
+    holds: bool = False  # has the body since the last grant
     asking: bool = False
     asked_ns: int = -ASK_NS
-    blocked: str = ""  # why the sender has to pause first
+    blocked: str = ""  # why the sender must pause first
     velocity: Velocity = ZERO
-    silence: Silence = Silence()  # since any command, also one that was refused
-    last_ns: int = -RELEASE_NS  # when the newest good one was sent, as far as it is known
+    silence: Silence = Silence()  # since any command, even a refused one
+    last_ns: int = -RELEASE_NS  # estimated sending time of the newest accepted command
     period_ns: int = TIMEOUT_NS  # of its sender
-    senders: tuple[Sender, ...] = ()  # the newest last
-    refusal: str = ""  # why commands are refused now; empty if they are not
+    senders: tuple[Sender, ...] = ()  # newest last
+    refusal: str = ""  # why commands are refused now; empty if they are accepted
 
 
 class Ask(NamedTuple):
@@ -182,7 +182,7 @@ class Send(NamedTuple):
 
 
 class Refuse(NamedTuple):
-    """Count a command that was refused."""
+    """Count a refused command."""
 
     code: str
 
@@ -196,7 +196,7 @@ def arrive(config: Config, limits: Limits, memory: Memory, wanted: Wanted, now: 
     paused = memory.silence.then(now.ns).is_pause
     memory = replace(memory, silence=Silence.broken(now.ns))
     code, text = _fault(config, limits, wanted, now)
-    if code == "not_finite":  # its sender is out of order: brake
+    if code == "not_finite":  # its sender is faulty: brake
         memory = replace(memory, velocity=ZERO, refusal=text)
         return memory, (Refuse(code), *((Send(ZERO),) if memory.holds else ()))
     if code:
@@ -243,7 +243,7 @@ def observe(config: Config, memory: Memory, state: RobotState, now: Now) -> Step
 
 
 def answer(config: Config, memory: Memory, gate: GateStatus | None, text: str, now: Now) -> Step:
-    """Process the gate's answer: `gate` if it has granted the body, else the reason."""
+    """Process the gate's answer: `gate` if it grants the body, else None with `text`."""
     memory = replace(memory, asking=False)
     if gate is None:
         return replace(memory, refusal=text), ()
@@ -254,12 +254,12 @@ def answer(config: Config, memory: Memory, gate: GateStatus | None, text: str, n
 
 
 def forget(memory: Memory, why: str) -> Memory:
-    """Stop commanding at once, as for an e-stop; the sender has to pause first."""
+    """Stop commanding at once, as for an e-stop; the sender must pause first."""
     return replace(memory, holds=False, velocity=ZERO, blocked=f"{why}; {PAUSE}")
 
 
 def silent(memory: Memory, now: Now) -> Step:
-    """Process a command of ROS while the robot is silent: a lease is over."""
+    """Process a command of ROS while the robot is silent, which ends a lease."""
     blocked = f"the robot was silent; {PAUSE}" if memory.holds else memory.blocked
     memory = replace(
         memory, gate=None, holds=False, velocity=ZERO, silence=Silence.broken(now.ns),
@@ -269,7 +269,7 @@ def silent(memory: Memory, now: Now) -> Step:
 
 
 def offsets_s(memory: Memory, now: Now) -> list[float]:
-    """Return by how many seconds the clock of each present sender is behind ours, at most."""
+    """Return how far the clock of each present sender is behind ours, at most [s]."""
     least = (
         one.lateness.shortest_ns for one in memory.senders if now.ns - one.last_ns < RELEASE_NS
     )
@@ -277,7 +277,7 @@ def offsets_s(memory: Memory, now: Now) -> list[float]:
 
 
 def _obey(config: Config, memory: Memory, now: Now) -> Step:
-    """Send the newest command, or ask for the body with which to."""
+    """Send the newest command, or ask for the body first."""
     gate = memory.gate
     if gate is None:
         return silent(memory, now)
@@ -295,12 +295,12 @@ def _obey(config: Config, memory: Memory, now: Now) -> Step:
 
 
 def _obstacle(config: Config, memory: Memory, gate: GateStatus) -> str:
-    """Return why the gate need not be asked for the body now; empty if it may be."""
+    """Return why it should not ask for the body now; empty if it may ask."""
     return memory.blocked or obstacle(gate, config.name, take=config.take)
 
 
 def obstacle(gate: GateStatus, name: str, *, take: bool) -> str:
-    """Return why the gate would not give the body to the commander `name`; empty if it may."""
+    """Return why the gate would refuse the body to the commander `name`; empty if it may grant."""
     if gate.commander not in ("", name) and not take:
         return f"{gate.commander} drives; end that first, or set `ros2: {{take: true}}`"
     if gate.mode == "latched":
@@ -310,7 +310,7 @@ def obstacle(gate: GateStatus, name: str, *, take: bool) -> str:
 
 
 def _lost(config: Config, memory: Memory) -> Memory:
-    """Note that a stop or another commander has ended the lease."""
+    """Record that a stop or another commander has ended the lease."""
     assert memory.gate
     why = lost(memory.gate, config.name)
     return replace(memory, holds=False, velocity=ZERO, blocked=f"{why}; {PAUSE}",
@@ -318,7 +318,7 @@ def _lost(config: Config, memory: Memory) -> Memory:
 
 
 def lost(gate: GateStatus, name: str) -> str:
-    """Return what has ended the lease of the commander `name`."""
+    """Return why the lease of the commander `name` ended."""
     if gate.commander not in ("", name):
         return f"{gate.commander} has taken the body"
     causes = "; ".join(cause.text for cause in gate.causes)
@@ -332,13 +332,13 @@ def _mine(config: Config, memory: Memory) -> bool:
 
 
 def _is_old(memory: Memory) -> bool:
-    """Return whether the newest state is from before the last grant."""
+    """Return whether the newest state is older than the last grant."""
     boot, enables = memory.granted
     return memory.gate is not None and memory.boot == boot and memory.gate.enables < enables
 
 
 def _fault(config: Config, limits: Limits, wanted: Wanted, now: Now) -> tuple[str, str]:
-    """Return code and text of what is wrong with a command; empty if nothing is."""
+    """Return code and text of a command's fault; empty if it has none."""
     if not all(math.isfinite(value) for value in (*wanted.linear, *wanted.angular)):
         return "not_finite", "a command holds NaN or infinity; repair the program that sends it"
     if not limits.linear_speed and any((*wanted.linear, *wanted.angular)):
@@ -356,7 +356,7 @@ def _fault(config: Config, limits: Limits, wanted: Wanted, now: Now) -> tuple[st
 
 
 def _next(config: Config, memory: Memory, wanted: Wanted, now: Now) -> Sender:
-    """Return the sender with this command."""
+    """Return its sender's data, updated by this command."""
     known = next((one for one in memory.senders if one.id == wanted.sender), None)
     known = known or Sender(wanted.sender, now.ns - RELEASE_NS)
     last, number, period_ns = known.number, wanted.number, _period_ns(config, known)
@@ -374,7 +374,7 @@ def _kept(senders: tuple[Sender, ...], newest: Sender) -> tuple[Sender, ...]:
 
 
 def _period_ns(config: Config, sender: Sender) -> int:
-    """Return how long a command counts: the median interval; the longest while there is none."""
+    """Return how long a command counts: the median interval, or the timeout without one."""
     if not sender.intervals:
         return config.timeout_ns
     return min(config.timeout_ns, round(statistics.median(sender.intervals)))

@@ -18,7 +18,7 @@ PERIOD_NS = 1_000_000_000
 
 
 class Diagnosing:
-    """Health of the processes, gate, safety, battery, and what the gateway refuses."""
+    """Health of processes, gate, safety and battery, and commands that the gateway refuses."""
 
     def __init__(
         self,
@@ -40,7 +40,7 @@ class Diagnosing:
                 self._publisher.publish(self.encoded(self._health))
 
     def encoded(self, processes: ProcessHealth) -> bytes:
-        """Return the array of now as CDR."""
+        """Return the present array as CDR."""
         bus, description = self._scene.bus, self._scene.description
         robot = description.robot_type if description else ""
         made = diagnostics.array(

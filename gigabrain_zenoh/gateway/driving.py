@@ -1,4 +1,4 @@
-"""Commands of ROS on the bus: /cmd_vel by the commander, and the poses that RViz publishes."""
+"""Commands from ROS: /cmd_vel through the commander, and poses from RViz."""
 
 import asyncio
 import logging
@@ -37,7 +37,7 @@ POSE, GUESS = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovari
 
 
 class RosCommander:
-    """Listens to /cmd_vel, and is one commander of the robot's gate."""
+    """Listens to /cmd_vel, and commands the robot's gate."""
 
     def __init__(
         self, scene: Scene, ros: RosTransport, types: Types, config: Ros2Config, work: Background
@@ -61,15 +61,15 @@ class RosCommander:
         return self._memory.holds
 
     def offsets_s(self) -> list[float]:
-        """Return by how much the clocks of those who command now are behind this host's."""
+        """Return how far the clocks of present senders are behind this host's [s]."""
         return commander.offsets_s(self._memory, self._now())
 
     def forget(self, why: str) -> None:
-        """Stop commanding at once, until its sender has paused."""
+        """Stop commanding at once, until the sender has paused."""
         self._memory = commander.forget(self._memory, why)
 
     def status(self) -> Status:
-        """Return a line of diagnostics: who may drive, and why a command is refused."""
+        """Return a line of diagnostics: the commander, and why commands are refused."""
         counters = self._bus.counters
         values = {key: n for key, n in counters.items() if key.startswith("cmd_vel_")}
         if self._memory.refusal:
@@ -147,7 +147,7 @@ class RosCommander:
 
 
 class PoseRequests:
-    """Passes on the poses that RViz publishes: where the robot is, and where it shall go."""
+    """Passes on poses from RViz: the initial pose, and goals."""
 
     def __init__(
         self, scene: Scene, ros: RosTransport, types: Types, config: Ros2Config, work: Background

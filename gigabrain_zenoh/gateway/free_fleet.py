@@ -1,8 +1,8 @@
 """ROS topics and services for Open-RMF's adapter free_fleet, on plain Zenoh keys.
 
-The keys and payloads are those that zenoh-bridge-ros2dds makes of a robot with Nav2, as the source
-of open-rmf/free_fleet at 002505f uses them: below the robot's name, CDR, no type and no attachment.
-The name is the robot's namespace on the bus, so that the bus's own session has these keys.
+Keys and payloads are those of zenoh-bridge-ros2dds for a robot with Nav2, as in the source of
+open-rmf/free_fleet at 002505f: below the robot's name, CDR, no type and no attachment. The name is
+the robot's namespace on the bus, so the bus's own session can use these keys.
 """
 
 import logging
@@ -17,7 +17,7 @@ from gigabrain_zenoh.ros2.qos import DEFAULT, Qos
 from gigabrain_zenoh.ros2.transport import Answer, Close, OnReaders
 
 log = logging.getLogger(__name__)
-TOPICS = ("tf", "battery_state")  # that the adapter reads, beside the action navigate_to_pose
+TOPICS = ("tf", "battery_state")  # read by the adapter, besides the action navigate_to_pose
 
 
 class FreeFleetPublisher:
@@ -34,11 +34,11 @@ class FreeFleetPublisher:
         self._transport.publish(self._topic, self._topic.key, payload, "")
 
     def close(self) -> None:
-        """Count readers no more."""
+        """Stop counting readers."""
         self._close()
 
-    def _count(self, there: bool) -> None:
-        self.readers = int(there)
+    def _count(self, present: bool) -> None:
+        self.readers = int(present)
         if self._on_readers:
             self._on_readers(self.readers)
 
@@ -53,11 +53,11 @@ class FreeFleet:
     def publisher(
         self, topic: str, type: str, qos: Qos = DEFAULT, on_readers: OnReaders | None = None
     ) -> FreeFleetPublisher:
-        """Return a publisher; type and QoS are not on the wire."""
+        """Return a publisher; type and QoS are not sent."""
         return FreeFleetPublisher(self._bus, topic, on_readers)
 
     def serve(self, service: str, type: str, handle: Answer) -> Close:
-        """Answer requests of a service, each in a task of its own."""
+        """Answer requests of a service, each in its own task."""
         fault, clock = QuietFault(log), self._bus.clock
 
         async def answer(request: bytes) -> tuple[bytes, str]:

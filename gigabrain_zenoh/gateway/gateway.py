@@ -1,4 +1,4 @@
-"""All that one robot offers to ROS, on an open transport."""
+"""All ROS interfaces of one robot, on an open transport."""
 
 import asyncio
 import logging
@@ -52,7 +52,7 @@ class Gateway:
         )
 
     async def close(self) -> None:
-        """End what runs for ROS; a body that it drives is stopped by the gate."""
+        """End all work for ROS; the gate stops a body that ROS drives."""
         await self.actions.close()
         await self.joints.close()
         for publishing in self.publishing:
@@ -70,7 +70,7 @@ class Gateway:
         await self.work.failed
 
     async def _report(self) -> None:
-        """Put into health what ROS wants and does not get, once a second. Raises ConfigError."""
+        """Add ROS's connection problems to health, once a second. Raises ConfigError."""
         async for _ in self._bus.clock.every(PERIOD_NS):
             self.graph.refuse_own_body()
             refused = (
@@ -93,7 +93,7 @@ class Gateway:
 
 
 def _check_left_out(config: Ros2Config) -> None:
-    """Raise UnknownName for a name to leave out that the gateway does not offer."""
+    """Raise UnknownName if the settings leave out a name that the gateway does not offer."""
     known = {row.topic for row in table()} | COMMANDED.keys()
     for name in config.leave_out:
         plain = name.strip("/")

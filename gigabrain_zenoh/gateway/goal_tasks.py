@@ -1,4 +1,4 @@
-"""Goals of an action as tasks: a cancel request ends one, and a newer goal the one before."""
+"""Goals of an action as tasks: a cancel request or a newer goal ends one."""
 
 import asyncio
 from collections.abc import Callable, Coroutine
@@ -8,7 +8,7 @@ from gigabrain_zenoh.ros2.actions import Goal, GoalState, Outcome
 
 
 class GoalTasks:
-    """Carries out one goal at a time. The part of an action's handler that all have in common."""
+    """Carries out one goal at a time. The common part of all actions' handlers."""
 
     def __init__(self) -> None:
         self._works: dict[bytes, asyncio.Task[Outcome]] = {}  # by goal
@@ -28,12 +28,12 @@ class GoalTasks:
     async def carried_out(
         self, goal: Goal, carry_out: Callable[[], Coroutine[Any, Any, Outcome]]
     ) -> Outcome:
-        """Return the outcome of a goal that ends those before it."""
+        """Carry out a goal, which ends earlier ones; return its outcome."""
         if goal.cancel_requested:
             return Outcome(GoalState.CANCELED)
         before = list(self._works.values())
         work = self._works[goal.id] = asyncio.ensure_future(carry_out())
-        for one in before:  # after the new one is begun, whose task takes the place of its own
+        for one in before:  # after the start of the new one, whose task replaces the robot's task
             one.cancel()
         try:
             return await work
@@ -47,6 +47,6 @@ class GoalTasks:
 
     @staticmethod
     def _closing() -> bool:
-        """Return whether the task that runs this is itself cancelled."""
+        """Return whether the calling task is being cancelled."""
         task = asyncio.current_task()
         return task is not None and task.cancelling() > 0

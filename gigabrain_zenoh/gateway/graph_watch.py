@@ -1,4 +1,4 @@
-"""Faults between ROS and the gateway, for health: types, QoS, hashes, clocks, doubled names."""
+"""Faults between ROS and the gateway, for health: types, QoS, hashes, clocks, duplicate names."""
 
 from collections.abc import Callable, Iterable, Mapping
 
@@ -22,27 +22,27 @@ MAX_CAUSES = 8
 MAX_TEXT = 500
 TOPIC_KINDS = ("publisher", "subscriber")
 REJOIN = "restart the robot's processes, or the process ros2 alone"
-EVERY = 5  # calls from one look at the graph to the next
+CHECK_EVERY = 5  # calls of `look` between two checks of the graph
 
 
 class GraphWatch:
-    """Looks at the graph every few seconds, as that of many nodes takes a while."""
+    """Checks the graph every few seconds, because a graph of many nodes takes time."""
 
     def __init__(
         self, ros: RosTransport, config: Ros2Config, offsets_s: Callable[[], Iterable[float]]
     ) -> None:
-        """Watch; `offsets_s` returns how far clocks of the publishers of /cmd_vel are behind."""
+        """`offsets_s` returns how far clocks of publishers of /cmd_vel are behind [s]."""
         self._ros, self._config, self._offsets_s = ros, config, offsets_s
-        # this host's addresses on joining: Cyclone DDS stays on an interface of theirs
+        # this host's addresses when joining: Cyclone DDS keeps one of their interfaces
         bound = config.transport == "dds" and not config.localhost
         self._joined = outer_addresses() if bound else None
         self._calls = 0
         self.causes: tuple[Cause, ...] = ()
 
     def refuse_own_body(self) -> None:
-        """Raise ConfigError where the driver of a ROS 2 robot has topics of the gateway.
+        """Raise ConfigError if a ROS 2 robot's driver uses topics of the gateway.
 
-        Its commands and scans would come back to it by the gateway, and keep the robot moving.
+        Its commands and scans would return to it through the gateway, and keep the robot moving.
         """
         endpoints = self._ros.endpoints()
         ours = {one.topic for one in endpoints if one.ours and one.kind in TOPIC_KINDS}
@@ -55,8 +55,8 @@ class GraphWatch:
             )
 
     def look(self) -> tuple[Cause, ...]:
-        """Return what is wrong; each fifth call looks again."""
-        if self._calls % EVERY == 0:
+        """Return the present faults; each fifth call checks again."""
+        if self._calls % CHECK_EVERY == 0:
             self.causes = tuple(self._find())[:MAX_CAUSES]
         self._calls += 1
         return self.causes
@@ -68,7 +68,7 @@ class GraphWatch:
         return Status("graph", Level.WARN, "; ".join(one.text for one in self.causes))
 
     def report(self) -> Mapping[str, str | int]:
-        """Return how the gateway has joined ROS, for `gigabrain doctor`."""
+        """Return the gateway's connection to ROS, for `gigabrain doctor`."""
         config = self._config
         others = {one.node for one in self._ros.endpoints() if not one.ours}
         return {
@@ -97,7 +97,7 @@ class GraphWatch:
                 yield Cause(code="ros2_clock", text=text, remedy=SYNCHRONISE)
 
     def _moved(self) -> str:
-        """Return why other hosts may not see the topics any more; empty if they may."""
+        """Return why other hosts may no longer see the topics; empty if they can."""
         now = outer_addresses()
         if self._joined is None or not now or self._joined & now:
             return ""

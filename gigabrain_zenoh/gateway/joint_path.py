@@ -1,8 +1,8 @@
-"""Judges trajectories of joints that ROS sends, whole, and says where joints are on them. Pure.
+"""Checks joint trajectories from ROS, and interpolates them. Pure.
 
-What is between the points, and what tolerances mean, is as in ros2_control's joint trajectory
-controller: straight lines for positions alone, cubic with velocities, quintic with accelerations
-as well. A path begins where the joints are sent now, as fast as they move now.
+Interpolation and tolerances are those of ros2_control's joint trajectory controller: linear for
+positions only, cubic with velocities, quintic with accelerations. A path begins at the present
+setpoint and speed of the joints.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,12 +18,12 @@ from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gateway.conversions.frames import stamp_ns
 from gigabrain_zenoh.geometry.joint_ramp import OVER, JointPoint
 
-LONGEST_S = 600.0  # of a trajectory
-LATEST_S = 10.0  # until it begins, by its stamp
+MAX_DURATION_S = 600.0  # of a trajectory
+MAX_DELAY_S = 10.0  # until its start, by its stamp
 ROUNDING = 1e-4  # [rad] or [m], of positions at a limit
 AT_REST = 1e-3  # [rad/s] or [m/s], of the last point
-NONE = -1.0  # of a tolerance: not checked; 0 is the default
-SAMPLES = np.linspace(0.0, 1.0, 17)  # of a segment, for its limits
+UNCHECKED = -1.0  # value of a tolerance that is not checked; 0 means the default
+SAMPLES = np.linspace(0.0, 1.0, 17)  # of a segment, to check its limits
 POWERS = np.arange(6)
 
 
@@ -47,7 +47,7 @@ class Unfit(Refused):
 
 
 class Points(NamedTuple):
-    """The points of a trajectory of n joints, and where it starts."""
+    """Points of a trajectory of n joints."""
 
     times: Floats  # (k,) [s] from the start, rising
     positions: Floats  # (k, n) [rad] or [m]
@@ -55,7 +55,7 @@ class Points(NamedTuple):
     accelerations: Floats | None = None  # (k, n)
 
     def after(self, seconds: float) -> "Points":
-        """Return the points later than that, timed from then."""
+        """Return the points after this time, with times relative to it."""
         late = self.times > seconds
         rows = (None if one is None else one[late] for one in self[1:])
         return Points(self.times[late] - seconds, *rows)  # type: ignore[arg-type]
@@ -65,7 +65,7 @@ class JointPath:
     """Polynomials of time from point to point."""
 
     def __init__(self, names: tuple[str, ...], start: Points, points: Points) -> None:
-        """Join the one point of `start`, at 0 s, and `points`, which come later."""
+        """Join the single point of `start`, at 0 s, and the later `points`."""
         self.names = names  # n
         self._times = np.concatenate((start.times, points.times))  # (k + 1,) [s]
         self._end = np.concatenate((start.positions, points.positions))[-1]
@@ -97,21 +97,21 @@ class JointPath:
         return position, velocity
 
     def check(self, joints: Sequence[JointDescription]) -> None:
-        """Raise Unfit where a joint would leave its range, or move faster than it can."""
+        """Raise Unfit if a joint would leave its range, or be too fast."""
         times = np.diff(self._times)[:, None] * SAMPLES  # (k, 17)
         found = np.einsum("ksdp,kpn->dksn", _powers(times), self._rows)  # (2, k, 17, n)
         positions, speeds = found[0].reshape(-1, len(joints)), np.abs(found[1])
         speeds = speeds.reshape(-1, len(joints))
         for column, joint in enumerate(joints):
             fastest = speeds[:, column].max(initial=0.0)
-            if not fastest <= OVER * joint.max_speed:  # NaN as well
+            if not fastest <= OVER * joint.max_speed:  # also for NaN
                 text = f"{joint.name} would have to move at {fastest:.3g}, more than"
                 raise Unfit(Code.INVALID_GOAL, f"{text} {joint.max_speed:g}")
             _check_range(joint, positions[:, column])
 
 
 def _ends(start: Floats, points: Floats) -> tuple[Floats, Floats]:
-    """Return the values at the begin and at the end of each segment."""
+    """Return the values at the start and at the end of each segment."""
     rows = np.concatenate((start, points))
     return rows[:-1], rows[1:]
 
@@ -143,12 +143,12 @@ def _quintic(way: Floats, v0: Floats, v1: Floats, a0: Floats, a1: Floats, t: Flo
 def judged(
     body: BodyDescription, message: Any, now: Sequence[JointPoint], ros_ns: int
 ) -> tuple[JointPath, float]:
-    """Return a trajectory_msgs/JointTrajectory as a path, and the seconds until it begins.
+    """Return a trajectory_msgs/JointTrajectory as a path, and the seconds until its start.
 
-    `now` is where all joints of the body were sent. Raises Unfit, before anything moves.
+    `now` is the setpoint of all joints of the body. Raises Unfit, before anything moves.
     """
     joints = _joints(body, message.joint_names)
-    with np.errstate(all="ignore"):  # of what is refused for it
+    with np.errstate(all="ignore"):  # overflows are refused below
         points = _points(joints, message.points)
         waits_s, stamp = 0.0, stamp_ns(message.header.stamp)
         if stamp:
@@ -157,8 +157,8 @@ def judged(
             if not len(points.times):
                 text = f"it ended {-waits_s - _seconds(message.points[-1]):.2f} s ago by its stamp"
                 raise Unfit(Code.OLD_HEADER_TIMESTAMP, f"{text}; compare the clocks")
-            if waits_s > LATEST_S:
-                text = f"it begins in {waits_s:.0f} s; expected {LATEST_S:g} s at most"
+            if waits_s > MAX_DELAY_S:
+                text = f"it begins in {waits_s:.0f} s; expected {MAX_DELAY_S:g} s at most"
                 raise Unfit(Code.INVALID_GOAL, text)
         start, points = _started(body, joints, now, points)
         path = JointPath(tuple(joint.name for joint in joints), start, points)
@@ -185,8 +185,8 @@ def _points(joints: Sequence[JointDescription], given: Sequence[Any]) -> Points:
         raise Unfit(Code.INVALID_GOAL, "it has no points")
     times = np.array([_seconds(point) for point in given])
     rising = np.diff(times, prepend=-1e-9) > 0
-    if times[0] < 0 or not rising.all() or times[-1] > LONGEST_S:
-        text = f"times of points have to rise, from 0 to {LONGEST_S:g} s at most"
+    if times[0] < 0 or not rising.all() or times[-1] > MAX_DURATION_S:
+        text = f"times of points have to rise, from 0 to {MAX_DURATION_S:g} s at most"
         raise Unfit(Code.INVALID_GOAL, text)
     if any(len(point.effort) for point in given):
         raise Unfit(Code.INVALID_GOAL, "efforts cannot be followed; leave them out")
@@ -240,7 +240,7 @@ def _started(
     now: Sequence[JointPoint],
     points: Points,
 ) -> tuple[Points, Points]:
-    """Return where it starts, and what comes later: a point at 0 s has to be where joints are."""
+    """Return the start and the later points; a point at 0 s must be the present setpoint."""
     every = {joint.name: point for joint, point in zip(body.joints, now, strict=True)}
     here = [every[joint.name] for joint in joints]
     fields = ([getattr(p, f) for p in here] for f in ("position", "velocity", "acceleration"))
@@ -257,17 +257,17 @@ def _started(
 
 
 class Tolerances(NamedTuple):
-    """The tolerances of a goal: of the body's joints [rad] or [m], and of speeds."""
+    """The tolerances of a goal: of joint positions [rad] or [m], and of speeds."""
 
     body: BodyDescription
-    path_speeds: Mapping[str, float]  # [rad/s] or [m/s], of joints whose speed is checked
+    path_speeds: Mapping[str, float]  # [rad/s] or [m/s], by joint with a checked speed
     goal_speeds: Mapping[str, float]
 
 
 def tolerances(body: BodyDescription, goal: Any = None) -> Tolerances:
-    """Return the tolerances of a FollowJointTrajectory goal; without one the body's. Raises Unfit.
+    """Return the tolerances of a FollowJointTrajectory goal, or the body's. Raises Unfit.
 
-    Accelerations are not measured, so their tolerances are not looked at.
+    Tolerances of accelerations are ignored, because they are not measured.
     """
     if goal is None:
         return Tolerances(body, {}, {})
@@ -288,7 +288,7 @@ def tolerances(body: BodyDescription, goal: Any = None) -> Tolerances:
     )
     time = goal.goal_time_tolerance
     goal_time = _tolerance(time.sec + time.nanosec / 1e9, body.arm.goal_time)
-    arm = replace(body.arm, goal_time=goal_time or LONGEST_S)
+    arm = replace(body.arm, goal_time=goal_time or MAX_DURATION_S)
     speeds = (_speeds(each.values()) for each in (path, goals))
     return Tolerances(replace(body, joints=joints, arm=arm), *speeds)
 
@@ -303,8 +303,8 @@ def _speeds(given: Iterable[Any]) -> dict[str, float]:
 
 
 def _tolerance(value: float, default: float) -> float:
-    """Return a tolerance; 0 is not checked."""
-    if value == NONE:
+    """Return a tolerance; 0 means not checked."""
+    if value == UNCHECKED:
         return 0.0
     if not 0.0 <= value < float("inf"):
         raise Unfit(Code.INVALID_GOAL, f"a tolerance is {value:g}; expected -1, 0 or more")

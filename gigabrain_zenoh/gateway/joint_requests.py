@@ -1,6 +1,6 @@
 """ROS interfaces that move joints: topic joint_trajectory, action follow_joint_trajectory.
 
-Both are offered once the robot has shown that it has joints.
+Both are offered after the description of a body with joints.
 """
 
 import asyncio
@@ -29,7 +29,7 @@ TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 FOLLOW_TYPE = "control_msgs/action/FollowJointTrajectory"
 TOPIC, ACTION = "joint_trajectory", "follow_joint_trajectory"
 MAX_BYTES = 256 << 10  # of a trajectory: 1500 points of six joints, with accelerations
-FEEDBACK_TICKS = 2  # 40 ms, from one feedback to the next
+FEEDBACK_TICKS = 2  # 40 ms, between two feedbacks
 
 
 def feedback(make: Make, names: Sequence[str], at_ns: int, progress: Progress) -> Any:
@@ -66,13 +66,13 @@ class FollowHandler(GoalTasks):
         self._scene, self._types, self._commander = scene, types, commander
 
     def accept(self, message: Any) -> bool:
-        """Accept any goal; `run` says what is wrong with it, by its code."""
+        """Accept any goal; `run` reports its faults by code."""
         return True
 
     async def run(self, goal: Goal, feed: Callable[[Any], None]) -> Outcome:
         """Follow the trajectory of a goal until its end."""
         body = self._scene.description
-        assert body  # it was offered for its joints
+        assert body  # the action is offered only for a known body
         told_tick = 0
 
         def tell(progress: Progress) -> None:
@@ -128,7 +128,7 @@ class JointRequests:
         self._requests = TopicRequests(scene.bus, ros, types, work)
         self._commander: JointCommander | None = None
         self._server: ActionServer | None = None
-        self._silence = Silence()  # since any trajectory by the topic
+        self._silence = Silence()  # since the last trajectory on the topic
         scene.on_body.append(self._offer)
         scene.on_state.append(lambda _: self._listen())
 
@@ -138,7 +138,7 @@ class JointRequests:
             self._commander.forget(why)
 
     def status(self) -> list[Status]:
-        """Return a line of diagnostics for what the topic was refused last."""
+        """Return a line of diagnostics with the topic's last refusal."""
         return self._requests.status()
 
     async def close(self) -> None:
@@ -168,7 +168,7 @@ class JointRequests:
         self._silence = self._silence.then(self._scene.bus.clock.now_ns())
 
     async def _obey(self, message: Any) -> str:
-        """Begin to follow a trajectory of the topic, in place of any other."""
+        """Begin to follow a trajectory of the topic; it replaces any other."""
         commander, body = self._commander, self._scene.description
         assert commander
         assert body
@@ -184,7 +184,7 @@ class JointRequests:
         return ""
 
     async def _watch(self, motion: JointMotion) -> None:
-        """Name in diagnostics how a trajectory ended, if that was a fault."""
+        """Report a trajectory's end in diagnostics, if it was a fault."""
         how = await motion.done
         if how.code is not Code.SUCCESSFUL:
             self._requests.fail(TOPIC, f"stopped: {how.text}")

@@ -1,8 +1,8 @@
-"""Trajectories of joints from ROS: one commander of the robot's gate, a topic and an action.
+"""Joint trajectories from ROS, for a topic and an action: a commander of the robot's gate.
 
-Control's joint trajectory controller makes the commands, one for each state of the robot. The
-first trajectory asks for the body, and 0.5 s after the end of the last one it is given back. What
-the gate stops does not go on by itself.
+Control's joint trajectory controller computes a command for each state of the robot. The first
+trajectory asks for the body; 0.5 s after the end of the last one the body is given back. A
+trajectory that the gate stops does not continue by itself.
 """
 
 import asyncio
@@ -29,8 +29,8 @@ from gigabrain_zenoh.gateway.scene import Scene
 from gigabrain_zenoh.geometry.joint_ramp import JointPoint, held, measured, prepare
 
 RELEASE_TICKS = RELEASE_NS // TICK_NS  # after the end of a trajectory
-ARRIVED = 1e-3  # [rad] or [m], what is sent off the end of a trajectory
-STOP_TICKS = 50  # for which a gate that still stops is asked again
+ARRIVED = 1e-3  # [rad] or [m], largest distance of the setpoint from the end of a trajectory
+STOP_TICKS = 50  # for which it asks a stopping gate again
 PAUSE = "pause for 0.5 s before it may move joints again"
 
 
@@ -39,25 +39,25 @@ class Ended(NamedTuple):
 
     code: Code
     text: str = ""
-    replaced: bool = False  # by a newer one, which is no fault
+    replaced: bool = False  # by a newer trajectory, which is no fault
 
 
 class Progress(NamedTuple):
-    """All joints of the body, in its order, at one time of a trajectory."""
+    """The state of all joints, in the body's order, at one time of a trajectory."""
 
-    seconds: float  # since its begin
+    seconds: float  # since its start
     desired: Sequence[JointPoint]
     actual: Sequence[JointPoint]
 
 
-Tell = Callable[[Progress], None]
+OnProgress = Callable[[Progress], None]
 
 
 class JointMotion:
-    """A trajectory that is followed."""
+    """A trajectory in execution."""
 
     def __init__(
-        self, path: JointPath, tolerances: Tolerances, not_before: int, tell: Tell
+        self, path: JointPath, tolerances: Tolerances, not_before: int, tell: OnProgress
     ) -> None:
         self.path, self.tell = path, tell
         self.begin: int | None = None  # tick; None until the gate lets joints move
@@ -74,15 +74,15 @@ class JointMotion:
             self.done.set_result(how)
 
     def passed(self, tick: int) -> float:
-        """Return the seconds since its begin; below 0 before it."""
+        """Return the seconds since its start; negative before."""
         return -math.inf if self.begin is None else (tick - self.begin) * TICK_S
 
     def body(self, tick: int) -> BodyDescription:
-        """Return the body with the tolerances of now."""
+        """Return the body with the tolerances that apply at a tick."""
         return self._tolerances.body if self.passed(tick) < self.path.seconds else self._at_end
 
     def intent(self, tick: int) -> Intent | None:
-        """Return what control should do after the state of a tick; None before its begin."""
+        """Return control's intent after the state of a tick; None before the start."""
         passed = self.passed(tick)
         if self.begin is None or passed < 0:
             return None
@@ -98,10 +98,10 @@ class JointMotion:
     def judge(
         self, tick: int, setpoint: Sequence[JointPoint], here: Sequence[JointPoint]
     ) -> Ended | None:
-        """Return how it ends by the measured joints, apart from what control says; None: not yet.
+        """Return its end by the measured joints, in addition to control's checks; None: not yet.
 
-        It has succeeded once all its joints were sent to its end and are there. Only the speeds
-        that a goal names count.
+        It succeeds when the setpoint is at its end and all its joints are there. Only speeds with a
+        tolerance in the goal count.
         """
         passed = self.passed(tick)
         if passed < 0:
@@ -118,11 +118,11 @@ class JointMotion:
             return Ended(Code.PATH_TOLERANCE_VIOLATED, f"{fast[0]} has another speed than wanted")
         if not over:
             return None
-        most = {joint.name: joint.goal_tolerance or math.inf for joint in self._at_end.joints}
+        tolerance = {joint.name: joint.goal_tolerance or math.inf for joint in self._at_end.joints}
         sent = {joint.name: at for joint, at in zip(self._at_end.joints, setpoint, strict=True)}
         ends = zip(self.path.names, positions, strict=True)
         arrived = all(_is_at(sent[name], place) for name, place in ends)
-        if arrived and not fast and all(abs(way) <= most[name] for name, way, _ in off):
+        if arrived and not fast and all(abs(way) <= tolerance[name] for name, way, _ in off):
             return Ended(Code.SUCCESSFUL)
         assert self._at_end.arm
         if fast and passed > self.path.seconds + self._at_end.arm.goal_time:
@@ -131,7 +131,7 @@ class JointMotion:
 
     def progress(self, tick: int, setpoint: Sequence[JointPoint],
                  here: Sequence[JointPoint]) -> Progress:  # fmt: skip
-        """Return where all joints should be and are; those that it does not name should stay."""
+        """Return desired and measured positions of all joints; joints without a target stay."""
         passed = max(0.0, self.passed(tick))
         positions, velocities = self.path.at(passed)
         named = dict(zip(self.path.names, zip(positions, velocities, strict=True), strict=True))
@@ -147,20 +147,20 @@ def _is_at(point: JointPoint, place: float) -> bool:
 
 
 class JointCommander:
-    """Follows one trajectory at a time; a newer one takes its place."""
+    """Follows one trajectory at a time; a newer one replaces it."""
 
     def __init__(self, scene: Scene, config: Ros2Config) -> None:
         self._scene, self._bus, self._take = scene, scene.bus, config.take
         self._name = scene.bus.process
         self._lease, self._asking = ControlLease(self._name), asyncio.Lock()
         self._arm = ArmControl(scene.bus, self._name)
-        self._motion: JointMotion | None = None  # also one that has succeeded: joints stay there
-        self._until_tick = 0  # joints are held until then
-        self.blocked = ""  # why a stream of trajectories has to pause first
+        self._motion: JointMotion | None = None  # even after its success: joints stay there
+        self._until_tick = 0  # joints are held until this tick
+        self.blocked = ""  # why a stream of trajectories must pause first
         scene.on_state.append(self._observe)
 
     def judge(self, message: Any) -> tuple[JointPath, float]:
-        """Return the path of a JointTrajectory, and the seconds until it begins.
+        """Return the path of a JointTrajectory, and the seconds until its start.
 
         Raises Unfit, and BodyLost while the robot is silent.
         """
@@ -172,9 +172,9 @@ class JointCommander:
         return judged(body.description, message, now, self._scene.ros_ns())
 
     async def begin(
-        self, path: JointPath, waits_s: float, tolerances: Tolerances, tell: Tell
+        self, path: JointPath, waits_s: float, tolerances: Tolerances, tell: OnProgress
     ) -> JointMotion:
-        """Begin to follow a path in place of the present one; its `done` says how it ends.
+        """Begin to follow a path, which replaces the present one; its `done` gets the result.
 
         Raises Refused if the gate does not grant the body, and BodyLost.
         """
@@ -187,7 +187,7 @@ class JointCommander:
         return motion
 
     def cancel(self, motion: JointMotion) -> None:
-        """Have joints come to rest, if they still follow this motion."""
+        """Stop the joints, if they still follow this motion."""
         if self._motion is motion:
             self._drop(Ended(Code.SUCCESSFUL, "cancelled"))
 
@@ -210,7 +210,7 @@ class JointCommander:
         return state.tick < self._until_tick and self._lease.has(state)
 
     async def _acquire(self) -> None:
-        """Ask the gate for the body, if it does not obey this commander yet."""
+        """Ask the gate for the body, unless it already obeys this commander."""
         state, body = self._known()
         prepare(len(body.description.joints))
         if self._lease.has(state):
@@ -234,7 +234,7 @@ class JointCommander:
                 return
 
     def _observe(self, state: RobotState) -> None:
-        """Send the command for a state while a trajectory is followed, and 0.5 s afterwards."""
+        """Send the command for a state during a trajectory, and 0.5 s after its end."""
         self._lease.update(state)
         body, motion = self._scene.body, self._motion
         ended = motion is None or motion.done.done()
@@ -260,13 +260,13 @@ class JointCommander:
             self._follow(motion, state, body)
 
     def _ready(self, state: RobotState) -> bool:
-        """Return whether the gate lets joints move: not in the first ticks of an enable."""
+        """Return whether the gate lets joints move: not in the first ticks after an enable."""
         memory = self._arm.memory
         same = (memory.boot, memory.enables) == (state.boot, state.gate.enables)
         return same and state.tick - memory.enabled_tick > CALM_TICKS
 
     def _follow(self, motion: JointMotion, state: RobotState, body: Body) -> None:
-        """Tell how far it is, and end it if it is over."""
+        """Report progress, and end the trajectory if it is over."""
         memory, here = self._arm.memory, measured(body.description, state)
         if not here or not memory.setpoint:
             return
@@ -285,7 +285,7 @@ class JointCommander:
             self._drop(how)
 
     def _drop(self, how: Ended) -> None:
-        """End the present trajectory, and have joints come to rest."""
+        """End the present trajectory, and stop the joints."""
         motion, self._motion = self._motion, None
         if motion:
             motion.end(how)

@@ -1,7 +1,7 @@
-"""Nav2's two navigators as actions of ROS, which share one robot.
+"""Nav2's two navigators as ROS actions, which share one robot.
 
-As in Nav2, a new goal of the same action preempts the one before, which ends as aborted. A goal of
-the other action is rejected meanwhile, and one that cannot be understood does not end the present.
+As in Nav2, a new goal of the same action preempts the previous one, which ends as aborted. A goal
+of the other action is rejected meanwhile. An invalid goal does not end the present one.
 """
 
 from collections.abc import Callable
@@ -39,7 +39,7 @@ class NavigateHandler(GoalTasks):
         self.others: list[NavigateHandler] = []
 
     def accept(self, message: Any) -> bool:
-        """Accept any goal while no other action has the robot; `run` says what is wrong with it."""
+        """Accept any goal while no other action has the robot; `run` reports its faults."""
         return not any(other.busy for other in self.others)
 
     async def run(self, goal: Goal, feed: Callable[[Any], None]) -> Outcome:
@@ -70,7 +70,7 @@ def _outcome(ended: Ended) -> Outcome:
 
 
 class Nav2Actions:
-    """The two actions on a transport; `fleet` has the first of them too."""
+    """The two actions on a transport; the first also on `fleet`."""
 
     def __init__(
         self,
@@ -107,6 +107,6 @@ class Nav2Actions:
         ]
 
     async def close(self) -> None:
-        """Withdraw the actions; goals end as aborted, and their tasks are cancelled."""
+        """Withdraw the actions; abort their goals, and cancel their tasks."""
         for server in self._servers:
             await server.close()

@@ -27,9 +27,9 @@ from gigabrain_zenoh.gateway.scene import Scene
 
 log = logging.getLogger(__name__)
 SECOND_NS = 1_000_000_000
-NEAR_M = 0.5  # by which the task's goal may be off the pose that it stands for
-ACCEPT_S = PLAN_S + STARTING_S  # for which ROS waits until a goal is accepted
-LATE_S = 60.0  # for which an answer is awaited, to cancel what ROS has given up
+NEAR_M = 0.5  # largest distance between a task's goal and its pose in the request
+ACCEPT_S = PLAN_S + STARTING_S  # ROS waits this long until a goal is accepted
+LATE_ANSWER_S = 60.0  # wait for a late answer, to cancel a task whose goal was aborted
 MAX_POSES = 200
 NO_TREES = "this navigator has no behavior trees; leave behavior_tree empty"
 _decode_map = Codec(MAP.type, MAP.max_bytes).decode
@@ -42,7 +42,7 @@ class EndState(IntEnum):
 
 
 class Outcome(NamedTuple):
-    """The final state of a goal, with its result code and a text for people."""
+    """The final state of a goal, with its result code and a text."""
 
     state: EndState
     code: int = result_codes.NONE
@@ -63,11 +63,11 @@ OnProgress = Callable[[Progress], None]
 
 
 class Navigator:
-    """Carries out one goal at a time. A new one preempts the one before."""
+    """Carries out one goal at a time. A new goal preempts the previous one."""
 
     def __init__(self, scene: Scene) -> None:
-        self._scene, self._tasks = scene, Tasks(scene.bus, plan_s=LATE_S)
-        self._task = ""  # name of the task that the robot is at for ROS
+        self._scene, self._tasks = scene, Tasks(scene.bus, plan_s=LATE_ANSWER_S)
+        self._task = ""  # name of the present task for ROS
         self._abandoned: set[str] = set()  # tasks whose goals were aborted without an answer
         self._cancels: set[asyncio.Task[None]] = set()
         self._listens = False
@@ -77,7 +77,7 @@ class Navigator:
     ) -> Outcome:
         """Drive to one pose, or through several in the map. Cancelling this cancels the task.
 
-        A goal that comes while another one is carried out replaces its task.
+        A new goal replaces the task of the present one.
         """
         before, self._task = self._task, ""
         abandoned, self._abandoned = self._abandoned, set()  # an accepted goal replaces them
@@ -99,7 +99,7 @@ class Navigator:
             self._abandon(name)
             return Outcome(EndState.ABORTED, codes.navigator + result_codes.UNKNOWN, str(error))
         except asyncio.CancelledError:
-            if self._task == name:  # no other goal takes its place
+            if self._task == name:  # no other goal replaces it
                 await self._cancel(name)
             raise
         finally:
@@ -114,7 +114,7 @@ class Navigator:
         return await self._tasks.carry_out(text, label="navigate_through_poses")
 
     async def _accepted(self, sending: asyncio.Future[str]) -> str:
-        """Return the name of a task; one that is accepted later is cancelled.
+        """Return the name of a task; cancel one that is accepted too late.
 
         Raises GigabrainError.
         """
@@ -127,10 +127,10 @@ class Navigator:
         )
 
     def _begin_cancel(self, sending: asyncio.Future[str]) -> asyncio.Task[None]:
-        """Cancel a task in the background, once it is accepted."""
+        """Cancel a task in the background, after it is accepted."""
 
         async def cancel() -> None:
-            with contextlib.suppress(GigabrainError):  # refused: then there is nothing to cancel
+            with contextlib.suppress(GigabrainError):  # refused: nothing to cancel
                 await self._cancel(await sending)
 
         return self._begin(cancel())
@@ -143,25 +143,25 @@ class Navigator:
 
     async def _cancel(self, name: str) -> None:
         if name:
-            with contextlib.suppress(GigabrainError):  # it has just ended
+            with contextlib.suppress(GigabrainError):  # it has ended meanwhile
                 await self._tasks.cancel(name)
 
     def _abandon(self, name: str) -> None:
-        """Have a task cancelled if it goes on after its goal was aborted in a silence."""
+        """Cancel a task if it still runs after a silence in which its goal was aborted."""
         self._abandoned.add(name)
         if not self._listens:
             self._listens = True
             self._scene.bus.subscribe(TASK, self._on_status)
 
     def _on_status(self, _key: str, status: TaskStatus) -> None:
-        source = self._scene.bus.process  # another client's task may have the name by now
+        source = self._scene.bus.process  # another client's task may have this name
         for task in (status.current, *status.queue):
             if task and task.source == source and task.id in self._abandoned:
                 self._abandoned.remove(task.id)
                 self._begin(self._cancel(task.id))
 
     async def _refused(self, codes: Codes, poses: Sequence[Pose], error: GigabrainError) -> Outcome:
-        """Return the outcome of a goal that was not accepted, with a code by the map."""
+        """Return the outcome of a refused goal, with a code that depends on the map."""
         if not isinstance(error, Refused):
             return Outcome(EndState.ABORTED, codes.navigator + result_codes.UNKNOWN, str(error))
         about, grid = self._scene.description, await self._map()
@@ -172,7 +172,7 @@ class Navigator:
     def _ended(self, codes: Codes, task: Task, *, had_path: bool) -> Outcome:
         if task.state == "succeeded":
             return Outcome(EndState.SUCCEEDED)
-        if task.state == "cancelled":  # by another client: a cancel of ROS ends the wait before
+        if task.state == "cancelled":  # by another client: a cancel of ROS ends the wait
             return Outcome(EndState.ABORTED, codes.navigator + result_codes.UNKNOWN, task.reason)
         return Outcome(
             EndState.ABORTED, result_codes.of_failure(codes, had_path=had_path), task.reason
@@ -197,7 +197,7 @@ class _Follower:
         self.had_path = False
 
     def update(self, status: TaskStatus) -> None:
-        """Take a status, if it is of this task."""
+        """Handle a status, if it is of this task."""
         if status.current is None or status.current.id != self._task:
             return
         self.had_path = self.had_path or len(status.path) > 1
@@ -221,7 +221,7 @@ class _Follower:
         )
 
     def _pass(self, goal: Pose) -> None:
-        """Move on to the pose that the task drives to now."""
+        """Count poses as reached up to the task's present goal."""
         for number in range(self._reached, len(self._poses)):
             if _apart(goal, self._poses[number]) <= NEAR_M:
                 self._reached = number
@@ -237,7 +237,7 @@ def _apart(one: Pose, other: Pose) -> float:
 
 
 class Requested(NamedTuple):
-    """A goal as ROS sent it: poses in the map, or why it cannot be carried out."""
+    """A goal from ROS: poses in the map, or the fault that prevents it."""
 
     poses: tuple[Pose, ...]
     fault: Outcome | None = None
@@ -261,7 +261,7 @@ def requested(codes: Codes, poses: Sequence[Any], tree: str, odom_in_map: Pose |
 
 
 def feedback(make: Make, action: str, at_ns: int, progress: Progress) -> Any:
-    """Return the feedback of an action; our navigator has no recoveries that it counts."""
+    """Return the feedback of an action; our navigator counts no recoveries."""
     here = progress.here or Pose(x=0.0, y=0.0, yaw=0.0)
     fields: dict[str, Any] = {
         "current_pose": pose_stamped(make, at_ns, MAP_FRAME if progress.here else "", here),

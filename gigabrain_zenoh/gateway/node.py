@@ -9,7 +9,7 @@ from gigabrain_zenoh.config.settings import Ros2Config
 
 async def run(config: Ros2Config, bus: Bus, ready: Callable[[], None]) -> None:
     """Serve ROS until the process ends. Raises ConfigError, and BusError."""
-    # imported when it runs: `ros2` says which packages are missing
+    # imported here: `ros2` reports missing packages
     from gigabrain_zenoh.gateway.gateway import serve
     from gigabrain_zenoh.ros2.opening import load_types, open_transport
 

@@ -1,6 +1,6 @@
-"""The parameters of the gateway's node, which every ROS tool may read and none may set.
+"""The parameters of the gateway's node, read-only for all ROS tools.
 
-They are its settings, which a deployment file has; a change takes a restart.
+They are its settings in the deployment file; a change needs a restart.
 """
 
 from collections.abc import Callable, Mapping
@@ -49,7 +49,7 @@ class Parameters:
 
     @property
     def values(self) -> dict[str, Value]:
-        """The parameters by name, as they are now."""
+        """The present parameters, by name."""
         return {"use_sim_time": self._simulated(), **asdict(self._config)}
 
     def _answerer(self, name: str, act: Callable[[Any], dict[str, Any]]) -> Any:

@@ -1,6 +1,6 @@
-"""`gigabrain ros2 pass`: one key of ours to one ROS topic, or back, without code.
+"""`gigabrain ros2 pass`: connects one key to one ROS topic, or back, without code.
 
-Messages pass as they come, and only while somebody reads them at the other end.
+Messages pass at once, and only while the other end has readers.
 """
 
 import asyncio
@@ -41,7 +41,7 @@ from gigabrain_zenoh.security.identity_files import identity_in
 log = logging.getLogger(__name__)
 Form = Literal["fields", "json", "cdr"]
 DEPTH = 10  # messages that wait for a busy reader
-CHECK_NS = 1_000_000_000  # from one look at the ROS graph to the next
+CHECK_NS = 1_000_000_000  # between two checks of the ROS graph
 ROBOT_KEYS = frozenset({one.key for one in TOPICS} | {one.key for one in SERVICES})
 
 
@@ -53,7 +53,7 @@ class Route(NamedTuple):
     type: str
     form: Form
     to_ros: bool
-    text_field: str = ""  # of the type, which holds JSON with the form json
+    text_field: str = ""  # field of the type that contains JSON, for the form json
 
     def __str__(self) -> str:
         ends = (self.key, self.topic) if self.to_ros else (self.topic, self.key)
@@ -79,7 +79,7 @@ def route(source: str, target: str, type: str, form: Form, types: Types) -> Rout
 
 
 def check_own_key(key: str) -> None:
-    """Raise Refused for a key of the table, and ConfigError for one that cannot be written."""
+    """Raise Refused for a key of the topic table, and ConfigError for an invalid key."""
     if key in ROBOT_KEYS or key.rpartition("/")[0] in ROBOT_KEYS:
         raise robots_own(key)
     try:
@@ -91,7 +91,7 @@ def check_own_key(key: str) -> None:
 
 
 def check_writer(keys: str, key: str) -> None:
-    """Raise Refused for an identity by which a router takes no key of one's own."""
+    """Raise Refused if the identity's role may not publish on its own keys."""
     identity = identity_in(Path(keys)) if keys else None
     if identity and identity.role not in ("robot", "process"):
         raise Refused(
@@ -101,7 +101,7 @@ def check_writer(keys: str, key: str) -> None:
 
 
 def robots_own(key: str) -> Refused:
-    """Return the error for a key on which the robot acts."""
+    """Return the error for a key that the robot itself uses."""
     return Refused(
         f"{key} is the robot's own: not writable here; command the robot through the gateway, "
         "`gigabrain ros2`"
@@ -109,7 +109,7 @@ def robots_own(key: str) -> Refused:
 
 
 def text_field(types: Types, type: str) -> str:
-    """Return the name of a type's only field, if it is a text. Raises ConfigError."""
+    """Return the name of a type's only field, a string. Raises ConfigError for other types."""
     if text := types.only_text(type):
         return text
     names = ", ".join(name for name, _ in types.fields(type))
@@ -120,7 +120,7 @@ def text_field(types: Types, type: str) -> str:
 
 
 def check_fields(types: Types, route: Route, topic: Topic[Any] | None) -> None:
-    """Raise ConfigError where a message of the table has nothing for the ROS type."""
+    """Raise ConfigError if a message of the table shares no field with the ROS type."""
     if topic is None or route.form == "json":
         return
     if route.form == "cdr":
@@ -137,7 +137,7 @@ def check_fields(types: Types, route: Route, topic: Topic[Any] | None) -> None:
 
 @dataclass(frozen=True)
 class Converter:
-    """Turns payloads of one end into those of the other. All raise BadPayload, and nothing else."""
+    """Converts payloads between the two ends. All methods raise only BadPayload."""
 
     types: Types
     route: Route
@@ -167,7 +167,7 @@ class Converter:
         return self._text(values) if self.route.form == "json" else self._fields(values)
 
     def to_payload(self, cdr: bytes) -> bytes:
-        """Return what a key gets of a ROS message: JSON, or its CDR."""
+        """Return the payload for a key from a ROS message: JSON, or its CDR."""
         payload = cdr
         if self.route.form != "cdr":
             message = self.types.decode(self.route.type, cdr)
@@ -196,7 +196,7 @@ class Converter:
 
 
 def _json_of(text: str) -> bytes:
-    """Return a text that is JSON. Raises BadPayload."""
+    """Return a text as JSON bytes. Raises BadPayload if it is not JSON."""
     try:
         msgspec.json.decode(text)
     except DECODE_ERRORS as error:
@@ -205,7 +205,7 @@ def _json_of(text: str) -> bytes:
 
 
 class Passage:
-    """A route at work: passes messages until it is closed."""
+    """Passes messages of a route."""
 
     def __init__(
         self,
@@ -216,7 +216,7 @@ class Passage:
         link: Ros2Link,
         topic: Topic[Any] | None = None,
     ) -> None:
-        """Begin. `topic` is that of the table for a key of the table."""
+        """`topic` is that of the table, for a key of the table; else None."""
         self.counts: Counter[str] = Counter()
         self._route, self._bus, self._ros, self._link = route, bus, ros, link
         self._converter, self._fault = Converter(types, route), Fault(log)
@@ -248,12 +248,12 @@ class Passage:
 
     async def _keep_looking(self) -> None:
         if not self._route.to_ros:
-            await self._bus.kept(BODY)  # nothing passes before the body is known
+            await self._bus.kept(BODY)  # wait for the body before passing anything
         async for _ in self._bus.clock.every(CHECK_NS):
             self.look()
 
     def look(self) -> None:
-        """Listen as the ROS publishers offer, and log what keeps them and us apart."""
+        """Listen with the QoS of the ROS publishers, and log incompatibilities."""
         self._looked, route = True, self._route
         theirs = [one for one in self._ros.endpoints() if one.topic == route.topic and not one.ours]
         if not route.to_ros:
@@ -313,7 +313,7 @@ class Passage:
         self._pass(self._converter.to_payload, received.payload, self._put)
 
     def _watch(self, read: bool) -> None:
-        """Listen to ROS while somebody reads the key."""
+        """Listen to ROS while the key has readers."""
         self._read = read
         if not read:
             self._end()
@@ -344,13 +344,13 @@ class Passage:
         return True
 
     def _check_body(self, _key: str, body: Body) -> None:
-        """Refuse a key that this very body obeys."""
+        """Refuse a key that this body obeys."""
         if body.description.control_topic == self._route.key:
             raise robots_own(self._route.key)
 
 
 def fitting_qos(route: Route, theirs: Iterable[GraphEndpoint]) -> Qos:
-    """Return the best QoS that all publishers found offer; best effort fits any."""
+    """Return the best QoS that all found publishers offer; best effort fits all."""
     offered = [one.qos for one in theirs if (one.type, one.kind) == (route.type, "publisher")]
     return Qos(
         reliable=bool(offered) and all(qos.reliable for qos in offered),

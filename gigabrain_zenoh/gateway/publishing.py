@@ -1,4 +1,4 @@
-"""Publishing to ROS: a table of topics, and publishers that work only while ROS reads them."""
+"""Publishing to ROS: a table of topics, and publishers that work only with readers."""
 
 import functools
 import logging
@@ -51,35 +51,35 @@ from gigabrain_zenoh.ros2.types import Types
 
 log = logging.getLogger(__name__)
 SECOND_NS = 1_000_000_000
-TF = Qos(depth=100)  # as tf2's broadcaster
-CLOCK = Qos(reliable=False, depth=1)  # as ROS's own subscription
-COMMANDED = {  # what ROS asks of the robot; what it reads is in `table`
+TF = Qos(depth=100)  # as in tf2's broadcaster
+CLOCK = Qos(reliable=False, depth=1)  # as in ROS's own subscription
+COMMANDED = {  # interfaces for commands from ROS; published topics are in `table`
     "cmd_vel": CMD_VEL.key, "initialpose": POSE_SET.key, "goal_pose": GOAL.key,
     "navigate_to_pose": GOAL.key, "navigate_through_poses": MISSION.key, "estop": ESTOP.key,
     "release": RELEASE.key, "enable": ENABLE.key, "map_save": MAP_SAVE.key,
     "joint_trajectory": JOINT_CMD.key, "follow_joint_trajectory": JOINT_CMD.key,
 }  # fmt: skip
 OF_FIRST_CAMERA = ("image", "depth", "camera_info")  # parts of its topics, below `camera`
-# a message, or its CDR; None: nothing to publish
+# returns a message, or its CDR; None: nothing to publish
 Convert = Callable[[Make, Any, Scene], Any | None]
 
 
 @dataclass(frozen=True)
 class Row:
-    """A ROS topic, and what it is made of."""
+    """A ROS topic, and its sources."""
 
     topic: str  # below the namespace
     type: str
     qos: Qos
     sources: tuple[tuple[Topic[Any], Convert], ...]
     name: str = "*"  # of the camera
-    every_ns: int = 0  # shortest time between two
-    content: Callable[[Any, Scene], object] | None = None  # published again only if it changed
-    simulated: bool = False  # of a simulation only
+    every_ns: int = 0  # shortest time between two messages
+    content: Callable[[Any, Scene], object] | None = None  # published again only if this changes
+    simulated: bool = False  # for simulations only
 
 
 def _tf(make: Make, state: RobotState, scene: Scene) -> Any:
-    """Return the moving frames, with the map's as of now: it is known, and as good as then."""
+    """Return the moving frames, with the present pose of the map's frame."""
     frames = of_body.moving_frames(scene.body, state)
     if odom := scene.odom_in_map:
         frames.insert(0, on_floor(MAP_FRAME, ODOM, odom))
@@ -104,7 +104,7 @@ class _ImuSource:
         return None if streams else of_body.imu_of_state(make, state)
 
 
-IMU_TICKS = 50  # after which a stream has ended
+IMU_TICKS = 50  # a stream has ended after this silence
 
 
 def table() -> tuple[Row, ...]:
@@ -141,7 +141,7 @@ def _tf_static(make: Make, body: Body, scene: Scene) -> Any:
 
 
 def _robot_description(make: Make, body: Body, scene: Scene) -> Any | None:
-    """Return the URDF, which is whole: readers may take the first one for good."""
+    """Return the complete URDF, because readers may keep the first one; None before."""
     return None if scene.awaits_arm else robot_description(make, body, scene.arm)
 
 
@@ -150,7 +150,7 @@ def _plain(convert: Callable[[Make, Any], Any | None]) -> Convert:
 
 
 class _Plans:
-    """Publishes a path while there is one, and once the empty one behind it."""
+    """Publishes a path while there is one, and then an empty one once."""
 
     def __init__(self) -> None:
         self._empty = False
@@ -200,7 +200,7 @@ def _apart(name: str, names: Collection[str]) -> str:
 
 @dataclass
 class _Published:
-    """One row at work."""
+    """A published row."""
 
     row: Row
     publisher: RosPublisher | None = None
@@ -208,11 +208,11 @@ class _Published:
     closes: list[Close] = field(default_factory=list)
     sent_ns: int = -SECOND_NS
     fault: Fault = field(default_factory=lambda: Fault(log))
-    content: object = None  # of the last, where the row compares it
+    content: object = None  # of the last message, if the row compares it
 
 
 class Publishing:
-    """Publishers of all rows; one without readers neither receives nor encodes anything."""
+    """Publishers of all rows; those without readers receive and encode nothing."""
 
     def __init__(
         self,
@@ -222,7 +222,7 @@ class Publishing:
         config: Ros2Config,
         only: Collection[str] | None = None,
     ) -> None:
-        """Offer all topics that `config` does not leave out, or of these those in `only`."""
+        """Offer all topics that `config` does not leave out; with `only`, only those."""
         self._scene, self._ros, self._types, self._config = scene, ros, types, config
         self._only = only
         self._cameras: tuple[Camera, ...] = ()
@@ -236,7 +236,7 @@ class Publishing:
 
     @property
     def topics(self) -> list[str]:
-        """The topics that are offered now, below the namespace."""
+        """The present topics, below the namespace."""
         every = [*self._rows, *self._of_cameras]
         return [one.row.topic for one in every if one.publisher]
 
@@ -247,7 +247,7 @@ class Publishing:
             self._end(one)
 
     def _follow_body(self, body: Body) -> None:
-        """Offer the topics of its cameras, and of a simulation its clock."""
+        """Offer the topics of its cameras, and for a simulation the clock."""
         if self._closed:
             return
         if body.link == "sim" and self._simulated is None:
@@ -275,7 +275,7 @@ class Publishing:
             one.publisher.close()
 
     def _count(self, one: _Published, readers: int) -> None:
-        """Begin with the first reader, end with the last."""
+        """Subscribe with the first reader, and end with the last."""
         before, one.readers = one.readers, readers
         if readers and not one.closes and not self._closed:
             one.content, one.sent_ns = None, -SECOND_NS

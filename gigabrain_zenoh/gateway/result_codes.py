@@ -1,7 +1,7 @@
-"""Error codes of Nav2 for goals that fail, by what is known of the robot, its map and the goal.
+"""Error codes of Nav2 for failed goals, from robot, map and goal.
 
-The codes are those of ComputePathToPose, ComputePathThroughPoses and FollowPath of Jazzy, which
-Nav2 hands on as its navigators' own, and of the navigators of Kilted.
+The codes are those of ComputePathToPose, ComputePathThroughPoses and FollowPath in Jazzy, which
+Nav2's navigators return unchanged, and those of the navigators in Kilted.
 """
 
 import math
@@ -19,7 +19,7 @@ FAILED_TO_MAKE_PROGRESS = 105  # of FollowPath
 UNKNOWN, NO_BEHAVIOR_TREE, NO_TRANSFORM = 0, 1, 2  # from the navigator's first code
 NO_TF, START_OUTSIDE, GOAL_OUTSIDE, START_OCCUPIED, GOAL_OCCUPIED = 2, 3, 4, 5, 6
 NO_PATH = 8  # of the planners, from their first code
-OCCUPIED = 65  # of 100: a cell that no body stands on
+OCCUPIED = 65  # of 100, least value of an occupied cell
 
 
 class Codes(NamedTuple):
@@ -39,10 +39,10 @@ def of_refusal(
     grid: OccupancyGrid | None,
     radius: float,
 ) -> int:
-    """Return the code for a goal that no path leads to.
+    """Return the code for a goal without a path.
 
-    `here` is the robot in the map, None if it is not localized. `radius` [m] is that of the largest
-    circle in the footprint.
+    `here` is the robot's pose in the map, None if it is not localized. `radius` [m] is that of the
+    largest circle in the footprint.
     """
     if here is None or grid is None:
         return codes.planner + NO_TF

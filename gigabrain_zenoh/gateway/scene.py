@@ -1,4 +1,4 @@
-"""The gateway's data of the robot. Each message is decoded once for all that use it."""
+"""The gateway's data about the robot. Each message is decoded once for all users."""
 
 import logging
 from collections.abc import Callable
@@ -70,13 +70,13 @@ class Scene:
         self.on_body: list[Callable[[Body], None]] = []
         self.state: RobotState | None = None  # newest, of any age
         self._history, self._seen_ns = PoseHistory(), 0
-        self._pose: PoseInMap | None = None  # whose state has not come yet
+        self._pose: PoseInMap | None = None  # waits for the state of its tick
         self._odom_in_map: Pose | None = None
         self._states, self._poses = (
             bus.latest(STATE, self._take_state),
             bus.latest(POSE, self._place),
         )
-        self.arm: ArmFrames | None = None  # None also for a model that cannot be read
+        self.arm: ArmFrames | None = None  # None also for an unreadable model
         self._described: tuple[BodyDescription, str] | None = None
         self._arm_models = bus.latest(ARM_MODEL, lambda _: self._follow_arm())
         self._bodies = bus.latest(BODY, self._take_body)
@@ -119,7 +119,7 @@ class Scene:
         return compose(odom, self.state.pose) if odom and self.state else None
 
     def ros_ns(self) -> int:
-        """Return ROS time: Unix time; of a simulation the stamps of its states go on."""
+        """Return ROS time: Unix time, or for a simulation its extrapolated stamps [ns]."""
         if self.simulated and self.state:
             return self.state.stamp_ns + self.bus.clock.now_ns() - self._seen_ns
         return self.bus.clock.unix_ns()
@@ -127,7 +127,7 @@ class Scene:
     def _take_state(self, state: RobotState) -> None:
         self.state, self._seen_ns = state, self.bus.clock.now_ns()
         if state.boot != self._history.boot:
-            self._odom_in_map = None  # its odometry begins again
+            self._odom_in_map = None  # its odometry restarts
         self._history = self._history.then(state)
         if self._pose:
             self._place(self._pose)
@@ -135,7 +135,7 @@ class Scene:
             handle(state)
 
     def _place(self, pose: PoseInMap) -> None:
-        """Take a pose in the map once the odometry of its tick is known."""
+        """Use a pose in the map when the odometry of its tick is known."""
         then = self._history.at(pose.boot, pose.basis)
         self._pose = pose if then is None else None
         if not pose.localized:
@@ -144,7 +144,7 @@ class Scene:
             self._odom_in_map = compose(Pose(x=pose.x, y=pose.y, yaw=pose.yaw), inverse(then))
 
     def _follow_arm(self) -> None:
-        """Take an arm's model once its body is known, and again when either is another one."""
+        """Update the arm when its model or its body changes."""
         body, model = self._bodies.newest, self._arm_models.newest
         if not (body and body.description.arm and model):
             self._described = self.arm = None

@@ -1,7 +1,7 @@
 """Services for ROS: e-stop, release, enable, saving the map, and the node's parameters.
 
-`map_save` is a Trigger: it is in every ROS installation, and its reply has words, where Nav2's
-SaveMap answers true or false.
+`map_save` is a Trigger: every ROS installation has this type, and its reply has a text; Nav2's
+SaveMap replies only true or false.
 """
 
 import datetime
@@ -37,9 +37,9 @@ class Services:
         config: Ros2Config,
         forget: Callable[[str], None],
     ) -> None:
-        """Serve them; `forget` has ROS stop commanding, for a reason."""
+        """Serve them; `forget(reason)` stops all commanding by ROS."""
         self._scene, self._types, self._forget = scene, types, forget
-        self._logged = ("", "", 0)  # the last call that was logged, and when
+        self._logged = ("", "", 0)  # name, text and time of the last logged call
         acts: dict[str, tuple[str, Callable[[Any], Awaitable[str]]]] = {
             "estop": (SET_BOOL, self._estop),
             "release": (TRIGGER, self._release),

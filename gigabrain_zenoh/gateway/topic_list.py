@@ -1,4 +1,4 @@
-"""`gigabrain ros2 topics`: the ROS graph, with our keys beside what the gateway offers. Pure."""
+"""`gigabrain ros2 topics`: the ROS graph, with our keys for the gateway's topics. Pure."""
 
 from collections import defaultdict
 from collections.abc import Collection, Iterable
@@ -15,7 +15,7 @@ from gigabrain_zenoh.gateway.publishing import COMMANDED, table
 from gigabrain_zenoh.ros2.graph import ACTION, troubles
 from gigabrain_zenoh.ros2.transport import EndpointKind, GraphEndpoint
 
-EVERY_NODE = ("rcl_interfaces/", "type_description_interfaces/")  # types of what all nodes have
+EVERY_NODE = ("rcl_interfaces/", "type_description_interfaces/")  # types that all nodes use
 GOES_OUT: tuple[EndpointKind, ...] = ("publisher", "server")
 COLUMNS = ("name", "type", "QoS", "from", "to", "robot")
 Kind = Literal["topic", "service", "action"]
@@ -31,8 +31,8 @@ class TopicRow(Struct, frozen=True, kw_only=True):
     requested: tuple[str, ...]  # QoS of its subscribers or clients
     senders: tuple[str, ...]  # nodes that publish or serve
     receivers: tuple[str, ...]  # nodes that subscribe or call
-    robot_keys: tuple[str, ...]  # to which the gateway connects it
-    troubles: tuple[str, ...]  # why something does not arrive, and what to do
+    robot_keys: tuple[str, ...]  # keys that the gateway connects to it
+    troubles: tuple[str, ...]  # reasons for lost messages, with remedies
 
 
 def robot_keys(name: str) -> tuple[str, ...]:
@@ -51,7 +51,7 @@ def rows(
 ) -> list[TopicRow]:
     """Return a row for each name and type; `link` names the gateway's node.
 
-    Without `all_topics` what every node has, and the parts of actions, are left out.
+    Without `all_topics`, topics and services of every node, and parts of actions, are omitted.
     """
     endpoints = tuple(endpoints)
     wrong: dict[str, list[str]] = defaultdict(list)
@@ -93,7 +93,7 @@ def _lines(texts: Collection[str]) -> Text:
 
 
 def _group(one: GraphEndpoint, all_topics: bool) -> tuple[str, Kind, str] | None:
-    """Return the row of an endpoint; None for the part of an action that is not listed."""
+    """Return the row of an endpoint; None for a hidden part of an action."""
     kind: Kind = "topic" if one.kind in ("publisher", "subscriber") else "service"
     name, is_action, part = one.topic.partition(ACTION)
     if not is_action or all_topics:

@@ -1,4 +1,4 @@
-"""Requests that ROS publishes on topics, which have no reply: diagnostics name what was refused."""
+"""Requests on ROS topics, which have no reply: diagnostics show refusals."""
 
 import logging
 from collections import deque
@@ -19,18 +19,18 @@ Ask = Callable[[Any], Awaitable[str]]  # raises GigabrainError; returns a text f
 
 
 class TopicRequests:
-    """Asks for one message of a topic at a time; the newest one waits for it."""
+    """Handles one message of a topic at a time; the newest one waits."""
 
     def __init__(self, bus: Bus, ros: RosTransport, types: Types, work: Background) -> None:
         self._bus, self._ros, self._types, self._work = bus, ros, types, work
-        self.problems: dict[str, str] = {}  # the last fault, by topic; gone once one is accepted
+        self.problems: dict[str, str] = {}  # last fault, by topic; an accepted message clears it
 
     def status(self) -> list[Status]:
-        """Return lines of diagnostics for what went wrong last."""
+        """Return lines of diagnostics with the last faults."""
         return [Status(topic, Level.WARN, text) for topic, text in self.problems.items()]
 
     def fail(self, topic: str, text: str) -> None:
-        """Name a fault of a topic until its next message is accepted."""
+        """Report a fault of a topic until its next message is accepted."""
         self.problems[topic] = text
 
     def serve(self, topic: str, name: str, ask: Ask, max_bytes: int = MAX_COMMAND) -> Close:

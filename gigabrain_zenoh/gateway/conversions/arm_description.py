@@ -57,7 +57,7 @@ def _draw(link: xml.Element, part: str, shape: Shape) -> Iterator[xml.Element]:
 
 
 def _geometries(shape: Shape) -> Iterator[Geometry]:
-    """Yield a shape as a URDF can have it: an ellipsoid is the ball round it."""
+    """Yield a shape's URDF geometries; an ellipsoid becomes its outer sphere."""
     a, b, _ = shape.size
     if shape.kind == "box":
         yield "box", {"size": urdf.numbers(2 * side for side in shape.size)}, shape.place
@@ -89,7 +89,7 @@ def _join(robot: xml.Element, frame: ArmFrame) -> None:
 
 
 def _limits(joint: ArmJoint) -> dict[str, str]:
-    """Return limits; an effort of 0 is not known, as in the robot's file."""
+    """Return the limits; an effort of 0 is unknown, as in the robot's file."""
     about = joint.limits
     slope, offset = (joint.mimic.multiplier, joint.mimic.offset) if joint.mimic else (1.0, 0.0)
     lower, upper = sorted((slope * about.lower + offset, slope * about.upper + offset))

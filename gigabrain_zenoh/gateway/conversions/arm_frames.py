@@ -1,4 +1,4 @@
-"""The frames of an arm: its links as ROS describes them, one joint each, and where they are."""
+"""The frames of an arm for ROS: one joint per link, and their poses."""
 
 from collections.abc import Collection, Iterator, Mapping
 from typing import NamedTuple
@@ -18,7 +18,7 @@ HERE = Place()
 
 
 class Mimic(NamedTuple):
-    """Mimic joint: its position is `multiplier` times that of another one, plus `offset`."""
+    """Mimic joint: its position is `multiplier` times that of `joint`, plus `offset`."""
 
     joint: str
     multiplier: float
@@ -26,14 +26,14 @@ class Mimic(NamedTuple):
 
 
 class ArmJoint(NamedTuple):
-    """A joint that turns about an axis of its frame, or slides along it."""
+    """A joint that turns about an axis of its frame, or slides along one."""
 
     about: LinkJoint
-    limits: JointDescription  # of the leader, where it follows another joint
+    limits: JointDescription  # of the leading joint, for a mimic joint
     mimic: Mimic | None = None
 
     def position(self, positions: Mapping[str, float]) -> float:
-        """Return where it is [rad] or [m], for those that are measured."""
+        """Return its position [rad] or [m], from measured `positions`."""
         mimic = self.mimic
         if mimic and mimic.joint in positions and self.about.name not in positions:
             return mimic.multiplier * positions[mimic.joint] + mimic.offset
@@ -41,20 +41,20 @@ class ArmJoint(NamedTuple):
 
 
 class ArmFrame(NamedTuple):
-    """A frame in its parent's, with its joint at 0 where it has one."""
+    """A frame in its parent frame, at joint position 0."""
 
     name: str
     parent: str
     place: Place
     joint: ArmJoint | None = None  # at its origin
-    link: int = -1  # of the model, whose things it carries; -1: none
+    link: int = -1  # of the model, whose shapes it has; -1: none
 
 
 class ArmFrames:
     """The frames of one arm's model."""
 
     def __init__(self, model: LinkModel, about: BodyDescription, taken: Collection[str]) -> None:
-        """Take a model; links that are called as `taken` frames get a name of their own."""
+        """Make the frames; links with names in `taken` get other names."""
         self.model, self._about, self._taken = model, about, taken
         self._followers = {one.name: one for one in model.followers}
         self._limits = {joint.name: joint for joint in about.joints}
@@ -70,12 +70,12 @@ class ArmFrames:
         )
 
     def static(self) -> list[Placed]:
-        """Return the frames that do not move in their parent's."""
+        """Return the frames that are fixed to their parents."""
         own = [_placed(one, one.place) for one in self.frames if one.joint is None]
         return [*own, *self.cameras]
 
     def moving(self, state: RobotState) -> list[Placed]:
-        """Return the others, by the joints as measured."""
+        """Return the moving frames, from the measured joints."""
         at = {joint.name: joint.position for joint in state.joints}
         return [
             _placed(one, one.place @ moved(one.joint.about, one.joint.position(at)))
@@ -87,9 +87,7 @@ class ArmFrames:
         names = self._names
         parents = {link.parent for link in self.model.links}
         carriers = {shape.link for shape in self.model.every_shape}
-        needed = {
-            one.link for one in self._about.cameras if one.link
-        }  # others are sites of sensors
+        needed = {one.link for one in self._about.cameras if one.link}  # other sites are of sensors
         if self._about.arm:
             needed.add(self._about.arm.tool)
         for number, link in enumerate(self.model.links[1:], 1):
@@ -98,7 +96,7 @@ class ArmFrames:
                 yield from self._of_link(number, link, names[number], names[link.parent])
 
     def _of_link(self, number: int, link: Link, name: str, parent: str) -> Iterator[ArmFrame]:
-        """Yield the frame of each joint, and the link's own one where that is another one."""
+        """Yield the frame of each joint, and the link's own frame if it differs."""
         place = link.place
         known = [(one, joint) for one in link.joints if (joint := self._joint(one))]
         for about, joint in known:
@@ -111,7 +109,7 @@ class ArmFrames:
             yield ArmFrame(name, parent, place, link=number)
 
     def _joint(self, about: LinkJoint) -> ArmJoint | None:
-        """Return a joint that is measured, or follows one that is; None for others."""
+        """Return a measured joint or its mimic; None for others."""
         if about.name in self._limits:
             return ArmJoint(about, self._limits[about.name])
         follower = self._followers.get(about.name)
@@ -120,7 +118,7 @@ class ArmFrames:
         return ArmJoint(about, self._limits[follower.leader], self._mimic(about, follower))
 
     def _mimic(self, about: LinkJoint, follower: Follower) -> Mimic:
-        """Return how a joint follows, as far as ROS can say it: in proportion."""
+        """Return the linear part of how a joint follows; ROS knows no other."""
         shift, slope = (*follower.polynomial, 0.0, 0.0)[:2]
         offset = about.rest + shift - slope * self._rests[follower.leader]
         return Mimic(follower.leader, slope, offset)

@@ -42,7 +42,7 @@ def twist(make: Make, velocity: Velocity) -> Any:
 
 
 def odometry(make: Make, state: RobotState) -> Any:
-    """Return nav_msgs/Odometry; its covariances are not known."""
+    """Return nav_msgs/Odometry with unknown covariances."""
     return make(
         "nav_msgs/msg/Odometry",
         header=header(make, state.stamp_ns, ODOM),
@@ -61,7 +61,7 @@ def odometry(make: Make, state: RobotState) -> Any:
 
 
 def moving_frames(body: Body | None, state: RobotState) -> list[Placed]:
-    """Return the base in the odometry, and wheels on the base where they are known."""
+    """Return the base's frame in the odometry, and those of known wheels on the base."""
     frames = [on_floor(ODOM, FOOTPRINT, state.pose)]
     if body:
         angles = {joint.name: joint.position for joint in state.joints}
@@ -74,7 +74,7 @@ def moving_frames(body: Body | None, state: RobotState) -> list[Placed]:
 
 
 def joint_states(make: Make, state: RobotState) -> Any | None:
-    """Return sensor_msgs/JointState; None for a body without joints. NaN: effort not measured."""
+    """Return sensor_msgs/JointState; None without joints. NaN: effort not measured."""
     joints = state.joints
     if not joints:
         return None
@@ -91,7 +91,7 @@ def joint_states(make: Make, state: RobotState) -> Any | None:
 
 
 def battery_state(make: Make, state: RobotState) -> Any | None:
-    """Return sensor_msgs/BatteryState; None for a body that measures none."""
+    """Return sensor_msgs/BatteryState; None for a body without a battery."""
     battery = state.battery
     if battery is None:
         return None
@@ -113,7 +113,7 @@ def battery_state(make: Make, state: RobotState) -> Any | None:
 
 
 def _supply(battery: Battery) -> int:
-    if battery.current == 0.0:  # as good as never measured: it is the default
+    if battery.current == 0.0:  # the default: not measured
         return STATUS_UNKNOWN
     return DISCHARGING if battery.current > 0 else CHARGING
 
@@ -124,7 +124,7 @@ def imu(make: Make, reading: Imu) -> Any:
 
 
 def imu_of_state(make: Make, state: RobotState) -> Any | None:
-    """Return sensor_msgs/Imu of a body that has it in its state; None for others."""
+    """Return sensor_msgs/Imu from a state; None for a state without one."""
     return _imu(make, state.stamp_ns, state.imu) if state.imu else None
 
 
@@ -142,5 +142,5 @@ def _imu(make: Make, at_ns: int, reading: Imu | ImuData) -> Any:
 
 
 def clock(make: Make, state: RobotState) -> Any:
-    """Return rosgraph_msgs/Clock, by which a simulation's messages are stamped."""
+    """Return rosgraph_msgs/Clock, the time of a simulation's stamps."""
     return make("rosgraph_msgs/msg/Clock", clock=time(make, state.stamp_ns))

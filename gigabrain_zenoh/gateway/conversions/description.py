@@ -1,4 +1,4 @@
-"""A URDF of the body, from the footprint, wheels and sensors of its file, and its arm's model."""
+"""A URDF of the body: footprint, wheels and sensors from its file, and its arm's model."""
 
 import math
 from typing import Any, NamedTuple
@@ -19,8 +19,8 @@ from gigabrain_zenoh.gateway.conversions.frames import (
 )
 from gigabrain_zenoh.geometry.link_model import LinkModel
 
-WHEEL_WIDTH = 0.15  # of its diameter; files do not give it
-ROUND_CORNERS, ROUND_SHARE = 8, 0.03  # a footprint of so many corners, so equally far, is round
+WHEEL_WIDTH = 0.15  # of its diameter; robots' files do not contain it
+ROUND_CORNERS, ROUND_SHARE = 8, 0.03  # a round footprint: least corners, largest radius error
 MIN_HEIGHT = 0.02  # [m] of the hull that is drawn
 
 
@@ -34,7 +34,7 @@ class Wheel(NamedTuple):
 
 
 def wheels(about: BodyDescription) -> tuple[Wheel, ...]:
-    """Return the two wheels of a differential base whose file has their sizes; else none."""
+    """Return the two wheels of a differential base with known sizes; empty for others."""
     if about.drive_type != "differential" or not about.wheel_radius or not about.wheel_separation:
         return ()
     half, radius = about.wheel_separation / 2, about.wheel_radius
@@ -77,7 +77,7 @@ def robot_description(make: Make, body: Body, arm: ArmFrames | None = None) -> A
 
 
 def _hull(link: xml.Element, about: BodyDescription) -> None:
-    """Draw the footprint up to the body's height: a cylinder where it is round, else a box."""
+    """Draw the footprint up to the body's height: a cylinder if it is round, else a box."""
     xs, ys = zip(*about.footprint, strict=True)
     middle = (max(xs) + min(xs)) / 2, (max(ys) + min(ys)) / 2
     lift = about.wheel_radius if wheels(about) else 0.0

@@ -28,7 +28,7 @@ class Status(NamedTuple):
 
 
 def of_process(health: Health, age_ns: int) -> Status:
-    """Return the status of a process; its problems warn, and silence is stale."""
+    """Return the status of a process: WARN with problems, STALE when silent."""
     values = {
         "cpu": f"{health.cpu:.3f}",
         "rss_mb": f"{health.rss_bytes / 1e6:.0f}",

@@ -12,7 +12,7 @@ Rotation = tuple[float, float, float, float]  # quaternion x, y, z, w
 
 MAP, ODOM, FOOTPRINT, BASE = "map", "odom", "base_footprint", "base_link"
 IMU_LINK, SCAN_LINK = "imu_link", "base_scan"
-PARTS = ("base", "imu", "wheel_left", "wheel_right")  # of a body, whose frames end in `_link`
+PARTS = ("base", "imu", "wheel_left", "wheel_right")  # of a body, with frames `..._link`
 SECOND_NS = 1_000_000_000
 END_NS = 2**31 * SECOND_NS  # of builtin_interfaces/Time
 STRAIGHT: Rotation = (0.0, 0.0, 0.0, 1.0)
@@ -70,10 +70,10 @@ def rotated(roll: float, pitch: float, yaw: float) -> Rotation:
 
 
 def yaw_of(quaternion: Any) -> float | None:
-    """Return the heading [rad] of a ROS quaternion; None where it is no rotation."""
+    """Return the heading [rad] of a ROS quaternion; None if it is no rotation."""
     x, y, z, w = quaternion.x, quaternion.y, quaternion.z, quaternion.w
     length = x * x + y * y + z * z + w * w
-    if not 0.5 < length < 2.0:  # also NaN, and the zeros of a message that was not filled in
+    if not 0.5 < length < 2.0:  # also false for NaN, and for zeros of an empty message
         return None
     return math.atan2(2 * (w * z + x * y), length - 2 * (y * y + z * z))
 
@@ -129,19 +129,19 @@ def _transform(make: Make, at_ns: int, placed: Placed) -> Any:
 
 
 def camera_link(camera: str) -> str:
-    """Return the frame of a camera's mount, which looks along x; no part of the body has it."""
+    """Return the frame of a camera's mount (x forward), different from all body parts."""
     return f"{camera}_camera_link" if camera in PARTS else f"{camera}_link"
 
 
 def optical_frame(camera: str) -> str:
-    """Return the frame of a camera's pictures, which looks along z."""
+    """Return the frame of a camera's pictures (z forward)."""
     return f"{camera}_optical_frame"
 
 
 def static_frames(body: Body) -> list[Placed]:
-    """Return the frames that do not move on the base: its sensors, and itself on the floor.
+    """Return the static frames: sensors on the base, and the base on the floor.
 
-    A file gives no height of its lidar: it counts as the highest part.
+    The lidar counts as the highest part, because robots' files contain no height of it.
     """
     about = body.description
     frames = [Placed(FOOTPRINT, BASE, 0.0, 0.0, 0.0), Placed(BASE, IMU_LINK, 0.0, 0.0, 0.0)]
@@ -154,7 +154,7 @@ def static_frames(body: Body) -> list[Placed]:
 
 
 def camera_frames(camera: Camera, parent: str) -> list[Placed]:
-    """Return the frames of a camera that is mounted on the frame `parent`."""
+    """Return the frames of a camera on the frame `parent`."""
     link, rotation = camera_link(camera.name), rotated(camera.roll, camera.pitch, camera.yaw)
     return [
         Placed(parent, link, camera.x, camera.y, camera.z, rotation),
@@ -163,5 +163,5 @@ def camera_frames(camera: Camera, parent: str) -> list[Placed]:
 
 
 def tf_static(make: Make, body: Body, of_arm: Sequence[Placed] = ()) -> Any:
-    """Return tf2_msgs/TFMessage of the frames that do not move on the body, and on its arm."""
+    """Return tf2_msgs/TFMessage of the static frames of the body and its arm."""
     return transforms(make, body.stamp_ns, [*static_frames(body), *of_arm])

@@ -1,4 +1,4 @@
-"""The map, the path, and poses that ROS sends."""
+"""Conversions of map, path, and poses from ROS."""
 
 import itertools
 import math
@@ -22,12 +22,12 @@ from gigabrain_zenoh.gateway.conversions.frames import (
 )
 from gigabrain_zenoh.geometry.pose import compose
 
-FARTHEST = 1e5  # [m], of coordinates
-PLANAR = (0, 1, 5)  # of x, y, z, roll, pitch, yaw
+MAX_COORDINATE = 1e5  # [m]
+PLANAR = (0, 1, 5)  # indices of x, y, yaw among x, y, z, roll, pitch, yaw
 
 
 def occupancy_grid(make: Make, grid: OccupancyGrid) -> Any:
-    """Return nav_msgs/OccupancyGrid: 0 free to 100 occupied, -1 unknown, as ours."""
+    """Return nav_msgs/OccupancyGrid: 0 free to 100 occupied, -1 unknown, as in ours."""
     return make(
         "nav_msgs/msg/OccupancyGrid",
         header=header(make, grid.stamp_ns, MAP),
@@ -44,7 +44,7 @@ def occupancy_grid(make: Make, grid: OccupancyGrid) -> Any:
 
 
 def plan(make: Make, status: TaskStatus) -> Any:
-    """Return nav_msgs/Path of the way to the goal, headed along it; without one it is empty."""
+    """Return nav_msgs/Path to the goal, headed along it; empty without a path."""
     points = status.path
     yaws = [math.atan2(b[1] - a[1], b[0] - a[0]) for a, b in itertools.pairwise(points)]
     yaws.append(yaws[-1] if yaws else 0.0)
@@ -58,10 +58,10 @@ def plan(make: Make, status: TaskStatus) -> Any:
 
 
 def planar(ros_pose: Any) -> Pose:
-    """Return a geometry_msgs/Pose on the floor. Raises Refused for one that is none."""
+    """Return a geometry_msgs/Pose as a pose on the floor. Raises Refused if it is not one."""
     x, y = float(ros_pose.position.x), float(ros_pose.position.y)
     yaw = yaw_of(ros_pose.orientation)
-    if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST):
+    if not (abs(x) <= MAX_COORDINATE and abs(y) <= MAX_COORDINATE):
         raise Refused(f"the position ({x:g}, {y:g}) is none in a map; expected metres")
     if yaw is None:
         raise Refused("the orientation is no quaternion of length 1; expected w: 1.0 for straight")
@@ -69,7 +69,7 @@ def planar(ros_pose: Any) -> Pose:
 
 
 def in_map(frame: str, at: Pose, odom_in_map: Pose | None) -> Pose:
-    """Return a pose of ROS in the map; frames are `map` and `odom`. Raises Refused for others."""
+    """Return a pose in the map, from the frame `map` or `odom`. Raises Refused for others."""
     if frame == MAP:
         return at
     if frame != ODOM:
@@ -82,11 +82,11 @@ def in_map(frame: str, at: Pose, odom_in_map: Pose | None) -> Pose:
 def planar_covariance(values: Any) -> tuple[float, ...]:
     """Return the covariance of x, y and yaw, 9 values by row, of a ROS covariance of 36.
 
-    Empty where nothing is known: all zero. Raises Refused for one that is no covariance.
+    Empty for an unknown one, which is all zero. Raises Refused if it is no covariance.
     """
     full = np.asarray(values, np.float64).reshape(6, 6)
     part = full[np.ix_(PLANAR, PLANAR)]
-    bounded = (np.abs(part) <= FARTHEST**2).all()  # also False for NaN
+    bounded = (np.abs(part) <= MAX_COORDINATE**2).all()  # false for NaN
     if not bounded or np.linalg.eigvalsh((part + part.T) / 2).min() < -1e-9:
         raise Refused("the covariance is none: expected finite values, symmetric, none negative")
     if not part.any():

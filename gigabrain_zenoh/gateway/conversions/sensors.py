@@ -1,4 +1,4 @@
-"""Scans, pictures and depth."""
+"""Conversions of scans, pictures and depth."""
 
 import struct
 from typing import Any
@@ -11,7 +11,7 @@ from gigabrain_schemas.vision import DepthImage
 from gigabrain_zenoh.gateway.conversions.frames import Make, header, optical_frame, seconds
 
 LITTLE_ENDIAN = b"\0\1\0\0"
-HEAD = struct.Struct("<4siII")  # of a message with a header, up to the length of its frame
+HEADER = struct.Struct("<4siII")  # CDR header, and std_msgs/Header up to the length of its frame
 NUMBERS = struct.Struct("<7fI")  # of a scan, up to the number of its ranges
 NO_INTENSITIES = bytes(4)
 PLUMB_BOB, RATIONAL = 5, 8  # coefficients of ROS's two models
@@ -20,22 +20,22 @@ STRAIGHT.flags.writeable = False
 
 
 def laser_scan(scan: LaserScan, body: Body | None = None) -> bytes:
-    """Return sensor_msgs/LaserScan as CDR, packed by hand: a message takes six times as long.
+    """Return sensor_msgs/LaserScan as CDR, packed by hand, six times as fast as a message.
 
-    REP-117: infinite is free as far as the sensor reaches, NaN is unknown. So infinite ranges of a
-    lidar that cannot tell them apart become NaN. Raises ValueError like `seconds`.
+    REP-117: infinite means free up to the maximal range, NaN unknown. Infinite ranges of a lidar
+    that cannot distinguish the two become NaN. Raises ValueError like `seconds`.
     """
     ranges, lidar = scan.ranges, body.description.lidar if body else None
     if lidar and lidar.no_return == "unknown":
         found = scan.ranges_m
         ranges = np.where(np.isinf(found), np.float32(np.nan), found).tobytes()
     count, frame = len(ranges) // 4, scan.frame_id.encode() + b"\0"
-    head = HEAD.pack(LITTLE_ENDIAN, *seconds(scan.stamp_ns), len(frame))
+    head = HEADER.pack(LITTLE_ENDIAN, *seconds(scan.stamp_ns), len(frame))
     numbers = NUMBERS.pack(
         scan.angle_min,
         scan.angle_min + scan.angle_increment * (count - 1),
         scan.angle_increment,
-        0.0,  # from beam to beam [s]
+        0.0,  # time between beams [s]
         1.0 / lidar.rate_hz if lidar else 0.0,
         scan.range_min,
         scan.range_max,
@@ -79,7 +79,7 @@ def depth_image(make: Make, depth: DepthImage, camera: str) -> Any:
 
 
 def camera_info(make: Make, stamp_ns: int, camera: Camera) -> Any:
-    """Return sensor_msgs/CameraInfo with the stamp of its picture, by which ROS joins the two."""
+    """Return sensor_msgs/CameraInfo with the stamp of its picture, as ROS requires."""
     fx, fy, cx, cy = camera.pinhole
     given = camera.distortion
     size = RATIONAL if len(given) > PLUMB_BOB else PLUMB_BOB

@@ -27,19 +27,19 @@ def joint(robot: xml.Element, name: str, kind: str, placed: Placed) -> xml.Eleme
 def drawn(
     link: xml.Element, part: str, place: Vector, rpy: Vector
 ) -> tuple[xml.Element, xml.Element]:
-    """Add a `visual` or a `collision` to a link; return it, and its geometry to be filled in."""
+    """Add a `visual` or a `collision` to a link; return it, and its empty geometry."""
     made = xml.SubElement(link, part)
     origin(made, place, rpy)
     return made, xml.SubElement(made, "geometry")
 
 
 def origin(element: xml.Element, xyz: Vector, rpy: Vector) -> None:
-    """Add where an element is [m], and how it is turned [rad]."""
+    """Add the origin of an element: position [m] and rotation [rad]."""
     xml.SubElement(element, "origin", xyz=numbers(xyz), rpy=numbers(rpy))
 
 
 def angles(rotation: Rotation) -> Vector:
-    """Return roll, pitch and yaw [rad] of a quaternion x, y, z, w; of a pitch of 90° roll 0."""
+    """Return roll, pitch and yaw [rad] of a quaternion x, y, z, w; at a pitch of 90° roll is 0."""
     x, y, z, w = rotation
     sin, cos = 2 * (w * y - z * x), math.hypot(1 - 2 * (y * y + z * z), 2 * (w * z + x * y))
     pitch = math.atan2(sin, cos)
@@ -50,5 +50,5 @@ def angles(rotation: Rotation) -> Vector:
 
 
 def numbers(values: Iterable[float]) -> str:
-    """Return numbers as a URDF has them."""
+    """Return numbers in URDF syntax."""
     return " ".join(f"{value + 0.0:.9g}" for value in values)
