@@ -1,5 +1,5 @@
-"""The fault suite: breaks a robot in the ways of its rows, and judges it by their limits.
+"""The fault suite: each row breaks a robot in one way, and judges it by limits.
 
-`rows` holds the tests, grouped by subject; the modules beside it are their shared equipment.
+`rows` contains the tests, grouped by subject; the other modules are shared by them.
 Only the `gigabrain faults` command and tests may import it.
 """

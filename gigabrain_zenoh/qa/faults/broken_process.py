@@ -1,8 +1,8 @@
-"""Runs a robot's process with a part of it broken: what it publishes, handles, or its clocks.
+"""Runs a robot's process with one broken part: published or received messages, or clocks.
 
-Started as `python -m gigabrain_zenoh.qa.faults.broken_process KIND CONFIG` in place of the
-process itself. KIND is `hanging`, a kind of `CLOCK_SKEWS`, or names of `TAMPERINGS` with commas
-between. The machine's own clock is not touched.
+Started as `python -m gigabrain_zenoh.qa.faults.broken_process KIND CONFIG` instead of the process
+itself. KIND is `hanging`, a kind of `CLOCK_SKEWS`, or comma-separated names of `TAMPERINGS`. The
+machine's own clock does not change.
 """
 
 import functools
@@ -36,7 +36,7 @@ from gigabrain_zenoh.launch.processes import run_process
 
 M = TypeVar("M", bound=Message)
 Ranges = NDArray[np.float32]
-Shift = Callable[[int], int]  # how far a clock is off, so long after the start [ns]
+Shift = Callable[[int], int]  # error of a clock [ns], by the time since the start [ns]
 HANGING = "hanging"
 HANGING_TOPICS: dict[str, Topic[Any]] = {  # messages that are no longer handled, by process
     "perception": SCAN,
@@ -47,15 +47,15 @@ HANGING_TOPICS: dict[str, Topic[Any]] = {  # messages that are no longer handled
 FUTURE_TICKS = 50  # a second
 YEAR_1970_NS, YEAR_2100_NS = 1, 4_102_444_800_000_000_000
 HOUR_NS, YEAR_NS = 3_600_000_000_000, 31_557_600_000_000_000
-JUMPS_NS = (0, HOUR_NS, -HOUR_NS, 10 * YEAR_NS, -10 * YEAR_NS)  # one after the other
-STAY_NS = 1_300_000_000  # with each; no whole number of seconds, so that processes differ
-BACK_NS = 500_000_000  # in each second
+JUMPS_NS = (0, HOUR_NS, -HOUR_NS, 10 * YEAR_NS, -10 * YEAR_NS)  # in turn
+STAY_NS = 1_300_000_000  # duration of each; not whole seconds, so that processes differ
+BACK_NS = 500_000_000  # jump back, in each second
 OTHER_HOST_NS = 5_000_000_000
-OTHER_RATE = 200e-6  # faster than the true one
+OTHER_RATE = 200e-6  # rate error: too fast
 
 
 class HangingBus(Bus):
-    """A bus that stops handing on messages of one topic once `hangs` is set."""
+    """A bus that stops delivering messages of one topic when `hangs` is set."""
 
     def __init__(
         self,
@@ -76,7 +76,7 @@ class HangingBus(Bus):
         *,
         name: str = "*",
     ) -> Close:
-        """Subscribe as any bus does."""
+        """Subscribe; messages of the hung topic are dropped while it hangs."""
 
         def handle(key: str, message: M) -> None:
             if topic is not self._hung or not self._hangs.is_set():
@@ -86,7 +86,7 @@ class HangingBus(Bus):
 
 
 class Tampering(NamedTuple):
-    """A topic, and the message or bytes that are sent in place of each message on it."""
+    """A topic, and a function that replaces each message on it by a message or bytes."""
 
     topic: Topic[Any]
     change: Callable[[Any], Message | bytes]
@@ -106,7 +106,7 @@ def _half(values: Ranges) -> Ranges:
 
 
 def _crooked(scan: LaserScan) -> bytes:
-    # an angle_increment of 0, which no LaserScan can have
+    # an angle_increment of 0, which is invalid
     plain = msgspec.to_builtins(scan, builtin_types=(bytes,))
     return msgspec.msgpack.encode({**plain, "angle_increment": 0.0})
 
@@ -123,7 +123,7 @@ def _battery(percentage: float, volts: float) -> Tampering:
 
 
 def _hot(state: RobotState) -> Message:
-    # 40 degrees more than a warm motor
+    # 40 degrees above a warm motor
     return replace(state, joints=tuple(replace(j, temperature=85.0) for j in state.joints))
 
 
@@ -181,17 +181,17 @@ def tampering_bus(steps: TamperingSteps, transport: Transport, clock: Clock, nam
 
 
 def jumps(since_ns: int) -> int:
-    """Return jumps by an hour and ten years, and half a second back every second."""
+    """Return errors with jumps by an hour and ten years, and half a second back every second."""
     return JUMPS_NS[since_ns // STAY_NS % len(JUMPS_NS)] - since_ns // 1_000_000_000 * BACK_NS
 
 
 def other_host(since_ns: int) -> int:
-    """Return the offset of a host that is five seconds ahead and 200 ppm too fast."""
+    """Return the error of a clock that is five seconds ahead and 200 ppm too fast."""
     return OTHER_HOST_NS + drift(since_ns)
 
 
 def drift(since_ns: int) -> int:
-    """Return what a clock that is 200 ppm too fast gains."""
+    """Return the error of a clock that is 200 ppm too fast."""
     return round(since_ns * OTHER_RATE)
 
 

@@ -33,16 +33,16 @@ FLOODER = "flooder"
 URGENT = replace(CMD_VEL, priority="real_time", express=True)
 PERIOD_NS = 5_000_000
 LARGE_PERIODS = 100  # periods between two large messages
-LARGE_TOPICS = (IMAGE, SCAN, INTENT, TELEOP, CMD_VEL)  # of the large messages, in turn
+LARGE_TOPICS = (IMAGE, SCAN, INTENT, TELEOP, CMD_VEL)  # of large messages, in turn
 ASKED_KEY = DESCRIBE.at("driver")
-ASKED_AT_ONCE, MAX_ASKED = 5, 2000  # queries in a period, and those that may be pending
+ASKED_AT_ONCE, MAX_ASKED = 5, 2000  # queries per period, and pending queries
 ANSWER_S = 5.0
 PICTURES_HZ, PICTURE_BYTES = 100.0, 1_000_000
 COMMANDS_PER_PICTURE = 10  # 1000 a second, of a client that has not asked for the body
 
 
 def spin() -> None:
-    """Use all of a core."""
+    """Use a core completely."""
     for _ in itertools.count():
         pass
 
@@ -55,7 +55,7 @@ def fill() -> None:
 
 
 def litter() -> None:
-    """Make objects for the garbage collector, a million at a time."""
+    """Create objects for the garbage collector, a million at a time."""
     for _ in itertools.count():
         ring: list[object] = []
         ring.extend([ring] for _ in range(OBJECTS))
@@ -154,7 +154,7 @@ async def running(kind: str, *words: str) -> AsyncIterator[asyncio.subprocess.Pr
     try:
         yield process
     finally:
-        with contextlib.suppress(ProcessLookupError):  # it has ended by itself
+        with contextlib.suppress(ProcessLookupError):  # it has already ended
             process.kill()
         await process.wait()
 

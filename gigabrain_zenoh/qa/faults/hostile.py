@@ -69,9 +69,9 @@ LONGEST_NOISE = 400  # bytes
 
 
 BOOT, COMMANDER = 7, "script"
-FIRST_TICKS = 30  # until the gate may be released, and is calm
+FIRST_TICKS = 30  # before the gate may be released
 TINY, HUGE = 5e-324, 1e300
-PARTNERS = 3  # other extremes of the same message that each valid one is paired with
+PARTNERS = 3  # number of other extremes that each valid extreme is paired with
 WORST = (BODY, MAP, SCAN, STATE, WORLD, POSE, CMD_VEL, INTENT, SAFETY, IMU)  # what a body moves by
 CHOSEN = 200  # messages in the suite, and those of them that have once stopped a robot:
 KNOWN = (
@@ -98,9 +98,9 @@ Change = tuple[Path, Any]
 
 
 def hostile_values(message: type[Message], seed: int = 0) -> Iterator[dict[str, Any]]:
-    """Yield, without end, the example of `message` as a plain map with one value replaced.
+    """Yield endlessly the example of `message` as a plain map with one replaced value.
 
-    Most are no longer valid, but some are: -0.0 is a number, and a name may be empty.
+    Most are invalid, but some are valid: -0.0 is a number, and a name may be empty.
     """
     chance, whole = random.Random(seed), as_map(message)
     paths = [path for path, _ in leaves(whole)]
@@ -110,7 +110,7 @@ def hostile_values(message: type[Message], seed: int = 0) -> Iterator[dict[str, 
 
 
 def hostile_payloads(message: type[Message], seed: int = 0) -> Iterator[bytes]:
-    """Yield, without end, bytes of every hostile kind, none of which is a valid `message`."""
+    """Yield endlessly bytes of every hostile kind; none is a valid `message`."""
     chance = random.Random(seed)
     values, codec = hostile_values(message, seed), codec_of(message)
     while True:
@@ -163,7 +163,7 @@ def _without_one(whole: dict[str, Any], chance: random.Random) -> dict[str, Any]
 
 
 def codec_of(message: type[Message]) -> Codec[Any]:
-    """Return the codec with which the bus would decode `message`."""
+    """Return the codec of `message` on the bus."""
     limits: dict[type[Message], int] = {}
     for service in SERVICES:
         limits[service.request] = limits[service.reply] = service.max_bytes
@@ -211,13 +211,13 @@ class OpenGate:
         self.open()
 
     def open(self) -> None:
-        """Enable the commander, as soon as the gate agrees."""
+        """Enable the commander as soon as the gate allows it."""
         while self.state.mode == "stopping":
             self.tick()
         self._ask(gate.Enable(COMMANDER))
 
     def tick(self, count: int = 1) -> None:
-        """Let `count` ticks pass, with a verdict of safety in each."""
+        """Advance by `count` ticks, with a verdict of safety in each."""
         for _ in range(count):
             self.feed(gate.Tick(Velocity()))
             verdict = SafetyState(verdict="ok", boot=self.state.boot, tick=self.state.tick)
@@ -293,7 +293,7 @@ def all_extremes() -> tuple[ExtremeMessage, ...]:
 
 @functools.cache
 def chosen_extremes() -> tuple[ExtremeMessage, ...]:
-    """Return those that are known, and others that decode, evenly spread; CHOSEN at most."""
+    """Return KNOWN ones, and others that decode, evenly spread; at most CHOSEN."""
     known = [one for one in all_extremes() if (one.to, one.what) in KNOWN]
     numbers = {one.number for one in known}
     valid = [one for one in all_extremes() if one.number not in numbers and decodes(one)]
@@ -329,7 +329,7 @@ def _singles(to: Topic[Any] | Service[Any, Any]) -> Iterator[tuple[str, Change]]
 
 
 def _maps() -> Iterator[tuple[str, tuple[Change, ...]]]:
-    """Yield maps whose size and cells agree, with the least and the largest cells."""
+    """Yield maps with consistent size and cells, for the smallest and the largest cells."""
     for width, height, cell in MAPS:
         for resolution in (0.001, 0.05, 1.0):
             yield (
@@ -342,7 +342,7 @@ def _maps() -> Iterator[tuple[str, tuple[Change, ...]]]:
 
 
 def _pairs(to: Topic[Any]) -> Iterator[tuple[str, tuple[Change, ...]]]:
-    """Pair each extreme that decodes with some others of the same message, always the same ones."""
+    """Pair each extreme that decodes with some others of the same message; deterministic."""
     singles = [
         (what, change)
         for what, change in _singles(to)
@@ -375,7 +375,7 @@ def _places(of: Any, value: Any, path: Path) -> Iterator[tuple[Path, str, Any]]:
 
 
 def _inside(of: Any, value: Any) -> Iterator[tuple[Any, str | int]]:
-    """Yield the types within a type, and their keys in `value`; only the first of what repeats."""
+    """Yield the types within a type, and their keys in `value`; only the first of repeated ones."""
     if isinstance(of, inspect.StructType):
         for index, field in enumerate(of.fields):
             at: str | int = index if of.array_like else field.encode_name
@@ -419,7 +419,7 @@ def _extremes(of: Any, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _bytes(value: bytes, most: int) -> Iterator[tuple[str, bytes]]:
-    """Yield as many bytes of the same floats, and as many as there may be of the present ones."""
+    """Yield equally many bytes of extreme floats, and as many of the present bytes as allowed."""
     for name, number in FLOATS.items():
         yield name, (struct.pack("<f", number) * (len(value) // 4 + 1))[: len(value)]
     yield "longest", (value * (most // max(1, len(value)) + 1))[:most]

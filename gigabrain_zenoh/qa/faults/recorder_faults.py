@@ -1,4 +1,4 @@
-"""Faults of the recorder: killed at any moment, its file cut anywhere, its disk slow or full."""
+"""Faults of the recorder: killed at any time, with a truncated file, a slow or a full disk."""
 
 import asyncio
 import errno
@@ -29,11 +29,11 @@ KILLS, LONG_KILLS = 3, 50
 LIFE_S = (1.0, 2.0)  # between a start of the recorder and its death
 CUTS, LONG_CUTS = 100, 5000  # of the last MB
 MB = 1_000_000
-SENT, SCAN_BYTES = 1500, 1440  # to a bad disk
-FULL_EVERY = 400  # messages, after which a disk is full for a moment
-SLOW_S = 0.002  # for a scan of 2 kB: about 1 MB a second
-PACE_S = 0.0005  # between two scans: faster than that
-MARGIN_S = 0.1  # by which suite and recorder may differ about a time of arrival
+SENT, SCAN_BYTES = 1500, 1440  # number of scans for a bad disk, and their size
+FULL_EVERY = 400  # messages between two moments of a full disk
+SLOW_S = 0.002  # per scan of 2 kB: about 1 MB a second
+PACE_S = 0.0005  # between two scans, faster than the slow disk
+MARGIN_S = 0.1  # difference between suite and recorder about a time of arrival
 ArrivalTimes = dict[tuple[str, int, int], int]  # by key, boot and number [ns, Unix]
 
 
@@ -62,7 +62,7 @@ async def kill_recorder(rig: Rig) -> tuple[float, int, float]:
 
 
 def _watch(robot: RobotUnderTest) -> ArrivalTimes:
-    """Note when each message arrives that the recorder should have."""
+    """Record the arrival of each message that the recorder should have."""
     arrivals: ArrivalTimes = {}
 
     def note(key: str, _encoding: str, payload: bytes) -> None:
@@ -102,13 +102,13 @@ def _absent(samples: list[Sample], arrivals: ArrivalTimes) -> int:
     there = {(s.key, s.header.boot, s.header.seq) for s in samples}
     first_ns, last_ns = samples[0].log_ns, samples[-1].log_ns
     margin_ns = round(MARGIN_S * 1e9)
-    until_now = arrivals.copy().items()  # another thread goes on writing
+    until_now = arrivals.copy().items()  # another thread still writes
     due = (what for what, ns in until_now if first_ns + margin_ns < ns < last_ns - margin_ns)
     return sum(what not in there for what in due)
 
 
 def _cut(path: Path, cuts: int, chance: random.Random) -> int:
-    """Cut a file at random places; count pieces that lack what they or a shorter piece had."""
+    """Truncate a file at random places; count pieces with fewer messages than expected."""
     whole, wrong, least = path.read_bytes(), 0, 0
     every = [sample.log_ns for sample in Bag(path)]
     piece = path.with_suffix(".cut")
@@ -125,7 +125,7 @@ def _cut(path: Path, cuts: int, chance: random.Random) -> int:
 
 
 class BadDisk(BagWriter):
-    """A recording on a disk that is slow, or full now and then."""
+    """A recording on a disk that is slow, or sometimes full."""
 
     slow = full = False
     count = 0
@@ -147,7 +147,7 @@ class SlowDisk(BadDisk):
 
 
 class FullDisk(BadDisk):
-    """A disk that is full now and then."""
+    """A disk that is sometimes full."""
 
     full = True
 

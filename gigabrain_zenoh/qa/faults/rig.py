@@ -1,4 +1,4 @@
-"""Hands out robots under test, and measures how a driving robot comes to rest after a fault."""
+"""Provides robots under test, and measures how a driving robot stops after a fault."""
 
 import itertools
 import signal
@@ -43,7 +43,7 @@ from gigabrain_zenoh.qa.robot_under_test import (
 from gigabrain_zenoh.runtime.managed_process import Backoff, ProcessSpec
 
 BROKEN_PROCESS = (sys.executable, "-P", "-m", "gigabrain_zenoh.qa.faults.broken_process")
-SPEED = 0.26  # [m/s], of all tests that do not say otherwise
+SPEED = 0.26  # [m/s], default of the tests
 BODIES: dict[Stage, str] = {
     "sim": "turtlebot3_waffle",
     "auto": "turtlebot3_waffle",
@@ -52,13 +52,13 @@ BODIES: dict[Stage, str] = {
     "tcp": "alpha",
     "arm": "so101",
 }
-SLOWER = 0.01  # [m/s], half of what a body brakes in a tick
-RESTED_TICKS = 50  # how long a robot must stand once all is well again
+SLOWER = 0.01  # [m/s], half of a body's braking per tick
+RESTED_TICKS = 50  # a robot must stand this long after the end of a fault
 
 BRAKES, ZERO = Figure("brakes after", "ms"), Figure("zero after", "ms")
 TRAVEL = Figure("travel", "m")
-MOVED_AGAIN = Figure("moved again", "m")  # before a person has enabled it again
-STALE = Figure("stale commands executed")  # they rest on data older than 250 ms
+MOVED_AGAIN = Figure("moved again", "m")  # before a person enables it again
+STALE = Figure("stale commands executed")  # based on data older than 250 ms
 MOTORS_ZERO = Figure("motors zero after", "ms")
 DEATHS = Figure("deaths")
 STOPS = Figure("unexplained stops")
@@ -78,16 +78,16 @@ HOLE = Chaos(hole=True)
 class Options:
     """Options of a run of the suite."""
 
-    body: str = ""  # instead of each stage's own
+    body: str = ""  # replaces the body of each stage
     world: str = "arena"
     behaviour: str = "avoid"
     cameras: bool = False
-    long: bool = False  # the forms for a release, instead of those for every change
-    wall: bool = True  # judge wall-clock limits too, which need an otherwise idle machine
+    long: bool = False  # long forms, for a release
+    wall: bool = True  # also judge wall-clock limits, which need an otherwise idle machine
 
 
 class Rig:
-    """Hands out running robots. Used as `async with`; no process is left afterwards."""
+    """Provides running robots inside its `async with` block; no process is left afterwards."""
 
     def __init__(self, options: Options, folder: Path) -> None:
         self.options, self.folder = options, folder
@@ -96,7 +96,7 @@ class Rig:
         self._robots: list[RobotUnderTest] = []
 
     def pids(self) -> list[int]:
-        """Return the pids of all processes that are ready, of all running robots."""
+        """Return the pids of all ready processes of all running robots."""
         return [pid for robot in self._robots for pid in robot.ready_pids()]
 
     @property
@@ -106,7 +106,7 @@ class Rig:
 
     @property
     def body(self) -> str:
-        """The body of tests that run no robot."""
+        """The body of tests without a robot."""
         return self.options.body or BODIES["sim"]
 
     @property
@@ -121,9 +121,9 @@ class Rig:
         await self.end_robot()
 
     async def robot(self, stage: Stage) -> RobotUnderTest:
-        """Return the robot of a stage: the running one if it is reusable, else a new one.
+        """Return a robot of a stage: the running one if it is reusable, else a new one.
 
-        Raises Skipped where the chosen body cannot play that part.
+        Raises Skipped if the chosen body does not fit the stage.
         """
         kept, wanted = self._kept, deployment_of(self.options, stage)
         if kept and (kept[0] != wanted or not kept[1].reusable):
@@ -138,7 +138,7 @@ class Rig:
         self, deployment: Deployment, change: Change | None = None,
         backoff: Backoff = NEVER_GIVE_UP, *, keep_stuck: bool = True,
     ) -> RobotUnderTest:  # fmt: skip
-        """Return a robot that is not started yet. To be used as `async with`, after `end_robot`."""
+        """Return a robot that is not started. Use it as `async with`, after `end_robot`."""
         folder = self.fresh_folder()
         robot = RobotUnderTest(deployment, folder, change, backoff, keep_stuck=keep_stuck)
         self._robots.append(robot)
@@ -149,7 +149,7 @@ class Rig:
         self, deployment: Deployment, change: Change | None = None,
         backoff: Backoff = NEVER_GIVE_UP, *, keep_stuck: bool = True, checked: bool = True,
     ) -> AsyncIterator[RobotUnderTest]:  # fmt: skip
-        """Run a robot for one test alone; contacts and deaths fail the test if `checked`."""
+        """Run a robot for one test only; with `checked`, contacts and deaths fail the test."""
         await self.end_robot()
         async with self.new(deployment, change, backoff, keep_stuck=keep_stuck) as robot:
             await robot.settle()
@@ -170,13 +170,13 @@ class Rig:
             await kept[1].close()
 
     async def check(self) -> None:
-        """Raise Failed where a test has left contacts or a dead process behind."""
+        """Raise Failed if a test has caused contacts or a dead process."""
         if self._kept:
             await self._kept[1].check()
 
 
 def deployment_of(options: Options, stage: Stage, resume: Resume = "manual") -> Deployment:
-    """Return the deployment of a stage. Raises Skipped where the chosen body has no such link."""
+    """Return the deployment of a stage. Raises Skipped if the chosen body has no such link."""
     body = options.body or BODIES[stage]
     link: LinkName = "sim" if stage in ("sim", "auto") else "emulated"
     wire: Literal["serial", "tcp", ""] = wire_kind(body) if link == "emulated" else ""
@@ -209,7 +209,7 @@ def deployment_of(options: Options, stage: Stage, resume: Resume = "manual") -> 
 
 
 def broken(names: tuple[str, ...], kind: str) -> Change:
-    """Return a change of deployment in which the named processes run broken."""
+    """Return a change of deployment that breaks the named processes."""
 
     def change(specs: list[ProcessSpec]) -> list[ProcessSpec]:
         return [
@@ -224,24 +224,24 @@ def broken(names: tuple[str, ...], kind: str) -> Change:
 
 @asynccontextmanager
 async def tampered(rig: Rig, *kinds: str) -> AsyncIterator[RobotUnderTest]:
-    """Boot a robot whose driver publishes what `kinds` of `broken_process.TAMPERINGS` say."""
+    """Start a robot whose driver tampers by `kinds` of `broken_process.TAMPERINGS`."""
     change = broken(("driver",), ",".join(kinds))
     async with rig.own_robot(deployment_of(rig.options, "sim"), change) as robot:
         yield robot
 
 
 def next_step(robot: RobotUnderTest) -> None:
-    """Begin the next kind of tampering, or end the present one."""
+    """Start the next kind of tampering, or end the present one."""
     robot.signal("driver", signal.SIGUSR1)
 
 
 class Stop(NamedTuple):
     """A stop from straight driving."""
 
-    brakes_ms: float  # from the last tick of the victim to the first that slows the body down
-    zero_ms: float  # to the first tick from which the body is measured at rest
-    travel_m: float  # by the physics, until at rest
-    distance_m: float  # the whole path so far, by the physics
+    brakes_ms: float  # from the victim's last tick to the first slower one
+    zero_ms: float  # from there to the first tick at rest, as measured
+    travel_m: float  # true distance until rest
+    distance_m: float  # true length of the whole path so far
 
     def figures(self) -> dict[Figure, float]:
         """Return the figures of `STOPS_IN_TIME`."""
@@ -249,9 +249,9 @@ class Stop(NamedTuple):
 
 
 async def stop_by(robot: RobotUnderTest, fault: Callable[[], object], victim: str = "") -> Stop:
-    """Cause a fault while the brain drives, and wait until the gate is shut and the body rests.
+    """Cause a fault while the brain drives; wait until the gate is shut and the body rests.
 
-    Times count from the last tick that the `victim` has answered.
+    Times count from the last tick that the `victim` answered.
     """
     probe = robot.probe
     await robot.until_driving()
@@ -271,10 +271,10 @@ async def stop_by(robot: RobotUnderTest, fault: Callable[[], object], victim: st
 
 
 def _last_answer(probe: Probe, victim: str, start: RobotState) -> int:
-    """Return the newest tick that the victim has answered.
+    """Return the newest tick that the victim answered.
 
-    Called once the gate shuts: by then all answers have arrived, however busy the machine is, and
-    the victim has not been restarted yet.
+    Call it when the gate shuts: then all answers have arrived, even on a busy machine, and the
+    victim is not restarted yet.
     """
     newest = {
         "decision": probe.intent.current,
@@ -285,7 +285,7 @@ def _last_answer(probe: Probe, victim: str, start: RobotState) -> int:
 
 
 def first_slower(probe: Probe, start: RobotState, begin: int) -> int:
-    """Return the first tick since `begin` that slows the body: a slower command, or a shut gate."""
+    """Return the first tick since `begin` with a slower command, or a shut gate."""
     shut = next(s.tick for s in probe.since(start)[1:] if s.gate.mode != "enabled")
     ours = [c for c in probe.commands if c.boot == start.boot]
     speed = next((c.linear_x for c in reversed(ours) if c.tick <= begin), 0.0)
@@ -294,7 +294,7 @@ def first_slower(probe: Probe, start: RobotState, begin: int) -> int:
 
 
 def first_zero(probe: Probe, start: RobotState, begin: int) -> int:
-    """Return the tick since `begin` from which the body is measured at rest."""
+    """Return the first tick since `begin` from which the body rests, as measured."""
     moving = [s.tick for s in probe.since(start) if s.tick > begin and not at_rest(s)]
     return (moving[-1] if moving else begin) + 1
 
@@ -303,7 +303,7 @@ def first_zero(probe: Probe, start: RobotState, begin: int) -> int:
 async def behind_proxy(
     rig: Rig, *names: str, resume: Resume = "manual"
 ) -> AsyncIterator[tuple[RobotUnderTest, TcpProxy]]:
-    """Boot a robot whose named processes reach the others through a proxy."""
+    """Start a robot whose named processes connect to the others through a proxy."""
     deployment = with_free_port(deployment_of(rig.options, "sim", resume))
     async with TcpProxy(address_of(client_endpoint(deployment))) as proxy:
 
@@ -321,7 +321,7 @@ async def behind_proxy(
 
 @asynccontextmanager
 async def proxy_to(robot: RobotUnderTest) -> AsyncIterator[tuple[TcpProxy, Endpoint]]:
-    """Put a proxy before a robot's router; yields it and the endpoint of clients behind it."""
+    """Put a proxy before a robot's router; yield it, and the endpoint for clients."""
     async with TcpProxy(address_of(robot.endpoint)) as proxy:
         yield proxy, structs.replace(robot.endpoint, connect=(proxy.endpoint,))
 
@@ -333,13 +333,13 @@ def address_of(endpoint: Endpoint) -> tuple[str, int]:
 
 
 class Forger:
-    """Sends messages with whatever header they have, and bytes that are no message."""
+    """Sends messages with their own header, and arbitrary bytes."""
 
     def __init__(self, transport: ZenohTransport) -> None:
         self._transport = transport
 
     def send(self, topic: Topic[Any], message: Message) -> None:
-        """Send a message with the header that it has."""
+        """Send a message with its own header."""
         self.send_bytes(topic, codec.encode(message), codec.encoding_of(topic.type))
 
     def send_bytes(self, topic: Topic[Any], payload: bytes, encoding: str = "") -> None:

@@ -1,4 +1,4 @@
-"""Runs fault tests one after the other, those that share a robot together, and judges them.
+"""Runs fault tests in turn, grouped by the robot that they share, and judges them.
 
 Speeds are 0.26 m/s unless a row says otherwise. Times are the robot's own (ticks of 20 ms) or the
 simulation's; those marked `wall` are wall time. Travel and contacts are the physics' truth. From
@@ -35,11 +35,11 @@ from gigabrain_zenoh.qa.judging import (
     judge,
 )
 
-MAX_DISTURBED = 3  # disturbed runs for each that counts, passed or failed
-LIMIT_S = 300.0  # for one run of one test in its short form
+MAX_DISTURBED = 3  # disturbed runs for each run that counts
+LIMIT_S = 300.0  # timeout of a run in its short form
 STAGES = get_args(Stage)
 POLL_S = 0.1
-DISTURBED_MS = 30.0  # of 100: a tick and a half in which a part of the robot could not run
+DISTURBED_MS = 30.0  # of 100, in which a part of the robot could not run; 1.5 ticks
 MAX_FILE_BYTES = 100_000_000
 
 RowBegun = Callable[[FaultRow], None]

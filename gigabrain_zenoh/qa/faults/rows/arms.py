@@ -1,6 +1,6 @@
 """Faults while an emulated arm moves or carries a thing: it rests, and drops nothing.
 
-It rests from when on no joint is more than 2 deg from where it ends.
+It is at rest when no joint is more than 2 deg from its final position.
 """
 
 import asyncio
@@ -21,10 +21,10 @@ from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
 SILENT_SERVO = 3  # the elbow's, while the first joint moves
 JOG_RAD_S = 1.0  # as fast as it carries things
 FAST_RAD_S = 0.8
-MIDDLE_RAD = 0.7  # round which it has room to go on
+MIDDLE_RAD = 0.7  # middle of the operator's motion, with room on both sides
 TURN_RAD = 1.2  # from the middle, where the operator turns back
 JOG_S = 0.05  # between two messages of the operator
-CARRIES_RAD_S = 0.5  # of the fastest joint, while it carries something
+CARRIES_RAD_S = 0.5  # of the fastest joint, while it carries a thing
 ALL = ("router", "driver", "perception", "decision", "control", "safety")
 REST_S = 1.5  # of simulated time, in which every arm has come to rest
 AGAIN = Figure("moved again", "ms")

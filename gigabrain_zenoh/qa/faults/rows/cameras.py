@@ -16,7 +16,7 @@ from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
 LOST = "camera_lost"
 BLIND_TICKS = 100  # for which a frozen camera stays frozen
 SLOW_M_S = 0.01
-DRIVING_SHARE = 0.5  # of the brain's speed that shows that it goes on
+DRIVING_SHARE = 0.5  # least share of the brain's speed of a robot that drives again
 
 NAMED = Figure("named after", "ms")
 WENT_AHEAD = Figure("went ahead blind", "m/s")
@@ -52,7 +52,7 @@ def _needs_cameras() -> None:
 async def _blinded(
     robot: RobotUnderTest, fault: Callable[[], object], mend: Callable[[], object] | None = None
 ) -> Measured:
-    """Return how a driving body stops when its pictures end, and when it goes on.
+    """Return how a driving body stops when its pictures end, and when it drives again.
 
     Without `mend` the supervisor mends.
     """

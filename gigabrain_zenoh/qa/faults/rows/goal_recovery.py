@@ -27,7 +27,7 @@ MIN_SPEED = 0.12  # [m/s], of a robot that counts as under way
 DEATHS = (("decision", 0.4), ("perception", 1.0))  # [m] from the start
 ARRIVAL_S = 120.0  # of wall time
 KILLS = 20  # in the long form
-EXPLORED_M, EXPLORE_S = 1.0, 180.0  # before each kill, and how long that may take
+EXPLORED_M, EXPLORE_S = 1.0, 180.0  # distance before each kill, and its timeout
 
 MOVED_WITHOUT = Figure("moved without it", "m")
 GOES_ON = Figure("goes on after", "s")

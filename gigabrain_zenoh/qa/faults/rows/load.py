@@ -32,17 +32,17 @@ LOADED_S, LONG_LOADED_S = 10.0, 600.0
 SETTLE_S = 3.0  # until the loads are at work
 ESTOPS = 10  # after each death
 PRESSES, LONG_PRESSES = 100, 300
-RECENT_TICKS = 250  # within which the promptest says when the others were due
+RECENT_TICKS = 250  # window; its most punctual tick defines when the others were due
 FLOODED_S, LONG_FLOODED_S = 8.0, 60.0
 RATE_HZ, LONG_RATE_HZ = 2000, 10_000  # of the flooder's commands
 LARGE_BYTES, LONG_LARGE_BYTES = 1_000_000, 10_000_000  # of a message twice a second
-MIN_SHARE = 0.5  # of that rate, else it was no flood
-QUIET_S = 20.0  # of driving that is judged, between two events of the long form
-WARM_UP_S = 600.0  # of the long form, whose memory is not judged: a robot that maps still learns
+MIN_SHARE = 0.5  # of that rate, for a valid flood
+QUIET_S = 20.0  # of judged driving, between two events of the long form
+WARM_UP_S = 600.0  # of the long form; memory is not judged while the robot still maps
 HOUR_S = 3600.0
 WARM_TICKS = 1000  # 20 s; a robot that has just started still takes memory
 COUNTED = (STATE, SCAN, WORLD, CMD_VEL, SAFETY)
-VICTIMS = ("decision", "control")  # the others live through the hour, and their memory is judged
+VICTIMS = ("decision", "control")  # the others survive, and their memory is judged
 SURVIVORS = ("perception", "driver", "safety", "router")
 VIEWED_S = 10.0
 RECORD = (
@@ -61,7 +61,7 @@ GROWS = {name: Figure(f"{name} grows", "MB/h", long=True) for name in SURVIVORS}
 
 
 class TickLateness:
-    """Measures how late the driver ticks, by its stamps: against the promptest recent tick."""
+    """Measures the driver's delay by its stamps, relative to its most punctual recent tick."""
 
     def __init__(self, robot: RobotUnderTest) -> None:
         self._recent: deque[int] = deque(maxlen=RECENT_TICKS)

@@ -61,8 +61,8 @@ from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
 from gigabrain_zenoh.safety.health import HALF_SPEED
 from gigabrain_zenoh.security.authority import issue, new_fleet
 
-NO_GAP_TICKS = 5  # up to which the gate waits for a command
-FREEZE_S = 2.4  # longer, and the supervisor replaces the router
+NO_GAP_TICKS = 5  # for which the gate waits for a command
+FREEZE_S = 2.4  # after a longer freeze the supervisor replaces the router
 SHORT_HOLE_S, SHORT_HOLES = 0.06, 5  # with 20 ms between commands, a gap of at most 80 ms
 HOLES_S, LONG_HOLES_S = (0.3, 1.0, 3.0), (0.15, 0.3, 1.0, 3.0, 30.0)
 DRIVE_TICKS = 150  # on each line that is only slow
