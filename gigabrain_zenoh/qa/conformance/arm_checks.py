@@ -1,4 +1,4 @@
-"""Checks of bodies with joints: by their driver alone, and behind the gate."""
+"""Checks of bodies with joints: of their driver alone, and behind the gate."""
 
 import math
 from collections.abc import Mapping
@@ -10,18 +10,18 @@ from gigabrain_zenoh.qa.conformance.gated_driver import ATTEMPTS, GatedDriver
 from gigabrain_zenoh.qa.judging import Failed, Finding
 
 STILL_TICKS = 50  # 1 s, in which nothing may move
-STILL_RAD = math.radians(0.5)  # that encoders may show meanwhile; [m] of a sliding joint
-TRAVEL = 0.15  # of a joint's range, that it is sent
-SLACK = 0.02  # of a joint's range, by which it may stay off: servos give way to weight
+STILL_RAD = math.radians(0.5)  # largest motion meanwhile; [m] for a sliding joint
+TRAVEL = 0.15  # of a joint's range, length of a commanded motion
+SLACK = 0.02  # of a joint's range: servos give way to weight
 TRAVEL_TICKS = 150
 MOVE_TICKS = 30
 SPEED_SHARE = 0.3  # of a joint's greatest speed
-SLOW = 0.2  # [rad/s] or [m/s], as encoders show it: a few counts between two states
+SLOW = 0.2  # [rad/s] or [m/s], a few encoder counts between two states
 EXCESS = 1.0  # [rad] or [m], beyond a joint's range
-ROUNDED = 0.01  # of a joint's range, by which its protocol may round
+ROUNDED = 0.01  # of a joint's range, largest rounding of its protocol
 FREEZE_TICKS = 6  # 120 ms
 SILENT_TICKS = 12  # 40 ms of a stream that has ended, then the ramp and the joint's own lag
-FELL_RAD = math.radians(2.0)  # that an arm may sag where it is held
+FELL_RAD = math.radians(2.0)  # largest sag of an arm that holds
 
 
 async def opens_still(checked: CheckedRobot) -> Finding:
@@ -129,7 +129,7 @@ async def _move(gated: GatedDriver) -> None:
 
 
 async def _frozen(gated: GatedDriver, most: int) -> Finding:
-    """Watch the joints come to rest within `most` ticks, and what they do in the second after."""
+    """Check that the joints come to rest within `most` ticks, and stay there for a second."""
     joints, begin, moving = gated.robot.joints, gated.tick, 0
     stopped = _positions(gated.state, joints)
     while gated.tick - begin < most + STILL_TICKS:
@@ -147,7 +147,7 @@ async def _frozen(gated: GatedDriver, most: int) -> Finding:
 
 
 def _aside(joint: JointDescription, here: float) -> float:
-    """Return a goal beside where a joint is, towards the middle of its range."""
+    """Return a goal beside a joint's position, towards the middle of its range."""
     way = 1 if here < (joint.lower + joint.upper) / 2 else -1
     return here + way * TRAVEL * (joint.upper - joint.lower)
 
@@ -160,7 +160,7 @@ def _positions(state: RobotState | None, joints: tuple[JointDescription, ...]) -
 
 
 def _held(state: RobotState | None, joints: tuple[JointDescription, ...]) -> dict[str, float]:
-    """Return where the body says that it holds its joints; nothing if it does not say so."""
+    """Return the positions that the body reports to hold; empty if it reports none."""
     if state is None or not state.joints_sent:
         return {}
     return dict(zip((joint.name for joint in joints), state.joints_sent, strict=True))

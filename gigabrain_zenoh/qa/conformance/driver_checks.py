@@ -26,17 +26,17 @@ from gigabrain_zenoh.qa.judging import Failed, Finding, Skipped
 
 POLL_S = 0.004
 PATIENCE_S = 10.0  # of wall time without a single tick
-REST_SPEED = 0.02  # [m/s], of the true body, below which it stands
+REST_SPEED = 0.02  # [m/s], largest true speed of a standing body
 WORLD = "arena"
 OPEN_TICKS = 250  # 5 s
-RAMP_TICKS = 75  # 1.5 s, to get to a speed
+RAMP_TICKS = 75  # 1.5 s, to reach a speed
 HOLD_TICKS = 15
-TOLERANCE = 0.1  # of the wanted speed, and
-UNIT = 0.02  # [m/s], [rad/s]: the coarsest step in which a body may take its commands
+TOLERANCE = 0.1  # of the wanted speed, plus UNIT
+UNIT = 0.02  # [m/s], [rad/s], the coarsest allowed step of commands
 MAX_CALL_S = 2.0  # of `stop` and `close`
 OPEN_S = 0.1
 CALLS = ("stop", "stop", "close", "stop", "close")
-EXCESS = 10.0  # times the greatest speed
+EXCESS = 10.0  # factor on the maximal speed
 
 
 class Timeline(abc.ABC):
@@ -67,7 +67,7 @@ class Timeline(abc.ABC):
     async def firsts(
         self, conditions: Mapping[str, Callable[[], object]], ticks: int
     ) -> dict[str, float]:
-        """Return when each condition first held [ms]; ends with the last one, or after `ticks`."""
+        """Return when each condition first held [ms]; stop after the last one, or after `ticks`."""
         loop = asyncio.get_running_loop()
         begin_s, found = loop.time(), dict[str, float]()
 
@@ -86,9 +86,9 @@ class Timeline(abc.ABC):
 
 
 class CheckedRobot:
-    """A robot by name or by its file. Used as `async with`; its emulator runs inside.
+    """A robot by name or file. Its emulator runs inside its `async with` block.
 
-    `folder` holds the ports and the gate's saved state.
+    `folder` contains the ports and the gate's saved state.
     """
 
     def __init__(self, name: str, link: LinkName, folder: Path) -> None:
@@ -114,7 +114,7 @@ class CheckedRobot:
         return catalog.make_driver(self.name, self.run)[1]
 
     def next_direction(self) -> int:
-        """Return 1 and -1 in turn, so that the body never comes to a wall."""
+        """Return 1 and -1 in turn, so that the body never reaches a wall."""
         self._way = -self._way
         return self._way
 
@@ -125,12 +125,12 @@ class CheckedRobot:
 
     @property
     def has_peer(self) -> bool:
-        """True where an emulated peer is at the other end of the line."""
+        """True if an emulated peer is at the other end of the line."""
         return self._emulator is not None
 
     @property
     def peer(self) -> Emulator:
-        """The emulated peer. Raises Skipped where there is none."""
+        """The emulated peer. Raises Skipped without one."""
         if self._emulator is None:
             raise Skipped(f"link {self.link} has no peer that could fail")
         return self._emulator
@@ -154,7 +154,7 @@ class CheckedRobot:
 
     @property
     def goes_on(self) -> bool:
-        """True where the motors have no watchdog. Raises Skipped where there is no peer."""
+        """True if the motors have no watchdog. Raises Skipped without a peer."""
         return self.peer.stations[BASE].device.goes_on
 
     def commanded(self, state: RobotState | None) -> tuple[float, float, float]:
@@ -165,7 +165,7 @@ class CheckedRobot:
         return (velocity.linear_x, velocity.linear_y, velocity.angular_z) if velocity else (0, 0, 0)
 
     def rests(self, state: RobotState | None) -> bool:
-        """Return whether the body stands still: truly, or as measured where there is no peer."""
+        """Return whether the body stands still: truly, or without a peer as measured."""
         if self._emulator is None:
             return state is not None and at_rest(state.velocity)
         speed = self._emulator.body.report().get("true_speed")
@@ -174,13 +174,13 @@ class CheckedRobot:
 
 
 class TracedLine(Protocol):
-    """A line that shows what goes over it."""
+    """A line with a trace of its bytes."""
 
     trace: Trace | None
 
 
 def link_of(driver: Driver) -> TracedLine:
-    """Return the line that a driver keeps in `link`. Raises Skipped."""
+    """Return the driver's attribute `link`. Raises Skipped without one."""
     link: TracedLine | None = getattr(driver, "link", None)
     if link is None or not hasattr(link, "trace"):
         raise Skipped("the driver keeps no line with a `trace` in `link`: no bytes to look at")
@@ -254,7 +254,7 @@ async def obeys(checked: CheckedRobot) -> Finding:
     """Drive forward, sideways where it can, and turn: the measured speed reaches the commanded."""
     robot, measured_texts = checked.file, []
     along, turn = 0.5 * robot.max_linear_speed, -0.5 * robot.max_angular_speed
-    car = robot.drive_type == "ackermann"  # it turns only as it drives
+    car = robot.drive_type == "ackermann"  # it turns only while it drives
     wishes = [("linear_x", Velocity(linear_x=along))]
     if robot.max_lateral_speed:
         wishes.append(("linear_y", Velocity(linear_y=0.5 * robot.max_lateral_speed)))
@@ -285,7 +285,7 @@ async def limits(checked: CheckedRobot) -> Finding:
     most, worst = _max_speeds(checked), 0.0
     slack = [TOLERANCE * limit for limit in most]
     if not checked.has_peer:
-        slack[1] = 3 * TOLERANCE * most[1] + UNIT  # a body that walks sways
+        slack[1] = 3 * TOLERANCE * most[1] + UNIT  # a walking body sways
     async with DriverSession(checked) as it:
         await it.connected()
         for x, y, turn in ((1, 0, 0), (0, 1, 0), (0, 0, -1), (-1, -1, 1)):

@@ -28,7 +28,7 @@ from gigabrain_zenoh.qa.probe import until
 SILENCE_TICKS = 7  # 100 ms without a command, applied in the next tick
 AT_ONCE_TICKS = 2
 DISORDER_TICKS = 35
-LATE_TICKS = 100  # for which a body that still moves is watched, to measure how late it is
+LATE_TICKS = 100  # a body that still moves is watched this long, to measure its delay
 COMMANDER = "import time\nwhile True:\n print(flush=True)\n time.sleep(0.02)\n"
 
 
@@ -42,11 +42,11 @@ MID_TICK_S = 0.008
 MAX_LATENCY_MS = 1.0
 UNPLUGGED_MS = 100.0  # until the gate reports a cut line
 FROZEN_MS = 250.0  # until it reports a frozen peer
-SLACK_MS = 100.0  # on top of these, for a shared machine
-NOTICED_TICKS = 12  # until the gate reports a loss, where that is not judged
+SLACK_MS = 100.0  # added to these, for a shared machine
+NOTICED_TICKS = 12  # until the gate reports a loss, if that is not judged
 BACK_TICKS = 250
 QUIET_TICKS = 15
-START_S = 20.0  # for a driver in a process of its own, on a busy machine
+START_S = 20.0  # for a driver in its own process, on a busy machine
 REPORTED, ZEROED, RESTS = "reported", "motors at zero", "at rest"  # since the fault
 
 
@@ -101,9 +101,7 @@ async def disorder(gated: GatedDriver) -> Finding:
     while gated.tick < end or (at_rest is None and gated.tick < begin + most + LATE_TICKS):
         gated.deliver(replace(last, linear_x=back))  # a duplicate
         gated.deliver(replace(last, linear_x=back, seq=last.seq - 3))  # overtaken
-        gated.deliver(
-            replace(earlier, linear_x=back, seq=last.seq + 100)
-        )  # old, but newly numbered
+        gated.deliver(replace(earlier, linear_x=back, seq=last.seq + 100))  # old, with a new number
         gated.deliver(replace(last, linear_x=back, seq=last.seq + 200, tick=gated.tick + 1000))
         if at_rest is None and gated.rests:
             at_rest = gated.tick - begin
@@ -307,7 +305,7 @@ async def driver_killed(robot: CheckedRobot) -> Finding:
 
 
 def _rest_ticks(gated: GatedDriver) -> int:
-    """Return the ticks within which the body must stop by itself."""
+    """Return the number of ticks in which the body must stop by itself."""
     return stop_ticks(gated, round((gated.checked.promised_ms + SLACK_MS) * 1e6 / TICK_NS))
 
 

@@ -38,16 +38,16 @@ KIT = "kit"  # the commander
 ENABLE_TICKS = 250
 MOVE_TICKS = 100
 SETTLE_TICKS = 15  # of the body, after the ramp of its commands
-STEP_TICKS = 30  # of a body that walks
-ATTEMPTS = 3  # the gate shuts when the machine stands still for 100 ms
+STEP_TICKS = 30  # of a walking body
+ATTEMPTS = 3  # because the gate shuts when the machine stalls for 100 ms
 SPEED_SHARE = 0.5  # of the body's greatest speed
-MOVING = 0.6  # of the wanted speed, from which the body counts as moving
+MOVING = 0.6  # least share of the wanted speed of a moving body
 
 
 class DriverTap:
     """Records the velocities that the gate lets through to a driver.
 
-    It replaces the driver's `set_base_velocity` by a method that records and calls it.
+    It wraps the driver's `set_base_velocity`.
     """
 
     def __init__(self, driver: Driver) -> None:
@@ -142,7 +142,7 @@ class GatedDriver(Timeline):
         self.last = self._bus.publish(self.topic, CmdVel(**fields, source=KIT))
 
     def deliver(self, command: CmdVel | dict[str, Any]) -> None:
-        """Deliver a command with the header that it has."""
+        """Deliver a command with its own header."""
         self.network.deliver(self.topic.at(), codec.encode(command))
 
     async def drive(self) -> Velocity:
@@ -169,7 +169,7 @@ class GatedDriver(Timeline):
         await self._bus.ask(ESTOP, EstopRequest(source=KIT))
 
     async def enable(self) -> None:
-        """Release and enable as soon as the gate agrees."""
+        """Release and enable as soon as the gate allows it."""
         why = "no state from the driver"
         begin = self.tick
         while not self.state or self.mode != "enabled" or self.state.gate.commander != KIT:

@@ -17,8 +17,8 @@ from gigabrain_zenoh.qa.conformance.gated_driver import GatedDriver
 from gigabrain_zenoh.qa.judging import DriverCheckResult, Failed, Finding, Skipped, summary
 
 MAX_CHECK_S = 60.0  # of one check
-ATTEMPTS = 3  # where the machine may have made a check late
-STARVED_SHARE = 0.1  # of a check's time, waited for a core: then the machine may be to blame
+ATTEMPTS = 3  # for a check that the machine may have delayed
+STARVED_SHARE = 0.1  # least share of a check's time in which it waited for a core
 
 
 class DriverCheck(NamedTuple):
@@ -166,9 +166,9 @@ async def _judged(
 
 
 async def _found(call: Callable[[], Awaitable[Finding]]) -> Finding:
-    """Run a check, and again where the machine, not the driver, may have been late.
+    """Run a check; repeat it if the machine, not the driver, may have been late.
 
-    Raises Skipped where that is so each time.
+    Raises Skipped if that happens each time.
     """
     for _ in range(ATTEMPTS):
         waited_ms = this_process.waited_ms()

@@ -1,4 +1,4 @@
-"""The bringup check of a ROS 2 robot: a node that listens for a while, and compares."""
+"""The bringup check of a ROS 2 robot: a node listens for a while, and compares with the file."""
 
 import asyncio
 import contextlib
@@ -37,7 +37,7 @@ DEPTH = 50
 
 
 async def check(name: str, link: LinkName, folder: Path, seconds: float) -> list[Finding]:
-    """Listen to a robot for a while; return what is right and wrong. Raises ConfigError."""
+    """Listen to a robot for a while; return the findings. Raises ConfigError."""
     run = Run(folder=folder, link=link, emulator=str(folder))
     robot, _, options, _ = catalog.load_link(name, run)
     if not isinstance(options, Ros2Options):
@@ -55,7 +55,7 @@ async def check(name: str, link: LinkName, folder: Path, seconds: float) -> list
 
 
 async def _address(options: Ros2Options) -> Any:
-    """Return how to join, once an emulator says where it is. Raises ConfigError."""
+    """Return how to join, as soon as an emulator's address exists. Raises ConfigError."""
     end_s = time.monotonic() + START_S
     while True:
         try:
@@ -69,7 +69,7 @@ async def _address(options: Ros2Options) -> Any:
 async def watch(
     transport: RosTransport, types: Types, options: Ros2Options, seconds: float
 ) -> Watched:
-    """Listen on all topics of the robot's file, and return what came."""
+    """Listen on all topics of the robot's file, and return the results."""
     watched, begun = Watched(), False
     best_effort = Qos(reliable=False, depth=DEPTH)  # which matches every publisher
     for row in rows(options):
@@ -92,7 +92,7 @@ async def watch(
 
 
 def _converter(part: str, options: Ros2Options) -> Callable[[Any], object]:
-    """Return what the driver makes of a topic's messages, without their mounting."""
+    """Return the driver's conversion of a topic's messages, without their mounting."""
     topics = options.topics
     if part == "battery" and topics.battery:
         return functools.partial(battery_of, options=topics.battery)
@@ -108,7 +108,7 @@ def _taker(
     convert: Callable[[Any], object],
     begun: Callable[[], bool],
 ) -> Callable[[Received], None]:
-    """Return what takes the messages of a topic."""
+    """Return the handler of a topic's messages."""
     first_s: list[float] = []
 
     def take(received: Received) -> None:
