@@ -1,4 +1,4 @@
-"""Pictures, detections and findings for viewers, received only while somebody looks."""
+"""Pictures, detections and findings for viewers; received only while there are viewers."""
 
 import functools
 from collections import deque
@@ -17,7 +17,7 @@ from gigabrain_zenoh.bus.listening import Sampled
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.host.bounded import put_newest
 
-RECENT = 8  # pictures of a camera; what is recognised in one comes up to 0.5 s later
+MAX_RECENT = 8  # pictures of a camera; detections arrive up to 0.5 s later
 _decode_image = Codec(IMAGE.type, IMAGE.max_bytes).decode
 
 
@@ -35,7 +35,7 @@ class CameraFeed:
         self._closes: list[Callable[[], None]] = []
 
     def watch(self, on: bool) -> None:
-        """Begin or end to receive."""
+        """Start or stop receiving."""
         if on == bool(self._closes):
             return
         for close in self._closes:
@@ -62,7 +62,7 @@ class CameraFeed:
         return sampled.poll() if sampled else None
 
     def picture_at(self, camera: str, basis: int) -> Image | None:
-        """Return the picture that was exposed at a tick, if it is one of the newest."""
+        """Return the picture with this basis, if it is one of the newest."""
         for payload in reversed(tuple(self._recent.get(camera, ()))):
             if header_of(payload).basis == basis:
                 with suppress(ValueError):
@@ -80,7 +80,7 @@ class CameraFeed:
         if held is not None and (name in held or len(held) < MAX_CAMERAS):
             held.setdefault(name, Sampled(self._bus, topic)).receive(key, encoding, payload)
             if topic is IMAGE and DETECTIONS in self._topics:
-                self._recent.setdefault(name, deque(maxlen=RECENT)).append(payload)
+                self._recent.setdefault(name, deque(maxlen=MAX_RECENT)).append(payload)
 
     def _add_detections(self, _key: str, found: Detections) -> None:
         put_newest(self._detections, found.camera, found, MAX_CAMERAS)

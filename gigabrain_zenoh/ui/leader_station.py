@@ -1,4 +1,4 @@
-"""Has an arm follow another one that a person moves by hand."""
+"""Makes an arm follow a leader arm that a person moves by hand."""
 
 import asyncio
 import math
@@ -12,10 +12,11 @@ from gigabrain_zenoh.geometry.joint_ramp import within
 from gigabrain_zenoh.host.signals import run_until, stop_signals
 from gigabrain_zenoh.ui.teleop_station import keys_of, typed_keys
 
-SLOW = math.radians(45)  # [rad/s], at which the follower goes to the leader's posture
-FAR, NEAR = math.radians(60), math.radians(3)  # off that posture, where this begins and ends
-PROGRESS_TICKS = 50  # between two lines about it
-PREFIX = "arm_"  # of the joints of an arm on a base
+APPROACH_SPEED = math.radians(45)  # [rad/s], of the follower towards the leader's posture
+# largest joint error [rad] at which a slow approach begins, and at which it ends:
+FAR, NEAR = math.radians(60), math.radians(3)
+PROGRESS_TICKS = 50  # between two lines about the approach
+PREFIX = "arm_"  # of joint names of an arm on a base
 HELP = "hold the leader and move it; space: e-stop; x or Ctrl-C: end"
 Posture = Mapping[str, float]  # [rad] by joint
 
@@ -24,7 +25,7 @@ class Leader(Protocol):
     """The arm that is moved by hand."""
 
     async def read(self) -> Posture:
-        """Return its posture. Raises ConfigError where it is lost."""
+        """Return its posture. Raises ConfigError if it is lost."""
 
 
 class LeaderStation:
@@ -33,14 +34,14 @@ class LeaderStation:
     def __init__(self, robot: Robot, leader: Leader, say: Callable[[str], None]) -> None:
         self._robot, self._leader, self._say = robot, leader, say
         self._ended, self._pressed = asyncio.Event(), False
-        self._speed: float | None = SLOW
-        self._slow_ticks = 0  # ticks that it has been slow for
+        self._speed: float | None = APPROACH_SPEED
+        self._slow_ticks = 0  # duration of the approach
 
     async def drive(self, take: bool) -> None:
-        """Lead until a key or a signal ends it; then the robot holds where it is.
+        """Lead until a key or a signal ends it; then the robot holds its position.
 
-        Raises ConfigError where the leader is lost, or has other joints than the robot, and Refused
-        where another commander has the robot and `take` is not set, or takes it later.
+        Raises ConfigError if the leader is lost, or has other joints than the robot. Raises Refused
+        if another commander has the robot and `take` is not set, or takes it later.
         """
         body = await self._robot.read_body()
         wanted = follower_posture(body, await self._leader.read())
@@ -77,7 +78,7 @@ class LeaderStation:
             wanted = follower_posture(body, await self._leader.read())
 
     def _choose_speed(self, sent: Posture, wanted: Posture) -> None:
-        """Be slow on the way to the leader's posture, and as fast as the leader once there."""
+        """Limit the speed until the follower has the leader's posture."""
         name = max(wanted, key=lambda one: abs(wanted[one] - sent[one]))
         off = abs(wanted[name] - sent[name])
         if self._speed and off < NEAR:
@@ -87,13 +88,13 @@ class LeaderStation:
             if self._slow_ticks % PROGRESS_TICKS == 0:
                 degrees = math.degrees(off)
                 self._say(f"slowly to the leader's posture: {name} has {degrees:.0f} deg to go")
-            self._speed, self._slow_ticks = SLOW, self._slow_ticks + 1
+            self._speed, self._slow_ticks = APPROACH_SPEED, self._slow_ticks + 1
 
 
 def follower_posture(body: BodyDescription, posture: Posture) -> dict[str, float]:
-    """Return where each joint of a body goes, within its range, for the posture of a leader.
+    """Return the goal of each joint, within its range, for the posture of a leader.
 
-    Raises Unsupported for a body without joints, and ConfigError for one with others.
+    Raises Unsupported for a body without joints, and ConfigError for other joints.
     """
     if not body.joints:
         raise Unsupported(f"{body.robot_type} has no arm")

@@ -1,7 +1,7 @@
-"""Cameras for browsers: each gets the newest picture when it has shown the last one.
+"""Cameras for browsers: each browser gets the newest picture after it has shown the last.
 
-A slow browser so gets fewer pictures, and none of them waits in the network. Nothing is received
-from the bus while no browser has the panel open.
+So a slow browser gets fewer pictures, and none waits in the network. Nothing is received from the
+bus while no browser has the panel open.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -20,10 +20,10 @@ from gigabrain_zenoh.host.bounded import put_newest
 from gigabrain_zenoh.ui.camera_feed import CameraFeed
 from gigabrain_zenoh.ui.page import frames
 
-PICTURE_INTERVAL_NS = 190_000_000  # at least, between two pictures of a camera: every second frame
-SHOWN_TIMEOUT_NS = 3_000_000_000  # after which a picture counts as lost on its way
-RECOGNISED_TICKS = 25  # from one picture to the next in which things are recognised
-MAX_TICKS = 50  # by which a picture may be older than the last; beyond, time has begun again
+PICTURE_INTERVAL_NS = 190_000_000  # shortest time between two pictures of a camera
+SHOWN_TIMEOUT_NS = 3_000_000_000  # a picture counts as lost after this time
+RECOGNISED_TICKS = 25  # longest time between two pictures with detections
+MAX_TICKS = 50  # an older picture means that time has started again
 MAX_NAMES = 16  # of cameras and perceptors
 
 

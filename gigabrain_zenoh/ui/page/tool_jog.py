@@ -9,16 +9,16 @@ from collections.abc import Sequence
 from gigabrain_schemas.body import BodyDescription, JointDescription, RobotState
 from gigabrain_zenoh.geometry.link_model import LinkModel, Vector, cross, rotated
 
-DAMPING_M = 0.02  # [m/rad]; where joints move the tool less than that, they are left out
-STEP = 1e-5  # [rad] or [m], by which positions are varied
-NEAR_LIMIT = 0.02  # [rad] or [m], within which a joint moves no nearer to the end of its range
+DAMPING_M = 0.02  # [m/rad]; joints that move the tool less are hardly used
+STEP = 1e-5  # [rad] or [m], for the numerical gradient
+NEAR_LIMIT = 0.02  # [rad] or [m], a joint this near to an end of its range moves no nearer
 
 
 ToolPlace = tuple[float, float, float, float]  # x, y, z [m], and how far it points down [rad]
 
 
 def tool_place(model: LinkModel, body: BodyDescription, state: RobotState) -> ToolPlace | None:
-    """Return where the arm's tool is in the frame of its base; None where that is not known."""
+    """Return the place of the arm's tool in the frame of its base; None if unknown."""
     at = {joint.name: joint.position for joint in state.joints}
     tool = body.arm.tool if body.arm else ""
     known = tool in (link.name for link in model.links)
@@ -34,8 +34,8 @@ def tool_speeds(
 ) -> dict[str, float]:
     """Return the speeds of the arm's joints at which its tool moves by `wanted` [m/s].
 
-    The direction that the tool looks in is not kept. All are slower where one would be too fast.
-    Empty where the model has no such tool, or a joint is not measured.
+    The tool's direction is not kept. If a joint would be too fast, all are scaled down. Empty if
+    the model has no such tool, or a joint is not measured.
     """
     at = {joint.name: joint.position for joint in state.joints}
     tool = body.arm.tool if body.arm else ""

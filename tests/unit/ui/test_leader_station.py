@@ -14,7 +14,7 @@ from gigabrain_schemas.requests import GateReply
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.errors import ConfigError, Refused, Unsupported
 from gigabrain_zenoh.testing.waiting import until
-from gigabrain_zenoh.ui.leader_station import SLOW, LeaderStation, follower_posture
+from gigabrain_zenoh.ui.leader_station import APPROACH_SPEED, LeaderStation, follower_posture
 
 ARM = load_robot("so101").description()
 LEKIWI = load_robot("lekiwi").description()
@@ -93,7 +93,7 @@ async def test_it_goes_slowly_to_the_leader_s_posture_and_says_so_then_it_follow
         "slowly to the leader's posture: shoulder_pan has 9 deg to go",
         "following",
     ]
-    assert robot.speeds == [SLOW] * 58 + [None] * 5
+    assert robot.speeds == [APPROACH_SPEED] * 58 + [None] * 5
     assert robot.at["shoulder_pan"] == pytest.approx(math.radians(85))
     assert robot.asked == ["enable take=False"]
 
@@ -108,7 +108,7 @@ async def test_a_follower_that_was_held_up_goes_slowly_again() -> None:
     robot.track_joint_positions = stuck  # type: ignore[method-assign]
     said = await led(robot, hand)
     assert said == ["following", "slowly to the leader's posture: shoulder_pan has 70 deg to go"]
-    assert robot.speeds == [SLOW, None, None, SLOW, SLOW]
+    assert robot.speeds == [APPROACH_SPEED, None, None, APPROACH_SPEED, APPROACH_SPEED]
 
 
 async def test_positions_out_of_a_joint_s_range_are_taken_to_be_at_its_end() -> None:
