@@ -1,7 +1,7 @@
-"""Recognition node: publishes what is recognised in the pictures of each camera.
+"""Recognition node: publishes detections of things and tags in the pictures of each camera.
 
-A worker thread looks at one picture at a time, always the newest of a camera whose turn it is, so
-that no number of pictures costs more than the rate of the settings.
+A worker thread processes one picture at a time, always the newest one of the camera that is due. So
+more pictures than the configured rate cost no more CPU time.
 """
 
 import asyncio
@@ -34,21 +34,21 @@ if TYPE_CHECKING:
     from gigabrain_zenoh.recognition.observer import Observer
 
 log = logging.getLogger(__name__)
-EARLY = 0.25  # of a period: a picture that comes so much earlier is not left out
-DEPTH_WAIT_NS = 60_000_000  # that a picture waits for its depth
-CONFIRMED_PICTURES = 5  # pictures in a row that show a tag in another size
-KEPT_DEPTHS = 4  # of a camera, for the picture of the same exposure
+EARLY_SHARE = 0.25  # a picture may be this share of a period early
+DEPTH_WAIT_NS = 60_000_000  # longest wait of a picture for its depth
+CONFIRMED_PICTURES = 5  # pictures in a row that show a tag in another size, before a warning
+KEPT_DEPTHS = 4  # newest depth pictures of a camera, to match pictures
 INSTALL = "recognition needs OpenCV; install it with: pip install 'gigabrain-zenoh[eyes]'"
 
 
 @dataclass
 class _Eye:
-    """A camera, its newest picture that waits, and the depth of its last exposures."""
+    """A camera, its waiting picture, and its newest depth pictures."""
 
     camera: Camera
-    due_ns: int = 0  # when its next picture is looked at
-    picture: Image | None = None
-    came_ns: int = 0  # when that picture came
+    due_ns: int = 0  # when its next picture is due
+    picture: Image | None = None  # newest, waiting
+    received_ns: int = 0  # arrival of that picture
     depths: dict[int, DepthImage] = field(default_factory=dict)  # by basis
     fault: QuietFault = field(default_factory=lambda: QuietFault(log))  # of its pictures
 
@@ -65,7 +65,7 @@ class _Eye:
 
 
 class Recognition:
-    """Follows the fixed cameras of a body, on the loop; `observer` runs in a thread beside it."""
+    """Follows a body's fixed cameras, on the loop; `observer` runs in a thread."""
 
     def __init__(self, config: RecognitionConfig, bus: Bus, observer: "Observer") -> None:
         self._bus, self._observer = bus, observer
@@ -74,7 +74,7 @@ class Recognition:
         self._eyes: dict[str, _Eye] = {}
         self._history = PoseHistory()
         self._busy, self._closed, self._taken, self._done = False, False, 0, 0
-        self._misread: dict[int, int] = {}  # how often in a row a tag had another size, by number
+        self._misread: dict[int, int] = {}  # pictures in a row with another size, by tag
         self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._pose = bus.latest(POSE)
         bus.latest(BODY, self._on_body)
@@ -84,7 +84,7 @@ class Recognition:
         bus.progress = Progress(lambda: (self._taken,) if self._eyes else (), lambda: self._done)
 
     def close(self) -> None:
-        """Let the thread end after its work; one that hangs is left."""
+        """Let the thread end after its work; leave one that hangs."""
         self._closed = True
         self._pool.shutdown(wait=False, cancel_futures=True)
 
@@ -105,16 +105,16 @@ class Recognition:
     def _on_image(self, key: str, picture: Image) -> None:
         eye = self._eyes.get(key.removeprefix(f"{IMAGE.key}/"))
         now_ns = self._bus.clock.now_ns()
-        if eye is None or now_ns < eye.due_ns - EARLY * self._period_ns:
+        if eye is None or now_ns < eye.due_ns - EARLY_SHARE * self._period_ns:
             return
         if picture.boot != self._bus.time.boot:
             return
-        eye.picture, eye.came_ns = picture, now_ns
+        eye.picture, eye.received_ns = picture, now_ns
         self._taken += 1
         self._start()
 
     def _start(self) -> None:
-        """Look at the picture that is most due, unless one is looked at."""
+        """Start processing the picture that is most overdue, unless the thread is busy."""
         if self._busy or self._closed:
             return
         now_ns = self._bus.clock.now_ns()
@@ -123,7 +123,7 @@ class Recognition:
             if picture is None:
                 continue
             depth = eye.depth_of(picture)
-            if eye.camera.depth and depth is None and now_ns - eye.came_ns < DEPTH_WAIT_NS:
+            if eye.camera.depth and depth is None and now_ns - eye.received_ns < DEPTH_WAIT_NS:
                 continue
             eye.picture = None
             eye.due_ns = max(eye.due_ns, now_ns - self._period_ns) + self._period_ns
@@ -152,7 +152,7 @@ class Recognition:
         self._start()
 
     def _warn_of_sizes(self, found: Detections) -> None:
-        """Log a tag that several pictures show in another size than the settings say, once."""
+        """Log once each tag whose size in several pictures differs from the settings."""
         measured = self._observer.other_sizes
         for tag in found.tags:
             if tag.id not in measured:
@@ -177,7 +177,7 @@ class Recognition:
         bus.publish(DETECTIONS, found, basis=picture.basis, stamp_ns=picture.stamp_ns)
 
     def _place(self, boot: int, tick: int) -> Pose | None:
-        """Return the body's pose in the map at `tick`; None where it is not localized."""
+        """Return the body's pose in the map at `tick`; None if it is not localized."""
         known: PoseInMap | None = self._pose.fresh()
         if known is None or not known.localized:
             return None
@@ -188,7 +188,7 @@ class Recognition:
 
 
 def in_map(found: Detections, place: Pose) -> Detections:
-    """Return detections with their places in the map, for a body at `place` in it."""
+    """Return detections with positions in the map, for a body at `place`."""
     from gigabrain_zenoh.vision.tags import yaw_of
 
     def at(position: Point) -> Point:
@@ -230,7 +230,7 @@ def make_observer(config: RecognitionConfig) -> "Observer":
 
 
 async def run(config: RecognitionConfig, bus: Bus, ready: Callable[[], None]) -> None:
-    """Publish what is recognised until the process ends. Raises ConfigError."""
+    """Publish detections until the process ends. Raises ConfigError."""
     recognition = Recognition(config, bus, await asyncio.to_thread(make_observer, config))
     try:
         ready()

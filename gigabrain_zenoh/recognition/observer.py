@@ -1,4 +1,4 @@
-"""Turns one picture, with its depth, into detections. It knows no bus and no clock."""
+"""Finds things and tags in one picture with its depth. Uses no bus and no clock."""
 
 import math
 import time
@@ -21,14 +21,14 @@ from gigabrain_zenoh.vision.thing_places import fits, part_of_wall, thing_place
 
 MAX_THINGS = 128
 MIN_BOX_PX = 1.0
-SAME_BOX = 0.6  # of two boxes of one thing: their intersection over their union
+SAME_BOX_IOU = 0.6  # least intersection over union of two boxes of one thing
 MARGIN = 1 / 8  # of a tag's side
 
 
 class Observer:
-    """Looks at the pictures of all cameras of a body, in one thread. Without a net, for tags only.
+    """Processes the pictures of all cameras, in one thread. Without a net, it finds only tags.
 
-    Figures at 320 x 240 on one core: net 12 ms, tags 4 ms, JPEG and depth 2 ms.
+    Costs at 320 x 240 on one core: net 12 ms, tags 4 ms, JPEG and depth 2 ms.
     """
 
     def __init__(self, net: Net | None, tags: TagFinder) -> None:
@@ -36,9 +36,9 @@ class Observer:
         self._models: dict[Camera, CameraModel] = {}
 
     def observe(self, camera: Camera, image: Image, depth: DepthImage | None) -> Detections:
-        """Return what is in a picture.
+        """Return the detections in a picture.
 
-        Raises ValueError where it is broken, of another size, or of another camera.
+        Raises ValueError for a broken picture, or one of another size or camera.
         """
         began = time.perf_counter()
         if image.frame_id != camera.name:
@@ -68,7 +68,7 @@ class Observer:
 
     @property
     def other_sizes(self) -> dict[int, float]:
-        """Return the sizes of tags that depth measures otherwise than the settings say [m]."""
+        """The measured sizes of tags that differ from the settings, by tag [m]."""
         return dict(self._tags.other_sizes)
 
     def _model(self, camera: Camera) -> CameraModel:
@@ -78,7 +78,7 @@ class Observer:
 
 
 def _find(net: Net, picture: NDArray[np.uint8], model: CameraModel) -> Found:
-    """Return what a net finds in a picture, turned upright by quarters for it."""
+    """Return the net's findings in a picture, which is first rotated upright by quarters."""
     turns = round(math.atan2(-model.rotation[2, 1], model.rotation[2, 2]) / (math.pi / 2)) % 4
     found = net.find(np.ascontiguousarray(np.rot90(picture, turns)))
     boxes = found.boxes
@@ -94,7 +94,7 @@ def _converted(picture: NDArray[np.uint8], how: int) -> NDArray[np.uint8]:
 
 
 def _depth_of(depth: DepthImage | None, camera: Camera) -> NDArray[np.uint16] | None:
-    """Return the depth of a picture's pixels [mm]; None where it is of another size or broken."""
+    """Return the depth of a picture's pixels [mm]; None if it is broken or of another size."""
     if depth is None or (depth.height, depth.width) != (camera.height, camera.width):
         return None
     pixels = depth.array()
@@ -124,10 +124,10 @@ def overlap(one: Box, other: Box) -> float:
 def _things(
     found: Found, model: CameraModel, depth: NDArray[np.uint16] | None, taken: list[Box]
 ) -> tuple[Detection, ...]:
-    """Return what a net found, the surest first, placed by depth.
+    """Return the net's findings, most confident first, with positions by depth.
 
-    A thing has one class, the surest of those that are not larger than it is. Parts of walls and
-    boxes of tags, in `taken`, are no things.
+    A thing gets one class: the most confident one whose size fits. Parts of walls and boxes of
+    tags, in `taken`, are no things.
     """
     things, taken = [], list(taken)
     for label, sure, corners in zip(
@@ -137,7 +137,7 @@ def _things(
         box: Box = (left, top, right, bottom)
         if right - left < MIN_BOX_PX or bottom - top < MIN_BOX_PX:
             continue
-        if any(overlap(box, other) > SAME_BOX for other in taken):
+        if any(overlap(box, other) > SAME_BOX_IOU for other in taken):
             continue
         if depth is not None and part_of_wall(label, box, model, depth):
             continue
