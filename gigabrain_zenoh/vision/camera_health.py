@@ -1,8 +1,8 @@
-"""Checks of a camera's pictures, one exposure after the other. Pure.
+"""Checks a camera's pictures, exposure by exposure. Pure.
 
-A camera that shows nothing new or nothing at all counts as blind. A sensor has noise, so two
-exposures never have the same bits. A surface that is nearer than the camera can measure takes all
-depth as a hand does, but a robot comes near it slowly.
+A camera whose pictures repeat or show nothing counts as blind. A sensor has noise, so two exposures
+never have the same bits. A surface nearer than the camera can measure hides all depth like a hand,
+but the robot approaches it slowly.
 """
 
 import zlib
@@ -17,17 +17,17 @@ from gigabrain_schemas.body import Camera
 FROZEN, REPEATS = "frozen", "repeats pictures"
 COVERED, SILENT = "covered", "no picture"
 UNDEREXPOSED, OVEREXPOSED = "underexposed", "overexposed"
-DARK = "covered, or in the dark"  # without depth the two look alike
+DARK = "covered, or in the dark"  # not distinguishable without depth
 
-WINDOW_S = 0.4  # that is looked at, or 2.5 periods of a slow camera
-BAD_SHARE = 0.4  # of the exposures of a window, and two of them at least: a fault
-REMEMBERED = 64  # exposures that a newer one may repeat
-SUDDEN_S = 0.25  # in which a cover takes all depth, or 1.5 periods
+WINDOW_S = 0.4  # of exposures that are judged; 2.5 periods for a slow camera
+BAD_SHARE = 0.4  # of a window's exposures, and at least two, for a fault
+MAX_FINGERPRINTS = 64  # of earlier exposures, to detect repetition
+SUDDEN_S = 0.25  # a cover removes all depth within this time, or 1.5 periods
 SEEN, UNSEEN, SEEN_AGAIN = 0.4, 0.05, 0.1  # share of pixels with depth
 BLACK, WHITE = 30, 250  # of 255
 DARK_SHARE, BRIGHT_SHARE = 0.98, 0.6  # of pixels
 FLAT, SMOOTH = 0.7, 4.0  # mean step between neighbouring blocks, of 255
-STEP_PX, BLOCK = 4, 5  # every fourth pixel is looked at, in blocks of 5 x 5
+STEP_PX, BLOCK = 4, 5  # samples every fourth pixel, in blocks of 5 x 5
 
 
 class PictureFigures(NamedTuple):
@@ -59,9 +59,8 @@ def figures_of(picture: NDArray[np.uint8]) -> PictureFigures:
 class CameraHealth:
     """Judges one camera. Times are of any clock [s], the same in all calls.
 
-    With `repeats` a still scene may give the same bits twice, as compressed streams do; then the
-    same picture is no fault. A camera on an arm may see nothing but what the gripper holds, so only
-    its silence is a fault.
+    With `repeats`, equal pictures are no fault: a compressed stream of a still scene may repeat
+    them. A camera on an arm may see only the held thing, so only its silence is a fault.
     """
 
     def __init__(self, camera: Camera, *, repeats: bool = False) -> None:
@@ -69,10 +68,10 @@ class CameraHealth:
         self._repeats, self._on_arm = repeats, bool(camera.link)
         self._window_s = max(WINDOW_S, 2.5 * period_s)
         self._sudden_s = max(SUDDEN_S, 1.5 * period_s)
-        self._came_s: float | None = None  # the newest exposure, or the first question
-        self._prints: deque[int] = deque(maxlen=REMEMBERED)
-        self._judged: deque[tuple[float, str, int]] = deque()  # when, its fault, its fingerprint
-        self._shares: deque[tuple[float, float]] = deque()  # when, share of pixels with depth
+        self._newest_s: float | None = None  # newest exposure, or first call of `problem`
+        self._prints: deque[int] = deque(maxlen=MAX_FINGERPRINTS)
+        self._judged: deque[tuple[float, str, int]] = deque()  # time, fault, fingerprint
+        self._shares: deque[tuple[float, float]] = deque()  # time, share of pixels with depth
         self._covered = False
         self._named = ""
 
@@ -82,14 +81,14 @@ class CameraHealth:
         picture: NDArray[np.uint8] | None,
         depth: NDArray[np.uint16] | None = None,
     ) -> bool:
-        """Take one exposure; return whether it may be used.
+        """Judge one exposure; return whether it is usable.
 
         `picture` is (height, width) or (height, width, 3), `depth` (height, width) [mm], 0 unknown.
         """
         mark = _fingerprint(picture, depth)
         repeated = not self._repeats and mark in self._prints
         self._prints.append(mark)
-        self._came_s = now_s
+        self._newest_s = now_s
         fault = ""
         if not self._on_arm:
             fault = FROZEN if repeated else self._fault(now_s, picture, depth)
@@ -97,10 +96,10 @@ class CameraHealth:
         return not fault
 
     def problem(self, now_s: float) -> str:
-        """Return why the camera is blind now; empty if it can be believed."""
-        if self._came_s is None:
-            self._came_s = now_s
-        if now_s - self._came_s >= self._window_s - 1e-6:
+        """Return why the camera is blind now; empty if it is healthy."""
+        if self._newest_s is None:
+            self._newest_s = now_s
+        if now_s - self._newest_s >= self._window_s - 1e-6:
             return SILENT
         while self._judged and now_s - self._judged[0][0] > self._window_s + 1e-6:
             self._judged.popleft()

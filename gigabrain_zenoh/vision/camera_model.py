@@ -1,6 +1,6 @@
-"""Conversion between the pixels of a camera and points in the body's frame.
+"""Conversion between camera pixels and points in the body's frame.
 
-Distortion by Brown's model (k1, k2, p1, p2, k3), or by the rational one (and k4, k5, k6), as in
+Distortion is Brown's model (k1, k2, p1, p2, k3), or the rational one (plus k4, k5, k6), as in
 OpenCV and ROS.
 """
 
@@ -16,12 +16,12 @@ Singles = NDArray[np.float32]
 Pixels = NDArray[np.intp]
 Floating = NDArray[np.floating]
 UNDISTORT_ROUNDS = 12
-WIDEST = 6.0  # tangent of the widest angle off the axis that is believed, 80 degrees
-BACK_PX = 0.5  # how far off its pixel a ray may come back: farther, the model is not invertible
+MAX_TANGENT = 6.0  # of the angle between a ray and the axis, 80 degrees
+MAX_BACK_ERROR_PX = 0.5  # of a pixel's ray projected back; beyond, the model is not invertible
 
 
 class CameraModel:
-    """Rays and projection of a camera that sits where its file says."""
+    """Rays and projection of a camera with the mounting in the robot's file."""
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
@@ -29,7 +29,7 @@ class CameraModel:
         self.rotation = rotation(camera.roll, camera.pitch, camera.yaw)  # to the body's frame
         self._distortion = (*camera.distortion, *[0.0] * 8)[:8]
         self.rays: Singles = self._rays()
-        # (3, height, width): in the body's frame, for a depth of 1 m; NaN where it has none
+        # (3, height, width): in the body's frame, for a depth of 1 m; NaN for pixels without a ray
 
     def _rays(self) -> Singles:
         camera = self.camera
@@ -44,7 +44,7 @@ class CameraModel:
                     x, y = x - (off_x - seen_x), y - (off_y - seen_y)
                 off_x, off_y = self._distorted(x, y)
                 off = np.hypot((off_x - seen_x) * fx, (off_y - seen_y) * fy)
-                wrong = ~(off < BACK_PX) | ~(np.hypot(x, y) < WIDEST)
+                wrong = ~(off < MAX_BACK_ERROR_PX) | ~(np.hypot(x, y) < MAX_TANGENT)
             x, y = np.where(wrong, np.nan, x), np.where(wrong, np.nan, y)
         in_camera = np.stack((np.ones_like(x), -x, -y))
         turned = np.tensordot(self.rotation, in_camera, axes=1)
@@ -63,7 +63,7 @@ class CameraModel:
     def project(self, points: NDArray[np.floating]) -> tuple[Pixels, Pixels, Floats]:
         """Return row, column and depth [m] of points (n, 3) in the body's frame.
 
-        Row and column are -1 for points that are not in the picture.
+        Row and column are -1 for points outside the picture.
         """
         camera = self.camera
         fx, fy, cx, cy = camera.pinhole
@@ -71,7 +71,7 @@ class CameraModel:
         ahead = depth > camera.depth_min / 2
         scale = np.where(ahead, depth, 1.0)
         x, y = -left / scale, -up / scale
-        ahead &= np.hypot(x, y) < WIDEST
+        ahead &= np.hypot(x, y) < MAX_TANGENT
         if any(self._distortion):
             with np.errstate(all="ignore"):
                 x, y = self._distorted(x, y)

@@ -1,7 +1,7 @@
-"""Memory of what cameras saw: cells in the plane of the odometry, with height and age.
+"""Memory of obstacles seen by cameras: cells in the odometry's plane, with height and age.
 
-A cell is emptied when it is seen through: when a picture shows what is behind it, or the floor
-under it. What is out of view stays, until the odometry has drifted too far since it was seen.
+A cell is removed when pictures show what is behind it, or the floor under it. Cells out of view
+stay until the odometry has drifted too far since they were seen.
 """
 
 import math
@@ -17,17 +17,17 @@ from gigabrain_zenoh.vision.depth_picture import SIGMA_AT_1M, Mask
 
 CELL_M = 0.025
 OBSTACLE, HOLE, MISSING, COLOUR = range(4)  # kinds of cells
-KEPT_S = 120.0  # unseen: the world changes; what stood behind the robot two minutes ago may be gone
-GLIMPSED_S = 1.0  # unseen, if only one picture showed it
-DRIFT_PER_M, DRIFT_PER_RAD = 0.02, 0.02  # of odometry: by way, and by turn for each metre away
-MAX_DRIFT_M = 0.15  # since it was seen, more than planners keep clear of
-KEPT_REACH_M = 5.0  # farther from the robot, nobody needs it
-GONE_STRIKES = 3.0  # pictures that see through it; new ones need one
-BESIDE_STRIKES = 0.05  # a picture that sees something there, but not quite in this cell
-STEADY_POINTS = 3.0  # pixels of a cell that counts in its first picture
-CONFIRMED_PICTURES = 4.0  # pictures, after which a cell is sure
-SHARES = (0.2, 0.45, 0.7)  # of its height, where a cell is looked at
-THROUGH_M = 0.02  # beyond noise
+MAX_AGE_S = 120.0  # without being seen; later the thing may be gone
+MAX_AGE_ONCE_S = 1.0  # of a cell that only one picture showed
+DRIFT_PER_M, DRIFT_PER_RAD = 0.02, 0.02  # of odometry: per metre driven; per rad and metre away
+MAX_DRIFT_M = 0.15  # since it was seen; planners' clearance is smaller
+MAX_DISTANCE_M = 5.0  # from the robot
+GONE_STRIKES = 3.0  # number of pictures that see through a removed cell; one for a new cell
+BESIDE_STRIKES = 0.05  # for a picture that shows something just beside the cell
+STEADY_POINTS = 3.0  # least pixels of a cell that counts in its first picture
+CONFIRMED_PICTURES = 4.0  # a cell is confirmed after this many pictures
+SHARES = (0.2, 0.45, 0.7)  # of its height, where a cell is checked
+THROUGH_M = 0.02  # behind a cell, beyond noise
 NEIGHBOURS = tuple((row, column) for row in (-1, 0, 1) for column in (-1, 0, 1))
 MAX_CELLS = 8000  # the newest; a picture has at most some thousand
 MIN_HALF_M = 0.004  # of a cell's box
@@ -54,7 +54,7 @@ Cells = NDArray[np.void]
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """The depth and the floor in a picture, to find cells whose thing is gone."""
+    """Depth and floor of a picture, to find cells whose thing is gone."""
 
     model: CameraModel
     depth: Singles  # (height, width) [m]; 0 is unknown
@@ -63,7 +63,7 @@ class Picture:
 
 
 class CellMemory:
-    """Cells that hold something. Positions and times are those of the odometry."""
+    """Occupied cells. Positions and times are those of the odometry."""
 
     def __init__(self) -> None:
         self.cells: Cells = np.empty(0, CELLS)
@@ -71,7 +71,7 @@ class CellMemory:
         self._driven = self._turned = self._now = 0.0
 
     def move(self, pose: Pose, now: float) -> None:
-        """Take the robot's pose at `now` [s], and forget what is too old or too far off."""
+        """Set the robot's pose at `now` [s], and remove cells that are too old or too far away."""
         if self._pose:
             self._driven += math.hypot(pose.x - self._pose.x, pose.y - self._pose.y)
             self._turned += abs(math.remainder(pose.yaw - self._pose.yaw, math.tau))
@@ -85,12 +85,14 @@ class CellMemory:
         away = np.hypot(middle[:, 0] - pose.x, middle[:, 1] - pose.y)
         drift = DRIFT_PER_M * (self._driven - cells["driven"])
         drift += DRIFT_PER_RAD * (self._turned - cells["turned"]) * away
-        kept = (now - cells["stamp"] <= KEPT_S) & (drift <= MAX_DRIFT_M) & (away <= KEPT_REACH_M)
-        kept &= (cells["seen"] > 1) | (now - cells["stamp"] <= GLIMPSED_S)
+        kept = (
+            (now - cells["stamp"] <= MAX_AGE_S) & (drift <= MAX_DRIFT_M) & (away <= MAX_DISTANCE_M)
+        )
+        kept &= (cells["seen"] > 1) | (now - cells["stamp"] <= MAX_AGE_ONCE_S)
         self.cells = cells[kept]
 
     def look(self, picture: Picture, kinds: tuple[int, ...]) -> None:
-        """Strike the cells of these kinds that a picture sees through. `move` comes first."""
+        """Strike cells of these kinds that a picture sees through. Call `move` before."""
         chosen = np.flatnonzero(np.isin(self.cells["kind"], kinds))
         if not len(chosen):
             return
@@ -100,7 +102,7 @@ class CellMemory:
         self.cells["seen"][chosen] -= through & (cells["seen"] > 1)
 
     def _seen_through(self, picture: Picture, cells: Cells) -> tuple[Mask, Mask]:
-        """Return which cells a picture shows to be empty, and where it shows something."""
+        """Return masks of cells that a picture shows as empty, and as occupied."""
         flat = cells["kind"] != OBSTACLE
         middle = self.to_body((cells["low"] + cells["high"]) / 2)
         ground = picture.floor[0] + middle @ picture.floor[1:]
@@ -114,9 +116,9 @@ class CellMemory:
         return free & ~held, held
 
     def add(self, points: NDArray[np.floating], kind: int) -> None:
-        """Add what the newest picture showed: points (n, 3), x and y in the body's frame.
+        """Add the newest picture's points (n, 3), x and y in the body's frame.
 
-        The third value is the height above the floor [m]. `look` comes first.
+        The third value is the height above the floor [m]. Call `look` before.
         """
         new = self._binned(points, kind)
         place = np.searchsorted(self.cells["key"], new["key"])
@@ -175,7 +177,7 @@ class CellMemory:
         return cells
 
     def steady(self) -> Mask:
-        """Return which cells most pictures show; pixels at edges show some only at times."""
+        """Return which cells most pictures show; pixels at edges show others only at times."""
         cells = self.cells
         doubts = np.where(cells["seen"] > 2, 2.0, 1.0)
         many = (cells["seen"] > 1) | (cells["points"] >= STEADY_POINTS)
@@ -204,7 +206,7 @@ class CellMemory:
 
 
 def _look_at(picture: Picture, points: Floats, flat: Mask) -> tuple[Mask, Mask]:
-    """Return where a picture sees through points (n, 3), and where it sees something there.
+    """Return masks of points (n, 3) that a picture sees through, and that it sees.
 
     All pixels round a point must agree. On the floor (`flat`) only floor counts as empty.
     """

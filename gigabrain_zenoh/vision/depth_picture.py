@@ -10,19 +10,19 @@ from gigabrain_zenoh.vision.camera_model import CameraModel, Singles
 from gigabrain_zenoh.vision.floor import FloorPlane, fit_floor, unseen_floor
 
 Mask = NDArray[np.bool_]
-SIGMA_AT_1M = 0.0015  # [m], standard deviation of depth; it grows with the square of the depth
-REACH_M = 3.5  # farther, nothing is taken for an obstacle or a hole
-LOW_M, HIGH_M = 0.012, 0.02  # heights of the points of an obstacle, and of its highest ones
-SIGMAS = 4.0  # a height that noise does not explain
+SIGMA_AT_1M = 0.0015  # [m], standard deviation of depth; grows with depth squared
+REACH_M = 3.5  # largest depth of obstacles and holes
+LOW_M, HIGH_M = 0.012, 0.02  # least heights of an obstacle's points, and of its highest ones
+SIGMAS = 4.0  # least height of an obstacle, relative to noise
 HOLE_M = 0.025  # below the floor
-LIKE_M, LIKE_SHARE, LIKE_SIGMAS = 0.008, 0.005, 3.5  # a pixel as deep as its neighbour
-SUPPORT = 3  # of eight neighbours at the same depth, as at the corner of a thing
-MISSING_REACH_M = 1.2  # where the floor always returns something
+LIKE_M, LIKE_SHARE, LIKE_SIGMAS = 0.008, 0.005, 3.5  # tolerances for pixels at the same depth
+SUPPORT = 3  # least neighbours, of eight, at the same depth, as at a thing's corner
+MISSING_REACH_M = 1.2  # up to here the floor always gives depth
 MISSING_PX, MISSING_SHARE = 9, 0.75  # side of a window, and its share of pixels without depth
-ROW_M = 0.25  # longest stretch of floor in one row of pixels, in which a hole's edge is known
-BLIND_SHARE = 0.02  # of pixels with depth: with fewer the picture shows nothing at all
-FIT_REACH_M = 4.0  # depth of the points of the fit
-FIT_STEP = 3  # rows and columns from one point of the fit to the next
+ROW_M = 0.25  # longest stretch of floor in one row of pixels, to locate a hole's edge
+BLIND_SHARE = 0.02  # least share of pixels with depth
+FIT_REACH_M = 4.0  # largest depth of points for the fit
+FIT_STEP = 3  # rows and columns between two points for the fit
 SUB_ROWS = (-0.375, -0.125, 0.125, 0.375)
 
 
@@ -31,15 +31,15 @@ class DepthView:
     """The content of a picture. Points are in the body's frame [m], heights above the floor [m]."""
 
     obstacles: Singles  # (n, 3): x, y, height
-    holes: Singles  # (m, 3): where the floor should be, and how high what was seen instead is
-    missing: Singles  # (k, 2): where the floor should be, and nothing returns
+    holes: Singles  # (m, 3): x, y where the floor should be, height of the seen point
+    missing: Singles  # (k, 2): x, y where the floor should be, without depth
     depth: Singles  # (height, width) [m]; 0 is unknown
     is_floor: Mask  # (height, width)
     floor: FloorPlane
 
 
 class DepthCamera:
-    """Takes the pictures of one camera apart; remembers the floor from one to the next."""
+    """Analyses the depth pictures of one camera; tracks the floor between them."""
 
     def __init__(self, model: CameraModel, body_height: float) -> None:
         self.model = model
@@ -51,15 +51,15 @@ class DepthCamera:
         least = np.where(up < 0, up * REACH_M, up * camera.depth_min)
         low = np.any(least < room, axis=1)  # NaN is not
         self._first = int(np.argmax(low)) if low.any() else camera.height - 2
-        # row of the picture, above which nothing is as low as the body
+        # first row of the picture that may show points below the body's height
         self._grid = np.s_[FIT_STEP // 2 :: FIT_STEP, FIT_STEP // 2 :: FIT_STEP]
         fitting = model.rays[:, *self._grid].astype(np.float64)
-        down = fitting[2] < 0.0  # no floor is seen upwards
+        down = fitting[2] < 0.0  # rays upwards see no floor
         self._fitting, self._fit_rays = down, fitting[:, down]
         self._usable = np.isfinite(model.rays[0])
 
     def view(self, millimetres: NDArray[np.uint16]) -> DepthView | None:
-        """Return what a picture (height, width) shows; None if it shows nothing at all."""
+        """Return the content of a picture (height, width); None if it shows nothing."""
         camera = self.model.camera
         depth = millimetres.astype(np.float32)
         depth *= np.float32(0.001)
@@ -75,12 +75,12 @@ class DepthCamera:
         at = np.flatnonzero((along > 0) & (along < FIT_REACH_M))
         along, rays = along[at], self._fit_rays[:, at]
         points = (rays * along).T + origin
-        low = np.abs(points[:, 2]) < 0.15  # far beyond what mounting and tilt can do
+        low = np.abs(points[:, 2]) < 0.15  # much more than mounting and tilt can cause
         sigma = SIGMA_AT_1M * np.square(along[low]) * np.abs(rays[2, low])
         return fit_floor(self._floor, points[low], sigma)
 
     def _apart(self, depth: Singles, floor: FloorPlane) -> DepthView:
-        """Take a picture apart by the height of each pixel above the floor."""
+        """Classify pixels by their height above the floor."""
         first = self._first
         rays = self.model.rays[:, first:]
         offset, slope_x, slope_y = (np.float32(c) for c in floor.coefficients)
@@ -111,7 +111,7 @@ class DepthCamera:
         )
 
     def _allowed(self, depth: Singles, rise: Singles, floor: FloorPlane) -> Singles:
-        """Return the height that noise and the floor's uncertainty explain [m], per pixel."""
+        """Return the largest height by noise and the floor's uncertainty [m], per pixel."""
         near, far = floor.sigma(np.array((0.0, REACH_M)), np.zeros(2)).tolist()
         plane = np.float32(near) + np.float32((far - near) / REACH_M) * depth
         noise = np.float32(SIGMA_AT_1M / 2) * depth * depth * np.abs(rise)  # smoothed
@@ -124,7 +124,7 @@ class DepthCamera:
         )
 
     def _sharp(self, expected: Singles, start: np.float32) -> Mask:
-        """Return where one row of pixels covers little floor, which is at `expected` [m]."""
+        """Return where a row of pixels covers little floor; `expected` is the floor's depth [m]."""
         fy = self.model.camera.pinhole[1]
         most = math.sqrt(max(float(start), 0.0) * fy * ROW_M)
         return np.asarray(expected < min(most, REACH_M))
@@ -132,7 +132,7 @@ class DepthCamera:
     def _gaping(
         self, rays: Singles, rise: Singles, start: np.float32, below: Mask, height: Singles
     ) -> Singles:
-        """Return where rays go through the floor, and how deep [m]; one point per part of a row."""
+        """Return where rays pass through the floor, with depth [m]; one point per part of a row."""
         rows, columns = np.nonzero(below)
         if not len(rows):
             return np.empty((0, 3), np.float32)
@@ -151,7 +151,7 @@ class DepthCamera:
         return np.concatenate(flat)
 
     def _missing(self, rays: Singles, expected: Singles, known: Mask) -> Singles:
-        """Return where much of the floor nearby returns nothing (k, 2)."""
+        """Return where much of the nearby floor gives no depth (k, 2)."""
         camera = self.model.camera
         looked_for = (expected > camera.depth_min * 1.2) & (expected < MISSING_REACH_M)
         absent = looked_for & ~known
@@ -164,10 +164,10 @@ class DepthCamera:
 
 
 def smoothed(depth: Singles) -> tuple[Singles, Mask]:
-    """Return the mean of each pixel and its neighbours at the same depth, and whether it is whole.
+    """Return the mean of pixels and their neighbours at the same depth, and a mask of whole ones.
 
-    A pixel at an edge that sees two things measures neither. It is whole if it is as deep as the
-    neighbours on two opposite sides, or as enough of them.
+    A pixel at an edge may see two things and measure neither. It is whole if its depth is that of
+    the neighbours on two opposite sides, or of enough neighbours.
     """
     threshold = LIKE_M + np.float32(LIKE_SHARE) * depth
     threshold += np.float32(LIKE_SIGMAS * SIGMA_AT_1M) * depth * depth

@@ -1,7 +1,7 @@
-"""The floor: a plane, fitted to each depth picture and remembered from one to the next.
+"""The floor: a plane that is fitted to each depth picture, and tracked between them.
 
-In the body's frame it would be z = 0, were the mounting known exactly and did the body not tilt.
-Both are known well enough that a table top, a wall or a ramp is never within reach of the fit.
+With an exact mounting and without tilt, it would be z = 0 in the body's frame. Both errors are so
+small that the fit can never reach a table top, a wall or a ramp.
 """
 
 from dataclasses import dataclass
@@ -15,10 +15,10 @@ OFFSET_M, SLOPE = 0.004, 0.009  # standard deviations before the first picture: 
 MAX_OFFSET_M, MAX_SLOPE = 0.015, 0.035  # 1.5 cm and 2 degrees: mounting and tilt together
 WALK_OFFSET_M, WALK_SLOPE = 0.001, 0.006  # standard deviations of the change per picture
 ROUGH_M = 0.003  # standard deviation of a real floor from its plane
-REACHES_M = (0.6, 1.0, 1.6, 2.4, 3.2, 3.2)  # outwards from what is sure to what is not
-GATE = 3.0  # standard deviations from the plane, beyond which a point is not floor
-INDEPENDENT = 60.0  # a picture counts as no more than this many independent points
-MIN_POINTS = 60  # with fewer the floor is not in view
+REACHES_M = (0.6, 1.0, 1.6, 2.4, 3.2, 3.2)  # of the rounds of a fit, from near to far
+GATE = 3.0  # largest distance of floor points from the plane, in standard deviations
+INDEPENDENT = 60.0  # largest number of independent points in a picture
+MIN_POINTS = 60  # for a floor in view
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,16 +42,16 @@ class FloorPlane:
 
 
 def unseen_floor() -> FloorPlane:
-    """Return what is known before the first picture."""
+    """Return the floor before the first picture."""
     return FloorPlane(np.zeros(3), np.diag((OFFSET_M, SLOPE, SLOPE)) ** 2)
 
 
 def fit_floor(before: FloorPlane, points: Floats, sigma: Floats) -> FloorPlane:
     """Return the floor in a picture of `points` (n, 3) in the body's frame.
 
-    `sigma` (n,) is the standard deviation of each height [m]. The fit begins at the floor before
-    and goes outwards, so that only what continues the floor nearby is taken for floor. Where too
-    little of it is in view, it stays as it was.
+    `sigma` (n,) is the standard deviation of each height [m]. The fit starts near the robot and
+    extends outwards, so that only a continuation of the near floor counts as floor. If too little
+    of it is in view, `before` is kept.
     """
     walk = np.diag((WALK_OFFSET_M, WALK_SLOPE, WALK_SLOPE)) ** 2
     predicted = FloorPlane(before.coefficients, _bounded(before.covariance + walk))
@@ -83,7 +83,7 @@ def fit_floor(before: FloorPlane, points: Floats, sigma: Floats) -> FloorPlane:
 
 
 def _bounded(covariance: Floats) -> Floats:
-    """Return a covariance that is no larger than before the first picture, axis by axis."""
+    """Limit a covariance to that before the first picture, axis by axis."""
     most = np.array((OFFSET_M, SLOPE, SLOPE))
     shrink = np.minimum(1.0, most / np.sqrt(np.diag(covariance)))
     return np.asarray(covariance * np.outer(shrink, shrink))

@@ -1,9 +1,9 @@
-"""The boundary of the floor by colour, for cameras without depth: a plain second source.
+"""The boundary of the floor by colour, a simple source for cameras without depth.
 
-The floor is what has the colours of the patch before the robot, as they were in pictures in which
-that patch was even. Where a column of the picture leaves those colours, something stands; by the
-plane of the floor (a homography) its place is known, its height is not. Shadows, carpets and
-patterns are taken for obstacles, and obstacles that have the floor's colour for floor.
+The floor's colours are those of the patch before the robot, in pictures where that patch is even.
+Where a column of the picture leaves these colours, there is an obstacle. The plane of the floor (a
+homography) gives its place, not its height. Shadows, carpets and patterns look like obstacles;
+obstacles of the floor's colour look like floor.
 """
 
 from dataclasses import dataclass
@@ -15,17 +15,17 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.vision.camera_model import CameraModel, Singles
 from gigabrain_zenoh.vision.depth_picture import Mask
 
-STEP = 2  # pixels to one of the small picture
-REACH_M = 2.5  # farther, a row of pixels covers too much floor
-PATCH_WIDTH, PATCH_M = 0.4, 0.25  # the middle of the picture; from the nearest floor in view
-EVEN = 30.0  # greatest standard deviation of the brightness (0 to 255) of an even patch
-SPREAD = 6.0  # least standard deviation of a colour: what a camera's noise and its JPEG do
-UNLIKE = 5.0  # standard deviations from the colour of the floor
-GAIN = 0.1  # of a new picture in the remembered colour
+STEP = 2  # the picture is reduced by this factor
+REACH_M = 2.5  # beyond it, a row of pixels covers too much floor
+PATCH_WIDTH, PATCH_M = 0.4, 0.25  # share of the width, and length from the nearest visible floor
+MAX_EVEN_SIGMA = 30.0  # largest standard deviation of the brightness (0 to 255) of an even patch
+MIN_SPREAD = 6.0  # least standard deviation of a colour, by noise and JPEG
+MIN_UNLIKE = 5.0  # least distance from the floor's colour, in standard deviations
+GAIN = 0.1  # weight of a new picture in the tracked colour
 RUN_PX = 3  # rows in sequence that are no floor; fewer are joints and specks
-DEEP_M = (0.0, 0.02)  # behind the boundary something stands, at least this deep
+DEEP_M = (0.0, 0.02)  # assumed depth range of an obstacle behind the boundary
 MIN_PX = 40  # of a patch
-DARK = 40.0  # added to the brightness that chromaticity is divided by: dark pixels have no colour
+DARK = 40.0  # added to the brightness before dividing by it, as dark pixels have no colour
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,16 +34,16 @@ class ColourView:
 
     boundary: Floats  # (n, 2) [m], where the floor ends
     is_floor: Mask  # (height, width)
-    known: Singles  # (height, width): 1 where it is known whether it is floor
+    known: Singles  # (height, width): 1 where `is_floor` is known
 
 
 class ColourCamera:
-    """Takes the pictures of one camera apart; remembers the colour of the floor."""
+    """Analyses the pictures of one camera; tracks the colour of the floor."""
 
     def __init__(self, model: CameraModel) -> None:
         self.model = model
         self._rows = np.s_[::-1] if model.rotation[2, 2] < 0 else np.s_[:]
-        # the lower a row, the nearer is its floor, also where the camera hangs upside down
+        # so that lower rows show nearer floor, even if the camera is upside down
         rays = model.rays[:, ::STEP, ::STEP][:, self._rows].astype(np.float64)
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = np.where(rays[2] < -1e-3, -model.origin[2] / rays[2], np.inf)
@@ -58,16 +58,16 @@ class ColourCamera:
             self._patch[:, middle - half : middle + half] = True
             self._patch &= self._near & (distance < nearest + PATCH_M)
         self._mean: Floats | None = None
-        self._spread: Floats = np.full(3, SPREAD)
+        self._spread: Floats = np.full(3, MIN_SPREAD)
 
     def view(self, pixels: NDArray[np.uint8]) -> ColourView | None:
-        """Return what a picture (height, width, 3) shows; None while no floor is known."""
+        """Return the content of a picture (height, width, 3); None before the floor is known."""
         features = _features(pixels[::STEP, ::STEP][self._rows])
         self._learn(features[self._patch])
         if self._mean is None:
             return None
         off = np.square((features - self._mean) / self._spread).sum(axis=2)
-        floor = (off < UNLIKE * UNLIKE) & self._near
+        floor = (off < MIN_UNLIKE * MIN_UNLIKE) & self._near
         row, column = _boundary(floor, self._near)
         ends = np.full(floor.shape[1], -1)
         ends[column] = row
@@ -80,15 +80,15 @@ class ColourCamera:
         return ColourView(boundary, known, known.astype(np.float32))
 
     def _learn(self, patch: Floats) -> None:
-        """Take the colour of the patch before the robot, if floor is all that it shows."""
+        """Learn the colour of the patch before the robot, if it shows only floor."""
         if len(patch) < MIN_PX:
             return
-        mean, spread = np.median(patch, axis=0), np.maximum(patch.std(axis=0), SPREAD)
-        if spread[0] > EVEN:
+        mean, spread = np.median(patch, axis=0), np.maximum(patch.std(axis=0), MIN_SPREAD)
+        if spread[0] > MAX_EVEN_SIGMA:
             return
         if self._mean is None:
             self._mean, self._spread = mean, spread
-        elif np.all(np.abs(mean - self._mean) < UNLIKE * self._spread):
+        elif np.all(np.abs(mean - self._mean) < MIN_UNLIKE * self._spread):
             self._mean = self._mean + GAIN * (mean - self._mean)
             self._spread = self._spread + GAIN * (spread - self._spread)
 
@@ -102,7 +102,7 @@ def _features(pixels: NDArray[np.uint8]) -> Floats:
 
 
 def _boundary(floor: Mask, near: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return row and column of the lowest pixel of each column that is no floor, as those above."""
+    """Return row and column of the lowest run of pixels without floor, in each column."""
     other = near & ~floor
     run = other.copy()
     for above in range(1, RUN_PX):

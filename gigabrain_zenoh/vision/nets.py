@@ -1,4 +1,4 @@
-"""Nets that recognise things: the shipped one, or one's own in a layout that people export."""
+"""Nets that recognise things: the shipped one, or a user's in a common export layout."""
 
 import importlib.util
 from collections.abc import Sequence
@@ -42,12 +42,12 @@ class Net(Protocol):
     """Finds things in a picture (h, w, 3), RGB."""
 
     def find(self, picture: Picture) -> Found:
-        """Return what is in it, the surest first."""
+        """Return the things in it, most confident first."""
         ...
 
 
 def load_net(config: RecognizerConfig) -> Net | None:
-    """Return the net of the settings; None where no weights are shipped. Raises ConfigError."""
+    """Return the net of the settings; None without shipped weights. Raises ConfigError."""
     own = config.layout != "things"
     if own and not config.onnx:
         text = f"recognizer: layout `{config.layout}` is for a net of one's own"
@@ -69,7 +69,7 @@ def load_net(config: RecognizerConfig) -> Net | None:
 
 
 def read_labels(path: Path) -> tuple[str, ...]:
-    """Return the classes of a file, one a line; an empty line is a class that is not reported."""
+    """Read the classes of a file, one a line; an empty line is a class that is not reported."""
     try:
         text = read_bounded(path, MAX_LABEL_BYTES).decode("utf-8-sig")
     except OSError as error:
@@ -146,7 +146,7 @@ class YoloNet:
         return _run(self._net, blob, self._path, f"export it so: {GOOD_YOLO}")
 
     def _unpacked(self, raw: Floats) -> tuple[Floats, NDArray[np.int64], Floats]:
-        """Return corners, labels and confidences of what is sure enough."""
+        """Return corners, labels and confidences above the least confidence."""
         if self._final:
             final = raw[raw[:, 4] >= self._least]
             return final[:, :4], final[:, 5].astype(np.int64), np.minimum(final[:, 4], 1)
@@ -160,7 +160,7 @@ class DetrNet:
     """A net with the heads of DETR, such as RF-DETR's, run by ONNX Runtime. Raises ConfigError.
 
     It gives logits (1, n, classes) and boxes (1, n, 4): middle and size, as shares of the picture.
-    Scores are by sigmoid; by softmax where the last class is "none", as DETR's own heads have it.
+    Scores are by sigmoid, or by softmax if the last class is "none", as in DETR's own heads.
     """
 
     def __init__(self, path: Path, classes: Sequence[str], config: RecognizerConfig) -> None:
@@ -282,7 +282,7 @@ def _rounded(picture: Picture) -> tuple[int, int]:
 
 
 def _run(net: cv2.dnn.Net, blob: Any, path: Path, advice: str) -> NDArray[Any]:
-    """Return what a net gives for a picture. Raises ConfigError where it cannot run."""
+    """Return a net's output for a picture. Raises ConfigError if it cannot run."""
     try:
         net.setInput(blob)
         return np.asarray(net.forward())

@@ -1,4 +1,4 @@
-"""Obstacle contours: what the cameras of a body saw, in its frame, remembered where it drives."""
+"""Obstacle contours from all cameras of a body, in its frame, with memory."""
 
 import math
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from gigabrain_zenoh.vision.cell_memory import (
     COLOUR,
     CONFIRMED_PICTURES,
     HOLE,
-    KEPT_S,
+    MAX_AGE_S,
     MISSING,
     OBSTACLE,
     CellMemory,
@@ -30,31 +30,31 @@ from gigabrain_zenoh.vision.depth_picture import HIGH_M, DepthCamera, DepthView
 from gigabrain_zenoh.vision.floor_colour import ColourCamera
 from gigabrain_zenoh.vision.outlines import Labels, connected, distinct, split, support_polygons
 
-ENOUGH_PIXELS = 320 * 240  # of larger pictures every second row and column is taken, or fewer
-MAX_CONTOURS = 128  # the nearest
-BOTTOMLESS_M = -1.0  # of a hole that returns nothing
-CLEARANCE_ABOVE_M = 0.01  # what hangs no higher than this above the body bars the way too
-AT_ONCE_POINTS = 12.0  # pixels of something that is believed in its first picture
-LATER_POINTS = 2.0  # ... in its second
-GROUPS = ((OBSTACLE,), (HOLE, MISSING), (COLOUR,))  # kinds of cells that make a contour together
+MAX_PIXELS = 320 * 240  # larger pictures are reduced to every second row and column, or fewer
+MAX_CONTOURS = 128  # the nearest ones
+BOTTOMLESS_M = -1.0  # height of a hole without depth
+CLEARANCE_ABOVE_M = 0.01  # things up to this height above the body are obstacles
+AT_ONCE_POINTS = 12.0  # least pixels of a thing that counts after its first picture,
+LATER_POINTS = 2.0  # and after its second
+GROUPS = ((OBSTACLE,), (HOLE, MISSING), (COLOUR,))  # kinds of cells that share contours
 MIN_SEEN = {OBSTACLE: 2.0, HOLE: 2.0, MISSING: 3.0, COLOUR: 3.0}  # pictures
-UNSURE = {MISSING: 0.5, COLOUR: 0.5}  # confidence of kinds that other things look like
-OwnPoints = Callable[[Floats], NDArray[np.bool_]]  # which points (n, 3) are on the body's own arm
+UNSURE = {MISSING: 0.5, COLOUR: 0.5}  # confidence of kinds with frequent mistakes
+OwnPoints = Callable[[Floats], NDArray[np.bool_]]  # mask of points (n, 3) on the body's own arm
 
 
 class Seen(NamedTuple):
-    """A depth picture, taken apart."""
+    """An analysed depth picture."""
 
     view: DepthView
     model: CameraModel
-    own: NDArray[np.bool_]  # (n,) of its obstacles that are the body itself
+    own: NDArray[np.bool_]  # (n,), obstacle points that are on the body itself
 
 
 class ObstacleContours:
     """Contours from the pictures of all cameras of a body. Never raises for a bad picture.
 
-    Poses are those of the odometry when a picture was exposed, times are in seconds of any clock
-    that goes on with them.
+    Poses are those of the odometry at the exposure of a picture. Times are in seconds of any clock
+    that is consistent with them.
     """
 
     def __init__(self, description: BodyDescription) -> None:
@@ -66,7 +66,7 @@ class ObstacleContours:
         self._colour: dict[str, ColourCamera] = {}
         self._memory = CellMemory()
         self._tracks = 0
-        self.seen: Seen | None = None  # the newest depth picture, unless it was refused
+        self.seen: Seen | None = None  # newest depth picture; None if it was refused
 
     def reset(self) -> None:
         """Forget everything, as after a restart of the odometry."""
@@ -80,7 +80,7 @@ class ObstacleContours:
         now: float,
         on_arm: OwnPoints | None = None,
     ) -> str:
-        """Take a depth picture of the camera `name`; return why it was refused, or ''."""
+        """Add a depth picture of the camera `name`; return why it was refused, or ''."""
         self.seen = None
         problem = self._refused(name, image.width, image.height)
         if problem:
@@ -115,9 +115,9 @@ class ObstacleContours:
         return ""
 
     def add_colour(self, name: str, pixels: NDArray[np.uint8], pose: Pose, now: float) -> str:
-        """Take a picture (height, width, 3) of the camera `name`; return why not, or ''.
+        """Add a picture (height, width, 3) of the camera `name`; return why it was refused, or ''.
 
-        It is a second source for cameras without depth: where the colour of the floor ends.
+        For cameras without depth: obstacles are where the floor's colour ends.
         """
         if pixels.ndim != 3 or pixels.shape[2] != 3:
             return f"it has no three colours, but the shape {pixels.shape}"
@@ -138,7 +138,7 @@ class ObstacleContours:
         return ""
 
     def contours(self, pose: Pose, now: float) -> tuple[Contour, ...]:
-        """Return what is known at `now` [s] in the frame of a body at `pose`, the nearest first."""
+        """Return the contours at `now` [s] in the frame of a body at `pose`, nearest first."""
         memory = self._memory
         memory.move(pose, now)
         found: list[tuple[float, Contour]] = []
@@ -159,7 +159,7 @@ class ObstacleContours:
         return ""
 
     def _of_group(self, at: Labels, now: float, taken: set[int]) -> list[tuple[float, Contour]]:
-        """Return the contours of some cells, with their distance, and mark the cells with them."""
+        """Return contours of some cells with their distance; store their tracks in the cells."""
         cells = self._memory.cells[at]
         labels = connected((cells["low"] + cells["high"]) / 2)
         believed = _believed(cells, labels)[labels]
@@ -186,7 +186,7 @@ class ObstacleContours:
         return found
 
     def _track(self, part: Cells, taken: set[int]) -> int:
-        """Return the track that most of the cells had, unless another contour has taken it."""
+        """Return the most frequent track of the cells, unless another contour uses it."""
         before, count = np.unique(part["track"], return_counts=True)
         numbers: list[int] = before[np.argsort(-count, kind="stable")].tolist()
         track = next((one for one in numbers if one and one not in taken), 0)
@@ -198,12 +198,12 @@ class ObstacleContours:
 
 
 def step_of(camera: Camera) -> int:
-    """Return how many rows and columns of its pictures to go on by, from one pixel to the next."""
-    return max(1, int(math.sqrt(camera.width * camera.height / ENOUGH_PIXELS) + 0.35))
+    """Return the step of rows and columns by which its pictures are reduced."""
+    return max(1, int(math.sqrt(camera.width * camera.height / MAX_PIXELS) + 0.35))
 
 
 def reduced(camera: Camera, step: int) -> Camera:
-    """Return a camera that sees only each `step`th row and column of the pixels."""
+    """Return a camera with only each `step`th row and column of pixels."""
     fx, fy, cx, cy = camera.pinhole
     return replace(
         camera,
@@ -214,7 +214,7 @@ def reduced(camera: Camera, step: int) -> Camera:
 
 
 def _believed(cells: Cells, labels: Labels) -> NDArray[np.bool_]:
-    """Return which groups of cells are more than noise."""
+    """Return a mask of groups of cells that are more than noise."""
     groups = int(labels.max()) + 1
     points = np.bincount(labels, cells["points"], groups)
     enough = np.zeros(groups, np.bool_)
@@ -239,7 +239,7 @@ def _contour(part: Cells, corners: Floats, track: int, now: float) -> Contour:
         bottom=float(np.clip(part["bottom"].min(), -10.0, 10.0)),
         top=float(np.clip(part["top"].max() if kind in (OBSTACLE, COLOUR) else 0.0, -10.0, 10.0)),
         age=age,
-        confidence=UNSURE.get(kind, 1.0) * surety * max(0.0, 1.0 - age / (2 * KEPT_S)),
+        confidence=UNSURE.get(kind, 1.0) * surety * max(0.0, 1.0 - age / (2 * MAX_AGE_S)),
         track=track,
         source="floor_colour" if kind == COLOUR else "depth",
     )

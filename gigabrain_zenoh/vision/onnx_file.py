@@ -1,4 +1,4 @@
-"""Reads what an ONNX file says of its inputs, without a library: cv2.dnn does not tell.
+"""Reads the input of an ONNX file, without a library, because cv2.dnn does not report it.
 
 An ONNX file is a ModelProto in protobuf's wire format (onnx/onnx.proto3).
 """
@@ -25,7 +25,7 @@ class OnnxInput(NamedTuple):
 
 
 def input_of(path: Path) -> OnnxInput:
-    """Return the input of a net. Raises ConfigError where the file is none, or cannot be read."""
+    """Return the first input of a net. Raises ConfigError for an invalid or unreadable file."""
     try:
         data = memoryview(read_bounded(path, MAX_BYTES))
     except OSError as error:

@@ -8,10 +8,10 @@ from gigabrain_schemas.arrays import Floats
 LINK_M = 0.05  # cells of this size that touch belong together
 DIRECTIONS = 16  # of an outline's corners; those of boxes are always among them
 SPLIT_ROUNDS = 6
-SAME_M = 1e-6  # corners so near to each other are the same
-HOLLOW_M = 0.07  # most that an outline is off its cells, along a part of an edge
-AROUND_M = 0.4  # a viewer so near to an outline, or in it, sees all of its edges
-EDGE_M, EDGE_PARTS = 0.15, 8  # shorter edges are not looked at; parts of the others
+SAME_M = 1e-6  # largest distance of equal corners
+HOLLOW_M = 0.07  # largest distance of an outline from its cells, along a part of an edge
+AROUND_M = 0.4  # a viewer this near to an outline, or in it, sees all of its edges
+EDGE_M, EDGE_PARTS = 0.15, 8  # least length of checked edges, and their number of parts
 Labels = NDArray[np.intp]
 _angles = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
 AXES: Floats = np.stack((np.cos(_angles), np.sin(_angles)))
@@ -54,8 +54,8 @@ def _joined(count: int, begin: Labels, end: Labels) -> Labels:
 def split(low: Floats, high: Floats, labels: Labels, viewer: Floats) -> Labels:
     """Return finer groups of the boxes from `low` to `high` (n, 2), so that none is hollow.
 
-    What lies behind the boxes, as seen from `viewer` (2,), is unknown: it may be in an outline,
-    unless that is so near that the viewer may be there itself.
+    The space behind the boxes, seen from `viewer` (2,), is unknown. It may be in an outline, unless
+    the outline is so near that the viewer may be in that space itself.
     """
     middle = (low + high) / 2
     labels = labels.copy()
@@ -72,7 +72,7 @@ def split(low: Floats, high: Floats, labels: Labels, viewer: Floats) -> Labels:
 
 
 def _hollow(middle: Floats, outline: Floats, first: Labels, viewer: Floats) -> NDArray[np.bool_]:
-    """Return which groups have an edge towards `viewer` that is far from all their boxes.
+    """Return groups with an edge towards `viewer` that is far from all their boxes.
 
     A viewer in an outline, as in the corner of two walls, may be where that edge cuts the corner.
     """

@@ -1,4 +1,4 @@
-"""Pictures of messages as arrays, within limits: a small JPEG may claim a billion pixels."""
+"""Decodes pictures of messages, within limits: a small JPEG may claim a billion pixels."""
 
 import struct
 from typing import Any

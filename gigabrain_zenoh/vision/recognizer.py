@@ -1,4 +1,4 @@
-"""Finds things of known classes in a picture, by a small net that `cv2.dnn` runs."""
+"""Finds things of known classes in a picture, with a small net in `cv2.dnn`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Found:
-    """Things found in one picture, the surest first.
+    """Things found in one picture, most confident first.
 
     boxes: float32 (n, 4), left, top, right, bottom [px of the picture]; labels: int64 (n,),
     indices into `classes`; confidences: float32 (n,), 0 to 1.
@@ -81,7 +81,7 @@ class Recognizer:
 
 
 def read_net(path: Path) -> cv2.dnn.Net:
-    """Return the net of an ONNX file. Raises ConfigError where cv2.dnn cannot run it."""
+    """Return the net of an ONNX file. Raises ConfigError if cv2.dnn cannot run it."""
     try:
         return cv2.dnn.readNetFromONNX(str(path))
     except cv2.error as error:
@@ -89,7 +89,7 @@ def read_net(path: Path) -> cv2.dnn.Net:
 
 
 def reason(error: cv2.error) -> str:
-    """Return what OpenCV says, in one line."""
+    """Return OpenCV's error as one line."""
     return str(error).split("error:")[-1].strip().splitlines()[0][:120]
 
 
@@ -122,7 +122,7 @@ def unfit(boxes: Floats, picture: Picture, scale: float, left: int, top: int) ->
 
 
 def decode(raw: Floats, min_confidence: float = MIN_CONFIDENCE) -> Found:
-    """Return what the net's answer (classes + 4, h, w) says, overlapping boxes dropped.
+    """Decode the net's output (classes + 4, h, w), without overlapping boxes.
 
     Logits of classes come first, then the logarithms of distances to left, top, right, bottom.
     """
@@ -145,7 +145,7 @@ def decode(raw: Floats, min_confidence: float = MIN_CONFIDENCE) -> Found:
 def suppress(
     boxes: Floats, labels: NDArray[np.int64], confidences: Floats, overlap: float = MAX_OVERLAP
 ) -> NDArray[np.int64]:
-    """Return the boxes to keep, surest first: of those of one class that overlap, the surest."""
+    """Return the boxes to keep, most confident first; drop those that overlap a better one."""
     if not len(boxes):
         return np.zeros(0, np.int64)
     sized = np.concatenate([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], axis=1)

@@ -1,8 +1,8 @@
 """Fits a box, an upright cylinder or a sphere to the points of a thing that stands on a floor.
 
-What is not seen is taken to be as what is: a thing whose front alone is seen is as thick as wide.
-The sides of boxes are found by how near all points are to one of them: X. Zhang et al., "Efficient
-L-Shape Fitting for Vehicle Detection Using Laser Scanners", IV 2017.
+Hidden parts are assumed to be like visible ones: a thing with only its front visible is as thick as
+wide. The sides of boxes minimise the points' distances to them: X. Zhang et al., "Efficient L-Shape
+Fitting for Vehicle Detection Using Laser Scanners", IV 2017.
 """
 
 import math
@@ -15,23 +15,23 @@ from gigabrain_schemas.arrays import Floats
 
 ShapeName = Literal["box", "cylinder", "sphere"]
 MIN_POINTS = 12
-FROM_ABOVE = math.tan(math.radians(20))  # slope of the line of sight from which a top is whole
-TOP_SHARE = 0.97  # of the heights lie below the top
-LID_M = 0.004  # below its top, where its rim is
+FROM_ABOVE = math.tan(math.radians(20))  # least slope of sight that shows a whole top
+TOP_SHARE = 0.97  # quantile of the heights that is the top
+LID_M = 0.004  # points this near to the top belong to its rim
 STEP_M = 0.0015  # between points along an outline
 ANGLES = np.radians(np.arange(0.0, 90.0, 2.0))
 FINE_RAD = np.radians(np.arange(-2.0, 2.1, 0.25))
-CLOSE_M = 0.001  # nearer to a side is no better
-FLAT_M = 0.008  # of a box of which one side is seen, at most
-MIN_ARC = 1.2  # of its radius, that is seen of a round thing
+CLOSE_M = 0.001  # smaller distances to a side count as this
+FLAT_M = 0.008  # largest visible depth of a box with one visible side
+MIN_ARC = 1.2  # least visible arc of a round thing, relative to its radius
 MAX_RADIUS_M = 0.2
 ROUNDS = 8  # of Gauss-Newton
-UNDECIDED = 0.9  # a thing is round where a circle fits better than sides do by this factor
-RESTS = 0.35  # of its radius, by which the middle of a ball may seem too high or too low
+UNDECIDED = 0.9  # a thing is round if a circle fits better than sides by this factor
+RESTS = 0.35  # largest height error of a ball's middle, relative to its radius
 
 
 class SolidFit(NamedTuple):
-    """A thing as it was fitted, in the frame of its points."""
+    """A fitted thing, in the frame of its points."""
 
     shape: ShapeName
     size: tuple[float, ...]  # [m]: box: x, y, z; cylinder: radius, height; sphere: radius
@@ -51,7 +51,7 @@ class _Outline(NamedTuple):
 
 
 def fit_solid(points: Floats, eye: Floats, spacing: float) -> SolidFit | None:
-    """Return what fits points best, or None where they are too few or fit nothing.
+    """Return the best fitting solid, or None if there are too few points or no solid fits.
 
     Args:
         points: (n, 3) x, y and height above the floor [m].

@@ -1,8 +1,7 @@
-"""Finds things that stand on the floor, or on a table that an arm stands on, in a depth picture.
+"""Finds things on the floor, or on the table of an arm, in a depth picture.
 
-A thing that is cut off by an edge of the picture, hidden by something nearer, so near that the
-camera cannot measure it, or touched by the robot's own arm gives nothing: what would be fitted to a
-part of it is not there.
+It omits things that are cut off by an edge of the picture, hidden by nearer things, too near for
+the camera, or touched by the robot's own arm: a fit to a part of a thing would be wrong.
 """
 
 from collections.abc import Iterator
@@ -18,21 +17,21 @@ from gigabrain_zenoh.vision.outlines import connected
 from gigabrain_zenoh.vision.solid_fit import MIN_POINTS, SolidFit, fit_solid
 
 REACH_M = 1.2  # from the camera
-LARGEST_M = 0.35  # across; what is larger is furniture
+MAX_WIDTH_M = 0.35  # larger things are furniture
 LINK_M = 0.006  # least gap between two things
-NEARER_M = 0.02  # than a thing: what is so may hide a part of it
-RING_PX, MAX_HIDDEN = 2, 0.08  # round a thing, and the share of that which may be nearer
-EDGE_PX = 2  # at the edges of a picture
-BLIND_M = 0.01  # beyond the least depth: a part that is nearer may not be seen
-TOUCH_M = 0.01  # from a thing, within which the arm hides a part of it, or holds it
-THROUGH_M = 0.01  # behind a thing: what is seen there shows that it is gone
+NEARER_M = 0.02  # points this much nearer than a thing may hide a part of it
+RING_PX, MAX_HIDDEN = 2, 0.08  # width of a ring round a thing, and its share that may be nearer
+EDGE_PX = 2  # margin at the edges of a picture
+BLIND_M = 0.01  # margin beyond the camera's least depth, where parts may be invisible
+TOUCH_M = 0.01  # an arm this near to a thing hides a part of it, or holds it
+THROUGH_M = 0.01  # points this far behind a thing show that it is gone
 Mask = NDArray[np.bool_]
 
 
 def find_solids(view: DepthView, model: CameraModel, own: Mask) -> list[SolidFit]:
-    """Return what stands in a picture, in the body's frame; `own` (n,) masks its own arm.
+    """Return the things in a picture, in the body's frame.
 
-    `own` belongs to the points of `view.obstacles`.
+    `own` (n,) marks the points of `view.obstacles` on the body's own arm.
     """
     floor, eye = view.floor.coefficients, model.origin
     raw = view.obstacles.astype(np.float64)
@@ -58,7 +57,7 @@ def find_solids(view: DepthView, model: CameraModel, own: Mask) -> list[SolidFit
 
 
 def is_gone(view: DepthView, model: CameraModel, place: Floats) -> bool:
-    """Return whether the picture shows what is behind a place (3,) in the body's frame [m]."""
+    """Return whether the picture sees through a place (3,) in the body's frame [m]."""
     rows, columns, depth = model.project(place[None])
     row, column = int(rows[0]), int(columns[0])
     height, width = view.depth.shape
@@ -78,11 +77,11 @@ def _levelling(floor: Floats) -> Floats:
 
 
 def _groups(flat: Floats) -> Iterator[NDArray[np.intp]]:
-    """Yield the numbers of the points (n, 2) of each group that may be a thing."""
+    """Yield the indices of the points (n, 2) of each group that may be a thing."""
     labels = connected(flat, LINK_M)
     order = np.argsort(labels, kind="stable")
     for group in np.split(order, np.flatnonzero(np.diff(labels[order])) + 1):
-        if len(group) >= MIN_POINTS and float(np.ptp(flat[group], axis=0).max()) < LARGEST_M:
+        if len(group) >= MIN_POINTS and float(np.ptp(flat[group], axis=0).max()) < MAX_WIDTH_M:
             yield group
 
 

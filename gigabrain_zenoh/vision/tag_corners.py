@@ -1,7 +1,7 @@
-"""Finds the corners of a tag to a tenth of a pixel, as where lines along its edges cross.
+"""Finds the corners of a tag to a tenth of a pixel, as intersections of lines along its edges.
 
-Along each edge the middle of the step from black to white is measured at several points, and a
-line is fitted to them, as AprilTag 3 does (Krogius, Haggenmiller and Olson 2019).
+It measures the middle of the step from black to white at several points of each edge, and fits a
+line to them, as in AprilTag 3 (Krogius, Haggenmiller and Olson 2019).
 """
 
 import cv2
@@ -13,13 +13,13 @@ from gigabrain_schemas.arrays import Floats
 POINTS = 16  # of an edge
 ENDS = 0.12  # share of an edge left out at each end
 CELLS = 8.0  # of the smallest family, across its black square
-REACH_CELLS, MAX_PX, MIN_PX = 0.7, 3.0, 1.0  # how far from an edge its step is looked for
+REACH_CELLS, MAX_PX, MIN_PX = 0.7, 3.0, 1.0  # search range on both sides of an edge
 STEP_PX = 0.25
-MAX_MOVE_PX = 2.5  # farther, the first guess is kept
+MAX_MOVE_PX = 2.5  # beyond it, the first guess is kept
 
 
 def refined(grey: NDArray[np.uint8], corners: Floats) -> Floats:
-    """Return the corners (4, 2) of a tag nearer to where they are [px], from a first guess."""
+    """Return the refined corners (4, 2) of a tag [px], from a first guess."""
     ends = np.roll(corners, -1, axis=0)
     along = ends - corners
     length = np.linalg.norm(along, axis=1)
@@ -45,7 +45,7 @@ def refined(grey: NDArray[np.uint8], corners: Floats) -> Floats:
 
 
 def _crossings(edges: Floats, weights: Floats) -> Floats:
-    """Return where the lines through points on four edges, (4, n, 2), cross: (4, 2)."""
+    """Return the intersections (4, 2) of lines through points on four edges (4, n, 2)."""
     share = weights / weights.sum(axis=1, keepdims=True)
     middle = (share[..., None] * edges).sum(axis=1)
     off = edges - middle[:, None]

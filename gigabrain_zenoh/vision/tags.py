@@ -1,8 +1,8 @@
 """Finds AprilTags in a picture, and their poses in the body's frame.
 
-The pose of a square in a picture is of two that look much alike (Collins and Bartoli, IPPE). Depth
-decides between them, and measures distance and tilt better than the corners do. Without depth, a
-tag that leaves it open is left out.
+A square in a picture has two possible poses that look similar (Collins and Bartoli, IPPE). Depth
+decides between them, and measures distance and tilt better than corners. Without depth, ambiguous
+tags are omitted.
 """
 
 import math
@@ -26,13 +26,13 @@ FAMILIES = {
 }
 MIN_SIDE_PX = 12.0  # of the shortest side
 FROM_LOWER_LEFT = (1, 0, 3, 2)  # OpenCV draws these families upside down, from the upper left
-TURNED_RAD = 0.35  # between two poses that are two answers
-MIN_ERROR_RATIO = 1.5  # by which the error of the other pose must be greater, without depth
-INNER = 0.85  # share of a tag's sides within which depth is taken: its edges mix with behind it
+TURNED_RAD = 0.35  # least difference between two poses that count as different
+MIN_ERROR_RATIO = 1.5  # of the second pose's error to the first's, without depth
+INNER = 0.85  # share of a tag's sides where depth is used, because edges mix with the background
 MIN_POINTS = 20  # with depth
-MAX_TILT_ERROR = 0.06  # [rad], of a plane by depth that is believed
-SAME_SIZE = (0.8, 1.25)  # measured by depth, of what the settings say
-EDGE_ON = -0.05  # cosine of the angle between a ray and a face that is too slanting
+MAX_TILT_ERROR = 0.06  # [rad], of a plane by depth
+SAME_SIZE = (0.8, 1.25)  # range of size by depth / size in the settings
+EDGE_ON = -0.05  # largest cosine of the angle between a ray and a face's normal
 MAX_TAGS = 64
 Grey = NDArray[np.uint8]
 Depth = NDArray[np.uint16]
@@ -45,7 +45,7 @@ class TagFinder:
         self, family: str = "36h11", size: float = 0.16, sizes: Mapping[int, float] | None = None
     ) -> None:
         self._size, self._sizes = size, dict(sizes or {})
-        self.other_sizes: dict[int, float] = {}  # [m], measured by depth: not what they should be
+        self.other_sizes: dict[int, float] = {}  # [m], by depth, if it differs from the settings
         found = cv2.aruco.DetectorParameters()
         found.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         found.minMarkerPerimeterRate = 0.03  # of the longer side of a picture
@@ -75,7 +75,7 @@ class TagFinder:
         return tuple(found.values())[:MAX_TAGS]
 
     def _compare(self, tag: int, size: float, measured: float) -> None:
-        """Note a tag whose size by depth is another one."""
+        """Record a tag whose size by depth differs from the settings."""
         if SAME_SIZE[0] < measured / size < SAME_SIZE[1]:
             self.other_sizes.pop(tag, None)
         elif math.isfinite(measured) and len(self.other_sizes) < MAX_TAGS:
@@ -98,9 +98,9 @@ class Plane(NamedTuple):
 
 
 def place(corners: Floats, size: float, model: CameraModel, plane: Plane | None) -> Placed | None:
-    """Return the pose of a tag by its corners [px], (4, 2), from the lower left; None if open.
+    """Return the pose of a tag from its corners [px], (4, 2), lower left first; None if ambiguous.
 
-    `plane` is where depth has it.
+    `plane` is its plane by depth.
     """
     poses = _poses(corners, size, model)
     if not poses:
@@ -118,7 +118,7 @@ def place(corners: Floats, size: float, model: CameraModel, plane: Plane | None)
 
 
 def _at_depth(placed: Placed, model: CameraModel, plane: Plane) -> Placed:
-    """Return a pose moved along its ray to where depth has it; as it is where that is far off."""
+    """Return a pose moved along its ray to the depth's plane; unchanged if that is far away."""
     ray, out = placed.position - model.origin, placed.axes[:, 0]
     farther = float(plane.point @ out / (ray @ out))
     if not SAME_SIZE[0] < farther < SAME_SIZE[1]:
@@ -127,7 +127,7 @@ def _at_depth(placed: Placed, model: CameraModel, plane: Plane) -> Placed:
 
 
 def _poses(corners: Floats, size: float, model: CameraModel) -> list[tuple[Placed, float]]:
-    """Return the poses that fit, the better first, each with its error [px]."""
+    """Return the possible poses, best first, each with its error [px]."""
     half = size / 2
     square = np.array(((-half, half, 0), (half, half, 0), (half, -half, 0), (-half, -half, 0)))
     seen = corners[[3, 2, 1, 0]]  # from the upper left, clockwise
@@ -160,7 +160,7 @@ def _to_body(vector: Floats, model: CameraModel) -> Floats:
 
 
 def _plane(corners: Floats, model: CameraModel, depth: Depth) -> Plane | None:
-    """Return the plane of a tag by the depth inside it; None where too little is known."""
+    """Return the plane of a tag by the depth inside it; None if too little is known."""
     middle = corners.mean(axis=0)
     inner = middle + INNER * (corners - middle)
     mask = np.zeros(depth.shape, np.uint8)
@@ -196,13 +196,13 @@ def _on_plane(corners: Floats, model: CameraModel, plane: Plane, size: float) ->
 
 
 def _measured(corners: Floats, model: CameraModel, plane: Plane) -> float:
-    """Return the mean side of a tag on a plane [m]; not a number where it is seen edge-on."""
+    """Return the mean side of a tag on a plane [m]; NaN if it is seen edge-on."""
     placed = _cast(corners, model, plane)
     return float(np.linalg.norm(placed - np.roll(placed, 1, axis=0), axis=1).mean())
 
 
 def _cast(corners: Floats, model: CameraModel, plane: Plane) -> Floats:
-    """Return where rays through pixels (n, 2) meet a plane, from the camera, in the body's axes."""
+    """Intersect rays through pixels (n, 2) with a plane; from the camera, in the body's axes."""
     straight = cv2.undistortPoints(corners.reshape(-1, 1, 2), *_lens(model)).reshape(4, 2)
     rays = np.stack([_to_body(np.array((x, y, 1.0)), model) for x, y in straight])
     slant = rays @ plane.normal
@@ -246,13 +246,13 @@ def quaternion(axes: Floats) -> tuple[float, float, float, float]:
 
 
 def yaw_of(orientation: tuple[float, float, float, float]) -> float:
-    """Return where the x axis of a quaternion x, y, z, w points in the plane [rad]."""
+    """Return the yaw of the x axis of a quaternion x, y, z, w [rad]."""
     x, y, z, w = orientation
     return math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
 
 
 def cells(tag: int, family: str = "36h11") -> NDArray[np.bool_]:
-    """Return which cells of a tag are white (n, n), with its black border, its top first.
+    """Return a mask of a tag's white cells (n, n), including its black border, top first.
 
     Raises ValueError for a tag that its family does not have.
     """

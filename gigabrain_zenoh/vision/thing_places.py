@@ -1,7 +1,7 @@
-"""Tells where a thing in a picture is, and how large, by the depth inside its box.
+"""Computes a thing's place and size from the depth inside its box in a picture.
 
-A camera measures the nearest face of a thing. Its middle is half its thickness farther, which is
-taken from its width: round things are as thick as wide.
+A camera measures the nearest face of a thing. Its middle is half its thickness farther. The
+thickness is estimated from the width: round things are as thick as wide.
 """
 
 import math
@@ -39,29 +39,29 @@ WIDTHS_M = {
     "robot": (0.1, 1.2),
 }
 OTHERS_BEHIND, MAX_BEHIND_M = 0.35, 0.35  # of other things, and of all
-INNER = (0.2, 0.15, 0.8, 0.75)  # left, top, right, bottom of the part that is looked at
-MIN_PIXELS, MIN_SHARE = 8, 0.15  # with depth, of that part
-LAYER_SHARE = 0.3  # of the depths that make a layer: nearer ones are something else's edge
-THIN_M, THICKNESS = 0.06, 0.7  # least, and of the width, that a layer may be thick
-EDGE_PX = 2.0  # a box that is so near to an edge may go on behind it
+INNER = (0.2, 0.15, 0.8, 0.75)  # left, top, right, bottom of the evaluated part of a box
+MIN_PIXELS, MIN_SHARE = 8, 0.15  # with depth, in that part
+LAYER_SHARE = 0.3  # least share of depths in a layer; nearer ones are edges of other things
+THIN_M, THICKNESS = 0.06, 0.7  # largest thickness of a layer: at least, and relative to the width
+EDGE_PX = 2.0  # a box this near to an edge may continue beyond it
 # what stands free; others, as doors and pictures, may be in a wall or on it
 STANDING = {"ball", "box", "can", "charger", "cube", "cylinder", "person", "robot"}
-STRIP = (0.1, 0.4)  # where it begins and ends, from a side of a box, of the box's width
-NARROW_M = 0.15  # less wide things stand out too little from a wall
-FLAT_M, BENT_M = 0.02, 0.05  # off a plane, inside a box in the mean, and farther beside it
+STRIP = (0.1, 0.4)  # its start and end outside a box's side, relative to the box's width
+NARROW_M = 0.15  # narrower things protrude too little from a wall
+FLAT_M, BENT_M = 0.02, 0.05  # distance from a plane: mean inside a box, and beside it
 
 
 class ThingPlace(NamedTuple):
     """The position and size of a thing, in the body's frame."""
 
     position: Point  # [m], of its middle
-    size: Extent | None  # [m], width and height; None where it is not all in the picture
+    size: Extent | None  # [m], width and height; None if it is partly outside the picture
 
 
 def thing_place(
     label: str, box: Box, model: CameraModel, depth: NDArray[np.uint16]
 ) -> ThingPlace | None:
-    """Return the place of the thing in a box [px], by depth [mm]; None where that does not tell.
+    """Return the place of the thing in a box [px], by depth [mm]; None if that is insufficient.
 
     A thing that is cut off at a side of the picture has an unknown middle.
     """
@@ -88,16 +88,16 @@ def thing_place(
 
 
 def fits(label: str, place: ThingPlace) -> bool:
-    """Return whether a thing of that class may be as wide as the one at a place."""
+    """Return whether a thing of class `label` may have the width of `place`."""
     least, most = WIDTHS_M.get(label, (0.0, math.inf))
     return place.size is None or least <= place.size[0] <= most
 
 
 def part_of_wall(label: str, box: Box, model: CameraModel, depth: NDArray[np.uint16]) -> bool:
-    """Return whether what is seen in a box ends at neither side, as a wall between two pillars.
+    """Return whether the surface in a box continues on both sides, as a wall between pillars.
 
-    It may be a floor as well. A side at the edge of the picture, or with unknown depth beside it,
-    tells nothing.
+    It may also be a floor. A side at the edge of the picture, or with unknown depth beside it,
+    gives no evidence.
     """
     left, _, right, _ = np.clip(box, 0, (*depth.shape[::-1],) * 2)
     wide, fx = right - left, model.camera.pinhole[0]
@@ -137,9 +137,9 @@ def _profile(box: Box, depth: NDArray[np.uint16]) -> NDArray[np.float64]:
 def _goes_on(
     profile: NDArray[np.float64], inside: tuple[float, float], beside: tuple[float, float]
 ) -> bool | None:
-    """Return whether columns `inside` are a plane that may go on `beside`; None if unknown.
+    """Return whether columns `inside` are a plane that may continue `beside`; None if unknown.
 
-    It may where what is seen there is no farther: the plane itself, or something before it.
+    It may if the depth there is no farther: the plane itself, or something before it.
     """
     columns = np.arange(len(profile))
     known = np.isfinite(profile)
@@ -163,7 +163,7 @@ def _inside(box: Box, depth: NDArray[np.uint16]) -> NDArray[np.float64]:
 
 
 def _front(depths: NDArray[np.float64], wide: float) -> float | None:
-    """Return the median depth of the nearest layer that is no mere edge [m]."""
+    """Return the median depth of the nearest layer that is not only an edge [m]."""
     known = depths[depths > 0]
     needed = max(MIN_PIXELS, MIN_SHARE * len(depths))
     if len(known) < needed:

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from gigabrain_drivers.cameras.depth_noise import DepthSensor
 from gigabrain_schemas.body import Camera
 from gigabrain_zenoh.geometry.polygon import area
-from gigabrain_zenoh.vision.obstacle_contours import ENOUGH_PIXELS, ObstacleContours, step_of
+from gigabrain_zenoh.vision.obstacle_contours import MAX_PIXELS, ObstacleContours, step_of
 from tests.unit.vision.scenes import (
     HIGH,
     LOW,
@@ -187,7 +187,7 @@ def test_a_camera_that_looks_back_and_lies_on_its_side_sees_the_same() -> None:
 def test_larger_pictures_show_the_same_and_cost_no_more(width: int, height: int) -> None:
     camera = replace(LOW, width=width, height=height, field_of_view=1.2)
     step = step_of(camera)
-    assert width * height / step**2 < 2 * ENOUGH_PIXELS
+    assert width * height / step**2 < 2 * MAX_PIXELS
     eyes = ObstacleContours(body(camera))
     contours = feed(eyes, camera, Box(x=1.0, y=0.2, half_x=0.05, half_y=0.05, top=0.1))
     (box,) = near(contours, 1.0, 0.2)
