@@ -15,11 +15,11 @@ class Clock:
         return time.monotonic_ns()
 
     def unix_ns(self) -> int:
-        """Return the time since 1970 [ns], for people and recordings; it jumps when set."""
+        """Return the time since 1970 [ns], for people and recordings; it may jump."""
         return time.time_ns()
 
     def boot_ns(self) -> int:
-        """Return the time since an arbitrary start [ns], in which a suspend counts.
+        """Return the time since an arbitrary start [ns], including suspended time.
 
         It does not jump when the clock is set. A host without such a clock returns Unix time.
         """
@@ -86,5 +86,5 @@ class FakeClock(Clock):
         self._now += duration_ns
 
     async def _settle(self) -> None:
-        for _ in range(10):  # more hand-overs than any node needs between two sleeps
+        for _ in range(10):  # more task switches than any node needs between two sleeps
             await asyncio.sleep(0)

@@ -9,13 +9,13 @@ from gigabrain_schemas.base import Message
 
 M = TypeVar("M", bound=Message)
 
-# everything that msgspec raises on hostile input: it is several exceptions, not one
+# all exceptions that msgspec raises on invalid input
 DECODE_ERRORS = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
 MAX_ERROR_CHARS = 200  # an error quotes the message, which may have 60 kB
 
 
 def _plain(value: Any) -> Any:
-    """Return a single number or truth value of numpy as Python's own. Raises TypeError."""
+    """Convert a scalar of NumPy to Python's own type. Raises TypeError."""
     if getattr(value, "ndim", None) != 0:
         kind = f"{type(value).__module__}.{type(value).__name__}"
         raise TypeError(f"Encoding objects of type {kind} is unsupported")
@@ -39,7 +39,7 @@ class Codec(Generic[M]):
         self._json: Callable[[bytes], M] = msgspec.json.Decoder(message).decode
 
     def decode(self, payload: bytes) -> M:
-        """Return the message in `payload`. Raises ValueError with a sentence if it is invalid.
+        """Return the message in `payload`. Raises ValueError if it is invalid.
 
         The first byte decides, since foreign clients rarely set a Zenoh encoding: JSON begins with
         ASCII, a MessagePack map never does.

@@ -13,7 +13,7 @@ from gigabrain_zenoh.bus.transport import Close
 
 
 class Waker(Protocol):
-    """Something that one thread can make readable for the loop of another."""
+    """A file descriptor that any thread can make readable, to wake the event loop."""
 
     def fileno(self) -> int:
         """Return the file descriptor that the loop watches."""
@@ -24,7 +24,7 @@ class Waker(Protocol):
         ...
 
     def clear(self) -> None:
-        """Make it unreadable, also where it was so already."""
+        """Make it unreadable, if it is readable."""
         ...
 
     def close(self) -> None:
@@ -33,7 +33,7 @@ class Waker(Protocol):
 
 
 class EventFd:
-    """Linux's own counter in a descriptor."""
+    """Waker with Linux's `eventfd`."""
 
     def __init__(self) -> None:
         self._fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
@@ -47,8 +47,8 @@ class EventFd:
         os.eventfd_write(self._fd, 1)
 
     def clear(self) -> None:
-        """Make it unreadable, also where it was so already."""
-        try:  # not by suppress(), which takes three calls more for each message
+        """Make it unreadable, if it is readable."""
+        try:  # suppress() would take three more calls per message
             os.eventfd_read(self._fd)
         except BlockingIOError:
             return
@@ -59,7 +59,7 @@ class EventFd:
 
 
 class SocketPair:
-    """The same with two sockets, for macOS and Windows."""
+    """Waker with a pair of sockets, for macOS and Windows."""
 
     def __init__(self) -> None:
         self._read, self._write = socket.socketpair()
@@ -72,11 +72,11 @@ class SocketPair:
 
     def signal(self) -> None:
         """Make it readable."""
-        with contextlib.suppress(BlockingIOError):  # full: it is more than readable
+        with contextlib.suppress(BlockingIOError):  # the buffer is full, so it is readable
             self._write.send(b"\1")
 
     def clear(self) -> None:
-        """Make it unreadable, also where it was so already."""
+        """Make it unreadable, if it is readable."""
         with contextlib.suppress(BlockingIOError):
             self._read.recv(4096)
 
@@ -97,21 +97,21 @@ class Bridge:
         self._queue: deque[tuple[Callable[[Any], object], Any]] = deque()
         self._signalled = False
         self._open = True
-        # held while signalling: the number of a closed descriptor may be reused at once
-        self._closing = threading.RLock()  # a garbage collection in between may post as well
+        # held while signalling, as the number of a closed descriptor may be reused at once
+        self._close_lock = threading.RLock()  # reentrant: garbage collection may post meanwhile
         self._waker = waker()
         self._loop.add_reader(self._waker.fileno(), self._drain)
 
     def post(self, function: Callable[[Any], object], argument: Any) -> None:
-        """Have the loop call `function(argument)`. From any thread; never blocks."""
+        """Let the loop call `function(argument)`. Never blocks; may be called from any thread."""
         if self._open:
             self._queue.append((function, argument))
             if not self._signalled:
                 self._wake()
 
     def close(self) -> None:
-        """Stop calling. What is still queued, or posted later, is dropped."""
-        with self._closing:
+        """Stop. Calls that are queued, or posted later, are dropped."""
+        with self._close_lock:
             if not self._open:
                 return
             self._open = False
@@ -120,28 +120,28 @@ class Bridge:
         self._queue.clear()
 
     def _wake(self) -> None:
-        with self._closing:
+        with self._close_lock:
             if self._open:
                 self._signalled = True
                 self._waker.signal()
 
     def _drain(self) -> None:
         self._waker.clear()
-        self._signalled = False  # before emptying: what comes now signals again
+        self._signalled = False  # before emptying, so that a later post signals again
         try:
-            for _ in range(len(self._queue)):  # bounded: what comes meanwhile waits its turn
+            for _ in range(len(self._queue)):  # bounded: later posts wait for the next call
                 if not self._open:
                     break
                 function, argument = self._queue.popleft()
                 function(argument)
         finally:
-            if self._queue and not self._signalled:  # one of them raised: the others still go
+            if self._queue and not self._signalled:  # a function raised: call the others later
                 self._wake()
 
 
 T = TypeVar("T")
-SPARE = 8  # samples kept at depth 1, of which the newest readable one is delivered
-MOST_KEYS = 64  # of one mailbox
+SPARE_SAMPLES = 8  # samples kept at depth 1, as the newest may be unreadable
+MAX_KEYS = 64  # per mailbox
 
 
 class Mailbox(Generic[T]):
@@ -149,14 +149,14 @@ class Mailbox(Generic[T]):
 
     Each key has its own queue, so that no camera displaces another one's samples. With `depth` 1,
     only the newest readable sample of a key is delivered. A sample is unreadable if `on_sample`
-    returns False. The mailbox keeps a few spares, so that invalid samples do not displace a valid
-    one.
+    returns False. The mailbox keeps a few spares, so that unreadable samples do not displace a
+    readable one.
     """
 
     def __init__(self, bridge: Bridge, on_sample: Callable[[T], bool | None], depth: int) -> None:
         self._bridge, self._on_sample = bridge, on_sample
         self._newest_only = depth == 1
-        self._size = SPARE if self._newest_only else depth
+        self._size = SPARE_SAMPLES if self._newest_only else depth
         self._queues: dict[str, deque[T]] = {}
         self._adding = threading.Lock()
         self._posted = False
@@ -173,9 +173,9 @@ class Mailbox(Generic[T]):
 
     def _add(self, key: str) -> deque[T]:
         with self._adding:
-            queues = dict(self._queues)  # a copy, as the loop may be looking through them
+            queues = dict(self._queues)  # a copy, as the loop may be iterating over them
             queue = queues.setdefault(key, deque(maxlen=self._size))
-            if len(queues) > MOST_KEYS:  # the first one is added again with its next sample
+            if len(queues) > MAX_KEYS:  # the first one is added again with its next sample
                 queues.pop(next(iter(queues)))
             self._queues = queues
             return queue
@@ -197,9 +197,9 @@ class Mailbox(Generic[T]):
                 break
 
 
-WAITING = 32  # queries of a key that may wait; beyond that the oldest are refused
-ANSWERING = 32  # queries of a key that are answered concurrently, unless urgent
-SLICE = 4  # queries started in one turn of the loop
+MAX_WAITING = 32  # queries per key; beyond that the oldest are refused
+MAX_CONCURRENT = 32  # answers per key, unless it is urgent
+MAX_STARTS = 4  # of answers, per turn of the loop
 
 
 class _QueriedKey(Generic[T]):
@@ -216,11 +216,11 @@ class _QueriedKey(Generic[T]):
 
         Urgent queries are not limited, as their answers may wait for a disk.
         """
-        return bool(self.waiting) and (self.urgent or self.answering < ANSWERING)
+        return bool(self.waiting) and (self.urgent or self.answering < MAX_CONCURRENT)
 
 
 class QueryQueue(Generic[T]):
-    """All queries of a process; `refuse` is called for dropped queries, from any thread."""
+    """All queries of a process. `refuse` is called for dropped ones, from any thread."""
 
     def __init__(self, bridge: Bridge, refuse: Callable[[T], None]) -> None:
         self._bridge, self._refuse = bridge, refuse
@@ -242,7 +242,7 @@ class QueryQueue(Generic[T]):
 
         def put(query: T) -> None:
             key.waiting.append(query)
-            while len(key.waiting) > WAITING:
+            while len(key.waiting) > MAX_WAITING:
                 self._refuse(key.waiting.popleft())
             self._wake()
 
@@ -267,9 +267,9 @@ class QueryQueue(Generic[T]):
             self._bridge.post(QueryQueue._begin, self)
 
     def _begin(self) -> None:
-        """Start up to SLICE queries; the others wait for the next turn of the loop."""
+        """Start up to MAX_STARTS queries; the others wait for the next turn of the loop."""
         self._posted = False  # before reading, so that new queries wake the loop again
-        for _ in range(SLICE):
+        for _ in range(MAX_STARTS):
             if not (key := self._next()):
                 return
             key.answering += 1

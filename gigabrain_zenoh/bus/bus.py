@@ -1,4 +1,4 @@
-"""Typed publish, subscribe and ask. The bus speaks messages; a transport speaks bytes."""
+"""Typed publish, subscribe and ask. A bus carries messages, over a transport of bytes."""
 
 import asyncio
 import logging
@@ -31,7 +31,7 @@ class Rejections:
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
-        self.faults: dict[str, tuple[Fault, int]] = {}  # and the time of the last invalid message
+        self.faults: dict[str, tuple[Fault, int]] = {}  # and time of the newest invalid message
         self.counts: Counter[str] = Counter()
 
     def reject(self, key: str, error: ValueError) -> None:
@@ -39,8 +39,8 @@ class Rejections:
         self.counts[key] += 1
         fault, _ = self.faults.get(key, (Fault(log), 0))
         self.faults[key] = fault, self._clock.now_ns()
-        about = {"event": "rejected", "key": key}
-        fault.begin(f"dropped a message on {key}: {error}", about)
+        data = {"event": "rejected", "key": key}
+        fault.begin(f"dropped a message on {key}: {error}", data)
 
     def accept(self, key: str) -> None:
         """End the fault on `key` after a valid message, if no invalid one came within QUIET_NS.
@@ -59,10 +59,10 @@ __all__ = ["Bus", "Latest", "RobotTime"]
 M = TypeVar("M", bound=Message)
 Q = TypeVar("Q", bound=Message)
 R = TypeVar("R", bound=Message)
-LOST_NS = 3_000_000_000  # without a state that can be believed, while others come
-PAUSE_NS = 1_000_000_000  # between two of them, and the count begins again
-FETCH_S = 1.0  # how long the one who keeps a value may take to hand it over
-FETCH_AGAIN_NS, MAX_FETCH_AGAIN_NS = 1_000_000_000, 8_000_000_000  # while none has come
+CLOCK_LOST_NS = 3_000_000_000  # a process fails when all states for this long are refused
+STATE_GAP_NS = 1_000_000_000  # after a longer gap between states, that time starts again
+FETCH_TIMEOUT_S = 1.0  # for the answer of a process that keeps a value
+FETCH_RETRY_NS, MAX_FETCH_RETRY_NS = 1_000_000_000, 8_000_000_000  # doubled each time
 
 
 class Bus:
@@ -70,26 +70,26 @@ class Bus:
 
     def __init__(self, transport: Transport, clock: Clock, process: str = "") -> None:
         self.transport, self.clock, self.process = transport, clock, process
-        # unlike its process, no other session has this name: there may be two pages
+        # unique, unlike the name of the process: there may be two pages
         self.session = f"{process[:40]}-{secrets.token_hex(8)}"
         self.time = RobotTime()
         self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._failed_at: tuple[BaseException | None, TracebackType | None] = None, None
+        self._failure: tuple[BaseException | None, TracebackType | None] = None, None
         self.sent: Counter[str] = Counter()
         self.received: Counter[str] = Counter()
         self._rejections = Rejections(clock)
         self.rejected = self._rejections.counts
         self.listens: list[str] = []
-        self.counters: Counter[str] = Counter()  # what a node counts of its own, for its health
-        self.problems: tuple[Cause, ...] = ()  # what a node cannot do now, for its health
-        self.latency_ms: dict[str, float] = {}  # what a node measures, for its health
+        self.counters: Counter[str] = Counter()  # the node's own counts, for its health
+        self.problems: tuple[Cause, ...] = ()  # the node's present problems, for its health
+        self.latency_ms: dict[str, float] = {}  # measured by the node, for its health
         self.report: Callable[[], Mapping[str, float | int | str | None]] = dict
         self.input_log = InputLogger()  # inputs that the node has used
-        self.params = Params()  # what may be changed while the process runs
-        self.arrived: dict[str, tuple[int, int]] = {}  # boot and tick of the newest, by key
-        # whether work was done since the last call; by default that the loop runs
+        self.params = Params()  # may change while the process runs
+        self.arrived: dict[str, tuple[int, int]] = {}  # boot and tick of the newest message, by key
+        # returns whether work was done since the last call; by default True, as the loop runs
         self.progress: Callable[[], bool] = lambda: True
-        self._refusing_ns = self._refused_ns = 0  # since when, and when last
+        self._refusing_since_ns = self._last_state_ns = 0
         self.closed = False
         self._kept: dict[str, bytes] = {}
         self._fetching: set[asyncio.Task[None]] = set()
@@ -106,7 +106,7 @@ class Bus:
     ) -> M:
         """Send `message` with its header filled in; returns what was sent.
 
-        `tick` and `stamp_ns` are those of now, unless it was measured earlier.
+        `tick` and `stamp_ns` are the present ones, unless given for an earlier measurement.
         """
         key = topic.at(name)
         self.sent[key] += 1
@@ -127,14 +127,14 @@ class Bus:
     def latest(
         self, topic: Topic[M], on_new: Callable[[M], None] | None = None, *, name: str = "*"
     ) -> Latest[M]:
-        """Keep the newest message on `topic`; `on_new` is called with each as it arrives."""
+        """Keep the newest message on `topic`; `on_new` is called with each new one."""
         latest = Latest(topic, self.clock, self.time)
 
-        def take(_key: str, message: M) -> None:
+        def receive(_key: str, message: M) -> None:
             if latest.store(message) and on_new:
                 on_new(message)
 
-        self.subscribe(topic, take, name=name)
+        self.subscribe(topic, receive, name=name)
         return latest
 
     def subscribe(
@@ -145,15 +145,15 @@ class Bus:
         *,
         name: str = "*",
     ) -> Close:
-        """Call `on_message(key, message)` for each valid arrival, `on_bad(payload)` for others.
+        """Call `on_message(key, message)` for each message, `on_bad(payload)` for invalid ones.
 
-        Returns the function that ends it.
+        Returns a function that ends the subscription.
         """
         decode, pattern = Codec(topic.type, topic.max_bytes).decode, topic.at(name)
-        moves_time, rejections, known = topic.key in CLOCK_KEYS, self._rejections, False
+        moves_time, rejections, has_value = topic.key in CLOCK_KEYS, self._rejections, False
 
         def receive(key: str, payload: bytes) -> bool | None:
-            nonlocal known
+            nonlocal has_value
             self.received[pattern] += 1
             try:
                 try:
@@ -167,36 +167,36 @@ class Bus:
                     rejections.accept(pattern)
                 self.arrived[pattern] = message.boot, message.tick
                 self.input_log.note(key, message.seq)
-                if moves_time and not self._in_time(topic, message):
+                if moves_time and not self._observe_time(topic, message):
                     return False
                 on_message(key, message)
             except Exception as error:  # noqa: BLE001 - ends the process: the runner raises it
                 self._fail(error)
                 return None
-            known = True
+            has_value = True
             return True
 
-        ends = self.transport.subscribe(pattern, receive, topic.depth)
+        unsubscribe = self.transport.subscribe(pattern, receive, topic.depth)
         if topic.keep and not topic.many:
-            ends = self._fetch_kept(topic, receive, lambda: known, ends)
-        return self._listening(pattern, ends)
+            unsubscribe = self._fetch_kept(topic, receive, lambda: has_value, unsubscribe)
+        return self._add_subscription(pattern, unsubscribe)
 
     def tap(self, pattern: str, on_raw: OnRaw) -> Close:
-        """Call `on_raw(key, encoding, payload)` for all on `pattern`, valid or not, in any thread.
+        """Call `on_raw(key, encoding, payload)` for each message on `pattern`, in any thread.
 
-        Returns the function that ends it.
+        Invalid messages are included. Returns a function that ends the subscription.
         """
-        return self._listening(pattern, self.transport.tap(pattern, on_raw))
+        return self._add_subscription(pattern, self.transport.tap(pattern, on_raw))
 
     async def kept(self, topic: Topic[Any]) -> list[bytes]:
-        """Return the last value of `topic` from each process that keeps it."""
-        replies = await self.transport.query(topic.key, b"", "", FETCH_S, topic.priority)
+        """Return the newest value of `topic` from each process that keeps it."""
+        replies = await self.transport.query(topic.key, b"", "", FETCH_TIMEOUT_S, topic.priority)
         return [reply for reply in replies if not isinstance(reply, str)]
 
     def serve(
         self, service: Service[Q, R], answer: Callable[[Q], Awaitable[R]], *, name: str = ""
     ) -> None:
-        """Answer `service`. An empty request counts as one with nothing but defaults."""
+        """Answer `service`. An empty payload is a request with all defaults."""
         decode, key = Codec(service.request, service.max_bytes).decode, service.at(name)
         encoding = codec.encoding_of(service.reply)
 
@@ -227,7 +227,7 @@ class Bus:
         name: str = "",
         skip_refusals: bool = False,
     ) -> list[R]:
-        """Return every answer that arrives in time; none without a server.
+        """Return all answers that arrive in time; an empty list without a server.
 
         Raises Refused if any server refuses, unless `skip_refusals`.
         """
@@ -258,48 +258,48 @@ class Bus:
             task.cancel()
         await self.transport.close()
 
-    def _listening(self, pattern: str, ends: Close) -> Close:
-        """Count a subscription; the returned function ends it, and may be called again."""
+    def _add_subscription(self, pattern: str, unsubscribe: Close) -> Close:
+        """List a subscription; return a function that ends it and may be called twice."""
         self.listens.append(pattern)
-        over = False
+        closed = False
 
         def close() -> None:
-            nonlocal over
-            if not over:
-                over = True
-                ends()
+            nonlocal closed
+            if not closed:
+                closed = True
+                unsubscribe()
                 self.listens.remove(pattern)
 
         return close
 
-    def _in_time(self, topic: Topic[Any], message: Message) -> bool:
-        """Move the robot's time. Return whether the message is credible.
+    def _observe_time(self, topic: Topic[Any], message: Message) -> bool:
+        """Update the robot's time from a message. Return whether the message is credible.
 
-        If all states are refused for LOST_NS, this process's own time is wrong, and it ends.
+        If all states are refused for CLOCK_LOST_NS, this process's time is wrong, and it fails.
         """
-        believed, now_ns = self.time.observe(message), self.clock.now_ns()
-        if not believed:
+        credible, now_ns = self.time.observe(message), self.clock.now_ns()
+        if not credible:
             self.counters["refused_ticks"] += 1
         if topic.key != STATE.key:
-            return believed
-        if believed or now_ns - self._refused_ns > PAUSE_NS:
-            self._refusing_ns = now_ns
-        self._refused_ns = now_ns
-        if not believed and now_ns - self._refusing_ns > LOST_NS:
+            return credible
+        if credible or now_ns - self._last_state_ns > STATE_GAP_NS:
+            self._refusing_since_ns = now_ns
+        self._last_state_ns = now_ns
+        if not credible and now_ns - self._refusing_since_ns > CLOCK_LOST_NS:
             self._fail(ClockLost(
-                f"every {topic.key} has been refused for {LOST_NS / 1e9:g} s: this process is at "
-                f"tick {self.time.tick}, the newest claims to be of tick {message.tick}"
+                f"every {topic.key} has been refused for {CLOCK_LOST_NS / 1e9:g} s: this process "
+                f"is at tick {self.time.tick}, the newest claims to be of tick {message.tick}"
             ))  # fmt: skip
-        return believed
+        return credible
 
     def _fail(self, error: Exception) -> None:
         if not self.failed.done():
             self.failed.set_exception(error)
-            self._failed_at = error, error.__traceback__
+            self._failure = error, error.__traceback__
 
     def restore_traceback(self, error: BaseException) -> None:
-        """Give the exception of `failed` its own traceback, which a second `await` takes away."""
-        failed, traceback = self._failed_at
+        """Restore the traceback of the exception of `failed`, which a second `await` replaces."""
+        failed, traceback = self._failure
         if error is failed:
             error.__traceback__ = traceback
 
@@ -314,24 +314,28 @@ class Bus:
             self.transport.serve(key, answer)
 
     def _fetch_kept(
-        self, topic: Topic[Any], receive: OnSample, known: Callable[[], bool], ends: Close
+        self,
+        topic: Topic[Any],
+        receive: OnSample,
+        has_value: Callable[[], bool],
+        unsubscribe: Close,
     ) -> Close:
-        """Ask for the kept value until that or a live message is known.
+        """Query the kept value until it or a live message arrives.
 
-        It was sent before the subscriber came, or its only message was lost. The returned function
-        ends this, and calls `ends`.
+        The live message may have been lost, or sent before the subscription. The returned function
+        stops the queries and calls `unsubscribe`.
         """
 
         async def fetch() -> None:
-            again_ns = FETCH_AGAIN_NS
+            retry_ns = FETCH_RETRY_NS
             while True:
                 kept = await self.kept(topic)
-                for payload in () if known() else kept:
+                for payload in () if has_value() else kept:
                     receive(topic.key, payload)
-                if known():
+                if has_value():
                     return
-                await self.clock.sleep_ns(again_ns)
-                again_ns = min(2 * again_ns, MAX_FETCH_AGAIN_NS)
+                await self.clock.sleep_ns(retry_ns)
+                retry_ns = min(2 * retry_ns, MAX_FETCH_RETRY_NS)
 
         def finished(task: "asyncio.Task[None]") -> None:
             self._fetching.discard(task)
@@ -344,6 +348,6 @@ class Bus:
 
         def end() -> None:
             task.cancel()
-            ends()
+            unsubscribe()
 
         return end

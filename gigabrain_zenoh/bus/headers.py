@@ -1,4 +1,4 @@
-"""Headers of messages, and the counts of messages that are missing between them."""
+"""Headers of messages, and counts of the messages that are missing between them."""
 
 from collections import Counter
 from typing import Any
@@ -8,10 +8,10 @@ import msgspec
 from gigabrain_schemas.topics import BODY, IMAGE, IMU, SCAN, STATE
 from gigabrain_zenoh.host.bounded import put_newest
 
-DRIVER_KEYS = (STATE.key, SCAN.key, IMU.key, BODY.key, IMAGE.key)  # with the driver's boot
+DRIVER_KEYS = (STATE.key, SCAN.key, IMU.key, BODY.key, IMAGE.key)  # they carry the driver's boot
 MAX_COUNT = 2**63 - 1
-MAX_GAP = 1_000_000  # messages; a count that jumps farther is another count, not a loss
-MAX_SENDERS = 4096  # pairs of key and sender whose messages are counted at a time
+MAX_GAP = 1_000_000  # messages; a larger jump is a new count, not a loss
+MAX_SENDERS = 4096  # pairs of key and sender that are remembered
 
 
 class Header(msgspec.Struct, frozen=True):
@@ -22,7 +22,7 @@ class Header(msgspec.Struct, frozen=True):
     boot: int = 0
     tick: int = 0
     basis: int = 0
-    process: Any = ""  # of log and audit records: several processes send on one key
+    process: Any = ""  # of log and audit records: several processes share a key
     source: Any = ""  # of commands, likewise
 
 
@@ -47,20 +47,20 @@ def header_of(payload: bytes) -> Header:
 
 
 class SequenceGaps:
-    """Counts per key the messages missing between those that were received."""
+    """Counts, per key, the messages missing between those received."""
 
     def __init__(self) -> None:
         self.missing: Counter[str] = Counter()
-        self.restarts: Counter[str] = Counter()  # how often a sender began another count
+        self.restarts: Counter[str] = Counter()  # times that a sender began a new count
         self._last: dict[tuple[str, str], Header] = {}
 
     def count(self, key: str, header: Header) -> int:
         """Count one message, and return how many are missing before it.
 
-        A sender that restarts counts from 1. Nothing is missing before the first message received,
-        nor where a count jumps by more than MAX_GAP.
+        A sender that restarts counts from 1. Before the first message, and after a jump of more
+        than MAX_GAP, none are missing.
         """
-        if header.seq == 0:  # its sender does not count
+        if header.seq == 0:  # the sender does not count
             return 0
         name = header.process or header.source
         sender = key, str(name)[:64] if name else ""

@@ -1,7 +1,6 @@
 """The inputs that a node consumed and the requests that it accepted, in order, for replay.
 
-A busy process skips messages, and work in other threads is done in time or not. A replay needs to
-know both.
+A busy process skips messages, and background work may finish too late. A replay repeats both.
 """
 
 import asyncio
@@ -28,22 +27,22 @@ from gigabrain_zenoh.host.threads import Job, done
 if TYPE_CHECKING:
     from gigabrain_zenoh.bus.bus import Bus
 
-EVERY_NS = 500_000_000  # from one word about it to the next
-MAX_WAITING = MAX_ENTRIES // 2  # entries; more may be added while they are published
-MAX_KEYS = 512  # of which the newest number is known
-HIGHEST = 2**63 - 1
+PUBLISH_PERIOD_NS = 500_000_000
+MAX_WAITING = MAX_ENTRIES // 2  # entries; publishing may add more
+MAX_KEYS = 512  # whose newest seq is remembered
+MAX_SEQ = 2**63 - 1
 
 
 class InputLogger:
-    """An input log that keeps nothing."""
+    """An input log that records nothing."""
 
-    live = True  # whether what the node does has effects beside the bus
+    live = True  # False in a replay: the node may have no effects outside the bus
 
     def note(self, key: str, seq: int) -> None:
         """Record that a message is used."""
 
     def in_time(self, job: Job, patience_s: float) -> bool:
-        """Return whether background work is done within that time; the node may use its result."""
+        """Wait for background work; return whether it is done within `patience_s`."""
         return done(job, patience_s)
 
     def when_done(self, job: Job, then: Callable[[Job], None]) -> None:
@@ -64,16 +63,16 @@ class InputLogger:
         """Publish all entries that are not published yet."""
 
     def _note_finished(self) -> None:
-        """Record that background work counts from now on."""
+        """Record that the result of background work is used from now on."""
 
 
 class PublishedInputLogger(InputLogger):
-    """Publishes the input log twice a second, if it holds anything."""
+    """Publishes the input log twice a second, unless it is empty."""
 
     def __init__(self, publish: Callable[[InputLog], object], unix_ns: Callable[[], int]) -> None:
         self._publish, self._unix_ns = publish, unix_ns
         self._keys: dict[str, int] = {}
-        self._taken: list[ConsumedInput] = []
+        self._entries: list[ConsumedInput] = []
         self._last: dict[str, int] = {}  # seq by key
         self._began_ns = 0
 
@@ -85,17 +84,17 @@ class PublishedInputLogger(InputLogger):
         self._add(key, seq)
 
     def in_time(self, job: Job, patience_s: float) -> bool:
-        """As it was, which is written down."""
-        there = done(job, patience_s)
-        self._add(WAITED, int(there))
-        return there
+        """Wait for background work, and record whether it was done in time."""
+        finished = done(job, patience_s)
+        self._add(WAITED, int(finished))
+        return finished
 
     def flush(self) -> None:
         """Publish all entries that are not published yet."""
-        taken, keys = self._taken, tuple(self._keys)
-        if taken:
-            self._taken, self._keys = [], {}
-            self._publish(InputLog(began_ns=self._began_ns, keys=keys, taken=tuple(taken)))
+        entries, keys = self._entries, tuple(self._keys)
+        if entries:
+            self._entries, self._keys = [], {}
+            self._publish(InputLog(began_ns=self._began_ns, keys=keys, taken=tuple(entries)))
 
     def _note_finished(self) -> None:
         self._add(FINISHED, 1)
@@ -103,34 +102,35 @@ class PublishedInputLogger(InputLogger):
     def _add(self, key: str, seq: int) -> None:
         now_ns = self._unix_ns()
         after_ns = now_ns - self._began_ns
-        if self._taken and (not 0 <= after_ns < EVERY_NS or len(self._taken) >= MAX_WAITING):
+        due = not 0 <= after_ns < PUBLISH_PERIOD_NS or len(self._entries) >= MAX_WAITING
+        if self._entries and due:
             self.flush()
-        if not self._taken:
+        if not self._entries:
             self._began_ns, after_ns = now_ns, 0
         index = self._keys.setdefault(key, len(self._keys))
-        self._taken.append(ConsumedInput(index, min(seq, HIGHEST), after_ns // 1000))
+        self._entries.append(ConsumedInput(index, min(seq, MAX_SEQ), after_ns // 1000))
 
 
 class ReplayedInputLogger(InputLogger):
-    """As it was: what was done in time then is waited for now, all else counts as undone."""
+    """Repeats recorded outcomes: waits for work that was done in time, and for no other."""
 
     live = False
 
     def __init__(self) -> None:
-        self.outcomes: deque[bool] = deque()  # of what is waited for at the present message
+        self.outcomes: deque[bool] = deque()  # of `in_time`, as recorded for the present message
         self._unfinished: deque[tuple[Job, Callable[[Job], None]]] = deque()
 
     def in_time(self, job: Job, patience_s: float) -> bool:
         """Return the recorded outcome; wait for work without one."""
-        there = self.outcomes.popleft() if self.outcomes else True
-        return there and done(job, None)
+        finished = self.outcomes.popleft() if self.outcomes else True
+        return finished and done(job, None)
 
     def when_done(self, job: Job, then: Callable[[Job], None]) -> None:
-        """Keep it until `finish`."""
+        """Queue `then(job)` for `finish`."""
         self._unfinished.append((job, then))
 
     def finish(self) -> None:
-        """Wait for the oldest work that is not finished, which counts from now on."""
+        """Wait for the oldest queued work, and call its `then`."""
         if self._unfinished:
             job, then = self._unfinished.popleft()
             done(job, None)
@@ -138,9 +138,9 @@ class ReplayedInputLogger(InputLogger):
 
 
 def log_accepted(bus: "Bus", key: str, request: Message, basis: int) -> None:
-    """Publish that a request on `key` counts from now on.
+    """Publish an accepted request on `key`, for replay.
 
-    `basis` is the tick of the newest world used.
+    `basis` is the tick of the newest world that was used.
     """
     text = msgspec.json.encode(request).decode()
     accepted = AcceptedRequest(process=bus.process, service=key, request=text)

@@ -1,4 +1,4 @@
-"""Key expressions of Zenoh: which are valid, which keys they match, and those of topic names."""
+"""Key expressions of Zenoh: their syntax, matching keys, and those of topic names."""
 
 import re
 from collections.abc import Iterable
@@ -22,11 +22,11 @@ def check_key_expression(text: str) -> None:
 def key_expressions(names: Iterable[str]) -> list[str]:
     """Return the key expressions of topic names; those with a `*` stay as given.
 
-    Raises ConfigError for an unknown name and for what is not a key expression.
+    Raises ConfigError for an unknown name or an invalid key expression.
     """
     found = [name if "*" in name else topic_named(name).at("**") for name in names]
-    for each in found:
-        check_key_expression(each)
+    for expression in found:
+        check_key_expression(expression)
     return found
 
 
@@ -41,10 +41,10 @@ def _matches(pattern: list[str], key: list[str]) -> bool:
     first, rest = pattern[0], pattern[1:]
     if first == "**":
         return any(_matches(rest, key[i:]) for i in range(len(key) + 1))
-    return bool(key) and _fits(first, key[0]) and _matches(rest, key[1:])
+    return bool(key) and _matches_part(first, key[0]) and _matches(rest, key[1:])
 
 
-def _fits(part: str, name: str) -> bool:
+def _matches_part(part: str, name: str) -> bool:
     if "$*" in part:
         return bool(re.fullmatch(".*".join(map(re.escape, part.split("$*"))), name, re.DOTALL))
     return part in ("*", name)

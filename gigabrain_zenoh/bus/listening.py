@@ -10,18 +10,18 @@ from typing import Any, TypeVar
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.topics import TOPICS, Topic, current_key
 from gigabrain_zenoh.bus.bus import Bus, Latest
-from gigabrain_zenoh.bus.freshness import CLOCK_KEYS, CONFIRMED
+from gigabrain_zenoh.bus.freshness import CLOCK_KEYS, CONFIRMATIONS
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import BodyLost, unknown
 
 M = TypeVar("M", bound=Message)
 TOPIC_BY_KEY: dict[str, Topic[Any]] = {topic.key: topic for topic in TOPICS}
-MAX_WAITING = 64  # messages that wait for a slow `async for`; the oldest give way
-PART_S = 0.1  # of a timeout, of which a process that is stopped meanwhile misses only one
+MAX_WAITING = 64  # messages for a slow `async for`; the oldest are dropped
+SLICE_S = 0.1  # part of a timeout; a process that is stopped meanwhile loses only one
 
 
 def topic_named(name: str) -> Topic[Any]:
-    """Return the topic `robot/scan`, or `scan` for short. Raises UnknownName."""
+    """Return a topic by its name, such as `robot/scan` or `scan`. Raises UnknownName."""
     known = {topic.key.removeprefix("robot/"): topic for topic in TOPICS}
     short = current_key(f"robot/{name.removeprefix('robot/')}").removeprefix("robot/")
     if short not in known:
@@ -38,35 +38,34 @@ def topic_of(key: str) -> Topic[Any] | None:
 
 
 async def arrival(arrived: asyncio.Event, timeout_s: float | None) -> None:
-    """Wait until `arrived` is set; with None for ever.
+    """Wait until `arrived` is set; without a timeout for ever.
 
-    Raises TimeoutError after `timeout_s`, without the time in which this process was stopped.
+    Raises TimeoutError after `timeout_s`. Time in which this process is stopped does not count.
     """
     left_s = math.inf if timeout_s is None else timeout_s
     while left_s > 0.0:
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(
-                min(left_s, PART_S)
-            ):  # `wait_for` may swallow a cancellation
+            # not `wait_for`, which may swallow a cancellation
+            async with asyncio.timeout(min(left_s, SLICE_S)):
                 await arrived.wait()
                 return
-        left_s -= PART_S
+        left_s -= SLICE_S
     raise TimeoutError
 
 
 async def listen(bus: Bus, topic: Topic[M], timeout_s: float | None = None) -> AsyncIterator[M]:
     """Yield every message on `topic` from the first `anext` on.
 
-    Raises BodyLost after `timeout_s` without one; with None it waits for ever.
+    Raises BodyLost after `timeout_s` without a message; without a timeout it waits for ever.
     """
     waiting: deque[M] = deque(maxlen=MAX_WAITING)
     arrived = asyncio.Event()
 
-    def take(_key: str, message: M) -> None:
+    def receive(_key: str, message: M) -> None:
         waiting.append(message)
         arrived.set()
 
-    close = bus.subscribe(topic, take)
+    close = bus.subscribe(topic, receive)
     try:
         while True:
             while waiting:
@@ -91,7 +90,7 @@ class Sampled(Latest[M]):
         self._robot_time = bus.time if topic.key in CLOCK_KEYS else None
         self._codec = Codec(topic.type, topic.max_bytes)
         # topics that move the clock keep enough messages to confirm a jump between two reads
-        self._raw: deque[bytes] = deque(maxlen=CONFIRMED if self._robot_time else 1)
+        self._raw: deque[bytes] = deque(maxlen=CONFIRMATIONS if self._robot_time else 1)
         if not topic.many:
             bus.tap(topic.key, self.receive)
 

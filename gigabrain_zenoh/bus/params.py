@@ -14,11 +14,11 @@ Get = Callable[[], str]
 Set = Callable[[str], None]  # raises ValueError, or Refused with its own text
 
 
-class _Known(NamedTuple):
+class _Entry(NamedTuple):
     expected: str
     get: Get
     put: Set
-    key: str  # in a deployment file
+    key: str  # dotted place in a deployment file
     initial: str
 
 
@@ -26,7 +26,7 @@ class Params:
     """The parameters of one process."""
 
     def __init__(self) -> None:
-        self._known: dict[str, _Known] = {}
+        self._known: dict[str, _Entry] = {}
         self._renamed: dict[str, str] = {}
 
     def add(self, name: str, expected: str, get: Get, put: Set, *, key: str = "") -> None:
@@ -35,7 +35,7 @@ class Params:
         `put` raises ValueError for a value that is not allowed, or Refused with the reason. `key`
         is the parameter's dotted place in a deployment file, if it has one.
         """
-        self._known[name] = _Known(expected, get, put, key, get())
+        self._known[name] = _Entry(expected, get, put, key, get())
 
     def add_field(
         self,
@@ -71,25 +71,25 @@ class Params:
             hint = f"; did you mean {near[0]!r}?" if near else ";"
             known = ", ".join(self._known)
             raise Refused(f"no parameter {name!r}{hint} known: {known}")
-        one = self._known[name]
-        before = one.get()
+        entry = self._known[name]
+        before = entry.get()
         try:
-            one.put(text)
+            entry.put(text)
         except ValueError:  # msgspec.ValidationError is one
-            raise Refused(f"{name}: expected {one.expected}, got {text!r}") from None
-        return before, one.get()
+            raise Refused(f"{name}: expected {entry.expected}, got {text!r}") from None
+        return before, entry.get()
 
     def all(self) -> tuple[Param, ...]:
         """Return all parameters with their current values."""
         return tuple(
             Param(
                 name=name,
-                value=one.get(),
-                expected=one.expected,
-                key=one.key,
-                initial=one.initial,
+                value=entry.get(),
+                expected=entry.expected,
+                key=entry.key,
+                initial=entry.initial,
             )
-            for name, one in self._known.items()
+            for name, entry in self._known.items()
         )
 
 

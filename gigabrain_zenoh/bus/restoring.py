@@ -12,7 +12,7 @@ NO_HEADER = dict.fromkeys(Message.__struct_fields__, 0)
 
 
 class RestoringPublisher:
-    """Publishes messages, and on `restore` again those that another sender has replaced."""
+    """Publishes messages; `restore` publishes again those that another sender replaced."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
@@ -20,7 +20,7 @@ class RestoringPublisher:
         self._replaced: set[str] = set()
 
     def publish(self, topic: Topic[Any], message: Message, *, basis: int = 0) -> None:
-        """Publish a message of which receivers keep the newest one."""
+        """Publish a message; receivers keep the newest one of its topic."""
         first = topic.key not in self._own
         self._own[topic.key] = topic, replace(message, **NO_HEADER)
         if first:
@@ -28,12 +28,12 @@ class RestoringPublisher:
         self._bus.publish(topic, message, basis=basis)
 
     def restore(self, *, basis: int = 0) -> None:
-        """Publish again what was replaced since the last call."""
+        """Publish again the messages that were replaced since the last call."""
         replaced, self._replaced = self._replaced, set()
         for key in replaced:
             self.publish(*self._own[key], basis=basis)
 
     def _on_message(self, key: str, message: Message) -> None:
-        valid = message.boot in (0, self._bus.time.boot)  # receivers ignore another start's
+        valid = message.boot in (0, self._bus.time.boot)  # receivers ignore other boots
         if not valid or replace(message, **NO_HEADER) != self._own[key][1]:
             self._replaced.add(key)

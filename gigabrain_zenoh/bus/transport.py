@@ -12,7 +12,7 @@ from gigabrain_zenoh.errors import GigabrainError
 
 OnSample = Callable[[str, bytes], bool | None]  # key, payload; returns False for an invalid payload
 OnRaw = Callable[[str, str, bytes], None]  # key, encoding, payload
-OnReaders = Callable[[bool], None]  # whether there are any
+OnReaders = Callable[[bool], None]  # True while there are readers
 Answer = Callable[[bytes], Awaitable[tuple[bytes, str]]]  # request; reply and its encoding
 Close = Callable[[], None]  # may be called twice
 T = TypeVar("T")
@@ -36,7 +36,7 @@ class Transport(Protocol):
     Calls and callbacks run on the event loop's thread, except the callback of `tap`.
     """
 
-    losses: int  # of the link to the others so far; queries on their way then have no answers
+    losses: int  # times that the link was lost so far; pending queries then get no answer
 
     def publish(self, topic: Topic[Any], key: str, payload: bytes, encoding: str) -> None:
         """Deliver to all listeners on `key` with the topic's QoS, without waiting for any."""
@@ -45,7 +45,7 @@ class Transport(Protocol):
     def subscribe(self, key: str, on_sample: OnSample, depth: int) -> Close:
         """Call `on_sample` for each sample on `key`; a busy loop keeps the newest `depth` samples.
 
-        Of a pattern it keeps so many of each key. With a depth of one, it keeps the newest sample
+        For a pattern, `depth` is per key. With a depth of one, it keeps the newest sample
         for which `on_sample` does not return False.
         """
         ...
@@ -55,7 +55,7 @@ class Transport(Protocol):
         ...
 
     def watch_readers(self, key: str, on_readers: OnReaders) -> Close:
-        """Call `on_readers` with whether others subscribe to `key`: now, and at each change."""
+        """Call `on_readers` now and at each change: True while others subscribe to `key`."""
         ...
 
     def serve(self, key: str, answer: Answer, *, urgent: bool = False) -> Close:
@@ -84,7 +84,7 @@ class Transport(Protocol):
 class _Watcher:
     key: str
     on_readers: OnReaders
-    there: bool  # as told last
+    has_readers: bool  # by the newest call of `on_readers`
 
 
 class LocalNetwork:
@@ -119,33 +119,33 @@ class LocalNetwork:
 
     def listen(self, key: str, on_sample: OnSample) -> Close:
         """Register a listener; return a function that removes it."""
-        remove = _added(self._listeners, (key, on_sample))
-        self._tell_watchers()
+        remove = _add(self._listeners, (key, on_sample))
+        self._notify_watchers()
 
         def close() -> None:
             remove()
-            self._tell_watchers()
+            self._notify_watchers()
 
         return close
 
     def watch(self, key: str, on_readers: OnReaders) -> Close:
         """Register a watcher of the listeners on `key`; return a function that removes it."""
         watcher = _Watcher(key, on_readers, self._has_listener(key))
-        on_readers(watcher.there)
-        return _added(self._watchers, watcher)
+        on_readers(watcher.has_readers)
+        return _add(self._watchers, watcher)
 
-    def _tell_watchers(self) -> None:
+    def _notify_watchers(self) -> None:
         for watcher in tuple(self._watchers):
-            before, watcher.there = watcher.there, self._has_listener(watcher.key)
-            if watcher.there != before:
-                watcher.on_readers(watcher.there)
+            before, watcher.has_readers = watcher.has_readers, self._has_listener(watcher.key)
+            if watcher.has_readers != before:
+                watcher.on_readers(watcher.has_readers)
 
     def _has_listener(self, key: str) -> bool:
         return any(_matches(pattern, key) for pattern, _ in self._listeners)
 
     def serve(self, key: str, answer: Answer) -> Close:
         """Register a server on `key`; return a function that removes it."""
-        return _added(self._servers, (key, answer))
+        return _add(self._servers, (key, answer))
 
     def servers(self, pattern: str) -> list[Answer]:
         """Return the servers on keys that match `pattern`."""
@@ -190,7 +190,7 @@ class LocalTransport:
         replies = []
         for answer in self._network.servers(key):
             with contextlib.suppress(TimeoutError):
-                replies.append(await asyncio.wait_for(_text_or(answer, payload), timeout_s))
+                replies.append(await asyncio.wait_for(_reply_or_error(answer, payload), timeout_s))
         return replies
 
     def links(self, on_link: OnLink) -> Close:
@@ -203,14 +203,14 @@ class LocalTransport:
             self._closers.pop()()
 
 
-async def _text_or(answer: Answer, payload: bytes) -> bytes | str:
+async def _reply_or_error(answer: Answer, payload: bytes) -> bytes | str:
     try:
         return (await answer(payload))[0]
     except GigabrainError as error:
         return str(error)
 
 
-def _added(entries: list[T], entry: T) -> Close:
+def _add(entries: list[T], entry: T) -> Close:
     entries.append(entry)
 
     def close() -> None:

@@ -3,7 +3,7 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from gigabrain_zenoh.bus.bridge import MOST_KEYS, Bridge, Mailbox
+from gigabrain_zenoh.bus.bridge import MAX_KEYS, Bridge, Mailbox
 from gigabrain_zenoh.testing.waiting import start_thread, until
 
 
@@ -69,10 +69,10 @@ async def test_a_flood_of_keys_is_bounded_and_later_ones_are_delivered(hand: Han
     mailbox = Mailbox(hand.bridge, hand.got.append, 2)
     for number in range(10_000):
         mailbox.put(number, str(number))
-    await hand.until(MOST_KEYS)
+    await hand.until(MAX_KEYS)
     mailbox.put(-1, "0")
-    await hand.until(MOST_KEYS + 1)
-    assert hand.got == [*range(10_000 - MOST_KEYS, 10_000), -1]
+    await hand.until(MAX_KEYS + 1)
+    assert hand.got == [*range(10_000 - MAX_KEYS, 10_000), -1]
 
 
 async def test_a_mailbox_that_is_flooded_lets_others_have_their_turn(hand: Hand) -> None:
