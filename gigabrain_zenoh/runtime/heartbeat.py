@@ -1,8 +1,8 @@
 """A supervised process reports progress to its supervisor once a second.
 
-Progress is judged by output per input. A loop that runs while scans arrive and no worlds are
-published makes none; a process without input has nothing to do, and is healthy.
-A beat is a log record like any other, which the supervisor does not show.
+Progress means work for the inputs that arrive: a loop that gets scans but publishes no worlds makes
+none. A process without input has nothing to do, and is healthy.
+A beat is a log record that the supervisor does not show.
 """
 
 import os
@@ -16,35 +16,37 @@ from gigabrain_zenoh.clock import Clock
 EVENT = "progress"
 PERIOD_NS = 1_000_000_000
 STALL_S = 5.0  # without progress for this time a process counts as stuck
-LOOK_S = 0.25  # how often a supervisor looks
+LOOK_S = 0.25  # period of the checks of a supervisor
 STDOUT = 1
 _LINE = msgspec.json.encode({"event": EVENT, "level": "debug"}) + b"\n"
 
 
 class Progress:
-    """Compares what came in with what was done, since the last call.
+    """Compares the arrived inputs with the work done since the last call.
 
-    `came` returns a value for each input that the work needs, which changes with every arrival;
-    nothing where the process cannot work yet. `done` changes with each piece of work.
+    `inputs` returns one value per required input, which changes with each arrival; an empty tuple
+    while the process cannot work yet. `work` returns a value that changes with each piece of work.
     """
 
-    def __init__(self, came: Callable[[], tuple[object, ...]], done: Callable[[], object]) -> None:
-        self._came, self._done = came, done
-        self._before = came(), done()
+    def __init__(
+        self, inputs: Callable[[], tuple[object, ...]], work: Callable[[], object]
+    ) -> None:
+        self._inputs, self._work = inputs, work
+        self._last = inputs(), work()
 
     def __call__(self) -> bool:
-        """Return whether something was done, or there was nothing to do."""
-        (came, done), self._before = self._before, (self._came(), self._done())
-        now = self._before[0]
-        fed = len(now) == len(came) > 0 and all(a != b for a, b in zip(came, now, strict=True))
-        return self._before[1] != done or not fed
+        """Return whether work was done, or there was nothing to do."""
+        (before, work), self._last = self._last, (self._inputs(), self._work())
+        now = self._last[0]
+        fed = len(now) == len(before) > 0 and all(a != b for a, b in zip(before, now, strict=True))
+        return self._last[1] != work or not fed
 
 
 class Silence:
     """Time without progress of a process [s], counted only while its supervisor ran.
 
-    A suspended machine or a stopped supervisor is no reason to kill a process: of the time between
-    two checks at most `LOOK_S` counts.
+    A suspended machine or a stopped supervisor is no reason to kill a process. So at most `LOOK_S`
+    of the time between two checks counts.
     """
 
     def __init__(self) -> None:
@@ -55,14 +57,14 @@ class Silence:
         self.seconds = 0.0
 
     def add(self, passed_s: float) -> bool:
-        """Add the time since the last look; return whether the process is stuck."""
+        """Add the time since the last check; return whether the process is stuck."""
         self.seconds += min(passed_s, LOOK_S)
         return self.seconds >= STALL_S
 
 
 async def beat(clock: Clock, progress: Callable[[], bool], out: int) -> None:
     """Write a line in each second with progress, until cancelled."""
-    progress()  # counts from now on
+    progress()  # forget earlier work
     async for _ in clock.every(PERIOD_NS):
         if progress() and _has_room(out):
             os.write(out, _LINE)

@@ -22,24 +22,24 @@ PERIOD_NS = 1_000_000_000
 
 
 def rss_bytes() -> int:
-    """Return the memory that this process holds."""
+    """Return the resident memory of this process."""
     return psutil.Process().memory_info().rss
 
 
 async def publish_health(bus: Bus) -> None:
     """Publish this process's health once a second, until cancelled."""
-    host, pid, began = socket.gethostname(), os.getpid(), bus.clock.now_ns()
-    then, cpu = began, time.process_time()
+    host, pid, start_ns = socket.gethostname(), os.getpid(), bus.clock.now_ns()
+    last_ns, last_cpu_s = start_ns, time.process_time()
     received, sent = Counter[str](), Counter[str]()
     async for now in bus.clock.every(PERIOD_NS):
-        seconds = max((now - then) / 1e9, 1e-3)
-        used = time.process_time()
+        seconds = max((now - last_ns) / 1e9, 1e-3)
+        cpu_s = time.process_time()
         message = Health(
             process=bus.process,
             pid=pid,
             host=host,
-            uptime_s=(now - began) / 1e9,
-            cpu=(used - cpu) / seconds,
+            uptime_s=(now - start_ns) / 1e9,
+            cpu=(cpu_s - last_cpu_s) / seconds,
             rss_bytes=rss_bytes(),
             received_hz=_rates(bus.received, received, seconds),
             sent_hz=_rates(bus.sent, sent, seconds),
@@ -48,7 +48,7 @@ async def publish_health(bus: Bus) -> None:
             counters=dict(bus.counters),
             problems=bus.problems,
         )
-        then, cpu, received, sent = now, used, bus.received.copy(), bus.sent.copy()
+        last_ns, last_cpu_s, received, sent = now, cpu_s, bus.received.copy(), bus.sent.copy()
         bus.publish(HEALTH, message, name=bus.process)
 
 
@@ -56,12 +56,12 @@ def _rates(now: Counter[str], before: Counter[str], seconds: float) -> dict[str,
     return {key: round((count - before[key]) / seconds, 2) for key, count in now.items()}
 
 
-ASK_S = 2.0  # how long an answer may take; without other processes there is no wait
-AGAIN_NS = 100_000_000  # until a process that has to exit, or refused to answer, is queried again
-TRIES = 10  # after this many refusals a process is ignored
-CONFIRM_NS = (1_000_000_000, 3_000_000_000)  # pauses before each query after the first
+TIMEOUT_S = 2.0  # without other processes there is no wait
+RETRY_NS = 100_000_000  # to query again a process that has to exit, or refused
+MAX_TRIES = 10  # after this many refusals a process is ignored
+CONFIRM_PAUSES_NS = (1_000_000_000, 3_000_000_000)  # pauses before each query after the first
 INSTANCE_BITS = 62
-WEAKEST = 1 << INSTANCE_BITS  # instance of a process that exits
+WEAKEST_INSTANCE = 1 << INSTANCE_BITS  # no other process exits for it
 
 
 class NameClaim:
@@ -77,21 +77,21 @@ class NameClaim:
         Raises ConfigError where another process keeps the name.
         """
         self._bus.serve(DESCRIBE, self._describe, name=self._bus.process)
-        await self._alone()
+        await self._wait_until_alone()
         self.claim = "working"
 
     async def settle(self) -> None:
         """Query the name again after each pause, then settle. Raises ConfigError like `acquire`."""
-        for pause_ns in CONFIRM_NS:
+        for pause_ns in CONFIRM_PAUSES_NS:
             await self._bus.clock.sleep_ns(pause_ns)
-            await self._alone()
+            await self._wait_until_alone()
         self.claim = "settled"
 
     async def keep(self) -> None:
         """Settle, and claim the name again after each loss of the link, until cancelled.
 
-        A process that was stopped or cut off may have been replaced: then it has to exit, as one
-        that is settled keeps the name. Raises ConfigError like `acquire`.
+        A process that was stopped or cut off may have been replaced. It then has to exit, as a
+        settled process keeps the name. Raises ConfigError like `acquire`.
         """
         while True:
             losses = self._bus.transport.losses
@@ -99,43 +99,45 @@ class NameClaim:
             while self._bus.transport.losses == losses:
                 await self._bus.clock.sleep_ns(PERIOD_NS)
             self.claim = "working"
-            while not any(one.instance == self.instance for one in await self._answers()):
-                await self._bus.clock.sleep_ns(AGAIN_NS)  # there is no link yet
-            await self._alone()
+            while not any(each.instance == self.instance for each in await self._query_claims()):
+                await self._bus.clock.sleep_ns(RETRY_NS)  # there is no link yet
+            await self._wait_until_alone()
 
-    async def _alone(self) -> None:
+    async def _wait_until_alone(self) -> None:
         """Wait until no other process answers to the name."""
-        while await self._others():
-            await self._bus.clock.sleep_ns(AGAIN_NS)
+        while await self._others_answer():
+            await self._bus.clock.sleep_ns(RETRY_NS)
 
-    async def _others(self) -> bool:
+    async def _others_answer(self) -> bool:
         """Return whether other processes answer that have to exit.
 
         Raises ConfigError if this process has to exit.
         """
         name = self._bus.process
-        others = [other for other in await self._answers() if other.instance != self.instance]
+        others = [other for other in await self._query_claims() if other.instance != self.instance]
         for other in others:
             if _strength(other.claim, other.instance) > _strength(self.claim, self.instance):
-                self.claim, self.instance = "starting", WEAKEST  # it makes no other one exit
+                self.claim, self.instance = "starting", WEAKEST_INSTANCE
                 raise ConfigError(
                     f"a {name} is already running here (pid {other.pid} on {other.host}); "
                     "stop it, or give this robot a namespace of its own"
                 )
         return bool(others)
 
-    async def _answers(self) -> list[Description]:
+    async def _query_claims(self) -> list[Description]:
         """Query every process of this name; retry after a refusal, as during a flood of queries."""
-        for _ in range(TRIES):
+        for _ in range(MAX_TRIES):
             try:
                 name = self._bus.process
-                return await self._bus.ask(DESCRIBE, DescribeRequest(), timeout_s=ASK_S, name=name)
+                return await self._bus.ask(
+                    DESCRIBE, DescribeRequest(), timeout_s=TIMEOUT_S, name=name
+                )
             except Refused:
-                await self._bus.clock.sleep_ns(AGAIN_NS)
+                await self._bus.clock.sleep_ns(RETRY_NS)
         return []  # a process that only refuses does not claim the name
 
     async def _describe(self, _: DescribeRequest) -> Description:
-        from gigabrain_zenoh.plugins import package_version  # 25 ms, so imported lazily
+        from gigabrain_zenoh.plugins import package_version  # takes 25 ms, so imported lazily
 
         bus = self._bus
         return Description(
