@@ -56,8 +56,12 @@ BUTTON_LOST = Cause(
     latching=True,
     remedy="check that its process runs, then release the robot",
 )
-BRAIN_SILENT = frozenset(("perception_silent", "decision_silent", "control_silent"))  # safety's
-LATE = BRAIN_SILENT | {SILENCE.code, STALE.code, SAFETY_SILENT.code}  # a process is too slow
+BRAIN_SILENT = frozenset(("perception_silent", "decision_silent", "control_silent"))  # in safety
+LATE = BRAIN_SILENT | {
+    SILENCE.code,
+    STALE.code,
+    SAFETY_SILENT.code,
+}  # codes of processes that are too slow
 
 
 def button(text: str) -> Cause:
@@ -71,7 +75,7 @@ def button(text: str) -> Cause:
 
 
 def estop(source: str) -> Cause:
-    """Return the cause of an e-stop that `source` has pressed."""
+    """Return the cause of an e-stop that `source` pressed."""
     return Cause(
         code="estop",
         text=f"e-stop pressed by {source}"[:500],
@@ -86,9 +90,9 @@ def latching(causes: tuple[Cause, ...]) -> tuple[Cause, ...]:
 
 
 def merge(known: tuple[Cause, ...], more: tuple[Cause, ...]) -> tuple[Cause, ...]:
-    """Return `known` and the new ones of `more`; a cause that now latches counts as new."""
-    held = {(cause.code, cause.latching) for cause in known}
-    return known + tuple(cause for cause in more if (cause.code, cause.latching) not in held)
+    """Return `known` with the new causes of `more`; one that latches now counts as new."""
+    known_keys = {(cause.code, cause.latching) for cause in known}
+    return known + tuple(cause for cause in more if (cause.code, cause.latching) not in known_keys)
 
 
 def in_words(causes: tuple[Cause, ...]) -> str:
@@ -96,8 +100,8 @@ def in_words(causes: tuple[Cause, ...]) -> str:
 
     The phrase is short enough to be a part of a reply.
     """
-    return "; ".join(map(_in_words, causes))[:400]
+    return "; ".join(map(_with_remedy, causes))[:400]
 
 
-def _in_words(cause: Cause) -> str:
+def _with_remedy(cause: Cause) -> str:
     return f"{cause.text} ({cause.remedy})" if cause.remedy else cause.text

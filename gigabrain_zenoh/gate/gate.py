@@ -1,15 +1,15 @@
-"""The gate: alone lets a command through to the body. A pure function, no I/O, no clock.
+"""The gate: the only way for a command to the body. A pure function, no I/O, no clock.
 
     latched ──release──► idle ──enable──► enabled ──any cause──► stopping ──► idle or latched
 
-`step(config, state, event) -> (state, outcome)`. Its time is the robot's tick (20 ms). With a
-wall clock (not when time is lock-stepped), events carry its time too. Both then bound the age of an
-echoed tick.
+`step(config, state, event) -> (state, outcome)`. Its time is the robot's tick (20 ms). Except in
+lock-step, events carry wall time as well. Both then limit the age of an echoed tick.
 """
 
 from msgspec.structs import replace
 
 from gigabrain_schemas.base import TICK_S, Cause, Velocity
+from gigabrain_schemas.body import GateMode
 from gigabrain_schemas.brain import CmdVel, JointCommand
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_zenoh.gate import causes as why
@@ -69,9 +69,9 @@ def release(state: GateState, event: Release) -> tuple[GateState, Outcome]:
         )
     if state.still_ticks < STILL_TICKS:
         return rejected(state, "the body is not at rest yet; wait half a second")
-    held = why.latching(state.faults + (state.safety.causes if state.safety else ()))
-    if held:
-        return rejected(state, f"the cause is still present: {why.in_words(held)}")
+    remaining = why.latching(state.faults + (state.safety.causes if state.safety else ()))
+    if remaining:
+        return rejected(state, f"the cause is still present: {why.in_words(remaining)}")
     by_hand = bool(why.latching(state.causes))
     state = replace(state, mode="idle", causes=(), by_hand=by_hand)
     return state, Outcome(text="released; enable it to move")
@@ -103,8 +103,8 @@ __all__ = [
 STOPPING_TICKS = 15  # 300 ms, then idle
 CALM_TICKS = 5  # 100 ms at zero after an enable, even if a joystick is held
 HEALTHY_TICKS = 25  # 0.5 s without a cause before an automatic resume
-RESUME_TICKS = 110  # from one start to an automatic one: starts and stops stay under 1 Hz
-NAN_STORM_COUNT, NAN_STORM_TICKS = 5, 50  # five in a second
+RESUME_TICKS = 110  # from an enable to an automatic resume: starts and stops stay below 1 Hz
+NAN_STORM_COUNT, NAN_STORM_TICKS = 5, 50  # five within a second
 
 
 def step(config: GateConfig, state: GateState, event: Event) -> tuple[GateState, Outcome]:
@@ -113,12 +113,12 @@ def step(config: GateConfig, state: GateState, event: Event) -> tuple[GateState,
     if after is state:
         return state, outcome
     if after.mode == "enabled":
-        found = stop_reasons(config, after, after.commander)
-        after = _stop(after, found) if found else after
+        reasons = stop_reasons(config, after, after.commander)
+        after = _stop(after, reasons) if reasons else after
     if after.mode == "latched" and state.mode != "latched":
         after = replace(after, latches=state.latches + 1)
-    output = _output(config, after)
-    return replace(after, output=output, joints=joints.output(config, after, _calm(after))), outcome
+    goals = joints.output(config, after, _just_enabled(after))
+    return replace(after, output=_output(config, after), joints=goals), outcome
 
 
 def _handle(config: GateConfig, state: GateState, event: Event) -> tuple[GateState, Outcome]:
@@ -148,50 +148,51 @@ def _tick(config: GateConfig, state: GateState, event: Tick) -> GateState:
         tick=state.tick + 1,
         issued_ns=issued[-ISSUED_TICKS:],
         faults=event.faults,
-        still_ticks=state.still_ticks + 1 if _rests(event) else 0,
+        still_ticks=state.still_ticks + 1 if _is_at_rest(event) else 0,
         late=event.late,
         before=state.output,
         joints_before=joints.before(state, event),
     )
     if state.mode == "enabled":
         return state
-    now = stop_reasons(config, state, BRAIN)
-    state = replace(state, healthy_ticks=0 if now else state.healthy_ticks + 1)
+    present = stop_reasons(config, state, BRAIN)
+    state = replace(state, healthy_ticks=0 if present else state.healthy_ticks + 1)
     if state.mode == "stopping":
-        return _stopping(state, now)
-    return _waiting(config, state, now)
+        return _continue_stopping(state, present)
+    return _wait(config, state, present)
 
 
-def _rests(event: Tick) -> bool:
+def _is_at_rest(event: Tick) -> bool:
     return at_rest(event.measured) and joints_at_rest(event.joints)
 
 
-def _stop(state: GateState, found: tuple[Cause, ...]) -> GateState:
-    return replace(state, mode="stopping", causes=found, stopped_tick=state.tick, healthy_ticks=0)
+def _stop(state: GateState, reasons: tuple[Cause, ...]) -> GateState:
+    return replace(state, mode="stopping", causes=reasons, stopped_tick=state.tick, healthy_ticks=0)
 
 
-def _stopping(state: GateState, now: tuple[Cause, ...]) -> GateState:
+def _continue_stopping(state: GateState, present: tuple[Cause, ...]) -> GateState:
     """Continue stopping. The commander must be enabled again afterwards."""
-    state = replace(state, causes=why.merge(state.causes, why.latching(now)))
+    state = replace(state, causes=why.merge(state.causes, why.latching(present)))
     if state.tick - state.stopped_tick < STOPPING_TICKS or state.before != ZERO:
         return state
     if any(joint.velocity for joint in state.joints_before):
         return state
-    held = why.latching(state.causes)
-    return replace(state, mode="latched" if held else "idle", causes=held or now, commander="")
+    remaining = why.latching(state.causes)
+    mode: GateMode = "latched" if remaining else "idle"
+    return replace(state, mode=mode, causes=remaining or present, commander="")
 
 
-def _waiting(config: GateConfig, state: GateState, now: tuple[Cause, ...]) -> GateState:
+def _wait(config: GateConfig, state: GateState, present: tuple[Cause, ...]) -> GateState:
     """Advance a tick while idle or latched."""
-    held = why.merge(why.latching(state.causes), why.latching(now))
-    if held:
-        return replace(state, mode="latched", causes=held)
-    rested = min(state.healthy_ticks, state.still_ticks) >= HEALTHY_TICKS
-    again = state.tick - state.enabled_tick >= RESUME_TICKS
-    if config.auto_resume and not state.by_hand and rested and again:
+    remaining = why.merge(why.latching(state.causes), why.latching(present))
+    if remaining:
+        return replace(state, mode="latched", causes=remaining)
+    healthy = min(state.healthy_ticks, state.still_ticks) >= HEALTHY_TICKS
+    due = state.tick - state.enabled_tick >= RESUME_TICKS
+    if config.auto_resume and not state.by_hand and healthy and due:
         return _enabled(state, BRAIN)
     boot = (why.BOOT,) if state.mode == "latched" else ()
-    return replace(state, causes=boot + now)
+    return replace(state, causes=boot + present)
 
 
 def _enabled(state: GateState, source: str) -> GateState:
@@ -215,14 +216,14 @@ def _enabled(state: GateState, source: str) -> GateState:
 def _output(config: GateConfig, state: GateState) -> Velocity:
     """Return the output: one ramp step from the output of the last tick.
 
-    Missed ticks are processed in a burst. A stop then takes all its steps, but the body must not
-    gain speed by several steps at once.
+    Missed ticks are processed in a burst. A stop then takes all of their steps, but the body must
+    not gain speed by several steps at once.
     """
     if state.mode in ("latched", "idle"):
         return ZERO
     target, command = ZERO, state.command
     live = command and state.tick - state.command_tick <= SILENCE_TICKS
-    if state.mode == "enabled" and command and live and state.safety and not _calm(state):
+    if state.mode == "enabled" and command and live and state.safety and not _just_enabled(state):
         target = clamp(
             Velocity(
                 linear_x=command.linear_x, linear_y=command.linear_y, angular_z=command.angular_z
@@ -234,7 +235,8 @@ def _output(config: GateConfig, state: GateState) -> Velocity:
     return change(state.before, target, config.limits, TICK_S)
 
 
-def _calm(state: GateState) -> bool:
+def _just_enabled(state: GateState) -> bool:
+    """Return whether the body must wait at rest after an enable."""
     return state.tick - state.enabled_tick < CALM_TICKS
 
 
@@ -257,23 +259,23 @@ def _command(
         return state, Outcome(refused="commander", ok=False)
     if command.seq < _next_seq(state, command):
         return state, Outcome(refused="seq", ok=False)
-    return _obeyed(state, command), Outcome()
+    return _obey(state, command), Outcome()
 
 
 def _next_seq(state: GateState, command: CmdVel | JointCommand) -> int:
     return state.next_joint_seq if isinstance(command, JointCommand) else state.next_seq
 
 
-def _obeyed(state: GateState, command: CmdVel | JointCommand) -> GateState:
-    """Return the state with a command that counts from now on."""
-    after = command.seq + 1
+def _obey(state: GateState, command: CmdVel | JointCommand) -> GateState:
+    """Make `command` the current one."""
+    next_seq = command.seq + 1
     if isinstance(command, JointCommand):
-        return replace(state, joint_command=command, joint_tick=state.tick, next_joint_seq=after)
-    return replace(state, command=command, command_tick=state.tick, next_seq=after)
+        return replace(state, joint_command=command, joint_tick=state.tick, next_joint_seq=next_seq)
+    return replace(state, command=command, command_tick=state.tick, next_seq=next_seq)
 
 
 def _not_finite(state: GateState, event: NotFinite) -> tuple[GateState, Outcome]:
-    """Stop at once if the commander sent it, and latch if it goes on, also once it is none."""
+    """Stop at once if the commander sent it. Latch if it goes on, even after losing command."""
     refused = Outcome(refused="not_finite", ok=False)
     sender = state.commander or state.nan_source
     if event.boot != state.boot or not sender or event.source != sender or state.mode == "latched":
@@ -309,10 +311,10 @@ def _enable(config: GateConfig, state: GateState, event: Enable) -> tuple[GateSt
             )
         if event.source == BRAIN and event.by in ("", BRAIN):
             return rejected(state, f"{state.commander} drives; only a person can enable the brain")
-    found = stop_reasons(config, state, event.source)
-    if found:
-        return rejected(state, f"not now: {why.in_words(found)}")
+    reasons = stop_reasons(config, state, event.source)
+    if reasons:
+        return rejected(state, f"not now: {why.in_words(reasons)}")
     granted = Outcome(text=f"{event.source} drives")
-    if state.commander == event.source:  # it continues: an enable is no command
+    if state.commander == event.source:  # no new start: an enable is not a command
         return replace(state, enables=state.enables + 1), granted
     return _enabled(state, event.source), granted

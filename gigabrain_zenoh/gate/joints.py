@@ -1,7 +1,7 @@
-"""The gate's part for joints: which commands count, and where each joint goes next.
+"""The gate's part for joints: checks commands, and computes the next goal of each joint.
 
-In every case but a live command of the commander, joints come to rest and are held there. They move
-no faster in a direction than safety's newest verdict allows, and not at all by an old one.
+Without a live command of the commander, joints come to rest and are held there. Safety's newest
+verdict limits their speed in each direction. While it is old, they do not move.
 """
 
 import math
@@ -23,13 +23,13 @@ from gigabrain_zenoh.geometry.joints import (
     stopped,
 )
 
-VERDICT_TICKS = 2  # 40 ms, the oldest verdict of safety by which joints move
-LIVE_TICKS = 2  # 40 ms after a command, joints that get no other brake
+MAX_VERDICT_TICKS = 2  # 40 ms; joints do not move by an older verdict
+COMMAND_TICKS = 2  # 40 ms; joints brake unless the next command arrives by then
 TOLERANCE = 1e-6  # [rad] or [m], of positions at a limit
 
 
 def refusal(config: GateConfig, state: GateState, command: JointCommand) -> str:
-    """Return the code for which a command for joints is refused; empty if it is valid."""
+    """Return the code of why a joint command is refused; empty if it is valid."""
     known = {joint.name: joint for joint in config.joints}
     if not known:
         return "no_joints"
@@ -45,10 +45,10 @@ def refusal(config: GateConfig, state: GateState, command: JointCommand) -> str:
 
 
 def before(state: GateState, event: Tick) -> tuple[JointMotion, ...]:
-    """Return where the joints were sent in the last tick.
+    """Return the goal of each joint in the last tick.
 
-    At the start, and while the body cannot be reached, that is where it holds them by itself; at
-    the start where they are, if nothing does.
+    At the start, and while the link is lost, this is where the body itself holds the joint. If it
+    does not report that at the start, or the joint is limp, this is the measured position.
     """
     if event.joints and event.limp:
         return tuple(map(frozen, event.joints))
@@ -60,23 +60,23 @@ def before(state: GateState, event: Tick) -> tuple[JointMotion, ...]:
 
 
 def output(config: GateConfig, state: GateState, calm: bool) -> tuple[JointMotion, ...]:
-    """Return where each joint goes: one step from the output of the last tick.
+    """Return the next goal of each joint: one step from that of the last tick.
 
-    A latched body's joints stop at once. Ticks that are made up for in a burst only brake.
+    A latched body's joints stop at once. Missed ticks, processed in a burst, only brake.
     """
-    now = state.joints_before
+    last = state.joints_before
     if state.mode == "latched":
-        return tuple(map(stopped, now))
+        return tuple(map(stopped, last))
     command = state.joint_command
-    live = command and state.tick - state.joint_tick < LIVE_TICKS
+    live = command and state.tick - state.joint_tick < COMMAND_TICKS
     safety = state.safety
-    known = safety is not None and state.tick - safety.tick <= VERDICT_TICKS
-    if state.mode != "enabled" or not live or not known or calm or state.late:
+    judged = safety is not None and state.tick - safety.tick <= MAX_VERDICT_TICKS
+    if state.mode != "enabled" or not live or not judged or calm or state.late:
         command = None
     bands = _bands(safety.joints if safety else ())
     return tuple(
         _step(joint, motion, command, bands.get(joint.name, ANY_SPEED))
-        for joint, motion in zip(config.joints, now, strict=False)
+        for joint, motion in zip(config.joints, last, strict=False)
     )
 
 
@@ -91,14 +91,14 @@ def _bands(caps: tuple[JointCap, ...]) -> dict[str, SpeedBand]:
 
 
 def _step(
-    joint: JointDescription, now: JointMotion, command: JointCommand | None, band: SpeedBand
+    joint: JointDescription, last: JointMotion, command: JointCommand | None, band: SpeedBand
 ) -> JointMotion:
     if command is None or joint.name not in command.name:
-        return braked(now, joint, TICK_S)
+        return braked(last, joint, TICK_S)
     index = command.name.index(joint.name)
     velocity = command.velocity[index] if command.velocity else 0.0
     if not command.position and not velocity:
-        return braked(now, joint, TICK_S)
+        return braked(last, joint, TICK_S)
     if not command.position:
-        return accelerated(now, velocity, joint, TICK_S, band)
-    return approach(now, JointMotion(command.position[index], velocity), joint, TICK_S, band)
+        return accelerated(last, velocity, joint, TICK_S, band)
+    return approach(last, JointMotion(command.position[index], velocity), joint, TICK_S, band)

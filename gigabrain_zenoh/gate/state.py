@@ -19,8 +19,8 @@ class GateConfig(msgspec.Struct, frozen=True, kw_only=True):
     """Settings of the gate, from the body and the deployment."""
 
     limits: Limits
-    joints: tuple[JointDescription, ...] = ()  # that can be commanded
-    basis_ns: int = 250_000_000  # oldest sensor data that may move the body
+    joints: tuple[JointDescription, ...] = ()  # those that accept commands
+    basis_ns: int = 250_000_000  # maximum age of sensor data that may move the body
     auto_resume: bool = False
 
 
@@ -34,31 +34,31 @@ class GateState(msgspec.Struct, frozen=True, kw_only=True):
     causes: tuple[Cause, ...] = (why.BOOT,)
     faults: tuple[Cause, ...] = ()  # reported by the driver at the last tick
     estop_generation: int = 0
-    by_hand: bool = False  # released from a latch: no automatic resume
+    by_hand: bool = False  # a person released a latch: no automatic resume
     commander: str = ""
     enables: int = 0
     latches: int = 0
-    enabled_tick: int = -1000  # when the present commander was enabled
-    command: CmdVel | None = None  # last valid one of the commander
-    command_tick: int = 0  # of its arrival
-    next_seq: int = 0  # the lowest that the commander may use
-    joint_command: JointCommand | None = None  # the same of the commander's other stream
+    enabled_tick: int = -1000  # when the commander was enabled
+    command: CmdVel | None = None  # newest valid one of the commander
+    command_tick: int = 0  # when it arrived
+    next_seq: int = 0  # the lowest that is accepted
+    joint_command: JointCommand | None = None  # these three: the same for joints
     joint_tick: int = 0
     next_joint_seq: int = 0
+    # newest valid one of the brain, also while it does not drive
     brain_command: CmdVel | JointCommand | None = None
-    # last valid one of the brain, also while another commands
     brain_tick: int = -1000
     safety: SafetyState | None = None
     stopped_tick: int = 0  # when stopping began
     still_ticks: int = 0
     healthy_ticks: int = 0
-    nan_ticks: tuple[int, ...] = ()  # when the newest commands that were not finite came
-    nan_source: str = ""  # from whom
-    late: bool = False  # this tick was missed and is made up for
+    nan_ticks: tuple[int, ...] = ()  # arrivals of the newest commands with NaN or infinity
+    nan_source: str = ""  # their sender
+    late: bool = False  # this tick was missed, and is processed in a burst
     before: Velocity = ZERO  # output of the last tick
     output: Velocity = ZERO  # velocity for the body
-    joints_before: tuple[JointMotion, ...] = ()  # output of the last tick, for each joint
-    joints: tuple[JointMotion, ...] = ()  # for the body; none before they were measured
+    joints_before: tuple[JointMotion, ...] = ()  # goals of the last tick
+    joints: tuple[JointMotion, ...] = ()  # goals for the body; empty before any measurement
 
 
 class Tick(msgspec.Struct, frozen=True):
@@ -67,10 +67,10 @@ class Tick(msgspec.Struct, frozen=True):
     measured: Velocity
     wall_ns: int | None = None
     faults: tuple[Cause, ...] = ()  # reported by the driver
-    late: bool = False  # it was missed and is made up for, right behind another one
-    joints: tuple[JointMotion, ...] = ()  # as measured, those that can be commanded
-    held: tuple[float, ...] = ()  # where the body holds them by itself; none if it does not say so
-    limp: bool = False  # the joints are let go of
+    late: bool = False  # it was missed, and is processed in a burst
+    joints: tuple[JointMotion, ...] = ()  # as measured, those that accept commands
+    held: tuple[float, ...] = ()  # where the body itself holds them; empty if not reported
+    limp: bool = False  # the torque of the joints is off
 
 
 class VelocityCommand(msgspec.Struct, frozen=True):
@@ -126,7 +126,7 @@ Event = Tick | VelocityCommand | JointsCommand | NotFinite | Safety | Estop | Re
 class Outcome(msgspec.Struct, frozen=True):
     """Result of an event."""
 
-    refused: str = ""  # why a command was not obeyed; a code
+    refused: str = ""  # code of why a command was not obeyed
     ok: bool = True  # whether a request was granted
     text: str = ""  # the answer to a request, for people
 
@@ -145,20 +145,20 @@ def status(state: GateState) -> GateStatus:
 
 ECHO_NS = 150_000_000  # commands and verdicts must echo a tick that was issued this recently
 ISSUED_TICKS = 16  # ticks whose wall time is remembered; an echo is accepted for 7
-SILENCE_TICKS = 5  # 100 ms without a good command
+SILENCE_TICKS = 5  # 100 ms without a valid command
 
 
 def age_ns(state: GateState, tick: int, wall_ns: int | None) -> int:
     """Return the age of `tick` [ns]: the larger of tick count and wall clock, if there is one."""
-    back = state.tick - tick
-    age = back * TICK_NS
-    if wall_ns is not None and 0 <= back < len(state.issued_ns):
-        age = max(age, wall_ns - state.issued_ns[-1 - back])
+    age_ticks = state.tick - tick
+    age = age_ticks * TICK_NS
+    if wall_ns is not None and 0 <= age_ticks < len(state.issued_ns):
+        age = max(age, wall_ns - state.issued_ns[-1 - age_ticks])
     return age
 
 
 def is_finite(command: CmdVel | JointCommand) -> bool:
-    """Return whether all of its numbers are finite; decoded messages always are."""
+    """Return whether all numbers of a command are finite; those of decoded messages are."""
     if isinstance(command, JointCommand):
         return all(map(math.isfinite, (*command.position, *command.velocity)))
     return all(map(math.isfinite, (command.linear_x, command.linear_y, command.angular_z)))
@@ -166,25 +166,25 @@ def is_finite(command: CmdVel | JointCommand) -> bool:
 
 def stop_reasons(config: GateConfig, state: GateState, source: str) -> tuple[Cause, ...]:
     """Return the causes for which `source` must not move the body now."""
-    found = [*state.faults, *_verdict(state)]
+    reasons = [*state.faults, *_safety_causes(state)]
     streams: tuple[tuple[CmdVel | JointCommand | None, int], ...]
     if state.mode == "enabled" and source == state.commander:
         streams = (state.command, state.command_tick), (state.joint_command, state.joint_tick)
     elif source == BRAIN:
         streams = ((state.brain_command, state.brain_tick),)
     else:
-        return tuple(found)  # a new commander need not have sent a command yet
+        return tuple(reasons)  # a new commander need not have sent a command yet
     live = [command for command, arrived in streams if state.tick - arrived <= SILENCE_TICKS]
     if not live:
-        found.append(why.SILENCE)
+        reasons.append(why.SILENCE)
         live = [command for command, _ in streams]
     bases = [command.basis for command in live if command and command.basis]
     if any(age_ns(state, basis, None) > config.basis_ns for basis in bases):
-        found.append(why.STALE)
-    return tuple(found)
+        reasons.append(why.STALE)
+    return tuple(reasons)
 
 
-def _verdict(state: GateState) -> tuple[Cause, ...]:
+def _safety_causes(state: GateState) -> tuple[Cause, ...]:
     """Return safety's stop causes; zones only cap speeds and are not among them."""
     safety = state.safety
     ticked_ns = state.issued_ns[-1] if state.issued_ns else None
@@ -196,7 +196,7 @@ def _verdict(state: GateState) -> tuple[Cause, ...]:
 
 
 def refusal(state: GateState, command: CmdVel | JointCommand, wall_ns: int | None) -> str:
-    """Return the code for which a command is refused, from any sender; empty if it is valid."""
+    """Return the code of why a command is refused, from any sender; empty if it is valid."""
     if command.boot != state.boot:
         return "boot"
     if command.tick > state.tick or command.basis > state.tick:
