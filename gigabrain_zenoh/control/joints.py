@@ -1,7 +1,7 @@
 """Joint trajectory controller: turns intents, or an operator's speeds, into joint positions.
 
-It starts from where the joints were sent, and keeps to speed, acceleration and jerk of each. What
-a joint lags behind is corrected by its gains. A joint that leaves its tolerance stops them all.
+It starts from the goals that the gate sent, and keeps each joint's limits of speed, acceleration
+and jerk. A joint's gains correct its lag. A joint that leaves its tolerance stops all of them.
 """
 
 from collections.abc import Sequence
@@ -27,9 +27,9 @@ from gigabrain_zenoh.geometry.joint_ramp import (
 )
 
 MAX_STEP_TICKS = 5  # longest step, also after a gap
-LOST_TICKS = 3  # by whose motion the joints may be away from where they were sent
-FASTEST = 1.1  # of a joint's greatest speed: the gate moves none faster, but for rounding
-SLOW = 0.01  # [rad/s] or [m/s], below which a joint should rest
+MAX_DEVIATION_TICKS = 3  # of motion at full speed, between our command and what the gate sent
+MAX_SPEED_FACTOR = 1.1  # the gate moves no joint faster than its maximum, except for rounding
+SLOW = 0.01  # [rad/s] or [m/s], a joint whose setpoint is slower counts as at rest
 Places = tuple[float, ...]
 
 
@@ -46,24 +46,24 @@ class JointMemory(msgspec.Struct, frozen=True, kw_only=True):
 
     boot: int = 0
     tick: int = 0
-    enables: int = 0  # the gate's count
+    enables: int = 0  # the gate's count of enables
     enabled_tick: int = 0  # when the gate opened; 0 while it is closed
     operator: bool = False  # an operator jogs, until the gate is enabled again
-    active: bool = False  # something was wanted since then: gains correct what joints lag behind
-    setpoint: tuple[JointPoint, ...] = ()  # for the tick after this one; none while closed
+    active: bool = False  # motion was requested since then, so that gains correct the lag
+    setpoint: tuple[JointPoint, ...] = ()  # for the next tick; empty while closed
     sent: Places = ()  # the last command
-    obeyed: Places = ()  # where the gate has sent the joints at that tick
+    obeyed: Places = ()  # positions that the gate sent at `tick`
     integral: Places = ()  # [rad] or [m], part of the correction
-    problem: str = ""  # code of the tolerance that was broken
-    detail: str = ""  # which joint broke it, and by how much
+    problem: str = ""  # code of the violated tolerance
+    detail: str = ""  # the joint and its error
     broken_tick: int = 0
-    hold: Places = ()  # where the joints were then
+    hold: Places = ()  # measured positions at `broken_tick`
 
 
 def step_joints(
     body: BodyDescription, memory: JointMemory, inputs: JointInputs, commander: str = BRAIN
 ) -> tuple[JointMemory, JointCommand | None]:
-    """Return the command for the tick after that of the state; None while joints are missing.
+    """Return the command for the tick after the state; None while joints are missing.
 
     It moves the joints while the gate obeys `commander`.
     """
@@ -94,15 +94,15 @@ def _step(
     if inputs.teleop:
         memory = replace(memory, operator=True)
     if inputs.intent is None and not (memory.operator or memory.problem):
-        return _resting(body, memory, here, posture)
+        return _brake(body, memory, here, posture)
     intent = None if memory.operator else inputs.intent
-    wants = intent and (intent.joints or intent.joint_trajectory)
-    memory = replace(memory, active=bool(memory.active or inputs.teleop or wants))
+    requested = intent and (intent.joints or intent.joint_trajectory)
+    memory = replace(memory, active=bool(memory.active or inputs.teleop or requested))
     if intent and intent.joint_trajectory:
         memory = _checked(body, memory, intent.joint_trajectory, here)
     elif intent or inputs.teleop:
         memory = replace(memory, problem="", detail="")
-    memory = replace(memory, setpoint=_moved(body, memory, inputs.teleop, intent, ticks))
+    memory = replace(memory, setpoint=_next_setpoint(body, memory, inputs.teleop, intent, ticks))
     return _corrected(body, memory, here, ticks)
 
 
@@ -113,10 +113,10 @@ def _next_tick(
     here: tuple[JointPoint, ...],
     posture: tuple[JointPoint, ...],
 ) -> tuple[JointMemory, int]:
-    """Advance to the tick of `state`; return the ticks since the last step as well.
+    """Advance to the tick of `state`; also return the ticks since the last step.
 
-    The joints start where they were sent: all after an enable, and each one that did not get what
-    was commanded, for the gate slowed it down. That one goes on at the speed at which it was sent.
+    After an enable, all joints start from the positions that the gate sent. So does a joint that
+    the gate slowed down; it continues at the speed that the gate sent.
     """
     opened = not memory.setpoint or memory.boot != state.boot
     handed_over = state.gate.enables != memory.enables
@@ -135,27 +135,27 @@ def _next_tick(
         return memory, 0
     passed = max(0, min(state.tick - memory.tick, MAX_STEP_TICKS))
     calm = state.tick - memory.enabled_tick <= CALM_TICKS
-    lost = [
-        calm or abs(sent - point.position) > LOST_TICKS * TICK_S * joint.max_speed
+    deviates = [
+        calm or abs(sent - point.position) > MAX_DEVIATION_TICKS * TICK_S * joint.max_speed
         for sent, point, joint in zip(memory.sent, posture, body.joints, strict=True)
     ]
     speeds = [0.0] * len(posture)
     for k, joint in enumerate(body.joints):
         moved = (posture[k].position - memory.obeyed[k]) / (max(1, passed) * TICK_S)
-        if abs(moved) <= FASTEST * joint.max_speed:  # else it was turned by hand
+        if abs(moved) <= MAX_SPEED_FACTOR * joint.max_speed:  # otherwise it was turned by hand
             speeds[k] = moved
-    memory = _from_sent(body, memory, here, posture, lost, speeds)
+    memory = _from_sent(body, memory, here, posture, deviates, speeds)
     memory = replace(memory, tick=state.tick, obeyed=_places(posture))
     return memory, 0 if calm else passed
 
 
-def _resting(
+def _brake(
     body: BodyDescription,
     memory: JointMemory,
     here: tuple[JointPoint, ...],
     posture: tuple[JointPoint, ...],
 ) -> tuple[JointMemory, JointCommand]:
-    """Have the gate brake the joints and hold them, as while decision is silent."""
+    """Let the gate brake and hold the joints, while decision is silent."""
     names, still = tuple(joint.name for joint in body.joints), (0.0,) * len(posture)
     memory = _from_sent(body, memory, here, posture, [True] * len(posture), still)
     return memory, JointCommand(name=names, velocity=still)
@@ -166,34 +166,34 @@ def _from_sent(
     memory: JointMemory,
     here: tuple[JointPoint, ...],
     posture: tuple[JointPoint, ...],
-    which: Sequence[bool],
+    selected: Sequence[bool],
     speeds: Sequence[float],
 ) -> JointMemory:
-    """Have `which` joints go on at `speeds` from where the gate has sent them.
+    """Let the selected joints continue at `speeds` from the positions that the gate sent.
 
-    What is corrected at rest is not part of the setpoint, or each time would add to it.
+    The correction at rest is subtracted from the setpoint, otherwise it would add up.
     """
     setpoint, sent = list(memory.setpoint), list(memory.sent)
     for k, joint in enumerate(body.joints):
-        if which[k]:
+        if selected[k]:
             sent[k] = place = posture[k].position
             if memory.active:
                 gains, now, old = joint.gains, here[k].position, memory.integral[k]
                 wanted = (place - old + gains.p * now) / (1.0 + gains.p)
-                most = gains.max_correction
-                place -= max(-most, min(most, gains.p * (wanted - now) + old))
+                limit = gains.max_correction
+                place -= max(-limit, min(limit, gains.p * (wanted - now) + old))
             setpoint[k] = JointPoint(within(joint, place), speeds[k])
     return replace(memory, setpoint=tuple(setpoint), sent=tuple(sent))
 
 
-def _moved(
+def _next_setpoint(
     body: BodyDescription,
     memory: JointMemory,
     teleop: JointSpeeds | None,
     intent: Intent | None,
     ticks: int,
 ) -> tuple[JointPoint, ...]:
-    """Return the setpoint `ticks` later, as the operator wants, else decision, else at rest."""
+    """Return the setpoint `ticks` later, by the operator, else by the intent, else at rest."""
     now, joints, dt = memory.setpoint, body.joints, ticks * TICK_S
     trajectory = intent.joint_trajectory if intent else None
     if memory.problem:
@@ -210,19 +210,19 @@ def _moved(
         goals = {target.name: JointGoal(target.position) for target in targets}
     if not goals and not any(point.velocity or point.acceleration for point in now):
         return now
-    limits = joints if teleop else [_with_room(joint) for joint in joints]
+    limits = joints if teleop else [_with_reserve(joint) for joint in joints]
     return ramp(now, [goals.get(joint.name, REST) for joint in joints], limits, dt)
 
 
 @lru_cache(maxsize=64)
-def _with_room(joint: JointDescription) -> JointDescription:
-    """Return a joint with less acceleration and jerk, so that it has room for the feed-forward.
+def _with_reserve(joint: JointDescription) -> JointDescription:
+    """Return a joint with less acceleration and jerk, to leave a reserve for the feed-forward.
 
-    What is sent is ahead by the speed: a + f j of it has to be within the joint's acceleration, or
-    the gate limits it, and the joint runs past its target.
+    The command leads by f v. Its acceleration a + f j must be within the joint's limit; otherwise
+    the gate limits it, and the joint overshoots.
     """
-    ahead = joint.gains.feed_forward * joint.max_jerk
-    share = joint.max_acceleration / (joint.max_acceleration + ahead)
+    lead = joint.gains.feed_forward * joint.max_jerk
+    share = joint.max_acceleration / (joint.max_acceleration + lead)
     acceleration, jerk = share * joint.max_acceleration, share * joint.max_jerk
     return replace(joint, max_acceleration=acceleration, max_jerk=jerk)
 
@@ -230,7 +230,7 @@ def _with_room(joint: JointDescription) -> JointDescription:
 def sample(
     body: BodyDescription, path: JointTrajectory, now: tuple[JointPoint, ...], tick: int
 ) -> Places:
-    """Return where each joint should be at a tick; joints that are not named stay as they are."""
+    """Return each joint's position on the path at a tick; other joints stay where they are."""
     points = path.array()
     at = max(0.0, min(len(points) - 1.0, (tick - path.start) * TICK_S / path.period))
     first = int(at)
@@ -246,14 +246,15 @@ def sample(
 def _checked(
     body: BodyDescription, memory: JointMemory, path: JointTrajectory, here: tuple[JointPoint, ...]
 ) -> JointMemory:
-    """Check the tolerances; a hold ends with a trajectory that was made after it began."""
+    """Check the tolerances. A hold ends with a trajectory that was made later."""
     assert body.arm
     wanted = sample(body, path, here, memory.tick)
-    off = _off(body.joints, wanted, here)
+    errors = _errors(body.joints, wanted, here)
     ended_s = (memory.tick - path.start) * TICK_S - (len(path.array()) - 1) * path.period
-    found = _broken("path_tolerance", off, [joint.path_tolerance for joint in body.joints])
+    found = _violation("path_tolerance", errors, [joint.path_tolerance for joint in body.joints])
     if not found[0] and ended_s > body.arm.goal_time:
-        found = _broken("goal_tolerance", off, [joint.goal_tolerance for joint in body.joints])
+        tolerances = [joint.goal_tolerance for joint in body.joints]
+        found = _violation("goal_tolerance", errors, tolerances)
     if memory.problem and (found[0] or path.start <= memory.broken_tick):
         return memory
     problem, detail = found
@@ -263,7 +264,7 @@ def _checked(
     return replace(memory, problem=problem, detail=detail, broken_tick=memory.tick, hold=places)
 
 
-def _off(
+def _errors(
     joints: tuple[JointDescription, ...], wanted: Places, here: tuple[JointPoint, ...]
 ) -> dict[str, float]:
     return {
@@ -272,9 +273,9 @@ def _off(
     }
 
 
-def _broken(code: str, off: dict[str, float], tolerances: list[float]) -> tuple[str, str]:
-    """Return the code and the first joint that is beyond its tolerance; 0 is not checked."""
-    for (name, error), tolerance in zip(off.items(), tolerances, strict=True):
+def _violation(code: str, errors: dict[str, float], tolerances: list[float]) -> tuple[str, str]:
+    """Return code and detail of the first joint beyond its tolerance; 0 means unlimited."""
+    for (name, error), tolerance in zip(errors.items(), tolerances, strict=True):
         if tolerance and abs(error) > tolerance:
             return code, f"{name} is {abs(error):.2f} off, more than {tolerance:g}"
     return "", ""
@@ -283,20 +284,20 @@ def _broken(code: str, off: dict[str, float], tolerances: list[float]) -> tuple[
 def _corrected(
     body: BodyDescription, memory: JointMemory, here: tuple[JointPoint, ...], ticks: int
 ) -> tuple[JointMemory, JointCommand]:
-    """Return the command: the setpoint, and what each joint's gains add to it."""
+    """Return the command: the setpoint plus the corrections by each joint's gains."""
     sent, integral = [], []
     for joint, point, now, old in zip(
         body.joints, memory.setpoint, here, memory.integral, strict=True
     ):
         gains = joint.gains
-        most = gains.max_correction
+        limit = gains.max_correction
         error = point.position - now.position
         still = memory.active and abs(point.velocity) < SLOW and not memory.problem
-        still = still and joint.part == "arm"  # a gripper that holds something never gets there
+        still = still and joint.part == "arm"  # a gripper with an object stays off its setpoint
         grown = old + gains.i * error * TICK_S * ticks if still else old
-        grown = max(-most, min(most, grown))
+        grown = max(-limit, min(limit, grown))
         fixed = gains.p * error + grown + gains.d * (point.velocity - now.velocity)
-        fixed = max(-most, min(most, fixed)) + gains.feed_forward * point.velocity
+        fixed = max(-limit, min(limit, fixed)) + gains.feed_forward * point.velocity
         fixed += gains.inertia * point.acceleration
         fixed = fixed if memory.active else 0.0
         integral.append(grown)
@@ -308,7 +309,7 @@ def _corrected(
 def between(
     body: BodyDescription, memory: JointMemory, command: JointCommand, after_s: float
 ) -> JointCommand:
-    """Return the command `after_s` after that of a state: how the joints go on by then."""
+    """Return `command`, extrapolated by `after_s`."""
     places = tuple(
         within(joint, place + speed * after_s)
         for joint, place, speed in zip(body.joints, command.position, command.velocity, strict=True)
@@ -317,9 +318,9 @@ def between(
 
 
 def _speeds(body: BodyDescription, memory: JointMemory) -> Places:
-    """Return how fast what is sent moves: the feed-forward of a joint that brakes goes back."""
-    ahead = [joint.gains.feed_forward if memory.active else 0.0 for joint in body.joints]
-    speeds = [p.velocity + f * p.acceleration for p, f in zip(memory.setpoint, ahead, strict=True)]
+    """Return the speeds of the commanded positions, including their feed-forward."""
+    lead = [joint.gains.feed_forward if memory.active else 0.0 for joint in body.joints]
+    speeds = [p.velocity + f * p.acceleration for p, f in zip(memory.setpoint, lead, strict=True)]
     return tuple(
         max(-joint.max_speed, min(joint.max_speed, speed))
         for joint, speed in zip(body.joints, speeds, strict=True)

@@ -27,7 +27,7 @@ from gigabrain_zenoh.bus.freshness import PreviousTick
 from gigabrain_zenoh.control.joints import JointInputs, JointMemory, between, step_joints
 from gigabrain_zenoh.control.teleop import OperatorStream, Teleop
 from gigabrain_zenoh.control.tracking import (
-    LONGEST_DELAY_TICKS,
+    MAX_DELAY_TICKS,
     track,
     turn_correction,
     within_turning_circle,
@@ -41,9 +41,9 @@ from gigabrain_zenoh.runtime.heartbeat import Progress
 log = logging.getLogger(__name__)
 
 MAX_RAMP_TICKS = 5  # longest step of the ramp, also after a gap
-STEADY_TICKS = 10  # until the measured speed has reached a constant setpoint
-INTENT_TICKS = 2  # by no older intent joints move: an arm rests within 120 ms of its last one
-MIN_LEARN_LINEAR, MIN_LEARN_ANGULAR = 0.05, 0.1  # [m/s], [rad/s]; encoders are coarse below
+STEADY_TICKS = 10  # of a constant setpoint, for the measured speed to reach it
+INTENT_TICKS = 2  # maximum age for joints: an arm rests within 120 ms of its last intent
+MIN_LEARN_LINEAR, MIN_LEARN_ANGULAR = 0.05, 0.1  # [m/s], [rad/s]; below, encoders are too coarse
 
 
 class ControlInputs(msgspec.Struct, frozen=True, kw_only=True):
@@ -60,35 +60,35 @@ class ControlMemory(msgspec.Struct, frozen=True, kw_only=True):
 
     boot: int = 0
     tick: int = 0
-    elapsed_ticks: int = 1  # since the tick before
-    before: Velocity = ZERO  # setpoint of the tick before
+    elapsed_ticks: int = 1  # since the previous state
+    before: Velocity = ZERO  # setpoint of the previous state
     setpoint: Velocity = ZERO
-    needed: Velocity = ZERO  # the setpoint with the learnt gains
-    allowed: Velocity = ZERO  # that within limits and caps
+    needed: Velocity = ZERO  # setpoint times the learnt gains
+    allowed: Velocity = ZERO  # `needed` within limits and caps
     steady_ticks: int = 0
-    gain_x: float = 1.0  # commanded over measured speed, learnt at steady speed
+    gain_x: float = 1.0  # commanded / measured speed, learnt at steady speed
     gain_z: float = 1.0
     basis: int = 0
     enabled_tick: int = 0  # when the gate opened; 0 while it is closed
     operator: bool = False  # an operator drives, until the gate is enabled again
-    enables: int = 0  # the gate's count
+    enables: int = 0  # the gate's count of enables
     sent: tuple[Velocity, ...] = ()  # setpoints of the previous ticks, newest last
     history: PoseHistory = PoseHistory()
-    off_track: bool = False  # the body is too far from the trajectory that it should follow
+    off_track: bool = False  # the body is too far from its trajectory
 
 
 def step(
     body: BodyDescription, memory: ControlMemory, inputs: ControlInputs
 ) -> tuple[ControlMemory, CmdVel]:
-    """Return the command. Repeated within a tick, it starts from the same setpoint."""
+    """Return the command. All commands of a tick start from the same setpoint."""
     state, intent = inputs.state, inputs.intent
     memory = _next_tick(body, memory, state)
     if intent and intent.basis > state.tick:
-        intent = None  # it rests on a future scan
+        intent = None  # it is based on a future scan
     if intent:
         memory = replace(memory, basis=max(memory.basis, intent.basis))
     if state.gate.mode != "enabled" or state.gate.commander != BRAIN:
-        return _at_rest(memory), _command(ZERO)
+        return _reset(memory), _command(ZERO)
     if state.gate.enables != memory.enables:  # an enable hands back to decision
         memory = replace(memory, enables=state.gate.enables, operator=False)
     if inputs.teleop:
@@ -101,9 +101,8 @@ def step(
     if memory.enabled_tick == state.tick:  # the first command after enabling is zero
         setpoint = ZERO
     gain_z = memory.gain_z
-    if intent and _follows(
-        memory, intent, inputs.teleop
-    ):  # the intent has a better estimate of the turn gain
+    if intent and _follows_trajectory(memory, intent, inputs.teleop):
+        # the intent has a better estimate of the turn gain
         gain_z, memory = turn_correction(intent.response.turn_gain), replace(memory, steady_ticks=0)
     needed = replace(
         setpoint,
@@ -116,7 +115,7 @@ def step(
 
 
 def _next_tick(body: BodyDescription, memory: ControlMemory, state: RobotState) -> ControlMemory:
-    """Advance to the tick of `state`, and learn how well the body has followed."""
+    """Advance to the tick of `state`, and learn the gains of the body."""
     if state.boot != memory.boot:
         return ControlMemory(boot=state.boot, tick=state.tick, history=memory.history.then(state))
     if state.tick == memory.tick:
@@ -125,14 +124,14 @@ def _next_tick(body: BodyDescription, memory: ControlMemory, state: RobotState) 
     if steady >= STEADY_TICKS:
         memory = _learn(body.control, memory, state.velocity)
     passed = state.tick - memory.tick
-    sent = (*memory.sent, *(memory.setpoint,) * min(passed, LONGEST_DELAY_TICKS))
+    sent = (*memory.sent, *(memory.setpoint,) * min(passed, MAX_DELAY_TICKS))
     return replace(
         memory,
         tick=state.tick,
         elapsed_ticks=min(passed, MAX_RAMP_TICKS),
         before=memory.setpoint,
         steady_ticks=steady,
-        sent=sent[-LONGEST_DELAY_TICKS:],
+        sent=sent[-MAX_DELAY_TICKS:],
         history=memory.history.then(state),
     )
 
@@ -140,7 +139,7 @@ def _next_tick(body: BodyDescription, memory: ControlMemory, state: RobotState) 
 def _learn(gains: ControlGains, memory: ControlMemory, measured: Velocity) -> ControlMemory:
     """Correct both gains by the error of the measured speed.
 
-    A body that is too slow because of a limit or a cap teaches nothing.
+    A gain does not grow while a limit or a cap slows the body.
     """
     setpoint, needed, allowed = memory.setpoint, memory.needed, memory.allowed
     gain_x, gain_z = memory.gain_x, memory.gain_z
@@ -152,16 +151,16 @@ def _learn(gains: ControlGains, memory: ControlMemory, measured: Velocity) -> Co
         error = 1.0 - measured.angular_z / setpoint.angular_z
         if error < 0 or allowed.angular_z == needed.angular_z:
             gain_z += gains.angular_integral * TICK_S * error
-    least, most = 1.0 - gains.max_correction, 1.0 + gains.max_correction
+    min_gain, max_gain = 1.0 - gains.max_correction, 1.0 + gains.max_correction
     return replace(
         memory,
-        gain_x=max(least, min(most, gain_x)),
-        gain_z=max(least, min(most, gain_z)),
+        gain_x=max(min_gain, min(max_gain, gain_x)),
+        gain_z=max(min_gain, min(max_gain, gain_z)),
     )
 
 
-def _at_rest(memory: ControlMemory) -> ControlMemory:
-    """Forget the gains while the gate is closed."""
+def _reset(memory: ControlMemory) -> ControlMemory:
+    """Forget gains and setpoints, while the gate is closed."""
     return ControlMemory(
         boot=memory.boot,
         tick=memory.tick,
@@ -172,16 +171,16 @@ def _at_rest(memory: ControlMemory) -> ControlMemory:
     )
 
 
-def _follows(memory: ControlMemory, intent: Intent, teleop: Velocity | None) -> bool:
+def _follows_trajectory(memory: ControlMemory, intent: Intent, teleop: Velocity | None) -> bool:
     return intent.follow and not teleop and not memory.operator
 
 
 def _wanted_velocity(
     body: BodyDescription, memory: ControlMemory, inputs: ControlInputs, intent: Intent | None
 ) -> tuple[ControlMemory, Velocity]:
-    """Return the velocity that the operator wants, else decision, else zero."""
+    """Return the operator's velocity, else that of the intent, else zero."""
     state, teleop = inputs.state, inputs.teleop
-    if intent and _follows(memory, intent, teleop):
+    if intent and _follows_trajectory(memory, intent, teleop):
         start = memory.history.at(state.boot, intent.basis)
         if start is None:
             return memory, ZERO
@@ -210,8 +209,8 @@ def _log_tracking(tick: int, *, lost: bool) -> None:
 def caps_at(verdicts: PreviousTick[SafetyState], state: RobotState) -> SpeedCaps:
     """Return the caps that safety set before the tick of `state`.
 
-    Within a tick the order of safety's verdict and decision's intent must not matter. The gate
-    obeys a verdict at once; control only plans for it, from the next tick on.
+    Within a tick, the order of safety's verdict and decision's intent must not matter. The gate
+    obeys a verdict at once; control adapts to it from the next tick on.
     """
     verdict = verdicts.at(state.boot, state.tick, SAFETY.stale_after_ns)
     return verdict.caps if verdict else NO_CAPS  # without a verdict the gate stops everything
@@ -219,12 +218,12 @@ def caps_at(verdicts: PreviousTick[SafetyState], state: RobotState) -> SpeedCaps
 
 async def run(bus: Bus, ready: Callable[[], None]) -> None:
     """Publish commands at the body's rate, and at once for each new intent."""
-    memory, lost, done = ControlMemory(), False, 0
+    memory, lost, commands = ControlMemory(), False, 0
     teleop, verdicts = Teleop(bus.clock.now_ns), PreviousTick[SafetyState]()
     arm = ArmControl(bus)
 
     def act(message: Message) -> None:
-        nonlocal done
+        nonlocal commands
         state, body = states.fresh(), bodies.current
         if state is None or body is None:
             return
@@ -233,10 +232,10 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
             drive(state, body, intent)
         if body.description.joints and message is state:
             arm.act(state, body, _recent(intent, state.tick))
-            done += 1  # also where it has no command, as joints are missing
+            commands += 1  # also without a command, while joints are missing
 
     def drive(state: RobotState, body: Body, intent: Intent | None) -> None:
-        nonlocal memory, lost, done
+        nonlocal memory, lost, commands
         inputs = ControlInputs(
             state=state,
             intent=intent,
@@ -251,7 +250,7 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
         due = state.tick % body.description.control.period_ticks == 0
         if due or memory.basis != before:
             bus.publish(command_topic(body.description), command, basis=memory.basis)
-            done += 1
+            commands += 1
 
     def on_intent(intent: Intent) -> None:
         # an intent whose state has not arrived waits for it
@@ -265,24 +264,24 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
     bus.latest(TELEOP, teleop.receive)
     bus.latest(JOINT_TELEOP, arm.teleop.receive)
     bus.progress = Progress(
-        lambda: (bus.arrived.get(STATE.key),) if bodies.current else (), lambda: done
+        lambda: (bus.arrived.get(STATE.key),) if bodies.current else (), lambda: commands
     )
     ready()
     await bus.failed
 
 
 def _recent(intent: Intent | None, tick: int) -> Intent | None:
-    """Return an intent that joints may still move by."""
+    """Return the intent if it is recent enough to move joints."""
     return intent if intent and tick - intent.tick <= INTENT_TICKS else None
 
 
 class ArmControl:
-    """Publishes commands for joints at each state, while the gate obeys its commander."""
+    """Publishes commands for joints at each state. They move while the gate obeys `commander`."""
 
     def __init__(self, bus: Bus, commander: str = BRAIN) -> None:
         self._bus, self._commander = bus, commander
         self._memory = JointMemory()
-        self._more: asyncio.Future[None] | None = None  # commands between two states
+        self._between_states: asyncio.Future[None] | None = None  # publishes further commands
         self.teleop: OperatorStream[JointSpeeds] = OperatorStream(bus.clock.now_ns)
 
     @property
@@ -291,14 +290,14 @@ class ArmControl:
         return self._memory
 
     def prepare(self, body: Body) -> None:
-        """Get ready for a body. Raises ConfigError where a library is missing."""
+        """Load the library for the joints of a body. Raises ConfigError if it is missing."""
         if joints := body.description.joints:
             joint_ramp.prepare(len(joints))
 
     def act(self, state: RobotState, body: Body, intent: Intent | None) -> None:
         """Publish the command for a state, unless joints are missing."""
         if intent and intent.basis > state.tick:
-            intent = None  # it rests on future data
+            intent = None  # it is based on future data
         teleop = self.teleop.live(state, echo_wanted=body.link == "real")
         inputs = JointInputs(state=state, intent=intent, teleop=teleop)
         before = self._memory.problem
@@ -307,22 +306,22 @@ class ArmControl:
             _log_tolerance(state.tick, self._memory)
         if command:
             self._bus.publish(JOINT_CMD, command, basis=state.tick)
-            self._go_on(state, body, command)
+            self._publish_between_states(state, body, command)
 
-    def _go_on(self, state: RobotState, body: Body, command: JointCommand) -> None:
-        """Publish more commands until the next state where an arm has a higher rate.
+    def _publish_between_states(self, state: RobotState, body: Body, command: JointCommand) -> None:
+        """Publish further commands until the next state, for an arm with a higher rate.
 
-        A simulation takes one for each of its ticks, so that runs can be repeated.
+        A simulation gets one per tick, so that runs are repeatable.
         """
-        if self._more:
-            self._more.cancel()
-            self._more = None
+        if self._between_states:
+            self._between_states.cancel()
+            self._between_states = None
         arm, memory = body.description.arm, self._memory
         count = round(arm.rate_hz * TICK_S) if arm and body.link != "sim" else 1
         if count < 2 or not any(point.velocity for point in memory.setpoint):
             return
 
-        async def more() -> None:
+        async def publish_later() -> None:
             for _ in range(1, count):
                 await self._bus.clock.sleep_ns(TICK_NS // count)
                 after_s = (self._bus.clock.now_ns() - began_ns) / 1e9
@@ -330,7 +329,7 @@ class ArmControl:
                 self._bus.publish(JOINT_CMD, later, basis=state.tick)
 
         began_ns = self._bus.clock.now_ns()
-        self._more = asyncio.ensure_future(more())
+        self._between_states = asyncio.ensure_future(publish_later())
 
 
 def _log_tolerance(tick: int, memory: JointMemory) -> None:

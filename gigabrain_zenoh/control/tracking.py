@@ -13,13 +13,13 @@ from gigabrain_schemas.brain import ActuationModel, Intent, TrajectoryPoint
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.geometry.pose import compose, interpolate, relative
 
-LONGEST_DELAY_TICKS = 15
-MAX_ERROR_M, MAX_ERROR_RAD = 0.3, 0.8  # farther off, the body does not follow the trajectory
-DAMPING, STIFFNESS = 0.7, 10.0  # feedback parameters, the second in [1/m2]
+MAX_DELAY_TICKS = 15
+MAX_ERROR_M, MAX_ERROR_RAD = 0.3, 0.8  # with larger errors the trajectory is given up
+DAMPING, STIFFNESS = 0.7, 10.0  # of the feedback; [1], [1/m2]
 MIN_BANDWIDTH, MAX_BANDWIDTH = 0.8, 2.5  # [1/s], of the feedback
 LATERAL_GAIN = 1.5  # [1/s], feedback for bodies that can move sideways
 MIN_LAG_S, MAX_LAG_S = 1e-3, 0.5
-MAX_GAIN = 2.0  # largest factor by which turn rates are increased or reduced
+MAX_GAIN = 2.0  # turn rates are corrected by at most this factor, up or down
 
 
 def track(
@@ -34,19 +34,19 @@ def track(
     `start` is the odometry pose at the intent's basis, `sent` the commands of the previous ticks,
     newest last. After the end of the trajectory the command is zero.
     """
-    late = min(round(intent.response.delay / TICK_S), LONGEST_DELAY_TICKS)
-    t = (state.tick - intent.basis + late) * TICK_S
+    delay_ticks = min(round(intent.response.delay / TICK_S), MAX_DELAY_TICKS)
+    t = (state.tick - intent.basis + delay_ticks) * TICK_S
     points = intent.trajectory
     i = bisect_right(points, t, key=lambda point: point.t)
     if i == len(points):
         return ZERO
     before, after = points[max(i - 1, 0)], points[i]
-    on_it = interpolate(_pose(before), _pose(after), _share(before, after, t))
-    here = predict(state.pose, state.velocity, sent, late, intent.response)
-    error = relative(here, compose(start, on_it))
+    target = interpolate(_pose(before), _pose(after), _fraction(before, after, t))
+    here = predict(state.pose, state.velocity, sent, delay_ticks, intent.response)
+    error = relative(here, compose(start, target))
     if math.hypot(error.x, error.y) > MAX_ERROR_M or abs(error.yaw) > MAX_ERROR_RAD:
         return None
-    planned = _without_lag(before, after, intent.response)
+    planned = _compensate_lag(before, after, intent.response)
     if body.max_lateral_speed > 0 and body.drive_type != "ackermann":
         return _holonomic(planned, error)
     return within_turning_circle(body, _unicycle(planned, error))
@@ -61,13 +61,13 @@ def predict(
     here: Pose, velocity: Velocity, sent: tuple[Velocity, ...], ticks: int, response: ActuationModel
 ) -> Pose:
     """Return the body's pose after `ticks` ticks of the commands already `sent`."""
-    follows = 1.0 - math.exp(-TICK_S / _lag(response))
+    gain = 1.0 - math.exp(-TICK_S / _lag(response))
     vx, vy, w = velocity.linear_x, velocity.linear_y, velocity.angular_z
     pose = here
     for command in sent[-ticks:] if ticks else ():
-        vx += follows * (command.linear_x - vx)
-        vy += follows * (command.linear_y - vy)
-        w += follows * (command.angular_z - w)
+        vx += gain * (command.linear_x - vx)
+        vy += gain * (command.linear_y - vy)
+        w += gain * (command.angular_z - w)
         middle = Pose(x=pose.x, y=pose.y, yaw=pose.yaw + w * TICK_S / 2)
         pose = compose(middle, Pose(x=vx * TICK_S, y=vy * TICK_S, yaw=w * TICK_S / 2))
     return pose
@@ -81,20 +81,20 @@ def _pose(point: TrajectoryPoint) -> Pose:
     return Pose(x=point.x, y=point.y, yaw=point.yaw)
 
 
-def _share(before: TrajectoryPoint, after: TrajectoryPoint, t: float) -> float:
+def _fraction(before: TrajectoryPoint, after: TrajectoryPoint, t: float) -> float:
     length = after.t - before.t
     return max(0.0, min(1.0, (t - before.t) / length)) if length > 0 else 1.0
 
 
-def _without_lag(
+def _compensate_lag(
     before: TrajectoryPoint, after: TrajectoryPoint, response: ActuationModel
 ) -> Velocity:
-    """Return the steady command that takes a body with this lag from one velocity to the next."""
-    left = math.exp(-max(after.t - before.t, TICK_S) / _lag(response))
+    """Return the constant command that takes a lagging body from one velocity to the next."""
+    remaining = math.exp(-max(after.t - before.t, TICK_S) / _lag(response))
     return Velocity(
-        linear_x=(after.linear_x - left * before.linear_x) / (1.0 - left),
-        linear_y=(after.linear_y - left * before.linear_y) / (1.0 - left),
-        angular_z=(after.angular_z - left * before.angular_z) / (1.0 - left),
+        linear_x=(after.linear_x - remaining * before.linear_x) / (1.0 - remaining),
+        linear_y=(after.linear_y - remaining * before.linear_y) / (1.0 - remaining),
+        angular_z=(after.angular_z - remaining * before.angular_z) / (1.0 - remaining),
     )
 
 
@@ -103,10 +103,10 @@ def _unicycle(planned: Velocity, error: Pose) -> Velocity:
     bandwidth = min(max(math.sqrt(w * w + STIFFNESS * v * v), MIN_BANDWIDTH), MAX_BANDWIDTH)
     along = 2 * DAMPING * bandwidth
     across = min(STIFFNESS * abs(v), bandwidth * bandwidth / max(abs(v), 1e-6))
-    straight = math.sin(error.yaw) / error.yaw if abs(error.yaw) > 1e-6 else 1.0
+    sinc = math.sin(error.yaw) / error.yaw if abs(error.yaw) > 1e-6 else 1.0
     return Velocity(
         linear_x=v * math.cos(error.yaw) + along * error.x,
-        angular_z=w + math.copysign(across, v) * straight * error.y + along * error.yaw,
+        angular_z=w + math.copysign(across, v) * sinc * error.y + along * error.yaw,
     )
 
 
@@ -120,9 +120,9 @@ def _holonomic(planned: Velocity, error: Pose) -> Velocity:
     )
 
 
-def within_turning_circle(body: BodyDescription, wish: Velocity) -> Velocity:
-    """Limit a car's turn rate to its tightest curve."""
+def within_turning_circle(body: BodyDescription, wanted: Velocity) -> Velocity:
+    """Limit the turn rate of an Ackermann base to its turning radius."""
     if body.drive_type != "ackermann":
-        return wish
-    most = abs(wish.linear_x) / body.turning_radius
-    return Velocity(linear_x=wish.linear_x, angular_z=max(-most, min(most, wish.angular_z)))
+        return wanted
+    limit = abs(wanted.linear_x) / body.turning_radius
+    return Velocity(linear_x=wanted.linear_x, angular_z=max(-limit, min(limit, wanted.angular_z)))
