@@ -45,8 +45,8 @@ class GateState(msgspec.Struct, frozen=True, kw_only=True):
     joint_command: JointCommand | None = None  # these three: the same for joints
     joint_tick: int = 0
     next_joint_seq: int = 0
-    # newest valid one of the brain, also while it does not drive
     brain_command: CmdVel | JointCommand | None = None
+    # newest valid one of the brain, also while it does not drive
     brain_tick: int = -1000
     safety: SafetyState | None = None
     stopped_tick: int = 0  # when stopping began

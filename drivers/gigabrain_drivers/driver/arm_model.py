@@ -1,7 +1,7 @@
 """The model of a body's arm as text that needs no other file.
 
-A body on wheels may take its arm from another body's model, by MJCF's `<attach>`. This is done here
-as MuJoCo does it, without MuJoCo: a driver on its real link does without the simulator.
+A body on wheels may attach the arm of another model, by MJCF's `<attach>`. This module attaches it
+as MuJoCo does, but without MuJoCo: a driver on its real link needs no simulator.
 """
 
 from collections.abc import Collection
@@ -13,82 +13,82 @@ from gigabrain_schemas.body import MAX_MODEL_CHARACTERS
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import read_bounded
 
-MAIN = "main"  # what MuJoCo calls defaults without a class
-NAMES = (
+DEFAULT_CLASS = "main"  # MuJoCo's name of defaults without a class
+NAME_ATTRIBUTES = (
     "name", "class", "childclass", "joint", "joint1", "joint2", "body", "body1", "body2",
     "geom", "geom1", "geom2", "site", "material", "tendon", "target", "objname",
 )  # fmt: skip
-TAKEN = ("contact", "equality", "tendon", "actuator")  # sections of an attached model
-LEFT_OUT = ("asset", "sensor", "keyframe")
+MERGED_SECTIONS = ("contact", "equality", "tendon", "actuator")  # of an attached model
+DROPPED_SECTIONS = ("asset", "sensor", "keyframe")
 BASE = "base"
 
 
 def arm_text(path: Path, joints: Collection[str]) -> str:
     """Return the model of an arm with these joints. Raises ConfigError.
 
-    One that attaches others comes with them, and without what neither moves with the joints nor is
-    part of the base, such as wheels: the base's own shapes stand for them.
+    Attached models are merged into it. Then bodies are left out that neither move with the joints
+    nor are the base, such as wheels: the base's own shapes stand for them.
     """
-    root = _parsed(path)
-    models = {one.get("name"): one.get("file", "") for one in root.iterfind("asset/model")}
-    places = [(above, one) for above in root.iter() for one in above.findall("attach")]
-    if not places:
-        return _text(path)
-    for above, attach in places:
+    root = _parse(path)
+    models = {each.get("name"): each.get("file", "") for each in root.iterfind("asset/model")}
+    attachments = [(parent, each) for parent in root.iter() for each in parent.findall("attach")]
+    if not attachments:
+        return _read_text(path)
+    for parent, attach in attachments:
         if (file := models.get(attach.get("model"))) is None:
             raise ConfigError(f"{path}: <attach>: no model {attach.get('model')!r} in its assets")
-        _attach(root, above, attach, path.parent / file)
-    _reduce(root, joints, path)
+        _attach(root, parent, attach, path.parent / file)
+    _drop_unmoved(root, joints, path)
     return ElementTree.tostring(root, encoding="unicode")
 
 
 def link_names(path: Path, joints: Collection[str]) -> list[str]:
-    """Return the bodies of the model of an arm, without its base. Raises ConfigError."""
+    """Return the names of the bodies in an arm's model, except its base. Raises ConfigError."""
     try:
         bodies = ElementTree.fromstring(arm_text(path, joints)).iter("body")
     except ElementTree.ParseError as error:
-        raise _no_xml(path, error) from None
+        raise _parse_error(path, error) from None
     return [name for body in bodies if (name := body.get("name", "")) not in ("", BASE)]
 
 
-def _attach(root: Element, above: Element, attach: Element, path: Path) -> None:
-    """Put the body of another model in the place of an `attach` element."""
-    child, prefix = _parsed(path), attach.get("prefix", "")
+def _attach(root: Element, parent: Element, attach: Element, path: Path) -> None:
+    """Replace an `attach` element by the body of another model."""
+    child, prefix = _parse(path), attach.get("prefix", "")
     for element in child.iter():
-        for name in NAMES:
+        for name in NAME_ATTRIBUTES:
             if name in element.attrib:
                 element.set(name, prefix + element.attrib[name])
     wanted = prefix + attach.get("body", "")
-    body = next((one for one in child.iter("body") if one.get("name") == wanted), None)
+    body = next((element for element in child.iter("body") if element.get("name") == wanted), None)
     if body is None:
         raise ConfigError(f"{path}: no body {attach.get('body')!r} to attach")
-    main = prefix + MAIN
-    body.set("childclass", main)
-    above[list(above).index(attach)] = body
+    default_class = prefix + DEFAULT_CLASS
+    body.set("childclass", default_class)
+    parent[list(parent).index(attach)] = body
     for default in child.findall("default"):
-        default.set("class", main)
+        default.set("class", default_class)
         _section(root, "default").append(default)
-    for section in TAKEN:
-        for one in child.iterfind(f"{section}/*"):
+    for section in MERGED_SECTIONS:
+        for element in child.iterfind(f"{section}/*"):
             if section == "actuator":
-                one.attrib.setdefault("class", main)
-            _section(root, section).append(one)
+                element.attrib.setdefault("class", default_class)
+            _section(root, section).append(element)
 
 
-def _reduce(root: Element, joints: Collection[str], path: Path) -> None:
-    """Leave out bodies that the arm's joints do not move, and what refers to them."""
+def _drop_unmoved(root: Element, joints: Collection[str], path: Path) -> None:
+    """Remove bodies that the arm's joints do not move, and the elements that refer to them."""
     base = root.find(f"worldbody/body[@name='{BASE}']")
     if base is None:
         raise ConfigError(f"{path}: no body {BASE!r} in the worldbody")
     for name in ("freejoint", "body"):
-        for one in base.findall(name):
-            if not any(joint.get("name") in joints for joint in one.iter("joint")):
-                base.remove(one)
+        for element in base.findall(name):
+            if not any(joint.get("name") in joints for joint in element.iter("joint")):
+                base.remove(element)
     for motors in root.findall("actuator"):
-        for one in list(motors):
-            if one.get("joint") not in joints:
-                motors.remove(one)
-    for name in LEFT_OUT:
+        for element in list(motors):
+            if element.get("joint") not in joints:
+                motors.remove(element)
+    for name in DROPPED_SECTIONS:
         for section in root.findall(name):
             root.remove(section)
 
@@ -98,19 +98,19 @@ def _section(root: Element, name: str) -> Element:
     return ElementTree.SubElement(root, name) if found is None else found
 
 
-def _text(path: Path) -> str:
+def _read_text(path: Path) -> str:
     try:
         return read_bounded(path, MAX_MODEL_CHARACTERS).decode()
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: the model of the arm: {error}") from None
 
 
-def _parsed(path: Path) -> Element:
+def _parse(path: Path) -> Element:
     try:
-        return ElementTree.fromstring(_text(path))
+        return ElementTree.fromstring(_read_text(path))
     except ElementTree.ParseError as error:
-        raise _no_xml(path, error) from None
+        raise _parse_error(path, error) from None
 
 
-def _no_xml(path: Path, error: ElementTree.ParseError) -> ConfigError:
+def _parse_error(path: Path, error: ElementTree.ParseError) -> ConfigError:
     return ConfigError(f"{path}: the model of the arm is no XML: {error}")

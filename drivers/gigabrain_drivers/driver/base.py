@@ -1,4 +1,4 @@
-"""The hardware abstraction layer: what every body offers."""
+"""The hardware abstraction layer: the interface of every body."""
 
 import abc
 import asyncio
@@ -24,9 +24,9 @@ from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of
 
 log = logging.getLogger(__name__)
 
-TIMER_SLACK_NS = 2_000_000  # before its time an event loop may call, as its own clock is coarse
+TIMER_SLACK_NS = 2_000_000  # an event loop may call this early, as its own clock is coarse
 AT_REST_SPEED = 0.02  # [m/s], [rad/s]
-MAX_REST_CHECKS = 40  # 0.8 s: a supervisor that ends this process waits little longer
+MAX_REST_CHECKS = 40  # 0.8 s; a supervisor that ends this process waits little longer
 
 Emit = Callable[[Topic[Any], Message], None]
 
@@ -38,18 +38,18 @@ class Driver(abc.ABC):
     work in any state, any number of times, and never raise.
     """
 
-    Options: ClassVar[type[LinkOptions]] = LinkOptions  # the link's part of the robot's file
-    lockstep = False  # whether time waits for the brain (simulation at other speeds than 1)
-    finished = False  # whether the body's time has come to its end (simulation with a duration)
+    Options: ClassVar[type[LinkOptions]] = LinkOptions  # the link's section in the robot's file
+    lockstep = False  # True if time waits for the brain (simulation at speeds other than 1)
+    finished = False  # True once the body's time has ended (simulation with a duration)
 
     def __init__(self, robot: RobotFile, options: Any, run: Run) -> None:
         self.robot, self.options, self.run = robot, options, run
-        self.emit: Emit = lambda topic, message: None  # the driver's process puts its own here
+        self.emit: Emit = lambda topic, message: None  # set by the driver's process
         self.sensors: dict[str, Message | None] = {}  # newest readings; None before the first
 
     @classmethod  # noqa: B027 - most drivers fit any body
     def check(cls, robot: RobotFile, options: Any) -> None:
-        """Raises ValueError, as `FIELD: ...`, where its options do not fit the body."""
+        """Raise ValueError, as `FIELD: ...`, if the options do not fit the body."""
 
     async def __aenter__(self) -> Self:
         try:
@@ -62,7 +62,7 @@ class Driver(abc.ABC):
     async def __aexit__(self, *_: object) -> None:
         try:
             await self.make_safe()
-        finally:  # it may be cancelled
+        finally:  # `make_safe` may be cancelled
             await self.close()
 
     @abc.abstractmethod
@@ -71,7 +71,7 @@ class Driver(abc.ABC):
 
     @abc.abstractmethod
     async def close(self) -> None:
-        """Let go of the body."""
+        """Disconnect from the body."""
 
     @abc.abstractmethod
     async def stop(self) -> None:
@@ -82,7 +82,7 @@ class Driver(abc.ABC):
         """Return the body's measurements; header and gate are added later. Raises BodyLost."""
 
     async def ticks(self, clock: Clock) -> AsyncIterator[int]:
-        """Yield whenever time has gone on, and by how many ticks of 20 ms of the body's time."""
+        """Yield the number of ticks of 20 ms that have passed in the body's time, when any has."""
         start, yielded = clock.now_ns(), 0
         async for now_ns in clock.every(TICK_NS):
             passed = (now_ns - start + TIMER_SLACK_NS) // TICK_NS + 1 - yielded
@@ -101,8 +101,8 @@ class Driver(abc.ABC):
     async def limp(self) -> None:
         """Switch joint torque off, to move the joints by hand. Raises BodyLost.
 
-        The next positions that are sent hold the joints again; `read_state` gives `limp` until
-        all of them do. Where they do not, `problem` says why.
+        The next positions that are sent hold the joints again. `read_state` returns `limp` until
+        all of them hold. If they do not, `problem` says why.
         """
         raise Unsupported(f"{type(self).__name__} cannot release its body's joints")
 
@@ -111,19 +111,19 @@ class Driver(abc.ABC):
         return getattr(type(self), state) is not getattr(Driver, state) or state == "hold"
 
     async def make_safe(self) -> None:
-        """Come to rest, then take up the safe state that the robot's file names. Never raises."""
+        """Come to rest, then enter the safe state of the robot's file. Never raises."""
         state = self.robot.safe_state
         await (self.hold() if state == "hold" else self.stop())
         if state in ("stop", "hold"):
             return
         try:
-            await self._rest()
+            await self._wait_for_rest()
             await (self.park() if state == "park" else self.limp())
         except GigabrainError as error:
             log.error("the body has stopped, but %s could not be done: %s", state, error)
 
-    async def _rest(self) -> None:
-        """Wait until the body stands still, but no longer than it may take to brake."""
+    async def _wait_for_rest(self) -> None:
+        """Wait until the body is at rest, at most for MAX_REST_CHECKS ticks."""
         for _ in range(MAX_REST_CHECKS):
             now = (await self.read_state()).velocity
             if max(abs(now.linear_x), abs(now.linear_y), abs(now.angular_z)) < AT_REST_SPEED:
@@ -132,29 +132,29 @@ class Driver(abc.ABC):
 
     @property
     def problem(self) -> str:
-        """The reason in one line why the body cannot be moved; empty for none, or none known."""
+        """One line on why the body cannot be moved; empty if it can, or if this is unknown."""
         return ""
 
     @property
     def guard_ms(self) -> float | None:
-        """Time in which a process of its own stops the motors if this one dies; None for none."""
+        """Time in which a guard process stops the motors if this one dies; None without a guard."""
         return None
 
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
     ) -> Velocity:
-        """Drive [m/s, m/s, rad/s]; returns what was really sent. Raises BodyLost."""
+        """Drive [m/s, m/s, rad/s]; return the velocity that was sent. Raises BodyLost."""
         raise Unsupported(f"{type(self).__name__} has no base to drive")
 
     def bounded(self, linear_x: float, linear_y: float, angular_z: float) -> Velocity:
-        """A command within the body's own limits; where one value is no number, all are zero."""
+        """Return a command within the body's limits; zero if any value is not finite."""
         if not all(map(math.isfinite, (linear_x, linear_y, angular_z))):
             return ZERO
         wanted = Velocity(linear_x=linear_x, linear_y=linear_y, angular_z=angular_z)
         return clamp(wanted, limits_of(self.robot))
 
     def bounded_joints(self, positions: Mapping[str, float]) -> dict[str, float]:
-        """Return positions within the joints' ranges, without those that are no numbers.
+        """Return positions within the joints' ranges, without values that are not finite.
 
         Raises Unsupported for a joint that the body does not have.
         """
@@ -170,11 +170,11 @@ class Driver(abc.ABC):
         }
 
     async def set_joint_positions(self, positions: Mapping[str, float]) -> Mapping[str, float]:
-        """Move joints together [rad or m]; returns what was really sent. Raises BodyLost."""
+        """Move joints together [rad or m]; return the positions that were sent. Raises BodyLost."""
         raise Unsupported(f"{type(self).__name__} has no joints to position")
 
     async def set_joint_position(self, joint_name: str, position: float) -> float:
-        """Move one joint [rad or m]; returns what was really sent. Raises BodyLost."""
+        """Move one joint [rad or m]; return the position that was sent. Raises BodyLost."""
         return (await self.set_joint_positions({joint_name: position}))[joint_name]
 
     async def get_joint_states(self) -> tuple[Joint, ...]:
@@ -182,14 +182,14 @@ class Driver(abc.ABC):
         return (await self.read_state()).joints
 
     def arm_model(self) -> ArmModel | None:
-        """Return the model of a body with an arm. Raises ConfigError."""
+        """Return the model of the arm; None without one. Raises ConfigError."""
         if self.robot.arm is None:
             return None
         path = self.run.folder / self.robot.arm_model
         return ArmModel(mjcf=arm_text(path, [joint.name for joint in self.robot.joints]))
 
     async def change_world(self, request: SimRequest) -> SimReply:
-        """Change the simulated world that the body is in. Raises Unsupported, and Refused."""
+        """Change the simulated world of the body. Raises Unsupported or Refused."""
         what = "a real body" if self.run.link == "real" else f"{type(self).__name__}, no simulation"
         raise Unsupported(f"{self.robot.robot_type} has no simulated world: it is {what}")
 
@@ -203,10 +203,10 @@ class Driver(abc.ABC):
         return self.sensors[sensor_name]
 
     def publish(self, sensor: str, topic: Topic[Any], message: Message) -> None:
-        """Emit a reading of a sensor, and keep it as the newest."""
+        """Emit a reading of a sensor, and store it as the newest."""
         self.sensors[sensor] = message
         self.emit(topic, message)
 
     def report(self) -> Mapping[str, float | int | str | None]:
-        """Return figures that only this driver knows, such as a simulation's truth."""
+        """Return figures of this driver only, such as a simulation's ground truth."""
         return {}

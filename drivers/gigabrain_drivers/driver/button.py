@@ -18,59 +18,59 @@ from gigabrain_zenoh.gate import causes as why
 
 log = logging.getLogger(__name__)
 
-ECHO_TIMEOUT_NS = 200_000_000  # what has not come back by then counts as never coming
-QUESTION_BYTES = 2  # of each question: none of them can be guessed, nor held over from before
+ECHO_TIMEOUT_NS = 200_000_000  # a byte without an echo by then is lost
+PROBE_BYTES = 2  # random, so that an echo cannot be guessed or be an old one
 
 BAUD = 115_200
-PERIOD_NS = 20_000_000  # between two questions
-PUBLISH_EVERY = 2  # of them: 25 times a second
-STARTUP_NS = 1_000_000_000  # for the port to open and the first echo, in which nothing is published
-RECHECK_S = 0.1  # between two looks at whether the robot is latched
+PERIOD_NS = 20_000_000  # between two probes
+PUBLISH_EVERY = 2  # probes: 25 times a second
+STARTUP_NS = 1_000_000_000  # for the first echo; until then nothing is published
+RECHECK_S = 0.1  # period of checking that the robot is latched
 
 
 class EchoLoop:
-    """Random bytes go out at TX, through a normally closed contact, and in at RX.
+    """Sends random bytes from TX, through a normally closed contact, back to RX.
 
-    An open contact, a broken wire and an adapter that is gone all look the same: nothing comes
-    back. A short circuit to something else that talks looks wrong.
+    With an open contact, a broken wire or no adapter, no bytes come back. With a short circuit to
+    another sender, wrong bytes come back.
     """
 
     def __init__(self, random: Callable[[int], bytes] = os.urandom) -> None:
         self._random = random
         self._expected: deque[tuple[int, int]] = deque()  # byte, sent at [ns]
-        self._good_ns: int | None = None  # when the newest byte that came back was sent
-        self._deaf_until_ns = 0
+        self._good_ns: int | None = None  # when the newest echoed byte was sent
+        self._ignored_until_ns = 0
 
     def opened(self) -> None:
-        """The line is new: nothing from before counts."""
+        """Forget all bytes: the line was opened again."""
         self._expected.clear()
         self._good_ns = None
 
     def next_bytes(self, now_ns: int) -> bytes:
         """Return the bytes to send now."""
-        if now_ns < self._deaf_until_ns:
+        if now_ns < self._ignored_until_ns:
             return b""
         while self._expected and now_ns - self._expected[0][1] > ECHO_TIMEOUT_NS:
             self._expected.popleft()
-        data = self._random(QUESTION_BYTES)
+        data = self._random(PROBE_BYTES)
         self._expected.extend((byte, now_ns) for byte in data)
         return data
 
     def check_echo(self, data: bytes, now_ns: int) -> None:
-        """Check bytes that came back. After a wrong byte none count until the line is quiet."""
+        """Check received bytes. After a wrong one, all are ignored until the line is quiet."""
         for byte in data:
-            if now_ns < self._deaf_until_ns:
+            if now_ns < self._ignored_until_ns:
                 return
             expected, sent_ns = self._expected.popleft() if self._expected else (None, 0)
             if byte != expected:
-                self._deaf_until_ns, self._good_ns = now_ns + ECHO_TIMEOUT_NS, None
+                self._ignored_until_ns, self._good_ns = now_ns + ECHO_TIMEOUT_NS, None
                 self._expected.clear()
             elif now_ns - sent_ns <= ECHO_TIMEOUT_NS:
                 self._good_ns = sent_ns
 
     def problem(self, now_ns: int) -> str:
-        """Return why the contact does not count as closed, or an empty text."""
-        if now_ns < self._deaf_until_ns:
+        """Return why the contact counts as open; empty if it is closed."""
+        if now_ns < self._ignored_until_ns:
             return "other bytes come back than were sent"
         if self._good_ns is None or now_ns - self._good_ns > ECHO_TIMEOUT_NS:
             return "the contact is open, or its wire is broken"
@@ -78,7 +78,7 @@ class EchoLoop:
 
 
 class Button:
-    """Sends and listens, and publishes the state of the contact on `robot/button`."""
+    """Probes the contact, and publishes its state on `robot/button`."""
 
     def __init__(self, config: ButtonConfig, bus: Bus) -> None:
         self._bus, self._loop = bus, EchoLoop()
@@ -86,7 +86,7 @@ class Button:
         self._link.on_open = self._loop.opened
         self._link.on_bytes = lambda data: self._loop.check_echo(data, bus.clock.now_ns())
         self._states = bus.latest(STATE)
-        self._problem: str | None = None  # not known yet
+        self._problem: str | None = None  # None: not known yet
         self._began_ns = bus.clock.now_ns()
         self._pressed = asyncio.Event()
 
@@ -112,7 +112,7 @@ class Button:
                 self._bus.publish(BUTTON, state)
 
     def _update(self, now_ns: int) -> bool:
-        """Update the state of the contact; return whether it has changed."""
+        """Update the state of the contact; return whether it changed."""
         before, now = self._problem, self._problem_at(now_ns)
         starting = before is None and now_ns - self._began_ns < STARTUP_NS
         if now == before or (starting and now):
@@ -132,7 +132,7 @@ class Button:
         return self._loop.problem(now_ns)
 
     async def _keep_latched(self) -> None:
-        """Latch the robot for as long as the contact is open."""
+        """Keep the robot latched while the contact is open."""
         while True:
             await self._pressed.wait()
             state = self._states.fresh()
@@ -151,10 +151,10 @@ async def run(config: ButtonConfig, bus: Bus, ready: Callable[[], None]) -> None
 
 
 class ButtonWatch:
-    """Holds the gate shut while the button is pressed, or silent for 200 ms.
+    """Keeps the gate closed while the button is pressed, or silent for 200 ms.
 
-    `on_press` is called as soon as it is pressed. Until its first message the button's silence does
-    not latch.
+    `on_press` is called at once when it is pressed. Before its first message, the button's silence
+    does not latch.
     """
 
     def __init__(self, bus: Bus, on_press: Callable[[str], object]) -> None:

@@ -1,4 +1,4 @@
-"""Finds robots and drivers by name: ours, those of installed packages, and people's own files."""
+"""Finds robots and drivers by name: shipped ones, those of installed packages, and files."""
 
 import difflib
 import importlib.util
@@ -26,10 +26,10 @@ from gigabrain_zenoh.geometry.body_settings import check_safe
 from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.plugins import load_plugin, offered, plugin_names
 
-GROUP = "gigabrain.drivers"  # of entry points
-EMULATOR = "{emulator}"  # in a robot's file: the folder of the emulator's ports
+GROUP = "gigabrain.drivers"  # group of entry points
+EMULATOR = "{emulator}"  # stands for the folder of the emulator's ports in a robot's file
 Options = TypeVar("Options", bound=Struct)
-EXTRAS = {"can": "can"}  # by the package that is missing; without an entry the simulator's
+EXTRA_OF_PACKAGE = {"can": "can"}  # by missing package; `sim` for all others
 
 
 def robot_files() -> dict[str, Path]:
@@ -40,7 +40,7 @@ def robot_files() -> dict[str, Path]:
 
 
 def _robots_of_packages() -> dict[str, Path]:
-    """A package that offers a driver may have a robot.yaml of the driver's name in its folder."""
+    """Return the robot.yaml of each package that offers a driver, by the driver's name."""
     found = {}
     for point in offered(GROUP):
         spec = importlib.util.find_spec(point.module.partition(".")[0])
@@ -51,7 +51,7 @@ def _robots_of_packages() -> dict[str, Path]:
 
 
 def known_drivers() -> list[str]:
-    """The names of all drivers: ours, and those that installed packages offer."""
+    """Return the names of all drivers: shipped ones, and those of installed packages."""
     return plugin_names(shipped_hosts(DRIVERS), GROUP)
 
 
@@ -61,7 +61,7 @@ def robot_path(name: str) -> Path:
         return Path(name)
     known = robot_files()
     if name not in known:
-        package = Path(f"gigabrain-{name.replace('_', '-')}")  # as `gigabrain driver new` calls it
+        package = Path(f"gigabrain-{name.replace('_', '-')}")  # named by `gigabrain driver new`
         if package.is_dir():
             raise UnknownName(
                 f"no robot {name!r} yet: its package has to be installed: pip install -e {package}"
@@ -83,7 +83,7 @@ def ports_folder(name: str) -> Path:
 
 
 def robot_links(robot: RobotFile) -> list[LinkName]:
-    """Return the links of a robot; what is real and has physics can be emulated."""
+    """Return the links of a robot. A real one with MuJoCo physics can be emulated as well."""
     known = {name for name in LINKS if getattr(robot, name) is not None}
     if robot.real is not None and (robot.sim or {}).get("driver") == "mujoco":
         known.add("emulated")
@@ -91,7 +91,7 @@ def robot_links(robot: RobotFile) -> list[LinkName]:
 
 
 def simulated(link: LinkName) -> list[str]:
-    """The robots that can be had over `link` with MuJoCo behind it, which knows the truth."""
+    """Return the robots that have `link` and MuJoCo physics, which know the ground truth."""
     known = {name: load_robot(name) for name in robot_files()}
     return [
         name
@@ -101,14 +101,14 @@ def simulated(link: LinkName) -> list[str]:
 
 
 def driver_class(name: str) -> type[Driver]:
-    """The driver called `name`: one of ours, or one that an installed package offers.
+    """Return the driver called `name`: a shipped one, or one of an installed package.
 
-    Raises UnknownName listing the known ones, and ConfigError when what it needs is missing.
+    Raises UnknownName with the known names, and ConfigError if a package is missing.
     """
     try:
         return cast("type[Driver]", load_plugin("driver", name, shipped_hosts(DRIVERS), GROUP))
-    except ModuleNotFoundError as error:  # of one of ours: few need an extra
-        extra = EXTRAS.get(error.name or "", "sim")
+    except ModuleNotFoundError as error:  # of a shipped driver: few need an extra
+        extra = EXTRA_OF_PACKAGE.get(error.name or "", "sim")
         raise ConfigError(
             f"driver {name!r} needs the package {error.name!r}; "
             f"install it with: pip install 'gigabrain-zenoh[{extra}]'"
@@ -116,19 +116,19 @@ def driver_class(name: str) -> type[Driver]:
 
 
 def make_driver(name: str, run: Run) -> tuple[RobotFile, Driver]:
-    """The robot called `name` and the driver of its link. Raises ConfigError."""
+    """Return the robot called `name` and the driver of its link. Raises ConfigError."""
     robot, driver, options, folder = load_link(name, run)
     try:
         return robot, driver(robot, options, msgspec.structs.replace(run, folder=folder))
-    except ConfigError as error:  # of what the file names, such as a model
+    except ConfigError as error:  # in a file that it names, such as a model
         raise located(robot_path(name), error) from None
 
 
 def load_link(name: str, run: Run) -> tuple[RobotFile, type[Driver], LinkOptions, Path]:
-    """A robot, the driver of the link of `run`, its options and the file's folder.
+    """Return a robot, the driver of the link of `run`, its options and the file's folder.
 
-    A link `emulated` that the file does not have is its `real` one with the emulator's ports.
-    Raises ConfigError, also for changes of the file that make the body less safe.
+    Without a section `emulated`, that link is the `real` one with the emulator's ports. Raises
+    ConfigError, also for changes of the file that make the body less safe.
     """
     path = robot_path(name)
     return load_layers(path, robot_layers(path, run.changes), run)
@@ -155,11 +155,11 @@ def link_type(name: str, link: LinkName) -> type[RobotFile]:
 def load_layers(
     path: Path, layers: Layers, run: Run
 ) -> tuple[RobotFile, type[Driver], LinkOptions, Path]:
-    """Return the same of a robot's file with what is laid over it. Raises ConfigError."""
+    """Return the same as `load_link`, from the layers of a robot's file. Raises ConfigError."""
     robot = layers.convert(RobotFile)
     section, borrowed = _section(robot, run.link)
     driver = _driver_of(path, layers, section, getattr(robot, section))
-    # read once more, now that it is known what this driver's part looks like: errors name the line
+    # read again with the exact type of the driver's section, so that errors name the line
     options = getattr(layers.convert(_exact_type(path, layers, run.link)), section)
     _check_safe(path, layers, robot)
     _check_links(path, layers, robot)
@@ -173,7 +173,7 @@ def load_layers(
 
 
 def _with_section(section: LinkName, type_: Any) -> type[RobotFile]:
-    """A robot's file in which it is known what one link may hold."""
+    """Return the type of a robot's file with the exact type of one link's section."""
     exact = msgspec.defstruct(
         "RobotFile",
         [(section, type_)],
@@ -186,7 +186,7 @@ def _with_section(section: LinkName, type_: Any) -> type[RobotFile]:
 
 
 def _section(robot: RobotFile, link: LinkName) -> tuple[LinkName, bool]:
-    """Return the part of the file for a link, and whether it is another link's."""
+    """Return the section of the file for a link, and whether it is that of another link."""
     if link not in robot_links(robot):
         has = ", ".join(robot_links(robot)) or "none"
         raise ConfigError(f"{robot.robot_type} has no link {link!r}; it has: {has}")
@@ -206,7 +206,7 @@ def _exact_type(path: Path, layers: Layers, link: LinkName) -> type[RobotFile]:
 
 
 def _check_safe(path: Path, layers: Layers, robot: RobotFile) -> None:
-    """Raise ConfigError where what is laid over a robot's file makes the body less safe."""
+    """Raise ConfigError if the layers over a robot's file make the body less safe."""
     try:
         check_safe(config.load(path, RobotFile).description(), robot.description())
     except ValueError as error:
@@ -215,7 +215,7 @@ def _check_safe(path: Path, layers: Layers, robot: RobotFile) -> None:
 
 
 def _check_links(path: Path, layers: Layers, robot: RobotFile) -> None:
-    """Raise ConfigError where a camera sits on a link that the arm's model does not have."""
+    """Raise ConfigError if a camera is on a link that the arm's model does not have."""
     for camera in robot.cameras:
         if not camera.link:
             continue
@@ -226,13 +226,13 @@ def _check_links(path: Path, layers: Layers, robot: RobotFile) -> None:
 
 
 def _driver_of(path: Path, layers: Layers, section: LinkName, link: dict[str, Any]) -> type[Driver]:
-    """The driver that a link names. Raises ConfigError with file and line."""
+    """Return the driver that a link names. Raises ConfigError with file and line."""
     if not isinstance(link.get("driver"), str):
         others = [key for key in link if not difflib.get_close_matches(key, ["driver"])]
         fields: list[tuple[str, Any] | tuple[str, Any, Any]] = [("driver", str)]
         fields += [(key, Any, None) for key in others if key.isidentifier()]
         named = msgspec.defstruct("Link", fields, kw_only=True, forbid_unknown_fields=True)
-        layers.convert(_with_section(section, named))  # which refuses it
+        layers.convert(_with_section(section, named))  # raises ConfigError
     try:
         return driver_class(link["driver"])
     except ConfigError as error:
@@ -240,8 +240,8 @@ def _driver_of(path: Path, layers: Layers, section: LinkName, link: dict[str, An
 
 
 def with_ports(options: LinkOptions) -> LinkOptions:
-    """The options of a real link with the emulator's ports in place of the real ones."""
-    options = msgspec.structs.replace(options, cameras={})  # rendered from the emulator's world
+    """Return the options of a real link, with the emulator's ports instead of the real ones."""
+    options = msgspec.structs.replace(options, cameras={})  # rendered in the emulator's world
     if hasattr(options, "port"):
         options = msgspec.structs.replace(options, port=f"{EMULATOR}/base")
     if options.scan:
@@ -251,7 +251,7 @@ def with_ports(options: LinkOptions) -> LinkOptions:
 
 
 def at_emulator(options: Options, folder: str) -> Options:
-    """The options with the folder of the emulator's ports wherever they say `{emulator}`."""
+    """Return the options with `{emulator}` replaced by the folder of the emulator's ports."""
     changes: dict[str, Any] = {}
     for field in options.__struct_fields__:
         value = getattr(options, field)
@@ -263,10 +263,10 @@ def at_emulator(options: Options, folder: str) -> Options:
 
 
 def link_options(driver: type[Driver], robot: RobotFile, link: dict[str, Any]) -> type[LinkOptions]:
-    """Return the type of a link's options, with those of its lidar and checks for this body."""
+    """Return the type of a link's options, including its lidar's, with checks for this body."""
     scan = link.get("scan")
     name = scan.get("driver") if isinstance(scan, dict) else None
-    # where the lidar is not named, the driver's own options refuse it, with the line
+    # without a name, the driver's own options refuse the lidar, with the line
     fields: list[Any] = [("scan", source_class(name).Options)] if isinstance(name, str) else []
     if "cameras" in link:
         fields.append(("cameras", camera_options(robot, link["cameras"])))
@@ -290,7 +290,7 @@ def link_options(driver: type[Driver], robot: RobotFile, link: dict[str, Any]) -
 
 
 def _check_scan(options: LinkOptions, robot: RobotFile) -> None:
-    """Raises ValueError where a lidar cannot be had as it is described."""
+    """Raise ValueError if a lidar does not fit its port or its description."""
     scan = options.scan
     if scan is None:
         return

@@ -1,4 +1,4 @@
-"""Clips what a faulty body reports to the bounds of its messages."""
+"""Clips the values of a faulty body to the bounds of its messages."""
 
 import contextlib
 import functools
@@ -18,13 +18,13 @@ Bounds = tuple[float, float]
 def clipped(record: R) -> R:
     """Return `record` with each bounded float within its bounds, in nested records as well.
 
-    A faulty body may report 1e6 m/s. Clipped, that is 100 m/s, which safety stops; refused by the
-    message, the whole state would be missing.
+    A faulty body may report 1e6 m/s. Clipped to 100 m/s, it makes safety stop the robot; unclipped,
+    the whole state would be refused.
     """
     decode = _decoder(type(record))
     if decode:
         with contextlib.suppress(*DECODE_ERRORS):
-            decode(encode(record))  # much faster than looking at each float
+            decode(encode(record))  # much faster than a check of each float
             return record
     changes: dict[str, Any] = {}
     for name, bounds in _fields(type(record)).items():
@@ -36,7 +36,7 @@ def clipped(record: R) -> R:
 
 
 def fault_of(record: Struct) -> str:
-    """Return which value is beyond its bounds, and which bounds those are; empty if none is."""
+    """Return a text on the first value beyond its bounds; empty if there is none."""
     decode = _decoder(type(record))
     try:
         if decode:
@@ -47,7 +47,7 @@ def fault_of(record: Struct) -> str:
 
 
 def _within(value: Any, bounds: Bounds | None) -> Any:
-    """Return `value` within its bounds; the same object where nothing changes."""
+    """Return `value` within its bounds; the same object if nothing changes."""
     if isinstance(value, Struct):
         return clipped(value)
     if isinstance(value, tuple):
@@ -60,7 +60,7 @@ def _within(value: Any, bounds: Bounds | None) -> Any:
 
 @functools.cache
 def _decoder(record: type[Struct]) -> Callable[[bytes], object] | None:
-    """Return what checks all bounds of an encoded record; None for one with arrays, as pictures."""
+    """Return a decoder, which checks all bounds; None for records with arrays, as pictures."""
     info = inspect.type_info(record)
     assert isinstance(info, inspect.StructType)
     arrays = any(isinstance(field.type, inspect.BytesType) for field in info.fields)
@@ -69,7 +69,7 @@ def _decoder(record: type[Struct]) -> Callable[[bytes], object] | None:
 
 @functools.cache
 def _fields(record: type[Struct]) -> dict[str, Bounds | None]:
-    """Return the fields that may have to be clipped, with the bounds of their floats."""
+    """Return the fields that may need clipping, with the bounds of their floats."""
     info = inspect.type_info(record)
     assert isinstance(info, inspect.StructType)
     fields = {field.name: _bounds(field.type) for field in info.fields}
@@ -88,6 +88,6 @@ def _bounds(info: inspect.Type) -> Bounds | tuple[()] | None:
     if isinstance(info, inspect.TupleType):
         return _bounds(info.item_types[0])
     if isinstance(info, inspect.UnionType):
-        found = [one for one in map(_bounds, info.types) if one != ()]
+        found = [bounds for bounds in map(_bounds, info.types) if bounds != ()]
         return found[0] if found else ()
     return ()

@@ -1,4 +1,4 @@
-"""Serves requests to change a simulated world; those that count are logged for recordings."""
+"""Serves requests to change a simulated world; accepted ones are logged for recordings."""
 
 import logging
 from collections.abc import Awaitable, Callable
