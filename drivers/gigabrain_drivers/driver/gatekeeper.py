@@ -1,4 +1,4 @@
-"""The gate of one body: what it remembers on disk, the requests to it, and what is audited."""
+"""The gate of one body: its file on disk, the requests to it, and its audit log."""
 
 import logging
 import secrets
@@ -43,37 +43,37 @@ UNREADABLE = Cause(
     remedy="look at the robot, then release it",
 )
 
-Raised = dict[str, tuple[str, Cause]]  # by its code: who raised it, and the cause
-ON_TIME_NS = TICK_NS // 2  # a tick at least this long after the last is not late
-DISK_RETRY_TICKS = 50  # once a second: what the disk did not take is tried again
+CausesByCode = dict[str, tuple[str, Cause]]  # by code: origin (gate, driver or safety) and cause
+ON_TIME_NS = TICK_NS // 2  # a tick at least this long after the previous one is on time
+DISK_RETRY_TICKS = 50  # failed writes are retried once a second
 REMEDY = "make it writable, or name another with --state-dir or XDG_STATE_HOME"
 Stop = Callable[[], Awaitable[None]]
-LetGo = Callable[[bool], Awaitable[None]]
+SetLimp = Callable[[bool], Awaitable[None]]
 
 
 class Latched(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The content of the file."""
+    """The content of a latch file."""
 
     causes: tuple[Cause, ...] = ()
-    estop_generation: Annotated[int, Meta(ge=0, le=2**62)] = 0  # and it can still count on
+    estop_generation: Annotated[int, Meta(ge=0, le=2**62)] = 0  # leaves room to count on
 
 
 class LatchFile:
-    """One small file, replaced as a whole and synced."""
+    """A small file, replaced as a whole and synced."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._path = folder, folder / "latch.json"
         self._written = Latched()
 
     def read(self) -> Latched:
-        """Return what was latched when the driver ended; an unreadable file counts as latched.
+        """Return the latched state of the last driver; an unreadable file counts as latched.
 
-        Raises ConfigError when the folder cannot be written, and DiskFull.
+        Raises ConfigError if the folder cannot be written, and DiskFull.
         """
         try:
             make_folder(self._folder)
             found = msgspec.json.decode(read_bounded(self._path, MAX_LATCH_BYTES), type=Latched)
-            self._written = found  # it is on disk already, also where that is full
+            self._written = found  # it need not be written, even if the disk is full
         except FileNotFoundError:
             found = Latched()
         except (ConfigError, *DECODE_ERRORS):
@@ -84,7 +84,7 @@ class LatchFile:
         return found
 
     def try_write(self, latched: Latched) -> str:
-        """Write; the problem in one line, or an empty text. From one thread at a time."""
+        """Write; return the problem in one line, or an empty text. Not thread-safe."""
         try:
             self.write(latched)
         except ConfigError as error:
@@ -92,7 +92,7 @@ class LatchFile:
         return ""
 
     def write(self, latched: Latched) -> None:
-        """On disk when this returns. Raises ConfigError and DiskFull as `read` does."""
+        """Write to disk, synced. Raises ConfigError and DiskFull like `read`."""
         if latched == self._written and self._path.exists():
             return
         try:
@@ -103,9 +103,9 @@ class LatchFile:
 
 
 async def wait_for_disk(folder: Path, clock: Clock) -> None:
-    """Wait until there is space for the latch: without it a restart would forget an e-stop.
+    """Wait until the disk has space for the latch; otherwise a restart would forget an e-stop.
 
-    Raises ConfigError when the folder cannot be written for another reason.
+    Raises ConfigError if the folder cannot be written for another reason.
     """
     logged = False
     while True:
@@ -121,16 +121,16 @@ async def wait_for_disk(folder: Path, clock: Clock) -> None:
 
 
 class CauseWatch:
-    """Compares what holds the robot back now with what did so before."""
+    """Audits the causes that appear and disappear."""
 
     def __init__(self, trail: AuditTrail) -> None:
         self._trail = trail
-        self._known: Raised = {}
+        self._known: CausesByCode = {}
 
     def audit_changes(self, state: GateState) -> None:
-        """Write down what is new, and what is gone."""
+        """Audit new causes, and those that are gone."""
         before = self._known
-        now = {code: before.get(code, found) for code, found in raised(state).items()}
+        now = {code: before.get(code, found) for code, found in present_causes(state).items()}
         for code, (who, cause) in now.items():
             if code not in before:
                 self._trail.note("raised", who, cause.text, code=code)
@@ -140,10 +140,10 @@ class CauseWatch:
         self._known = now
 
 
-def raised(state: GateState) -> Raised:
+def present_causes(state: GateState) -> CausesByCode:
     """Return every present cause by its code, with its origin: gate, driver or safety."""
     safety = state.safety
-    found: Raised = {cause.code: ("gate", cause) for cause in state.causes}
+    found: CausesByCode = {cause.code: ("gate", cause) for cause in state.causes}
     found |= {cause.code: ("driver", cause) for cause in state.faults}
     for cause in (*safety.causes, *safety.warnings) if safety else ():
         found[cause.code] = ("safety", cause)
@@ -153,7 +153,7 @@ def raised(state: GateState) -> Raised:
 class Gatekeeper:
     """Steps the gate, and serves requests to it. An e-stop is on disk before it is confirmed.
 
-    `changed` is called whenever there is a new command for the body.
+    `changed` is called for each new command to the body.
     """
 
     def __init__(
@@ -172,7 +172,7 @@ class Gatekeeper:
             lambda newest: file.try_write(newest[-1]), room=1
         )
         self._latched, self._on_disk = latched, self._writer.put(latched)
-        self._on_time_ns = -ON_TIME_NS  # when the newest tick came that was not late
+        self._last_on_time_ns = -ON_TIME_NS  # of the newest tick that was not late
         self._disk_fault = Fault(log, logging.ERROR)
         self.state = gate.GateState(
             boot=secrets.randbits(47) + 1,
@@ -185,33 +185,35 @@ class Gatekeeper:
         self._trail.note("boot", bus.process, f"the driver of {robot_type} has started")
 
     def serve(self, stop: Stop) -> None:
-        """Answer requests from now on; `stop` brings the body to rest."""
+        """Serve requests; `stop` brings the body to rest."""
         self._stop = stop
         self._bus.serve(ESTOP, self._on_estop)
         self._bus.subscribe(
-            ESTOP_SAID, lambda _, said: self._stop_without_reply(said), self._on_undecodable_estop
+            ESTOP_SAID,
+            lambda _, request: self._stop_without_reply(request),
+            self._on_undecodable_estop,
         )
         self._bus.serve(RELEASE, self._on_release)
         self._bus.serve(ENABLE, self._on_enable)
 
-    def serve_limp(self, let_go: LetGo) -> None:
-        """Serve requests to let go of an arm and to hold it, while the gate is not enabled.
+    def serve_limp(self, set_limp: SetLimp) -> None:
+        """Serve requests to make an arm limp or hold it, while the gate is not enabled.
 
-        `let_go` raises a GigabrainError, with the reason, where that cannot be done.
+        `set_limp` raises a GigabrainError with the reason if that is impossible.
         """
 
         async def answer(request: LimpRequest) -> GateReply:
-            outcome = await self._tried(let_go, request.limp)
+            outcome = await self._try_limp(set_limp, request.limp)
             self._audit("limp" if request.limp else "hold", request.source, outcome)
             return self._reply(outcome)
 
         self._bus.serve(LIMP, answer)
 
-    async def _tried(self, let_go: LetGo, limp: bool) -> gate.Outcome:
-        """Let go of the joints or hold them; return what came of it."""
+    async def _try_limp(self, set_limp: SetLimp, limp: bool) -> gate.Outcome:
+        """Make the joints limp or hold them; return the outcome."""
         try:
             self.refuse_if_enabled()
-            await let_go(limp)
+            await set_limp(limp)
         except GigabrainError as error:
             return gate.Outcome(ok=False, text=str(error))
         done = "all joints are let go of" if limp else "the joints hold where they are"
@@ -224,7 +226,7 @@ class Gatekeeper:
             raise Refused(f"{holder} holds the arm; press the e-stop first")
 
     def limit(self, limits: Limits) -> None:
-        """Let no command exceed other limits from now on; a faster body is slowed at its ramp."""
+        """Replace the limits of commands. A body that is faster slows down with its ramp."""
         self._config = replace(self._config, limits=limits)
 
     def step(self, event: gate.Event) -> gate.Outcome:
@@ -233,24 +235,24 @@ class Gatekeeper:
         self.state, outcome = gate.step(self._config, before, event)
         if self.state.output != before.output:
             self._output_changed()
-        if _differs(before, self.state):
+        if _has_visible_change(before, self.state):
             self._note_change(before)
         return outcome
 
     def command(self, event: gate.VelocityCommand | gate.JointsCommand) -> gate.Outcome:
-        """A command through the gate; one that is refused is counted, and its sender named."""
+        """Step the gate by a command; a refused one is counted and audited."""
         outcome = self.step(event)
         reason, source = outcome.refused, event.command.source
         if reason:
             self._bus.counters[f"refused_{reason}"] += 1
-        if reason and source != gate.BRAIN:  # the brain keeps talking while others drive
+        if reason and source != gate.BRAIN:  # the brain keeps sending while others drive
             drives = self.state.commander or "nobody"
             text = f"its commands are not obeyed ({reason}); {drives} drives"
             self._trail.note("refused", source or "anonymous", text, code=reason, ok=False)
         return outcome
 
     def ticks(self, passed: int, tick: gate.Tick) -> None:
-        """Step the gate by `passed` ticks since the last call, all but one of them missed."""
+        """Step the gate by the `passed` ticks since the last call; all but one were missed."""
         for _ in range(passed):
             late = self._is_late(tick.wall_ns)
             self._bus.counters["late_ticks"] += late
@@ -258,11 +260,11 @@ class Gatekeeper:
             self._retry_disk()
 
     def _is_late(self, wall_ns: int | None) -> bool:
-        """Return whether a tick only makes up for lost time, right after another one."""
+        """Return whether a tick was missed, and is processed in a burst after another one."""
         if wall_ns is None:
             return False
-        late = wall_ns - self._on_time_ns < ON_TIME_NS
-        self._on_time_ns = self._on_time_ns if late else wall_ns
+        late = wall_ns - self._last_on_time_ns < ON_TIME_NS
+        self._last_on_time_ns = self._last_on_time_ns if late else wall_ns
         return late
 
     def _retry_disk(self) -> None:
@@ -272,7 +274,7 @@ class Gatekeeper:
                 self._store(self._latched)
 
     async def close(self) -> None:
-        """Have all written down."""
+        """Write everything that is pending, and stop."""
         self._trail.note("end", self._bus.process, "the driver ends")
         await self._trail.close()
         await self._writer.close()
@@ -293,7 +295,7 @@ class Gatekeeper:
     def _store(self, latched: Latched) -> None:
         self._latched, self._on_disk = latched, self._writer.put(latched)
 
-    async def _stored(self) -> str:
+    async def _disk_problem(self) -> str:
         """Wait for the disk; return the text to add to a reply if it failed."""
         problem = await self._on_disk
         if not problem:
@@ -303,15 +305,15 @@ class Gatekeeper:
         return f"; but a restart would lose it: {problem}"
 
     def press(self, text: str) -> None:
-        """The e-stop button of this robot is pressed."""
+        """Latch and stop, as this robot's e-stop button is pressed."""
         self._stop_without_reply(EstopRequest(source="button", reason=text))
 
-    def _stop_without_reply(self, said: EstopRequest) -> None:
-        """Latch and stop, where nothing waits for an answer."""
-        outcome = self.step(gate.Estop(said.source))
+    def _stop_without_reply(self, request: EstopRequest) -> None:
+        """Latch and stop for a sender that expects no answer."""
+        outcome = self.step(gate.Estop(request.source))
         self._output_changed()
-        log.warning("e-stop by %s %s", said.source, said.reason)
-        self._audit("estop", said.source, outcome, said.reason)
+        log.warning("e-stop by %s %s", request.source, request.reason)
+        self._audit("estop", request.source, outcome, request.reason)
 
     def _on_undecodable_estop(self, payload: bytes) -> None:
         if not payload:
@@ -322,12 +324,12 @@ class Gatekeeper:
         await self._stop()  # before disk and log
         log.warning("e-stop by %s %s", request.source, request.reason)
         self._audit("estop", request.source, outcome, request.reason)
-        return self._reply(outcome, await self._stored())
+        return self._reply(outcome, await self._disk_problem())
 
     async def _on_release(self, request: ReleaseRequest) -> GateReply:
         outcome = self.step(gate.Release(request.estop_generation))
         self._audit("release", request.source, outcome)
-        return self._reply(outcome, await self._stored())
+        return self._reply(outcome, await self._disk_problem())
 
     async def _on_enable(self, request: EnableRequest) -> GateReply:
         before = self.state.commander
@@ -342,25 +344,25 @@ class Gatekeeper:
         text = ", ".join(part for part in (outcome.text, detail) if part)
         self._trail.note(what, source or "anonymous", text, ok=outcome.ok)
 
-    def _reply(self, outcome: gate.Outcome, more: str = "") -> GateReply:
+    def _reply(self, outcome: gate.Outcome, suffix: str = "") -> GateReply:
         return GateReply(
             ok=outcome.ok,
-            text=(outcome.text + more)[:500],
+            text=(outcome.text + suffix)[:500],
             robot_type=self._robot_type,
             gate=gate.status(self.state),
         )
 
 
-def _differs(before: gate.GateState, now: gate.GateState) -> bool:
-    """Return whether a change matters to anybody; nearly all ticks and commands change nothing."""
+def _has_visible_change(before: gate.GateState, now: gate.GateState) -> bool:
+    """Return whether causes or mode differ, to be logged; after most events they do not."""
     return (
         now.mode != before.mode
         or now.estop_generation != before.estop_generation
         or now.causes is not before.causes
         or now.faults is not before.faults
-        or _said(now) != _said(before)
+        or _safety_causes(now) != _safety_causes(before)
     )
 
 
-def _said(state: gate.GateState) -> tuple[tuple[Cause, ...], ...]:
+def _safety_causes(state: gate.GateState) -> tuple[tuple[Cause, ...], ...]:
     return (state.safety.causes, state.safety.warnings) if state.safety else ()

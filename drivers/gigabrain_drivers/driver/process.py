@@ -1,4 +1,4 @@
-"""The driver process: joins a body to the bus, through the gate. Written once for all bodies."""
+"""The driver process: connects a body to the bus, through the gate. The same for all bodies."""
 
 import asyncio
 import functools
@@ -59,12 +59,13 @@ from gigabrain_zenoh.runtime.heartbeat import Progress
 
 log = logging.getLogger(__name__)
 
-PATH = r" - at `[^`]*`$"  # that msgspec adds to an error
+ERROR_PATH = r" - at `[^`]*`$"  # the end that msgspec adds to an error
 BODY_EVERY_TICKS = 50  # once a second
-OF_THE_STATE = (SIM_SCENE, SIM_POSES)  # they are of the tick whose state comes next
-CAMERAS_S = 30.0  # that the first tick of lock-step waits for pictures
-HOLD_TICKS = 25  # 0.5 s, in which limp joints have to hold once they are asked to
-STALE_NS = 250_000_000  # the echo's 150 ms and the watchdog's 100: older must never move the body
+STATE_TOPICS = (SIM_SCENE, SIM_POSES)  # emitted before their tick, so that they wait for it
+CAMERAS_S = 30.0  # for the pictures of the first tick in lock-step
+MAX_HOLD_TICKS = 25  # 0.5 s, for limp joints to hold again
+# the echo's 150 ms plus the watchdog's 100 ms: no older command may move the body
+STALE_NS = 250_000_000
 
 
 class DriverProcess:
@@ -72,7 +73,7 @@ class DriverProcess:
 
     def __init__(self, config: DriverConfig, robot: RobotFile, driver: Driver, bus: Bus) -> None:
         self._config, self._robot, self._driver, self._bus = config, robot, driver, bus
-        self._settings, _ = split(config.robot)  # of the body that are not its file's, by path
+        self._settings, _ = split(config.robot)  # replaced settings of the body, by path
         description = restricted(robot.description(), self._settings)
         self._body = Body(description=description, link=config.link)
         gate_config = gate.GateConfig(
@@ -89,25 +90,26 @@ class DriverProcess:
         self._button = ButtonWatch(bus, press) if config.button else None
         wait_s = config.lockstep_timeout_s
         self._lockstep = Lockstep(robot.control.period_ticks, wait_s) if driver.lockstep else None
-        self._sensors: list[tuple[Topic[Any], Message]] = []  # that wait for the next tick
-        self._poses: Message | None = None  # of the simulated world, the newest
+        self._sensors: list[tuple[Topic[Any], Message]] = []  # to be published with the next tick
+        self._poses: Message | None = None  # newest ones of the simulated world
         self._restoring = RestoringPublisher(bus)
-        self._bodies = RestoringPublisher(bus)  # restored at once: a wrong one latches the gate
+        # restored each tick, as a wrong body latches the gate
+        self._bodies = RestoringPublisher(bus)
         self._round_trip = RoundTrip()
-        self._line = asyncio.Lock()  # one call at a time goes out to the body
+        self._line = asyncio.Lock()  # held during each call to the body
         self._sent = ZERO  # the newest command to the body
         self._joints_sent: tuple[float, ...] = ()
-        self._state: RobotState | None = None  # the newest, before gate and commands are added
+        self._state: RobotState | None = None  # newest one of the driver, without gate and commands
         self._limp = False  # in the newest state, or by request
-        self._let_go = False  # by request, until it is moved or held again
+        self._limp_requested = False  # until the joints are moved or held again
         self._body_tick = 0  # when BODY was last published
-        self._beyond = QuietFault(log)  # a value beyond its bounds
+        self._clipped = QuietFault(log)
         driver.emit = self._emit
         bus.report = self.report
-        bus.progress = Progress(self._time_goes_on, lambda: bus.sent[STATE.key])
+        bus.progress = Progress(self._progress_inputs, lambda: bus.sent[STATE.key])
 
     async def run(self, ready: Callable[[], None]) -> None:
-        """Serve the body until cancelled; it is safe when this ends, however it ends."""
+        """Serve the body until cancelled. In any case the body is safe at the end."""
         try:
             async with self._driver:
                 await self._serve(ready)
@@ -124,7 +126,7 @@ class DriverProcess:
             self._gatekeeper.serve_limp(self._on_limp)
         if self._lockstep and self._robot.cameras:
             self._await_cameras(self._lockstep)
-        if self._config.link != "emulated":  # the emulator has the world then
+        if self._config.link != "emulated":  # then the emulator has the world
             serve_world(bus, self._driver.change_world)
         self._serve_settings()
         self._bodies.publish(BODY, self._body)
@@ -136,23 +138,23 @@ class DriverProcess:
             tasks.create_task(self._apply_commands())
 
     def _await_cameras(self, lockstep: Lockstep) -> None:
-        """Have ticks wait for pictures, and for the contours in them."""
+        """Let ticks wait for pictures, and for their contours."""
 
-        def take(key: str, message: Message) -> None:
+        def receive(key: str, message: Message) -> None:
             if message.boot == self._gate.boot:
                 lockstep.picture(key.rpartition("/")[2], message.basis)
 
         topics: tuple[Topic[Any], ...] = (DEPTH, IMAGE, CAMERA)
         for topic in topics:
-            self._bus.subscribe(topic, take)
+            self._bus.subscribe(topic, receive)
         self._bus.latest(WORLD, lockstep.world)
 
     def _serve_settings(self) -> None:
-        """Offer the settings of the body that may change while it runs."""
+        """Serve the settings of the body that may change while it runs."""
         file = self._robot.description()
         for path, one in SETTINGS.items():
             bound = setting_of(file, path)
-            if not one.live or not bound:  # a body that cannot move so has no limit for it
+            if not one.live or not bound:  # the body has no such motion
                 continue
             side = "at least" if one.at_least else "above 0, at most"
             expected = f"a number, {side} {bound:g} [{one.unit}], the body's own {one.kind}"
@@ -168,16 +170,16 @@ class DriverProcess:
         return shown(setting_of(self._body.description, path))
 
     def _change_setting(self, path: str, text: str) -> None:
-        """Have gate, safety, planner and control obey another value from now on.
+        """Change a setting for gate, safety, planner and control.
 
-        Raises Refused for one that is less safe than the body's own, and ValueError.
+        Raises Refused for a value less safe than the body's own, and ValueError.
         """
         settings = self._settings | {path: float(text)}
         try:
             description = restricted(self._robot.description(), settings)
         except ValueError as error:
-            if re.search(PATH, str(error)):  # no body may have it: `Params` names what is expected
-                raise
+            if re.search(ERROR_PATH, str(error)):  # invalid for any body
+                raise  # `Params` says what is expected
             raise Refused(str(error)) from None
         self._settings, self._body = settings, replace(self._body, description=description)
         self._gatekeeper.limit(limits_of(description))
@@ -191,7 +193,7 @@ class DriverProcess:
         await self._bus.failed
 
     async def _apply_commands(self) -> None:
-        """Between two ticks as well: a command need not wait for anybody's period."""
+        """Apply commands between ticks as well, as soon as they arrive."""
         while True:
             await self._wake.wait()
             await self._apply_command()
@@ -205,16 +207,16 @@ class DriverProcess:
         }
         return {**self._driver.report(), **self._round_trip.report(), **figures}
 
-    def _time_goes_on(self) -> tuple[object, ...]:
-        """The body's time, which is to go on until a simulation is over."""
+    def _progress_inputs(self) -> tuple[object, ...]:
+        """Return the inputs of progress: the clock, until a simulation is over."""
         return () if self._driver.finished else (self._bus.clock.now_ns(),)
 
     async def _tick(self, passed: int) -> None:
-        """20 ms of the body's time, or several where the process was held up."""
+        """Process a tick of the body; several if this process was late."""
         self._state = state = self._checked(await self._driver.read_state())
-        self._limp = state.limp or self._let_go
+        self._limp = state.limp or self._limp_requested
         if self._wake.is_set():
-            await self._apply_command()  # the gate goes on from the body's newest command
+            await self._apply_command()  # the gate continues from the body's newest command
         button = self._button.faults() if self._button else ()
         faults = button if state.link.connected else (why.LINK_LOST, *button)
         tick = gate.Tick(
@@ -234,20 +236,20 @@ class DriverProcess:
         await self._apply_command()
 
     def _checked(self, reported: RobotState) -> RobotState:
-        """Return a state within its bounds; log what was beyond them."""
+        """Return the state clipped to its bounds; log which value was beyond them."""
         state, now_ns = clipped(reported), self._bus.clock.now_ns()
         if state is reported:
-            self._beyond.end("the body's values are within their bounds again", now_ns)
+            self._clipped.end("the body's values are within their bounds again", now_ns)
         else:
             what = f"{fault_of(reported)}; is it in another unit?"
-            self._beyond.begin(f"the body's state was clipped to its bounds: {what}", now_ns)
+            self._clipped.begin(f"the body's state was clipped to its bounds: {what}", now_ns)
         return state
 
     def _emit(self, topic: Topic[Any], message: Message) -> None:
-        """Publish a sensor's message at once, or with the next tick: all of them in lock-step."""
+        """Publish a sensor's message: at once, or with the next tick, as always in lock-step."""
         self._poses = message if topic is SIM_POSES else self._poses
         message = clipped(message)
-        if self._lockstep or not self._gate.tick or topic in OF_THE_STATE:
+        if self._lockstep or not self._gate.tick or topic in STATE_TOPICS:
             self._sensors.append((topic, message))
         else:
             self._send(topic, message)
@@ -278,7 +280,7 @@ class DriverProcess:
     async def _step_in_lockstep(self, lockstep: Lockstep, state: RobotState) -> None:
         """Announce the tick and wait until it is answered.
 
-        The first one waits until the whole brain has answered a scan, so that runs can be repeated.
+        The first one waits until the whole brain answers a scan, so that runs are repeatable.
         """
         if self._gate.tick > 1:
             self._begin(lockstep, state)
@@ -288,7 +290,7 @@ class DriverProcess:
         while not answered:
             if scan:
                 self._sensors.append((SCAN, scan))
-            if self._poses and self._robot.cameras:  # not kept for those that come late
+            if self._poses and self._robot.cameras:  # late subscribers do not get the old ones
                 self._sensors.append((SIM_POSES, self._poses))
             self._begin(lockstep, state)
             if cameras_s <= 0:
@@ -297,7 +299,7 @@ class DriverProcess:
             cameras_s -= REPEAT_S
 
     def _begin(self, lockstep: Lockstep, state: RobotState) -> None:
-        """Announce the tick; on a network in memory the answers come before this returns."""
+        """Announce the tick; on a network in memory, answers arrive before this returns."""
         tick = self._gate.tick
         with_scan = any(topic is SCAN for topic, _ in self._sensors)
         basis = tick if with_scan else self._round_trip.scan_tick
@@ -305,7 +307,7 @@ class DriverProcess:
         self._publish_tick(state)
 
     def _exposed(self, tick: int) -> list[str]:
-        """Return the cameras that take a picture in a tick; in the first one, all."""
+        """Return the cameras that take a picture in a tick; all of them in the first one."""
         cameras = self._robot.cameras
         return [one.name for one in cameras if tick == 1 or exposes(one.rate_hz, tick)]
 
@@ -317,12 +319,12 @@ class DriverProcess:
         return self._gatekeeper.state
 
     async def _apply_command(self) -> None:
-        """Have the body do what the gate lets through."""
+        """Send the output of the gate to the body."""
         async with self._line:
             self._wake.clear()
             await self._apply_joints(self._gate)
-            now = self._gate  # which may have changed while the joints were sent
-            if now.mode == "latched" and not now.joints:  # those are held where the gate says
+            now = self._gate  # it may have changed while the joints were sent
+            if now.mode == "latched" and not now.joints:  # `now.joints` would be held
                 self._sent = ZERO
                 await self._driver.stop()
                 return
@@ -338,10 +340,10 @@ class DriverProcess:
             self._bus.counters["stale_commands_executed"] += late
 
     async def _apply_joints(self, now: gate.GateState) -> None:
-        """Have the joints go where the gate says; those of a limp body are left alone."""
+        """Send the joints to the positions of the gate, unless the body is limp."""
         if not now.joints or (self._limp and now.mode != "enabled"):
             return
-        self._let_go = False
+        self._limp_requested = False
         await self._send_joints(now)
 
     async def _send_joints(self, now: gate.GateState) -> None:
@@ -351,30 +353,30 @@ class DriverProcess:
         self._joints_sent = tuple(sent[name] for name in names)
 
     async def _on_limp(self, limp: bool) -> None:
-        """Let go of the joints, or hold them where they are. Raises BodyLost where they do not.
+        """Make the joints limp, or hold them where they are. Raises BodyLost if they do not hold.
 
-        If the gate is enabled meanwhile, it holds the joints again and raises Refused.
+        If the gate is enabled meanwhile, hold the joints again and raise Refused.
         """
         async with self._line:
             if limp:
                 self._gatekeeper.refuse_if_enabled()
                 await self._driver.limp()
-                self._let_go = self._limp = True
+                self._limp_requested = self._limp = True
                 try:
                     self._gatekeeper.refuse_if_enabled()
                 except Refused:
-                    self._let_go = False
+                    self._limp_requested = False
                     if self._gate.joints:
                         await self._send_joints(self._gate)
                     raise
                 return
             if self._gate.joints:
                 await self._send_joints(self._gate)
-            self._state = None  # only a state from now on tells whether they hold
-        for _ in range(HOLD_TICKS):
+            self._state = None  # only a later state shows whether they hold
+        for _ in range(MAX_HOLD_TICKS):
             await self._bus.clock.sleep_ns(TICK_NS)
             if self._state and holds(self._body.description, self._state):
-                self._let_go = self._limp = False
+                self._limp_requested = self._limp = False
                 return
         raise BodyLost(self._driver.problem or "the joints do not hold")
 
@@ -389,22 +391,22 @@ class DriverProcess:
 
     def _on_joint_command(self, _key: str, command: JointCommand) -> None:
         self._gatekeeper.command(gate.JointsCommand(command, self._wall_ns()))
-        mine = command.source == (self._gate.commander or gate.BRAIN)
-        if self._lockstep and mine and command.boot == self._gate.boot:
+        from_commander = command.source == (self._gate.commander or gate.BRAIN)
+        if self._lockstep and from_commander and command.boot == self._gate.boot:
             self._lockstep.command(command)
 
     def _on_bad_command(self, payload: bytes) -> None:
-        """Not a valid command: was it the commander, with a value that is not a number?"""
+        """Step the gate if an invalid command has NaN or infinity."""
         if sender := not_finite(payload):
             self._gatekeeper.step(gate.NotFinite(*sender))
 
-    def _on_safety(self, said: SafetyState) -> None:
-        self._gatekeeper.step(gate.Safety(said))
-        if self._lockstep and said.boot == self._gate.boot:
-            self._lockstep.verdict(said)
+    def _on_safety(self, verdict: SafetyState) -> None:
+        self._gatekeeper.step(gate.Safety(verdict))
+        if self._lockstep and verdict.boot == self._gate.boot:
+            self._lockstep.verdict(verdict)
 
     def _wall_ns(self) -> int | None:
-        """Return the host's clock; None in lock-step, where it means nothing."""
+        """Return the host's clock [ns]; None in lock-step, where it has no meaning."""
         return None if self._lockstep else self._bus.clock.now_ns()
 
     def _update_figures(self) -> None:
@@ -418,13 +420,13 @@ class DriverProcess:
 
 
 async def run(config: DriverConfig, bus: Bus, ready: Callable[[], None]) -> None:
-    """Drive one body until the process ends. Raises ConfigError for what cannot be driven."""
+    """Drive one body until the process ends. Raises ConfigError for a wrong configuration."""
     if config.link != "sim" and config.speed != 1.0:
         raise ConfigError(f"link {config.link!r} runs in real time; --speed is for simulation")
     if config.link == "real" and config.resume == "auto":
         raise ConfigError("resume: auto is not allowed with link real; use manual")
     if config.link != "real":
-        load_world(config.world, config.seed)  # a mock takes any, and would hide a wrong one
+        load_world(config.world, config.seed)  # checked here, as a mock accepts any world
     where = Run(
         folder=Path(),
         link=config.link,
@@ -448,7 +450,7 @@ async def run(config: DriverConfig, bus: Bus, ready: Callable[[], None]) -> None
     try:
         process = DriverProcess(config, robot, driver, bus)
     except ValueError as error:
-        raise ConfigError(f"robot: {re.sub(PATH, '', str(error))}") from None
+        raise ConfigError(f"robot: {re.sub(ERROR_PATH, '', str(error))}") from None
     await process.run(ready)
 
 
@@ -477,12 +479,12 @@ def not_finite(payload: bytes) -> tuple[str, int] | None:
 
 
 def holds(body: BodyDescription, state: RobotState) -> bool:
-    """Return whether all joints that can be commanded are there, and hold."""
+    """Return whether all commandable joints are reported and hold."""
     return state.link.connected and not state.limp and bool(commanded_joints(body, state))
 
 
 def commanded_joints(body: BodyDescription, state: RobotState) -> tuple[JointMotion, ...]:
-    """Return the joints that can be commanded, as measured; none while one is missing."""
+    """Return the commandable joints as measured; empty while one is missing."""
     measured = {joint.name: joint for joint in state.joints}
     if any(joint.name not in measured for joint in body.joints):
         return ()
