@@ -1,4 +1,4 @@
-"""Settings of a body that may change while it runs: each only makes it safer than its file says.
+"""Body settings that may be changed, but only to values safer than those in the body's file.
 
 The driver publishes the changed description, so gate, safety, planner and control obey the same
 values.
@@ -15,12 +15,12 @@ from gigabrain_schemas.body import DEFAULT, BodyDescription, Thresholds
 
 
 class BodySetting(NamedTuple):
-    """One setting, and which of its values are safe."""
+    """Unit of a setting, and the direction in which its values are safer."""
 
     unit: str
-    kind: str  # of the bound, in words
-    at_least: bool = False  # the file's value is the least one; otherwise the greatest
-    live: bool = True  # may change while the body runs; otherwise at the start only
+    kind: str  # word for the bound in error texts
+    at_least: bool = False  # the file's value is the minimum, otherwise the maximum
+    live: bool = True  # may also be changed while the body runs
 
 
 SETTINGS = {
@@ -47,39 +47,39 @@ def setting_of(body: BodyDescription, path: str) -> float:
 
 
 def split(changes: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, Any]]:
-    """Return the live settings in changes of a robot's file, by path, and all other changes."""
+    """Split changes of a robot's file into live settings, by path, and all other changes."""
     settings: dict[str, float] = {}
-    rest = dict(changes)
-    for path, one in SETTINGS.items():
-        if not one.live:
+    others = dict(changes)
+    for path, setting in SETTINGS.items():
+        if not setting.live:
             continue
         section, _, name = path.rpartition(".")
-        place = rest.get(section, {}) if section else rest
-        if name not in place:
+        values = others.get(section, {}) if section else others
+        if name not in values:
             continue
-        settings[path] = place[name]
-        kept = {key: value for key, value in place.items() if key != name}
-        rest = {**rest, section: kept} if section else kept
-    return settings, rest
+        settings[path] = values[name]
+        kept = {key: value for key, value in values.items() if key != name}
+        others = {**others, section: kept} if section else kept
+    return settings, others
 
 
 def check_safe(file: BodyDescription, wanted: BodyDescription) -> None:
     """Raise ValueError for the first setting of `wanted` that is less safe than in `file`."""
-    for path, one in SETTINGS.items():
+    for path, setting in SETTINGS.items():
         bound, value = setting_of(file, path), setting_of(wanted, path)
-        if value < bound if one.at_least else value > bound:
-            side = "below" if one.at_least else "above"
+        if value < bound if setting.at_least else value > bound:
+            side = "below" if setting.at_least else "above"
             raise ValueError(
-                f"{path}: {value:g} {one.unit} is {side} the body's own {one.kind}, "
-                f"{bound:g} {one.unit} in its file"
+                f"{path}: {value:g} {setting.unit} is {side} the body's own {setting.kind}, "
+                f"{bound:g} {setting.unit} in its file"
             )
 
 
 def restricted(file: BodyDescription, settings: Mapping[str, float]) -> BodyDescription:
-    """Return the body of a file with other settings, by path. Raises ValueError if unsafe.
+    """Return the body of a file with changed settings, by path. Raises ValueError if unsafe.
 
-    A slower car turns as tightly as before, so its yaw rate falls with its speed. Tolerances of
-    `thresholds` are never above what the slower body can be off.
+    A slower car keeps its turning radius: its yaw rate is reduced like its speed. The following
+    tolerances of `thresholds` are limited to the new speeds or their defaults, if those are higher.
     """
     top = {path: value for path, value in settings.items() if "." not in path}
     inner = {path.partition(".")[2]: settings[path] for path in settings if "." in path}

@@ -1,6 +1,6 @@
-"""Smooth motion of joints from tick to tick, within speed, acceleration and jerk. Pure.
+"""Smooth joint motion, tick by tick, within limits of speed, acceleration and jerk. Pure.
 
-Ruckig finds the fastest way; it is imported where joints are moved, and nowhere else.
+Ruckig computes time-optimal motions. It is imported only by processes that move joints.
 """
 
 import importlib
@@ -14,11 +14,11 @@ import msgspec
 from gigabrain_schemas.body import BodyDescription, JointDescription, RobotState
 from gigabrain_zenoh.errors import ConfigError
 
-OVER = 1.02  # by which a step along a path may be beyond the limits: rounding, float32
-CATCH_UP = 0.95  # of a joint's greatest speed, at which a path may run away from it
-PATHS = 0.5  # of its acceleration, that a path may have while a joint gets onto it
-NOTHING = 1e-9  # speed and acceleration that are rounding, for which Ruckig may find no way
-SLACK = 1e-3  # [rad/s] or [m/s], the same for joints that barely move
+OVER = 1.02  # factor by which steps along a path may exceed the limits: rounding, float32
+SLACK = 1e-3  # [rad/s] or [m/s], added to that limit, for joints that barely move
+PATH_SPEED_SHARE = 0.95  # of a joint's maximum speed; the rest is left to catch up with a path
+PATH_ACCELERATION_SHARE = 0.5  # of its maximum acceleration, likewise
+ROUNDING = 1e-9  # smaller speeds and accelerations are set to 0, as Ruckig may fail on them
 
 
 class JointPoint(msgspec.Struct, frozen=True):
@@ -32,9 +32,9 @@ class JointPoint(msgspec.Struct, frozen=True):
 class JointGoal(msgspec.Struct, frozen=True):
     """The goal of a joint: a position, or a velocity."""
 
-    position: float | None = None  # [rad] or [m]; None: nowhere, it moves at `velocity`
+    position: float | None = None  # [rad] or [m]; None: move at `velocity`
     velocity: float = 0.0  # [rad/s] or [m/s], without a position
-    max_speed: float | None = None  # [rad/s] or [m/s] on the way there, lower than its own
+    max_speed: float | None = None  # [rad/s] or [m/s]; None: the joint's own limit
 
 
 REST = JointGoal()
@@ -46,23 +46,23 @@ def prepare(joints: int) -> None:
 
 
 def within(joint: JointDescription, position: float) -> float:
-    """Return the position in the joint's range that is nearest to `position`."""
+    """Return `position` limited to the joint's range."""
     return max(joint.lower, min(joint.upper, position))
 
 
 def measured(body: BodyDescription, state: RobotState) -> tuple[JointPoint, ...]:
-    """Return the joints that can be commanded, as measured; none while one is missing."""
+    """Return the measured state of all joints of `body`; empty while one is missing."""
     found = {joint.name: joint for joint in state.joints}
     if any(joint.name not in found for joint in body.joints):
         return ()
-    these = (found[joint.name] for joint in body.joints)
-    return tuple(JointPoint(joint.position, joint.velocity) for joint in these)
+    ordered = (found[joint.name] for joint in body.joints)
+    return tuple(JointPoint(joint.position, joint.velocity) for joint in ordered)
 
 
 def held(body: BodyDescription, state: RobotState) -> tuple[JointPoint, ...]:
-    """Return the posture that the joints were sent to; the measured one, if nothing holds them.
+    """Return the newest commanded posture, or the measured one if the joints are not held.
 
-    It is within their ranges. None while a joint is missing.
+    Positions are limited to the joints' ranges. Empty while a joint is missing.
     """
     now = measured(body, state)
     if now and not state.limp and len(state.joints_sent) == len(now):
@@ -77,34 +77,34 @@ def ramp(
     limits: Sequence[JointDescription],
     dt: float,
 ) -> tuple[JointPoint, ...]:
-    """Return where the joints are `dt` [s] later on the fastest way to their goals.
+    """Return the joints after `dt` [s] of time-optimal motion to their goals.
 
-    All that have a position arrive there at once; the others do not wait for them. Raises
+    Joints with a goal position arrive together. The others do not wait for them. Raises
     ConfigError without Ruckig.
     """
-    given = _input(now, limits)
+    inputs = _input(now, limits)
     interface, synchronization = _ruckig().ControlInterface, _ruckig().Synchronization
-    pairs = tuple(zip(goals, limits, now, strict=True))
-    given.max_velocity = [
-        min(goal.max_speed or one.max_speed, one.max_speed) for goal, one, _ in pairs
+    joints = tuple(zip(goals, limits, now, strict=True))
+    inputs.max_velocity = [
+        min(goal.max_speed or joint.max_speed, joint.max_speed) for goal, joint, _ in joints
     ]
-    given.target_position = [
+    inputs.target_position = [
         point.position if goal.position is None else within(joint, goal.position)
-        for goal, joint, point in pairs
+        for goal, joint, point in joints
     ]
-    given.target_velocity = [
-        0.0 if goal.position is not None else _braking_in_time(goal.velocity, point, joint)
-        for goal, joint, point in pairs
+    inputs.target_velocity = [
+        0.0 if goal.position is not None else _stoppable_velocity(goal.velocity, point, joint)
+        for goal, joint, point in joints
     ]
-    given.per_dof_control_interface = [
+    inputs.per_dof_control_interface = [
         interface.Velocity if goal.position is None else interface.Position for goal in goals
     ]
-    given.per_dof_synchronization = [
+    inputs.per_dof_synchronization = [
         synchronization.No if goal.position is None else synchronization.Time for goal in goals
     ]
     return tuple(
         msgspec.structs.replace(point, position=within(joint, point.position))
-        for point, joint in zip(_after(given, dt), limits, strict=True)
+        for point, joint in zip(_advanced(inputs, dt), limits, strict=True)
     )
 
 
@@ -114,15 +114,15 @@ def along(
     limits: Sequence[JointDescription],
     dt: float,
 ) -> tuple[JointPoint, ...]:
-    """Return where joints are `dt` [s] later that follow a path.
+    """Return the joints after `dt` [s] along a path.
 
-    One that cannot be on it by then gets there as fast as it may: seen from a frame that goes along
-    the path, it comes to rest. Raises ConfigError without Ruckig.
+    If a joint cannot reach the path in that time, all joints approach it as fast as their limits
+    allow. Raises ConfigError without Ruckig.
 
     Args:
-        now: Where the joints are.
-        path: Where each should be now, `dt` later, and twice as late.
-        limits: What they can.
+        now: Current state of the joints.
+        path: Positions of the joints on the path: now, after `dt` and after 2 `dt`.
+        limits: Limits of the joints.
         dt: Time step [s].
     """
     before, after, _ = path
@@ -133,106 +133,112 @@ def along(
     nexts = tuple(
         JointPoint(b, (b - a) / dt, ((b - a) / dt - step.velocity) / dt)
         for a, b, step in zip(before, after, steps, strict=True)
-    )  # from then on at the path's speed
-    if all(map(_possible, (*steps, *nexts), (*limits, *limits))):
+    )  # the step after that, along the path
+    if all(map(_within_limits, (*steps, *nexts), (*limits, *limits))):
         return steps
-    return _onto(now, path, limits, dt)
+    return _approach_path(now, path, limits, dt)
 
 
-def _onto(
+def _approach_path(
     now: Sequence[JointPoint],
     path: Sequence[Sequence[float]],
     limits: Sequence[JointDescription],
     dt: float,
 ) -> tuple[JointPoint, ...]:
-    """Return where joints are `dt` [s] later that get onto a path as fast as they may."""
-    frame = [_frame(joint, places, dt) for joint, *places in zip(limits, *path, strict=True)]
+    """Return the joints after `dt` [s] of the fastest approach to a path.
+
+    In a frame that moves along the path, they come to rest at its origin.
+    """
+    frame = [_path_frame(joint, places, dt) for joint, *places in zip(limits, *path, strict=True)]
     off = [
         JointPoint(
             p.position - f.position, p.velocity - f.velocity, p.acceleration - f.acceleration
         )
         for p, f in zip(now, frame, strict=True)
     ]
-    given = _input(off, limits)
+    inputs = _input(off, limits)
     pairs = list(zip(limits, frame, strict=True))
-    given.max_acceleration = [j.max_acceleration - f.acceleration for j, f in pairs]
-    given.min_acceleration = [-j.max_acceleration - f.acceleration for j, f in pairs]
-    given.max_velocity = [j.max_speed - f.velocity for j, f in pairs]
-    given.min_velocity = [-j.max_speed - f.velocity for j, f in pairs]
-    given.target_position = given.target_velocity = [0.0] * len(limits)
-    given.per_dof_synchronization = [_ruckig().Synchronization.No] * len(limits)
+    inputs.max_acceleration = [j.max_acceleration - f.acceleration for j, f in pairs]
+    inputs.min_acceleration = [-j.max_acceleration - f.acceleration for j, f in pairs]
+    inputs.max_velocity = [j.max_speed - f.velocity for j, f in pairs]
+    inputs.min_velocity = [-j.max_speed - f.velocity for j, f in pairs]
+    inputs.target_position = inputs.target_velocity = [0.0] * len(limits)
+    inputs.per_dof_synchronization = [_ruckig().Synchronization.No] * len(limits)
     return tuple(
         JointPoint(
             within(joint, f.position + speed * dt + p.position),
             speed + p.velocity,
             f.acceleration + p.acceleration,
         )
-        for joint, f, p in zip(limits, frame, _after(given, dt), strict=True)
+        for joint, f, p in zip(limits, frame, _advanced(inputs, dt), strict=True)
         for speed in (f.velocity + f.acceleration * dt,)
     )
 
 
-def _frame(joint: JointDescription, path: Sequence[float], dt: float) -> JointPoint:
-    """Return a frame that goes along a path, as fast as the joint can follow it."""
+def _path_frame(joint: JointDescription, path: Sequence[float], dt: float) -> JointPoint:
+    """Return a frame that moves along a path, slowly enough for the joint to catch up."""
     before, after, later = path
-    most, fastest = PATHS * joint.max_acceleration, CATCH_UP * joint.max_speed
-    acceleration = max(-most, min(most, (later - 2.0 * after + before) / dt**2))
-    velocity = max(-fastest, min(fastest, (after - before) / dt))
+    max_acceleration = PATH_ACCELERATION_SHARE * joint.max_acceleration
+    max_speed = PATH_SPEED_SHARE * joint.max_speed
+    wanted = (later - 2.0 * after + before) / dt**2
+    acceleration = max(-max_acceleration, min(max_acceleration, wanted))
+    velocity = max(-max_speed, min(max_speed, (after - before) / dt))
     return JointPoint(before, velocity - acceleration * dt, acceleration)
 
 
-def _braking_in_time(velocity: float, now: JointPoint, joint: JointDescription) -> float:
-    """Return the part of `velocity` from which the joint comes to rest within its range."""
-    left = joint.upper - now.position if velocity > 0 else now.position - joint.lower
-    most = min(joint.max_speed, math.sqrt(joint.max_acceleration * max(0.0, left)))
-    return max(-most, min(most, velocity))
+def _stoppable_velocity(velocity: float, now: JointPoint, joint: JointDescription) -> float:
+    """Return `velocity`, limited so that the joint can stop within its range."""
+    room = joint.upper - now.position if velocity > 0 else now.position - joint.lower
+    max_speed = min(joint.max_speed, math.sqrt(joint.max_acceleration * max(0.0, room)))
+    return max(-max_speed, min(max_speed, velocity))
 
 
 def _input(now: Sequence[JointPoint], limits: Sequence[JointDescription]) -> Any:
-    given = _ruckig().InputParameter(len(limits))
-    given.current_position = [point.position for point in now]
-    given.current_velocity = [_rounded(point.velocity) for point in now]
-    given.current_acceleration = [_rounded(point.acceleration) for point in now]
-    given.max_acceleration = [joint.max_acceleration for joint in limits]
-    given.max_jerk = [joint.max_jerk for joint in limits]
-    return given
+    inputs = _ruckig().InputParameter(len(limits))
+    inputs.current_position = [point.position for point in now]
+    inputs.current_velocity = [_rounded(point.velocity) for point in now]
+    inputs.current_acceleration = [_rounded(point.acceleration) for point in now]
+    inputs.max_acceleration = [joint.max_acceleration for joint in limits]
+    inputs.max_jerk = [joint.max_jerk for joint in limits]
+    return inputs
 
 
 def _rounded(value: float) -> float:
-    return 0.0 if abs(value) < NOTHING else value
+    return 0.0 if abs(value) < ROUNDING else value
 
 
-def _after(given: Any, dt: float) -> tuple[JointPoint, ...]:
-    """Return the points `dt` [s] later; where Ruckig finds no common way, each joint has its own.
+def _advanced(inputs: Any, dt: float) -> tuple[JointPoint, ...]:
+    """Return the joints after `dt` [s].
 
-    Joints for which it finds none either brake.
+    If Ruckig finds no synchronized motion, each joint moves by itself. If it still fails, all
+    joints brake.
     """
     ruckig = _ruckig()
-    path = ruckig.Trajectory(given.degrees_of_freedom)
-    alone = [ruckig.Synchronization.No] * given.degrees_of_freedom
-    for synchronization in (given.per_dof_synchronization, alone):
-        given.per_dof_synchronization = synchronization
+    trajectory = ruckig.Trajectory(inputs.degrees_of_freedom)
+    independent = [ruckig.Synchronization.No] * inputs.degrees_of_freedom
+    for synchronization in (inputs.per_dof_synchronization, independent):
+        inputs.per_dof_synchronization = synchronization
         try:
-            _solver(given.degrees_of_freedom).calculate(given, path)
-        except ruckig.RuckigError:  # numerical, where a joint hardly moves
+            _solver(inputs.degrees_of_freedom).calculate(inputs, trajectory)
+        except ruckig.RuckigError:  # numerical failure for joints that hardly move
             continue
-        return tuple(map(JointPoint, *path.at_time(dt)))
+        return tuple(map(JointPoint, *trajectory.at_time(dt)))
     return tuple(
         _braked(*motion, dt)
         for motion in zip(
-            given.current_position, given.current_velocity, given.max_acceleration, strict=True
+            inputs.current_position, inputs.current_velocity, inputs.max_acceleration, strict=True
         )
     )
 
 
-def _braked(position: float, velocity: float, most: float, dt: float) -> JointPoint:
-    slower = math.copysign(max(0.0, abs(velocity) - most * dt), velocity)
-    return JointPoint(position + slower * dt, slower)
+def _braked(position: float, velocity: float, deceleration: float, dt: float) -> JointPoint:
+    speed = math.copysign(max(0.0, abs(velocity) - deceleration * dt), velocity)
+    return JointPoint(position + speed * dt, speed)
 
 
-def _possible(step: JointPoint, limits: JointDescription) -> bool:
-    fast = abs(step.velocity) > OVER * limits.max_speed + SLACK
-    return not fast and abs(step.acceleration) <= OVER * limits.max_acceleration + SLACK
+def _within_limits(step: JointPoint, limits: JointDescription) -> bool:
+    too_fast = abs(step.velocity) > OVER * limits.max_speed + SLACK
+    return not too_fast and abs(step.acceleration) <= OVER * limits.max_acceleration + SLACK
 
 
 def _ruckig() -> Any:

@@ -1,4 +1,4 @@
-"""Joint motion within limits, from tick to tick. Pure functions."""
+"""Joint motion within limits, tick by tick. Pure functions."""
 
 import math
 from collections.abc import Sequence
@@ -8,17 +8,17 @@ import msgspec
 
 from gigabrain_schemas.body import JointDescription
 
-AT_REST_JOINT_SPEED = 0.05  # [rad/s] or [m/s], of a joint that stands still
-BRAKING = 2.0  # times its greatest planned acceleration, by which a joint is stopped
-OVERRUN = 0.6  # of the way that a joint lags behind, which it runs on if nothing takes it back
+AT_REST_JOINT_SPEED = 0.05  # [rad/s] or [m/s]; a slower joint counts as at rest
+BRAKING_FACTOR = 2.0  # times a joint's maximum planned acceleration, to stop it
+OVERRUN_SHARE = 0.6  # of its lag, by which a servo would overrun a stop
 
 
 class JointMotion(msgspec.Struct, frozen=True):
-    """The position and velocity of a joint; of one that is sent there, its servo's lag as well."""
+    """Measured motion of a joint, or its commanded motion with its servo's lag."""
 
     position: float  # [rad] or [m]
     velocity: float = 0.0  # [rad/s] or [m/s]
-    lag: float = 0.0  # [rad] or [m], how far the joint is still from there
+    lag: float = 0.0  # [rad] or [m], from the servo to the commanded position
 
 
 def joints_at_rest(measured: Sequence[JointMotion]) -> bool:
@@ -27,33 +27,33 @@ def joints_at_rest(measured: Sequence[JointMotion]) -> bool:
 
 
 def frozen(now: JointMotion) -> JointMotion:
-    """Return a joint that stops where it is."""
+    """Return `now` without velocity and lag."""
     return JointMotion(now.position)
 
 
 def stopped(now: JointMotion) -> JointMotion:
-    """Return a joint that comes to rest as soon as its servo can make it.
+    """Return the command that brings a joint to rest as soon as its servo can.
 
-    The servo is still on its way to `now`. It stops on the rest of that way.
+    The servo still lags behind `now`, so the command goes back by a part of that lag.
     """
-    return JointMotion(now.position - OVERRUN * now.lag)
+    return JointMotion(now.position - OVERRUN_SHARE * now.lag)
 
 
 def braked(now: JointMotion, limits: JointDescription, dt: float) -> JointMotion:
-    """Return where a joint is sent after `dt` [s] of braking harder than any plan would.
+    """Return the command after `dt` [s] of braking, which is harder than in any plan.
 
-    As `stopped`, it takes back what was sent ahead for the speed that is lost.
+    Like `stopped`, it takes back a part of the lag: that of the lost speed.
     """
-    slower = max(0.0, abs(now.velocity) - BRAKING * limits.max_acceleration * dt)
-    after = _moved(now, math.copysign(slower, now.velocity), limits, dt)
+    speed = max(0.0, abs(now.velocity) - BRAKING_FACTOR * limits.max_acceleration * dt)
+    after = _moved(now, math.copysign(speed, now.velocity), limits, dt)
     ahead = limits.gains.feed_forward * (now.velocity - after.velocity)
-    lost = min(now.lag, ahead, key=abs)  # a joint that has just set off lags behind by less
+    lost = min(now.lag, ahead, key=abs)  # a joint that has just started lags less
     lag = min(now.lag - lost, after.lag, key=abs)
-    return JointMotion(after.position - OVERRUN * lost, after.velocity, lag)
+    return JointMotion(after.position - OVERRUN_SHARE * lost, after.velocity, lag)
 
 
 class SpeedBand(NamedTuple):
-    """The velocities that a joint may have now [rad/s] or [m/s]."""
+    """Range of velocities that a joint may have now [rad/s] or [m/s]."""
 
     lowest: float
     highest: float
@@ -69,9 +69,9 @@ def approach(
     dt: float,
     band: SpeedBand = ANY_SPEED,
 ) -> JointMotion:
-    """Return where a joint gets within `dt` [s] on the way to where `target` is then.
+    """Return a joint after `dt` [s] on the way to `target`, which is given for that time.
 
-    It keeps to its greatest speed and acceleration, and does not run past a target that rests.
+    It stays within its maximum speed and acceleration, and does not overshoot a target at rest.
     """
     behind = target.position - target.velocity * dt - now.position
     catch_up = min(abs(behind) / dt, braking_speed(abs(behind), limits.max_acceleration, dt))
@@ -86,9 +86,9 @@ def accelerated(
     dt: float,
     band: SpeedBand = ANY_SPEED,
 ) -> JointMotion:
-    """Return where a joint gets within `dt` [s] that should move at `velocity`.
+    """Return a joint after `dt` [s] of acceleration towards `velocity`.
 
-    A joint that is faster than `band` allows brakes at its greatest acceleration.
+    A joint that is faster than `band` allows brakes at its maximum acceleration.
     """
     change = limits.max_acceleration * dt
     velocity = max(-limits.max_speed, min(limits.max_speed, velocity))
@@ -98,9 +98,9 @@ def accelerated(
 
 
 def braking_speed(distance: float, acceleration: float, dt: float) -> float:
-    """Return the greatest speed from which steps of `dt` [s] come to rest within `distance`.
+    """Return the maximum speed from which a joint stops within `distance`, in steps of `dt` [s].
 
-    From n whole changes of speed and a part of one, n + 1 steps are left.
+    A speed of n full speed changes and a part of one takes n + 1 steps.
     """
     change = acceleration * dt
     steps = 2 * max(0.0, distance) / (change * dt)
@@ -109,7 +109,7 @@ def braking_speed(distance: float, acceleration: float, dt: float) -> float:
 
 
 def _moved(now: JointMotion, velocity: float, limits: JointDescription, dt: float) -> JointMotion:
-    """Return `now` after `dt` [s], slow enough to come to rest within the joint's range."""
+    """Return `now` after `dt` [s] at `velocity`, limited so that it can stop within its range."""
     a = limits.max_acceleration
     highest = braking_speed(limits.upper - now.position, a, dt)
     lowest = -braking_speed(now.position - limits.lower, a, dt)
@@ -121,10 +121,10 @@ def _moved(now: JointMotion, velocity: float, limits: JointDescription, dt: floa
 
 
 def _lag(now: JointMotion, position: float, limits: JointDescription, dt: float) -> float:
-    """Return how far a servo is behind `position`, to which it was sent on within `dt` [s].
+    """Return the servo's lag after its command has moved to `position` within `dt` [s].
 
-    It follows with the time constant that its feed-forward makes up for.
+    The servo is a first-order lag. Its feed-forward compensates for the time constant.
     """
-    late = limits.gains.feed_forward
-    kept = math.exp(-dt / late) if late else 0.0
-    return now.lag * kept + (position - now.position) / dt * late * (1.0 - kept)
+    time_constant = limits.gains.feed_forward
+    decay = math.exp(-dt / time_constant) if time_constant else 0.0
+    return now.lag * decay + (position - now.position) / dt * time_constant * (1.0 - decay)

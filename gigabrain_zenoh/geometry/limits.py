@@ -10,11 +10,11 @@ from gigabrain_schemas.safety import SpeedCaps
 
 ZERO = Velocity()
 NO_CAPS = SpeedCaps()
-AT_REST_SPEED, AT_REST_YAW_RATE = 0.01, 0.05  # [m/s], [rad/s], of a body that stands still
+AT_REST_SPEED, AT_REST_YAW_RATE = 0.01, 0.05  # [m/s], [rad/s]; slower is at rest
 
 
 class Limits(msgspec.Struct, frozen=True, kw_only=True):
-    """The limits of one body."""
+    """Maximum speeds and accelerations of one body."""
 
     linear_speed: float  # [m/s]
     lateral_speed: float  # [m/s]
@@ -23,13 +23,13 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True):
     linear_deceleration: float  # [m/s2]
     angular_acceleration: float  # [rad/s2], both ways
     rim_speed: float = math.inf  # [m/s], of each wheel of a differential base
-    half_track: float = 0.0  # [m], from its middle to a wheel
+    half_track: float = 0.0  # [m], from the middle of that base to a wheel
 
 
 class SentCommand(msgspec.Struct, frozen=True):
     """A command sent to the body."""
 
-    tick: int  # from which on it holds
+    tick: int  # in which it begins to apply
     velocity: Velocity
 
 
@@ -64,27 +64,27 @@ def rim_speed(body: BodyDescription) -> float:
 
 
 def clamp(velocity: Velocity, limits: Limits, caps: SpeedCaps = NO_CAPS) -> Velocity:
-    """Return `velocity` within the body's speeds and the present caps, axis by axis.
+    """Return `velocity` limited to the body's speeds and the current caps, axis by axis.
 
-    If a wheel would still be too fast, the body is slower along the same curve.
+    If a wheel would still be too fast, the body drives the same curve more slowly.
     """
     turning = limits.angular_speed if caps.rotation is None else caps.rotation
     turning = min(turning, limits.angular_speed)
-    forward = _within(velocity.linear_x, limits.linear_speed, caps.backward, caps.forward)
-    turn = _within(velocity.angular_z, turning, caps.turn_right, caps.turn_left)
+    forward = _limited(velocity.linear_x, limits.linear_speed, caps.backward, caps.forward)
+    turn = _limited(velocity.angular_z, turning, caps.turn_right, caps.turn_left)
     rim = abs(forward) + abs(turn) * limits.half_track
-    slower = max(1.0, rim / limits.rim_speed)
+    divisor = max(1.0, rim / limits.rim_speed)
     return Velocity(
-        linear_x=forward / slower,
-        linear_y=_within(velocity.linear_y, limits.lateral_speed, caps.right, caps.left),
-        angular_z=turn / slower,
+        linear_x=forward / divisor,
+        linear_y=_limited(velocity.linear_y, limits.lateral_speed, caps.right, caps.left),
+        angular_z=turn / divisor,
     )
 
 
 def ramp(current: Velocity, target: Velocity, limits: Limits, dt: float) -> Velocity:
-    """Return what `current` can become within `dt` [s] on the way to `target`.
+    """Return the velocity after `dt` [s] of acceleration from `current` towards `target`.
 
-    Both have to be within the limits; then so is the result.
+    The result is within the limits if both of them are.
     """
     up, down = limits.linear_acceleration * dt, limits.linear_deceleration * dt
     turn = limits.angular_acceleration * dt
@@ -97,9 +97,9 @@ def ramp(current: Velocity, target: Velocity, limits: Limits, dt: float) -> Velo
 
 
 def _within_rim_speed(current: Velocity, step: Velocity, limits: Limits) -> Velocity:
-    """Let an axis gain only the speed that the other one has left to the wheels.
+    """Reduce the speed that the axes gain, so that no wheel is too fast.
 
-    What slows down is left alone, so this never makes braking slower.
+    An axis that slows down is not changed, so braking is never delayed.
     """
     gain_x = max(0.0, abs(step.linear_x) - abs(current.linear_x))
     gain_z = max(0.0, abs(step.angular_z) - abs(current.angular_z))
@@ -116,7 +116,7 @@ def _within_rim_speed(current: Velocity, step: Velocity, limits: Limits) -> Velo
 
 
 def slowed(current: Velocity, target: Velocity, limits: Limits, dt: float) -> Velocity:
-    """Return `ramp` without speeding up: an axis that would gain speed or reverse keeps its own."""
+    """Return `ramp`, but an axis that would gain speed or reverse keeps its velocity."""
     return ramp(
         current,
         Velocity(
@@ -133,16 +133,16 @@ def _no_faster(current: float, target: float) -> float:
     return target if min(0.0, current) <= target <= max(0.0, current) else current
 
 
-def _within(value: float, limit: float, below: float | None, above: float | None) -> float:
-    lowest = -limit if below is None else -min(limit, below)
-    highest = limit if above is None else min(limit, above)
+def _limited(value: float, limit: float, low_cap: float | None, high_cap: float | None) -> float:
+    lowest = -limit if low_cap is None else -min(limit, low_cap)
+    highest = limit if high_cap is None else min(limit, high_cap)
     return max(lowest, min(highest, value))
 
 
-def _approach(current: float, target: float, up: float, down: float) -> float:
-    """Return one step of an axis; it stops at zero before it reverses."""
+def _approach(current: float, target: float, gain: float, loss: float) -> float:
+    """Return an axis after one step by `gain` or `loss`; it stops at zero before it reverses."""
     if current * target < 0:
         target = 0.0
-    highest = current + (up if current >= 0 else down)
-    lowest = current - (up if current <= 0 else down)
+    highest = current + (gain if current >= 0 else loss)
+    lowest = current - (gain if current <= 0 else loss)
     return max(lowest, min(highest, target))

@@ -1,4 +1,4 @@
-"""Polygons in the plane: corners (n, 2) [m], closed from the last to the first."""
+"""Polygons in the plane: corners (n, 2) [m]; the last one is joined to the first."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ MIN_AREA_M2 = 1e-4
 
 
 def problem(corners: Floats) -> str:
-    """Return why corners make no simple polygon, or an empty text."""
+    """Return why corners are not a simple polygon; an empty text if they are."""
     if edges_cross(corners):
         return "its edges cross"
     return "it has no area" if abs(area(corners)) < MIN_AREA_M2 else ""
@@ -19,22 +19,22 @@ def problem(corners: Floats) -> str:
 
 def area(corners: Floats) -> float:
     """Return the area [m2], negative for a clockwise polygon."""
-    x, y = (corners - corners[0]).T  # small numbers keep their digits
+    x, y = (corners - corners[0]).T  # avoids rounding far from the origin
     return float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
 
 
 def edges_cross(corners: Floats) -> bool:
-    """Return whether any two edges cross or touch, besides neighbours at their corner."""
+    """Return whether any two edges cross or touch, except neighbours at their corner."""
     begin, end = corners, np.roll(corners, -1, axis=0)
     count = len(corners)
     for first in range(count - 2):
         others = np.arange(first + 2, count - (first == 0))
-        if len(others) and _meet(begin[first], end[first], begin[others], end[others]).any():
+        if len(others) and _intersect(begin[first], end[first], begin[others], end[others]).any():
             return True
     return False
 
 
-def _meet(a: Floats, b: Floats, c: Floats, d: Floats) -> NDArray[np.bool_]:
+def _intersect(a: Floats, b: Floats, c: Floats, d: Floats) -> NDArray[np.bool_]:
     """Return which of the segments `c`-`d`, (n, 2) each, meet the segment `a`-`b`."""
     of_c, of_d = _side(a, b, c), _side(a, b, d)
     of_a, of_b = _side(c, d, a), _side(c, d, b)
@@ -55,9 +55,9 @@ def contains(corners: Floats, points: Floats) -> NDArray[np.bool_]:
     inside = np.zeros(len(points), np.bool_)
     x, y = points.T
     for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        beside = np.flatnonzero((ay > y) != (by > y))
-        share = (y[beside] - ay) / (by - ay)
-        inside[beside] ^= x[beside] < ax + share * (bx - ax)
+        crossing = np.flatnonzero((ay > y) != (by > y))
+        share = (y[crossing] - ay) / (by - ay)
+        inside[crossing] ^= x[crossing] < ax + share * (bx - ax)
     return inside
 
 
@@ -74,7 +74,7 @@ def distance(corners: Floats, points: Floats) -> Floats:
 
 
 def edges(polygons: Sequence[Floats]) -> tuple[Floats, Floats, NDArray[np.intp]]:
-    """Return where all edges of `polygons` begin and end, (n, 2) each, and the first of each."""
+    """Return begins and ends of all edges, (n, 2) each, and the index of each polygon's first."""
     begin = np.concatenate(polygons)
     counts = np.array([len(one) for one in polygons])
     first = np.cumsum(counts) - counts
@@ -86,7 +86,7 @@ def edges(polygons: Sequence[Floats]) -> tuple[Floats, Floats, NDArray[np.intp]]
 def points_on_edges(polygons: Sequence[Floats], step: float, most: int | None = None) -> Floats:
     """Return points (n, 2) on the edges of all `polygons`, corners included.
 
-    They are at most `step` [m] apart, unless an edge would need more than `most`.
+    They are at most `step` [m] apart, but an edge has at most `most` of them.
     """
     begin, end, _ = edges(polygons)
     length = np.hypot(*(end - begin).T)
@@ -98,6 +98,6 @@ def points_on_edges(polygons: Sequence[Floats], step: float, most: int | None = 
 
 
 def spread(counts: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return each index as often as `counts` (n,) says, and how often it has come before."""
+    """Repeat each index `counts` (n,) times. Return the indices and the repetition numbers."""
     index = np.repeat(np.arange(len(counts)), counts)
     return index, np.arange(len(index)) - np.repeat(np.cumsum(counts) - counts, counts)

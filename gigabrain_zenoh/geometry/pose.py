@@ -16,8 +16,8 @@ from gigabrain_schemas.sensors import LaserScan
 
 ORIGIN = Pose(x=0.0, y=0.0, yaw=0.0)
 
-KEPT_STATES = 100  # states; 2 s
-MAX_GAP_TICKS = 10  # interpolate two states; over wider gaps no pose is interpolated
+KEPT_STATES = 100  # 2 s
+MAX_GAP_TICKS = 10  # between states; no pose is interpolated over wider gaps
 
 
 def wrap_angle(angle: float) -> float:
@@ -123,10 +123,11 @@ class PoseHistory(Struct, frozen=True):
 
 
 class PlacedScans:
-    """Calls `on_scan(scan, pose)` for each scan; the pose is None where states are missing.
+    """Calls `on_scan(scan, pose)` for each scan; the pose is None if states are missing.
 
     A scan that arrives before the state of its tick waits for it, so that the outcome does not
-    depend on which message came first. If the next scan comes first, it goes to `on_missed`.
+    depend on which message came first. If another scan comes first, the waiting scan goes to
+    `on_missed`.
     """
 
     def __init__(
@@ -151,9 +152,9 @@ class PlacedScans:
         self._place(scan)
 
     def _place(self, scan: LaserScan) -> None:
-        """Hand a scan on if its tick has been reached; otherwise keep it waiting."""
-        here = self.history
+        """Pass a scan on if its tick has been reached; otherwise keep it waiting."""
+        history = self.history
         self._waiting = scan
-        if scan.boot == here.boot and scan.basis <= here.newest_tick:
+        if scan.boot == history.boot and scan.basis <= history.newest_tick:
             self._waiting = None
-            self._on_scan(scan, here.at(scan.boot, scan.basis))
+            self._on_scan(scan, history.at(scan.boot, scan.basis))

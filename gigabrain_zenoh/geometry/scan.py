@@ -1,4 +1,4 @@
-"""Evaluates one scan of a planar lidar: positions of its hits, and whether it is plausible."""
+"""Checks whether a scan of a planar lidar is plausible, and locates its hits."""
 
 import math
 from functools import lru_cache
@@ -10,12 +10,12 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.sensors import LaserScan
 
-EDGE = 1e-9  # [rad], [m], tolerance, so that rounding does not decide at an edge
-STUCK_BEAMS = 8  # from this many beams on, exactly equal ranges mean a stuck lidar
+EDGE = 1e-9  # [rad], [m], tolerance at edges for rounding
+STUCK_BEAMS = 8  # lidars with fewer beams are not checked for equal ranges
 
 
 def scan_problem(lidar: Lidar, values: NDArray[np.float32], nearest: float) -> str:
-    """Return why a scan is not plausible, or an empty text. A blind lidar does not mean free space.
+    """Return why a scan is not plausible, or an empty text. A blind lidar shows no free space.
 
     The ranges `values` (n,) are in [m]; those below `nearest` [m] are the lidar's own housing.
     """
@@ -30,8 +30,8 @@ def scan_problem(lidar: Lidar, values: NDArray[np.float32], nearest: float) -> s
         return "the lidar sees nothing at all"
     if 2 * found <= count:
         return f"{count - found} of {count} beams are missing"
-    alike = count >= STUCK_BEAMS and values[0] == values[1] < np.inf
-    if alike and (values == values[0]).all():
+    suspicious = count >= STUCK_BEAMS and values[0] == values[1] < np.inf
+    if suspicious and (values == values[0]).all():
         return "all beams report the same distance"
     return ""
 
@@ -53,14 +53,14 @@ def hits(lidar: Lidar, scan: LaserScan, nearest: float) -> tuple[Floats, Floats]
     """Return x and y of the hits of `scan` in the body's frame [m], (n,) each."""
     values = scan.ranges_m
     farthest = min(scan.range_max, lidar.range_max)
-    hit = (values >= nearest) & (values <= farthest)  # nan and inf are neither
+    hit = (values >= nearest) & (values <= farthest)  # False for nan and inf
     cosines, sines = beams(len(values), scan.angle_min, scan.angle_increment, lidar.yaw)
     reached = values[hit]
     return lidar.x + reached * cosines[hit], lidar.y + reached * sines[hit]
 
 
 def median(values: NDArray[np.floating]) -> float:
-    """Return the median of `values` (n,), which are finite. numpy's takes five times as long."""
+    """Return the median of finite `values` (n,). numpy's median takes five times as long."""
     ordered, count = np.sort(values), len(values)
     return float((ordered[(count - 1) // 2] + ordered[count // 2]) / 2)
 

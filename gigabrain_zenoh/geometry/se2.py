@@ -23,7 +23,7 @@ def wrap(angle: Floats) -> Floats:
 
 
 def wrapped(pose: Floats) -> Floats:
-    """Return the same poses, their yaw within -pi to pi."""
+    """Return the same poses with their yaw within -pi to pi."""
     if pose.ndim == 1:
         x, y, yaw = pose.tolist()
         return np.array((x, y, _wrapped(yaw)))
@@ -50,7 +50,7 @@ def inverse(pose: Floats) -> Floats:
     return np.stack((x, y, wrap(-pose[..., 2])), axis=-1)
 
 
-# the same for single poses, which take six times as long in arrays
+# the same for single poses; numpy takes six times as long for one
 
 
 def _wrapped(angle: float) -> float:

@@ -15,7 +15,7 @@ REPEAT_TICKS = 2  # safety's verdict is repeated every 40 ms, and at once when i
 
 
 def scan_limit_ns(body: BodyDescription) -> int:
-    """Return the allowed age of sensor data: `scan_age`, or 1.5 scan periods if more [ns]."""
+    """Return the allowed age of sensor data: `scan_age`, or 1.5 scan periods if longer [ns]."""
     period_ns = 1e9 / body.lidar.rate_hz if body.lidar else 0.0
     return round(max(body.thresholds.scan_age * 1e9, 1.5 * period_ns))
 

@@ -13,10 +13,10 @@ from gigabrain_schemas.arrays import Floats
 
 Corners = tuple[tuple[float, float], ...]
 
-STEP = 0.02  # [m], how far any part of the body moves between two checks
+STEP = 0.02  # [m], maximum motion of any part of the body between two checks
 MAX_STEPS = 1000  # checks along one path; longer paths use longer steps
-AT_ONCE = 1_000_000  # distances from points to edges that are computed in one batch
-NEARER = 0.005  # [m], how much closer a point already within the margin may come
+BATCH_SIZE = 1_000_000  # distances from points to edges per batch, to bound memory
+MAX_APPROACH = 0.005  # [m], by which a point already within the margin may come closer
 
 
 class Edges(NamedTuple):
@@ -100,7 +100,7 @@ def _both_ways(
     width: tuple[float, float],
     margin: float,
 ) -> tuple[float | None, float | None]:
-    """Return the shortest distances from a body to a point in its strip, ahead of it and behind it.
+    """Return the distances from a body to the nearest points in its strip, ahead and behind.
 
     The body covers `length` along the strip and `width` across. A point inside the footprint counts
     as ahead or behind, by the half that it is in.
@@ -111,10 +111,10 @@ def _both_ways(
     inside = (along >= rear) & (along <= front) & (across >= low) & (across <= high)
     ahead = along[(along > front) | (inside & (along > 0))] - front
     behind = rear - along[(along < rear) | (inside & (along < 0))]
-    return _least(ahead), _least(behind)
+    return _shortest(ahead), _shortest(behind)
 
 
-def _least(ways: Floats) -> float | None:
+def _shortest(ways: Floats) -> float | None:
     return max(0.0, float(ways.min())) if ways.size else None
 
 
@@ -127,10 +127,10 @@ def turning(
     if not len(near):
         return None, None
     angles = _steps(min(reach, math.tau), STEP / outer)
-    still = np.zeros_like(angles)
+    zeros = np.zeros_like(angles)
     return (
-        _free(footprint, near, margin, angles, (still, still, angles)),
-        _free(footprint, near, margin, angles, (still, still, -angles)),
+        _free_way(footprint, near, margin, angles, (zeros, zeros, angles)),
+        _free_way(footprint, near, margin, angles, (zeros, zeros, -angles)),
     )
 
 
@@ -151,15 +151,15 @@ def arc(
     near = points[np.hypot(points[:, 0], points[:, 1]) <= outer + margin + reach]
     if not len(near):
         return None
-    quickest = speed + abs(w) * outer  # upper bound of the speed of any corner
-    ways = _steps(reach, STEP * speed / quickest)
+    max_corner_speed = speed + abs(w) * outer  # upper bound of the speed of any corner
+    ways = _steps(reach, STEP * speed / max_corner_speed)
     yaw = ways * (w / speed)
     if abs(w) < 1e-6:
         sine, cosine = ways / speed, np.zeros_like(ways)
     else:
         sine, cosine = np.sin(yaw) / w, (1.0 - np.cos(yaw)) / w
     x, y = vx * sine - vy * cosine, vx * cosine + vy * sine
-    return _free(footprint, near, margin, ways, (x, y, yaw))
+    return _free_way(footprint, near, margin, ways, (x, y, yaw))
 
 
 def _steps(reach: float, step: float) -> Floats:
@@ -167,30 +167,30 @@ def _steps(reach: float, step: float) -> Floats:
     return np.arange(0.0, reach + step, step)
 
 
-def _free(
+def _free_way(
     footprint: Corners,
     points: Floats,
     margin: float,
     ways: Floats,
     poses: tuple[Floats, Floats, Floats],
 ) -> float | None:
-    """Return the last of `ways` (k,) before the footprint touches a point.
+    """Return the last of `ways` (k,) before the footprint touches a point; None if it never does.
 
-    Its `poses` there are x, y and yaw, (k,) each.
+    The footprint's `poses` there are x, y and yaw, (k,) each.
 
-    A point within the margin from the start is touched when the body comes closer to it. Points
-    inside the footprint are ignored here, or the body could never turn away from them. The straight
-    directions check those.
+    A point that is within the margin from the start is touched when the body comes closer to it.
+    Points inside the footprint are ignored, so that the body can turn away from them. `straight`
+    takes them into account.
     """
     hull, (x, y, yaw) = edges(footprint), poses
     begin = depth(hull, points)
-    points, begin = points[begin > NEARER], begin[begin > NEARER]
+    points, begin = points[begin > MAX_APPROACH], begin[begin > MAX_APPROACH]
     if not len(points):
         return None
-    allowed = np.minimum(margin, begin - NEARER)
-    many = max(1, AT_ONCE // (len(points) * len(hull.offsets)))
-    for first in range(0, len(ways), many):
-        part = slice(first, first + many)
+    allowed = np.minimum(margin, begin - MAX_APPROACH)
+    batch = max(1, BATCH_SIZE // (len(points) * len(hull.offsets)))
+    for first in range(0, len(ways), batch):
+        part = slice(first, first + batch)
         dx, dy = points[:, 0] - x[part, None], points[:, 1] - y[part, None]
         cosine, sine = np.cos(yaw[part])[:, None], np.sin(yaw[part])[:, None]
         seen = np.stack([cosine * dx + sine * dy, cosine * dy - sine * dx], axis=-1)
