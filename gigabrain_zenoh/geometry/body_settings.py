@@ -78,8 +78,8 @@ def check_safe(file: BodyDescription, wanted: BodyDescription) -> None:
 def restricted(file: BodyDescription, settings: Mapping[str, float]) -> BodyDescription:
     """Return the body of a file with changed settings, by path. Raises ValueError if unsafe.
 
-    A slower car keeps its turning radius: its yaw rate is reduced like its speed. The following
-    tolerances of `thresholds` are limited to the new speeds or their defaults, if those are higher.
+    A slower car keeps its turning radius: its yaw rate is reduced like its speed. The
+    tolerances `follow_*` are limited to the new speeds, but not below their defaults.
     """
     top = {path: value for path, value in settings.items() if "." not in path}
     inner = {path.partition(".")[2]: settings[path] for path in settings if "." in path}

@@ -1,4 +1,4 @@
-"""The place of a thing in a camera's picture, and hits of the scan that may hide it."""
+"""Locates things in a camera's picture, and finds scan hits that may hide them."""
 
 import math
 from typing import NamedTuple
@@ -9,21 +9,24 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.body import Camera
 from gigabrain_zenoh.vision.camera_model import rotation
 
-EDGE = 0.08  # of the picture's width and height, at its rim: what is there may be cut off
-MIN_PX = 10.0  # a smaller thing is not surely recognised
+RIM_SHARE = 0.08  # of the picture's width and height; things in this rim may be cut off
+MIN_PX = 10.0  # smaller things are not recognised reliably
 NEAREST_M = 0.35
-BEAM_RAD = math.radians(1.5)  # beside a line of sight, in which a hit hides what is behind
+BEAM_RAD = math.radians(1.5)  # half width of a line of sight; hits in it hide what is behind them
 
 
 class Spot(NamedTuple):
-    """The place of a thing in a picture."""
+    """Position of a thing in a picture."""
 
     pixel: tuple[float, float]
     depth: float  # [m], along the camera's axis
 
 
 class CameraView:
-    """A camera as its file mounts it, without its distortion: for what is well inside."""
+    """A camera as mounted in the body's file, for things well inside its picture.
+
+    Distortion is ignored.
+    """
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
@@ -31,9 +34,10 @@ class CameraView:
         self._turn = rotation(camera.roll, camera.pitch, camera.yaw)
 
     def spot(self, position: Floats, extent: float, farthest: float) -> Spot | None:
-        """Return where a thing (3,) [m] of an `extent` [m], in the body's frame, is seen.
+        """Return where a thing of size `extent` [m] at `position` (3,) [m] is in the picture.
 
-        None if it is cut off, too small, too near, or more than `farthest` [m] away.
+        The position is in the body's frame. None if the thing is cut off, too small, too near, or
+        more than `farthest` [m] away.
         """
         camera = self._camera
         depth, left, up = (self._turn.T @ (position - self._origin)).tolist()
@@ -42,21 +46,24 @@ class CameraView:
         fx, fy, cx, cy = camera.pinhole
         u, v = cx - fx * left / depth, cy - fy * up / depth
         half = fx * extent / 2 / depth
-        rim_u, rim_v = EDGE * camera.width + half, EDGE * camera.height + half
+        rim_u, rim_v = RIM_SHARE * camera.width + half, RIM_SHARE * camera.height + half
         inside = rim_u <= u <= camera.width - rim_u and rim_v <= v <= camera.height - rim_v
         return Spot((u, v), depth) if inside and 2 * half >= MIN_PX else None
 
     def hidden(self, hits: Floats, place: tuple[float, float], before: float) -> bool:
-        """Return whether a hit of the scan (n, 2) lies on the way to a place, and `before` it [m].
+        """Return whether one of the scan's `hits` (n, 2) hides a place.
 
-        All in the body's frame. What the scan does not meet, because it is low, is not known.
+        It must be on the line of sight, and more than `before` [m] nearer. All are in the body's
+        frame. Low obstacles, which the scan misses, are not considered.
         """
         if not len(hits):
             return False
         way = np.array(place) - self._origin[:2]
-        far = float(np.hypot(*way))
+        distance = float(np.hypot(*way))
         off = hits - self._origin[:2]
-        along = off @ way / max(far, 1e-6)
-        beside = np.abs(off[:, 0] * way[1] - off[:, 1] * way[0]) / max(far, 1e-6)
-        hiding = (along > 0.05) & (along < far - before) & (beside < along * math.tan(BEAM_RAD))
+        along = off @ way / max(distance, 1e-6)
+        beside = np.abs(off[:, 0] * way[1] - off[:, 1] * way[0]) / max(distance, 1e-6)
+        hiding = (
+            (along > 0.05) & (along < distance - before) & (beside < along * math.tan(BEAM_RAD))
+        )
         return bool(hiding.any())

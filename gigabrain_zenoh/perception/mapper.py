@@ -48,10 +48,10 @@ log = logging.getLogger(__name__)
 
 MAP_TICKS = round(1e9 / TICK_NS)  # shortest interval between published maps
 MAP_AGAIN_TICKS = 2 * MAP_TICKS  # interval after which an unchanged map is published again
-FREE_M = 10.0  # a beam without a hit marks free space up to this distance at most,
-SHORT_M = 0.05  # and ends this much before the lidar's range
+MAX_FREE_M = 10.0  # maximum distance at which a beam without a hit marks free space,
+RANGE_MARGIN_M = 0.05  # which ends this much before the lidar's range
 SETTLE_NS, SETTLES = 20_000_000, 100  # poll interval and count: a save waits for idle threads
-TIMED = 1000  # scans whose processing time is kept for the percentiles
+TIMED_SCANS = 1000  # whose processing times give the percentiles
 
 
 def chart_of(config: PerceptionConfig, in_time: InTime = done) -> RobotMap:
@@ -86,7 +86,7 @@ def view_of(lidar: Lidar, scan: LaserScan, hits: NDArray[np.floating]) -> View:
     cosines, sines = beams(len(values), scan.angle_min, scan.angle_increment, lidar.yaw)
     sensor = np.array((lidar.x, lidar.y))
     clear = values == np.inf if lidar.no_return == "free" else np.zeros(len(values), np.bool_)
-    reach = min(scan.range_max - SHORT_M, FREE_M)
+    reach = min(scan.range_max - RANGE_MARGIN_M, MAX_FREE_M)
     free = sensor + reach * np.column_stack((cosines[clear], sines[clear]))
     return View(Scan.of(hits, free), sensor)
 
@@ -104,10 +104,10 @@ class Mapper:
         self._published: OccupancyGrid | None = None
         self._checked_tick = self._sent_tick = 0
         self._autosave = self._autosave_of(config)
-        self._before: OdometrySample | None = None  # at the last scan in a restored map
-        self._logged, self._left_out = "", ""
+        self._restored: OdometrySample | None = None  # at the last scan of a restored map
+        self._logged_pose, self._skip_reason = "", ""
         self._early = False  # the first scan arrived without its odometry
-        self._took_ms = NewestValues(TIMED)
+        self._took_ms = NewestValues(TIMED_SCANS)
         self._saving = asyncio.Lock()  # concurrent saves would write to the same files
         self._zones = ZoneServer(bus, config.state_dir, lambda: self._tick)
         found = zone_file.load(map_file.path_of(config.map)) if config.map else ZoneFile()
@@ -120,7 +120,7 @@ class Mapper:
         bus.report = self._report
 
     def process_scan(self, scan: LaserScan, world: WorldModel) -> None:
-        """Process a scan and its world, or skip a bad one, and one whose odometry is missing."""
+        """Process a scan and its world. Skip a bad scan, or one whose odometry is missing."""
         if world.scan_problem:
             self._skip(world.scan_problem)
             return
@@ -144,7 +144,7 @@ class Mapper:
             self._autosave.close()
 
     async def finish_writing(self) -> None:
-        """Return once zones and objects are written."""
+        """Wait until zones and objects are written."""
         await self._zones.finish_writing()
         if self._objects:
             await self._objects.finish_writing()
@@ -174,14 +174,14 @@ class Mapper:
         if self._boot:
             self._chart.lose("the driver has restarted")
         self._boot, self._fusion, self._last, self._published = boot, OdometryFusion(), None, None
-        self._before, self._early = None, False
+        self._restored, self._early = None, False
         self._hints.clear()
         resumed = not self._mapped and self._bus.input_log.live and self._resume(boot)
         self._zones.set_boot(boot)
-        self._watch(boot, body, resumed=resumed)
+        self._start_objects(boot, body, resumed=resumed)
 
-    def _watch(self, boot: int, body: BodyDescription, *, resumed: bool) -> None:
-        """Remember what the cameras of a body see, if it has some."""
+    def _start_objects(self, boot: int, body: BodyDescription, *, resumed: bool) -> None:
+        """Start the object memory of a body with cameras, or restart it for a new boot."""
         if self._objects is None and body.cameras:
             from gigabrain_zenoh.perception.object_server import ObjectServer  # as above
 
@@ -195,23 +195,23 @@ class Mapper:
     def _resume(self, boot: int) -> bool:
         """Resume the map and the zones of an earlier process of this run of the driver.
 
-        Return whether there is one to go on with.
+        Return whether there was a map to resume.
         """
         kept = self._zones.restore(boot)
-        if kept and kept.maps_loaded:  # another map than that of the settings
+        if kept and kept.maps_loaded:  # not the map of the settings
             try:
                 self._use(replace(self._config, map=kept.map, mapping=kept.mapping), loaded=False)
             except ConfigError as error:
                 text = f"map {kept.map!r} is not loaded again: {error}; going on without it"
                 log.warning("%s", text, extra={"data": {"event": "map"}})
                 if not kept.mapping == self._config.mapping == "slam":
-                    return False  # what was kept does not fit the map of the settings
+                    return False  # the kept state does not fit the map of the settings
         if self._autosave:
             self._resume_map(self._autosave, boot)
-        found = bool(self._config.map) and kept and kept.map == self._zones.map
-        if kept and (self._mapped or found):
+        same_map = bool(self._config.map) and kept and kept.map == self._zones.map
+        if kept and (self._mapped or same_map):
             self._zones.resume(kept)
-        return self._mapped or bool(found)
+        return self._mapped or bool(same_map)
 
     def _resume_map(self, autosave: Autosave, boot: int) -> None:
         """Resume the newest intact map that was saved during this run of the driver, if any."""
@@ -228,7 +228,7 @@ class Mapper:
             self._chart.close()
             self._chart, self._blank, self._mapped = chart, False, True
             odometry = np.array(head.odometry)
-            self._before = OdometrySample(head.tick, odometry, odometry, slipping=False, jumps=0)
+            self._restored = OdometrySample(head.tick, odometry, odometry, slipping=False, jumps=0)
             data = {"event": "map_restored", "map_tick": head.tick}
             log.info("resumed the map of tick %d", head.tick, extra={"data": data})
             return
@@ -259,7 +259,7 @@ class Mapper:
         self._bus.publish(POSE, message_of(place), basis=scan.basis)
         self._log_pose(place)
         self._publish_map(scan.basis)
-        self._left_out = ""
+        self._skip_reason = ""
         self._took_ms.add((time.perf_counter() - began) * 1e3)
 
     def _motion(self, moment: OdometrySample) -> tuple[Floats, Floats]:
@@ -268,8 +268,8 @@ class Mapper:
         The first scan of a new map is placed at its odometry pose. After a crash of this process,
         positions in the map thus stay the same, except for the odometry drift since then.
         """
-        last = self._last or self._before or moment
-        self._last, self._before = moment, None
+        last = self._last or self._restored or moment
+        self._last, self._restored = moment, None
         blank, self._blank = self._blank, False
         step, noise = way(last, moment)
         if last.jumps != moment.jumps:
@@ -277,10 +277,10 @@ class Mapper:
         return moment.fused if blank else step, noise
 
     def _suggest(self, moment: OdometrySample) -> None:
-        """Tell the map where the robot is by a tag in the newest picture, or by a person."""
-        seen = self._objects and self._objects.hint()
-        if seen:
-            self._hints.add(*seen)
+        """Pass the map a hint about the pose, from a tag in the newest picture or from a person."""
+        by_tag = self._objects and self._objects.hint()
+        if by_tag:
+            self._hints.add(*by_tag)
         hint = self._hints.at(moment)
         if hint:
             self._chart.suggest(hint)
@@ -288,12 +288,11 @@ class Mapper:
     def _autosave_map(self, autosave: Autosave, before: OdometrySample) -> None:
         """Save the map as it was at the scan `before`, when a save is due.
 
-        The copy is cheap and does not alter the map. A run with saves and a run without behave the
-        same.
+        The snapshot is cheap and does not alter the map. The robot behaves the same without saves.
         """
-        still = self._chart.kept()
-        if still:
-            autosave.save(self._boot, before.tick, before.odometry, still)
+        snapshot = self._chart.kept()
+        if snapshot:
+            autosave.save(self._boot, before.tick, before.odometry, snapshot)
         elif autosave.due(self._boot, before.tick):
             self._chart.keep()
 
@@ -333,9 +332,9 @@ class Mapper:
     def _log_pose(self, place: Place) -> None:
         """Log changes of the localization, with the reason when the robot is not localized."""
         text = "localized" if place.localized else f"not localized: {place.why}"
-        if text == self._logged:
+        if text == self._logged_pose:
             return
-        self._logged = text
+        self._logged_pose = text
         if place.localized:
             x, y, yaw = place.pose.tolist()
             text = f"{text} at ({x:.2f}, {y:.2f}), {np.degrees(yaw):.0f} degrees"
@@ -344,8 +343,8 @@ class Mapper:
 
     def _skip(self, why: str) -> None:
         self._bus.counters["scans_left_out"] += 1
-        if why != self._left_out:
-            self._left_out = why
+        if why != self._skip_reason:
+            self._skip_reason = why
             log.warning("scan not mapped: %s", why, extra={"data": {"event": "scan"}})
 
     async def _save(self, request: MapRequest) -> MapReply:
@@ -365,18 +364,18 @@ class Mapper:
         return MapReply(ok=True, text=text[:500])
 
     async def _saved(self, path: Path, *, replace: bool, same: bool) -> str:
-        """Save the map; `same` tells that it began with the one at `path`. Raises Refused."""
+        """Save the map; `same` if `path` is the map that it began with. Raises Refused."""
         for _ in range(SETTLES):
             if self._chart.settle():
                 break
             await self._bus.clock.sleep_ns(SETTLE_NS)
-        still = self._chart.still()  # what belongs to it is taken with it: a loop may move them
+        snapshot = self._chart.still()  # before zones and objects can move
         self._zones.follow(*self._chart.keyframes())
         zones, objects = zone_file.encoded(self._zones.present), None if same else b""
         if self._objects:
             self._objects.follow(self._chart.keyframes()[1])
             objects = self._objects.encoded()
-        saved, graph = await asyncio.to_thread(still.to_save)
+        saved, graph = await asyncio.to_thread(snapshot.to_save)
         if self._bus.input_log.live:
             await asyncio.to_thread(
                 map_file.save, path, saved, graph, replace=replace, zones=zones, objects=objects
@@ -393,13 +392,13 @@ class Mapper:
         try:
             async with self._saving:
                 await ensure_compiled(MAP_KERNELS if config.mapping == "slam" else LOCALIZE_KERNELS)
-                made = await asyncio.to_thread(_loaded, config, self._bus.input_log.in_time)
+                new = await asyncio.to_thread(_loaded, config, self._bus.input_log.in_time)
         except ConfigError as error:
             text = f"not loaded: {error}"
             log.warning("map for %s: %s", request.source, text, extra={"data": {"event": "map"}})
             return MapReply(ok=False, text=text[:500])
         log_accepted(self._bus, MAP_LOAD.key, request, self._tick)
-        self._use(config, made)
+        self._use(config, new)
         if self._autosave:
             self._autosave.discard()
         text = f"loaded {request.name}; looking for the robot in it"
@@ -409,12 +408,12 @@ class Mapper:
     def _use(
         self,
         config: PerceptionConfig,
-        made: "tuple[RobotMap, ZoneFile] | None" = None,
+        new: "tuple[RobotMap, ZoneFile] | None" = None,
         *,
         loaded: bool = True,
     ) -> None:
-        """Use another map from now on. Raises ConfigError."""
-        chart, zones = made or _loaded(config, self._bus.input_log.in_time)
+        """Switch to another map. Raises ConfigError."""
+        chart, zones = new or _loaded(config, self._bus.input_log.in_time)
         self._chart.close()
         if self._autosave:
             self._autosave.close()

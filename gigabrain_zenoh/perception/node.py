@@ -70,7 +70,7 @@ def _ahead(
     squares: Floats,
     bearings: Floats,
 ) -> NDArray[np.bool_]:
-    """Return the mask of hits in the cone ahead, or in the strip needed to drive on and still turn.
+    """Return the mask of hits in the cone ahead, or in the strip needed to drive on and turn.
 
     `squares` are the squared distances [m2]; only the nearest hit needs a square root.
     """
@@ -94,18 +94,18 @@ def _unknown(problem: str) -> WorldModel:
 
 
 class WorldPublisher:
-    """Publishes a world for each scan, and the newest one again when cameras have seen more."""
+    """Publishes a world for each scan, and the newest one again with new camera contours."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
-        self.cameras: CameraContours | None = None  # imported and made only where there are some
-        self.on_state: Callable[[RobotState], object] = id  # called while there are cameras
-        self._of: BodyDescription | None = None
+        self.cameras: CameraContours | None = None  # imported only for bodies with cameras
+        self.on_state: Callable[[RobotState], object] = id  # called if there are cameras
+        self._description: BodyDescription | None = None
         self._newest: tuple[WorldModel, Pose | None] | None = None
         self.body = bus.latest(BODY, self._on_body)
 
     def close(self) -> None:
-        """End the thread that looks at pictures."""
+        """Stop the thread that processes pictures."""
         if self.cameras:
             self.cameras.close()
             self.cameras = None
@@ -124,7 +124,7 @@ class WorldPublisher:
             world = replace(world, contours=contours, cameras=statuses)
         return self._bus.publish(WORLD, world, basis=world.basis, tick=world.tick)
 
-    def _on_new(self) -> None:
+    def _on_contours(self) -> None:
         """Publish the newest world again, unless its scan is old."""
         time, body = self._bus.time, self.body.current
         if self._newest and body:
@@ -136,14 +136,14 @@ class WorldPublisher:
 
     def _on_body(self, body: Body) -> None:
         description = body.description
-        if description == self._of:
+        if description == self._description:
             return
         self.close()
-        self._of, self._newest = description, None
+        self._description, self._newest = description, None
         if description.fixed_cameras:
             from gigabrain_zenoh.perception.camera_contours import CameraContours
 
-            self.cameras = CameraContours(self._bus, description, self._on_new, self._on_state)
+            self.cameras = CameraContours(self._bus, description, self._on_contours, self._on_state)
 
     def _on_state(self, state: RobotState) -> None:
         self.on_state(state)
@@ -173,7 +173,7 @@ async def _run_with_maps(
 ) -> None:
     maps = config.mapping == "slam"
     kernels = Kernels(MAP_KERNELS if maps else LOCALIZE_KERNELS, bus.input_log.in_time)
-    # a saved map is checked before anything drives by it
+    # a saved map is checked before the robot drives by it
     await kernels.load(wait=config.compile_first or bool(config.map) or not bus.input_log.live)
     async with AsyncExitStack() as stack:
         stack.push_async_callback(kernels.close)
@@ -182,9 +182,9 @@ async def _run_with_maps(
         def mapper() -> "Mapper":
             from gigabrain_zenoh.perception.mapper import Mapper  # imports numba: for maps only
 
-            made = stack.enter_context(closing(Mapper(config, bus, worlds.body)))
-            stack.push_async_callback(made.finish_writing)
-            return made
+            new = stack.enter_context(closing(Mapper(config, bus, worlds.body)))
+            stack.push_async_callback(new.finish_writing)
+            return new
 
         if not kernels.beside:
             mapper()
@@ -215,7 +215,7 @@ def _follow_odometry(
 ) -> None:
     """Publish world models with obstacles placed by odometry; then pass each scan to the mapper.
 
-    The mapper begins at the first state that finds its kernels loaded.
+    The mapper starts at the first state after its kernels are loaded.
     """
     tracker = ObstacleTracker()
     mapper: Mapper | None = None

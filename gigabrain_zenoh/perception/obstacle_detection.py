@@ -27,20 +27,20 @@ MIN_CLUSTER_HITS = 3  # fewer may be noise
 GRAZING_RAD = math.radians(10.0)  # surfaces met at a smaller angle give single hits
 MIN_GAP_M, MAX_GAP_M = 0.10, 0.35  # between two things
 NOISE_GAP_SIGMAS = 5.0  # standard deviations of noise between two neighbours
-TO_DEVIATION = math.sqrt(2.0) / (0.6745 * math.sqrt(6.0))  # from the median of second differences
-LOST_GAP_M, LOST_BEAMS = 0.10, 6.5  # a smaller gap of fewer lost beams is no gap
-MISSING_BEAMS = 2.5  # from this many beams between two hits on, beams are missing
+TO_DEVIATION = math.sqrt(2.0) / (0.6745 * math.sqrt(6.0))  # per median of second differences
+LOST_GAP_M, LOST_BEAMS = 0.10, 6.5  # a smaller gap with fewer lost beams ends no cluster
+MISSING_BEAMS = 2.5  # with a wider step between two hits, beams are missing
 MAX_SIZE_M = 1.2  # a longer cluster is a wall
 MAX_RADIUS_M = 0.75
-EDGE_BEAMS = 1.5  # closer to the end of the field of view a thing may extend beyond it
+EDGE_BEAMS = 1.5  # things closer to the end of the field of view may extend beyond it
 USABLE_RANGE_SHARE = 0.97  # of the lidar's range; farther things may be cut off
 NOISE_M = 0.01  # of a position, in addition to the spacing of the beams
 
 RIM_GATES_M = (0.25, 0.2, 0.15, 0.12, 0.12)  # largest distance of a hit from the rim, by round
 MIN_RIM_HITS = 4  # fewer do not show the centre
-MAX_RIM_RMS_M = 0.05  # distance from the rim; more is another thing
+MAX_RIM_RMS_M = 0.05  # of distances from the rim; more is another thing
 MIN_RIM_NOISE_M = 0.015
-MIN_MIDDLE_DISTANCE_M = 0.02  # a hit closer to the centre does not show where that is
+MIN_MIDDLE_DISTANCE_M = 0.02  # hits closer to the centre do not show its direction
 RIM_TOLERANCE_M = 0.1  # distance from the rim up to which a hit is on it
 PRIOR_WEIGHT = 0.02  # of the expected centre, per hit
 
@@ -52,25 +52,25 @@ MIDDLE_OFFSET_RADII = 0.7  # first guess of the centre, behind the mean of the h
 MAX_ARC_NOISE_M = 0.08  # standard deviation of the centre
 MIN_RIM_SHARE = 0.9  # of the hits
 
-MOTION_M = 0.4  # a quick thing is compared with its position this far back
-COMPARED_S = 0.5  # age of the scan that is compared, for slow things
+MOTION_M = 0.4  # a quick thing is compared with the scan before it moved this far
+COMPARED_S = 0.5  # age of the compared scan for slow things
 KEPT_SCANS = 32
 BEYOND_MARGIN_M = 0.12  # how far beyond a free point a beam must go; more than noise
-HIT_MARGIN_M = 0.1  # around a disc, in which its hits lie
+HIT_MARGIN_M = 0.1  # around a disc; hits within it belong to the disc
 MIN_FREE_SHARE = 0.35  # of hits in free space, to confirm motion
-ODOMETRY_ERROR = 0.06  # of the way and of the turn between two scans, also by a late stamp
+ODOMETRY_ERROR = 0.06  # of distance and turn between two scans, including late stamps
 NOISE_GATE_M = 0.03  # between hits of two scans on the same surface
-MIN_STATIC_SHARE = 0.2  # by how much more of the hits must be known, to refute motion
+MIN_STATIC_SHARE = 0.2  # of hits, by which rest must explain more than motion does
 FIELD_EDGE_BEAMS = 3  # ignored at the ends of the field of view
 
 
 class Cluster(Struct, frozen=True):
-    """One thing as a disc, in polar coordinates round the lidar."""
+    """One thing as a disc, in polar coordinates around the lidar."""
 
     near: float  # [m] from the lidar to its near side
     bearing: float  # [rad], in the body's frame
     radius: float  # [m]
-    whole: bool  # nothing hides an end of it
+    whole: bool  # neither end is hidden
     noise: float  # [m], standard deviation of its place
 
 
@@ -85,7 +85,7 @@ def find_clusters(hits: Floats, lidar: Lidar, spacing: float) -> list[Cluster]:
     breaks, empty = _breaks(points, bearings, ranges, spacing)
     if not breaks.any():
         return []
-    begin = int(np.flatnonzero(breaks)[0]) + 1  # cut the turn where one thing ends
+    begin = int(np.flatnonzero(breaks)[0]) + 1  # begin after the end of a cluster
     points, ranges = _rotated(begin, points), _rotated(begin, ranges)
     breaks, empty = _rotated(begin, breaks), _rotated(begin, empty)
     bearings = np.concatenate((bearings[begin:], bearings[:begin] + math.tau))
@@ -110,18 +110,18 @@ def _rotated(begin: int, values: NDArray[S]) -> NDArray[S]:
 def _breaks(
     points: Floats, bearings: Floats, ranges: Floats, spacing: float
 ) -> tuple[Bools, Bools]:
-    """Return after which hits a cluster ends, and after which of them beams hit nothing, (n,)."""
+    """Return masks (n,) of hits after which a cluster ends, and after which beams are missing."""
     following = _rotated(1, points)
     turned = _rotated(1, bearings) - bearings
     turned[-1:] += math.tau
     apart = np.hypot(following[:, 0] - points[:, 0], following[:, 1] - points[:, 1])
     nearer = np.minimum(ranges, _rotated(1, ranges))
     steps = np.minimum(turned, GRAZING_RAD / 2)
-    most = nearer * np.sin(steps) / np.sin(GRAZING_RAD - steps)
+    surface_gap = nearer * np.sin(steps) / np.sin(GRAZING_RAD - steps)
     empty = turned > MISSING_BEAMS * spacing
-    least = max(MIN_GAP_M, NOISE_GAP_SIGMAS * _roughness(ranges))
-    ended = empty & ((apart > max(LOST_GAP_M, least)) | (turned > LOST_BEAMS * spacing))
-    return ended | (apart > np.minimum(np.maximum(most, least), MAX_GAP_M)), empty
+    noise_gap = max(MIN_GAP_M, NOISE_GAP_SIGMAS * _roughness(ranges))
+    ended = empty & ((apart > max(LOST_GAP_M, noise_gap)) | (turned > LOST_BEAMS * spacing))
+    return ended | (apart > np.minimum(np.maximum(surface_gap, noise_gap), MAX_GAP_M)), empty
 
 
 def _roughness(ranges: Floats) -> float:
@@ -147,20 +147,20 @@ def _in_front(ranges: Floats, empty: Bools, first: Indices, last: Indices, reach
 
 
 def _inside(bearings: Floats, first: Indices, last: Indices, half: float, spacing: float) -> Bools:
-    """Return which clusters stay clear of both ends, `half` [rad] to each side, (k,).
+    """Return which clusters are clear of both ends of the field of view, (k,).
 
-    `bearings` are from the middle of the field of view.
+    It extends by `half` [rad] to each side. `bearings` are from its middle.
     """
     if half > math.pi - spacing:
         return np.ones(len(first), dtype=np.bool_)
-    most = half - EDGE_BEAMS * spacing
+    limit = half - EDGE_BEAMS * spacing
     begins, ends = (np.remainder(bearings[k] + math.pi, math.tau) - math.pi for k in (first, last))
-    found: Bools = (begins > -most) & (ends < most)
+    found: Bools = (begins > -limit) & (ends < limit)
     return found
 
 
 def _sized(points: Floats, ranges: Floats, first: Indices, last: Indices) -> Bools:
-    """Return which clusters have enough hits, are no walls and not too far away, (k,)."""
+    """Return which clusters have enough hits, and are neither walls nor too far away, (k,)."""
     sides = np.maximum.reduceat(points, first) - np.minimum.reduceat(points, first)
     small = np.hypot(sides[:, 0], sides[:, 1]) <= MAX_SIZE_M
     found: Bools = (last - first + 1 >= MIN_CLUSTER_HITS) & small & (ranges[first] <= MAX_RANGE_M)
@@ -177,7 +177,7 @@ def _disc_of_cluster(
     sine = math.sin(min((ends - begins + spacing) / 2, 1.0))
     radius = min(near * sine / (1.0 - sine), MAX_RADIUS_M)
     return Cluster(
-        near=near - 0.02 * radius,  # the middle third is not quite all at its nearest point
+        near=near - 0.02 * radius,  # on average, the middle third is beyond the nearest point
         bearing=(begins + ends) / 2,
         radius=radius,
         whole=whole,
@@ -193,7 +193,7 @@ def on_rim(points: Floats, x: float, y: float, radius: float) -> Bools:
 
 
 def off_rims(points: Floats, discs: Floats) -> Floats:
-    """Return the `points` (n, 2) on the rim of none of `discs` (m, 3): x, y, radius [m]."""
+    """Return the `points` (n, 2) that are on no rim of `discs` (m, 3): x, y, radius [m]."""
     away = np.hypot(points[:, :1] - discs[:, 0], points[:, 1:] - discs[:, 1])
     found: Floats = points[(np.abs(away - discs[:, 2]) >= RIM_TOLERANCE_M).all(axis=1)]
     return found
@@ -210,40 +210,40 @@ def fit_disc(
     for gate in RIM_GATES_M:
         dx, dy = points[:, 0] - x, points[:, 1] - y
         away = np.hypot(dx, dy)
-        mine = (np.abs(away - radius) < gate) & (away > MIN_MIDDLE_DISTANCE_M)
-        count = int(mine.sum())
+        rim = (np.abs(away - radius) < gate) & (away > MIN_MIDDLE_DISTANCE_M)
+        count = int(rim.sum())
         if count < MIN_RIM_HITS:
             return None
-        ux, uy, off = dx[mine] / away[mine], dy[mine] / away[mine], away[mine] - radius
+        ux, uy, off = dx[rim] / away[rim], dy[rim] / away[rim], away[rim] - radius
         xx, xy, yy = float(ux @ ux), float(ux @ uy), float(uy @ uy)
         fx, fy = float(ux @ off), float(uy @ off)
         a, b = xx + PRIOR_WEIGHT * count, yy + PRIOR_WEIGHT * count
         determinant = a * b - xy * xy
         x += (b * fx - xy * fy) / determinant
         y += (a * fy - xy * fx) / determinant
-    rough = math.sqrt(float(off @ off) / count)
-    if rough > MAX_RIM_RMS_M:
+    rms = math.sqrt(float(off @ off) / count)
+    if rms > MAX_RIM_RMS_M:
         return None
     worse = (a + b) / 2 - math.sqrt(((a - b) / 2) ** 2 + xy * xy)
-    return x, y, max(rough, MIN_RIM_NOISE_M) / math.sqrt(worse)
+    return x, y, max(rms, MIN_RIM_NOISE_M) / math.sqrt(worse)
 
 
 def discs_of(points: Floats, eye: tuple[float, float], radius: float) -> list[FittedDisc]:
     """Return discs of this `radius` [m] that arcs of `points` (n, 2) belong to, seen from `eye`.
 
-    The points are in the order of their beams. A disc is its centre (x, y) and the standard
-    deviation of that [m].
+    The points are in the order of their beams. A disc is its centre (x, y) and the
+    centre's standard deviation [m].
     """
     if len(points) < MIN_ARC_HITS:
         return []
     apart = np.hypot(*np.diff(points, axis=0).T)
     arcs = np.split(points, np.flatnonzero(apart > ARC_GAP_M) + 1)
     found = (_disc_of_arc(arc, eye, radius) for arc in arcs)
-    return [place for place in found if place]
+    return [disc for disc in found if disc]
 
 
 def _disc_of_arc(arc: Floats, eye: tuple[float, float], radius: float) -> FittedDisc | None:
-    """Return the disc that an arc belongs to, if there is one."""
+    """Return the disc that an arc belongs to; None if it fits no disc."""
     if len(arc) < MIN_ARC_HITS or np.hypot(*(arc[-1] - arc[0])) > MAX_ARC_RADII * radius:
         return None
     middle = arc.mean(axis=0)
@@ -292,7 +292,7 @@ class PastScan:
         return passed
 
     def hit(self, points: Floats, within: float) -> Bools:
-        """Return which `points` (n, 2) have a hit of this scan `within` so many metres."""
+        """Return which `points` (n, 2) have a hit of this scan within `within` [m]."""
         if not len(self.points):
             return np.zeros(len(points), dtype=np.bool_)
         dx, dy = (points[:, k, None] - self.points[:, k] for k in (0, 1))
@@ -302,15 +302,15 @@ class PastScan:
     def tolerance(self, other: "PastScan", x: float, y: float) -> float:
         """Return how far hits of a standing thing at (x, y) may differ in two scans [m].
 
-        Odometry errs with the way and the turn between them, and noise along a beam lies aside when
-        seen from elsewhere.
+        The odometry error grows with the distance and turn between the scans. From another place,
+        range noise along a beam also appears sideways.
         """
         here, there = self._place, other._place
         turn = abs(math.remainder(here.yaw - there.yaw, math.tau))
-        way = math.hypot(here.x - there.x, here.y - there.y)
+        distance = math.hypot(here.x - there.x, here.y - there.y)
         away = math.hypot(x - here.x, y - here.y)
-        parallax = min(1.0, way / away) if away else 1.0
-        return ODOMETRY_ERROR * (turn * away + way) + BEYOND_MARGIN_M * parallax
+        parallax = min(1.0, distance / away) if away else 1.0
+        return ODOMETRY_ERROR * (turn * away + distance) + BEYOND_MARGIN_M * parallax
 
     def _polar(self, points: Floats) -> tuple[Floats, Floats]:
         dx, dy = points[:, 0] - self._place.x, points[:, 1] - self._place.y
@@ -319,7 +319,7 @@ class PastScan:
 
 
 class FreeSpace:
-    """The scans of the last second."""
+    """The newest scans, which show where space is or was free."""
 
     def __init__(self) -> None:
         self._scans: deque[PastScan] = deque(maxlen=KEPT_SCANS)
@@ -340,7 +340,7 @@ class FreeSpace:
         self, x: float, y: float, velocity_x: float, velocity_y: float, radius: float
     ) -> bool:
         """Return whether free space confirms the velocity [m/s] of a disc at (x, y) [m]."""
-        now, before = self._scans[-1], self._compared(math.hypot(velocity_x, velocity_y))
+        now, before = self._scans[-1], self._earlier_scan(math.hypot(velocity_x, velocity_y))
         if before is now:
             return False
         dt, within = (now.tick - before.tick) * TICK_S, now.tolerance(before, x, y)
@@ -354,22 +354,22 @@ class FreeSpace:
     def shows_rest(
         self, x: float, y: float, velocity_x: float, velocity_y: float, radius: float
     ) -> bool:
-        """Return whether the hits of a disc at (x, y) [m] were there before, and not behind it.
+        """Return whether hits before show rest of a disc at (x, y) [m], not its velocity [m/s].
 
-        Behind it is where they were if it has that velocity [m/s].
+        At rest, hits were at the same places. With that velocity, they were behind.
         """
-        now, before = self._scans[-1], self._compared(math.hypot(velocity_x, velocity_y))
+        now, before = self._scans[-1], self._earlier_scan(math.hypot(velocity_x, velocity_y))
         dt, within = (now.tick - before.tick) * TICK_S, now.tolerance(before, x, y)
         mine = _near(now.points, x, y, radius)
         behind = mine - np.array((velocity_x, velocity_y)) * dt
         stood, moved = (before.hit(points, within + NOISE_GATE_M) for points in (mine, behind))
         return before is not now and _share(stood) > _share(moved) + MIN_STATIC_SHARE
 
-    def _compared(self, speed: float) -> PastScan:
-        """Return the scan with which a thing of this speed [m/s] is compared."""
+    def _earlier_scan(self, speed: float) -> PastScan:
+        """Return the earlier scan that is compared for a thing of this `speed` [m/s]."""
         now = self._scans[-1]
-        long_ago = COMPARED_S if speed * COMPARED_S < MOTION_M else MOTION_M / speed
-        old = [scan for scan in self._scans if (now.tick - scan.tick) * TICK_S >= long_ago]
+        min_age_s = COMPARED_S if speed * COMPARED_S < MOTION_M else MOTION_M / speed
+        old = [scan for scan in self._scans if (now.tick - scan.tick) * TICK_S >= min_age_s]
         return old[-1] if old else self._scans[0]
 
 
@@ -378,5 +378,5 @@ def _near(points: Floats, x: float, y: float, radius: float) -> Floats:
     return found
 
 
-def _share(of: Bools) -> float:
-    return np.count_nonzero(of) / len(of) if len(of) else 0.0
+def _share(mask: Bools) -> float:
+    return np.count_nonzero(mask) / len(mask) if len(mask) else 0.0

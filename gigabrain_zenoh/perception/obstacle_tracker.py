@@ -29,32 +29,32 @@ from gigabrain_zenoh.perception.obstacle_detection import (
 
 ACCELERATION_SIGMA = 0.8  # [m/s2], standard deviation for a walking person
 INITIAL_SPEED_SIGMA = 1.0  # [m/s], standard deviation of an unknown speed
-TURNS_S = 0.06  # longest time in the opposite direction since it was last seen
-TURNED, TURNED_PARTLY = 10.0, 16.0  # squared deviations that noise does not explain
+MAX_REVERSED_S = 0.06  # longest time that a thing may have moved backwards while unseen
+TURN_GATE, PARTIAL_TURN_GATE = 10.0, 16.0  # squared deviations; more is a turn, not noise
 MAX_OFF_SIGMAS = 4.0  # standard deviations between a track and its partly hidden disc
-SHIFT_M = 0.05
-MAX_OFF_M = 0.5
-RADIUS_GAIN = 0.25  # of a new radius in the filtered one
-MOVING_M, MOVING_SPEED = 0.15, 0.15  # [m], [m/s]: less is no motion
+SHIFT_M = 0.05  # added to that distance
+MAX_OFF_M = 0.5  # limit of the sum
+RADIUS_GAIN = 0.25  # weight of a new radius in the filtered one
+MOVING_M, MOVING_SPEED = 0.15, 0.15  # [m], [m/s], minimum of a motion
 QUICK_SPEED = 0.5  # [m/s]
-MOVING_SIGMAS = 2.5  # standard deviations of a speed above zero
-STANDING_SPEED, STANDING_S = 0.12, 0.6  # slower for this long, it stands
-REFUTED_S = 0.2  # its hits were there before for this long: it has never moved
+MOVING_SIGMAS = 2.5  # standard deviations of a moving thing's speed above zero
+STANDING_SPEED, STANDING_S = 0.12, 0.6  # [m/s], [s]: a thing this slow for this long stands
+REFUTED_S = 0.2  # evidence of rest for this long refutes a motion
 
-GATE_SIGMAS = 4.0  # standard deviations from the prediction; a farther cluster is another
+GATE_SIGMAS = 4.0  # standard deviations from the prediction; a farther cluster is another thing
 MAX_JUMP_M = 0.6
 PARTIAL_NOISE_FACTOR = 4.0  # for clusters that are partly hidden
-CONFIRMED_SCANS = 2  # before it is published
-FORGET_S, FORGET_NEW_S = 1.0, 0.25  # unseen, if it may be hidden
-FORGET_QUICK_S = 1.5  # unseen, if quick: it may be behind the body
-FORGET_GONE_S = 0.45  # if beams pass through its place
+CONFIRMED_SCANS = 2  # scans with a thing before it is published
+FORGET_S, FORGET_NEW_S = 1.0, 0.25  # a track is forgotten when unseen for this long
+FORGET_QUICK_S = 1.5  # the same for quick things, which may be behind the body
+FORGET_GONE_S = 0.45  # the same if beams pass through its place
 MAX_GAP_S = 1.0  # between scans; a longer gap clears all tracks
-MAX_OBSTACLES = 64  # published, the nearest ones
+MAX_OBSTACLES = 64  # the nearest ones are published
 
 
 @dataclass
 class ObstacleTrack:
-    """Position and velocity in the frame of the odometry."""
+    """Position and velocity of a thing in the odometry frame."""
 
     id: int
     x: float  # [m]
@@ -68,14 +68,14 @@ class ObstacleTrack:
     seen: int = 1  # scans
     unseen_s: float = 0.0
     moving: bool = False
-    partly: bool = False  # when it was first seen, only a part of it was
+    partial: bool = False  # only a part was visible when it was first seen
     standing_s: float = 0.0
     refuted_s: float = 0.0
     anchor_x: float = 0.0  # [m], last place where it stood
     anchor_y: float = 0.0
 
     def predict(self, dt: float) -> None:
-        """Let `dt` [s] pass."""
+        """Predict the state after `dt` [s]."""
         self.x += dt * self.velocity_x
         self.y += dt * self.velocity_y
         q = ACCELERATION_SIGMA**2
@@ -87,15 +87,15 @@ class ObstacleTrack:
         self.unseen_s += dt
 
     def correct(
-        self, x: float, y: float, radius: float, noise: float, *, most_off: float = math.inf
+        self, x: float, y: float, radius: float, noise: float, *, turn_gate: float = math.inf
     ) -> None:
         """Correct by a measurement at (x, y) [m] with standard deviation `noise` [m].
 
-        Beyond `most_off` (squared deviations) from the predicted position, it has turned.
+        Farther than `turn_gate` (squared deviations) from the prediction, it has turned.
         """
         dx, dy = x - self.x, y - self.y
         off = (dx * dx + dy * dy) / (self.position_variance + noise * noise)
-        if self.moving and off > most_off:
+        if self.moving and off > turn_gate:
             self._turn()
         innovation = self.position_variance + noise * noise
         k, kv = self.position_variance / innovation, self.covariance / innovation
@@ -108,7 +108,7 @@ class ObstacleTrack:
         self.position_variance *= 1.0 - k
         self.radius += RADIUS_GAIN * (radius - self.radius)
         self.seen += 1
-        self._stand(self.unseen_s)
+        self._update_standing(self.unseen_s)
         self.unseen_s = 0.0
 
     def _turn(self) -> None:
@@ -120,8 +120,8 @@ class ObstacleTrack:
 
     def may_be_at(self, x: float, y: float, noise: float) -> bool:
         """Return whether it can be at (x, y) [m], measured with a deviation of `noise` [m]."""
-        most = SHIFT_M + MAX_OFF_SIGMAS * math.sqrt(self.position_variance + noise * noise)
-        return math.hypot(x - self.x, y - self.y) < min(MAX_OFF_M, most)
+        limit = SHIFT_M + MAX_OFF_SIGMAS * math.sqrt(self.position_variance + noise * noise)
+        return math.hypot(x - self.x, y - self.y) < min(MAX_OFF_M, limit)
 
     def covers(self, place: tuple[float, float]) -> bool:
         """Return whether a place [m] is within its disc."""
@@ -131,7 +131,7 @@ class ObstacleTrack:
     def may_be_off(self) -> float:
         """Return how far it may be from the predicted position if it has turned round [m]."""
         speed = math.hypot(self.velocity_x, self.velocity_y)
-        return 2 * speed * min(self.unseen_s, TURNS_S) if self.moving else 0.0
+        return 2 * speed * min(self.unseen_s, MAX_REVERSED_S) if self.moving else 0.0
 
     @property
     def moves_quickly(self) -> bool:
@@ -139,23 +139,23 @@ class ObstacleTrack:
         return self.moving and math.hypot(self.velocity_x, self.velocity_y) > QUICK_SPEED
 
     def seems_to_move(self) -> bool:
-        """Return whether it has moved so far and so fast that free space should confirm it."""
+        """Return whether it has moved far and fast enough to check that against free space."""
         if self.moving or self.unseen_s > 0:
             return False
         speed = math.hypot(self.velocity_x, self.velocity_y)
-        gone = math.hypot(self.x - self.anchor_x, self.y - self.anchor_y)
-        sure = speed > MOVING_SIGMAS * math.sqrt(self.velocity_variance)
-        return gone > MOVING_M and speed > MOVING_SPEED and sure
+        distance = math.hypot(self.x - self.anchor_x, self.y - self.anchor_y)
+        significant = speed > MOVING_SIGMAS * math.sqrt(self.velocity_variance)
+        return distance > MOVING_M and speed > MOVING_SPEED and significant
 
-    def _stand(self, dt: float) -> None:
-        """Record that it has stopped, once it has been slow for STANDING_S."""
+    def _update_standing(self, dt: float) -> None:
+        """Count `dt` [s] of slow motion. After STANDING_S, it stands."""
         speed = math.hypot(self.velocity_x, self.velocity_y)
         self.standing_s = self.standing_s + dt if speed < STANDING_SPEED else 0.0
         if self.moving and self.standing_s >= STANDING_S:
             self._rest()
 
     def refute(self, dt: float) -> None:
-        """Record for `dt` [s] that its hits show no motion; after REFUTED_S it stands."""
+        """Count `dt` [s] in which its hits showed no motion. After REFUTED_S, it stands."""
         self.refuted_s += dt
         if self.refuted_s >= REFUTED_S:
             self.velocity_x = self.velocity_y = 0.0
@@ -165,7 +165,7 @@ class ObstacleTrack:
         self.moving, self.anchor_x, self.anchor_y = False, self.x, self.y
 
     def obstacle(self) -> Obstacle:
-        """Return it as a message; without a velocity while it stands."""
+        """Return it as a message, with zero velocity while it stands."""
         p, c, v = self.position_variance, self.covariance, self.velocity_variance
         return Obstacle(
             id=self.id,
@@ -214,21 +214,21 @@ class ObstacleTracker:
         for track in self._tracks:
             track.predict(dt)
         clusters = find_clusters(hits, lidar, abs(spacing)) if len(hits) else []
-        places = [_place(cluster, lidar, pose, cluster.radius) for cluster in clusters]
-        taken = self._match(clusters, places)
+        places = [_centre(cluster, lidar, pose, cluster.radius) for cluster in clusters]
+        matches = self._match(clusters, places)
         points = _placed(hits, pose)
-        parts = self._correct_all(clusters, taken, points, lidar, pose)
+        parts = self._correct_all(clusters, matches, points, lidar, pose)
         self._space.add(PastScan(tick, points, lidar, abs(spacing), pose))
-        self._judge(dt)
-        self._tracks = [track for track in self._tracks if self._lives(track)]
-        self._begin_parts(points, lidar, pose)
-        for j in set(range(len(clusters))) - set(taken.values()):
+        self._check_motion(dt)
+        self._tracks = [track for track in self._tracks if self._is_kept(track)]
+        self._start_partial(points, lidar, pose)
+        for j in set(range(len(clusters))) - set(matches.values()):
             if clusters[j].whole and not any(track.covers(places[j]) for track in parts):
-                self._begin(clusters[j], places[j])
+                self._start(clusters[j], places[j])
         return self._obstacles(pose)
 
     def _match(self, clusters: list[Cluster], places: list[tuple[float, float]]) -> dict[int, int]:
-        """Return the cluster of each track: the best pairs first, within the gates."""
+        """Return matching clusters by track index. The best pairs are matched first."""
         if not clusters or not self._tracks:
             return {}
         mine = np.array(
@@ -243,59 +243,61 @@ class ObstacleTracker:
         fits = (squares < gates**2) & (squares < (MAX_JUMP_M + other_size) ** 2)
         cost = squares / variance + (other_size / 0.2) ** 2
         pairs = np.argwhere(fits)
-        taken: dict[int, int] = {}
+        matches: dict[int, int] = {}
         used: set[int] = set()
         for i, j in pairs[np.argsort(cost[fits], kind="stable")].tolist():
-            if i not in taken and j not in used:
-                taken[i] = j
+            if i not in matches and j not in used:
+                matches[i] = j
                 used.add(j)
-        return taken
+        return matches
 
     def _correct_all(
-        self, clusters: list[Cluster], taken: dict[int, int], points: Floats, lidar: Lidar,
+        self, clusters: list[Cluster], matches: dict[int, int], points: Floats, lidar: Lidar,
         pose: Pose,
     ) -> list[ObstacleTrack]:  # fmt: skip
-        """Correct all tracks that were seen; return the moving ones that were seen in part."""
+        """Correct all tracks that were seen. Return those of which only a part was seen."""
         whole, parts = [], []
         for i, track in enumerate(self._tracks):
-            cluster = clusters[taken[i]] if i in taken else None
-            if (track.moving or track.partly) and not (cluster and cluster.whole):
+            cluster = clusters[matches[i]] if i in matches else None
+            if (track.moving or track.partial) and not (cluster and cluster.whole):
                 parts.append(track)
             elif cluster:
                 self._correct(track, cluster, lidar, pose)
                 whole.append(track)
         parts.sort(key=lambda track: track.position_variance)
         if parts:
-            points = _beside(points, whole)
+            points = _unexplained(points, whole)
         found = []
         for track in parts:
             place = fit_disc(points, track.x, track.y, track.radius)
             if place and track.may_be_at(*place):
-                track.correct(place[0], place[1], track.radius, place[2], most_off=TURNED_PARTLY)
+                track.correct(
+                    place[0], place[1], track.radius, place[2], turn_gate=PARTIAL_TURN_GATE
+                )
                 points = points[~on_rim(points, track.x, track.y, track.radius)]
                 found.append(track)
         return found
 
     def _correct(self, track: ObstacleTrack, cluster: Cluster, lidar: Lidar, pose: Pose) -> None:
-        x, y = _place(cluster, lidar, pose, track.radius)
+        x, y = _centre(cluster, lidar, pose, track.radius)
         if cluster.whole:
-            track.correct(x, y, cluster.radius, cluster.noise, most_off=TURNED)
-        else:  # a hidden part does not make it smaller
+            track.correct(x, y, cluster.radius, cluster.noise, turn_gate=TURN_GATE)
+        else:  # a partly hidden thing keeps its radius
             track.correct(x, y, track.radius, PARTIAL_NOISE_FACTOR * cluster.noise)
 
-    def _judge(self, dt: float) -> None:
-        """Let free space decide which tracks move, rather than only show another side."""
+    def _check_motion(self, dt: float) -> None:
+        """Check by free space which tracks move, and which only show another side."""
         for t in self._tracks:
-            moves = t.x, t.y, t.velocity_x, t.velocity_y, t.radius
+            motion = t.x, t.y, t.velocity_x, t.velocity_y, t.radius
             if t.seems_to_move():
-                t.moving, t.refuted_s = self._space.shows_motion(*moves), 0.0
+                t.moving, t.refuted_s = self._space.shows_motion(*motion), 0.0
             elif t.moving and t.unseen_s == 0.0:
-                if self._space.shows_rest(*moves):
+                if self._space.shows_rest(*motion):
                     t.refute(dt)
                 else:
                     t.refuted_s = 0.0
 
-    def _lives(self, track: ObstacleTrack) -> bool:
+    def _is_kept(self, track: ObstacleTrack) -> bool:
         limit = FORGET_S if track.seen > CONFIRMED_SCANS else FORGET_NEW_S
         if track.moves_quickly:
             limit = FORGET_QUICK_S
@@ -303,25 +305,28 @@ class ObstacleTracker:
             return False
         return track.unseen_s < limit
 
-    def _begin(self, cluster: Cluster, place: tuple[float, float]) -> None:
-        self._add(*place, cluster.radius, cluster.noise, partly=False)
+    def _start(self, cluster: Cluster, place: tuple[float, float]) -> None:
+        self._add(*place, cluster.radius, cluster.noise, partial=False)
 
-    def _add(self, x: float, y: float, radius: float, noise: float, *, partly: bool) -> None:
+    def _add(self, x: float, y: float, radius: float, noise: float, *, partial: bool) -> None:
         self._ids += 1
         self._tracks.append(
-            ObstacleTrack(self._ids, x, y, radius, noise**2, anchor_x=x, anchor_y=y, partly=partly)
+            ObstacleTrack(
+                self._ids, x, y, radius, noise**2, anchor_x=x, anchor_y=y, partial=partial
+            )
         )
 
-    def _begin_parts(self, points: Floats, lidar: Lidar, pose: Pose) -> None:
-        """Begin tracks of partly hidden discs near moving things, with their median size."""
-        sizes = [track.radius for track in self._tracks if track.moves_quickly]
-        if not sizes:
+    def _start_partial(self, points: Floats, lidar: Lidar, pose: Pose) -> None:
+        """Start tracks of partly hidden discs, with the median radius of the quick things."""
+        radii = [track.radius for track in self._tracks if track.moves_quickly]
+        if not radii:
             return
-        radius = statistics.median(sizes)
-        eye = compose(pose, Pose(x=lidar.x, y=lidar.y, yaw=0.0))
-        for x, y, noise in discs_of(_beside(points, self._tracks), (eye.x, eye.y), radius):
+        radius = statistics.median(radii)
+        sensor = compose(pose, Pose(x=lidar.x, y=lidar.y, yaw=0.0))
+        rest = _unexplained(points, self._tracks)
+        for x, y, noise in discs_of(rest, (sensor.x, sensor.y), radius):
             if not any(track.covers((x, y)) for track in self._tracks):
-                self._add(x, y, radius, noise, partly=True)
+                self._add(x, y, radius, noise, partial=True)
 
     def _obstacles(self, pose: Pose) -> tuple[Obstacle, ...]:
         known = [track for track in self._tracks if track.seen >= CONFIRMED_SCANS]
@@ -329,8 +334,8 @@ class ObstacleTracker:
         return tuple(track.obstacle() for track in known[:MAX_OBSTACLES])
 
 
-def _beside(points: Floats, tracks: list[ObstacleTrack]) -> Floats:
-    """Return the `points` (n, 2) on the rim of none of the `tracks`."""
+def _unexplained(points: Floats, tracks: list[ObstacleTrack]) -> Floats:
+    """Return the `points` (n, 2) that are on the rim of no track."""
     return off_rims(points, np.array([(t.x, t.y, t.radius) for t in tracks]).reshape(-1, 3))
 
 
@@ -342,7 +347,7 @@ def _placed(hits: Floats, pose: Pose) -> Floats:
     return np.column_stack((x, y))
 
 
-def _place(cluster: Cluster, lidar: Lidar, pose: Pose, radius: float) -> tuple[float, float]:
+def _centre(cluster: Cluster, lidar: Lidar, pose: Pose, radius: float) -> tuple[float, float]:
     """Return the centre of a cluster of this radius [m], in the parent frame of `pose`."""
     distance = cluster.near + radius
     ahead = lidar.x + distance * math.cos(cluster.bearing)

@@ -1,9 +1,9 @@
-"""Perceptors: perception steps that packages offer, each run by a process of its own.
+"""Perceptors: perception steps offered by packages, each in its own process.
 
-A perceptor looks for things in each scan, and what it finds is published on
-`robot/perceived/<name>`. Behaviours get these objects, and the planner keeps clear of those that
-are to be avoided. One that raises or hangs costs only itself. Packages offer theirs as entry points
-of the group `gigabrain.perceptors`.
+A perceptor detects objects in each scan, which are published on `robot/perceived/<name>`.
+Behaviours receive these objects, and the planner keeps clear of those that are to be avoided. A
+perceptor that raises or hangs stops no other process. Packages offer perceptors as entry points of
+the group `gigabrain.perceptors`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -31,25 +31,25 @@ class PerceptorInputs:
     """Inputs of a perceptor at one scan."""
 
     scan: LaserScan
-    world: WorldModel  # what perception has made of that scan, in the body's frame
+    world: WorldModel  # perception's model of that scan, in the body's frame
     pose: Pose  # of the body at the scan, in the odometry frame
     body: BodyDescription
 
 
 class Perceptor(Protocol):
-    """Finds objects, one step per scan. It has its own memory, no clock and no bus."""
+    """Detects objects, one step per scan. It may keep state, but has no clock and no bus."""
 
     Config: ClassVar[type[Struct]]
 
     def __init__(self, config: Any) -> None: ...
 
     def step(self, inputs: PerceptorInputs) -> Sequence[DetectedObject]:
-        """Return what is there now, in the odometry frame."""
+        """Return the objects at this scan, in the odometry frame."""
         ...
 
 
 def check_known(name: str) -> None:
-    """Raise UnknownName where no installed package offers the perceptor; import nothing."""
+    """Raise UnknownName if no installed package offers the perceptor. Nothing is imported."""
     if name not in (known := plugin_names(SHIPPED, GROUP)):
         raise unknown("perceptor", name, known)
 
@@ -61,7 +61,7 @@ def load(name: str) -> type[Perceptor]:
 
 
 class PerceptorLoop:
-    """Steps a perceptor once per world, when the state of its tick is there as well."""
+    """Steps a perceptor once per world, as soon as the state of its tick has arrived."""
 
     def __init__(self, perceptor: Perceptor) -> None:
         self._perceptor = perceptor
@@ -70,22 +70,22 @@ class PerceptorLoop:
         self._scan: LaserScan | None = None
 
     def add_scan(self, scan: LaserScan) -> None:
-        """Keep a scan until the world that rests on it comes."""
+        """Keep a scan until the world based on it arrives."""
         self._scan = scan
 
     def add_world(self, world: WorldModel) -> None:
-        """Keep a world until the state of its tick comes."""
+        """Keep a world until the state of its tick arrives."""
         scan = self._scan
         found = scan and (scan.boot, scan.basis) == (world.boot, world.basis)
         self._waiting = (scan, world) if scan and found else None
-        self._scan = None  # cameras make more worlds of one scan
+        self._scan = None  # cameras cause more worlds from the same scan
 
     def add_state(self, state: RobotState) -> None:
-        """Add the odometry."""
+        """Add a robot state, for its odometry pose."""
         self._history = self._history.then(state)
 
     def step(self, body: BodyDescription) -> tuple[Objects, int] | None:
-        """Return what the perceptor finds, with its basis; None while something is missing."""
+        """Return the detected objects and their basis; None while an input is missing."""
         if self._waiting is None:
             return None
         scan, world = self._waiting
@@ -98,10 +98,10 @@ class PerceptorLoop:
 
 
 async def run(perceptor: Perceptor, bus: Bus, ready: Callable[[], None]) -> None:
-    """Publish what a perceptor finds in each scan, until the process ends."""
+    """Publish a perceptor's objects for each scan, until the process ends."""
     loop, body = PerceptorLoop(perceptor), bus.latest(BODY)
 
-    def look() -> None:
+    def publish() -> None:
         found = loop.step(body.current.description) if body.current else None
         if found:
             objects, basis = found
@@ -109,11 +109,11 @@ async def run(perceptor: Perceptor, bus: Bus, ready: Callable[[], None]) -> None
 
     def on_world(world: WorldModel) -> None:
         loop.add_world(world)
-        look()
+        publish()
 
     def on_state(state: RobotState) -> None:
         loop.add_state(state)
-        look()
+        publish()
 
     bus.latest(SCAN, loop.add_scan)
     bus.latest(WORLD, on_world)

@@ -1,7 +1,7 @@
 """Loads, changes, saves and publishes the zones and places of the map.
 
-Zones are fixed to the keyframe that is nearest to their middle. When a loop corrects the map, they
-move with the walls around them.
+Each zone is anchored to the keyframe nearest to its middle. When a loop closure corrects the map,
+the zone moves with the walls around it.
 """
 
 import asyncio
@@ -32,8 +32,8 @@ from gigabrain_zenoh.mapping.zone_file import ZoneFile
 
 log = logging.getLogger(__name__)
 
-AGAIN_TICKS = round(2e9 / TICK_NS)  # after which unchanged zones are published again
-MIN_SHIFT_M = 0.01  # of a vertex, less is not published
+REPUBLISH_TICKS = round(2e9 / TICK_NS)  # maximum interval between published zones
+MIN_SHIFT_M = 0.01  # smaller shifts of a corner are not published
 STATE_FILE = "zones.json"
 MAX_STATE_BYTES = 4_000_000
 
@@ -48,7 +48,7 @@ class Anchor(Struct, frozen=True):
 
 
 class Anchored(Struct, frozen=True, kw_only=True):
-    """A zone or a place as it was drawn, and its anchor."""
+    """A zone or place as it was drawn, and its anchor."""
 
     zone: Zone | None = None
     place: Place | None = None
@@ -56,14 +56,14 @@ class Anchored(Struct, frozen=True, kw_only=True):
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """The name of the zone or place."""
         return self.zone.name if self.zone else self.place.name if self.place else ""
 
 
 class ZoneState(Struct, frozen=True, kw_only=True):
-    """The state for the next perception process: the map in use, and its zones."""
+    """State for the next perception process: the map in use, and its zones."""
 
-    boot: Count  # start of the driver for which it counts
+    boot: Count  # start of the driver that it belongs to
     map: Name = ""
     mapping: MappingMode = "off"
     maps_loaded: Count = 0
@@ -77,20 +77,20 @@ class ZoneServer:
         self._bus, self._basis = bus, basis
         self._state_path = Path(state_dir) / STATE_FILE if state_dir else None
         self._items: tuple[Anchored, ...] = ()
-        self._poses: Floats = np.empty((0, 3))  # of keyframes, as they are in the grid
+        self._poses: Floats = np.empty((0, 3))  # of keyframes, as in the newest grid
         self._version = -1  # of these poses
-        self._now = Zones()  # as published
+        self._current = Zones()
         self._sent_tick: int | None = None
         self._state = ZoneState(boot=0)  # without items
         self._file: Path | None = None  # YAML file of the map, unless it grows
-        self._changing = asyncio.Lock()  # one change after the other
+        self._changing = asyncio.Lock()  # serializes changes
         self._fault, self.problem = Fault(log), ""
         self._writer: BackgroundWriter[ZoneState] = BackgroundWriter(self._write, 1)
         bus.serve(ZONES_CHANGE, self._change)
 
     def use_map(self, name: str, mapping: MappingMode, zones: ZoneFile, *, loaded: bool) -> None:
-        """Use the zones of a map from now on; `loaded` tells that it replaces another map."""
-        # a growing map is not the one in the file any more
+        """Use the zones of a map; `loaded` if it replaces another map at run time."""
+        # a growing map differs from its file
         self._file = map_file.path_of(name) if name and mapping == "localize" else None
         count = self._state.maps_loaded + loaded
         short = name if len(name) <= 64 and "/" not in name else Path(name).stem[:64]
@@ -104,13 +104,13 @@ class ZoneServer:
         self._keep_state()
 
     def saved_as(self, name: str) -> None:
-        """Name the map that was saved with these zones."""
+        """Set the name of the map, which was saved with these zones."""
         self._state = replace(self._state, map=name)
         self._update()
         self._keep_state()
 
     def restore(self, boot: int) -> ZoneState | None:
-        """Return what an earlier process kept in this start of the driver, if anything."""
+        """Return the state of an earlier process, if it belongs to this start of the driver."""
         if self._state_path is None:
             return None
         try:
@@ -124,18 +124,18 @@ class ZoneServer:
         return found if found.boot == boot else None
 
     def resume(self, state: ZoneState) -> None:
-        """Go on with the zones of an earlier process, in the same map."""
+        """Continue with the zones of an earlier process, in the same map."""
         self._state, self._items = replace(state, items=()), state.items
         self._version = -1
         self._update()
 
     def set_boot(self, boot: int) -> None:
-        """Keep the zones for this start of the driver."""
+        """Save the state for this start of the driver."""
         self._state = replace(self._state, boot=boot)
         self._keep_state()
 
     def follow(self, version: int, poses: Floats) -> None:
-        """Move zones with the keyframes (n, 3) that they are fixed to, if the map was redrawn."""
+        """Move zones with their keyframes (n, 3) if the map has been corrected."""
         if version == self._version and len(poses) == len(self._poses):
             return
         moved = version != self._version
@@ -146,14 +146,14 @@ class ZoneServer:
 
     def publish(self, tick: int) -> None:
         """Publish the zones if they are due at this tick."""
-        if self._sent_tick is None or not 0 <= tick - self._sent_tick < AGAIN_TICKS:
-            self._now = self._bus.publish(ZONES, self._now, basis=tick)
+        if self._sent_tick is None or not 0 <= tick - self._sent_tick < REPUBLISH_TICKS:
+            self._current = self._bus.publish(ZONES, self._current, basis=tick)
             self._sent_tick = tick
-            if self.problem:  # there may be room by now
+            if self.problem:  # try again: the disk may have room now
                 self._keep_state()
 
     async def finish_writing(self) -> None:
-        """Return once all is written."""
+        """Wait until the state is written."""
         await self._writer.close()
 
     @property
@@ -163,11 +163,11 @@ class ZoneServer:
 
     @property
     def present(self) -> ZoneFile:
-        """The zones and places in the map as it is now."""
-        return ZoneFile(zones=self._now.zones, places=self._now.places)
+        """The zones and places at their current positions in the map."""
+        return ZoneFile(zones=self._current.zones, places=self._current.places)
 
     def problems(self) -> tuple[Cause, ...]:
-        """Return why zones are not kept, if they are not."""
+        """Return the cause if zones cannot be saved."""
         if not self.problem:
             return ()
         remedy = "make room on the disk, and see that the folder can be written"
@@ -175,15 +175,17 @@ class ZoneServer:
         return (Cause(code="zones_unsaved", text=text, remedy=remedy),)
 
     def _update(self) -> None:
-        """Compute the present zones; they are published at the next opportunity if they differ."""
+        """Compute the current zones. If they have changed, they are published next."""
         placed = [_placed(one, self._poses) for one in self._items]
         zones = tuple(one.zone for one in placed if one.zone)
         places = tuple(one.place for one in placed if one.place)
-        now, state = self._now, self._state
-        same = (now.map, now.maps_loaded) == (state.map, state.maps_loaded)
-        if same and _alike(now, zones, places):
+        current, state = self._current, self._state
+        same = (current.map, current.maps_loaded) == (state.map, state.maps_loaded)
+        if same and _nearly_equal(current, zones, places):
             return
-        self._now = Zones(zones=zones, places=places, map=state.map, maps_loaded=state.maps_loaded)
+        self._current = Zones(
+            zones=zones, places=places, map=state.map, maps_loaded=state.maps_loaded
+        )
         self._sent_tick = None
 
     async def _change(self, request: ZonesRequest) -> ZonesReply:
@@ -203,36 +205,36 @@ class ZoneServer:
             return ZonesReply(ok=True, text=f"{text}{await self._write_file()}"[:500])
 
     def _apply(self, request: ZonesRequest) -> str:
-        """Make a change; return it as text. Raises Refused."""
+        """Apply a change, and describe it. Raises Refused."""
         new = Anchored(zone=request.zone, place=request.place)
         name = new.name or request.remove
         others = tuple(one for one in self._items if one.name != name)
-        there = len(others) < len(self._items)
+        exists = len(others) < len(self._items)
         if request.remove:
-            if not there:
+            if not exists:
                 known = [one.name for one in self._items] or ["none"]
                 raise Refused(str(unknown("zone or place", name, known)))
             items, verb = others, "removed"
         else:
-            if there and not request.replace:
+            if exists and not request.replace:
                 remedy = "replace it (--replace), or choose another name"
                 raise Refused(f"{name!r} is there already; {remedy}")
             if request.zone and (problem := zone_file.new_zone_problem(request.zone)):
                 raise Refused(f"zone {name!r}: {problem}")
             items = (*others, _anchored(new, self._poses))
-            verb = "replaced" if there else "added"
+            verb = "replaced" if exists else "added"
         before, self._items = self._items, items
         try:
             self._update()
             zone_file.encoded(self.present)
-        except (ValueError, Refused) as error:  # too many of them
+        except (ValueError, Refused) as error:  # too many zones or places
             self._items = before
             self._update()
             raise Refused(str(error)) from None
         return f"{verb} {name!r}"
 
     async def _write_file(self) -> str:
-        """Write the zones beside a saved map; return where they are kept, as text."""
+        """Write the zones beside a saved map. Return a note about it for the reply."""
         if self._file is None:
             return "; save the map to keep it"
         if not self._bus.input_log.live:
@@ -244,7 +246,7 @@ class ZoneServer:
         return f", kept with the map {self._state.map}"
 
     def _keep_state(self) -> None:
-        """Write what the next process needs, beside everything else."""
+        """Write the state for the next process in the background."""
         if self._state_path and self._state.boot and self._bus.input_log.live:
             written = self._writer.put(replace(self._state, items=self._items))
             written.add_done_callback(lambda done: self._on_written(done.result()))
@@ -267,7 +269,7 @@ class ZoneServer:
 
 
 def _anchored(item: Anchored, poses: Floats) -> Anchored:
-    """Return an item with an anchor, if there are keyframes and it has none that is still there."""
+    """Return an item anchored to the nearest keyframe, unless its anchor still exists."""
     if not len(poses) or (item.anchor and item.anchor.keyframe < len(poses)):
         return item
     middle = _points(item).mean(axis=0)
@@ -277,15 +279,15 @@ def _anchored(item: Anchored, poses: Floats) -> Anchored:
 
 
 def _placed(item: Anchored, poses: Floats) -> Anchored:
-    """Return an item as it is in the map now."""
+    """Return an item at its current position in the map."""
     anchor = item.anchor
     if anchor is None or anchor.keyframe >= len(poses):
         return item
-    then = np.array((anchor.x, anchor.y, anchor.yaw))
+    before = np.array((anchor.x, anchor.y, anchor.yaw))
     now = poses[anchor.keyframe]
-    if np.array_equal(now, then):
+    if np.array_equal(now, before):
         return item
-    moved = compose(now, inverse(then))
+    moved = compose(now, inverse(before))
     points = transform(moved, _points(item)).tolist()
     if item.zone:
         corners = tuple((x, y) for x, y in points)
@@ -303,17 +305,17 @@ def _points(item: Anchored) -> Floats:
     return np.array(((item.place.x, item.place.y),))
 
 
-def _alike(now: Zones, zones: tuple[Zone, ...], places: tuple[Place, ...]) -> bool:
-    """Return whether zones differ from those published by no more than a small shift."""
-    if [_rules(one) for one in now.zones] != [_rules(one) for one in zones]:
+def _nearly_equal(old: Zones, zones: tuple[Zone, ...], places: tuple[Place, ...]) -> bool:
+    """Return whether zones differ from `old` by less than MIN_SHIFT_M."""
+    if [_rules(one) for one in old.zones] != [_rules(one) for one in zones]:
         return False
-    if [(one.name, one.yaw is None) for one in now.places] != [
+    if [(one.name, one.yaw is None) for one in old.places] != [
         (one.name, one.yaw is None) for one in places
     ]:
         return False
-    before = [Anchored(zone=one) for one in now.zones] + [Anchored(place=p) for p in now.places]
+    before = [Anchored(zone=one) for one in old.zones] + [Anchored(place=p) for p in old.places]
     after = [Anchored(zone=one) for one in zones] + [Anchored(place=one) for one in places]
-    turned = [abs((a.yaw or 0.0) - (b.yaw or 0.0)) for a, b in zip(now.places, places, strict=True)]
+    turned = [abs((a.yaw or 0.0) - (b.yaw or 0.0)) for a, b in zip(old.places, places, strict=True)]
     shifts = [
         float(np.abs(_points(a) - _points(b)).max()) for a, b in zip(before, after, strict=True)
     ]
