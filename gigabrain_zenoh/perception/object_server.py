@@ -1,7 +1,7 @@
-"""Remembers things and tags: takes detections, publishes, saves and forgets.
+"""Serves the memory of objects and tags: adds detections, publishes, saves and forgets.
 
-Only a body with cameras has one. Pictures are placed at the next scan, by the odometry of their
-exposure, so that the work a scan takes is bounded.
+Only bodies with cameras need it. Pictures are processed at the next scan, with the odometry of
+their exposure, so that the work per scan is bounded.
 """
 
 import asyncio
@@ -47,15 +47,15 @@ from gigabrain_zenoh.perception.tag_memory import TagMemory
 
 log = logging.getLogger(__name__)
 
-WAITING = 4  # pictures that wait for the next scan; of a flood the newest count
-FUTURE_TICKS = 50  # that a picture may be ahead of the odometry
-CHANGED_TICKS = round(0.6e9 / TICK_NS)  # shortest interval between changed object maps,
-AGAIN_TICKS = round(2e9 / TICK_NS)  # and longest one between unchanged ones
-DOUBT_TICKS = round(2e9 / TICK_NS)  # between copies, to go back to when the robot is lost
-SAVED_TICKS = round(5e9 / TICK_NS)  # shortest interval between writes
-RECOGNIZING_TICKS = round(3e9 / TICK_NS)  # since the last detections
-STEADY_RAD_S, RATE_TICKS = 0.8, 5  # turning faster blurs pictures; ticks to measure it over
-SHIFT_M = 0.01  # of an object, less is not published at once
+MAX_WAITING = 4  # pictures that wait for the next scan; older ones are dropped
+MAX_FUTURE_TICKS = 50  # by which a picture may be ahead of the odometry
+CHANGED_TICKS = round(0.6e9 / TICK_NS)  # minimum interval between changed object maps,
+REPUBLISH_TICKS = round(2e9 / TICK_NS)  # and maximum interval between unchanged ones
+COPY_TICKS = round(2e9 / TICK_NS)  # between copies, which are restored when the robot is lost
+SAVE_TICKS = round(5e9 / TICK_NS)  # minimum interval between writes
+RECOGNIZING_TICKS = round(3e9 / TICK_NS)  # maximum age of the last detections while recognizing
+STEADY_RAD_S, RATE_TICKS = 0.8, 5  # faster turns blur pictures; ticks to measure the rate
+MIN_SHIFT_M = 0.01  # smaller shifts of an object are not published at once
 UNSAVED = "objects are not saved"
 STATE_FILE, MAX_STATE_BYTES = "objects.json", 1_000_000
 
@@ -86,13 +86,13 @@ class KeptTag(Struct, frozen=True):
 class ObjectState(Struct, frozen=True, kw_only=True):
     """The state for the next perception process."""
 
-    boot: Count  # start of the driver for which it counts
+    boot: Count  # start of the driver that it belongs to
     map: Name = ""
     objects: tuple[KeptObject, ...] = ()
     tags: tuple[KeptTag, ...] = ()
 
 
-Write = tuple[ObjectState, Path | None, ObjectFile]  # and where the latter is written, if at all
+Write = tuple[ObjectState, Path | None, ObjectFile]  # and the map's file for the latter, if any
 Copy = tuple[list[tuple[MapObject, Anchor | None]], list[tuple[MapTag, Anchor | None]]]
 
 
@@ -103,17 +103,17 @@ class ObjectServer:
         self._bus, self._fusion = bus, fusion
         self._state_path = Path(state_dir) / STATE_FILE if state_dir else None
         self.memory, self.tags = ObjectMemory(), TagMemory()
-        self._waiting: deque[Detections] = deque(maxlen=WAITING)
+        self._waiting: deque[Detections] = deque(maxlen=MAX_WAITING)
         self._boot = self._tick = 0
         self._seen_tick: int | None = None  # of the last detections
-        self._now = ObjectMap()  # as published
+        self._published = ObjectMap()
         self._sent_tick: int | None = None
-        self._taken: dict[str, int] = {}  # tick of the newest picture, by camera
+        self._newest_ticks: dict[str, int] = {}  # tick of the newest picture, by camera
         self._copies: deque[Copy] = deque(maxlen=2)  # the older one is 2 to 4 s old
         self._copied_tick = 0
         self._map = ""  # in use
         self._file: Path | None = None  # where its objects are written
-        self._saved: ObjectMap | None = ObjectMap()  # as written last; None where that failed
+        self._saved: ObjectMap | None = ObjectMap()  # the newest one written; None if that failed
         self._saved_tick = 0
         self.problem = ""
         self._writer: BackgroundWriter[Write] = BackgroundWriter(self._write, 1)
@@ -121,13 +121,13 @@ class ObjectServer:
         bus.serve(OBJECTS_CHANGE, self._change)
 
     def use_map(self, name: str, mapping: MappingMode) -> None:
-        """Use the objects of a map from now on. A file that cannot be read is left as it is."""
+        """Use the objects of a map. A file that cannot be read is not overwritten."""
         self.memory.clear()
         self.tags.clear()
         self._copies.clear()
         path = map_file.path_of(name) if name else None
         self._map = name if len(name) <= 64 and "/" not in name else Path(name).stem[:64]
-        # a growing map is not the one in the file any more
+        # a growing map differs from its file
         self._file = path if mapping == "localize" else None
         self.problem, self._sent_tick, found = "", None, ObjectFile()
         try:
@@ -140,14 +140,14 @@ class ObjectServer:
         self._keep_state()
 
     def saved_as(self, name: str) -> None:
-        """Name the map that was saved with these objects."""
+        """Set the name of the map, which was saved with these objects."""
         self._map, self._sent_tick = name, None
         self._keep_state()
 
     def restore(self, boot: int) -> None:
-        """Go on with what an earlier process kept in this start of the driver.
+        """Restore the state of an earlier process, if it belongs to this start of the driver.
 
-        The map must be the same, though it may have been saved under a name since.
+        The map must be the same. It may have got a name since.
         """
         if self._state_path is None or not self._bus.input_log.live:
             return
@@ -165,20 +165,20 @@ class ObjectServer:
             self.tags.restore([(one.tag, _anchor(one.anchor)) for one in found.tags])
 
     def restart(self, boot: int) -> None:
-        """Begin with another start of the driver: ticks and odometry begin again."""
+        """Prepare for another start of the driver, as ticks and odometry restart."""
         self._boot, self._tick = boot, 0
         self._waiting.clear()
         self._seen_tick = self._sent_tick = None
         self._saved_tick = self._copied_tick = 0
-        self._taken.clear()
+        self._newest_ticks.clear()
         if self._copies:
-            self._doubt()
+            self._go_back()
         self.memory.restart()
         self.tags.restart()
         self._keep_state()
 
     def hint(self) -> tuple[PoseHint, OdometrySample] | None:
-        """Return where the robot was by the tags in a picture that waits, and its odometry then."""
+        """Return a pose hint by the tags in a waiting picture, and the odometry at its exposure."""
         for picture in reversed(self._waiting):
             sample = self._fusion().at(picture.basis)
             found = self.tags.hint(picture.tags) if sample else None
@@ -189,30 +189,30 @@ class ObjectServer:
     def surroundings(
         self, body: BodyDescription, world: WorldModel, view: View, keyframes: Floats
     ) -> Surroundings:
-        """Return what `at_scan` needs to know of a scan."""
+        """Return the surroundings at a scan, for `at_scan`."""
         return Surroundings(body, world, view.scan.points.astype(np.float64), keyframes)
 
     def at_scan(self, seen: Surroundings, place: Place, moment: OdometrySample) -> None:
-        """Take the pictures that wait; the robot was at `place` at the scan of `moment`."""
+        """Process the waiting pictures. The robot was at `place` at the scan of `moment`."""
         self._tick = moment.tick
         if not place.localized:
-            self._doubt()
+            self._go_back()
         self.follow(seen.keyframes)
-        for picture in self._ready():
-            self._take(picture, seen, place, moment)
+        for picture in self._take_ready():
+            self._process(picture, seen, place, moment)
         self.follow(seen.keyframes)
-        if place.localized and not 0 <= moment.tick - self._copied_tick < DOUBT_TICKS:
+        if place.localized and not 0 <= moment.tick - self._copied_tick < COPY_TICKS:
             self._copied_tick = moment.tick
             self._copies.append((self.memory.anchored(), self.tags.anchored()))
 
     def follow(self, keyframes: Floats) -> None:
-        """Move objects and tags with the keyframes (n, 3) that they are fixed to."""
+        """Move objects and tags with their keyframes (n, 3)."""
         self.memory.follow(keyframes)
         self.tags.follow(keyframes)
 
     def publish(self, tick: int) -> None:
-        """Publish the objects if they are due at this tick, and keep them."""
-        since = AGAIN_TICKS if self._sent_tick is None else tick - self._sent_tick
+        """Publish and save the objects if they are due at this tick."""
+        since = REPUBLISH_TICKS if self._sent_tick is None else tick - self._sent_tick
         if 0 <= since < CHANGED_TICKS:
             return
         seen = self._seen_tick
@@ -222,9 +222,9 @@ class ObjectServer:
             map=self._map,
             recognizing=seen is not None and 0 <= tick - seen <= RECOGNIZING_TICKS,
         )
-        if 0 <= since < AGAIN_TICKS and _alike(now, self._now):
+        if 0 <= since < REPUBLISH_TICKS and _nearly_equal(now, self._published):
             return
-        self._now = self._bus.publish(OBJECT_MAP, now, basis=tick)
+        self._published = self._bus.publish(OBJECT_MAP, now, basis=tick)
         self._sent_tick = tick
         self._keep(tick)
 
@@ -234,41 +234,41 @@ class ObjectServer:
 
     @property
     def present(self) -> ObjectFile:
-        """Return the objects and tags that stay, in the map as it is now."""
+        """The objects and tags that do not move by themselves, in the current map."""
         return ObjectFile(
             objects=tuple(one for one, _ in self.memory.anchored())[: object_file.MAX_OBJECTS],
             tags=self.tags.tags()[: object_file.MAX_OBJECTS],
         )
 
     def problems(self) -> tuple[Cause, ...]:
-        """Return why objects are not kept, if they are not."""
+        """Return the cause if objects cannot be loaded or saved."""
         if not self.problem:
             return ()
         remedy = "remove the damaged file, and load the map again"
-        if self.problem.startswith(UNSAVED):  # a map that is loaded again has those of its file
+        if self.problem.startswith(UNSAVED):  # loading the map again would discard newer objects
             remedy = "make room on the disk; it is tried again every few seconds"
         return (Cause(code="objects_unsaved", text=self.problem[:500], remedy=remedy),)
 
     async def finish_writing(self) -> None:
-        """Return once all is written."""
+        """Wait until everything is written."""
         if self._tick:
-            self._keep(self._tick + SAVED_TICKS)
+            self._keep(self._tick + SAVE_TICKS)
         await self._writer.close()
 
     def _receive(self, _key: str, picture: Detections) -> None:
-        if picture.boot != self._boot or len(self._waiting) == WAITING:
+        if picture.boot != self._boot or len(self._waiting) == MAX_WAITING:
             self._bus.counters["detections_left_out"] += 1
         if picture.boot == self._boot:
             self._waiting.append(picture)
 
-    def _ready(self) -> list[Detections]:
-        """Take the pictures whose odometry is known; drop those that can never be placed."""
+    def _take_ready(self) -> list[Detections]:
+        """Take out the pictures whose odometry is known. Drop those that can never be placed."""
         newest = self._fusion().newest
         ready, later = [], []
         for one in self._waiting:
             if newest and one.basis <= newest.tick:
                 ready.append(one)
-            elif newest and one.basis <= newest.tick + FUTURE_TICKS:
+            elif newest and one.basis <= newest.tick + MAX_FUTURE_TICKS:
                 later.append(one)
             else:
                 self._bus.counters["detections_left_out"] += 1
@@ -276,17 +276,17 @@ class ObjectServer:
         self._waiting.extend(later)
         return ready
 
-    def _take(
+    def _process(
         self, picture: Detections, seen: Surroundings, place: Place, moment: OdometrySample
     ) -> None:
         if any(one.link and one.name == picture.camera for one in seen.body.cameras):
-            return  # it is not known what a camera on an arm looks at
+            return  # the pose of a camera on an arm is not known
         camera, sample = seen.camera(picture.camera), self._fusion().at(picture.basis)
-        again = picture.basis <= self._taken.get(picture.camera, -1)
+        again = picture.basis <= self._newest_ticks.get(picture.camera, -1)
         if camera is None or sample is None or again or sample.jumps != moment.jumps:
             self._bus.counters["detections_left_out"] += 1
             return
-        self._taken[camera.name] = self._seen_tick = picture.basis
+        self._newest_ticks[camera.name] = self._seen_tick = picture.basis
         if not place.localized:
             return
         motion = between(moment.fused, sample.fused)
@@ -295,7 +295,7 @@ class ObjectServer:
             camera=camera,
             pose=compose(place.pose, motion),
             spread=place.covariance,
-            hits=_moved(seen.hiding(camera.z), motion),
+            hits=_in_moved_frame(seen.hiding(camera.z), motion),
             time_s=picture.basis * TICK_S,
             unix_ns=picture.stamp_ns,
             steady=self._steady(sample),
@@ -303,8 +303,8 @@ class ObjectServer:
         self.memory.look(glance)
         self.tags.look(glance)
 
-    def _doubt(self) -> None:
-        """Go back to what was known some seconds ago: since then the robot may have been lost."""
+    def _go_back(self) -> None:
+        """Restore the memory of some seconds ago, as the robot may have been lost since then."""
         self.tags.doubt()
         if self._copies:
             objects, tags = self._copies[0]
@@ -325,7 +325,7 @@ class ObjectServer:
             text = self._forget(request)
         except Refused as error:
             return ObjectsReply(ok=False, text=str(error)[:500])
-        self._copies.clear()  # they hold what is forgotten
+        self._copies.clear()  # they contain the forgotten objects
         log_accepted(self._bus, OBJECTS_CHANGE.key, request, self._tick)
         self._sent_tick = None
         if self._tick:
@@ -334,7 +334,7 @@ class ObjectServer:
         return ObjectsReply(ok=True, text=text[:500])
 
     def _forget(self, request: ObjectsRequest) -> str:
-        """Forget what is asked for; return it as text. Raises Refused if it is not known."""
+        """Forget the requested objects, and describe that. Raises Refused for unknown ones."""
         known = self.present
         if request.everything:
             self.memory.clear()
@@ -352,17 +352,17 @@ class ObjectServer:
         return f"forgot {', '.join(names)}"
 
     def _keep(self, tick: int) -> None:
-        """Write what the next process needs, and the map's file in a saved map, if it changed."""
-        if 0 <= tick - self._saved_tick < SAVED_TICKS:
+        """Save the objects if they have changed and a save is due."""
+        if 0 <= tick - self._saved_tick < SAVE_TICKS:
             return
         found = self.present
         now = ObjectMap(objects=found.objects, tags=found.tags, map=self._map)
-        if self._saved is None or not _alike(now, self._saved):
+        if self._saved is None or not _nearly_equal(now, self._saved):
             self._saved, self._saved_tick = now, tick
             self._keep_state()
 
     def _keep_state(self) -> None:
-        """Write them at once."""
+        """Write the state for the next process, and the file of a saved map, in the background."""
         nowhere = self._state_path is None and self._file is None
         if not self._boot or nowhere or not self._bus.input_log.live:
             return
@@ -396,26 +396,26 @@ class ObjectServer:
             self.problem = ""
 
 
-def _moved(hits: Floats, motion: Floats) -> Floats:
-    """Return points (n, 2) of one body frame in that of the body after `motion`."""
+def _in_moved_frame(hits: Floats, motion: Floats) -> Floats:
+    """Transform points (n, 2) from a body's frame to its frame after `motion`."""
     cos, sin = np.cos(motion[2]), np.sin(motion[2])
     off = hits - motion[:2]
     return np.column_stack((off @ (cos, sin), off @ (-sin, cos)))
 
 
-def _alike(one: ObjectMap, other: ObjectMap) -> bool:
-    """Return whether two maps differ by no more than small shifts."""
+def _nearly_equal(one: ObjectMap, other: ObjectMap) -> bool:
+    """Return whether two maps differ only by shifts of less than MIN_SHIFT_M."""
     if one.map != other.map or one.recognizing != other.recognizing:
         return False
     if [(it.id, it.label) for it in one.objects] != [(it.id, it.label) for it in other.objects]:
         return False
     if [it.id for it in one.tags] != [it.id for it in other.tags]:
         return False
-    return bool((np.abs(_places(one) - _places(other)) < SHIFT_M).all())
+    return bool((np.abs(_positions(one) - _positions(other)) < MIN_SHIFT_M).all())
 
 
-def _places(found: ObjectMap) -> Floats:
-    """Return where everything is, (n, 2) [m]."""
+def _positions(found: ObjectMap) -> Floats:
+    """Return the positions of objects, then of tags, (n, 2) [m]."""
     objects = [(one.x, one.y) for one in found.objects]
     return np.array(objects + [(one.x, one.y) for one in found.tags]).reshape(-1, 2)
 

@@ -1,4 +1,4 @@
-"""Publishes what stands near the arm of a body with a depth camera: `robot/solids`."""
+"""Publishes the solids near the arm of a body with a depth camera on `robot/solids`."""
 
 import logging
 import math
@@ -22,31 +22,33 @@ from gigabrain_zenoh.vision.solids import EDGE_PX, find_solids, is_gone
 if TYPE_CHECKING:
     from gigabrain_zenoh.manipulation.arm_mask import ArmMask
 
-KEPT_STATES = 50  # whose joints are known at the exposure of a picture
-LATE_TICKS = 3  # joints move no farther than the mask's margin meanwhile
+KEPT_STATES = 50  # whose joint positions are kept until a picture of that time arrives
+MAX_OFFSET_TICKS = (
+    3  # from a picture to a state; meanwhile, joints move less than the mask's margin
+)
 log = logging.getLogger(__name__)
 
 
 class SolidPublisher:
-    """Remembers what stands near an arm, on the loop."""
+    """Tracks and publishes the solids near an arm. Runs on the event loop."""
 
     def __init__(self, bus: Bus, description: BodyDescription) -> None:
         self._bus, self._description = bus, description
         self._memory, self._history = SolidMemory(), PoseHistory()
         self._mask: ArmMask | None = None
         self._joints: deque[tuple[int, dict[str, float]]] = deque(maxlen=KEPT_STATES)
-        self._ends = [
+        self._unsubscribe = [
             bus.subscribe(ARM_MODEL, lambda _, model: self._on_model(model)),
             bus.subscribe(DETECTIONS, lambda _, found: self._on_detections(found)),
         ]
 
     def close(self) -> None:
-        """Stop listening."""
-        for end in self._ends:
-            end()
+        """End the subscriptions."""
+        for unsubscribe in self._unsubscribe:
+            unsubscribe()
 
     def on_state(self, state: RobotState) -> None:
-        """Record where joints and body are; another start of the driver forgets everything."""
+        """Record the positions of joints and body. A restart of the driver clears everything."""
         if state.boot != self._history.boot:
             self._memory = SolidMemory()
             self._joints.clear()
@@ -54,21 +56,21 @@ class SolidPublisher:
         self._joints.append((state.tick, {one.name: one.position for one in state.joints}))
 
     def own(self, tick: int) -> OwnPoints | None:
-        """Return what tells which points of a picture of `tick` are on the arm, if it is known."""
+        """Return a function that finds the arm's points in a picture of `tick`; None if unknown."""
         if self._mask is None or not self._joints:
             return None
         then, joints = min(self._joints, key=lambda one: abs(one[0] - tick))
-        if abs(then - tick) > LATE_TICKS or not self._mask.knows(joints):
+        if abs(then - tick) > MAX_OFFSET_TICKS or not self._mask.knows(joints):
             return None
         return partial(self._mask.covers, joints=joints)
 
     @staticmethod
     def find(seen: Seen) -> tuple[SolidFit, ...]:
-        """Return what stands in a picture; to be called in a thread beside the loop."""
+        """Return the solids in a picture. This is slow: call it in a thread."""
         return tuple(find_solids(seen.view, seen.model, seen.own))
 
     def look(self, seen: Seen, fits: Sequence[SolidFit], pose: Pose, tick: int) -> None:
-        """Take what was found in a picture of `tick`, seen from a body at `pose`, and publish."""
+        """Add the fits in a picture of `tick` by a body at `pose`, and publish the solids."""
         self._memory.look(fits, pose, tick, partial(is_gone, seen.view, seen.model))
         self._bus.publish(SOLIDS, Solids(solids=self._memory.solids(pose, tick)), basis=tick)
 
@@ -88,7 +90,7 @@ class SolidPublisher:
         log.warning("%s", text, extra={"data": {"event": "solids"}})
 
     def _on_detections(self, found: Detections) -> None:
-        """Take the classes of what was recognised, and is not cut off by an edge of the picture."""
+        """Add the classes of recognised things that no edge of the picture cuts off."""
         pose = self._history.at(found.boot, found.basis)
         camera = next((one for one in self._description.cameras if one.name == found.camera), None)
         if pose is None or camera is None:

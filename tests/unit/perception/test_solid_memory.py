@@ -7,7 +7,7 @@ import pytest
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.objects import SeenSolid
 from gigabrain_zenoh.geometry.pose import ORIGIN
-from gigabrain_zenoh.perception.solid_memory import KEPT_S, MAX_SOLIDS, MISSES, SolidMemory
+from gigabrain_zenoh.perception.solid_memory import KEPT_S, MAX_MISSES, MAX_SOLIDS, SolidMemory
 from gigabrain_zenoh.vision.solid_fit import SolidFit
 
 
@@ -63,7 +63,7 @@ def test_a_thing_that_is_seen_through_goes_and_one_that_is_hidden_stays() -> Non
     for tick in range(3, 30):
         looked(memory, tick=tick)
     assert only(memory).age == 0.0
-    for tick in range(30, 30 + MISSES):
+    for tick in range(30, 30 + MAX_MISSES):
         looked(memory, tick=tick, gone=True)
     assert memory.solids(ORIGIN, 40) == ()
 
