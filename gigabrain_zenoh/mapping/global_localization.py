@@ -17,7 +17,7 @@ from gigabrain_zenoh.kernels.images import dilated
 from gigabrain_zenoh.kernels.jit import kernel
 from gigabrain_zenoh.mapping.keyframes import Beams, Points
 from gigabrain_zenoh.mapping.likelihood_field import (
-    JUDGED,
+    MIN_JUDGED,
     FieldFit,
     LikelihoodField,
     fit,
@@ -156,7 +156,7 @@ def _outdone(field: LikelihoodField, one: FieldFit, found: list[FieldFit]) -> bo
 
     `one` is mostly not shown, and the map does not match itself when moved there.
     """
-    if one.shown >= JUDGED or not found:
+    if one.shown >= MIN_JUDGED or not found:
         return False
     best = found[0]
     clear = best.shown >= CLEAR_SHOWN and best.score >= CLEAR_SCORE and best.wrong <= CLEAR_WRONG
@@ -165,7 +165,7 @@ def _outdone(field: LikelihoodField, one: FieldFit, found: list[FieldFit]) -> bo
 
 def _least(shown: float) -> float:
     """Return the least score of what is shown: the less is shown, the higher."""
-    return MIN_SCORE + (MIN_SCORE_HIDDEN - MIN_SCORE) * max(0.0, 1.0 - shown / JUDGED)
+    return MIN_SCORE + (MIN_SCORE_HIDDEN - MIN_SCORE) * max(0.0, 1.0 - shown / MIN_JUDGED)
 
 
 def _standing(field: LikelihoodField) -> NDArray[np.bool_]:

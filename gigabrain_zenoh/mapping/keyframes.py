@@ -13,38 +13,39 @@ from gigabrain_zenoh.geometry.scan import median
 from gigabrain_zenoh.kernels.jit import kernel
 
 Points = NDArray[np.float32]
-NEIGHBOUR = 0.4  # [m], a point farther away lies on something else
-SPREAD, FARTHEST = 2.5, 1.2  # unless beams are so many times farther apart there; and [m]
-SPAN = 0.12  # [m], a normal rests on neighbours at least so far to either side, where there are any
+NEIGHBOUR_M = 0.4  # a point farther away lies on another surface,
+NEIGHBOUR_BEAMS = 2.5  # unless the beams are sparse: then it may be so many beams away,
+SPARSE_NEIGHBOUR_M = 1.2  # up to this distance
+MIN_SPAN_M = 0.12  # a normal uses neighbours up to at least this distance on either side
 MIN_NEIGHBOURS, MAX_NEIGHBOURS = 3, 10  # neighbours on either side
-MIN_POINTS = 3  # points under a normal
+MIN_POINTS = 3  # for a normal
 
-BINS = 360  # of bearing
-MARGIN = 0.3  # [m], what lies nearer than a beam's end by less was hit by it
-MIN_SEEN_POINTS = 20  # points in view; fewer prove nothing
+BEARING_BINS = 360
+HIT_MARGIN_M = 0.3  # a point this near to the end of a beam was hit by it
+MIN_SEEN_POINTS = 20  # fewer points in view prove nothing
 
 Arrays = Mapping[str, NDArray[np.generic]]
-REACH_M = 200.0  # of a beam: what it passes is drawn cell by cell
+REACH_M = 200.0  # longest beam, as the grid draws every cell that it passes
 
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """One scan in the body's frame. Points are in the order of the beams, which normals need."""
+    """One scan in the body's frame. Points are in beam order, which normals need."""
 
     points: Points  # [m], (n, 2): where beams hit
     normals: Points  # (n, 2), unit length, sign unknown; zeros where unknown
-    free: Points  # [m], (m, 2): how far beams that hit nothing are known to be free
+    free: Points  # [m], (m, 2): free ends of beams that hit nothing
 
     @classmethod
     def of(cls, points: NDArray[np.floating], free: NDArray[np.floating] | None = None) -> "Scan":
         """Make a scan of hits (n, 2) in beam order; ValueError for another shape or NaN.
 
-        Hits beyond REACH_M are left out: no map could be loaded with them.
+        Hits beyond REACH_M are left out, as no map could be loaded with them.
         """
-        kept = pairs("points", points)
+        kept = as_points("points", points)
         near = np.abs(kept) <= REACH_M
         kept = kept if near.all() else kept[near.all(axis=1)]
-        ends = np.empty((0, 2), np.float32) if free is None else pairs("free", free)
+        ends = np.empty((0, 2), np.float32) if free is None else as_points("free", free)
         return cls(kept, normals(kept), ends)
 
 
@@ -52,13 +53,13 @@ class Beams(NamedTuple):
     """Ends of a scan's beams in the body's frame [m]."""
 
     hits: Points  # (n, 2)
-    free: Points  # (m, 2): how far beams that hit nothing are known to be free
-    sensor: Floats  # (2,): where they start
+    free: Points  # (m, 2): free ends of beams that hit nothing
+    sensor: Floats  # (2,): where beams start
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One scan in the body's frame."""
+    """One scan in the body's frame, and the sensor's position."""
 
     scan: Scan
     sensor: Floats  # (2,) [m], where the beams start
@@ -69,7 +70,7 @@ class View:
         return Beams(self.scan.points, self.scan.free, self.sensor)
 
 
-def pairs(name: str, values: NDArray[np.floating]) -> Points:
+def as_points(name: str, values: NDArray[np.floating]) -> Points:
     """Return a copy of `values` as (n, 2) points; ValueError for another shape or NaN."""
     if values.ndim != 2 or values.shape[1] != 2:
         raise ValueError(f"{name}: expected shape (n, 2), got {values.shape}")
@@ -83,31 +84,31 @@ def from_beams(
 ) -> Scan:
     """Return the scan of beams at `angles` [rad]; ValueError unless `ranges` [m] match.
 
-    A beam that hit nothing within `range_max` counts as free up to `free_range`. One shorter than
-    `range_min`, or NaN, is left out.
+    A beam that hit nothing within `range_max` counts as free up to `free_range`. Ranges below
+    `range_min` and NaN are left out.
     """
     if angles.shape != ranges.shape or angles.ndim != 1:
         raise ValueError(f"expected {angles.shape[0]} ranges, got {ranges.shape}")
     hit = (ranges > range_min) & (ranges < range_max)
     clear = (ranges >= range_max) & (free_range > 0)
-    ways = np.column_stack((np.cos(angles), np.sin(angles)))
-    return Scan.of(ways[hit] * ranges[hit, None], ways[clear] * free_range)
+    directions = np.column_stack((np.cos(angles), np.sin(angles)))
+    return Scan.of(directions[hit] * ranges[hit, None], directions[clear] * free_range)
 
 
-def thinned(points: Points, most: int) -> Points:
-    """Return at most `most` of the points, evenly spaced by beam."""
-    if len(points) <= most:
+def thinned(points: Points, limit: int) -> Points:
+    """Return at most `limit` of the points, evenly spaced by beam."""
+    if len(points) <= limit:
         return points
-    return points[_evenly(len(points), most)]
+    return points[_spaced_indices(len(points), limit)]
 
 
 @lru_cache(maxsize=256)
-def _evenly(count: int, most: int) -> NDArray[np.intp]:
-    return np.linspace(0, count - 1, most).astype(np.intp)
+def _spaced_indices(count: int, limit: int) -> NDArray[np.intp]:
+    return np.linspace(0, count - 1, limit).astype(np.intp)
 
 
 def normals(points: Points) -> Points:
-    """Return the normal at each point, of the line through its neighbours in beam order."""
+    """Return the normal (n, 2) at each point: of the line through its neighbours in beam order."""
     if len(points) < MIN_POINTS:
         return np.zeros_like(points)
     bearings = np.arctan2(points[:, 1], points[:, 0])
@@ -115,24 +116,24 @@ def normals(points: Points) -> Points:
 
 
 @kernel
-def _normals(points: Points, between: float) -> Points:
-    """Fit lines; where beams, `between` [rad] apart, are far apart, so are neighbours."""
+def _normals(points: Points, spacing: float) -> Points:
+    """Fit lines to neighbours, farther away where the beams' `spacing` [rad] is wide."""
     count = len(points)
     found = np.zeros((count, 2), np.float32)
     for k in range(count):
         n, sx, sy, sxx, syy, sxy = 1, 0.0, 0.0, 0.0, 0.0, 0.0
         range_ = np.sqrt(points[k, 0] ** 2 + points[k, 1] ** 2)
-        most_away = min(max(NEIGHBOUR, SPREAD * between * range_), FARTHEST)
+        max_distance = min(max(NEIGHBOUR_M, NEIGHBOUR_BEAMS * spacing * range_), SPARSE_NEIGHBOUR_M)
         for side in (-1, 1):
             for step in range(1, min(MAX_NEIGHBOURS, count - 1) + 1):
                 j = (k + side * step) % count
                 dx, dy = points[j, 0] - points[k, 0], points[j, 1] - points[k, 1]
-                away = np.sqrt(dx * dx + dy * dy)
-                if away < most_away:
+                distance = np.sqrt(dx * dx + dy * dy)
+                if distance < max_distance:
                     n += 1
                     sx, sy = sx + dx, sy + dy
                     sxx, syy, sxy = sxx + dx * dx, syy + dy * dy, sxy + dx * dy
-                if step >= MIN_NEIGHBOURS and away >= SPAN:
+                if step >= MIN_NEIGHBOURS and distance >= MIN_SPAN_M:
                     break
         if n >= MIN_POINTS:
             xx, yy, xy = sxx - sx * sx / n, syy - sy * sy / n, sxy - sx * sy / n
@@ -141,85 +142,85 @@ def _normals(points: Points, between: float) -> Points:
     return found
 
 
-def seen_through(shown: Points, scan: Points, pose: Floats) -> float:
-    """Return the share of the points `shown` (n, 2) that a scan at `pose` looks through.
+def seen_through(mapped: Points, scan: Points, pose: Floats) -> float:
+    """Return the share of the points `mapped` (n, 2) that beams of a scan at `pose` pass through.
 
-    Only points in its view count, not those behind its hits. `scan` (m, 2) is in the body's frame.
-    NaN if hardly any point is in view.
+    Points behind hits do not count. `scan` (m, 2) is in the body's frame. NaN if fewer than
+    MIN_SEEN_POINTS are in view.
     """
-    nearest, farthest = _ends(scan)
-    through, hit = _look(shown, nearest, farthest, pose)
+    nearest, farthest = _range_limits(scan)
+    through, hit = _count_seen(mapped, nearest, farthest, pose)
     return through / (through + hit) if through + hit >= MIN_SEEN_POINTS else np.nan
 
 
-def share_hit(shown: Points, scan: Points, pose: Floats) -> float:
-    """Return the share of the points `shown` (n, 2) that a scan at `pose` has hit as well."""
-    if not len(shown):
+def share_hit(mapped: Points, scan: Points, pose: Floats) -> float:
+    """Return the share of the points `mapped` (n, 2) that a scan at `pose` hits as well."""
+    if not len(mapped):
         return 1.0
-    nearest, farthest = _ends(scan)
-    _, hit = _look(shown, nearest, farthest, np.array(pose))
-    return hit / len(shown)
+    nearest, farthest = _range_limits(scan)
+    _, hit = _count_seen(mapped, nearest, farthest, np.array(pose))
+    return hit / len(mapped)
 
 
 @kernel
-def _bin(x: float, y: float) -> int:
-    return int((np.arctan2(y, x) / (2 * np.pi) + 1.0) * BINS) % BINS
+def _bearing_bin(x: float, y: float) -> int:
+    return int((np.arctan2(y, x) / (2 * np.pi) + 1.0) * BEARING_BINS) % BEARING_BINS
 
 
 @kernel
-def _ends(scan: Points) -> tuple[Floats, Floats]:
-    """Return the least and the greatest range of the beams around each bearing."""
-    low, high = np.full(BINS, np.inf), np.full(BINS, -np.inf)
+def _range_limits(scan: Points) -> tuple[Floats, Floats]:
+    """Return the smallest and the largest range of the beams around each bearing."""
+    low, high = np.full(BEARING_BINS, np.inf), np.full(BEARING_BINS, -np.inf)
     for x, y in scan:
-        away, at = np.sqrt(x * x + y * y), _bin(x, y)
+        distance, bearing = np.sqrt(x * x + y * y), _bearing_bin(x, y)
         for side in (-1, 0, 1):
-            b = (at + side) % BINS
-            low[b], high[b] = min(low[b], away), max(high[b], away)
+            b = (bearing + side) % BEARING_BINS
+            low[b], high[b] = min(low[b], distance), max(high[b], distance)
     return low, high
 
 
 @kernel
-def _look(shown: Points, low: Floats, high: Floats, pose: Floats) -> tuple[int, int]:
-    """Count the points that beams have passed through, and those that they have hit."""
+def _count_seen(mapped: Points, low: Floats, high: Floats, pose: Floats) -> tuple[int, int]:
+    """Return the numbers of points that beams pass through, and that they hit."""
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     through = hit = 0
-    for k in range(len(shown)):
-        dx, dy = shown[k, 0] - pose[0], shown[k, 1] - pose[1]
+    for k in range(len(mapped)):
+        dx, dy = mapped[k, 0] - pose[0], mapped[k, 1] - pose[1]
         x, y = cos * dx + sin * dy, cos * dy - sin * dx
-        at, away = _bin(x, y), np.sqrt(dx * dx + dy * dy)
-        if low[at] == np.inf:
+        bearing, distance = _bearing_bin(x, y), np.sqrt(dx * dx + dy * dy)
+        if low[bearing] == np.inf:
             continue
-        if away < low[at] - MARGIN:
+        if distance < low[bearing] - HIT_MARGIN_M:
             through += 1
-        elif away < high[at] + MARGIN:
+        elif distance < high[bearing] + HIT_MARGIN_M:
             hit += 1
     return through, hit
 
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """Keyframe `second` as seen from keyframe `first`, both by index."""
+    """Pose of keyframe `second` in the frame of keyframe `first`, both by index."""
 
     first: int
     second: int
-    relative: Floats
+    relative: Floats  # (3,)
     covariance: Floats  # (3, 3), of x, y and yaw in the axes of `second`
-    doubtful: bool  # may be all wrong, so it counts the less the more it disagrees with others
+    doubtful: bool  # may be false: it loses weight where it disagrees with other edges
 
 
 @dataclass(frozen=True, slots=True)
 class Keyframe:
-    """A scan that is kept, and the link by which it hangs on an earlier one."""
+    """A scan that the map keeps, and its link to an earlier keyframe."""
 
     points: Points  # as in Scan
     free: Points
-    link: Edge  # the first keyframe hangs on itself, `relative` being its pose in the map
-    travel: float  # [m], driven until here
-    segment: int  # parts of the drive between which the sequence broke
+    link: Edge  # the first keyframe is linked to itself; `relative` is its pose in the map
+    travel: float  # [m], driven before it
+    segment: int  # number of its part of the drive; a break of the sequence starts a new one
 
     @property
     def scan(self) -> Scan:
-        """The scan. Its normals are computed again, as storing them would double the memory."""
+        """The scan. Its normals are computed again: storing them would double the memory."""
         return Scan(self.points, normals(self.points), self.free)
 
 
@@ -229,16 +230,16 @@ class KeyframePolicy:
 
     travel: float = 0.2  # [m]
     turn: float = 0.26  # [rad]
-    fewest: int = 8  # keyframes, however far apart they are
-    most: int = 20  # keyframes, however near
-    length: float = 4.0  # [m] of travel, between the two
+    min_held: int = 8
+    max_held: int = 20
+    held_travel: float = 4.0  # [m], limits the number between the two
 
     def first(self, poses: Floats) -> int:
         """Return the index of the first of the poses (n, 3) that the local map still holds."""
         steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
-        behind = np.append(np.cumsum(steps[::-1])[::-1], 0.0)  # travel from each to the last
+        behind = np.append(np.cumsum(steps[::-1])[::-1], 0.0)  # [m], from each to the last
         age = np.arange(len(poses))[::-1]
-        held = (age < self.fewest) | ((age < self.most) & (behind <= self.length))
+        held = (age < self.min_held) | ((age < self.max_held) & (behind <= self.held_travel))
         return int(np.argmax(held))
 
 
@@ -248,9 +249,9 @@ def keyframes_to_arrays(keyframes: Sequence[Keyframe]) -> dict[str, NDArray[np.g
         **edges_to_arrays("link", [keyframe.link for keyframe in keyframes]),
         "travel": np.array([keyframe.travel for keyframe in keyframes]),
         "segment": np.array([keyframe.segment for keyframe in keyframes], np.int32),
-        "points": _joined(keyframe.points for keyframe in keyframes),
+        "points": _concatenated(keyframe.points for keyframe in keyframes),
         "points_each": np.array([len(keyframe.points) for keyframe in keyframes], np.int32),
-        "free": _joined(keyframe.free for keyframe in keyframes),
+        "free": _concatenated(keyframe.free for keyframe in keyframes),
         "free_each": np.array([len(keyframe.free) for keyframe in keyframes], np.int32),
     }
 
@@ -262,7 +263,9 @@ def keyframes_from_arrays(arrays: Arrays) -> list[Keyframe]:
     free = split(arrays["free"], arrays["free_each"])
     rows = zip(links, points, free, arrays["travel"], arrays["segment"], strict=True)
     return [
-        Keyframe(pairs("points", hits), pairs("free", ends), link, float(travel), int(segment))
+        Keyframe(
+            as_points("points", hits), as_points("free", ends), link, float(travel), int(segment)
+        )
         for link, hits, ends, travel, segment in rows
     ]
 
@@ -294,14 +297,14 @@ def edges_from_arrays(name: str, arrays: Arrays) -> list[Edge]:
 
 
 def shaped(arrays: Arrays, name: str, *shape: int) -> Floats:
-    """Return one of the arrays; KeyError without it, ValueError for another shape."""
+    """Return an array as floats; KeyError if it is missing, ValueError for another shape."""
     values = arrays[name].astype(np.float64)
     if values.shape != shape:
         raise ValueError(f"{name} of shape {values.shape}, expected {shape}")
     return values
 
 
-def _joined(parts: Iterable[Points]) -> Points:
+def _concatenated(parts: Iterable[Points]) -> Points:
     return np.concatenate([np.empty((0, 2), np.float32), *parts])
 
 

@@ -15,7 +15,7 @@ from gigabrain_zenoh.host.threads import ScheduledWorker, Take
 from gigabrain_zenoh.mapping.global_localization import MIN_POINTS, Candidate, apart, search
 from gigabrain_zenoh.mapping.keyframes import View
 from gigabrain_zenoh.mapping.likelihood_field import (
-    CONTRADICTED_M,
+    CONTRADICTION_CAP_M,
     LikelihoodField,
     clearance,
     contradiction,
@@ -387,6 +387,6 @@ class KidnapDetector:
         made_of = grid, grid.scans, x, y
         if made_of != self._made_of:
             cells, corner = grid.around(x, y, JUDGED_RADIUS_M)
-            self._field = field_of(cells, CELL, corner, CONTRADICTED_M) if cells.size else None
+            self._field = field_of(cells, CELL, corner, CONTRADICTION_CAP_M) if cells.size else None
             self._made_of = made_of
         return self._field

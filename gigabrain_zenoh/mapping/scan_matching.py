@@ -15,26 +15,26 @@ from numpy.typing import NDArray
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import kernel, lean_kernel
 from gigabrain_zenoh.mapping.keyframes import Points, thinned
-from gigabrain_zenoh.mapping.local_map import BLOCK, BUCKET, Buckets, Bytes, LikelihoodImage
+from gigabrain_zenoh.mapping.local_map import BLOCK, BUCKET_M, Buckets, Bytes, LikelihoodImage
 
-SEARCHED = 90  # points of a scan are enough to search with
-ASIDE = 0.01  # of the score, at the window's rim: of equals, the one nearest to the guess
+MAX_SEARCH_POINTS = 90
+OFFSET_PENALTY = 0.01  # of the score at the window's rim: of equals, the nearest to the guess wins
 
-ITERATIONS = 25
-STILL = 1e-4  # [m] and [rad], a step this small ends ICP
-SHRINK = 0.6  # of the gate, each iteration
-GATE_LEAST = 0.12  # [m]
-SIGMA = 0.06  # [m], residuals beyond it lose their weight
-SOFT = 1e-9  # keeps the normal equations regular where the points say nothing
+MAX_ITERATIONS = 25
+CONVERGED_STEP = 1e-4  # [m] and [rad], a smaller step ends ICP
+GATE_SHRINK = 0.6  # factor of the gate per iteration
+MIN_GATE_M = 0.12
+SIGMA_M = 0.06  # larger residuals lose their weight
+DAMPING = 1e-9  # keeps the normal equations regular where points leave a direction open
 
 
 class LatticeHits(NamedTuple):
-    """Points of a scan at each heading of a window, at the window's first row and column."""
+    """Cells of a scan's points at each heading, with the body in the window's first cell."""
 
-    inside: NDArray[np.uint32]  # (headings, n): cells, counted row by row, of points that
-    inside_count: NDArray[np.int64]  # stay in the image all over the window; how many
-    rim: NDArray[np.int64]  # (headings, n, 2): row and column of those that may be in it
-    rim_count: NDArray[np.int64]
+    inside: NDArray[np.uint32]  # (headings, n), flat indices of points always in the image
+    inside_count: NDArray[np.int64]  # (headings,)
+    rim: NDArray[np.int64]  # (headings, n, 2), row and column of points sometimes in the image
+    rim_count: NDArray[np.int64]  # (headings,)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,22 +67,22 @@ def search(
     points: Points,
     guess: Floats,
     window: Window,
-    least: float = -np.inf,
-    most: int = SEARCHED,
+    min_score: float = -np.inf,
+    max_points: int = MAX_SEARCH_POINTS,
 ) -> SearchResult:
     """Search the window for the pose whose points fall on the likeliest cells.
 
-    Returns the guess, with a score of 0, if no pose scores `least`, which saves most of the search.
-    At most `most` of the points are used.
+    Returns the guess with score 0 if no pose reaches `min_score`; a high one saves much time.
+    At most `max_points` of the points are used.
     """
     if not len(points):
         return SearchResult(guess, 0.0)
     steps = math.ceil(window.away / image.cell)
     turns = math.ceil(window.turn / window.step)
-    lattice, few = Lattice(steps, turns, window.step), thinned(points, most)
-    hits = _placed(few, guess, image, lattice)
-    bounds = _bounds(image.coarse, hits, len(few), lattice)
-    score, t, i, j = _best(image.cells, hits, bounds, len(few), lattice, least)
+    lattice, used = Lattice(steps, turns, window.step), thinned(points, max_points)
+    hits = _placed(used, guess, image, lattice)
+    bounds = _bounds(image.coarse, hits, len(used), lattice)
+    score, t, i, j = _best(image.cells, hits, bounds, len(used), lattice, min_score)
     off = np.array(((j - steps) * image.cell, (i - steps) * image.cell, (t - turns) * window.step))
     return SearchResult(guess + off, score)
 
@@ -120,7 +120,7 @@ def _score(likelihood: float, down: int, right: int, t: int, lattice: Lattice) -
     """
     away = (down * down + right * right) / (lattice.steps * lattice.steps + 1)
     turned = t * t / (lattice.turns * lattice.turns + 1)
-    return likelihood - ASIDE * (away + turned)
+    return likelihood - OFFSET_PENALTY * (away + turned)
 
 
 @lean_kernel
@@ -129,9 +129,9 @@ def _total(
 ) -> int:
     """Return the summed likelihood of all points of heading `t`, shifted by `row` and `column`."""
     total = 0
-    on = np.uint32(row * cells.shape[1] + column)
+    shift = np.uint32(row * cells.shape[1] + column)
     for k in range(hits.inside_count[t]):
-        total += flat[hits.inside[t, k] + on]
+        total += flat[hits.inside[t, k] + shift]
     for k in range(hits.rim_count[t]):
         i, j = hits.rim[t, k, 0] + row, hits.rim[t, k, 1] + column
         if 0 <= i < cells.shape[0] and 0 <= j < cells.shape[1]:
@@ -157,14 +157,12 @@ def _bounds(coarse: Bytes, hits: LatticeHits, count: int, lattice: Lattice) -> F
 
 @kernel
 def _best(
-    cells: Bytes, hits: LatticeHits, bounds: Floats, count: int, lattice: Lattice, least: float
+    cells: Bytes, hits: LatticeHits, bounds: Floats, count: int, lattice: Lattice, min_score: float
 ) -> tuple[float, int, int, int]:
-    """Return likelihood, heading, row and column of the pose with the best score, the first of
-    equals.
-    """
-    blocks, best, flat, (steps, turns, _) = bounds.shape[1], least, cells.ravel(), lattice
+    """Return likelihood, heading, row and column of the best pose (the first of equals)."""
+    blocks, best, flat, (steps, turns, _) = bounds.shape[1], min_score, cells.ravel(), lattice
     likeliest, at_t, at_i, at_j = 0.0, turns, steps, steps
-    first = np.argmax(bounds)  # the sooner something good is found, the more can be left out
+    first = np.argmax(bounds)  # a good first pose allows to skip more blocks
     for n in range(-1, bounds.size):
         block = first if n < 0 else n
         t, top, left = block // (blocks * blocks), block // blocks % blocks, block % blocks
@@ -184,8 +182,8 @@ class IcpResult(NamedTuple):
 
     pose: Floats
     information: Floats  # (3, 3), of x, y and yaw about the body, in the map's axes
-    inliers: float  # share of the points that lie on a line
-    rms: float  # [m], of their distances from it
+    inliers: float  # share of the points that are matched to a line
+    rms: float  # [m], of the inliers' distances from their lines
 
 
 @lean_kernel
@@ -194,43 +192,43 @@ def _nearest(local: Buckets, x: float, y: float, gate: float, known: int) -> int
     points, starts, width, origin = local.points, local.starts, local.width, local.origin
     best, found = gate * gate, -1
     if known >= 0:
-        away = _away(points, known, x, y)
+        away = _squared_distance(points, known, x, y)
         if away < best:
             best, found, gate = away, known, np.sqrt(away)
     height = (len(starts) - 1) // width
-    left = max(int(np.floor((x - gate - origin[0]) / BUCKET)), 0)
-    right = min(int(np.floor((x + gate - origin[0]) / BUCKET)), width - 1)
-    top = max(int(np.floor((y - gate - origin[1]) / BUCKET)), 0)
-    bottom = min(int(np.floor((y + gate - origin[1]) / BUCKET)), height - 1)
+    left = max(int(np.floor((x - gate - origin[0]) / BUCKET_M)), 0)
+    right = min(int(np.floor((x + gate - origin[0]) / BUCKET_M)), width - 1)
+    top = max(int(np.floor((y - gate - origin[1]) / BUCKET_M)), 0)
+    bottom = min(int(np.floor((y + gate - origin[1]) / BUCKET_M)), height - 1)
     if left > right:
         return found
     for row in range(top, bottom + 1):
         for k in range(starts[row * width + left], starts[row * width + right + 1]):
-            away = _away(points, k, x, y)
+            away = _squared_distance(points, k, x, y)
             if away < best:
                 best, found = away, k
     return found
 
 
 @lean_kernel
-def _away(local: Points, k: int, x: float, y: float) -> float:
+def _squared_distance(local: Points, k: int, x: float, y: float) -> float:
     dx, dy = local[k, 0] - x, local[k, 1] - y
     away: float = dx * dx + dy * dy
     return away
 
 
 @kernel
-def solved(m: Floats, v: Floats) -> Floats:
-    """x of m x = v, m being a symmetric (3, 3) matrix, by Cramer's rule."""
+def solve_symmetric(m: Floats, v: Floats) -> Floats:
+    """Solve m x = v for a symmetric (3, 3) matrix by Cramer's rule; only its upper half is read."""
     a, b, c = m[0, 0], m[0, 1], m[0, 2]
     d, e, f = m[1, 1], m[1, 2], m[2, 2]
     aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
     dd, ee, ff = a * f - c * c, b * c - a * e, a * d - b * b
-    whole = a * aa + b * bb + c * cc
+    determinant = a * aa + b * bb + c * cc
     x = np.empty(3)
-    x[0] = (aa * v[0] + bb * v[1] + cc * v[2]) / whole
-    x[1] = (bb * v[0] + dd * v[1] + ee * v[2]) / whole
-    x[2] = (cc * v[0] + ee * v[1] + ff * v[2]) / whole
+    x[0] = (aa * v[0] + bb * v[1] + cc * v[2]) / determinant
+    x[1] = (bb * v[0] + dd * v[1] + ee * v[2]) / determinant
+    x[2] = (cc * v[0] + ee * v[1] + ff * v[2]) / determinant
     return x
 
 
@@ -246,9 +244,9 @@ def _linearize(
     local: Buckets, points: Points, pose: Floats, gate: float, nearest: NDArray[np.int32],
     sums: NormalEquations,
 ) -> tuple[int, float]:  # fmt: skip
-    """Add the points at `pose` to `sums`; return how many have a line, and their squared errors.
+    """Add the points at `pose` to `sums`; return the numbers of inliers and their squared errors.
 
-    `nearest` are the points of `local` that they were matched to before, or -1.
+    `nearest` are the indices of the points in `local` of the previous matches, or -1.
     """
     inliers, squares, near = 0, 0.0, -1
     (hessian, gradient), normals, known = sums, local.normals, local.points
@@ -256,7 +254,7 @@ def _linearize(
     for k in range(len(points)):
         rx = cos * points[k, 0] - sin * points[k, 1]
         ry = sin * points[k, 0] + cos * points[k, 1]
-        near = nearest[k] if nearest[k] >= 0 else near  # or that of the beam beside
+        near = nearest[k] if nearest[k] >= 0 else near  # or the match of the previous beam
         j = _nearest(local, pose[0] + rx, pose[1] + ry, gate, near)
         nearest[k] = j
         if j < 0:
@@ -264,7 +262,7 @@ def _linearize(
         near = j
         nx, ny = normals[j, 0], normals[j, 1]
         error = (pose[0] + rx - known[j, 0]) * nx + (pose[1] + ry - known[j, 1]) * ny
-        weight = (SIGMA / (SIGMA * SIGMA + error * error)) ** 2  # divided by the variance
+        weight = (SIGMA_M / (SIGMA_M * SIGMA_M + error * error)) ** 2  # divided by the variance
         lever = rx * ny - ry * nx  # how the error grows with yaw
         inliers += 1
         squares += error * error
@@ -287,24 +285,24 @@ def icp(
 ) -> IcpResult:
     """Slide `points` onto the lines of `local`, beginning at `start`.
 
-    `prior` is the (3, 3) information about `guess`, the pose that odometry expects. It decides
-    where the lines leave a direction open.
+    `prior` (3, 3) is the information about `guess`, the pose that odometry expects. It decides in
+    directions that the lines leave open.
     """
     pose, hessian = start.copy(), np.zeros((3, 3))
     inliers, squares = 0, 0.0
     nearest = np.full(len(points), -1, np.int32)
-    for _ in range(ITERATIONS):
+    for _ in range(MAX_ITERATIONS):
         hessian, gradient = np.zeros((3, 3)), np.zeros(3)
         sums = NormalEquations(hessian, gradient)
         inliers, squares = _linearize(local, points, pose, gate, nearest, sums)
         off = pose - guess
         off[2] = (off[2] + np.pi) % (2 * np.pi) - np.pi
-        for row in range(3):  # `@` would call for a BLAS
+        for row in range(3):  # `@` would need a BLAS
             gradient[row] += (prior[row] * off).sum()
-        step = solved(hessian + prior + SOFT * np.eye(3), gradient)
+        step = solve_symmetric(hessian + prior + DAMPING * np.eye(3), gradient)
         pose -= step
-        if np.abs(step).max() < STILL and gate <= GATE_LEAST:
+        if np.abs(step).max() < CONVERGED_STEP and gate <= MIN_GATE_M:
             break
-        gate = max(gate * SHRINK, GATE_LEAST)
+        gate = max(gate * GATE_SHRINK, MIN_GATE_M)
     rms = np.sqrt(squares / max(inliers, 1))
     return IcpResult(pose, hessian, inliers / max(len(points), 1), rms)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gigabrain_zenoh.mapping.keyframes import Beams
-from gigabrain_zenoh.mapping.likelihood_field import CONTRADICTED_M, contradiction, field_of
+from gigabrain_zenoh.mapping.likelihood_field import CONTRADICTION_CAP_M, contradiction, field_of
 
 CELL = 0.05
 AT = np.zeros(3)
@@ -29,5 +29,5 @@ def test_short_distances_tell_the_same_of_beams_as_long_ones() -> None:
         ([on_wall, (1.3, 0.1)], 0.0),  # too near to the wall to be amid free ground
         ([on_wall, (1.2, 0.1)], 0.5),
     ):
-        assert share(ends, CONTRADICTED_M) == share(ends, 2.0) == expected
-    assert share([through], CONTRADICTED_M) == share([through], 2.0) >= 1.0
+        assert share(ends, CONTRADICTION_CAP_M) == share(ends, 2.0) == expected
+    assert share([through], CONTRADICTION_CAP_M) == share([through], 2.0) >= 1.0
