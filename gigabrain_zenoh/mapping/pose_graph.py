@@ -1,8 +1,7 @@
 """Pose graph of keyframes, optimised incrementally (iSAM2, gtsam), and bounds of its drift.
 
 M. Kaess et al., iSAM2: Incremental smoothing and mapping using the Bayes tree, IJRR 2012. Drift is
-summed along the least uncertain path between two keyframes, an upper bound of what the graph
-knows.
+summed along the least uncertain path between two keyframes: an upper bound.
 """
 
 import heapq
@@ -17,26 +16,26 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.geometry.se2 import between, compose
 from gigabrain_zenoh.mapping.keyframes import Edge
 
-ANCHOR = 1e-3  # [m] and [rad], how firmly the first pose is held
-ROBUST = 1.0  # standard deviations, doubtful edges beyond it lose their weight
-MOVED = 0.01  # [m] and [rad], what moves farther is linearised again
-NEVER = 1 << 30  # updates
-ROUNDS = 3  # of that after loops are closed
-PIECE = 1500  # poses solved for in one go; each takes 15 to 40 us
-FAILURES = (RuntimeError, ValueError, IndexError)  # what gtsam's exceptions become in Python
+ANCHOR_SIGMA = 1e-3  # [m] and [rad], of the first pose
+ROBUST_SIGMAS = 1.0  # doubtful edges with larger residuals lose their weight
+RELINEARIZE_THRESHOLD = 0.01  # [m] and [rad], poses that move farther are linearised again
+RELINEARIZE_SKIP = 1 << 30  # updates: as linearising takes long, it happens only when forced
+RELINEARIZATIONS = 3  # after loops are closed
+MAX_POSES_AT_ONCE = 1500  # solved for in one go; each takes 15 to 40 us
+GTSAM_ERRORS = (RuntimeError, ValueError, IndexError)  # as Python sees its exceptions
 
-JOINT = 0.03  # [m] and [rad], of every loop
-GATE = 16.3  # 99.9 % of chi-square with three degrees of freedom
+LOOP_SIGMA = 0.03  # [m] and [rad]
+CHI_SQUARE_LIMIT = 16.3  # 99.9 %, three degrees of freedom
 
 
 class Graph:
     """Poses of keyframes 0 to n - 1. One thread at a time.
 
-    Closing a loop is done in pieces, as gtsam blocks all other threads.
+    Loops are closed in pieces, as gtsam blocks all other threads.
 
-    gtsam raises for a system that it takes for indeterminate, and cannot be used afterwards. The
-    optimiser is then rebuilt with QR in place of Cholesky: slower, and it solves what Cholesky
-    cannot. If that fails too, even without the newest loops, poses stay and no loop closes.
+    If gtsam takes a system for indeterminate, it raises, and cannot be used afterwards. The
+    optimiser is then rebuilt with QR instead of Cholesky: slower, but it solves more. If that fails
+    too, even without the newest loops, poses stay and no loop closes.
     """
 
     def __init__(self) -> None:
@@ -44,14 +43,14 @@ class Graph:
         self._links: list[Edge] = []
         self.poses: Floats = np.empty((0, 3))
         self.loops: list[Edge] = []
-        self._newest = 0  # loops that have not settled yet
-        self._rounds = 0  # that are left
-        self._round = 0  # poses solved for in the last of them
-        self.rebuilt = 0  # how often the optimiser had to be
-        self.failure = ""  # why no loop closes any more
+        self._unsettled = 0  # newest loops, not yet settled
+        self._rounds_left = 0
+        self._poses_per_round = 0  # that the last round solved for
+        self.rebuilt = 0  # times that the optimiser was rebuilt
+        self.failure = ""  # reason why no more loops are closed
 
     def extend(self, links: Iterable[Edge], poses: Floats | None = None) -> None:
-        """Add keyframes, each by its link; at `poses` (n, 3), or where the links lead."""
+        """Add keyframes by their links, at `poses` (n, 3) or where the links lead."""
         links, known = list(links), len(self.poses)
         placed = np.concatenate((self.poses, np.empty((len(links), 3))))
         for at, link in enumerate(links, known):
@@ -63,81 +62,81 @@ class Graph:
         if self._isam is None:
             return
         try:
-            self._isam.update(*_linked(links, placed))
-        except FAILURES as error:
+            self._isam.update(*_keyframe_factors(links, placed))
+        except GTSAM_ERRORS as error:
             self._rebuild(error)
 
     def close(self, loops: Sequence[Edge], *, known: bool = False) -> bool:
-        """Add loops, and begin to settle; whether that is done already.
+        """Add loops, and start to settle; return whether that is done.
 
-        Those that cannot be closed are missing in `loops` afterwards, unless the poses are `known`
-        to rest on them.
+        Loops that cannot be closed are missing in `self.loops` afterwards, unless the poses are
+        `known` to include them.
         """
         if known or self._isam:
             self.loops = [*self.loops, *loops]
         if self._isam is None:
             return True
-        self._newest = 0 if known else len(loops)
-        self._rounds, self._round = ROUNDS, len(self.poses)
+        self._unsettled = 0 if known else len(loops)
+        self._rounds_left, self._poses_per_round = RELINEARIZATIONS, len(self.poses)
         try:
-            added = self._isam.update(_joined(loops), gtsam.Values())
+            added = self._isam.update(_loop_factors(loops), gtsam.Values())
             return self._settled(self._isam, added.getVariablesReeliminated())
-        except FAILURES as error:
+        except GTSAM_ERRORS as error:
             self._rebuild(error)
             return True
 
     def settle(self) -> bool:
-        """Go on moving all poses to where everything agrees best; whether that is done."""
+        """Continue to move all poses to the optimum; return whether that is done."""
         if self._isam is None:
             return True
         try:
             return self._settled(self._isam, 0)
-        except FAILURES as error:
+        except GTSAM_ERRORS as error:
             self._rebuild(error)
             return True
 
     def _settled(self, isam: gtsam.ISAM2, solved: int) -> bool:
         """Update until the rounds are done or the piece is full; return whether they are done.
 
-        `solved` poses of this piece have been solved for already.
+        `solved` is the number of poses that this piece has solved for already.
         """
-        while self._rounds:
-            if solved and solved + self._round > PIECE:
+        while self._rounds_left:
+            if solved and solved + self._poses_per_round > MAX_POSES_AT_ONCE:
                 return False
             result = isam.update(force_relinearize=True)
-            self._round = result.getVariablesReeliminated()
-            self._rounds = self._rounds - 1 if result.getVariablesRelinearized() else 0
-            solved += self._round
-        self.poses, self._newest = _estimate(isam), 0
+            self._poses_per_round = result.getVariablesReeliminated()
+            self._rounds_left = self._rounds_left - 1 if result.getVariablesRelinearized() else 0
+            solved += self._poses_per_round
+        self.poses, self._unsettled = _estimate(isam), 0
         return True
 
     def _rebuild(self, error: Exception) -> None:
-        """Replace the optimiser that has raised `error`; it settles in one go, for that is rare."""
-        self._rounds = 0
+        """Replace the optimiser that raised `error`; as that is rare, it settles in one go."""
+        self._rounds_left = 0
         self.rebuilt += 1
-        settled = self.loops[: len(self.loops) - self._newest]
-        for loops in (self.loops, settled) if self._newest else (settled,):
+        settled = self.loops[: len(self.loops) - self._unsettled]
+        for loops in (self.loops, settled) if self._unsettled else (settled,):
             isam = _optimiser("QR")
             try:
-                isam.update(*_linked(self._links, self.poses))
-                isam.update(_joined(loops), gtsam.Values())
-                for _ in range(ROUNDS):
+                isam.update(*_keyframe_factors(self._links, self.poses))
+                isam.update(_loop_factors(loops), gtsam.Values())
+                for _ in range(RELINEARIZATIONS):
                     isam.update(force_relinearize=True)
                 self.poses = _estimate(isam)
-            except FAILURES as again:
-                error = again
+            except GTSAM_ERRORS as new_error:
+                error = new_error
                 continue
-            self._isam, self.loops, self._newest = isam, loops, 0
+            self._isam, self.loops, self._unsettled = isam, loops, 0
             return
-        self._isam, self.loops, self._newest = None, settled, 0
+        self._isam, self.loops, self._unsettled = None, settled, 0
         self.failure = " ".join(str(error).split())[:120]
 
 
 def _optimiser(factorization: str) -> gtsam.ISAM2:
     params = gtsam.ISAM2Params()
     params.setFactorization(factorization)
-    params.setRelinearizeThreshold(MOVED)
-    params.relinearizeSkip = NEVER  # unless it is asked for: it is what takes long
+    params.setRelinearizeThreshold(RELINEARIZE_THRESHOLD)
+    params.relinearizeSkip = RELINEARIZE_SKIP
     return gtsam.ISAM2(params)
 
 
@@ -148,14 +147,14 @@ def _estimate(isam: gtsam.ISAM2) -> Floats:
     return poses
 
 
-def _linked(
+def _keyframe_factors(
     links: Iterable[Edge], poses: Floats
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """Return factors and values of keyframes at their poses."""
+    """Return the factors and values of keyframes at `poses`."""
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for link in links:
         if link.first == link.second:
-            noise = gtsam.noiseModel.Isotropic.Sigma(3, ANCHOR)
+            noise = gtsam.noiseModel.Isotropic.Sigma(3, ANCHOR_SIGMA)
             factors.add(gtsam.PriorFactorPose2(link.second, _pose(link.relative), noise))
         else:
             factors.add(_factor(link))
@@ -163,7 +162,7 @@ def _linked(
     return factors, values
 
 
-def _joined(loops: Iterable[Edge]) -> gtsam.NonlinearFactorGraph:
+def _loop_factors(loops: Iterable[Edge]) -> gtsam.NonlinearFactorGraph:
     factors = gtsam.NonlinearFactorGraph()
     for loop in loops:
         factors.add(_factor(loop))
@@ -182,7 +181,7 @@ def _noise(edge: Edge) -> gtsam.noiseModel.Base:
     noise = gtsam.noiseModel.Gaussian.Covariance(edge.covariance)
     if not edge.doubtful:
         return noise
-    cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(ROBUST)
+    cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(ROBUST_SIGMAS)
     return gtsam.noiseModel.Robust.Create(cauchy, noise)
 
 
@@ -195,13 +194,13 @@ class DriftRates:
 
 
 class Drift:
-    """The ways between keyframes, with the variance of yaw [rad²] and of place [m²] on each."""
+    """Variances of yaw [rad²] and position [m²] that drift adds along the edges of the graph."""
 
     def __init__(self, rates: DriftRates) -> None:
         self._rates = rates
-        self._ways: dict[int, list[tuple[int, float, float]]] = defaultdict(list)
+        self._edges: dict[int, list[tuple[int, float, float]]] = defaultdict(list)
 
-    def linked(self, link: Edge) -> None:
+    def add_link(self, link: Edge) -> None:
         """Add the link of a keyframe, unless it is the first."""
         if link.first == link.second:
             return
@@ -212,34 +211,34 @@ class Drift:
             driven = float(np.hypot(*link.relative[:2]))
             self._add(link, self._rates.turn**2 * driven, self._rates.away**2 * driven)
 
-    def closed(self, loop: Edge) -> None:
-        """Add a loop that is beyond doubt."""
-        self._add(loop, JOINT**2, JOINT**2)
+    def add_loop(self, loop: Edge) -> None:
+        """Add a confirmed loop."""
+        self._add(loop, LOOP_SIGMA**2, LOOP_SIGMA**2)
 
     def _add(self, edge: Edge, turn: float, away: float) -> None:
-        self._ways[edge.first].append((edge.second, turn, away))
-        self._ways[edge.second].append((edge.first, turn, away))
+        self._edges[edge.first].append((edge.second, turn, away))
+        self._edges[edge.second].append((edge.first, turn, away))
 
     def explains(self, loop: Edge, poses: Floats) -> bool:
-        """Return whether drift may explain the correction that closing `loop` would make."""
+        """Return whether drift may explain the correction by `loop`."""
         return explained(loop, poses, *self.between(loop.first, loop.second, poses))
 
     def between(self, first: int, second: int, poses: Floats) -> tuple[float, float]:
-        """Return the variance of yaw and of place on the least uncertain path (Dijkstra)."""
-        turn, away = self._spread(second, poses, first)
+        """Return the variances of yaw and position on the least uncertain path (Dijkstra)."""
+        turn, away = self._variances(second, poses, first)
         if not np.isfinite(turn[first]):
             raise ValueError(f"no way from keyframe {first} to {second}")
         return float(turn[first]), float(away[first])
 
     def spread(self, to: int, poses: Floats) -> tuple[Floats, Floats]:
-        """Return the variances of yaw and of place from each keyframe to one of them, (n,) each."""
-        return self._spread(to, poses)
+        """Return the variances of yaw and position from each keyframe to `to`, (n,) each."""
+        return self._variances(to, poses)
 
-    def _spread(self, to: int, poses: Floats, only: int | None = None) -> tuple[Floats, Floats]:
+    def _variances(self, to: int, poses: Floats, goal: int | None = None) -> tuple[Floats, Floats]:
         far = poses[:, :2] - poses[to, :2]
-        levers = (far * far).sum(axis=1).tolist()  # a turn on the way moves what is far from it
+        squared_levers = (far * far).sum(axis=1).tolist()  # a turn moves what is far from it
         turns, aways = np.full(len(poses), np.inf), np.full(len(poses), np.inf)
-        queue = [(JOINT**2, JOINT**2, to)]
+        queue = [(LOOP_SIGMA**2, LOOP_SIGMA**2, to)]
         done = set()
         while queue:
             turn, away, at = heapq.heappop(queue)
@@ -247,16 +246,16 @@ class Drift:
                 continue
             done.add(at)
             turns[at], aways[at] = turn, away
-            if at == only:
+            if at == goal:
                 break
-            for by, more_turn, more_away in self._ways[at]:
-                if by not in done:
-                    moved = away + more_away + more_turn * levers[at]
-                    heapq.heappush(queue, (turn + more_turn, moved, by))
+            for neighbour, more_turn, more_away in self._edges[at]:
+                if neighbour not in done:
+                    new_away = away + more_away + more_turn * squared_levers[at]
+                    heapq.heappush(queue, (turn + more_turn, new_away, neighbour))
         return turns, aways
 
 
 def explained(loop: Edge, poses: Floats, turn: float, away: float) -> bool:
-    """Return whether drift of these variances may have brought about what the loop corrects."""
+    """Return whether drift of these variances may explain the correction by `loop`."""
     x, y, yaw = between(between(poses[loop.first], poses[loop.second]), loop.relative)
-    return bool((x * x + y * y) / away + yaw * yaw / turn < GATE)
+    return bool((x * x + y * y) / away + yaw * yaw / turn < CHI_SQUARE_LIMIT)

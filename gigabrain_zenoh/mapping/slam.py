@@ -1,8 +1,8 @@
 """SLAM: front end, pose graph and loop closure together.
 
-`add` is the work per scan. `close_loops` may run in another thread meanwhile; its result moves
-nothing until `apply`. On ground that earlier passes mapped, scans are matched to existing
-keyframes, so that a map grows with the ground and not with the time driven.
+`add` processes a scan. Meanwhile `close_loops` may run in another thread; its result moves nothing
+until `apply`. On ground that earlier passes mapped, scans are matched to existing keyframes: a map
+grows with the ground, not with the time driven.
 """
 
 import copy
@@ -30,38 +30,38 @@ from gigabrain_zenoh.mapping.keyframes import (
 from gigabrain_zenoh.mapping.loop_closure import LoopSearch, around
 from gigabrain_zenoh.mapping.pose_graph import DriftRates, Graph
 
-LINK = np.diag((0.05, 0.05, 0.01)) ** 2  # covariance of a link beside that of its match,
-GUIDED = np.diag((0.02, 0.02, 0.005)) ** 2  # and where odometry was known to be good
-TIED = 4.0  # [m] of travel since a loop, so long the way is known to lie right on earlier ones
-DRIFTED = np.diag((0.05, 0.05, 0.02)) ** 2  # covariance of that
-AGAIN = 12.0  # [m] of travel between the ends of a loop that ties the way to an earlier one
+LINK_COVARIANCE = np.diag((0.05, 0.05, 0.01)) ** 2  # of a link, added to that of its match
+GUIDED_COVARIANCE = np.diag((0.02, 0.02, 0.005)) ** 2  # the same where odometry guided the match
+MAX_TIED_TRAVEL_M = 4.0  # since a loop; so long the path lies exactly on earlier ones
+TIED_COVARIANCE = np.diag((0.05, 0.05, 0.02)) ** 2  # of the drift since the loop
+MIN_TIE_TRAVEL_M = 12.0  # between the ends of a loop that ties the path to earlier ones
 
-TRAVEL = 12.0  # [m] since, or it is the same pass
-NEAR = 0.75  # [m], keyframes so near are of this place
-PASSES = 2  # over a place, from then on it is known
-REACH = 3.0  # [m], keyframes farther off show other places
-SQUARE, SECTOR = 0.4, np.pi / 2  # [m] and [rad]: of keyframes seen from one place one is enough
-TURNED = 0.5  # [m] that a keyframe may be farther off, for each rad that it is less turned away
-MAX_CANDIDATES = 16  # keyframes
+PASS_TRAVEL_M = 12.0  # after this travel a keyframe belongs to an earlier pass
+NEAR_M = 0.75  # keyframes this near show the robot's place
+MIN_PASSES = 2  # after which ground is known
+SIGHT_M = 3.0  # keyframes farther away show other places
+SQUARE_M, SECTOR_RAD = 0.4, np.pi / 2  # one keyframe is enough for each place and direction
+TURN_COST_M = 0.5  # per rad of turn, when keyframes are ranked by distance
+MAX_CANDIDATES = 16
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
     """Pose of the robot at a scan."""
 
-    pose: Floats  # in the map as it is now
-    covariance: Floats  # (3, 3), of x, y and yaw in the map, against what is mapped round the robot
-    keyframe: int  # the keyframe that this hangs on: a correction moves both
-    relative: Floats  # the pose in that keyframe's frame
-    kind: Kind  # how it was found, see ScanMatch
+    pose: Floats  # (3,), in the present map
+    covariance: Floats  # (3, 3), of x, y and yaw in the map, relative to its surroundings
+    keyframe: int  # a correction of this keyframe moves the pose as well
+    relative: Floats  # (3,), the pose in that keyframe's frame
+    kind: Kind  # see ScanMatch
     score: float  # 0 to 1, how well the scan fits
-    kept: bool  # the scan has become a keyframe
-    lost: bool  # the sequence broke, and nothing has joined the parts since
+    kept: bool  # the scan became a keyframe
+    lost: bool  # the sequence broke, and no loop joins the parts yet
 
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """Corrected poses of the first keyframes, after loops were closed."""
+    """Corrected poses of the first n keyframes, after loops were closed."""
 
     poses: Floats  # (n, 3)
     loops: tuple[Edge, ...]
@@ -77,20 +77,20 @@ class Slam:
         rates: DriftRates | None = None,
     ) -> None:
         self._front = FrontEnd(spacing or KeyframePolicy(), pose)
-        self._anchor = (0, pose)  # a keyframe, and where the front end has it
+        self._anchor = (0, pose)  # a keyframe, and its pose in the front end's frame
         self._poses: list[Floats] = []
         self._segment = 0
         self._joined = {0}  # segments that loops have joined to the first
         self._travel = 0.0
-        self._tied = -np.inf  # [m] of travel, where the way lay right on earlier ones last
-        self._known = False  # whether scans are laid onto earlier keyframes alone
-        self._smooth: Floats = IDENTITY  # the front end's frame, in the one that never jumps
+        self._tied_travel = -np.inf  # [m] of travel, where the path last lay on earlier ones
+        self._on_known_ground = False  # scans are matched to earlier keyframes only
+        self._smooth: Floats = IDENTITY  # the front end's frame in the frame that never jumps
         self._ground = KnownGround()
-        self._shown: dict[int, Scan] = {}  # keyframes of known ground; their normals take long
+        self._known_scans: dict[int, Scan] = {}  # by keyframe; kept, as their normals take long
         self._graph = Graph()
         self._rates = rates or DriftRates()
         self._search = LoopSearch(self._rates)
-        self._closing: tuple[Edge, ...] = ()  # loops that the graph has not settled with
+        self._closing: tuple[Edge, ...] = ()  # loops with which the graph has not settled
         self.keyframes: list[Keyframe] = []  # only appended to
         self.revision = 0  # changes whenever poses of keyframes are corrected
 
@@ -105,31 +105,31 @@ class Slam:
 
     @property
     def pose(self) -> Floats:
-        """The robot's pose at the last scan in the present map. Needs a keyframe."""
-        keyframe, placed = self._anchor
-        return compose(self._poses[keyframe], between(placed, self._front.pose))
+        """The robot's pose (3,) at the last scan in the present map. Needs a keyframe."""
+        keyframe, front_pose = self._anchor
+        return compose(self._poses[keyframe], between(front_pose, self._front.pose))
 
     @property
     def smooth(self) -> Floats:
-        """The robot's pose in a frame that drifts and never jumps."""
+        """The robot's pose (3,) in a frame that drifts and never jumps."""
         return compose(self._smooth, self._front.pose)
 
     def add(self, scan: Scan, delta: Floats, noise: Floats | None = None) -> Estimate:
-        """Add a scan after odometry has moved by `delta` (x, y, yaw).
+        """Add a scan after a step `delta` (x, y, yaw) of odometry.
 
-        `noise` (3, 3) is the covariance of `delta` in its own frame. Without it odometry is assumed
-        to be bad, and counts little where there is anything to match.
+        `noise` (3, 3) is the covariance of `delta` in its own frame. Without it odometry counts
+        little where scans can be matched.
         """
         if not np.isfinite(delta).all():
             raise ValueError(f"odometry: expected finite numbers, got {delta}")
         self._travel += float(np.hypot(delta[0], delta[1]))
         match, far = self._front.add(scan, delta, noise)
-        known = self._familiar(scan, match) if far else None
+        known = self._match_known_ground(scan, match) if far else None
         match, kept = known or match, far and known is None
-        keyframe, placed = self._anchor
-        relative = between(placed, match.pose)
+        keyframe, front_pose = self._anchor
+        relative = between(front_pose, match.pose)
         if kept:
-            self._keep(scan, match, relative)
+            self._add_keyframe(scan, match, relative)
             keyframe, relative = len(self.keyframes) - 1, IDENTITY
         pose = compose(self._poses[keyframe], relative)
         return Estimate(
@@ -155,61 +155,66 @@ class Slam:
         smooth = self.smooth
         self._front.place(pose)
         self._front.restart([self.keyframes[k].scan for k in ids], [poses[k] for k in ids])
-        self._hang_on(nearest, poses, smooth)
+        self._continue_from(nearest, poses, smooth)
 
-    def _hang_on(self, keyframe: int, poses: Floats, smooth: Floats) -> None:
-        """Go on in the map's frame from an earlier keyframe, the robot being at `smooth`."""
+    def _continue_from(self, keyframe: int, poses: Floats, smooth: Floats) -> None:
+        """Continue in the map's frame from an earlier keyframe; the robot is at `smooth`."""
         self._anchor = (keyframe, poses[keyframe])
         self._segment = self.keyframes[keyframe].segment
-        self._tied = self._travel
+        self._tied_travel = self._travel
         self._smooth = compose(smooth, inverse(self._front.pose))
 
-    def _familiar(self, scan: Scan, match: ScanMatch) -> ScanMatch | None:
-        """Lay the scan onto the keyframes of known ground, and match to those from now on.
+    def _match_known_ground(self, scan: Scan, match: ScanMatch) -> ScanMatch | None:
+        """Match the scan to the keyframes of known ground, and the next scans as well.
 
-        Return None where the ground is not known, or shows something else.
+        Return None if the ground is not known, or the scan does not fit it.
         """
-        known, self._known = self._known, False
-        if match.kind != "matched" or self._travel - self._tied > TIED:
+        known, self._on_known_ground = self._on_known_ground, False
+        if match.kind != "matched" or self._travel - self._tied_travel > MAX_TIED_TRAVEL_M:
             return None
-        keyframe, placed = self._anchor
+        keyframe, front_pose = self._anchor
         poses, smooth = self.poses, self.smooth
-        pose = compose(poses[keyframe], between(placed, match.pose))
-        ids = self._ground.round(pose, self._travel, poses, self._joined)
+        pose = compose(poses[keyframe], between(front_pose, match.pose))
+        ids = self._ground.keyframes_near(pose, self._travel, poses, self._joined)
         if not ids:
             return None
         covariance = turned(match.covariance, float(pose[2] - match.pose[2]))
-        about = replace(match, pose=pose, covariance=covariance + (0.0 if known else DRIFTED))
-        self._shown = {k: self._shown.get(k) or self.keyframes[k].scan for k in ids}
-        found = self._front.settle(scan, list(self._shown.values()), list(poses[ids]), about)
+        expected = replace(
+            match, pose=pose, covariance=covariance + (0.0 if known else TIED_COVARIANCE)
+        )
+        self._known_scans = {k: self._known_scans.get(k) or self.keyframes[k].scan for k in ids}
+        found = self._front.settle(
+            scan, list(self._known_scans.values()), list(poses[ids]), expected
+        )
         if found:
-            self._known = True
-            self._hang_on(ids[-1], poses, smooth)
+            self._on_known_ground = True
+            self._continue_from(ids[-1], poses, smooth)
         return found
 
     def close_loops(self) -> Correction | None:
-        """Take in the next keyframe and look for a loop from it, or go on closing what was found.
+        """Search for loops from the next keyframe, or continue to close those that were found.
 
-        None when that corrects nothing. Call it until `behind` is 0; one thread at a time, any.
+        Return None if nothing is corrected yet. Call it until `behind` is 0, from one thread at a
+        time.
         """
         if self._closing:
-            return self._closed(self._graph.settle())
+            return self._correction(self._graph.settle())
         here = len(self._graph.poses)
         if here == len(self.keyframes):
             return None
         keyframes = self.keyframes[: here + 1]
         link = keyframes[here].link
         self._graph.extend([link])
-        self._search.drift.linked(link)
+        self._search.drift.add_link(link)
         if self._graph.failure:
             return None
         loops = self._search.find(keyframes, self._graph.poses)
         if not loops:
             return None
         self._closing = tuple(loops)
-        return self._closed(self._graph.close(loops))
+        return self._correction(self._graph.close(loops))
 
-    def _closed(self, settled: bool) -> Correction | None:
+    def _correction(self, settled: bool) -> Correction | None:
         if not settled:
             return None
         kept = {id(loop) for loop in self._graph.loops}
@@ -232,28 +237,28 @@ class Slam:
         return len(self.keyframes) - len(self._graph.poses) + bool(self._closing)
 
     def apply(self, correction: Correction) -> None:
-        """Move the keyframes to where `close_loops` has found them to be."""
+        """Move the keyframes to the poses that `close_loops` returned."""
         done = len(correction.poses)
         self._poses = list(correction.poses)
         for keyframe in self.keyframes[done:]:
             link = keyframe.link
             self._poses.append(compose(self._poses[link.first], link.relative))
-        self._join(correction.loops)
+        self._join_segments(correction.loops)
         self.revision += 1
 
     def still(self) -> "Slam":
-        """Return a copy for `freeze`. Not while `close_loops` runs."""
-        held = copy.copy(self)
-        held.keyframes, held._poses = list(self.keyframes), list(self._poses)
-        held._front, held._graph = copy.copy(self._front), copy.copy(self._graph)
-        held._search = copy.copy(self._search)
-        held._search.waiting = list(self._search.waiting)
-        return held
+        """Return a copy for `freeze`. Do not call it while `close_loops` runs."""
+        copied = copy.copy(self)
+        copied.keyframes, copied._poses = list(self.keyframes), list(self._poses)
+        copied._front, copied._graph = copy.copy(self._front), copy.copy(self._graph)
+        copied._search = copy.copy(self._search)
+        copied._search.waiting = list(self._search.waiting)
+        return copied
 
     def freeze(self) -> dict[str, NDArray[np.generic]]:
-        """Return the state as arrays, to be saved. Not while `close_loops` runs."""
-        held = {id(keyframe.points): k for k, keyframe in enumerate(self.keyframes)}
-        scans, placed = self._front.held
+        """Return the state as arrays, to be saved. Do not call it while `close_loops` runs."""
+        indices = {id(keyframe.points): k for k, keyframe in enumerate(self.keyframes)}
+        scans, local_poses = self._front.held
         return {
             **keyframes_to_arrays(self.keyframes),
             **edges_to_arrays("loop", self._graph.loops),
@@ -262,8 +267,8 @@ class Slam:
             "behind": np.array(len(self.keyframes) - len(self._graph.poses)),
             "searched": np.array(self._search.searched),
             "driven": np.array(self._travel),
-            "local": np.array([held[id(scan.points)] for scan in scans], np.int32),
-            "local_poses": np.array(placed).reshape(-1, 3),
+            "local": np.array([indices[id(scan.points)] for scan in scans], np.int32),
+            "local_poses": np.array(local_poses).reshape(-1, 3),
             "front": self._front.pose,
             "anchor": np.array(self._anchor[0]),
             "anchor_pose": self._anchor[1],
@@ -273,7 +278,7 @@ class Slam:
     def thaw(
         cls, arrays: Arrays, spacing: KeyframePolicy | None = None, rates: DriftRates | None = None
     ) -> "Slam":
-        """Go on from what was frozen; KeyError or ValueError if it does not belong together."""
+        """Restore a frozen state; KeyError or ValueError if the arrays do not belong together."""
         slam = cls(shaped(arrays, "front", 3), spacing, rates)
         slam.keyframes = keyframes_from_arrays(arrays)
         for keyframe in slam.keyframes:
@@ -295,28 +300,28 @@ class Slam:
         loops = edges_from_arrays("loop", arrays)
         self._graph = _graph_of(self.keyframes[: len(poses)], poses, loops)
         for keyframe in self.keyframes[: len(poses)]:
-            self._search.drift.linked(keyframe.link)
+            self._search.drift.add_link(keyframe.link)
         for loop in loops:
-            self._search.drift.closed(loop)
+            self._search.drift.add_loop(loop)
         self._search.waiting = edges_from_arrays("waiting", arrays)
         self._search.searched = float(arrays["searched"])
-        self._join(loops)
+        self._join_segments(loops)
 
-    def _join(self, loops: Sequence[Edge]) -> None:
+    def _join_segments(self, loops: Sequence[Edge]) -> None:
         for loop in loops:
             here, there = self.keyframes[loop.second].travel, self.keyframes[loop.first].travel
-            if here - there > AGAIN:
-                self._tied = max(self._tied, here)
-            ends = {self.keyframes[loop.first].segment, self.keyframes[loop.second].segment}
-            if ends & self._joined:
-                self._joined |= ends
+            if here - there > MIN_TIE_TRAVEL_M:
+                self._tied_travel = max(self._tied_travel, here)
+            segments = {self.keyframes[loop.first].segment, self.keyframes[loop.second].segment}
+            if segments & self._joined:
+                self._joined |= segments
 
-    def _keep(self, scan: Scan, match: ScanMatch, relative: Floats) -> None:
+    def _add_keyframe(self, scan: Scan, match: ScanMatch, relative: Floats) -> None:
         here = len(self.keyframes)
         broken = match.kind == "broken"
         self._segment += broken
-        beside = GUIDED if match.guided else LINK
-        covariance = beside + turned(match.covariance, -float(match.pose[2]))
+        extra = GUIDED_COVARIANCE if match.guided else LINK_COVARIANCE
+        covariance = extra + turned(match.covariance, -float(match.pose[2]))
         doubtful = match.kind in ("odometry", "broken")
         link = Edge(self._anchor[0], here, relative if here else match.pose, covariance, doubtful)
         self.keyframes.append(Keyframe(scan.points, scan.free, link, self._travel, self._segment))
@@ -327,7 +332,7 @@ class Slam:
 
 
 def _graph_of(keyframes: Sequence[Keyframe], poses: Floats, loops: Sequence[Edge]) -> Graph:
-    """Return the graph of keyframes that are about where they belong."""
+    """Return the settled graph of keyframes whose `poses` are about right."""
     graph = Graph()
     graph.extend([keyframe.link for keyframe in keyframes], poses)
     settled = not loops or graph.close(loops, known=True)
@@ -337,7 +342,7 @@ def _graph_of(keyframes: Sequence[Keyframe], poses: Floats, loops: Sequence[Edge
 
 
 class KnownGround:
-    """Keyframes by place. Corrections move them, so each call takes their poses."""
+    """Finds keyframes by place. Corrections move them, so their poses are given to each call."""
 
     def __init__(self) -> None:
         self._travel: Floats = np.empty(0)
@@ -348,36 +353,38 @@ class KnownGround:
         self._travel = np.append(self._travel, keyframe.travel)
         self._segments = np.append(self._segments, keyframe.segment)
 
-    def round(self, pose: Floats, travel: float, poses: Floats, joined: set[int]) -> list[int]:
+    def keyframes_near(
+        self, pose: Floats, travel: float, poses: Floats, joined: set[int]
+    ) -> list[int]:
         """Return the keyframes that show the ground round `pose` (3,), the nearest last.
 
-        Earlier passes count only, after `travel` [m] now, and segments that are joined to the map.
-        Nothing is returned where there were fewer than PASSES of them.
+        Only passes before `travel` [m] count, in segments that are `joined` to the map. The list is
+        empty after fewer than MIN_PASSES of them.
         """
-        earlier = np.flatnonzero(travel - self._travel > TRAVEL)
+        earlier = np.flatnonzero(travel - self._travel > PASS_TRAVEL_M)
         away = np.hypot(*(poses[earlier, :2] - pose[:2]).T)
-        around = away < REACH
+        around = away < SIGHT_M
         around &= np.isin(self._segments[earlier], list(joined))
         ids, away = earlier[around], away[around]
-        if self._passes(ids[away < NEAR]) < PASSES:
+        if self._count_passes(ids[away < NEAR_M]) < MIN_PASSES:
             return []
-        return _chosen(ids, poses[ids], pose)
+        return _newest_by_place(ids, poses[ids], pose)
 
-    def _passes(self, ids: NDArray[np.intp]) -> int:
-        """Return how often the robot has come by these keyframes, which are in their order."""
+    def _count_passes(self, ids: NDArray[np.intp]) -> int:
+        """Return the number of passes by these keyframes, which are in order of travel."""
         passes, last = 0, -np.inf
         for travel in self._travel[ids].tolist():
-            if travel - last > TRAVEL:
+            if travel - last > PASS_TRAVEL_M:
                 passes, last = passes + 1, travel
         return passes
 
 
-def _chosen(ids: NDArray[np.intp], poses: Floats, pose: Floats) -> list[int]:
-    """Return the newest keyframe of each place and direction; of those the nearest ones."""
-    places = np.floor(poses / (SQUARE, SQUARE, SECTOR))
+def _newest_by_place(ids: NDArray[np.intp], poses: Floats, pose: Floats) -> list[int]:
+    """Return the newest keyframe of each place and direction, only the nearest, farthest first."""
+    places = np.floor(poses / (SQUARE_M, SQUARE_M, SECTOR_RAD))
     _, newest = np.unique(places[::-1], axis=0, return_index=True)
     ids, poses = ids[::-1][newest], poses[::-1][newest]
-    off = poses - pose
-    far = np.hypot(off[:, 0], off[:, 1]) + TURNED * np.abs(wrap(off[:, 2]))
+    offsets = poses - pose
+    far = np.hypot(offsets[:, 0], offsets[:, 1]) + TURN_COST_M * np.abs(wrap(offsets[:, 2]))
     order = np.lexsort((ids, far))[:MAX_CANDIDATES]
     return [int(k) for k in ids[order[::-1]]]

@@ -94,7 +94,7 @@ def off(found: Graph, other: Graph) -> float:
 def test_an_optimiser_that_raises_once_is_rebuilt_and_no_loop_is_lost(
     call: int, fail: Callable[[Plan], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pose_graph, "PIECE", 10)  # so that loops settle in several pieces
+    monkeypatch.setattr(pose_graph, "MAX_POSES_AT_ONCE", 10)  # loops settle in several pieces
     undisturbed = driven()
     fail(lambda number, _: number == call)
     found = driven()

@@ -110,7 +110,7 @@ def around(travels: list[float], poses: Floats, now: float) -> list[int]:
     ground = KnownGround()
     for travel in travels:
         ground.add(keyframe(travel))
-    return ground.round(IDENTITY, now, poses, {0})
+    return ground.keyframes_near(IDENTITY, now, poses, {0})
 
 
 def test_ground_is_known_after_two_passes_that_are_over() -> None:

@@ -24,7 +24,7 @@ def searched(
     for k, pose in enumerate(poses):
         scan, before = lidar.scan(walls, pose), max(k - 1, 0)
         link = Edge(before, k, between(thought[before], thought[k]), np.eye(3) * 1e-3, False)
-        drift.linked(link)
+        drift.add_link(link)
         keyframes.append(Keyframe(scan.points, scan.free, link, float(travel[k]), 0))
         if k >= first:
             loops += search.find(Trajectory(keyframes, thought[: k + 1], travel[: k + 1]))
