@@ -1,7 +1,7 @@
 """Global localization: finds all poses in the map that explain one scan.
 
-Every block of 8 x 8 cells at every heading gets an upper bound of how well the scan may fit there;
-only the best blocks are looked at cell by cell (Olson 2009, Hess et al. 2016).
+Every block of 8 x 8 cells at every heading gets an upper bound of the scan's score; only the best
+blocks are searched cell by cell (Olson 2009, Hess et al. 2016).
 """
 
 import math
@@ -24,23 +24,23 @@ from gigabrain_zenoh.mapping.likelihood_field import (
     is_self_similar,
 )
 
-POINTS = 90  # of a scan, evenly chosen
+POINTS = 90  # of a scan, evenly sampled
 MIN_POINTS = 20
-SIGMA = 0.15  # [m], wide enough for the steps between headings
+SIGMA_M = 0.15  # wide enough for the steps between headings
 BLOCK = 8  # cells
 STEP_M, FINEST_RAD, COARSEST_RAD = 0.15, math.radians(1.0), math.radians(3.0)
-MIN_SCORE = 0.5  # a worse fit does not count
-UNKNOWN = 191  # of 255, what a hit on what the map does not show counts: neither for nor against
-BAND = 0.2  # candidates that much worse than the best are not looked at
-MIN_SCORE_HIDDEN = 0.9  # and that good where next to nothing is shown
-SHOWN = 0.2  # of the hits, at least, to make out a place
-CLEAR_SHOWN, CLEAR_SCORE, CLEAR_WRONG = 0.8, 0.8, 0.03  # a place beyond doubt, but for its likes
-AGAINST = 0.1  # beams that the map rules out, more than elsewhere: it is not there
-BEYOND_M = 3.0  # past the edge of what is known to be free
+MIN_SCORE = 0.5
+NEUTRAL = 191  # of 255, likelihood of a hit that the map cannot judge
+SCORE_BAND = 0.2  # below the best score, within which candidates are searched
+MIN_SCORE_HIDDEN = 0.9  # replaces MIN_SCORE where the map can judge hardly any hit
+MIN_SHOWN = 0.2  # share of the hits that the map must judge
+CLEAR_SHOWN, CLEAR_SCORE, CLEAR_WRONG = 0.8, 0.8, 0.03  # of a place that only a twin can rival
+MAX_MORE_WRONG = 0.1  # share of ruled-out beams above that of the best candidate
+MAX_BEYOND_EDGE_M = 3.0  # from free cells into unknown ones
 MAX_BLOCKS, MAX_TRIED, MAX_FOUND = 40_000, 192, 24
-APART_M, APART_RAD = 0.3, math.radians(20)  # nearer ones are the same
-SLID_M = 0.25  # a fit that went farther from where it began has become another place
-WEAK = np.diag((1.0, 1.0, 1.0))  # information that holds a candidate where it was found
+SAME_PLACE_M, SAME_PLACE_RAD = 0.3, math.radians(20)
+MAX_SLIDE_M = 0.25  # a fit that moves farther is another place
+WEAK_PRIOR = np.diag((1.0, 1.0, 1.0))  # information that holds a candidate where it was found
 
 Bytes = NDArray[np.uint8]
 
@@ -49,44 +49,44 @@ class Candidate(NamedTuple):
     """A pose of the body that would explain the scan."""
 
     pose: Floats  # (3,)
-    score: float  # as Fit's
+    score: float  # see FieldFit
 
 
 def search(field: LikelihoodField, beams: Beams, last: Floats | None = None) -> list[Candidate]:
     """Return all poses in the map that explain a scan about equally well, the best first.
 
-    The pose (3,) that was known `last` is among them if it explains the scan at all. Meant for a
-    thread in the background.
+    The `last` known pose (3,) is among them if it explains the scan at all. This is slow: call it
+    in a background thread.
     """
     hits = beams.hits
     if len(hits) < MIN_POINTS or not field.free.any():
         return []
-    tried = _likely(field, hits)
-    fits = [fit(field, beams, pose, WEAK) for pose in tried]
-    stayed = [one for one, pose in zip(fits, tried, strict=True) if _near(one.pose, pose)]
-    found = [Candidate(one.pose, one.score) for one in _distinct(field, stayed)]
+    tried = _promising_poses(field, hits)
+    fits = [fit(field, beams, pose, WEAK_PRIOR) for pose in tried]
+    kept = [one for one, pose in zip(fits, tried, strict=True) if _stayed(one.pose, pose)]
+    found = [Candidate(one.pose, one.score) for one in _distinct(field, kept)]
     if last is None:
         return found
-    here = fit(field, beams, last, WEAK)
-    if here.score < MIN_SCORE or not apart(here.pose, (one.pose for one in found)):
+    at_last = fit(field, beams, last, WEAK_PRIOR)
+    if at_last.score < MIN_SCORE or not apart(at_last.pose, (one.pose for one in found)):
         return found
-    return [*found, Candidate(here.pose, here.score)]
+    return [*found, Candidate(at_last.pose, at_last.score)]
 
 
-def _likely(field: LikelihoodField, hits: Points) -> list[Floats]:
+def _promising_poses(field: LikelihoodField, hits: Points) -> list[Floats]:
     """Return poses (3,) that put the hits near walls, the best first."""
-    chosen = hits[np.linspace(0, len(hits) - 1, min(POINTS, len(hits))).astype(np.intp)]
-    image = np.round(255 * np.exp(-0.5 * (field.distance / SIGMA) ** 2)).astype(np.uint8)
-    image[image == UNKNOWN] += 1
-    image[~field.shown] = UNKNOWN
-    standing = _standing(field)
-    bounds, headings = _bounds(image, standing, chosen, field.cell)
+    sampled = hits[np.linspace(0, len(hits) - 1, min(POINTS, len(hits))).astype(np.intp)]
+    image = np.round(255 * np.exp(-0.5 * (field.distance / SIGMA_M) ** 2)).astype(np.uint8)
+    image[image == NEUTRAL] += 1
+    image[~field.shown] = NEUTRAL
+    body_cells = _where_body_may_be(field)
+    bounds, headings = _bounds(image, body_cells, sampled, field.cell)
     places = _best_blocks(bounds)
-    offsets = _turned(chosen, headings, field.cell)
-    scores, cells = _inside(image, standing, offsets, places, bounds)
+    offsets = _point_offsets(sampled, headings, field.cell)
+    scores, cells = _search_blocks(image, body_cells, offsets, places, bounds)
     tried: list[Floats] = []
     for k in np.argsort(-scores, kind="stable")[: 50 * MAX_TRIED]:
-        if scores[k] < max(MIN_SCORE, scores.max() - BAND) or len(tried) == MAX_TRIED:
+        if scores[k] < max(MIN_SCORE, scores.max() - SCORE_BAND) or len(tried) == MAX_TRIED:
             break
         xy = field.origin + (cells[k] + 0.5) * field.cell
         pose = np.array((*xy, headings[places[k, 0]]))
@@ -96,20 +96,20 @@ def _likely(field: LikelihoodField, hits: Points) -> list[Floats]:
 
 
 def _bounds(
-    image: Bytes, standing: NDArray[np.bool_], points: Points, cell: float
+    image: Bytes, body_cells: NDArray[np.bool_], points: Points, cell: float
 ) -> tuple[Bytes, Floats]:
-    """Upper bounds (headings, rows, columns) of blocks, 0 to 255, and the headings [rad]."""
+    """Return upper bounds of blocks (headings, rows, columns), 0 to 255, and the headings [rad]."""
     reach = float(np.percentile(np.hypot(points[:, 0], points[:, 1]), 75))
-    finest = min(max(STEP_M / max(reach, STEP_M), FINEST_RAD), COARSEST_RAD)
-    headings = np.arange(0.0, math.tau, math.tau / math.ceil(math.tau / finest))
+    step = min(max(STEP_M / max(reach, STEP_M), FINEST_RAD), COARSEST_RAD)
+    headings = np.arange(0.0, math.tau, math.tau / math.ceil(math.tau / step))
     best_within = dilated(image, 0, BLOCK - 1)
-    some_free = dilated(standing.view(np.uint8), 0, BLOCK - 1)
-    offsets = _turned(points, headings, cell)
+    some_free = dilated(body_cells.view(np.uint8), 0, BLOCK - 1)
+    offsets = _point_offsets(points, headings, cell)
     blocks = some_free[::BLOCK, ::BLOCK].copy()
-    return _coarse(best_within, blocks, offsets), headings
+    return _block_bounds(best_within, blocks, offsets), headings
 
 
-def _turned(points: Points, headings: Floats, cell: float) -> NDArray[np.int64]:
+def _point_offsets(points: Points, headings: Floats, cell: float) -> NDArray[np.int64]:
     """Return the offset of each point from the body in cells (headings, points, 2)."""
     cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
     x, y = points[:, 0][None, :], points[:, 1][None, :]
@@ -120,41 +120,43 @@ def _turned(points: Points, headings: Floats, cell: float) -> NDArray[np.int64]:
 def _best_blocks(bounds: Bytes) -> NDArray[np.int64]:
     """Return the promising blocks (n, 3) as heading, row and column, the best first."""
     flat = bounds.ravel()
-    worth = np.flatnonzero(flat >= round(255 * MIN_SCORE))
-    order = np.argsort(-flat[worth].astype(np.int16), kind="stable")[:MAX_BLOCKS]
-    return np.stack(np.unravel_index(worth[order], bounds.shape), axis=-1).astype(np.int64)
+    promising = np.flatnonzero(flat >= round(255 * MIN_SCORE))
+    order = np.argsort(-flat[promising].astype(np.int16), kind="stable")[:MAX_BLOCKS]
+    return np.stack(np.unravel_index(promising[order], bounds.shape), axis=-1).astype(np.int64)
 
 
 def apart(pose: Floats, others: Iterable[Floats]) -> bool:
     """Return whether `pose` is far from all `others`."""
     for other in others:
-        off = pose - other
-        near = math.hypot(off[0], off[1]) < APART_M
-        if near and abs(float(wrap(off[2]))) < APART_RAD:
+        offset = pose - other
+        near = math.hypot(offset[0], offset[1]) < SAME_PLACE_M
+        if near and abs(float(wrap(offset[2]))) < SAME_PLACE_RAD:
             return False
     return True
 
 
-def _near(one: Floats, other: Floats) -> bool:
-    return math.hypot(*(one - other)[:2]) <= SLID_M
+def _stayed(fitted: Floats, start: Floats) -> bool:
+    return math.hypot(*(fitted - start)[:2]) <= MAX_SLIDE_M
 
 
 def _distinct(field: LikelihoodField, fits: list[FieldFit]) -> list[FieldFit]:
     """Return the best fit of each place, the best first, without those the scan contradicts."""
-    possible = [one for one in fits if one.shown >= SHOWN and one.likely >= _least(one.shown)]
-    most = min((one.wrong for one in possible), default=0.0) + AGAINST
+    possible = [
+        one for one in fits if one.shown >= MIN_SHOWN and one.likely >= _min_score(one.shown)
+    ]
+    max_wrong = min((one.wrong for one in possible), default=0.0) + MAX_MORE_WRONG
     found: list[FieldFit] = []
     for one in sorted(possible, key=lambda one: -one.score):
-        new = one.wrong <= most and apart(one.pose, (other.pose for other in found))
-        if new and len(found) < MAX_FOUND and not _outdone(field, one, found):
+        new = one.wrong <= max_wrong and apart(one.pose, (other.pose for other in found))
+        if new and len(found) < MAX_FOUND and not _is_ruled_out_by_best(field, one, found):
             found.append(one)
     return found
 
 
-def _outdone(field: LikelihoodField, one: FieldFit, found: list[FieldFit]) -> bool:
-    """Return whether another place is shown whole and fits, and is not the twin of this one.
+def _is_ruled_out_by_best(field: LikelihoodField, one: FieldFit, found: list[FieldFit]) -> bool:
+    """Return whether a clearly better place rules out `one`, which the map mostly does not show.
 
-    `one` is mostly not shown, and the map does not match itself when moved there.
+    It does not if the map matches itself when moved from one place to the other.
     """
     if one.shown >= MIN_JUDGED or not found:
         return False
@@ -163,22 +165,22 @@ def _outdone(field: LikelihoodField, one: FieldFit, found: list[FieldFit]) -> bo
     return clear and not is_self_similar(field, compose(one.pose, inverse(best.pose)))
 
 
-def _least(shown: float) -> float:
-    """Return the least score of what is shown: the less is shown, the higher."""
+def _min_score(shown: float) -> float:
+    """Return the minimal score, which is higher if less is shown."""
     return MIN_SCORE + (MIN_SCORE_HIDDEN - MIN_SCORE) * max(0.0, 1.0 - shown / MIN_JUDGED)
 
 
-def _standing(field: LikelihoodField) -> NDArray[np.bool_]:
-    """Return the cells for the body: free ground, and unknown cells just past its edge."""
-    standing = field.free.astype(np.uint8)
-    open_ground = (field.free | ~field.shown).astype(np.uint8)
-    for _ in range(round(BEYOND_M / field.cell)):  # step by step, as walls are in the way
-        standing = np.minimum(dilated(standing, 1, 1), open_ground)
-    return standing.astype(np.bool_)
+def _where_body_may_be(field: LikelihoodField) -> NDArray[np.bool_]:
+    """Return the cells where the body may be: free, or unknown and just past the edge of free."""
+    body_cells = field.free.astype(np.uint8)
+    open_cells = (field.free | ~field.shown).astype(np.uint8)
+    for _ in range(round(MAX_BEYOND_EDGE_M / field.cell)):  # cell by cell, as walls block
+        body_cells = np.minimum(dilated(body_cells, 1, 1), open_cells)
+    return body_cells.astype(np.bool_)
 
 
 @kernel
-def _coarse(image: Bytes, some_free: Bytes, offsets: NDArray[np.int64]) -> Bytes:
+def _block_bounds(image: Bytes, some_free: Bytes, offsets: NDArray[np.int64]) -> Bytes:
     height, width = image.shape
     rows, columns = some_free.shape
     headings, count, _ = offsets.shape
@@ -194,15 +196,15 @@ def _coarse(image: Bytes, some_free: Bytes, offsets: NDArray[np.int64]) -> Bytes
                     y = row * BLOCK + offsets[heading, k, 1]
                     # a block that begins outside may end within
                     if -BLOCK < x < width and -BLOCK < y < height:
-                        total += max(UNKNOWN, image[max(y, 0), max(x, 0)])
+                        total += max(NEUTRAL, image[max(y, 0), max(x, 0)])
                     else:
-                        total += UNKNOWN
+                        total += NEUTRAL
                 bounds[heading, row, column] = total // count
     return bounds
 
 
 @kernel
-def _inside(
+def _search_blocks(
     image: Bytes,
     free: NDArray[np.bool_],
     offsets: NDArray[np.int64],
@@ -215,12 +217,12 @@ def _inside(
     scores, cells = np.zeros(len(places)), np.zeros((len(places), 2), np.int64)
     for place in range(len(places)):
         heading, row, column = places[place]
-        enough = max(MIN_SCORE, best - BAND) * 255.0 * count
-        if (bounds[heading, row, column] + 1) * count < enough:
-            break  # those that follow are no better
+        bar = max(MIN_SCORE, best - SCORE_BAND) * 255.0 * count
+        if (bounds[heading, row, column] + 1) * count < bar:
+            break  # the following ones are no better
         for y in range(row * BLOCK, min((row + 1) * BLOCK, height)):
             for x in range(column * BLOCK, min((column + 1) * BLOCK, width)):
-                total = _total(image, offsets[heading], x, y, enough) if free[y, x] else 0
+                total = _total(image, offsets[heading], x, y, bar) if free[y, x] else 0
                 score = total / (255.0 * count)
                 if score > scores[place]:
                     scores[place] = score
@@ -230,17 +232,17 @@ def _inside(
 
 
 @kernel
-def _total(image: Bytes, offsets: NDArray[np.int64], x: int, y: int, enough: float) -> int:
-    """Return the sum over all points; 0 if `enough` is out of reach or few are shown."""
+def _total(image: Bytes, offsets: NDArray[np.int64], x: int, y: int, bar: float) -> int:
+    """Return the sum over all points; 0 if it cannot reach `bar`, or few points are shown."""
     height, width = image.shape
     count, total, shown = len(offsets), 0, 0
     for k in range(count):
         at_x, at_y = x + offsets[k, 0], y + offsets[k, 1]
-        likely = UNKNOWN
+        likelihood = NEUTRAL
         if 0 <= at_x < width and 0 <= at_y < height:
-            likely = int(image[at_y, at_x])
-        total += likely
-        shown += likely != UNKNOWN
-        if total + 255 * (count - 1 - k) < enough:
+            likelihood = int(image[at_y, at_x])
+        total += likelihood
+        shown += likelihood != NEUTRAL
+        if total + 255 * (count - 1 - k) < bar:
             return 0
-    return total if shown >= SHOWN * count else 0
+    return total if shown >= MIN_SHOWN * count else 0

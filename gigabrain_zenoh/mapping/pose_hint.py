@@ -1,7 +1,7 @@
 """Poses near a hint that explain a scan: a tag or a person says roughly where the robot is.
 
-The hint's ellipsoid is sampled, the likeliest samples are fitted to the scan, and the hint holds
-the fit near itself. So a hint never moves the robot to where the scan does not fit.
+The hint's ellipsoid is sampled, and the likeliest samples are fitted to the scan. Fits far from the
+hint are dropped. A hint never moves the robot to where the scan does not fit.
 """
 
 import math
@@ -16,18 +16,18 @@ from gigabrain_zenoh.mapping.global_localization import MIN_POINTS, Candidate, a
 from gigabrain_zenoh.mapping.keyframes import Beams, Points
 from gigabrain_zenoh.mapping.likelihood_field import LikelihoodField, fit
 
-SIGMAS = 2.0  # of the hint's ellipsoid that are sampled
+MAX_SIGMAS = 2.0  # of the hint, that are sampled
 STEP_M = 0.12  # between samples
-REACH_M = 1.5  # turns count as the way of a wall at this distance
-MAX_SAMPLES, AT_ONCE = 20_000, 1000
-POINTS = 90  # of a scan, evenly chosen
-SIGMA_M = 0.15  # how near a hit of a sample should be to a wall
-UNKNOWN = 0.75  # likelihood of a hit that the map cannot judge, as in the global search
-TRIED, MAX_FOUND = 12, 4
+LEVER_M = 1.5  # metres of a step per rad of a turn
+MAX_SAMPLES, SAMPLES_AT_ONCE = 20_000, 1000
+POINTS = 90  # of a scan, evenly sampled
+SIGMA_M = 0.15  # deviation of hits from walls
+NEUTRAL = 0.75  # likelihood of a hit that the map cannot judge, as in the global search
+MAX_TRIED, MAX_FOUND = 12, 4
 MIN_SCORE, MIN_SHOWN = 0.5, 0.2
-WEAK = np.diag((1.0, 1.0, 1.0))  # information that holds a fit at its sample
-FAR_SIGMAS = 4.0  # off the hint: the robot is not where it thinks to be, or the tag was moved
-LEAVING_SCORE, LEAVING_GAIN = 0.65, 0.15  # of a place that a localized robot leaves its own for
+PRIOR = np.diag((1.0, 1.0, 1.0))  # information that holds a fit at its sample
+FAR_SIGMAS = 4.0  # off the hint: the robot's pose is wrong, or the tag was moved
+MIN_LEAVE_SCORE, MIN_LEAVE_GAIN = 0.65, 0.15  # of a place to which a localized robot is moved
 OFF_COST = 0.02  # of the score, for one standard deviation off the hint
 
 
@@ -43,18 +43,18 @@ def explained(field: LikelihoodField, beams: Beams, hint: PoseHint) -> list[Cand
     if len(beams.hits) < MIN_POINTS:
         return []
     samples = _samples(hint)
-    likely = _likelihoods(field, beams.hits, samples)
+    likelihoods = _likelihoods(field, beams.hits, samples)
     tried: list[Floats] = []
-    for k in np.argsort(-likely, kind="stable")[: 20 * TRIED]:
-        if len(tried) < TRIED and apart(samples[k], tried):
+    for k in np.argsort(-likelihoods, kind="stable")[: 20 * MAX_TRIED]:
+        if len(tried) < MAX_TRIED and apart(samples[k], tried):
             tried.append(samples[k])
-    fits = [fit(field, beams, pose, WEAK) for pose in tried]
+    fits = [fit(field, beams, pose, PRIOR) for pose in tried]
     good = [
         (Candidate(one.pose, one.score), _squared_deviation(hint, one.pose))
         for one in fits
         if one.score >= MIN_SCORE and one.shown >= MIN_SHOWN
     ]
-    good = [one for one in good if one[1] <= (SIGMAS + 1.0) ** 2]
+    good = [one for one in good if one[1] <= (MAX_SIGMAS + 1.0) ** 2]
     found: list[Candidate] = []
     for one, _ in sorted(good, key=lambda pair: OFF_COST * pair[1] - pair[0].score):
         if len(found) < MAX_FOUND and apart(one.pose, (other.pose for other in found)):
@@ -63,32 +63,32 @@ def explained(field: LikelihoodField, beams: Beams, hint: PoseHint) -> list[Cand
 
 
 def far_from(hint: PoseHint, pose: Floats) -> bool:
-    """Return whether the hint says that the robot is somewhere else."""
+    """Return whether `pose` contradicts the hint."""
     return _squared_deviation(hint, pose) > FAR_SIGMAS**2
 
 
 def better(field: LikelihoodField, beams: Beams, hint: PoseHint, pose: Floats) -> list[Candidate]:
-    """Return the poses within the hint that explain a scan, if they do so better than `pose`.
+    """Return the poses within the hint that explain a scan, if they are better than `pose`.
 
-    So a tag that was moved throws no robot off, whose scan fits where it thinks to be.
+    So a tag that was moved does not mislead a robot whose scan fits at its own pose.
     """
     found = explained(field, beams, hint)
-    if not found or found[0].score < LEAVING_SCORE:
+    if not found or found[0].score < MIN_LEAVE_SCORE:
         return []
-    return found if found[0].score > fit(field, beams, pose, WEAK).score + LEAVING_GAIN else []
+    return found if found[0].score > fit(field, beams, pose, PRIOR).score + MIN_LEAVE_GAIN else []
 
 
 def _samples(hint: PoseHint) -> Floats:
     """Return poses (n, 3) in a lattice along the axes of the hint's ellipsoid."""
-    scale = np.array((1.0, 1.0, REACH_M))
+    scale = np.array((1.0, 1.0, LEVER_M))
     values, axes = np.linalg.eigh(hint.covariance * np.outer(scale, scale))
-    reaches = SIGMAS * np.sqrt(np.maximum(values, 1e-12))
-    reaches = np.minimum(reaches, math.pi * REACH_M)
+    reaches = MAX_SIGMAS * np.sqrt(np.maximum(values, 1e-12))
+    reaches = np.minimum(reaches, math.pi * LEVER_M)
     step = STEP_M
     while np.prod(2 * np.ceil(reaches / step) + 1) > MAX_SAMPLES:
         step *= 1.2
     counts = np.ceil(reaches / step).astype(int)
-    lines = [np.linspace(-far, far, 2 * n + 1) for far, n in zip(reaches, counts, strict=True)]
+    lines = [np.linspace(-end, end, 2 * n + 1) for end, n in zip(reaches, counts, strict=True)]
     lattice = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
     inside = (np.square(lattice / np.maximum(reaches, 1e-9)).sum(axis=1) <= 1.01) | (
         np.abs(lattice).max(axis=1) < 1e-9
@@ -97,18 +97,18 @@ def _samples(hint: PoseHint) -> Floats:
 
 
 def _likelihoods(field: LikelihoodField, hits: Points, samples: Floats) -> Floats:
-    """Return how near the hits of a scan are to walls at each sample, 0 to 1."""
-    chosen = hits[np.linspace(0, len(hits) - 1, min(POINTS, len(hits))).astype(np.intp)]
+    """Return how near the hits of a scan are to walls at each sample (n,), 0 to 1."""
+    sampled = hits[np.linspace(0, len(hits) - 1, min(POINTS, len(hits))).astype(np.intp)]
     image = np.exp(-0.5 * (field.distance / SIGMA_M) ** 2)
-    image[~field.shown] = UNKNOWN
+    image[~field.shown] = NEUTRAL
     found = [
-        _mean(image, field, chosen, samples[k : k + AT_ONCE])
-        for k in range(0, len(samples), AT_ONCE)
+        _mean_likelihood(image, field, sampled, samples[k : k + SAMPLES_AT_ONCE])
+        for k in range(0, len(samples), SAMPLES_AT_ONCE)
     ]
     return np.concatenate(found)
 
 
-def _mean(
+def _mean_likelihood(
     image: NDArray[np.floating], field: LikelihoodField, hits: Points, samples: Floats
 ) -> Floats:
     cos, sin = np.cos(samples[:, 2])[:, None], np.sin(samples[:, 2])[:, None]
@@ -119,13 +119,13 @@ def _mean(
     height, width = image.shape
     inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
     values = image[np.where(inside, rows, 0), np.where(inside, columns, 0)]
-    return np.asarray(np.where(inside, values, UNKNOWN).mean(axis=1), np.float64)
+    return np.asarray(np.where(inside, values, NEUTRAL).mean(axis=1), np.float64)
 
 
 def _squared_deviation(hint: PoseHint, pose: Floats) -> float:
-    """Return how many standard deviations a fit is off the hint, squared."""
-    off = pose - hint.pose
-    off[2] = math.remainder(off[2], math.tau)
-    slack = np.diag((STEP_M, STEP_M, STEP_M / REACH_M)) ** 2  # of the map and the lattice
+    """Return the squared Mahalanobis distance of `pose` from the hint."""
+    offset = pose - hint.pose
+    offset[2] = math.remainder(offset[2], math.tau)
+    slack = np.diag((STEP_M, STEP_M, STEP_M / LEVER_M)) ** 2  # of the map and the lattice
     spread = inverse_of(hint.covariance + slack)
-    return float(off @ spread @ off)
+    return float(offset @ spread @ offset)
