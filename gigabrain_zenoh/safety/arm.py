@@ -1,6 +1,6 @@
-"""Monitors of an arm's joints: whether they are where they were sent, and not overloaded.
+"""Monitors of an arm's joints: position errors, overload, and lost or implausible data.
 
-What the arm comes near to is judged by `arm_motion`.
+Distances to obstacles are judged by `arm_motion`.
 """
 
 from collections.abc import Sequence
@@ -14,30 +14,31 @@ from gigabrain_zenoh.geometry.joints import JointMotion
 from gigabrain_zenoh.safety.arm_motion import ArmLimits, ArmShape, limits
 from gigabrain_zenoh.safety.catalogue import cause, lasting, ticks_of
 
-WINDOW_TICKS = 15  # 0.3 s for the line to the servos and back, and for them to follow
+WINDOW_TICKS = 15  # 0.3 s: the line's round trip, and the servos' own delay
 LOST_TICKS = 5  # 0.1 s without a joint in the state
-JUMP_FACTOR, JUMP_TICKS = 1.5, 3  # of the greatest speed; states that may come late
-GRIP_FACTOR = 5.0  # a gripper may hold something so many times longer at its greatest effort
-Counts = dict[str, int]  # by joint, in ticks
+JUMP_FACTOR = 1.5  # a joint that is this much faster than its maximum speed jumps
+JUMP_TICKS = 3  # a state may be this late
+GRIP_FACTOR = 5.0  # a gripper may be at its maximum effort this many times longer
+Counts = dict[str, int]  # ticks by joint
 
 
 class ArmMonitor(Struct, frozen=True, kw_only=True):
-    """Compares joints with what they were sent, and finds how fast they may move."""
+    """Compares joints with their setpoints, and computes their speed limits."""
 
-    sent: tuple[tuple[float, ...], ...] = ()  # of the newest ticks
-    measured: tuple[Joint, ...] = ()  # of the last state
-    speeds: tuple[float, ...] = ()  # at which they are sent on [rad/s] or [m/s]
+    sent: tuple[tuple[float, ...], ...] = ()  # setpoints of the newest ticks
+    measured: tuple[Joint, ...] = ()  # joints in the last state
+    speeds: tuple[float, ...] = ()  # of the setpoints [rad/s] or [m/s]
     limits: ArmLimits = ArmLimits()
-    judged: tuple[object, ...] = ()  # the postures that the limits are for
+    limits_inputs: tuple[object, ...] = ()  # from which `limits` are computed
     shape: ArmShape | None = None
-    lost: Counts = {}
-    off: Counts = {}
-    strained: Counts = {}
+    lost: Counts = {}  # not in the state
+    off: Counts = {}  # too far from the recent setpoints
+    overloaded: Counts = {}
     frozen: Counts = {}
-    jumped: str = ""  # the joint that did, in this state
-    low_ticks: int = 0  # of the voltage
-    high_ticks: int = 0
-    problem: str = ""  # of its model
+    jumped: str = ""  # joint that jumped in this state
+    low_voltage_ticks: int = 0
+    high_voltage_ticks: int = 0
+    problem: str = ""  # with the arm's model
 
     def then(
         self,
@@ -50,43 +51,44 @@ class ArmMonitor(Struct, frozen=True, kw_only=True):
     ) -> "ArmMonitor":
         """Return the monitor after one more state, `passed` ticks after the last one.
 
-        `elapsed` are those of them that count. Without a `shape` there is a `problem`.
+        Counters grow by `elapsed` ticks. Without a `shape`, `problem` says why.
         """
         if not body.joints or not elapsed:
             return self
         measured = {joint.name: joint for joint in state.joints}
-        lost = _counted(
+        lost = _count_ticks(
             self.lost, elapsed, {joint.name: joint.name not in measured for joint in body.joints}
         )
-        now = replace(self, lost=lost, problem=problem, jumped="")._powered(body, state, elapsed)
+        now = replace(self, lost=lost, problem=problem, jumped="")
+        now = now._with_voltage(body, state, elapsed)
         if not state.link.connected or len(measured.keys() & lost.keys()) < len(body.joints):
             return now
         joints = tuple(measured[joint.name] for joint in body.joints)
-        now = now._moved(body, state, joints, elapsed, passed)
+        now = now._with_joints(body, state, joints, elapsed, passed)
         if shape is None:
             return now
-        there = tuple(JointMotion(joint.position, joint.velocity) for joint in joints)
+        motion = tuple(JointMotion(joint.position, joint.velocity) for joint in joints)
         sent = now.sent[-1] if now.sent else tuple(joint.position for joint in joints)
         speeds = now.speeds or (0.0,) * len(joints)
-        judged = (sent, speeds, there)
-        if judged == now.judged and shape is now.shape:  # it rests
+        inputs = (sent, speeds, motion)
+        if inputs == now.limits_inputs and shape is now.shape:  # the arm rests
             return now
         clearance = body.thresholds.arm_clearance
-        found = limits(body.joints, shape, sent, speeds, there, clearance)
-        return replace(now, limits=found, judged=judged, shape=shape)
+        found = limits(body.joints, shape, sent, speeds, motion, clearance)
+        return replace(now, limits=found, limits_inputs=inputs, shape=shape)
 
-    def _powered(self, body: BodyDescription, state: RobotState, elapsed: int) -> "ArmMonitor":
+    def _with_voltage(self, body: BodyDescription, state: RobotState, elapsed: int) -> "ArmMonitor":
         if body.arm is None or body.arm.voltage is None or state.battery is None:
             return self
-        least, most = body.arm.voltage
+        lowest, highest = body.arm.voltage
         volts = state.battery.voltage
         return replace(
             self,
-            low_ticks=lasting(self.low_ticks, volts < least, elapsed),
-            high_ticks=lasting(self.high_ticks, volts > most, elapsed),
+            low_voltage_ticks=lasting(self.low_voltage_ticks, volts < lowest, elapsed),
+            high_voltage_ticks=lasting(self.high_voltage_ticks, volts > highest, elapsed),
         )
 
-    def _moved(
+    def _with_joints(
         self,
         body: BodyDescription,
         state: RobotState,
@@ -94,100 +96,102 @@ class ArmMonitor(Struct, frozen=True, kw_only=True):
         elapsed: int,
         passed: int,
     ) -> "ArmMonitor":
-        """Compare a state with the last one, and with what was sent."""
-        if state.limp or not state.joints_sent:  # a person may move them
+        """Compare the joints with the last state, and with their setpoints."""
+        if state.limp or not state.joints_sent:  # a person may move the joints
             return replace(
-                self, sent=(), measured=joints, speeds=(), off={}, strained={}, frozen={}
+                self, sent=(), measured=joints, speeds=(), off={}, overloaded={}, frozen={}
             )
         sent = (*self.sent, state.joints_sent)[-WINDOW_TICKS:]
         pairs = tuple(zip(body.joints, joints, strict=True))
         before = self.measured or joints
-        stays = {
-            one.name: one == last and _error(limit, one, [sent[-1]], index) > 0.5
-            for index, ((limit, one), last) in enumerate(zip(pairs, before, strict=True))
+        frozen = {
+            joint.name: joint == last and _relative_error(limit, joint, [sent[-1]], index) > 0.5
+            for index, ((limit, joint), last) in enumerate(zip(pairs, before, strict=True))
         }
         off = {
-            one.name: _error(limit, one, sent, index) > 1.0
-            for index, (limit, one) in enumerate(pairs)
+            joint.name: _relative_error(limit, joint, sent, index) > 1.0
+            for index, (limit, joint) in enumerate(pairs)
         }
         jumped = (
-            one.name
-            for (limit, one), last in zip(pairs, before, strict=True)
-            if abs(one.position - last.position) > _jump(limit, passed)
+            joint.name
+            for (limit, joint), last in zip(pairs, before, strict=True)
+            if abs(joint.position - last.position) > _max_travel(limit, passed)
         )
         return replace(
             self,
             sent=sent,
             measured=joints,
-            speeds=_speeds(sent, passed),
-            off=_counted(self.off, elapsed, off),
-            strained=_counted(
-                self.strained, elapsed, {one.name: _strained(limit, one) for limit, one in pairs}
+            speeds=_setpoint_speeds(sent, passed),
+            off=_count_ticks(self.off, elapsed, off),
+            overloaded=_count_ticks(
+                self.overloaded,
+                elapsed,
+                {joint.name: _overloaded(limit, joint) for limit, joint in pairs},
             ),
-            frozen=_counted(self.frozen, elapsed, stays),
+            frozen=_count_ticks(self.frozen, elapsed, frozen),
             jumped=next(jumped, ""),
         )
 
     def causes(self, body: BodyDescription) -> tuple[Cause, ...]:
-        """Return why the arm must stop."""
-        times = body.thresholds
-        sustain = ticks_of(times.battery_sustain)
+        """Return the causes that stop the arm."""
+        thresholds = body.thresholds
+        sustain = ticks_of(thresholds.battery_sustain)
         found = [cause("arm_model", self.problem)] if self.problem else []
         if self.jumped:
             found.append(cause("joint_jump", f"{self.jumped} jumped farther than it can move"))
-        if self.low_ticks >= sustain:
+        if self.low_voltage_ticks >= sustain:
             found.append(cause("voltage_low"))
-        if self.high_ticks >= sustain:
+        if self.high_voltage_ticks >= sustain:
             found.append(cause("voltage_high"))
-        grip = GRIP_FACTOR * times.effort_sustain
+        grip_s = GRIP_FACTOR * thresholds.effort_sustain
         for joint in body.joints:
-            effort = grip if joint.part == "gripper" else times.effort_sustain
-            judged = (
+            effort_s = grip_s if joint.part == "gripper" else thresholds.effort_sustain
+            faults = (
                 ("joint_lost", self.lost, LOST_TICKS, "is no longer reported"),
-                ("joint_frozen", self.frozen, ticks_of(times.frozen_sustain),
+                ("joint_frozen", self.frozen, ticks_of(thresholds.frozen_sustain),
                  "repeats the same values although it should move"),
-                ("joint_off", self.off, ticks_of(times.joint_sustain),
+                ("joint_off", self.off, ticks_of(thresholds.joint_sustain),
                  "is not where it was sent"),
-                ("joint_overload", self.strained, ticks_of(effort),
+                ("joint_overload", self.overloaded, ticks_of(effort_s),
                  "has been at its greatest effort for too long"),
             )  # fmt: skip
             found += [
-                cause(code, f"{joint.name} {words}")
-                for code, counts, enough, words in judged
-                if counts.get(joint.name, 0) >= enough
+                cause(code, f"{joint.name} {text}")
+                for code, counts, max_ticks, text in faults
+                if counts.get(joint.name, 0) >= max_ticks
             ]
         return tuple(found)
 
 
-def _counted(before: Counts, elapsed: int, wrong: dict[str, bool]) -> Counts:
-    return {name: lasting(before.get(name, 0), is_so, elapsed) for name, is_so in wrong.items()}
+def _count_ticks(before: Counts, elapsed: int, faults: dict[str, bool]) -> Counts:
+    return {name: lasting(before.get(name, 0), fault, elapsed) for name, fault in faults.items()}
 
 
-def _error(
+def _relative_error(
     limit: JointDescription, joint: Joint, sent: Sequence[tuple[float, ...]], index: int
 ) -> float:
-    """Return how far a joint is off what was sent lately, in parts of what it may be off.
+    """Return a joint's distance from its recent setpoints, as a share of its allowed error.
 
-    A gripper that holds something cannot reach what it was sent; it is judged by its effort.
+    It is 0 for a gripper: one that holds something cannot reach its setpoint.
     """
     if limit.part == "gripper":
         return 0.0
-    positions = [one[index] for one in sent]
-    over, under = joint.position - max(positions), min(positions) - joint.position
+    setpoints = [posture[index] for posture in sent]
+    over, under = joint.position - max(setpoints), min(setpoints) - joint.position
     return max(over, under, 0.0) / limit.follow_error
 
 
-def _jump(limit: JointDescription, passed: int) -> float:
+def _max_travel(limit: JointDescription, passed: int) -> float:
     return JUMP_FACTOR * limit.max_speed * TICK_S * (passed + JUMP_TICKS)
 
 
-def _strained(limit: JointDescription, joint: Joint) -> bool:
+def _overloaded(limit: JointDescription, joint: Joint) -> bool:
     pairs = ((joint.effort, limit.max_effort), (joint.current, limit.max_current))
-    return any(value is not None and most and abs(value) >= most for value, most in pairs)
+    return any(value is not None and high and abs(value) >= high for value, high in pairs)
 
 
-def _speeds(sent: Sequence[tuple[float, ...]], passed: int) -> tuple[float, ...]:
-    """Return the speeds at which joints are sent on [rad/s] or [m/s]."""
+def _setpoint_speeds(sent: Sequence[tuple[float, ...]], passed: int) -> tuple[float, ...]:
+    """Return the speeds of the setpoints [rad/s] or [m/s]; empty while unknown."""
     if len(sent) < 2 or not passed:
         return ()
     return tuple(

@@ -1,6 +1,6 @@
-"""Distances of an arm's shapes by MuJoCo, from the text of its model.
+"""Distances between an arm's shapes, computed by MuJoCo from the text of its model.
 
-Imported where an arm is described, since MuJoCo takes memory and time that a base need not pay.
+Only imported for bodies with an arm, since MuJoCo costs memory and start-up time.
 """
 
 import re
@@ -16,15 +16,15 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.safety.arm_motion import Kind, Near
 
 FLOOR = "the floor"
-KEEP_OUT = "keep_out/"  # begins the names of boxes in the compiled model
-REFUSED = re.compile(
+KEEP_OUT = "keep_out/"  # prefix of the boxes' names in the compiled model
+REFUSED_ELEMENTS = re.compile(
     r"<\s*(include|mesh|hfield|skin|flex|flexcomp|composite|plugin|attach|model)\b"
 )
-FILES = re.compile(r"\b(file|fileright|fileleft|fileup|filedown|filefront|fileback)\s*=")
-NEXT, LAST = (1, 2, 0), (2, 0, 1)  # of the axes x, y, z
-TOUCH_M = 1e-9
+FILE_ATTRIBUTES = re.compile(r"\b(file|fileright|fileleft|fileup|filedown|filefront|fileback)\s*=")
+NEXT, PREVIOUS = (1, 2, 0), (2, 0, 1)  # of the axes x, y, z
+MIN_DISTANCE_M = 1e-9  # avoids a division by 0 for shapes that touch
 SLIDE = mujoco.mjtJoint.mjJNT_SLIDE.value
-FLAT = mujoco.mjtGeom.mjGEOM_PLANE.value
+PLANE = mujoco.mjtGeom.mjGEOM_PLANE.value
 BOX = mujoco.mjtGeom.mjGEOM_BOX.value
 CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE.value
 ELLIPSOID = mujoco.mjtGeom.mjGEOM_ELLIPSOID.value
@@ -34,54 +34,55 @@ Indices = NDArray[np.int64]
 
 
 class _Poses(NamedTuple):
-    """The poses of shapes and joints in some postures."""
+    """Poses of shapes and joints in several postures."""
 
     positions: Floats  # (postures, movable joints) [rad] or [m]
-    middles: Floats  # (postures, shapes, 3) [m]
-    turns: Floats  # (postures, shapes, 9)
+    centers: Floats  # (postures, shapes, 3) [m]
+    rotations: Floats  # (postures, shapes, 9), matrices by row
     axes: Floats  # (postures, joints, 3)
     anchors: Floats  # (postures, joints, 3) [m]
 
 
 class MujocoArm:
-    """The arm's shapes, and what they must not touch: each other, the floor and boxes.
+    """The arm's shapes, which must not touch each other, the floor or keep-out boxes.
 
-    Raises ConfigError, in one line, for a model that safety does not take.
+    Raises ConfigError for a model that safety does not accept.
     """
 
     def __init__(self, mjcf: str, body: BodyDescription) -> None:
-        self._model = model = _compiled(mjcf, body)
+        self._model = model = _compile(mjcf, body)
         self._data = mujoco.MjData(model)
-        self._coupling, self._start = _coupling(model, [joint.name for joint in body.joints])
+        self._coupling, self._offsets = _coupling(model, [joint.name for joint in body.joints])
         self._joints = _movable(model)
-        self._places = model.jnt_qposadr[self._joints]
+        self._qpos_indices = model.jnt_qposadr[self._joints]
         self._slides = model.jnt_type[self._joints] == SLIDE
-        moves = _moves(model)
+        moved = _moved_by_joints(model)
         shapes = _shapes(model)
-        pairs = _pairs(model, shapes, moves)
+        pairs = _pairs(model, shapes, moved)
         self._floor = body.arm.floor if body.arm else None
-        low = [] if self._floor is None else shapes[moves[model.geom_bodyid[shapes]].any(axis=1)]
-        self._ends = np.array([*pairs, *((int(geom), -1) for geom in low)], np.int64).reshape(-1, 2)
-        self._below = self._ends[:, 1] < 0
-        first = moves[model.geom_bodyid[self._ends[:, 0]]]
-        second = moves[model.geom_bodyid[self._ends[:, 1]]] & ~self._below[:, None]
-        self._signs = second.astype(float) - first  # (pairs, movable joints)
-        reach = _reach(model, moves)
-        reach = np.where(first, reach[self._ends[:, 0]], reach[self._ends[:, 1]])
+        moving = [] if self._floor is None else shapes[moved[model.geom_bodyid[shapes]].any(axis=1)]
+        with_floor = ((int(geom), -1) for geom in moving)
+        self._geoms = np.array([*pairs, *with_floor], np.int64).reshape(-1, 2)
+        self._with_floor = self._geoms[:, 1] < 0
+        moves_first = moved[model.geom_bodyid[self._geoms[:, 0]]]
+        moves_second = moved[model.geom_bodyid[self._geoms[:, 1]]] & ~self._with_floor[:, None]
+        self._signs = moves_second.astype(float) - moves_first  # (pairs, movable joints)
+        reach = _reach(model, moved)
+        reach = np.where(moves_first, reach[self._geoms[:, 0]], reach[self._geoms[:, 1]])
         self._levers: Floats = np.abs(self._signs) * reach @ np.abs(self._coupling)
-        self._radii = model.geom_rbound[self._ends].sum(axis=1, where=self._ends >= 0)
-        self._words = [self._in_words(a, b) for a, b in self._ends.tolist()]
+        self._radii = model.geom_rbound[self._geoms].sum(axis=1, where=self._geoms >= 0)
+        self._descriptions = [self._description(a, b) for a, b in self._geoms.tolist()]
 
     @property
     def levers(self) -> Floats:
-        """The greatest gradients that there can be, (pairs, joints), all positive."""
+        """Upper bounds of the absolute gradients, (pairs, joints)."""
         return self._levers
 
     def describe(self, pair: int) -> tuple[Kind, str, str]:
-        """Return what a pair is: its kind, and the names of both."""
-        return self._words[pair]
+        """Return the kind of a pair, and the names of both shapes."""
+        return self._descriptions[pair]
 
-    def _in_words(self, a: int, b: int) -> tuple[Kind, str, str]:
+    def _description(self, a: int, b: int) -> tuple[Kind, str, str]:
         if b < 0:
             return "floor", self._name(a), FLOOR
         box = self._model.geom(b).name
@@ -90,81 +91,83 @@ class MujocoArm:
         return "self", self._name(a), self._name(b)
 
     def near(self, postures: Floats, within: Floats) -> Near:
-        """Return each pair that is nearer than its value in `within`, (postures, pairs) [m].
+        """Return the pairs that are nearer than their limits `within`, (postures, pairs) [m].
 
-        Pairs whose enclosing spheres are farther apart are left out without measuring them.
+        Pairs whose bounding spheres are farther apart are not measured.
         """
-        poses = self._posed(postures)
-        where, pairs = np.nonzero(self._apart(poses.middles) < within)
-        most = within[where, pairs]
-        distances, points, normals = self._measured(poses, where, pairs, most)
-        (near,) = np.nonzero(distances < most)
-        where, pairs = where[near], pairs[near]
-        speeds = self._speeds(poses, where, points[near], normals[near])
+        poses = self._poses(postures)
+        indices, pairs = np.nonzero(self._lower_bounds(poses.centers) < within)
+        limits = within[indices, pairs]
+        distances, points, normals = self._measure(poses, indices, pairs, limits)
+        (near,) = np.nonzero(distances < limits)
+        indices, pairs = indices[near], pairs[near]
+        speeds = self._speeds(poses, indices, points[near], normals[near])
         gradients = (speeds * self._signs[pairs]) @ self._coupling
-        return Near(where, pairs, distances[near], gradients)
+        return Near(indices, pairs, distances[near], gradients)
 
-    def _posed(self, postures: Floats) -> _Poses:
+    def _poses(self, postures: Floats) -> _Poses:
         model, data, count = self._model, self._data, len(postures)
         shapes, joints = (count, model.ngeom), (count, model.njnt)
         poses = _Poses(
-            self._start + postures @ self._coupling.T,
+            self._offsets + postures @ self._coupling.T,
             np.empty((*shapes, 3)), np.empty((*shapes, 9)),
             np.empty((*joints, 3)), np.empty((*joints, 3)),
         )  # fmt: skip
         for index in range(count):
             self._pose(poses.positions[index])
-            poses.middles[index], poses.turns[index] = data.geom_xpos, data.geom_xmat
+            poses.centers[index], poses.rotations[index] = data.geom_xpos, data.geom_xmat
             poses.axes[index], poses.anchors[index] = data.xaxis, data.xanchor
         return poses
 
     def _pose(self, positions: Floats) -> None:
-        self._data.qpos[self._places] = positions
+        self._data.qpos[self._qpos_indices] = positions
         mujoco.mj_kinematics(self._model, self._data)
 
-    def _apart(self, middles: Floats) -> Floats:
-        """Return the least distances by spheres round the shapes, (postures, pairs) [m]."""
-        a, b = self._ends.T
-        between = middles[:, a] - middles[:, b]
-        apart = np.sqrt(np.einsum("kni,kni->kn", between, between))
-        height = middles[:, a, 2] - (self._floor or 0.0)
-        return np.asarray(np.where(self._below, height, apart) - self._radii)
+    def _lower_bounds(self, centers: Floats) -> Floats:
+        """Return the distances of bounding spheres, (postures, pairs) [m]."""
+        a, b = self._geoms.T
+        offsets = centers[:, a] - centers[:, b]
+        distances = np.sqrt(np.einsum("kni,kni->kn", offsets, offsets))
+        height = centers[:, a, 2] - (self._floor or 0.0)
+        return np.asarray(np.where(self._with_floor, height, distances) - self._radii)
 
-    def _measured(
-        self, poses: _Poses, where: Indices, pairs: Indices, most: Floats
+    def _measure(
+        self, poses: _Poses, postures: Indices, pairs: Indices, limits: Floats
     ) -> tuple[Floats, Floats, Floats]:
-        """Return distances (n,), points between the shapes and normals to the second (n, 3).
+        """Return distances (n,), midpoints between shapes and normals to the second (n, 3).
 
-        From its value in `most` on, (n,) [m], a distance is not measured.
+        Distances beyond their `limits` (n,) [m] are not measured.
         """
         model, data = self._model, self._data
         distances, lines = np.zeros(len(pairs)), np.zeros((len(pairs), 6))
-        below, posed = self._below[pairs], -1
-        rows = zip(where.tolist(), *self._ends[pairs].T.tolist(), most.tolist(), lines, strict=True)
-        for row, (index, a, b, cutoff, line) in enumerate(rows):
+        floor, posed = self._with_floor[pairs], -1
+        geoms = self._geoms[pairs].T.tolist()
+        rows = zip(postures.tolist(), *geoms, limits.tolist(), lines, strict=True)
+        for row, (posture, a, b, cutoff, line) in enumerate(rows):
             if b < 0:
                 continue
-            if index != posed:
-                self._pose(poses.positions[index])
-                posed = index
+            if posture != posed:
+                self._pose(poses.positions[posture])
+                posed = posture
             distances[row] = mj_geomDistance(model, data, a, b, cutoff, line)
         starts, stops = lines[:, :3], lines[:, 3:]
-        apart = np.where(np.abs(distances) < TOUCH_M, TOUCH_M, distances)
-        points, normals = (starts + stops) / 2, (stops - starts) / apart[:, None]  # outwards, too
-        if below.any():
-            index, shapes = where[below], self._ends[pairs[below], 0]
-            turns = poses.turns[index, shapes].reshape(-1, 3, 3)
-            lowest = poses.middles[index, shapes] + _lowest(model, shapes, turns)
-            distances[below] = lowest[:, 2] - (self._floor or 0.0)
-            points[below], normals[below] = lowest, (0.0, 0.0, -1.0)
+        divisor = np.where(np.abs(distances) < MIN_DISTANCE_M, MIN_DISTANCE_M, distances)
+        # normals point outwards also where shapes overlap, as their distance is negative
+        points, normals = (starts + stops) / 2, (stops - starts) / divisor[:, None]
+        if floor.any():
+            indices, shapes = postures[floor], self._geoms[pairs[floor], 0]
+            rotations = poses.rotations[indices, shapes].reshape(-1, 3, 3)
+            lowest = poses.centers[indices, shapes] + _lowest_points(model, shapes, rotations)
+            distances[floor] = lowest[:, 2] - (self._floor or 0.0)
+            points[floor], normals[floor] = lowest, (0.0, 0.0, -1.0)
         return distances, points, normals
 
-    def _speeds(self, poses: _Poses, where: Indices, points: Floats, normals: Floats) -> Floats:
-        """Return how fast points move along normals with each movable joint, (n, joints)."""
+    def _speeds(self, poses: _Poses, postures: Indices, points: Floats, normals: Floats) -> Floats:
+        """Return the speeds of points along normals at unit joint speed, (n, movable joints)."""
         axes, anchors = poses.axes[:, self._joints], poses.anchors[:, self._joints]
         turns = np.concatenate((axes, _cross(anchors, axes)), axis=2)
         slides = np.concatenate((np.zeros_like(axes), axes), axis=2)
-        lines = np.where(self._slides[:, None], slides, turns)[where]
+        lines = np.where(self._slides[:, None], slides, turns)[postures]
         along = np.concatenate((_cross(points, normals), normals), axis=1)
         return np.asarray(np.einsum("nji,ni->nj", lines, along))
 
@@ -172,24 +175,24 @@ class MujocoArm:
         return str(self._model.body(self._model.geom_bodyid[geom]).name) or "the base"
 
 
-def _compiled(mjcf: str, body: BodyDescription) -> mujoco.MjModel:
-    """Return the model with the boxes of the description."""
+def _compile(mjcf: str, body: BodyDescription) -> mujoco.MjModel:
+    """Return the model with the keep-out boxes of the body."""
     if len(mjcf.encode()) > MAX_MODEL_CHARACTERS:
         raise ConfigError(f"the arm's model is larger than {MAX_MODEL_CHARACTERS // 1024} kB")
-    if found := REFUSED.search(mjcf) or FILES.search(mjcf):
+    if found := REFUSED_ELEMENTS.search(mjcf) or FILE_ATTRIBUTES.search(mjcf):
         raise ConfigError(
             f"the arm's model has {found[1]!r}; safety takes primitive shapes only, in one file"
         )
     try:
         spec = mujoco.MjSpec.from_string(mjcf)
         for box in body.arm.keep_out if body.arm else ():
-            turn = [np.cos(box.yaw / 2), 0.0, 0.0, np.sin(box.yaw / 2)]
+            quaternion = [np.cos(box.yaw / 2), 0.0, 0.0, np.sin(box.yaw / 2)]
             spec.worldbody.add_geom(
                 name=f"{KEEP_OUT}{box.name}",
                 type=mujoco.mjtGeom.mjGEOM_BOX,
                 pos=box.center,
                 size=[side / 2 for side in box.size],
-                quat=turn,
+                quat=quaternion,
                 contype=-1,
                 conaffinity=-1,
             )
@@ -208,91 +211,96 @@ def _movable(model: mujoco.MjModel) -> NDArray[np.int64]:
 
 
 def _coupling(model: mujoco.MjModel, names: list[str]) -> tuple[Floats, Floats]:
-    """Return (movable joints, described joints) and offsets: all positions from those described.
+    """Return the matrix (movable joints, described joints) and offsets that give all positions.
 
-    A joint that an equality ties to another follows it; one that is not described stays where the
-    model begins.
+    An equality makes a joint follow another. Other joints that the body does not describe keep the
+    model's initial position.
     """
     joints = _movable(model).tolist()
     coupling = np.zeros((len(joints), len(names)))
-    begin = np.array(model.qpos0[model.jnt_qposadr[joints]])
-    start = begin.copy()
+    initial = np.array(model.qpos0[model.jnt_qposadr[joints]])
+    offsets = initial.copy()
     for row, joint in enumerate(joints):
         name = model.joint(joint).name
         if name in names:
-            coupling[row, names.index(name)], start[row] = 1.0, 0.0
-    for one in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT.value):
-        follower, leader = model.eq_obj1id[one], model.eq_obj2id[one]
-        offset, factor = model.eq_data[one, :2]
+            coupling[row, names.index(name)], offsets[row] = 1.0, 0.0
+    for equality in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT.value):
+        follower, leader = model.eq_obj1id[equality], model.eq_obj2id[equality]
+        offset, factor = model.eq_data[equality, :2]
         if leader < 0 or follower not in joints or leader not in joints:
             continue
         first, second = joints.index(follower), joints.index(leader)
-        offset += begin[first] - factor * begin[second]
-        if coupling[first].any():  # the follower is the one described
+        offset += initial[first] - factor * initial[second]
+        if coupling[first].any():  # the follower is described
             first, second, factor = second, first, 1 / factor
             offset *= -factor
-        coupling[first], start[first] = factor * coupling[second], offset + factor * start[second]
-    return coupling, start
+        coupling[first], offsets[first] = (
+            factor * coupling[second],
+            offset + factor * offsets[second],
+        )
+    return coupling, offsets
 
 
-def _moves(model: mujoco.MjModel) -> NDArray[np.bool_]:
-    """Return which movable joint moves which body, (bodies, joints)."""
+def _moved_by_joints(model: mujoco.MjModel) -> NDArray[np.bool_]:
+    """Return a mask (bodies, movable joints): the joint moved the body."""
     joints = _movable(model)
-    moves = np.zeros((model.nbody, len(joints)), bool)
+    moved = np.zeros((model.nbody, len(joints)), bool)
     for body in range(1, model.nbody):
-        moves[body] = moves[model.body_parentid[body]] | (model.jnt_bodyid[joints] == body)
-    return moves
+        moved[body] = moved[model.body_parentid[body]] | (model.jnt_bodyid[joints] == body)
+    return moved
 
 
-def _reach(model: mujoco.MjModel, moves: NDArray[np.bool_]) -> Floats:
-    """Return how far from each movable joint any point of a geom can be, (geoms, joints) [m].
+def _reach(model: mujoco.MjModel, moved: NDArray[np.bool_]) -> Floats:
+    """Return the maximum distances of geoms' points from joints, (geoms, movable joints) [m].
 
-    For a joint that slides it is 1, what a point moves with it.
+    For a sliding joint it is 1: a point moved as far as the joint.
     """
     joints = _movable(model)
     slides = model.jnt_type[joints] == SLIDE
-    ways = np.zeros(model.nbody)  # by which a body can slide
-    np.add.at(ways, model.jnt_bodyid[joints], slides * np.abs(model.jnt_range[joints]).max(axis=1))
-    steps = np.linalg.norm(model.body_pos, axis=1) + ways
+    slide_ranges = np.zeros(model.nbody)  # [m] by which a body can slide
+    np.add.at(
+        slide_ranges, model.jnt_bodyid[joints], slides * np.abs(model.jnt_range[joints]).max(axis=1)
+    )
+    steps = np.linalg.norm(model.body_pos, axis=1) + slide_ranges
     reach = np.zeros((model.nbody, len(joints)))  # of a body's origin
     for body in range(1, model.nbody):
-        begins = model.jnt_bodyid[joints] == body
+        attached = model.jnt_bodyid[joints] == body
         reach[body] = np.where(
-            begins,
-            np.linalg.norm(model.jnt_pos[joints], axis=1) + ways[body],
+            attached,
+            np.linalg.norm(model.jnt_pos[joints], axis=1) + slide_ranges[body],
             reach[model.body_parentid[body]] + steps[body],
         )
     own = np.linalg.norm(model.geom_pos, axis=1) + model.geom_rbound
-    found = (reach[model.geom_bodyid] + own[:, None]) * moves[model.geom_bodyid]
+    found = (reach[model.geom_bodyid] + own[:, None]) * moved[model.geom_bodyid]
     return np.asarray(np.where(slides, 1.0 * (found > 0), found))
 
 
 def _shapes(model: mujoco.MjModel) -> NDArray[np.int64]:
-    """Return the geoms that touch anything; planes are given by the body's file instead."""
+    """Return the solid geoms without planes: the body's file has the floor."""
     solid = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    return np.flatnonzero(solid & (model.geom_type != FLAT))
+    return np.flatnonzero(solid & (model.geom_type != PLANE))
 
 
 def _pairs(
-    model: mujoco.MjModel, shapes: NDArray[np.int64], moves: NDArray[np.bool_]
+    model: mujoco.MjModel, shapes: NDArray[np.int64], moved: NDArray[np.bool_]
 ) -> list[tuple[int, int]]:
-    """Return the pairs that must not touch: not of one link, of neighbours, or excluded."""
+    """Return the pairs that must not touch, without excluded ones and those of neighbours."""
     link = model.body_weldid
     parent = link[model.body_parentid[link]]
-    excluded = {(int(one) >> 16, int(one) & 0xFFFF) for one in model.exclude_signature}
+    excluded = {(int(pair) >> 16, int(pair) & 0xFFFF) for pair in model.exclude_signature}
     found = []
     for index, b in enumerate(shapes.tolist()):
         for a in shapes[:index].tolist():
-            box = [model.geom(one).name.startswith(KEEP_OUT) for one in (a, b)]
+            is_box = [model.geom(geom).name.startswith(KEEP_OUT) for geom in (a, b)]
             first, second = int(model.geom_bodyid[a]), int(model.geom_bodyid[b])
-            if (moves[first] == moves[second]).all():
-                continue  # nothing moves one of them without the other
+            if (moved[first] == moved[second]).all():
+                continue  # the same joints move both
             i, j = link[first], link[second]
             neighbours = parent[i] == j or parent[j] == i
-            if not any(box) and (neighbours or excluded & {(first, second), (second, first)}):
+            if not any(is_box) and (neighbours or excluded & {(first, second), (second, first)}):
                 continue
             if _collides(model, a, b):
-                found.append((b, a) if box[0] else (a, b))
+                found.append((b, a) if is_box[0] else (a, b))
     return found
 
 
@@ -301,18 +309,18 @@ def _collides(model: mujoco.MjModel, a: int, b: int) -> bool:
     return bool((kinds[a] & others[b]) | (kinds[b] & others[a]))
 
 
-def _lowest(model: mujoco.MjModel, shapes: Indices, turns: Floats) -> Floats:
-    """Return the lowest point of shapes turned by (n, 3, 3), from their middles (n, 3) [m]."""
-    down, sizes, kinds = -turns[:, 2], model.geom_size[shapes], model.geom_type[shapes]
-    offsets = np.sign(down) * sizes  # of boxes
+def _lowest_points(model: mujoco.MjModel, shapes: Indices, rotations: Floats) -> Floats:
+    """Return the lowest points of rotated shapes, relative to their centers (n, 3) [m]."""
+    down, sizes, kinds = -rotations[:, 2], model.geom_size[shapes], model.geom_type[shapes]
+    offsets = np.sign(down) * sizes  # right for boxes
     for kind in set(kinds.tolist()) - {BOX}:
         (rows,) = np.nonzero(kinds == kind)
-        offsets[rows] = _lowest_of(kind, sizes[rows], down[rows])
-    return np.asarray(np.einsum("nij,nj->ni", turns, offsets))
+        offsets[rows] = _farthest_points(kind, sizes[rows], down[rows])
+    return np.asarray(np.einsum("nij,nj->ni", rotations, offsets))
 
 
-def _lowest_of(kind: int, sizes: Floats, down: Floats) -> Floats:
-    """Return the points of round shapes that lie farthest in directions, in their own frames."""
+def _farthest_points(kind: int, sizes: Floats, down: Floats) -> Floats:
+    """Return the points of round shapes farthest in the directions `down`, in their own frames."""
     if kind == ELLIPSOID:
         scaled = sizes * down
         return np.asarray(sizes * scaled / _lengths(scaled))
@@ -331,5 +339,5 @@ def _lengths(vectors: Floats) -> Floats:
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
-    """Return the cross products of the last axes, as np.cross does in five times the time."""
-    return a[..., NEXT] * b[..., LAST] - a[..., LAST] * b[..., NEXT]
+    """Return the cross products of the last axes; np.cross takes five times as long."""
+    return a[..., NEXT] * b[..., PREVIOUS] - a[..., PREVIOUS] * b[..., NEXT]

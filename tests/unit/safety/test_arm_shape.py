@@ -136,7 +136,7 @@ def test_what_is_near_in_many_postures_is_what_is_near_in_each() -> None:
     limits_of_pairs = rng.uniform(-0.01, 0.15, (20, len(arm.levers)))
     near = arm.near(postures, limits_of_pairs)
     for index, posture in enumerate(postures):
-        each, one = distances(arm, posture), near.where == index
+        each, one = distances(arm, posture), near.postures == index
         found = dict(zip(near.pairs[one].tolist(), near.distances[one].tolist(), strict=True))
         most = limits_of_pairs[index].tolist()
         assert found == pytest.approx({p: d for p, d in each.items() if d < most[p]}, abs=1e-6)
